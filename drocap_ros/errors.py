@@ -1,0 +1,26 @@
+"""The exceptions of drocap_ros and the exit status that each ends a command with."""
+
+from __future__ import annotations
+
+
+class DrocapError(Exception):
+    """Root of every error that drocap_ros raises on purpose; ends a command with status 1."""
+
+    exit_status = 1
+
+
+class InputError(DrocapError):
+    """An input, option, message or parameter cannot be used; ends a command with status 2.
+
+    The text is one line: what was expected, what was found, what to do.
+    """
+
+    exit_status = 2
+
+
+class ParameterError(InputError):
+    """A parameter is unknown, of the wrong type, or outside its range."""
+
+
+class NodeError(DrocapError):
+    """A node of the running graph failed."""

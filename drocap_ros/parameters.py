@@ -1,0 +1,93 @@
+"""Typed component parameters: one frozen dataclass per component is the only source.
+
+The YAML loader, the ROS parameter declarations and the table in ``docs/parameters.md`` all read the
+metadata that :func:`param` attaches to a field.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar, get_type_hints
+
+from drocap_ros.errors import ParameterError
+
+P = TypeVar("P", bound="Parameters")
+
+
+def param(
+    default: Any,
+    description: str,
+    *,
+    unit: str = "",
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: tuple[str, ...] | None = None,
+) -> Any:
+    """Dataclass field of a :class:`Parameters` class; the range is inclusive at both ends."""
+    metadata = {
+        "description": description,
+        "unit": unit,
+        "minimum": minimum,
+        "maximum": maximum,
+        "choices": choices,
+    }
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Base of all component parameters: bool, int, float or str fields made with :func:`param`.
+
+    Raises
+    ------
+    ParameterError
+        At construction, when a value has the wrong type or lies outside its range.
+    """
+
+    def __post_init__(self) -> None:
+        types = get_type_hints(type(self))
+        for spec in dataclasses.fields(self):
+            value = _checked(spec, types[spec.name], getattr(self, spec.name), type(self).__name__)
+            object.__setattr__(self, spec.name, value)
+
+    @classmethod
+    def from_mapping(cls: type[P], values: Mapping[str, Any], where: str = "") -> P:
+        """Build from a mapping, refusing names that do not exist."""
+        known = {spec.name for spec in dataclasses.fields(cls)}
+        unknown = sorted(set(values) - known)
+        if unknown:
+            raise ParameterError(
+                f"{where or cls.__name__}: unknown parameter {unknown[0]!r}; expected one of {', '.join(sorted(known))}"
+            )
+        return cls(**values)
+
+
+def _checked(spec: dataclasses.Field[Any], kind: type, value: Any, owner: str) -> Any:
+    name = f"{owner}.{spec.name}"
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not kind:
+        raise ParameterError(f"{name}: expected {kind.__name__}, got {value!r}; correct the value")
+    meta = spec.metadata
+    if kind is float and not math.isfinite(value):
+        raise ParameterError(f"{name}: expected a finite number, got {value!r}; correct the value")
+    low, high = meta.get("minimum"), meta.get("maximum")
+    if (low is not None and value < low) or (high is not None and value > high):
+        unit = f" {meta['unit']}" if meta.get("unit") else ""
+        raise ParameterError(
+            f"{name}: expected {_range_text(low, high)}{unit}, got {value!r}; choose a value in the range"
+        )
+    if meta.get("choices") and value not in meta["choices"]:
+        raise ParameterError(f"{name}: expected one of {', '.join(meta['choices'])}, got {value!r}")
+    return value
+
+
+def _range_text(low: float | None, high: float | None) -> str:
+    if low is None:
+        return f"at most {high:g}"
+    if high is None:
+        return f"at least {low:g}"
+    return f"{low:g} to {high:g}"

@@ -1,0 +1,112 @@
+"""Named joint sets, their bones, and the maps between them.
+
+``BODY_15`` is the set that every 3D result uses.  Its joints follow the MoCap convention of Human3.6M:
+``pelvis`` is the middle of the hips, ``neck`` the top of the neck (not the line of the shoulders) and
+``head`` the middle of the skull's upper half.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+
+
+@dataclass(frozen=True)
+class JointSet:
+    """An ordered set of named joints with its kinematic tree (parent index per joint, -1 at a root)."""
+
+    name: str
+    joints: tuple[str, ...]
+    parents: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def index(self, joint: str) -> int:
+        """Place of a joint by its name."""
+        return self.joints.index(joint)
+
+    @cached_property
+    def bones(self) -> np.ndarray:
+        """(L, 2) int, rows parent, child."""
+        return np.array([(p, c) for c, p in enumerate(self.parents) if p >= 0])
+
+    @cached_property
+    def mirror(self) -> np.ndarray:
+        """(P,) int, the joint of the other body side for each joint (itself on the midline)."""
+        return np.array([self.joints.index(_other_side(j, self.joints)) for j in self.joints])
+
+
+def _other_side(joint: str, joints: tuple[str, ...]) -> str:
+    for a, b in (("l", "r"), ("r", "l"), ("left_", "right_"), ("right_", "left_")):
+        if joint.startswith(a) and b + joint[len(a) :] in joints:
+            return b + joint[len(a) :]
+    return joint
+
+
+BODY_15 = JointSet(
+    "body15",
+    (
+        "pelvis", "rhip", "rknee", "rankle", "lhip", "lknee", "lankle", "neck", "head",
+        "lshoulder", "lelbow", "lwrist", "rshoulder", "relbow", "rwrist",
+    ),
+    (-1, 0, 1, 2, 0, 4, 5, 0, 7, 7, 9, 10, 7, 12, 13),
+)  # fmt: skip
+
+COCO_17 = JointSet(
+    "coco17",
+    (
+        "nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder",
+        "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip",
+        "left_knee", "right_knee", "left_ankle", "right_ankle",
+    ),
+    (-1, 0, 0, 1, 2, 0, 0, 5, 6, 7, 8, 5, 6, 11, 12, 13, 14),
+)  # fmt: skip
+
+JOINT_SETS: dict[str, JointSet] = {s.name: s for s in (BODY_15, COCO_17)}
+
+#: The twelve joints over which the paper's tables average.
+LIMB_JOINTS = (
+    "rhip", "rknee", "rankle", "lhip", "lknee", "lankle",
+    "lshoulder", "lelbow", "lwrist", "rshoulder", "relbow", "rwrist",
+)  # fmt: skip
+
+#: Bones of ``BODY_15`` that keep their length on a real person (the spine and the shoulder girdle do not).
+RIGID_BONES = (
+    ("rhip", "rknee"), ("rknee", "rankle"), ("lhip", "lknee"), ("lknee", "lankle"), ("rhip", "lhip"),
+    ("lshoulder", "lelbow"), ("lelbow", "lwrist"), ("rshoulder", "relbow"), ("relbow", "rwrist"),
+    ("neck", "head"),
+)  # fmt: skip
+
+
+def joint_set(name: str) -> JointSet:
+    """Joint set by its name.
+
+    Raises
+    ------
+    InputError
+        When there is no set of that name.
+    """
+    try:
+        return JOINT_SETS[name]
+    except KeyError:
+        raise InputError(f"skeleton: expected one of {', '.join(JOINT_SETS)}, got {name!r}") from None
+
+
+def indices(joints: tuple[str, ...] | list[str], wanted: tuple[str, ...]) -> np.ndarray:
+    """(len(wanted),) int, where the wanted joints stand in ``joints``.
+
+    Raises
+    ------
+    InputError
+        When a wanted joint is missing.
+    """
+    place = {name: i for i, name in enumerate(joints)}
+    missing = [name for name in wanted if name not in place]
+    if missing:
+        raise InputError(f"joints: expected {', '.join(wanted)}; missing {', '.join(missing)}; rename or add them")
+    return np.array([place[name] for name in wanted])

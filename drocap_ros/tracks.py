@@ -1,0 +1,169 @@
+"""2D tracks of one subject: the input of every reconstruction, and its ``.npz`` file."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+
+#: Longest sequence that is accepted (10 h at 30 fps); refusing beats running out of memory.
+MAX_FRAMES = 1_080_000
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Keypoints of one subject over F images, P joints.
+
+    keypoints : (F, P, 2) float64, px, NaN where not seen
+    joints : P joint names
+    stamp_ns : (F,) int64, exposure times, strictly increasing
+    image_size : (width, height) px
+    confidence : (F, P) in [0, 1], or None
+    covariance : (F, P, 3) px^2, xx xy yy, or None
+    camera_rotation : (F, 3, 3) world (ENU) -> camera (x right, y down, z forward), or None
+    camera_position : (F, 3) m ENU, or None
+    camera_matrix : (3, 3) px, or None
+    """
+
+    keypoints: np.ndarray
+    joints: tuple[str, ...]
+    stamp_ns: np.ndarray
+    image_size: tuple[int, int]
+    confidence: np.ndarray | None = None
+    covariance: np.ndarray | None = None
+    camera_rotation: np.ndarray | None = None
+    camera_position: np.ndarray | None = None
+    camera_matrix: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+
+def _check(t: Tracks) -> None:
+    k = t.keypoints
+    if k.ndim != 3 or k.shape[2] != 2 or k.dtype.kind != "f":
+        raise InputError(f"keypoints: expected float (F, P, 2), got {k.dtype} {k.shape}; add or move the axes")
+    frames, joints = k.shape[:2]
+    if frames == 0:
+        raise InputError("keypoints: expected at least 1 frame, got 0")
+    if frames > MAX_FRAMES:
+        raise InputError(f"keypoints: expected at most {MAX_FRAMES} frames, got {frames}; cut the recording")
+    if len(t.joints) != joints:
+        raise InputError(f"joints: expected {joints} names, one per keypoint, got {len(t.joints)}")
+    if len(set(t.joints)) != joints:
+        raise InputError("joints: expected distinct names, got a repeated one; rename it")
+    shapes = {
+        "stamp_ns": (frames,),
+        "confidence": (frames, joints),
+        "covariance": (frames, joints, 3),
+        "camera_rotation": (frames, 3, 3),
+        "camera_position": (frames, 3),
+        "camera_matrix": (3, 3),
+    }
+    for name, shape in shapes.items():
+        value = getattr(t, name)
+        if value is not None and value.shape != shape:
+            raise InputError(f"{name}: expected shape {shape}, got {value.shape}; make it fit keypoints {k.shape}")
+    if t.stamp_ns.dtype != np.int64:
+        raise InputError(f"stamp_ns: expected int64 nanoseconds, got {t.stamp_ns.dtype}")
+    if np.any(np.diff(t.stamp_ns) <= 0):
+        raise InputError("stamp_ns: expected strictly increasing times, got a repeated or earlier one; sort the frames")
+    if np.isinf(k).any():
+        raise InputError("keypoints: expected finite px or NaN where not seen, got infinity; use NaN")
+    if min(t.image_size) < 1:
+        raise InputError(f"image_size: expected positive width and height, got {t.image_size}")
+    _check_telemetry(t)
+
+
+def _check_telemetry(t: Tracks) -> None:
+    if t.camera_rotation is not None:
+        r = t.camera_rotation
+        off = np.abs(r @ np.swapaxes(r, 1, 2) - np.eye(3)).max() if np.isfinite(r).all() else np.inf
+        if off > 1e-3 or np.any(np.linalg.det(r) < 0):
+            raise InputError("camera_rotation: expected rotation matrices (orthonormal, determinant 1), got others")
+    if t.camera_position is not None and not np.isfinite(t.camera_position).all():
+        raise InputError("camera_position: expected finite metres, got NaN or infinity; fill the gaps in")
+    if t.camera_matrix is not None and not (
+        np.isfinite(t.camera_matrix).all() and t.camera_matrix[0, 0] > 0 and t.camera_matrix[1, 1] > 0
+    ):
+        raise InputError("camera_matrix: expected finite values with positive focal lengths")
+
+
+_REQUIRED = ("keypoints", "joints", "stamp_ns", "image_size")
+_OPTIONAL = ("confidence", "covariance", "camera_rotation", "camera_position", "camera_matrix")
+
+
+def read_npz(path: Path, required: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Arrays of an ``.npz`` file (never pickles).
+
+    Raises
+    ------
+    InputError
+        When the file is missing, is no ``.npz``, or lacks a required array.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            if not hasattr(archive, "files"):
+                raise InputError(f"{path}: expected an .npz archive, got a single array")
+            arrays = {name: archive[name] for name in archive.files}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the path") from None
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: expected a readable .npz archive; {reason}") from None
+    missing = [name for name in required if name not in arrays]
+    if missing:
+        raise InputError(f"{path}: expected the arrays {', '.join(required)}; missing {', '.join(missing)}")
+    return arrays
+
+
+def load_tracks(path: str | Path) -> Tracks:
+    """Read a tracks ``.npz``; every array is checked and the error names the file.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be used.
+    """
+    path = Path(path)
+    arrays = read_npz(path, _REQUIRED)
+    try:
+        size = arrays["image_size"]
+        if size.shape != (2,) or not np.isfinite(size.astype(float)).all():
+            raise InputError(f"image_size: expected (2,) width, height, got shape {size.shape}")
+        stamp = arrays["stamp_ns"]
+        return Tracks(
+            keypoints=_as_float(arrays["keypoints"], "keypoints"),
+            joints=tuple(str(name) for name in np.atleast_1d(arrays["joints"])),
+            stamp_ns=stamp.astype(np.int64) if stamp.dtype.kind in "iu" else stamp,
+            image_size=(int(size[0]), int(size[1])),
+            **{name: _as_float(arrays[name], name) for name in _OPTIONAL if name in arrays},
+        )
+    except (InputError, ValueError) as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _as_float(array: np.ndarray, name: str) -> np.ndarray:
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{name}: expected numbers, got {array.dtype}")
+    return array.astype(np.float64)
+
+
+def save_tracks(path: str | Path, tracks: Tracks) -> None:
+    """Write a tracks ``.npz``."""
+    arrays = {name: getattr(tracks, name) for name in _OPTIONAL if getattr(tracks, name) is not None}
+    np.savez_compressed(
+        path,
+        keypoints=tracks.keypoints,
+        joints=np.array(tracks.joints),
+        stamp_ns=tracks.stamp_ns,
+        image_size=np.array(tracks.image_size),
+        **arrays,
+    )
