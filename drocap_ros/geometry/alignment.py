@@ -1,0 +1,90 @@
+"""Alignment of point sets and the body-fixed torso frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drocap_ros.geometry.rotations import project_to_so3
+from drocap_ros.skeleton import BODY_15, JointSet
+
+
+def similarity(
+    source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None, *, with_scale: bool = True
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Best similarity transformation without reflection (Umeyama 1991), per leading index.
+
+    Parameters
+    ----------
+    source, target : (..., P, 3)
+    weights : (..., P) non-negative, or None for equal ones
+    with_scale : False for a rigid motion
+
+    Returns
+    -------
+    scale (...), rotation (..., 3, 3), translation (..., 3)
+        ``target ~ scale * source @ rotation^T + translation``.  A source of one point has scale 1.
+    """
+    w = np.ones(source.shape[:-1]) if weights is None else weights
+    w = (w / np.maximum(w.sum(-1, keepdims=True), 1e-300))[..., None]
+    mean_s, mean_t = np.sum(w * source, axis=-2, keepdims=True), np.sum(w * target, axis=-2, keepdims=True)
+    s, t = source - mean_s, target - mean_t
+    cross = np.swapaxes(t, -1, -2) @ (w * s)
+    rotation = project_to_so3(cross)
+    spread = np.sum(w * s * s, axis=(-2, -1))
+    scale = np.ones(spread.shape)
+    if with_scale:
+        fitted = np.sum(rotation * cross, axis=(-2, -1))
+        scale = np.where(spread > 1e-300, fitted / np.where(spread > 1e-300, spread, 1.0), 1.0)
+    translation = mean_t - scale[..., None, None] * (mean_s @ np.swapaxes(rotation, -1, -2))
+    return scale, rotation, translation[..., 0, :]
+
+
+def apply_similarity(
+    points: np.ndarray, scale: np.ndarray, rotation: np.ndarray, translation: np.ndarray
+) -> np.ndarray:
+    """``scale * points @ rotation^T + translation`` for points (..., P, 3)."""
+    return scale[..., None, None] * (points @ np.swapaxes(rotation, -1, -2)) + translation[..., None, :]
+
+
+def torso_frame(s: np.ndarray, joints: JointSet = BODY_15) -> np.ndarray:
+    """Body-fixed frame of each pose: x forward, y to the left, z up along the trunk.
+
+    Parameters
+    ----------
+    s : (..., P, 3), any right-handed frame and unit
+
+    Returns
+    -------
+    (..., 3, 3) rotation; its columns are the axes of the body, so ``s @ torso_frame(s)`` is the pose in them.
+        The trunk's axis is pelvis to neck; left is right-to-left over hips and shoulders.
+    """
+    at = {name: s[..., joints.index(name), :] for name in ("neck", "pelvis", "lhip", "rhip", "lshoulder", "rshoulder")}
+    z = _unit(at["neck"] - at["pelvis"], np.array([0.0, 0.0, 1.0]))
+    left = _unit(at["lhip"] - at["rhip"], np.zeros(3)) + _unit(at["lshoulder"] - at["rshoulder"], np.zeros(3))
+    left = left - np.sum(left * z, axis=-1, keepdims=True) * z
+    # A trunk seen edge-on has no left: any axis across z then does.
+    spare = np.cross(z, np.where(np.abs(z[..., :1]) < 0.9, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])))
+    y = _unit(left, _unit(spare, np.zeros(3)))
+    return np.stack([np.cross(y, z), y, z], axis=-1)
+
+
+def _unit(v: np.ndarray, fallback: np.ndarray) -> np.ndarray:
+    norm = np.linalg.norm(v, axis=-1, keepdims=True)
+    good = norm > 1e-9
+    return np.where(good, v / np.where(good, norm, 1.0), fallback)
+
+
+def to_torso_frame(s: np.ndarray, joints: JointSet = BODY_15) -> tuple[np.ndarray, np.ndarray]:
+    """Split poses into body-fixed shapes and the rotation of the body.
+
+    Parameters
+    ----------
+    s : (..., P, 3), for example in the camera's frame
+
+    Returns
+    -------
+    shape (..., P, 3), rotation (..., 3, 3)
+        ``s == shape @ rotation^T``.
+    """
+    rotation = torso_frame(s, joints)
+    return s @ rotation, rotation

@@ -1,0 +1,113 @@
+"""Rotation matrices, rotation vectors and quaternions (xyzw, Hamilton), batched over leading axes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def hat(v: np.ndarray) -> np.ndarray:
+    """Cross-product matrix (..., 3, 3) of vectors (..., 3): ``hat(v) @ u == cross(v, u)``."""
+    out = np.zeros((*v.shape[:-1], 3, 3), dtype=v.dtype)
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def exp_so3(v: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad, by Rodrigues' formula."""
+    angle2 = np.sum(v * v, axis=-1)[..., None, None]
+    angle = np.sqrt(angle2)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1.0 - angle2 / 6.0, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    k = hat(v)
+    return np.eye(3, dtype=v.dtype) + a * k + b * (k @ k)
+
+
+def log_so3(r: np.ndarray) -> np.ndarray:
+    """Rotation vectors (..., 3) in rad, angle in [0, pi], of rotation matrices (..., 3, 3)."""
+    q = quaternion_from_matrix(r)
+    q = np.where(q[..., 3:] < 0, -q, q)
+    sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, q[..., 3:])
+    small = sine < 1e-8
+    return q[..., :3] * np.where(small, 2.0, angle / np.where(small, 1.0, sine))
+
+
+def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle (...) in rad of the rotation from ``a`` to ``b``, both (..., 3, 3)."""
+    # Chordal distance |a - b|_F = 2 sqrt(2) sin(angle / 2) keeps its precision near zero; the trace does not.
+    chord = np.linalg.norm(a - b, axis=(-2, -1)) / (2.0 * np.sqrt(2.0))
+    return 2.0 * np.arcsin(np.clip(chord, 0.0, 1.0))
+
+
+def project_to_so3(m: np.ndarray) -> np.ndarray:
+    """Closest rotation (..., 3, 3), in Frobenius norm, to each matrix (..., 3, 3)."""
+    u, _, vt = np.linalg.svd(m)
+    u = np.ascontiguousarray(u)
+    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return u @ vt
+
+
+def complete_rotation(rows: np.ndarray) -> np.ndarray:
+    """Rotation (..., 3, 3) whose first two rows are closest to ``rows`` (..., 2, 3), in Frobenius norm.
+
+    This is the projection on the Stiefel manifold V(2, 3), the third row being the cross product.
+    """
+    u, _, vt = np.linalg.svd(rows, full_matrices=False)
+    first = u @ vt
+    return np.concatenate([first, np.cross(first[..., :1, :], first[..., 1:, :])], axis=-2)
+
+
+def matrix_from_quaternion(q: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4), x y z w; they are normalized first."""
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_matrix(r: np.ndarray) -> np.ndarray:
+    """Unit quaternions (..., 4), x y z w, of rotation matrices (..., 3, 3); the largest component is positive."""
+    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    # Row i of 4 q q^T, one row per component; the row of the largest component divides by no small number.
+    rows = np.stack(
+        [
+            np.stack([1 + xx - yy - zz, r[..., 0, 1] + r[..., 1, 0], r[..., 0, 2] + r[..., 2, 0],
+                      r[..., 2, 1] - r[..., 1, 2]], -1),
+            np.stack([r[..., 0, 1] + r[..., 1, 0], 1 - xx + yy - zz, r[..., 1, 2] + r[..., 2, 1],
+                      r[..., 0, 2] - r[..., 2, 0]], -1),
+            np.stack([r[..., 0, 2] + r[..., 2, 0], r[..., 1, 2] + r[..., 2, 1], 1 - xx - yy + zz,
+                      r[..., 1, 0] - r[..., 0, 1]], -1),
+            np.stack([r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1],
+                      1 + xx + yy + zz], -1),
+        ],
+        axis=-2,
+    )  # fmt: skip
+    best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)[..., None, None]
+    q = np.take_along_axis(rows, np.broadcast_to(best, (*rows.shape[:-2], 1, 4)), axis=-2)[..., 0, :]
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+
+
+def slerp(q0: np.ndarray, q1: np.ndarray, s: np.ndarray | float) -> np.ndarray:
+    """Spherical interpolation (..., 4) from ``q0`` (s = 0) to ``q1`` (s = 1) along the shorter arc; x y z w."""
+    q0 = q0 / np.linalg.norm(q0, axis=-1, keepdims=True)
+    q1 = q1 / np.linalg.norm(q1, axis=-1, keepdims=True)
+    dot = np.sum(q0 * q1, axis=-1, keepdims=True)
+    q1 = np.where(dot < 0, -q1, q1)
+    s = np.asarray(s, dtype=float)[..., None]
+    # atan2 of the chord keeps its precision for nearly equal quaternions, where arccos does not.
+    angle = 2.0 * np.arctan2(
+        np.linalg.norm(q1 - q0, axis=-1, keepdims=True), np.linalg.norm(q1 + q0, axis=-1, keepdims=True)
+    )
+    small = angle < 1e-6
+    sine = np.where(small, 1.0, np.sin(angle))
+    a = np.where(small, 1.0 - s, np.sin((1.0 - s) * angle) / sine)
+    b = np.where(small, s, np.sin(s * angle) / sine)
+    out = a * q0 + b * q1
+    return out / np.linalg.norm(out, axis=-1, keepdims=True)
