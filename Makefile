@@ -1,0 +1,40 @@
+# `make demo` and `make test` do all the set-up by themselves.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# A parent process that already runs in a ROS environment must not leak its libraries into ours.
+CLEAN := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE -u LD_LIBRARY_PATH -u PYTHONPATH -u AMENT_PREFIX_PATH -u CMAKE_PREFIX_PATH
+SOURCES := $(shell find drocap_ros msg config resource -type f -not -path '*/__pycache__/*') setup.py CMakeLists.txt package.xml
+
+.PHONY: help setup demo test lint bench clean
+help:  ## this list
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
+
+setup: $(VENV)/.package  ## virtual environment with ROS 2 Jazzy and this package
+
+$(VENV)/.requirements: requirements.lock
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 10) <= v <= (3, 13) else f"make setup: expected Python 3.10 to 3.13, found {v[0]}.{v[1]}; run: make PYTHON=python3.11 ...")'
+	$(CLEAN) $(PYTHON) -m venv $(VENV)
+	$(CLEAN) $(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	@touch $@
+
+$(VENV)/.package: $(VENV)/.requirements $(SOURCES)
+	$(CLEAN) DROCAP_BUILD_DIR=$(CURDIR)/build/pip $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps --force-reinstall .
+	@touch $@
+
+demo: setup  ## a whole simulated capture, reconstructed and compared with its truth
+	$(CLEAN) $(BIN)/drocap demo --out demo_out
+
+test: setup  ## the whole test suite
+	$(CLEAN) $(BIN)/python -m pytest
+
+lint: setup  ## ruff and mypy
+	$(CLEAN) $(BIN)/ruff check .
+	$(CLEAN) $(BIN)/ruff format --check .
+	$(CLEAN) $(BIN)/mypy
+
+bench: setup  ## benchmarks; results under benchmarks/results
+	for file in benchmarks/[a-z]*.py; do $(CLEAN) $(BIN)/python $$file || exit 1; done
+
+clean:  ## remove everything that was built
+	rm -rf $(VENV) build install log
