@@ -1,0 +1,1 @@
+"""The synthetic world of the demo and the tests: person, camera, keypoint observation, vehicle."""

@@ -1,0 +1,72 @@
+"""The camera of the simulated drone: orbit, look-at, pinhole projection."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """(F, 3, 3) world (ENU) -> camera (x right, y down, z forward), level, looking from position to target (F, 3) m.
+
+    A camera straight above or below its target has no level; it then keeps world x as its right.
+    """
+    forward = target - position
+    forward = forward / np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), 1e-9)
+    right = np.stack([forward[:, 1], -forward[:, 0], np.zeros(len(forward))], axis=1)
+    length = np.linalg.norm(right, axis=1, keepdims=True)
+    right = np.where(length > 1e-6, right / np.maximum(length, 1e-6), np.array([1.0, 0.0, 0.0]))
+    return np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
+def orbit_camera(
+    t: np.ndarray,
+    centre: np.ndarray,
+    radius_m: float,
+    height_m: float,
+    speed_deg_s: float,
+    start_deg: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Camera that circles a (moving) centre and looks at it.
+
+    Parameters
+    ----------
+    t : (F,) s
+    centre : (F, 3) m ENU, what it looks at
+    radius_m, height_m : horizontal distance from the centre; height above the ground (z = 0)
+    speed_deg_s : positive = counter-clockwise seen from above
+    start_deg : bearing of the camera from the centre at t = 0, 0 = east
+
+    Returns
+    -------
+    rotation (F, 3, 3) world -> camera optical, position (F, 3) m ENU.
+    """
+    angle = np.deg2rad(start_deg + speed_deg_s * np.asarray(t))
+    position = np.stack(
+        [
+            centre[:, 0] + radius_m * np.cos(angle),
+            centre[:, 1] + radius_m * np.sin(angle),
+            np.full(len(centre), float(height_m)),
+        ],
+        axis=1,
+    )
+    return look_at(position, centre), position
+
+
+def pinhole_matrix(image_width: int, image_height: int, horizontal_fov_deg: float) -> np.ndarray:
+    """(3, 3) px, square pixels, principal point in the middle (pixel centres at whole numbers)."""
+    focal = 0.5 * image_width / np.tan(0.5 * np.deg2rad(horizontal_fov_deg))
+    return np.array([[focal, 0.0, 0.5 * (image_width - 1)], [0.0, focal, 0.5 * (image_height - 1)], [0.0, 0.0, 1.0]])
+
+
+def to_camera(points: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """(F, P, 3) m in the camera frame of world points (F, P, 3)."""
+    return np.einsum("fij,fpj->fpi", rotation, points - position[:, None, :])
+
+
+def project(points: np.ndarray, rotation: np.ndarray, position: np.ndarray, camera_matrix: np.ndarray) -> np.ndarray:
+    """(F, P, 2) px of world points (F, P, 3); NaN for points not in front of the camera."""
+    local = to_camera(points, rotation, position)
+    depth = local[..., 2]
+    safe = np.where(depth > 1e-3, depth, np.nan)
+    pixel = np.einsum("ij,fpj->fpi", camera_matrix, local)
+    return pixel[..., :2] / safe[..., None]

@@ -1,0 +1,112 @@
+"""A whole simulated capture: person, orbiting camera, observed keypoints, telemetry, and the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.simulation.camera import orbit_camera, pinhole_matrix, project, to_camera
+from drocap_ros.simulation.config import SimulationConfig
+from drocap_ros.simulation.observation import Observation, observe_keypoints, occlusion
+from drocap_ros.simulation.person import simulate_person
+from drocap_ros.skeleton import BODY_15
+from drocap_ros.tracks import MAX_FRAMES, Tracks
+
+
+@dataclass(frozen=True)
+class SimulatedCapture:
+    """What a flight would have recorded, and what was really there.
+
+    tracks : keypoints with noise, and camera telemetry with its slow errors
+    joints3d_world : (F, 15, 3) m ENU, truth
+    camera_rotation, camera_position : (F, 3, 3) world -> camera, (F, 3) m ENU, truth
+    keypoints_exact : (F, 15, 2) px, truth
+    observation : which keypoints were occluded or made outliers
+    """
+
+    tracks: Tracks
+    joints3d_world: np.ndarray
+    camera_rotation: np.ndarray
+    camera_position: np.ndarray
+    keypoints_exact: np.ndarray
+    observation: Observation
+
+
+def simulate_capture(
+    seconds: float, fps: float = 30.0, seed: int = 0, config: SimulationConfig | None = None, start_ns: int = 0
+) -> SimulatedCapture:
+    """Simulate a capture flight.
+
+    Parameters
+    ----------
+    seconds, fps : length and picture rate; at least one frame
+    seed : person, take and noise
+    start_ns : stamp of the first picture
+
+    Raises
+    ------
+    InputError
+        When length or rate cannot be used.
+    """
+    config = config or SimulationConfig()
+    if not (np.isfinite(fps) and 0 < fps <= 1000):
+        raise InputError(f"fps: expected above 0 and at most 1000, got {fps!r}; choose a picture rate")
+    if not (np.isfinite(seconds) and 0 < seconds <= 36_000) or seconds * fps > MAX_FRAMES:
+        raise InputError(f"seconds: expected above 0 and at most {MAX_FRAMES} pictures, got {seconds!r} s at {fps:g}/s")
+    t = np.arange(max(1, round(seconds * fps))) / fps
+    joints = simulate_person(t, config.action, seed, config.stature_m)
+    centre = _aim(t, seed, config)
+    rng = np.random.default_rng([seed, 0xCA])
+    rotation, position = orbit_camera(
+        t, centre, config.radius_m, config.height_m, config.angular_speed_deg_s, rng.uniform(-180, 180)
+    )
+    matrix = pinhole_matrix(config.image_width, config.image_height, config.horizontal_fov_deg)
+    exact = project(joints, rotation, position, matrix)
+    inside = np.all((exact >= -0.5) & (exact < np.array([config.image_width, config.image_height]) - 0.5), axis=-1)
+    seen = np.where(inside[..., None], exact, np.nan)
+    hidden = occlusion(exact, to_camera(joints, rotation, position)[..., 2], matrix[0, 0])
+    observation = observe_keypoints(
+        seen,
+        hidden,
+        seed,
+        noise_scale=config.noise_scale,
+        outlier_fraction=config.outlier_fraction,
+        missed_fraction=config.missed_fraction,
+    )
+    told_rotation, told_position = _telemetry(t, rotation, position, rng, config)
+    tracks = Tracks(
+        keypoints=observation.keypoints,
+        joints=BODY_15.joints,
+        stamp_ns=start_ns + np.round(t * 1e9).astype(np.int64),
+        image_size=(config.image_width, config.image_height),
+        confidence=observation.confidence,
+        covariance=observation.covariance,
+        camera_rotation=told_rotation,
+        camera_position=told_position,
+        camera_matrix=matrix,
+    )
+    return SimulatedCapture(tracks, joints, rotation, position, exact, observation)
+
+
+def _aim(t: np.ndarray, seed: int, config: SimulationConfig) -> np.ndarray:
+    """(F, 3) m, the point that the drone circles: the person's place as a follower sees it, 0.3 s late and smooth."""
+    late = np.maximum(t[:, None] - 0.3 + np.linspace(-0.3, 0.3, 7), 0.0)
+    pelvis = simulate_person(late.ravel(), config.action, seed, config.stature_m)[:, 0].reshape(*late.shape, 3)
+    aim = pelvis.mean(axis=1)
+    aim[:, 2] = 0.5 * config.stature_m
+    return aim
+
+
+def _telemetry(
+    t: np.ndarray, rotation: np.ndarray, position: np.ndarray, rng: np.random.Generator, config: SimulationConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Camera pose as the autopilot would report it: with slow errors of the configured size (RMS over axes)."""
+    from scipy.spatial.transform import Rotation
+
+    rate = rng.uniform(0.02, 0.2, (2, 3))
+    phase = rng.uniform(0, 2 * np.pi, (2, 3))
+    wave = np.sin(2 * np.pi * rate[:, None] * t[:, None] + phase[:, None]) * np.sqrt(2 / 3)
+    turn = Rotation.from_rotvec(np.deg2rad(config.attitude_error_deg) * wave[0]).as_matrix()
+    return turn @ rotation, position + config.position_error_m * wave[1]

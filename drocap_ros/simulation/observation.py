@@ -1,0 +1,116 @@
+"""What a 2D pose detector makes of the simulated person: noise, outliers, missed joints, confidence, covariance."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.skeleton import BODY_15, JointSet
+
+#: Standard deviation over the box height, per kind of joint (detectors are worst at the ends of the limbs).
+_SPREAD = {
+    "pelvis": 0.007, "hip": 0.008, "knee": 0.007, "ankle": 0.010, "neck": 0.006, "head": 0.006,
+    "shoulder": 0.006, "elbow": 0.008, "wrist": 0.011,
+}  # fmt: skip
+_CORRELATION = 0.6  # of the noise of one image with that of the image before
+_LIMB_RADIUS_M = 0.07
+_OCCLUDED_NOISE = 2.2
+_CHUNK = 4096
+
+
+class Observation(NamedTuple):
+    """Keypoints (F, P, 2) px, confidence (F, P), covariance (F, P, 3) px^2 and what was done to them (F, P) bool."""
+
+    keypoints: np.ndarray
+    confidence: np.ndarray
+    covariance: np.ndarray
+    occluded: np.ndarray
+    outlier: np.ndarray
+
+
+def occlusion(px: np.ndarray, depth: np.ndarray, focal_px: float, joint_set: JointSet = BODY_15) -> np.ndarray:
+    """(F, P) bool, joints behind another limb or the trunk.
+
+    px (F, P, 2), depth (F, P) m.  Limbs are capsules of 7 cm radius, the trunk of 14 cm.
+    """
+    hidden = np.zeros(depth.shape, dtype=bool)
+    parent, child = joint_set.bones.T
+    radius = np.where((parent == 0) & (child == joint_set.index("neck")), 2 * _LIMB_RADIUS_M, _LIMB_RADIUS_M)
+    own = (np.arange(len(joint_set))[:, None] == parent) | (np.arange(len(joint_set))[:, None] == child)
+    for start in range(0, len(px), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        a, b = px[part, None, parent], px[part, None, child]
+        axis = b - a
+        along = np.sum((px[part, :, None] - a) * axis, axis=-1) / np.maximum(np.sum(axis**2, axis=-1), 1e-9)
+        along = np.clip(along, 0.0, 1.0)
+        gap = np.linalg.norm(px[part, :, None] - a - along[..., None] * axis, axis=-1)
+        near = depth[part, None, parent] * (1 - along) + depth[part, None, child] * along
+        covered = (gap * near < radius * focal_px) & (near < depth[part, :, None] - radius) & ~own
+        hidden[part] = covered.any(axis=2)
+    return hidden
+
+
+def observe_keypoints(
+    px: np.ndarray,
+    occluded: np.ndarray | None = None,
+    seed: int = 0,
+    *,
+    noise_scale: float = 1.0,
+    outlier_fraction: float = 0.03,
+    missed_fraction: float = 0.015,
+    joint_set: JointSet = BODY_15,
+) -> Observation:
+    """Keypoints as a detector would report them.
+
+    Noise is proportional to the height of the person's box, larger for wrists, ankles and occluded joints, and
+    correlated over time; gross outliers and misses are three times as frequent among occluded joints.  The
+    reported covariance is right on average but not per keypoint; outliers get a lower confidence, most of them.
+
+    Parameters
+    ----------
+    px : (F, P, 2) exact projections, NaN outside the view
+    occluded : (F, P) bool, see :func:`occlusion`
+    """
+    from scipy.signal import lfilter
+
+    rng = np.random.default_rng([seed, 0x0B5])
+    frames, joints = px.shape[:2]
+    hidden = np.zeros((frames, joints), bool) if occluded is None else occluded
+    height = _box_height(px)
+    share = np.array([_SPREAD[name.lstrip("lr") if name[1:] in _SPREAD else name] for name in joint_set.joints])
+    sigma = height[:, None] * share * np.where(hidden, _OCCLUDED_NOISE, 1.0)
+    white = rng.standard_normal((frames, joints, 2))
+    white[1:] *= np.sqrt(1 - _CORRELATION**2)
+    noise = lfilter([1.0], [1.0, -_CORRELATION], white, axis=0)
+    keypoints = px + noise_scale * sigma[..., None] * noise
+
+    rate = np.where(hidden, 3.0, 1.0)
+    outlier = rng.random((frames, joints)) < outlier_fraction * rate
+    angle = rng.uniform(0, 2 * np.pi, (frames, joints))
+    length = rng.uniform(0.1, 0.4, (frames, joints)) * height[:, None]
+    shift = length[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    keypoints = np.where(outlier[..., None], keypoints + shift, keypoints)
+    missed = rng.random((frames, joints)) < missed_fraction * rate
+
+    spread = np.maximum(noise_scale, 0.05) * sigma * np.where(outlier, 3.0, 1.0)
+    variance = spread[..., None] ** 2 * np.exp(rng.normal(-0.03, 0.25, (frames, joints, 2)))
+    mixed = 0.2 * rng.uniform(-1, 1, (frames, joints)) * np.sqrt(variance[..., 0] * variance[..., 1])
+    covariance = np.stack([variance[..., 0], mixed, variance[..., 1]], axis=-1)
+
+    good = rng.beta(14, 2.5, (frames, joints)) * np.where(hidden, 0.75, 1.0)
+    confidence = np.where(outlier, rng.beta(3, 4.5, (frames, joints)), good)
+
+    missed = missed | ~np.isfinite(px).all(axis=-1)
+    keypoints = np.where(missed[..., None], np.nan, keypoints)
+    covariance = np.where(missed[..., None], np.nan, covariance)
+    confidence = np.where(missed, 0.0, confidence)
+    return Observation(keypoints, confidence, covariance, hidden, outlier & ~missed)
+
+
+def _box_height(px: np.ndarray) -> np.ndarray:
+    """(F,) px; 0 for images without the person."""
+    y = px[..., 1]
+    top = np.min(np.where(np.isfinite(y), y, np.inf), axis=1)
+    bottom = np.max(np.where(np.isfinite(y), y, -np.inf), axis=1)
+    return np.where(np.isfinite(top) & np.isfinite(bottom), np.maximum(bottom - top, 1.0), 0.0)

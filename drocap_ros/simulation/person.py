@@ -1,0 +1,324 @@
+"""An articulated person who walks, boxes, kicks and squats.
+
+Every action is written as smooth controls (path of the root, trunk angles, goals of wrists and ankles); two-bone
+inverse kinematics turns the goals into joints, so that all bone lengths of ``BODY_15`` are constant.
+World: ENU, m, z up, the ground at z = 0.  Body: x forward, y left, z up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.skeleton import BODY_15
+
+_SINGLE = ("walk", "boxing", "kicking", "squats")
+#: What a simulated person can do; "mixed" goes through the others in turn.
+ACTIONS = ("mixed", "stand", *_SINGLE)
+
+#: Bone lengths as shares of the stature (means of adults; hips and shoulders from the midline).
+_SHARES = {
+    "hip": 0.055, "thigh": 0.245, "shank": 0.246, "foot": 0.045, "trunk": 0.37, "head": 0.055,
+    "shoulder_side": 0.115, "shoulder_drop": 0.075, "upper_arm": 0.172, "forearm": 0.157,
+}  # fmt: skip
+
+_PATH_STEP_S = 0.01
+_MIXED_SEGMENT_S = 5.0
+_STANCE = 0.6  # share of a stride during which a foot stands
+
+
+@dataclass(frozen=True)
+class _Style:
+    """What distinguishes one person and take from another."""
+
+    size: dict[str, float]
+    speed_m_s: float
+    stride_hz: float
+    turn_rad_s: float
+    wander_rad: tuple[float, float]
+    wander_hz: tuple[float, float]
+    wander_phase: tuple[float, float]
+    heading_rad: float
+    punch_hz: float
+    kick_hz: float
+    squat_hz: float
+    phase: float
+
+
+def _style(seed: int, stature_m: float) -> _Style:
+    rng = np.random.default_rng(seed)
+    size = {name: share * stature_m * (1 + 0.03 * rng.uniform(-1, 1)) for name, share in _SHARES.items()}
+    return _Style(
+        size=size,
+        speed_m_s=0.58 * stature_m * rng.uniform(0.9, 1.1),
+        stride_hz=rng.uniform(0.85, 0.98),
+        turn_rad_s=rng.choice([-1, 1]) * rng.uniform(0.15, 0.3),
+        wander_rad=(rng.uniform(0.3, 0.6), rng.uniform(0.1, 0.25)),
+        wander_hz=(rng.uniform(0.06, 0.1), rng.uniform(0.15, 0.25)),
+        wander_phase=(rng.uniform(0, 6.28), rng.uniform(0, 6.28)),
+        heading_rad=rng.uniform(-np.pi, np.pi),
+        punch_hz=rng.uniform(0.55, 0.75),
+        kick_hz=rng.uniform(0.32, 0.4),
+        squat_hz=rng.uniform(0.33, 0.42),
+        phase=rng.uniform(0, 1),
+    )
+
+
+def simulate_person(t: np.ndarray, action: str = "mixed", seed: int = 0, stature_m: float = 1.75) -> np.ndarray:
+    """Joints of a moving person.
+
+    Parameters
+    ----------
+    t : (F,) s, at least 0, in any order; the pose at an instant does not depend on the other instants
+    action : one of ``ACTIONS``
+    seed : chooses the person's proportions and the take
+    stature_m : height of the person
+
+    Returns
+    -------
+    (F, 15, 3) m, order of ``BODY_15``, world ENU.
+
+    Raises
+    ------
+    InputError
+        When the action is unknown, or the times are negative, not finite or beyond 10 h.
+    """
+    if action not in ACTIONS:
+        raise InputError(f"action: expected one of {', '.join(ACTIONS)}, got {action!r}")
+    t = np.asarray(t, dtype=np.float64)
+    if t.ndim != 1 or not np.isfinite(t).all() or np.any(t < 0) or np.any(t > 36_000):
+        raise InputError("t: expected (F,) seconds from 0 to 36000; give times from the start of the take")
+    style = _style(seed, stature_m)
+    if t.size == 0:
+        return np.empty((0, len(BODY_15), 3))
+    weight = action_weights(t, action)
+    root, yaw = _walk_path(t, action, style)
+    return _assemble(t, weight, root, yaw, action, style)
+
+
+def action_weights(t: np.ndarray, action: str) -> np.ndarray:
+    """(F, 4) in [0, 1], how much of walk, boxing, kicking and squats there is at each instant."""
+    weight = np.zeros((t.size, len(_SINGLE)))
+    if action in _SINGLE:
+        weight[:, _SINGLE.index(action)] = 1.0
+    elif action == "mixed":
+        cycle = t % (_MIXED_SEGMENT_S * len(_SINGLE))
+        for i in range(len(_SINGLE)):
+            weight[:, i] = _plateau(
+                (cycle - i * _MIXED_SEGMENT_S) % (_MIXED_SEGMENT_S * len(_SINGLE)), 0.0, _MIXED_SEGMENT_S, 0.8
+            )
+    return weight
+
+
+def _smooth(u: np.ndarray) -> np.ndarray:
+    """Quintic step from 0 to 1 over u in [0, 1]: continuous in acceleration."""
+    u = np.clip(u, 0.0, 1.0)
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def _plateau(x: np.ndarray, start: float, end: float, ramp: float) -> np.ndarray:
+    """1 between start and end, 0 outside, with smooth ramps inside."""
+    return _smooth((x - start) / ramp) * _smooth((end - x) / ramp)
+
+
+def _heading(t: np.ndarray, style: _Style) -> np.ndarray:
+    yaw = style.heading_rad + style.turn_rad_s * t
+    for amplitude, rate, phase in zip(style.wander_rad, style.wander_hz, style.wander_phase, strict=True):
+        yaw = yaw + amplitude * np.sin(2 * np.pi * rate * t + phase)
+    return yaw
+
+
+def _walk_speed(t: np.ndarray, action: str, style: _Style) -> np.ndarray:
+    weight = action_weights(t, action)
+    return style.speed_m_s * (weight[:, 0] + 0.15 * weight[:, 1]) * _smooth(t / 1.0)
+
+
+def _grid_path(seconds: float, action: str, style: _Style) -> tuple[np.ndarray, np.ndarray]:
+    """Path of the root on a fixed time grid, so that it does not depend on which instants are asked for."""
+    grid = np.arange(0.0, seconds + 4.0, _PATH_STEP_S)
+    yaw, speed = _heading(grid, style), _walk_speed(grid, action, style)
+    velocity = speed[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    steps = 0.5 * (velocity[1:] + velocity[:-1]) * _PATH_STEP_S
+    return grid, np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+
+
+def _walk_path(t: np.ndarray, action: str, style: _Style) -> tuple[np.ndarray, np.ndarray]:
+    """Ground point under the pelvis (F, 2) m and heading (F,) rad."""
+    grid, path = _grid_path(float(t.max()), action, style)
+    return np.stack([np.interp(t, grid, path[:, i]) for i in range(2)], axis=1), _heading(t, style)
+
+
+def _footprints(t: np.ndarray, side: int, action: str, style: _Style) -> tuple[np.ndarray, np.ndarray]:
+    """Ankle goal (F, 3) m of the stepping leg and its swing phase (F,), 0 while it stands."""
+    grid, path = _grid_path(float(t.max()), action, style)
+    stride = style.stride_hz * t + style.phase + (0.5 if side > 0 else 0.0)
+    count, part = np.floor(stride), stride % 1.0
+    swing = np.clip((part - _STANCE) / (1 - _STANCE), 0.0, 1.0)
+
+    def place(number: np.ndarray) -> np.ndarray:
+        middle = (number + _STANCE / 2 - style.phase - (0.5 if side > 0 else 0.0)) / style.stride_hz
+        middle = np.maximum(middle, 0.0)
+        yaw = _heading(middle, style)
+        across = side * 0.9 * style.size["hip"] * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
+        return np.stack([np.interp(middle, grid, path[:, i]) for i in range(2)], axis=1) + across
+
+    ground = place(count) + _smooth(swing)[:, None] * (place(count + 1) - place(count))
+    walking = np.clip(_walk_speed(t, action, style) / style.speed_m_s, 0.0, 1.0)
+    # The foot rolls over the toes at the end of stance, then swings.
+    roll = _smooth((part - 0.42) / 0.25) * _smooth((1.0 - part) / 0.25)
+    lift = (0.07 * np.sin(np.pi * swing) ** 2 + 0.11 * roll) * walking
+    return np.concatenate([ground, (style.size["foot"] + lift)[:, None]], axis=1), swing
+
+
+def _rotation(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    """(F, 3, 3) body -> world: roll about x, then pitch forward about y, then yaw about z."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1)).as_matrix()
+
+
+def _apply(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    return np.einsum("fij,...fj->...fi", rotation, np.broadcast_to(vector, (*vector.shape[:-2], len(rotation), 3)))
+
+
+def two_bone(
+    start: np.ndarray, goal: np.ndarray, pole: np.ndarray, first_m: float, second_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Middle and end joint (F, 3) of a two-bone limb that reaches for ``goal`` and bends towards ``pole``.
+
+    A goal out of reach is pulled in along the line from the start, so both bones keep their lengths exactly.
+    """
+    away = goal - start
+    distance = np.linalg.norm(away, axis=1, keepdims=True)
+    direction = away / np.maximum(distance, 1e-9)
+    reach = np.clip(distance, 0.3 * (first_m + second_m), 0.998 * (first_m + second_m))
+    along = (first_m**2 - second_m**2 + reach**2) / (2 * reach)
+    height = np.sqrt(np.maximum(first_m**2 - along**2, 0.0))
+    side = pole - np.sum(pole * direction, axis=1, keepdims=True) * direction
+    side = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+    return start + along * direction + height * side, start + reach * direction
+
+
+def _assemble(
+    t: np.ndarray, weight: np.ndarray, root: np.ndarray, yaw: np.ndarray, action: str, style: _Style
+) -> np.ndarray:
+    s = style.size
+    walk, box, kick, squat = weight.T
+    stride = 2 * np.pi * (style.stride_hz * t + style.phase)
+    squat_depth = squat * 0.5 * (1 - np.cos(2 * np.pi * style.squat_hz * t))
+    punch = {side: box * _pulse(style.punch_hz * t + (0.5 if side < 0 else 0.0), 0.1, 0.5) for side in (1, -1)}
+    kicks = {side: _kick_phase(style.kick_hz * t + 0.1, side, kick) for side in (1, -1)}
+    kick_any = kicks[1][0] + kicks[-1][0]
+
+    leg = s["thigh"] + s["shank"]
+    height = s["foot"] + leg * (0.965 - 0.025 * walk - 0.05 * box - 0.02 * kick_any - 0.40 * squat_depth)
+    height = height + leg * 0.015 * walk * np.cos(2 * stride)
+    sway = 0.02 * walk * np.sin(stride) + 0.035 * box * np.sin(2 * np.pi * 0.5 * style.punch_hz * t)
+    back = -0.16 * squat_depth
+    ahead, left = _ground_axes(yaw)
+    pelvis = np.concatenate([root + back[:, None] * ahead + sway[:, None] * left, height[:, None]], axis=1)
+
+    twist = 0.45 * (punch[-1] - punch[1]) - 0.12 * walk * np.cos(stride) + 0.2 * (kicks[1][1] - kicks[-1][1])
+    hips = _rotation(yaw - 0.4 * twist + 0.05 * np.sin(0.7 * t), 0.25 * squat_depth, 0.03 * walk * np.cos(stride))
+    lean = 0.06 * walk + 0.18 * box + 0.75 * squat_depth - 0.28 * (kicks[1][1] + kicks[-1][1])
+    trunk = _rotation(yaw + twist, lean, 0.04 * np.sin(1.1 * t + 6.28 * style.phase) - 0.03 * walk * np.cos(stride))
+    nod = _rotation(yaw + 0.5 * twist + 0.3 * np.sin(0.5 * t), 0.3 * lean + 0.1 + 0.08 * np.sin(0.9 * t), 0.0 * t)
+
+    joints = np.empty((t.size, len(BODY_15), 3))
+    neck = pelvis + _apply(trunk, np.array([[0.0, 0.0, s["trunk"]]]))
+    joints[:, BODY_15.index("pelvis")] = pelvis
+    joints[:, BODY_15.index("neck")] = neck
+    joints[:, BODY_15.index("head")] = neck + _apply(nod, np.array([[0.0, 0.0, s["head"]]]))
+    for side, letter in ((1, "l"), (-1, "r")):
+        hip = pelvis + _apply(hips, np.array([[0.0, side * s["hip"], 0.0]]))
+        ankle = _ankle_goal(t, side, kicks[side], box, squat_depth, hip, yaw, action, style)
+        knee_pole = _apply(_rotation(yaw, 0 * t, 0 * t), np.array([[1.0, side * 0.15, 0.0]]))
+        knee, ankle = two_bone(hip, ankle, knee_pole + np.array([0, 0, 0.1]), s["thigh"], s["shank"])
+        shoulder = neck + _apply(trunk, np.array([[0.0, side * s["shoulder_side"], -s["shoulder_drop"]]]))
+        wrist_goal = shoulder + _apply(trunk, _wrist_goal(side, stride, walk, box, kick, squat, squat_depth, punch, s))
+        elbow_pole = _apply(trunk, np.array([[-0.6, side * 0.6, -0.6]]))
+        elbow, wrist = two_bone(shoulder, wrist_goal, elbow_pole, s["upper_arm"], s["forearm"])
+        for name, value in zip(
+            ("hip", "knee", "ankle", "shoulder", "elbow", "wrist"),
+            (hip, knee, ankle, shoulder, elbow, wrist),
+            strict=True,
+        ):
+            joints[:, BODY_15.index(letter + name)] = value
+    return joints
+
+
+def _ground_axes(yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    return ahead, np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+
+
+def _pulse(phase: np.ndarray, start: float, end: float) -> np.ndarray:
+    """Smooth bump between two phases of a cycle."""
+    part = phase % 1.0
+    middle = 0.5 * (start + end)
+    return _plateau(part, start, end, middle - start)
+
+
+def _kick_phase(phase: np.ndarray, side: int, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far the leg is lifted, and how far stretched; the legs take turns."""
+    turn = (phase * 0.5 + (0.5 if side > 0 else 0.0)) % 1.0 * 2.0
+    lifted = weight * _plateau(turn, 0.05, 0.75, 0.25)
+    stretched = weight * _plateau(turn, 0.25, 0.58, 0.165)
+    return lifted, stretched
+
+
+def _ankle_goal(
+    t: np.ndarray,
+    side: int,
+    kick: tuple[np.ndarray, np.ndarray],
+    box: np.ndarray,
+    squat_depth: np.ndarray,
+    hip: np.ndarray,
+    yaw: np.ndarray,
+    action: str,
+    style: _Style,
+) -> np.ndarray:
+    goal, _ = _footprints(t, side, action, style)
+    ahead, left = _ground_axes(yaw)
+    # A boxer's stance: left foot before the right; a wider stance for squats.
+    goal[:, :2] += (0.16 * side * box)[:, None] * ahead
+    goal[:, :2] += (side * (0.06 * box + 0.05 * squat_depth))[:, None] * left
+    leg = style.size["thigh"] + style.size["shank"]
+    flat = np.zeros((t.size, 1))
+    ahead3 = np.concatenate([ahead, flat], axis=1)
+    chamber = hip + 0.35 * leg * ahead3 - np.array([0, 0, 0.42 * leg])
+    stretched = hip + 0.93 * leg * ahead3 + np.array([0, 0, 0.12 * leg])
+    lifted, extended = (k[:, None] for k in kick)
+    return goal + lifted * (chamber - goal) + extended * (stretched - chamber)
+
+
+def _wrist_goal(
+    side: int,
+    stride: np.ndarray,
+    walk: np.ndarray,
+    box: np.ndarray,
+    kick: np.ndarray,
+    squat: np.ndarray,
+    squat_depth: np.ndarray,
+    punch: dict[int, np.ndarray],
+    s: dict[str, float],
+) -> np.ndarray:
+    """(F, 3) m, from the shoulder in the trunk frame."""
+    arm = s["upper_arm"] + s["forearm"]
+    swing = side * 0.5 * np.cos(stride)  # against the leg of the same side
+    one = np.ones_like(stride)
+
+    def along(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+        return arm * np.stack([x * one, y * one, z * one], axis=1)
+
+    hang = along(0.1 * one, 0.12 * side * one, -0.95 * one)
+    walking = along(np.sin(swing) * 0.85 + 0.18, 0.12 * side * one, -0.88 * np.cos(swing))
+    reach = punch[side]
+    guard = along(0.45 + 0.52 * reach, -side * (0.22 - 0.08 * reach), 0.12 - 0.02 * reach)
+    balance = along(0.3 * one, 0.45 * side * one, -0.45 * one)
+    forward = along(0.1 + 0.8 * squat_depth, 0.12 * side * one, -0.95 + 0.95 * squat_depth)
+    rest = np.clip(1 - walk - box - kick - squat, 0.0, 1.0)
+    parts = ((rest, hang), (walk, walking), (box, guard), (kick, balance), (squat, forward))
+    return np.sum([w[:, None] * goal for w, goal in parts], axis=0)
