@@ -1,0 +1,216 @@
+"""Multi-frame bundle adjustment: the paper's equations (2) to (4).
+
+    min over S, R, L of  f(S, R, L) + alpha |S#|_*                                        (2)
+    f = sum_t |W_t - R_t S_t|_F^2 + gamma |l(S) - L|_F^2                                  (3)
+    S <- prox_{alpha / mu}(S - grad f / mu)                                               (4)
+
+S is updated by the accelerated proximal gradient method with backtracking and restart, L by SVD, R on SO(3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.geometry.alignment import torso_frame
+from drocap_ros.reconstruction.articulation import articulation_term
+from drocap_ros.reconstruction.camera_update import rotation_change, update_rotations
+from drocap_ros.reconstruction.config import BundleAdjusterConfig
+from drocap_ros.reconstruction.data_term import Projection, information_from
+from drocap_ros.reconstruction.low_rank import nuclear_norm, singular_value_threshold
+
+#: Length at which alpha is given: the protocol's 10 s at 24 fps.
+REFERENCE_FRAMES = 240
+
+
+@dataclass(frozen=True)
+class AdjustmentResult:
+    """What the solver found and why it stopped.
+
+    shape : (F, P, 3) S, torso frame, centred, in the unit of W
+    rotation : (F, 3, 3) R, torso -> camera; its first two rows are the paper's R_t
+    translation : (F, 2) in the unit of W; ``W ~ shape @ rotation[:, :2]^T + translation``
+    cost : total; cost_terms : per term (reprojection, articulation, nuclear_norm, smoothness)
+    history : (iterations + 1,) cost after each step
+    stop_reason : "converged" or "iterations"
+    """
+
+    shape: np.ndarray
+    rotation: np.ndarray
+    translation: np.ndarray
+    cost: float
+    cost_terms: dict[str, float]
+    iterations: int
+    restarts: int
+    stop_reason: str
+    history: np.ndarray = field(repr=False)
+
+    @property
+    def camera_shape(self) -> np.ndarray:
+        """(F, P, 3) poses in camera axes, in the unit of W."""
+        return self.shape @ np.swapaxes(self.rotation, 1, 2)
+
+
+class Objective:
+    """Equations (2) and (3) for fixed measurements; R is a state that :meth:`turn` updates."""
+
+    def __init__(self, projection: Projection, rotation: np.ndarray, config: BundleAdjusterConfig) -> None:
+        self.projection, self.rotation, self.config = projection, rotation, config
+        self.alpha = config.alpha * float(np.sqrt(len(rotation) / REFERENCE_FRAMES))
+        self._rotation_cost = config.rotation_smoothness * rotation_change(rotation)
+
+    def smooth(self, s: np.ndarray) -> tuple[float, np.ndarray]:
+        """F of equation (3), and its gradient (F, P, 3) by S, L at its optimum."""
+        value, gradient = self.projection.value_and_gradient(s, self.rotation)
+        value += self._rotation_cost
+        if self.config.gamma > 0.0:
+            articulation, slope = articulation_term(s)
+            value, gradient = value + self.config.gamma * articulation, gradient + self.config.gamma * slope
+        if self.config.shape_smoothness > 0.0:
+            change, slope = smoothness_term(s)
+            value = value + self.config.shape_smoothness * change
+            gradient = gradient + self.config.shape_smoothness * slope
+        # S stays centred: its centroid is the translation's.
+        return value, gradient - gradient.mean(axis=1, keepdims=True)
+
+    def turn(self, s: np.ndarray) -> None:
+        """One downhill step of every rotation."""
+        self.rotation = update_rotations(
+            self.projection, s, self.rotation, smoothness=self.config.rotation_smoothness
+        )
+        self._rotation_cost = self.config.rotation_smoothness * rotation_change(self.rotation)
+
+    def terms(self, s: np.ndarray) -> dict[str, float]:
+        """Cost per term of equation (2), weighted."""
+        return {
+            "reprojection": self.projection.value_and_gradient(s, self.rotation)[0],
+            "articulation": self.config.gamma * articulation_term(s)[0],
+            "nuclear_norm": self.alpha * nuclear_norm(s),
+            "smoothness": self.config.shape_smoothness * smoothness_term(s)[0]
+            + self._rotation_cost,
+        }
+
+
+def smoothness_term(s: np.ndarray) -> tuple[float, np.ndarray]:
+    """Value and gradient (F, P, 3) of the squared change of shape between frames."""
+    step = s[1:] - s[:-1]
+    gradient = np.zeros_like(s)
+    gradient[1:] += 2.0 * step
+    gradient[:-1] -= 2.0 * step
+    return float(np.sum(step * step)), gradient
+
+
+def bundle_adjust(
+    w: np.ndarray,
+    s0: np.ndarray,
+    r0: np.ndarray | None = None,
+    weights: np.ndarray | None = None,
+    covariance: np.ndarray | None = None,
+    config: BundleAdjusterConfig | None = None,
+    *,
+    progress: Callable[[float], None] | None = None,
+) -> AdjustmentResult:
+    """Refine poses over one window of frames.
+
+    Parameters
+    ----------
+    w : (F, P, 2) 2D joints of BODY_15, centred about the person, in units of their standard deviation; NaN where
+        not seen
+    s0 : (F, P, 3) start, in the unit of w, in any frame that ``r0`` leads from to the camera's axes
+    r0 : (F, 3, 3), or None when s0 is in camera axes (x right, y down, z forward)
+    weights : (F, P) >= 0 of the reprojection term, or None
+    covariance : (F, P, 3) xx, xy, yy of w, or None
+    config : weights of the terms and limits of the solver
+
+    Raises
+    ------
+    InputError
+        When the shapes do not fit or the start is not finite.
+    """
+    config = config or BundleAdjusterConfig()
+    _check(w, s0, r0)
+    r0 = np.broadcast_to(np.eye(3), (len(w), 3, 3)) if r0 is None else r0
+    # Low rank holds in a body-fixed frame only: in the camera's or the world's, a turning body is of high rank.
+    body = torso_frame(s0)
+    shape = (s0 - s0.mean(axis=1, keepdims=True)) @ body
+    projection = Projection(w, information_from(w, weights, covariance))
+    objective = Objective(projection, r0 @ body, config)
+    shape, outcome = _minimize(objective, shape, progress)
+    terms = objective.terms(shape)
+    projected = shape @ np.swapaxes(objective.rotation[:, :2], 1, 2)
+    return AdjustmentResult(
+        shape=shape,
+        rotation=objective.rotation,
+        translation=projection.translation(projected),
+        cost=sum(terms.values()),
+        cost_terms=terms,
+        **outcome,
+    )
+
+
+def _check(w: np.ndarray, s0: np.ndarray, r0: np.ndarray | None) -> None:
+    if w.ndim != 3 or w.shape[2] != 2:
+        raise InputError(f"w: expected shape (F, P, 2), got {w.shape}; add or move the axes")
+    if s0.shape != (*w.shape[:2], 3) or not np.isfinite(s0).all():
+        raise InputError(f"s0: expected finite values of shape {(*w.shape[:2], 3)}, got {s0.shape}; fill the gaps in")
+    if r0 is not None and r0.shape != (len(w), 3, 3):
+        raise InputError(f"r0: expected shape {(len(w), 3, 3)}, got {r0.shape}; give one rotation per frame")
+
+
+def _minimize(
+    objective: Objective, s: np.ndarray, progress: Callable[[float], None] | None
+) -> tuple[np.ndarray, dict[str, object]]:
+    """Accelerated proximal gradient steps (4) with backtracking; momentum restarts when the cost would rise."""
+    config, alpha = objective.config, objective.alpha
+    value, gradient = objective.smooth(s)
+    cost = value + alpha * nuclear_norm(s) if alpha > 0.0 else value
+    history = [cost]
+    ahead, t, mu, restarts, stop = s, 1.0, 4.0, 0, "iterations"
+    for k in range(config.iterations):
+        if k % config.rotation_every == 0:
+            objective.turn(s)
+            value, gradient = objective.smooth(ahead)
+            if ahead is s:
+                cost = min(cost, value + alpha * nuclear_norm(s)) if alpha > 0.0 else min(cost, value)
+        new, new_value, new_gradient, norm, mu = _proximal_step(objective, ahead, value, gradient, mu)
+        new_cost = new_value + alpha * norm
+        if new_cost > cost and ahead is not s:
+            restarts += 1
+            ahead, t = s, 1.0
+            value, gradient = objective.smooth(s)
+            new, new_value, new_gradient, norm, mu = _proximal_step(objective, s, value, gradient, mu)
+            new_cost = new_value + alpha * norm
+        t_new = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * t * t))
+        ahead = new + ((t - 1.0) / t_new) * (new - s)
+        s, t, cost = new, t_new, new_cost
+        mu *= 0.9
+        history.append(cost)
+        if progress is not None and k % 10 == 0:
+            progress(k / config.iterations)
+        if k >= 20 and history[-11] - cost <= config.tolerance * abs(cost):
+            stop = "converged"
+            break
+        value, gradient = objective.smooth(ahead)
+    return s, {
+        "iterations": len(history) - 1,
+        "restarts": restarts,
+        "stop_reason": stop,
+        "history": np.array(history),
+    }
+
+
+def _proximal_step(
+    objective: Objective, at: np.ndarray, value: float, gradient: np.ndarray, mu: float
+) -> tuple[np.ndarray, float, np.ndarray, float, float]:
+    """Equation (4) from ``at``; mu doubles until the quadratic model bounds f from above."""
+    while True:
+        new, norm = singular_value_threshold(at - gradient / mu, objective.alpha / mu)
+        new_value, new_gradient = objective.smooth(new)
+        move = new - at
+        bound = value + float(np.sum(gradient * move)) + 0.5 * mu * float(np.sum(move * move))
+        if new_value <= bound + 1e-9 * abs(bound) or mu > 1e12:
+            return new, new_value, new_gradient, norm, mu
+        mu *= 2.0

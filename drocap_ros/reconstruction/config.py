@@ -1,0 +1,53 @@
+"""Parameters of the initializer and of the bundle adjuster."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drocap_ros.parameters import Parameters, param
+
+
+@dataclass(frozen=True)
+class InitializerConfig(Parameters):
+    """Single-view initialization; lengths "2D std" are the standard deviation of the centred 2D joints."""
+
+    dictionary: str = param("", "dictionary file; empty for the shipped one")
+    azimuth_starts: int = param(8, "viewpoints around the body that the fit starts from", minimum=1, maximum=64)
+    elevation_start_deg: float = param(15.0, "camera elevation of the starts", unit="deg", minimum=-89.0, maximum=89.0)
+    convex_start: bool = param(False, "add the convex relaxation (spectral norm, ADMM) to the starts")
+    start_components: int = param(20, "principal components in the search of the start", minimum=1, maximum=45)
+    start_iterations: int = param(14, "damped Gauss-Newton steps per start", minimum=1, maximum=200)
+    keypoint_std: float = param(0.1, "standard deviation of an ordinary 2D joint", unit="2D std", minimum=0.001)
+    outlier_std: float = param(
+        0.0, "residual in standard deviations beyond which a joint is taken for an outlier; 0 = never", minimum=0.0
+    )
+    scale_std: float = param(0.05, "relative change of the body's image size in the sequence", minimum=0.001, maximum=1)
+    sparsity: float = param(0.05, "weight of the L1 norm of the coefficients (alpha)", unit="2D std", minimum=0.0)
+    sparse_rounds: int = param(6, "alternations of sparse coefficients and rotation", minimum=0, maximum=100)
+    sparse_iterations: int = param(12, "accelerated proximal steps per alternation", minimum=1, maximum=500)
+    coefficient_smoothness: float = param(0.3, "weight of the change of coefficients over time", minimum=0.0)
+    rotation_smoothness: float = param(0.3, "weight of the change of rotation over time", minimum=0.0)
+    switch_cost: float = param(1.0, "cost of a jump between hypotheses, per squared 2D std", minimum=0.0)
+    block_frames: int = param(2000, "frames that are fitted together at most", minimum=16, maximum=20000)
+    assumed_height_m: float = param(1.70, "stature that sets the scale when none is known", unit="m", minimum=0.3,
+                                    maximum=3.0)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class BundleAdjusterConfig(Parameters):
+    """Bundle adjustment, the paper's equations (2) to (4)."""
+
+    alpha: float = param(0.1, "weight of the nuclear norm at 240 frames; grows with the root of the length",
+                         minimum=0.0)  # fmt: skip
+    gamma: float = param(1.0, "weight of the articulation term; 0 leaves it out", minimum=0.0)
+    shape_smoothness: float = param(0.0, "weight of the change of shape over time", minimum=0.0)
+    rotation_smoothness: float = param(0.0, "weight of the change of rotation over time", minimum=0.0)
+    iterations: int = param(150, "proximal steps at most", minimum=1, maximum=100000)
+    rotation_every: int = param(3, "proximal steps per update of the rotations", minimum=1, maximum=1000)
+    tolerance: float = param(1e-5, "relative decrease of the cost over 10 steps that ends the solve", minimum=0.0)
+    window_s: float = param(12.0, "length of an adjustment window", unit="s", minimum=0.5, maximum=120.0)
+    period_s: float = param(1.0, "time between two adjustments of the live node", unit="s", minimum=0.05, maximum=60.0)
+    window_frames: int = param(480, "frames in a window at most", minimum=8, maximum=5000)
+    overlap_frames: int = param(60, "frames that neighbouring windows of a long recording share", minimum=0,
+                                maximum=2000)  # fmt: skip
+    threads: int = param(2, "threads of the linear algebra in the live node", minimum=1, maximum=64)
