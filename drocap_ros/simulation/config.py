@@ -27,3 +27,7 @@ class SimulationConfig(Parameters):
     missed_fraction: float = param(0.015, "share of keypoints not found", minimum=0, maximum=0.5)
     attitude_error_deg: float = param(0.5, "slow error of the camera telemetry", unit="deg", minimum=0, maximum=20)
     position_error_m: float = param(0.2, "slow error of the position telemetry", unit="m", minimum=0, maximum=20)
+    seconds: float = param(20.0, "length of the simulated flight", unit="s", minimum=0.1, maximum=36000)
+    rate_hz: float = param(30.0, "pictures per second", unit="Hz", minimum=1, maximum=240)
+    seed: int = param(0, "seed of person, take and noise", minimum=0)
+    vehicle_url: str = param("", "MAVLink URL that the simulated vehicle speaks on; empty = no vehicle")

@@ -1,0 +1,85 @@
+"""The autopilot's clock in terms of ours, so that attitude and position carry the stamps of our clock."""
+
+from __future__ import annotations
+
+from collections import deque
+
+_NS = 1_000_000_000
+
+
+class ClockOffset:
+    """Offset between our clock and the autopilot's time since boot.
+
+    Answers to TIMESYNC give it from both directions: of the exchanges of the last minute, that with the shortest
+    round trip counts.  Until one comes, the fastest message of the last ten seconds gives it from one direction,
+    late by the shortest transmission time.  A restart of the autopilot or a jump of either clock starts afresh.
+    """
+
+    def __init__(self, window_s: float = 60.0, one_way_window_s: float = 10.0, jump_s: float = 1.0) -> None:
+        self._window_ns = int(window_s * _NS)
+        self._one_way_window_ns = int(one_way_window_s * _NS)
+        self._jump_ns = int(jump_s * _NS)
+        self._exchanges: deque[tuple[int, int, int]] = deque(maxlen=512)  # received, round trip, offset
+        self._best: tuple[int, int, int] | None = None
+        self._fastest: deque[tuple[int, int]] = deque(maxlen=4096)  # received, offset; offsets increase
+        self._suspects = 0
+
+    @property
+    def offset_ns(self) -> int | None:
+        """Our clock minus the autopilot's, or None before the first message."""
+        if self._best is not None:
+            return self._best[2]
+        return self._fastest[0][1] if self._fastest else None
+
+    @property
+    def round_trip_ns(self) -> int | None:
+        """Of the exchange that counts, or None when there was none."""
+        return None if self._best is None else self._best[1]
+
+    def exchange(self, sent_ns: int, remote_ns: int, received_ns: int) -> None:
+        """Take an answer to TIMESYNC: our time of sending, the autopilot's of answering, ours of receiving."""
+        trip = received_ns - sent_ns
+        if not 0 <= trip <= 2 * _NS:
+            return
+        offset = sent_ns + trip // 2 - remote_ns
+        if self._best is not None and abs(offset - self._best[2]) > self._jump_ns + trip:
+            self.reset()
+        self._exchanges.append((received_ns, trip, offset))
+        while self._exchanges and received_ns - self._exchanges[0][0] > self._window_ns:
+            self._exchanges.popleft()
+        self._best = min(self._exchanges, key=lambda e: e[1])
+
+    def observe(self, remote_ns: int, received_ns: int) -> None:
+        """Take any message that tells the autopilot's time since boot."""
+        offset = received_ns - remote_ns
+        known = self.offset_ns
+        if known is not None and not -self._jump_ns < offset - known < 5 * self._jump_ns:
+            # One odd message is a late or damaged one; several in a row mean that a clock has jumped.
+            self._suspects += 1
+            if self._suspects < 3:
+                return
+            self.reset()
+        self._suspects = 0
+        while self._fastest and self._fastest[-1][1] >= offset:
+            self._fastest.pop()
+        self._fastest.append((received_ns, offset))
+        while received_ns - self._fastest[0][0] > self._one_way_window_ns and len(self._fastest) > 1:
+            self._fastest.popleft()
+
+    def to_local_ns(self, remote_ns: int, received_ns: int) -> int:
+        """Our clock's stamp of an instant told in the autopilot's time; never later than its reception.
+
+        An instant that would lie more than 5 s before its reception is not believed: then the reception counts.
+        """
+        offset = self.offset_ns
+        if offset is None:
+            return received_ns
+        stamp = min(remote_ns + offset, received_ns)
+        return stamp if received_ns - stamp <= 5 * _NS else received_ns
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._exchanges.clear()
+        self._fastest.clear()
+        self._best = None
+        self._suspects = 0

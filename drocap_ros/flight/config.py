@@ -1,0 +1,42 @@
+"""Parameters of the MAVLink bridge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drocap_ros.parameters import Parameters, param
+
+
+@dataclass(frozen=True)
+class MavlinkBridgeConfig(Parameters):
+    """The link to the autopilot and the telemetry asked of it."""
+
+    url: str = param(
+        "udpin:127.0.0.1:14540",
+        "udpin:HOST:PORT (listen), udpout:HOST:PORT, udp:HOST:PORT (as udpin), tcp:HOST:PORT, serial:DEVICE[:BAUD]",
+    )
+    system_id: int = param(
+        1,
+        "own MAVLink system; that of the vehicle we ride on.  Never 255: it is the ground station's, and an "
+        "autopilot that hears it does not notice the loss of the real one",
+        minimum=1,
+        maximum=254,
+    )
+    component_id: int = param(191, "own MAVLink component; 191 = onboard computer", minimum=2, maximum=250)
+    target_system_id: int = param(0, "vehicle to read; 0 = the first autopilot heard", minimum=0, maximum=254)
+    heartbeat_hz: float = param(1.0, "rate of our heartbeat", unit="Hz", minimum=0.2, maximum=10)
+    attitude_hz: float = param(50.0, "wanted rate of attitude", unit="Hz", minimum=1, maximum=200)
+    position_hz: float = param(20.0, "wanted rate of local position", unit="Hz", minimum=1, maximum=100)
+    gimbal_hz: float = param(
+        20.0, "wanted rate of the gimbal's attitude; 0 = do not ask", unit="Hz", minimum=0, maximum=100
+    )
+    status_hz: float = param(
+        2.0, "wanted rate of GPS, battery, estimator and landed state", unit="Hz", minimum=0.2, maximum=20
+    )
+    time_sync_hz: float = param(2.0, "rate of time synchronization", unit="Hz", minimum=0.1, maximum=20)
+    rate_window_s: float = param(3.0, "time over which the real rates are measured", unit="s", minimum=1, maximum=30)
+    rate_shortfall: float = param(
+        0.5, "share of the wanted rate below which a message is asked for again", minimum=0, maximum=1
+    )
+    request_retry_s: float = param(2.0, "time between requests for the same message", unit="s", minimum=0.2, maximum=60)
+    link_timeout_s: float = param(3.0, "silence after which the link counts as lost", unit="s", minimum=0.5, maximum=60)

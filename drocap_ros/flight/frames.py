@@ -1,0 +1,138 @@
+"""The one place where aviation frames (NED, FRD) become those of ROS (ENU, FLU), and back.
+
+Both changes of axes are their own inverses:
+
+- world: ``(north, east, down) <-> (east, north, up)``: swap the first two, negate the third;
+- body: ``(forward, right, down) <-> (forward, left, up)``: negate the last two.
+
+Quaternions are x y z w (ROS); MAVLink's are w x y z.  Arrays may have any leading axes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drocap_ros.geometry.rotations import matrix_from_quaternion
+
+_HALF = np.sqrt(0.5)
+#: Rotation NED -> ENU (and ENU -> NED), x y z w: half a turn about north-east.
+_NED_ENU = np.array([_HALF, _HALF, 0.0, 0.0])
+#: Rotation FRD -> FLU (and FLU -> FRD): half a turn about forward.
+_FRD_FLU = np.array([1.0, 0.0, 0.0, 0.0])
+#: Camera body (x forward, y left, z up) -> optical frame (x right, y down, z forward).
+OPTICAL_FROM_FLU = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+# WGS 84
+_EQUATOR_RADIUS_M = 6_378_137.0
+_ECCENTRICITY2 = 6.694379990141316e-3
+
+
+def ned_to_enu(vector: np.ndarray) -> np.ndarray:
+    """(..., 3) NED -> ENU."""
+    return np.stack([vector[..., 1], vector[..., 0], -vector[..., 2]], axis=-1)
+
+
+def enu_to_ned(vector: np.ndarray) -> np.ndarray:
+    """(..., 3) ENU -> NED."""
+    return ned_to_enu(vector)
+
+
+def frd_to_flu(vector: np.ndarray) -> np.ndarray:
+    """(..., 3) body FRD -> FLU."""
+    return vector * np.array([1.0, -1.0, -1.0])
+
+
+def flu_to_frd(vector: np.ndarray) -> np.ndarray:
+    """(..., 3) body FLU -> FRD."""
+    return frd_to_flu(vector)
+
+
+def quaternion_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Product (..., 4) x y z w: first ``b``, then ``a``."""
+    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
+    vector = aw * bv + bw * av + np.cross(av, bv)
+    return np.concatenate([vector, aw * bw - np.sum(av * bv, axis=-1, keepdims=True)], axis=-1)
+
+
+def orientation_to_ros(frd_to_ned: np.ndarray) -> np.ndarray:
+    """(..., 4) x y z w, rotation body FRD -> NED, to the rotation body FLU -> ENU; the w of the result is >= 0."""
+    q = quaternion_multiply(quaternion_multiply(_NED_ENU, frd_to_ned), _FRD_FLU)
+    return np.where(q[..., 3:] < 0, -q, q)
+
+
+def orientation_to_aviation(flu_to_enu: np.ndarray) -> np.ndarray:
+    """(..., 4) x y z w, rotation body FLU -> ENU, to the rotation body FRD -> NED; the w of the result is >= 0."""
+    return orientation_to_ros(flu_to_enu)
+
+
+def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> np.ndarray:
+    """(4,) x y z w of MAVLink's angles: yaw about down, then pitch, then roll; rotation body FRD -> NED."""
+    half = 0.5 * np.array([roll_rad, pitch_rad, yaw_rad])
+    (cr, cp, cy), (sr, sp, sy) = np.cos(half), np.sin(half)
+    return np.array(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ]
+    )
+
+
+def yaw_of(frd_to_ned: np.ndarray) -> np.ndarray:
+    """(...) rad, heading from north towards east, of rotations (..., 4) x y z w body FRD -> NED."""
+    x, y, z, w = np.moveaxis(np.asarray(frd_to_ned), -1, 0)
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def camera_rotation(camera_flu_to_enu: np.ndarray) -> np.ndarray:
+    """(..., 3, 3) world ENU -> optical frame, from the rotation (..., 4) x y z w camera FLU -> ENU."""
+    return OPTICAL_FROM_FLU @ np.swapaxes(matrix_from_quaternion(camera_flu_to_enu), -1, -2)
+
+
+def _ecef(latitude_deg: np.ndarray, longitude_deg: np.ndarray, altitude_m: np.ndarray) -> np.ndarray:
+    lat, lon = np.deg2rad(latitude_deg), np.deg2rad(longitude_deg)
+    normal = _EQUATOR_RADIUS_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(lat) ** 2)
+    return np.stack(
+        [
+            (normal + altitude_m) * np.cos(lat) * np.cos(lon),
+            (normal + altitude_m) * np.cos(lat) * np.sin(lon),
+            (normal * (1 - _ECCENTRICITY2) + altitude_m) * np.sin(lat),
+        ],
+        axis=-1,
+    )
+
+
+def _enu_axes(latitude_deg: float, longitude_deg: float) -> np.ndarray:
+    """(3, 3) rotation ECEF -> ENU."""
+    lat, lon = np.deg2rad(latitude_deg), np.deg2rad(longitude_deg)
+    return np.array(
+        [
+            [-np.sin(lon), np.cos(lon), 0.0],
+            [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
+            [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
+        ]
+    )
+
+
+def geodetic_to_enu(geodetic: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(..., 3) m ENU at ``origin``, of (..., 3) latitude deg, longitude deg, altitude m (WGS 84).
+
+    ``origin`` is (3,) of the same kind.
+    """
+    offset = _ecef(*np.moveaxis(geodetic, -1, 0)) - _ecef(*origin)
+    return offset @ _enu_axes(origin[0], origin[1]).T
+
+
+def enu_to_geodetic(enu: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(..., 3) latitude deg, longitude deg, altitude m, of (..., 3) m ENU at ``origin`` (3,)."""
+    x, y, z = np.moveaxis(enu @ _enu_axes(origin[0], origin[1]) + _ecef(*origin), -1, 0)
+    across = np.hypot(x, y)
+    lat = np.arctan2(z, across * (1 - _ECCENTRICITY2))
+    for _ in range(5):  # converges by a factor of about 300 a step near the ground
+        normal = _EQUATOR_RADIUS_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(lat) ** 2)
+        lat = np.arctan2(z + _ECCENTRICITY2 * normal * np.sin(lat), across)
+    normal = _EQUATOR_RADIUS_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(lat) ** 2)
+    # This form of the altitude holds at the poles too, where across / cos(lat) does not.
+    altitude = across * np.cos(lat) + z * np.sin(lat) - _EQUATOR_RADIUS_M**2 / normal
+    return np.stack([np.rad2deg(lat), np.rad2deg(np.arctan2(y, x)), altitude], axis=-1)

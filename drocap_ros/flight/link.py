@@ -1,0 +1,232 @@
+"""The one owner of the connection to the autopilot.
+
+It reads telemetry, asks for it, keeps its heartbeat and the clocks in step.  It sends no motion: what it may send
+is listed in ``SENDABLE`` and nothing else leaves the port.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from drocap_ros.errors import InputError
+from drocap_ros.flight.config import MavlinkBridgeConfig
+from drocap_ros.flight.parser import MavlinkParser
+from drocap_ros.flight.state_estimator import VehicleStateEstimator
+from drocap_ros.flight.telemetry_request import TelemetryRequests
+from drocap_ros.flight.transport import LinkError, open_transport
+from drocap_ros.flight.vehicle_state import VehicleState
+
+_NS = 1_000_000_000
+_STREAM_FALLBACK_S = 5.0
+_RECONNECT_S = 1.0
+SENDABLE = frozenset({"HEARTBEAT", "TIMESYNC", "COMMAND_LONG", "REQUEST_DATA_STREAM"})
+_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL})
+
+logger = logging.getLogger(__name__)
+
+
+class LinkStatus(NamedTuple):
+    """How the link does.
+
+    connected : something of the vehicle was heard within the time-out
+    silence_s : since then; infinity before the first
+    round_trip_s : of the best time synchronization, NaN without one
+    rates_hz : (real, wanted) of each message asked for, by its name
+    refused : MAV_RESULT of what the autopilot does not grant
+    bad_count : pieces of data that were no message
+    """
+
+    connected: bool
+    silence_s: float
+    round_trip_s: float
+    rates_hz: dict[str, tuple[float, float]]
+    refused: dict[str, int]
+    bad_count: int
+
+
+class MavlinkLink:
+    """Link to one autopilot.  Use as a context manager, and either call :meth:`spin_once` or :meth:`run`.
+
+    Parameters
+    ----------
+    config : where to connect, what to ask for
+    clock_ns : our clock, ns; that of the stamps
+
+    Raises
+    ------
+    InputError
+        At construction, when the URL cannot be used.
+    """
+
+    def __init__(self, config: MavlinkBridgeConfig, clock_ns: Callable[[], int] = time.time_ns) -> None:
+        self.config = config
+        self.estimator = VehicleStateEstimator(config.target_system_id)
+        self._clock_ns = clock_ns
+        self._transport = open_transport(config.url)
+        self._parser = MavlinkParser()
+        self._requests = TelemetryRequests(config)
+        self._mav = mavlink.MAVLink(None, srcSystem=config.system_id, srcComponent=config.component_id)
+        self._autopilot: str | None = None
+        self._heard_s: float | None = None  # monotonic
+        self._due: dict[str, float] = {}
+        self._sync_sent: dict[int, int] = {}
+        self._broken_s: float | None = None
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> MavlinkLink:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._transport.close()
+
+    def run(self, on_state: Callable[[VehicleState], None], stop: threading.Event) -> None:
+        """Read until ``stop`` is set; the states go to the callback.  A broken link is opened again."""
+        while not stop.is_set():
+            for state in self.spin_once(0.05):
+                on_state(state)
+
+    def spin_once(self, timeout_s: float = 0.0) -> list[VehicleState]:
+        """Read what has come, waiting at most ``timeout_s``; send what is due.
+
+        Returns one state per attitude message.  Never raises on what comes in.
+        """
+        data = self._read(timeout_s)
+        now_ns = self._clock_ns()
+        with self._lock:
+            states = [self._take(message, now_ns) for message in (self._parser.feed(data) if data else [])]
+            self._send_due()
+        return [state for state in states if state is not None]
+
+    def status(self) -> LinkStatus:
+        """How the link does now."""
+        with self._lock:
+            return self._status()
+
+    def _status(self) -> LinkStatus:
+        silence = float("inf") if self._heard_s is None else time.monotonic() - self._heard_s
+        trip = self.estimator.clock.round_trip_ns
+        now_ns = self._clock_ns()
+        return LinkStatus(
+            connected=silence < self.config.link_timeout_s,
+            silence_s=silence,
+            round_trip_s=float("nan") if trip is None else trip / _NS,
+            rates_hz=self._requests.rates_hz(now_ns),
+            refused=self._requests.refused(),
+            bad_count=self._parser.bad_count,
+        )
+
+    def _read(self, timeout_s: float) -> bytes:
+        if self._broken_s is not None and not self._reopened(timeout_s):
+            return b""
+        try:
+            return self._transport.read(timeout_s)
+        except LinkError as error:
+            logger.warning("%s; trying again every %g s", error, _RECONNECT_S)
+            self._broken_s = time.monotonic()
+            return b""
+
+    def _reopened(self, timeout_s: float) -> bool:
+        if self._broken_s is None or time.monotonic() - self._broken_s < _RECONNECT_S:
+            time.sleep(min(timeout_s, _RECONNECT_S))
+            return False
+        self._transport.close()
+        try:
+            self._transport = open_transport(self.config.url)
+        except InputError:
+            self._broken_s = time.monotonic()
+            return False
+        self._broken_s = None
+        return True
+
+    def _take(self, message: Any, now_ns: int) -> VehicleState | None:
+        name = message.get_type()
+        try:
+            state = self.estimator.update(message, now_ns)
+        except (ValueError, TypeError, OverflowError, AttributeError) as error:  # values outside their enumerations
+            logger.debug("dropped %s: %s", name, error)
+            return None
+        if message.get_srcSystem() != self.estimator.system_id or self.estimator.component_id == 0:
+            return state
+        self._heard_s = time.monotonic()
+        self._transport.accept_peer()
+        if self._autopilot is None:
+            self._autopilot = _autopilot_kind(message)
+            if self._autopilot is not None:
+                self._requests.set_autopilot(self._autopilot)
+        self._requests.count(message.get_msgId(), now_ns)
+        if name == "TIMESYNC":
+            self._take_time_sync(message, now_ns)
+        elif name == "COMMAND_ACK" and message.command in _COMMANDS:
+            self._requests.acknowledge(message.result, now_ns)
+        return state
+
+    def _take_time_sync(self, message: Any, now_ns: int) -> None:
+        if message.tc1 == 0:  # the autopilot asks
+            self._send(self._mav.timesync_encode(now_ns, message.ts1))
+            return
+        sent_ns = self._sync_sent.pop(message.ts1, None)
+        if sent_ns is not None:
+            self.estimator.clock.exchange(sent_ns, message.tc1, now_ns)
+
+    def _send_due(self) -> None:
+        config = self.config
+        if self._is_due("heartbeat", 1.0 / config.heartbeat_hz):
+            self._send(
+                self._mav.heartbeat_encode(
+                    mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE
+                )
+            )
+        if self._autopilot is None:
+            return
+        now_ns = self._clock_ns()
+        if self._is_due("time_sync", 1.0 / config.time_sync_hz):
+            if len(self._sync_sent) > 64:
+                self._sync_sent.clear()
+            self._sync_sent[now_ns] = now_ns
+            self._send(self._mav.timesync_encode(0, now_ns))
+        system, component = self.estimator.system_id, self.estimator.component_id
+        if self._is_due("request", 0.02):
+            for number, interval_us in self._requests.due(now_ns):
+                self._send(
+                    self._mav.command_long_encode(
+                        system, component, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, interval_us, 0, 0, 0, 0, 0
+                    )
+                )
+        if self._requests.unanswered() and self._is_due("streams", _STREAM_FALLBACK_S):
+            # Autopilots and proxies too old for SET_MESSAGE_INTERVAL know this one.
+            rate = round(min(config.position_hz, 50))
+            self._send(self._mav.request_data_stream_encode(system, component, mavlink.MAV_DATA_STREAM_ALL, rate, 1))
+
+    def _is_due(self, what: str, period_s: float) -> bool:
+        now = time.monotonic()
+        if now < self._due.get(what, 0.0):
+            return False
+        self._due[what] = now + period_s
+        return True
+
+    def _send(self, message: Any) -> None:
+        name = message.get_type()
+        if name not in SENDABLE or (name == "COMMAND_LONG" and message.command not in _COMMANDS):
+            raise AssertionError(f"this link sends no {name}")
+        try:
+            self._transport.write(message.pack(self._mav))
+        except LinkError as error:
+            logger.warning("%s; trying again every %g s", error, _RECONNECT_S)
+            self._broken_s = time.monotonic()
+        self._mav.seq = (self._mav.seq + 1) % 256
+
+
+def _autopilot_kind(message: Any) -> str | None:
+    if message.get_type() != "HEARTBEAT":
+        return None
+    return "px4" if message.autopilot == mavlink.MAV_AUTOPILOT_PX4 else "ardupilot"

@@ -1,0 +1,193 @@
+"""Byte transports under MAVLink: UDP, TCP and serial, opened from one URL."""
+
+from __future__ import annotations
+
+import re
+import select
+import socket
+from typing import Protocol
+
+from drocap_ros.errors import DrocapError, InputError
+
+URL_FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE[:BAUD]"
+_MAX_DATAGRAM = 65535
+_CONNECT_TIMEOUT_S = 3.0
+_DEFAULT_BAUD = 57600
+
+
+class LinkError(DrocapError):
+    """The link to the autopilot broke."""
+
+
+class Transport(Protocol):
+    """Something that carries bytes to and from an autopilot."""
+
+    def read(self, timeout_s: float) -> bytes:
+        """Whatever has come within the time; empty when nothing has.  Raises LinkError when the link broke."""
+
+    def write(self, data: bytes) -> bool:
+        """Send; False when there is nobody to send to, or no room."""
+
+    def accept_peer(self) -> None:
+        """Answer from now on to whom the latest bytes came from (UDP that listens)."""
+
+    def close(self) -> None:
+        """Give the port back."""
+
+
+def open_transport(url: str) -> Transport:
+    """Open the transport that a URL names: one of ``URL_FORMS``, also with ``//`` after the colon.
+
+    Raises
+    ------
+    InputError
+        When the URL cannot be understood, or its address, port or device cannot be used.
+    """
+    match = re.fullmatch(r"(udp|udpin|udpout|tcp|serial):(?://)?(.+)", url.strip())
+    if match is None:
+        raise InputError(f"url: expected {URL_FORMS}, got {url!r}; correct the parameter")
+    kind, rest = match.groups()
+    if kind == "serial":
+        return _open_serial(rest, url)
+    host, port = _address(rest, url)
+    try:
+        if kind == "tcp":
+            return _TcpTransport(host, port)
+        return _UdpTransport(host, port, listen=kind != "udpout")
+    except OSError as error:
+        raise InputError(
+            f"url: expected an address that can be opened, got {url!r}: {error.strerror or error}; "
+            "check host and port, and that no other program holds them"
+        ) from None
+
+
+def _address(text: str, url: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not port.isdigit() or not 0 < int(port) < 65536:
+        raise InputError(f"url: expected a port from 1 to 65535 after the last colon, got {url!r}; use {URL_FORMS}")
+    return host.strip("[]") or "0.0.0.0", int(port)
+
+
+def _open_serial(rest: str, url: str) -> Transport:
+    device, _, baud = rest.rpartition(":")
+    if not device:
+        device, baud = rest, str(_DEFAULT_BAUD)
+    if not baud.isdigit() or int(baud) == 0:
+        raise InputError(f"url: expected a baud rate after the last colon, got {url!r}; use serial:/dev/ttyACM0:57600")
+    try:
+        import serial
+    except ImportError:
+        raise InputError(
+            "url: expected the package pyserial for serial URLs, found none; pip install pyserial"
+        ) from None
+    try:
+        return _SerialTransport(serial.Serial(device, int(baud), timeout=0, write_timeout=0.2))
+    except (serial.SerialException, OSError, ValueError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"url: expected a serial device that can be opened, got {url!r}: {reason}") from None
+
+
+class _UdpTransport:
+    def __init__(self, host: str, port: int, listen: bool) -> None:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._peer = None if listen else address
+        self._fixed_peer = not listen
+        self._sender = None
+        try:
+            if listen:
+                self._socket.bind(address)
+        except OSError:
+            self._socket.close()
+            raise
+
+    def read(self, timeout_s: float) -> bytes:
+        if not select.select([self._socket], [], [], timeout_s)[0]:
+            return b""
+        try:
+            data, self._sender = self._socket.recvfrom(_MAX_DATAGRAM)
+        except (BlockingIOError, ConnectionRefusedError):  # refused: nobody listens there yet
+            return b""
+        return data
+
+    def write(self, data: bytes) -> bool:
+        if self._peer is None:
+            return False
+        try:
+            self._socket.sendto(data, self._peer)
+        except (BlockingIOError, ConnectionRefusedError, OSError):
+            return False
+        return True
+
+    def accept_peer(self) -> None:
+        if not self._fixed_peer and self._sender is not None:
+            self._peer = self._sender
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class _TcpTransport:
+    def __init__(self, host: str, port: int) -> None:
+        self._socket = socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT_S)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setblocking(False)
+
+    def read(self, timeout_s: float) -> bytes:
+        try:
+            if not select.select([self._socket], [], [], timeout_s)[0]:
+                return b""
+            data = self._socket.recv(_MAX_DATAGRAM)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise LinkError(f"the TCP link to the autopilot broke: {error.strerror or error}") from None
+        if not data:
+            raise LinkError("the autopilot's side closed the TCP link")
+        return data
+
+    def write(self, data: bytes) -> bool:
+        # A partial write would tear a packet: MAVLink resynchronizes, and the packets are small.
+        try:
+            return self._socket.send(data) == len(data)
+        except BlockingIOError:
+            return False
+        except OSError as error:
+            raise LinkError(f"the TCP link to the autopilot broke: {error.strerror or error}") from None
+
+    def accept_peer(self) -> None:
+        """Nothing to choose: there is one peer."""
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class _SerialTransport:
+    def __init__(self, port: object) -> None:
+        from typing import Any, cast
+
+        self._port = cast(Any, port)
+
+    def read(self, timeout_s: float) -> bytes:
+        try:
+            if not select.select([self._port.fileno()], [], [], timeout_s)[0]:
+                return b""
+            data = bytes(self._port.read(_MAX_DATAGRAM))
+        except Exception as error:
+            raise LinkError(f"the serial link to the autopilot broke: {error}") from None
+        if not data:
+            raise LinkError("the serial link to the autopilot broke: the device is gone")
+        return data
+
+    def write(self, data: bytes) -> bool:
+        try:
+            return self._port.write(data) == len(data)
+        except Exception:
+            return False
+
+    def accept_peer(self) -> None:
+        """Nothing to choose: there is one peer."""
+
+    def close(self) -> None:
+        self._port.close()
