@@ -60,9 +60,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def learn_from_folder(
-    folder: Path, include: str, every: int, atoms: int, sparsity: float, seed: int
-) -> Dictionary:
+def learn_from_folder(folder: Path, include: str, every: int, atoms: int, sparsity: float, seed: int) -> Dictionary:
     """Dictionary from the files ``include`` of a MoCap folder, every n-th frame."""
     from drocap_ros.reconstruction.dictionary import learn, normalize_poses
     from drocap_ros.reconstruction.protocol import load_mocap, mocap_files

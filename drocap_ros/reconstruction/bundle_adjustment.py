@@ -78,9 +78,7 @@ class Objective:
 
     def turn(self, s: np.ndarray) -> None:
         """One downhill step of every rotation."""
-        self.rotation = update_rotations(
-            self.projection, s, self.rotation, smoothness=self.config.rotation_smoothness
-        )
+        self.rotation = update_rotations(self.projection, s, self.rotation, smoothness=self.config.rotation_smoothness)
         self._rotation_cost = self.config.rotation_smoothness * rotation_change(self.rotation)
 
     def terms(self, s: np.ndarray) -> dict[str, float]:
@@ -89,8 +87,7 @@ class Objective:
             "reprojection": self.projection.value_and_gradient(s, self.rotation)[0],
             "articulation": self.config.gamma * articulation_term(s)[0],
             "nuclear_norm": self.alpha * nuclear_norm(s),
-            "smoothness": self.config.shape_smoothness * smoothness_term(s)[0]
-            + self._rotation_cost,
+            "smoothness": self.config.shape_smoothness * smoothness_term(s)[0] + self._rotation_cost,
         }
 
 
@@ -111,6 +108,7 @@ def bundle_adjust(
     covariance: np.ndarray | None = None,
     config: BundleAdjusterConfig | None = None,
     *,
+    information: np.ndarray | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> AdjustmentResult:
     """Refine poses over one window of frames.
@@ -124,6 +122,8 @@ def bundle_adjust(
     weights : (F, P) >= 0 of the reprojection term, or None
     covariance : (F, P, 3) xx, xy, yy of w, or None
     config : weights of the terms and limits of the solver
+    information : (F, P, 3) in place of weights and covariance, as
+        :func:`~drocap_ros.reconstruction.data_term.information_from` makes it
 
     Raises
     ------
@@ -136,7 +136,7 @@ def bundle_adjust(
     # Low rank holds in a body-fixed frame only: in the camera's or the world's, a turning body is of high rank.
     body = torso_frame(s0)
     shape = (s0 - s0.mean(axis=1, keepdims=True)) @ body
-    projection = Projection(w, information_from(w, weights, covariance))
+    projection = Projection(w, information_from(w, weights, covariance) if information is None else information)
     objective = Objective(projection, r0 @ body, config)
     shape, outcome = _minimize(objective, shape, progress)
     terms = objective.terms(shape)

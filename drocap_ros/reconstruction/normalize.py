@@ -77,7 +77,7 @@ def normalize_tracks(
     if not scale_px > 1e-6 * (1.0 + np.abs(points).max()):
         raise InputError("keypoints: expected joints apart from each other, got all in one point; check the 2D tracks")
     precision = None if covariance is None else _precision(covariance, seen, scale_px)
-    return NormalizedTracks(w / scale_px, weights, precision, _filled(centre, count > 0), scale_px)
+    return NormalizedTracks(w / scale_px, weights, precision, filled(centre, count > 0), scale_px)
 
 
 def _precision(covariance: np.ndarray, seen: np.ndarray, scale_px: float) -> np.ndarray:
@@ -95,7 +95,7 @@ def _precision(covariance: np.ndarray, seen: np.ndarray, scale_px: float) -> np.
     return np.where(seen[..., None, None], inverse, 0.0) * scale_px**2
 
 
-def _filled(centre: np.ndarray, known: np.ndarray) -> np.ndarray:
+def filled(centre: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Centres of images without a joint, interpolated from their neighbours."""
     if known.all():
         return centre

@@ -1,0 +1,181 @@
+"""The methods of ``drocap reconstruct``, over recordings of any length: overlapping windows, linear time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drocap_ros.reconstruction.bundle_adjustment import bundle_adjust
+from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.data_term import Projection, information_from
+from drocap_ros.reconstruction.dictionary import Dictionary
+from drocap_ros.reconstruction.normalize import NormalizedTracks, normalize_tracks
+from drocap_ros.reconstruction.single_view import initialize
+from drocap_ros.reconstruction.window import MIN_WINDOW, fill_frames
+from drocap_ros.tracks import Tracks
+
+#: "ba" is the best there is, the others are the paper's method and its ablations.
+METHODS = ("ba", "paper", "paper-no-articulation", "initial", "mf-nnm")
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class CameraPoses:
+    """Poses in camera axes, in px, and how they were found.
+
+    joints_px : (F, 15, 3), centred; ``keypoints ~ joints_px[..., :2] + translation_px``
+    translation_px : (F, 2)
+    seconds : wall-clock per stage
+    """
+
+    joints_px: np.ndarray
+    translation_px: np.ndarray
+    seconds: dict[str, float]
+    iterations: int
+    stop_reason: str
+    cost_terms: dict[str, float]
+
+
+def run_method(
+    method: str,
+    stamp_ns: np.ndarray,
+    keypoints: np.ndarray,
+    confidence: np.ndarray | None,
+    covariance: np.ndarray | None,
+    tracks: Tracks,
+    initializer: InitializerConfig,
+    adjuster: BundleAdjusterConfig,
+    dictionary: Dictionary,
+    progress: Progress | None,
+) -> CameraPoses:
+    """Poses of BODY_15 keypoints (F, 15, 2) px by one of :data:`METHODS`."""
+    normalize_tracks(keypoints, confidence, covariance)  # refuses what no window can use
+    if method == "mf-nnm":
+        from drocap_ros.reconstruction.factorization import run_factorization
+
+        return run_factorization(stamp_ns, keypoints, confidence, covariance, adjuster, dictionary, progress)
+    clock = time.perf_counter()
+    joints = initial_poses(stamp_ns, keypoints, confidence, covariance, initializer, dictionary, progress)
+    seconds = {"initial": time.perf_counter() - clock, "ba": 0.0}
+    if method == "initial":
+        translation = _translations(keypoints, confidence, covariance, joints)
+        return CameraPoses(joints, translation, seconds, 0, "start only", {})
+    if method == "paper-no-articulation":
+        adjuster = replace(adjuster, gamma=0.0)
+    clock = time.perf_counter()
+    poses = adjust(stamp_ns, keypoints, confidence, covariance, joints, adjuster, progress)
+    seconds["ba"] = time.perf_counter() - clock
+    return replace(poses, seconds=seconds)
+
+
+def initial_poses(
+    stamp_ns: np.ndarray,
+    keypoints: np.ndarray,
+    confidence: np.ndarray | None,
+    covariance: np.ndarray | None,
+    config: InitializerConfig,
+    dictionary: Dictionary,
+    progress: Progress | None = None,
+) -> np.ndarray:
+    """Single-view poses (F, 15, 3) px in camera axes, centred, block by block; empty frames are interpolated."""
+    out = np.full((*keypoints.shape[:2], 3), np.nan)
+    for rows, n, information in _blocks(keypoints, confidence, covariance, config.block_frames, 0):
+        fit = initialize(n.w, information, dictionary, config)
+        shown = (n.weights > 0.0).sum(1) >= 3
+        shape = np.where(shown[:, None, None], fit.camera_shape, np.nan)
+        out[rows] = (shape - shape.mean(axis=1, keepdims=True)) * n.scale_px
+        if progress is not None:
+            progress("initial", rows.stop / len(keypoints))
+    return fill_frames(stamp_ns, out)
+
+
+def adjust(
+    stamp_ns: np.ndarray,
+    keypoints: np.ndarray,
+    confidence: np.ndarray | None,
+    covariance: np.ndarray | None,
+    joints: np.ndarray,
+    config: BundleAdjusterConfig,
+    progress: Progress | None = None,
+) -> CameraPoses:
+    """Bundle adjustment of poses (F, 15, 3) px over overlapping windows, cross-faded where they overlap."""
+    out, weight = np.zeros_like(joints), np.zeros(len(joints))
+    iterations, terms, stops = 0, dict[str, float](), set[str]()
+    for rows, n, information in _blocks(keypoints, confidence, covariance, config.window_frames, config.overlap_frames):
+        count = rows.stop - rows.start
+        fade = _fade(count, config.overlap_frames, rows.start > 0, rows.stop < len(keypoints))
+        if count < MIN_WINDOW:
+            found = joints[rows]
+            stops.add("too short")
+        else:
+            result = bundle_adjust(n.w, joints[rows] / n.scale_px, None, None, None, config, information=information)
+            found = result.camera_shape * n.scale_px
+            iterations += result.iterations
+            stops.add(result.stop_reason)
+            for name, value in result.cost_terms.items():
+                terms[name] = terms.get(name, 0.0) + value
+        out[rows] += fade[:, None, None] * found
+        weight[rows] += fade
+        if progress is not None:
+            progress("ba", rows.stop / len(keypoints))
+    poses = out / weight[:, None, None]
+    translation = _translations(keypoints, confidence, covariance, poses)
+    return CameraPoses(poses, translation, {}, iterations, ", ".join(sorted(stops)), terms)
+
+
+def windows(frames: int, length: int, overlap: int) -> list[slice]:
+    """Windows of about equal length, at most ``length``, neighbours sharing ``overlap`` frames."""
+    if frames <= length:
+        return [slice(0, frames)]
+    overlap = min(overlap, length // 2)
+    count = int(np.ceil((frames - overlap) / (length - overlap)))
+    starts = np.round(np.linspace(0, frames - length, count)).astype(int)
+    return [slice(int(start), int(start) + length) for start in starts]
+
+
+def _blocks(
+    keypoints: np.ndarray, confidence: np.ndarray | None, covariance: np.ndarray | None, length: int, overlap: int
+) -> Iterator[tuple[slice, NormalizedTracks, np.ndarray]]:
+    """Normalized tracks and their information, window by window."""
+    whole: NormalizedTracks | None = None
+    for rows in windows(len(keypoints), length, overlap):
+        part = (
+            keypoints[rows],
+            None if confidence is None else confidence[rows],
+            None if covariance is None else covariance[rows],
+        )
+        if (np.isfinite(part[0]).all(-1).sum(1) < 4).all():
+            # A window without the person borrows the unit of the recording.
+            whole = whole or normalize_tracks(keypoints, confidence, covariance)
+            n = _slice(whole, rows)
+        else:
+            n = normalize_tracks(*part)
+        seen = np.where((n.weights > 0.0)[..., None], n.w, np.nan)
+        units = None if part[2] is None else part[2] / n.scale_px**2
+        yield rows, n, information_from(seen, n.weights, units)
+
+
+def _slice(n: NormalizedTracks, rows: slice) -> NormalizedTracks:
+    return NormalizedTracks(n.w[rows], n.weights[rows], None, n.centre_px[rows], n.scale_px)
+
+
+def _fade(count: int, overlap: int, at_start: bool, at_end: bool) -> np.ndarray:
+    """Weights (count,) that rise over the overlap with the window before and fall over that with the next."""
+    ramp = np.minimum(np.arange(1, count + 1) / (overlap + 1.0), 1.0)
+    return (ramp if at_start else np.ones(count)) * (ramp[::-1] if at_end else np.ones(count))
+
+
+def _translations(
+    keypoints: np.ndarray, confidence: np.ndarray | None, covariance: np.ndarray | None, joints: np.ndarray
+) -> np.ndarray:
+    """(F, 2) px that move the projected poses on the keypoints; interpolated where nothing was seen."""
+    from drocap_ros.reconstruction.normalize import filled
+
+    seen = np.isfinite(keypoints).all(-1)
+    weights = seen.astype(float) if confidence is None else np.where(seen, np.nan_to_num(confidence), 0.0)
+    projection = Projection(keypoints, information_from(keypoints, weights, covariance))
+    return filled(projection.translation(joints[..., :2]), (weights > 0.0).any(1))

@@ -1,0 +1,163 @@
+"""From 2D tracks to a motion: the whole offline reconstruction, method by method."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from drocap_ros import __version__
+from drocap_ros.errors import InputError
+from drocap_ros.motion import Motion
+from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
+from drocap_ros.reconstruction.methods import METHODS, CameraPoses, run_method
+from drocap_ros.reconstruction.placement import metres_per_px, place_in_world
+from drocap_ros.skeleton import BODY_15
+from drocap_ros.tracks import Tracks
+
+Progress = Callable[[str, float], None]
+
+
+def reconstruct(
+    tracks: Tracks,
+    *,
+    method: str = "ba",
+    initializer: InitializerConfig | None = None,
+    adjuster: BundleAdjusterConfig | None = None,
+    dictionary: Dictionary | None = None,
+    progress: Progress | None = None,
+) -> Motion:
+    """3D motion of the subject of ``tracks``.
+
+    Parameters
+    ----------
+    tracks : joints are taken by the names of BODY_15; others are ignored, missing ones filled in by the model
+    method : "ba" the best there is; "paper" single-view start and equations (2)-(4); "paper-no-articulation" with
+        gamma = 0; "initial" the start alone; "mf-nnm" factorization and nuclear norm minimization
+    progress : called with a stage and the fraction of it that is done
+
+    Returns
+    -------
+    Motion
+        In frame "world" when the tracks know the camera's rotation, else in frame "camera".
+
+    Raises
+    ------
+    InputError
+        When the method is unknown or the tracks show too little.
+    """
+    if method not in METHODS:
+        raise InputError(f"method: expected one of {', '.join(METHODS)}, got {method!r}; choose one of them")
+    initializer = initializer or InitializerConfig()
+    adjuster = adjuster or BundleAdjusterConfig()
+    dictionary = dictionary or load_dictionary(initializer.dictionary or None)
+    started = time.perf_counter()
+    keypoints, confidence, covariance = body_keypoints(tracks)
+    result = run_method(
+        method, tracks.stamp_ns, keypoints, confidence, covariance, tracks, initializer, adjuster, dictionary, progress
+    )
+    motion = _to_motion(tracks, keypoints, confidence, result, initializer)
+    motion.meta.update(
+        method=method,
+        versions=_versions(),
+        git_revision=git_revision(),
+        parameters={"initializer": dataclasses.asdict(initializer), "adjuster": dataclasses.asdict(adjuster)},
+        dictionary=dictionary.metadata,
+        seconds={**result.seconds, "total": time.perf_counter() - started},
+        iterations=result.iterations,
+        stop_reason=result.stop_reason,
+        cost_terms=result.cost_terms,
+        frames=len(tracks),
+    )
+    return motion
+
+
+def body_keypoints(tracks: Tracks) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Keypoints (F, 15, 2) px, confidence (F, 15) and covariance (F, 15, 3) in BODY_15's order; NaN, 0 where absent.
+
+    Raises
+    ------
+    InputError
+        When too few joints have a name of BODY_15.
+    """
+    place = {name: i for i, name in enumerate(tracks.joints)}
+    have = [(j, place[name]) for j, name in enumerate(BODY_15.joints) if name in place]
+    if len(have) < 4:
+        raise InputError(
+            f"joints: expected at least 4 of {', '.join(BODY_15.joints)}, got {len(have)} of them; rename the joints"
+        )
+    ours, theirs = np.array(have).T
+    frames, p = len(tracks), len(BODY_15)
+    keypoints = np.full((frames, p, 2), np.nan)
+    keypoints[:, ours] = tracks.keypoints[:, theirs]
+    keypoints[np.isnan(keypoints).any(-1)] = np.nan
+    confidence = covariance = None
+    if tracks.confidence is not None:
+        confidence = np.zeros((frames, p))
+        confidence[:, ours] = tracks.confidence[:, theirs]
+    if tracks.covariance is not None:
+        covariance = np.full((frames, p, 3), np.nan)
+        covariance[:, ours] = tracks.covariance[:, theirs]
+        # A joint of unknown uncertainty counts as one that was not seen.
+        if confidence is None:
+            confidence = np.isfinite(keypoints).all(-1).astype(float)
+    return keypoints, confidence, covariance
+
+
+def _to_motion(
+    tracks: Tracks,
+    keypoints: np.ndarray,
+    confidence: np.ndarray | None,
+    result: CameraPoses,
+    config: InitializerConfig,
+) -> Motion:
+    seen = np.isfinite(keypoints).all(-1)
+    shown = np.where(seen, 1.0 if confidence is None else np.nan_to_num(confidence), 0.0)
+    projected = result.joints_px[..., :2] + result.translation_px[:, None]
+    reprojection = np.linalg.norm(projected - keypoints, axis=-1)
+    pelvis = BODY_15.index("pelvis")
+    per_px = metres_per_px(result.joints_px, tracks.stamp_ns, config.assumed_height_m)
+    joints = (result.joints_px - result.joints_px[:, pelvis][:, None]) * per_px[:, None, None]
+    rotation, frame = np.broadcast_to(np.eye(3), (len(tracks), 3, 3)).copy(), "camera"
+    if tracks.camera_rotation is not None:
+        rotation, frame = tracks.camera_rotation, "world"
+        joints = place_in_world(joints, projected[:, pelvis], per_px, tracks)
+    return Motion(
+        joints3d=np.ascontiguousarray(joints),
+        joints=BODY_15.joints,
+        parents=BODY_15.parents,
+        stamp_ns=tracks.stamp_ns,
+        frame=frame,
+        metric=False,
+        scale_source="assumed_height",
+        camera_rotation=rotation,
+        confidence=shown,
+        keypoints=keypoints,
+        reprojection_px=reprojection,
+        meta={"assumed_height_m": config.assumed_height_m, "reference_stature_m": REFERENCE_STATURE_M},
+    )
+
+
+def _versions() -> dict[str, str]:
+    import platform
+
+    return {"drocap_ros": __version__, "numpy": np.__version__, "python": platform.python_version()}
+
+
+def git_revision() -> str | None:
+    """Revision of the source tree this package runs from, or None outside a repository."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()

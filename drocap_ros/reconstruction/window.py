@@ -1,0 +1,344 @@
+"""The windowed core that the live nodes and the offline command share.
+
+:class:`SlidingWindowInitializer` turns one image's keypoints at a time into a pose (causal, bounded memory);
+:func:`adjust_window` refines the poses of a window.  Both speak px in, metres in camera axes out.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.reconstruction.bundle_adjustment import bundle_adjust
+from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.data_term import Projection, information_from
+from drocap_ros.reconstruction.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
+from drocap_ros.reconstruction.metrics import limb_lengths
+from drocap_ros.reconstruction.normalize import MIN_JOINTS, NormalizedTracks, normalize_tracks
+from drocap_ros.reconstruction.pose_covariance import packed_covariance, pose_covariance
+from drocap_ros.reconstruction.single_view import sparse_from_dense
+from drocap_ros.reconstruction.sparse_fit import fit_sparse
+from drocap_ros.reconstruction.starts import DenseFit, fit_dense, image_scale, viewpoint_starts
+from drocap_ros.skeleton import BODY_15
+
+#: Images over which the live start remembers the person's size.
+MEMORY = 120
+
+#: Windows of fewer frames hold no second view worth adjusting to.
+MIN_WINDOW = 4
+
+
+@dataclass(frozen=True)
+class InitialPose:
+    """Pose of one image.
+
+    joints3d : (15, 3) m, camera axes, pelvis at the origin; NaN when the image shows too little
+    covariance : (15, 6) m^2, xx xy xz yy yz zz
+    confidence : (15,) in [0, 1], 0 where the joint was not seen and the model filled it in
+    rotation : (3, 3) torso -> camera
+    """
+
+    stamp_ns: int
+    joints3d: np.ndarray
+    covariance: np.ndarray
+    confidence: np.ndarray
+    reprojection_rms_px: float
+    rotation: np.ndarray
+
+
+@dataclass(frozen=True)
+class AdjustedWindow:
+    """Poses of a window: joints3d (F, 15, 3) m and covariance (F, 15, 6) m^2 in camera axes, pelvis at the origin."""
+
+    joints3d: np.ndarray
+    covariance: np.ndarray
+    confidence: np.ndarray
+    reprojection_rms_px: np.ndarray
+    iterations: int
+    cost: float
+    stop_reason: str
+    cost_terms: dict[str, float]
+
+
+class SlidingWindowInitializer:
+    """Single-view initialization as the images come: warm-started, causal, bounded memory.
+
+    The hypotheses of the last image stay alive: their summed costs decide, so one ambiguous image does not flip
+    the body.
+    """
+
+    def __init__(self, config: InitializerConfig | None = None, dictionary: Dictionary | None = None) -> None:
+        self.config = config or InitializerConfig()
+        self.dictionary = dictionary or load_dictionary(self.config.dictionary or None)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the subject."""
+        self._stamp_ns: int | None = None
+        self._spread: deque[tuple[float, int]] = deque(maxlen=MEMORY)
+        self._metre_px: deque[float] = deque(maxlen=MEMORY)
+        self._alive: DenseFit | None = None
+        self._total = np.zeros(0)
+        self._unit_px = 1.0
+
+    def push(
+        self,
+        stamp_ns: int,
+        keypoints: np.ndarray,
+        confidence: np.ndarray | None = None,
+        covariance: np.ndarray | None = None,
+    ) -> InitialPose:
+        """Pose of the next image.  A stamp before the last one starts anew (a replay that jumped back).
+
+        Parameters
+        ----------
+        keypoints : (15, 2) px, NaN where not seen
+        confidence : (15,) in [0, 1], or None
+        covariance : (15, 3) px^2, or None
+
+        Raises
+        ------
+        InputError
+            When an array has a wrong shape or an impossible value.
+        """
+        confidence = np.isfinite(keypoints).all(-1).astype(float) if confidence is None else confidence
+        _check_image(keypoints, confidence, covariance)
+        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
+            self.reset()
+        self._stamp_ns = stamp_ns
+        seen = np.isfinite(keypoints).all(-1) & (np.nan_to_num(confidence) > 0.0)
+        extent = np.ptp(keypoints[seen], axis=0).max() if seen.any() else 0.0
+        if seen.sum() < MIN_JOINTS or not extent > 1e-3:
+            return _unknown(stamp_ns)
+        n = self._normalize(keypoints, confidence, covariance, seen)
+        information = information_from(n.w, n.weights, _units(covariance, n.scale_px))
+        scale = self._scale(n, information)
+        dense = self._fit(n.w, information, scale)
+        best = self._decide(dense)
+        self._metre_px.append(float(dense.coefficients[best, 0]) * n.scale_px)
+        return self._result(stamp_ns, n, information, dense, best, np.where(seen, np.nan_to_num(confidence), 0.0))
+
+    def _normalize(
+        self, keypoints: np.ndarray, confidence: np.ndarray, covariance: np.ndarray | None, seen: np.ndarray
+    ) -> NormalizedTracks:
+        points = keypoints[seen] - keypoints[seen].mean(0)
+        self._spread.append((float(np.sum(points**2)), 2 * int(seen.sum())))
+        total, count = np.sum(np.array(self._spread), axis=0)
+        unit = float(np.sqrt(total / count))
+        n = normalize_tracks(
+            keypoints[None], confidence[None], None if covariance is None else covariance[None], scale_px=unit
+        )
+        if self._alive is not None:
+            # The unit has moved a little: the hypotheses of the last image follow it.
+            f = self._unit_px / unit
+            a = self._alive
+            self._alive = DenseFit(a.rotation, a.coefficients * f, a.translation * f, a.camera_shape * f, a.cost)
+        self._unit_px = unit
+        return n
+
+    def _scale(self, n: NormalizedTracks, information: np.ndarray) -> float:
+        if not self._metre_px:
+            return image_scale(n.w, information, self.dictionary)
+        return float(np.median(self._metre_px)) / n.scale_px
+
+    def _fit(self, w: np.ndarray, information: np.ndarray, scale: float) -> DenseFit:
+        c = self.config
+        rotation = viewpoint_starts(w, information, c.azimuth_starts, np.deg2rad(c.elevation_start_deg))[:, 0]
+        size = min(c.start_components, len(self.dictionary.components))
+        coefficients = np.zeros((len(rotation), 1 + size))
+        coefficients[:, 0] = scale
+        if self._alive is not None:
+            rotation = np.concatenate([self._alive.rotation, rotation])
+            coefficients = np.concatenate([self._alive.coefficients, coefficients])
+        count = len(rotation)
+        return fit_dense(
+            np.repeat(w, count, axis=0), np.repeat(information, count, axis=0), rotation, coefficients,
+            self.dictionary, c, scale=scale, scale_std=c.scale_std * (3.0 if len(self._metre_px) < 5 else 1.0),
+            iterations=c.start_iterations,
+        )  # fmt: skip
+
+    def _decide(self, dense: DenseFit) -> int:
+        """Add this image's costs to those of the hypotheses that led here; keep the best few."""
+        total = dense.cost
+        if self._alive is not None:
+            change = dense.camera_shape[:, None] - self._alive.camera_shape[None]
+            total = total + np.min(self._total[None] + self.config.switch_cost * np.sum(change**2, axis=(2, 3)), axis=1)
+        order = np.argsort(total, kind="stable")
+        keep: list[int] = []
+        for i in order:
+            apart = [np.sum((dense.camera_shape[i] - dense.camera_shape[j]) ** 2) > 0.05 for j in keep]
+            if all(apart):
+                keep.append(int(i))
+            if len(keep) == self.config.azimuth_starts:
+                break
+        self._alive = DenseFit(*(value[keep] for value in vars(dense).values()))
+        self._total = total[keep] - total[keep[0]]
+        return keep[0]
+
+    def _result(
+        self,
+        stamp_ns: int,
+        n: NormalizedTracks,
+        information: np.ndarray,
+        dense: DenseFit,
+        best: int,
+        confidence: np.ndarray,
+    ) -> InitialPose:
+        one = slice(best, best + 1)
+        projection = Projection(n.w, information)
+        fit = fit_sparse(
+            projection, dense.rotation[one], sparse_from_dense(dense.coefficients[one], self.dictionary),
+            self.dictionary, self.config,
+        )  # fmt: skip
+        camera = fit.shape @ np.swapaxes(fit.rotation, 1, 2)
+        metres = self.config.assumed_height_m / REFERENCE_STATURE_M / float(np.median(self._metre_px)) * n.scale_px
+        gap, _ = projection.residual(fit.shape, fit.rotation)
+        covariance = pose_covariance(information, fit.rotation, dense.coefficients[one], self.dictionary, self.config)
+        rms = np.sqrt(np.mean(np.sum(gap[0, confidence > 0.0] ** 2, axis=-1))) * n.scale_px
+        return InitialPose(
+            stamp_ns=stamp_ns,
+            joints3d=(camera[0] - camera[0, BODY_15.index("pelvis")]) * metres,
+            covariance=packed_covariance(covariance[0]) * metres**2,
+            confidence=confidence,
+            reprojection_rms_px=float(rms),
+            rotation=fit.rotation[0],
+        )
+
+
+def _check_image(keypoints: np.ndarray, confidence: np.ndarray, covariance: np.ndarray | None) -> None:
+    p = len(BODY_15)
+    if keypoints.shape != (p, 2) or np.isinf(keypoints).any():
+        raise InputError(f"keypoints: expected ({p}, 2) finite px or NaN, got {keypoints.shape}; use the body15 joints")
+    if confidence.shape != (p,):
+        raise InputError(f"confidence: expected shape ({p},), got {confidence.shape}; give one per joint")
+    if covariance is not None and covariance.shape != (p, 3):
+        raise InputError(f"covariance: expected shape ({p}, 3), got {covariance.shape}; give xx, xy, yy per joint")
+
+
+def _unknown(stamp_ns: int) -> InitialPose:
+    p = len(BODY_15)
+    return InitialPose(
+        stamp_ns, np.full((p, 3), np.nan), np.full((p, 6), np.nan), np.zeros(p), float("nan"), np.full((3, 3), np.nan)
+    )
+
+
+def _units(covariance: np.ndarray | None, scale_px: float) -> np.ndarray | None:
+    if covariance is None:
+        return None
+    return (covariance[None] if covariance.ndim == 2 else covariance) / scale_px**2
+
+
+def adjust_window(
+    stamp_ns: np.ndarray,
+    keypoints: np.ndarray,
+    confidence: np.ndarray | None,
+    covariance: np.ndarray | None,
+    initial_joints: np.ndarray,
+    config: BundleAdjusterConfig | None = None,
+) -> AdjustedWindow:
+    """Bundle adjustment of one window.
+
+    Parameters
+    ----------
+    stamp_ns : (F,) increasing
+    keypoints, confidence, covariance : (F, 15, 2) px, (F, 15) or None, (F, 15, 3) px^2 or None
+    initial_joints : (F, 15, 3) m, camera axes; frames of NaN are filled in from their neighbours
+    config : weights and limits
+
+    Raises
+    ------
+    InputError
+        When the arrays do not fit, show no person, or no frame has a start.
+    """
+    config = config or BundleAdjusterConfig()
+    frames = len(keypoints)
+    if initial_joints.shape != (frames, len(BODY_15), 3) or len(stamp_ns) != frames:
+        raise InputError(
+            f"initial_joints: expected shape {(frames, len(BODY_15), 3)} and {frames} stamps, got"
+            f" {initial_joints.shape} and {len(stamp_ns)}; give one pose and stamp per image"
+        )
+    start = fill_frames(stamp_ns, initial_joints)
+    n = normalize_tracks(keypoints, confidence, covariance)
+    in_units = _units(covariance, n.scale_px)
+    projection = Projection(n.w, information_from(n.w, n.weights, in_units))
+    scale = _scale_to_image(start, projection)
+    unseen = np.where((n.weights > 0.0)[..., None], n.w, np.nan)
+    seen = n.weights > 0.0
+    if frames < MIN_WINDOW:
+        shape, rotation = start * scale, np.broadcast_to(np.eye(3), (frames, 3, 3))
+        iterations, terms, stop = 0, {"reprojection": float(projection.per_frame(shape, rotation).sum())}, "too short"
+    else:
+        result = bundle_adjust(unseen, start * scale, None, n.weights, in_units, config)
+        shape, rotation, iterations = result.shape, result.rotation, result.iterations
+        terms, stop = result.cost_terms, result.stop_reason
+    gap, _ = projection.residual(shape, rotation)
+    square = np.where(seen, np.sum(gap**2, axis=-1), 0.0)
+    rms = np.sqrt(square.sum(1) / np.maximum(seen.sum(1), 1)) * n.scale_px
+    joints = shape @ np.swapaxes(rotation, 1, 2)
+    joints = joints - joints[:, BODY_15.index("pelvis")][:, None]
+    # The scale of a monocular result is the start's: keep the mean limb length.
+    metres = float(limb_lengths(start).mean() / limb_lengths(joints).mean())
+    return AdjustedWindow(
+        joints3d=joints * metres,
+        covariance=window_covariance(projection, joints, seen) * metres**2,
+        confidence=n.weights,
+        reprojection_rms_px=np.where(seen.any(1), rms, np.nan),
+        iterations=iterations,
+        cost=float(sum(terms.values())),
+        stop_reason=stop,
+        cost_terms=terms,
+    )
+
+
+def window_covariance(projection: Projection, joints: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """(F, P, 6) in squared units: across the image from the window's residuals, along the ray three times that.
+
+    The ratio is that of the errors of adjusted poses on the CMU training sequences; unseen joints are known half
+    as well.
+    """
+    gap, _ = projection.residual(joints, np.broadcast_to(np.eye(3), (len(joints), 3, 3)))
+    square = np.where(seen, 0.5 * np.sum(gap**2, axis=-1), 0.0)
+    across = square.sum() / max(int(seen.sum()), 1) + 0.05**2
+    variance = across * np.where(seen, 1.0, 4.0)
+    out = np.zeros((*joints.shape[:2], 6))
+    out[..., 0] = out[..., 3] = variance
+    out[..., 5] = 9.0 * variance
+    return out
+
+
+def fill_frames(stamp_ns: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """Poses (F, P, 3) with frames of NaN interpolated in time from their neighbours.
+
+    Raises
+    ------
+    InputError
+        When no frame has a pose.
+    """
+    known = np.isfinite(joints).all(axis=(1, 2))
+    if known.all():
+        return joints
+    if not known.any():
+        raise InputError("initial_joints: expected a pose in at least one frame, got NaN in all; check the start")
+    t = (stamp_ns - stamp_ns[0]).astype(np.float64)
+    at = np.clip(np.searchsorted(t[known], t) - 1, 0, max(int(known.sum()) - 2, 0))
+    nxt = np.minimum(at + 1, int(known.sum()) - 1)
+    t0, t1 = t[known][at], t[known][nxt]
+    s = np.clip((t - t0) / np.where(t1 > t0, t1 - t0, 1.0), 0.0, 1.0)[:, None, None]
+    filled = (1.0 - s) * joints[known][at] + s * joints[known][nxt]
+    return np.where(known[:, None, None], joints, filled)
+
+
+def _scale_to_image(start: np.ndarray, projection: Projection) -> float:
+    """Factor from metres to the unit of the 2D joints, least squares over the window."""
+    flat = start[..., :2]
+    weight = projection.information[..., 0][..., None]
+    mean = np.sum(weight * flat, axis=1, keepdims=True) / np.maximum(weight.sum(1, keepdims=True), 1e-12)
+    centre = np.sum(weight * projection.w, axis=1, keepdims=True) / np.maximum(weight.sum(1, keepdims=True), 1e-12)
+    x, y = flat - mean, projection.w - centre
+    spread = float(np.sum(weight * x * x))
+    fitted = float(np.sum(weight * x * y)) / spread if spread > 0.0 else 0.0
+    # A start that disagrees with the image altogether still has its size.
+    return fitted if fitted > 0.0 else float(np.sqrt(np.sum(weight * y * y) / max(spread, 1e-12)))
