@@ -1,0 +1,302 @@
+"""Start any subset of the nodes from one configuration, without ``ros2 launch``.
+
+    with bringup(config, ["image_ingest", "pose_estimator", "session_recorder"]) as graph:
+        graph.wait_finished("image_ingest", timeout_s=60)
+
+On entry every publisher and subscriber among the chosen nodes has found its peers, and only then the sources
+begin: nothing is lost at the start.  On exit the nodes stop from the sources downwards, each working off
+what has arrived, and what a node raised is raised here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import rclpy
+import yaml
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_msgs.msg import Empty, String
+
+from drocap_ros.config import DrocapConfig
+from drocap_ros.errors import DrocapError, InputError, NodeError
+from drocap_ros.nodes.component import ComponentNode
+from drocap_ros.nodes.run import spin
+from drocap_ros.nodes.topics import GRAPH_QOS, NODES
+
+#: Above the drain time of a node, and the time that its files may take to close.
+STOP_TIMEOUT_S = 20.0
+
+
+class Graph:
+    """A running graph, as the script that started it sees it.
+
+    node : an rclpy node in the graph's namespace, domain and context, for the script's own endpoints
+    domain_id, namespace, names : where the graph runs and what runs in it
+    """
+
+    def __init__(self, node: Node, domain_id: int, namespace: str, names: list[str]) -> None:
+        self.node = node
+        self.domain_id = domain_id
+        self.namespace = namespace
+        self.names = names
+        self.ready: set[str] = set()
+        self.finished: set[str] = set()
+        self._runners: list[_Runner] = []
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+        self._start = node.create_publisher(Empty, "graph/start", GRAPH_QOS)
+        node.create_subscription(String, "graph/ready", lambda m: self.ready.add(m.data), GRAPH_QOS)
+        node.create_subscription(String, "graph/finished", lambda m: self.finished.add(m.data), GRAPH_QOS)
+
+    def check(self) -> None:
+        """Raise what a node raised.
+
+        Raises
+        ------
+        DrocapError
+            The error itself from a node in this process; :class:`NodeError` with its words from another.
+        """
+        for runner in self._runners:
+            runner.check()
+
+    def wait_until(self, condition: Callable[[], bool], timeout_s: float, what: str = "the condition") -> None:
+        """Serve the script's own callbacks until ``condition()`` holds.
+
+        Raises
+        ------
+        NodeError
+            When that takes longer than ``timeout_s``, or a node failed meanwhile.
+        """
+        end = time.monotonic() + timeout_s
+        while not condition():
+            self.check()
+            if time.monotonic() > end:
+                raise NodeError(f"waited {timeout_s:g} s for {what}; it did not come")
+            self._executor.spin_once(timeout_sec=0.05)
+        self.check()
+
+    def wait_finished(self, *names: str, timeout_s: float) -> None:
+        """Wait until the named sources have published all they have."""
+        self.wait_until(lambda: self.finished >= set(names), timeout_s, f"the end of {', '.join(names)}")
+
+    def pid(self, name: str) -> int:
+        """Process that runs a node."""
+        return next(runner.pid for runner in self._runners if runner.name == name)
+
+
+@contextlib.contextmanager
+def bringup(
+    config: DrocapConfig,
+    nodes: Sequence[str],
+    *,
+    processes: bool = False,
+    namespace: str = "/drocap",
+    domain_id: int | None = None,
+    timeout_s: float = 60.0,
+) -> Iterator[Graph]:
+    """Run the named nodes while the context lasts.
+
+    Parameters
+    ----------
+    config : parameters of every component
+    nodes : names out of ``nodes.topics.NODES``
+    processes : one process each (True), or all in this one, a thread each
+    namespace : of the topics that have no leading slash
+    domain_id : DDS domain; None takes a free one and keeps discovery on this machine, so that graphs side by
+        side do not hear each other
+    timeout_s : for all endpoints to be matched
+
+    Raises
+    ------
+    InputError
+        When a node is unknown or refuses its parameters.
+    NodeError
+        When the endpoints are not matched in time, or a node fails.
+    """
+    names = [name for name in NODES if name in nodes]
+    unknown = sorted(set(nodes) - set(NODES))
+    if unknown or not names:
+        raise InputError(f"nodes: expected some of {', '.join(NODES)}; got {', '.join(unknown) or 'none'}")
+    with contextlib.ExitStack() as stack:
+        isolated = domain_id is None
+        if domain_id is None:
+            domain_id = stack.enter_context(free_domain())
+        if isolated:
+            stack.enter_context(_environment(ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST"))
+        context = Context()
+        rclpy.init(args=[], context=context, domain_id=domain_id)
+        stack.callback(context.try_shutdown)
+        observer = Node("bringup", context=context, namespace=namespace)
+        stack.callback(observer.destroy_node)
+        graph = Graph(observer, domain_id, namespace, names)
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="drocap_bringup_")))
+        try:
+            for name in names:
+                runner: _Runner
+                if processes:
+                    runner = _Process(name, config, names, namespace, domain_id, folder)
+                else:
+                    runner = _Thread(name, config, names, namespace, context)
+                graph._runners.append(runner)
+            graph.wait_until(lambda: graph.ready >= set(names), timeout_s, _missing(graph))
+            graph._start.publish(Empty())
+            yield graph
+        finally:
+            for runner in graph._runners:
+                runner.stop()
+        graph.check()
+
+
+def _missing(graph: Graph) -> str:
+    return f"the endpoints of {', '.join(graph.names)} to be matched"
+
+
+class _Runner:
+    """One node, wherever it runs."""
+
+    name: str
+    pid: int
+
+    def check(self) -> None:
+        """Raise what the node raised."""
+        raise NotImplementedError
+
+    def stop(self) -> None:
+        """Ask the node to stop and wait for it."""
+        raise NotImplementedError
+
+
+class _Thread(_Runner):
+    """A node in a thread of this process."""
+
+    def __init__(self, name: str, config: DrocapConfig, names: list[str], namespace: str, context: Context) -> None:
+        self.name, self.pid = name, os.getpid()
+        self._error: BaseException | None = None
+        self._stop = threading.Event()
+        node = node_class(name)(
+            config.section(name),
+            context=context,
+            namespace=namespace,
+            use_global_arguments=False,
+            parameter_overrides=[Parameter("graph_nodes", value=",".join(names))],
+        )
+        self._thread = threading.Thread(target=self._run, args=(node,), name=name, daemon=True)
+        self._thread.start()
+
+    def _run(self, node: ComponentNode) -> None:
+        try:
+            spin(node, self._stop)
+        except BaseException as error:  # handed to the thread that waits for the graph
+            self._error = error
+
+    def check(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join(STOP_TIMEOUT_S)
+
+
+class _Process(_Runner):
+    """A node in a process of its own."""
+
+    def __init__(
+        self, name: str, config: DrocapConfig, names: list[str], namespace: str, domain_id: int, folder: Path
+    ) -> None:
+        self.name = name
+        parameters = folder / f"{name}.yaml"
+        section = config.to_parameter_file()[f"/**/{name}"]["ros__parameters"]
+        values = {**section, "graph_nodes": ",".join(names)}
+        parameters.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}), encoding="utf-8")
+        self._log = folder / f"{name}.log"
+        command = [sys.executable, "-m", f"drocap_ros.nodes.{name}", "--ros-args"]
+        command += ["-r", f"__ns:={namespace}", "--params-file", str(parameters), "--disable-stdout-logs"]
+        with self._log.open("wb") as log:
+            self._process = subprocess.Popen(
+                command, env={**os.environ, "ROS_DOMAIN_ID": str(domain_id)}, stderr=log, start_new_session=True
+            )
+        self.pid = self._process.pid
+        self._stopping = False
+
+    def check(self) -> None:
+        status = self._process.poll()
+        if status is None or (self._stopping and status in (0, -signal.SIGINT)):
+            return
+        lines = self._log.read_text(errors="replace").strip().splitlines() or ["it said nothing"]
+        words = lines[-1].removeprefix("drocap: ")
+        if status == InputError.exit_status:
+            raise InputError(words)
+        raise NodeError(f"node {self.name} ended with status {status}: {words}")
+
+    def stop(self) -> None:
+        if self._process.poll() is not None:
+            return
+        self._stopping = True
+        self._process.send_signal(signal.SIGINT)
+        try:
+            self._process.wait(STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def node_class(name: str) -> type[ComponentNode]:
+    """Class of a node by its name; only the chosen ones are imported."""
+    module = importlib.import_module(f"drocap_ros.nodes.{name}")
+    found: type[ComponentNode] = next(
+        value
+        for value in vars(module).values()
+        if isinstance(value, type) and issubclass(value, ComponentNode) and value.__dict__.get("component") == name
+    )
+    return found
+
+
+@contextlib.contextmanager
+def free_domain() -> Iterator[int]:
+    """A DDS domain id that nobody else on this machine took this way, kept while the context lasts.
+
+    A bound TCP port stands for the id, as in ROS's domain_coordinator; ids up to 100 keep clear of Linux's
+    ephemeral ports.
+    """
+    for domain_id in range(1, 101):
+        with socket.socket() as holder:
+            try:
+                holder.bind(("127.0.0.1", 22_600 + domain_id))
+            except OSError:
+                continue
+            yield domain_id
+            return
+    raise NodeError("expected a free DDS domain id between 1 and 100, found none; stop other graphs")
+
+
+@contextlib.contextmanager
+def _environment(**values: str) -> Iterator[None]:
+    before: dict[str, Any] = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+__all__ = ["DrocapError", "Graph", "bringup", "free_domain", "node_class"]

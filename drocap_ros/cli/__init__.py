@@ -1,0 +1,56 @@
+"""The ``drocap`` command: one module per subcommand, each with ``add_parser`` and ``run``."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import logging
+import os
+import sys
+from collections.abc import Sequence
+
+from drocap_ros import __version__
+from drocap_ros.errors import DrocapError
+
+COMMANDS = (
+    "demo", "live", "record", "track", "reconstruct", "evaluate", "learn_dictionary", "train_lifter", "info", "models",
+)  # fmt: skip
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Parser of the whole command line."""
+    parser = argparse.ArgumentParser(
+        prog="drocap",
+        description="Human motion capture with one drone: 3D motion of a person from the video of an orbiting camera.",
+        epilog="Exit status: 0 done, 2 the input or the options cannot be used, 1 anything else.",
+    )
+    parser.add_argument("--version", action="version", version=f"drocap {__version__}")
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for name in COMMANDS:
+        importlib.import_module(f"drocap_ros.cli.{name}").add_parser(subparsers)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    logging.basicConfig(level=logging.WARNING, format="drocap: %(message)s")
+    args = build_parser().parse_args(argv)
+    try:
+        status: int = args.run(args)
+        sys.stdout.flush()
+        return status
+    except DrocapError as error:
+        print(f"drocap: {error}", file=sys.stderr)
+        return error.exit_status
+    except KeyboardInterrupt:
+        print("drocap: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The reader of our output has gone (`drocap ... | head`): that is no failure, and nothing more to say.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        if os.environ.get("DROCAP_DEBUG"):
+            raise
+        print(f"drocap: unexpected {type(error).__name__}: {error}; DROCAP_DEBUG=1 shows where", file=sys.stderr)
+        return 1

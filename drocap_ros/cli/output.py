@@ -1,0 +1,54 @@
+"""Output folders that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from drocap_ros.errors import InputError
+
+
+def check_output_folder(target: Path) -> None:
+    """Refuse an output folder before any work is done for it.
+
+    Raises
+    ------
+    InputError
+        When it is a file, or its parent does not exist or cannot be written to.
+    """
+    if target.exists() and not target.is_dir():
+        raise InputError(f"--out {target}: expected a folder, found a file; choose another name")
+    parent = target if target.exists() else target.absolute().parent
+    while not parent.exists():
+        parent = parent.parent
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise InputError(f"--out {target}: expected a place that can be written to; choose another")
+
+
+@contextlib.contextmanager
+def output_folder(target: Path) -> Iterator[Path]:
+    """A folder to write into, whose files are moved to ``target`` together when the block succeeds."""
+    check_output_folder(target)
+    parent = target.absolute().parent
+    parent.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=parent))
+    try:
+        work.chmod(0o755)
+        yield work
+        if target.exists():
+            for path in work.iterdir():
+                _replace(path, target / path.name)
+        else:
+            work.rename(target)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _replace(path: Path, target: Path) -> None:
+    if target.is_dir() and not target.is_symlink():
+        shutil.rmtree(target)
+    path.replace(target)

@@ -1,0 +1,86 @@
+"""``drocap reconstruct``: from a video, recording or tracks file to a 3D motion."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from drocap_ros.motion import Motion
+
+METHODS = ("ba", "paper", "paper-no-articulation", "initial", "mf-nnm")
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the command's options; ``run`` is its action."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "reconstruct",
+        help="3D motion from a video, recording or tracks file",
+        description="Recover the 3D motion of the person in INPUT and write motion.npz, tracks.npz and preview.png.",
+    )
+    parser.add_argument(
+        "input",
+        metavar="INPUT",
+        type=Path,
+        help="video file, image folder, .mcap, rosbag1 .bag, rosbag2 folder, or tracks .npz",
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, help="output folder (default: INPUT's name + _motion)")
+    parser.add_argument(
+        "--method",
+        choices=METHODS,
+        default="ba",
+        help="ba: the best we have (default); paper: the paper as written; paper-no-articulation: without its rank-1"
+        " term; initial: the paper's single-view start alone; mf-nnm: factorization and nuclear norm (Dai 2012)",
+    )
+    parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
+    parser.add_argument("--dictionary", metavar="NPZ", type=Path, help="pose dictionary instead of the shipped one")
+    parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
+    parser.add_argument("--quiet", action="store_true", help="no progress, only errors")
+    parser.set_defaults(run=run)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Reconstruct and write the output folder."""
+    from drocap_ros.cli.output import check_output_folder, output_folder
+    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.config import DrocapConfig, load_config
+    from drocap_ros.motion import save_motion
+    from drocap_ros.pipeline import reconstruct_input
+    from drocap_ros.report.preview import save_preview
+    from drocap_ros.tracks import save_tracks
+
+    out = args.out or Path(f"{args.input.name.split('.')[0] or 'drocap'}_motion")
+    check_output_folder(out)
+    config = load_config(args.config) if args.config else DrocapConfig()
+    if args.dictionary:
+        config = config.replace("initializer", dictionary=str(args.dictionary))
+    with progress_bars(args.quiet) as progress:
+        motion, tracks = reconstruct_input(
+            args.input, method=args.method, config=config, models=args.models, progress=progress
+        )
+    with output_folder(out) as folder:
+        save_motion(folder / "motion.npz", motion)
+        save_tracks(folder / "tracks.npz", tracks)
+        save_preview(folder / "preview.png", motion)
+    if not args.quiet:
+        print(summary(motion, args.method))
+        print(f"written: {out}/motion.npz, tracks.npz, preview.png")
+    return 0
+
+
+def summary(motion: Motion, method: str) -> str:
+    """What a person wants to know at the end of a reconstruction."""
+    import numpy as np
+
+    seen = np.isfinite(motion.keypoints).all(axis=2)
+    with_subject = seen.any(axis=1).mean()
+    error = motion.reprojection_px[np.isfinite(motion.reprojection_px)]
+    rms = float(np.sqrt(np.mean(error**2))) if error.size else float("nan")
+    seconds = ", ".join(f"{name} {value:.2f} s" for name, value in motion.meta.get("seconds", {}).items())
+    return (
+        f"{len(motion.joints3d)} frames, a subject in {with_subject:.1%}; method {method}, frame {motion.frame},"
+        f" scale from {motion.scale_source}\n"
+        f"reprojection RMS {rms:.2f} px; {seconds}"
+    )

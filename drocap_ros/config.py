@@ -1,0 +1,102 @@
+"""The configuration of the whole system: one section per component, from one YAML file.
+
+The file has the form of a ROS 2 parameter file, so that ``drocap live --config FILE`` and
+``ros2 run drocap_ros NODE --ros-args --params-file FILE`` read the same one::
+
+    /**/pose_estimator:
+      ros__parameters:
+        threads: 2
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from drocap_ros.errors import InputError, ParameterError
+from drocap_ros.flight.config import MavlinkBridgeConfig
+from drocap_ros.parameters import Parameters
+from drocap_ros.perception.config import ImageIngestConfig, PoseEstimatorConfig
+from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.recording.config import SessionRecorderConfig
+from drocap_ros.simulation.config import SimulationConfig
+
+
+@dataclass(frozen=True)
+class DrocapConfig:
+    """Parameters of every component; each field bears the name of its node."""
+
+    image_ingest: ImageIngestConfig = field(default_factory=ImageIngestConfig)
+    pose_estimator: PoseEstimatorConfig = field(default_factory=PoseEstimatorConfig)
+    initializer: InitializerConfig = field(default_factory=InitializerConfig)
+    bundle_adjuster: BundleAdjusterConfig = field(default_factory=BundleAdjusterConfig)
+    mavlink_bridge: MavlinkBridgeConfig = field(default_factory=MavlinkBridgeConfig)
+    session_recorder: SessionRecorderConfig = field(default_factory=SessionRecorderConfig)
+    capture_simulator: SimulationConfig = field(default_factory=SimulationConfig)
+
+    def section(self, component: str) -> Parameters:
+        """Parameters of one component by its node's name."""
+        value: Parameters = getattr(self, component)
+        return value
+
+    def replace(self, component: str, **values: Any) -> DrocapConfig:
+        """Copy with some values of one component changed (and checked)."""
+        changed = dataclasses.replace(self.section(component), **values)
+        return dataclasses.replace(self, **{component: changed})
+
+    def to_parameter_file(self) -> dict[str, Any]:
+        """The whole configuration in the form of a ROS 2 parameter file."""
+        return {
+            f"/**/{spec.name}": {"ros__parameters": dataclasses.asdict(self.section(spec.name))}
+            for spec in dataclasses.fields(self)
+        }
+
+
+def section_types() -> dict[str, type[Parameters]]:
+    """Component name -> its parameter class."""
+    return dict(get_type_hints(DrocapConfig).items())
+
+
+def load_config(path: str | Path) -> DrocapConfig:
+    """Read a configuration file; sections and values that it leaves out keep their defaults.
+
+    Raises
+    ------
+    InputError
+        When the file is missing, is no YAML, or names an unknown component or parameter.
+    """
+    import yaml
+
+    path = Path(path)
+    try:
+        with path.open(encoding="utf-8") as stream:
+            data = yaml.safe_load(stream)
+    except OSError as error:
+        raise InputError(f"{path}: expected a configuration file; {error.strerror or error}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        place = getattr(error, "problem_mark", None)
+        where = f" at line {place.line + 1}" if place else ""
+        raise InputError(f"{path}: expected YAML, found something else{where}; correct the file") from None
+    return parse_config(data or {}, str(path))
+
+
+def parse_config(data: Any, where: str) -> DrocapConfig:
+    """Configuration from the mapping that a parameter file holds."""
+    if not isinstance(data, Mapping):
+        raise InputError(f"{where}: expected a mapping of components, found {type(data).__name__}")
+    types = section_types()
+    sections: dict[str, Parameters] = {}
+    for key, body in data.items():
+        name = str(key).rstrip("/").rsplit("/", 1)[-1]
+        if name not in types:
+            raise ParameterError(f"{where}: unknown component {key!r}; expected one of {', '.join(types)}")
+        values = body.get("ros__parameters", body) if isinstance(body, Mapping) else body
+        if not isinstance(values, Mapping):
+            raise ParameterError(f"{where}: {key}: expected 'ros__parameters:' with values, found {body!r}")
+        # ROS's own parameters may stand in the same file; they are not ours to check.
+        ours = {str(k): v for k, v in values.items() if k != "use_sim_time"}
+        sections[name] = types[name].from_mapping(ours, f"{where}: {name}")
+    return DrocapConfig(**sections)  # type: ignore[arg-type]

@@ -1,0 +1,1 @@
+"""The ROS 2 nodes: parameters, conversions, one call into a room, publish."""

@@ -1,0 +1,116 @@
+"""Node ``capture_simulator``: the keypoints of a simulated flight, in place of pictures and perception.
+
+Publishes ``pose2d`` and ``camera_info`` at the pace of a camera, and flies a simulated MAVLink vehicle along
+the same orbit.  For the demo and the tests.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from typing import Any
+
+import numpy as np
+from sensor_msgs.msg import CameraInfo
+
+from drocap_ros.nodes.component import OK, ComponentNode
+from drocap_ros.nodes.conversions import header_at, pose2d_to_ros
+from drocap_ros.nodes.run import node_main
+from drocap_ros.perception.observation import PoseObservation
+from drocap_ros.simulation.capture import SimulatedCapture, simulate_capture
+from drocap_ros.simulation.flight_path import SampledPath
+from drocap_ros.simulation.vehicle import SimulatedVehicle
+from drocap_ros.tracks import Tracks
+
+#: The drone hovers this long before the first picture: links come up and clocks get in step.
+HOVER_S = 3.0
+FRAME_ID = "camera_optical"
+
+
+class CaptureSimulatorNode(ComponentNode):
+    """Plays a simulated capture against the clock."""
+
+    component = "capture_simulator"
+
+    def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
+        super().__init__(config, **node_kwargs)
+        self._capture: SimulatedCapture = simulate_capture(
+            self.config.seconds, self.config.rate_hz, self.config.seed, self.config
+        )
+        self._pose2d = self.output("pose2d")
+        self._infos = self.output("camera_info")
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="capture_simulator", daemon=True)
+
+    def on_start(self) -> None:
+        """Take off."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the flight."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0)
+
+    def _run(self) -> None:
+        tracks = self._capture.tracks
+        start_ns = self.get_clock().now().nanoseconds + int(HOVER_S * 1e9)
+        begin = time.monotonic() + HOVER_S
+        with contextlib.ExitStack() as stack:
+            if self.config.vehicle_url:
+                path = _delayed_path(tracks)
+                vehicle = stack.enter_context(SimulatedVehicle(self.config.vehicle_url, path))
+                vehicle.start()
+            for i, offset_ns in enumerate(tracks.stamp_ns):
+                if self._stop.wait(max(0.0, begin + offset_ns * 1e-9 - time.monotonic())):
+                    return
+                self._publish(tracks, i, start_ns + int(offset_ns))
+            self._stop.wait(0.5)  # the telemetry around the last picture
+        self.report(OK, "the flight has ended")
+        self.finish()
+
+    def _publish(self, tracks: Tracks, i: int, stamp_ns: int) -> None:
+        self._pose2d.publish(pose2d_to_ros(observation_of(tracks, i, stamp_ns), FRAME_ID))
+        assert tracks.camera_matrix is not None
+        k = tracks.camera_matrix.ravel().tolist()
+        width, height = tracks.image_size
+        self._infos.publish(CameraInfo(header=header_at(stamp_ns, FRAME_ID), width=width, height=height, k=k))
+        self.count("poses")
+
+
+def _delayed_path(tracks: Tracks) -> SampledPath:
+    """The camera's path as the vehicle reports it, after the hover."""
+    assert tracks.camera_rotation is not None
+    assert tracks.camera_position is not None
+    t = HOVER_S + tracks.stamp_ns * 1e-9
+    return SampledPath(t, tracks.camera_rotation, tracks.camera_position)
+
+
+def observation_of(tracks: Tracks, i: int, stamp_ns: int) -> PoseObservation:
+    """One frame of simulated tracks as perception would tell it."""
+    keypoints = tracks.keypoints[i].astype(np.float32)
+    seen = np.isfinite(keypoints).all(axis=1)
+    if not seen.any() or tracks.covariance is None or tracks.confidence is None:
+        return PoseObservation(stamp_ns, 0, tracks.image_size)
+    low, high = keypoints[seen].min(axis=0), keypoints[seen].max(axis=0)
+    margin = 0.1 * (high - low)
+    return PoseObservation(
+        stamp_ns=stamp_ns,
+        track_id=1,
+        image_size=tracks.image_size,
+        roi=np.concatenate([low - margin, high + margin]).astype(np.float32),
+        detection_score=0.9,
+        keypoints=keypoints,
+        covariance=tracks.covariance[i].astype(np.float32),
+        confidence=tracks.confidence[i].astype(np.float32),
+    )
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return node_main(CaptureSimulatorNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,161 @@
+"""What every node shares: parameters, diagnostics, and the handshake with the bringup."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+from std_msgs.msg import Empty, String
+
+from drocap_ros.config import section_types
+from drocap_ros.errors import InputError
+from drocap_ros.nodes.parameters import declare_parameters
+from drocap_ros.nodes.topics import GRAPH_QOS, TOPICS, publishers_of, subscribers_of
+from drocap_ros.parameters import Parameters
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+class ComponentNode(Node):
+    """A node of the capture graph.
+
+    Topics (beside its own, see ``topics.NODES``): publishes ``/diagnostics`` once a second; with parameter
+    ``graph_nodes`` set, publishes its name on ``graph/ready`` as soon as all its peers are matched and
+    begins to produce only at ``graph/start``; ``graph/finished`` when its source has ended.
+
+    Parameters
+    ----------
+    config : the component's parameters; ROS parameter overrides go before it
+    node_kwargs : passed on to :class:`rclpy.node.Node` (context, namespace, parameter_overrides, ...)
+    """
+
+    component: ClassVar[str]
+
+    def __init__(self, config: Parameters | None = None, **node_kwargs: Any) -> None:
+        node_kwargs.setdefault("namespace", "/drocap")
+        super().__init__(self.component, **node_kwargs)
+        peers = self.declare_parameter("graph_nodes", "").value
+        self._peers: list[str] = [name for name in peers.split(",") if name]
+        self.config: Any = declare_parameters(self, config or section_types()[self.component]())
+        self.counters: Counter[str] = Counter()
+        self.started = False
+        self.callbacks_done = 0
+        self._level = OK
+        self._text = "running"
+        self._outputs: list[tuple[str, Publisher]] = []
+        self._inputs: list[tuple[str, Subscription]] = []
+        self._diagnostics = self.output("/diagnostics")
+        self._ready = self.create_publisher(String, "graph/ready", GRAPH_QOS)
+        self._finished = self.create_publisher(String, "graph/finished", GRAPH_QOS)
+        self.create_subscription(Empty, "graph/start", lambda _: self._start(), GRAPH_QOS)
+        self.create_timer(1.0, self._publish_diagnostics)
+        self._handshake = self.create_timer(0.05, self._match)
+
+    # -- endpoints -------------------------------------------------------------------------------------
+
+    def output(self, topic: str) -> Publisher:
+        """Publisher of a topic of the table."""
+        publisher = self.create_publisher(TOPICS[topic].message, topic, TOPICS[topic].qos)
+        self._outputs.append((topic, publisher))
+        return publisher
+
+    def input(
+        self, topic: str, callback: Callable[..., None], *, raw: bool = False, qos: QoSProfile | None = None
+    ) -> Subscription:
+        """Subscription to a topic of the table.  A message that the callback refuses is counted, not fatal."""
+
+        def guarded(message: Any) -> None:
+            self.callbacks_done += 1
+            try:
+                callback(message)
+            except InputError as error:
+                self.count("messages refused")
+                self.report(WARN, f"{topic}: {error}")
+
+        subscription = self.create_subscription(
+            TOPICS[topic].message, topic, guarded, qos or TOPICS[topic].qos, raw=raw
+        )
+        self._inputs.append((topic, subscription))
+        return subscription
+
+    # -- start and end ---------------------------------------------------------------------------------
+
+    def on_start(self) -> None:
+        """Begin to produce; called once, when every peer is matched or there is no bringup to wait for."""
+
+    def close(self) -> None:
+        """Finish what is under way and let go of files, links and threads; called before destruction."""
+
+    def flush(self) -> None:
+        """Wait until what was published has arrived, but not long."""
+        for _, publisher in self._outputs:
+            publisher.wait_for_all_acked(Duration(seconds=1))
+
+    def finish(self) -> None:
+        """Tell the graph that this node's source has ended."""
+        self._finished.publish(String(data=self.component))
+
+    def _match(self) -> None:
+        if not self._peers:
+            self._handshake.cancel()
+            self._start()
+        elif self._matched():
+            self._handshake.cancel()
+            self._ready.publish(String(data=self.component))
+
+    def _matched(self) -> bool:
+        return all(
+            publisher.get_subscription_count() >= subscribers_of(topic, self._peers)
+            for topic, publisher in self._outputs
+        ) and all(
+            subscription.get_publisher_count() >= _publishers(topic, self._peers)
+            for topic, subscription in self._inputs
+        )
+
+    def _start(self) -> None:
+        if not self.started:
+            self.started = True
+            self.on_start()
+
+    # -- diagnostics -----------------------------------------------------------------------------------
+
+    def count(self, what: str, amount: int = 1) -> None:
+        """Add to a counter that ``/diagnostics`` shows."""
+        self.counters[what] += amount
+
+    def report(self, level: bytes, text: str) -> None:
+        """Set the node's state in words; warnings and errors are logged too, at most every 5 s."""
+        self._level, self._text = level, text
+        if level == ERROR:
+            self.get_logger().error(text, throttle_duration_sec=5.0)
+        elif level == WARN:
+            self.get_logger().warning(text, throttle_duration_sec=5.0)
+
+    def _publish_diagnostics(self) -> None:
+        message = DiagnosticArray()
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.status = [
+            DiagnosticStatus(
+                level=self._level,
+                name=f"{self.get_namespace().strip('/')}/{self.component}",
+                message=self._text,
+                hardware_id="drocap_ros",
+                values=[KeyValue(key=key, value=str(value)) for key, value in sorted(self.counters.items())],
+            )
+        ]
+        self._diagnostics.publish(message)
+
+
+def _publishers(topic: str, nodes: list[str]) -> int:
+    # Every node has diagnostics, which the table therefore leaves out.
+    return len(nodes) if topic == "/diagnostics" else publishers_of(topic, nodes)
+
+
+__all__ = ["ERROR", "OK", "WARN", "ComponentNode"]

@@ -1,0 +1,64 @@
+"""Node ``initializer``: keypoints in, a first 3D pose of every image out.
+
+Subscribes ``pose2d``; publishes ``pose3d/initial`` (drocap_ros/Pose3D, stage INITIAL) in the camera's frame.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from drocap_ros.msg import Pose2D, Pose3D
+from drocap_ros.nodes.component import OK, WARN, ComponentNode
+from drocap_ros.nodes.conversions import pose2d_from_ros, pose3d_to_ros
+from drocap_ros.nodes.run import node_main
+from drocap_ros.reconstruction.window import SlidingWindowInitializer
+from drocap_ros.skeleton import BODY_15
+
+
+class InitializerNode(ComponentNode):
+    """Feeds every observation to the sliding-window initializer of the core."""
+
+    component = "initializer"
+
+    def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
+        super().__init__(config, **node_kwargs)
+        self._initializer = SlidingWindowInitializer(self.config)
+        self._initial = self.output("pose3d/initial")
+        self.input("pose2d", self._on_pose2d)
+
+    def _on_pose2d(self, message: Pose2D) -> None:
+        observation = pose2d_from_ros(message)
+        if not observation.has_subject:
+            self.report(WARN, "no subject in view")
+            return
+        pose = self._initializer.push(
+            observation.stamp_ns,
+            observation.keypoints.astype(np.float64),
+            observation.confidence.astype(np.float64),
+            observation.covariance.astype(np.float64),
+        )
+        self._initial.publish(
+            pose3d_to_ros(
+                message.header,
+                track_id=message.track_id,
+                stage=Pose3D.INITIAL,
+                skeleton=BODY_15.name,
+                joints=pose.joints3d,
+                covariance=pose.covariance,
+                confidence=pose.confidence,
+                reprojection_rms_px=pose.reprojection_rms_px,
+            )
+        )
+        self.count("poses")
+        self.report(OK, "running")
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return node_main(InitializerNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,54 @@
+"""Node ``pose_estimator``: pictures in, the subject's keypoints out.
+
+Subscribes ``image/compressed`` (sensor_msgs/CompressedImage), ``roi`` (sensor_msgs/RegionOfInterest, the box
+of a drone's own tracker); publishes ``pose2d`` (drocap_ros/Pose2D), its header equal to the picture's.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from sensor_msgs.msg import CompressedImage, RegionOfInterest
+
+from drocap_ros.nodes.component import OK, WARN, ComponentNode
+from drocap_ros.nodes.conversions import pose2d_to_ros, stamp_from_ros
+from drocap_ros.nodes.run import node_main
+from drocap_ros.perception.estimator import PoseEstimator
+from drocap_ros.perception.images import decode_image
+from drocap_ros.perception.models import models_folder
+
+
+class PoseEstimatorNode(ComponentNode):
+    """Runs detection, subject tracking and 2D pose on every picture that arrives while it is free."""
+
+    component = "pose_estimator"
+
+    def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
+        super().__init__(config, **node_kwargs)
+        self._estimator = PoseEstimator(models_folder(self.config.models_dir or None), self.config)
+        self._roi: np.ndarray | None = None
+        self._pose2d = self.output("pose2d")
+        self.input("image/compressed", self._on_image)
+        self.input("roi", self._on_roi)
+
+    def _on_roi(self, message: RegionOfInterest) -> None:
+        x, y = message.x_offset, message.y_offset
+        self._roi = np.array([x, y, x + message.width, y + message.height], np.float64)
+
+    def _on_image(self, message: CompressedImage) -> None:
+        image = decode_image(message.data)
+        observation = self._estimator.process(image, stamp_from_ros(message.header.stamp), self._roi)
+        self._roi = None
+        self._pose2d.publish(pose2d_to_ros(observation, message.header.frame_id))
+        self.count("images")
+        self.report(*((OK, "following the subject") if observation.has_subject else (WARN, "no subject in view")))
+
+
+def main() -> int:
+    """Run the node as a process."""
+    return node_main(PoseEstimatorNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,64 @@
+"""Spin one node: the body of every node's ``main`` and of the bringup's threads."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Callable
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+
+from drocap_ros.errors import DrocapError
+from drocap_ros.nodes.component import ComponentNode
+
+#: After the order to stop, messages that have arrived are still worked off, for this long at most.
+DRAIN_S = 2.0
+
+
+def spin(node: ComponentNode, stop: threading.Event) -> None:
+    """Run the node's callbacks until ``stop``, then work off what has arrived, and close the node.
+
+    Whatever a callback raises comes out of here.
+    """
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    try:
+        while not stop.is_set() and node.context.ok():
+            executor.spin_once(timeout_sec=0.1)
+        _drain(executor, node)
+        node.flush()
+    except ExternalShutdownException:
+        pass
+    finally:
+        node.close()
+        executor.shutdown()
+        node.destroy_node()
+
+
+def _drain(executor: SingleThreadedExecutor, node: ComponentNode) -> None:
+    clock = node.get_clock()
+    end = clock.now().nanoseconds + int(DRAIN_S * 1e9)
+    idle = False
+    while not idle and clock.now().nanoseconds < end and node.context.ok():
+        before = node.callbacks_done
+        executor.spin_once(timeout_sec=0.05)
+        idle = node.callbacks_done == before
+
+
+def node_main(make: Callable[[], ComponentNode]) -> int:
+    """Run one node as a process until SIGINT or SIGTERM; returns the exit status."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        spin(make(), stop)
+    except DrocapError as error:
+        print(f"drocap: {error}", file=sys.stderr)
+        return error.exit_status
+    finally:
+        rclpy.try_shutdown()
+    return 0

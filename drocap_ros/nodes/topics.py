@@ -1,0 +1,79 @@
+"""Topics, their types and quality of service, and which node has which: the graph, in one table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, RegionOfInterest
+
+from drocap_ros.msg import OrbitCommand, OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleState
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:  # not among the ROS wheels; `make setup` builds it, a ROS installation has it
+    TFMessage = None
+
+#: A picture that comes late is worth nothing: the newest only, and no retransmission.
+IMAGE_QOS = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
+#: A recorder takes what a burst brings.
+IMAGE_RECORDING_QOS = QoSProfile(depth=30, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
+#: Results are small, and none may be lost: 10 s of them at 100 Hz.
+RESULT_QOS = QoSProfile(depth=1000, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
+#: Handshake of nodes and bringup, for whoever comes later; as deep as there are nodes to speak.
+GRAPH_QOS = QoSProfile(
+    depth=100,
+    history=HistoryPolicy.KEEP_LAST,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic: message class and quality of service; names without a leading slash lie in the namespace."""
+
+    message: type
+    qos: QoSProfile
+
+
+TOPICS: dict[str, Topic] = {
+    "image/compressed": Topic(CompressedImage, IMAGE_QOS),
+    "camera_info": Topic(CameraInfo, RESULT_QOS),
+    "roi": Topic(RegionOfInterest, RESULT_QOS),
+    "pose2d": Topic(Pose2D, RESULT_QOS),
+    "pose3d/initial": Topic(Pose3D, RESULT_QOS),
+    "pose3d/refined": Topic(Pose3DWindow, RESULT_QOS),
+    "pose3d/latest": Topic(Pose3D, RESULT_QOS),
+    "vehicle/state": Topic(VehicleState, RESULT_QOS),
+    "orbit/command": Topic(OrbitCommand, RESULT_QOS),
+    "orbit/status": Topic(OrbitStatus, RESULT_QOS),
+    "/diagnostics": Topic(DiagnosticArray, RESULT_QOS),
+}
+if TFMessage is not None:
+    TOPICS["/tf"] = Topic(TFMessage, RESULT_QOS)
+
+#: node -> (topics it publishes, topics it subscribes to).  The recorder takes all that anybody publishes.
+NODES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "image_ingest": (("image/compressed", "camera_info"), ()),
+    "pose_estimator": (("pose2d",), ("image/compressed", "roi")),
+    "capture_simulator": (("pose2d", "camera_info"), ()),
+    "initializer": (("pose3d/initial",), ("pose2d",)),
+    "bundle_adjuster": (("pose3d/refined", "pose3d/latest"), ("pose2d", "pose3d/initial", "vehicle/state")),
+    "mavlink_bridge": (
+        ("vehicle/state", "orbit/status", *(("/tf",) if TFMessage is not None else ())),
+        ("pose2d", "orbit/command"),
+    ),
+    "session_recorder": ((), tuple(TOPICS)),
+}
+
+
+def publishers_of(topic: str, nodes: list[str]) -> int:
+    """How many of the named nodes publish the topic."""
+    return sum(topic in NODES[name][0] for name in nodes)
+
+
+def subscribers_of(topic: str, nodes: list[str]) -> int:
+    """How many of the named nodes subscribe to the topic."""
+    return sum(topic in NODES[name][1] for name in nodes)

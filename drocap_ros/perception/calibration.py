@@ -1,0 +1,86 @@
+"""What is known of the camera: a calibration file, or a stated field of view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.perception.config import ImageIngestConfig
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """Pinhole camera as ``sensor_msgs/CameraInfo`` tells it.
+
+    width, height : px
+    matrix : (3, 3) px
+    distortion : coefficients of the named model, empty for an ideal lens
+    """
+
+    width: int
+    height: int
+    matrix: np.ndarray
+    distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    distortion_model: str = "plumb_bob"
+
+    def resized(self, width: int, height: int) -> CameraModel:
+        """The same lens at another picture size."""
+        scale = np.array([width / self.width, height / self.height, 1.0])
+        return CameraModel(width, height, self.matrix * scale[:, None], self.distortion, self.distortion_model)
+
+
+def camera_model(config: ImageIngestConfig, size: tuple[int, int]) -> CameraModel | None:
+    """Camera of a source whose pictures have ``size`` (width, height); None when nothing is known of it.
+
+    Raises
+    ------
+    InputError
+        When the calibration file cannot be used.
+    """
+    if config.calibration_file:
+        model = load_calibration(Path(config.calibration_file))
+        if abs(model.width * size[1] - model.height * size[0]) > 0.02 * model.width * size[1]:
+            raise InputError(
+                f"{config.calibration_file}: expected the picture's shape {size[0]}x{size[1]}, found"
+                f" {model.width}x{model.height}; calibrate with pictures of this camera mode"
+            )
+        return model.resized(*size)
+    if config.horizontal_fov_deg > 0:
+        focal = 0.5 * size[0] / np.tan(np.deg2rad(0.5 * config.horizontal_fov_deg))
+        centre = (np.array(size) - 1) / 2
+        return CameraModel(*size, np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]]))
+    return None
+
+
+def load_calibration(path: Path) -> CameraModel:
+    """Read the YAML that ROS's ``camera_calibration`` writes.
+
+    Raises
+    ------
+    InputError
+        When the file is missing or lacks a value.
+    """
+    import yaml
+
+    try:
+        data: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        matrix = np.array(data["camera_matrix"]["data"], float).reshape(3, 3)
+        distortion = np.array(data.get("distortion_coefficients", {}).get("data", []), float).ravel()
+        model = CameraModel(
+            int(data["image_width"]), int(data["image_height"]), matrix, distortion,
+            str(data.get("distortion_model", "plumb_bob")),
+        )  # fmt: skip
+    except OSError as error:
+        raise InputError(f"{path}: expected a calibration file; {error.strerror or error}") from None
+    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(
+            f"{path}: expected image_width, image_height, camera_matrix as camera_calibration writes them;"
+            f" found a problem with {str(error).splitlines()[0] or type(error).__name__}"
+        ) from None
+    if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0 and min(model.width, model.height) > 0):
+        raise InputError(f"{path}: expected positive focal lengths and picture size, found others")
+    return model

@@ -1,0 +1,81 @@
+"""``preview.png``: a motion at a glance, as in the paper's figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drocap_ros.motion import Motion
+
+_SIDE_COLOURS = {"r": "#c0392b", "l": "#2471a3", "": "#444444"}
+_POSES = 7
+
+
+def save_preview(path: Path, motion: Motion) -> None:
+    """Draw 2D keypoints, front and side view of poses spread over the motion, and the reprojection error."""
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    count = min(_POSES, len(motion.joints3d))
+    frames = np.unique(np.linspace(0, len(motion.joints3d) - 1, count).round().astype(int))
+    with mpl.rc_context({"font.size": 8}):
+        figure = Figure(figsize=(1.9 * _POSES, 8.2), layout="constrained")
+        FigureCanvasAgg(figure)
+        grid = figure.add_gridspec(4, _POSES, height_ratios=(1, 1, 1, 0.7))
+        body, limit = _upright_body(motion)
+        for column, frame in enumerate(frames):
+            seconds = (motion.stamp_ns[frame] - motion.stamp_ns[0]) * 1e-9
+            flat = motion.keypoints[frame]
+            _draw(figure.add_subplot(grid[0, column]), flat * (1, -1), motion, None, f"{seconds:.1f} s")
+            _draw(figure.add_subplot(grid[1, column]), body[frame][:, [0, 2]], motion, limit, "")
+            _draw(figure.add_subplot(grid[2, column]), body[frame][:, [1, 2]], motion, limit, "")
+        for row, name in enumerate(("2D keypoints", "3D, as seen", "3D, from the side")):
+            figure.text(0.002, 0.86 - 0.265 * row, name, rotation=90, va="center", fontsize=9)
+        _plot_error(figure.add_subplot(grid[3, :]), motion)
+        figure.get_layout_engine().set(rect=(0.02, 0, 0.98, 1))  # type: ignore[union-attr]
+        figure.savefig(path, dpi=100)
+
+
+def _upright_body(motion: Motion) -> tuple[np.ndarray, float]:
+    """Pelvis-centred poses in axes right, away from the camera, up, and the half-width that shows them all."""
+    centred = motion.joints3d - motion.joints3d[:, :1]
+    if motion.frame == "camera":
+        body = centred[..., [0, 2, 1]] * (1, 1, -1)
+    else:
+        # Turn about the vertical only, so that the picture keeps gravity: right is the camera's right.
+        right = motion.camera_rotation[:, 0] * (1, 1, 0)
+        right = right / np.maximum(np.linalg.norm(right, axis=1, keepdims=True), 1e-9)
+        up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), right.shape)
+        axes = np.stack([right, np.cross(up, right), up], axis=1)
+        body = np.einsum("fij,fpj->fpi", axes, centred)
+    return body, float(np.nanmax(np.abs(body), initial=0.1)) * 1.05
+
+
+def _draw(axes: Any, points: np.ndarray, motion: Motion, limit: float | None, title: str) -> None:
+    for child, parent in enumerate(motion.parents):
+        if parent >= 0:
+            name = motion.joints[child]
+            side = name[0] if name[1:] in ("hip", "knee", "ankle", "shoulder", "elbow", "wrist") else ""
+            axes.plot(*points[[parent, child]].T, color=_SIDE_COLOURS[side], linewidth=1.8, solid_capstyle="round")
+    axes.set_aspect("equal")
+    axes.set_title(title)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    if limit is not None:
+        axes.set_xlim(-limit, limit)
+        axes.set_ylim(-limit, limit)
+
+
+def _plot_error(axes: Any, motion: Motion) -> None:
+    seconds = (motion.stamp_ns - motion.stamp_ns[0]) * 1e-9
+    squared = np.where(np.isfinite(motion.reprojection_px), motion.reprojection_px, 0.0) ** 2
+    seen = np.isfinite(motion.reprojection_px).sum(axis=1)
+    rms = np.sqrt(squared.sum(axis=1) / np.maximum(seen, 1))
+    axes.plot(seconds, np.where(seen > 0, rms, np.nan), color="#444444", linewidth=1)
+    axes.set_xlabel("s")
+    axes.set_ylabel("reprojection RMS, px")
+    axes.set_ylim(bottom=0)
+    axes.margins(x=0)

@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+
+from drocap_ros.errors import InputError
+from drocap_ros.skeleton import BODY_15, COCO_17, JOINT_SETS
+from drocap_ros.tracks import Tracks, load_tracks, save_tracks
+
+
+def arrays(frames=4, joints=BODY_15.joints):
+    rng = np.random.default_rng(0)
+    return {
+        "keypoints": rng.uniform(0, 500, (frames, len(joints), 2)),
+        "joints": np.array(joints),
+        "stamp_ns": np.arange(frames) * 40_000_000,
+        "image_size": np.array([640, 480]),
+    }
+
+
+def test_tracks_survive_a_trip_through_their_file(tmp_path):
+    tracks = Tracks(
+        keypoints=arrays()["keypoints"],
+        joints=BODY_15.joints,
+        stamp_ns=arrays()["stamp_ns"],
+        image_size=(640, 480),
+        confidence=np.full((4, 15), 0.5),
+        camera_rotation=np.tile(np.eye(3), (4, 1, 1)),
+    )
+    save_tracks(tmp_path / "t.npz", tracks)
+    back = load_tracks(tmp_path / "t.npz")
+    assert back.joints == tracks.joints
+    assert back.image_size == tracks.image_size
+    for name in ("keypoints", "stamp_ns", "confidence", "camera_rotation"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(tracks, name))
+    assert back.covariance is None
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"keypoints": np.zeros((4, 15))}, r"expected float \(F, P, 2\)"),
+        ({"keypoints": np.zeros((4, 14, 2))}, "expected 14 names"),
+        ({"keypoints": np.zeros((0, 15, 2))}, "at least 1 frame"),
+        ({"keypoints": np.full((4, 15, 2), np.inf)}, "got infinity"),
+        ({"keypoints": np.array([["a"]])}, "expected numbers"),
+        ({"stamp_ns": np.zeros(4, np.int64)}, "strictly increasing"),
+        ({"stamp_ns": np.arange(4) * 0.04}, "expected int64"),
+        ({"stamp_ns": np.arange(3)}, "expected shape"),
+        ({"joints": np.array(["a"] * 15)}, "distinct"),
+        ({"image_size": np.array([0, 480])}, "positive"),
+        ({"image_size": np.array([640])}, "image_size"),
+        ({"confidence": np.zeros((4, 3))}, "confidence: expected shape"),
+        ({"camera_rotation": np.zeros((4, 3, 3))}, "rotation matrices"),
+        ({"camera_rotation": -np.tile(np.eye(3), (4, 1, 1))}, "rotation matrices"),
+        ({"camera_position": np.full((4, 3), np.nan)}, "finite metres"),
+        ({"camera_matrix": np.zeros((3, 3))}, "focal"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused_in_one_line(tmp_path, change, words):
+    path = tmp_path / "bad.npz"
+    np.savez(path, **{**arrays(), **change})
+    with pytest.raises(InputError, match=words) as caught:
+        load_tracks(path)
+    assert "\n" not in str(caught.value)
+    assert "bad.npz" in str(caught.value)
+
+
+def test_files_that_are_no_tracks_are_refused(tmp_path):
+    text, whole, cut, single = (tmp_path / f"{n}.npz" for n in ("text", "whole", "cut", "single"))
+    text.write_text("hello")
+    np.savez(whole, **arrays())
+    cut.write_bytes(whole.read_bytes()[:200])
+    with single.open("wb") as stream:
+        np.save(stream, np.zeros(3))
+    np.savez(tmp_path / "other.npz", a=1)
+    with (tmp_path / "object.npz").open("wb") as stream:
+        np.savez(stream, **{**arrays(), "joints": np.array([{}], dtype=object)})
+    for name in ("text", "cut", "single", "other", "object", "none"):
+        with pytest.raises(InputError, match=name):
+            load_tracks(tmp_path / f"{name}.npz")
+
+
+def test_mirror_is_an_involution_that_swaps_the_sides():
+    for joints in JOINT_SETS.values():
+        np.testing.assert_array_equal(joints.mirror[joints.mirror], np.arange(len(joints)))
+    assert BODY_15.joints[BODY_15.mirror[BODY_15.index("rwrist")]] == "lwrist"
+    assert COCO_17.joints[COCO_17.mirror[COCO_17.index("left_ear")]] == "right_ear"
+    assert BODY_15.mirror[BODY_15.index("neck")] == BODY_15.index("neck")
