@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -162,7 +163,7 @@ def _check(w: np.ndarray, s0: np.ndarray, r0: np.ndarray | None) -> None:
 
 def _minimize(
     objective: Objective, s: np.ndarray, progress: Callable[[float], None] | None
-) -> tuple[np.ndarray, dict[str, object]]:
+) -> tuple[np.ndarray, dict[str, Any]]:
     """Accelerated proximal gradient steps (4) with backtracking; momentum restarts when the cost would rise."""
     config, alpha = objective.config, objective.alpha
     value, gradient = objective.smooth(s)
@@ -175,13 +176,13 @@ def _minimize(
             value, gradient = objective.smooth(ahead)
             if ahead is s:
                 cost = min(cost, value + alpha * nuclear_norm(s)) if alpha > 0.0 else min(cost, value)
-        new, new_value, new_gradient, norm, mu = _proximal_step(objective, ahead, value, gradient, mu)
+        new, new_value, norm, mu = _proximal_step(objective, ahead, value, gradient, mu)
         new_cost = new_value + alpha * norm
         if new_cost > cost and ahead is not s:
             restarts += 1
             ahead, t = s, 1.0
             value, gradient = objective.smooth(s)
-            new, new_value, new_gradient, norm, mu = _proximal_step(objective, s, value, gradient, mu)
+            new, new_value, norm, mu = _proximal_step(objective, s, value, gradient, mu)
             new_cost = new_value + alpha * norm
         t_new = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * t * t))
         ahead = new + ((t - 1.0) / t_new) * (new - s)
@@ -204,13 +205,13 @@ def _minimize(
 
 def _proximal_step(
     objective: Objective, at: np.ndarray, value: float, gradient: np.ndarray, mu: float
-) -> tuple[np.ndarray, float, np.ndarray, float, float]:
+) -> tuple[np.ndarray, float, float, float]:
     """Equation (4) from ``at``; mu doubles until the quadratic model bounds f from above."""
     while True:
         new, norm = singular_value_threshold(at - gradient / mu, objective.alpha / mu)
-        new_value, new_gradient = objective.smooth(new)
+        new_value, _ = objective.smooth(new)
         move = new - at
         bound = value + float(np.sum(gradient * move)) + 0.5 * mu * float(np.sum(move * move))
         if new_value <= bound + 1e-9 * abs(bound) or mu > 1e12:
-            return new, new_value, new_gradient, norm, mu
+            return new, new_value, norm, mu
         mu *= 2.0

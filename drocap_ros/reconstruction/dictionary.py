@@ -75,7 +75,7 @@ def mirror_poses(s: np.ndarray) -> np.ndarray:
     return s[..., BODY_15.mirror, :] * np.array([1.0, -1.0, 1.0])
 
 
-def soft_threshold(x: np.ndarray, tau: float | np.ndarray) -> np.ndarray:
+def soft_threshold(x: np.ndarray, tau: float | np.floating | np.ndarray) -> np.ndarray:
     """Proximal step of ``tau * sum |x|``."""
     return np.sign(x) * np.maximum(np.abs(x) - tau, 0.0)
 

@@ -83,8 +83,8 @@ def initial_poses(
 ) -> np.ndarray:
     """Single-view poses (F, 15, 3) px in camera axes, centred, block by block; empty frames are interpolated."""
     out = np.full((*keypoints.shape[:2], 3), np.nan)
-    for rows, n, information in _blocks(keypoints, confidence, covariance, config.block_frames, 0):
-        fit = initialize(n.w, information, dictionary, config)
+    for rows, n in _blocks(keypoints, confidence, covariance, config.block_frames, 0):
+        fit = initialize(n.w, n.information, dictionary, config)
         shown = (n.weights > 0.0).sum(1) >= 3
         shape = np.where(shown[:, None, None], fit.camera_shape, np.nan)
         out[rows] = (shape - shape.mean(axis=1, keepdims=True)) * n.scale_px
@@ -105,14 +105,14 @@ def adjust(
     """Bundle adjustment of poses (F, 15, 3) px over overlapping windows, cross-faded where they overlap."""
     out, weight = np.zeros_like(joints), np.zeros(len(joints))
     iterations, terms, stops = 0, dict[str, float](), set[str]()
-    for rows, n, information in _blocks(keypoints, confidence, covariance, config.window_frames, config.overlap_frames):
+    for rows, n in _blocks(keypoints, confidence, covariance, config.window_frames, config.overlap_frames):
         count = rows.stop - rows.start
         fade = _fade(count, config.overlap_frames, rows.start > 0, rows.stop < len(keypoints))
         if count < MIN_WINDOW:
             found = joints[rows]
             stops.add("too short")
         else:
-            result = bundle_adjust(n.w, joints[rows] / n.scale_px, None, None, None, config, information=information)
+            result = bundle_adjust(n.w, joints[rows] / n.scale_px, config=config, information=n.information)
             found = result.camera_shape * n.scale_px
             iterations += result.iterations
             stops.add(result.stop_reason)
@@ -139,8 +139,8 @@ def windows(frames: int, length: int, overlap: int) -> list[slice]:
 
 def _blocks(
     keypoints: np.ndarray, confidence: np.ndarray | None, covariance: np.ndarray | None, length: int, overlap: int
-) -> Iterator[tuple[slice, NormalizedTracks, np.ndarray]]:
-    """Normalized tracks and their information, window by window."""
+) -> Iterator[tuple[slice, NormalizedTracks]]:
+    """Normalized tracks, window by window."""
     whole: NormalizedTracks | None = None
     for rows in windows(len(keypoints), length, overlap):
         part = (
@@ -151,16 +151,13 @@ def _blocks(
         if (np.isfinite(part[0]).all(-1).sum(1) < 4).all():
             # A window without the person borrows the unit of the recording.
             whole = whole or normalize_tracks(keypoints, confidence, covariance)
-            n = _slice(whole, rows)
+            yield rows, _slice(whole, rows)
         else:
-            n = normalize_tracks(*part)
-        seen = np.where((n.weights > 0.0)[..., None], n.w, np.nan)
-        units = None if part[2] is None else part[2] / n.scale_px**2
-        yield rows, n, information_from(seen, n.weights, units)
+            yield rows, normalize_tracks(*part)
 
 
 def _slice(n: NormalizedTracks, rows: slice) -> NormalizedTracks:
-    return NormalizedTracks(n.w[rows], n.weights[rows], None, n.centre_px[rows], n.scale_px)
+    return NormalizedTracks(n.w[rows], n.weights[rows], n.information[rows], n.centre_px[rows], n.scale_px)
 
 
 def _fade(count: int, overlap: int, at_start: bool, at_end: bool) -> np.ndarray:
@@ -178,4 +175,4 @@ def _translations(
     seen = np.isfinite(keypoints).all(-1)
     weights = seen.astype(float) if confidence is None else np.where(seen, np.nan_to_num(confidence), 0.0)
     projection = Projection(keypoints, information_from(keypoints, weights, covariance))
-    return filled(projection.translation(joints[..., :2]), (weights > 0.0).any(1))
+    return filled(projection.translation(joints[..., :2]), np.any(weights > 0.0, axis=1))

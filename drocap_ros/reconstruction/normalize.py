@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.reconstruction.data_term import information_from
 
 #: Fewer joints than this in every image fix no pose.
 MIN_JOINTS = 4
@@ -17,15 +18,15 @@ class NormalizedTracks:
     """Tracks in the solvers' units: ``px = w * scale_px + centre_px``.
 
     w : (F, P, 2), 0 where not seen
-    weights : (F, P) >= 0, 0 where not seen; 1 is an ordinary joint
-    precision : (F, P, 2, 2) inverse covariance in units of 1 / scale_px^2, or None
+    weights : (F, P) >= 0, 0 where not seen; the confidence
+    information : (F, P, 3) xx, xy, yy weight of each joint in the data term; 1, 0, 1 is an ordinary joint
     centre_px : (F, 2)
     scale_px : px per unit; the standard deviation of all centred, visible coordinates
     """
 
     w: np.ndarray
     weights: np.ndarray
-    precision: np.ndarray | None
+    information: np.ndarray
     centre_px: np.ndarray
     scale_px: float
 
@@ -69,30 +70,31 @@ def normalize_tracks(
             f" {seen.sum(1).max(initial=0)}; check the 2D tracks"
         )
     points = np.where(seen[..., None], keypoints, 0.0)
-    count = seen.sum(1)
+    count = np.sum(seen, axis=1)
     centre = points.sum(1) / np.maximum(count, 1)[:, None]
     w = np.where(seen[..., None], points - centre[:, None], 0.0)
     if scale_px is None:
         scale_px = float(np.sqrt(np.sum(w * w) / (2.0 * count.sum())))
     if not scale_px > 1e-6 * (1.0 + np.abs(points).max()):
         raise InputError("keypoints: expected joints apart from each other, got all in one point; check the 2D tracks")
-    precision = None if covariance is None else _precision(covariance, seen, scale_px)
-    return NormalizedTracks(w / scale_px, weights, precision, filled(centre, count > 0), scale_px)
+    if covariance is not None:
+        _check_covariance(covariance, seen)
+    w = w / scale_px
+    units = None if covariance is None else covariance / scale_px**2
+    information = information_from(np.where(seen[..., None], w, np.nan), weights, units)
+    return NormalizedTracks(w, weights, information, filled(centre, count > 0), scale_px)
 
 
-def _precision(covariance: np.ndarray, seen: np.ndarray, scale_px: float) -> np.ndarray:
+def _check_covariance(covariance: np.ndarray, seen: np.ndarray) -> None:
     xx, xy, yy = np.moveaxis(np.asarray(covariance, dtype=np.float64), -1, 0)
-    det = xx * yy - xy * xy
-    bad = seen & ~(np.isfinite(covariance).all(-1) & (xx > 0) & (yy > 0) & (det > 0))
-    if bad.any():
-        f, p = np.argwhere(bad)[0]
+    with np.errstate(invalid="ignore", over="ignore"):
+        good = np.isfinite(covariance).all(-1) & (xx > 0) & (yy > 0) & (xx * yy - xy * xy > 0)
+    if (seen & ~good).any():
+        f, p = np.argwhere(seen & ~good)[0]
         raise InputError(
             f"covariance: expected finite, positive definite px^2 where a joint is seen, got"
-            f" {covariance[f, p].tolist()} at frame {f} joint {p}; drop the covariance or the joint"
+            f" {np.asarray(covariance)[f, p].tolist()} at frame {f} joint {p}; drop the covariance or the joint"
         )
-    det = np.where(seen, det, 1.0)
-    inverse = np.stack([np.stack([yy, -xy], -1), np.stack([-xy, xx], -1)], -2) / det[..., None, None]
-    return np.where(seen[..., None, None], inverse, 0.0) * scale_px**2
 
 
 def filled(centre: np.ndarray, known: np.ndarray) -> np.ndarray:

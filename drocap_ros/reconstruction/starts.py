@@ -52,11 +52,11 @@ def viewpoint_starts(w: np.ndarray, information: np.ndarray, azimuths: int, elev
 def image_scale(w: np.ndarray, information: np.ndarray, dictionary: Dictionary) -> float:
     """2D units per metre of the dictionary, from the extent of the joints in the image, robust over the frames."""
     weight = information[..., 0]
-    complete = (weight > 0.0).sum(1) >= 0.7 * w.shape[1]
-    frames = complete if complete.any() else (weight > 0.0).sum(1) > 1
-    share = weight[frames] / weight[frames].sum(1, keepdims=True)
-    mean = np.sum(share[..., None] * w[frames], axis=1, keepdims=True)
-    spread = np.sum(share[..., None] * (w[frames] - mean) ** 2, axis=(1, 2))
+    count = np.sum(weight > 0.0, axis=1)
+    full: np.ndarray = count >= min(int(0.7 * w.shape[1]), int(count.max()))
+    share = weight[full] / weight[full].sum(1, keepdims=True)
+    mean = np.sum(share[..., None] * w[full], axis=1, keepdims=True)
+    spread = np.sum(share[..., None] * (w[full] - mean) ** 2, axis=(1, 2))
     expected = np.sum(dictionary.mean[:, 1:] ** 2) / len(dictionary.mean)
     return float(np.sqrt(np.percentile(spread, 75) / expected))
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.reconstruction.bundle_adjustment import bundle_adjust
 from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.data_term import Projection, information_from
+from drocap_ros.reconstruction.data_term import Projection
 from drocap_ros.reconstruction.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
 from drocap_ros.reconstruction.metrics import limb_lengths
 from drocap_ros.reconstruction.normalize import MIN_JOINTS, NormalizedTracks, normalize_tracks
@@ -29,6 +30,30 @@ MEMORY = 120
 
 #: Windows of fewer frames hold no second view worth adjusting to.
 MIN_WINDOW = 4
+
+
+class Observation(Protocol):
+    """Keypoints of one image, as perception gives them."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Exposure time."""
+
+    @property
+    def track_id(self) -> int:
+        """Subject; a change starts a new window."""
+
+    @property
+    def keypoints(self) -> np.ndarray:
+        """(15, 2) px."""
+
+    @property
+    def confidence(self) -> np.ndarray:
+        """(15,)."""
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(15, 3) px^2."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +78,7 @@ class InitialPose:
 class AdjustedWindow:
     """Poses of a window: joints3d (F, 15, 3) m and covariance (F, 15, 6) m^2 in camera axes, pelvis at the origin."""
 
+    stamp_ns: np.ndarray
     joints3d: np.ndarray
     covariance: np.ndarray
     confidence: np.ndarray
@@ -114,12 +140,21 @@ class SlidingWindowInitializer:
         if seen.sum() < MIN_JOINTS or not extent > 1e-3:
             return _unknown(stamp_ns)
         n = self._normalize(keypoints, confidence, covariance, seen)
-        information = information_from(n.w, n.weights, _units(covariance, n.scale_px))
+        information = n.information
         scale = self._scale(n, information)
         dense = self._fit(n.w, information, scale)
         best = self._decide(dense)
         self._metre_px.append(float(dense.coefficients[best, 0]) * n.scale_px)
         return self._result(stamp_ns, n, information, dense, best, np.where(seen, np.nan_to_num(confidence), 0.0))
+
+    def push_observation(self, observation: Observation) -> InitialPose:
+        """:meth:`push` of what perception says about an image."""
+        return self.push(
+            observation.stamp_ns,
+            observation.keypoints.astype(np.float64),
+            observation.confidence.astype(np.float64),
+            observation.covariance.astype(np.float64),
+        )
 
     def _normalize(
         self, keypoints: np.ndarray, confidence: np.ndarray, covariance: np.ndarray | None, seen: np.ndarray
@@ -225,10 +260,44 @@ def _unknown(stamp_ns: int) -> InitialPose:
     )
 
 
-def _units(covariance: np.ndarray | None, scale_px: float) -> np.ndarray | None:
-    if covariance is None:
-        return None
-    return (covariance[None] if covariance.ndim == 2 else covariance) / scale_px**2
+class AdjustmentWindow:
+    """The last ``window_s`` of keypoints and initial poses of one subject, and when to adjust them.
+
+    Time is that of the images, so that a replay at another speed adjusts the same windows.
+    """
+
+    def __init__(self, config: BundleAdjusterConfig | None = None) -> None:
+        self.config = config or BundleAdjusterConfig()
+        self._rows: deque[tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = deque()
+        self._track_id = 0
+        self._adjusted_ns: int | None = None
+
+    def push(self, observation: Observation, joints3d: np.ndarray) -> bool:
+        """Add an image and its initial pose (15, 3) m; True when the window is due for an adjustment."""
+        stamp = observation.stamp_ns
+        if self._rows and (stamp <= self._rows[-1][0] or observation.track_id != self._track_id):
+            self._rows.clear()
+            self._adjusted_ns = None
+        self._track_id = observation.track_id
+        self._rows.append((stamp, observation.keypoints, observation.confidence, observation.covariance, joints3d))
+        oldest = stamp - round(self.config.window_s * 1e9)
+        while self._rows[0][0] < oldest or len(self._rows) > self.config.window_frames:
+            self._rows.popleft()
+        if len(self._rows) < MIN_WINDOW or not any(np.isfinite(row[4]).all() for row in self._rows):
+            return False
+        since = self._rows[0][0] if self._adjusted_ns is None else self._adjusted_ns
+        if stamp - since < round(self.config.period_s * 1e9):
+            return False
+        self._adjusted_ns = stamp
+        return True
+
+    def snapshot(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Arguments of :func:`adjust_window` for the present window, copied."""
+        stamps, keypoints, confidence, covariance, joints = zip(*self._rows, strict=True)
+        kp, conf, cov, start = (
+            np.array(rows, dtype=np.float64) for rows in (keypoints, confidence, covariance, joints)
+        )
+        return np.array(stamps, dtype=np.int64), kp, conf, cov, start
 
 
 def adjust_window(
@@ -262,16 +331,14 @@ def adjust_window(
         )
     start = fill_frames(stamp_ns, initial_joints)
     n = normalize_tracks(keypoints, confidence, covariance)
-    in_units = _units(covariance, n.scale_px)
-    projection = Projection(n.w, information_from(n.w, n.weights, in_units))
+    projection = Projection(n.w, n.information)
     scale = _scale_to_image(start, projection)
-    unseen = np.where((n.weights > 0.0)[..., None], n.w, np.nan)
     seen = n.weights > 0.0
     if frames < MIN_WINDOW:
         shape, rotation = start * scale, np.broadcast_to(np.eye(3), (frames, 3, 3))
         iterations, terms, stop = 0, {"reprojection": float(projection.per_frame(shape, rotation).sum())}, "too short"
     else:
-        result = bundle_adjust(unseen, start * scale, None, n.weights, in_units, config)
+        result = bundle_adjust(n.w, start * scale, config=config, information=n.information)
         shape, rotation, iterations = result.shape, result.rotation, result.iterations
         terms, stop = result.cost_terms, result.stop_reason
     gap, _ = projection.residual(shape, rotation)
@@ -282,6 +349,7 @@ def adjust_window(
     # The scale of a monocular result is the start's: keep the mean limb length.
     metres = float(limb_lengths(start).mean() / limb_lengths(joints).mean())
     return AdjustedWindow(
+        stamp_ns=np.asarray(stamp_ns, dtype=np.int64),
         joints3d=joints * metres,
         covariance=window_covariance(projection, joints, seen) * metres**2,
         confidence=n.weights,
