@@ -131,9 +131,12 @@ class MavlinkLink:
         try:
             return self._transport.read(timeout_s)
         except LinkError as error:
-            logger.warning("%s; trying again every %g s", error, _RECONNECT_S)
-            self._broken_s = time.monotonic()
+            self._break(error)
             return b""
+
+    def _break(self, error: LinkError) -> None:
+        logger.warning("%s; trying again every %g s", error, _RECONNECT_S)
+        self._broken_s = time.monotonic()
 
     def _reopened(self, timeout_s: float) -> bool:
         if self._broken_s is None or time.monotonic() - self._broken_s < _RECONNECT_S:
@@ -218,11 +221,12 @@ class MavlinkLink:
         name = message.get_type()
         if name not in SENDABLE or (name == "COMMAND_LONG" and message.command not in _COMMANDS):
             raise AssertionError(f"this link sends no {name}")
+        if self._broken_s is not None:
+            return
         try:
             self._transport.write(message.pack(self._mav))
         except LinkError as error:
-            logger.warning("%s; trying again every %g s", error, _RECONNECT_S)
-            self._broken_s = time.monotonic()
+            self._break(error)
         self._mav.seq = (self._mav.seq + 1) % 256
 
 

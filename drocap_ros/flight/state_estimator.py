@@ -60,6 +60,7 @@ class VehicleStateEstimator:
         self.component_id = 0
         self.utc_minus_boot_ns: int | None = None
         self._heard_ns: int | None = None
+        self._stamp_ns = -(10**18)
         self._heartbeat: tuple[str, str, bool] | None = None
         self._attitude: tuple[int, np.ndarray, np.ndarray] | None = None  # boot ns, FRD -> NED x y z w, rates FRD
         self._quaternion_ns = -(10**18)
@@ -73,6 +74,7 @@ class VehicleStateEstimator:
     def update(self, message: Any, receive_time_ns: int) -> VehicleState | None:
         """Take one decoded pymavlink message; a new state when it tells the attitude, else None.
 
+        Stamps increase, but after a jump of a clock by more than five seconds.
         Values that cannot be (not finite, quaternion of no unit length) are dropped.
         """
         name = message.get_type()
@@ -87,7 +89,14 @@ class VehicleStateEstimator:
         handler = _HANDLERS.get(name) if from_autopilot or name in _FROM_ANY_COMPONENT else None
         if handler is None:
             return None
-        return self.snapshot(receive_time_ns) if handler(self, message, receive_time_ns) else None
+        if not handler(self, message, receive_time_ns):
+            return None
+        state = self.snapshot(receive_time_ns)
+        # The clock's offset becomes better with time: what would go back by a little is left out.
+        if state is None or 0 <= self._stamp_ns - state.stamp_ns < 5 * _NS:
+            return None
+        self._stamp_ns = state.stamp_ns
+        return state
 
     def snapshot(self, now_ns: int) -> VehicleState | None:
         """The state as known at ``now_ns``; None before the first heartbeat and attitude."""

@@ -1,0 +1,1 @@
+"""Sessions: written by us, read from us and from others."""

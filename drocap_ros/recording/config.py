@@ -1,0 +1,26 @@
+"""Parameters of the session recorder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drocap_ros.parameters import Parameters, param
+
+
+@dataclass(frozen=True)
+class SessionRecorderConfig(Parameters):
+    """Where and how a session is written."""
+
+    session_dir: str = param("session", "folder to create; it must not exist, or be empty")
+    chunk_s: float = param(
+        0.5, "time after which what has come is written and flushed", unit="s", minimum=0.05, maximum=10
+    )
+    chunk_kib: int = param(1024, "size after which a chunk is written earlier", unit="KiB", minimum=16, maximum=65536)
+    compression: str = param("zstd", "of the chunks", choices=("none", "lz4", "zstd"))
+    queue_mib: int = param(
+        128, "what waits for the disk at most; then pictures are dropped first", unit="MiB", minimum=1, maximum=4096
+    )
+    free_mib: int = param(
+        256, "space that stays free on the disk; below it the recording ends", unit="MiB", minimum=0, maximum=1_000_000
+    )
+    sync: bool = param(True, "force each flush to the disk itself, so that a power cut loses at most the last chunk")
