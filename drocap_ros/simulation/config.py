@@ -12,10 +12,6 @@ from drocap_ros.simulation.person import ACTIONS
 class SimulationConfig(Parameters):
     """Person, orbit, camera and observation quality of a simulated capture."""
 
-    seconds: float = param(20.0, "length of the flight", unit="s", minimum=0.1, maximum=36_000)
-    rate_hz: float = param(30.0, "rate of the pictures", unit="Hz", minimum=1, maximum=240)
-    seed: int = param(0, "chooses person, take and noise", minimum=0)
-    vehicle_url: str = param("udpout:127.0.0.1:14540", "where the simulated vehicle speaks MAVLink; empty = none flies")
     action: str = param("mixed", "what the person does", choices=ACTIONS)
     stature_m: float = param(1.75, "height of the person", unit="m", minimum=0.5, maximum=2.5)
     radius_m: float = param(6.0, "horizontal distance of the camera from the person", unit="m", minimum=2.0, maximum=50)
