@@ -67,7 +67,49 @@ COCO_17 = JointSet(
     (-1, 0, 0, 1, 2, 0, 0, 5, 6, 7, 8, 5, 6, 11, 12, 13, 14),
 )  # fmt: skip
 
-JOINT_SETS: dict[str, JointSet] = {s.name: s for s in (BODY_15, COCO_17)}
+HALPE_26 = JointSet(
+    "halpe26",
+    (*COCO_17.joints, "head_top", "neck", "hip", "left_big_toe", "right_big_toe", "left_small_toe", "right_small_toe",
+     "left_heel", "right_heel"),
+    (18, 0, 0, 1, 2, 18, 18, 5, 6, 7, 8, 19, 19, 11, 12, 13, 14, 18, 19, -1, 15, 16, 15, 16, 15, 16),
+)  # fmt: skip
+
+#: COCO-WholeBody: the body, six points of the feet, 68 of the face, 21 of each hand.
+WHOLEBODY_133 = JointSet(
+    "wholebody133",
+    (
+        *COCO_17.joints,
+        "left_big_toe", "left_small_toe", "left_heel", "right_big_toe", "right_small_toe", "right_heel",
+        *(f"face_{i}" for i in range(68)),
+        *(f"left_hand_{i}" for i in range(21)),
+        *(f"right_hand_{i}" for i in range(21)),
+    ),
+    (
+        *COCO_17.parents, 15, 15, 15, 16, 16, 16, *([0] * 68),
+        *(9 if i == 0 else 91 if i % 4 == 1 else 90 + i for i in range(21)),
+        *(10 if i == 0 else 112 if i % 4 == 1 else 111 + i for i in range(21)),
+    ),
+)  # fmt: skip
+
+MPII_16 = JointSet(
+    "mpii16",
+    (
+        "right_ankle", "right_knee", "right_hip", "left_hip", "left_knee", "left_ankle", "pelvis", "thorax",
+        "upper_neck", "head_top", "right_wrist", "right_elbow", "right_shoulder", "left_shoulder", "left_elbow", "left_wrist",
+    ),
+    (1, 2, 6, 6, 3, 4, -1, 6, 7, 8, 11, 12, 7, 7, 13, 14),
+)  # fmt: skip
+
+H36M_17 = JointSet(
+    "h36m17",
+    (
+        "pelvis", "rhip", "rknee", "rankle", "lhip", "lknee", "lankle", "spine", "thorax", "neck", "head",
+        "lshoulder", "lelbow", "lwrist", "rshoulder", "relbow", "rwrist",
+    ),
+    (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 9, 8, 11, 12, 8, 14, 15),
+)  # fmt: skip
+
+JOINT_SETS: dict[str, JointSet] = {s.name: s for s in (BODY_15, COCO_17, HALPE_26, WHOLEBODY_133, MPII_16, H36M_17)}
 
 #: The twelve joints over which the paper's tables average.
 LIMB_JOINTS = (

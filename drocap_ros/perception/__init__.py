@@ -1,0 +1,1 @@
+"""From any camera to one person's keypoints: sources, detection, subject tracking, 2D pose, uncertainty."""

@@ -1,0 +1,134 @@
+"""Outputs of each detector layout -> boxes, scores (and keypoints) in input px, before suppression."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.perception.model_spec import ModelSpec, grid_centres, map_grid
+
+
+class RawDetections(NamedTuple):
+    """boxes (N, 4) x_min y_min x_max y_max in input px, scores (N,), keypoints (N, P, 3) x y score or None."""
+
+    boxes: np.ndarray
+    scores: np.ndarray
+    keypoints: np.ndarray | None = None
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    return 1.0 / (1.0 + np.exp(-np.clip(x, -50, 50)))
+
+
+def _corners(boxes: np.ndarray) -> np.ndarray:
+    """Cx cy w h -> x_min y_min x_max y_max."""
+    half = boxes[:, 2:4] / 2
+    return np.concatenate([boxes[:, :2] - half, boxes[:, :2] + half], axis=1)
+
+
+def _flat(output: np.ndarray) -> np.ndarray:
+    """(1, N, C) or (N, C) -> (N, C)."""
+    return output.reshape(output.shape[-2:])
+
+
+def rtmdet_maps(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
+    """RTMDet's raw maps: class logits and distances l t r b (px) from each cell's corner.
+
+    Either one map a stride with both, classes first, or a class map and a distance map a stride; NHWC or NCHW.
+    """
+    by_stride: dict[int, list[np.ndarray]] = {}
+    for output in outputs:
+        grid = map_grid(output.shape, spec.input_size)
+        if grid is None:
+            raise InputError(f"rtmdet-maps: expected maps of stride 8, 16, 32 of {spec.input_size}, got {output.shape}")
+        by_stride.setdefault(grid[0], []).append(output[0] if grid[2] else np.moveaxis(output[0], 0, 2))
+    boxes, scores = [], []
+    for stride in sorted(by_stride):
+        maps = by_stride[stride]
+        if len(maps) == 1:
+            logits, distances = maps[0][..., spec.person_class], maps[0][..., -4:]
+        else:
+            # The distance map comes second, as in the exports, unless only the first has four channels.
+            first, second = maps
+            swapped = first.shape[-1] == 4 and second.shape[-1] != 4
+            logits, distances = (second if swapped else first)[..., spec.person_class], first if swapped else second
+        score = _sigmoid(logits)
+        rows, columns = np.nonzero(score >= threshold)
+        corner = np.stack([columns, rows], 1).astype(np.float32) * stride
+        d = distances[rows, columns]
+        boxes.append(np.concatenate([corner - d[:, :2], corner + d[:, 2:]], axis=1))
+        scores.append(score[rows, columns])
+    return RawDetections(np.concatenate(boxes), np.concatenate(scores))
+
+
+def yolox_grid(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
+    """YOLOX's grid: cx cy w h, objectness, classes; centres in cells and log sizes unless already decoded."""
+    rows = _flat(outputs[0])
+    score = rows[:, 4] * rows[:, 5 + spec.person_class]
+    keep = np.nonzero(score >= threshold)[0]
+    boxes = rows[keep, :4].astype(np.float32)
+    if not spec.decoded:
+        strides = (8, 16, 32) if len(rows) == len(grid_centres(spec.input_size, (8, 16, 32))[0]) else (8, 16, 32, 64)
+        corners, stride = grid_centres(spec.input_size, strides)
+        s = stride[keep, None]
+        boxes = np.concatenate([boxes[:, :2] * s + corners[keep], np.exp(np.clip(boxes[:, 2:], -10, 10)) * s], axis=1)
+    return RawDetections(_corners(boxes), score[keep])
+
+
+def boxes_nms(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
+    """Suppression inside: x_min y_min x_max y_max score, and class labels where there is a second output."""
+    rows = _flat(outputs[0])
+    keep = rows[:, 4] >= threshold
+    if len(outputs) > 1:
+        keep &= outputs[1].reshape(-1) == spec.person_class
+    return RawDetections(rows[keep, :4], rows[keep, 4])
+
+
+def yolo_nms(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
+    """Suppression inside, one output: x_min y_min x_max y_max score class (and keypoints x y score)."""
+    rows = _flat(outputs[0])
+    rows = rows[(rows[:, 4] >= threshold) & (np.round(rows[:, 5]) == spec.person_class)]
+    keypoints = rows[:, 6:].reshape(len(rows), -1, 3) if rows.shape[1] > 6 else None
+    return RawDetections(rows[:, :4], rows[:, 4], keypoints)
+
+
+def yolo(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
+    """YOLO without objectness, channels first: cx cy w h, classes."""
+    rows = _flat(outputs[0]).T
+    score = rows[:, 4 + spec.person_class]
+    rows, score = rows[score >= threshold], score[score >= threshold]
+    return RawDetections(_corners(rows[:, :4]), score)
+
+
+def yolo_pose(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
+    """YOLO-pose before suppression: cx cy w h, score (or objectness and class), keypoints x y score."""
+    rows = _flat(outputs[0])
+    if rows.shape[0] < rows.shape[1]:  # channels first
+        rows = rows.T
+    first = 5 if (rows.shape[1] - 5) % 3 == 0 else 6
+    score = rows[:, 4] if first == 5 else rows[:, 4] * rows[:, 5]
+    keep = score >= threshold
+    rows = rows[keep]
+    return RawDetections(_corners(rows[:, :4]), score[keep], rows[:, first:].reshape(len(rows), -1, 3))
+
+
+def rtmo(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
+    """RTMO with suppression inside: boxes with score, keypoints x y score."""
+    rows, keypoints = _flat(outputs[0]), outputs[1].reshape(-1, *outputs[1].shape[-2:])
+    keep = rows[:, 4] >= threshold
+    return RawDetections(rows[keep, :4], rows[keep, 4], keypoints[keep])
+
+
+DECODERS: dict[str, Callable[[list[np.ndarray], ModelSpec, float], RawDetections]] = {
+    "rtmdet-maps": rtmdet_maps,
+    "yolox-grid": yolox_grid,
+    "boxes-nms": boxes_nms,
+    "yolo-nms": yolo_nms,
+    "yolo": yolo,
+    "yolo-pose": yolo_pose,
+    "yolo-pose-nms": yolo_nms,
+    "rtmo": rtmo,
+}

@@ -1,0 +1,149 @@
+"""From the joint sets of public networks to ``BODY_15``: positions, covariance and confidence.
+
+Each of our joints is a weighted mean of a network's joints.  Most are one joint, the pelvis is the middle
+of the hips where the network has none, and ``neck`` and ``head`` are extrapolated along the line from the
+middle of the shoulders: in the MoCap convention the neck lies 135 mm and the head 232 mm above it, the ears
+about 190 mm.  Extrapolated joints carry an extra variance for what a line cannot know (where the head
+leans), in units of the network's own shoulder-to-ear or neck-to-crown distance, and less confidence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.skeleton import BODY_15
+
+#: Shares of the way from the middle of the shoulders to the middle of the ears.
+_NECK_ON_EARS, _HEAD_ON_EARS = 135 / 190, 232 / 190
+#: Standard deviation of neck and head about that line, share of the same way (20 and 25 mm of 190).
+_NECK_SPREAD, _HEAD_SPREAD = 0.11, 0.14
+_EXTRAPOLATED_CONFIDENCE = 0.85
+
+_SIDES = (("l", "left_"), ("r", "right_"))
+_LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+
+Weights = dict[str, float]
+
+
+def _mix(start: Weights, end: Weights, share: float) -> Weights:
+    total = {name: (1 - share) * w for name, w in start.items()}
+    for name, w in end.items():
+        total[name] = total.get(name, 0.0) + share * w
+    return total
+
+
+def _limbs_by_side() -> dict[str, Weights]:
+    return {short + part: {long + part: 1.0} for short, long in _SIDES for part in _LIMBS}
+
+
+def _coco_like(pelvis: Weights | None = None) -> dict[str, Weights]:
+    shoulders = {"left_shoulder": 0.5, "right_shoulder": 0.5}
+    ears = {"left_ear": 0.5, "right_ear": 0.5}
+    return _limbs_by_side() | {
+        "pelvis": pelvis or {"left_hip": 0.5, "right_hip": 0.5},
+        "neck": _mix(shoulders, ears, _NECK_ON_EARS),
+        "head": _mix(shoulders, ears, _HEAD_ON_EARS),
+    }
+
+
+#: Our joint -> weights of the network's joints, which sum to 1.
+TABLES: dict[str, dict[str, Weights]] = {
+    "body15": {name: {name: 1.0} for name in BODY_15.joints},
+    "coco17": _coco_like(),
+    "wholebody133": _coco_like(),
+    "halpe26": _coco_like(pelvis={"left_hip": 0.5, "right_hip": 0.5}),
+    # MPII's upper neck is ours; the crown lies about 310 mm above the middle of the shoulders.
+    "mpii16": _limbs_by_side() | {
+        "pelvis": {"left_hip": 0.5, "right_hip": 0.5},
+        "neck": {"upper_neck": 1.0},
+        "head": _mix({"upper_neck": 1.0}, {"head_top": 1.0}, (232 - 135) / (310 - 135)),
+    },
+    "h36m17": {name: {name: 1.0} for name in BODY_15.joints},
+}  # fmt: skip
+
+#: Line whose length scales the extra variance of an extrapolated joint: from, to, spread.
+_EXTRA: dict[str, dict[str, tuple[Weights, Weights, float]]] = {
+    **{
+        name: {
+            joint: (
+                {"left_shoulder": 0.5, "right_shoulder": 0.5}, {"left_ear": 0.5, "right_ear": 0.5}, spread,
+            )
+            for joint, spread in (("neck", _NECK_SPREAD), ("head", _HEAD_SPREAD))
+        }
+        for name in ("coco17", "wholebody133", "halpe26")
+    },
+    "mpii16": {"head": ({"upper_neck": 1.0}, {"head_top": 1.0}, 0.12)},
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class JointMap:
+    """Linear map of one joint set to ``BODY_15``.
+
+    weights : (15, P), rows summing to 1
+    lines : (15, P), rows summing to 0: the line that scales the extra spread, 0 where there is none
+    spread : (15,) standard deviation as a share of the line's length
+    """
+
+    weights: np.ndarray
+    lines: np.ndarray
+    spread: np.ndarray
+
+    def apply(
+        self, xy: np.ndarray, covariance: np.ndarray, confidence: np.ndarray, box_size: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Keypoints (P, 2) px, covariance (P, 3) px^2 and confidence (P,) -> the same for ``BODY_15``.
+
+        A joint is NaN, its confidence 0, where one of its parts is NaN.  The line's length is at least 5 %
+        of ``box_size``: a person seen from above has a short one, yet a head that is no better known.
+        """
+        seen = np.isfinite(xy).all(axis=1)
+        used = self.weights != 0
+        fine = ~(used & ~seen).any(axis=1)
+        points = np.nan_to_num(xy)
+        out = self.weights @ points
+        # The parts' errors are taken as independent.
+        out_covariance = self.weights**2 @ np.nan_to_num(covariance)
+        length = np.maximum(np.linalg.norm(self.lines @ points, axis=1), 0.05 * box_size)
+        extra = np.where(self.spread > 0, (self.spread * length) ** 2, 0.0)
+        out_covariance = out_covariance + extra[:, None] * np.array([1.0, 0.0, 1.0])
+        lowest = np.where(used, np.nan_to_num(confidence)[None], np.inf).min(axis=1)
+        out_confidence = np.where(self.spread > 0, _EXTRAPOLATED_CONFIDENCE, 1.0) * lowest
+        out[~fine] = np.nan
+        out_covariance[~fine] = np.nan
+        return out, out_covariance, np.where(fine, out_confidence, 0.0)
+
+
+@cache
+def joint_map(skeleton: str) -> JointMap:
+    """Map of a joint set to ``BODY_15``.
+
+    Raises
+    ------
+    InputError
+        When there is no table for that set.
+    """
+    from drocap_ros.skeleton import joint_set
+
+    if skeleton not in TABLES:
+        raise InputError(
+            f"skeleton: expected one of {', '.join(TABLES)}, got {skeleton!r}; add a table to joint_maps.py"
+        )
+    source = joint_set(skeleton)
+    weights = np.zeros((len(BODY_15), len(source)))
+    lines = np.zeros_like(weights)
+    spread = np.zeros(len(BODY_15))
+    for row, joint in enumerate(BODY_15.joints):
+        for name, weight in TABLES[skeleton][joint].items():
+            weights[row, source.index(name)] = weight
+        if joint in _EXTRA.get(skeleton, {}):
+            start, end, spread[row] = _EXTRA[skeleton][joint]
+            for name, weight in _mix({n: -w for n, w in start.items()}, {}, 0.0).items():
+                lines[row, source.index(name)] = weight
+            for name, weight in end.items():
+                lines[row, source.index(name)] = weight
+    return JointMap(weights, lines, spread)

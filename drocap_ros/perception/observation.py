@@ -1,0 +1,45 @@
+"""What perception says about one image: the subject's box and keypoints with their uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from drocap_ros.skeleton import BODY_15, JointSet
+
+
+def _empty(*shape: int) -> np.ndarray:
+    return np.empty(shape, np.float32)
+
+
+@dataclass(frozen=True)
+class PoseObservation:
+    """The subject in one image; P joints, or empty arrays when there is no subject.
+
+    stamp_ns : exposure time of the image
+    track_id : 1, 2, ... for the subject; 0 = no subject
+    joints : names and order of the keypoints
+    image_size : (width, height) px
+    roi : (4,) float32, the subject's box x_min y_min x_max y_max px; NaN without a subject
+    detection_score : the detector's score of the box in [0, 1]; 0 while the box is only predicted
+    keypoints : (P, 2) float32 px, NaN = not seen
+    covariance : (P, 3) float32 px^2, xx xy yy, NaN where the keypoint is
+    confidence : (P,) float32 in [0, 1], calibrated: the share of such keypoints that lie within 10 % of the
+        box height of where a person would mark them
+    """
+
+    stamp_ns: int
+    track_id: int
+    image_size: tuple[int, int]
+    joints: JointSet = BODY_15
+    roi: np.ndarray = field(default_factory=lambda: np.full(4, np.nan, np.float32))
+    detection_score: float = 0.0
+    keypoints: np.ndarray = field(default_factory=lambda: _empty(0, 2))
+    covariance: np.ndarray = field(default_factory=lambda: _empty(0, 3))
+    confidence: np.ndarray = field(default_factory=lambda: _empty(0))
+
+    @property
+    def has_subject(self) -> bool:
+        """Whether a subject was followed in this image."""
+        return self.track_id > 0

@@ -1,0 +1,55 @@
+"""One person seen in the image, the subject or a bystander."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drocap_ros.perception.tracking.appearance import similarity
+from drocap_ros.perception.tracking.motion import BoxMotion
+
+#: Share of a new look taken into the remembered one.
+_LOOK_RATE = 0.08
+#: Images after which the remembered look is settled.
+_LOOK_SETTLED = 10
+
+
+class Person:
+    """Motion, look and history of one person."""
+
+    def __init__(self, box: np.ndarray, score: float, stamp_ns: int, look: np.ndarray | None) -> None:
+        self.motion = BoxMotion(box, stamp_ns)
+        self.box = np.asarray(box, float)
+        self.first_ns = stamp_ns
+        self.seen_ns = stamp_ns
+        self.score = score
+        self.hits = 1
+        self.look = look
+        self._looks = 1 if look is not None else 0
+
+    def gap_s(self, stamp_ns: int) -> float:
+        """Seconds since the person was last seen."""
+        return (stamp_ns - self.seen_ns) * 1e-9
+
+    def see(self, box: np.ndarray, score: float, stamp_ns: int) -> None:
+        """Take in a detection."""
+        self.motion.update(box)
+        self.box = np.asarray(box, float)
+        self.seen_ns = stamp_ns
+        self.score = score
+        self.hits += 1
+
+    def learn_look(self, look: np.ndarray | None) -> None:
+        """Blend a look into the remembered one, faster at first."""
+        if look is None:
+            return
+        self._looks += 1
+        if self.look is None:
+            self.look = look
+            return
+        rate = max(_LOOK_RATE, 1 / self._looks) if self._looks < _LOOK_SETTLED else _LOOK_RATE
+        # The squares are the histograms; blending these keeps their sum.
+        self.look = np.sqrt((1 - rate) * self.look**2 + rate * look**2)
+
+    def likeness(self, look: np.ndarray | None) -> float:
+        """Similarity to a look in [0, 1]."""
+        return similarity(self.look, look)

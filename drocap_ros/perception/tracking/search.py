@@ -1,0 +1,58 @@
+"""Where to look for persons in the next image."""
+
+from __future__ import annotations
+
+import numpy as np
+
+Window = tuple[int, int, int, int]
+
+#: Side of the window over the subject's longer side, and its least side in px: detectors of 320-416 px input
+#: find a person best who fills a quarter to a half of it.
+_WINDOW_OVER_BOX = 2.4
+_WINDOW_LEAST = 416
+#: Images longer than this are also searched in tiles of this side, one an image.
+_TILE = 800
+
+
+def window_around(box: np.ndarray, image_size: tuple[int, int]) -> Window | None:
+    """Square window around a box, moved into the image; None when it would be the whole image anyway."""
+    width, height = image_size
+    side = max(_WINDOW_OVER_BOX * float(max(box[2] - box[0], box[3] - box[1])), _WINDOW_LEAST)
+    if side >= max(width, height):
+        return None
+    cx, cy = float(box[0] + box[2]) / 2, float(box[1] + box[3]) / 2
+    w, h = int(min(side, width)), int(min(side, height))
+    x0 = int(np.clip(cx - w / 2, 0, width - w))
+    y0 = int(np.clip(cy - h / 2, 0, height - h))
+    return x0, y0, x0 + w, y0 + h
+
+
+def tiles(image_size: tuple[int, int]) -> list[Window]:
+    """Overlapping tiles that cover a large image; none for one that the detector takes in at a glance."""
+    width, height = image_size
+    if max(width, height) <= 1.6 * _TILE:
+        return []
+    side = max(_TILE, max(width, height) // 6)
+
+    def starts(length: int) -> list[int]:
+        if length <= side:
+            return [0]
+        count = int(np.ceil((length - side) / (0.75 * side))) + 1
+        return [round(i * (length - side) / (count - 1)) for i in range(count)]
+
+    return [(x, y, min(x + side, width), min(y + side, height)) for y in starts(height) for x in starts(width)]
+
+
+def inside(boxes: np.ndarray, window: Window | None, image_size: tuple[int, int]) -> np.ndarray:
+    """(N,) bool: boxes that do not touch an edge of the window which is no edge of the image."""
+    if window is None:
+        return np.ones(len(boxes), bool)
+    x0, y0, x1, y1 = window
+    width, height = image_size
+    margin = 2.0
+    return (
+        ((boxes[:, 0] > x0 + margin) | (x0 == 0))
+        & ((boxes[:, 1] > y0 + margin) | (y0 == 0))
+        & ((boxes[:, 2] < x1 - margin) | (x1 == width))
+        & ((boxes[:, 3] < y1 - margin) | (y1 == height))
+    )

@@ -1,0 +1,294 @@
+"""The subject: chosen once, kept through crossings and gaps, never swapped for somebody else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drocap_ros.errors import ParameterError
+from drocap_ros.perception.config import PoseEstimatorConfig
+from drocap_ros.perception.detection.nms import iou
+from drocap_ros.perception.tracking.appearance import describe
+from drocap_ros.perception.tracking.association import assign
+from drocap_ros.perception.tracking.person import Person
+from drocap_ros.perception.tracking.search import Window, tiles, window_around
+
+#: Overlap with another person from which a predicted box is taken to be hidden behind them.
+_HIDDEN_IOU = 0.25
+#: Overlap above which two persons' looks mix and are not learned.
+_MIXED_IOU = 0.1
+#: A bystander unseen for so long is forgotten.
+_BYSTANDER_S = 2.0
+#: Persons remembered at most; a crowd's rest is of no use.
+_MOST_PERSONS = 30
+#: A new person with this score needs no confirmation by further images when nothing was seen before.
+_SURE_SCORE = 0.6
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The subject in one image.
+
+    track_id : 1, 2, ...
+    box : (4,) x_min y_min x_max y_max px, detected, or predicted while ``score`` is 0
+    score : the detector's score; 0 = predicted
+    hidden : predicted where somebody else stands: keypoints found there would be theirs
+    """
+
+    track_id: int
+    box: np.ndarray
+    score: float
+    hidden: bool
+
+
+class SubjectTracker:
+    """Keeps one person apart from all others.
+
+    All persons in view are followed, so that in a crossing each detection has its own owner.  A subject
+    without detection is predicted for ``coast_s``; then there is no subject until a person appears who was
+    not in view together with the subject, looks like it and could have come there in the time.
+    """
+
+    def __init__(self, config: PoseEstimatorConfig) -> None:
+        self._config = config
+        self._persons: list[Person] = []
+        self._subject: Person | None = None
+        self._track_id = 0
+        self._left = False
+        self._wanted: np.ndarray | None = parse_box(config.subject_box) if config.subject == "box" else None
+        self._full_ns: int | None = None
+        self._tile = 0
+        self._started = False
+
+    def choose(self, box: np.ndarray) -> None:
+        """Make the person in this box (4,) px the subject from the next image on, under a new track_id."""
+        self._wanted = np.asarray(box, float)
+
+    def windows(self, image_size: tuple[int, int], stamp_ns: int) -> list[Window | None]:
+        """Parts of the next image to detect in; None = all of it.
+
+        Near the subject while it is in view, and over the whole at intervals; without it over the whole, and
+        one tile of a large image in turn.
+        """
+        if self._wanted is not None:
+            return list({window_around(self._wanted, image_size): None, None: None})
+        subject = self._subject
+        if subject is not None and subject.gap_s(stamp_ns) <= self._config.coast_s:
+            near = window_around(subject.motion.box(), image_size)
+            due = self._full_ns is None or stamp_ns - self._full_ns >= self._config.full_frame_every_s * 1e9
+            if near is None or due or stamp_ns < (self._full_ns or 0):
+                self._full_ns = stamp_ns
+                return list({near: None, None: None})
+            return [near]
+        self._full_ns = stamp_ns
+        parts = tiles(image_size)
+        if not parts:
+            return [None]
+        self._tile = (self._tile + 1) % len(parts)
+        return [None, parts[self._tile]]
+
+    def update(
+        self, image: np.ndarray, stamp_ns: int, boxes: np.ndarray, scores: np.ndarray, roi: np.ndarray | None = None
+    ) -> Subject | None:
+        """Take in one image's detections.
+
+        Parameters
+        ----------
+        image : (H, W, 3) uint8 BGR
+        stamp_ns : later than the last
+        boxes : (N, 4) px; scores : (N,), both of at least ``low_threshold``
+        roi : (4,) px, the drone's own box of the person it tracks, or None
+        """
+        if roi is not None:
+            self._take_roi(np.asarray(roi, float), stamp_ns)
+        for person in self._persons:
+            person.motion.predict(stamp_ns)
+        looks = [describe(image, box) for box in boxes]
+        used = self._match(boxes, scores, looks, stamp_ns)
+        fresh = self._welcome(boxes, scores, looks, used, stamp_ns)
+        self._retake(stamp_ns)
+        self._settle_choice(boxes, stamp_ns)
+        self._select(image.shape, stamp_ns, fresh)
+        self._forget(image.shape, stamp_ns)
+        self._started = self._started or bool(len(boxes))
+        return self._report(stamp_ns)
+
+    def confirm(self, box: np.ndarray, stamp_ns: int) -> None:
+        """Tell that the pose network found the whole subject in its predicted box, at ``box`` (4,) px."""
+        if self._subject is not None:
+            self._subject.motion.update(box, noise=2.0)
+            self._subject.seen_ns = stamp_ns
+
+    def _match(self, boxes: np.ndarray, scores: np.ndarray, looks: list[np.ndarray | None], stamp_ns: int) -> set[int]:
+        """First the sure detections to all persons, then the doubtful ones to those who are left."""
+        coasting = self._config.coast_s
+        open_persons = [p for p in self._persons if p.gap_s(stamp_ns) <= coasting or p is not self._subject]
+        used: set[int] = set()
+        for sure in (True, False):
+            at = np.nonzero((scores >= self._config.detection_threshold) == sure)[0]
+            at = np.array([j for j in at if j not in used], int)
+            pairs = assign(open_persons, boxes[at], [looks[j] for j in at], stamp_ns)
+            matched = set()
+            for i, k in pairs:
+                person, j = open_persons[i], int(at[k])
+                likeness = person.likeness(looks[j])
+                if (
+                    person is self._subject
+                    and likeness < self._config.appearance_threshold
+                    and self._contested(boxes, j)
+                ):
+                    continue
+                person.see(boxes[j], float(scores[j]), stamp_ns)
+                if not self._mixed(boxes, j):
+                    person.learn_look(looks[j])
+                used.add(j)
+                matched.add(id(person))
+            open_persons = [p for p in open_persons if id(p) not in matched]
+        return used
+
+    def _contested(self, boxes: np.ndarray, j: int) -> bool:
+        """Whether somebody else was near this detection."""
+        others = [p for p in self._persons if p is not self._subject]
+        near = np.array([p.motion.box() for p in others]).reshape(-1, 4)
+        return bool((iou(boxes[j][None].astype(float), near) > _MIXED_IOU).any())
+
+    def _mixed(self, boxes: np.ndarray, j: int) -> bool:
+        overlap = iou(boxes[j][None], boxes)[0]
+        overlap[j] = 0.0
+        return bool((overlap > _MIXED_IOU).any())
+
+    def _welcome(
+        self, boxes: np.ndarray, scores: np.ndarray, looks: list[np.ndarray | None], used: set[int], stamp_ns: int
+    ) -> list[Person]:
+        fresh = []
+        for j in range(len(boxes)):
+            if j in used or scores[j] < self._config.detection_threshold:
+                continue
+            if used and iou(boxes[j][None], boxes[sorted(used)]).max() > 0.5:
+                continue
+            fresh.append(Person(boxes[j], float(scores[j]), stamp_ns, looks[j]))
+        self._persons += fresh
+        return fresh
+
+    def _retake(self, stamp_ns: int) -> None:
+        """Recognize a lost subject in a newcomer."""
+        lost = self._subject
+        if lost is None or lost.gap_s(stamp_ns) <= 0:
+            return
+        for person in self._persons:
+            if person is lost or person.seen_ns != stamp_ns or person.first_ns <= lost.seen_ns:
+                continue
+            if person.hits < self._config.confirm_frames or not self._plausible(lost, person):
+                continue
+            self._persons.remove(lost)
+            person.look = lost.look if lost.look is not None else person.look
+            self._subject = person
+            self._left = False
+            return
+
+    def _plausible(self, lost: Person, person: Person) -> bool:
+        """Whether a newcomer looks like the lost subject and can have come there in the time."""
+        gap = (person.first_ns - lost.seen_ns) * 1e-9
+        if gap > self._config.forget_s:
+            return False
+        start, end = lost.box, person.box
+        height = max(lost.motion.height, 1.0)
+        distance = float(np.linalg.norm((start[:2] + start[2:] - end[:2] - end[2:]) / 2)) / height
+        growth = abs(float(np.log(max(end[3] - end[1], 1.0) / height)))
+        near = distance < 1.0 + 1.5 * gap and growth < 0.5 + 0.3 * gap
+        return near and person.likeness(lost.look) >= self._config.appearance_threshold
+
+    def _take_roi(self, roi: np.ndarray, stamp_ns: int) -> None:
+        """A new roi is a choice; one that stays on the subject carries it on where the detector is blind."""
+        subject = self._subject
+        if subject is None or iou(roi[None], subject.motion.box()[None])[0, 0] < 0.1:
+            self._wanted = roi
+        elif self._config.subject == "roi" and subject.gap_s(stamp_ns) > 0.5 * self._config.coast_s:
+            subject.see(roi, 0.0, stamp_ns)
+
+    def _settle_choice(self, boxes: np.ndarray, stamp_ns: int) -> None:
+        if self._wanted is None:
+            return
+        wanted, self._wanted = self._wanted, None
+        seen = [p for p in self._persons if p.seen_ns == stamp_ns]
+        overlap = iou(wanted[None], np.array([p.box for p in seen]).reshape(-1, 4))[0]
+        if len(overlap) and overlap.max() >= 0.2:
+            chosen = seen[int(overlap.argmax())]
+        else:
+            chosen = Person(wanted, 0.0, stamp_ns, None)
+            self._persons.append(chosen)
+        if chosen is not self._subject:
+            self._follow(chosen)
+
+    def _select(self, shape: tuple[int, ...], stamp_ns: int, fresh: list[Person]) -> None:
+        """The standing choice, where there is no subject to wait for."""
+        config = self._config
+        if config.subject in ("box", "roi"):
+            return
+        if self._subject is not None:
+            if config.on_loss == "wait":
+                return
+            patience = 0.0 if self._left else config.give_up_s
+            if self._subject.gap_s(stamp_ns) <= config.coast_s + patience:
+                return
+        sure = [
+            p
+            for p in self._persons
+            if p.seen_ns == stamp_ns
+            and p is not self._subject
+            and (p.hits >= config.confirm_frames or (not self._started and p.score >= _SURE_SCORE))
+        ]
+        if not sure:
+            return
+        if config.subject == "largest":
+            best = max(sure, key=lambda p: float(np.prod(p.box[2:] - p.box[:2])))
+        else:
+            middle = np.array([shape[1], shape[0]]) / 2
+            best = min(sure, key=lambda p: float(np.linalg.norm((p.box[:2] + p.box[2:]) / 2 - middle)))
+        self._follow(best)
+
+    def _follow(self, person: Person) -> None:
+        self._subject = person
+        self._track_id += 1
+        self._left = False
+
+    def _forget(self, shape: tuple[int, ...], stamp_ns: int) -> None:
+        subject = self._subject
+        if subject is not None and subject.gap_s(stamp_ns) > 0 and not self._left:
+            height, width = shape[:2]
+            edge = 0.01 * max(width, height)
+            box = subject.box
+            self._left = bool(box[0] < edge or box[1] < edge or box[2] > width - edge or box[3] > height - edge)
+        kept = [p for p in self._persons if p is subject or p.gap_s(stamp_ns) <= _BYSTANDER_S]
+        if len(kept) > _MOST_PERSONS:
+            kept.sort(key=lambda p: (p is not subject, -p.seen_ns))
+        self._persons = kept[:_MOST_PERSONS]
+
+    def _report(self, stamp_ns: int) -> Subject | None:
+        subject = self._subject
+        if subject is None or subject.gap_s(stamp_ns) > self._config.coast_s:
+            return None
+        if subject.seen_ns == stamp_ns:
+            return Subject(self._track_id, subject.box, subject.score, False)
+        box = subject.motion.box()
+        others = [p.box for p in self._persons if p is not subject and p.seen_ns == stamp_ns]
+        hidden = bool(len(others)) and bool((iou(box[None], np.array(others)) > _HIDDEN_IOU).any())
+        return Subject(self._track_id, box, 0.0, hidden)
+
+
+def parse_box(text: str) -> np.ndarray:
+    """(4,) x_min y_min x_max y_max from "x,y,x,y".
+
+    Raises
+    ------
+    ParameterError
+        When the text is no such box.
+    """
+    try:
+        box = np.array([float(v) for v in text.split(",")])
+    except ValueError:
+        box = np.empty(0)
+    if box.shape != (4,) or not np.isfinite(box).all() or (box[2:] <= box[:2]).any():
+        raise ParameterError(f"subject_box: expected x_min,y_min,x_max,y_max px, got {text!r}; correct it")
+    return box
