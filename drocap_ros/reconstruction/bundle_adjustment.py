@@ -139,7 +139,7 @@ def bundle_adjust(
     shape = (s0 - s0.mean(axis=1, keepdims=True)) @ body
     projection = Projection(w, information_from(w, weights, covariance) if information is None else information)
     objective = Objective(projection, r0 @ body, config)
-    shape, outcome = _minimize(objective, shape, progress)
+    shape, outcome = minimize(objective, shape, progress)
     terms = objective.terms(shape)
     projected = shape @ np.swapaxes(objective.rotation[:, :2], 1, 2)
     return AdjustmentResult(
@@ -161,8 +161,8 @@ def _check(w: np.ndarray, s0: np.ndarray, r0: np.ndarray | None) -> None:
         raise InputError(f"r0: expected shape {(len(w), 3, 3)}, got {r0.shape}; give one rotation per frame")
 
 
-def _minimize(
-    objective: Objective, s: np.ndarray, progress: Callable[[float], None] | None
+def minimize(
+    objective: Objective, s: np.ndarray, progress: Callable[[float], None] | None = None
 ) -> tuple[np.ndarray, dict[str, Any]]:
     """Accelerated proximal gradient steps (4) with backtracking; momentum restarts when the cost would rise."""
     config, alpha = objective.config, objective.alpha

@@ -12,6 +12,7 @@ from drocap_ros.reconstruction.bundle_adjustment import bundle_adjust
 from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.data_term import Projection, information_from
 from drocap_ros.reconstruction.dictionary import Dictionary
+from drocap_ros.reconstruction.factorization import factorize
 from drocap_ros.reconstruction.normalize import NormalizedTracks, normalize_tracks
 from drocap_ros.reconstruction.single_view import initialize
 from drocap_ros.reconstruction.window import MIN_WINDOW, fill_frames
@@ -21,6 +22,9 @@ from drocap_ros.tracks import Tracks
 METHODS = ("ba", "paper", "paper-no-articulation", "initial", "mf-nnm")
 
 Progress = Callable[[str, float], None]
+
+#: Poses (F, 15, 3) in camera axes in the window's unit, cost per term, iterations, stop reason.
+WindowResult = tuple[np.ndarray, dict[str, float], int, str]
 
 
 @dataclass(frozen=True)
@@ -54,11 +58,17 @@ def run_method(
 ) -> CameraPoses:
     """Poses of BODY_15 keypoints (F, 15, 2) px by one of :data:`METHODS`."""
     normalize_tracks(keypoints, confidence, covariance)  # refuses what no window can use
-    if method == "mf-nnm":
-        from drocap_ros.reconstruction.factorization import run_factorization
-
-        return run_factorization(stamp_ns, keypoints, confidence, covariance, adjuster, dictionary, progress)
     clock = time.perf_counter()
+    if method == "mf-nnm":
+        poses = over_windows(
+            keypoints,
+            confidence,
+            covariance,
+            adjuster,
+            lambda _, n: factorize(n.w, n.information, dictionary, adjuster),
+            progress,
+        )
+        return replace(poses, seconds={"initial": 0.0, "ba": time.perf_counter() - clock})
     joints = initial_poses(stamp_ns, keypoints, confidence, covariance, initializer, dictionary, progress)
     seconds = {"initial": time.perf_counter() - clock, "ba": 0.0}
     if method == "initial":
@@ -67,7 +77,7 @@ def run_method(
     if method == "paper-no-articulation":
         adjuster = replace(adjuster, gamma=0.0)
     clock = time.perf_counter()
-    poses = adjust(stamp_ns, keypoints, confidence, covariance, joints, adjuster, progress)
+    poses = adjust(keypoints, confidence, covariance, joints, adjuster, progress)
     seconds["ba"] = time.perf_counter() - clock
     return replace(poses, seconds=seconds)
 
@@ -94,7 +104,6 @@ def initial_poses(
 
 
 def adjust(
-    stamp_ns: np.ndarray,
     keypoints: np.ndarray,
     confidence: np.ndarray | None,
     covariance: np.ndarray | None,
@@ -102,24 +111,38 @@ def adjust(
     config: BundleAdjusterConfig,
     progress: Progress | None = None,
 ) -> CameraPoses:
-    """Bundle adjustment of poses (F, 15, 3) px over overlapping windows, cross-faded where they overlap."""
-    out, weight = np.zeros_like(joints), np.zeros(len(joints))
+    """Bundle adjustment of poses (F, 15, 3) px over overlapping windows."""
+
+    def solve(rows: slice, n: NormalizedTracks) -> WindowResult:
+        start = joints[rows] / n.scale_px
+        if len(start) < MIN_WINDOW:
+            return start, {}, 0, "too short"
+        result = bundle_adjust(n.w, start, config=config, information=n.information)
+        return result.camera_shape, result.cost_terms, result.iterations, result.stop_reason
+
+    return over_windows(keypoints, confidence, covariance, config, solve, progress)
+
+
+def over_windows(
+    keypoints: np.ndarray,
+    confidence: np.ndarray | None,
+    covariance: np.ndarray | None,
+    config: BundleAdjusterConfig,
+    solve: Callable[[slice, NormalizedTracks], WindowResult],
+    progress: Progress | None = None,
+) -> CameraPoses:
+    """Solve window by window and cross-fade the poses where windows overlap."""
+    out, weight = np.zeros((*keypoints.shape[:2], 3)), np.zeros(len(keypoints))
     iterations, terms, stops = 0, dict[str, float](), set[str]()
     for rows, n in _blocks(keypoints, confidence, covariance, config.window_frames, config.overlap_frames):
-        count = rows.stop - rows.start
-        fade = _fade(count, config.overlap_frames, rows.start > 0, rows.stop < len(keypoints))
-        if count < MIN_WINDOW:
-            found = joints[rows]
-            stops.add("too short")
-        else:
-            result = bundle_adjust(n.w, joints[rows] / n.scale_px, config=config, information=n.information)
-            found = result.camera_shape * n.scale_px
-            iterations += result.iterations
-            stops.add(result.stop_reason)
-            for name, value in result.cost_terms.items():
-                terms[name] = terms.get(name, 0.0) + value
-        out[rows] += fade[:, None, None] * found
+        found, cost_terms, steps, stop = solve(rows, n)
+        fade = _fade(len(found), config.overlap_frames, rows.start > 0, rows.stop < len(keypoints))
+        out[rows] += (fade * n.scale_px)[:, None, None] * found
         weight[rows] += fade
+        iterations += steps
+        stops.add(stop)
+        for name, value in cost_terms.items():
+            terms[name] = terms.get(name, 0.0) + value
         if progress is not None:
             progress("ba", rows.stop / len(keypoints))
     poses = out / weight[:, None, None]

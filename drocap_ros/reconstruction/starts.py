@@ -83,7 +83,7 @@ def fit_dense(
     """
     problem = _Problem(w, information, dictionary, config, scale, scale_std)
     state = problem.evaluate(rotation, coefficients, np.zeros((len(w), 2)))
-    damping = np.full(len(w), 1e-2)
+    damping: np.ndarray = np.full(len(w), 1e-2)
     for _ in range(iterations):
         trial = problem.step(state, damping)
         better = trial.cost < state.cost
