@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,9 @@ from drocap_ros.skeleton import BODY_15
 
 #: A predicted box is confirmed when the pose network is so sure of the trunk and limbs in it on average.
 _CONFIRM_CONFIDENCE = 0.5
+
+
+log = logging.getLogger(__name__)
 
 
 class PoseEstimator:
@@ -53,14 +57,13 @@ class PoseEstimator:
         Parameters
         ----------
         image : (H, W, 3) uint8 BGR
-        stamp_ns : exposure time, later than the last image's
+        stamp_ns : exposure time; one earlier than the last image's begins anew, with a warning
         roi : (4,) x_min y_min x_max y_max px: the drone's own box of the person it tracks, or a user's choice
         """
         image = _checked(image)
-        if self._last_ns is not None and stamp_ns <= self._last_ns:
-            raise InputError(
-                f"stamp: expected a time later than {self._last_ns} ns, got {stamp_ns}; start a new estimator"
-            )
+        if self._last_ns is not None and stamp_ns < self._last_ns:
+            log.warning("stamps went back by %.3f s: following anew", (self._last_ns - stamp_ns) * 1e-9)
+            self.tracker.restart()
         self._last_ns = stamp_ns
         size = (image.shape[1], image.shape[0])
         found = self._detect(image, stamp_ns)

@@ -180,8 +180,8 @@ def _defaults(
             fields |= _MMDET
         elif not {"mean", "std", "colour"} <= set(overrides):
             raise InputError(
-                f"{stem}.onnx: expected rtmdet or yolox in the name, since their outputs (boxes, labels) are alike; rename"
-                f" it or write colour, mean and std into {stem}.yaml"
+                f"{stem}.onnx: expected rtmdet or yolox in the name, since their outputs (boxes, labels) are alike;"
+                f" rename it or write colour, mean and std into {stem}.yaml"
             )
     elif layout == "rtmo":
         fields |= _RAW_BGR
@@ -213,8 +213,8 @@ def _skeleton(layout: str, outputs: list[np.ndarray], stem: str, overrides: Mapp
         return "h36m17"
     if count not in JOINTS_BY_COUNT:
         raise InputError(
-            f"{stem}.onnx: expected {', '.join(map(str, sorted(JOINTS_BY_COUNT)))} joints, found {count}; name its joint"
-            f" set as skeleton in {stem}.yaml"
+            f"{stem}.onnx: expected {', '.join(map(str, sorted(JOINTS_BY_COUNT)))} joints, found {count}; name its"
+            f" joint set as skeleton in {stem}.yaml"
         )
     return JOINTS_BY_COUNT[count]
 

@@ -10,7 +10,8 @@ class StreamClock:
     """Maps presentation times to the time of ``now``.
 
     The offset between the two is the smallest difference between arrival and presentation time seen so far:
-    the network and the decoder only ever add delay.  It may creep up by 0.2 per mille, so that a slower foreign clock is followed.
+    the network and the decoder only ever add delay.  It may creep up by 0.2 per mille, so that a slower
+    foreign clock is followed.
     """
 
     def __init__(self) -> None:

@@ -61,6 +61,10 @@ class SubjectTracker:
         self._tile = 0
         self._started = False
 
+    def restart(self) -> None:
+        """Forget all persons, since time began anew; track ids go on."""
+        self._persons, self._subject, self._full_ns, self._started = [], None, None, False
+
     def choose(self, box: np.ndarray) -> None:
         """Make the person in this box (4,) px the subject from the next image on, under a new track_id."""
         self._wanted = np.asarray(box, float)
