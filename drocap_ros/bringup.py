@@ -41,6 +41,9 @@ from drocap_ros.nodes.topics import GRAPH_QOS, NODES
 #: Above the drain time of a node, and the time that its files may take to close.
 STOP_TIMEOUT_S = 20.0
 
+#: The matrices of a node are small: more BLAS threads cost more than they bring, the more so in six processes.
+_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
 
 class Graph:
     """A running graph, as the script that started it sees it.
@@ -229,8 +232,9 @@ class _Process(_Runner):
         command += ["-r", f"__ns:={namespace}", "--params-file", str(parameters), "--disable-stdout-logs"]
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
-                command, env={**os.environ, "ROS_DOMAIN_ID": str(domain_id)}, stderr=log, start_new_session=True
-            )
+                command, env={**_ONE_THREAD, **os.environ, "ROS_DOMAIN_ID": str(domain_id)}, stderr=log,
+                start_new_session=True,
+            )  # fmt: skip
         self.pid = self._process.pid
         self._stopping = False
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from drocap_ros.errors import InputError
 
 #: Longest sequence that is accepted (10 h at 30 fps); refusing beats running out of memory.
 MAX_FRAMES = 1_080_000
+#: Arrays of such a sequence, every optional one with them, stay below this.
+MAX_BYTES = 4 * 2**30
 
 
 @dataclass(frozen=True)
@@ -109,13 +112,17 @@ def read_npz(path: Path, required: tuple[str, ...]) -> dict[str, np.ndarray]:
         When the file is missing, is no ``.npz``, or lacks a required array.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not hasattr(archive, "files"):
-                raise InputError(f"{path}: expected an .npz archive, got a single array")
+        archive = np.load(path, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise InputError(f"{path}: expected an .npz archive, got a single array")
+        with archive:
+            size = sum(entry.file_size for entry in archive.zip.infolist()) if archive.zip else 0
+            if size > MAX_BYTES:
+                raise InputError(f"{path}: expected at most {MAX_BYTES} bytes of arrays, got {size}; cut the recording")
             arrays = {name: archive[name] for name in archive.files}
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the path") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: expected a readable .npz archive; {reason}") from None
     missing = [name for name in required if name not in arrays]

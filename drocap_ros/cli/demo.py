@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import socket
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,9 +40,10 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.pipeline import reconstruct_input
     from drocap_ros.report.preview import save_preview
     from drocap_ros.simulation.capture import simulate_capture
+    from drocap_ros.simulation.ports import free_udp_port
 
     check_output_folder(args.out)
-    url = f"127.0.0.1:{_free_udp_port()}"
+    url = f"127.0.0.1:{free_udp_port()}"
     config = DrocapConfig().replace(
         "capture_simulator", seconds=args.seconds, seed=args.seed, vehicle_url=f"udpout:{url}"
     )
@@ -122,12 +122,3 @@ def _verdict(motion: Motion, truth: SimulatedCapture) -> str:
         f"reconstruction error against the simulated truth: {1000 * error:.1f} mm (PA-MPJPE, 12 limb joints);"
         f" scale error {100 * scale:+.1f} % ({motion.scale_source})"
     )
-
-
-def _free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-

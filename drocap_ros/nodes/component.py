@@ -45,6 +45,7 @@ class ComponentNode(Node):
         self._peers: list[str] = [name for name in peers.split(",") if name]
         self.config: Any = declare_parameters(self, config or section_types()[self.component]())
         self.counters: Counter[str] = Counter()
+        self.details: dict[str, str] = {}
         self.started = False
         self.callbacks_done = 0
         self._level = OK
@@ -139,6 +140,7 @@ class ComponentNode(Node):
             self.get_logger().warning(text, throttle_duration_sec=5.0)
 
     def _publish_diagnostics(self) -> None:
+        values = {**self.details, **dict(sorted(self.counters.items()))}
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
         message.status = [
@@ -147,7 +149,7 @@ class ComponentNode(Node):
                 name=f"{self.get_namespace().strip('/')}/{self.component}",
                 message=self._text,
                 hardware_id="drocap_ros",
-                values=[KeyValue(key=key, value=str(value)) for key, value in sorted(self.counters.items())],
+                values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
             )
         ]
         self._diagnostics.publish(message)

@@ -15,11 +15,6 @@ from drocap_ros.msg import Pose2D, Pose3D, VehicleState
 from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.skeleton import joint_set
 
-#: Stamps outside these years are a clock that was never set, not a time.
-_EARLIEST_NS = 0
-_LATEST_NS = 4_102_444_800 * 10**9  # 2100-01-01
-
-
 def stamp_to_ros(stamp_ns: int) -> Time:
     """Integer nanoseconds -> builtin_interfaces/Time."""
     seconds, nanoseconds = divmod(int(stamp_ns), 10**9)
@@ -70,13 +65,13 @@ def pose2d_from_ros(message: Pose2D) -> PoseObservation:
     Raises
     ------
     InputError
-        When the skeleton is unknown, an array has the wrong length, a value is infinite or the stamp is no time.
+        When the skeleton is unknown, an array has the wrong length, a value is infinite or the stamp is negative.
     """
     joints = joint_set(message.skeleton)
     count = len(joints) if message.track_id else 0
     stamp_ns = stamp_from_ros(message.header.stamp)
-    if not _EARLIEST_NS <= stamp_ns < _LATEST_NS:
-        raise InputError(f"stamp: expected a time before the year 2100, got {stamp_ns} ns; set the sender's clock")
+    if stamp_ns < 0:
+        raise InputError(f"stamp: expected a time after 1970, got {stamp_ns} ns; set the sender's clock")
     if message.image_width < 1 or message.image_height < 1:
         raise InputError(f"image size: expected at least 1x1 px, got {message.image_width}x{message.image_height}")
     return PoseObservation(

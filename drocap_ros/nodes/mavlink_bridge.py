@@ -85,8 +85,8 @@ class MavlinkBridgeNode(ComponentNode):
         else:
             self.report(OK, "reading telemetry" + ("" if self._tf else "; no tf2_msgs here, so no TF"))
         for name, (real, _) in status.rates_hz.items():
-            self.counters[f"{name} mHz"] = round(1000 * real)
-        self.counters["bad MAVLink data"] = status.bad_count
+            self.details[f"{name} Hz"] = f"{real:.1f}"
+        self.details["bad MAVLink data"] = str(status.bad_count)
         self._publish_status("reading telemetry only")
 
     def _publish_status(self, reason: str) -> None:

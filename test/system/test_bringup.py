@@ -1,0 +1,112 @@
+"""The graph, brought up from a script."""
+
+import os
+import time
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+
+from drocap_ros.bringup import bringup, free_domain
+from drocap_ros.config import DrocapConfig
+from drocap_ros.errors import InputError, NodeError
+from drocap_ros.msg import OrbitCommand, OrbitStatus, Pose2D, Pose3D, Pose3DWindow
+from drocap_ros.nodes.conversions import stamp_from_ros
+from drocap_ros.nodes.topics import NODES, RESULT_QOS, TOPICS
+from drocap_ros.simulation.ports import free_udp_port
+
+CAPTURE = ["capture_simulator", "initializer", "bundle_adjuster"]
+
+
+def short_flight(seconds=3.0, seed=0, **adjuster):
+    # Small starts and short solves: these tests are about the graph, not about accuracy.
+    config = DrocapConfig().replace("capture_simulator", seconds=seconds, seed=seed, rate_hz=15.0)
+    config = config.replace("initializer", azimuth_starts=2, start_iterations=4, sparse_rounds=1)
+    return config.replace("bundle_adjuster", **{"iterations": 10, **adjuster})
+
+
+def collect(graph, *topics):
+    got = {topic: [] for topic in topics}
+    for topic, messages in got.items():
+        graph.node.create_subscription(TOPICS[topic].message, topic, messages.append, TOPICS[topic].qos)
+    return got
+
+
+@pytest.mark.parametrize("processes", [False, True], ids=["one process", "a process each"])
+def test_nothing_is_lost_at_the_start_and_every_keypoint_becomes_a_pose(processes):
+    with bringup(short_flight(), CAPTURE, processes=processes) as graph:
+        got = collect(graph, "pose2d", "pose3d/initial", "pose3d/refined", "pose3d/latest")
+        graph.wait_finished("capture_simulator", timeout_s=60)
+        graph.wait_until(lambda: len(got["pose3d/initial"]) >= 45, 20, "45 initial poses")
+        graph.wait_until(lambda: got["pose3d/refined"], 20, "an adjusted window")
+    keypoints, poses = got["pose2d"], got["pose3d/initial"]
+    assert len(keypoints) == len(poses) == 45
+    stamps = [stamp_from_ros(m.header.stamp) for m in keypoints]
+    assert stamps == [stamp_from_ros(m.header.stamp) for m in poses]
+    np.testing.assert_allclose(np.diff(stamps), 1e9 / 15, atol=2)
+    assert all(isinstance(m, Pose2D) and m.skeleton == "body15" for m in keypoints)
+    assert all(m.stage == Pose3D.INITIAL and np.isfinite(m.joints).all() for m in poses)
+    window = got["pose3d/refined"][-1]
+    assert isinstance(window, Pose3DWindow)
+    assert len(window.poses) > 10
+    assert window.iterations > 0
+    assert window.stop_reason
+    assert {m.stage for m in got["pose3d/latest"]} == {Pose3D.REFINED}
+
+
+def test_two_graphs_side_by_side_do_not_hear_each_other():
+    with ExitStack() as stack:
+        graphs = [stack.enter_context(bringup(short_flight(2.0, seed), CAPTURE[:2])) for seed in (0, 1)]
+        assert graphs[0].domain_id != graphs[1].domain_id
+        got = [collect(graph, "pose2d") for graph in graphs]
+        for graph in graphs:
+            graph.wait_finished("capture_simulator", timeout_s=60)
+    first, second = (np.array([m.keypoints for m in g["pose2d"]]) for g in got)
+    assert len(first) == len(second) == 30
+    assert not np.array_equal(first, second)
+
+
+def test_a_free_domain_is_not_given_twice():
+    with free_domain() as first, free_domain() as second:
+        assert first != second
+
+
+@pytest.mark.parametrize("processes", [False, True], ids=["one process", "a process each"])
+def test_what_a_node_refuses_is_raised_here(processes, tmp_path):
+    config = DrocapConfig().replace("image_ingest", source=str(tmp_path / "none.mp4"))
+    with pytest.raises(InputError, match="none.mp4"), bringup(config, ["image_ingest"], processes=processes):
+        pytest.fail("the graph came up without its source")
+
+
+def test_a_killed_process_is_noticed_and_the_rest_still_stops():
+    with pytest.raises(NodeError, match="initializer ended with status -9"):  # noqa: SIM117
+        with bringup(short_flight(20.0), CAPTURE[:2], processes=True) as graph:
+            os.kill(graph.pid("initializer"), 9)
+            graph.wait_until(lambda: False, 20)
+
+
+def test_an_unknown_node_is_refused():
+    with pytest.raises(InputError, match="expected some of"), bringup(DrocapConfig(), ["pose_estimater"]):
+        pass
+
+
+def test_the_bridge_refuses_to_fly_and_says_why():
+    config = DrocapConfig().replace("mavlink_bridge", url=f"udpin:127.0.0.1:{free_udp_port()}")
+    with bringup(config, ["mavlink_bridge"]) as graph:
+        got = collect(graph, "orbit/status")
+        command = graph.node.create_publisher(OrbitCommand, "orbit/command", RESULT_QOS)
+        graph.wait_until(command.get_subscription_count, 20, "the bridge to listen")
+        command.publish(OrbitCommand(command=OrbitCommand.START))
+        graph.wait_until(lambda: any("no motion" in m.reason for m in got["orbit/status"]), 20, "a refusal")
+    assert {m.state for m in got["orbit/status"]} == {OrbitStatus.IDLE}
+
+
+def test_stopping_takes_no_longer_than_it_should():
+    with bringup(short_flight(30.0), CAPTURE[:2]):
+        begin = time.monotonic()
+    assert time.monotonic() - begin < 15
+
+
+def test_the_table_of_the_graph_names_topics_that_exist():
+    for publishes, subscribes in NODES.values():
+        assert set(publishes) | set(subscribes) <= set(TOPICS)
