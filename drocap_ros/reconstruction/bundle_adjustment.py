@@ -17,10 +17,10 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.alignment import torso_frame
-from drocap_ros.reconstruction.articulation import articulation_term
+from drocap_ros.reconstruction.articulation import articulation_term, articulation_value
 from drocap_ros.reconstruction.camera_update import rotation_change, update_rotations
 from drocap_ros.reconstruction.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.data_term import Projection, information_from
+from drocap_ros.reconstruction.data_term import Projection, frames_first, frames_last, information_from, rotate
 from drocap_ros.reconstruction.low_rank import nuclear_norm, singular_value_threshold
 
 #: Length at which alpha is given: the protocol's 10 s at 24 fps.
@@ -56,26 +56,39 @@ class AdjustmentResult:
 
 
 class Objective:
-    """Equations (2) and (3) for fixed measurements; R is a state that :meth:`turn` updates."""
+    """Equations (2) and (3) for fixed measurements, shapes (3, P, F); R is a state that :meth:`turn` updates.
+
+    rotation : (3, 3, F)
+    """
 
     def __init__(self, projection: Projection, rotation: np.ndarray, config: BundleAdjusterConfig) -> None:
         self.projection, self.rotation, self.config = projection, rotation, config
-        self.alpha = config.alpha * float(np.sqrt(len(rotation) / REFERENCE_FRAMES))
+        self.alpha = config.alpha * float(np.sqrt(rotation.shape[-1] / REFERENCE_FRAMES))
         self._rotation_cost = config.rotation_smoothness * rotation_change(rotation)
 
-    def smooth(self, s: np.ndarray) -> tuple[float, np.ndarray]:
-        """F of equation (3), and its gradient (F, P, 3) by S, L at its optimum."""
+    def value(self, s: np.ndarray) -> float:
+        """F of equation (3), L at its optimum."""
+        value = self.projection.value(s, self.rotation) + self._rotation_cost
+        if self.config.gamma > 0.0:
+            value += self.config.gamma * articulation_value(s)
+        if self.config.shape_smoothness > 0.0:
+            value += self.config.shape_smoothness * shape_change(s)
+        return value
+
+    def value_and_gradient(self, s: np.ndarray) -> tuple[float, np.ndarray]:
+        """F of equation (3), and its gradient (3, P, F) by centred S."""
         value, gradient = self.projection.value_and_gradient(s, self.rotation)
         value += self._rotation_cost
         if self.config.gamma > 0.0:
             articulation, slope = articulation_term(s)
-            value, gradient = value + self.config.gamma * articulation, gradient + self.config.gamma * slope
+            value += self.config.gamma * articulation
+            gradient += self.config.gamma * slope
         if self.config.shape_smoothness > 0.0:
-            change, slope = smoothness_term(s)
-            value = value + self.config.shape_smoothness * change
-            gradient = gradient + self.config.shape_smoothness * slope
+            value += self.config.shape_smoothness * shape_change(s)
+            gradient += self.config.shape_smoothness * shape_change_gradient(s)
         # S stays centred: its centroid is the translation's.
-        return value, gradient - gradient.mean(axis=1, keepdims=True)
+        gradient -= gradient.mean(axis=1, keepdims=True)
+        return value, gradient
 
     def turn(self, s: np.ndarray) -> None:
         """One downhill step of every rotation."""
@@ -85,20 +98,26 @@ class Objective:
     def terms(self, s: np.ndarray) -> dict[str, float]:
         """Cost per term of equation (2), weighted."""
         return {
-            "reprojection": self.projection.value_and_gradient(s, self.rotation)[0],
-            "articulation": self.config.gamma * articulation_term(s)[0],
+            "reprojection": self.projection.value(s, self.rotation),
+            "articulation": self.config.gamma * articulation_value(s),
             "nuclear_norm": self.alpha * nuclear_norm(s),
-            "smoothness": self.config.shape_smoothness * smoothness_term(s)[0] + self._rotation_cost,
+            "smoothness": self.config.shape_smoothness * shape_change(s) + self._rotation_cost,
         }
 
 
-def smoothness_term(s: np.ndarray) -> tuple[float, np.ndarray]:
-    """Value and gradient (F, P, 3) of the squared change of shape between frames."""
-    step = s[1:] - s[:-1]
+def shape_change(s: np.ndarray) -> float:
+    """Sum over time of the squared change of shape (..., F)."""
+    step = s[..., 1:] - s[..., :-1]
+    return float(np.vdot(step, step))
+
+
+def shape_change_gradient(s: np.ndarray) -> np.ndarray:
+    """Gradient of :func:`shape_change`."""
+    step = 2.0 * (s[..., 1:] - s[..., :-1])
     gradient = np.zeros_like(s)
-    gradient[1:] += 2.0 * step
-    gradient[:-1] -= 2.0 * step
-    return float(np.sum(step * step)), gradient
+    gradient[..., 1:] += step
+    gradient[..., :-1] -= step
+    return gradient
 
 
 def bundle_adjust(
@@ -138,14 +157,14 @@ def bundle_adjust(
     body = torso_frame(s0)
     shape = (s0 - s0.mean(axis=1, keepdims=True)) @ body
     projection = Projection(w, information_from(w, weights, covariance) if information is None else information)
-    objective = Objective(projection, r0 @ body, config)
-    shape, outcome = minimize(objective, shape, progress)
-    terms = objective.terms(shape)
-    projected = shape @ np.swapaxes(objective.rotation[:, :2], 1, 2)
+    rotation = np.ascontiguousarray(np.moveaxis(r0 @ body, 0, -1))
+    objective = Objective(projection, rotation, config)
+    s, outcome = minimize(objective, frames_last(shape), progress)
+    terms = objective.terms(s)
     return AdjustmentResult(
-        shape=shape,
-        rotation=objective.rotation,
-        translation=projection.translation(projected),
+        shape=frames_first(s),
+        rotation=np.ascontiguousarray(np.moveaxis(objective.rotation, -1, 0)),
+        translation=projection.translation(rotate(objective.rotation, s, 2)).T,
         cost=sum(terms.values()),
         cost_terms=terms,
         **outcome,
@@ -164,29 +183,33 @@ def _check(w: np.ndarray, s0: np.ndarray, r0: np.ndarray | None) -> None:
 def minimize(
     objective: Objective, s: np.ndarray, progress: Callable[[float], None] | None = None
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """Accelerated proximal gradient steps (4) with backtracking; momentum restarts when the cost would rise."""
+    """Accelerated proximal gradient steps (4) with backtracking; momentum restarts when the cost would rise.
+
+    Parameters
+    ----------
+    s : (3, P, F) start
+
+    Returns
+    -------
+    shapes (3, P, F), and iterations, restarts, stop_reason and history of the cost
+    """
     config, alpha = objective.config, objective.alpha
-    value, gradient = objective.smooth(s)
-    cost = value + alpha * nuclear_norm(s) if alpha > 0.0 else value
+    cost = objective.value(s) + alpha * nuclear_norm(s)
     history = [cost]
     ahead, t, mu, restarts, stop = s, 1.0, 4.0, 0, "iterations"
     for k in range(config.iterations):
         if k % config.rotation_every == 0:
+            before = objective.value(s)
             objective.turn(s)
-            value, gradient = objective.smooth(ahead)
-            if ahead is s:
-                cost = min(cost, value + alpha * nuclear_norm(s)) if alpha > 0.0 else min(cost, value)
-        new, new_value, norm, mu = _proximal_step(objective, ahead, value, gradient, mu)
-        new_cost = new_value + alpha * norm
+            cost += objective.value(s) - before
+        new, new_cost, mu = _proximal_step(objective, ahead, mu)
         if new_cost > cost and ahead is not s:
-            restarts += 1
-            ahead, t = s, 1.0
-            value, gradient = objective.smooth(s)
-            new, new_value, norm, mu = _proximal_step(objective, s, value, gradient, mu)
-            new_cost = new_value + alpha * norm
-        t_new = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * t * t))
+            restarts, t = restarts + 1, 1.0
+            new, new_cost, mu = _proximal_step(objective, s, mu)
+        t_new = 0.5 * (1.0 + float(np.sqrt(1.0 + 4.0 * t * t)))
         ahead = new + ((t - 1.0) / t_new) * (new - s)
         s, t, cost = new, t_new, new_cost
+        # Let the step grow again where the surface has become flatter.
         mu *= 0.9
         history.append(cost)
         if progress is not None and k % 10 == 0:
@@ -194,7 +217,6 @@ def minimize(
         if k >= 20 and history[-11] - cost <= config.tolerance * abs(cost):
             stop = "converged"
             break
-        value, gradient = objective.smooth(ahead)
     return s, {
         "iterations": len(history) - 1,
         "restarts": restarts,
@@ -203,15 +225,19 @@ def minimize(
     }
 
 
-def _proximal_step(
-    objective: Objective, at: np.ndarray, value: float, gradient: np.ndarray, mu: float
-) -> tuple[np.ndarray, float, float, float]:
-    """Equation (4) from ``at``; mu doubles until the quadratic model bounds f from above."""
+def _proximal_step(objective: Objective, at: np.ndarray, mu: float) -> tuple[np.ndarray, float, float]:
+    """Equation (4) from ``at``; mu doubles until the quadratic model bounds f from above.
+
+    Returns
+    -------
+    new shapes, their cost (2), mu
+    """
+    value, gradient = objective.value_and_gradient(at)
     while True:
         new, norm = singular_value_threshold(at - gradient / mu, objective.alpha / mu)
-        new_value, _ = objective.smooth(new)
+        new_value = objective.value(new)
         move = new - at
-        bound = value + float(np.sum(gradient * move)) + 0.5 * mu * float(np.sum(move * move))
+        bound = value + float(np.vdot(gradient, move)) + 0.5 * mu * float(np.vdot(move, move))
         if new_value <= bound + 1e-9 * abs(bound) or mu > 1e12:
-            return new, new_value, norm, mu
+            return new, new_value + objective.alpha * norm, mu
         mu *= 2.0

@@ -1,4 +1,7 @@
-"""The reprojection term: scaled orthographic projection, per-joint information, translation eliminated."""
+"""The reprojection term: scaled orthographic projection, per-joint information, translation eliminated.
+
+Within the solvers frames come last: shapes (3, P, F), image points (2, P, F), rotations (3, 3, F).
+"""
 
 from __future__ import annotations
 
@@ -31,53 +34,79 @@ def information_from(
     return np.stack([scale * yy, -scale * xy, scale * xx], axis=-1)
 
 
-def apply_information(information: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Information (..., 3) times residuals (..., 2)."""
-    x, y = r[..., 0], r[..., 1]
-    return np.stack(
-        [information[..., 0] * x + information[..., 1] * y, information[..., 1] * x + information[..., 2] * y], -1
-    )
+def frames_last(a: np.ndarray) -> np.ndarray:
+    """(F, A, B) to contiguous (B, A, F): poses to the solvers' layout.  Rotations need a transpose before."""
+    return np.ascontiguousarray(np.swapaxes(a, 0, 2))
+
+
+def frames_first(a: np.ndarray) -> np.ndarray:
+    """(B, A, F) to contiguous (F, A, B), the inverse of :func:`frames_last`."""
+    return np.ascontiguousarray(np.swapaxes(a, 0, 2))
+
+
+def rotate(r: np.ndarray, s: np.ndarray, rows: int = 3) -> np.ndarray:
+    """The first rows of R S: (rows, P, F) for rotations (3, 3, F) and shapes (3, P, F)."""
+    return np.stack([r[i, 0] * s[0] + r[i, 1] * s[1] + r[i, 2] * s[2] for i in range(rows)])
+
+
+def rotate_back(r: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """R^T X: (3, P, F) for rotations (3, 3, F) and the first rows X (2 or 3, P, F)."""
+    return np.stack([sum(r[i, j] * x[i] for i in range(len(x))) for j in range(3)])
 
 
 class Projection:
-    """``W - R S - T`` with the translation T of each frame at its optimum.
+    """``R S + T - W`` with the translation T of each frame at its optimum.
 
     w : (F, P, 2), anything where the information is 0
     information : (F, P, 3)
     """
 
     def __init__(self, w: np.ndarray, information: np.ndarray) -> None:
-        self.w = np.where(np.isfinite(w), w, 0.0)
-        self.information = information
-        xx, xy, yy = np.moveaxis(information.sum(1), -1, 0)
+        self.w = frames_last(np.where(np.isfinite(w), w, 0.0))
+        self.information = frames_last(information)
+        xx, xy, yy = self.information.sum(1)
         det = xx * yy - xy * xy
-        safe = np.where(det > 1e-12, det, 1.0)
-        inverse = np.stack([np.stack([yy, -xy], -1), np.stack([-xy, xx], -1)], -2) / safe[:, None, None]
-        self._inverse = np.where((det > 1e-12)[:, None, None], inverse, 0.0)
-        self.isotropic = bool(np.all(information[..., 1] == 0.0) and np.all(information[..., 0] == information[..., 2]))
-        self._weights = np.ascontiguousarray(information[..., 0])
-        self._share = self._weights / np.maximum(self._weights.sum(1, keepdims=True), 1e-12)
+        good = det > 1e-12
+        self._inverse = np.stack([yy, -xy, xx]) * np.where(good, 1.0 / np.where(good, det, 1.0), 0.0)
+        self.isotropic = bool(np.all(self.information[1] == 0.0) and np.all(self.information[0] == self.information[2]))
+        self.weights = self.information[0]
+        self.share = self.weights / np.maximum(self.weights.sum(0), 1e-12)
+
+    def inform(self, gap: np.ndarray) -> np.ndarray:
+        """Information times residuals (2, P, F)."""
+        if self.isotropic:
+            return self.weights * gap
+        xx, xy, yy = self.information
+        return np.stack([xx * gap[0] + xy * gap[1], xy * gap[0] + yy * gap[1]])
 
     def translation(self, projected: np.ndarray) -> np.ndarray:
-        """Best translation (F, 2) for projected joints (F, P, 2)."""
+        """Best translation (2, F) for projected joints (2, P, F)."""
         gap = self.w - projected
         if self.isotropic:
-            return (self._share[:, None] @ gap)[:, 0]
-        return (self._inverse @ apply_information(self.information, gap).sum(1)[..., None])[..., 0]
+            return np.einsum("pf,ipf->if", self.share, gap)
+        x, y = self.inform(gap).sum(1)
+        return np.stack([self._inverse[0] * x + self._inverse[1] * y, self._inverse[1] * x + self._inverse[2] * y])
 
-    def residual(self, s: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals ``R S + T - W`` (F, P, 2) and their product with the information, for R (F, 2 or 3, 3)."""
-        projected = s @ np.swapaxes(r[:, :2], 1, 2)
-        gap = projected + self.translation(projected)[:, None] - self.w
-        weighted = gap * self._weights[..., None] if self.isotropic else apply_information(self.information, gap)
-        return gap, weighted
+    def residual(self, s: np.ndarray, r: np.ndarray) -> np.ndarray:
+        """``R S + T - W`` (2, P, F)."""
+        projected = rotate(r, s, 2)
+        translation = self.translation(projected)
+        projected -= self.w
+        projected += translation[:, None]
+        return projected
+
+    def value(self, s: np.ndarray, r: np.ndarray) -> float:
+        """Reprojection cost."""
+        gap = self.residual(s, r)
+        return float(np.vdot(gap, self.inform(gap)))
 
     def value_and_gradient(self, s: np.ndarray, r: np.ndarray) -> tuple[float, np.ndarray]:
-        """Reprojection cost and its gradient (F, P, 3) by S."""
-        gap, weighted = self.residual(s, r)
-        return float(np.sum(gap * weighted)), 2.0 * weighted @ r[:, :2]
+        """Reprojection cost and its gradient (3, P, F) by S."""
+        gap = self.residual(s, r)
+        weighted = self.inform(gap)
+        return float(np.vdot(gap, weighted)), rotate_back(2.0 * r, weighted)
 
     def per_frame(self, s: np.ndarray, r: np.ndarray) -> np.ndarray:
         """Reprojection cost (F,) of each frame."""
-        gap, weighted = self.residual(s, r)
-        return np.sum(gap * weighted, axis=(1, 2))
+        gap = self.residual(s, r)
+        return np.einsum("ipf,ipf->f", gap, self.inform(gap))

@@ -14,7 +14,7 @@ from drocap_ros.geometry.alignment import to_torso_frame
 from drocap_ros.geometry.rotations import complete_rotation
 from drocap_ros.reconstruction.bundle_adjustment import Objective, minimize
 from drocap_ros.reconstruction.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.data_term import Projection
+from drocap_ros.reconstruction.data_term import Projection, frames_first, frames_last, rotate
 from drocap_ros.reconstruction.dictionary import Dictionary, normalize_poses
 
 #: Rank 3K of the factorization; Dai, Li and He choose K per sequence, best on the truth, which we do not.
@@ -45,10 +45,11 @@ def factorize(
     full = full - full.mean(axis=1, keepdims=True)
     rotation = rotations_by_factorization(full, basis_shapes)
     # Pseudo-inverse start: the depth-free back-projection into the common frame.
-    start = full @ rotation[:, :2]
-    fixed = _FixedCameras(Projection(w, information), rotation, replace(config, gamma=0.0))
+    start = frames_last(full @ rotation[:, :2])
+    cameras = np.ascontiguousarray(np.moveaxis(rotation, 0, -1))
+    fixed = _FixedCameras(Projection(w, information), cameras, replace(config, gamma=0.0))
     shape, outcome = minimize(fixed, start)
-    poses = shape @ np.swapaxes(rotation, 1, 2)
+    poses = frames_first(rotate(cameras, shape))
     mirrored = poses * MIRROR
     if _strangeness(mirrored, dictionary) < _strangeness(poses, dictionary):
         poses = mirrored

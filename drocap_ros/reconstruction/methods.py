@@ -10,7 +10,7 @@ import numpy as np
 
 from drocap_ros.reconstruction.bundle_adjustment import bundle_adjust
 from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.data_term import Projection, information_from
+from drocap_ros.reconstruction.data_term import Projection, frames_last, information_from
 from drocap_ros.reconstruction.dictionary import Dictionary
 from drocap_ros.reconstruction.factorization import factorize
 from drocap_ros.reconstruction.normalize import NormalizedTracks, normalize_tracks
@@ -198,4 +198,4 @@ def _translations(
     seen = np.isfinite(keypoints).all(-1)
     weights = seen.astype(float) if confidence is None else np.where(seen, np.nan_to_num(confidence), 0.0)
     projection = Projection(keypoints, information_from(keypoints, weights, covariance))
-    return filled(projection.translation(joints[..., :2]), np.any(weights > 0.0, axis=1))
+    return filled(projection.translation(frames_last(joints[..., :2])).T, np.any(weights > 0.0, axis=1))

@@ -15,7 +15,7 @@ import numpy as np
 
 from drocap_ros.reconstruction.camera_update import update_rotations
 from drocap_ros.reconstruction.config import InitializerConfig
-from drocap_ros.reconstruction.data_term import Projection
+from drocap_ros.reconstruction.data_term import Projection, frames_first
 from drocap_ros.reconstruction.dictionary import Dictionary, soft_threshold
 
 
@@ -34,8 +34,9 @@ class SparseFit:
 
 
 def basis_matrix(dictionary: Dictionary) -> np.ndarray:
-    """(1 + K, 3P): the mean pose and the atoms, flattened."""
-    return np.concatenate([dictionary.mean[None], dictionary.atoms]).reshape(len(dictionary.atoms) + 1, -1)
+    """(1 + K, 3P): the mean pose and the atoms, flattened coordinate by coordinate."""
+    basis = np.concatenate([dictionary.mean[None], dictionary.atoms])
+    return np.ascontiguousarray(np.swapaxes(basis, 1, 2)).reshape(len(basis), -1)
 
 
 def fit_sparse(
@@ -52,37 +53,41 @@ def fit_sparse(
     rotation, coefficients : (F, 3, 3), (F, 1 + K) starts
     """
     basis = basis_matrix(dictionary)
-    penalty = np.full(len(basis), config.sparsity)
+    penalty = np.full((len(basis), 1), config.sparsity)
     penalty[0] = 0.0
-    # The mean pose spans the image, an atom moves a limb: precondition by the curvature of each.
-    curvature = np.linalg.norm(basis @ basis.T, 2) * float(projection.information[..., [0, 2]].max())
+    curvature = np.linalg.norm(basis @ basis.T, 2) * float(projection.information[[0, 2]].max())
     step = 1.0 / (curvature + 4.0 * config.coefficient_smoothness)
-    c = coefficients
+    c, r = np.ascontiguousarray(coefficients.T), np.ascontiguousarray(np.moveaxis(rotation, 0, -1))
     for _ in range(config.sparse_rounds):
         ahead, t = c, 1.0
         for _ in range(config.sparse_iterations):
-            gradient = sparse_gradient(projection, rotation, ahead, basis, config.coefficient_smoothness)
+            gradient = sparse_gradient(projection, r, ahead, basis, config.coefficient_smoothness)
             new = soft_threshold(ahead - step * gradient, step * penalty)
-            t_new = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * t * t))
-            ahead = new + ((t - 1.0) / t_new) * (new - c)
+            t_new = 0.5 * (1.0 + float(np.sqrt(1.0 + 4.0 * t * t)))
+            move = new - c
             # Gradient restart (O'Donoghue and Candes 2015): the momentum must not point uphill.
-            if np.sum((ahead - new) * (new - c)) < 0.0:
+            if np.vdot(ahead - new, move) > 0.0:
                 ahead, t_new = new, 1.0
+            else:
+                ahead = new + ((t - 1.0) / t_new) * move
             c, t = new, t_new
-        shape = (c @ basis).reshape(len(c), -1, 3)
-        rotation = update_rotations(projection, shape, rotation, steps=2, smoothness=config.rotation_smoothness)
-    return SparseFit(c, rotation, (c @ basis).reshape(len(c), -1, 3))
+        r = update_rotations(projection, _shapes(basis, c), r, steps=2, smoothness=config.rotation_smoothness)
+    return SparseFit(c.T, np.ascontiguousarray(np.moveaxis(r, -1, 0)), frames_first(_shapes(basis, c)))
 
 
 def sparse_gradient(
-    projection: Projection, rotation: np.ndarray, c: np.ndarray, basis: np.ndarray, smoothness: float
+    projection: Projection, r: np.ndarray, c: np.ndarray, basis: np.ndarray, smoothness: float
 ) -> np.ndarray:
-    """(F, 1 + K) gradient of the smooth part of the objective by the coefficients."""
-    shape = (c @ basis).reshape(len(c), -1, 3)
-    _, slope = projection.value_and_gradient(shape, rotation)
-    gradient = 0.5 * slope.reshape(len(c), -1) @ basis.T
+    """(1 + K, F) gradient of the smooth part by the coefficients (1 + K, F), for rotations (3, 3, F)."""
+    _, slope = projection.value_and_gradient(_shapes(basis, c), r)
+    gradient = 0.5 * (basis @ slope.reshape(basis.shape[1], -1))
     if smoothness > 0.0:
-        change = smoothness * (c[1:] - c[:-1])
-        gradient[1:] += change
-        gradient[:-1] -= change
+        change = smoothness * (c[:, 1:] - c[:, :-1])
+        gradient[:, 1:] += change
+        gradient[:, :-1] -= change
     return gradient
+
+
+def _shapes(basis: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """(3, P, F) shapes of coefficients (1 + K, F)."""
+    return (basis.T @ c).reshape(3, -1, c.shape[1])

@@ -15,7 +15,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.reconstruction.bundle_adjustment import bundle_adjust
 from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.data_term import Projection
+from drocap_ros.reconstruction.data_term import Projection, frames_first, frames_last
 from drocap_ros.reconstruction.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
 from drocap_ros.reconstruction.metrics import limb_lengths
 from drocap_ros.reconstruction.normalize import MIN_JOINTS, NormalizedTracks, normalize_tracks
@@ -230,7 +230,7 @@ class SlidingWindowInitializer:
         )  # fmt: skip
         camera = fit.shape @ np.swapaxes(fit.rotation, 1, 2)
         metres = self.config.assumed_height_m / REFERENCE_STATURE_M / float(np.median(self._metre_px)) * n.scale_px
-        gap, _ = projection.residual(fit.shape, fit.rotation)
+        gap = camera_residual(projection, camera)
         covariance = pose_covariance(information, fit.rotation, dense.coefficients[one], self.dictionary, self.config)
         rms = np.sqrt(np.mean(np.sum(gap[0, confidence > 0.0] ** 2, axis=-1))) * n.scale_px
         return InitialPose(
@@ -335,23 +335,21 @@ def adjust_window(
     scale = _scale_to_image(start, projection)
     seen = n.weights > 0.0
     if frames < MIN_WINDOW:
-        shape, rotation = start * scale, np.broadcast_to(np.eye(3), (frames, 3, 3))
-        iterations, terms, stop = 0, {"reprojection": float(projection.per_frame(shape, rotation).sum())}, "too short"
+        joints, iterations, terms, stop = start * scale, 0, dict[str, float](), "too short"
     else:
         result = bundle_adjust(n.w, start * scale, config=config, information=n.information)
-        shape, rotation, iterations = result.shape, result.rotation, result.iterations
+        joints, iterations = result.camera_shape, result.iterations
         terms, stop = result.cost_terms, result.stop_reason
-    gap, _ = projection.residual(shape, rotation)
+    gap = camera_residual(projection, joints)
     square = np.where(seen, np.sum(gap**2, axis=-1), 0.0)
     rms = np.sqrt(square.sum(1) / np.maximum(seen.sum(1), 1)) * n.scale_px
-    joints = shape @ np.swapaxes(rotation, 1, 2)
     joints = joints - joints[:, BODY_15.index("pelvis")][:, None]
     # The scale of a monocular result is the start's: keep the mean limb length.
     metres = float(limb_lengths(start).mean() / limb_lengths(joints).mean())
     return AdjustedWindow(
         stamp_ns=np.asarray(stamp_ns, dtype=np.int64),
         joints3d=joints * metres,
-        covariance=window_covariance(projection, joints, seen) * metres**2,
+        covariance=window_covariance(gap, seen) * metres**2,
         confidence=n.weights,
         reprojection_rms_px=np.where(seen.any(1), rms, np.nan),
         iterations=iterations,
@@ -361,17 +359,22 @@ def adjust_window(
     )
 
 
-def window_covariance(projection: Projection, joints: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """(F, P, 6) in squared units: across the image from the window's residuals, along the ray three times that.
+def camera_residual(projection: Projection, joints: np.ndarray) -> np.ndarray:
+    """Distance (F, P, 2) of the projected poses (F, P, 3), in camera axes, from the keypoints."""
+    flat = frames_last(joints[..., :2])
+    return frames_first(flat + projection.translation(flat)[:, None] - projection.w)
+
+
+def window_covariance(gap: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """(F, P, 6) in squared units: across the image from the window's residuals (F, P, 2), along the ray three times it.
 
     The ratio is that of the errors of adjusted poses on the CMU training sequences; unseen joints are known half
     as well.
     """
-    gap, _ = projection.residual(joints, np.broadcast_to(np.eye(3), (len(joints), 3, 3)))
     square = np.where(seen, 0.5 * np.sum(gap**2, axis=-1), 0.0)
     across = square.sum() / max(int(seen.sum()), 1) + 0.05**2
     variance = across * np.where(seen, 1.0, 4.0)
-    out = np.zeros((*joints.shape[:2], 6))
+    out = np.zeros((*gap.shape[:2], 6))
     out[..., 0] = out[..., 3] = variance
     out[..., 5] = 9.0 * variance
     return out
@@ -402,10 +405,10 @@ def fill_frames(stamp_ns: np.ndarray, joints: np.ndarray) -> np.ndarray:
 def _scale_to_image(start: np.ndarray, projection: Projection) -> float:
     """Factor from metres to the unit of the 2D joints, least squares over the window."""
     flat = start[..., :2]
-    weight = projection.information[..., 0][..., None]
+    weight, target = frames_first(projection.information)[..., :1], frames_first(projection.w)
     mean = np.sum(weight * flat, axis=1, keepdims=True) / np.maximum(weight.sum(1, keepdims=True), 1e-12)
-    centre = np.sum(weight * projection.w, axis=1, keepdims=True) / np.maximum(weight.sum(1, keepdims=True), 1e-12)
-    x, y = flat - mean, projection.w - centre
+    centre = np.sum(weight * target, axis=1, keepdims=True) / np.maximum(weight.sum(1, keepdims=True), 1e-12)
+    x, y = flat - mean, target - centre
     spread = float(np.sum(weight * x * x))
     fitted = float(np.sum(weight * x * y)) / spread if spread > 0.0 else 0.0
     # A start that disagrees with the image altogether still has its size.
