@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -30,30 +29,6 @@ MEMORY = 120
 
 #: Windows of fewer frames hold no second view worth adjusting to.
 MIN_WINDOW = 4
-
-
-class Observation(Protocol):
-    """Keypoints of one image, as perception gives them."""
-
-    @property
-    def stamp_ns(self) -> int:
-        """Exposure time."""
-
-    @property
-    def track_id(self) -> int:
-        """Subject; a change starts a new window."""
-
-    @property
-    def keypoints(self) -> np.ndarray:
-        """(15, 2) px."""
-
-    @property
-    def confidence(self) -> np.ndarray:
-        """(15,)."""
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """(15, 3) px^2."""
 
 
 @dataclass(frozen=True)
@@ -146,15 +121,6 @@ class SlidingWindowInitializer:
         best = self._decide(dense)
         self._metre_px.append(float(dense.coefficients[best, 0]) * n.scale_px)
         return self._result(stamp_ns, n, information, dense, best, np.where(seen, np.nan_to_num(confidence), 0.0))
-
-    def push_observation(self, observation: Observation) -> InitialPose:
-        """:meth:`push` of what perception says about an image."""
-        return self.push(
-            observation.stamp_ns,
-            observation.keypoints.astype(np.float64),
-            observation.confidence.astype(np.float64),
-            observation.covariance.astype(np.float64),
-        )
 
     def _normalize(
         self, keypoints: np.ndarray, confidence: np.ndarray, covariance: np.ndarray | None, seen: np.ndarray
@@ -258,46 +224,6 @@ def _unknown(stamp_ns: int) -> InitialPose:
     return InitialPose(
         stamp_ns, np.full((p, 3), np.nan), np.full((p, 6), np.nan), np.zeros(p), float("nan"), np.full((3, 3), np.nan)
     )
-
-
-class AdjustmentWindow:
-    """The last ``window_s`` of keypoints and initial poses of one subject, and when to adjust them.
-
-    Time is that of the images, so that a replay at another speed adjusts the same windows.
-    """
-
-    def __init__(self, config: BundleAdjusterConfig | None = None) -> None:
-        self.config = config or BundleAdjusterConfig()
-        self._rows: deque[tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = deque()
-        self._track_id = 0
-        self._adjusted_ns: int | None = None
-
-    def push(self, observation: Observation, joints3d: np.ndarray) -> bool:
-        """Add an image and its initial pose (15, 3) m; True when the window is due for an adjustment."""
-        stamp = observation.stamp_ns
-        if self._rows and (stamp <= self._rows[-1][0] or observation.track_id != self._track_id):
-            self._rows.clear()
-            self._adjusted_ns = None
-        self._track_id = observation.track_id
-        self._rows.append((stamp, observation.keypoints, observation.confidence, observation.covariance, joints3d))
-        oldest = stamp - round(self.config.window_s * 1e9)
-        while self._rows[0][0] < oldest or len(self._rows) > self.config.window_frames:
-            self._rows.popleft()
-        if len(self._rows) < MIN_WINDOW or not any(np.isfinite(row[4]).all() for row in self._rows):
-            return False
-        since = self._rows[0][0] if self._adjusted_ns is None else self._adjusted_ns
-        if stamp - since < round(self.config.period_s * 1e9):
-            return False
-        self._adjusted_ns = stamp
-        return True
-
-    def snapshot(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Arguments of :func:`adjust_window` for the present window, copied."""
-        stamps, keypoints, confidence, covariance, joints = zip(*self._rows, strict=True)
-        kp, conf, cov, start = (
-            np.array(rows, dtype=np.float64) for rows in (keypoints, confidence, covariance, joints)
-        )
-        return np.array(stamps, dtype=np.int64), kp, conf, cov, start
 
 
 def adjust_window(

@@ -1,0 +1,74 @@
+"""Alignment: exact recovery, no reflection, weights; the torso frame follows the body."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drocap_ros.geometry.alignment import apply_similarity, similarity, to_torso_frame, torso_frame
+from drocap_ros.skeleton import BODY_15
+
+
+def poses(n: int) -> np.ndarray:
+    rng = np.random.default_rng(4)
+    return rng.normal(size=(n, 15, 3))
+
+
+def test_a_similarity_is_recovered_exactly() -> None:
+    source = poses(20)
+    rng = np.random.default_rng(0)
+    scale, r, t = rng.uniform(0.1, 9.0, 20), Rotation.random(20, random_state=0).as_matrix(), rng.normal(size=(20, 3))
+    target = apply_similarity(source, scale, r, t)
+    s2, r2, t2 = similarity(source, target)
+    np.testing.assert_allclose(s2, scale, rtol=1e-12)
+    np.testing.assert_allclose(r2, r, atol=1e-12)
+    np.testing.assert_allclose(t2, t, atol=1e-11)
+
+
+def test_a_mirror_image_is_not_undone() -> None:
+    source = poses(5)
+    _, r, _ = similarity(source, source * np.array([1.0, 1.0, -1.0]))
+    np.testing.assert_allclose(np.linalg.det(r), 1.0, atol=1e-12)
+
+
+def test_it_is_the_best_rigid_motion() -> None:
+    source, target = poses(2)[:1], poses(2)[1:]
+    fit = similarity(source, target, with_scale=False)
+    best = np.sum((apply_similarity(source, *fit) - target) ** 2)
+    for r in Rotation.random(300, random_state=2).as_matrix():
+        moved = source @ r.T
+        moved = moved - moved.mean(1) + target.mean(1)
+        assert best <= np.sum((moved - target) ** 2) + 1e-9
+
+
+def test_points_of_weight_zero_do_not_count() -> None:
+    source = poses(1)
+    target = apply_similarity(source, np.array([2.0]), Rotation.random(1, random_state=5).as_matrix(), np.ones((1, 3)))
+    target[0, 3] += 50.0
+    weights = np.ones((1, 15))
+    weights[0, 3] = 0.0
+    moved = apply_similarity(source, *similarity(source, target, weights))
+    np.testing.assert_allclose(np.delete(moved, 3, 1), np.delete(target, 3, 1), atol=1e-10)
+
+
+def test_the_torso_frame_turns_with_the_body() -> None:
+    s = poses(30)
+    r = Rotation.random(30, random_state=0).as_matrix()
+    frame = torso_frame(s)
+    np.testing.assert_allclose(np.linalg.det(frame), 1.0, atol=1e-12)
+    np.testing.assert_allclose(torso_frame(s @ np.swapaxes(r, 1, 2)), r @ frame, atol=1e-12)
+    shape, rotation = to_torso_frame(s)
+    np.testing.assert_allclose(shape @ np.swapaxes(rotation, 1, 2), s, atol=1e-12)
+
+
+def test_the_axes_point_forward_left_and_up() -> None:
+    s = np.zeros((15, 3))
+    s[BODY_15.index("neck")] = [0.0, 0.0, 0.5]
+    s[BODY_15.index("lhip")], s[BODY_15.index("rhip")] = [0.0, 0.1, 0.0], [0.0, -0.1, 0.0]
+    s[BODY_15.index("lshoulder")], s[BODY_15.index("rshoulder")] = [0.0, 0.2, 0.4], [0.0, -0.2, 0.4]
+    np.testing.assert_allclose(torso_frame(s), np.eye(3), atol=1e-12)
+
+
+def test_a_body_without_extent_still_has_a_frame() -> None:
+    frame = torso_frame(np.zeros((2, 15, 3)))
+    np.testing.assert_allclose(frame @ np.swapaxes(frame, 1, 2), np.broadcast_to(np.eye(3), (2, 3, 3)), atol=1e-12)
