@@ -1,0 +1,77 @@
+"""From image messages to arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+
+_MAX_PIXELS = 200_000_000
+#: encoding -> (bytes per pixel, name of OpenCV's conversion to BGR)
+_ENCODINGS: dict[str, tuple[int, str | None]] = {
+    "bgr8": (3, None),
+    "8UC3": (3, None),
+    "rgb8": (3, "COLOR_RGB2BGR"),
+    "bgra8": (4, "COLOR_BGRA2BGR"),
+    "rgba8": (4, "COLOR_RGBA2BGR"),
+    "mono8": (1, "COLOR_GRAY2BGR"),
+    "8UC1": (1, "COLOR_GRAY2BGR"),
+    # ROS names a Bayer pattern by its first two pixels, OpenCV by the second row's.
+    "bayer_rggb8": (1, "COLOR_BayerBG2BGR"),
+    "bayer_bggr8": (1, "COLOR_BayerRG2BGR"),
+    "bayer_gbrg8": (1, "COLOR_BayerGR2BGR"),
+    "bayer_grbg8": (1, "COLOR_BayerGB2BGR"),
+    "yuv422": (2, "COLOR_YUV2BGR_UYVY"),
+    "uyvy": (2, "COLOR_YUV2BGR_UYVY"),
+    "yuv422_yuy2": (2, "COLOR_YUV2BGR_YUYV"),
+    "yuyv": (2, "COLOR_YUV2BGR_YUYV"),
+}
+
+
+def image_from_message(message: Any, compressed: bool) -> np.ndarray:
+    """(H, W, 3) uint8 BGR of a ``sensor_msgs`` Image or CompressedImage.
+
+    Raises
+    ------
+    InputError
+        When the encoding is unknown or the data does not fit.
+    """
+    data = np.ascontiguousarray(np.frombuffer(bytes(message.data), np.uint8))
+    return _decompressed(data, str(message.format)) if compressed else _raw(message, data)
+
+
+def _decompressed(data: np.ndarray, form: str) -> np.ndarray:
+    import cv2
+
+    image = None
+    if data.size:
+        try:
+            image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        except cv2.error:
+            image = None
+    if image is None:
+        raise InputError(f"image: expected JPEG, PNG or another picture, got format {form[:40]!r} that does not decode")
+    return np.asarray(image)
+
+
+def _raw(message: Any, data: np.ndarray) -> np.ndarray:
+    import cv2
+
+    height, width, step, encoding = message.height, message.width, message.step, str(message.encoding)
+    if encoding not in _ENCODINGS:
+        raise InputError(f"image: expected encoding {', '.join(_ENCODINGS)}, got {encoding[:40]!r}; convert it")
+    size, conversion = _ENCODINGS[encoding]
+    if not 0 < height * width <= _MAX_PIXELS or step < width * size or data.size < height * step:
+        raise InputError(
+            f"image: expected {height} rows of {step} bytes for {width}x{height} px {encoding}, got {data.size} bytes"
+        )
+    rows = data[: height * step].reshape(height, step)[:, : width * size]
+    pixels = rows.reshape(height, width, size) if size > 1 else rows
+    if conversion is None:
+        return np.ascontiguousarray(pixels)
+    try:
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), getattr(cv2, conversion)))
+    except cv2.error:
+        raise InputError(f"image: expected a size that {encoding} can have, got {width}x{height} px") from None

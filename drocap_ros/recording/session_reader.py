@@ -1,0 +1,240 @@
+"""What reconstruction wants of a recording: keypoints with camera telemetry, or pictures."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.recording.camera_telemetry import VehicleTrack, camera_poses
+from drocap_ros.recording.pictures import image_from_message
+from drocap_ros.recording.session import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    POSE2D,
+    VEHICLE_STATE,
+    Session,
+    SessionInfo,
+    TopicInfo,
+    is_recording,
+    open_session,
+)
+from drocap_ros.skeleton import joint_set
+from drocap_ros.tracks import MAX_FRAMES, Tracks
+
+if TYPE_CHECKING:
+    from drocap_ros.perception.sources import Frame
+
+__all__ = [
+    "Session",
+    "SessionInfo",
+    "TopicInfo",
+    "is_recording",
+    "open_session",
+    "read_images",
+    "read_pose2d",
+    "read_vehicle_track",
+    "session_info",
+]
+
+
+def session_info(path: str | Path) -> SessionInfo:
+    """Topics, types, counts, time and metadata of a recording.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read.
+    """
+    with open_session(path) as session:
+        return session.info
+
+
+def read_pose2d(session: Session, topic: str | None = None, mount_pitch_deg: float | None = None) -> Tracks:
+    """Tracks of the subject, keypoints exactly as in the recorded messages.
+
+    Images without a subject are frames of NaN.  Where the recording tells the camera's pose at every picture (see
+    :func:`drocap_ros.recording.camera_telemetry.camera_poses`), the tracks carry it.  What was missing or left out
+    stands in ``session.warnings``.
+
+    Parameters
+    ----------
+    topic : which ``Pose2D`` topic, by its name or the name's end; None = the one with most messages
+    mount_pitch_deg : pitch of a camera fixed to the body of a vehicle without a gimbal, negative looks down
+
+    Raises
+    ------
+    InputError
+        When there are no keypoints, or those there cannot be used.
+    """
+    chosen = session.choose_topic(topic, POSE2D)
+    poses: dict[int, Any] = {}
+    again = 0
+    for _, message in session.messages((chosen.name,)):
+        stamp_ns = _stamp_ns(message)
+        if stamp_ns in poses:
+            again += 1
+            if not message.track_id or poses[stamp_ns].track_id:
+                continue
+        poses[stamp_ns] = message
+        if len(poses) > MAX_FRAMES:
+            raise InputError(f"{session.path}: expected at most {MAX_FRAMES} poses; cut the recording")
+    if again:
+        session.warn(f"{again} poses of images that had one already were left out")
+    if not poses:
+        raise InputError(f"{session.path}: expected poses on {chosen.name}, none could be decoded; record it anew")
+    ordered = [poses[stamp] for stamp in sorted(poses)]
+    try:
+        arrays = _pose_arrays(ordered)
+        stamps = np.array(sorted(poses), dtype=np.int64)
+        return Tracks(stamp_ns=stamps, **arrays, **_telemetry(session, stamps, chosen.name, mount_pitch_deg))
+    except InputError as error:
+        raise InputError(f"{session.path}: {chosen.name}: {error}") from None
+
+
+def read_images(session: Session, topic: str | None = None) -> Iterator[Frame]:
+    """Pictures of a recording, one at a time, with strictly increasing stamps.
+
+    Pictures that do not decode, or whose stamp is not later than the one before, are left out with a warning.
+
+    Raises
+    ------
+    InputError
+        When there are no pictures, or none decodes.
+    """
+    from drocap_ros.perception.sources.base import Frame
+
+    chosen = session.choose_topic(topic, IMAGE, COMPRESSED_IMAGE)
+    compressed = chosen.type_name == COMPRESSED_IMAGE
+    last_ns, given, unordered, problems = None, 0, 0, Counter[str]()
+    for _, message in session.messages((chosen.name,)):
+        stamp_ns = _stamp_ns(message)
+        if last_ns is not None and stamp_ns <= last_ns:
+            unordered += 1
+            continue
+        try:
+            image = image_from_message(message, compressed)
+        except InputError as error:
+            problems[str(error)] += 1
+            continue
+        last_ns = stamp_ns
+        given += 1
+        yield Frame(stamp_ns, image)
+    if unordered:
+        session.warn(f"{unordered} pictures on {chosen.name} with a stamp not later than the one before were left out")
+    if problems:
+        worst, _ = problems.most_common(1)[0]
+        session.warn(f"{sum(problems.values())} pictures on {chosen.name} were left out: {worst}")
+        if not given:
+            raise InputError(f"{session.path}: {chosen.name}: {worst}")
+
+
+def read_vehicle_track(session: Session, near: str = "") -> VehicleTrack | None:
+    """States of the vehicle, or None where there are none.
+
+    ``near`` is a topic whose namespace is preferred.
+    """
+    topic = _nearest(session.topics_of(VEHICLE_STATE), near)
+    if topic is None:
+        return None
+    rows: dict[int, tuple[np.ndarray, ...]] = {}
+    for _, message in session.messages((topic.name,)):
+        position = np.asarray(message.position_enu_m, dtype=np.float64)
+        rows[_stamp_ns(message)] = (position, _xyzw(message.orientation), _xyzw(message.gimbal_orientation))
+    if not rows:
+        return None
+    stamps = sorted(rows)
+    position, orientation, gimbal = (np.array([rows[s][i] for s in stamps]) for i in range(3))
+    return VehicleTrack(np.array(stamps, dtype=np.int64), position, _unit(orientation), _unit(gimbal))
+
+
+def _pose_arrays(messages: list[Any]) -> dict[str, Any]:
+    """Arrays of a tracks object from Pose2D messages."""
+    seen = next((m for m in messages if m.track_id), messages[0])
+    joints = joint_set(seen.skeleton)
+    size = (int(seen.image_width), int(seen.image_height))
+    frames, count = len(messages), len(joints)
+    keypoints = np.full((frames, count, 2), np.nan)
+    covariance = np.full((frames, count, 3), np.nan)
+    confidence = np.zeros((frames, count))
+    for i, message in enumerate(messages):
+        if not message.track_id:
+            continue
+        if message.skeleton != seen.skeleton:
+            raise InputError(f"skeleton: expected {seen.skeleton} throughout, got {message.skeleton[:40]!r}")
+        if (message.image_width, message.image_height) != size:
+            raise InputError(
+                f"image size: expected {size[0]}x{size[1]} px throughout, got "
+                f"{message.image_width}x{message.image_height}; cut the recording where it changes"
+            )
+        _fill(keypoints[i], message.keypoints, "keypoints")
+        _fill(covariance[i], message.covariance, "covariance")
+        _fill(confidence[i], message.confidence, "confidence")
+    return {
+        "keypoints": keypoints,
+        "joints": joints.joints,
+        "image_size": size,
+        "confidence": confidence,
+        "covariance": covariance,
+    }
+
+
+def _fill(target: np.ndarray, values: Any, name: str) -> None:
+    array = np.asarray(values, dtype=np.float64)
+    if array.size != target.size:
+        raise InputError(f"{name}: expected {target.size} values, got {array.size}; was it recorded by drocap?")
+    target[...] = array.reshape(target.shape)
+
+
+def _telemetry(session: Session, stamp_ns: np.ndarray, topic: str, mount_pitch_deg: float | None) -> dict[str, Any]:
+    matrix = _camera_matrix(session, topic)
+    track = read_vehicle_track(session, topic)
+    if track is None:
+        return {"camera_matrix": matrix}
+    poses = camera_poses(track, stamp_ns, mount_pitch_deg)
+    if poses.reason:
+        session.warn(f"camera telemetry incomplete: {poses.reason}")
+    return {"camera_matrix": matrix, "camera_rotation": poses.rotation, "camera_position": poses.position}
+
+
+def _camera_matrix(session: Session, topic: str) -> np.ndarray | None:
+    """(3, 3) px of the first usable camera info, or None."""
+    info = _nearest(session.topics_of(CAMERA_INFO), topic)
+    if info is None:
+        return None
+    for _, message in session.messages((info.name,)):
+        # ROS 2 names it k, ROS 1 names it K.
+        matrix = np.asarray(getattr(message, "k", getattr(message, "K", ())), dtype=np.float64)
+        if matrix.size == 9 and np.isfinite(matrix).all() and matrix[0] > 0 and matrix[4] > 0:
+            return matrix.reshape(3, 3)
+    session.warn(f"no usable calibration on {info.name}: its matrix is not set")
+    return None
+
+
+def _nearest(topics: list[TopicInfo], near: str) -> TopicInfo | None:
+    """The topic that shares the longest beginning of its name with another."""
+
+    def shared(topic: TopicInfo) -> int:
+        return sum(a == b for a, b in zip(topic.name.split("/")[:-1], near.split("/")[:-1], strict=False))
+
+    return max(topics, key=shared, default=None)
+
+
+def _stamp_ns(message: Any) -> int:
+    stamp = message.header.stamp
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def _xyzw(quaternion: Any) -> np.ndarray:
+    return np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], dtype=np.float64)
+
+
+def _unit(quaternions: np.ndarray) -> np.ndarray:
+    """(N, 4) normalized; NaN where they are no rotations."""
+    length = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return np.where(np.abs(length - 1.0) < 0.1, quaternions / np.where(length > 0, length, 1.0), np.nan)
