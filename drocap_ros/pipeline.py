@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -13,10 +14,13 @@ from drocap_ros.motion import Motion
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.models import models_folder
 from drocap_ros.perception.sources import Frame, open_source
-from drocap_ros.perception.tracking_run import tracks_from_observations
+from drocap_ros.perception.tracking_run import observe, tracks_from_observations
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording import session_reader
+from drocap_ros.recording.session import is_recording, open_session
 from drocap_ros.tracks import Tracks, load_tracks
+
+logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, float], None]
 
@@ -55,11 +59,15 @@ def read_input(path: Path, config: DrocapConfig, models: Path | None, progress: 
         raise InputError(f"{path}: no such file or folder; check the path")
     if path.suffix == ".npz":
         return load_tracks(path)
-    if session_reader.is_recording(path):
-        with session_reader.open_session(path) as session:
+    if is_recording(path):
+        with open_session(path) as session:
             if session.has_pose2d:
-                return session_reader.read_pose2d(session)
-            return _watch(session_reader.read_images(session), None, config, models, progress, str(path))
+                tracks = session_reader.read_pose2d(session)
+            else:
+                tracks = _watch(session_reader.read_images(session), None, config, models, progress, str(path))
+            for warning in session.warnings:
+                logger.warning("%s: %s", path, warning)
+            return tracks
     with open_source(str(path), config.image_ingest) as source:
         return _watch(source, source.length, config, models, progress, str(path))
 
@@ -72,14 +80,15 @@ def _watch(
     progress: Progress | None,
     name: str,
 ) -> Tracks:
-    estimator = PoseEstimator(models_folder(models), config.pose_estimator)
-    observations = []
-    for frame in frames:
-        observations.append(estimator.process(frame.image, frame.stamp_ns))
+    def count(*_: object) -> None:
+        nonlocal done
+        done += 1
         if progress is not None:
-            progress("2D pose", len(observations) / length if length else -1.0)
-    if not any(observation.has_subject for observation in observations):
-        raise InputError(
-            f"{name}: expected a person in view, found none in {len(observations)} pictures; try another video or model"
-        )
-    return tracks_from_observations(observations)
+            progress("2D pose", done / length if length else -1.0)
+
+    done = 0
+    estimator = PoseEstimator(models_folder(models or config.pose_estimator.models_dir or None), config.pose_estimator)
+    try:
+        return tracks_from_observations(observe(frames, estimator, count))
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None

@@ -13,7 +13,7 @@ from drocap_ros import __version__
 from drocap_ros.errors import DrocapError
 
 COMMANDS = (
-    "demo", "live", "record", "track", "reconstruct", "evaluate", "learn_dictionary", "train_lifter", "info", "models",
+    "demo", "live", "record", "track", "reconstruct", "learn_dictionary", "models",
 )  # fmt: skip
 
 

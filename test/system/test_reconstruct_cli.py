@@ -1,0 +1,171 @@
+"""``drocap reconstruct`` as a user runs it: real videos, and whatever else people feed it."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drocap_ros.motion import load_motion
+from drocap_ros.reconstruction.metrics import pa_mpjpe
+from drocap_ros.simulation.capture import simulate_capture
+from drocap_ros.skeleton import LIMB_JOINTS, indices
+from drocap_ros.tracks import Tracks, save_tracks
+
+ROOT = Path(__file__).resolve().parents[2]
+
+#: BlazePose-33's places of the 12 limb joints, in the order of LIMB_JOINTS.
+BLAZEPOSE = [24, 26, 28, 23, 25, 27, 11, 13, 15, 12, 14, 16]
+
+
+def drocap(*arguments, cwd, **env):
+    # A terminal's colours and a models folder of the person who runs the tests must not matter.
+    clean = {k: v for k, v in os.environ.items() if k not in ("DROCAP_MODELS", "DROCAP_DEBUG")}
+    clean["PYTHONPATH"] = str(ROOT)
+    command = [sys.executable, "-m", "drocap_ros.cli", *map(str, arguments)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=280, env={**clean, **env})
+
+
+def reconstructed(path, cwd, *options):
+    done = drocap("reconstruct", path, "--out", "out", *options, cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    return load_motion(cwd / "out" / "motion.npz")
+
+
+def assert_refused(done, cwd, words):
+    assert done.returncode == 2, done.stderr
+    assert words in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "Traceback" not in done.stderr
+    assert not (cwd / "out").exists()
+    assert not list(cwd.glob(".out*"))
+
+
+@pytest.fixture
+def tracks_file(tmp_path):
+    capture = simulate_capture(3.0, 24.0, seed=3)
+    save_tracks(tmp_path / "tracks.npz", capture.tracks)
+    return tmp_path / "tracks.npz"
+
+
+def changed(path, **arrays):
+    with np.load(path) as archive:
+        values = {**dict(archive), **arrays}
+    np.savez(path.parent / "changed.npz", **{k: v for k, v in values.items() if v is not None})
+    return path.parent / "changed.npz"
+
+
+def test_a_walk_outdoors(shared, tmp_path):
+    motion = reconstructed(shared / "media" / "outdoor_walk.mp4", tmp_path, "--models", shared / "models")
+    assert motion.joints3d.shape == (230, 15, 3)
+    assert motion.joints3d.dtype == np.float64
+    assert motion.frame == "camera"
+    seen = np.isfinite(motion.keypoints).all(axis=2)
+    assert seen.any(axis=1).mean() >= 0.95
+    # In the optical frame y points down.
+    head, feet = (motion.joints3d[:, indices(motion.joints, names), 1] for names in (("head",), ("rankle", "lankle")))
+    assert (feet > head).all()
+    assert set(motion.meta["seconds"]) >= {"pose2d", "initial", "ba"}
+    assert motion.meta["iterations"] > 0
+    assert motion.meta["stop_reason"]
+
+
+def test_squats_against_another_system(shared, tmp_path):
+    motion = reconstructed(shared / "media" / "pose_squats.mp4", tmp_path, "--models", shared / "models")
+    assert np.isfinite(motion.keypoints).all(axis=2).any(axis=1).mean() >= 0.95
+    landmarks = json.loads((shared / "media" / "pose_squats_landmarks3d.json").read_text())
+    other = np.array(landmarks, float)[: len(motion.joints3d), BLAZEPOSE, :3]
+    ours = motion.joints3d[:, indices(motion.joints, LIMB_JOINTS)]
+    # Not a truth, another estimate: agreement to a hand's breadth shows that nothing is flipped or mixed up.
+    assert 1000 * pa_mpjpe(ours, other, LIMB_JOINTS).mean() < 130
+
+
+def test_the_same_input_gives_the_same_arrays(tracks_file, tmp_path):
+    first = reconstructed(tracks_file, tmp_path)
+    (tmp_path / "again").mkdir()
+    second = reconstructed(tracks_file, tmp_path / "again")
+    for name in ("joints3d", "camera_rotation", "confidence", "keypoints", "reprojection_px", "stamp_ns"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+@pytest.mark.parametrize("method", ["ba", "paper", "paper-no-articulation", "initial", "mf-nnm"])
+def test_every_method_runs_on_tracks(tracks_file, tmp_path, method):
+    motion = reconstructed(tracks_file, tmp_path, "--method", method)
+    assert motion.frame == "world"
+    assert np.isfinite(motion.joints3d).all()
+    assert motion.meta["method"] == method
+    assert (tmp_path / "out" / "preview.png").stat().st_size > 10_000
+
+
+def test_one_frame_is_enough_for_a_pose(tracks_file, tmp_path):
+    capture = simulate_capture(0.05, 20.0, seed=1)
+    save_tracks(tmp_path / "one.npz", capture.tracks)
+    motion = reconstructed(tmp_path / "one.npz", tmp_path)
+    assert motion.joints3d.shape == (1, 15, 3)
+    assert np.isfinite(motion.joints3d).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"keypoints": np.zeros((72, 15))}, "keypoints: expected float (F, P, 2)"),
+        ({"keypoints": np.full((72, 15, 2), np.nan)}, "keypoints"),
+        ({"stamp_ns": None}, "missing stamp_ns"),
+        ({"joints": np.array([f"j{i}" for i in range(15)])}, "joints: expected at least 4"),
+        ({"covariance": np.full((72, 15, 3), -1.0)}, "covariance"),
+    ],
+)
+def test_tracks_that_cannot_be_used_are_refused(tracks_file, tmp_path, change, words):
+    path = changed(tracks_file, **change)
+    assert_refused(drocap("reconstruct", path, "--out", "out", cwd=tmp_path), tmp_path, words)
+
+
+def test_files_that_are_no_video_are_refused(tmp_path):
+    (tmp_path / "text.mp4").write_text("This is not a video.\n" * 50)
+    (tmp_path / "empty.mp4").touch()
+    (tmp_path / "folder").mkdir()
+    for name, words in (
+        ("none.mp4", "no such file"),
+        ("text.mp4", "text.mp4"),
+        ("empty.mp4", "empty.mp4"),
+        ("folder", "folder"),
+    ):
+        assert_refused(drocap("reconstruct", name, "--out", "out", cwd=tmp_path), tmp_path, words)
+
+
+def test_a_truncated_video_is_refused(shared, tmp_path):
+    data = (shared / "media" / "pose_squats.mp4").read_bytes()
+    (tmp_path / "cut.mp4").write_bytes(data[: len(data) // 2])
+    done = drocap("reconstruct", "cut.mp4", "--models", shared / "models", "--out", "out", cwd=tmp_path)
+    assert_refused(done, tmp_path, "cut.mp4")
+
+
+def test_a_models_folder_without_a_pose_model_is_refused(shared, tmp_path):
+    models = tmp_path / "models"
+    models.mkdir()
+    for names in ((), ("rtmdet-nano.onnx",)):
+        for name in names:
+            (models / name).symlink_to(shared / "models" / name)
+        video = shared / "media" / "pose_squats.mp4"
+        done = drocap("reconstruct", video, "--models", models, "--out", "out", cwd=tmp_path)
+        assert_refused(done, tmp_path, "drocap models fetch")
+
+
+def test_an_output_that_cannot_be_written_is_refused_before_the_work(tracks_file, tmp_path):
+    (tmp_path / "file").touch()
+    done = drocap("reconstruct", tracks_file, "--out", "file", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "expected a folder" in done.stderr
+
+
+def test_help_lists_only_what_works(tmp_path):
+    done = drocap("--help", cwd=tmp_path)
+    assert done.returncode == 0
+    for command in ("demo", "live", "record", "reconstruct", "info", "models", "learn-dictionary"):
+        assert command in done.stdout
+        assert drocap(command, "--help", cwd=tmp_path).returncode == 0
+    for later in ("replay", "export", "orbit"):
+        assert f"    {later} " not in done.stdout
