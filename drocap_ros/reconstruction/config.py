@@ -12,12 +12,18 @@ class InitializerConfig(Parameters):
     """Single-view initialization; lengths "2D std" are the standard deviation of the centred 2D joints."""
 
     dictionary: str = param("", "dictionary file; empty for the shipped one")
-    azimuth_starts: int = param(8, "viewpoints around the body that the fit starts from", minimum=1, maximum=64)
+    azimuth_starts: int = param(4, "viewpoints around the body that the fit starts from", minimum=1, maximum=64)
     elevation_start_deg: float = param(15.0, "camera elevation of the starts", unit="deg", minimum=-89.0, maximum=89.0)
     convex_start: bool = param(False, "add the convex relaxation (spectral norm, ADMM) to the starts")
+    convex_alpha: float = param(0.1, "weight of the spectral norms in the convex relaxation", unit="2D std",
+                                minimum=0.0)  # fmt: skip
+    convex_iterations: int = param(100, "ADMM steps of the convex relaxation", minimum=1, maximum=10000)
     start_components: int = param(20, "principal components in the search of the start", minimum=1, maximum=45)
     start_iterations: int = param(14, "damped Gauss-Newton steps per start", minimum=1, maximum=200)
     keypoint_std: float = param(0.1, "standard deviation of an ordinary 2D joint", unit="2D std", minimum=0.001)
+    em_rounds: int = param(2, "E-steps over the uncertain 2D joints", minimum=0, maximum=50)
+    outlier_share: float = param(0.05, "share of gross outliers among the 2D joints that the E-step expects",
+                                 minimum=1e-6, maximum=0.5)  # fmt: skip
     outlier_std: float = param(
         0.0, "residual in standard deviations beyond which a joint is taken for an outlier; 0 = never", minimum=0.0
     )

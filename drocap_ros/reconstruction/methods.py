@@ -69,7 +69,7 @@ def run_method(
             progress,
         )
         return replace(poses, seconds={"initial": 0.0, "ba": time.perf_counter() - clock})
-    joints = initial_poses(stamp_ns, keypoints, confidence, covariance, initializer, dictionary, progress)
+    joints, credit = initial_poses(stamp_ns, keypoints, confidence, covariance, initializer, dictionary, progress)
     seconds = {"initial": time.perf_counter() - clock, "ba": 0.0}
     if method == "initial":
         translation = _translations(keypoints, confidence, covariance, joints)
@@ -77,7 +77,7 @@ def run_method(
     if method == "paper-no-articulation":
         adjuster = replace(adjuster, gamma=0.0)
     clock = time.perf_counter()
-    poses = adjust(keypoints, confidence, covariance, joints, adjuster, progress)
+    poses = adjust(keypoints, confidence, covariance, joints, adjuster, progress, credit=credit)
     seconds["ba"] = time.perf_counter() - clock
     return replace(poses, seconds=seconds)
 
@@ -90,17 +90,27 @@ def initial_poses(
     config: InitializerConfig,
     dictionary: Dictionary,
     progress: Progress | None = None,
-) -> np.ndarray:
-    """Single-view poses (F, 15, 3) px in camera axes, centred, block by block; empty frames are interpolated."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Single-view initialization, block by block.
+
+    Returns
+    -------
+    poses (F, 15, 3) px in camera axes, centred; frames that show too little are interpolated
+    credit (F, 15) in [0, 1]: how far the last E-step believes each 2D joint
+    """
     out = np.full((*keypoints.shape[:2], 3), np.nan)
+    credit = np.zeros(keypoints.shape[:2])
     for rows, n in _blocks(keypoints, confidence, covariance, config.block_frames, 0):
         fit = initialize(n.w, n.information, dictionary, config)
         shown = (n.weights > 0.0).sum(1) >= 3
         shape = np.where(shown[:, None, None], fit.camera_shape, np.nan)
+        given = n.information[..., 0] + n.information[..., 2]
+        believed = fit.information[..., 0] + fit.information[..., 2]
+        credit[rows] = believed / np.where(given > 0.0, given, 1.0)
         out[rows] = (shape - shape.mean(axis=1, keepdims=True)) * n.scale_px
         if progress is not None:
             progress("initial", rows.stop / len(keypoints))
-    return fill_frames(stamp_ns, out)
+    return fill_frames(stamp_ns, out), credit
 
 
 def adjust(
@@ -110,14 +120,17 @@ def adjust(
     joints: np.ndarray,
     config: BundleAdjusterConfig,
     progress: Progress | None = None,
+    *,
+    credit: np.ndarray | None = None,
 ) -> CameraPoses:
-    """Bundle adjustment of poses (F, 15, 3) px over overlapping windows."""
+    """Bundle adjustment of poses (F, 15, 3) px over overlapping windows; ``credit`` (F, 15) scales the information."""
 
     def solve(rows: slice, n: NormalizedTracks) -> WindowResult:
         start = joints[rows] / n.scale_px
         if len(start) < MIN_WINDOW:
             return start, {}, 0, "too short"
-        result = bundle_adjust(n.w, start, config=config, information=n.information)
+        information = n.information if credit is None else n.information * credit[rows][..., None]
+        result = bundle_adjust(n.w, start, config=config, information=information)
         return result.camera_shape, result.cost_terms, result.iterations, result.stop_reason
 
     return over_windows(keypoints, confidence, covariance, config, solve, progress)

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.reconstruction.config import InitializerConfig
-from drocap_ros.reconstruction.data_term import Projection
+from drocap_ros.reconstruction.convex_start import convex_relaxation, rotation_and_coefficients
+from drocap_ros.reconstruction.data_term import Projection, frames_first, frames_last
 from drocap_ros.reconstruction.dictionary import Dictionary, sparse_code
 from drocap_ros.reconstruction.hypotheses import choose_path
-from drocap_ros.reconstruction.sparse_fit import fit_sparse
+from drocap_ros.reconstruction.sparse_fit import SparseFit, fit_sparse
 from drocap_ros.reconstruction.starts import DenseFit, fit_dense, image_scale, viewpoint_starts
+from drocap_ros.reconstruction.uncertainty import GaussianJoints, UncertainJoints
 
 
 @dataclass(frozen=True)
@@ -23,12 +25,15 @@ class SingleViewFit:
     rotation : (F, 3, 3) torso -> camera
     scale : units per metre of the dictionary's 1.70 m person
     cost : (F,) of the chosen start
+    w, information : (F, P, 2), (F, P, 3) the 2D joints as the last E-step believes them
     """
 
     shape: np.ndarray
     rotation: np.ndarray
     scale: float
     cost: np.ndarray
+    w: np.ndarray
+    information: np.ndarray
 
     @property
     def camera_shape(self) -> np.ndarray:
@@ -42,30 +47,44 @@ def initialize(
     dictionary: Dictionary,
     config: InitializerConfig | None = None,
     *,
+    joints: UncertainJoints | None = None,
     scale: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> SingleViewFit:
-    """Poses of all frames: multi-start search, choice over time, sparse refinement.
+    """Poses of all frames: multi-start search, choice over time, sparse refinement within EM over the 2D joints.
 
     Parameters
     ----------
     w : (F, P, 2) centred joints in units of their standard deviation, 0 where the information is 0
     information : (F, P, 3) as :func:`~drocap_ros.reconstruction.data_term.information_from` makes it
+    joints : evidence in place of w and information, as mixtures or heatmaps; by default they are Gaussians
     scale : units per metre of the dictionary where it is known from earlier frames
     """
     config = config or InitializerConfig()
+    joints = joints or GaussianJoints(w, information, config.outlier_share)
+    w, information = joints.start()
     dense, known = multi_start(w, information, dictionary, config, scale=scale)
     path = choose_path(dense.cost, dense.camera_shape, config.switch_cost)
     frames = np.arange(len(w))
     if progress is not None:
         progress(0.6)
-    rotation, coefficients = dense.rotation[path, frames], dense.coefficients[path, frames]
-    fit = fit_sparse(
-        Projection(w, information), rotation, sparse_from_dense(coefficients, dictionary), dictionary, config
-    )
+    rotation = dense.rotation[path, frames]
+    coefficients = sparse_from_dense(dense.coefficients[path, frames], dictionary)
+    for k in range(config.em_rounds + 1):
+        projection = Projection(w, information)
+        fit = fit_sparse(projection, rotation, coefficients, dictionary, config)
+        if k < config.em_rounds:
+            rotation, coefficients = fit.rotation, fit.coefficients
+            w, information = joints.expect(projected_joints(projection, fit), config.keypoint_std)
     if progress is not None:
         progress(1.0)
-    return SingleViewFit(fit.shape, fit.rotation, known, dense.cost[path, frames])
+    return SingleViewFit(fit.shape, fit.rotation, known, dense.cost[path, frames], w, information)
+
+
+def projected_joints(projection: Projection, fit: SparseFit) -> np.ndarray:
+    """(F, P, 2) the model's joints in the image."""
+    flat = frames_last((fit.shape @ np.swapaxes(fit.rotation, 1, 2))[..., :2])
+    return frames_first(flat + projection.translation(flat)[:, None])
 
 
 def multi_start(
@@ -78,8 +97,13 @@ def multi_start(
 ) -> tuple[DenseFit, float]:
     """Fits with a leading axis of starts, (A, F, ...), and the body's image scale."""
     views = viewpoint_starts(w, information, config.azimuth_starts, np.deg2rad(config.elevation_start_deg))
-    starts, frames = views.shape[:2]
     size = min(config.start_components, len(dictionary.components))
+    if config.convex_start:
+        relaxed = convex_relaxation(
+            w, information[..., 0] > 0.0, dictionary, alpha=config.convex_alpha, iterations=config.convex_iterations
+        )
+        views = np.concatenate([rotation_and_coefficients(relaxed)[0][None], views])
+    starts, frames = views.shape[:2]
     tiled_w, tiled_i = np.tile(w, (starts, 1, 1)), np.tile(information, (starts, 1, 1))
     rotation = views.reshape(-1, 3, 3)
     coefficients = np.zeros((len(rotation), 1 + size))
