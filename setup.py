@@ -13,8 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from setuptools import find_packages, setup
-from setuptools.command.bdist_wheel import bdist_wheel
+from setuptools import Distribution, find_packages, setup
 from setuptools.command.build_py import build_py
 
 ROOT = Path(__file__).resolve().parent
@@ -85,14 +84,12 @@ class BuildPy(build_py):
         self.distribution.data_files = sorted(files.items())
 
 
-class BdistWheel(bdist_wheel):
+class BinaryWhereRos(Distribution):
     """A wheel with messages in it belongs to one Python and one platform."""
 
-    def finalize_options(self) -> None:
-        """Mark the wheel as binary where ROS is there."""
-        super().finalize_options()
-        if ros_prefixes():
-            self.root_is_pure = False
+    def has_ext_modules(self) -> bool:
+        """Whether the messages' libraries come with it."""
+        return bool(ros_prefixes())
 
 
 setup(
@@ -117,8 +114,12 @@ setup(
         "rich>=13",
         "matplotlib>=3.8",
     ],
-    extras_require={"train": ["torch>=2.4", "onnx>=1.16"], "test": ["pytest", "pytest-timeout", "hypothesis", "mcap-ros2-support"]},
+    extras_require={
+        "train": ["torch>=2.4", "onnx>=1.16"],
+        "test": ["pytest", "pytest-timeout", "hypothesis", "mcap-ros2-support"],
+    },
     entry_points={"console_scripts": ["drocap = drocap_ros.cli:main"]},
-    cmdclass={"build_py": BuildPy, "bdist_wheel": BdistWheel},
+    cmdclass={"build_py": BuildPy},
+    distclass=BinaryWhereRos,
     zip_safe=False,
 )

@@ -63,8 +63,14 @@ class Graph:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._start = node.create_publisher(Empty, "graph/start", GRAPH_QOS)
-        node.create_subscription(String, "graph/ready", lambda m: self.ready.add(m.data), GRAPH_QOS)
-        node.create_subscription(String, "graph/finished", lambda m: self.finished.add(m.data), GRAPH_QOS)
+        self._collect("graph/ready", self.ready)
+        self._collect("graph/finished", self.finished)
+
+    def _collect(self, topic: str, names: set[str]) -> None:
+        def add(message: Any) -> None:
+            names.add(message.data)
+
+        self.node.create_subscription(String, topic, add, GRAPH_QOS)
 
     def check(self) -> None:
         """Raise what a node raised.
@@ -156,17 +162,14 @@ def bringup(
                 else:
                     runner = _Thread(name, config, names, namespace, context)
                 graph._runners.append(runner)
-            graph.wait_until(lambda: graph.ready >= set(names), timeout_s, _missing(graph))
+            matched = f"the endpoints of {', '.join(names)} to be matched"
+            graph.wait_until(lambda: graph.ready >= set(names), timeout_s, matched)
             graph._start.publish(Empty())
             yield graph
         finally:
             for runner in graph._runners:
                 runner.stop()
         graph.check()
-
-
-def _missing(graph: Graph) -> str:
-    return f"the endpoints of {', '.join(graph.names)} to be matched"
 
 
 class _Runner:

@@ -44,8 +44,8 @@ class DrocapConfig:
 
     def replace(self, component: str, **values: Any) -> DrocapConfig:
         """Copy with some values of one component changed (and checked)."""
-        changed = dataclasses.replace(self.section(component), **values)
-        return dataclasses.replace(self, **{component: changed})
+        changes: dict[str, Any] = {component: dataclasses.replace(self.section(component), **values)}
+        return dataclasses.replace(self, **changes)
 
     def to_parameter_file(self) -> dict[str, Any]:
         """The whole configuration in the form of a ROS 2 parameter file."""

@@ -72,7 +72,7 @@ def _checked(spec: dataclasses.Field[Any], kind: type, value: Any, owner: str) -
     if type(value) is not kind:
         raise ParameterError(f"{name}: expected {kind.__name__}, got {value!r}; correct the value")
     meta = spec.metadata
-    if kind is float and not math.isfinite(value):
+    if isinstance(value, float) and not math.isfinite(value):
         raise ParameterError(f"{name}: expected a finite number, got {value!r}; correct the value")
     low, high = meta.get("minimum"), meta.get("maximum")
     if (low is not None and value < low) or (high is not None and value > high):

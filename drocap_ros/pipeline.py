@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
 import time
 from collections.abc import Callable, Iterable
@@ -80,13 +81,12 @@ def _watch(
     progress: Progress | None,
     name: str,
 ) -> Tracks:
-    def count(*_: object) -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress("2D pose", done / length if length else -1.0)
+    done = itertools.count(1)
 
-    done = 0
+    def count(*_: object) -> None:
+        if progress is not None:
+            progress("2D pose", next(done) / length if length else -1.0)
+
     estimator = PoseEstimator(models_folder(models or config.pose_estimator.models_dir or None), config.pose_estimator)
     try:
         return tracks_from_observations(observe(frames, estimator, count))

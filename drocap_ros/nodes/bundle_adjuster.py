@@ -29,7 +29,6 @@ from drocap_ros.reconstruction.adjustment_window import AdjustmentWindow, Window
 from drocap_ros.reconstruction.window import AdjustedWindow, adjust_window
 from drocap_ros.skeleton import BODY_15
 
-
 #: Keypoints that wait for their initial pose; more of them means that no initializer runs.
 MAX_PENDING = 1000
 

@@ -15,6 +15,7 @@ from drocap_ros.msg import Pose2D, Pose3D, VehicleState
 from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.skeleton import joint_set
 
+
 def stamp_to_ros(stamp_ns: int) -> Time:
     """Integer nanoseconds -> builtin_interfaces/Time."""
     seconds, nanoseconds = divmod(int(stamp_ns), 10**9)

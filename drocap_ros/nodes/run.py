@@ -15,7 +15,7 @@ from drocap_ros.errors import DrocapError
 from drocap_ros.nodes.component import ComponentNode
 
 #: After the order to stop, messages that have arrived are still worked off, for this long at most.
-DRAIN_S = 2.0
+DRAIN_S = 5.0
 
 
 def spin(node: ComponentNode, stop: threading.Event) -> None:

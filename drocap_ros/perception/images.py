@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from array import array
 
 import numpy as np
 
@@ -22,7 +22,7 @@ def encode_jpeg(image: np.ndarray, quality: int = 90) -> bytes:
     return data.tobytes()
 
 
-def decode_image(data: bytes | Sequence[int]) -> np.ndarray:
+def decode_image(data: bytes | bytearray | memoryview | array[int]) -> np.ndarray:
     """Image (H, W, 3) uint8 BGR from JPEG or PNG bytes.
 
     Raises

@@ -18,11 +18,13 @@ def save_preview(path: Path, motion: Motion) -> None:
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     count = min(_POSES, len(motion.joints3d))
     frames = np.unique(np.linspace(0, len(motion.joints3d) - 1, count).round().astype(int))
     with mpl.rc_context({"font.size": 8}):
-        figure = Figure(figsize=(1.9 * _POSES, 8.2), layout="constrained")
+        layout = ConstrainedLayoutEngine(rect=(0.02, 0, 0.98, 1))
+        figure = Figure(figsize=(1.9 * _POSES, 8.2), layout=layout)
         FigureCanvasAgg(figure)
         grid = figure.add_gridspec(4, _POSES, height_ratios=(1, 1, 1, 0.7))
         body, limit = _upright_body(motion)
@@ -35,7 +37,6 @@ def save_preview(path: Path, motion: Motion) -> None:
         for row, name in enumerate(("2D keypoints", "3D, as seen", "3D, from the side")):
             figure.text(0.002, 0.86 - 0.265 * row, name, rotation=90, va="center", fontsize=9)
         _plot_error(figure.add_subplot(grid[3, :]), motion)
-        figure.get_layout_engine().set(rect=(0.02, 0, 0.98, 1))  # type: ignore[union-attr]
         figure.savefig(path, dpi=100)
 
 

@@ -6,11 +6,11 @@ from contextlib import ExitStack
 
 import numpy as np
 import pytest
+from drocap_ros.msg import OrbitCommand, OrbitStatus, Pose2D, Pose3D, Pose3DWindow
 
 from drocap_ros.bringup import bringup, free_domain
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError, NodeError
-from drocap_ros.msg import OrbitCommand, OrbitStatus, Pose2D, Pose3D, Pose3DWindow
 from drocap_ros.nodes.conversions import stamp_from_ros
 from drocap_ros.nodes.topics import NODES, RESULT_QOS, TOPICS
 from drocap_ros.simulation.ports import free_udp_port
@@ -74,15 +74,19 @@ def test_a_free_domain_is_not_given_twice():
 @pytest.mark.parametrize("processes", [False, True], ids=["one process", "a process each"])
 def test_what_a_node_refuses_is_raised_here(processes, tmp_path):
     config = DrocapConfig().replace("image_ingest", source=str(tmp_path / "none.mp4"))
-    with pytest.raises(InputError, match="none.mp4"), bringup(config, ["image_ingest"], processes=processes):
+    with pytest.raises(InputError, match=r"none\.mp4"), bringup(config, ["image_ingest"], processes=processes):
         pytest.fail("the graph came up without its source")
 
 
+def kill_a_node_in_flight():
+    with bringup(short_flight(20.0), CAPTURE[:2], processes=True) as graph:
+        os.kill(graph.pid("initializer"), 9)
+        graph.wait_until(lambda: False, 20)
+
+
 def test_a_killed_process_is_noticed_and_the_rest_still_stops():
-    with pytest.raises(NodeError, match="initializer ended with status -9"):  # noqa: SIM117
-        with bringup(short_flight(20.0), CAPTURE[:2], processes=True) as graph:
-            os.kill(graph.pid("initializer"), 9)
-            graph.wait_until(lambda: False, 20)
+    with pytest.raises(NodeError, match="initializer ended with status -9"):
+        kill_a_node_in_flight()
 
 
 def test_an_unknown_node_is_refused():

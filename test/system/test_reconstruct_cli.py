@@ -13,7 +13,7 @@ from drocap_ros.motion import load_motion
 from drocap_ros.reconstruction.metrics import pa_mpjpe
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import LIMB_JOINTS, indices
-from drocap_ros.tracks import Tracks, save_tracks
+from drocap_ros.tracks import save_tracks
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -1,0 +1,112 @@
+"""The package builds and installs the ways that people do it: colcon, colcon --symlink-install, pip."""
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PREFIX = Path(sys.prefix)
+PARTS = (
+    "CMakeLists.txt", "package.xml", "setup.py", "pyproject.toml", "README.md",
+    "drocap_ros", "msg", "config", "resource",
+)  # fmt: skip
+NODES = ["image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
+
+pytestmark = pytest.mark.skipif(
+    not (PREFIX / "bin" / "colcon").exists(), reason="not in the environment that `make setup` makes"
+)
+
+
+def environment(**values):
+    clean = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH")}
+    return {**clean, "PATH": f"{PREFIX / 'bin'}{os.pathsep}{os.environ['PATH']}", **values}
+
+
+def run(*command, cwd, env):
+    done = subprocess.run(list(map(str, command)), cwd=cwd, env=env, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.fixture
+def source(tmp_path):
+    """A copy of what the package is built from, so that a build leaves nothing in the checkout."""
+    folder = tmp_path / "src" / "drocap_ros"
+    folder.mkdir(parents=True)
+    for name in PARTS:
+        path = ROOT / name
+        if path.is_dir():
+            shutil.copytree(path, folder / name, ignore=shutil.ignore_patterns("__pycache__", ".*"))
+        else:
+            shutil.copy(path, folder)
+    return folder
+
+
+@pytest.mark.parametrize("option", ["", "--symlink-install"])
+def test_colcon_builds_a_workspace_in_which_messages_and_nodes_import(source, tmp_path, option):
+    ros = environment(AMENT_PREFIX_PATH=str(PREFIX), CMAKE_PREFIX_PATH=str(PREFIX))
+    build = ["colcon", "build", *option.split(), "--cmake-args", f"-DPython3_EXECUTABLE={sys.executable}"]
+    run(*build, "-DBUILD_TESTING=OFF", "-GNinja", cwd=tmp_path, env=ros)
+    imports = "; ".join(f"import drocap_ros.nodes.{name}" for name in NODES)
+    check = f"import drocap_ros.msg as m; m.Pose2D(); print(m.__file__); {imports}; print(drocap_ros.nodes.__file__)"
+    shell = f". install/setup.sh && python3 -c '{check}' && ls install/drocap_ros/lib/drocap_ros"
+    lines = run("bash", "-c", shell, cwd=tmp_path, env=ros).split()
+    # The workspace's own copy, not the one of the environment beside it.
+    install = str(tmp_path / "install")
+    assert lines[0].startswith(install)
+    assert lines[1].startswith(install)
+    assert set(lines[2:]) == {"drocap", *NODES}
+    run("bash", "-c", ". install/setup.sh && install/drocap_ros/lib/drocap_ros/drocap --version", cwd=tmp_path, env=ros)
+
+
+def test_pip_makes_a_wheel_with_the_messages_and_their_libraries(source, tmp_path):
+    run(
+        sys.executable, "-m", "pip", "wheel", source, "--no-deps", "--no-build-isolation", "-w", tmp_path / "wheels",
+        cwd=tmp_path, env=environment(),
+    )  # fmt: skip
+    (wheel,) = (tmp_path / "wheels").glob("*.whl")
+    assert "none-any" not in wheel.name
+    names = zipfile.ZipFile(wheel).namelist()
+    for wanted in (
+        "drocap_ros/msg/_pose2_d.py",
+        "drocap_ros/nodes/initializer.py",
+        "drocap_ros/data/dictionary_cmu.npz",
+        "drocap_ros/py.typed",
+    ):
+        assert wanted in names
+    assert any(name.endswith("/lib/libdrocap_ros__rosidl_typesupport_c.so") for name in names)
+    assert any(name.endswith("/share/drocap_ros/msg/Pose2D.msg") for name in names)
+
+
+def test_without_ros_the_package_installs_and_all_but_the_messages_imports(source, tmp_path):
+    base = Path(sys.base_prefix) / "bin" / "python3"
+    run(base, "-m", "venv", "--without-pip", "bare", cwd=tmp_path, env=environment())
+    site = str(PREFIX / "lib" / f"python{sys.version_info[0]}.{sys.version_info[1]}" / "site-packages")
+    bare = environment(PYTHONPATH=site)
+    python = tmp_path / "bare" / "bin" / "python"
+    run(
+        python, "-m", "pip", "install", source, "--no-deps", "--no-build-isolation", "--target", "target",
+        cwd=tmp_path, env=bare,
+    )  # fmt: skip
+    assert not (tmp_path / "target" / "drocap_ros" / "msg").exists()
+    check = """
+import sys, pkgutil, importlib
+sys.path.insert(0, "target")
+for ros in ("rclpy", "std_msgs", "sensor_msgs", "geometry_msgs", "rcl_interfaces", "diagnostic_msgs"):
+    sys.modules[ros] = None
+import drocap_ros
+drocap_ros.__path__ = drocap_ros.__path__[:1]
+for module in pkgutil.walk_packages(drocap_ros.__path__, "drocap_ros."):
+    if not module.name.startswith(("drocap_ros.nodes", "drocap_ros.bringup")) and "__main__" not in module.name:
+        if "train_lifter" not in module.name:
+            importlib.import_module(module.name)
+print(drocap_ros.__file__)
+from drocap_ros.cli import main
+assert main(["live", "--config", "target/none.yaml"]) == 2
+"""
+    assert "target" in run(python, "-c", check, cwd=tmp_path, env=bare)
