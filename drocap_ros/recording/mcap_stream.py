@@ -38,6 +38,20 @@ class McapMessage(NamedTuple):
     data: bytes
 
 
+class _BoundedFile:
+    """A file of which no more can be asked than is there: a length that lies must not take memory."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self.size = file.seek(0, 2)
+        file.seek(0)
+        self.tell, self.seek = file.tell, file.seek
+
+    def read(self, size: int = -1) -> bytes:
+        rest = max(self.size - self._file.tell(), 0)
+        return self._file.read(rest if size < 0 else min(size, rest))
+
+
 @dataclass
 class McapStream:
     """Reads one file; see the module's text.
@@ -81,12 +95,12 @@ class McapStream:
 
         try:
             with self.path.open("rb") as file:
-                size = file.seek(0, 2)
+                bounded: Any = _BoundedFile(file)
                 file.seek(-len(MAGIC), 2)
                 if file.read() != MAGIC:
                     return None
                 file.seek(0)
-                return SeekingReader(file, record_size_limit=max(size, 1)).get_summary()
+                return SeekingReader(bounded, record_size_limit=bounded.size).get_summary()
         except Exception:  # a damaged summary raises all kinds; the stream itself is the truth
             return None
 
@@ -96,9 +110,8 @@ class McapStream:
 
         try:
             with self.path.open("rb") as file:
-                size = file.seek(0, 2)
-                file.seek(0)
-                reader = SeekingReader(file, record_size_limit=max(size, 1))
+                bounded: Any = _BoundedFile(file)
+                reader = SeekingReader(bounded, record_size_limit=bounded.size)
                 return {record.name: dict(record.metadata) for record in reader.iter_metadata()}
         except Exception:
             return {}
@@ -112,16 +125,15 @@ class McapStream:
         except OSError as error:
             raise InputError(f"{self.path}: expected a readable file; {error.strerror}") from None
         with file:
-            size = file.seek(0, 2)
-            file.seek(0)
-            if file.read(len(MAGIC)) != MAGIC:
+            bounded: Any = _BoundedFile(file)
+            if bounded.read(len(MAGIC)) != MAGIC:
                 raise InputError(
                     f"{self.path}: expected an MCAP file, found other content at its start; check the path"
                 )
             file.seek(0)
-            reader = StreamReader(file, emit_chunks=True, record_size_limit=max(size, 1))
+            reader = StreamReader(bounded, emit_chunks=True, record_size_limit=bounded.size)
             bad_chunks = 0
-            for record in self._until_damaged(iter(reader.records), file, size):
+            for record in self._until_damaged(iter(reader.records), file, bounded.size):
                 if not isinstance(record, Chunk):
                     yield record
                     continue

@@ -1,0 +1,161 @@
+"""``drocap info``: what a recording, a motion or a tracks file holds."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from drocap_ros.errors import InputError
+
+
+class Summary(NamedTuple):
+    """What to print: facts by name, one table, warnings."""
+
+    facts: list[tuple[str, str]]
+    columns: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+    warnings: Sequence[str]
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the command's options; ``run`` is its action."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "info",
+        help="what a recording, motion or tracks file holds",
+        description="Print what a recording (session folder, .mcap, .bag, rosbag2 folder), a motion.npz or a tracks "
+        ".npz holds: topics, types, counts, duration, shapes.",
+    )
+    parser.add_argument("session", metavar="SESSION", type=Path, help="recording, motion.npz or tracks .npz")
+    parser.set_defaults(run=run)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the summary: a table on a terminal, plain lines in a pipe."""
+    summary = summarize(args.session)
+    if sys.stdout.isatty():
+        _print_table(summary)
+    else:
+        _print_plain(summary)
+    for warning in summary.warnings:
+        print(f"drocap: warning: {warning}", file=sys.stderr)
+    return 0
+
+
+def summarize(path: Path) -> Summary:
+    """What a file or folder holds.
+
+    Raises
+    ------
+    InputError
+        When it is missing, unreadable, or of no kind that drocap knows.
+    """
+    if not path.exists():
+        raise InputError(f"{path}: expected a recording, motion or tracks file, found no such file; check the path")
+    return _of_arrays(path) if path.suffix == ".npz" else _of_session(path)
+
+
+def _of_session(path: Path) -> Summary:
+    from drocap_ros.recording.session_reader import session_info
+
+    info = session_info(path)
+    facts = [
+        ("path", str(path)),
+        ("kind", info.kind),
+        ("start", _time_text(info.start_ns)),
+        ("duration", f"{info.duration_s:.3f} s"),
+        ("messages", str(info.message_count)),
+        *sorted(info.metadata.items()),
+    ]
+    rows = [(t.name, t.type_name, str(t.count), _rate_text(t.count, info.duration_s)) for t in info.topics]
+    return Summary(facts, ("topic", "type", "messages", "rate"), rows, info.warnings)
+
+
+def _of_arrays(path: Path) -> Summary:
+    from drocap_ros.motion import load_motion
+    from drocap_ros.tracks import load_tracks, read_npz
+
+    arrays = read_npz(path, ())
+    facts = [("path", str(path))]
+    if "joints3d" in arrays:
+        motion = load_motion(path)
+        scale = "metric" if motion.metric else "assumed"
+        facts += [
+            ("kind", "motion"),
+            *_times(motion.stamp_ns),
+            ("joints", ", ".join(motion.joints)),
+            ("frame", motion.frame),
+            ("scale", f"{scale} ({motion.scale_source})"),
+            *((key, str(motion.meta[key])) for key in ("method", "input", "version") if key in motion.meta),
+        ]
+    elif "keypoints" in arrays:
+        tracks = load_tracks(path)
+        seen = (tracks.keypoints == tracks.keypoints).all(axis=2)
+        facts += [
+            ("kind", "tracks"),
+            *_times(tracks.stamp_ns),
+            ("joints", ", ".join(tracks.joints)),
+            ("image", f"{tracks.image_size[0]}x{tracks.image_size[1]} px"),
+            ("seen", f"{seen.any(axis=1).sum()} of {len(tracks)} frames, {100 * seen.mean():.1f} % of the keypoints"),
+        ]
+    else:
+        raise InputError(
+            f"{path}: expected a motion (joints3d) or tracks (keypoints) file, found the arrays "
+            f"{', '.join(sorted(arrays)[:8]) or 'none'}; check the path"
+        )
+    rows = [(name, str(a.dtype), " x ".join(map(str, a.shape)) or "scalar") for name, a in sorted(arrays.items())]
+    return Summary(facts, ("array", "type", "shape"), rows, ())
+
+
+def _times(stamp_ns: Any) -> list[tuple[str, str]]:
+    frames = len(stamp_ns)
+    duration = float(stamp_ns[-1] - stamp_ns[0]) * 1e-9 if frames else 0.0
+    rate = f", {(frames - 1) / duration:.2f} frames/s" if duration > 0 else ""
+    return [("frames", str(frames)), ("duration", f"{duration:.3f} s{rate}")]
+
+
+def _time_text(stamp_ns: int | None) -> str:
+    if stamp_ns is None:
+        return "no messages"
+    try:
+        moment = datetime.fromtimestamp(stamp_ns * 1e-9, tz=timezone.utc)
+    except (ValueError, OverflowError, OSError):
+        return f"{stamp_ns} ns"
+    return f"{moment:%Y-%m-%d %H:%M:%S} UTC"
+
+
+def _rate_text(count: int, seconds: float) -> str:
+    return f"{(count - 1) / seconds:.2f} Hz" if seconds > 0 and count > 1 else "-"
+
+
+def _print_table(summary: Summary) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console()
+    facts = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    for name, value in summary.facts:
+        facts.add_row(Text(name, style="bold"), Text(value))
+    table = Table(*summary.columns)
+    for row in summary.rows:
+        table.add_row(*(Text(cell) for cell in row))
+    console.print(facts)
+    console.print(table)
+
+
+def _print_plain(summary: Summary) -> None:
+    for name, value in summary.facts:
+        print(f"{name}: {_one_line(value)}")
+    table = [summary.columns, *summary.rows]
+    widths = [max(len(row[i]) for row in table) for i in range(len(summary.columns))]
+    for row in table:
+        print("  ".join(_one_line(cell).ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())

@@ -1,0 +1,80 @@
+import argparse
+
+import numpy as np
+import pytest
+
+from drocap_ros.cli import info
+from drocap_ros.errors import InputError
+from drocap_ros.motion import Motion, save_motion
+from drocap_ros.skeleton import BODY_15
+from drocap_ros.tracks import save_tracks
+
+
+def run(path):
+    parser = argparse.ArgumentParser()
+    info.add_parser(parser.add_subparsers())
+    args = parser.parse_args(["info", str(path)])
+    return args.run(args)
+
+
+def test_session(pose_session, capture, capsys):
+    assert run(pose_session) == 0
+    out, err = capsys.readouterr()
+    assert "messages: 120" in out
+    assert "duration: 3.967 s" in out
+    assert "start: 2023-11-14 22:13:20 UTC" in out
+    (line,) = [line for line in out.splitlines() if line.startswith("/drocap/pose2d")]
+    assert line.split() == ["/drocap/pose2d", "drocap_ros/msg/Pose2D", "120", "30.00", "Hz"]
+    assert err == ""
+
+
+def test_truncated_session_warns_on_stderr(pose_session, capsys):
+    path = pose_session / "session_0.mcap"
+    path.write_bytes(path.read_bytes()[:-500])
+    assert run(path) == 0
+    out, err = capsys.readouterr()
+    assert "/drocap/pose2d" in out
+    assert err.startswith("drocap: warning: session_0.mcap: cut off")
+
+
+def test_table_on_a_terminal(pose_session, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    info._print_table(info.summarize(pose_session))
+    out = capsys.readouterr().out
+    assert "/drocap/pose2d" in out
+    assert "┃" in out
+
+
+def test_tracks_and_motion(tmp_path, capture, capsys):
+    save_tracks(tmp_path / "tracks.npz", capture.tracks)
+    assert run(tmp_path / "tracks.npz") == 0
+    out = capsys.readouterr().out
+    assert "kind: tracks" in out
+    assert "frames: 120" in out
+    assert "duration: 3.967 s, 30.00 frames/s" in out
+    assert any(line.split() == ["keypoints", "float64", "120", "x", "15", "x", "2"] for line in out.splitlines())
+    tracks = capture.tracks
+    save_motion(
+        tmp_path / "motion.npz",
+        Motion(
+            joints3d=capture.joints3d_world, joints=BODY_15.joints, parents=BODY_15.parents, stamp_ns=tracks.stamp_ns,
+            frame="world", metric=False, scale_source="assumed_height", camera_rotation=tracks.camera_rotation,
+            confidence=tracks.confidence, keypoints=tracks.keypoints, reprojection_px=np.zeros((120, 15)),
+            meta={"method": "ba"},
+        ),
+    )  # fmt: skip
+    assert run(tmp_path / "motion.npz") == 0
+    out = capsys.readouterr().out
+    assert "kind: motion" in out
+    assert "scale: assumed (assumed_height)" in out
+    assert "method: ba" in out
+
+
+def test_files_of_no_known_kind(tmp_path):
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    (tmp_path / "text.npz").write_text("no archive")
+    (tmp_path / "x.mp4").write_bytes(b"0000")
+    for name in ("missing", "other.npz", "text.npz", "x.mp4"):
+        with pytest.raises(InputError, match="expected") as error:
+            run(tmp_path / name)
+        assert "\n" not in str(error.value)
