@@ -159,6 +159,22 @@ def test_gimbal_yaw_from_north_and_from_the_nose(ready):
         assert np.isclose(axis[2], -math.sin(0.5))
 
 
+def test_turning_gimbal_is_told_at_the_time_of_the_attitude(ready):
+    estimator, sender = ready
+    gimbal = Sender(component=154)
+    for i, yaw in enumerate((0.0, 0.02)):  # 50 ms apart
+        q = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
+        message = gimbal("gimbal_device_attitude_status", 0, 0, 7, 64, q, 0, 0, 0, 0)  # with a clock of its own
+        estimator.update(message, 10 * S + i * S // 20)
+    for after_ms, expected in ((0, 0.02), (20, 0.028), (40, 0.036), (500, 0.04)):
+        now = 10 * S + S // 20 + after_ms * S // 1000
+        state = estimator.update(attitude(sender, 1000 + after_ms), now)
+        forward = Rotation.from_quat(state.gimbal_orientation_xyzw).apply([1, 0, 0])
+        assert np.isclose(np.arctan2(forward[0], forward[1]), expected, atol=1e-6)
+    state = estimator.update(attitude(sender, 9000), 18 * S)
+    assert np.isnan(state.gimbal_orientation_xyzw).all()
+
+
 def test_old_mount_messages_agree_with_the_new(ready):
     estimator, sender = ready
     estimator.update(attitude(sender), 10 * S)
