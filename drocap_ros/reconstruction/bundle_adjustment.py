@@ -106,17 +106,21 @@ class Objective:
 
 
 def shape_change(s: np.ndarray) -> float:
-    """Sum over time of the squared change of shape (..., F)."""
-    step = s[..., 1:] - s[..., :-1]
-    return float(np.vdot(step, step))
+    """Sum over time of the squared second difference of shape (..., F): steady motion is free."""
+    if s.shape[-1] < 3:
+        return 0.0
+    bend = s[..., 2:] - 2.0 * s[..., 1:-1] + s[..., :-2]
+    return float(np.vdot(bend, bend))
 
 
 def shape_change_gradient(s: np.ndarray) -> np.ndarray:
     """Gradient of :func:`shape_change`."""
-    step = 2.0 * (s[..., 1:] - s[..., :-1])
     gradient = np.zeros_like(s)
-    gradient[..., 1:] += step
-    gradient[..., :-1] -= step
+    if s.shape[-1] >= 3:
+        bend = 2.0 * (s[..., 2:] - 2.0 * s[..., 1:-1] + s[..., :-2])
+        gradient[..., 2:] += bend
+        gradient[..., 1:-1] -= 2.0 * bend
+        gradient[..., :-2] += bend
     return gradient
 
 

@@ -13,7 +13,7 @@ from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerCo
 from drocap_ros.reconstruction.data_term import Projection, frames_last, information_from
 from drocap_ros.reconstruction.dictionary import Dictionary
 from drocap_ros.reconstruction.factorization import factorize
-from drocap_ros.reconstruction.normalize import NormalizedTracks, normalize_tracks
+from drocap_ros.reconstruction.normalize import MIN_JOINTS, NormalizedTracks, normalize_tracks
 from drocap_ros.reconstruction.single_view import initialize
 from drocap_ros.reconstruction.window import MIN_WINDOW, fill_frames
 from drocap_ros.tracks import Tracks
@@ -56,8 +56,26 @@ def run_method(
     dictionary: Dictionary,
     progress: Progress | None,
 ) -> CameraPoses:
-    """Poses of BODY_15 keypoints (F, 15, 2) px by one of :data:`METHODS`."""
+    """Poses of BODY_15 keypoints (F, 15, 2) px by one of :data:`METHODS`.
+
+    Frames that show fewer than four joints take no part; their poses are interpolated from those around them.
+    """
     normalize_tracks(keypoints, confidence, covariance)  # refuses what no window can use
+    use = shown_frames(keypoints, confidence)
+    if not use.all():
+        found = run_method(
+            method,
+            stamp_ns[use],
+            keypoints[use],
+            None if confidence is None else confidence[use],
+            None if covariance is None else covariance[use],
+            select_frames(tracks, use),
+            initializer,
+            adjuster,
+            dictionary,
+            progress,
+        )
+        return _spread(found, use, stamp_ns)
     clock = time.perf_counter()
     if method == "mf-nnm":
         poses = over_windows(
@@ -69,7 +87,7 @@ def run_method(
             progress,
         )
         return replace(poses, seconds={"initial": 0.0, "ba": time.perf_counter() - clock})
-    joints, credit = initial_poses(stamp_ns, keypoints, confidence, covariance, initializer, dictionary, progress)
+    joints, credit = initial_poses(keypoints, confidence, covariance, initializer, dictionary, progress)
     seconds = {"initial": time.perf_counter() - clock, "ba": 0.0}
     if method == "initial":
         translation = _translations(keypoints, confidence, covariance, joints)
@@ -82,8 +100,35 @@ def run_method(
     return replace(poses, seconds=seconds)
 
 
+def shown_frames(keypoints: np.ndarray, confidence: np.ndarray | None) -> np.ndarray:
+    """(F,) bool, frames with at least :data:`~drocap_ros.reconstruction.normalize.MIN_JOINTS` joints apart."""
+    seen = np.isfinite(keypoints).all(-1)
+    if confidence is not None:
+        seen &= np.nan_to_num(confidence) > 0.0
+    low = np.where(seen[..., None], keypoints, np.inf).min(axis=1)
+    high = np.where(seen[..., None], keypoints, -np.inf).max(axis=1)
+    with np.errstate(invalid="ignore"):
+        apart = (high - low).max(axis=1) > 1e-6 * (1.0 + np.abs(np.nan_to_num(keypoints)).max())
+    return np.asarray((np.sum(seen, axis=1) >= MIN_JOINTS) & apart)
+
+
+def select_frames(tracks: Tracks, use: np.ndarray) -> Tracks:
+    """Tracks with some of the frames (F,) bool."""
+    per_frame = ("keypoints", "stamp_ns", "confidence", "covariance", "camera_rotation", "camera_position")
+    parts = {name: getattr(tracks, name)[use] for name in per_frame if getattr(tracks, name) is not None}
+    return replace(tracks, **parts)
+
+
+def _spread(found: CameraPoses, use: np.ndarray, stamp_ns: np.ndarray) -> CameraPoses:
+    """Poses of the frames in use, interpolated over all frames."""
+    joints = np.full((len(use), *found.joints_px.shape[1:]), np.nan)
+    joints[use] = found.joints_px
+    t = (stamp_ns - stamp_ns[0]).astype(np.float64)
+    translation = np.stack([np.interp(t, t[use], found.translation_px[:, i]) for i in range(2)], axis=-1)
+    return replace(found, joints_px=fill_frames(stamp_ns, joints), translation_px=translation)
+
+
 def initial_poses(
-    stamp_ns: np.ndarray,
     keypoints: np.ndarray,
     confidence: np.ndarray | None,
     covariance: np.ndarray | None,
@@ -95,22 +140,21 @@ def initial_poses(
 
     Returns
     -------
-    poses (F, 15, 3) px in camera axes, centred; frames that show too little are interpolated
+    poses (F, 15, 3) px in camera axes, centred
     credit (F, 15) in [0, 1]: how far the last E-step believes each 2D joint
     """
-    out = np.full((*keypoints.shape[:2], 3), np.nan)
+    out = np.zeros((*keypoints.shape[:2], 3))
     credit = np.zeros(keypoints.shape[:2])
     for rows, n in _blocks(keypoints, confidence, covariance, config.block_frames, 0):
         fit = initialize(n.w, n.information, dictionary, config)
-        shown = (n.weights > 0.0).sum(1) >= 3
-        shape = np.where(shown[:, None, None], fit.camera_shape, np.nan)
+        shape = fit.camera_shape
         given = n.information[..., 0] + n.information[..., 2]
         believed = fit.information[..., 0] + fit.information[..., 2]
         credit[rows] = believed / np.where(given > 0.0, given, 1.0)
         out[rows] = (shape - shape.mean(axis=1, keepdims=True)) * n.scale_px
         if progress is not None:
             progress("initial", rows.stop / len(keypoints))
-    return fill_frames(stamp_ns, out), credit
+    return out, credit
 
 
 def adjust(
@@ -177,23 +221,9 @@ def _blocks(
     keypoints: np.ndarray, confidence: np.ndarray | None, covariance: np.ndarray | None, length: int, overlap: int
 ) -> Iterator[tuple[slice, NormalizedTracks]]:
     """Normalized tracks, window by window."""
-    whole: NormalizedTracks | None = None
     for rows in windows(len(keypoints), length, overlap):
-        part = (
-            keypoints[rows],
-            None if confidence is None else confidence[rows],
-            None if covariance is None else covariance[rows],
-        )
-        if (np.isfinite(part[0]).all(-1).sum(1) < 4).all():
-            # A window without the person borrows the unit of the recording.
-            whole = whole or normalize_tracks(keypoints, confidence, covariance)
-            yield rows, _slice(whole, rows)
-        else:
-            yield rows, normalize_tracks(*part)
-
-
-def _slice(n: NormalizedTracks, rows: slice) -> NormalizedTracks:
-    return NormalizedTracks(n.w[rows], n.weights[rows], n.information[rows], n.centre_px[rows], n.scale_px)
+        part = [None if a is None else a[rows] for a in (confidence, covariance)]
+        yield rows, normalize_tracks(keypoints[rows], *part)
 
 
 def _fade(count: int, overlap: int, at_start: bool, at_end: bool) -> np.ndarray:
@@ -206,9 +236,7 @@ def _translations(
     keypoints: np.ndarray, confidence: np.ndarray | None, covariance: np.ndarray | None, joints: np.ndarray
 ) -> np.ndarray:
     """(F, 2) px that move the projected poses on the keypoints; interpolated where nothing was seen."""
-    from drocap_ros.reconstruction.normalize import filled
-
     seen = np.isfinite(keypoints).all(-1)
     weights = seen.astype(float) if confidence is None else np.where(seen, np.nan_to_num(confidence), 0.0)
     projection = Projection(keypoints, information_from(keypoints, weights, covariance))
-    return filled(projection.translation(frames_last(joints[..., :2])).T, np.any(weights > 0.0, axis=1))
+    return projection.translation(frames_last(joints[..., :2])).T

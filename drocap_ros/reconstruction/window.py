@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.geometry.alignment import to_torso_frame
+from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, slerp
 from drocap_ros.reconstruction.bundle_adjustment import bundle_adjust
 from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.data_term import Projection, frames_first, frames_last
@@ -320,12 +322,17 @@ def fill_frames(stamp_ns: np.ndarray, joints: np.ndarray) -> np.ndarray:
     if not known.any():
         raise InputError("initial_joints: expected a pose in at least one frame, got NaN in all; check the start")
     t = (stamp_ns - stamp_ns[0]).astype(np.float64)
-    at = np.clip(np.searchsorted(t[known], t) - 1, 0, max(int(known.sum()) - 2, 0))
-    nxt = np.minimum(at + 1, int(known.sum()) - 1)
-    t0, t1 = t[known][at], t[known][nxt]
-    s = np.clip((t - t0) / np.where(t1 > t0, t1 - t0, 1.0), 0.0, 1.0)[:, None, None]
-    filled = (1.0 - s) * joints[known][at] + s * joints[known][nxt]
-    return np.where(known[:, None, None], joints, filled)
+    count = int(np.count_nonzero(known))
+    before = np.clip(np.searchsorted(t[known], t, side="right") - 1, 0, count - 1)
+    after = np.minimum(before + 1, count - 1)
+    t0, t1 = t[known][before], t[known][after]
+    s = np.clip((t - t0) / np.where(t1 > t0, t1 - t0, 1.0), 0.0, 1.0)
+    # Body and orientation by themselves: joints moved along straight lines would shrink a turning body.
+    shape, rotation = to_torso_frame(joints[known])
+    q = quaternion_from_matrix(rotation)
+    turned = matrix_from_quaternion(slerp(q[before], q[after], s))
+    bent = (1.0 - s)[:, None, None] * shape[before] + s[:, None, None] * shape[after]
+    return np.where(known[:, None, None], joints, bent @ np.swapaxes(turned, 1, 2))
 
 
 def _scale_to_image(start: np.ndarray, projection: Projection) -> float:
