@@ -108,7 +108,7 @@ setup(
         "onnxruntime>=1.17",
         "opencv-python-headless>=4.8",
         "pymavlink>=2.4.40",
-        "mcap>=1.1",
+        "mcap>=1.6",
         "rosbags>=0.10",
         "PyYAML>=6",
         "rich>=13",
