@@ -49,7 +49,7 @@ class PoseEstimatorConfig(Parameters):
     threads: int = param(1, "threads of one model run on the CPU", minimum=1, maximum=256)
     detection_threshold: float = param(0.35, "least score that makes a new subject", minimum=0.01, maximum=1)
     low_threshold: float = param(
-        0.12, "least score that continues a subject near its prediction", minimum=0.01, maximum=1
+        0.2, "least score that continues a subject near its prediction", minimum=0.01, maximum=1
     )
     nms_iou: float = param(0.6, "overlap above which two boxes are one person", minimum=0.05, maximum=1)
     keypoint_threshold: float = param(
@@ -70,7 +70,7 @@ class PoseEstimatorConfig(Parameters):
         3, "images in which a new person is seen before it is the subject", minimum=1, maximum=100
     )
     coast_s: float = param(
-        0.6, "time without detection over which the box is predicted", unit="s", minimum=0, maximum=10
+        0.6, "time without a sure detection over which the box is predicted", unit="s", minimum=0, maximum=10
     )
     forget_s: float = param(
         20.0, "time after which a lost subject is not taken up again", unit="s", minimum=0.1, maximum=3600
@@ -86,5 +86,8 @@ class PoseEstimatorConfig(Parameters):
         maximum=3600,
     )
     appearance_threshold: float = param(
-        0.55, "least similarity of clothes (Bhattacharyya, 0..1) to take a lost subject up again", minimum=0, maximum=1
+        0.92,
+        "least similarity of colours (Bhattacharyya, 0 to 1) to take a lost subject up again",
+        minimum=0,
+        maximum=1,
     )

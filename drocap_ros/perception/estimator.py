@@ -10,13 +10,13 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.perception.config import PoseEstimatorConfig
 from drocap_ros.perception.detection.detector import Detections
-from drocap_ros.perception.detection.nms import suppress
+from drocap_ros.perception.detection.nms import suppress, whole
 from drocap_ros.perception.joint_maps import joint_map
 from drocap_ros.perception.models import load_detector, load_pose_model
 from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.perception.pose import Keypoints
 from drocap_ros.perception.tracking import Subject, SubjectTracker
-from drocap_ros.perception.tracking.search import inside
+from drocap_ros.perception.tracking.search import Window, inside
 from drocap_ros.perception.uncertainty import calibrate
 from drocap_ros.skeleton import BODY_15
 
@@ -75,8 +75,10 @@ class PoseEstimator:
             return _unseen(stamp_ns, size, subject)
         self.keypoints = self.pose_model.estimate(image, subject.box)
         xy, covariance, confidence = self._in_our_joints(self.keypoints)
-        if subject.score == 0.0 and not self._confirmed(xy, confidence, stamp_ns):
-            return _unseen(stamp_ns, size, subject)
+        if subject.score < self.config.detection_threshold:
+            confirmed = self._confirmed(xy, confidence, stamp_ns)
+            if subject.score == 0.0 and not confirmed:
+                return _unseen(stamp_ns, size, subject)
         unseen = confidence < self.config.keypoint_threshold
         xy[unseen], covariance[unseen] = np.nan, np.nan
         return PoseObservation(
@@ -87,17 +89,27 @@ class PoseEstimator:
     def _detect(self, image: np.ndarray, stamp_ns: int) -> Detections:
         """Detections of all windows together, one per person."""
         size = (image.shape[1], image.shape[0])
-        boxes, scores = [np.empty((0, 4), np.float32)], [np.empty(0, np.float32)]
+        found = Detections(np.empty((0, 4), np.float32), np.empty(0, np.float32))
         for window in self.tracker.windows(size, stamp_ns):
-            found = self.detector.detect(image, window, self.config.low_threshold)
-            whole = inside(found.boxes, window, size)
-            boxes.append(found.boxes[whole])
-            scores.append(found.scores[whole])
-        all_boxes, all_scores = np.concatenate(boxes), np.concatenate(scores)
-        if len(boxes) > 2:
-            kept = suppress(all_boxes, all_scores, self.config.nms_iou)
-            all_boxes, all_scores = all_boxes[kept], all_scores[kept]
-        return Detections(all_boxes, all_scores)
+            found = self._merged(found, self._look(image, window))
+        closer = self.tracker.second_look(size, stamp_ns, found.boxes, found.scores)
+        if closer is not None:
+            found = self._merged(found, self._look(image, closer))
+        kept = whole(found.boxes, found.scores)
+        return Detections(found.boxes[kept], found.scores[kept])
+
+    def _look(self, image: np.ndarray, window: Window | None) -> Detections:
+        """Detections in a window, without those that its edge cuts."""
+        found = self.detector.detect(image, window, self.config.low_threshold)
+        uncut = inside(found.boxes, window, (image.shape[1], image.shape[0]))
+        return Detections(found.boxes[uncut], found.scores[uncut])
+
+    def _merged(self, a: Detections, b: Detections) -> Detections:
+        if not len(a) or not len(b):
+            return b if len(b) else a
+        boxes, scores = np.concatenate([a.boxes, b.boxes]), np.concatenate([a.scores, b.scores])
+        kept = suppress(boxes, scores, self.config.nms_iou)
+        return Detections(boxes[kept], scores[kept])
 
     def _in_our_joints(self, keypoints: Keypoints) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         covariance, confidence = calibrate(keypoints, self.pose_model.spec.layout)

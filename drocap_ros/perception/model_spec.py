@@ -40,6 +40,7 @@ class ModelSpec:
     skeleton : joint set of the keypoints ("" for a detector)
     person_class : class index of a person
     decoded : for "yolox-grid": whether the grid is already added inside
+    udp : for "heatmap": trained with unit-length coordinates (MMPose's UDPHeatmap; its ViTPose and later HRNets)
     box_padding : side of the pose crop over that of the box; 0 = the estimator's setting
     """
 
@@ -54,6 +55,7 @@ class ModelSpec:
     skeleton: str = ""
     person_class: int = 0
     decoded: bool = False
+    udp: bool = False
     box_padding: float = 0.0
 
 

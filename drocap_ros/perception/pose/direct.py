@@ -22,8 +22,7 @@ def as_peaks(points: np.ndarray) -> Peaks:
 def decode_movenet(output: np.ndarray, input_size: tuple[int, int]) -> Peaks:
     """MoveNet (1, 1, P, 3): y, x as shares of the picture, score."""
     rows = output.reshape(output.shape[-2:])
-    # A share of 0 is the first pixel's edge.
-    points = np.stack([rows[:, 1] * input_size[0] - 0.5, rows[:, 0] * input_size[1] - 0.5, rows[:, 2]], -1)
+    points = np.stack([rows[:, 1] * input_size[0], rows[:, 0] * input_size[1], rows[:, 2]], -1)
     return as_peaks(points.astype(np.float32))
 
 

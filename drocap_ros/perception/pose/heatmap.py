@@ -10,11 +10,13 @@ from drocap_ros.perception.pose.keypoints import Peaks
 _RADIUS = 6
 #: Highest peaks reported per joint.
 CANDIDATES = 3
+#: Least height of a further candidate, as a share of the highest peak.
+_LEAST_CANDIDATE = 0.1
 #: Standard deviation in cells of the Gaussian that networks of this kind are trained to draw.
 _TRAINED_SIGMA = 2.0
 
 
-def decode_heatmaps(maps: np.ndarray, input_size: tuple[int, int]) -> Peaks:
+def decode_heatmaps(maps: np.ndarray, input_size: tuple[int, int], udp: bool = False) -> Peaks:
     """Joints of a stack of heatmaps.
 
     The position is the maximum of the logarithm's Taylor expansion after smoothing (Zhang et al.,
@@ -24,17 +26,20 @@ def decode_heatmaps(maps: np.ndarray, input_size: tuple[int, int]) -> Peaks:
     ----------
     maps : (P, h, w) float32, larger = more likely
     input_size : (width, height) px of the picture that the network saw
+    udp : whether the network was trained with unit-length coordinates (Huang et al., "The Devil is in the
+        details", 2020): the first and last cells then lie on the first and last pixels
     """
     _, rows, columns = maps.shape
-    stride = np.array([input_size[0] / columns, input_size[1] / rows], np.float32)
+    less = 1 if udp else 0
+    stride = np.array([(input_size[0] - less) / (columns - less), (input_size[1] - less) / (rows - less)], np.float32)
     tops, scores = _local_maxima(maps)
     smooth = _blur(np.maximum(maps, 0.0))
     xy = _refine(smooth, tops[:, 0])
     spread = _spread(maps, tops[:, 0], xy)
     candidates = np.concatenate([tops.astype(np.float32), scores[..., None]], axis=2)
     candidates[:, 0, :2] = xy
-    # Cell i covers input pixels i * stride ... (i + 1) * stride - 1; its centre is what the peak names.
-    candidates[..., :2] = (candidates[..., :2] + 0.5) * stride - 0.5
+    # Networks are trained with the peak of a joint at pixel x drawn at cell x / stride, not at the cell's middle.
+    candidates[..., :2] *= stride
     candidates[~np.isfinite(scores)] = np.nan
     scale = np.array([stride[0] ** 2, stride[0] * stride[1], stride[1] ** 2], np.float32)
     return Peaks(candidates[:, 0, :2].copy(), scores[:, 0].copy(), spread * scale, candidates)
@@ -43,15 +48,27 @@ def decode_heatmaps(maps: np.ndarray, input_size: tuple[int, int]) -> Peaks:
 def _local_maxima(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(P, K, 2) int x y and (P, K) heights of the highest local maxima; -inf where there are fewer."""
     joints, _, columns = maps.shape
+    flat = maps.reshape(joints, -1)
+    top = flat.argmax(axis=1)
+    heights = np.full((joints, CANDIDATES), -np.inf, np.float32)
+    picked = np.repeat(top[:, None], CANDIDATES, axis=1)
+    heights[:, 0] = flat[np.arange(joints), top]
     padded = np.pad(maps, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
     across = np.maximum(np.maximum(padded[:, :, :-2], padded[:, :, 1:-1]), padded[:, :, 2:])
     highest = np.maximum(np.maximum(across[:, :-2], across[:, 1:-1]), across[:, 2:])
-    peaks = np.where(maps >= highest, maps, -np.inf).reshape(joints, -1)
-    picked = np.argpartition(peaks, -CANDIDATES, axis=1)[:, -CANDIDATES:]
-    heights = np.take_along_axis(peaks, picked, 1)
-    order = np.argsort(-heights, axis=1, kind="stable")
-    picked, heights = np.take_along_axis(picked, order, 1), np.take_along_axis(heights, order, 1)
-    return np.stack([picked % columns, picked // columns], -1), heights.astype(np.float32)
+    # Ripples far below the best peak are no candidates; leaving them out keeps the sort short.
+    peak = (maps >= highest) & (maps > _LEAST_CANDIDATE * heights[:, 0, None, None])
+    joint, place = np.nonzero(peak.reshape(joints, -1))
+    other = place != top[joint]
+    joint, place = joint[other], place[other]
+    value = flat[joint, place]
+    order = np.lexsort((place, -value, joint))
+    joint, place, value = joint[order], place[order], value[order]
+    rank = np.arange(len(joint)) - np.searchsorted(joint, joint) + 1
+    kept = rank < CANDIDATES
+    picked[joint[kept], rank[kept]] = place[kept]
+    heights[joint[kept], rank[kept]] = value[kept]
+    return np.stack([picked % columns, picked // columns], -1), heights
 
 
 def _blur(maps: np.ndarray) -> np.ndarray:

@@ -50,7 +50,7 @@ class PoseModel:
         size = self.spec.input_size
         if self.spec.layout == "heatmap":
             # A stacked network refines its guess from stack to stack: the last is the answer.
-            return decode_heatmaps(outputs[-1][0], size)
+            return decode_heatmaps(outputs[-1][0], size, self.spec.udp)
         if self.spec.layout == "simcc":
             return decode_simcc(outputs[0][0], outputs[1][0], size)
         if self.spec.layout == "movenet":

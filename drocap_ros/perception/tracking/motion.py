@@ -1,11 +1,11 @@
-"""Motion of a box in the image: a constant-velocity Kalman filter in units of the person's height."""
+"""Motion of a box in the image: a constant-velocity Kalman filter in units of the person's length."""
 
 from __future__ import annotations
 
 import numpy as np
 
-#: Standard deviations: of a measured centre (heights) and log size; of the acceleration (heights/s^2) and of
-#: the log size's (1/s^2).  A runner turns at about 1 g, 5 heights/s^2; a drone's yaw adds its own.
+#: Standard deviations: of a measured centre (lengths) and log size; of the acceleration (lengths/s^2) and of
+#: the log size's (1/s^2).  A runner turns at about 1 g, 5 lengths/s^2; a drone's yaw adds its own.
 _MEASURED = np.array([0.03, 0.03, 0.08, 0.08])
 _ACCELERATION = np.array([4.0, 4.0, 2.0, 2.0])
 #: A prediction over a longer time says nothing about velocity any more.
@@ -29,18 +29,24 @@ class BoxMotion:
         self.p[:, 1, 1] = rate**2
 
     def _scaled(self, values: np.ndarray) -> np.ndarray:
-        height = np.exp(self.x[3, 0]) if hasattr(self, "x") else 1.0
-        return values * np.array([height, height, 1.0, 1.0])
+        return values * np.array([self.length, self.length, 1.0, 1.0])
 
     def box(self) -> np.ndarray:
         """(4,) x_min y_min x_max y_max px."""
         cx, cy, w, h = self.x[0, 0], self.x[1, 0], np.exp(self.x[2, 0]), np.exp(self.x[3, 0])
         return np.array([cx - w / 2, cy - h / 2, cx + w / 2, cy + h / 2])
 
+    def box_at(self, stamp_ns: int) -> np.ndarray:
+        """(4,) px predicted for a time, without moving on to it."""
+        dt = float(np.clip((stamp_ns - self.stamp_ns) * 1e-9, 0.0, _LONGEST_PREDICTION_S))
+        cx, cy, w, h = self.x[:, 0] + dt * self.x[:, 1]
+        half = np.exp(np.clip([w, h], 0.0, 10.0)) / 2
+        return np.array([cx - half[0], cy - half[1], cx + half[0], cy + half[1]])
+
     @property
-    def height(self) -> float:
-        """Box height, px."""
-        return float(np.exp(self.x[3, 0]))
+    def length(self) -> float:
+        """Longer side of the box, px: the measure of a person who stands, lies or turns a somersault."""
+        return float(np.exp(self.x[2:, 0].max()))
 
     def predict(self, stamp_ns: int) -> None:
         """Move on to a later time; the velocity fades while nothing is measured."""

@@ -13,15 +13,25 @@ _LOOK_RATE = 0.08
 _LOOK_SETTLED = 10
 
 
+#: Share of a new score in the quality.
+_QUALITY_RATE = 0.3
+
+
 class Person:
-    """Motion, look and history of one person."""
+    """Motion, look and history of one person.
+
+    seen_ns : last detection; sure_ns : last one that was certain
+    quality : recent mean of the detection score: low for parts of somebody and for clutter
+    """
 
     def __init__(self, box: np.ndarray, score: float, stamp_ns: int, look: np.ndarray | None) -> None:
         self.motion = BoxMotion(box, stamp_ns)
         self.box = np.asarray(box, float)
         self.first_ns = stamp_ns
         self.seen_ns = stamp_ns
+        self.sure_ns = stamp_ns
         self.score = score
+        self.quality = score
         self.hits = 1
         self.look = look
         self._looks = 1 if look is not None else 0
@@ -30,13 +40,22 @@ class Person:
         """Seconds since the person was last seen."""
         return (stamp_ns - self.seen_ns) * 1e-9
 
+    def unsure_s(self, stamp_ns: int) -> float:
+        """Seconds since the person was surely seen."""
+        return (stamp_ns - self.sure_ns) * 1e-9
+
     def see(self, box: np.ndarray, score: float, stamp_ns: int) -> None:
-        """Take in a detection."""
+        """Take in a doubtful detection; :meth:`assure` makes it a sure one."""
         self.motion.update(box)
         self.box = np.asarray(box, float)
         self.seen_ns = stamp_ns
         self.score = score
+        self.quality += _QUALITY_RATE * (score - self.quality)
         self.hits += 1
+
+    def assure(self, stamp_ns: int) -> None:
+        """Note that it was surely the person, not clutter."""
+        self.seen_ns = self.sure_ns = stamp_ns
 
     def learn_look(self, look: np.ndarray | None) -> None:
         """Blend a look into the remembered one, faster at first."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from drocap_ros.errors import ParameterError
 from drocap_ros.perception.config import PoseEstimatorConfig
-from drocap_ros.perception.detection.nms import iou
+from drocap_ros.perception.detection.nms import iou, shared
 from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.association import assign
 from drocap_ros.perception.tracking.person import Person
@@ -18,6 +18,18 @@ from drocap_ros.perception.tracking.search import Window, tiles, window_around
 _HIDDEN_IOU = 0.25
 #: Overlap above which two persons' looks mix and are not learned.
 _MIXED_IOU = 0.1
+#: Below this likeness a detection that might also be somebody else is not the subject's.
+_STRANGE_LOOK = 0.85
+#: By so much somebody else's look must fit better.
+_LOOK_MARGIN = 0.05
+#: Least quality of a bystander who may claim a detection from the subject; parts and clutter score below.
+_SOLID_QUALITY = 0.4
+#: Overlap with the predicted box of a detection that leaves no doubt.
+_CLEAR_IOU = 0.5
+#: Outward speed, lengths/s, of a box at the picture's edge that counts as leaving.
+_LEAVING_SPEED = 0.15
+#: Share of the smaller box inside the larger from which both are one person.
+_PART = 0.75
 #: A bystander unseen for so long is forgotten.
 _BYSTANDER_S = 2.0
 #: Persons remembered at most; a crowd's rest is of no use.
@@ -78,8 +90,8 @@ class SubjectTracker:
         if self._wanted is not None:
             return list({window_around(self._wanted, image_size): None, None: None})
         subject = self._subject
-        if subject is not None and subject.gap_s(stamp_ns) <= self._config.coast_s:
-            near = window_around(subject.motion.box(), image_size)
+        if subject is not None and subject.unsure_s(stamp_ns) <= self._config.coast_s:
+            near = window_around(subject.motion.box_at(stamp_ns), image_size)
             due = self._full_ns is None or stamp_ns - self._full_ns >= self._config.full_frame_every_s * 1e9
             if near is None or due or stamp_ns < (self._full_ns or 0):
                 self._full_ns = stamp_ns
@@ -91,6 +103,19 @@ class SubjectTracker:
             return [None]
         self._tile = (self._tile + 1) % len(parts)
         return [None, parts[self._tile]]
+
+    def second_look(
+        self, image_size: tuple[int, int], stamp_ns: int, boxes: np.ndarray, scores: np.ndarray
+    ) -> Window | None:
+        """A tighter window for a subject whom the first detections (N, 4), (N,) do not show clearly, or None."""
+        subject = self._subject
+        if subject is None or self._wanted is not None or subject.unsure_s(stamp_ns) > self._config.coast_s:
+            return None
+        box = subject.motion.box_at(stamp_ns)
+        clear = scores >= self._config.detection_threshold
+        if clear.any() and iou(box[None], boxes[clear].astype(float)).max() > _CLEAR_IOU:
+            return None
+        return window_around(box, image_size, tight=True)
 
     def update(
         self, image: np.ndarray, stamp_ns: int, boxes: np.ndarray, scores: np.ndarray, roi: np.ndarray | None = None
@@ -110,52 +135,59 @@ class SubjectTracker:
             person.motion.predict(stamp_ns)
         looks = [describe(image, box) for box in boxes]
         used = self._match(boxes, scores, looks, stamp_ns)
-        fresh = self._welcome(boxes, scores, looks, used, stamp_ns)
+        self._welcome(boxes, scores, looks, used, stamp_ns)
         self._retake(stamp_ns)
         self._settle_choice(boxes, stamp_ns)
-        self._select(image.shape, stamp_ns, fresh)
+        self._select(image.shape, stamp_ns)
         self._forget(image.shape, stamp_ns)
         self._started = self._started or bool(len(boxes))
         return self._report(stamp_ns)
 
     def confirm(self, box: np.ndarray, stamp_ns: int) -> None:
-        """Tell that the pose network found the whole subject in its predicted box, at ``box`` (4,) px."""
+        """Tell that the pose network found the subject where it is predicted or doubtful, at ``box`` (4,) px."""
         if self._subject is not None:
             self._subject.motion.update(box, noise=2.0)
-            self._subject.seen_ns = stamp_ns
+            self._subject.assure(stamp_ns)
 
     def _match(self, boxes: np.ndarray, scores: np.ndarray, looks: list[np.ndarray | None], stamp_ns: int) -> set[int]:
-        """First the sure detections to all persons, then the doubtful ones to those who are left."""
-        coasting = self._config.coast_s
-        open_persons = [p for p in self._persons if p.gap_s(stamp_ns) <= coasting or p is not self._subject]
+        """Sure detections to known persons, then to those who may be clutter, then the doubtful ones.
+
+        Returns the detections that have an owner.
+        """
+        persons = [p for p in self._persons if p is not self._subject or p.unsure_s(stamp_ns) <= self._config.coast_s]
+        solid = [p for p in persons if p is self._subject or p.quality >= _SOLID_QUALITY]
+        thin = [p for p in persons if not any(p is q for q in solid)]
+        sure = scores >= self._config.detection_threshold
         used: set[int] = set()
-        for sure in (True, False):
-            at = np.nonzero((scores >= self._config.detection_threshold) == sure)[0]
-            at = np.array([j for j in at if j not in used], int)
-            pairs = assign(open_persons, boxes[at], [looks[j] for j in at], stamp_ns)
-            matched = set()
+        refused: set[int] = set()
+        for owners, wanted in ((solid, sure), (thin, sure), (solid, ~sure)):
+            free = [p for p in owners if p.seen_ns < stamp_ns and id(p) not in refused]
+            at = np.array([j for j in np.nonzero(wanted)[0] if j not in used], int)
+            pairs = assign(free, boxes[at], scores[at], [looks[j] for j in at], stamp_ns, tight=wanted is not sure)
             for i, k in pairs:
-                person, j = open_persons[i], int(at[k])
-                likeness = person.likeness(looks[j])
-                if (
-                    person is self._subject
-                    and likeness < self._config.appearance_threshold
-                    and self._contested(boxes, j)
-                ):
+                person, j = free[i], int(at[k])
+                if person is self._subject and self._stranger(boxes[j], looks[j]):
+                    refused.add(id(person))  # nor may a doubtful detection stand in for it
                     continue
                 person.see(boxes[j], float(scores[j]), stamp_ns)
+                if wanted is sure:
+                    person.assure(stamp_ns)
                 if not self._mixed(boxes, j):
                     person.learn_look(looks[j])
                 used.add(j)
-                matched.add(id(person))
-            open_persons = [p for p in open_persons if id(p) not in matched]
         return used
 
-    def _contested(self, boxes: np.ndarray, j: int) -> bool:
-        """Whether somebody else was near this detection."""
-        others = [p for p in self._persons if p is not self._subject]
+    def _stranger(self, box: np.ndarray, look: np.ndarray | None) -> bool:
+        """Whether a detection near the subject looks unlike it and more like somebody else who was there."""
+        if self._subject is None or look is None:
+            return False
+        own = self._subject.likeness(look)
+        if own >= _STRANGE_LOOK:
+            return False
+        others = [p for p in self._persons if p is not self._subject and p.quality >= _SOLID_QUALITY]
         near = np.array([p.motion.box() for p in others]).reshape(-1, 4)
-        return bool((iou(boxes[j][None].astype(float), near) > _MIXED_IOU).any())
+        close = iou(box[None].astype(float), near)[0] > _MIXED_IOU
+        return any(p.likeness(look) > own + _LOOK_MARGIN for p, at in zip(others, close, strict=True) if at)
 
     def _mixed(self, boxes: np.ndarray, j: int) -> bool:
         overlap = iou(boxes[j][None], boxes)[0]
@@ -164,24 +196,27 @@ class SubjectTracker:
 
     def _welcome(
         self, boxes: np.ndarray, scores: np.ndarray, looks: list[np.ndarray | None], used: set[int], stamp_ns: int
-    ) -> list[Person]:
-        fresh = []
+    ) -> None:
+        """Remember sure detections without an owner as new persons."""
+        known = boxes[sorted(used)].astype(float).reshape(-1, 4)
+        subject = self._subject
+        if subject is not None and not self._left and 0.0 < subject.unsure_s(stamp_ns) <= self._config.coast_s:
+            known = np.concatenate([known, subject.motion.box()[None]])
         for j in range(len(boxes)):
             if j in used or scores[j] < self._config.detection_threshold:
                 continue
-            if used and iou(boxes[j][None], boxes[sorted(used)]).max() > 0.5:
+            # A part of somebody known, or somebody known with more around.
+            if len(known) and shared(boxes[j][None].astype(float), known).max() > _PART:
                 continue
-            fresh.append(Person(boxes[j], float(scores[j]), stamp_ns, looks[j]))
-        self._persons += fresh
-        return fresh
+            self._persons.append(Person(boxes[j], float(scores[j]), stamp_ns, looks[j]))
 
     def _retake(self, stamp_ns: int) -> None:
         """Recognize a lost subject in a newcomer."""
         lost = self._subject
-        if lost is None or lost.gap_s(stamp_ns) <= 0:
+        if lost is None or lost.unsure_s(stamp_ns) <= 0:
             return
         for person in self._persons:
-            if person is lost or person.seen_ns != stamp_ns or person.first_ns <= lost.seen_ns:
+            if person is lost or person.seen_ns != stamp_ns or person.first_ns <= lost.sure_ns:
                 continue
             if person.hits < self._config.confirm_frames or not self._plausible(lost, person):
                 continue
@@ -193,23 +228,27 @@ class SubjectTracker:
 
     def _plausible(self, lost: Person, person: Person) -> bool:
         """Whether a newcomer looks like the lost subject and can have come there in the time."""
-        gap = (person.first_ns - lost.seen_ns) * 1e-9
+        gap = (person.first_ns - lost.sure_ns) * 1e-9
         if gap > self._config.forget_s:
             return False
         start, end = lost.box, person.box
-        height = max(lost.motion.height, 1.0)
-        distance = float(np.linalg.norm((start[:2] + start[2:] - end[:2] - end[2:]) / 2)) / height
-        growth = abs(float(np.log(max(end[3] - end[1], 1.0) / height)))
-        near = distance < 1.0 + 1.5 * gap and growth < 0.5 + 0.3 * gap
-        return near and person.likeness(lost.look) >= self._config.appearance_threshold
+        length = max(lost.motion.length, 1.0)
+        distance = float(np.linalg.norm((start[:2] + start[2:] - end[:2] - end[2:]) / 2)) / length
+        growth = abs(float(np.log(max(end[3] - end[1], end[2] - end[0], 1.0) / length)))
+        threshold = self._config.appearance_threshold
+        if self._left:
+            # Who comes back into the picture comes back where they left it, and must look the same twice over.
+            return distance < 1.5 and person.likeness(lost.look) >= 0.5 * (1 + threshold)
+        return distance < 1.0 + 1.5 * gap and growth < 0.5 + 0.3 * gap and person.likeness(lost.look) >= threshold
 
     def _take_roi(self, roi: np.ndarray, stamp_ns: int) -> None:
         """A new roi is a choice; one that stays on the subject carries it on where the detector is blind."""
         subject = self._subject
         if subject is None or iou(roi[None], subject.motion.box()[None])[0, 0] < 0.1:
             self._wanted = roi
-        elif self._config.subject == "roi" and subject.gap_s(stamp_ns) > 0.5 * self._config.coast_s:
+        elif self._config.subject == "roi" and subject.unsure_s(stamp_ns) > 0.5 * self._config.coast_s:
             subject.see(roi, 0.0, stamp_ns)
+            subject.assure(stamp_ns)
 
     def _settle_choice(self, boxes: np.ndarray, stamp_ns: int) -> None:
         if self._wanted is None:
@@ -225,7 +264,7 @@ class SubjectTracker:
         if chosen is not self._subject:
             self._follow(chosen)
 
-    def _select(self, shape: tuple[int, ...], stamp_ns: int, fresh: list[Person]) -> None:
+    def _select(self, shape: tuple[int, ...], stamp_ns: int) -> None:
         """The standing choice, where there is no subject to wait for."""
         config = self._config
         if config.subject in ("box", "roi"):
@@ -234,13 +273,14 @@ class SubjectTracker:
             if config.on_loss == "wait":
                 return
             patience = 0.0 if self._left else config.give_up_s
-            if self._subject.gap_s(stamp_ns) <= config.coast_s + patience:
+            if self._subject.unsure_s(stamp_ns) <= config.coast_s + patience:
                 return
         sure = [
             p
             for p in self._persons
             if p.seen_ns == stamp_ns
             and p is not self._subject
+            and p.score >= config.detection_threshold
             and (p.hits >= config.confirm_frames or (not self._started and p.score >= _SURE_SCORE))
         ]
         if not sure:
@@ -259,11 +299,8 @@ class SubjectTracker:
 
     def _forget(self, shape: tuple[int, ...], stamp_ns: int) -> None:
         subject = self._subject
-        if subject is not None and subject.gap_s(stamp_ns) > 0 and not self._left:
-            height, width = shape[:2]
-            edge = 0.01 * max(width, height)
-            box = subject.box
-            self._left = bool(box[0] < edge or box[1] < edge or box[2] > width - edge or box[3] > height - edge)
+        if subject is not None:
+            self._left = subject.gap_s(stamp_ns) > 0 and (self._left or _leaving(subject, shape))
         kept = [p for p in self._persons if p is subject or p.gap_s(stamp_ns) <= _BYSTANDER_S]
         if len(kept) > _MOST_PERSONS:
             kept.sort(key=lambda p: (p is not subject, -p.seen_ns))
@@ -271,14 +308,24 @@ class SubjectTracker:
 
     def _report(self, stamp_ns: int) -> Subject | None:
         subject = self._subject
-        if subject is None or subject.gap_s(stamp_ns) > self._config.coast_s:
+        if subject is None or subject.unsure_s(stamp_ns) > (0.0 if self._left else self._config.coast_s):
             return None
         if subject.seen_ns == stamp_ns:
             return Subject(self._track_id, subject.box, subject.score, False)
         box = subject.motion.box()
-        others = [p.box for p in self._persons if p is not subject and p.seen_ns == stamp_ns]
+        others = [p.box for p in self._persons if p is not subject and p.sure_ns == stamp_ns]
         hidden = bool(len(others)) and bool((iou(box[None], np.array(others)) > _HIDDEN_IOU).any())
         return Subject(self._track_id, box, 0.0, hidden)
+
+
+def _leaving(person: Person, shape: tuple[int, ...]) -> bool:
+    """Whether the person was at an edge of the picture when last seen, moving outwards."""
+    height, width = shape[:2]
+    edge = 0.01 * max(width, height)
+    x0, y0, x1, y1 = person.box
+    vx, vy = person.motion.x[:2, 1] / person.motion.length
+    out = ((x0 < edge, -vx), (x1 > width - edge, vx), (y0 < edge, -vy), (y1 > height - edge, vy))
+    return any(at_edge and speed > _LEAVING_SPEED for at_edge, speed in out)
 
 
 def parse_box(text: str) -> np.ndarray:
