@@ -1,12 +1,13 @@
 """Baseline MF+NNM: rotations by matrix factorization, shapes by nuclear norm minimization (Dai, Li and He 2012).
 
-It needs no dictionary and no start.  Its mirror ambiguity is resolved by the dictionary's poses, which the
-original leaves open.
+It needs no start.  What the original leaves open or chooses with the truth in hand, the rank and the mirror image,
+is chosen here by how far the result is from the dictionary's poses.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -14,11 +15,11 @@ from drocap_ros.geometry.alignment import to_torso_frame
 from drocap_ros.geometry.rotations import complete_rotation
 from drocap_ros.reconstruction.bundle_adjustment import Objective, minimize
 from drocap_ros.reconstruction.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.data_term import Projection, frames_first, frames_last, rotate
+from drocap_ros.reconstruction.data_term import Projection, frames_first, frames_last
 from drocap_ros.reconstruction.dictionary import Dictionary, normalize_poses
 
-#: Rank 3K of the factorization; Dai, Li and He choose K per sequence, best on the truth, which we do not.
-BASIS_SHAPES = 3
+#: Candidates of K in the rank 3K of the factorization.
+BASIS_SHAPES = (2, 3)
 
 MIRROR = np.array([1.0, 1.0, -1.0])
 
@@ -28,8 +29,6 @@ def factorize(
     information: np.ndarray,
     dictionary: Dictionary,
     config: BundleAdjusterConfig,
-    *,
-    basis_shapes: int = BASIS_SHAPES,
 ) -> tuple[np.ndarray, dict[str, float], int, str]:
     """Poses of one window by MF+NNM.
 
@@ -43,17 +42,34 @@ def factorize(
     """
     full = fill_joints(w, information[..., 0] > 0.0)
     full = full - full.mean(axis=1, keepdims=True)
-    rotation = rotations_by_factorization(full, basis_shapes)
-    # Pseudo-inverse start: the depth-free back-projection into the common frame.
-    start = frames_last(full @ rotation[:, :2])
-    cameras = np.ascontiguousarray(np.moveaxis(rotation, 0, -1))
-    fixed = _FixedCameras(Projection(w, information), cameras, replace(config, gamma=0.0))
-    shape, outcome = minimize(fixed, start)
-    poses = frames_first(rotate(cameras, shape))
-    mirrored = poses * MIRROR
-    if _strangeness(mirrored, dictionary) < _strangeness(poses, dictionary):
-        poses = mirrored
-    return poses, fixed.terms(shape), int(outcome["iterations"]), str(outcome["stop_reason"])
+    config = replace(config, gamma=0.0)
+    found = []
+    for basis_shapes in BASIS_SHAPES:
+        rotation = rotations_by_factorization(full, basis_shapes)
+        shape, terms, outcome = minimize_nuclear_norm(w, information, rotation, config)
+        poses = shape @ np.swapaxes(rotation, 1, 2)
+        found += [(candidate, terms, outcome) for candidate in (poses, poses * MIRROR)]
+    poses, terms, outcome = min(found, key=lambda one: _strangeness(one[0], dictionary))
+    return poses, terms, int(outcome["iterations"]), str(outcome["stop_reason"])
+
+
+def minimize_nuclear_norm(
+    w: np.ndarray,
+    information: np.ndarray,
+    rotation: np.ndarray,
+    config: BundleAdjusterConfig,
+    *,
+    start: np.ndarray | None = None,
+) -> tuple[np.ndarray, dict[str, float], dict[str, Any]]:
+    """Shapes (F, P, 3) in the common frame for known rotations (F, 3, 3); cost per term; the solver's outcome.
+
+    The start is the pseudo-inverse: joints back-projected into the common frame without depth.
+    """
+    centred = w - w.mean(axis=1, keepdims=True)
+    s = frames_last(centred @ rotation[:, :2] if start is None else start)
+    fixed = _FixedCameras(Projection(w, information), np.ascontiguousarray(np.moveaxis(rotation, 0, -1)), config)
+    s, outcome = minimize(fixed, s)
+    return frames_first(s), fixed.terms(s), outcome
 
 
 class _FixedCameras(Objective):
@@ -63,7 +79,7 @@ class _FixedCameras(Objective):
         """Nothing to do."""
 
 
-def rotations_by_factorization(w: np.ndarray, basis_shapes: int = BASIS_SHAPES) -> np.ndarray:
+def rotations_by_factorization(w: np.ndarray, basis_shapes: int) -> np.ndarray:
     """Camera rotations (F, 3, 3) of centred, complete tracks (F, P, 2), up to a common rotation and mirroring."""
     frames, p = w.shape[:2]
     stacked = np.swapaxes(w, 1, 2).reshape(2 * frames, p)

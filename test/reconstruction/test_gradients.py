@@ -111,7 +111,7 @@ def test_sparse_coefficients(projection: Projection, dictionary: Dictionary) -> 
 
     def value(x: np.ndarray) -> float:
         shape = (basis.T @ x).reshape(3, 15, F)
-        return 0.5 * projection.value(shape, r) + 0.5 * 0.4 * shape_change(x)
+        return 0.5 * projection.value(shape, r) + 0.5 * 0.4 * np.sum(np.diff(x, axis=1) ** 2)
 
     np.testing.assert_allclose(sparse_gradient(projection, r, c, basis, 0.4), numeric(value, c), atol=1e-6)
 
