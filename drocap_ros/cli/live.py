@@ -20,7 +20,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="bring the graph up on real hardware",
         description="Start the nodes and run until the source ends or Ctrl-C. Each in a process of its own.",
     )
-    parser.add_argument("--config", metavar="FILE", type=Path, required=True, help="parameters of the components (YAML)")
+    parser.add_argument(
+        "--config", metavar="FILE", type=Path, required=True, help="parameters of the components (YAML)"
+    )
     parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
     parser.add_argument("--source", metavar="URI", help="instead of the configuration's image_ingest.source")
     parser.add_argument("--session", metavar="DIR", type=Path, help="record to this new folder")

@@ -153,7 +153,9 @@ def _mirrored(features: np.ndarray) -> np.ndarray:
 def _checked(keypoints: np.ndarray, confidence: np.ndarray | None, fps: float) -> tuple[np.ndarray, np.ndarray]:
     keypoints = np.asarray(keypoints, dtype=np.float64)
     if keypoints.ndim != 3 or keypoints.shape[1:] != (_JOINTS, 2) or len(keypoints) == 0:
-        raise InputError(f"keypoints: expected (F, {_JOINTS}, 2) with F >= 1, got {keypoints.shape}; map the joints first")
+        raise InputError(
+            f"keypoints: expected (F, {_JOINTS}, 2) with F >= 1, got {keypoints.shape}; map the joints first"
+        )
     if not 1 <= fps <= 1000:
         raise InputError(f"fps: expected 1 to 1000 frames per second, got {fps!r}; check the time stamps")
     keypoints = np.where(np.isfinite(keypoints).all(axis=-1, keepdims=True), keypoints, np.nan)

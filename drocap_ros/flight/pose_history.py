@@ -1,0 +1,74 @@
+"""The camera's pose at the instant of an image, from the vehicle's states around it."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.flight.frames import camera_rotation, quaternion_multiply
+from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.geometry.rotations import slerp
+
+_NS = 1_000_000_000
+
+
+class CameraPose(NamedTuple):
+    """(3, 3) world ENU -> optical, and (3,) m ENU."""
+
+    rotation: np.ndarray
+    position: np.ndarray
+
+
+class PoseHistory:
+    """States of the last seconds, by their stamps.
+
+    Parameters
+    ----------
+    mount_pitch_deg : tilt of the camera against the body, down positive, where no mount tells its attitude
+    keep_s : how far back
+    extrapolate_s : how far beyond the newest state a pose is still told
+    """
+
+    def __init__(self, mount_pitch_deg: float = 0.0, keep_s: float = 3.0, extrapolate_s: float = 0.15) -> None:
+        half = 0.5 * np.deg2rad(mount_pitch_deg)
+        self._mount = np.array([0.0, np.sin(half), 0.0, np.cos(half)])  # about FLU y: positive turns the nose down
+        self._keep_ns, self._extrapolate_ns = int(keep_s * _NS), int(extrapolate_s * _NS)
+        self._poses: deque[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = deque()
+
+    def add(self, state: VehicleState) -> None:
+        """Take a state; one without position or attitude is left out.  A stamp that goes back starts afresh."""
+        camera = state.gimbal_orientation_xyzw
+        if not np.isfinite(camera).all():
+            camera = quaternion_multiply(state.orientation_xyzw, self._mount)
+        if not (np.isfinite(camera).all() and np.isfinite(state.position_enu_m).all()):
+            return
+        if self._poses and state.stamp_ns <= self._poses[-1][0]:
+            self._poses.clear()
+        velocity = np.nan_to_num(state.velocity_enu_m_s)
+        self._poses.append((state.stamp_ns, camera, state.position_enu_m, velocity))
+        while state.stamp_ns - self._poses[0][0] > self._keep_ns:
+            self._poses.popleft()
+
+    def at(self, stamp_ns: int) -> CameraPose | None:
+        """Pose at an instant; None when the states do not reach there."""
+        if not self._poses or stamp_ns < self._poses[0][0] - self._extrapolate_ns:
+            return None
+        newest = self._poses[-1]
+        if stamp_ns >= newest[0]:
+            gap_ns = stamp_ns - newest[0]
+            if gap_ns > self._extrapolate_ns:
+                return None
+            before = self._poses[-2] if len(self._poses) > 1 else newest
+            step = newest[0] - before[0]
+            camera = slerp(before[1], newest[1], 1.0 + min(gap_ns / step, 3.0)) if step > 0 else newest[1]
+            return CameraPose(camera_rotation(camera), newest[2] + newest[3] * gap_ns / _NS)
+        later = newest
+        for pose in reversed(self._poses):
+            if pose[0] <= stamp_ns:
+                part = (stamp_ns - pose[0]) / (later[0] - pose[0])
+                position = (1 - part) * pose[2] + part * later[2]
+                return CameraPose(camera_rotation(slerp(pose[1], later[1], part)), position)
+            later = pose
+        return CameraPose(camera_rotation(later[1]), later[2])
