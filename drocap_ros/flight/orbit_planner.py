@@ -1,0 +1,206 @@
+"""The orbit around a moving subject: a pure function of state and time.
+
+A reference point circles a smoothed centre; the setpoint is that point with its velocity and acceleration
+(centripetal ``-omega^2 R r_hat`` included) and a yaw from the vehicle's *actual* place to the subject.  The
+reference waits for a vehicle that lags.  Angular speed, radius and height change along ramps limited in
+acceleration and jerk.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.errors import ParameterError
+from drocap_ros.flight.orbit_config import OrbitConfig, check_orbit
+from drocap_ros.flight.setpoint import Setpoint
+
+_FREE_LEAD = 0.6  # share of the greatest lead below which the reference does not wait
+_CENTRE_RATE = 2.5  # 1/s, how fast the centre follows
+_CENTRE_ACCELERATION = 1.5  # m/s^2
+
+
+class OrbitGoal(NamedTuple):
+    """What the operator asked for."""
+
+    radius_m: float
+    height_m: float
+    angular_speed_rad_s: float
+
+
+class Ramp(NamedTuple):
+    """A value with its rate and the change of that."""
+
+    value: float
+    rate: float = 0.0
+    acceleration: float = 0.0
+
+
+class OrbitState(NamedTuple):
+    """Where the reference is.
+
+    phase : rad, bearing of the reference from the centre, from east
+    omega : rad/s with its rate
+    radius, height : m; height in the map frame
+    centre, centre_velocity, centre_acceleration : (2,) m, m/s, m/s^2
+    """
+
+    phase: float
+    omega: Ramp
+    radius: Ramp
+    height: Ramp
+    centre: np.ndarray
+    centre_velocity: np.ndarray
+    centre_acceleration: np.ndarray
+
+
+def goal_of(
+    config: OrbitConfig,
+    radius_m: float = math.nan,
+    height_m: float = math.nan,
+    angular_speed_deg_s: float = math.nan,
+    present: OrbitGoal | None = None,
+) -> OrbitGoal:
+    """Goal from a command; NaN = as at present, or as configured.
+
+    Raises
+    ------
+    ParameterError
+        When the limits do not allow it.
+    """
+    base = present or OrbitGoal(config.radius_m, config.height_m, math.radians(config.angular_speed_deg_s))
+    for name, value in (("radius_m", radius_m), ("height_m", height_m), ("angular_speed_deg_s", angular_speed_deg_s)):
+        if math.isinf(value):
+            raise ParameterError(f"{name}: expected a finite number or NaN (as it is), got {value!r}")
+    radius = base.radius_m if math.isnan(radius_m) else radius_m
+    height = base.height_m if math.isnan(height_m) else height_m
+    speed = math.degrees(base.angular_speed_rad_s) if math.isnan(angular_speed_deg_s) else angular_speed_deg_s
+    check_orbit(config, radius, speed)
+    return OrbitGoal(radius, height, math.radians(speed))
+
+
+def begin_orbit(vehicle: np.ndarray, velocity: np.ndarray, subject: np.ndarray, config: OrbitConfig) -> OrbitState:
+    """Reference at the vehicle's own place: nothing jumps at the start.
+
+    vehicle, velocity, subject : (3,) ENU
+    """
+    offset = vehicle[:2] - subject[:2]
+    return OrbitState(
+        phase=math.atan2(offset[1], offset[0]),
+        omega=Ramp(0.0),
+        radius=Ramp(max(float(np.hypot(*offset)), config.min_distance_m)),
+        height=Ramp(float(vehicle[2])),
+        centre=subject[:2].copy(),
+        centre_velocity=np.zeros(2),
+        centre_acceleration=np.zeros(2),
+    )
+
+
+def advance(
+    state: OrbitState,
+    goal: OrbitGoal,
+    vehicle: np.ndarray,
+    subject: np.ndarray,
+    subject_velocity: np.ndarray,
+    ground_m: float,
+    dt: float,
+    config: OrbitConfig,
+) -> OrbitState:
+    """The reference ``dt`` seconds later (at most 0.2 s of them).
+
+    vehicle, subject, subject_velocity : (3,) ENU, as they are
+    ground_m : height of the subject's ground in the map frame
+    """
+    dt = min(max(dt, 0.0), 0.2)
+    if dt == 0.0:
+        return state
+    centre, centre_velocity, centre_acceleration = _follow(state, subject[:2], subject_velocity[:2], dt, config)
+    jerk = config.max_jerk_m_s3
+    slow = min(0.5 * config.max_acceleration_m_s2, 1.0)
+    radius = _toward(state.radius, max(goal.radius_m, config.min_distance_m), config.approach_speed_m_s, slow, jerk, dt)
+    height = _toward(state.height, ground_m + goal.height_m, config.approach_speed_m_s, slow, jerk, dt)
+    target = _allowed_speed(goal.angular_speed_rad_s, radius.value, float(np.hypot(*centre_velocity)), config)
+    lead = float(np.linalg.norm(reference_position(state)[:2] - vehicle[:2]))
+    wait = (config.max_lead_m - lead) / ((1 - _FREE_LEAD) * config.max_lead_m)
+    target *= min(max(wait, 0.0), 1.0)
+    # A ramp of the wanted length with rounded ends: its greatest rate is 1.5 times its mean.
+    rate = 1.5 * max(abs(goal.angular_speed_rad_s), math.radians(5.0)) / config.ramp_s
+    omega = _speed_toward(state.omega, target, rate, 6.0 * rate / config.ramp_s, dt)
+    # The ramp is too slow for a vehicle that suddenly stays behind: then the phase itself waits.
+    creep = min(max((1.3 * config.max_lead_m - lead) / (0.3 * config.max_lead_m), 0.0), 1.0)
+    phase = state.phase + 0.5 * (state.omega.value + omega.value) * dt * creep
+    return OrbitState(
+        math.remainder(phase, 2 * math.pi), omega, radius, height, centre, centre_velocity, centre_acceleration
+    )
+
+
+def reference_position(state: OrbitState) -> np.ndarray:
+    """(3,) m ENU, where the reference is."""
+    c, s = math.cos(state.phase), math.sin(state.phase)
+    r = state.radius.value
+    return np.array([state.centre[0] + r * c, state.centre[1] + r * s, state.height.value])
+
+
+def setpoint_of(
+    state: OrbitState, vehicle: np.ndarray, subject: np.ndarray, subject_velocity: np.ndarray, config: OrbitConfig
+) -> Setpoint:
+    """What to send: the reference, never farther from the vehicle than the greatest lead."""
+    c, s = math.cos(state.phase), math.sin(state.phase)
+    outward, along = np.array([c, s]), np.array([-s, c])
+    r, omega = state.radius, state.omega
+    flat_velocity = state.centre_velocity + r.rate * outward + r.value * omega.value * along
+    flat_acceleration = (
+        state.centre_acceleration
+        + (r.acceleration - omega.value**2 * r.value) * outward
+        + (r.value * omega.rate + 2 * r.rate * omega.value) * along
+    )
+    velocity = _shortened(np.array([*flat_velocity, state.height.rate]), config.max_speed_m_s)
+    acceleration = _shortened(np.array([*flat_acceleration, state.height.acceleration]), config.max_acceleration_m_s2)
+    position = vehicle + _shortened(reference_position(state) - vehicle, config.max_lead_m)
+    sight = subject[:2] - vehicle[:2]
+    distance2 = max(float(sight @ sight), 0.25)
+    # The subject moves as estimated, the vehicle as it is asked to.
+    drift = subject_velocity[:2] - velocity[:2]
+    yaw_rate = float(sight[0] * drift[1] - sight[1] * drift[0]) / distance2
+    return Setpoint(position, velocity, acceleration, math.atan2(sight[1], sight[0]), yaw_rate)
+
+
+def _allowed_speed(wanted: float, radius: float, centre_speed: float, config: OrbitConfig) -> float:
+    """Angular speed (rad/s) that radius, speed and acceleration limits leave of the wanted one."""
+    by_acceleration = math.sqrt(config.max_acceleration_m_s2 / radius)
+    by_speed = max(config.max_speed_m_s - centre_speed, 0.0) / radius
+    return math.copysign(min(abs(wanted), by_acceleration, by_speed), wanted)
+
+
+def _follow(
+    state: OrbitState, subject: np.ndarray, velocity: np.ndarray, dt: float, config: OrbitConfig
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centre after the subject: critically damped, limited in speed and acceleration, so that no jump comes through."""
+    pull = _CENTRE_RATE**2 * (subject - state.centre) + 2 * _CENTRE_RATE * (velocity - state.centre_velocity)
+    acceleration = _shortened(pull, _CENTRE_ACCELERATION)
+    moved = _shortened(state.centre_velocity + acceleration * dt, config.max_subject_speed_m_s)
+    # Only part of it is fed forward: what the filter makes of noise should not shake the vehicle.
+    return state.centre + 0.5 * (state.centre_velocity + moved) * dt, moved, 0.3 * acceleration
+
+
+def _toward(ramp: Ramp, target: float, max_rate: float, max_acceleration: float, jerk: float, dt: float) -> Ramp:
+    gap = target - ramp.value
+    # Speed from which braking at half the acceleration ends at the target; linear near it.
+    rate = min(max_rate, math.sqrt(max_acceleration * abs(gap)), 1.2 * abs(gap))
+    speed = _speed_toward(Ramp(ramp.rate, ramp.acceleration), math.copysign(rate, gap), max_acceleration, jerk, dt)
+    return Ramp(ramp.value + 0.5 * (ramp.rate + speed.value) * dt, speed.value, speed.rate)
+
+
+def _speed_toward(speed: Ramp, target: float, max_acceleration: float, jerk: float, dt: float) -> Ramp:
+    """One step of a speed (value, its rate) towards a target, the rate and its change limited."""
+    gap = target - speed.value
+    rate = math.copysign(min(max_acceleration, math.sqrt(2 * jerk * abs(gap)), abs(gap) / dt, 4.0 * abs(gap)), gap)
+    rate = speed.rate + min(max(rate - speed.rate, -jerk * dt), jerk * dt)
+    return Ramp(speed.value + rate * dt, rate)
+
+
+def _shortened(vector: np.ndarray, length: float) -> np.ndarray:
+    norm = float(np.linalg.norm(vector))
+    return vector if norm <= length else vector * (length / norm)
