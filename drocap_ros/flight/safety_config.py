@@ -1,0 +1,62 @@
+"""Parameters of the conditions for motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drocap_ros.errors import ParameterError
+from drocap_ros.parameters import Parameters, param
+
+
+@dataclass(frozen=True)
+class SafetyConfig(Parameters):
+    """When motion may be commanded, and how it is ended."""
+
+    commands_enabled: bool = param(False, "whether motion may be commanded at all")
+    mode_change_allowed: bool = param(
+        False, "whether the operator's `engage` may change the mode to GUIDED or OFFBOARD; `start` never does"
+    )
+    max_subject_age_s: float = param(0.4, "greatest age of the subject's position", unit="s", minimum=0.05, maximum=2)
+    max_subject_sd_m: float = param(
+        1.5, "greatest standard deviation of the subject's position", unit="m", minimum=0.05, maximum=10
+    )
+    max_state_age_s: float = param(
+        0.4, "greatest age of the vehicle's attitude and position", unit="s", minimum=0.05, maximum=2
+    )
+    max_status_age_s: float = param(
+        1.5, "greatest age of GPS, estimator and battery messages", unit="s", minimum=0.3, maximum=10
+    )
+    max_heartbeat_age_s: float = param(2.5, "greatest age of the flight mode", unit="s", minimum=0.3, maximum=10)
+    max_round_trip_s: float = param(0.5, "greatest round trip on the link", unit="s", minimum=0.02, maximum=5)
+    max_echo_age_s: float = param(
+        1.5, "time without the autopilot's echo of our setpoints after which it is taken not to follow them",
+        unit="s", minimum=0.3, maximum=10,
+    )  # fmt: skip
+    min_battery_fraction: float = param(0.25, "least charge of the battery", minimum=0, maximum=1)
+    fence_radius_m: float = param(
+        40.0, "greatest horizontal distance from where the orbit began", unit="m", minimum=5, maximum=1000
+    )
+    min_height_m: float = param(1.2, "least height above the subject's ground", unit="m", minimum=0.3, maximum=100)
+    max_height_m: float = param(20.0, "greatest height above the subject's ground", unit="m", minimum=1, maximum=120)
+    braking_m_s2: float = param(
+        1.3, "deceleration that is counted on: the margin to every limit is v^2 / (2 of this)", unit="m/s^2",
+        minimum=0.2, maximum=10,
+    )  # fmt: skip
+    speed_margin: float = param(
+        1.3, "share of max_speed_m_s above which the vehicle is stopped", minimum=1.0, maximum=3.0
+    )
+    hold_s: float = param(
+        3.0, "time for which a place is held by setpoints before the autopilot's hold mode is asked for, if the "
+        "vehicle has not come to rest before", unit="s", minimum=0.5, maximum=30,
+    )  # fmt: skip
+    engage_timeout_s: float = param(
+        5.0, "time for GUIDED or OFFBOARD to come after `engage`", unit="s", minimum=1, maximum=30
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.max_height_m < self.min_height_m + 1.0:
+            raise ParameterError(
+                f"max_height_m: expected at least min_height_m and 1 m, {self.min_height_m + 1.0:g}, "
+                f"got {self.max_height_m:g}; leave room to fly in"
+            )
