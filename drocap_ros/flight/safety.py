@@ -376,8 +376,10 @@ def _orbit(seen: Observed, now_s: float) -> SafetyState:
 
 
 def _hold(state: SafetyState, reason: str, seen: Observed, now_s: float, blind: bool) -> SafetyState:
-    known = not blind or bool(np.isfinite(seen.position).all() and seen.position_age_s <= 0.3 and seen.position_ok)
-    known = known and seen.gps_fix_type >= 3 and math.isfinite(seen.yaw)
+    # Something else may be wrong while the place is still known: then the place is held.
+    fresh = max(seen.link_age_s, seen.state_age_s, seen.position_age_s) <= 0.3
+    usable = bool(np.isfinite(seen.position).all()) and math.isfinite(seen.yaw)
+    known = not blind or (fresh and usable and seen.position_ok and seen.gps_fix_type >= 3)
     return dataclasses.replace(
         state, state=State.HOLDING, since_s=now_s, reason=reason, blind=not known, rest_s=math.nan,
         hold_position=seen.position.copy() if known else state.hold_position,

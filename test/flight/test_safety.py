@@ -231,9 +231,9 @@ def test_in_any_history(history):
 
 def test_reasons_are_all_different():
     reasons = [reduce(SafetyState(), bad(name), 0.0, None, LIMITS)[0].reason for name in BAD]
-    for a, b in itertools.combinations([n for n in range(len(reasons))], 2):
-        same = {"position nan", "heading nan", "subject uncertain"}
-        assert reasons[a] != reasons[b] or {list(BAD)[a], list(BAD)[b]} & same
+    named = list(zip(BAD, reasons, strict=True))
+    for (a, reason_a), (b, reason_b) in itertools.combinations(named, 2):
+        assert reason_a != reason_b or {a, b} == {"position nan", "heading nan"}
 
 
 def test_contradicting_limits_are_refused():
