@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drocap_ros.parameters import Parameters, param
+from drocap_ros.errors import ParameterError
+from drocap_ros.flight.orbit_config import OrbitConfig
+from drocap_ros.flight.safety_config import SafetyConfig
+from drocap_ros.flight.subject_config import SubjectConfig
+from drocap_ros.parameters import param
 
 
 @dataclass(frozen=True)
-class MavlinkBridgeConfig(Parameters):
-    """The link to the autopilot and the telemetry asked of it."""
+class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
+    """The link to the autopilot, the telemetry asked of it, the orbit, and when motion may be commanded."""
 
     url: str = param(
         "udpin:127.0.0.1:14540",
@@ -31,7 +35,7 @@ class MavlinkBridgeConfig(Parameters):
         20.0, "wanted rate of the gimbal's attitude; 0 = do not ask", unit="Hz", minimum=0, maximum=100
     )
     status_hz: float = param(
-        2.0, "wanted rate of GPS, battery, estimator and landed state", unit="Hz", minimum=0.2, maximum=20
+        5.0, "wanted rate of GPS, battery, estimator and landed state", unit="Hz", minimum=0.2, maximum=20
     )
     time_sync_hz: float = param(2.0, "rate of time synchronization", unit="Hz", minimum=0.1, maximum=20)
     rate_window_s: float = param(3.0, "time over which the real rates are measured", unit="s", minimum=1, maximum=30)
@@ -40,3 +44,29 @@ class MavlinkBridgeConfig(Parameters):
     )
     request_retry_s: float = param(2.0, "time between requests for the same message", unit="s", minimum=0.2, maximum=60)
     link_timeout_s: float = param(3.0, "silence after which the link counts as lost", unit="s", minimum=0.5, maximum=60)
+    control_hz: float = param(20.0, "rate of setpoints", unit="Hz", minimum=5, maximum=50)
+    watchdog_s: float = param(
+        0.3, "time without a step of the control loop after which the watchdog holds the vehicle", unit="s",
+        minimum=0.1, maximum=2,
+    )  # fmt: skip
+    gimbal_control: bool = param(False, "whether the mount's pitch is turned to the subject")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        low, high = self.min_height_m + 0.3, self.max_height_m - 0.5
+        if not low <= self.height_m <= high:
+            raise ParameterError(
+                f"height_m: expected {low:g} to {high:g} m (inside min_height_m and max_height_m), "
+                f"got {self.height_m:g}; change one of them"
+            )
+        if self.radius_m + 1.0 > self.fence_radius_m:
+            raise ParameterError(
+                f"fence_radius_m: expected at least radius_m and 1 m, {self.radius_m + 1.0:g}, "
+                f"got {self.fence_radius_m:g}; widen the fence or come closer"
+            )
+        for name, least in (("attitude_hz", 5.0), ("position_hz", 5.0), ("status_hz", 2.0)):
+            if self.commands_enabled and getattr(self, name) < least:
+                raise ParameterError(
+                    f"{name}: expected at least {least:g} Hz to fly by it, got {getattr(self, name):g}; raise it or "
+                    "set commands_enabled to false"
+                )

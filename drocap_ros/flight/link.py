@@ -1,7 +1,8 @@
 """The one owner of the connection to the autopilot.
 
-It reads telemetry, asks for it, keeps its heartbeat and the clocks in step.  It sends no motion: what it may send
-is listed in ``SENDABLE`` and nothing else leaves the port.
+It reads telemetry, asks for it, keeps its heartbeat and the clocks in step.  What it may send is listed in
+``SENDABLE``, and with ``commands_enabled`` in ``MOTION`` and its modes too; nothing else leaves the port.  It can
+neither arm, nor take off, nor ask for any mode but the control mode and the hold mode of the dialect.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.config import MavlinkBridgeConfig
+from drocap_ros.flight.dialects import DIALECTS
 from drocap_ros.flight.parser import MavlinkParser
 from drocap_ros.flight.state_estimator import VehicleStateEstimator
 from drocap_ros.flight.telemetry_request import TelemetryRequests
-from drocap_ros.flight.transport import LinkError, open_transport
+from drocap_ros.flight.transport import LinkError, Transport, open_transport
 from drocap_ros.flight.vehicle_state import VehicleState
 
 _NS = 1_000_000_000
@@ -27,6 +29,10 @@ _STREAM_FALLBACK_S = 5.0
 _RECONNECT_S = 1.0
 SENDABLE = frozenset({"HEARTBEAT", "TIMESYNC", "COMMAND_LONG", "REQUEST_DATA_STREAM"})
 _COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL})
+MOTION = frozenset({"SET_POSITION_TARGET_LOCAL_NED", "COMMAND_LONG"})
+_MODES = frozenset(
+    (float(main), float(sub)) for d in DIALECTS.values() for main, sub in (d.control_numbers, d.hold_numbers)
+)
 
 logger = logging.getLogger(__name__)
 
@@ -57,6 +63,8 @@ class MavlinkLink:
     ----------
     config : where to connect, what to ask for
     clock_ns : our clock, ns; that of the stamps
+    monotonic_s : clock of the periods and of silence
+    transport : instead of that of ``config.url``
 
     Raises
     ------
@@ -64,11 +72,19 @@ class MavlinkLink:
         At construction, when the URL cannot be used.
     """
 
-    def __init__(self, config: MavlinkBridgeConfig, clock_ns: Callable[[], int] = time.time_ns) -> None:
+    def __init__(
+        self,
+        config: MavlinkBridgeConfig,
+        clock_ns: Callable[[], int] = time.time_ns,
+        *,
+        monotonic_s: Callable[[], float] = time.monotonic,
+        transport: Transport | None = None,
+    ) -> None:
         self.config = config
         self.estimator = VehicleStateEstimator(config.target_system_id)
         self._clock_ns = clock_ns
-        self._transport = open_transport(config.url)
+        self._monotonic_s = monotonic_s
+        self._transport = transport or open_transport(config.url)
         self._parser = MavlinkParser()
         self._requests = TelemetryRequests(config)
         self._mav = mavlink.MAVLink(None, srcSystem=config.system_id, srcComponent=config.component_id)
@@ -78,6 +94,7 @@ class MavlinkLink:
         self._sync_sent: dict[int, int] = {}
         self._broken_s: float | None = None
         self._lock = threading.Lock()
+        self._answers: list[tuple[int, int]] = []
 
     def __enter__(self) -> MavlinkLink:
         return self
@@ -107,13 +124,56 @@ class MavlinkLink:
             self._send_due()
         return [state for state in states if state is not None]
 
+    @property
+    def mav(self) -> Any:
+        """Encoder of messages in our name."""
+        return self._mav
+
+    @property
+    def target(self) -> tuple[int, int]:
+        """System and component of the autopilot."""
+        return self.estimator.system_id, self.estimator.component_id
+
+    def send_motion(self, message: Any) -> None:
+        """Send a setpoint or a command of the allow-list.
+
+        Raises
+        ------
+        AssertionError
+            When motion is not enabled, or the message is not on the list: an error in the program.
+        """
+        if not self.config.commands_enabled or not _is_motion(message):
+            raise AssertionError(f"this link sends no {message.get_type()}")
+        with self._lock:
+            self._transmit(message)
+
+    def send_unlocked(self, packet: bytes) -> None:
+        """Send what :meth:`pack_motion` made without waiting for anybody: for the watchdog of a loop that hangs."""
+        try:
+            self._transport.write(packet)
+        except LinkError as error:
+            logger.warning("the watchdog could not send: %s", error)
+
+    def pack_motion(self, message: Any) -> bytes:
+        """Bytes of a message of the allow-list, to be sent by :meth:`send_unlocked` if it comes to that."""
+        if not self.config.commands_enabled or not _is_motion(message):
+            raise AssertionError(f"this link sends no {message.get_type()}")
+        with self._lock:
+            return bytes(message.pack(self._mav))
+
+    def take_answers(self) -> list[tuple[int, int]]:
+        """(command, MAV_RESULT) of the acknowledgements that came since the last call, telemetry's left out."""
+        with self._lock:
+            answers, self._answers = self._answers, []
+        return answers
+
     def status(self) -> LinkStatus:
         """How the link does now."""
         with self._lock:
             return self._status()
 
     def _status(self) -> LinkStatus:
-        silence = float("inf") if self._heard_s is None else time.monotonic() - self._heard_s
+        silence = float("inf") if self._heard_s is None else self._monotonic_s() - self._heard_s
         trip = self.estimator.clock.round_trip_ns
         now_ns = self._clock_ns()
         return LinkStatus(
@@ -136,17 +196,17 @@ class MavlinkLink:
 
     def _break(self, error: LinkError) -> None:
         logger.warning("%s; trying again every %g s", error, _RECONNECT_S)
-        self._broken_s = time.monotonic()
+        self._broken_s = self._monotonic_s()
 
     def _reopened(self, timeout_s: float) -> bool:
-        if self._broken_s is None or time.monotonic() - self._broken_s < _RECONNECT_S:
+        if self._broken_s is None or self._monotonic_s() - self._broken_s < _RECONNECT_S:
             time.sleep(min(timeout_s, _RECONNECT_S))
             return False
         self._transport.close()
         try:
             self._transport = open_transport(self.config.url)
         except InputError:
-            self._broken_s = time.monotonic()
+            self._broken_s = self._monotonic_s()
             return False
         self._broken_s = None
         return True
@@ -160,7 +220,7 @@ class MavlinkLink:
             return None
         if message.get_srcSystem() != self.estimator.system_id or self.estimator.component_id == 0:
             return state
-        self._heard_s = time.monotonic()
+        self._heard_s = self._monotonic_s()
         self._transport.accept_peer()
         if self._autopilot is None:
             self._autopilot = _autopilot_kind(message)
@@ -171,6 +231,8 @@ class MavlinkLink:
             self._take_time_sync(message, now_ns)
         elif name == "COMMAND_ACK" and message.command in _COMMANDS:
             self._requests.acknowledge(message.result, now_ns)
+        elif name == "COMMAND_ACK" and message.target_system in (0, self.config.system_id):
+            self._answers = [*self._answers[-31:], (int(message.command), int(message.result))]
         return state
 
     def _take_time_sync(self, message: Any, now_ns: int) -> None:
@@ -211,7 +273,7 @@ class MavlinkLink:
             self._send(self._mav.request_data_stream_encode(system, component, mavlink.MAV_DATA_STREAM_ALL, rate, 1))
 
     def _is_due(self, what: str, period_s: float) -> bool:
-        now = time.monotonic()
+        now = self._monotonic_s()
         if now < self._due.get(what, 0.0):
             return False
         self._due[what] = now + period_s
@@ -221,6 +283,9 @@ class MavlinkLink:
         name = message.get_type()
         if name not in SENDABLE or (name == "COMMAND_LONG" and message.command not in _COMMANDS):
             raise AssertionError(f"this link sends no {name}")
+        self._transmit(message)
+
+    def _transmit(self, message: Any) -> None:
         if self._broken_s is not None:
             return
         try:
@@ -228,6 +293,17 @@ class MavlinkLink:
         except LinkError as error:
             self._break(error)
         self._mav.seq = (self._mav.seq + 1) % 256
+
+
+def _is_motion(message: Any) -> bool:
+    """The narrow list: setpoints, the dialects' own modes, the mount's pitch."""
+    if message.get_type() not in MOTION:
+        return False
+    if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
+        return True
+    if message.command == mavlink.MAV_CMD_DO_SET_MODE:
+        return (float(message.param2), float(message.param3)) in _MODES
+    return bool(message.command == mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW)
 
 
 def _autopilot_kind(message: Any) -> str | None:

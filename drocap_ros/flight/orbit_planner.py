@@ -17,9 +17,10 @@ from drocap_ros.errors import ParameterError
 from drocap_ros.flight.orbit_config import OrbitConfig, check_orbit
 from drocap_ros.flight.setpoint import Setpoint
 
+_TRIM_RATE, _MAX_TRIM_M = 0.15, 0.5  # 1/s, m
 _FREE_LEAD = 0.6  # share of the greatest lead below which the reference does not wait
-_CENTRE_RATE = 2.5  # 1/s, how fast the centre follows
-_CENTRE_ACCELERATION = 1.5  # m/s^2
+_CENTRE_RATE = 3.0
+_CENTRE_ACCELERATION = 3.0
 
 
 class OrbitGoal(NamedTuple):
@@ -45,6 +46,7 @@ class OrbitState(NamedTuple):
     omega : rad/s with its rate
     radius, height : m; height in the map frame
     centre, centre_velocity, centre_acceleration : (2,) m, m/s, m/s^2
+    trim : m, added to the radius: what the vehicle stays out or in on the mean (wind, lag), learned slowly
     """
 
     phase: float
@@ -54,6 +56,7 @@ class OrbitState(NamedTuple):
     centre: np.ndarray
     centre_velocity: np.ndarray
     centre_acceleration: np.ndarray
+    trim: float = 0.0
 
 
 def goal_of(
@@ -119,7 +122,8 @@ def advance(
     centre, centre_velocity, centre_acceleration = _follow(state, subject[:2], subject_velocity[:2], dt, config)
     jerk = config.max_jerk_m_s3
     slow = min(0.5 * config.max_acceleration_m_s2, 1.0)
-    radius = _toward(state.radius, max(goal.radius_m, config.min_distance_m), config.approach_speed_m_s, slow, jerk, dt)
+    approach = _approach_speed(state, config)
+    radius = _toward(state.radius, max(goal.radius_m, config.min_distance_m), approach, slow, jerk, dt)
     height = _toward(state.height, ground_m + goal.height_m, config.approach_speed_m_s, slow, jerk, dt)
     target = _allowed_speed(goal.angular_speed_rad_s, radius.value, float(np.hypot(*centre_velocity)), config)
     lead = float(np.linalg.norm(reference_position(state)[:2] - vehicle[:2]))
@@ -131,15 +135,19 @@ def advance(
     # The ramp is too slow for a vehicle that suddenly stays behind: then the phase itself waits.
     creep = min(max((1.3 * config.max_lead_m - lead) / (0.3 * config.max_lead_m), 0.0), 1.0)
     phase = state.phase + 0.5 * (state.omega.value + omega.value) * dt * creep
+    trim = state.trim
+    if creep == 1.0:
+        error = radius.value - float(np.hypot(*(vehicle[:2] - subject[:2])))
+        trim = min(max(trim + _TRIM_RATE * error * dt, -_MAX_TRIM_M), _MAX_TRIM_M)
     return OrbitState(
-        math.remainder(phase, 2 * math.pi), omega, radius, height, centre, centre_velocity, centre_acceleration
+        math.remainder(phase, 2 * math.pi), omega, radius, height, centre, centre_velocity, centre_acceleration, trim
     )
 
 
 def reference_position(state: OrbitState) -> np.ndarray:
     """(3,) m ENU, where the reference is."""
     c, s = math.cos(state.phase), math.sin(state.phase)
-    r = state.radius.value
+    r = state.radius.value + state.trim
     return np.array([state.centre[0] + r * c, state.centre[1] + r * s, state.height.value])
 
 
@@ -167,6 +175,14 @@ def setpoint_of(
     return Setpoint(position, velocity, acceleration, math.atan2(sight[1], sight[0]), yaw_rate)
 
 
+def _approach_speed(state: OrbitState, config: OrbitConfig) -> float:
+    """Speed of radius changes: slower after a subject that walks away, who may stop while the vehicle cannot."""
+    outward = np.array([math.cos(state.phase), math.sin(state.phase)])
+    chase = max(-float(state.centre_velocity @ outward), 0.0)
+    room = max(state.radius.value - config.min_distance_m, 0.0)
+    return min(max(math.sqrt(room) - chase, 0.2), config.approach_speed_m_s)
+
+
 def _allowed_speed(wanted: float, radius: float, centre_speed: float, config: OrbitConfig) -> float:
     """Angular speed (rad/s) that radius, speed and acceleration limits leave of the wanted one."""
     by_acceleration = math.sqrt(config.max_acceleration_m_s2 / radius)
@@ -181,14 +197,13 @@ def _follow(
     pull = _CENTRE_RATE**2 * (subject - state.centre) + 2 * _CENTRE_RATE * (velocity - state.centre_velocity)
     acceleration = _shortened(pull, _CENTRE_ACCELERATION)
     moved = _shortened(state.centre_velocity + acceleration * dt, config.max_subject_speed_m_s)
-    # Only part of it is fed forward: what the filter makes of noise should not shake the vehicle.
-    return state.centre + 0.5 * (state.centre_velocity + moved) * dt, moved, 0.3 * acceleration
+    return state.centre + 0.5 * (state.centre_velocity + moved) * dt, moved, acceleration
 
 
 def _toward(ramp: Ramp, target: float, max_rate: float, max_acceleration: float, jerk: float, dt: float) -> Ramp:
     gap = target - ramp.value
     # Speed from which braking at half the acceleration ends at the target; linear near it.
-    rate = min(max_rate, math.sqrt(max_acceleration * abs(gap)), 1.2 * abs(gap))
+    rate = min(max_rate, math.sqrt(0.7 * max_acceleration * abs(gap)), 0.8 * abs(gap))
     speed = _speed_toward(Ramp(ramp.rate, ramp.acceleration), math.copysign(rate, gap), max_acceleration, jerk, dt)
     return Ramp(ramp.value + 0.5 * (ramp.rate + speed.value) * dt, speed.value, speed.rate)
 

@@ -20,6 +20,7 @@ from drocap_ros.flight.safety_config import SafetyConfig
 _AT_REST_M_S = 0.35
 _BLIND_MODE_REQUEST_S = 1.0
 _BLIND_STOP_S = 10.0
+_REACTION_S = 0.5
 _HOLD_MODE_PATIENCE_S = 5.0
 _LANDED_BAD = {1: "on the ground", 3: "taking off", 4: "landing"}
 
@@ -69,7 +70,8 @@ class Observed:
     position_age_s : since the reported position last changed: frozen telemetry ages too
     position, velocity : (3,) ENU
     height_m : above the subject's ground
-    subject_distance_m, closing_m_s : horizontal; closing positive = nearing
+    subject_distance_m : horizontal
+    closing_m_s, approach_m_s : how fast the vehicle moves towards the subject, and the subject towards the vehicle
     disturbance : something that ends motion and that no other field tells, in words
     """
 
@@ -98,6 +100,7 @@ class Observed:
     subject_sd_m: float = math.inf
     subject_distance_m: float = math.nan
     closing_m_s: float = 0.0
+    approach_m_s: float = 0.0
     disturbance: str = ""
 
 
@@ -214,7 +217,11 @@ def subject_problem(seen: Observed, limits: Limits) -> str:
         return f"the subject was last located {_ago(seen.subject_age_s)}"
     if not seen.subject_sd_m <= safety.max_subject_sd_m:
         return f"the subject's position is uncertain by {seen.subject_sd_m:.1f} m"
-    nearest = seen.subject_distance_m - _braking(max(seen.closing_m_s, 0.0), safety)
+    # Braking takes the speed at which the distance shrinks.  A subject that walks towards the vehicle cannot be
+    # stopped: its steps until a hold has begun count.  One that is followed may stop dead: its speed counts too.
+    chase, approach = max(-seen.approach_m_s, 0.0), max(seen.approach_m_s, 0.0)
+    own = max(seen.closing_m_s - chase, 0.0)
+    nearest = seen.subject_distance_m - _braking(own, safety) - _braking(chase, safety) - _REACTION_S * approach
     if not nearest >= limits.orbit.min_distance_m:
         return f"the subject is {seen.subject_distance_m:.1f} m away: at the limit of {limits.orbit.min_distance_m:g} m"
     if seen.subject_distance_m > limits.orbit.max_distance_m:

@@ -74,6 +74,9 @@ class VehicleStateEstimator:
         self._gimbal: tuple[int, np.ndarray] | None = None  # reception, camera FRD -> NED x y z w
         self._gimbal_before: tuple[int, np.ndarray] | None = None
         self._values: dict[str, Any] = {}
+        #: When the latest message of each kind came from the vehicle, and when its position last changed: our clock.
+        self.received_ns: dict[str, int] = {}
+        self.position_changed_ns = -(10**18)
 
     def update(self, message: Any, receive_time_ns: int) -> VehicleState | None:
         """Take one decoded pymavlink message; a new state when it tells the attitude, else None.
@@ -90,6 +93,7 @@ class VehicleStateEstimator:
         from_autopilot = message.get_srcComponent() == self.component_id
         if from_autopilot:
             self._heard_ns = receive_time_ns
+            self.received_ns[name] = receive_time_ns
         handler = _HANDLERS.get(name) if from_autopilot or name in _FROM_ANY_COMPONENT else None
         if handler is None:
             return None
@@ -101,6 +105,11 @@ class VehicleStateEstimator:
             return None
         self._stamp_ns = state.stamp_ns
         return state
+
+    def age_s(self, names: tuple[str, ...], now_ns: int) -> float:
+        """Time since the latest of these kinds of message came from the vehicle; infinity before the first."""
+        latest = max((self.received_ns[name] for name in names if name in self.received_ns), default=None)
+        return math.inf if latest is None else (now_ns - latest) / _NS
 
     def snapshot(self, now_ns: int) -> VehicleState | None:
         """The state as known at ``now_ns``; None before the first heartbeat and attitude."""
@@ -138,6 +147,7 @@ class VehicleStateEstimator:
             return
         self.system_id, self.component_id = system, message.get_srcComponent()
         self._heard_ns = now_ns
+        self.received_ns["HEARTBEAT"] = now_ns
         self._heartbeat = (
             _AUTOPILOTS.get(message.autopilot, "other"),
             mode_name(message),
@@ -176,7 +186,11 @@ class VehicleStateEstimator:
         velocity = np.array([message.vx, message.vy, message.vz], dtype=float)
         if np.isfinite(ned).all() and np.isfinite(velocity).all():
             self._local_position_ns = now_ns
-            self._position = (self._boot_ns(message, now_ns), ned_to_enu(ned), ned_to_enu(velocity))
+            position = ned_to_enu(ned)
+            # A real estimate never repeats bit for bit: one that does is frozen, however fresh its stamp.
+            if self._position is None or not np.array_equal(self._position[1], position):
+                self.position_changed_ns = now_ns
+            self._position = (self._boot_ns(message, now_ns), position, ned_to_enu(velocity))
         return False
 
     def _take_global_position(self, message: Any, now_ns: int) -> bool:

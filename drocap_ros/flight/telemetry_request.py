@@ -10,6 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.flight.config import MavlinkBridgeConfig
 
 _NS = 1_000_000_000
+_FAST_HEARTBEAT_HZ = 5.0
+_ECHO_HZ = 5.0
 
 
 @dataclass
@@ -39,6 +41,10 @@ class TelemetryRequests:
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: config.status_hz,
             mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: config.gimbal_hz,
         }
+        if config.commands_enabled:
+            # A pilot's change of mode and the echo of our setpoints must not be seen a second late.
+            rates[mavlink.MAVLINK_MSG_ID_HEARTBEAT] = _FAST_HEARTBEAT_HZ
+            rates[mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED] = _ECHO_HZ
         self._wanted = {number: _Wanted(rate) for number, rate in rates.items() if rate > 0}
         self._since_ns: int | None = None
 

@@ -24,7 +24,7 @@ from drocap_ros.flight.frames import (
     orientation_to_aviation,
 )
 from drocap_ros.flight.parser import MavlinkParser
-from drocap_ros.flight.transport import open_transport
+from drocap_ros.flight.transport import Transport, open_transport
 from drocap_ros.simulation.flight_path import FlightPath, VehiclePose, orbit_path
 
 AUTOPILOTS = ("ardupilot", "px4")
@@ -49,6 +49,7 @@ class SimulatedVehicle:
     system_id : its MAVLink system
     max_rate_hz : what it delivers at most, whatever is asked and acknowledged (a slow link)
     boot_s : seconds since boot at path time 0
+    transport : instead of that of the URL
 
     Raises
     ------
@@ -66,13 +67,14 @@ class SimulatedVehicle:
         system_id: int = 1,
         max_rate_hz: float = 400.0,
         boot_s: float = 30.0,
+        transport: Transport | None = None,
     ) -> None:
         if autopilot not in AUTOPILOTS:
             raise InputError(f"autopilot: expected one of {', '.join(AUTOPILOTS)}, got {autopilot!r}")
         self.path, self.autopilot, self.gimbal = path, autopilot, gimbal
         self.received: list[str] = []  # names of what came in, for tests that nothing else was sent
         self._max_rate_hz, self._boot_s = max_rate_hz, boot_s
-        self._transport = open_transport(url)
+        self._transport = transport or open_transport(url)
         self._parser = MavlinkParser()
         self._mav = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
         self._period_s: dict[int, float] = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}

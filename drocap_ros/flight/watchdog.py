@@ -1,0 +1,75 @@
+"""Holds the vehicle when the control loop hangs: a thread of its own that shares no lock with the loop."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+_PERIOD_S = 0.1
+_ASK_MODE_S = 3.0
+_GIVE_UP_S = 10.0
+
+
+class LastWords(NamedTuple):
+    """What to send if the loop is not heard of again: packets of the place to hold, and of the hold mode."""
+
+    hold: bytes
+    hold_mode: bytes
+
+
+class Watchdog:
+    """Sends the last words that the loop left, once it has not come back for ``limit_s``.
+
+    Parameters
+    ----------
+    send : sends a packet without waiting for any lock
+    limit_s : time without :meth:`kick`
+    """
+
+    def __init__(self, send: Callable[[bytes], None], limit_s: float) -> None:
+        self._send, self._limit_s = send, limit_s
+        self._left: tuple[float, LastWords | None] = (-1e18, None)  # replaced whole: no lock
+        self._sent_s = -1e18
+        self.fired = False
+        self.mode_asked = False
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def kick(self, now_s: float, words: LastWords | None) -> None:
+        """The loop is alive; ``words`` is None while nothing is commanded."""
+        self._left = (now_s, words)
+
+    def step(self, now_s: float) -> None:
+        """Look at the loop and act."""
+        left_s, words = self._left
+        silent_s = now_s - left_s
+        if words is None or not self._limit_s < silent_s < _GIVE_UP_S or now_s - self._sent_s < _PERIOD_S:
+            return
+        self.fired, self._sent_s = True, now_s
+        self._send(words.hold)
+        if silent_s > _ASK_MODE_S and not self.mode_asked:
+            self.mode_asked = True
+            self._send(words.hold_mode)
+
+    def take_fired(self) -> tuple[bool, bool]:
+        """Whether it has acted, and asked for the hold mode, since the last call."""
+        result = (self.fired, self.mode_asked)
+        self.fired = self.mode_asked = False
+        return result
+
+    def start(self) -> None:
+        """Watch in a thread, in real time."""
+        self._thread = threading.Thread(target=self._run, name="flight-watchdog", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop watching."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(1.0)
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.05):
+            self.step(time.monotonic())
