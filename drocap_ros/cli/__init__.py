@@ -13,7 +13,7 @@ from drocap_ros import __version__
 from drocap_ros.errors import DrocapError
 
 COMMANDS = (
-    "demo", "live", "record", "track", "reconstruct", "learn_dictionary", "info", "models",
+    "demo", "live", "orbit", "record", "track", "reconstruct", "learn_dictionary", "info", "models",
 )  # fmt: skip
 
 

@@ -46,7 +46,7 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
     link_timeout_s: float = param(3.0, "silence after which the link counts as lost", unit="s", minimum=0.5, maximum=60)
     control_hz: float = param(20.0, "rate of setpoints", unit="Hz", minimum=5, maximum=50)
     watchdog_s: float = param(
-        0.3, "time without a step of the control loop after which the watchdog holds the vehicle", unit="s",
+        0.2, "time without a step of the control loop after which the watchdog holds the vehicle", unit="s",
         minimum=0.1, maximum=2,
     )  # fmt: skip
     gimbal_control: bool = param(False, "whether the mount's pitch is turned to the subject")

@@ -138,6 +138,7 @@ def advance(
     trim = state.trim
     if creep == 1.0:
         error = radius.value - float(np.hypot(*(vehicle[:2] - subject[:2])))
+        error = min(max(error, -1.0), 1.0)
         trim = min(max(trim + _TRIM_RATE * error * dt, -_MAX_TRIM_M), _MAX_TRIM_M)
     return OrbitState(
         math.remainder(phase, 2 * math.pi), omega, radius, height, centre, centre_velocity, centre_acceleration, trim

@@ -18,7 +18,7 @@ from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.safety_config import SafetyConfig
 
 _AT_REST_M_S = 0.35
-_BLIND_MODE_REQUEST_S = 1.0
+_BLIND_MODE_REQUEST_S = 2.0
 _BLIND_STOP_S = 10.0
 _REACTION_S = 0.5
 _HOLD_MODE_PATIENCE_S = 5.0
@@ -150,7 +150,7 @@ def vehicle_problem(seen: Observed, limits: Limits) -> str:
     """Why the vehicle may not be commanded; "" = it may."""
     safety = limits.safety
     if not safety.commands_enabled:
-        return "commands are disabled: set commands_enabled to allow motion"
+        return "no motion is commanded: commands are disabled; set commands_enabled to true to allow it"
     if seen.disturbance:
         return seen.disturbance
     if seen.link_age_s > safety.max_state_age_s:
@@ -352,9 +352,11 @@ def _what_to_send(state: SafetyState, seen: Observed, now_s: float, limits: Limi
     if state.state not in (State.HOLDING, State.FAULT) or seen.in_hold:
         return Action.NOTHING, ModeRequest.NONE
     if state.blind:
-        # The pilot may have taken over unseen: setpoints are ignored then, a change of mode would not be.
         since = now_s - state.since_s
-        asked = ModeRequest.HOLD if state.state == State.HOLDING and since < _BLIND_MODE_REQUEST_S else ModeRequest.NONE
+        # Not at once: the autopilot's brake takes longer than velocity zero.  And not without seeing the mode: the
+        # pilot may have taken over unseen; setpoints are ignored then, a request for a mode would not be.
+        seen_mode = seen.link_age_s <= limits.safety.max_state_age_s and seen.in_control
+        asked = ModeRequest.HOLD if since > _BLIND_MODE_REQUEST_S and seen_mode else ModeRequest.NONE
         return (Action.HALT if since < _BLIND_STOP_S else Action.NOTHING), asked
     return Action.HOLD, ModeRequest.NONE if math.isnan(state.rest_s) else ModeRequest.HOLD
 

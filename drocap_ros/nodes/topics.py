@@ -63,7 +63,7 @@ NODES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "bundle_adjuster": (("pose3d/refined", "pose3d/latest"), ("pose2d", "pose3d/initial", "vehicle/state")),
     "mavlink_bridge": (
         ("vehicle/state", "orbit/status", *(("/tf",) if TFMessage is not None else ())),
-        ("pose2d", "orbit/command"),
+        ("pose2d", "camera_info", "orbit/command"),
     ),
     "session_recorder": ((), tuple(TOPICS)),
 }

@@ -54,7 +54,7 @@ class SimulatedCopter(SimulatedVehicle):
         system_id: int = 1,
     ) -> None:  # fmt: skip
         super().__init__("", _Nowhere(), autopilot, gimbal=gimbal, system_id=system_id, transport=transport)
-        self.path = self  # type: ignore[assignment]
+        self.path = self
         self.body = PointMass(position, yaw, np.zeros(3) if wind is None else wind, seed)
         self.mode, self.armed, self.battery, self.landed_state = mode, True, 87, mavlink.MAV_LANDED_STATE_IN_AIR
         self.guid_timeout_s = guid_timeout_s
@@ -64,6 +64,8 @@ class SimulatedCopter(SimulatedVehicle):
         self.frozen_clock = False
         self.crashed = ""
         self.accepted_setpoints = 0
+        self.deaf = False  # takes setpoints no more and says nothing
+        self.motion_until_s = -1.0  # when somebody's setpoints last made it move
         self.fence_m = math.inf
         self.camera_pitch = math.radians(gimbal_pitch_deg)
         self.mode_log: list[tuple[float, str, str]] = [(0.0, mode, "start")]
@@ -120,6 +122,9 @@ class SimulatedCopter(SimulatedVehicle):
     def _present_target(self, dt: float) -> Target:
         if self.mode == _CONTROL[self.autopilot]:
             silent_s = self._t - self._heard_s
+            expired = self.autopilot == "ardupilot" and silent_s > self.guid_timeout_s
+            if float(np.linalg.norm(self._target.velocity)) > 0.05 and not expired:
+                self.motion_until_s = self._t
             if self.autopilot == "ardupilot":
                 if silent_s <= self.guid_timeout_s:
                     if self._target.position is not None:
@@ -206,7 +211,7 @@ class SimulatedCopter(SimulatedVehicle):
         if self._t - self._seen_s > _PX4_GAP_S:
             self._stream_s = self._t
         self._seen_s = self._t
-        if self.mode != _CONTROL[self.autopilot]:
+        if self.mode != _CONTROL[self.autopilot] or self.deaf:
             return  # silently ignored
         if not all(math.isfinite(v) for v in (*values[:3], m.yaw)):
             self.crashed = "a setpoint with NaN"

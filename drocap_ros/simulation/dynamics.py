@@ -13,7 +13,7 @@ import numpy as np
 
 _POSITION_GAIN, _VELOCITY_GAIN, _INTEGRAL_GAIN = 0.75, 1.9, 0.8
 _LAG_S = 0.15
-_SHAPING_M_S2 = 2.6  # how fast the loops let the wanted velocity change, beyond what is fed forward
+_SHAPING_M_S2 = 3.3  # how fast the loops let the wanted velocity change, beyond what is fed forward
 _MAX_ACCELERATION, _MAX_SPEED, _MAX_CLIMB = 4.5, 10.0, 2.5
 _YAW_GAIN, _YAW_LAG_S, _MAX_YAW_RATE = 4.5, 0.12, 1.6
 _DRAG = 0.012
@@ -37,13 +37,17 @@ class PointMass:
     """
 
     def __init__(self, position: np.ndarray, yaw: float, wind: np.ndarray, seed: int = 0) -> None:
-        self.position, self.velocity = position.astype(float), np.zeros(3)
-        self.acceleration, self.yaw, self.yaw_rate = np.zeros(3), yaw, 0.0
-        self._thrust, self._integral, self._shaped = np.zeros(3), np.zeros(3), np.zeros(3)
-        self._wind, self._gust = wind.astype(float), np.zeros(3)
+        self.position: np.ndarray = position.astype(float)
+        self.velocity: np.ndarray = np.zeros(3)
+        self.acceleration: np.ndarray = np.zeros(3)
+        self.yaw, self.yaw_rate = yaw, 0.0
+        self._thrust: np.ndarray = np.zeros(3)
+        self._shaped: np.ndarray = np.zeros(3)
+        self._wind: np.ndarray = wind.astype(float)
+        self._gust: np.ndarray = np.zeros(3)
         self._rng = np.random.default_rng([seed, 0xF1])
         # Whoever hovers has already learned the wind.
-        self._integral = -self._drag()
+        self._integral: np.ndarray = -self._drag()
 
     def step(self, target: Target, dt: float) -> None:
         """Fly for ``dt`` seconds."""

@@ -130,16 +130,23 @@ def test_hold_mode_is_asked_for_even_when_the_vehicle_does_not_come_to_rest():
     assert state.state == State.READY
 
 
-def test_without_a_trustworthy_state_velocity_zero_and_the_hold_mode_only_for_a_moment():
+def test_without_a_trustworthy_state_velocity_zero_and_no_mode_while_it_cannot_be_seen():
     state, decision = reduce(orbiting(), bad("link"), 1.0, None, LIMITS)
-    assert decision == (Action.HALT, ModeRequest.HOLD, "")
-    _, decision = reduce(state, bad("link"), 2.5, None, LIMITS)
+    assert decision == (Action.HALT, ModeRequest.NONE, "")
+    _, decision = reduce(state, bad("link"), 4.0, None, LIMITS)
     assert decision == (Action.HALT, ModeRequest.NONE, "")
     _, decision = reduce(state, bad("link"), 12.0, None, LIMITS)
     assert decision == (Action.NOTHING, ModeRequest.NONE, "")
     back, decision = reduce(state, GOOD, 2.5, None, LIMITS)
     assert decision.action == Action.HOLD
     assert np.array_equal(back.hold_position, GOOD.position)
+
+
+def test_without_satellites_velocity_zero_then_the_hold_mode():
+    state, decision = reduce(orbiting(), bad("gps"), 1.0, None, LIMITS)
+    assert decision == (Action.HALT, ModeRequest.NONE, "")
+    _, decision = reduce(state, bad("gps"), 3.5, None, LIMITS)
+    assert decision == (Action.HALT, ModeRequest.HOLD, "")
 
 
 def test_fence_counts_what_it_takes_to_brake():
