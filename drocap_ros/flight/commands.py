@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 _RETRY_S = 0.4
 _TRIES = 5
 _PROGRESS_S = 3.0
+_AGAIN_S = 1.5
 RESULT_WORDS = {
     mavlink.MAV_RESULT_ACCEPTED: "accepted",
     mavlink.MAV_RESULT_TEMPORARILY_REJECTED: "rejected for now",
@@ -28,6 +29,7 @@ class _Pending:
     tries: int = 0
     sent_s: float = -1e9
     outcome: str = ""
+    answered_s: float = -1e9
 
 
 class CommandQueue:
@@ -36,10 +38,15 @@ class CommandQueue:
     def __init__(self) -> None:
         self._pending: dict[int, _Pending] = {}
 
-    def request(self, command: int, parameters: tuple[float, ...], label: str) -> None:
-        """Send a command until it is answered; the same one under way is left to it, another takes its place."""
+    def request(self, command: int, parameters: tuple[float, ...], label: str, now_s: float) -> None:
+        """Send a command until it is answered; another takes its place.
+
+        The same one, asked for again, waits a while after its answer: whoever repeats a mode that has been granted
+        before it is seen takes it back from a pilot who has just chosen another.
+        """
         present = self._pending.get(command)
-        if present is None or present.parameters != parameters or present.outcome:
+        same = present is not None and present.parameters == parameters
+        if present is None or not same or (present.outcome and now_s - present.answered_s > _AGAIN_S):
             self._pending[command] = _Pending(parameters, label)
 
     def cancel(self, command: int) -> None:
@@ -61,6 +68,7 @@ class CommandQueue:
             pending.sent_s = now_s  # tried again after the usual time
         else:
             pending.outcome = RESULT_WORDS.get(result, f"answered with result {result}")
+            pending.answered_s = now_s
 
     def due(self, now_s: float) -> list[tuple[int, int, tuple[float, ...]]]:
         """(command, confirmation, parameters) to send now."""
@@ -69,7 +77,7 @@ class CommandQueue:
             if pending.outcome or now_s - pending.sent_s < _RETRY_S:
                 continue
             if pending.tries >= _TRIES:
-                pending.outcome = f"not answered after {pending.tries} tries"
+                pending.outcome, pending.answered_s = f"not answered after {pending.tries} tries", now_s
                 continue
             ready.append((command, pending.tries, pending.parameters))
             pending.sent_s = now_s

@@ -158,7 +158,7 @@ class OrbitController:
         self.safety, decision = reduce(before, seen, now_s, kind, limits)
         if self.safety.state != before.state:
             self._on_change(before, seen, estimate, now_s)
-        self._request_mode(decision.mode_request, dialect)
+        self._request_mode(decision.mode_request, dialect, now_s)
         sent = self._send(decision.action, seen, estimate, dt)
         self._send_commands(seen, estimate, now_s)
         self._leave_words(seen, dialect, now_s)
@@ -258,14 +258,14 @@ class OrbitController:
         if self.safety.state in (State.TAKEN_OVER, State.IDLE):
             self._queue.cancel_all()
 
-    def _request_mode(self, request: ModeRequest, dialect: Dialect) -> None:
+    def _request_mode(self, request: ModeRequest, dialect: Dialect, now_s: float) -> None:
         if request == ModeRequest.NONE:
             self._queue.cancel(_SET_MODE)
             return
         hold = request == ModeRequest.HOLD
         mode = dialect.hold_mode if hold else dialect.control_mode
         self.safety = permit_mode(self.safety, mode)
-        self._queue.request(_SET_MODE, dialect.mode_parameters(hold), f"mode {mode}")
+        self._queue.request(_SET_MODE, dialect.mode_parameters(hold), f"mode {mode}", now_s)
 
     def _send(self, action: Action, seen: Observed, estimate: SubjectEstimate | None, dt: float) -> Action:
         mav, target = self._link.mav, self._link.target
@@ -296,7 +296,7 @@ class OrbitController:
             pitch = -math.degrees(math.atan2(drop, max(seen.subject_distance_m, 0.1)))
             nan = math.nan
             if not self._queue.failure(_GIMBAL):  # without a mount it is refused, and not asked again
-                self._queue.request(_GIMBAL, (round(pitch, 1), 0.0, nan, nan, 0.0, 0.0, 0.0), "gimbal pitch")
+                self._queue.request(_GIMBAL, (round(pitch, 1), 0.0, nan, nan, 0.0, 0.0, 0.0), "gimbal pitch", now_s)
             self._gimbal_s = now_s
         for command, confirmation, parameters in self._queue.due(now_s):
             message = command_message(self._link.mav, self._link.target, command, confirmation, parameters)

@@ -21,6 +21,7 @@ _AT_REST_M_S = 0.35
 _BLIND_MODE_REQUEST_S = 2.0
 _BLIND_STOP_S = 10.0
 _REACTION_S = 0.5
+_DEAD_RECKONING_S = 0.6
 _HOLD_MODE_PATIENCE_S = 5.0
 _LANDED_BAD = {1: "on the ground", 3: "taking off", 4: "landing"}
 
@@ -334,8 +335,9 @@ def _await(state: SafetyState, seen: Observed, now_s: float, problem: str, limit
 def _settle(state: SafetyState, seen: Observed, now_s: float, blind: bool) -> SafetyState:
     """Holding: what was unknown at its beginning may become known, and the hold mode may fail to come."""
     if state.blind and not blind:
-        place, yaw = seen.position.copy(), seen.yaw
-        state = dataclasses.replace(state, blind=False, hold_position=place, hold_yaw=yaw, rest_s=math.nan)
+        state = dataclasses.replace(state, blind=False, since_s=now_s, rest_s=math.nan)
+        if state.hold_position is None:
+            state = dataclasses.replace(state, hold_position=seen.position.copy(), hold_yaw=seen.yaw)
     late = not math.isnan(state.rest_s) and now_s - state.rest_s > _HOLD_MODE_PATIENCE_S
     if state.state == State.HOLDING and late and not seen.in_hold:
         reason = f"{state.reason}; the autopilot's hold mode does not come: take over by hand"
@@ -357,7 +359,8 @@ def _what_to_send(state: SafetyState, seen: Observed, now_s: float, limits: Limi
         # pilot may have taken over unseen; setpoints are ignored then, a request for a mode would not be.
         seen_mode = seen.link_age_s <= limits.safety.max_state_age_s and seen.in_control
         asked = ModeRequest.HOLD if since > _BLIND_MODE_REQUEST_S and seen_mode else ModeRequest.NONE
-        return (Action.HALT if since < _BLIND_STOP_S else Action.NOTHING), asked
+        action = Action.HALT if state.hold_position is None else Action.HOLD
+        return (action if since < _BLIND_STOP_S else Action.NOTHING), asked
     return Action.HOLD, ModeRequest.NONE if math.isnan(state.rest_s) else ModeRequest.HOLD
 
 
@@ -385,14 +388,16 @@ def _orbit(seen: Observed, now_s: float) -> SafetyState:
 
 
 def _hold(state: SafetyState, reason: str, seen: Observed, now_s: float, blind: bool) -> SafetyState:
-    # Something else may be wrong while the place is still known: then the place is held.
-    fresh = max(seen.link_age_s, seen.state_age_s, seen.position_age_s) <= 0.3
-    usable = bool(np.isfinite(seen.position).all()) and math.isfinite(seen.yaw)
-    known = not blind or (fresh and usable and seen.position_ok and seen.gps_fix_type >= 3)
+    # Something may be wrong while the place is still known, or was until a moment ago: then a place is held, the
+    # one that the last known velocity leads to.  A position setpoint stops sooner than velocity zero.
+    age_s = max(seen.position_age_s, seen.state_age_s)
+    finite = bool(np.isfinite(seen.position).all() and np.isfinite(seen.velocity).all()) and math.isfinite(seen.yaw)
+    known = finite and seen.position_ok and seen.gps_fix_type >= 3 and age_s <= _DEAD_RECKONING_S
+    fresh = known and max(seen.link_age_s, age_s) <= 0.25
+    place = seen.position + seen.velocity * (0.0 if fresh else seen.position_age_s) if known else None
     return dataclasses.replace(
-        state, state=State.HOLDING, since_s=now_s, reason=reason, blind=not known, rest_s=math.nan,
-        hold_position=seen.position.copy() if known else state.hold_position,
-        hold_yaw=seen.yaw if known else state.hold_yaw,
+        state, state=State.HOLDING, since_s=now_s, reason=reason, blind=blind and not fresh, rest_s=math.nan,
+        hold_position=place, hold_yaw=seen.yaw,
     )  # fmt: skip
 
 

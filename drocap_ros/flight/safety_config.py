@@ -21,7 +21,7 @@ class SafetyConfig(Parameters):
         1.5, "greatest standard deviation of the subject's position", unit="m", minimum=0.05, maximum=10
     )
     max_state_age_s: float = param(
-        0.4, "greatest age of the vehicle's attitude and position", unit="s", minimum=0.05, maximum=2
+        0.3, "greatest age of the vehicle's attitude and position", unit="s", minimum=0.05, maximum=2
     )
     max_status_age_s: float = param(
         1.5, "greatest age of GPS, estimator and battery messages", unit="s", minimum=0.3, maximum=10

@@ -239,7 +239,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("pilot takes RTL", _mode("RTL"), _HEARTBEAT_S),
     Fault(
         "pilot takes over during a hold", _perceive(lambda seen: None), _FRAME_S,
-        later=((0.8, _mode("LOITER", "POSCTL")),),
+        later=((0.8, _mode("LOITER", "POSCTL")),), cause="the pilot's mode stops the vehicle in its own way",
     ),
     Fault(
         "pilot takes over and gives back", _mode("LOITER", "POSCTL"), _HEARTBEAT_S,
@@ -249,7 +249,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("clock jumps 3 s back", _set(clock_jump_s=-3.0), 0.05),
     Fault("telemetry frozen, clock goes on", _set(copter__frozen=True), 0.05),
     Fault("telemetry frozen with its clock", _set(copter__frozen=True, copter__frozen_clock=True), 0.05),
-    Fault("autopilot follows no more, says nothing", _set(copter__deaf=True), 0.2),
+    Fault("autopilot follows no more, says nothing", _set(copter__deaf=True), 0.2, cause=_GUID),
     Fault("storm of 500 commands", _storm),
     Fault("landing reported", _set(copter__landed_state=mavlink.MAV_LANDED_STATE_LANDING), _HEARTBEAT_S),
     Fault("subject walks towards the vehicle", _walk_into, harmless=True),

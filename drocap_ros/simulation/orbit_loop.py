@@ -134,7 +134,7 @@ class OrbitLoop:
 
     def command(self, kind: Command, **values: float) -> None:
         """The operator's command, now."""
-        self.controller.command(OperatorCommand(int(kind), stamp_ns=self.clock_ns(), **values))  # type: ignore[arg-type]
+        self.controller.command(OperatorCommand(int(kind), stamp_ns=self.clock_ns(), **values))
 
     def pelvis(self, t_s: float | None = None) -> np.ndarray:
         """(3,) m, truth."""

@@ -54,14 +54,16 @@ def test_halt_is_velocity_zero_and_nothing_else():
 
 def test_command_is_sent_until_answered_and_failure_is_in_words():
     queue = CommandQueue()
-    queue.request(SET_MODE, ARDUPILOT.mode_parameters(False), "mode GUIDED")
+    queue.request(SET_MODE, ARDUPILOT.mode_parameters(False), "mode GUIDED", 0.0)
     assert queue.due(0.0) == [(SET_MODE, 0, (1.0, 4.0, 0.0, 0.0, 0.0, 0.0, 0.0))]
     assert queue.due(0.1) == []
     assert queue.due(0.5)[0][1] == 1
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_DENIED, 0.6)
     assert queue.due(5.0) == []
     assert queue.failure(SET_MODE) == "mode GUIDED: denied"
-    queue.request(SET_MODE, ARDUPILOT.mode_parameters(False), "mode GUIDED")  # asked anew
+    queue.request(SET_MODE, ARDUPILOT.mode_parameters(False), "mode GUIDED", 1.0)  # too soon
+    assert queue.due(5.0) == []
+    queue.request(SET_MODE, ARDUPILOT.mode_parameters(False), "mode GUIDED", 6.0)
     assert len(queue.due(6.0)) == 1
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_ACCEPTED, 6.1)
     assert queue.failure(SET_MODE) == ""
@@ -69,7 +71,7 @@ def test_command_is_sent_until_answered_and_failure_is_in_words():
 
 def test_command_without_an_answer_gives_up():
     queue = CommandQueue()
-    queue.request(SET_MODE, PX4.mode_parameters(True), "mode LOITER")
+    queue.request(SET_MODE, PX4.mode_parameters(True), "mode LOITER", 0.0)
     sent = sum(len(queue.due(0.5 * i)) for i in range(40))
     assert sent == 5
     assert "not answered after 5 tries" in queue.failure(SET_MODE)
@@ -77,7 +79,7 @@ def test_command_without_an_answer_gives_up():
 
 def test_temporary_rejection_is_tried_again_and_progress_waited_for():
     queue = CommandQueue()
-    queue.request(SET_MODE, PX4.mode_parameters(False), "mode OFFBOARD")
+    queue.request(SET_MODE, PX4.mode_parameters(False), "mode OFFBOARD", 0.0)
     queue.due(0.0)
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, 0.1)
     assert len(queue.due(0.6)) == 1

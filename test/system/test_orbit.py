@@ -1,0 +1,140 @@
+"""The orbit through the real nodes, a real socket and the command line, in real time."""
+
+import contextlib
+import io
+import threading
+import time
+
+import numpy as np
+import pytest
+from drocap_ros.msg import OrbitStatus
+from sensor_msgs.msg import CameraInfo
+
+from drocap_ros.bringup import bringup
+from drocap_ros.cli import main
+from drocap_ros.config import DrocapConfig
+from drocap_ros.flight.frames import camera_rotation
+from drocap_ros.flight.transport import open_transport
+from drocap_ros.nodes.conversions import pose2d_to_ros
+from drocap_ros.nodes.topics import TOPICS
+from drocap_ros.perception.observation import PoseObservation
+from drocap_ros.simulation.camera import pinhole_matrix, project
+from drocap_ros.simulation.copter import SimulatedCopter
+from drocap_ros.simulation.observation import observe_keypoints
+from drocap_ros.simulation.person import simulate_person
+from drocap_ros.simulation.ports import free_udp_port
+
+MATRIX = pinhole_matrix(1280, 720, 60.0)
+
+
+class Drone:
+    """Copter on a UDP link and its camera with perfect perception, each in real time."""
+
+    def __init__(self, graph, port):
+        transport = open_transport(f"udpout:127.0.0.1:{port}")
+        self.copter = SimulatedCopter(transport, np.array([7.0, 0, 2.8]), np.pi, mode="GUIDED", seed=1)
+        self.graph, self.seeing = graph, True
+        self._pose2d = graph.node.create_publisher(TOPICS["pose2d"].message, "pose2d", TOPICS["pose2d"].qos)
+        self._info = graph.node.create_publisher(CameraInfo, "camera_info", TOPICS["camera_info"].qos)
+        self._joints = simulate_person(np.zeros(1), "stand", 1)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self):
+        begin, frame = time.monotonic(), 0
+        while not self._stop.wait(0.005):
+            t = time.monotonic() - begin
+            self.copter.fly(t)
+            if t * 12 >= frame:
+                frame += 1
+                if self.seeing:
+                    self._see(frame)
+
+    def _see(self, frame):
+        rotation = camera_rotation(self.copter.camera_orientation())[None]
+        exact = project(self._joints, rotation, self.copter.body.position[None], MATRIX)
+        seen = observe_keypoints(exact, None, frame)
+        stamp = self.graph.node.get_clock().now().nanoseconds
+        observation = PoseObservation(
+            stamp, 1, (1280, 720), keypoints=seen.keypoints[0].astype(np.float32),
+            covariance=seen.covariance[0].astype(np.float32), confidence=seen.confidence[0].astype(np.float32),
+        )  # fmt: skip
+        self._pose2d.publish(pose2d_to_ros(observation, "camera_optical"))
+        self._info.publish(CameraInfo(width=1280, height=720, k=MATRIX.ravel()))
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._stop.set()
+        self._thread.join(5.0)
+        self.copter.close()
+
+
+@contextlib.contextmanager
+def flying(**values):
+    port = free_udp_port()
+    config = DrocapConfig().replace("mavlink_bridge", url=f"udpin:127.0.0.1:{port}", **values)
+    with bringup(config, ["mavlink_bridge"]) as graph, Drone(graph, port) as drone:
+        got = []
+        graph.node.create_subscription(OrbitStatus, "orbit/status", got.append, TOPICS["orbit/status"].qos)
+        yield graph, drone, got
+
+
+def operator(graph, *words):
+    """Run ``drocap orbit`` as the operator does; returns the exit status and what it printed."""
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        status = main(["orbit", *words, "--domain-id", str(graph.domain_id), "--timeout", "20"])
+    return status, out.getvalue().strip()
+
+
+def test_the_operator_flies_an_orbit_from_the_command_line():
+    with flying(commands_enabled=True) as (graph, drone, got):
+        graph.wait_until(lambda: got and got[-1].state == OrbitStatus.READY, 40, "readiness")
+        assert operator(graph, "start", "--radius", "2") == (
+            1, "refused: radius_m: expected at least 3.5 m (min_distance_m and 0.5 m of room), got 2; "
+            "choose a larger radius",
+        )  # fmt: skip
+        assert operator(graph, "start", "--speed", "15") == (0, "orbiting")
+        begin = time.monotonic()
+        graph.wait_until(lambda: time.monotonic() - begin > 6, 30)
+        assert np.linalg.norm(drone.copter.body.velocity) > 0.8, [(m.state, m.reason) for m in got[-5:]]
+        status, sentence = operator(graph, "status")
+        assert status == 0
+        assert sentence.startswith("orbiting: orbiting the subject; ")
+        drone.seeing = False
+        graph.wait_until(lambda: got[-1].state == OrbitStatus.HOLDING, 10, "a hold when perception stops")
+        assert "last located" in got[-1].reason
+        graph.wait_until(lambda: drone.copter.mode == "BRAKE", 15, "the hold mode")
+        drone.copter.set_mode("LOITER", "pilot")
+        graph.wait_until(lambda: got[-1].state == OrbitStatus.TAKEN_OVER, 10, "the take-over to be seen")
+        status, answer = operator(graph, "start")
+        assert (status, answer.split(";")[0]) == (1, "refused: the pilot has taken over")
+        assert operator(graph, "stop") == (0, "acknowledged")
+
+
+def test_without_permission_nothing_moves():
+    with flying() as (graph, drone, got):
+        graph.wait_until(lambda: got, 40, "a status")
+        status, answer = operator(graph, "engage")
+        assert status == 1
+        assert "commands are disabled" in answer
+    assert "SET_POSITION_TARGET_LOCAL_NED" not in drone.copter.received
+    assert drone.copter.mode == "GUIDED"
+
+
+@pytest.mark.parametrize(
+    "words", [["start", "--radius", "inf"], ["stop", "--radius", "5"], ["status", "--timeout", "0"]]
+)
+def test_options_that_cannot_be_used(words, capsys):
+    assert main(["orbit", *words]) == 2
+    error = capsys.readouterr().err
+    assert "expected" in error or "takes no values" in error
+    assert error.count("\n") == 1
+
+
+def test_no_graph_to_talk_to(capsys):
+    assert main(["orbit", "status", "--timeout", "1", "--domain-id", "97"]) == 2
+    assert "drocap live" in capsys.readouterr().err
