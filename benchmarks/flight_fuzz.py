@@ -70,8 +70,8 @@ def main() -> int:
         more = fuzz(blocks)
         packets, commands, blocks, well = packets + more[0], commands + more[1], blocks + 1, well + more[2]
     print(
-        f"{seconds:.0f} s: {packets} packets and {commands} commands in {blocks} flights of {_BLOCK_S:.0f} s: no crash, "
-        f"no motion; {well} of {blocks} flew an orbit afterwards"
+        f"{seconds:.0f} s: {packets} packets and {commands} commands in {blocks} flights of {_BLOCK_S:.0f} s: "
+        f"no crash, no motion; {well} of {blocks} flew an orbit afterwards"
     )
     return 0 if well == blocks else 1
 

@@ -69,7 +69,7 @@ class Observed:
 
     in_control, in_hold : the mode is GUIDED or OFFBOARD; it is the autopilot's hold mode
     position_age_s : since the reported position last changed: frozen telemetry ages too
-    position, velocity : (3,) ENU
+    position, velocity : (3,) ENU; the position is carried on over the age of the state
     height_m : above the subject's ground
     subject_distance_m : horizontal
     closing_m_s, approach_m_s : how fast the vehicle moves towards the subject, and the subject towards the vehicle
@@ -394,7 +394,8 @@ def _hold(state: SafetyState, reason: str, seen: Observed, now_s: float, blind: 
     finite = bool(np.isfinite(seen.position).all() and np.isfinite(seen.velocity).all()) and math.isfinite(seen.yaw)
     known = finite and seen.position_ok and seen.gps_fix_type >= 3 and age_s <= _DEAD_RECKONING_S
     fresh = known and max(seen.link_age_s, age_s) <= 0.25
-    place = seen.position + seen.velocity * (0.0 if fresh else seen.position_age_s) if known else None
+    behind_s = 0.0 if fresh else max(seen.position_age_s - seen.state_age_s, 0.0)
+    place = seen.position + seen.velocity * behind_s if known else None
     return dataclasses.replace(
         state, state=State.HOLDING, since_s=now_s, reason=reason, blind=blind and not fresh, rest_s=math.nan,
         hold_position=place, hold_yaw=seen.yaw,

@@ -196,6 +196,8 @@ def _deny_hold(loop: OrbitLoop) -> None:
 
 _GUID = "nothing of ours runs: the autopilot's own time-out ends it, GUID_TIMEOUT 0.5 s, COM_OF_LOSS_T 1 s"
 
+_SILENCE = "silence counts after 0.3 s, 0.6 m at 2 m/s; then the stop of 1.5 m, and the position's own drift"
+
 FAULTS: tuple[Fault, ...] = (
     Fault("perception stops", _perceive(lambda seen: None), _FRAME_S),
     Fault("perception says there is nobody", _perceive(lambda s: dataclasses.replace(s, track_id=0)), _FRAME_S),
@@ -222,7 +224,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("control loop hangs for 1 s", _set(hung=True), later=((1.0, _set(hung=False)),)),
     Fault("link lost", _both(cut=True), 0.05, cause=_GUID),
     Fault("link lost for 2 s", _both(cut=True), 0.05, cause=_GUID, later=((2.0, _both(cut=False)),)),
-    Fault("downlink lost", _set(down__cut=True), 0.05),
+    Fault("downlink lost", _set(down__cut=True), 0.05, cause=_SILENCE),
     Fault("uplink lost", _set(up__cut=True), 0.05, cause=_GUID),
     Fault("link delayed by 1 s", _both(delay_s=1.0), 0.05, cause="the hold itself arrives a second late"),
     Fault("30 % loss", _both(loss=0.3), harmless=True),
@@ -247,8 +249,8 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault("clock jumps 3 s ahead", _set(clock_jump_s=3.0), 0.05),
     Fault("clock jumps 3 s back", _set(clock_jump_s=-3.0), 0.05),
-    Fault("telemetry frozen, clock goes on", _set(copter__frozen=True), 0.05),
-    Fault("telemetry frozen with its clock", _set(copter__frozen=True, copter__frozen_clock=True), 0.05),
+    Fault("telemetry frozen, clock goes on", _set(copter__frozen=True), 0.05, cause=_SILENCE),
+    Fault("telemetry frozen with its clock", _set(copter__frozen=True, copter__frozen_clock=True), 0.05, cause=_SILENCE),
     Fault("autopilot follows no more, says nothing", _set(copter__deaf=True), 0.2, cause=_GUID),
     Fault("storm of 500 commands", _storm),
     Fault("landing reported", _set(copter__landed_state=mavlink.MAV_LANDED_STATE_LANDING), _HEARTBEAT_S),

@@ -131,11 +131,12 @@ def test_hold_mode_is_asked_for_even_when_the_vehicle_does_not_come_to_rest():
 
 
 def test_without_a_trustworthy_state_the_last_place_and_no_mode_while_it_cannot_be_seen():
-    lost = dataclasses.replace(GOOD, link_age_s=0.4, state_age_s=0.4, position_age_s=0.4)
+    lost = dataclasses.replace(GOOD, state_age_s=0.05, position_age_s=0.45)  # frozen
     lost = dataclasses.replace(lost, velocity=np.array([0.0, 2.0, 0.0]))
     state, decision = reduce(orbiting(), lost, 1.0, None, LIMITS)
     assert decision == (Action.HOLD, ModeRequest.NONE, "")
     assert np.allclose(state.hold_position, [6.0, 0.8, 2.5])  # carried on by the last velocity
+    lost = dataclasses.replace(lost, link_age_s=3.0)
     _, decision = reduce(state, lost, 4.0, None, LIMITS)
     assert decision == (Action.HOLD, ModeRequest.NONE, "")
     _, decision = reduce(state, lost, 12.0, None, LIMITS)
