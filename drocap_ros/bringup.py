@@ -99,6 +99,13 @@ class Graph:
             self._executor.spin_once(timeout_sec=0.05)
         self.check()
 
+    def spin_for(self, seconds: float) -> None:
+        """Serve the script's own callbacks for some time; raises what a node raised."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self.check()
+            self._executor.spin_once(timeout_sec=min(left, 0.05))
+
     def wait_finished(self, *names: str, timeout_s: float) -> None:
         """Wait until the named sources have published all they have."""
         self.wait_until(lambda: self.finished >= set(names), timeout_s, f"the end of {', '.join(names)}")

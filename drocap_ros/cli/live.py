@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +23,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="bring the graph up on real hardware",
         description="Start the nodes and run until the source ends or Ctrl-C. Each in a process of its own.",
     )
-    parser.add_argument("--config", metavar="FILE", type=Path, required=True, help="parameters of the components (YAML)")
+    parser.add_argument(
+        "--config", metavar="FILE", type=Path, required=True, help="parameters of the components (YAML)"
+    )
     parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
     parser.add_argument("--source", metavar="URI", help="instead of the configuration's image_ingest.source")
     parser.add_argument("--session", metavar="DIR", type=Path, help="record to this new folder")
@@ -62,20 +67,24 @@ def run_graph(config: DrocapConfig, nodes: list[str], args: argparse.Namespace) 
         from drocap_ros.bringup import bringup
     except ImportError as error:
         raise InputError(f"expected ROS 2 with drocap_ros's messages, found none ({error}); run `make setup`") from None
+    from drocap_ros.cli.dashboard import dashboard_on_terminal
+    from drocap_ros.nodes.topics import TOPICS
+
     with bringup(
         config, nodes, processes=not args.one_process, namespace=args.namespace, domain_id=args.domain_id
     ) as graph:
         if not args.quiet:
             print(f"running {', '.join(graph.names)} in {args.namespace}, domain {args.domain_id}; Ctrl-C stops")
-        try:
-            _watch(graph, "image_ingest" in nodes)
-        except KeyboardInterrupt:
-            if not args.quiet:
-                print("stopping")
+            sys.stdout.flush()
+        with dashboard_on_terminal(not args.quiet) as (dashboard, draw):
+            entry = TOPICS["/diagnostics"]
+            graph.node.create_subscription(entry.message, "/diagnostics", dashboard.take, entry.qos)
+            with contextlib.suppress(KeyboardInterrupt):
+                _watch(graph, "image_ingest" in nodes, draw)
     return 0
 
 
-def _watch(graph: Graph, until_source_ends: bool) -> None:
+def _watch(graph: Graph, until_source_ends: bool, draw: Callable[[], None]) -> None:
     while not (until_source_ends and "image_ingest" in graph.finished):
-        begin = graph.node.get_clock().now().nanoseconds
-        graph.wait_until(lambda: graph.node.get_clock().now().nanoseconds - begin > 5e8, 60.0)  # noqa: B023
+        graph.spin_for(0.5)
+        draw()
