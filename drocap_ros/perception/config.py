@@ -70,7 +70,7 @@ class PoseEstimatorConfig(Parameters):
         3, "images in which a new person is seen before it is the subject", minimum=1, maximum=100
     )
     coast_s: float = param(
-        0.6, "time without a sure detection over which the box is predicted", unit="s", minimum=0, maximum=10
+        1.0, "time without a sure detection over which the box is predicted", unit="s", minimum=0, maximum=10
     )
     forget_s: float = param(
         20.0, "time after which a lost subject is not taken up again", unit="s", minimum=0.1, maximum=3600

@@ -20,8 +20,11 @@ from drocap_ros.perception.tracking.search import Window, inside
 from drocap_ros.perception.uncertainty import calibrate
 from drocap_ros.skeleton import BODY_15
 
-#: A predicted box is confirmed when the pose network is so sure of the trunk and limbs in it on average.
+#: A predicted or doubtful box is confirmed when the mean confidence of its joints reaches this: on boxes without
+#: a person it stays below 0.33, on persons in bad light it is 0.5 to 0.9.
 _CONFIRM_CONFIDENCE = 0.5
+#: Confidence of a joint that helps to place the box.
+_FINE_JOINT = 0.3
 
 
 log = logging.getLogger(__name__)
@@ -76,9 +79,7 @@ class PoseEstimator:
         self.keypoints = self.pose_model.estimate(image, subject.box)
         xy, covariance, confidence = self._in_our_joints(self.keypoints)
         if subject.score < self.config.detection_threshold:
-            confirmed = self._confirmed(xy, confidence, stamp_ns)
-            if subject.score == 0.0 and not confirmed:
-                return _unseen(stamp_ns, size, subject)
+            self._confirm(xy, confidence, stamp_ns)
         unseen = confidence < self.config.keypoint_threshold
         xy[unseen], covariance[unseen] = np.nan, np.nan
         return PoseObservation(
@@ -115,15 +116,14 @@ class PoseEstimator:
         covariance, confidence = calibrate(keypoints, self.pose_model.spec.layout)
         return self._map.apply(keypoints.xy.astype(float), covariance, confidence, keypoints.box_size)
 
-    def _confirmed(self, xy: np.ndarray, confidence: np.ndarray, stamp_ns: int) -> bool:
-        """Whether the pose network saw a whole person in the predicted box; if so the tracker learns where."""
-        fine = confidence >= self.config.keypoint_threshold
+    def _confirm(self, xy: np.ndarray, confidence: np.ndarray, stamp_ns: int) -> None:
+        """Tell the tracker where the subject is when the pose network sees a whole person in the predicted box."""
+        fine = confidence >= _FINE_JOINT
         if confidence.mean() < _CONFIRM_CONFIDENCE or fine.sum() < 0.7 * len(fine):
-            return False
+            return
         low, high = np.nanmin(xy[fine], axis=0), np.nanmax(xy[fine], axis=0)
         margin = 0.06 * (high - low).max()
         self.tracker.confirm(np.concatenate([low - margin, high + margin]), stamp_ns)
-        return True
 
 
 def _unseen(stamp_ns: int, size: tuple[int, int], subject: Subject) -> PoseObservation:
