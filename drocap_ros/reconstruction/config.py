@@ -57,4 +57,4 @@ class BundleAdjusterConfig(Parameters):
     overlap_frames: int = param(60, "frames that neighbouring windows of a long recording share", minimum=0,
                                 maximum=2000)  # fmt: skip
     max_pending: int = param(120, "images that wait for their initial pose in the live node", minimum=1, maximum=10000)
-    threads: int = param(2, "threads of the linear algebra in the live node", minimum=1, maximum=64)
+    threads: int = param(1, "threads of the linear algebra; the matrices are small", minimum=1, maximum=64)

@@ -17,6 +17,7 @@ from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerCo
 from drocap_ros.reconstruction.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
 from drocap_ros.reconstruction.methods import METHODS, CameraPoses, run_method
 from drocap_ros.reconstruction.placement import metres_per_px, place_in_world
+from drocap_ros.reconstruction.threads import blas_threads
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
 
@@ -58,9 +59,11 @@ def reconstruct(
     dictionary = dictionary or load_dictionary(initializer.dictionary or None)
     started = time.perf_counter()
     keypoints, confidence, covariance = body_keypoints(tracks)
-    result = run_method(
-        method, tracks.stamp_ns, keypoints, confidence, covariance, tracks, initializer, adjuster, dictionary, progress
-    )
+    with blas_threads(adjuster.threads):
+        result = run_method(
+            method, tracks.stamp_ns, keypoints, confidence, covariance, tracks, initializer, adjuster, dictionary,
+            progress,
+        )  # fmt: skip
     motion = _to_motion(tracks, keypoints, confidence, result, initializer)
     motion.meta.update(
         method=method,

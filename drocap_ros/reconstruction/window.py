@@ -24,6 +24,7 @@ from drocap_ros.reconstruction.pose_covariance import packed_covariance, pose_co
 from drocap_ros.reconstruction.single_view import sparse_from_dense
 from drocap_ros.reconstruction.sparse_fit import fit_sparse
 from drocap_ros.reconstruction.starts import DenseFit, fit_dense, image_scale, viewpoint_starts
+from drocap_ros.reconstruction.threads import blas_threads
 from drocap_ros.skeleton import BODY_15
 
 #: Images over which the live start remembers the person's size.
@@ -119,10 +120,11 @@ class SlidingWindowInitializer:
         n = self._normalize(keypoints, confidence, covariance, seen)
         information = n.information
         scale = self._scale(n, information)
-        dense = self._fit(n.w, information, scale)
-        best = self._decide(dense)
-        self._metre_px.append(float(dense.coefficients[best, 0]) * n.scale_px)
-        return self._result(stamp_ns, n, information, dense, best, np.where(seen, np.nan_to_num(confidence), 0.0))
+        with blas_threads(1):
+            dense = self._fit(n.w, information, scale)
+            best = self._decide(dense)
+            self._metre_px.append(float(dense.coefficients[best, 0]) * n.scale_px)
+            return self._result(stamp_ns, n, information, dense, best, np.where(seen, np.nan_to_num(confidence), 0.0))
 
     def _normalize(
         self, keypoints: np.ndarray, confidence: np.ndarray, covariance: np.ndarray | None, seen: np.ndarray
@@ -265,7 +267,8 @@ def adjust_window(
     if frames < MIN_WINDOW:
         joints, iterations, terms, stop = start * scale, 0, dict[str, float](), "too short"
     else:
-        result = bundle_adjust(n.w, start * scale, config=config, information=n.information)
+        with blas_threads(config.threads):
+            result = bundle_adjust(n.w, start * scale, config=config, information=n.information)
         joints, iterations = result.camera_shape, result.iterations
         terms, stop = result.cost_terms, result.stop_reason
     gap = camera_residual(projection, joints)
