@@ -7,6 +7,8 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
+from drocap_ros.nodes.latency import LATENCY, RATE
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -28,15 +30,20 @@ class Dashboard:
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
             self._rows[status.name] = (level, status.message, values)
 
-    def table(self) -> Table:
-        """The table of all nodes heard so far."""
+    def heard(self, namespace: str = "") -> list[str]:
+        """Names of the nodes heard so far in a namespace."""
+        return sorted(name for name in self._rows if name.startswith(namespace.strip("/")))
+
+    def table(self, namespace: str = "") -> Table:
+        """The table of the nodes heard so far in a namespace."""
         from rich.table import Table
 
-        table = Table("node", "state", "what it says", "counts", expand=True)
-        for name, (level, text, values) in sorted(self._rows.items()):
+        table = Table("node", "state", "Hz", "late, ms (p50 / p95 / p99)", "what it says", "counts", expand=True)
+        for name in self.heard(namespace):
+            level, text, values = self._rows[name]
             counts = ", ".join(f"{key} {value}" for key, value in values.items() if value.isdigit())
-            colour = _COLOURS.get(level, "white")
-            table.add_row(name, f"[{colour}]{_LEVELS.get(level, str(level))}[/]", text, counts)
+            state = f"[{_COLOURS.get(level, 'white')}]{_LEVELS.get(level, str(level))}[/]"
+            table.add_row(name, state, values.get(RATE, ""), values.get(LATENCY, ""), text, counts)
         return table
 
 

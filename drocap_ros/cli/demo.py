@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from drocap_ros.motion import Motion
     from drocap_ros.simulation.capture import SimulatedCapture
 
-NODES = ("capture_simulator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder")
+NODES = ("capture_simulator", "initializer", "bundle_adjuster", "mavlink_bridge", "visualizer", "session_recorder")
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -69,15 +69,10 @@ def _say(args: argparse.Namespace, text: str) -> None:
 
 
 def _fly(config: DrocapConfig, args: argparse.Namespace) -> None:
-    from drocap_ros.errors import InputError
-
-    try:
-        from drocap_ros.bringup import bringup
-    except ImportError as error:
-        raise InputError(f"expected ROS 2 with drocap_ros's messages, found none ({error}); run `make setup`") from None
+    from drocap_ros.cli.live import import_bringup
     from drocap_ros.cli.progress import progress_bars
 
-    with bringup(config, NODES, processes=True) as graph, progress_bars(args.quiet) as progress:
+    with import_bringup().bringup(config, NODES, processes=True) as graph, progress_bars(args.quiet) as progress:
         begin = graph.node.get_clock().now().nanoseconds
         length = args.seconds + 3.5
 

@@ -125,6 +125,7 @@ class BundleAdjusterNode(ComponentNode):
         self._latest.publish(poses[-1])
         self._sequence += 1
         self.count("adjustments")
+        self.produced(int(window.stamp_ns[-1]))
         self.report(OK, f"{len(poses)} poses in {seconds:.2f} s: {window.stop_reason}")
 
 

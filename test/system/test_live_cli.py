@@ -15,6 +15,7 @@ from drocap_ros.bringup import free_domain
 from drocap_ros.recording.session_reader import session_info
 
 ROOT = Path(__file__).resolve().parents[2]
+IMAGES = "/drocap/image/compressed"
 
 
 @pytest.fixture(scope="module")
@@ -49,22 +50,29 @@ def test_a_video_file_goes_live_into_a_session_and_the_command_ends_with_it(vide
         assert live.wait(120) == 0, (tmp_path / "log").read_text()
     assert "running image_ingest, session_recorder" in (tmp_path / "log").read_text()
     # Pictures are best effort; on one machine at this size nearly all arrive.
-    assert 30 <= counts(tmp_path / "session")["/drocap/image/compressed"] <= 40
+    assert 30 <= counts(tmp_path / "session")[IMAGES] <= 40
 
 
 def test_record_takes_what_another_graph_publishes_until_it_is_interrupted(video, tmp_path):
-    config = ROOT / "config" / "video_file.yaml"
+    # The recorder joins a graph that runs: discovery may take seconds, so the video goes round.
+    config = tmp_path / "loop.yaml"
+    config.write_text(f"/**/image_ingest: {{ros__parameters: {{source: {video}, loop: true}}}}")
     with free_domain() as domain:
+        common = ("--config", config, "--domain-id", domain, "--nodes", "image_ingest")
+        live = start("live", *common, log=tmp_path / "live.log")
         record = start("record", "--out", tmp_path / "rec", "--domain-id", domain, log=tmp_path / "record.log")
         end = time.monotonic() + 60
-        while "running" not in (tmp_path / "record.log").read_text() and time.monotonic() < end:
-            time.sleep(0.1)
-        common = ("--config", config, "--source", video, "--domain-id", domain, "--nodes", "image_ingest")
-        live = start("live", *common, log=tmp_path / "live.log")
-        assert live.wait(120) == 0, (tmp_path / "live.log").read_text()
-        record.send_signal(signal.SIGINT)
+        while time.monotonic() < end:
+            time.sleep(0.5)
+            # Chunks are flushed while it records, so that the file can be read before it is closed.
+            up = all("running" in (tmp_path / f"{name}.log").read_text() for name in ("live", "record"))
+            if up and counts(tmp_path / "rec").get(IMAGES, 0) > 20:
+                break
+        for process in (record, live):
+            process.send_signal(signal.SIGINT)
         assert record.wait(60) == 0, (tmp_path / "record.log").read_text()
-    assert counts(tmp_path / "rec")["/drocap/image/compressed"] > 5
+        assert live.wait(60) == 0, (tmp_path / "live.log").read_text()
+    assert counts(tmp_path / "rec")[IMAGES] > 20
 
 
 @pytest.mark.parametrize(
@@ -83,3 +91,20 @@ def test_what_cannot_run_is_refused_with_status_2(tmp_path, arguments, words):
     text = (tmp_path / "log").read_text().strip()
     assert words in text
     assert "Traceback" not in text
+
+
+def test_top_shows_the_nodes_of_a_running_graph(video, tmp_path):
+    config = ROOT / "config" / "video_file.yaml"
+    with free_domain() as domain:
+        nodes = ("--nodes", "session_recorder")
+        common = ("--config", config, "--session", tmp_path / "session", "--domain-id", domain)
+        live = start("live", *common, *nodes, log=tmp_path / "live.log")
+        try:
+            top = start("top", "--once", "--domain-id", domain, log=tmp_path / "top.log")
+            assert top.wait(60) == 0, (tmp_path / "live.log").read_text()
+        finally:
+            live.send_signal(signal.SIGINT)
+            assert live.wait(60) == 0
+        assert "drocap/session_recorder" in (tmp_path / "top.log").read_text()
+        # Nobody is left to be heard.
+        assert start("top", "--once", "--domain-id", domain, log=tmp_path / "top.log").wait(60) == 1
