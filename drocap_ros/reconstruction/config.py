@@ -34,7 +34,7 @@ class InitializerConfig(Parameters):
     coefficient_smoothness: float = param(0.3, "weight of the change of coefficients over time", minimum=0.0)
     rotation_smoothness: float = param(0.3, "weight of the change of rotation over time", minimum=0.0)
     switch_cost: float = param(1.0, "cost of a jump between hypotheses, per squared 2D std", minimum=0.0)
-    block_frames: int = param(2000, "frames that are fitted together at most", minimum=16, maximum=20000)
+    block_frames: int = param(500, "frames that are fitted together at most", minimum=16, maximum=20000)
     assumed_height_m: float = param(1.70, "stature that sets the scale when none is known", unit="m", minimum=0.3,
                                     maximum=3.0)  # fmt: skip
 
