@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -76,6 +76,8 @@ class SlidingWindowInitializer:
 
     def __init__(self, config: InitializerConfig | None = None, dictionary: Dictionary | None = None) -> None:
         self.config = config or InitializerConfig()
+        # The start is warm and alone: two alternations take it where a batch from scratch needs six.
+        self._refining = replace(self.config, sparse_rounds=min(self.config.sparse_rounds, 2))
         self.dictionary = dictionary or load_dictionary(self.config.dictionary or None)
         self.reset()
 
@@ -196,7 +198,7 @@ class SlidingWindowInitializer:
         projection = Projection(n.w, information)
         fit = fit_sparse(
             projection, dense.rotation[one], sparse_from_dense(dense.coefficients[one], self.dictionary),
-            self.dictionary, self.config,
+            self.dictionary, self._refining,
         )  # fmt: skip
         camera = fit.shape @ np.swapaxes(fit.rotation, 1, 2)
         metres = self.config.assumed_height_m / REFERENCE_STATURE_M / float(np.median(self._metre_px)) * n.scale_px

@@ -14,7 +14,7 @@ from drocap_ros.reconstruction.camera_update import rotation_change, rotation_gr
 from drocap_ros.reconstruction.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.data_term import Projection, information_from
 from drocap_ros.reconstruction.dictionary import Dictionary
-from drocap_ros.reconstruction.sparse_fit import basis_matrix, sparse_gradient
+from drocap_ros.reconstruction.sparse_fit import sparse_gradient
 
 F = 7
 
@@ -105,7 +105,7 @@ def test_sum_of_all_terms(projection: Projection, state: tuple[np.ndarray, np.nd
 
 def test_sparse_coefficients(projection: Projection, dictionary: Dictionary) -> None:
     rng = np.random.default_rng(3)
-    basis = basis_matrix(dictionary)
+    basis = dictionary.basis
     c = 0.3 * rng.normal(size=(len(basis), F))
     r = np.moveaxis(exp_so3(rng.normal(size=(F, 3))), 0, -1)
 
