@@ -36,6 +36,12 @@ def start(*arguments, log):
     return subprocess.Popen(command, env=env, stdout=log.open("w"), stderr=subprocess.STDOUT)
 
 
+def wait_for_running(log):
+    end = time.monotonic() + 60
+    while "running" not in log.read_text() and time.monotonic() < end:
+        time.sleep(0.1)
+
+
 def counts(session):
     return {topic.name: topic.count for topic in session_info(session).topics}
 
@@ -61,13 +67,12 @@ def test_record_takes_what_another_graph_publishes_until_it_is_interrupted(video
         common = ("--config", config, "--domain-id", domain, "--nodes", "image_ingest")
         live = start("live", *common, log=tmp_path / "live.log")
         record = start("record", "--out", tmp_path / "rec", "--domain-id", domain, log=tmp_path / "record.log")
+        for name in ("live", "record"):
+            wait_for_running(tmp_path / f"{name}.log")
         end = time.monotonic() + 60
-        while time.monotonic() < end:
+        # Chunks are flushed while it records, so that the file can be read before it is closed.
+        while counts(tmp_path / "rec").get(IMAGES, 0) <= 20 and time.monotonic() < end:
             time.sleep(0.5)
-            # Chunks are flushed while it records, so that the file can be read before it is closed.
-            up = all("running" in (tmp_path / f"{name}.log").read_text() for name in ("live", "record"))
-            if up and counts(tmp_path / "rec").get(IMAGES, 0) > 20:
-                break
         for process in (record, live):
             process.send_signal(signal.SIGINT)
         assert record.wait(60) == 0, (tmp_path / "record.log").read_text()
@@ -100,6 +105,7 @@ def test_top_shows_the_nodes_of_a_running_graph(video, tmp_path):
         common = ("--config", config, "--session", tmp_path / "session", "--domain-id", domain)
         live = start("live", *common, *nodes, log=tmp_path / "live.log")
         try:
+            wait_for_running(tmp_path / "live.log")
             top = start("top", "--once", "--domain-id", domain, log=tmp_path / "top.log")
             assert top.wait(60) == 0, (tmp_path / "live.log").read_text()
         finally:
