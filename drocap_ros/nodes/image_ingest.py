@@ -60,10 +60,13 @@ class ImageIngestNode(ComponentNode):
     def close(self) -> None:
         """Stop reading and release the source."""
         self._stop.set()
-        if self._source is not None:
+        # A live source waits for pictures and ends only by being closed; a file must not be closed while it is read.
+        if self._source is not None and self._source.live:
             self._source.close()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
+        if self._source is not None:
+            self._source.close()
 
     # -- files, cameras, streams -----------------------------------------------------------------------
 
