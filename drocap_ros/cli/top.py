@@ -8,7 +8,6 @@ from typing import Any
 
 from drocap_ros.cli.live import check_domain, dashboard_of, import_bringup, stop_signals
 
-
 #: How long ``--once`` waits for a first word.
 ONCE_TIMEOUT_S = 8.0
 
