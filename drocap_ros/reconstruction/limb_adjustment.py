@@ -121,10 +121,10 @@ def _band(p: LimbProblem, r: _Residuals) -> np.ndarray:
         block[:, b, :, b] += m
         block[:, a, :, b] -= m
         block[:, b, :, a] -= m
-    block = block.reshape(frames, _SIZE, _SIZE)
+    rows = block.reshape(frames, _SIZE, _SIZE)
     band = np.zeros((frames, _SIZE, 2 * _SIZE + 1))
     for i in range(_SIZE):
-        band[:, i, : _SIZE - i] = block[:, i, i:]
+        band[:, i, : _SIZE - i] = rows[:, i, i:]
     band[:, :, 0] += diagonal.reshape(frames, _SIZE)
     if frames > 2:
         w = p.acceleration_weight

@@ -11,6 +11,7 @@ import numpy as np
 from drocap_ros.reconstruction.bundle_adjustment import bundle_adjust
 from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.data_term import Projection, frames_last, information_from
+from drocap_ros.reconstruction.default_method import DefaultMethodConfig, default_poses
 from drocap_ros.reconstruction.dictionary import Dictionary
 from drocap_ros.reconstruction.factorization import factorize
 from drocap_ros.reconstruction.normalize import MIN_JOINTS, NormalizedTracks, normalize_tracks
@@ -87,6 +88,8 @@ def run_method(
             progress,
         )
         return replace(poses, seconds={"initial": 0.0, "ba": time.perf_counter() - clock})
+    if method == "ba":
+        return _default(stamp_ns, keypoints, confidence, covariance, adjuster, progress)
     joints, credit = initial_poses(keypoints, confidence, covariance, initializer, dictionary, progress)
     seconds = {"initial": time.perf_counter() - clock, "ba": 0.0}
     if method == "initial":
@@ -98,6 +101,32 @@ def run_method(
     poses = adjust(keypoints, confidence, covariance, joints, adjuster, progress, credit=credit)
     seconds["ba"] = time.perf_counter() - clock
     return replace(poses, seconds=seconds)
+
+
+def _default(
+    stamp_ns: np.ndarray,
+    keypoints: np.ndarray,
+    confidence: np.ndarray | None,
+    covariance: np.ndarray | None,
+    adjuster: BundleAdjusterConfig,
+    progress: Progress | None,
+) -> CameraPoses:
+    """The default method (:mod:`drocap_ros.reconstruction.default_method`), window by window."""
+    config = DefaultMethodConfig()
+    seconds = {"initial": 0.0, "ba": 0.0}
+
+    def solve(rows: slice, n: NormalizedTracks) -> WindowResult:
+        points = np.where((n.weights > 0.0)[..., None], n.w, np.nan)
+        variance = None if covariance is None else 0.5 * (covariance[rows, :, 0] + covariance[rows, :, 2])
+        found = default_poses(
+            stamp_ns[rows], points, n.weights, None if variance is None else variance / n.scale_px**2, config
+        )
+        for stage, value in found.seconds.items():
+            seconds[stage] += value
+        centred = found.joints - found.joints.mean(axis=1, keepdims=True)
+        return centred, found.cost_terms, found.iterations, found.stop_reason
+
+    return replace(over_windows(keypoints, confidence, covariance, adjuster, solve, progress), seconds=seconds)
 
 
 def shown_frames(keypoints: np.ndarray, confidence: np.ndarray | None) -> np.ndarray:
