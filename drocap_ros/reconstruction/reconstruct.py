@@ -126,18 +126,20 @@ def _to_motion(
     pelvis = BODY_15.index("pelvis")
     per_px = metres_per_px(result.joints_px, tracks.stamp_ns, config.assumed_height_m)
     joints = (result.joints_px - result.joints_px[:, pelvis][:, None]) * per_px[:, None, None]
+    metric, scale_source = False, "assumed_height"
     rotation, frame = np.broadcast_to(np.eye(3), (len(tracks), 3, 3)).copy(), "camera"
     if tracks.camera_rotation is not None:
         rotation, frame = tracks.camera_rotation, "world"
-        joints = place_in_world(joints, projected[:, pelvis], per_px, tracks)
+        world = place_in_world(joints, projected, per_px, tracks)
+        joints, metric, scale_source = world.joints, world.metric, world.scale_source
     return Motion(
         joints3d=np.ascontiguousarray(joints),
         joints=BODY_15.joints,
         parents=BODY_15.parents,
         stamp_ns=tracks.stamp_ns,
         frame=frame,
-        metric=False,
-        scale_source="assumed_height",
+        metric=metric,
+        scale_source=scale_source,
         camera_rotation=rotation,
         confidence=shown,
         keypoints=keypoints,
