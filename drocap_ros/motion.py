@@ -49,6 +49,16 @@ class Motion:
     meta: dict[str, Any] = field(default_factory=dict)
 
 
+def upright_joints(motion: Motion) -> np.ndarray:
+    """(F, P, 3) m, z up: frame "world" as it is; frame "camera" as x right, y away from the camera, z up.
+
+    The vertical of the latter is the camera's; gravity is not known.
+    """
+    if motion.frame == "world":
+        return motion.joints3d
+    return motion.joints3d[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
+
+
 def save_motion(path: str | Path, motion: Motion) -> None:
     """Write ``motion.npz``."""
     np.savez_compressed(

@@ -38,6 +38,7 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.config import DrocapConfig
     from drocap_ros.motion import save_motion
     from drocap_ros.pipeline import reconstruct_input
+    from drocap_ros.report.page import save_report
     from drocap_ros.report.preview import save_preview
     from drocap_ros.simulation.capture import simulate_capture
     from drocap_ros.simulation.ports import free_udp_port
@@ -57,9 +58,10 @@ def run(args: argparse.Namespace) -> int:
         save_motion(folder / "motion.npz", motion)
         _save_truth(folder / "truth.npz", truth, motion)
         save_preview(folder / "preview.png", motion)
+        save_report(folder / "report.html", motion, command=args.command_line)
     _say(args, summary(motion, "ba"))
     print(_verdict(motion, truth))
-    print(f"files: {args.out}/motion.npz, truth.npz, preview.png; session: {args.out}/session")
+    print(f"files: {args.out}/motion.npz, truth.npz, preview.png, report.html; session: {args.out}/session")
     return 0
 
 

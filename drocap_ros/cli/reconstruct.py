@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "reconstruct",
         help="3D motion from a video, recording or tracks file",
-        description="Recover the 3D motion of the person in INPUT and write motion.npz, tracks.npz and preview.png.",
+        description="Recover the 3D motion of the person in INPUT and write motion.npz, tracks.npz, preview.png and"
+        " report.html.",
     )
     parser.add_argument(
         "input",
@@ -36,6 +38,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
     parser.add_argument("--dictionary", metavar="NPZ", type=Path, help="pose dictionary instead of the shipped one")
     parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
+    parser.add_argument("--no-report", action="store_true", help="leave report.html out")
     parser.add_argument("--quiet", action="store_true", help="no progress, only errors")
     parser.set_defaults(run=run)
     return parser
@@ -48,6 +51,8 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.config import DrocapConfig, load_config
     from drocap_ros.motion import save_motion
     from drocap_ros.pipeline import reconstruct_input
+    from drocap_ros.report.page import save_report
+    from drocap_ros.report.pictures import has_pictures
     from drocap_ros.report.preview import save_preview
     from drocap_ros.tracks import save_tracks
 
@@ -60,13 +65,16 @@ def run(args: argparse.Namespace) -> int:
         motion, tracks = reconstruct_input(
             args.input, method=args.method, config=config, models=args.models, progress=progress
         )
+    motion = dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line})
     with output_folder(out) as folder:
         save_motion(folder / "motion.npz", motion)
         save_tracks(folder / "tracks.npz", tracks)
         save_preview(folder / "preview.png", motion)
+        if not args.no_report:
+            save_report(folder / "report.html", motion, video=args.input if has_pictures(args.input) else None)
     if not args.quiet:
         print(summary(motion, args.method))
-        print(f"written: {out}/motion.npz, tracks.npz, preview.png")
+        print(f"written: {out}/motion.npz, tracks.npz, preview.png" + ("" if args.no_report else ", report.html"))
     return 0
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.motion import Motion
+from drocap_ros.motion import Motion, upright_joints
 from drocap_ros.tracks import MAX_FRAMES
 
 #: Stamps that stray from an even time line by less than this share of a frame count as even.
@@ -64,13 +64,11 @@ def clip_of(motion: Motion) -> Clip:
     times = (motion.stamp_ns - motion.stamp_ns[0]) * 1e-9
     step = float(np.median(np.diff(times)))
     notes = []
-    positions = motion.joints3d
     if motion.frame == "camera":
-        positions = positions[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
         notes.append("upright as the camera saw it: its vertical is the camera's, not gravity's")
     if not motion.metric:
         notes.append(f"scale from {motion.scale_source}, not measured")
-    return Clip(positions, motion.joints, motion.parents, times, 1.0 / step, notes=tuple(notes))
+    return Clip(upright_joints(motion), motion.joints, motion.parents, times, 1.0 / step, notes=tuple(notes))
 
 
 def y_up(clip: Clip) -> Clip:
