@@ -110,6 +110,7 @@ setup(
         "pymavlink>=2.4.40",
         "mcap>=1.6",
         "rosbags>=0.10",
+        "pyulog>=1.0",
         "threadpoolctl>=3.1",
         "PyYAML>=6",
         "rich>=13",

@@ -15,6 +15,8 @@ from drocap_ros.recording.bag_metadata import METADATA_FILE
 from drocap_ros.recording.mcap_stream import McapChannel, McapStream
 
 POSE2D = "drocap_ros/msg/Pose2D"
+POSE3D = "drocap_ros/msg/Pose3D"
+POSE3D_WINDOW = "drocap_ros/msg/Pose3DWindow"
 VEHICLE_STATE = "drocap_ros/msg/VehicleState"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 IMAGE = "sensor_msgs/msg/Image"
