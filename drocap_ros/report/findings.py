@@ -16,7 +16,9 @@ _SHORT_S, _SHORT_FRAMES = 2.0, 30
 _MISSING_SHARE = 0.1
 #: Of the body's size in the image.
 _HIGH_ERROR = 0.02
-_OUTLYING, _OUTLIERS = 0.08, 0.01
+#: Keypoints count as outlying from this share of the body's size; more of them than these shares are noted, warned of.
+_OUTLYING = 0.08
+_SOME_OUTLIERS, _MANY_OUTLIERS = 0.01, 0.1
 _BONE_SPREAD = 0.1
 _MIRRORED_SHARE, _MIRRORED_COUNT = 0.5, 10
 
@@ -84,10 +86,10 @@ def _error(_: Motion, m: Measures) -> Finding | None:
 def _outliers(motion: Motion, m: Measures) -> Finding | None:
     error = motion.reprojection_px[np.isfinite(motion.reprojection_px)]
     share = float(np.mean(error > _OUTLYING * m.body_px)) if error.size else 0.0
-    if not share > _OUTLIERS:
+    if not share > _SOME_OUTLIERS:
         return None
     return Finding(
-        "note",
+        "warning" if share > _MANY_OUTLIERS else "note",
         "Outlying keypoints",
         f"{share:.1%} of the keypoints lie further than {_OUTLYING:.0%} of the body's size from where the motion puts"
         f" them. They raise the RMS ({m.rms_px:.1f} px) far above the median ({m.median_px:.1f} px).",

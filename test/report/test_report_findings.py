@@ -98,6 +98,9 @@ def test_high_error_is_told_from_a_few_outliers(walker):
     few[::20] = 0.5 * size
     assert titles(dataclasses.replace(walker, reprojection_px=few), "warning") == []
     assert "Outlying keypoints" in titles(dataclasses.replace(walker, reprojection_px=few))
+    many = few.copy()
+    many[::5] = 0.5 * size
+    assert "Outlying keypoints" in titles(dataclasses.replace(walker, reprojection_px=many), "warning")
     all_over = np.full_like(few, 0.03 * size)
     assert "High reprojection error" in titles(dataclasses.replace(walker, reprojection_px=all_over), "warning")
 

@@ -93,6 +93,29 @@ def test_a_real_video_gives_each_frame_its_picture(walker, shared):
     assert found.frames == tuple(range(count))
 
 
+def test_a_recordings_pictures_are_found(walker, tmp_path):
+    """A ROS 1 bag written by rosbags, compressed images on a topic of its own."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    image, header, time = (
+        store.types[name]
+        for name in ("sensor_msgs/msg/CompressedImage", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    stamps = 1_700_000_000_000_000_000 + np.arange(12) * 100_000_000
+    with Writer(tmp_path / "flight.bag") as bag:
+        connection = bag.add_connection("/front/image/compressed", image.__msgtype__, typestore=store)
+        for number, stamp in enumerate(stamps.tolist()):
+            jpeg = cv2.imencode(".jpg", np.full((240, 320, 3), 10 * number + 50, np.uint8))[1].ravel()
+            at = header(seq=number, stamp=time(sec=stamp // 10**9, nanosec=stamp % 10**9), frame_id="camera")
+            message = image(header=at, format="jpeg", data=jpeg)
+            bag.write(connection, stamp, store.serialize_ros1(message, image.__msgtype__))
+    assert has_pictures(tmp_path / "flight.bag")
+    found = read_pictures(tmp_path / "flight.bag", seen_at(walker, stamps[::2]))
+    assert [level(j) for j in found.jpegs] == pytest.approx([10 * n + 50 for n in range(0, 12, 2)], abs=1)
+
+
 def test_what_has_no_pictures_is_refused(walker, tmp_path):
     motion = first_frames(walker, 5)
     (tmp_path / "text.mp4").write_text("no video")
