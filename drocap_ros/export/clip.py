@@ -17,6 +17,8 @@ EVEN_TOLERANCE = 0.05
 _SAME_FRAME = 1e-3
 #: What every format can hold as a name.
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,60}")
+#: glTF skins in one byte per joint, and what C3D readers accept.
+_MAX_JOINTS = 255
 #: Between two frames further apart than this nothing is known, and resampling leaves a gap.
 LONGEST_BRIDGE_S = 0.5
 
@@ -51,13 +53,16 @@ def clip_of(motion: Motion) -> Clip:
     Raises
     ------
     InputError
-        When there are fewer than two frames, no joint is known in any of them, or a name suits no format.
+        When there are fewer than two frames, no joint is known in any of them, or joints are too many or
+        bear names that suit no format.
     """
     frames = len(motion.joints3d)
     if frames < 2:
         raise InputError(f"motion: expected at least 2 frames to animate, got {frames}; reconstruct a longer recording")
     if not np.isfinite(motion.joints3d).all(axis=2).any():
         raise InputError("motion: expected 3D joints in at least one frame, got NaN in all of them; see its report")
+    if len(motion.joints) > _MAX_JOINTS:
+        raise InputError(f"joints: expected at most {_MAX_JOINTS} joints, got {len(motion.joints)}; leave some out")
     for name in motion.joints:
         if not _NAME.fullmatch(name):
             raise InputError(f"joints: expected names of letters, digits, _ . -, got {name[:60]!r}; rename the joint")

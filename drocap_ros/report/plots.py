@@ -67,7 +67,7 @@ def range_plot(names: Sequence[str], samples: np.ndarray, *, unit: str, classes:
     """SVG of the spread of each column of ``samples`` (F, B): 5th to 95th percentile, and the median as a dot."""
     bands = [column[np.isfinite(column)] for column in samples.T]
     quantiles = [np.quantile(band, (0.05, 0.5, 0.95)) if band.size else None for band in bands]
-    top = max((float(q[2]) for q in quantiles if q is not None), default=1.0) * 1.05
+    top = max(max((float(q[2]) for q in quantiles if q is not None), default=1.0), 1e-9) * 1.05
     long_label = 140
     span = WIDTH - long_label - 64
     parts = []

@@ -7,8 +7,9 @@ import pytest
 from export_readers import READERS
 
 from drocap_ros.cli import main
-from drocap_ros.export import FORMATS
-from drocap_ros.motion import save_motion
+from drocap_ros.errors import InputError
+from drocap_ros.export import FORMATS, export_motion
+from drocap_ros.motion import load_motion, save_motion
 
 
 @pytest.fixture
@@ -99,6 +100,19 @@ def test_a_time_line_that_no_rate_can_fill_is_refused(walker, folder, capsys):
     refused(["export", folder / "far.npz", "--to", "bvh"], folder, capsys, "csv or glb")
 
 
+def test_a_skeleton_of_too_many_joints_is_refused(walker, folder, capsys):
+    count = 300
+    chain = {
+        name: np.resize(getattr(walker, name), (48, count, *getattr(walker, name).shape[2:]))
+        for name in ("joints3d", "confidence", "keypoints", "reprojection_px")
+    }
+    names = tuple(f"j{i}" for i in range(count))
+    save_motion(
+        folder / "chain.npz", dataclasses.replace(walker, **chain, joints=names, parents=tuple(range(-1, count - 1)))
+    )
+    refused(["export", folder / "chain.npz", "--to", "bvh"], folder, capsys, "at most 255 joints")
+
+
 def test_a_joint_that_is_never_known_is_named(walker, folder, capsys):
     joints = walker.joints3d.copy()
     joints[:, 3] = np.nan
@@ -125,3 +139,26 @@ def test_outputs_that_cannot_be_written_are_refused(folder, capsys):
     motion = folder / "motion.npz"
     refused(["export", motion, "--to", "csv", "--out", folder / "here"], folder, capsys, "found a folder")
     refused(["export", motion, "--to", "csv", "--out", folder / "file" / "a.csv"], folder, capsys, "--out")
+
+
+def test_mutated_motions_are_exported_or_refused_in_one_line(walker, tmp_path):
+    """Bytes flipped, cut and replaced: a motion comes out, or one line; nothing else is raised."""
+    short = {f.name: getattr(walker, f.name) for f in dataclasses.fields(walker)}
+    short = {k: v[:8] if isinstance(v, np.ndarray) else v for k, v in short.items()}
+    save_motion(tmp_path / "motion.npz", type(walker)(**short))
+    whole = (tmp_path / "motion.npz").read_bytes()
+    rng = np.random.default_rng(0)
+    refusals: list[str] = []
+    for _ in range(150):
+        data = bytearray(whole)
+        for place in rng.integers(0, len(data), rng.integers(1, 6)):
+            data[place] = rng.integers(0, 256)
+        if rng.random() < 0.2:
+            data = data[: rng.integers(1, len(data))]
+        (tmp_path / "mutated.npz").write_bytes(data)
+        try:
+            export_motion(load_motion(tmp_path / "mutated.npz"), "bvh", tmp_path / "out.bvh")
+        except InputError as error:
+            refusals.append(str(error))
+    assert len(refusals) > 75
+    assert all(len(text.splitlines()) == 1 for text in refusals)

@@ -145,6 +145,11 @@ def test_nothing_known_is_refused(walker):
         render_report(dataclasses.replace(walker, joints=tuple("nose" if j == "neck" else j for j in walker.joints)))
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-300, 1e5])
+def test_bodies_of_any_size_are_drawn(walker, size):
+    assert "Bone lengths" in render_report(dataclasses.replace(walker, joints3d=size * walker.joints3d))
+
+
 def test_no_keypoints_at_all(walker):
     unknown = np.full_like(walker.keypoints, np.nan)
     error = np.full_like(walker.reprojection_px, np.nan)
