@@ -45,6 +45,8 @@ class BundleAdjusterConfig(Parameters):
 
     alpha: float = param(0.1, "weight of the nuclear norm at 240 frames; grows with the root of the length",
                          minimum=0.0)  # fmt: skip
+    noise_alpha: float = param(0.5, "alpha is at least this share of the threshold that hides the 2D joints' noise"
+                               " (2 sigma (sqrt F + sqrt 2P)); 0 = alpha as given", minimum=0.0)  # fmt: skip
     gamma: float = param(1.0, "weight of the articulation term; 0 leaves it out", minimum=0.0)
     shape_smoothness: float = param(0.0, "weight of the change of shape over time", minimum=0.0)
     rotation_smoothness: float = param(0.0, "weight of the change of rotation over time", minimum=0.0)
