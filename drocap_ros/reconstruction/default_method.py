@@ -16,13 +16,14 @@ import numpy as np
 
 from drocap_ros.parameters import Parameters, param
 from drocap_ros.reconstruction.depth_signs import depth_signs
-from drocap_ros.reconstruction.lifter import LiftedMotion, Lifter
+from drocap_ros.reconstruction.lifter import Lifter
 from drocap_ros.reconstruction.lifter_input import LIFTER_FPS, nanmedian_small
 from drocap_ros.reconstruction.limb_adjustment import (
     LimbProblem,
     LimbResult,
     adjust_limbs,
     span_lengths,
+    zoom_model,
 )
 from drocap_ros.skeleton import BODY_15
 
@@ -46,6 +47,9 @@ class DefaultMethodConfig(Parameters):
     smoothing_std_m_s2: float = param(
         10.0, "ordinary acceleration in the image when outliers are sought", unit="m/s^2", minimum=0.01, maximum=1000.0
     )
+    zoom_std_per_s: float = param(
+        0.01, "relative change of the person's size in the image per second", minimum=1e-6, maximum=1.0
+    )
     sign_speed_m_s: float = param(
         1.44, "speed of a bone's end in depth that costs one sigma", unit="m/s", minimum=0.01, maximum=100.0
     )
@@ -58,7 +62,8 @@ class DefaultMethodConfig(Parameters):
 class DefaultResult:
     """A window's result.
 
-    joints : (F, 15, 3) in camera axes and the unit of the keypoints, x and y in the image
+    joints : (F, 15, 3) in camera axes and the unit of the keypoints; x and y where the joint is in the image, depth
+        in the scale of the pelvis
     sigma : (F, 15, 2) the lifter's expected absolute error of x, y (each) and of depth, in the same unit
     lengths : (14,) bone lengths in the same unit (joint j to its parent at j - 1)
     seconds : wall-clock of "initial" (the lifter) and of "ba" (the rest)
@@ -78,6 +83,7 @@ def default_start_and_refine(
     confidence: np.ndarray | None = None,
     variance: np.ndarray | None = None,
     fps: float = LIFTER_FPS,
+    focal: float | None = None,
     config: DefaultMethodConfig | None = None,
     lifter: Lifter | None = None,
 ) -> DefaultResult:
@@ -89,6 +95,7 @@ def default_start_and_refine(
     confidence : (F, 15) in [0, 1], or None
     variance : (F, 15) of each coordinate in the keypoints' unit squared, or None (estimated from the sequence)
     fps : frames per second
+    focal : focal length in the keypoints' unit; None = unknown, and the camera is taken to be far away
     config, lifter : the defaults if None
 
     Raises
@@ -99,32 +106,44 @@ def default_start_and_refine(
     config = config or DefaultMethodConfig()
     lifter = lifter or Lifter.load(config.lifter or None)
     clock = time.perf_counter()
-    first = lifter.lift(keypoints, confidence, fps)
+    lifted = lifter.lift(keypoints, confidence, fps)
     seconds = {"initial": time.perf_counter() - clock, "ba": 0.0}
-    clock = time.perf_counter()
-    mm = _YARDSTICK_MM / max(float(np.median(_bone_lengths(first.joints), axis=0)[_YARDSTICK].sum()), 1e-12)
-    weight, noise = _weights(keypoints * mm, confidence, variance, mm, config)
-    look = _look(keypoints, first, mm)
-    result = _solve(look, weight, noise, None, fps, config, config.first_iterations)
-    seconds["ba"] = time.perf_counter() - clock
 
     clock = time.perf_counter()
-    lengths = result.lengths
-    second = lifter.lift(keypoints, confidence, fps, lengths[: len(_BONES)] / mm)
-    seconds["initial"] += time.perf_counter() - clock
+    mm = _YARDSTICK_MM / max(float(np.median(_bone_lengths(lifted.joints), axis=0)[_YARDSTICK].sum()), 1e-12)
+    weight, noise = _weights(keypoints * mm, confidence, variance, mm, config)
+    setting = _Setting(weight, noise, fps, config, *zoom_model(len(keypoints), fps, config.zoom_std_per_s))
+    centre = np.median(lifted.joints[..., :2], axis=1)
+    zoom = _zoom_of(lifted.joints, fps)
+    start = lifted.joints.copy()
+    start[..., :2] -= centre[:, None]
+    start *= mm / zoom[:, None, None]
+    flat = _orthographic(keypoints, start[..., 2], centre, zoom, mm, focal)
+    found = _solve(setting, flat, start, lifted.sigma * mm, None, config.first_iterations)
+    zoom = zoom * found.zoom
+    flat = _orthographic(keypoints, found.joints[..., 2] - found.joints[:, :1, 2], centre, zoom, mm, focal)
+    seconds["ba"] += time.perf_counter() - clock
+
     clock = time.perf_counter()
-    look = _look(keypoints, second, mm)
-    result = _solve(look, weight, noise, lengths, fps, config, config.iterations)
-    joints = result.joints / mm
-    joints[..., :2] += look.centre[:, None]
+    lifted = lifter.lift(flat, confidence, fps, found.lengths[: len(_BONES)])
+    seconds["initial"] += time.perf_counter() - clock
+
+    clock = time.perf_counter()
+    found = _solve(setting, flat, lifted.joints, lifted.sigma, found.lengths, config.iterations)
+    size = (zoom / mm)[:, None, None]
+    joints = found.joints.copy()
+    if focal is not None:
+        joints[..., :2] /= _magnification(joints[..., 2] - joints[:, :1, 2], focal * mm / zoom)
+    joints *= size
+    joints[..., :2] += centre[:, None]
     seconds["ba"] += time.perf_counter() - clock
     return DefaultResult(
         joints=joints,
-        sigma=second.sigma,
-        lengths=result.lengths[: len(_BONES)] / mm,
-        cost_terms=result.cost_terms,
-        iterations=result.iterations,
-        stop_reason=result.stop_reason,
+        sigma=lifted.sigma * size,
+        lengths=found.lengths[: len(_BONES)] / mm,
+        cost_terms=found.cost_terms,
+        iterations=found.iterations,
+        stop_reason=found.stop_reason,
         seconds=seconds,
     )
 
@@ -134,6 +153,7 @@ def default_poses(
     keypoints: np.ndarray,
     confidence: np.ndarray | None,
     variance: np.ndarray | None,
+    focal: float | None,
     config: DefaultMethodConfig,
 ) -> DefaultResult:
     """:func:`default_start_and_refine` for frames at any increasing times ``stamp_ns`` (F,).
@@ -142,7 +162,7 @@ def default_poses(
     """
     slot, fps = even_slots(stamp_ns)
     if slot[-1] + 1 == len(slot):
-        return default_start_and_refine(keypoints, confidence, variance, fps, config)
+        return default_start_and_refine(keypoints, confidence, variance, fps, focal, config)
 
     def spread(values: np.ndarray | None, empty: float) -> np.ndarray | None:
         if values is None:
@@ -153,7 +173,7 @@ def default_poses(
 
     points = spread(keypoints, np.nan)
     assert points is not None
-    r = default_start_and_refine(points, spread(confidence, 0.0), spread(variance, np.nan), fps, config)
+    r = default_start_and_refine(points, spread(confidence, 0.0), spread(variance, np.nan), fps, focal, config)
     return replace(r, joints=r.joints[slot], sigma=r.sigma[slot])
 
 
@@ -174,20 +194,45 @@ def even_slots(stamp_ns: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 @dataclass(frozen=True)
-class _Look:
-    """2D joints and the lifter's opinion in mm about each frame's centre (F, 2), which is in image units."""
+class _Setting:
+    """What both adjustments of a window share; weight (F, 15) in 1/mm^2 of the 2D joints, 0 where not seen."""
 
-    keypoints: np.ndarray
-    joints: np.ndarray
-    sigma: np.ndarray
-    centre: np.ndarray
+    weight: np.ndarray
+    noise_mm: float
+    fps: float
+    config: DefaultMethodConfig
+    zoom_basis: np.ndarray
+    zoom_precision: np.ndarray
 
 
-def _look(keypoints: np.ndarray, lifted: LiftedMotion, mm: float) -> _Look:
-    centre = np.median(lifted.joints[..., :2], axis=1)
-    joints = lifted.joints.copy()
-    joints[..., :2] -= centre[:, None]
-    return _Look((keypoints - centre[:, None]) * mm, joints * mm, lifted.sigma * mm, centre)
+def _orthographic(
+    keypoints: np.ndarray, depth_mm: np.ndarray, centre: np.ndarray, zoom: np.ndarray, mm: float, focal: float | None
+) -> np.ndarray:
+    """(F, 15, 2) mm, where a distant camera would see the joints about each frame's centre (F, 2).
+
+    ``mm`` per unit of the keypoints at zoom 1.  With the focal length the pelvis' distance is known from the
+    scale, and joints that are ``depth_mm`` (F, 15) behind the pelvis are moved out, those before it in.
+    """
+    flat = (keypoints - centre[:, None]) * (mm / zoom)[:, None, None]
+    if focal is None:
+        return flat
+    return flat * _magnification(depth_mm, focal * mm / zoom)
+
+
+def _magnification(depth_mm: np.ndarray, distance_mm: np.ndarray) -> np.ndarray:
+    """(F, 15, 1) true over seen distance from the axis for joints behind the pelvis, which is at (F,) mm."""
+    return np.maximum(1.0 + depth_mm / distance_mm[:, None], 0.2)[..., None]
+
+
+def _zoom_of(joints: np.ndarray, fps: float) -> np.ndarray:
+    """(F,) relative size of the lifter's bodies (F, 15, 3) over time, smooth, of median 1."""
+    from scipy.ndimage import gaussian_filter1d
+
+    size = _bone_lengths(joints).sum(axis=-1)
+    smooth = gaussian_filter1d(size, 1.0 * fps, mode="nearest", truncate=3.0)
+    change = np.log(np.maximum(smooth / max(float(np.median(smooth)), 1e-12), 1e-3))
+    # The lifter's sizes err by some percent: small changes are left to the adjustment to find.
+    return np.exp(np.sign(change) * np.maximum(np.abs(change) - 0.03, 0.0))
 
 
 def _bone_lengths(joints: np.ndarray) -> np.ndarray:
@@ -221,33 +266,34 @@ def _weights(
 
 
 def _solve(
-    look: _Look,
-    weight: np.ndarray,
-    noise: float,
+    setting: _Setting,
+    keypoints: np.ndarray,
+    prior: np.ndarray,
+    sigma: np.ndarray,
     lengths: np.ndarray | None,
-    fps: float,
-    config: DefaultMethodConfig,
     iterations: int,
 ) -> LimbResult:
-    points = np.where(weight[..., None] > 0, np.nan_to_num(look.keypoints), 0.0)
-    prior_xy = config.image_weight / (2 * np.square(look.sigma[..., 0]) + 5.0**2)
-    gap = np.square(points - look.joints[..., :2]).sum(axis=-1)
-    sane = gap < 9 * (2 * noise**2 + 2 * np.square(look.sigma[..., 0]) + 8.0**2)
+    """Signs and adjustment of 2D joints (F, 15, 2) and the lifter's joints (F, 15, 3), all in mm."""
+    config, weight, fps = setting.config, setting.weight, setting.fps
+    points = np.where(weight[..., None] > 0, np.nan_to_num(keypoints), 0.0)
+    prior_xy = config.image_weight / (2 * np.square(sigma[..., 0]) + 5.0**2)
+    gap = np.square(points - prior[..., :2]).sum(axis=-1)
+    sane = gap < 9 * (2 * setting.noise_mm**2 + 2 * np.square(sigma[..., 0]) + 8.0**2)
     smoothing = (1000 * config.smoothing_std_m_s2 / fps**2) ** -2
-    flat = _smooth(points, weight * sane, look.joints[..., :2], prior_xy, smoothing)
+    flat = _smooth(points, weight * sane, prior[..., :2], prior_xy, smoothing)
 
     image = span_lengths(flat)
     if lengths is None:
-        seen_lengths = np.median(span_lengths(np.concatenate([flat, look.joints[..., 2:]], axis=-1)), axis=0)
+        seen_lengths = np.median(span_lengths(np.concatenate([flat, prior[..., 2:]], axis=-1)), axis=0)
         # A bone is at least as long as it is seen, but for the noise.
         lengths = np.maximum(seen_lengths, np.quantile(image, 0.97, axis=0))
     reach = np.sqrt(np.maximum(np.square(lengths) - np.square(image), 0.0))[:, : len(_BONES)]
     parent, child = _BONES[:, 0], _BONES[:, 1]
-    sigma = np.hypot(look.sigma[:, parent, 1], look.sigma[:, child, 1])
+    spread = np.hypot(sigma[:, parent, 1], sigma[:, child, 1])
     sign = depth_signs(
         reach,
-        look.joints[:, child, 2] - look.joints[:, parent, 2],
-        np.maximum(sigma, 1e-3),
+        prior[:, child, 2] - prior[:, parent, 2],
+        np.maximum(spread, 1e-3),
         1000 * config.sign_speed_m_s / fps,
         1000 * config.sign_acceleration_m_s2 / fps**2,
     )
@@ -257,10 +303,12 @@ def _solve(
     problem = LimbProblem(
         keypoints=points,
         weight=weight,
-        prior=look.joints,
+        prior=prior,
         prior_weight_xy=prior_xy,
-        prior_weight_z=config.depth_weight / np.maximum(look.sigma[..., 1], 10.0),
+        prior_weight_z=config.depth_weight / np.maximum(sigma[..., 1], 10.0),
         acceleration_weight=(1000 * config.acceleration_std_m_s2 / fps**2) ** -2,
+        zoom_basis=setting.zoom_basis,
+        zoom_precision=setting.zoom_precision,
     )
     return adjust_limbs(problem, np.concatenate([flat, depth[..., None]], axis=-1), lengths, iterations)
 

@@ -1,13 +1,15 @@
 """Refinement of the default method: poses of a window whose bones keep their lengths, by damped Gauss-Newton.
 
-The unknowns are the joints of all frames in camera axes and one length per bone.  The cost is
+The unknowns are the joints of all frames in camera axes, one length per bone, and how the person's size in the
+image changes over time (the zoom: 1 plus a piecewise linear function of time).  The cost is
 
 - a robust (Geman-McClure) distance of the projected joints from the 2D joints, weighted joint by joint,
 - the distance from the lifter's joints, weighted by its expected errors, robust in depth,
-- the deviation of every bone from its length, as in the paper's articulation term,
-- the acceleration of the joints.
+- the deviation of every bone from its length times the zoom, as in the paper's articulation term,
+- the acceleration of the joints,
+- the change of the zoom.
 
-Its normal equations couple neighbouring frames only: a band, bordered by the bone lengths.
+Its normal equations couple neighbouring frames only: a band, bordered by the lengths and the zoom.
 """
 
 from __future__ import annotations
@@ -40,6 +42,8 @@ class LimbProblem:
     keypoints : (F, 15, 2); weight : (F, 15) 1/mm^2, 0 where not seen
     prior : (F, 15, 3); prior_weight_xy : (F, 15) 1/mm^2; prior_weight_z : (F, 15) 1/mm
     acceleration_weight : 1/mm^2, of second differences
+    zoom_basis : (F, K) value in each frame of the piecewise linear functions that the zoom is made of
+    zoom_precision : (K, K) inverse covariance of their coefficients
     """
 
     keypoints: np.ndarray
@@ -48,14 +52,17 @@ class LimbProblem:
     prior_weight_xy: np.ndarray
     prior_weight_z: np.ndarray
     acceleration_weight: float
+    zoom_basis: np.ndarray
+    zoom_precision: np.ndarray
 
 
 @dataclass(frozen=True)
 class LimbResult:
-    """joints (F, 15, 3) mm, lengths (16,) mm of :data:`SPANS`, cost per term, iterations, why it stopped."""
+    """joints (F, 15, 3) mm, lengths (16,) mm of :data:`SPANS`, zoom (F,), cost per term, iterations, stop reason."""
 
     joints: np.ndarray
     lengths: np.ndarray
+    zoom: np.ndarray
     cost_terms: dict[str, float]
     iterations: int
     stop_reason: str
@@ -66,10 +73,22 @@ def span_lengths(joints: np.ndarray) -> np.ndarray:
     return np.linalg.norm(joints[..., SPANS[:, 1], :] - joints[..., SPANS[:, 0], :], axis=-1)
 
 
+def zoom_model(frames: int, fps: float, std_per_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Basis (F, K) with a knot per second, and precision (K, K) of a random walk with a weak pull to zero."""
+    knots = max(int(np.ceil((frames - 1) / fps)) + 1, 2)
+    at = np.arange(frames) / fps
+    basis = np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(knots)))
+    step = np.diff(np.eye(knots), axis=0)
+    return basis, step.T @ step / std_per_s**2 + np.eye(knots) / (10 * std_per_s) ** 2
+
+
 class _Residuals:
     """What the cost and its derivatives share at one point."""
 
-    def __init__(self, p: LimbProblem, joints: np.ndarray, lengths: np.ndarray) -> None:
+    def __init__(self, p: LimbProblem, joints: np.ndarray, lengths: np.ndarray, zooms: np.ndarray) -> None:
+        self.lengths = lengths
+        self.zoom = 1.0 + p.zoom_basis @ zooms
+        self.zoom_pull = p.zoom_precision @ zooms
         self.image = joints[..., :2] - p.keypoints
         square = np.square(self.image).sum(axis=-1) * p.weight
         self.belief = 1.0 / (1.0 + square / _BELIEF)
@@ -79,7 +98,7 @@ class _Residuals:
         span = joints[:, SPANS[:, 1]] - joints[:, SPANS[:, 0]]
         length = np.sqrt(np.square(span).sum(axis=-1) + 1e-6)
         self.direction = span / length[..., None]
-        self.stretch = (length - lengths) / SPAN_STD_MM
+        self.stretch = (length - self.zoom[:, None] * lengths) / SPAN_STD_MM
         self.swing = joints[2:] - 2 * joints[1:-1] + joints[:-2]
         self.terms = {
             "reprojection": 0.5 * float((square * self.belief).sum()),
@@ -87,12 +106,13 @@ class _Residuals:
             "lifter_depth": float((p.prior_weight_z * (self.rounded - _DEPTH_ROUNDING_MM)).sum()),
             "articulation": 0.5 * float(np.square(self.stretch).sum()),
             "acceleration": 0.5 * p.acceleration_weight * float(np.square(self.swing).sum()),
+            "zoom": 0.5 * float(zooms @ self.zoom_pull),
         }
         self.cost = sum(self.terms.values())
 
 
 def _gradient(p: LimbProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of the cost: (F, 15, 3) by the joints, (16,) by the lengths."""
+    """Derivatives of the cost: (F, 15, 3) by the joints, (16 + K,) by the lengths and the zoom's coefficients."""
     g = np.zeros(p.prior.shape)
     g[..., :2] = (p.weight * np.square(r.belief))[..., None] * r.image + p.prior_weight_xy[..., None] * r.flat
     g[..., 2] = p.prior_weight_z * r.depth / r.rounded
@@ -104,7 +124,9 @@ def _gradient(p: LimbProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
     g[2:] += swing
     g[1:-1] -= 2 * swing
     g[:-2] += swing
-    return g, -(r.stretch / SPAN_STD_MM).sum(axis=0)
+    by_length = -(r.zoom[:, None] * r.stretch / SPAN_STD_MM).sum(axis=0)
+    by_zoom = r.zoom_pull - p.zoom_basis.T @ (r.stretch @ (r.lengths / SPAN_STD_MM))
+    return g, np.concatenate([by_length, by_zoom])
 
 
 def _band(p: LimbProblem, r: _Residuals) -> np.ndarray:
@@ -136,14 +158,28 @@ def _band(p: LimbProblem, r: _Residuals) -> np.ndarray:
     return band.reshape(frames * _SIZE, -1)
 
 
-def _border(r: _Residuals) -> np.ndarray:
-    """(16, F * 45) coupling of the lengths with the joints."""
-    out = np.zeros((len(SPANS), r.direction.shape[0], len(BODY_15), 3))
+def _border(p: LimbProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
+    """(16 + K, F * 45) coupling of lengths and zoom with the joints, and (16 + K, 16 + K) with each other."""
+    frames, knots = p.zoom_basis.shape
+    count = len(SPANS)
+    by_length = np.zeros((count, frames, len(BODY_15), 3))
+    by_size = np.zeros((frames, len(BODY_15), 3))
     slope = r.direction / np.square(SPAN_STD_MM)[:, None]
     for k, (a, b) in enumerate(SPANS):
-        out[k, :, b] = -slope[:, k]
-        out[k, :, a] = slope[:, k]
-    return out.reshape(len(SPANS), -1)
+        pull = r.zoom[:, None] * slope[:, k]
+        by_length[k, :, b] = -pull
+        by_length[k, :, a] = pull
+        by_size[:, b] -= r.lengths[k] * slope[:, k]
+        by_size[:, a] += r.lengths[k] * slope[:, k]
+    by_zoom = p.zoom_basis.T[:, :, None] * by_size.reshape(1, frames, -1)
+    precision = 1.0 / np.square(SPAN_STD_MM)
+    corner = np.zeros((count + knots, count + knots))
+    corner[:count, :count] = np.diag(precision * np.square(r.zoom).sum())
+    # The product of the two unknowns bends the cost: its second derivative is left out, as in Gauss-Newton.
+    corner[:count, count:] = (precision * r.lengths)[:, None] * (r.zoom @ p.zoom_basis)
+    corner[count:, :count] = corner[:count, count:].T
+    corner[count:, count:] = (precision * np.square(r.lengths)).sum() * p.zoom_basis.T @ p.zoom_basis + p.zoom_precision
+    return np.concatenate([by_length.reshape(count, -1), by_zoom.reshape(knots, -1)]), corner
 
 
 def adjust_limbs(
@@ -160,13 +196,13 @@ def adjust_limbs(
     """
     from scipy.linalg.lapack import dpbtrf, dpbtrs
 
-    frames = len(joints)
     damping, stop = 1e-4, "iterations"
-    here = _Residuals(problem, joints, lengths)
+    zooms = np.zeros(problem.zoom_basis.shape[1])
+    here = _Residuals(problem, joints, lengths, zooms)
     done = 0
     while done < iterations:
-        g, g_lengths = _gradient(problem, here)
-        band, border = _band(problem, here), _border(here)
+        g, g_sizes = _gradient(problem, here)
+        band, (border, corner) = _band(problem, here), _border(problem, here)
         right = np.concatenate([-g.reshape(1, -1), border])
         accepted = False
         for _ in range(8):
@@ -175,10 +211,11 @@ def adjust_limbs(
             factor, info = dpbtrf(damped.T, lower=1, overwrite_ab=1)
             if info == 0:
                 x = dpbtrs(factor, right.T, lower=1)[0]
-                schur = np.diag(frames / np.square(SPAN_STD_MM) * (1 + damping)) - border @ x[:, 1:]
-                step_lengths = np.linalg.solve(schur, -g_lengths - border @ x[:, 0])
-                step = (x[:, 0] - x[:, 1:] @ step_lengths).reshape(joints.shape)
-                there = _Residuals(problem, joints + step, lengths + step_lengths)
+                schur = corner + np.diag(damping * np.diag(corner)) - border @ x[:, 1:]
+                sizes = np.linalg.solve(schur, -g_sizes - border @ x[:, 0])
+                step = (x[:, 0] - x[:, 1:] @ sizes).reshape(joints.shape)
+                step_lengths, step_zooms = sizes[: len(SPANS)], sizes[len(SPANS) :]
+                there = _Residuals(problem, joints + step, lengths + step_lengths, zooms + step_zooms)
                 if there.cost <= here.cost:
                     accepted = True
                     break
@@ -187,10 +224,10 @@ def adjust_limbs(
             stop = "no descent"
             break
         decrease = here.cost - there.cost
-        joints, lengths, here = joints + step, lengths + step_lengths, there
+        joints, lengths, zooms, here = joints + step, lengths + step_lengths, zooms + step_zooms, there
         damping *= 0.2
         done += 1
         if decrease <= tolerance * here.cost:
             stop = "converged"
             break
-    return LimbResult(joints, lengths, here.terms, done, stop)
+    return LimbResult(joints, lengths, here.zoom, here.terms, done, stop)

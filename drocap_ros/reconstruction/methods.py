@@ -95,7 +95,7 @@ def run_method(
         )
         return replace(poses, seconds={"initial": 0.0, "ba": time.perf_counter() - clock})
     if method == "ba":
-        return _default(stamp_ns, keypoints, confidence, covariance, adjuster, progress)
+        return _default(stamp_ns, keypoints, confidence, covariance, tracks, adjuster, progress)
     joints, credit = initial_poses(keypoints, confidence, covariance, initializer, dictionary, progress)
     seconds = {"initial": time.perf_counter() - clock, "ba": 0.0}
     if method == "initial":
@@ -115,18 +115,26 @@ def _default(
     keypoints: np.ndarray,
     confidence: np.ndarray | None,
     covariance: np.ndarray | None,
+    tracks: Tracks,
     adjuster: BundleAdjusterConfig,
     progress: Progress | None,
 ) -> CameraPoses:
     """The default method (:mod:`drocap_ros.reconstruction.default_method`), window by window."""
     config = DefaultMethodConfig()
     seconds = {"initial": 0.0, "ba": 0.0}
+    k = tracks.camera_matrix
+    focal_px = None if k is None else 0.5 * float(k[0, 0] + k[1, 1])
 
     def solve(rows: slice, n: NormalizedTracks) -> WindowResult:
         points = np.where((n.weights > 0.0)[..., None], n.w, np.nan)
         variance = None if covariance is None else 0.5 * (covariance[rows, :, 0] + covariance[rows, :, 2])
         found = default_poses(
-            stamp_ns[rows], points, n.weights, None if variance is None else variance / n.scale_px**2, config
+            stamp_ns[rows],
+            points,
+            n.weights,
+            None if variance is None else variance / n.scale_px**2,
+            None if focal_px is None else focal_px / n.scale_px,
+            config,
         )
         for stage, value in found.seconds.items():
             seconds[stage] += value

@@ -128,6 +128,10 @@ def _to_motion(
     joints = (result.joints_px - result.joints_px[:, pelvis][:, None]) * per_px[:, None, None]
     metric, scale_source = False, "assumed_height"
     rotation, frame = np.broadcast_to(np.eye(3), (len(tracks), 3, 3)).copy(), "camera"
+    if tracks.camera_rotation is None and tracks.camera_matrix is not None:
+        # Joints behind the pelvis are farther from the axis than they look: undo the perspective, as place_in_world.
+        range_m = 0.5 * (tracks.camera_matrix[0, 0] + tracks.camera_matrix[1, 1]) * per_px
+        joints[..., :2] *= np.maximum(1.0 + joints[..., 2] / range_m[:, None], 0.1)[..., None]
     if tracks.camera_rotation is not None:
         rotation, frame = tracks.camera_rotation, "world"
         world = place_in_world(joints, projected, per_px, tracks)
