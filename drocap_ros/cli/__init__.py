@@ -14,7 +14,7 @@ from drocap_ros import __version__
 from drocap_ros.errors import DrocapError
 
 COMMANDS = (
-    "demo", "live", "record", "track", "reconstruct", "learn_dictionary",
+    "demo", "live", "record", "replay", "track", "reconstruct", "learn_dictionary",
     "export", "report", "info", "recover", "top", "models",
 )  # fmt: skip
 

@@ -73,6 +73,8 @@ NODES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("markers/initial", "markers/latest", "markers/camera_path", *(("/tf",) if TFMessage is not None else ())),
         ("pose3d/initial", "pose3d/latest", "vehicle/state"),
     ),
+    # What it publishes is what the session holds.
+    "session_player": ((), ()),
     "session_recorder": ((), tuple(TOPICS)),
 }
 

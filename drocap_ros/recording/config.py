@@ -30,3 +30,15 @@ class SessionRecorderConfig(Parameters):
         600.0, "time after which a new file is begun; 0 = never", unit="s", minimum=0, maximum=86_400
     )
     sync: bool = param(True, "force each flush to the disk itself, so that a power cut loses at most the last chunk")
+
+
+@dataclass(frozen=True)
+class SessionPlayerConfig(Parameters):
+    """What of a session is published again, and how fast."""
+
+    session: str = param("", "session folder, .mcap, .bag or rosbag2 folder")
+    rate: float = param(1.0, "times the speed of the recording", minimum=0.01, maximum=100)
+    start_s: float = param(0.0, "how far into the recording to begin", unit="s", minimum=0)
+    loop: bool = param(False, "begin again at the end, until stopped")
+    topics: str = param("", "names, or their ends, separated by spaces; empty = all but /diagnostics and /clock")
+    clock: bool = param(True, "publish the recording's time on /clock")
