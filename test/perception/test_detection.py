@@ -115,7 +115,7 @@ def test_a_window_moves_the_boxes(tmp_path):
     write_model(tmp_path / "rtmdet.onnx", (1, 3, SIZE[1], SIZE[0]), end_to_end())
     detector = load_detector(tmp_path, PoseEstimatorConfig())
     found = detector.detect(np.zeros((400, 600, 3), np.uint8), (100, 50, 100 + 128, 50 + 96), 0.3)
-    np.testing.assert_allclose(found.boxes[0], BOX + [100, 50, 100, 50], atol=0.01)
+    np.testing.assert_allclose(found.boxes[0], BOX + np.array([100, 50, 100, 50]), atol=0.01)
 
 
 def test_boxes_and_labels_alone_do_not_tell_how_a_model_is_fed(tmp_path):

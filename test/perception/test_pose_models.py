@@ -85,7 +85,9 @@ def heatmap_outputs(joints: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     return {"heatmaps": heatmaps(joints, 64, 48, cells)}, 4 * cells
 
 
-@pytest.mark.parametrize(("joints", "skeleton"), [(17, "coco17"), (16, "mpii16"), (26, "halpe26"), (133, "wholebody133")])
+@pytest.mark.parametrize(
+    ("joints", "skeleton"), [(17, "coco17"), (16, "mpii16"), (26, "halpe26"), (133, "wholebody133")]
+)
 def test_heatmap_models_of_every_joint_set(tmp_path, joints, skeleton):
     outputs, expected = heatmap_outputs(joints)
     write_model(tmp_path / "a.onnx", (1, 3, 256, 192), outputs)
@@ -217,7 +219,9 @@ def test_a_wrong_yaml_is_refused_with_what_it_should_hold(tmp_path, text, compla
 
 
 def test_a_folder_without_a_pose_model_says_how_to_get_one(tmp_path):
-    with pytest.raises(InputError, match=r"expected a 2D pose model \(\.onnx\), found no \.onnx file.*drocap models fetch"):
+    with pytest.raises(
+        InputError, match=r"expected a 2D pose model \(\.onnx\), found no \.onnx file.*drocap models fetch"
+    ):
         load(tmp_path)
     with pytest.raises(InputError, match="found no such folder"):
         load(tmp_path / "nowhere")

@@ -57,6 +57,7 @@ def test_a_variable_frame_rate_keeps_its_times(tmp_path):
         return content[:12] + struct.pack(">I", delta)
 
     patch_box(path, b"stts", edit)
+
     # Two runs need a longer box: write the frames of a second half at three times the distance as an edit of
     # the media's time scale for the whole file, which no nominal rate knows of.
     def slower(content: bytes) -> bytes:
@@ -184,9 +185,12 @@ def test_decoding_ahead_keeps_order_and_passes_errors_on():
         raise InputError("the twenty-first is bad")
 
     seen = []
+
+    def read() -> None:
+        seen.extend(frame.stamp_ns for frame in prefetch(frames()))
+
     with pytest.raises(InputError, match="twenty-first"):
-        for frame in prefetch(frames()):
-            seen.append(frame.stamp_ns)
+        read()
     assert seen == list(range(20))
 
 

@@ -34,7 +34,9 @@ def write_model(
     return path
 
 
-def heatmaps(joints: int, rows: int, columns: int, at: np.ndarray, height: float = 0.9, sigma: float = 2.0) -> np.ndarray:
+def heatmaps(
+    joints: int, rows: int, columns: int, at: np.ndarray, height: float = 0.9, sigma: float = 2.0
+) -> np.ndarray:
     """(1, joints, rows, columns) float32 Gaussians at ``at`` (joints, 2) cells."""
     y, x = np.mgrid[:rows, :columns]
     squared = (x[None] - at[:, 0, None, None]) ** 2 + (y[None] - at[:, 1, None, None]) ** 2
