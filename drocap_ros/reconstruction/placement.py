@@ -29,7 +29,8 @@ def smooth_over_time(values: np.ndarray, stamp_ns: np.ndarray, std_s: float) -> 
     if len(values) < 2:
         return values
     step_s = float(np.median(np.diff(stamp_ns))) * 1e-9
-    return gaussian_filter1d(values, std_s / step_s, axis=0, mode="nearest", truncate=3.0)
+    # Stamps of nonsense (a counter for nanoseconds) must not make a kernel of a thousand million taps.
+    return gaussian_filter1d(values, min(std_s / step_s, len(values), 1000.0), axis=0, mode="nearest", truncate=3.0)
 
 
 @dataclass(frozen=True)

@@ -117,4 +117,6 @@ def test_size_is_averaged_over_time() -> None:
     assert np.all(np.diff(per_px) < 0.0)
     constant = smooth_over_time(np.full((50, 2), 3.0), stamps(50), 1.0)
     np.testing.assert_allclose(constant, 3.0)
+    counted = smooth_over_time(np.arange(20.0), np.arange(20), 1.0)  # frames counted as nanoseconds
+    assert np.ptp(counted) < 10.0
     np.testing.assert_array_equal(smooth_over_time(np.array([5.0]), stamps(1), 1.0), [5.0])
