@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.export.clip import Clip
+from drocap_ros.skeleton import side_of
 
 #: Linear RGB of the body's sides; the order is that of the parts and of the materials.
 COLOURS = {"right": (0.53, 0.04, 0.03), "left": (0.02, 0.16, 0.37), "middle": (0.18, 0.18, 0.2)}
@@ -38,20 +39,13 @@ def body_mesh(rest: np.ndarray, clip: Clip) -> list[MeshPart]:
     corners: dict[str, list[np.ndarray]] = {side: [] for side in COLOURS}
     owners: dict[str, list[np.ndarray]] = {side: [] for side in COLOURS}
     for joint, parent in enumerate(clip.parents):
-        side = _side(clip.joints[joint], clip.joints)
+        side = side_of(clip.joints[joint], clip.joints)
         corners[side].append(rest[joint] + _KNOB_M * _octahedron(np.array([0.0, 1.0, 0.0])))
         owners[side].append(np.full(6, joint))
         if parent >= 0:
             corners[side].append(_spindle(rest[parent], rest[joint]))
             owners[side].append(np.array([parent] * 5 + [joint]))
     return [_part(np.array(corners[side]), np.array(owners[side])) for side in COLOURS if corners[side]]
-
-
-def _side(joint: str, joints: tuple[str, ...]) -> str:
-    for letter, other, side in (("r", "l", "right"), ("l", "r", "left")):
-        if joint.startswith(letter) and other + joint[1:] in joints:
-            return side
-    return "middle"
 
 
 def _octahedron(along: np.ndarray) -> np.ndarray:

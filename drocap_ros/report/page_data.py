@@ -11,6 +11,7 @@ import numpy as np
 from drocap_ros.motion import Motion, upright_joints
 from drocap_ros.report.measures import Measures, camera_axes
 from drocap_ros.report.pictures import Pictures
+from drocap_ros.skeleton import side_of
 
 #: Poses in the page; of longer motions every n-th is shown.
 MAX_POSES = 3000
@@ -38,14 +39,6 @@ def page_data(motion: Motion, m: Measures, pictures: Pictures | None) -> dict[st
         "series": {"error": _numbers(m.error_px[shown]), "view": _numbers(m.view_deg[shown])},
         "picture": None if pictures is None else _pictures(pictures, shown),
     }
-
-
-def side_of(joint: str, joints: tuple[str, ...]) -> str:
-    """Body side of a joint: "left", "right" or "middle"."""
-    for letter, other, side in (("r", "l", "right"), ("l", "r", "left")):
-        if joint.startswith(letter) and other + joint[1:] in joints:
-            return side
-    return "middle"
 
 
 def script_json(data: Any) -> str:

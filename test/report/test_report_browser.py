@@ -157,6 +157,25 @@ def test_mouse_and_wheel(browser, pages):
     assert browser.errors == []
 
 
+def test_space_belongs_to_the_player_after_a_click_and_to_a_button_reached_by_keyboard(browser, pages):
+    browser.open(pages / "plain.html", 1280, 1400)
+    x, y = browser.run(
+        """(({x, y, width, height}) => [x + width / 2, y + height / 2])(
+        document.querySelector("[data-view=front]").getBoundingClientRect())"""
+    )
+    browser.mouse("mousePressed", x, y, button="left", buttons=1, clickCount=1)
+    browser.mouse("mouseReleased", x, y, button="left", clickCount=1)
+    browser.settle()
+    assert pressed(browser) == "front"
+    browser.key(" ")
+    assert browser.run("state.playing")
+    browser.key(" ")
+    browser.run('document.querySelector("[data-view=profile]").focus()')
+    browser.key(" ")
+    assert pressed(browser) == "profile"
+    assert not browser.run("state.playing")
+
+
 def test_two_fingers_zoom(browser, pages):
     browser.open(pages / "plain.html", 400, 900)
     x, y = browser.run(

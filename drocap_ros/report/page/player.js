@@ -148,8 +148,15 @@ function listen() {
   byId("overlay").addEventListener("change", (event) => { state.overlay = event.target.checked; redraw(); });
   for (const button of document.querySelectorAll("[data-view]")) button.addEventListener("click", () => setView(button.dataset.view));
 
+  // A button that was clicked gives the keys back to the player; one reached by keyboard keeps them.
+  document.addEventListener("click", (event) => {
+    const active = document.activeElement;
+    if (event.detail && active.matches("button, [type=checkbox]")) active.blur();
+  });
+
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("select, summary")) return;
+    if (event.key === " " && event.target.matches("button, [type=checkbox]")) return; // its own key
     const step = event.shiftKey ? 10 : 1;
     const actions = {
       " ": () => play(!state.playing),
