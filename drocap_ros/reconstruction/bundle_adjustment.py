@@ -116,12 +116,14 @@ def effective_alpha(projection: Projection, config: BundleAdjusterConfig) -> flo
     """Weight of the nuclear norm: ``config.alpha`` for the window's length, more where the 2D joints are noisy.
 
     Noise of standard deviation sigma alone has singular values up to sigma (sqrt F + sqrt 2P); to hide it, the
-    threshold has to be of that size (the data term has no factor 1/2, hence the 2).
+    threshold has to be of that size (the data term has no factor 1/2, hence the 2).  It stays below a tenth of what
+    the joints themselves have, so that a window of nothing but noise still has a body.
     """
     w, information = frames_first(projection.w), frames_first(projection.information)
     frames, p = w.shape[:2]
     hiding = 2.0 * noise_std(w, information) * (np.sqrt(frames) + np.sqrt(2.0 * p)) if config.noise_alpha > 0.0 else 0.0
-    return float(max(config.alpha * np.sqrt(frames / REFERENCE_FRAMES), config.noise_alpha * hiding))
+    most = 0.1 * float(np.linalg.norm(projection.w.reshape(-1, frames), 2))
+    return float(max(config.alpha * np.sqrt(frames / REFERENCE_FRAMES), min(config.noise_alpha * hiding, most)))
 
 
 def shape_change(s: np.ndarray) -> float:
