@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from drocap_ros.errors import InputError
-from drocap_ros.motion import Motion
+
+if TYPE_CHECKING:
+    from drocap_ros.motion import Motion
 
 #: Format -> units and up axis of its files.
 FORMATS = {
