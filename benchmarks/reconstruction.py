@@ -143,7 +143,7 @@ def markdown(result: dict[str, Any]) -> str:
         f"{m['cpu']}, {m['cores']} cores, {m['memory_gb']} GB, {m['system']}, Python {m['python']}, numpy {m['numpy']};"
         f" load average at the end {m['load_average']:.1f} (where it is above 1, trust the processor time).",
         "",
-        "| method | threads | frames | start, ms/frame | adjustment, s | total, s | processor, s | memory above start, MB |",
+        "| method | threads | frames | start, ms/frame | adjustment, s | total, s | cpu, s | memory above start, MB |",
         "|---|---|---|---|---|---|---|---|",
     ]
     lines += [
