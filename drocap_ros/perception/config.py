@@ -78,6 +78,11 @@ class PoseEstimatorConfig(Parameters):
     give_up_s: float = param(
         3.0, "for on_loss = next: time a subject lost in mid-picture is waited for", unit="s", minimum=0, maximum=3600
     )
+    detect_every_s: float = param(
+        0.1,
+        "longest time between detections of a subject whom the pose network sees clearly and alone; 0 = every image",
+        unit="s", minimum=0, maximum=10,
+    )  # fmt: skip
     full_frame_every_s: float = param(
         1.0,
         "interval of detection over the whole image while the subject is in view",

@@ -35,6 +35,8 @@ _CLEAR_IOU = 0.5
 _LEAVING_SPEED = 0.15
 #: Share of the smaller box inside the larger from which both are one person.
 _PART = 0.75
+#: Distance to the next person, lengths, from which nobody is near.
+_ALONE = 0.4
 #: A bystander unseen for so long is forgotten.
 _BYSTANDER_S = 2.0
 #: Persons remembered at most; a crowd's rest is of no use.
@@ -110,6 +112,36 @@ class SubjectTracker:
             return [None]
         self._tile = (self._tile + 1) % len(parts)
         return [None, parts[self._tile]]
+
+    def steady(self, image_size: tuple[int, int], stamp_ns: int) -> Subject | None:
+        """The subject predicted, if it was seen in the last image, stands free of others and clear of the edges."""
+        subject = self._subject
+        if subject is None or self._wanted is not None or self._last_ns is None or subject.sure_ns != self._last_ns:
+            return None
+        full_due = self._full_ns is None or stamp_ns - self._full_ns >= self._config.full_frame_every_s * 1e9
+        box = subject.motion.box_at(stamp_ns)
+        reach = _ALONE * subject.motion.length
+        around = box + reach * np.array([-1, -1, 1, 1])
+        solid = [p for p in self._persons if p is not subject and p.quality >= _SOLID_QUALITY]
+        others = np.array([p.motion.box_at(stamp_ns) for p in solid]).reshape(-1, 4)
+        near = (shared(around[None], others) > 0).any()
+        edge = 0.01 * max(image_size)
+        at_edge = (box[:2] < edge).any() or (box[2:] > np.array(image_size) - edge).any()
+        if full_due or near or at_edge:
+            return None
+        return Subject(self._track_id, box, subject.score, False)
+
+    def carry(self, box: np.ndarray, stamp_ns: int) -> None:
+        """Take the subject's box (4,) px from the pose network, in an image without detection."""
+        subject = self._subject
+        if subject is None:
+            return
+        for person in self._persons:
+            person.motion.predict(stamp_ns)
+        subject.motion.update(box)
+        subject.box = np.asarray(box, float)
+        subject.assure(stamp_ns)
+        self._last_ns = stamp_ns
 
     def second_look(
         self, image_size: tuple[int, int], stamp_ns: int, boxes: np.ndarray, scores: np.ndarray
