@@ -118,7 +118,7 @@ setup(
         "c3d>=0.6",
     ],
     extras_require={
-        "train": ["torch>=2.4", "onnx>=1.16"],
+        "train": ["torch>=2.9", "onnx>=1.16"],
         "test": [
             "pytest",
             "pytest-timeout",

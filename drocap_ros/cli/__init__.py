@@ -15,7 +15,7 @@ from drocap_ros.errors import DrocapError
 
 COMMANDS = (
     "demo", "live", "record", "replay", "track", "reconstruct", "learn_dictionary",
-    "export", "report", "info", "recover", "top", "models",
+    "export", "report", "info", "recover", "top", "models", "evaluate", "train_lifter",
 )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import math
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from drocap_ros.parameters import Parameters, param
 from drocap_ros.reconstruction.lifter_input import FEATURES
 from drocap_ros.reconstruction.train_lifter_views import MocapBank, sample_batch
 from drocap_ros.skeleton import BODY_15, LIMB_JOINTS, indices
+from drocap_ros.tracks import read_npz
 
 if TYPE_CHECKING:
     import torch
@@ -51,6 +53,27 @@ def _torch() -> Any:
     except ImportError:
         raise DrocapError("training needs PyTorch, which is not installed; pip install 'drocap_ros[train]'") from None
     return torch
+
+
+def set_threads(count: int) -> None:
+    """Threads of PyTorch."""
+    _torch().set_num_threads(count)
+
+
+def describe_training(
+    files: list[Path], include: str, options: LifterTraining, facts: dict[str, Any]
+) -> dict[str, str]:
+    """Metadata of the ONNX file: what was learned from, under which licence, by which command."""
+    arrays = [read_npz(path, ("X",)) for path in files]
+    return {
+        "origin": "; ".join(sorted({str(a["source"]) for a in arrays if "source" in a})),
+        "licence": "; ".join(sorted({str(a["licence"]) for a in arrays if "licence" in a})),
+        "files": str(len(files)),
+        "mocap_frames": str(sum(len(a["X"]) for a in arrays)),
+        "command": f"drocap train-lifter MOCAP_DIR --include '{include}' --minutes {options.minutes:g}"
+        f" --width {options.width} --seed {options.seed} --out ONNX",
+        **{name: str(value) for name, value in facts.items()},
+    }
 
 
 def build_network(width: int) -> torch.nn.Module:
@@ -213,16 +236,19 @@ def export_onnx(network: torch.nn.Module, path: Path, facts: dict[str, str]) -> 
         raise InputError(f"--out: expected a file name ending in .onnx, got {path.name!r}")
     network = copy.deepcopy(network).eval().float()
     path.parent.mkdir(parents=True, exist_ok=True)
-    torch.onnx.export(
-        network,
-        (torch.zeros(2, 16, FEATURES),),
-        str(path),
-        input_names=["features"],
-        output_names=["joints", "log_sigma"],
-        dynamic_axes={name: {0: "windows", 1: "frames"} for name in ("features", "joints", "log_sigma")},
-        opset_version=17,
-        dynamo=False,
-    )
+    with warnings.catch_warnings():
+        # The exporter warns that it will be replaced and that it leaves some slices unfolded.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            network,
+            (torch.zeros(2, 16, FEATURES),),
+            str(path),
+            input_names=["features"],
+            output_names=["joints", "log_sigma"],
+            dynamic_axes={name: {0: "windows", 1: "frames"} for name in ("features", "joints", "log_sigma")},
+            opset_version=17,
+            dynamo=False,
+        )
     model = onnx.load(str(path))
     kept, casts = [], []
     for tensor in model.graph.initializer:
