@@ -275,9 +275,8 @@ def plot(pose: str, cases: list[Case], worse: list[Case], layout: str) -> None:
     left.set(xlabel="error / stated standard deviation", ylabel="density", title=f"{pose}: covariance")
     left.legend()
     gross, confidence = gross_and_confidence(worse + cases, layout)
-    edges = np.quantile(confidence, np.linspace(0, 1, 13))
-    place = np.clip(np.searchsorted(edges, confidence, side="right") - 1, 0, 11)
-    filled = [place == i for i in range(12) if (place == i).any()]
+    place = np.clip((confidence * 10).astype(int), 0, 9)
+    filled = [place == i for i in range(10) if (place == i).sum() >= 20]
     stated = [confidence[at].mean() for at in filled]
     right.plot([0, 1], [0, 1], "k--")
     right.plot(stated, [1 - gross[at].mean() for at in filled], "o-")

@@ -125,7 +125,9 @@ class PoseEstimator:
         self, stamp_ns: int, size: tuple[int, int], subject: Subject, pose: tuple[np.ndarray, np.ndarray, np.ndarray]
     ) -> PoseObservation:
         xy, covariance, confidence = pose
-        unseen = confidence < self.config.keypoint_threshold
+        outside = ~((xy >= 0) & (xy < np.array(size))).all(axis=1)  # networks guess beyond the picture: nobody saw that
+        confidence = np.where(outside, 0.0, confidence)
+        unseen = outside | (confidence < self.config.keypoint_threshold)
         xy[unseen], covariance[unseen] = np.nan, np.nan
         return PoseObservation(
             stamp_ns, subject.track_id, size, BODY_15, subject.box.astype(np.float32), subject.score,
