@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.reconstruction.dictionary import LIMBS_PER_STATURE
-from drocap_ros.reconstruction.metric_scale import estimate_scale
+from drocap_ros.reconstruction.metric_scale import ScaleEstimate, estimate_scale
 from drocap_ros.reconstruction.metrics import limb_lengths
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
@@ -35,11 +35,12 @@ def smooth_over_time(values: np.ndarray, stamp_ns: np.ndarray, std_s: float) -> 
 
 @dataclass(frozen=True)
 class WorldPoses:
-    """Poses (F, 15, 3) m in the world, and whether their scale was measured (how: ``scale_source``)."""
+    """Poses (F, 15, 3) m in the world, whether their scale was measured (how: ``scale_source``), and the estimate."""
 
     joints: np.ndarray
     metric: bool
     scale_source: str
+    scale: ScaleEstimate | None
 
 
 def place_in_world(joints: np.ndarray, projected_px: np.ndarray, per_px: np.ndarray, tracks: Tracks) -> WorldPoses:
@@ -53,7 +54,7 @@ def place_in_world(joints: np.ndarray, projected_px: np.ndarray, per_px: np.ndar
     to_world = tracks.camera_rotation
     assert to_world is not None
     if tracks.camera_position is None or tracks.camera_matrix is None:
-        return WorldPoses(joints @ to_world, False, "assumed_height")
+        return WorldPoses(joints @ to_world, False, "assumed_height", None)
     k = tracks.camera_matrix
     range_m = 0.5 * (k[0, 0] + k[1, 1]) * per_px
     ray = np.concatenate(
@@ -67,4 +68,4 @@ def place_in_world(joints: np.ndarray, projected_px: np.ndarray, per_px: np.ndar
     trusted = scale is not None and scale.trusted
     factor = scale.factor if scale is not None and trusted else 1.0
     placed = tracks.camera_position[:, None] + factor * from_camera
-    return WorldPoses(placed, trusted, "telemetry" if trusted else "assumed_height")
+    return WorldPoses(placed, trusted, "telemetry" if trusted else "assumed_height", scale)

@@ -7,6 +7,7 @@ import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -127,6 +128,7 @@ def _to_motion(
     per_px = metres_per_px(result.joints_px, tracks.stamp_ns, config.assumed_height_m)
     joints = (result.joints_px - result.joints_px[:, pelvis][:, None]) * per_px[:, None, None]
     metric, scale_source = False, "assumed_height"
+    meta: dict[str, Any] = {"assumed_height_m": config.assumed_height_m, "reference_stature_m": REFERENCE_STATURE_M}
     rotation, frame = np.broadcast_to(np.eye(3), (len(tracks), 3, 3)).copy(), "camera"
     if tracks.camera_rotation is None and tracks.camera_matrix is not None:
         # Joints behind the pelvis are farther from the axis than they look: undo the perspective, as place_in_world.
@@ -136,6 +138,8 @@ def _to_motion(
         rotation, frame = tracks.camera_rotation, "world"
         world = place_in_world(joints, projected, per_px, tracks)
         joints, metric, scale_source = world.joints, world.metric, world.scale_source
+        if world.scale is not None:
+            meta["scale"] = dataclasses.asdict(world.scale)
     return Motion(
         joints3d=np.ascontiguousarray(joints),
         joints=BODY_15.joints,
@@ -148,7 +152,7 @@ def _to_motion(
         confidence=shown,
         keypoints=keypoints,
         reprojection_px=reprojection,
-        meta={"assumed_height_m": config.assumed_height_m, "reference_stature_m": REFERENCE_STATURE_M},
+        meta=meta,
     )
 
 

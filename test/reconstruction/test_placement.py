@@ -67,6 +67,7 @@ def test_a_moving_camera_measures_the_person(stature_m: float) -> None:
     truth = capture(stature_m)
     motion = reconstruct(truth.tracks, method="paper")
     assert (motion.frame, motion.metric, motion.scale_source) == ("world", True, "telemetry")
+    assert 0.2 < motion.meta["scale"]["support"] <= 1.0
     assumed = abs(1.70 / stature_m - 1.0)
     assert abs(scale_error(motion.joints3d, truth.joints3d_world)) < 0.6 * assumed
     assert np.linalg.norm(motion.joints3d[:, 0] - truth.joints3d_world[:, 0], axis=1).mean() < 0.3
