@@ -99,6 +99,13 @@ class Graph:
             self._executor.spin_once(timeout_sec=0.05)
         self.check()
 
+    def spin_for(self, seconds: float) -> None:
+        """Serve the script's own callbacks for some time; raises what a node raised."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self.check()
+            self._executor.spin_once(timeout_sec=min(left, 0.05))
+
     def wait_finished(self, *names: str, timeout_s: float) -> None:
         """Wait until the named sources have published all they have."""
         self.wait_until(lambda: self.finished >= set(names), timeout_s, f"the end of {', '.join(names)}")
@@ -142,17 +149,10 @@ def bringup(
     if unknown or not names:
         raise InputError(f"nodes: expected some of {', '.join(NODES)}; got {', '.join(unknown) or 'none'}")
     with contextlib.ExitStack() as stack:
-        isolated = domain_id is None
         if domain_id is None:
             domain_id = stack.enter_context(free_domain())
-        if isolated:
             stack.enter_context(_environment(ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST"))
-        context = Context()
-        rclpy.init(args=[], context=context, domain_id=domain_id)
-        stack.callback(context.try_shutdown)
-        observer = Node("bringup", context=context, namespace=namespace)
-        stack.callback(observer.destroy_node)
-        graph = Graph(observer, domain_id, namespace, names)
+        graph = stack.enter_context(watch(namespace, domain_id, names))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="drocap_bringup_")))
         try:
             for name in names:
@@ -160,7 +160,7 @@ def bringup(
                 if processes:
                     runner = _Process(name, config, names, namespace, domain_id, folder)
                 else:
-                    runner = _Thread(name, config, names, namespace, context)
+                    runner = _Thread(name, config, names, namespace, graph.node.context)
                 graph._runners.append(runner)
             matched = f"the endpoints of {', '.join(names)} to be matched"
             graph.wait_until(lambda: graph.ready >= set(names), timeout_s, matched)
@@ -170,6 +170,21 @@ def bringup(
             for runner in graph._runners:
                 runner.stop()
         graph.check()
+
+
+@contextlib.contextmanager
+def watch(namespace: str, domain_id: int, names: Sequence[str] = ()) -> Iterator[Graph]:
+    """Look at a graph that runs already: a node in its namespace and domain, for the script's own endpoints."""
+    context = Context()
+    rclpy.init(args=[], context=context, domain_id=domain_id)
+    try:
+        node = Node("bringup", context=context, namespace=namespace, use_global_arguments=False)
+        try:
+            yield Graph(node, domain_id, namespace, list(names))
+        finally:
+            node.destroy_node()
+    finally:
+        context.try_shutdown()
 
 
 class _Runner:
@@ -306,4 +321,4 @@ def _environment(**values: str) -> Iterator[None]:
                 os.environ[name] = value
 
 
-__all__ = ["DrocapError", "Graph", "bringup", "free_domain", "node_class"]
+__all__ = ["DrocapError", "Graph", "bringup", "free_domain", "node_class", "watch"]

@@ -21,7 +21,8 @@ from drocap_ros.flight.config import MavlinkBridgeConfig
 from drocap_ros.parameters import Parameters
 from drocap_ros.perception.config import ImageIngestConfig, PoseEstimatorConfig
 from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.recording.config import SessionRecorderConfig
+from drocap_ros.recording.config import SessionPlayerConfig, SessionRecorderConfig
+from drocap_ros.report.config import VisualizerConfig
 from drocap_ros.simulation.config import SimulationConfig
 
 
@@ -35,6 +36,8 @@ class DrocapConfig:
     bundle_adjuster: BundleAdjusterConfig = field(default_factory=BundleAdjusterConfig)
     mavlink_bridge: MavlinkBridgeConfig = field(default_factory=MavlinkBridgeConfig)
     session_recorder: SessionRecorderConfig = field(default_factory=SessionRecorderConfig)
+    session_player: SessionPlayerConfig = field(default_factory=SessionPlayerConfig)
+    visualizer: VisualizerConfig = field(default_factory=VisualizerConfig)
     capture_simulator: SimulationConfig = field(default_factory=SimulationConfig)
 
     def section(self, component: str) -> Parameters:

@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.tracks import read_npz
+from drocap_ros.tracks import MAX_FRAMES, read_npz
+
+#: Joints further than this from the origin are no motion of a person, in whatever unit they are.
+_FARTHEST_M = 1e6
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,16 @@ class Motion:
     keypoints: np.ndarray
     reprojection_px: np.ndarray
     meta: dict[str, Any] = field(default_factory=dict)
+
+
+def upright_joints(motion: Motion) -> np.ndarray:
+    """(F, P, 3) m, z up: frame "world" as it is; frame "camera" as x right, y away from the camera, z up.
+
+    The vertical of the latter is the camera's; gravity is not known.
+    """
+    if motion.frame == "world":
+        return motion.joints3d
+    return motion.joints3d[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
 
 
 def save_motion(path: str | Path, motion: Motion) -> None:
@@ -84,11 +97,13 @@ def load_motion(path: str | Path) -> Motion:
     joints3d = a["joints3d"]
     if joints3d.ndim != 3 or joints3d.shape[2] != 3 or joints3d.shape[1] != a["joints"].size:
         raise InputError(f"{path}: joints3d: expected (F, {a['joints'].size}, 3), got {joints3d.shape}")
+    if a["parents"].ndim != 1 or a["parents"].dtype.kind not in "iu" or a["joints"].ndim != 1:
+        raise InputError(f"{path}: joints, parents: expected (P) names and (P) integers, got {a['parents'].dtype}")
     try:
         meta = json.loads(str(a["meta"]))
     except ValueError:
         raise InputError(f"{path}: meta: expected JSON text; was the file written by drocap?") from None
-    return Motion(
+    motion = Motion(
         joints3d=joints3d,
         joints=tuple(str(j) for j in a["joints"]),
         parents=tuple(int(p) for p in a["parents"]),
@@ -100,5 +115,49 @@ def load_motion(path: str | Path) -> Motion:
         confidence=a["confidence"],
         keypoints=a["keypoints"],
         reprojection_px=a["reprojection_px"],
-        meta=meta,
+        meta=meta if isinstance(meta, dict) else {},
     )
+    try:
+        _check(motion)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return motion
+
+
+def _check(m: Motion) -> None:
+    frames, joints = m.joints3d.shape[:2]
+    if not 1 <= frames <= MAX_FRAMES:
+        raise InputError(f"joints3d: expected 1 to {MAX_FRAMES} frames, got {frames}; cut the motion")
+    shapes = {
+        "joints3d": (frames, joints, 3),
+        "stamp_ns": (frames,),
+        "camera_rotation": (frames, 3, 3),
+        "confidence": (frames, joints),
+        "keypoints": (frames, joints, 2),
+        "reprojection_px": (frames, joints),
+    }
+    for name, shape in shapes.items():
+        value = getattr(m, name)
+        if value.shape != shape or value.dtype.kind not in "fiu":
+            raise InputError(f"{name}: expected numbers of shape {shape}, got {value.dtype} {value.shape}")
+        if value.dtype.kind == "f" and np.isinf(value).any():
+            raise InputError(f"{name}: expected finite numbers or NaN, got infinity; use NaN for unknown")
+    if np.any(np.abs(m.joints3d) > _FARTHEST_M):
+        raise InputError(f"joints3d: expected metres up to {_FARTHEST_M:g}, got larger; is the unit right?")
+    if m.stamp_ns.dtype.kind == "f" or np.any(np.diff(m.stamp_ns.astype(np.int64)) <= 0):
+        raise InputError("stamp_ns: expected strictly increasing integer nanoseconds; sort the frames")
+    if m.frame not in ("world", "camera"):
+        raise InputError(f"frame: expected 'world' or 'camera', got {m.frame[:40]!r}")
+    _check_tree(m.joints, m.parents)
+
+
+def _check_tree(joints: tuple[str, ...], parents: tuple[int, ...]) -> None:
+    if len(set(joints)) != len(joints):
+        raise InputError("joints: expected distinct names, got a repeated one; rename it")
+    if len(parents) != len(joints) or not all(-1 <= parent < len(joints) for parent in parents):
+        raise InputError(f"parents: expected {len(joints)} joint indices, -1 at the root, got {parents[:40]}")
+    reached = {-1}
+    while grown := {j for j, parent in enumerate(parents) if parent in reached} - reached:
+        reached |= grown
+    if parents.count(-1) != 1 or len(reached) != len(joints) + 1:
+        raise InputError("parents: expected one tree with one root, got a loop or several roots; correct them")

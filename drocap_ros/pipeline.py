@@ -7,10 +7,12 @@ import itertools
 import logging
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
+from drocap_ros.live_session import reconstruct_live, recorded_config
 from drocap_ros.motion import Motion
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.models import models_folder
@@ -19,6 +21,8 @@ from drocap_ros.perception.tracking_run import observe, tracks_from_observations
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording import session_reader
 from drocap_ros.recording.session import is_recording, open_session
+from drocap_ros.recording.telemetry import TelemetryLog, read_telemetry
+from drocap_ros.recording.video_time import find_offset
 from drocap_ros.tracks import Tracks, load_tracks
 
 logger = logging.getLogger(__name__)
@@ -26,25 +30,53 @@ logger = logging.getLogger(__name__)
 Progress = Callable[[str, float], None]
 
 
+@dataclass(frozen=True)
+class Telemetry:
+    """A telemetry log beside a video.
+
+    path : .tlog, .ulg, .bin or .srt
+    time_offset_s : from the log's first state to the video's first picture; None = known or estimated
+    mount_pitch_deg : of a camera fixed to the body of a vehicle without a gimbal, negative looks down
+    """
+
+    path: Path
+    time_offset_s: float | None = None
+    mount_pitch_deg: float | None = None
+
+
 def reconstruct_input(
-    path: str | Path, *, method: str, config: DrocapConfig, models: Path | None = None, progress: Progress | None = None
+    path: str | Path,
+    *,
+    method: str,
+    config: DrocapConfig,
+    models: Path | None = None,
+    progress: Progress | None = None,
+    telemetry: Telemetry | None = None,
 ) -> tuple[Motion, Tracks]:
     """Motion of the subject in a video file, image folder, recording or tracks file.
 
     Parameters
     ----------
     path : video, folder of pictures, ``.mcap``, rosbag1 ``.bag``, rosbag2 folder, or tracks ``.npz``
-    method : one of :data:`drocap_ros.reconstruction.reconstruct.METHODS`
+    method : one of :data:`drocap_ros.reconstruction.reconstruct.METHODS`, or "live": the sliding windows of the live
+        graph on a recording with ``pose2d``, with the parameters that it was recorded with unless ``config`` is other
+        than the defaults
     models : folder of ONNX files; None = ``DROCAP_MODELS`` or the user's own
     progress : called with a stage's name and the share done
+    telemetry : log beside a video, which tells the camera's pose
 
     Raises
     ------
     InputError
         When the input cannot be used.
     """
+    if method == "live":
+        return _reconstruct_live(Path(path), config, progress)
     begin = time.perf_counter()
+    log = read_telemetry(telemetry.path) if telemetry is not None else None
     tracks = read_input(Path(path), config, models, progress)
+    if telemetry is not None and log is not None:
+        tracks = _with_telemetry(Path(path), tracks, telemetry, log, progress)
     seconds = time.perf_counter() - begin
     motion = reconstruct(
         tracks, method=method, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress
@@ -52,6 +84,37 @@ def reconstruct_input(
     meta = {**motion.meta, "input": Path(path).name}
     meta["seconds"] = {"pose2d": round(seconds, 4), **meta.get("seconds", {})}
     return dataclasses.replace(motion, meta=meta), tracks
+
+
+def _reconstruct_live(path: Path, config: DrocapConfig, progress: Progress | None) -> tuple[Motion, Tracks]:
+    if not path.exists() or not is_recording(path):
+        raise InputError(f"{path}: expected a recording with pose2d for method live, found none; use another method")
+    with open_session(path) as session:
+        if config == DrocapConfig():
+            config = recorded_config(session) or config
+        motion, tracks, _ = reconstruct_live(session, config, progress)
+        for warning in session.warnings:
+            logger.warning("%s: %s", path, warning)
+    return dataclasses.replace(motion, meta={**motion.meta, "input": path.name}), tracks
+
+
+def _with_telemetry(
+    path: Path, tracks: Tracks, telemetry: Telemetry, log: TelemetryLog, progress: Progress | None
+) -> Tracks:
+    """Tracks of a video with the camera's poses of the log beside it; says what the log lacks."""
+    if path.is_dir() or path.suffix == ".npz" or is_recording(path):
+        raise InputError(f"--telemetry: expected a video file as input, found {path}; recordings hold their telemetry")
+    pitch = telemetry.mount_pitch_deg
+    offset = find_offset(path, log, telemetry.time_offset_s, pitch, progress)
+    logger.warning("%s: %s; time offset %.2f s, %s", telemetry.path, log.kind, offset.seconds, offset.source)
+    for text in (*(f"the log tells {lack}" for lack in log.lacks), offset.warning):
+        if text:
+            logger.warning("%s: %s", telemetry.path, text)
+    at_ns = tracks.stamp_ns - tracks.stamp_ns[0] + int(log.track.stamp_ns[0]) + round(offset.seconds * 1e9)
+    tracks, reason = session_reader.with_camera(tracks, log.track, at_ns, pitch)
+    if reason:
+        logger.warning("%s: camera telemetry incomplete: %s", telemetry.path, reason)
+    return tracks
 
 
 def read_input(path: Path, config: DrocapConfig, models: Path | None, progress: Progress | None = None) -> Tracks:

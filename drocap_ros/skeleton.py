@@ -140,6 +140,14 @@ def joint_set(name: str) -> JointSet:
         raise InputError(f"skeleton: expected one of {', '.join(JOINT_SETS)}, got {name!r}") from None
 
 
+def side_of(joint: str, joints: tuple[str, ...]) -> str:
+    """Body side of a joint of ``BODY_15``'s naming among others: "left", "right" or "middle"."""
+    for letter, other, side in (("l", "r", "left"), ("r", "l", "right")):
+        if joint.startswith(letter) and other + joint[1:] in joints:
+            return side
+    return "middle"
+
+
 def indices(joints: tuple[str, ...] | list[str], wanted: tuple[str, ...]) -> np.ndarray:
     """(len(wanted),) int, where the wanted joints stand in ``joints``.
 

@@ -6,6 +6,7 @@ import argparse
 import importlib
 import logging
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 
@@ -13,7 +14,8 @@ from drocap_ros import __version__
 from drocap_ros.errors import DrocapError
 
 COMMANDS = (
-    "demo", "live", "orbit", "record", "track", "reconstruct", "learn_dictionary", "info", "models",
+    "demo", "live", "orbit", "record", "replay", "track", "reconstruct", "learn_dictionary",
+    "export", "report", "info", "recover", "top", "models", "evaluate", "train_lifter",
 )  # fmt: skip
 
 
@@ -34,7 +36,9 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     logging.basicConfig(level=logging.WARNING, format="drocap: %(message)s")
-    args = build_parser().parse_args(argv)
+    words = sys.argv[1:] if argv is None else list(argv)
+    args = build_parser().parse_args(words)
+    args.command_line = shlex.join(["drocap", *words])
     try:
         status: int = args.run(args)
         sys.stdout.flush()

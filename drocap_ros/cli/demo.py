@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from drocap_ros.motion import Motion
     from drocap_ros.simulation.capture import SimulatedCapture
 
-NODES = ("capture_simulator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder")
+NODES = ("capture_simulator", "initializer", "bundle_adjuster", "mavlink_bridge", "visualizer", "session_recorder")
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -38,6 +38,7 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.config import DrocapConfig
     from drocap_ros.motion import save_motion
     from drocap_ros.pipeline import reconstruct_input
+    from drocap_ros.report.page import save_report
     from drocap_ros.report.preview import save_preview
     from drocap_ros.simulation.capture import simulate_capture
     from drocap_ros.simulation.ports import free_udp_port
@@ -57,9 +58,10 @@ def run(args: argparse.Namespace) -> int:
         save_motion(folder / "motion.npz", motion)
         _save_truth(folder / "truth.npz", truth, motion)
         save_preview(folder / "preview.png", motion)
+        save_report(folder / "report.html", motion, command=args.command_line)
     _say(args, summary(motion, "ba"))
     print(_verdict(motion, truth))
-    print(f"files: {args.out}/motion.npz, truth.npz, preview.png; session: {args.out}/session")
+    print(f"files: {args.out}/motion.npz, truth.npz, preview.png, report.html; session: {args.out}/session")
     return 0
 
 
@@ -69,15 +71,10 @@ def _say(args: argparse.Namespace, text: str) -> None:
 
 
 def _fly(config: DrocapConfig, args: argparse.Namespace) -> None:
-    from drocap_ros.errors import InputError
-
-    try:
-        from drocap_ros.bringup import bringup
-    except ImportError as error:
-        raise InputError(f"expected ROS 2 with drocap_ros's messages, found none ({error}); run `make setup`") from None
+    from drocap_ros.cli.live import import_bringup
     from drocap_ros.cli.progress import progress_bars
 
-    with bringup(config, NODES, processes=True) as graph, progress_bars(args.quiet) as progress:
+    with import_bringup().bringup(config, NODES, processes=True) as graph, progress_bars(args.quiet) as progress:
         begin = graph.node.get_clock().now().nanoseconds
         length = args.seconds + 3.5
 

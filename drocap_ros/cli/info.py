@@ -30,12 +30,17 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         ".npz holds: topics, types, counts, duration, shapes.",
     )
     parser.add_argument("session", metavar="SESSION", type=Path, help="recording, motion.npz or tracks .npz")
+    parser.add_argument(
+        "--metadata", action="store_true", help="print the session's configuration and the like in full"
+    )
     parser.set_defaults(run=run)
     return parser
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the summary: a table on a terminal, plain lines in a pipe."""
+    if args.metadata:
+        return _print_metadata(args.session)
     summary = summarize(args.session)
     if sys.stdout.isatty():
         _print_table(summary)
@@ -69,10 +74,23 @@ def _of_session(path: Path) -> Summary:
         ("start", _time_text(info.start_ns)),
         ("duration", f"{info.duration_s:.3f} s"),
         ("messages", str(info.message_count)),
-        *sorted(info.metadata.items()),
+        *((key, _short(value)) for key, value in sorted(info.metadata.items())),
     ]
     rows = [(t.name, t.type_name, str(t.count), _rate_text(t.count, info.duration_s)) for t in info.topics]
     return Summary(facts, ("topic", "type", "messages", "rate"), rows, info.warnings)
+
+
+def _short(value: str) -> str:
+    lines = value.strip().splitlines()
+    return value if len(lines) < 2 else f"{len(lines)} lines; --metadata prints them"
+
+
+def _print_metadata(path: Path) -> int:
+    from drocap_ros.recording.session_reader import session_info
+
+    for key, value in sorted(session_info(path).metadata.items()):
+        print(f"# {key}\n{value.rstrip()}\n")
+    return 0
 
 
 def _of_arrays(path: Path) -> Summary:

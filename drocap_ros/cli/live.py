@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import importlib
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
+
+from drocap_ros.cli.dashboard import Dashboard, dashboard_on_terminal
+from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
     from drocap_ros.bringup import Graph
     from drocap_ros.config import DrocapConfig
 
-NODES = ("image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder")
+NODES = (
+    "image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "visualizer",
+    "session_recorder",
+)  # fmt: skip
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -56,28 +69,53 @@ def run(args: argparse.Namespace) -> int:
 
 def run_graph(config: DrocapConfig, nodes: list[str], args: argparse.Namespace) -> int:
     """Bring nodes up, show what they say, stop on Ctrl-C or when the source has ended."""
-    from drocap_ros.errors import InputError
-
-    if not 0 <= args.domain_id <= 101:
-        raise InputError(f"--domain-id: expected 0 to 101, got {args.domain_id}")
-    try:
-        from drocap_ros.bringup import bringup
-    except ImportError as error:
-        raise InputError(f"expected ROS 2 with drocap_ros's messages, found none ({error}); run `make setup`") from None
+    check_domain(args.domain_id)
+    bringup = import_bringup().bringup
     with bringup(
         config, nodes, processes=not args.one_process, namespace=args.namespace, domain_id=args.domain_id
     ) as graph:
         if not args.quiet:
             print(f"running {', '.join(graph.names)} in {args.namespace}, domain {args.domain_id}; Ctrl-C stops")
-        try:
-            _watch(graph, "image_ingest" in nodes)
-        except KeyboardInterrupt:
-            if not args.quiet:
-                print("stopping")
+            sys.stdout.flush()
+        with dashboard_of(graph, show=not args.quiet) as (_, draw), stop_signals() as stop:
+            while not stop.is_set() and not ("image_ingest" in nodes and "image_ingest" in graph.finished):
+                graph.spin_for(0.5)
+                draw()
     return 0
 
 
-def _watch(graph: Graph, until_source_ends: bool) -> None:
-    while not (until_source_ends and "image_ingest" in graph.finished):
-        begin = graph.node.get_clock().now().nanoseconds
-        graph.wait_until(lambda: graph.node.get_clock().now().nanoseconds - begin > 5e8, 60.0)  # noqa: B023
+@contextlib.contextmanager
+def stop_signals() -> Iterator[threading.Event]:
+    """An event that SIGINT and SIGTERM set, so that neither breaks into the middle of anything."""
+    stop = threading.Event()
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def check_domain(domain_id: int) -> None:
+    """Refuse a DDS domain that does not exist."""
+    if not 0 <= domain_id <= 101:
+        raise InputError(f"--domain-id: expected 0 to 101, got {domain_id}")
+
+
+def import_bringup() -> ModuleType:
+    """The module that knows ROS, or one clear line where there is no ROS."""
+    try:
+        return importlib.import_module("drocap_ros.bringup")
+    except ImportError as error:
+        raise InputError(f"expected ROS 2 with drocap_ros's messages, found none ({error}); run `make setup`") from None
+
+
+@contextlib.contextmanager
+def dashboard_of(graph: Graph, show: bool) -> Iterator[tuple[Dashboard, Callable[[], None]]]:
+    """Dashboard fed by the graph's ``/diagnostics``, and the function that draws it."""
+    from drocap_ros.nodes.topics import TOPICS
+
+    with dashboard_on_terminal(show) as (dashboard, draw):
+        entry = TOPICS["/diagnostics"]
+        graph.node.create_subscription(entry.message, "/diagnostics", dashboard.take, entry.qos)
+        yield dashboard, draw

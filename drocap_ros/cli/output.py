@@ -48,6 +48,26 @@ def output_folder(target: Path) -> Iterator[Path]:
         shutil.rmtree(work, ignore_errors=True)
 
 
+@contextlib.contextmanager
+def output_file(target: Path) -> Iterator[Path]:
+    """A file to write, moved to ``target`` when the block succeeds; one that stood there before is replaced.
+
+    Raises
+    ------
+    InputError
+        When the target is a folder, or its folder cannot be written to.
+    """
+    if target.is_dir():
+        raise InputError(f"--out {target}: expected a file, found a folder; name a file in it")
+    parent = target.absolute().parent
+    check_output_folder(parent)
+    parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=parent) as work:
+        path = Path(work) / target.name
+        yield path
+        path.replace(target)
+
+
 def _replace(path: Path, target: Path) -> None:
     if target.is_dir() and not target.is_symlink():
         shutil.rmtree(target)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from drocap_ros.motion import Motion
 
-METHODS = ("ba", "paper", "paper-no-articulation", "initial", "mf-nnm")
+METHODS = ("ba", "paper", "paper-no-articulation", "initial", "mf-nnm", "live")
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -17,7 +18,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "reconstruct",
         help="3D motion from a video, recording or tracks file",
-        description="Recover the 3D motion of the person in INPUT and write motion.npz, tracks.npz and preview.png.",
+        description="Recover the 3D motion of the person in INPUT and write motion.npz, tracks.npz, preview.png and"
+        " report.html.",
     )
     parser.add_argument(
         "input",
@@ -31,11 +33,31 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         choices=METHODS,
         default="ba",
         help="ba: the best we have (default); paper: the paper as written; paper-no-articulation: without its rank-1"
-        " term; initial: the paper's single-view start alone; mf-nnm: factorization and nuclear norm (Dai 2012)",
+        " term; initial: the paper's single-view start alone; mf-nnm: factorization and nuclear norm (Dai 2012);"
+        " live: the live graph's sliding windows, from a recording's pose2d",
+    )
+    parser.add_argument(
+        "--telemetry",
+        metavar="LOG",
+        type=Path,
+        help="log beside a video: MAVLink .tlog, PX4 .ulg, ArduPilot .bin, DJI .srt",
+    )
+    parser.add_argument(
+        "--time-offset",
+        metavar="S",
+        type=float,
+        help="seconds from the log's first state to the video's first picture (default: estimated where that can be)",
+    )
+    parser.add_argument(
+        "--mount-pitch",
+        metavar="DEG",
+        type=float,
+        help="pitch of a camera fixed to a vehicle without a gimbal, negative looks down",
     )
     parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
     parser.add_argument("--dictionary", metavar="NPZ", type=Path, help="pose dictionary instead of the shipped one")
     parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
+    parser.add_argument("--no-report", action="store_true", help="leave report.html out")
     parser.add_argument("--quiet", action="store_true", help="no progress, only errors")
     parser.set_defaults(run=run)
     return parser
@@ -48,6 +70,8 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.config import DrocapConfig, load_config
     from drocap_ros.motion import save_motion
     from drocap_ros.pipeline import reconstruct_input
+    from drocap_ros.report.page import save_report
+    from drocap_ros.report.pictures import has_pictures
     from drocap_ros.report.preview import save_preview
     from drocap_ros.tracks import save_tracks
 
@@ -58,16 +82,40 @@ def run(args: argparse.Namespace) -> int:
         config = config.replace("initializer", dictionary=str(args.dictionary))
     with progress_bars(args.quiet) as progress:
         motion, tracks = reconstruct_input(
-            args.input, method=args.method, config=config, models=args.models, progress=progress
+            args.input,
+            method=args.method,
+            config=config,
+            models=args.models,
+            progress=progress,
+            telemetry=_telemetry(args),
         )
+    motion = dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line})
     with output_folder(out) as folder:
         save_motion(folder / "motion.npz", motion)
         save_tracks(folder / "tracks.npz", tracks)
         save_preview(folder / "preview.png", motion)
+        if not args.no_report:
+            save_report(folder / "report.html", motion, video=args.input if has_pictures(args.input) else None)
     if not args.quiet:
         print(summary(motion, args.method))
-        print(f"written: {out}/motion.npz, tracks.npz, preview.png")
+        print(f"written: {out}/motion.npz, tracks.npz, preview.png" + ("" if args.no_report else ", report.html"))
     return 0
+
+
+def _telemetry(args: argparse.Namespace) -> Any:
+    import math
+
+    from drocap_ros.errors import InputError
+    from drocap_ros.pipeline import Telemetry
+
+    for name, value in (("--time-offset", args.time_offset), ("--mount-pitch", args.mount_pitch)):
+        if value is None:
+            continue
+        if args.telemetry is None:
+            raise InputError(f"{name}: expected --telemetry LOG with it, found none; name the log")
+        if not math.isfinite(value):
+            raise InputError(f"{name}: expected a finite number, got {value}; correct the value")
+    return Telemetry(args.telemetry, args.time_offset, args.mount_pitch) if args.telemetry else None
 
 
 def summary(motion: Motion, method: str) -> str:

@@ -16,7 +16,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="record a running graph",
         description="Record the topics of a running graph to a rosbag2 session (MCAP) until Ctrl-C.",
     )
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="new folder of the session")
+    parser.add_argument("--out", metavar="DIR", type=Path, help="new folder of the session (default: named by date)")
     parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
     add_graph_options(parser)
     parser.set_defaults(run=run)
@@ -28,5 +28,6 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.config import DrocapConfig, load_config
 
     config = load_config(args.config) if args.config else DrocapConfig()
-    config = config.replace("session_recorder", session_dir=str(args.out.absolute()))
+    if args.out is not None:
+        config = config.replace("session_recorder", session_dir=str(args.out.absolute()))
     return run_graph(config, ["session_recorder"], args)

@@ -45,6 +45,7 @@ class BundleAdjusterNode(ComponentNode):
         super().__init__(config, **node_kwargs)
         self._window = AdjustmentWindow(self.config)
         self._waiting: OrderedDict[int, PoseObservation] = OrderedDict()
+        self._early: OrderedDict[int, np.ndarray] = OrderedDict()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="bundle_adjuster")
         self._job: Future[None] | None = None
         self._sequence = 0
@@ -62,19 +63,32 @@ class BundleAdjusterNode(ComponentNode):
 
     def _on_pose2d(self, message: Pose2D) -> None:
         observation = pose2d_from_ros(message)
-        if observation.has_subject:
-            self._waiting[observation.stamp_ns] = observation
-            self._frame_id = message.header.frame_id
-            while len(self._waiting) > MAX_PENDING:
-                self._waiting.popitem(last=False)
-                self.count("keypoints without an initial pose")
+        if not observation.has_subject:
+            return
+        self._frame_id = message.header.frame_id
+        # Two topics keep no order between them: either may come first, and both must take the same way.
+        joints = self._early.pop(observation.stamp_ns, None)
+        if joints is not None:
+            self._on_frame(observation, joints)
+            return
+        self._waiting[observation.stamp_ns] = observation
+        while len(self._waiting) > MAX_PENDING:
+            self._waiting.popitem(last=False)
+            self.count("keypoints without an initial pose")
 
     def _on_initial(self, message: Pose3D) -> None:
         joints, _ = pose3d_from_ros(message)
-        observation = self._waiting.pop(stamp_from_ros(message.header.stamp), None)
-        if observation is None:
-            self.count("initial poses without keypoints")
+        stamp_ns = stamp_from_ros(message.header.stamp)
+        observation = self._waiting.pop(stamp_ns, None)
+        if observation is not None:
+            self._on_frame(observation, joints)
             return
+        self._early[stamp_ns] = joints
+        while len(self._early) > MAX_PENDING:
+            self._early.popitem(last=False)
+            self.count("initial poses without keypoints")
+
+    def _on_frame(self, observation: PoseObservation, joints: np.ndarray) -> None:
         self._track_id = observation.track_id
         due = self._window.push(observation, joints)
         if not due:
@@ -125,6 +139,7 @@ class BundleAdjusterNode(ComponentNode):
         self._latest.publish(poses[-1])
         self._sequence += 1
         self.count("adjustments")
+        self.produced(int(window.stamp_ns[-1]))
         self.report(OK, f"{len(poses)} poses in {seconds:.2f} s: {window.stop_reason}")
 
 

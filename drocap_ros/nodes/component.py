@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -16,6 +17,7 @@ from std_msgs.msg import Empty, String
 
 from drocap_ros.config import section_types
 from drocap_ros.errors import InputError
+from drocap_ros.nodes.latency import LATENCY, RATE, Latency
 from drocap_ros.nodes.parameters import declare_parameters
 from drocap_ros.nodes.topics import GRAPH_QOS, TOPICS, publishers_of, subscribers_of
 from drocap_ros.parameters import Parameters
@@ -46,6 +48,7 @@ class ComponentNode(Node):
         self.config: Any = declare_parameters(self, config or section_types()[self.component]())
         self.counters: Counter[str] = Counter()
         self.details: dict[str, str] = {}
+        self._latency = Latency()
         self.started = False
         self.callbacks_done = 0
         self._level = OK
@@ -131,6 +134,11 @@ class ComponentNode(Node):
         """Add to a counter that ``/diagnostics`` shows."""
         self.counters[what] += amount
 
+    def produced(self, stamp_ns: int) -> None:
+        """Note that the result of the image of this stamp has just been published."""
+        late_s = (self.get_clock().now().nanoseconds - stamp_ns) * 1e-9
+        self._latency.add(late_s, time.monotonic())
+
     def report(self, level: bytes, text: str) -> None:
         """Set the node's state in words; warnings and errors are logged too, at most every 5 s."""
         self._level, self._text = level, text
@@ -140,6 +148,9 @@ class ComponentNode(Node):
             self.get_logger().warning(text, throttle_duration_sec=5.0)
 
     def _publish_diagnostics(self) -> None:
+        if late := self._latency.text_ms():
+            self.details[LATENCY] = late
+            self.details[RATE] = f"{self._latency.rate_hz(time.monotonic()):.1f}"
         values = {**self.details, **dict(sorted(self.counters.items()))}
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()

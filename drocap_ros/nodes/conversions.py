@@ -9,10 +9,10 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion
 from std_msgs.msg import Header
 
-from drocap_ros.errors import InputError
 from drocap_ros.flight.vehicle_state import VehicleState as VehicleStateData
 from drocap_ros.msg import Pose2D, Pose3D, VehicleState
 from drocap_ros.perception.observation import PoseObservation
+from drocap_ros.recording.pose_messages import float_array, observation_from_message
 from drocap_ros.skeleton import joint_set
 
 
@@ -68,34 +68,7 @@ def pose2d_from_ros(message: Pose2D) -> PoseObservation:
     InputError
         When the skeleton is unknown, an array has the wrong length, a value is infinite or the stamp is negative.
     """
-    joints = joint_set(message.skeleton)
-    count = len(joints) if message.track_id else 0
-    stamp_ns = stamp_from_ros(message.header.stamp)
-    if stamp_ns < 0:
-        raise InputError(f"stamp: expected a time after 1970, got {stamp_ns} ns; set the sender's clock")
-    if message.image_width < 1 or message.image_height < 1:
-        raise InputError(f"image size: expected at least 1x1 px, got {message.image_width}x{message.image_height}")
-    return PoseObservation(
-        stamp_ns=stamp_ns,
-        track_id=message.track_id,
-        joints=joints,
-        image_size=(message.image_width, message.image_height),
-        roi=np.array(message.roi, np.float32),
-        detection_score=message.detection_score,
-        keypoints=_array(message.keypoints, (count, 2), "keypoints"),
-        covariance=_array(message.covariance, (count, 3), "covariance"),
-        confidence=_array(message.confidence, (count,), "confidence"),
-    )
-
-
-def _array(values: array, shape: tuple[int, ...], name: str) -> np.ndarray:
-    wanted = int(np.prod(shape))
-    if len(values) != wanted:
-        raise InputError(f"{name}: expected {wanted} values for shape {shape}, got {len(values)}")
-    result = np.array(values, np.float32).reshape(shape)
-    if np.isinf(result).any():
-        raise InputError(f"{name}: expected finite values or NaN where unknown, got infinity")
-    return result
+    return observation_from_message(message)
 
 
 def pose3d_to_ros(
@@ -136,8 +109,8 @@ def pose3d_from_ros(message: Pose3D) -> tuple[np.ndarray, np.ndarray]:
         When the skeleton is unknown or an array has the wrong length or is infinite.
     """
     count = len(joint_set(message.skeleton)) if message.track_id else 0
-    joints = _array(message.joints, (count, 3), "joints").astype(np.float64)
-    return joints, _array(message.confidence, (count,), "confidence").astype(np.float64)
+    joints = float_array(message.joints, (count, 3), "joints").astype(np.float64)
+    return joints, float_array(message.confidence, (count,), "confidence").astype(np.float64)
 
 
 def vehicle_state_to_ros(state: VehicleStateData) -> VehicleState:

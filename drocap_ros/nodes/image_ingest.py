@@ -1,7 +1,9 @@
-"""Node ``image_ingest``: a video file, picture folder, camera or stream in, JPEG pictures out.
+"""Node ``image_ingest``: a video file, picture folder, camera, stream or image topic in, JPEG pictures out.
 
 Publishes ``image/compressed`` (sensor_msgs/CompressedImage) and, where the camera is known, ``camera_info``.
-Stamps are the exposure times: those of the source, counted from the node's start for a file.
+Stamps are the exposure times: those of the source, for a file counted from the node's start.
+With ``source = topic:NAME`` it subscribes to that topic: CompressedImage where the name ends in "compressed",
+else Image in one of the usual encodings; stamps are the messages'.
 """
 
 from __future__ import annotations
@@ -9,17 +11,23 @@ from __future__ import annotations
 import threading
 import time
 from array import array
+from collections.abc import Iterator
 from typing import Any
 
-from sensor_msgs.msg import CameraInfo, CompressedImage
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Header
 
-from drocap_ros.errors import DrocapError
-from drocap_ros.nodes.component import ERROR, OK, ComponentNode
-from drocap_ros.nodes.conversions import header_at
+from drocap_ros.errors import DrocapError, InputError
+from drocap_ros.nodes.component import ERROR, OK, WARN, ComponentNode
+from drocap_ros.nodes.conversions import header_at, stamp_from_ros
 from drocap_ros.nodes.run import node_main
 from drocap_ros.perception.calibration import CameraModel, camera_model
-from drocap_ros.perception.images import encode_jpeg
+from drocap_ros.perception.images import decode_image, encode_jpeg
 from drocap_ros.perception.sources import Frame, ImageSource, open_source
+from drocap_ros.recording.pictures import image_from_message
+
+_TOPIC = "topic:"
 
 
 class ImageIngestNode(ComponentNode):
@@ -29,51 +37,135 @@ class ImageIngestNode(ComponentNode):
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
-        self._source: ImageSource = open_source(self.config.source, self.config)
-        self._camera: CameraModel | None = camera_model(self.config, self._source.size)
         self._images = self.output("image/compressed")
         self._infos = self.output("camera_info")
+        self._camera: CameraModel | None = None
+        self._last_ns: int | None = None
+        self._arrived_s = time.monotonic()
         self._stop = threading.Event()
+        self._source: ImageSource | None = None
         self._thread = threading.Thread(target=self._run, name="image_ingest", daemon=True)
+        if self.config.source.startswith(_TOPIC):
+            self._subscribe(self.config.source.removeprefix(_TOPIC))
+        else:
+            self._source = open_source(self.config.source, self.config)
+            self._camera = camera_model(self.config, self._source.size)
+        self.create_timer(0.5, self._watch)
 
     def on_start(self) -> None:
         """Begin to read."""
-        self._thread.start()
+        if self._source is not None:
+            self._thread.start()
 
     def close(self) -> None:
         """Stop reading and release the source."""
         self._stop.set()
+        # A live source waits for pictures and ends only by being closed; a file must not be closed while it is read.
+        if self._source is not None and self._source.live:
+            self._source.close()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
-        self._source.close()
+        if self._source is not None:
+            self._source.close()
+
+    # -- files, cameras, streams -----------------------------------------------------------------------
 
     def _run(self) -> None:
-        # Files are stamped from the moment of the start, so that their pictures fit the vehicle's telemetry.
-        origin_ns = 0 if self._source.live else self.get_clock().now().nanoseconds
-        begin = time.monotonic()
         try:
-            for frame in self._source:
+            for frame in self._frames():
                 if self._stop.is_set():
                     return
-                if not self._source.live and self.config.realtime:
-                    self._stop.wait(max(0.0, begin + frame.stamp_ns * 1e-9 - time.monotonic()))
-                self._publish(frame, origin_ns + frame.stamp_ns)
+                self._publish(header_at(frame.stamp_ns, self.config.frame_id), frame)
             self.report(OK, "the source has ended")
         except DrocapError as error:
             self.report(ERROR, str(error))
         if not self._stop.is_set():
             self.finish()
 
-    def _publish(self, frame: Frame, stamp_ns: int) -> None:
-        header = header_at(stamp_ns, self.config.frame_id)
-        jpeg = encode_jpeg(frame.image, self.config.jpeg_quality)
-        self._images.publish(CompressedImage(header=header, format="bgr8; jpeg compressed bgr8", data=array("B", jpeg)))
+    def _frames(self) -> Iterator[Frame]:
+        """Frames with the stamps that they are published with, at the pace that is wanted."""
+        assert self._source is not None
+        if self._source.live:
+            yield from self._source
+            return
+        # Files are stamped from the moment of the start, so that their pictures fit the vehicle's telemetry.
+        begin_ns = self.get_clock().now().nanoseconds
+        offset_ns, last_ns, step_ns = 0, 0, 0
+        while True:
+            for frame in self._source:
+                step_ns = frame.stamp_ns + offset_ns - last_ns or step_ns
+                last_ns = frame.stamp_ns + offset_ns
+                ahead_ns = begin_ns + last_ns - self.get_clock().now().nanoseconds
+                if self.config.realtime and self._stop.wait(max(0.0, ahead_ns * 1e-9)):
+                    return
+                yield Frame(begin_ns + last_ns, frame.image)
+            if not self.config.loop or self._stop.is_set():
+                return
+            offset_ns = last_ns + step_ns
+            self._source.close()
+            self._source = open_source(self.config.source, self.config)
+
+    # -- image topics ----------------------------------------------------------------------------------
+
+    def _subscribe(self, topic: str) -> None:
+        if not topic:
+            raise InputError(f"source: expected {_TOPIC}NAME of an image topic, got no name")
+        compressed = topic.endswith("compressed")
+
+        def take(message: Any) -> None:
+            if not self.started:
+                return
+            try:
+                self._take(message, compressed)
+            except InputError as error:
+                self.count("messages refused")
+                self.report(WARN, f"{topic}: {error}")
+
+        kind = CompressedImage if compressed else Image
+        self.create_subscription(kind, topic, take, qos_profile_sensor_data)
+        self.report(WARN, f"waiting for {kind.__name__} on {topic}")
+
+    def _take(self, message: Any, compressed: bool) -> None:
+        stamp_ns = stamp_from_ros(message.header.stamp)
+        image = decode_image(message.data) if compressed else image_from_message(message, compressed=False)
+        if self._camera is None:
+            self._camera = camera_model(self.config, (image.shape[1], image.shape[0]))
+        header = Header(stamp=message.header.stamp, frame_id=message.header.frame_id or self.config.frame_id)
+        # What is JPEG already goes on as it came.
+        jpeg = bytes(message.data) if compressed and "jp" in message.format.lower() else None
+        self._publish(header, Frame(stamp_ns, image), jpeg)
+
+    # -- out -------------------------------------------------------------------------------------------
+
+    def _publish(self, header: Header, frame: Frame, jpeg: bytes | None = None) -> None:
+        rate = self.config.max_rate_hz
+        # A hundredth of slack: a source of just that rate keeps every picture.
+        if rate > 0 and self._last_ns is not None and 0 <= frame.stamp_ns - self._last_ns < 0.99e9 / rate:
+            self.count("images skipped by max_rate_hz")
+            return
+        self._last_ns = frame.stamp_ns
+        data = jpeg or encode_jpeg(frame.image, self.config.jpeg_quality)
+        self._images.publish(CompressedImage(header=header, format="bgr8; jpeg compressed bgr8", data=array("B", data)))
         if self._camera is not None:
             self._infos.publish(_camera_info(header, self._camera))
         self.count("images")
+        self.produced(frame.stamp_ns)
+        self._arrived_s = time.monotonic()
+        self.report(OK, "running")
+
+    def _watch(self) -> None:
+        """Say within 2 s when a camera, stream or topic gives nothing."""
+        for event in self._source.events() if self._source is not None else ():
+            self.count(f"source {event.kind}")
+        waits_on_others = self._source is None or self._source.live
+        silence_s = time.monotonic() - self._arrived_s
+        if self.started and waits_on_others and silence_s > self.config.stall_timeout_s:
+            self.report(
+                WARN, f"no image from {self.config.source} for {silence_s:.1f} s; check the camera and its link"
+            )
 
 
-def _camera_info(header: Any, camera: CameraModel) -> CameraInfo:
+def _camera_info(header: Header, camera: CameraModel) -> CameraInfo:
     k = camera.matrix.ravel().tolist()
     return CameraInfo(
         header=header,

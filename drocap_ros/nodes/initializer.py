@@ -52,6 +52,7 @@ class InitializerNode(ComponentNode):
             )
         )
         self.count("poses")
+        self.produced(observation.stamp_ns)
         self.report(OK, "running")
 
 

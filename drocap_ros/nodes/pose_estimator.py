@@ -42,6 +42,7 @@ class PoseEstimatorNode(ComponentNode):
         self._roi = None
         self._pose2d.publish(pose2d_to_ros(observation, message.header.frame_id))
         self.count("images")
+        self.produced(observation.stamp_ns)
         self.report(*((OK, "following the subject") if observation.has_subject else (WARN, "no subject in view")))
 
 

@@ -1,17 +1,34 @@
 """Node ``session_recorder``: every topic of the graph into a rosbag2 MCAP session.
 
-Subscribes to all topics of ``topics.TOPICS`` as serialized bytes and writes them as they are.
+Subscribes to all topics of ``topics.TOPICS`` as serialized bytes and writes them as they are.  The parameters of the
+other nodes, the hashes of their models and the camera's calibration go into the session's metadata.
 """
 
 from __future__ import annotations
 
+import shutil
+import threading
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drocap_ros.nodes.component import OK, WARN, ComponentNode
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CameraInfo
+
+from drocap_ros.nodes.component import ERROR, OK, WARN, ComponentNode
+from drocap_ros.nodes.parameter_survey import ParameterSurvey
 from drocap_ros.nodes.run import node_main
 from drocap_ros.nodes.topics import IMAGE_RECORDING_QOS, TOPICS
+from drocap_ros.perception.models import models_folder
+from drocap_ros.recording.provenance import (
+    CALIBRATION,
+    CONFIGURATION,
+    MODELS,
+    configuration_text,
+    dated_name,
+    model_hashes,
+    session_provenance,
+)
 from drocap_ros.recording.schemas import schema_text
 from drocap_ros.recording.session_writer import SessionWriter
 
@@ -23,29 +40,74 @@ class SessionRecorderNode(ComponentNode):
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
-        self._writer = SessionWriter(Path(self.config.session_dir), self.config)
+        folder = self.config.session_dir or dated_name(self.get_clock().now().nanoseconds)
+        self._writer = SessionWriter(Path(folder), self.config, session_provenance(self.get_namespace()))
+        self._survey = ParameterSurvey(self, self._on_parameters)
+        self._calibrated = False
         for topic, entry in TOPICS.items():
             name = topic if topic.startswith("/") else f"{self.get_namespace().rstrip('/')}/{topic}"
             kind = _type_name(entry.message)
             image = topic == "image/compressed"
             self._writer.register(name, kind, schema_text(kind), image=image)
             qos = IMAGE_RECORDING_QOS if image else entry.qos
-            self.input(topic, partial(self._on_message, name), raw=True, qos=qos)
+            take = self._on_camera_info if topic == "camera_info" else self._on_message
+            self.input(topic, partial(take, name), raw=True, qos=qos)
         self.create_timer(1.0, self._on_second)
 
     def _on_message(self, name: str, data: bytes) -> None:
         self._writer.write(name, data, self.get_clock().now().nanoseconds)
         self.count("messages")
 
+    def _on_camera_info(self, name: str, data: bytes) -> None:
+        self._on_message(name, data)
+        if not self._calibrated:
+            self._calibrated = True
+            info = deserialize_message(data, CameraInfo)
+            text = (
+                f"width: {info.width}\nheight: {info.height}\nk: {[float(v) for v in info.k]}\n"
+                f"distortion_model: {info.distortion_model}\nd: {[float(v) for v in info.d]}\n"
+            )
+            self._writer.add_metadata({CALIBRATION: text})
+
+    def _on_parameters(self, sections: dict[str, dict[str, Any]]) -> None:
+        self._writer.add_metadata({CONFIGURATION: configuration_text(sections)})
+        if "pose_estimator" in sections:
+            folder = models_folder(sections["pose_estimator"].get("models_dir") or None)
+            # Large networks take a while to read: not in the thread that receives.
+            threading.Thread(target=self._hash_models, args=(folder,), name="model-hashes", daemon=True).start()
+
+    def _hash_models(self, folder: Path) -> None:
+        try:
+            self._writer.add_metadata({MODELS: model_hashes(folder)})
+        except OSError as error:
+            self.get_logger().warning(f"models: expected readable files; {error.strerror}")
+
     def _on_second(self) -> None:
-        if self._writer.dropped:
-            self.report(WARN, f"{self._writer.dropped} messages dropped: the disk is too slow")
+        writer = self._writer
+        self._survey.look()
+        self.details["file"] = str(writer.path)
+        self.details["written"] = str(writer.written)
+        self.details["waiting_kib"] = str(writer.queued_bytes >> 10)
+        self.details["free_mib"] = str(_free_mib(writer.folder))
+        for topic, count in sorted(writer.dropped_by_topic.items()):
+            self.details[f"dropped {topic}"] = str(count)
+        if writer.error is not None:
+            self.report(ERROR, writer.error)
+        elif writer.dropped:
+            self.report(WARN, f"{writer.dropped} messages dropped: the disk is too slow; lower the pictures' quality")
         else:
-            self.report(OK, f"recording to {self.config.session_dir}")
+            self.report(OK, f"recording to {writer.folder}")
 
     def close(self) -> None:
         """Write what is queued and finish the files."""
         self._writer.close()
+
+
+def _free_mib(folder: Path) -> int | str:
+    try:
+        return shutil.disk_usage(folder).free >> 20
+    except OSError:
+        return "unknown"
 
 
 def _type_name(message: type) -> str:

@@ -70,7 +70,7 @@ class PoseEstimatorConfig(Parameters):
         3, "images in which a new person is seen before it is the subject", minimum=1, maximum=100
     )
     coast_s: float = param(
-        0.6, "time without a sure detection over which the box is predicted", unit="s", minimum=0, maximum=10
+        1.0, "time without a sure detection over which the box is predicted", unit="s", minimum=0, maximum=10
     )
     forget_s: float = param(
         20.0, "time after which a lost subject is not taken up again", unit="s", minimum=0.1, maximum=3600
@@ -78,6 +78,11 @@ class PoseEstimatorConfig(Parameters):
     give_up_s: float = param(
         3.0, "for on_loss = next: time a subject lost in mid-picture is waited for", unit="s", minimum=0, maximum=3600
     )
+    detect_every_s: float = param(
+        0.1,
+        "longest time between detections of a subject whom the pose network sees clearly and alone; 0 = every image",
+        unit="s", minimum=0, maximum=10,
+    )  # fmt: skip
     full_frame_every_s: float = param(
         1.0,
         "interval of detection over the whole image while the subject is in view",

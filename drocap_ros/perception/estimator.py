@@ -20,8 +20,15 @@ from drocap_ros.perception.tracking.search import Window, inside
 from drocap_ros.perception.uncertainty import calibrate
 from drocap_ros.skeleton import BODY_15
 
-#: A predicted box is confirmed when the pose network is so sure of the trunk and limbs in it on average.
+#: A predicted or doubtful box is confirmed when the mean confidence of its joints reaches this: on boxes without
+#: a person it stays below 0.33, on persons in bad light it is 0.5 to 0.9.
 _CONFIRM_CONFIDENCE = 0.5
+#: Detector's score and mean confidence of the joints from which the next images need no detection.
+_STEADY_SCORE, _STEADY_CONFIDENCE = 0.6, 0.8
+#: A detection is due a little before its time: stamps are never even.
+_SLACK_S = 0.005
+#: Confidence of a joint that helps to place the box.
+_FINE_JOINT = 0.3
 
 
 log = logging.getLogger(__name__)
@@ -48,6 +55,8 @@ class PoseEstimator:
         self.tracker = SubjectTracker(self.config)
         self._map = joint_map(self.pose_model.joints.name)
         self._last_ns: int | None = None
+        self._margins: np.ndarray | None = None
+        self._detected_ns = 0
         #: The pose network's own keypoints of the last image, with further candidate peaks; None without a subject.
         self.keypoints: Keypoints | None = None
 
@@ -64,22 +73,61 @@ class PoseEstimator:
         if self._last_ns is not None and stamp_ns < self._last_ns:
             log.warning("stamps went back by %.3f s: following anew", (self._last_ns - stamp_ns) * 1e-9)
             self.tracker.restart()
+            self._margins = None
         self._last_ns = stamp_ns
         size = (image.shape[1], image.shape[0])
-        found = self._detect(image, stamp_ns)
-        subject = self.tracker.update(image, stamp_ns, found.boxes, found.scores, _checked_roi(roi))
+        roi = _checked_roi(roi)
         self.keypoints = None
+        if roi is None and (carried := self._carry(image, stamp_ns)) is not None:
+            return carried
+        found = self._detect(image, stamp_ns)
+        subject = self.tracker.update(image, stamp_ns, found.boxes, found.scores, roi)
         if subject is None:
             return PoseObservation(stamp_ns, 0, size)
         if subject.hidden:
             return _unseen(stamp_ns, size, subject)
         self.keypoints = self.pose_model.estimate(image, subject.box)
-        xy, covariance, confidence = self._in_our_joints(self.keypoints)
+        pose = self._in_our_joints(self.keypoints)
+        self._margins = None
+        seen = _extent(pose)
         if subject.score < self.config.detection_threshold:
-            confirmed = self._confirmed(xy, confidence, stamp_ns)
-            if subject.score == 0.0 and not confirmed:
-                return _unseen(stamp_ns, size, subject)
-        unseen = confidence < self.config.keypoint_threshold
+            if seen is not None and pose[2].mean() >= _CONFIRM_CONFIDENCE:
+                margin = 0.06 * (seen[2:] - seen[:2]).max()
+                self.tracker.confirm(seen + margin * np.array([-1, -1, 1, 1]), stamp_ns)
+        elif seen is not None and subject.score >= _STEADY_SCORE and pose[2].mean() >= _STEADY_CONFIDENCE:
+            self._margins = (subject.box - seen) / (seen[2:] - seen[:2]).max()
+            self._detected_ns = stamp_ns
+        return self._observation(stamp_ns, size, subject, pose)
+
+    def _carry(self, image: np.ndarray, stamp_ns: int) -> PoseObservation | None:
+        """The subject without detection: where it stands alone and the pose network sees it clearly, or None.
+
+        The box is then that of the joints, with the margins that the last detection had around them.
+        """
+        if self._margins is None or (stamp_ns - self._detected_ns) * 1e-9 > self.config.detect_every_s - _SLACK_S:
+            return None
+        predicted = self.tracker.steady((image.shape[1], image.shape[0]), stamp_ns)
+        if predicted is None:
+            return None
+        keypoints = self.pose_model.estimate(image, predicted.box)
+        pose = self._in_our_joints(keypoints)
+        seen = _extent(pose)
+        if seen is None or pose[2].mean() < _STEADY_CONFIDENCE:
+            return None
+        box = seen + self._margins * (seen[2:] - seen[:2]).max()
+        box = np.clip(box, 0, np.array([image.shape[1], image.shape[0]] * 2, float))
+        self.tracker.carry(box, stamp_ns)
+        self.keypoints = keypoints
+        subject = Subject(predicted.track_id, box, predicted.score, False)
+        return self._observation(stamp_ns, (image.shape[1], image.shape[0]), subject, pose)
+
+    def _observation(
+        self, stamp_ns: int, size: tuple[int, int], subject: Subject, pose: tuple[np.ndarray, np.ndarray, np.ndarray]
+    ) -> PoseObservation:
+        xy, covariance, confidence = pose
+        outside = ~((xy >= 0) & (xy < np.array(size))).all(axis=1)  # networks guess beyond the picture: nobody saw that
+        confidence = np.where(outside, 0.0, confidence)
+        unseen = outside | (confidence < self.config.keypoint_threshold)
         xy[unseen], covariance[unseen] = np.nan, np.nan
         return PoseObservation(
             stamp_ns, subject.track_id, size, BODY_15, subject.box.astype(np.float32), subject.score,
@@ -115,15 +163,14 @@ class PoseEstimator:
         covariance, confidence = calibrate(keypoints, self.pose_model.spec.layout)
         return self._map.apply(keypoints.xy.astype(float), covariance, confidence, keypoints.box_size)
 
-    def _confirmed(self, xy: np.ndarray, confidence: np.ndarray, stamp_ns: int) -> bool:
-        """Whether the pose network saw a whole person in the predicted box; if so the tracker learns where."""
-        fine = confidence >= self.config.keypoint_threshold
-        if confidence.mean() < _CONFIRM_CONFIDENCE or fine.sum() < 0.7 * len(fine):
-            return False
-        low, high = np.nanmin(xy[fine], axis=0), np.nanmax(xy[fine], axis=0)
-        margin = 0.06 * (high - low).max()
-        self.tracker.confirm(np.concatenate([low - margin, high + margin]), stamp_ns)
-        return True
+
+def _extent(pose: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray | None:
+    """(4,) px box of the joints, None when too few of them are seen."""
+    xy, _, confidence = pose
+    fine = confidence >= _FINE_JOINT
+    if fine.sum() < 0.7 * len(fine):
+        return None
+    return np.concatenate([xy[fine].min(axis=0), xy[fine].max(axis=0)])
 
 
 def _unseen(stamp_ns: int, size: tuple[int, int], subject: Subject) -> PoseObservation:
@@ -142,9 +189,10 @@ def _checked(image: np.ndarray) -> np.ndarray:
 
 
 def _checked_roi(roi: np.ndarray | None) -> np.ndarray | None:
+    """A usable roi; an empty one says, as in ROS, that there is none."""
     if roi is None:
         return None
     roi = np.asarray(roi, float)
-    if roi.shape != (4,) or not np.isfinite(roi).all() or (roi[2:] <= roi[:2]).any():
+    if roi.shape != (4,) or not np.isfinite(roi).all():
         raise InputError(f"roi: expected x_min y_min x_max y_max px, got {roi.tolist()}; correct its sender")
-    return roi
+    return None if (roi[2:] <= roi[:2]).any() else roi

@@ -129,6 +129,8 @@ def guess_layout(shapes: list[tuple[int, ...]], input_size: tuple[int, int]) -> 
 
 def _holds_keypoints(channels: int, first: int) -> bool:
     """Whether a row of an anchor is ``first`` numbers and x, y, score of a known number of joints."""
+    if channels in (84, 85):  # the boxes and 80 classes of COCO, which 26 joints would also fit
+        return False
     return (channels - first) % 3 == 0 and (channels - first) // 3 in JOINTS_BY_COUNT
 
 

@@ -22,7 +22,8 @@ class PoseObservation:
     joints : names and order of the keypoints
     image_size : (width, height) px
     roi : (4,) float32, the subject's box x_min y_min x_max y_max px; NaN without a subject
-    detection_score : the detector's score of the box in [0, 1]; 0 while the box is only predicted
+    detection_score : the detector's score of the box in [0, 1], the last one while the pose network carries the
+        box on; 0 while the box is only predicted
     keypoints : (P, 2) float32 px, NaN = not seen
     covariance : (P, 3) float32 px^2, xx xy yy, NaN where the keypoint is
     confidence : (P,) float32 in [0, 1], calibrated: the share of such keypoints that lie within 10 % of the

@@ -10,6 +10,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.observation import PoseObservation
+from drocap_ros.perception.sides import exchange, exchanged_legs
 from drocap_ros.perception.sources.base import Frame
 from drocap_ros.perception.sources.prefetch import prefetch
 from drocap_ros.skeleton import BODY_15
@@ -47,6 +48,8 @@ def subjects(observations: Sequence[PoseObservation]) -> list[tuple[int, int]]:
 def tracks_from_observations(observations: Sequence[PoseObservation], track_id: int | None = None) -> Tracks:
     """Tracks of one subject over all images; NaN where another or none was followed.
 
+    Legs that the network exchanged for some images are put right (:mod:`drocap_ros.perception.sides`).
+
     Parameters
     ----------
     observations : in the order of time, of images of one size
@@ -74,10 +77,14 @@ def tracks_from_observations(observations: Sequence[PoseObservation], track_id: 
     for i in np.nonzero(mine)[0]:
         keypoints[i], covariance[i] = observations[i].keypoints, observations[i].covariance
         confidence[i] = observations[i].confidence
+    stamp_ns = np.array([o.stamp_ns for o in observations], np.int64)
+    rois = np.array([o.roi for o in observations], float)
+    swapped = exchanged_legs(keypoints, confidence, stamp_ns, np.nan_to_num((rois[:, 2:] - rois[:, :2]).max(axis=1)))
+    keypoints, covariance, confidence = exchange(keypoints, covariance, confidence, swapped)
     return Tracks(
         keypoints=keypoints,
         joints=BODY_15.joints,
-        stamp_ns=np.array([o.stamp_ns for o in observations], np.int64),
+        stamp_ns=stamp_ns,
         image_size=observations[0].image_size,
         confidence=confidence,
         covariance=covariance,

@@ -20,7 +20,14 @@ from drocap_ros.geometry.alignment import torso_frame
 from drocap_ros.reconstruction.articulation import articulation_term, articulation_value
 from drocap_ros.reconstruction.camera_update import rotation_change, update_rotations
 from drocap_ros.reconstruction.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.data_term import Projection, frames_first, frames_last, information_from, rotate
+from drocap_ros.reconstruction.data_term import (
+    Projection,
+    frames_first,
+    frames_last,
+    information_from,
+    noise_std,
+    rotate,
+)
 from drocap_ros.reconstruction.low_rank import nuclear_norm, singular_value_threshold
 
 #: Length at which alpha is given: the protocol's 10 s at 24 fps.
@@ -63,7 +70,7 @@ class Objective:
 
     def __init__(self, projection: Projection, rotation: np.ndarray, config: BundleAdjusterConfig) -> None:
         self.projection, self.rotation, self.config = projection, rotation, config
-        self.alpha = config.alpha * float(np.sqrt(rotation.shape[-1] / REFERENCE_FRAMES))
+        self.alpha = effective_alpha(projection, config)
         self._rotation_cost = config.rotation_smoothness * rotation_change(rotation)
 
     def value(self, s: np.ndarray) -> float:
@@ -103,6 +110,20 @@ class Objective:
             "nuclear_norm": self.alpha * nuclear_norm(s),
             "smoothness": self.config.shape_smoothness * shape_change(s) + self._rotation_cost,
         }
+
+
+def effective_alpha(projection: Projection, config: BundleAdjusterConfig) -> float:
+    """Weight of the nuclear norm: ``config.alpha`` for the window's length, more where the 2D joints are noisy.
+
+    Noise of standard deviation sigma alone has singular values up to sigma (sqrt F + sqrt 2P); to hide it, the
+    threshold has to be of that size (the data term has no factor 1/2, hence the 2).  It stays below a tenth of what
+    the joints themselves have, so that a window of nothing but noise still has a body.
+    """
+    w, information = frames_first(projection.w), frames_first(projection.information)
+    frames, p = w.shape[:2]
+    hiding = 2.0 * noise_std(w, information) * (np.sqrt(frames) + np.sqrt(2.0 * p)) if config.noise_alpha > 0.0 else 0.0
+    most = 0.1 * float(np.linalg.norm(projection.w.reshape(-1, frames), 2))
+    return float(max(config.alpha * np.sqrt(frames / REFERENCE_FRAMES), min(config.noise_alpha * hiding, most)))
 
 
 def shape_change(s: np.ndarray) -> float:

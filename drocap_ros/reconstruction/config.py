@@ -34,7 +34,7 @@ class InitializerConfig(Parameters):
     coefficient_smoothness: float = param(0.3, "weight of the change of coefficients over time", minimum=0.0)
     rotation_smoothness: float = param(0.3, "weight of the change of rotation over time", minimum=0.0)
     switch_cost: float = param(1.0, "cost of a jump between hypotheses, per squared 2D std", minimum=0.0)
-    block_frames: int = param(2000, "frames that are fitted together at most", minimum=16, maximum=20000)
+    block_frames: int = param(500, "frames that are fitted together at most", minimum=16, maximum=20000)
     assumed_height_m: float = param(1.70, "stature that sets the scale when none is known", unit="m", minimum=0.3,
                                     maximum=3.0)  # fmt: skip
 
@@ -45,6 +45,8 @@ class BundleAdjusterConfig(Parameters):
 
     alpha: float = param(0.1, "weight of the nuclear norm at 240 frames; grows with the root of the length",
                          minimum=0.0)  # fmt: skip
+    noise_alpha: float = param(0.5, "alpha is at least this share of the threshold that hides the 2D joints' noise"
+                               " (2 sigma (sqrt F + sqrt 2P)); 0 = alpha as given", minimum=0.0)  # fmt: skip
     gamma: float = param(1.0, "weight of the articulation term; 0 leaves it out", minimum=0.0)
     shape_smoothness: float = param(0.0, "weight of the change of shape over time", minimum=0.0)
     rotation_smoothness: float = param(0.0, "weight of the change of rotation over time", minimum=0.0)
@@ -57,4 +59,4 @@ class BundleAdjusterConfig(Parameters):
     overlap_frames: int = param(60, "frames that neighbouring windows of a long recording share", minimum=0,
                                 maximum=2000)  # fmt: skip
     max_pending: int = param(120, "images that wait for their initial pose in the live node", minimum=1, maximum=10000)
-    threads: int = param(2, "threads of the linear algebra in the live node", minimum=1, maximum=64)
+    threads: int = param(1, "threads of the linear algebra; the matrices are small", minimum=1, maximum=64)

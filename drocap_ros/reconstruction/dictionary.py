@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +49,16 @@ class Dictionary:
     component_std: np.ndarray
     metadata: dict[str, Any] = field(default_factory=dict)
 
-    @property
-    def spread(self) -> float:
-        """Standard deviation (m) of the mean pose's coordinates: the model's unit in the solvers."""
-        return float(np.sqrt(np.mean(self.mean**2)))
+    @cached_property
+    def basis(self) -> np.ndarray:
+        """(1 + K, 3P): the mean pose and the atoms, flattened coordinate by coordinate."""
+        poses = np.concatenate([self.mean[None], self.atoms])
+        return np.ascontiguousarray(np.swapaxes(poses, 1, 2)).reshape(len(poses), -1)
+
+    @cached_property
+    def curvature(self) -> float:
+        """Largest eigenvalue of ``basis basis^T``."""
+        return float(np.linalg.norm(self.basis, 2) ** 2)
 
 
 def normalize_poses(x: np.ndarray) -> np.ndarray:
@@ -88,7 +95,7 @@ def sparse_code(
     Minimizes ``0.5 |poses - C atoms|^2 + sparsity |C|_1`` for atoms (K, 3P).
     """
     gram, target = atoms @ atoms.T, poses @ atoms.T
-    step = 1.0 / np.linalg.norm(gram, 2)
+    step = 1.0 / np.linalg.norm(atoms, 2) ** 2
     c = np.zeros_like(target) if start is None else start
     ahead, t = c, 1.0
     for _ in range(iterations):

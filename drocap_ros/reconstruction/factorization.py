@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from drocap_ros.errors import InputError
 from drocap_ros.geometry.alignment import to_torso_frame
 from drocap_ros.geometry.rotations import complete_rotation
 from drocap_ros.reconstruction.bundle_adjustment import Objective, minimize
@@ -20,6 +21,8 @@ from drocap_ros.reconstruction.dictionary import Dictionary, normalize_poses
 
 #: Candidates of K in the rank 3K of the factorization.
 BASIS_SHAPES = (2, 3)
+
+MIN_IMAGES = 3
 
 MIRROR = np.array([1.0, 1.0, -1.0])
 
@@ -39,7 +42,16 @@ def factorize(
     Returns
     -------
     poses (F, P, 3) in camera axes, cost per term, iterations, stop reason
+
+    Raises
+    ------
+    InputError
+        When there are too few images: two orthographic ones fix no rotation.
     """
+    if len(w) < MIN_IMAGES:
+        raise InputError(
+            f"mf-nnm: expected at least {MIN_IMAGES} images that show the subject, got {len(w)}; choose another method"
+        )
     full = fill_joints(w, information[..., 0] > 0.0)
     full = full - full.mean(axis=1, keepdims=True)
     config = replace(config, gamma=0.0)

@@ -16,6 +16,8 @@ from drocap_ros.skeleton import BODY_15
 SHIPPED = Path(__file__).parent.parent / "data" / "lifter_cmu.onnx"
 
 _JOINTS = len(BODY_15)
+#: Where the parts of the features begin: confidences, bone lengths, depth ranges.
+_PARTS = np.cumsum([2 * _JOINTS, _JOINTS, _JOINTS - 1])
 #: Frames of one window and overlap of neighbouring windows; about the length of the training windows.
 _WINDOW, _OVERLAP = 240, 80
 #: Frame rates, in units of LIFTER_FPS, that the network was trained to take as they are.
@@ -58,7 +60,11 @@ class Lifter:
         return dict(self._session.get_modelmeta().custom_metadata_map)
 
     def lift(
-        self, keypoints: np.ndarray, confidence: np.ndarray | None = None, fps: float = LIFTER_FPS
+        self,
+        keypoints: np.ndarray,
+        confidence: np.ndarray | None = None,
+        fps: float = LIFTER_FPS,
+        lengths: np.ndarray | None = None,
     ) -> LiftedMotion:
         """Lift a sequence of evenly spaced frames.
 
@@ -67,6 +73,7 @@ class Lifter:
         keypoints : (F, 15, 2) of ``BODY_15``, any unit, y down; NaN where not seen
         confidence : (F, 15) in [0, 1]; None = all visible joints alike
         fps : frames per second, 1 to 1000
+        lengths : (14,) of the bones (joint j to its parent at j - 1) in the keypoints' unit, where known
 
         Raises
         ------
@@ -76,21 +83,25 @@ class Lifter:
         keypoints, confidence = _checked(keypoints, confidence, fps)
         pace = fps / LIFTER_FPS
         if pace > _FASTEST:
-            return self._lift_fast(keypoints, confidence, round(pace))
+            return self._lift_fast(keypoints, confidence, lengths, round(pace))
         if pace < _SLOWEST and len(keypoints) > 1:
-            return self._lift_slow(keypoints, confidence, round(1 / pace))
-        return self._lift_long(keypoints, confidence)
+            return self._lift_slow(keypoints, confidence, lengths, round(1 / pace))
+        return self._lift_long(keypoints, confidence, lengths)
 
-    def _lift_fast(self, keypoints: np.ndarray, confidence: np.ndarray, stride: int) -> LiftedMotion:
+    def _lift_fast(
+        self, keypoints: np.ndarray, confidence: np.ndarray, lengths: np.ndarray | None, stride: int
+    ) -> LiftedMotion:
         """Every ``stride``-th frame makes a sequence of its own, so that no frame is interpolated."""
         joints = np.empty((*keypoints.shape[:2], 3))
         sigma = np.empty((*keypoints.shape[:2], 2))
         for phase in range(min(stride, len(keypoints))):
-            part = self._lift_long(keypoints[phase::stride], confidence[phase::stride])
+            part = self._lift_long(keypoints[phase::stride], confidence[phase::stride], lengths)
             joints[phase::stride], sigma[phase::stride] = part.joints, part.sigma
         return LiftedMotion(joints, sigma)
 
-    def _lift_slow(self, keypoints: np.ndarray, confidence: np.ndarray, factor: int) -> LiftedMotion:
+    def _lift_slow(
+        self, keypoints: np.ndarray, confidence: np.ndarray, lengths: np.ndarray | None, factor: int
+    ) -> LiftedMotion:
         """Frames are put between frames; each is lifted on, and only the real ones are returned."""
         part = np.arange(factor) / factor
 
@@ -101,10 +112,10 @@ class Lifter:
 
         dense = between(keypoints)
         dense[::factor] = keypoints
-        result = self._lift_long(dense, between(confidence))
+        result = self._lift_long(dense, between(confidence), lengths)
         return LiftedMotion(result.joints[::factor], result.sigma[::factor])
 
-    def _lift_long(self, keypoints: np.ndarray, confidence: np.ndarray) -> LiftedMotion:
+    def _lift_long(self, keypoints: np.ndarray, confidence: np.ndarray, lengths: np.ndarray | None) -> LiftedMotion:
         """Windows that overlap and fade into each other: linear time, bounded memory."""
         frames = len(keypoints)
         joints = np.zeros((frames, _JOINTS, 3))
@@ -117,15 +128,17 @@ class Lifter:
             fade = np.minimum(1.0, (there - begin + 1) / (_OVERLAP + 1)) if begin else np.ones(len(there))
             if window.stop < frames:
                 fade = np.minimum(fade, (window.stop - there) / (_OVERLAP + 1))
-            part_joints, part_sigma = self._lift_window(keypoints[window], confidence[window])
+            part_joints, part_sigma = self._lift_window(keypoints[window], confidence[window], lengths)
             joints[window] += fade[:, None, None] * part_joints
             sigma[window] += fade[:, None, None] * part_sigma
             total[window] += fade
         return LiftedMotion(joints / total[:, None, None], sigma / total[:, None, None])
 
-    def _lift_window(self, keypoints: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _lift_window(
+        self, keypoints: np.ndarray, confidence: np.ndarray, lengths: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """One window, averaged over its mirror image and over both ways of pairing frames."""
-        features, centre, scale = normalise(keypoints, confidence)
+        features, centre, scale = normalise(keypoints, confidence, lengths)
         frames = len(features)
         length = frames + 2 - frames % 2
         variants = np.zeros((4, length, FEATURES), np.float32)
@@ -146,8 +159,13 @@ class Lifter:
 
 
 def _mirrored(features: np.ndarray) -> np.ndarray:
-    xy = features[:, : 2 * _JOINTS].reshape(-1, _JOINTS, 2)[:, BODY_15.mirror] * np.array([-1, 1], np.float32)
-    return np.concatenate([xy.reshape(len(features), -1), features[:, 2 * _JOINTS :][:, BODY_15.mirror]], axis=1)
+    """Features (F, 73) of the scene seen in a mirror: x negated, left and right exchanged."""
+    xy, weight, length, reach = np.split(features, _PARTS, axis=1)
+    xy = xy.reshape(-1, _JOINTS, 2)[:, BODY_15.mirror] * np.array([-1, 1], np.float32)
+    bones = BODY_15.mirror[1:] - 1
+    return np.concatenate(
+        [xy.reshape(len(features), -1), weight[:, BODY_15.mirror], length[:, bones], reach[:, bones]], axis=1
+    )
 
 
 def _checked(keypoints: np.ndarray, confidence: np.ndarray | None, fps: float) -> tuple[np.ndarray, np.ndarray]:

@@ -11,8 +11,10 @@ from drocap_ros.skeleton import BODY_15, indices
 
 #: Frame rate that the network works at; other rates are resampled.
 LIFTER_FPS = 24.0
-#: Input features of a frame: x, y and visibility of every joint.
-FEATURES = 3 * len(BODY_15)
+#: Bones whose lengths the network may be told: that of joint j to its parent stands at j - 1.
+BONES = BODY_15.bones
+#: Input features of a frame: x, y and confidence of every joint, length and depth range of every bone.
+FEATURES = 3 * len(BODY_15) + 2 * len(BONES)
 
 _TORSO = indices(BODY_15.joints, ("pelvis", "rhip", "lhip", "neck", "lshoulder", "rshoulder"))
 _CLIP = 6.0
@@ -57,17 +59,21 @@ def scale_of(centred: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(size) & (size > 0), size, 1.0)
 
 
-def normalise(keypoints: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def normalise(
+    keypoints: np.ndarray, confidence: np.ndarray, lengths: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Features of windows of 2D joints.
 
     Parameters
     ----------
     keypoints : (..., F, 15, 2), any unit, y down; NaN where not seen
     confidence : (..., F, 15) in [0, 1]
+    lengths : (..., 14) of the bones in the unit of the keypoints, NaN where unknown; None = unknown
 
     Returns
     -------
-    features : (..., F, 45) float32: x, y of every joint (0 where not seen), then its confidence
+    features : (..., F, 73) float32: x, y of every joint (0 where not seen), its confidence, then the length of
+        every bone and how far it must reach in depth to have that length (0 where unknown)
     centre : (..., F, 2) of every frame
     scale : (...) one for the window
     """
@@ -75,8 +81,20 @@ def normalise(keypoints: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray
     centred = keypoints - centre[..., None, :]
     scale = scale_of(centred)
     seen = np.isfinite(centred[..., 0])
-    xy = np.where(seen[..., None], centred, 0) / scale[..., None, None, None]
+    xy = np.clip(np.where(seen[..., None], centred, 0) / scale[..., None, None, None], -_CLIP, _CLIP)
     weight = np.where(seen, confidence, 0)
-    shape = (*xy.shape[:-2], -1)
-    features = np.concatenate([np.clip(xy, -_CLIP, _CLIP).reshape(shape), weight], axis=-1)
-    return features.astype(np.float32), centre, scale
+    features = [xy.reshape(*xy.shape[:-2], -1), weight, *_bone_features(xy, seen, scale, lengths)]
+    return np.concatenate(features, axis=-1, dtype=np.float32), centre, scale
+
+
+def _bone_features(
+    xy: np.ndarray, seen: np.ndarray, scale: np.ndarray, lengths: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    shape = (*seen.shape[:-1], len(BONES))
+    if lengths is None:
+        return np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    length = np.nan_to_num(lengths / scale[..., None])[..., None, :]
+    flat = np.square(xy[..., BONES[:, 1], :] - xy[..., BONES[:, 0], :]).sum(axis=-1)
+    both = seen[..., BONES[:, 1]] & seen[..., BONES[:, 0]] & (length > 0)
+    reach = np.sqrt(np.where(both, np.maximum(np.square(length) - flat, 0), 0))
+    return np.broadcast_to(length, shape), reach

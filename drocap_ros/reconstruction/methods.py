@@ -11,6 +11,7 @@ import numpy as np
 from drocap_ros.reconstruction.bundle_adjustment import bundle_adjust
 from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.data_term import Projection, frames_last, information_from
+from drocap_ros.reconstruction.default_method import DefaultMethodConfig, default_poses
 from drocap_ros.reconstruction.dictionary import Dictionary
 from drocap_ros.reconstruction.factorization import factorize
 from drocap_ros.reconstruction.normalize import MIN_JOINTS, NormalizedTracks, normalize_tracks
@@ -23,7 +24,8 @@ METHODS = ("ba", "paper", "paper-no-articulation", "initial", "mf-nnm")
 
 Progress = Callable[[str, float], None]
 
-#: Poses (F, 15, 3) in camera axes in the window's unit, cost per term, iterations, stop reason.
+#: Poses (F, 15, 3) in camera axes, x and y where they are in the window's normalized image; cost per term,
+#: iterations, stop reason.
 WindowResult = tuple[np.ndarray, dict[str, float], int, str]
 
 
@@ -77,27 +79,68 @@ def run_method(
         )
         return _spread(found, use, stamp_ns)
     clock = time.perf_counter()
+
+    def factorized(_: slice, n: NormalizedTracks) -> WindowResult:
+        poses, terms, iterations, stop = factorize(n.w, n.information, dictionary, adjuster)
+        return placed(poses, n.w, n.information), terms, iterations, stop
+
     if method == "mf-nnm":
         poses = over_windows(
             keypoints,
             confidence,
             covariance,
             adjuster,
-            lambda _, n: factorize(n.w, n.information, dictionary, adjuster),
+            factorized,
             progress,
         )
         return replace(poses, seconds={"initial": 0.0, "ba": time.perf_counter() - clock})
+    if method == "ba":
+        return _default(stamp_ns, keypoints, confidence, covariance, tracks, adjuster, progress)
     joints, credit = initial_poses(keypoints, confidence, covariance, initializer, dictionary, progress)
     seconds = {"initial": time.perf_counter() - clock, "ba": 0.0}
     if method == "initial":
-        translation = _translations(keypoints, confidence, covariance, joints)
-        return CameraPoses(joints, translation, seconds, 0, "start only", {})
+        weights = credit if confidence is None else credit * np.nan_to_num(confidence)
+        information = information_from(keypoints, weights, covariance)
+        return CameraPoses(*split(placed(joints, keypoints, information)), seconds, 0, "start only", {})
     if method == "paper-no-articulation":
         adjuster = replace(adjuster, gamma=0.0)
     clock = time.perf_counter()
     poses = adjust(keypoints, confidence, covariance, joints, adjuster, progress, credit=credit)
     seconds["ba"] = time.perf_counter() - clock
     return replace(poses, seconds=seconds)
+
+
+def _default(
+    stamp_ns: np.ndarray,
+    keypoints: np.ndarray,
+    confidence: np.ndarray | None,
+    covariance: np.ndarray | None,
+    tracks: Tracks,
+    adjuster: BundleAdjusterConfig,
+    progress: Progress | None,
+) -> CameraPoses:
+    """The default method (:mod:`drocap_ros.reconstruction.default_method`), window by window."""
+    config = DefaultMethodConfig()
+    seconds = {"initial": 0.0, "ba": 0.0}
+    k = tracks.camera_matrix
+    focal_px = None if k is None else 0.5 * float(k[0, 0] + k[1, 1])
+
+    def solve(rows: slice, n: NormalizedTracks) -> WindowResult:
+        points = np.where((n.weights > 0.0)[..., None], n.w, np.nan)
+        variance = None if covariance is None else 0.5 * (covariance[rows, :, 0] + covariance[rows, :, 2])
+        found = default_poses(
+            stamp_ns[rows],
+            points,
+            n.weights,
+            None if variance is None else variance / n.scale_px**2,
+            None if focal_px is None else focal_px / n.scale_px,
+            config,
+        )
+        for stage, value in found.seconds.items():
+            seconds[stage] += value
+        return found.joints, found.cost_terms, found.iterations, found.stop_reason
+
+    return replace(over_windows(keypoints, confidence, covariance, adjuster, solve, progress), seconds=seconds)
 
 
 def shown_frames(keypoints: np.ndarray, confidence: np.ndarray | None) -> np.ndarray:
@@ -172,10 +215,11 @@ def adjust(
     def solve(rows: slice, n: NormalizedTracks) -> WindowResult:
         start = joints[rows] / n.scale_px
         if len(start) < MIN_WINDOW:
-            return start, {}, 0, "too short"
+            return placed(start, n.w, n.information), {}, 0, "too short"
         information = n.information if credit is None else n.information * credit[rows][..., None]
         result = bundle_adjust(n.w, start, config=config, information=information)
-        return result.camera_shape, result.cost_terms, result.iterations, result.stop_reason
+        poses = placed(result.camera_shape, n.w, information)
+        return poses, result.cost_terms, result.iterations, result.stop_reason
 
     return over_windows(keypoints, confidence, covariance, config, solve, progress)
 
@@ -194,7 +238,9 @@ def over_windows(
     for rows, n in _blocks(keypoints, confidence, covariance, config.window_frames, config.overlap_frames):
         found, cost_terms, steps, stop = solve(rows, n)
         fade = _fade(len(found), config.overlap_frames, rows.start > 0, rows.stop < len(keypoints))
-        out[rows] += (fade * n.scale_px)[:, None, None] * found
+        in_image = found * n.scale_px
+        in_image[..., :2] += n.centre_px[:, None]
+        out[rows] += fade[:, None, None] * in_image
         weight[rows] += fade
         iterations += steps
         stops.add(stop)
@@ -202,9 +248,20 @@ def over_windows(
             terms[name] = terms.get(name, 0.0) + value
         if progress is not None:
             progress("ba", rows.stop / len(keypoints))
-    poses = out / weight[:, None, None]
-    translation = _translations(keypoints, confidence, covariance, poses)
-    return CameraPoses(poses, translation, {}, iterations, ", ".join(sorted(stops)), terms)
+    return CameraPoses(*split(out / weight[:, None, None]), {}, iterations, ", ".join(sorted(stops)), terms)
+
+
+def placed(poses: np.ndarray, w: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Poses (F, P, 3) moved in the image so that they fit the joints ``w`` (F, P, 2) best."""
+    moved = poses.copy()
+    moved[..., :2] += Projection(w, information).translation(frames_last(poses[..., :2])).T[:, None]
+    return moved
+
+
+def split(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centred poses (F, P, 3), and where their middle is in the image (F, 2)."""
+    middle = poses.mean(axis=1, keepdims=True)
+    return poses - middle, middle[:, 0, :2]
 
 
 def windows(frames: int, length: int, overlap: int) -> list[slice]:
@@ -230,13 +287,3 @@ def _fade(count: int, overlap: int, at_start: bool, at_end: bool) -> np.ndarray:
     """Weights (count,) that rise over the overlap with the window before and fall over that with the next."""
     ramp = np.minimum(np.arange(1, count + 1) / (overlap + 1.0), 1.0)
     return (ramp if at_start else np.ones(count)) * (ramp[::-1] if at_end else np.ones(count))
-
-
-def _translations(
-    keypoints: np.ndarray, confidence: np.ndarray | None, covariance: np.ndarray | None, joints: np.ndarray
-) -> np.ndarray:
-    """(F, 2) px that move the projected poses on the keypoints; interpolated where nothing was seen."""
-    seen = np.isfinite(keypoints).all(-1)
-    weights = seen.astype(float) if confidence is None else np.where(seen, np.nan_to_num(confidence), 0.0)
-    projection = Projection(keypoints, information_from(keypoints, weights, covariance))
-    return projection.translation(frames_last(joints[..., :2])).T

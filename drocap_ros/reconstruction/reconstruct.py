@@ -7,6 +7,7 @@ import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerCo
 from drocap_ros.reconstruction.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
 from drocap_ros.reconstruction.methods import METHODS, CameraPoses, run_method
 from drocap_ros.reconstruction.placement import metres_per_px, place_in_world
+from drocap_ros.reconstruction.threads import blas_threads
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
 
@@ -58,9 +60,11 @@ def reconstruct(
     dictionary = dictionary or load_dictionary(initializer.dictionary or None)
     started = time.perf_counter()
     keypoints, confidence, covariance = body_keypoints(tracks)
-    result = run_method(
-        method, tracks.stamp_ns, keypoints, confidence, covariance, tracks, initializer, adjuster, dictionary, progress
-    )
+    with blas_threads(adjuster.threads):
+        result = run_method(
+            method, tracks.stamp_ns, keypoints, confidence, covariance, tracks, initializer, adjuster, dictionary,
+            progress,
+        )  # fmt: skip
     motion = _to_motion(tracks, keypoints, confidence, result, initializer)
     motion.meta.update(
         method=method,
@@ -123,23 +127,32 @@ def _to_motion(
     pelvis = BODY_15.index("pelvis")
     per_px = metres_per_px(result.joints_px, tracks.stamp_ns, config.assumed_height_m)
     joints = (result.joints_px - result.joints_px[:, pelvis][:, None]) * per_px[:, None, None]
+    metric, scale_source = False, "assumed_height"
+    meta: dict[str, Any] = {"assumed_height_m": config.assumed_height_m, "reference_stature_m": REFERENCE_STATURE_M}
     rotation, frame = np.broadcast_to(np.eye(3), (len(tracks), 3, 3)).copy(), "camera"
+    if tracks.camera_rotation is None and tracks.camera_matrix is not None:
+        # Joints behind the pelvis are farther from the axis than they look: undo the perspective, as place_in_world.
+        range_m = 0.5 * (tracks.camera_matrix[0, 0] + tracks.camera_matrix[1, 1]) * per_px
+        joints[..., :2] *= np.maximum(1.0 + joints[..., 2] / range_m[:, None], 0.1)[..., None]
     if tracks.camera_rotation is not None:
         rotation, frame = tracks.camera_rotation, "world"
-        joints = place_in_world(joints, projected[:, pelvis], per_px, tracks)
+        world = place_in_world(joints, projected, per_px, tracks)
+        joints, metric, scale_source = world.joints, world.metric, world.scale_source
+        if world.scale is not None:
+            meta["scale"] = dataclasses.asdict(world.scale)
     return Motion(
         joints3d=np.ascontiguousarray(joints),
         joints=BODY_15.joints,
         parents=BODY_15.parents,
         stamp_ns=tracks.stamp_ns,
         frame=frame,
-        metric=False,
-        scale_source="assumed_height",
+        metric=metric,
+        scale_source=scale_source,
         camera_rotation=rotation,
         confidence=shown,
         keypoints=keypoints,
         reprojection_px=reprojection,
-        meta={"assumed_height_m": config.assumed_height_m, "reference_stature_m": REFERENCE_STATURE_M},
+        meta=meta,
     )
 
 

@@ -33,12 +33,6 @@ class SparseFit:
     shape: np.ndarray
 
 
-def basis_matrix(dictionary: Dictionary) -> np.ndarray:
-    """(1 + K, 3P): the mean pose and the atoms, flattened coordinate by coordinate."""
-    basis = np.concatenate([dictionary.mean[None], dictionary.atoms])
-    return np.ascontiguousarray(np.swapaxes(basis, 1, 2)).reshape(len(basis), -1)
-
-
 def fit_sparse(
     projection: Projection,
     rotation: np.ndarray,
@@ -52,10 +46,10 @@ def fit_sparse(
     ----------
     rotation, coefficients : (F, 3, 3), (F, 1 + K) starts
     """
-    basis = basis_matrix(dictionary)
+    basis = dictionary.basis
     penalty = np.full((len(basis), 1), config.sparsity)
     penalty[0] = 0.0
-    curvature = np.linalg.norm(basis @ basis.T, 2) * float(projection.information[[0, 2]].max())
+    curvature = dictionary.curvature * float(projection.information[[0, 2]].max())
     step = 1.0 / (curvature + 4.0 * config.coefficient_smoothness)
     c, r = np.ascontiguousarray(coefficients.T), np.ascontiguousarray(np.moveaxis(rotation, 0, -1))
     for _ in range(config.sparse_rounds):

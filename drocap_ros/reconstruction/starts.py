@@ -15,6 +15,9 @@ from drocap_ros.reconstruction.config import InitializerConfig
 from drocap_ros.reconstruction.dictionary import Dictionary
 from drocap_ros.skeleton import BODY_15
 
+#: Poses fitted in one batch: their Jacobians fit the processor's cache.
+CHUNK = 256
+
 
 @dataclass(frozen=True)
 class DenseFit:
@@ -81,9 +84,21 @@ def fit_dense(
     rotation, coefficients : (N, 3, 3), (N, 1 + D) starts
     scale, scale_std : expected coefficient of the mean pose and its relative spread
     """
-    problem = _Problem(w, information, dictionary, config, scale, scale_std)
-    state = problem.evaluate(rotation, coefficients, np.zeros((len(w), 2)))
-    damping: np.ndarray = np.full(len(w), 1e-2)
+    parts = [
+        _descend(
+            _Problem(w[rows], information[rows], dictionary, config, scale, scale_std),
+            rotation[rows],
+            coefficients[rows],
+            iterations,
+        )
+        for rows in (slice(first, first + CHUNK) for first in range(0, len(w), CHUNK))
+    ]
+    return DenseFit(*(np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True)))
+
+
+def _descend(problem: _Problem, rotation: np.ndarray, coefficients: np.ndarray, iterations: int) -> DenseFit:
+    state = problem.evaluate(rotation, coefficients, np.zeros((len(rotation), 2)))
+    damping: np.ndarray = np.full(len(rotation), 1e-2)
     for _ in range(iterations):
         trial = problem.step(state, damping)
         better = trial.cost < state.cost

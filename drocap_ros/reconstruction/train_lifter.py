@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import math
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from drocap_ros.parameters import Parameters, param
 from drocap_ros.reconstruction.lifter_input import FEATURES
 from drocap_ros.reconstruction.train_lifter_views import MocapBank, sample_batch
 from drocap_ros.skeleton import BODY_15, LIMB_JOINTS, indices
+from drocap_ros.tracks import read_npz
 
 if TYPE_CHECKING:
     import torch
@@ -36,8 +38,11 @@ class LifterTraining(Parameters):
 
     minutes: float = param(80.0, "wall-clock time of the training", unit="min", minimum=0.01, maximum=10000.0)
     width: int = param(240, "channels of the network", minimum=8, maximum=2048)
-    frames_per_batch: int = param(3840, "frames of a batch, all windows together", minimum=64, maximum=1_000_000)
-    learning_rate: float = param(2e-3, "peak of the schedule", minimum=1e-6, maximum=1.0)
+    frames_per_batch: int = param(4800, "frames of a batch, all windows together", minimum=64, maximum=1_000_000)
+    learning_rate: float = param(2e-3, "peak of the schedule, AdamW", minimum=1e-6, maximum=1.0)
+    matrix_learning_rate: float = param(
+        0.02, "peak of the schedule, Muon, for the matrices of the body", minimum=1e-6, maximum=1.0
+    )
     weight_decay: float = param(0.02, "decoupled weight decay", minimum=0.0, maximum=1.0)
     seed: int = param(0, "of the samples and of the first weights", minimum=0)
 
@@ -50,12 +55,34 @@ def _torch() -> Any:
     return torch
 
 
+def set_threads(count: int) -> None:
+    """Threads of PyTorch."""
+    _torch().set_num_threads(count)
+
+
+def describe_training(
+    files: list[Path], include: str, options: LifterTraining, facts: dict[str, Any]
+) -> dict[str, str]:
+    """Metadata of the ONNX file: what was learned from, under which licence, by which command."""
+    arrays = [read_npz(path, ("X",)) for path in files]
+    return {
+        "origin": "; ".join(sorted({str(a["source"]) for a in arrays if "source" in a})),
+        "licence": "; ".join(sorted({str(a["licence"]) for a in arrays if "licence" in a})),
+        "files": str(len(files)),
+        "mocap_frames": str(sum(len(a["X"]) for a in arrays)),
+        "command": f"drocap train-lifter MOCAP_DIR --include '{include}' --minutes {options.minutes:g}"
+        f" --width {options.width} --seed {options.seed} --out ONNX",
+        **{name: str(value) for name, value in facts.items()},
+    }
+
+
 def build_network(width: int) -> torch.nn.Module:
-    """Network (B, T, 45) -> joints (B, T, 15, 3), log sigma (B, T, 15, 2) of x, y and of depth; T even."""
+    """Network (B, T, 73) -> joints (B, T, 15, 3), log sigma (B, T, 15, 2) of x, y and of depth; T even."""
     torch = _torch()
     nn, functional = torch.nn, torch.nn.functional
+    module: Any = nn.Module
 
-    class Block(nn.Module):
+    class Block(module):
         def __init__(self, dilation: int) -> None:
             super().__init__()
             self.dilation = dilation
@@ -65,24 +92,24 @@ def build_network(width: int) -> torch.nn.Module:
             nn.init.zeros_(self.out.bias)
             self.out.weight.data.mul_(0.3)
 
-        def forward(self, x: torch.Tensor) -> torch.Tensor:
+        def forward(self, x: Any) -> Any:
             d = self.dilation
             y = functional.pad(self.norm(x), (0, 0, d, d))
             length = x.shape[1]
             y = torch.cat([y[:, :length], y[:, d : d + length], y[:, 2 * d : 2 * d + length]], dim=2)
             return x + self.out(functional.relu(self.mix(y)))
 
-    class Pool(nn.Module):
+    class Pool(module):
         def __init__(self) -> None:
             super().__init__()
             self.norm = nn.LayerNorm(width)
             self.into = nn.Linear(width, width // 2)
             self.out = nn.Linear(width // 2, width)
 
-        def forward(self, x: torch.Tensor) -> torch.Tensor:
+        def forward(self, x: Any) -> Any:
             return x + self.out(functional.relu(self.into(self.norm(x))).mean(dim=1, keepdim=True))
 
-    class Lifting(nn.Module):
+    class Lifting(module):
         def __init__(self) -> None:
             super().__init__()
             self.embed = nn.Linear(2 * FEATURES, width)
@@ -92,7 +119,7 @@ def build_network(width: int) -> torch.nn.Module:
             self.norm = nn.LayerNorm(width)
             self.head = nn.Linear(width, 2 * _JOINTS * 5)
 
-        def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        def forward(self, x: Any) -> tuple[Any, Any]:
             batch, frames = x.shape[0], x.shape[1]
             y = self.embed(x.reshape(batch, frames // 2, 2 * FEATURES))
             y = self.head(self.norm(self.body(y))).float()
@@ -131,12 +158,26 @@ def _rate(progress: float) -> float:
     return min(progress / 0.02, 1.0) * (0.5 + 0.5 * math.cos(math.pi * min(progress, 1.0))) + 1e-4
 
 
+def _optimisers(network: torch.nn.Module, options: LifterTraining) -> list[Any]:
+    """AdamW for embedding, head, norms and biases; Muon, which halved the steps in a trial, for the rest."""
+    torch = _torch()
+    matrices: list[Any] = []
+    others: list[Any] = []
+    for name, weight in network.named_parameters():
+        (matrices if weight.ndim == 2 and name.startswith("body") else others).append(weight)
+    return [
+        torch.optim.AdamW(others, lr=options.learning_rate, weight_decay=options.weight_decay, betas=(0.9, 0.98)),
+        torch.optim.Muon(matrices, lr=options.matrix_learning_rate, weight_decay=options.weight_decay),
+    ]
+
+
 def train(
     bank: MocapBank,
     options: LifterTraining,
     report: Callable[[str], None],
     checkpoint: Callable[[torch.nn.Module, dict[str, Any]], None],
     checkpoint_minutes: float = 5.0,
+    initial: dict[str, Any] | None = None,
 ) -> tuple[torch.nn.Module, dict[str, Any]]:
     """Train on endless virtual views for a given time; returns averaged weights and what was seen.
 
@@ -146,24 +187,26 @@ def train(
     torch.manual_seed(options.seed)
     rng = np.random.default_rng(options.seed)
     network = build_network(options.width)
+    if initial is not None:
+        network.load_state_dict(initial)
     average = copy.deepcopy(network)
-    optimiser = torch.optim.AdamW(
-        network.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay, betas=(0.9, 0.98)
-    )
+    optimisers = _optimisers(network, options)
+    peaks = [options.learning_rate, options.matrix_learning_rate]
     begin = time.monotonic()
     step, frames_seen, shown, saved, smooth = 0, 0, 0.0, 0.0, math.nan
     while (elapsed := (time.monotonic() - begin) / 60) < options.minutes:
         frames = int(rng.choice([16, 64, 160, 240], p=[0.05, 0.1, 0.45, 0.4]))
         batch = sample_batch(bank, rng, max(options.frames_per_batch // frames, 1), frames)
-        for group in optimiser.param_groups:
-            group["lr"] = options.learning_rate * _rate(elapsed / options.minutes)
+        for optimiser, peak in zip(optimisers, peaks, strict=True):
+            optimiser.param_groups[0]["lr"] = peak * _rate(elapsed / options.minutes)
         with torch.autocast("cpu", dtype=torch.bfloat16):
             joints, log_sigma = network(torch.from_numpy(batch.features))
         loss, distance = lifting_loss(joints, log_sigma, torch.from_numpy(batch.target))
-        optimiser.zero_grad(set_to_none=True)
+        network.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimiser.step()
+        for optimiser in optimisers:
+            optimiser.step()
         step += 1
         frames_seen += batch.features.shape[0] * frames
         keep = min(0.9995, step / (step + 10))
@@ -193,16 +236,19 @@ def export_onnx(network: torch.nn.Module, path: Path, facts: dict[str, str]) -> 
         raise InputError(f"--out: expected a file name ending in .onnx, got {path.name!r}")
     network = copy.deepcopy(network).eval().float()
     path.parent.mkdir(parents=True, exist_ok=True)
-    torch.onnx.export(
-        network,
-        (torch.zeros(2, 16, FEATURES),),
-        str(path),
-        input_names=["features"],
-        output_names=["joints", "log_sigma"],
-        dynamic_axes={name: {0: "windows", 1: "frames"} for name in ("features", "joints", "log_sigma")},
-        opset_version=17,
-        dynamo=False,
-    )
+    with warnings.catch_warnings():
+        # The exporter warns that it will be replaced and that it leaves some slices unfolded.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            network,
+            (torch.zeros(2, 16, FEATURES),),
+            str(path),
+            input_names=["features"],
+            output_names=["joints", "log_sigma"],
+            dynamic_axes={name: {0: "windows", 1: "frames"} for name in ("features", "joints", "log_sigma")},
+            opset_version=17,
+            dynamo=False,
+        )
     model = onnx.load(str(path))
     kept, casts = [], []
     for tensor in model.graph.initializer:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.reconstruction.lifter_input import LIFTER_FPS, normalise
+from drocap_ros.reconstruction.lifter_input import BONES, LIFTER_FPS, normalise
 from drocap_ros.skeleton import BODY_15, indices
 from drocap_ros.tracks import read_npz
 
@@ -59,7 +59,7 @@ def load_bank(paths: list[Path]) -> MocapBank:
 
 @dataclass(frozen=True)
 class Batch:
-    """features (B, T, 45); target (B, T, 15, 3) in the features' units, x and y where the joint would be seen."""
+    """features (B, T, 73); target (B, T, 15, 3) in the features' units, x and y where the joint would be seen."""
 
     features: np.ndarray
     target: np.ndarray
@@ -125,7 +125,7 @@ def _vary_body(motion: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
     # Poses: every limb is turned a little (the lower limb with the upper one), the trunk as a whole; postures
     # bend trunk, hips and knees about the axis of the hips.
-    strength = np.where(rng.random(windows) < 0.6, rng.uniform(0, 0.25, windows), 0).astype(np.float32)
+    strength = np.where(rng.random(windows) < 0.5, rng.uniform(0, 0.22, windows), 0).astype(np.float32)
     turn = _slow(rng, windows, frames, (9, 3)) * strength[:, None, None, None]
     posture = _posture(rng, windows, frames)
     pitch = bone[:, :, _J["rhip"]] - bone[:, :, _J["lhip"]]
@@ -154,14 +154,10 @@ def _vary_body(motion: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     right /= np.linalg.norm(right, axis=-1, keepdims=True) + 1e-6
     front = np.cross(up, right)
     shift = (0.02 * rng.standard_normal((windows, 1, 4, 3, 1))).astype(np.float32)
-    frame = (right, front, up)
-    for k, (a, b) in enumerate((("neck", ""), ("head", ""), ("rshoulder", "lshoulder"), ("rhip", "lhip"))):
-        side = np.float32(1.0 if b else 0.0)
-        for axis, sign in zip(range(3), (side, 1, 1), strict=True):
-            bone[:, :, _J[a]] += sign * shift[:, :, k, axis] * frame[axis]
-        for axis, sign in zip(range(3), (-1, 1, 1), strict=True):
-            if b:
-                bone[:, :, _J[b]] += sign * shift[:, :, k, axis] * frame[axis]
+    places = (("neck", 0), ("head", 0), ("rshoulder", 1), ("lshoulder", -1), ("rhip", 1), ("lhip", -1))
+    for (joint_name, side), k in zip(places, (0, 1, 2, 2, 3, 3), strict=True):
+        across, along, high = shift[:, :, k, 0], shift[:, :, k, 1], shift[:, :, k, 2]
+        bone[:, :, _J[joint_name]] += side * across * right + along * front + high * up
 
     body = np.empty_like(bone)
     body[:, :, 0] = 0
@@ -177,6 +173,9 @@ def _vary_body(motion: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     pitch = body[:, :, _J["rhip"]] - body[:, :, _J["lhip"]]
     pitch = pitch.mean(axis=1, keepdims=True) + 1e-6
     pitch /= np.linalg.norm(pitch, axis=-1, keepdims=True)
+    # Some lie on a side: the axis that the body tips over about is not the hips'.
+    aside = np.where(rng.random(windows) < 0.4, rng.uniform(-np.pi, np.pi, windows), 0.2 * rng.standard_normal(windows))
+    pitch = _turn(pitch, (aside[:, None] * np.array([0.0, 0.0, 1.0])).astype(np.float32)[:, None])
     return _turn(body, (posture[:, :, 0, None] * pitch)[:, :, None])
 
 
@@ -187,21 +186,24 @@ def _posture(rng: np.random.Generator, windows: int, frames: int) -> np.ndarray:
     again.  Everyday MoCap holds little of that.
     """
     kind = rng.random(windows)
-    on = kind < 0.28
-    low = np.array([-1.8, -0.4, -0.2, -0.2, 0.0, 0.0])
-    high = np.array([1.8, 1.3, 1.9, 1.9, 2.0, 2.0])
+    low = np.array([-0.4, -0.4, -0.2, -0.2, 0.0, 0.0])
+    high = np.array([0.4, 1.3, 1.9, 1.9, 2.0, 2.0])
     angle = rng.uniform(low, high, (windows, 6))
-    angle[kind < 0.12, 0] *= 0.2
+    lying = kind < 0.2
+    flat = rng.choice([-1, 1], windows) * rng.normal(1.55, 0.15, windows)
+    angle[lying, 0] = np.where(rng.random(windows) < 0.7, flat, rng.uniform(-1.5, 1.5, windows))[lying]
+    angle[lying & (rng.random(windows) < 0.4), 1:] *= 0.2
+    angle[kind > 0.36] = 0.0
     together = rng.random(windows) < 0.6
     for right, left in ((2, 3), (4, 5)):
-        angle[together, left] = angle[together, right] + 0.2 * rng.standard_normal(together.sum())
+        angle[together, left] = angle[together, right] * (1 + 0.2 * rng.standard_normal(together.sum()))
     time = np.arange(frames)[None, :, None]
     begin = rng.uniform(-1.2 * frames, 0.8 * frames, (windows, 1, 1)) + rng.uniform(-10, 10, (windows, 1, 6))
     rise = np.clip((time - begin) / rng.uniform(15, 60, (windows, 1, 6)), 0, 1)
     end = begin + rng.uniform(40, 300, (windows, 1, 1)) + rng.uniform(-10, 10, (windows, 1, 6))
     fall = np.clip((time - end) / rng.uniform(15, 60, (windows, 1, 6)), 0, 1)
     curve = rise * (1 - fall)
-    return (on[:, None, None] * angle[:, None] * curve**2 * (3 - 2 * curve)).astype(np.float32)
+    return (angle[:, None] * curve**2 * (3 - 2 * curve)).astype(np.float32)
 
 
 def camera_rotation(azimuth: np.ndarray, elevation: np.ndarray, roll: np.ndarray) -> np.ndarray:
@@ -231,7 +233,7 @@ def _orbit(rng: np.random.Generator, windows: int, frames: int) -> np.ndarray:
 
 
 def _see(body: np.ndarray, rng: np.random.Generator) -> Batch:
-    windows, frames, joints, _ = body.shape
+    windows, frames = body.shape[:2]
     seen = np.einsum("btij,btpj->btpi", _orbit(rng, windows, frames), body, optimize=True)
 
     # Half of the cameras are orthographic; the others stand 3-15 m away, and the distance drifts.
@@ -242,10 +244,17 @@ def _see(body: np.ndarray, rng: np.random.Generator) -> Batch:
     truth = np.concatenate([exact, seen[..., 2:] * zoom[..., None, None]], axis=-1)
 
     keypoints, confidence = _spoil(exact, rng)
-    features, centre, scale = normalise(keypoints, confidence)
+    features, centre, scale = normalise(keypoints, confidence, _told_lengths(truth, rng))
     truth[..., :2] -= centre[:, :, None]
     truth /= scale[:, None, None, None]
     return Batch(features, truth.astype(np.float32))
+
+
+def _told_lengths(truth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """(B, 14) bone lengths with the errors of an estimate; unknown (NaN) in two windows of five."""
+    length = np.median(np.linalg.norm(truth[:, :, BONES[:, 1]] - truth[:, :, BONES[:, 0]], axis=-1), axis=1)
+    error = np.abs(0.025 * rng.standard_normal((len(length), 1))) * rng.standard_normal(length.shape)
+    return np.where(rng.random((len(length), 1)) < 0.4, np.nan, length * np.exp(error))
 
 
 def _runs(rng: np.random.Generator, shape: tuple[int, ...], frames: int, share: np.ndarray, longest: int) -> np.ndarray:

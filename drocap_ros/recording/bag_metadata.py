@@ -23,6 +23,25 @@ class TopicRecord:
     count: int = 0
 
 
+@dataclass
+class FileRecord:
+    """One storage file of a session.
+
+    start_ns, end_ns : log times of its first and last message; None, 0 without any
+    """
+
+    name: str
+    start_ns: int | None = None
+    end_ns: int = 0
+    messages: int = 0
+
+    def count(self, log_time_ns: int) -> None:
+        """Take note of one more message."""
+        self.start_ns = log_time_ns if self.start_ns is None else min(self.start_ns, log_time_ns)
+        self.end_ns = max(self.end_ns, log_time_ns)
+        self.messages += 1
+
+
 def qos_profile(*, reliable: bool = True, depth: int = 1000) -> list[dict[str, Any]]:
     """Offered quality of service in rosbag2's form."""
     return [
@@ -51,20 +70,16 @@ def dump_yaml(value: Any) -> str:
     return str(yaml.dump(value, Dumper=Plain, sort_keys=False, default_flow_style=False))
 
 
-def bag_metadata(
-    file_name: str, topics: list[TopicRecord], start_ns: int | None, end_ns: int, custom: dict[str, str]
-) -> dict[str, Any]:
-    """Content of the file: one storage file, its topics, its time."""
-    count = sum(topic.count for topic in topics)
-    begin = {"nanoseconds_since_epoch": 0 if start_ns is None else start_ns}
-    duration = {"nanoseconds": 0 if start_ns is None else end_ns - start_ns}
+def bag_metadata(files: list[FileRecord], topics: list[TopicRecord], custom: dict[str, str]) -> dict[str, Any]:
+    """Content of the file: its storage files, their topics, their time."""
+    starts = [f.start_ns for f in files if f.start_ns is not None]
+    start_ns = min(starts, default=None)
     return {
         "rosbag2_bagfile_information": {
             "version": _VERSION,
             "storage_identifier": "mcap",
-            "duration": duration,
-            "starting_time": begin,
-            "message_count": count,
+            **_time(start_ns, max((f.end_ns for f in files), default=0)),
+            "message_count": sum(f.messages for f in files),
             "topics_with_message_count": [
                 {
                     "topic_metadata": {
@@ -80,19 +95,40 @@ def bag_metadata(
             ],
             "compression_format": "",
             "compression_mode": "",
-            "relative_file_paths": [file_name],
-            "files": [{"path": file_name, "starting_time": begin, "duration": duration, "message_count": count}],
+            "relative_file_paths": [f.name for f in files],
+            "files": [{"path": f.name, **_time(f.start_ns, f.end_ns), "message_count": f.messages} for f in files],
             "custom_data": custom or None,
             "ros_distro": "jazzy",
         }
     }
 
 
+def _time(start_ns: int | None, end_ns: int) -> dict[str, Any]:
+    return {
+        "duration": {"nanoseconds": 0 if start_ns is None else end_ns - start_ns},
+        "starting_time": {"nanoseconds_since_epoch": 0 if start_ns is None else start_ns},
+    }
+
+
 def write_atomically(path: Path, text: str) -> None:
     """Replace a file so that a reader or a power cut finds the old content or the new, never half of it."""
     temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    try:
+        with temporary.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Force names that were made or replaced in a folder to the disk."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -76,6 +76,11 @@ class BoundedQueue:
         """Whether it takes nothing more in."""
         return self._closed
 
+    @property
+    def size(self) -> int:
+        """Bytes that wait."""
+        return self._size
+
     def drop_all(self) -> None:
         """Drop what waits, counted."""
         with self._changed:

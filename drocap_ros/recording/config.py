@@ -11,7 +11,7 @@ from drocap_ros.parameters import Parameters, param
 class SessionRecorderConfig(Parameters):
     """Where and how a session is written."""
 
-    session_dir: str = param("session", "folder to create; it must not exist, or be empty")
+    session_dir: str = param("", "folder to create; it must not exist, or be empty; empty = a new one named by date")
     chunk_s: float = param(
         0.5, "time after which what has come is written and flushed", unit="s", minimum=0.05, maximum=10
     )
@@ -23,4 +23,22 @@ class SessionRecorderConfig(Parameters):
     free_mib: int = param(
         256, "space that stays free on the disk; below it the recording ends", unit="MiB", minimum=0, maximum=1_000_000
     )
+    split_mib: int = param(
+        2048, "size after which a new file is begun; 0 = never", unit="MiB", minimum=0, maximum=1_000_000
+    )
+    split_s: float = param(
+        600.0, "time after which a new file is begun; 0 = never", unit="s", minimum=0, maximum=86_400
+    )
     sync: bool = param(True, "force each flush to the disk itself, so that a power cut loses at most the last chunk")
+
+
+@dataclass(frozen=True)
+class SessionPlayerConfig(Parameters):
+    """What of a session is published again, and how fast."""
+
+    session: str = param("", "session folder, .mcap, .bag or rosbag2 folder")
+    rate: float = param(1.0, "times the speed of the recording", minimum=0.01, maximum=100)
+    start_s: float = param(0.0, "how far into the recording to begin", unit="s", minimum=0)
+    loop: bool = param(False, "begin again at the end, until stopped")
+    topics: str = param("", "names, or their ends, separated by spaces; empty = all but /diagnostics and /clock")
+    clock: bool = param(True, "publish the recording's time on /clock")

@@ -6,6 +6,8 @@ other.  Damaged chunks are skipped and counted; sizes are checked before anythin
 
 from __future__ import annotations
 
+import logging
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -14,10 +16,19 @@ from typing import IO, Any, NamedTuple
 
 from drocap_ros.errors import InputError
 
+logger = logging.getLogger(__name__)
+
 MAGIC = b"\x89MCAP0\r\n"
 _MAX_CHUNK = 512 << 20
 _FREE_EXPANSION = 64 << 20
 _MAX_EXPANSION = 1000
+
+
+_SEARCH = 1 << 20
+_CHUNK_OPCODE = 6
+#: opcode, length, start and end time, unpacked size, checksum, length of the compression's name
+_CHUNK_HEAD = struct.Struct("<BQQQQII")
+_COMPRESSION = re.compile(rb"\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4")
 
 
 class McapChannel(NamedTuple):
@@ -28,6 +39,8 @@ class McapChannel(NamedTuple):
     message_encoding: str
     schema_encoding: str
     schema: str
+    raw_type_name: str = ""
+    metadata: tuple[tuple[str, str], ...] = ()
 
 
 class McapMessage(NamedTuple):
@@ -36,6 +49,8 @@ class McapMessage(NamedTuple):
     channel: McapChannel
     log_time_ns: int
     data: bytes
+    publish_time_ns: int = 0
+    sequence: int = 0
 
 
 class _BoundedFile:
@@ -56,11 +71,14 @@ class _BoundedFile:
 class McapStream:
     """Reads one file; see the module's text.
 
+    resync : after damage, look for the next whole chunk instead of ending there
     damage : in words, what could not be read so far
     """
 
     path: Path
+    resync: bool = False
     damage: list[str] = field(default_factory=list)
+    _whole_until: int = 0
 
     def messages(self) -> Iterator[McapMessage]:
         """All messages in the order of the file.
@@ -85,7 +103,7 @@ class McapStream:
                 if channel is None:
                     lost += 1
                     continue
-                yield McapMessage(channel, record.log_time, record.data)
+                yield McapMessage(channel, record.log_time, record.data, record.publish_time, record.sequence)
         if lost:
             self.damage.append(f"{lost} messages of unknown channels")
 
@@ -104,21 +122,45 @@ class McapStream:
         except Exception:  # a damaged summary raises all kinds; the stream itself is the truth
             return None
 
-    def metadata(self) -> dict[str, dict[str, str]]:
-        """Metadata records by name, from a file with a usable summary."""
+    def profile(self) -> str:
+        """What the file says it is: "ros2", "ros1" or something else; "ros2" where it does not say."""
         from mcap.reader import SeekingReader
 
         try:
             with self.path.open("rb") as file:
-                bounded: Any = _BoundedFile(file)
-                reader = SeekingReader(bounded, record_size_limit=bounded.size)
-                return {record.name: dict(record.metadata) for record in reader.iter_metadata()}
+                return str(SeekingReader(file).get_header().profile)
         except Exception:
-            return {}
+            return "ros2"
+
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Metadata records by name, those of one name merged; without a summary the whole file is looked through."""
+        from mcap.reader import SeekingReader
+
+        found: dict[str, dict[str, str]] = {}
+        try:
+            with self.path.open("rb") as file:
+                bounded: Any = _BoundedFile(file)
+                whole = self.summary() is not None
+                reader = SeekingReader(bounded, record_size_limit=bounded.size)
+                for record in reader.iter_metadata() if whole else self._loose_metadata(file):
+                    found.setdefault(record.name, {}).update(record.metadata)
+        except Exception:  # what is told of a damaged file is a convenience
+            logger.debug("%s: metadata cannot be read", self.path)
+        return found
+
+    def _loose_metadata(self, file: IO[bytes]) -> Iterator[Any]:
+        from mcap.records import Metadata
+        from mcap.stream_reader import StreamReader
+
+        bounded: Any = _BoundedFile(file)
+        damage, self.damage = self.damage, []
+        records = StreamReader(bounded, emit_chunks=True, record_size_limit=bounded.size).records
+        yield from (r for r in self._until_damaged(iter(records), file, bounded.size) if isinstance(r, Metadata))
+        self.damage = damage
 
     def _records(self) -> Iterator[Any]:
         from mcap.records import Chunk
-        from mcap.stream_reader import StreamReader, breakup_chunk
+        from mcap.stream_reader import breakup_chunk
 
         try:
             file = self.path.open("rb")
@@ -131,9 +173,8 @@ class McapStream:
                     f"{self.path}: expected an MCAP file, found other content at its start; check the path"
                 )
             file.seek(0)
-            reader = StreamReader(bounded, emit_chunks=True, record_size_limit=bounded.size)
             bad_chunks = 0
-            for record in self._until_damaged(iter(reader.records), file, bounded.size):
+            for record in self._raw_records(bounded, file):
                 if not isinstance(record, Chunk):
                     yield record
                     continue
@@ -146,11 +187,29 @@ class McapStream:
             if bad_chunks:
                 self.damage.append(f"{bad_chunks} damaged chunks")
 
+    def _raw_records(self, bounded: Any, file: IO[bytes]) -> Iterator[Any]:
+        from mcap.stream_reader import StreamReader
+
+        skip = False
+        while True:
+            reader = StreamReader(bounded, skip_magic=skip, emit_chunks=True, record_size_limit=bounded.size)
+            known = len(self.damage)
+            yield from self._until_damaged(iter(reader.records), file, bounded.size)
+            if not self.resync or len(self.damage) == known:
+                return
+            place = _next_chunk(file, self._whole_until + 1)
+            if place is None:
+                return
+            self.damage[-1] = f"{place - self._whole_until} bytes skipped at byte {self._whole_until}"
+            file.seek(place)
+            skip = True
+
     def _until_damaged(self, records: Iterator[Any], file: IO[bytes], size: int) -> Iterator[Any]:
         from mcap.records import Footer
 
-        ended, place = False, 0
+        ended, place = False, file.tell()
         while True:
+            self._whole_until = place
             try:
                 record = next(records)
             except StopIteration:
@@ -164,6 +223,25 @@ class McapStream:
             yield record
 
 
+def _next_chunk(file: IO[bytes], start: int) -> int | None:
+    """Place of the next record at or after ``start`` that looks like a chunk and fits into the file."""
+    size = file.seek(0, 2)
+    overlap = _CHUNK_HEAD.size
+    place = start
+    while place < size - overlap:
+        file.seek(place)
+        data = file.read(_SEARCH + overlap)
+        for match in _COMPRESSION.finditer(data):
+            at = match.start() - _CHUNK_HEAD.size + 4
+            if at < 0 or data[at] != _CHUNK_OPCODE:
+                continue
+            _, length, begin, end, unpacked, _, _ = _CHUNK_HEAD.unpack_from(data, at)
+            if place + at + 9 + length <= size and begin <= end and unpacked <= _MAX_CHUNK:
+                return place + at
+        place += _SEARCH
+    return None
+
+
 def _channel(record: Any, schema: Any | None) -> McapChannel:
     text = schema.data.decode("utf-8", "replace") if schema is not None else ""
     return McapChannel(
@@ -172,6 +250,8 @@ def _channel(record: Any, schema: Any | None) -> McapChannel:
         message_encoding=record.message_encoding,
         schema_encoding=schema.encoding if schema is not None else "",
         schema=text,
+        raw_type_name=schema.name if schema is not None else "",
+        metadata=tuple(sorted(record.metadata.items())),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -14,6 +15,8 @@ from drocap_ros.recording.bag_metadata import METADATA_FILE
 from drocap_ros.recording.mcap_stream import McapChannel, McapStream
 
 POSE2D = "drocap_ros/msg/Pose2D"
+POSE3D = "drocap_ros/msg/Pose3D"
+POSE3D_WINDOW = "drocap_ros/msg/Pose3DWindow"
 VEHICLE_STATE = "drocap_ros/msg/VehicleState"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 IMAGE = "sensor_msgs/msg/Image"
@@ -193,10 +196,10 @@ def open_session(path: str | Path) -> Session:
         if path.suffix == ".mcap" and path.is_file():
             return McapSession(path, [path], {})
         if path.is_dir():
-            description, warnings = _read_bag_metadata(path)
+            description, warnings = read_bag_metadata(path)
             storage = description.get("storage_identifier", "")
             packed = str(description.get("compression_mode", "")).lower() not in ("", "none")
-            files = _storage_files(path, description)
+            files = storage_files(path, description)
             if files and storage in ("mcap", "") and not packed and all(f.suffix == ".mcap" for f in files):
                 session: Session = McapSession(path, files, description.get("custom_data") or {})
             else:
@@ -208,7 +211,8 @@ def open_session(path: str | Path) -> Session:
         raise InputError(f"{path}: expected a readable recording; {error.strerror or error}") from None
 
 
-def _read_bag_metadata(folder: Path) -> tuple[dict[str, Any], list[str]]:
+def read_bag_metadata(folder: Path) -> tuple[dict[str, Any], list[str]]:
+    """The description in a rosbag2 folder's ``metadata.yaml``, empty where there is no usable one, and warnings."""
     import yaml
 
     path = folder / METADATA_FILE
@@ -224,13 +228,21 @@ def _read_bag_metadata(folder: Path) -> tuple[dict[str, Any], list[str]]:
         return {}, [f"{METADATA_FILE} cannot be read; read the files that are there"]
 
 
-def _storage_files(folder: Path, description: dict[str, Any]) -> list[Path]:
+def storage_files(folder: Path, description: dict[str, Any]) -> list[Path]:
+    """Files of a folder in their order; one that a crash left out of the list is taken in."""
+    there = sorted((p for p in folder.iterdir() if p.suffix == ".mcap"), key=_by_number)
     named = description.get("relative_file_paths")
     if isinstance(named, list) and named:
         files = [folder / Path(str(name)).name for name in named]
         if all(file.is_file() for file in files):
-            return files
-    return sorted(p for p in folder.iterdir() if p.suffix == ".mcap")
+            beside = [p for p in there if p not in files] if all(f.suffix == ".mcap" for f in files) else []
+            return files + beside
+    return there
+
+
+def _by_number(path: Path) -> tuple[Any, ...]:
+    """``s_10`` comes after ``s_9``."""
+    return tuple(int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name))
 
 
 class McapSession(Session):
@@ -238,6 +250,10 @@ class McapSession(Session):
 
     def __init__(self, path: Path, files: list[Path], custom: dict[str, str]) -> None:
         super().__init__(path)
+        # A power cut right after a file was made leaves it empty: it says nothing of the others.
+        empty = [file for file in files if file.stat().st_size == 0] if len(files) > 1 else []
+        files = [file for file in files if file not in empty]
+        self.warnings += [f"{file.name} is empty; `drocap recover` puts that right" for file in empty]
         self._streams = [McapStream(file) for file in files]
         self._custom = {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
         self._stores: dict[McapChannel, Any] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -40,6 +41,7 @@ __all__ = [
     "read_pose2d",
     "read_vehicle_track",
     "session_info",
+    "with_camera",
 ]
 
 
@@ -90,11 +92,38 @@ def read_pose2d(session: Session, topic: str | None = None, mount_pitch_deg: flo
         raise InputError(f"{session.path}: expected poses on {chosen.name}, none could be decoded; record it anew")
     ordered = [poses[stamp] for stamp in sorted(poses)]
     try:
-        arrays = _pose_arrays(ordered)
         stamps = np.array(sorted(poses), dtype=np.int64)
-        return Tracks(stamp_ns=stamps, **arrays, **_telemetry(session, stamps, chosen.name, mount_pitch_deg))
+        tracks = Tracks(stamp_ns=stamps, **_pose_arrays(ordered), camera_matrix=_camera_matrix(session, chosen.name))
+        vehicle = read_vehicle_track(session, chosen.name)
+        if vehicle is None:
+            return tracks
+        tracks, reason = with_camera(tracks, vehicle, tracks.stamp_ns, mount_pitch_deg)
+        if reason:
+            session.warn(f"camera telemetry incomplete: {reason}")
+        return tracks
     except InputError as error:
         raise InputError(f"{session.path}: {chosen.name}: {error}") from None
+
+
+def with_camera(
+    tracks: Tracks, vehicle: VehicleTrack, at_ns: np.ndarray, mount_pitch_deg: float | None = None
+) -> tuple[Tracks, str]:
+    """Tracks with the camera's pose at each picture, and in words what is missing.
+
+    Pictures at the start or end for which the vehicle's states tell nothing are left out, if most remain; see
+    :func:`drocap_ros.recording.camera_telemetry.camera_poses`.
+
+    Parameters
+    ----------
+    at_ns : (F,) times of the pictures by the clock of the vehicle's states
+    """
+    poses = camera_poses(vehicle, at_ns, mount_pitch_deg)
+    arrays: dict[str, Any] = {}
+    for name in ("keypoints", "stamp_ns", "confidence", "covariance"):
+        value = getattr(tracks, name)
+        arrays[name] = None if value is None else value[poses.keep]
+    changed = dataclasses.replace(tracks, **arrays, camera_rotation=poses.rotation, camera_position=poses.position)
+    return changed, poses.reason
 
 
 def read_images(session: Session, topic: str | None = None) -> Iterator[Frame]:
@@ -189,17 +218,6 @@ def _fill(target: np.ndarray, values: Any, name: str) -> None:
     if array.size != target.size:
         raise InputError(f"{name}: expected {target.size} values, got {array.size}; was it recorded by drocap?")
     target[...] = array.reshape(target.shape)
-
-
-def _telemetry(session: Session, stamp_ns: np.ndarray, topic: str, mount_pitch_deg: float | None) -> dict[str, Any]:
-    matrix = _camera_matrix(session, topic)
-    track = read_vehicle_track(session, topic)
-    if track is None:
-        return {"camera_matrix": matrix}
-    poses = camera_poses(track, stamp_ns, mount_pitch_deg)
-    if poses.reason:
-        session.warn(f"camera telemetry incomplete: {poses.reason}")
-    return {"camera_matrix": matrix, "camera_rotation": poses.rotation, "camera_position": poses.position}
 
 
 def _camera_matrix(session: Session, topic: str) -> np.ndarray | None:

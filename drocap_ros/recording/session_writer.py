@@ -1,10 +1,8 @@
-"""Writes a session: a rosbag2 folder with one MCAP file that survives whatever happens to the machine."""
+"""Writes a session: a rosbag2 folder of MCAP files that survives whatever happens to the machine."""
 
 from __future__ import annotations
 
-import errno
 import logging
-import os
 import shutil
 import threading
 import time
@@ -15,18 +13,22 @@ from typing import Any
 from drocap_ros.errors import InputError
 from drocap_ros.recording.bag_metadata import (
     METADATA_FILE,
+    FileRecord,
     TopicRecord,
     bag_metadata,
     dump_yaml,
     qos_profile,
+    sync_folder,
     write_atomically,
 )
 from drocap_ros.recording.bounded_queue import BoundedQueue, QueuedMessage
-from drocap_ros.recording.committed_file import CommittedFile
 from drocap_ros.recording.config import SessionRecorderConfig
+from drocap_ros.recording.mcap_file import McapFile
 from drocap_ros.recording.schemas import type_hash
 
 _MIB = 1 << 20
+#: Name of the metadata records that this package writes.
+RECORD = "drocap_ros"
 
 logger = logging.getLogger(__name__)
 
@@ -35,13 +37,15 @@ class SessionWriter:
     """Takes serialized messages from any thread and writes them in a thread of its own.
 
     Chunks are compressed and handed to the disk at least every ``config.chunk_s``; a crash or power cut leaves
-    whole chunks up to then.  ``write`` never waits and never raises: what the disk cannot take is dropped, pictures
-    first, and counted.  ``metadata.yaml`` stands from the start and is completed by :meth:`close`.
+    whole chunks up to then.  After ``config.split_mib`` or ``config.split_s`` a new file is begun; each stands by
+    itself.  ``write`` never waits and never raises: what the disk cannot take is dropped, pictures first, and
+    counted.  ``metadata.yaml`` stands from the start and is completed by :meth:`close`.  When less than
+    ``config.free_mib`` is left on the disk the files are finished while that is still possible, and ``error`` says so.
 
     Parameters
     ----------
     folder : to create; it must not exist, or be empty
-    config : chunks, queue, free space
+    config : chunks, files, queue, free space
     metadata : what to know of the session later: configuration, versions, model hashes
 
     Raises
@@ -56,45 +60,26 @@ class SessionWriter:
         config: SessionRecorderConfig | None = None,
         metadata: Mapping[str, str] | None = None,
     ) -> None:
-        from mcap.writer import CompressionType, Writer
-
         self.folder = Path(folder)
         self.config = config or SessionRecorderConfig()
         self._make_folder()
-        self.path = self.folder / f"{self.folder.absolute().name}_0.mcap"
         self._custom = dict(metadata or {})
-        self._topics: dict[str, TopicRecord] = {}
-        self._channels: dict[str, int] = {}
+        self._custom_news: dict[str, str] = {}
+        self._topics: dict[str, TopicRecord] = {}  # counts: of the files that are finished
+        self._schemas: dict[str, str] = {}
         self._pictures: set[str] = set()
-        self._schemas: dict[tuple[str, str], int] = {}
-        self._start_ns: int | None = None
-        self._end_ns = 0
+        self._finished: list[FileRecord] = []
         self._unsaved_s: float | None = None  # when the oldest message that is not yet on the disk came
         self._space_checked_s = -1e9
-        self._topics_changed = False
-        self._lock = threading.Lock()  # of the MCAP writer and of what describes the file
+        self._description_changed = False
+        self._lock = threading.Lock()  # of the current file and of what describes the session
         self._error: str | None = None
         self._closed = False
         self._queue = BoundedQueue(self.config.queue_mib * _MIB)
         try:
-            self._file = CommittedFile(self.path)
+            self._file = self._new_file()
+            self._write_description()
         except OSError as error:
-            raise self._cannot(error) from None
-        compression = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
-        self._mcap = Writer(
-            self._file,  # type: ignore[arg-type]
-            chunk_size=self.config.chunk_kib * 1024,
-            compression=compression[self.config.compression],
-        )
-        try:
-            self._mcap.start("ros2", _library())
-            if self._custom:
-                self._mcap.add_metadata("drocap_ros", self._custom)
-            self._file.commit(self.config.sync)
-            self._write_metadata()
-            _sync_folder(self.folder)
-        except OSError as error:
-            self._file.close()
             raise self._cannot(error) from None
         self._thread = threading.Thread(target=self._run, name="session-writer", daemon=True)
         self._thread.start()
@@ -104,6 +89,11 @@ class SessionWriter:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    @property
+    def path(self) -> Path:
+        """The file that is being written."""
+        return self._file.path
 
     @property
     def dropped(self) -> int:
@@ -117,8 +107,13 @@ class SessionWriter:
 
     @property
     def written(self) -> int:
-        """Messages handed to the file."""
-        return sum(topic.count for topic in self._topics.values())
+        """Messages handed to the files."""
+        return sum(record.messages for record in self._finished) + self._file.record.messages
+
+    @property
+    def queued_bytes(self) -> int:
+        """What waits for the disk."""
+        return self._queue.size
 
     @property
     def error(self) -> str | None:
@@ -155,19 +150,14 @@ class SessionWriter:
                     raise InputError(f"{topic}: expected type {known.type_name} as registered before, got {type_name}")
                 return
             profile = qos or qos_profile(reliable=not image)
-            self._topics[topic] = TopicRecord(topic, type_name, type_hash(type_name, schema), profile)
-            key = (type_name, schema)
-            if key not in self._schemas:
-                self._schemas[key] = self._mcap.register_schema(type_name, "ros2msg", schema.encode())
-            self._channels[topic] = self._mcap.register_channel(
-                topic=topic,
-                message_encoding="cdr",
-                schema_id=self._schemas[key],
-                metadata={"offered_qos_profiles": dump_yaml(profile)},
-            )
+            record = TopicRecord(topic, type_name, type_hash(type_name, schema), profile)
+            if self._error is None:
+                self._file.register(record, schema)
+            self._schemas[topic] = schema
+            self._topics[topic] = record
             if image:
                 self._pictures.add(topic)
-            self._topics_changed = True
+            self._description_changed = True
 
     def write(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int | None = None) -> bool:
         """Queue one serialized (CDR) message; False when it was dropped.
@@ -177,10 +167,17 @@ class SessionWriter:
         InputError
             When the topic was not registered.
         """
-        if topic not in self._channels:
+        if topic not in self._topics:
             raise InputError(f"{topic}: expected a registered topic; call register first")
         published_ns = log_time_ns if publish_time_ns is None else publish_time_ns
         return self._queue.put(QueuedMessage(topic, bytes(data), log_time_ns, published_ns), topic in self._pictures)
+
+    def add_metadata(self, values: Mapping[str, str]) -> None:
+        """Add to what is told of the session; it reaches the disk with the next chunk."""
+        with self._lock:
+            self._custom_news.update({k: v for k, v in values.items() if self._custom.get(k) != v})
+            if self._custom_news and self._unsaved_s is None:
+                self._unsaved_s = time.monotonic()
 
     def close(self) -> None:
         """Write what is queued, finish the file and ``metadata.yaml``.  A second call does nothing."""
@@ -190,17 +187,12 @@ class SessionWriter:
         self._queue.close()
         self._thread.join()
         with self._lock:
-            try:
-                if self._error is None:
-                    text = dump_yaml(self._metadata())
-                    self._mcap.add_metadata("rosbag2", {"serialized_metadata": text})
-                    self._mcap.finish()
-                    self._file.commit(self.config.sync)
-                self._write_metadata()
-            except OSError as error:
-                self._fail(error)
-            finally:
-                self._file.close()
+            if self._error is None:
+                try:
+                    self._finish_file()
+                    self._write_description(current=False)
+                except OSError as error:
+                    self._fail(error)
 
     def _run(self) -> None:
         while True:
@@ -224,20 +216,15 @@ class SessionWriter:
         return max(0.0, self._unsaved_s + self.config.chunk_s - time.monotonic())
 
     def _add(self, message: QueuedMessage) -> None:
-        topic = self._topics[message.topic]
         if self._error is not None:
             self._queue.dropped[message.topic] += 1
             return
-        self._mcap.add_message(
-            self._channels[message.topic],
-            log_time=message.log_time_ns,
-            data=message.data,
-            publish_time=message.publish_time_ns,
-            sequence=topic.count & 0xFFFFFFFF,
-        )
-        topic.count += 1
-        self._start_ns = message.log_time_ns if self._start_ns is None else min(self._start_ns, message.log_time_ns)
-        self._end_ns = max(self._end_ns, message.log_time_ns)
+        if self._file_is_full(message.log_time_ns):
+            self._finish_file()
+            self._file = self._new_file()
+            self._write_description()
+        number = self._topics[message.topic].count + self._file.topics[message.topic].count
+        self._file.add(message.topic, message.data, message.log_time_ns, message.publish_time_ns, number)
         if self._unsaved_s is None:
             self._unsaved_s = time.monotonic()
 
@@ -247,37 +234,99 @@ class SessionWriter:
         now = time.monotonic()
         due = self._unsaved_s is not None and now - self._unsaved_s >= self.config.chunk_s
         if due or ended:
-            self._check_space(now)
-            self._mcap.flush()
-            self._file.commit(self.config.sync)
+            if self._custom_news:
+                self._file.add_metadata(RECORD, self._custom_news)
+                self._custom.update(self._custom_news)
+                self._custom_news = {}
+                self._description_changed = True
+            self._file.save(self.config.sync)
             self._unsaved_s = None
-            if self._topics_changed:
-                self._topics_changed = False
-                self._write_metadata()
+            if self._description_changed:
+                self._description_changed = False
+                self._write_description()
+            if self._space_is_low(now):
+                self._end_early()
         elif self._file.pending:
             self._file.commit()
 
-    def _check_space(self, now: float) -> None:
+    # -- files -----------------------------------------------------------------------------------------
+
+    def _new_file(self) -> McapFile:
+        path = self.folder / f"{self.folder.absolute().name}_{len(self._finished)}.mcap"
+        file = McapFile(path, self.config.compression, self.config.chunk_kib * 1024)
+        for name, topic in self._topics.items():
+            file.register(topic, self._schemas[name])
+        if self._custom:
+            file.add_metadata(RECORD, self._custom)
+        file.commit(self.config.sync)
+        sync_folder(self.folder)
+        return file
+
+    def _file_is_full(self, log_time_ns: int) -> bool:
+        record, config = self._file.record, self.config
+        if not record.messages or record.start_ns is None:
+            return False
+        old = config.split_s > 0 and (log_time_ns - record.start_ns) * 1e-9 >= config.split_s
+        return old or (config.split_mib > 0 and self._file.size >= config.split_mib * _MIB)
+
+    def _finish_file(self) -> None:
+        text = dump_yaml(self._description(current=True))
+        self._file.add_metadata("rosbag2", {"serialized_metadata": text})
+        self._file.finish(self.config.sync)
+        self._keep_counts()
+
+    def _keep_counts(self) -> None:
+        for name, topic in self._file.topics.items():
+            self._topics[name].count += topic.count
+            topic.count = 0
+        self._finished.append(self._file.record)
+        self._file.record = FileRecord("")
+
+    # -- what can go wrong -----------------------------------------------------------------------------
+
+    def _space_is_low(self, now: float) -> bool:
         if now - self._space_checked_s < 1.0:
-            return
+            return False
         self._space_checked_s = now
-        if shutil.disk_usage(self.folder).free < self.config.free_mib * _MIB:
-            raise OSError(errno.ENOSPC, f"less than {self.config.free_mib} MiB left on the disk")
+        return shutil.disk_usage(self.folder).free < self.config.free_mib * _MIB
+
+    def _end_early(self) -> None:
+        """Finish the session while there is still room for that."""
+        self._finish_file()
+        self._write_description(current=False)
+        self._set_error(f"less than {self.config.free_mib} MiB left on the disk; the session is complete until then")
 
     def _fail(self, error: Exception) -> None:
-        reason = getattr(error, "strerror", None) or str(error).splitlines()[0] if str(error) else type(error).__name__
-        self._error = (
-            f"{self.folder}: the recording ended early: {reason}; what was written before stays "
-            "readable; make room and start a new session"
-        )
+        if self._error is not None:
+            return
+        reason = getattr(error, "strerror", None) or (str(error).splitlines() or [type(error).__name__])[0]
+        for topic, count in self._file.abandon().items():
+            self._queue.dropped[topic] += count
+        if self._file.record.name:
+            self._keep_counts()
+        self._set_error(f"{reason}; what was written before stays readable, `drocap recover` completes it")
+        try:
+            self._write_description(current=False)
+        except OSError:  # the files themselves tell the same, to whoever reads them
+            logger.debug("metadata.yaml of %s is not up to date", self.folder)
+
+    def _set_error(self, reason: str) -> None:
+        self._error = f"{self.folder}: the recording ended early: {reason}; make room and start a new session"
         logger.error("%s", self._error)
 
-    def _metadata(self) -> dict[str, Any]:
-        topics = [self._topics[name] for name in sorted(self._topics)]
-        return bag_metadata(self.path.name, topics, self._start_ns, self._end_ns, self._custom)
+    # -- what describes the session --------------------------------------------------------------------
 
-    def _write_metadata(self) -> None:
-        write_atomically(self.folder / METADATA_FILE, dump_yaml(self._metadata()))
+    def _description(self, current: bool) -> dict[str, Any]:
+        topics = []
+        for name in sorted(self._topics):
+            topic = self._topics[name]
+            count = topic.count + (self._file.topics[name].count if current else 0)
+            topics.append(TopicRecord(name, topic.type_name, topic.type_hash, topic.qos, count))
+        files = [*self._finished, self._file.record] if current else self._finished
+        return bag_metadata(files, topics, self._custom)
+
+    def _write_description(self, current: bool = True) -> None:
+        write_atomically(self.folder / METADATA_FILE, dump_yaml(self._description(current)))
 
     def _make_folder(self) -> None:
         folder = self.folder
@@ -299,20 +348,3 @@ class SessionWriter:
 
     def _cannot(self, error: OSError) -> InputError:
         return InputError(f"{self.folder}: expected a folder to write to; {error.strerror or error}; choose another")
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _library() -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return f"drocap_ros {version('drocap_ros')}; mcap {version('mcap')}"
-    except PackageNotFoundError:
-        return f"drocap_ros; mcap {version('mcap')}"

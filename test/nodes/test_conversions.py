@@ -2,10 +2,10 @@ from array import array
 
 import numpy as np
 import pytest
-from drocap_ros.msg import Pose3D
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.msg import Pose3D
 from drocap_ros.nodes import conversions as c
 from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.skeleton import BODY_15

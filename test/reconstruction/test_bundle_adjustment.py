@@ -176,3 +176,23 @@ def test_the_same_call_gives_the_same_bits() -> None:
 def test_wrong_shapes_are_refused(w: np.ndarray, s0: np.ndarray, match: str) -> None:
     with pytest.raises(InputError, match=match):
         bundle_adjust(w, s0)
+
+
+def test_a_window_of_nothing_but_noise_still_has_a_body() -> None:
+    rng = np.random.default_rng(0)
+    w, walk = rng.normal(size=(30, 15, 2)), make_walk(30)
+    result = bundle_adjust(w, walk.in_camera / 0.35)
+    assert np.isfinite(result.shape).all()
+    assert limb_lengths(result.shape).mean() > 0.1
+
+
+def test_noise_raises_the_weight_of_the_low_rank() -> None:
+    walk = make_walk(240)
+    w, scale = units(walk)
+    noisy = w + np.random.default_rng(0).normal(0.0, 0.04, w.shape)
+    start, truth = disturbed(walk, scale), 1000.0 * walk.in_camera
+    aware = bundle_adjust(noisy, start)
+    blind = bundle_adjust(noisy, start, config=BundleAdjusterConfig(noise_alpha=0.0))
+    assert pa_mpjpe(aware.camera_shape, truth).mean() < 0.9 * pa_mpjpe(blind.camera_shape, truth).mean()
+    clean = [bundle_adjust(w, start, config=BundleAdjusterConfig(noise_alpha=n)).shape for n in (0.0, 0.5)]
+    np.testing.assert_array_equal(clean[0], clean[1])

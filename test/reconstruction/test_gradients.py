@@ -12,9 +12,9 @@ from drocap_ros.reconstruction.articulation import articulation_term, best_rank_
 from drocap_ros.reconstruction.bundle_adjustment import Objective, shape_change, shape_change_gradient
 from drocap_ros.reconstruction.camera_update import rotation_change, rotation_gradient, turn, update_rotations
 from drocap_ros.reconstruction.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.data_term import Projection, information_from
+from drocap_ros.reconstruction.data_term import Projection, information_from, noise_std
 from drocap_ros.reconstruction.dictionary import Dictionary
-from drocap_ros.reconstruction.sparse_fit import basis_matrix, sparse_gradient
+from drocap_ros.reconstruction.sparse_fit import sparse_gradient
 
 F = 7
 
@@ -105,7 +105,7 @@ def test_sum_of_all_terms(projection: Projection, state: tuple[np.ndarray, np.nd
 
 def test_sparse_coefficients(projection: Projection, dictionary: Dictionary) -> None:
     rng = np.random.default_rng(3)
-    basis = basis_matrix(dictionary)
+    basis = dictionary.basis
     c = 0.3 * rng.normal(size=(len(basis), F))
     r = np.moveaxis(exp_so3(rng.normal(size=(F, 3))), 0, -1)
 
@@ -129,3 +129,20 @@ def test_rotation_updates_only_go_down(
         np.testing.assert_allclose(np.linalg.det(matrices), 1.0, atol=1e-9)
     assert np.all(np.diff(costs) <= 1e-9)
     assert costs[-1] < costs[0]
+
+
+def test_noise_is_measured_and_motion_is_not() -> None:
+    rng = np.random.default_rng(0)
+    t = np.arange(240) / 24.0
+    w = np.sin(2.0 * np.pi * t[:, None, None] * rng.uniform(0.2, 1.0, (15, 2)))
+    information = np.tile(np.array([1.0, 0.0, 1.0]), (240, 15, 1))
+    assert noise_std(w, information) < 0.005
+    noisy = w + rng.normal(0.0, 0.05, w.shape)
+    gross = rng.random((240, 15)) < 0.05
+    noisy[gross] += 3.0
+    assert noise_std(noisy, information) == pytest.approx(0.05, rel=0.35)
+    information[:, 3] = 0.0
+    noisy[:, 3] = 77.0
+    assert noise_std(noisy, information) == pytest.approx(0.05, rel=0.35)
+    assert noise_std(w[:5], information[:5]) == 0.0
+    assert noise_std(w, 0.0 * information) == 0.0

@@ -1,3 +1,5 @@
+import subprocess
+
 import pytest
 from recorded import START_NS, Messages, write_poses
 
@@ -18,3 +20,15 @@ def capture():
 def pose_session(tmp_path, messages, capture):
     write_poses(tmp_path / "session", messages, capture.tracks)
     return tmp_path / "session"
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A disk of 8 MB, where this machine lets us make one."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "none", str(place)], capture_output=True)
+    if made.returncode != 0:
+        pytest.skip("no permission to mount a tmpfs here")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)

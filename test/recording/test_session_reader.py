@@ -114,22 +114,40 @@ def test_camera_fixed_to_the_body_at_a_told_pitch(tmp_path, messages, capture):
     assert np.rad2deg(angle_between(tracks.camera_rotation, capture.camera_rotation)).max() < np.ptp(pitch) + 0.2
 
 
-def test_gap_in_the_telemetry_leaves_it_unknown(tmp_path, messages, capture):
+def test_short_gap_in_the_telemetry_is_bridged_and_told(tmp_path, messages, capture):
     record(tmp_path / "s", flight_entries(messages, capture, skip_s=(1.0, 2.5)))
     with open_session(tmp_path / "s") as session:
         tracks = read_pose2d(session)
+        assert len(tracks) == len(capture.tracks)
+        assert np.rad2deg(angle_between(tracks.camera_rotation, capture.camera_rotation))[:-1].max() < 2.0
+        assert any("the attitude was interpolated over gaps of up to 1.5 s" in w for w in session.warnings)
+
+
+def test_long_gap_in_the_telemetry_leaves_it_unknown(tmp_path, messages, capture):
+    record(tmp_path / "s", flight_entries(messages, capture, skip_s=(0.8, 3.2)))
+    with open_session(tmp_path / "s") as session:
+        tracks = read_pose2d(session)
+        assert len(tracks) == len(capture.tracks)
         assert tracks.camera_rotation is None
         assert tracks.camera_position is None
-        assert any("1.5 s from an attitude" in warning for warning in session.warnings)
+        assert any("2.4 s from an attitude" in warning for warning in session.warnings)
 
 
 def test_telemetry_that_starts_late(tmp_path, messages, capture):
-    record(tmp_path / "a", flight_entries(messages, capture, start_s=0.5))
-    record(tmp_path / "b", flight_entries(messages, capture, start_s=2.0))
+    record(tmp_path / "a", flight_entries(messages, capture, start_s=1.0))
+    record(tmp_path / "b", flight_entries(messages, capture, start_s=3.0))
     with open_session(tmp_path / "a") as session:
-        assert read_pose2d(session).camera_rotation is not None
+        tracks = read_pose2d(session)
+        assert any("27 pictures at the start or end lie up to 1.0 s" in w for w in session.warnings)
+    assert np.array_equal(tracks.stamp_ns, capture.tracks.stamp_ns[27:])
+    assert np.array_equal(tracks.keypoints, capture.tracks.keypoints[27:].astype(np.float32), equal_nan=True)
+    error = np.rad2deg(angle_between(tracks.camera_rotation, capture.camera_rotation[27:]))
+    assert error.max() < 3.0  # the first state holds for the three pictures right before it
+    assert np.median(error) < 0.01
     with open_session(tmp_path / "b") as session:
-        assert read_pose2d(session).camera_rotation is None
+        tracks = read_pose2d(session)
+    assert tracks.camera_rotation is None
+    assert len(tracks) == len(capture.tracks)
 
 
 def test_several_topics_the_named_one_counts(tmp_path, messages, capture):

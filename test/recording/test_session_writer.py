@@ -15,7 +15,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.recording.committed_file import CommittedFile
 from drocap_ros.recording.config import SessionRecorderConfig
 from drocap_ros.recording.schemas import schema_text
-from drocap_ros.recording.session_reader import open_session, read_pose2d
+from drocap_ros.recording.session_reader import open_session, read_pose2d, session_info
 from drocap_ros.recording.session_writer import SessionWriter
 
 POSE2D = NAMES["pose2d"]
@@ -206,7 +206,7 @@ def test_disk_full_in_mid_flight(tmp_path, messages, capture, monkeypatch):
     real = os.write
 
     def half_then_full(fd, view):
-        if fd != writer._file._fd:
+        if fd != writer._file._file._fd:
             return real(fd, view)
         if len(view) > 10:
             return real(fd, view[: len(view) // 2])
@@ -223,6 +223,81 @@ def test_disk_full_in_mid_flight(tmp_path, messages, capture, monkeypatch):
     writer.close()
     with open_session(tmp_path / "s") as session:
         assert [raw.log_time_ns for raw in session.raw_messages()] == [START_NS + i for i in range(20)]
+
+
+def test_a_real_disk_that_fills_up(small_disk, messages, capture):
+    folder = small_disk / "s"
+    writer = SessionWriter(folder, SessionRecorderConfig(chunk_s=0.05, free_mib=0, compression="none"))
+    writer.register("/a", POSE2D, schema_text(POSE2D))
+    writer.register("/image", NAMES["compressed"], schema_text(NAMES["compressed"]), image=True)
+    pose = messages.cdr(messages.pose2d(capture.tracks, 0, START_NS))
+    picture = messages.cdr(messages(NAMES["compressed"], data=np.zeros(100_000, np.uint8)))
+    sent = 0
+    while writer.error is None and sent < 1000:
+        writer.write("/a", pose, START_NS + sent)
+        writer.write("/image", picture, START_NS + sent)
+        sent += 1
+        time.sleep(0.005)
+    writer.close()
+    assert "No space left" in writer.error
+    assert writer.written + writer.dropped == 2 * sent  # each message is either there or counted as lost
+    with open_session(folder) as session:
+        there = list(session.raw_messages())
+    assert len(there) == writer.written > 50
+    assert [raw.log_time_ns for raw in there if raw.topic == "/a"] == [START_NS + i for i in range(len(there) // 2)]
+
+
+def test_little_space_left_ends_the_session_while_it_can_be_finished(small_disk, messages, capture):
+    from mcap.reader import make_reader
+
+    folder = small_disk / "s"
+    writer = SessionWriter(folder, SessionRecorderConfig(chunk_s=0.05, free_mib=4))
+    writer.register("/a", POSE2D, schema_text(POSE2D))
+    (small_disk / "filler").write_bytes(bytes(5 << 20))
+    pose = messages.cdr(messages.pose2d(capture.tracks, 0, START_NS))
+    end = time.monotonic() + 10
+    while writer.error is None and time.monotonic() < end:
+        writer.write("/a", pose, time.time_ns())
+        time.sleep(0.01)
+    assert "less than 4 MiB left" in writer.error
+    written = writer.written
+    writer.write("/a", pose, time.time_ns())
+    writer.close()
+    assert writer.dropped_by_topic["/a"] >= 1
+    with writer.path.open("rb") as file:
+        assert make_reader(file).get_summary().statistics.message_count == written > 0
+    assert session_info(folder).warnings == ()
+
+
+@pytest.mark.parametrize("by", [{"split_s": 1.0}, {"split_mib": 1}])
+def test_split_files_stand_by_themselves(tmp_path, messages, capture, by):
+    from mcap.reader import make_reader
+    from rosbags.highlevel import AnyReader
+
+    folder = tmp_path / "s"
+    config = SessionRecorderConfig(compression="none", chunk_kib=64, **by)
+    picture = messages.cdr(messages(NAMES["compressed"], data=np.zeros(30_000, np.uint8)))
+    with SessionWriter(folder, config, {"git_revision": "abc"}) as writer:
+        writer.register("/pose2d", POSE2D, schema_text(POSE2D))
+        writer.register("/image", NAMES["compressed"], schema_text(NAMES["compressed"]), image=True)
+        for i, stamp_ns in enumerate(capture.tracks.stamp_ns.tolist()):
+            writer.write("/pose2d", messages.cdr(messages.pose2d(capture.tracks, i, stamp_ns)), stamp_ns)
+            writer.write("/image", picture, stamp_ns)
+    files = sorted(folder.glob("*.mcap"))
+    assert [p.name for p in files] == [f"s_{i}.mcap" for i in range(4)]
+    for path in files:
+        with path.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            assert len(list(reader.iter_messages())) == reader.get_summary().statistics.message_count > 0
+            assert {m.name: m.metadata for m in reader.iter_metadata()}["drocap_ros"] == {"git_revision": "abc"}
+    with AnyReader([folder]) as bag:
+        assert bag.message_count == 240
+    with open_session(folder) as session:
+        assert session.info.message_count == 240
+        assert np.array_equal(read_pose2d(session).stamp_ns, capture.tracks.stamp_ns)
+        assert session.warnings == []
+        sequences = [raw.log_time_ns for raw in session.raw_messages(("/image",))]
+    assert sequences == capture.tracks.stamp_ns.tolist()
 
 
 def test_committed_file_never_ends_in_half_a_piece(tmp_path, monkeypatch):

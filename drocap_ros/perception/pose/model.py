@@ -36,7 +36,7 @@ class PoseModel:
         crop = crop_around(box, self.spec.input_size, self._padding)
         outputs = self.model(self._normalize(cut(image, crop)))
         corners = np.asarray(box, np.float32).reshape(2, 2)
-        in_crop = (corners + 0.5 - np.array(crop.centre, np.float32)) * crop.scale + np.array(crop.size) / 2 - 0.5
+        in_crop = (corners - np.array(crop.centre, np.float32)) * crop.scale + np.array(crop.size) / 2
         peaks = self._decode(outputs, in_crop.reshape(4))
         inverse = np.float32(1 / crop.scale)
         candidates = peaks.candidates.copy()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -20,6 +19,11 @@ from drocap_ros.perception.sources.stamps import StreamClock
 log = logging.getLogger(__name__)
 
 _FIRST_BACKOFF_S = 0.25
+
+_STREAM_OPTIONS = (
+    "rtsp_transport;tcp|fflags;nobuffer"
+    "|protocol_whitelist;file,pipe,rtp,udp,tcp,http,https,tls,rtsp,rtsps,srt,rtmp,crypto"
+)
 
 
 class Connection(Protocol):
@@ -220,16 +224,13 @@ def open_stream(url: str, config: ImageIngestConfig) -> LiveSource:
     def connect() -> Connection:
         import cv2
 
-        from drocap_ros.perception.sources.video import quiet_ffmpeg
+        from drocap_ros.perception.sources.video import ffmpeg_options, quiet_ffmpeg
 
         quiet_ffmpeg()
-        os.environ.setdefault(
-            "OPENCV_FFMPEG_CAPTURE_OPTIONS",
-            "rtsp_transport;tcp|fflags;nobuffer|protocol_whitelist;file,pipe,rtp,udp,tcp,http,https,tls,rtsp,rtsps,srt,rtmp,crypto",
-        )
         wait_ms = max(1000, round(2000 * config.stall_timeout_s))
         options = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 8000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, wait_ms]
-        capture = cv2.VideoCapture(url, cv2.CAP_FFMPEG, options)
+        with ffmpeg_options(_STREAM_OPTIONS):
+            capture = cv2.VideoCapture(url, cv2.CAP_FFMPEG, options)
         if not capture.isOpened():
             raise InputError("nothing answers there in a form that FFmpeg reads")
         return CaptureConnection(capture)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +27,25 @@ def quiet_ffmpeg() -> None:
 
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+
+#: OpenCV hands options to FFmpeg through one variable of the whole process.
+_OPTIONS_LOCK = threading.Lock()
+_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+
+
+@contextlib.contextmanager
+def ffmpeg_options(options: str | None) -> Iterator[None]:
+    """Options for the captures opened inside; a user's own in the environment come first."""
+    with _OPTIONS_LOCK:
+        if options is None or _OPTIONS in os.environ:
+            yield
+            return
+        os.environ[_OPTIONS] = options
+        try:
+            yield
+        finally:
+            del os.environ[_OPTIONS]
 
 
 class VideoSource(ImageSource):
@@ -51,7 +73,8 @@ class VideoSource(ImageSource):
         size = path.stat().st_size
         if size == 0:
             raise InputError(f"{path}: expected a video file, found 0 bytes; copy or record it again")
-        self._capture: Any = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        with ffmpeg_options(None):  # not while a stream is being opened with other options
+            self._capture: Any = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         if not self._capture.isOpened():
             raise InputError(
                 f"{path}: expected a video that FFmpeg can open, found {size} bytes without a readable header or index"

@@ -8,8 +8,8 @@ import numpy as np
 #: the log size's (1/s^2).  A runner turns at about 1 g, 5 lengths/s^2; a drone's yaw adds its own.
 _MEASURED = np.array([0.03, 0.03, 0.08, 0.08])
 _ACCELERATION = np.array([4.0, 4.0, 2.0, 2.0])
-#: A prediction over a longer time says nothing about velocity any more.
-_LONGEST_PREDICTION_S = 1.0
+#: Longest time over which a velocity carries on: after that a person has turned, stooped or stopped.
+_LONGEST_PREDICTION_S = 0.4
 
 
 class BoxMotion:

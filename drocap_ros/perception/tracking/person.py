@@ -69,6 +69,11 @@ class Person:
         # The squares are the histograms; blending these keeps their sum.
         self.look = np.sqrt((1 - rate) * self.look**2 + rate * look**2)
 
+    @property
+    def look_settled(self) -> bool:
+        """Whether the remembered look is a mean over enough images."""
+        return self._looks >= _LOOK_SETTLED
+
     def likeness(self, look: np.ndarray | None) -> float:
         """Similarity to a look in [0, 1]."""
         return similarity(self.look, look)

@@ -20,6 +20,11 @@ _HIDDEN_IOU = 0.25
 _MIXED_IOU = 0.1
 #: Below this likeness a detection that might also be somebody else is not the subject's.
 _STRANGE_LOOK = 0.85
+#: Below this, all of a sudden and at the same size, it is somebody else: sun and shade change one's own look to 0.8,
+#: stooping and coming in bit by bit to 0.6, but these change the box as well.
+_OTHER_LOOK, _SUDDEN_S, _SAME_SIZE = 0.7, 0.15, 0.2
+#: Quality from which a subject is seen clearly, so that its look can be trusted.
+_CLEARLY_SEEN = 0.6
 #: By so much somebody else's look must fit better.
 _LOOK_MARGIN = 0.05
 #: Least quality of a bystander who may claim a detection from the subject; parts and clutter score below.
@@ -30,6 +35,8 @@ _CLEAR_IOU = 0.5
 _LEAVING_SPEED = 0.15
 #: Share of the smaller box inside the larger from which both are one person.
 _PART = 0.75
+#: Distance to the next person, lengths, from which nobody is near.
+_ALONE = 0.4
 #: A bystander unseen for so long is forgotten.
 _BYSTANDER_S = 2.0
 #: Persons remembered at most; a crowd's rest is of no use.
@@ -72,10 +79,12 @@ class SubjectTracker:
         self._full_ns: int | None = None
         self._tile = 0
         self._started = False
+        self._coast_s = config.coast_s
+        self._last_ns: int | None = None
 
     def restart(self) -> None:
         """Forget all persons, since time began anew; track ids go on."""
-        self._persons, self._subject, self._full_ns, self._started = [], None, None, False
+        self._persons, self._subject, self._full_ns, self._started, self._last_ns = [], None, None, False, None
 
     def choose(self, box: np.ndarray) -> None:
         """Make the person in this box (4,) px the subject from the next image on, under a new track_id."""
@@ -90,7 +99,7 @@ class SubjectTracker:
         if self._wanted is not None:
             return list({window_around(self._wanted, image_size): None, None: None})
         subject = self._subject
-        if subject is not None and subject.unsure_s(stamp_ns) <= self._config.coast_s:
+        if subject is not None and subject.unsure_s(stamp_ns) <= self._coast_s:
             near = window_around(subject.motion.box_at(stamp_ns), image_size)
             due = self._full_ns is None or stamp_ns - self._full_ns >= self._config.full_frame_every_s * 1e9
             if near is None or due or stamp_ns < (self._full_ns or 0):
@@ -104,12 +113,42 @@ class SubjectTracker:
         self._tile = (self._tile + 1) % len(parts)
         return [None, parts[self._tile]]
 
+    def steady(self, image_size: tuple[int, int], stamp_ns: int) -> Subject | None:
+        """The subject predicted, if it was seen in the last image, stands free of others and clear of the edges."""
+        subject = self._subject
+        if subject is None or self._wanted is not None or self._last_ns is None or subject.sure_ns != self._last_ns:
+            return None
+        full_due = self._full_ns is None or stamp_ns - self._full_ns >= self._config.full_frame_every_s * 1e9
+        box = subject.motion.box_at(stamp_ns)
+        reach = _ALONE * subject.motion.length
+        around = box + reach * np.array([-1, -1, 1, 1])
+        solid = [p for p in self._persons if p is not subject and p.quality >= _SOLID_QUALITY]
+        others = np.array([p.motion.box_at(stamp_ns) for p in solid]).reshape(-1, 4)
+        near = (shared(around[None], others) > 0).any()
+        edge = 0.01 * max(image_size)
+        at_edge = (box[:2] < edge).any() or (box[2:] > np.array(image_size) - edge).any()
+        if full_due or near or at_edge:
+            return None
+        return Subject(self._track_id, box, subject.score, False)
+
+    def carry(self, box: np.ndarray, stamp_ns: int) -> None:
+        """Take the subject's box (4,) px from the pose network, in an image without detection."""
+        subject = self._subject
+        if subject is None:
+            return
+        for person in self._persons:
+            person.motion.predict(stamp_ns)
+        subject.motion.update(box)
+        subject.box = np.asarray(box, float)
+        subject.assure(stamp_ns)
+        self._last_ns = stamp_ns
+
     def second_look(
         self, image_size: tuple[int, int], stamp_ns: int, boxes: np.ndarray, scores: np.ndarray
     ) -> Window | None:
         """A tighter window for a subject whom the first detections (N, 4), (N,) do not show clearly, or None."""
         subject = self._subject
-        if subject is None or self._wanted is not None or subject.unsure_s(stamp_ns) > self._config.coast_s:
+        if subject is None or self._wanted is not None or subject.unsure_s(stamp_ns) > self._coast_s:
             return None
         box = subject.motion.box_at(stamp_ns)
         clear = scores >= self._config.detection_threshold
@@ -131,6 +170,10 @@ class SubjectTracker:
         """
         if roi is not None:
             self._take_roi(np.asarray(roi, float), stamp_ns)
+        # At a few images a second two missed ones are already long.
+        interval_s = 0.0 if self._last_ns is None else (stamp_ns - self._last_ns) * 1e-9
+        self._coast_s = max(self._config.coast_s, min(2.5 * interval_s, self._config.forget_s))
+        self._last_ns = stamp_ns
         for person in self._persons:
             person.motion.predict(stamp_ns)
         looks = [describe(image, box) for box in boxes]
@@ -154,7 +197,7 @@ class SubjectTracker:
 
         Returns the detections that have an owner.
         """
-        persons = [p for p in self._persons if p is not self._subject or p.unsure_s(stamp_ns) <= self._config.coast_s]
+        persons = [p for p in self._persons if p is not self._subject or p.unsure_s(stamp_ns) <= self._coast_s]
         solid = [p for p in persons if p is self._subject or p.quality >= _SOLID_QUALITY]
         thin = [p for p in persons if not any(p is q for q in solid)]
         sure = scores >= self._config.detection_threshold
@@ -166,6 +209,12 @@ class SubjectTracker:
             pairs = assign(free, boxes[at], scores[at], [looks[j] for j in at], stamp_ns, tight=wanted is not sure)
             for i, k in pairs:
                 person, j = free[i], int(at[k])
+                if person is self._subject and self._replaced(boxes[j], looks[j], stamp_ns):
+                    # A newcomer in the subject's place owns this detection from now on.
+                    self._persons.append(Person(boxes[j], float(scores[j]), stamp_ns, looks[j]))
+                    refused.add(id(person))
+                    used.add(j)
+                    continue
                 if person is self._subject and self._stranger(boxes[j], looks[j]):
                     refused.add(id(person))  # nor may a doubtful detection stand in for it
                     continue
@@ -176,6 +225,16 @@ class SubjectTracker:
                     person.learn_look(looks[j])
                 used.add(j)
         return used
+
+    def _replaced(self, box: np.ndarray, look: np.ndarray | None, stamp_ns: int) -> bool:
+        """Whether from one image to the next somebody of the same size but another look stands there."""
+        subject = self._subject
+        if subject is None or look is None or not subject.look_settled or subject.gap_s(stamp_ns) > _SUDDEN_S:
+            return False
+        if subject.quality < _CLEARLY_SEEN:
+            return False
+        growth = np.abs(np.log(np.maximum(box[2:] - box[:2], 1.0) / np.maximum(subject.box[2:] - subject.box[:2], 1.0)))
+        return bool(growth.max() < _SAME_SIZE) and subject.likeness(look) < _OTHER_LOOK
 
     def _stranger(self, box: np.ndarray, look: np.ndarray | None) -> bool:
         """Whether a detection near the subject looks unlike it and more like somebody else who was there."""
@@ -200,7 +259,7 @@ class SubjectTracker:
         """Remember sure detections without an owner as new persons."""
         known = boxes[sorted(used)].astype(float).reshape(-1, 4)
         subject = self._subject
-        if subject is not None and not self._left and 0.0 < subject.unsure_s(stamp_ns) <= self._config.coast_s:
+        if subject is not None and not self._left and 0.0 < subject.unsure_s(stamp_ns) <= self._coast_s:
             known = np.concatenate([known, subject.motion.box()[None]])
         for j in range(len(boxes)):
             if j in used or scores[j] < self._config.detection_threshold:
@@ -246,7 +305,7 @@ class SubjectTracker:
         subject = self._subject
         if subject is None or iou(roi[None], subject.motion.box()[None])[0, 0] < 0.1:
             self._wanted = roi
-        elif self._config.subject == "roi" and subject.unsure_s(stamp_ns) > 0.5 * self._config.coast_s:
+        elif self._config.subject == "roi" and subject.unsure_s(stamp_ns) > 0.5 * self._coast_s:
             subject.see(roi, 0.0, stamp_ns)
             subject.assure(stamp_ns)
 
@@ -272,8 +331,8 @@ class SubjectTracker:
         if self._subject is not None:
             if config.on_loss == "wait":
                 return
-            patience = 0.0 if self._left else config.give_up_s
-            if self._subject.unsure_s(stamp_ns) <= config.coast_s + patience:
+            patience = 0.0 if self._left else self._coast_s + config.give_up_s
+            if self._subject.unsure_s(stamp_ns) <= patience:
                 return
         sure = [
             p
@@ -308,7 +367,7 @@ class SubjectTracker:
 
     def _report(self, stamp_ns: int) -> Subject | None:
         subject = self._subject
-        if subject is None or subject.unsure_s(stamp_ns) > (0.0 if self._left else self._config.coast_s):
+        if subject is None or subject.unsure_s(stamp_ns) > (0.0 if self._left else self._coast_s):
             return None
         if subject.seen_ns == stamp_ns:
             return Subject(self._track_id, subject.box, subject.score, False)

@@ -1,0 +1,407 @@
+"""Figures of the recording: `python benchmarks/recording.py`, or some of its parts by name.
+
+load       recorder node under 1280x720 JPEG 30 Hz + poses 30 Hz + telemetry 50 Hz (`--seconds 300` for the full time)
+kills      SIGKILL at random moments, recover, read by three libraries (`--kills 200`)
+mutations  mutated copies of a session, tracks, tlog, ULog, DataFlash and SRT (`--mutations 1000`)
+long       a session of `--minutes 30` against one of a minute: time per frame, memory
+live       a simulated flight of `--flight 60` s, repeated offline bit for bit
+
+Each part runs in processes of its own, so that memory and processor time are that part's.  Results go to
+benchmarks/results/recording.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "test" / "recording")]
+PARTS = ("load", "kills", "mutations", "long", "live")
+CLOCK_TICKS = os.sysconf("SC_CLK_TCK")
+PAGE_MIB = os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []])
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--kills", type=int, default=10)
+    parser.add_argument("--mutations", type=int, default=100)
+    parser.add_argument("--minutes", type=int, default=5)
+    parser.add_argument("--flight", type=float, default=20.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results")
+    parser.add_argument("--cell", nargs="+", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.cell:
+        print(json.dumps(CELLS[args.cell[0]](*args.cell[1:])))
+        return 0
+    args.out.mkdir(parents=True, exist_ok=True)
+    target = args.out / "recording.json"
+    results = json.loads(target.read_text()) if target.exists() else {}
+    for part in args.parts or PARTS:
+        with tempfile.TemporaryDirectory(prefix="drocap_bench_") as folder:
+            results[part] = globals()[f"part_{part}"](args, Path(folder))
+        print(f"{part}: {json.dumps(results[part])}", flush=True)
+        target.write_text(json.dumps(results, indent=1) + "\n")
+    return 0
+
+
+def cell(*words: object) -> dict[str, Any]:
+    """Run a part of this file in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, __file__, "--cell", *map(str, words)], stdout=subprocess.PIPE, text=True, check=True
+    )
+    result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return result
+
+
+def peak_mib() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+# -- load --------------------------------------------------------------------------------------------------
+
+
+def part_load(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Publishers in this process, the recorder in its own, DDS between them."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
+    from drocap_ros.bringup import bringup
+    from drocap_ros.config import DrocapConfig
+    from drocap_ros.recording.session_reader import session_info
+
+    config = DrocapConfig().replace("session_recorder", session_dir=str(folder / "session"))
+    with bringup(config, ["session_recorder"], processes=True) as graph:
+        pid = graph.pid("session_recorder")
+        node = rclpy.create_node("load", namespace=graph.namespace, context=graph.node.context)
+        executor = SingleThreadedExecutor(context=graph.node.context)
+        executor.add_node(node)
+        sources = make_sources(node)
+        graph.wait_until(lambda: all(p.get_subscription_count() for p, *_ in sources), 20, "the recorder to listen")
+        drops: list[int] = []
+        usage = [process_usage(pid)]
+        begin = time.monotonic()
+        thread = threading.Thread(target=watch_process, args=(pid, begin, args.seconds, usage), daemon=True)
+        thread.start()
+        sent = publish_all(sources, begin, args.seconds)
+        thread.join()
+        time.sleep(1.0)
+        executor.shutdown()
+    info = session_info(folder / "session")
+    counts = {topic.name.rsplit("/", 1)[-1]: topic.count for topic in info.topics}
+    third = max(1, len(usage) // 3)
+    memory = [mib for _, mib in usage]
+    return {
+        "seconds": args.seconds,
+        "sent": sent,
+        "recorded": {name: counts.get(name.rsplit("/", 1)[-1], 0) for name in sent},
+        "warnings": [*info.warnings, *map(str, drops)],
+        "cores_used": round((usage[-1][0] - usage[0][0]) / (len(usage) - 1 or 1), 3),
+        "memory_mib_first_third": round(max(memory[:third]), 1),
+        "memory_mib_last_third": round(max(memory[-third:]), 1),
+        "mib_written": round(sum(p.stat().st_size for p in (folder / "session").iterdir()) / 2**20, 1),
+        "load_average": os.getloadavg()[0],
+    }
+
+
+def make_sources(node: Any) -> list[tuple[Any, Any, float, str]]:
+    """(publisher, function of a number -> message, Hz, topic)."""
+    import cv2
+    import numpy as np
+
+    from drocap_ros.msg import VehicleState
+    from drocap_ros.nodes.capture_simulator import observation_of
+    from drocap_ros.nodes.conversions import header_at, pose2d_to_ros
+    from drocap_ros.nodes.topics import TOPICS
+    from drocap_ros.simulation.capture import simulate_capture
+
+    tracks = simulate_capture(2.0, 30.0, 0).tracks
+    rng = np.random.default_rng(0)
+    scene = cv2.GaussianBlur(rng.integers(0, 255, (720, 1400, 3), dtype=np.uint8), (0, 0), 3)
+    scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
+    jpegs = [cv2.imencode(".jpg", np.ascontiguousarray(scene[:, i : i + 1280]))[1].tobytes() for i in range(0, 100, 10)]
+
+    def image(i: int) -> Any:
+        return TOPICS["image/compressed"].message(
+            header=header_at(time.time_ns(), "camera_optical"), format="jpeg", data=jpegs[i % len(jpegs)]
+        )
+
+    def pose(i: int) -> Any:
+        return pose2d_to_ros(observation_of(tracks, i % len(tracks), time.time_ns()), "camera_optical")
+
+    def state(_: int) -> Any:
+        return VehicleState(header=header_at(time.time_ns(), "map"), autopilot="px4", mode="OFFBOARD")
+
+    kinds = (("image/compressed", image, 30.0), ("pose2d", pose, 30.0), ("vehicle/state", state, 50.0))
+    return [
+        (node.create_publisher(TOPICS[topic].message, topic, TOPICS[topic].qos), make, hz, topic)
+        for topic, make, hz in kinds
+    ]
+
+
+def publish_all(sources: list[tuple[Any, Any, float, str]], begin: float, seconds: float) -> dict[str, int]:
+    sent = dict.fromkeys((topic for *_, topic in sources), 0)
+    while True:
+        due, publisher, make, topic = min(
+            ((begin + sent[topic] / hz, p, make, topic) for p, make, hz, topic in sources), key=lambda entry: entry[0]
+        )
+        if due - begin >= seconds:
+            return sent
+        time.sleep(max(0.0, due - time.monotonic()))
+        publisher.publish(make(sent[topic]))
+        sent[topic] += 1
+
+
+def watch_process(pid: int, begin: float, seconds: float, usage: list[tuple[float, float]]) -> None:
+    while time.monotonic() - begin < seconds:
+        time.sleep(1.0)
+        usage.append(process_usage(pid))
+
+
+def process_usage(pid: int) -> tuple[float, float]:
+    """Processor seconds and resident MiB so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return (int(fields[11]) + int(fields[12])) / CLOCK_TICKS, pages * PAGE_MIB
+
+
+# -- kills -------------------------------------------------------------------------------------------------
+
+
+def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    from test_recover import check_recovered, killed_session
+
+    rng = random.Random(args.seed)
+    messages, gaps, delays = 0, [], []
+    for i in range(args.kills):
+        delay_s = rng.uniform(0.02, 2.2)
+        begun_ns, killed_ns = killed_session(folder / f"s{i}", delay_s)
+        count, gap_s = check_recovered(folder / f"s{i}", begun_ns, killed_ns)
+        messages, delays = messages + count, [*delays, delay_s]
+        gaps.append(gap_s)
+        shutil.rmtree(folder / f"s{i}")
+    return {
+        "kills": args.kills,
+        "messages_recovered": messages,
+        "last_message_before_kill_s": {"median": sorted(gaps)[len(gaps) // 2], "worst": max(gaps)},
+    }
+
+
+# -- mutations ---------------------------------------------------------------------------------------------
+
+
+def part_mutations(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    return {
+        kind: cell("mutations", kind, args.mutations, args.seed, folder)
+        for kind in ("mcap", "npz", "tlog", "srt", "bin", "ulg")
+    }
+
+
+def cell_mutations(kind: str, count: str, seed: str, folder: str) -> dict[str, Any]:
+    from test_telemetry import mutated
+
+    whole = whole_file(kind, Path(folder))
+    rng = random.Random(f"{seed} {kind}")
+    path = Path(folder) / f"mutated.{kind}"
+    base_mib = peak_mib()
+    refused = used = 0
+    worst_s, faults = 0.0, []
+    signal.signal(signal.SIGALRM, _too_long)
+    for i in range(int(count)):
+        path.write_bytes(mutated(whole, rng))
+        begin = time.monotonic()
+        signal.setitimer(signal.ITIMER_REAL, 10.0)
+        try:
+            status, words = use(kind, path)
+        except BaseException as error:
+            status, words = 1, f"{type(error).__name__}: {error}"
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+        worst_s = max(worst_s, time.monotonic() - begin)
+        used, refused = used + (status == 0), refused + (status == 2)
+        if status not in (0, 2) or "Traceback" in words or (status == 2 and len(words.strip().splitlines()) > 1):
+            faults.append(f"{i}: {words.strip()[:200]}")
+            shutil.copy(path, Path(tempfile.gettempdir()) / f"drocap_fault_{i}.{kind}")
+    return {
+        "copies": int(count), "used": used, "refused": refused, "faults": faults[:5], "fault_count": len(faults),
+        "worst_s": round(worst_s, 2), "peak_mib": round(peak_mib()), "base_mib": round(base_mib),
+    }  # fmt: skip
+
+
+def _too_long(*_: object) -> None:
+    raise TimeoutError("longer than 10 s")
+
+
+def use(kind: str, path: Path) -> tuple[int, str]:
+    """What a command does with the file: its exit status and what it says on stderr."""
+    from drocap_ros.cli import main as drocap
+    from drocap_ros.config import DrocapConfig
+    from drocap_ros.errors import InputError
+    from drocap_ros.pipeline import read_input
+    from drocap_ros.recording.camera_telemetry import camera_poses
+    from drocap_ros.recording.telemetry import read_telemetry
+
+    said, out = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(out):
+        try:
+            if kind in ("mcap", "npz"):
+                status = drocap(["info", str(path)])
+                if status == 0:
+                    said.truncate(0)
+                    read_input(path, DrocapConfig(), None)
+            else:
+                log = read_telemetry(path)
+                camera_poses(log.track, log.track.stamp_ns[:100])
+                status = 0
+        except InputError as error:
+            said.write(f"{error}\n")
+            status = 2
+    return status, said.getvalue()
+
+
+def whole_file(kind: str, folder: Path) -> bytes:
+    import numpy as np
+    from dataflash import write_dataflash
+    from recorded import START_NS, Messages, write_poses
+    from test_telemetry import new_form, srt_text
+
+    from drocap_ros.recording.config import SessionRecorderConfig
+    from drocap_ros.simulation.capture import simulate_capture
+    from drocap_ros.tracks import save_tracks
+
+    media = ROOT.parent / "shared" / "media"
+    t = np.arange(0, 8, 0.05).round(3)
+    angles = np.stack([0.1 * np.sin(t), 0.05 * np.cos(t), 0.4 * t - 1], axis=1)
+    geodetic = np.stack([47 + 1e-5 * np.sin(t), 8 + 1e-5 * np.cos(t), 500 + 0.5 * t], axis=1)
+    if kind == "tlog":
+        return (media / "arduplane_vtol_sitl.tlog").read_bytes()[:200_000]
+    if kind == "ulg":
+        return (media / "px4_sample_small.ulg").read_bytes()[:300_000]
+    if kind == "srt":
+        return srt_text(t, [new_form(i, g, a) for i, (g, a) in enumerate(zip(geodetic, angles, strict=True))]).encode()
+    if kind == "bin":
+        return write_dataflash(folder / "whole.bin", t, angles, geodetic, angles).read_bytes()
+    tracks = simulate_capture(4, 30, seed=2, start_ns=START_NS).tracks
+    if kind == "npz":
+        save_tracks(folder / "whole.npz", tracks)
+        return (folder / "whole.npz").read_bytes()
+    return write_poses(folder / "s", Messages(), tracks, SessionRecorderConfig(chunk_kib=16)).read_bytes()
+
+
+# -- long sessions -----------------------------------------------------------------------------------------
+
+
+def part_long(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for minutes in (1, args.minutes):
+        session = folder / f"session{minutes}"
+        cell("write_long", minutes, session)
+        for what in ("read", "ba"):
+            result[f"{what}_{minutes}_min"] = cell("long", what, session)
+    for what in ("read", "ba"):
+        one, many = (result[f"{what}_{minutes}_min"]["ms_per_frame"] for minutes in (1, args.minutes))
+        result[f"{what}_ratio"] = round(many / one, 3)
+    return result
+
+
+def cell_write_long(minutes: str, folder: str) -> dict[str, Any]:
+    """The same simulated minute again and again, with telemetry at 50 Hz."""
+    import numpy as np
+    from recorded import NAMES, START_NS, Messages
+
+    from drocap_ros.recording.schemas import schema_text
+    from drocap_ros.recording.session_writer import SessionWriter
+    from drocap_ros.simulation.capture import simulate_capture
+    from drocap_ros.simulation.flight_path import SampledPath
+
+    messages, capture = Messages(), simulate_capture(60.0, 30.0, seed=5, start_ns=START_NS)
+    tracks = capture.tracks
+    path = SampledPath((tracks.stamp_ns - START_NS) * 1e-9, capture.camera_rotation, capture.camera_position)
+    poses = [messages.pose2d(tracks, i, START_NS) for i in range(len(tracks))]
+    states = [path.at(s) for s in np.arange(0, 60, 0.02)]
+    with SessionWriter(folder) as writer:
+        for name in ("pose2d", "state"):
+            writer.register(f"/drocap/{name}", NAMES[name], schema_text(NAMES[name]))
+        for minute in range(int(minutes)):
+            base_ns = START_NS + minute * 60 * 10**9
+            for i, pose in enumerate(poses):
+                pose.header = messages.header(base_ns + round(i / 30 * 1e9))
+                writer.write("/drocap/pose2d", messages.cdr(pose), base_ns + round(i / 30 * 1e9))
+            for i, state in enumerate(states):
+                stamp_ns = base_ns + i * 20_000_000
+                message = messages(
+                    NAMES["state"], header=messages.header(stamp_ns, "map"), position_enu_m=state.position_enu_m,
+                    orientation=messages.quaternion(state.orientation_xyzw),
+                    gimbal_orientation=messages.quaternion(state.gimbal_orientation_xyzw),
+                )  # fmt: skip
+                writer.write("/drocap/state", messages.cdr(message), stamp_ns)
+            while writer.queued_bytes > 8 << 20:
+                time.sleep(0.05)
+    assert writer.dropped == 0
+    return {"messages": writer.written}
+
+
+def cell_long(what: str, folder: str) -> dict[str, Any]:
+    from drocap_ros.config import DrocapConfig
+    from drocap_ros.pipeline import read_input, reconstruct_input
+
+    base_mib, begin = peak_mib(), time.process_time()
+    if what == "read":
+        frames = len(read_input(Path(folder), DrocapConfig(), None))
+    else:
+        motion, _ = reconstruct_input(folder, method=what, config=DrocapConfig())
+        frames = len(motion.joints3d)
+    seconds = time.process_time() - begin
+    return {
+        "frames": frames,
+        "ms_per_frame": round(1e3 * seconds / frames, 4),
+        "peak_mib": round(peak_mib()),
+        "base_mib": round(base_mib),
+    }
+
+
+# -- live against offline ----------------------------------------------------------------------------------
+
+
+def part_live(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    from drocap_ros.bringup import bringup
+    from drocap_ros.config import DrocapConfig
+    from drocap_ros.live_session import reconstruct_live, recorded_config
+    from drocap_ros.recording.session import open_session
+
+    config = DrocapConfig().replace("capture_simulator", seconds=args.flight)
+    config = config.replace("session_recorder", session_dir=str(folder / "session"))
+    nodes = ["capture_simulator", "initializer", "bundle_adjuster", "session_recorder"]
+    with bringup(config, nodes, processes=True) as graph:
+        graph.wait_finished("capture_simulator", timeout_s=5 * args.flight + 60)
+    with open_session(folder / "session") as session:
+        motion, _, agreement = reconstruct_live(session, recorded_config(session) or config)
+    return {
+        "flight_s": args.flight,
+        "frames": len(motion.joints3d),
+        "initial_compared_and_equal": agreement.initial,
+        "windows_compared_and_equal": agreement.windows,
+    }
+
+
+CELLS = {"mutations": cell_mutations, "write_long": cell_write_long, "long": cell_long}
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,42 @@
+"""``drocap export``: a motion for Blender, OpenSim and the like."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from drocap_ros.cli.motion_input import HELP, read_motion
+from drocap_ros.export import FORMATS
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the command's options; ``run`` is its action."""
+    units = "; ".join(f"{form}: {facts}" for form, facts in FORMATS.items())
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "export",
+        help="a motion as BVH, C3D, TRC, CSV or glTF",
+        description=f"Write a motion in the format of another tool. {units}. docs/export.md says more.",
+    )
+    parser.add_argument("motion", metavar="MOTION", type=Path, help=HELP)
+    parser.add_argument("--to", metavar="FORMAT", choices=tuple(FORMATS), required=True, help=", ".join(FORMATS))
+    parser.add_argument("--out", metavar="FILE", type=Path, help="file to write (default: beside MOTION)")
+    parser.add_argument("--quiet", action="store_true", help="say nothing")
+    parser.set_defaults(run=run)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Export and say what the file holds."""
+    from drocap_ros.cli.output import output_file
+    from drocap_ros.export import export_motion
+
+    path, motion = read_motion(args.motion)
+    out = args.out or path.with_suffix(f".{args.to}")
+    with output_file(out) as file:
+        notes = export_motion(motion, args.to, file)
+    if not args.quiet:
+        print(f"written: {out} ({len(motion.joints)} joints, {FORMATS[args.to]})")
+        for note in notes:
+            print(f"  {note}")
+    return 0

@@ -1,0 +1,40 @@
+"""``drocap report``: one HTML file that shows a motion and says how far to trust it."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from drocap_ros.cli.motion_input import HELP, read_motion
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the command's options; ``run`` is its action."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "report",
+        help="a motion as one HTML page that works offline",
+        description="Write one self-contained HTML file: 3D player, 2D keypoints, plots, warnings, provenance.",
+    )
+    parser.add_argument("motion", metavar="MOTION", type=Path, help=HELP)
+    parser.add_argument("--out", metavar="FILE", type=Path, help="file to write (default: report.html beside MOTION)")
+    parser.add_argument(
+        "--video", metavar="VIDEO", type=Path, help="video, picture folder or recording of MOTION, for its pictures"
+    )
+    parser.add_argument("--quiet", action="store_true", help="say nothing")
+    parser.set_defaults(run=run)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the report."""
+    from drocap_ros.cli.output import output_file
+    from drocap_ros.report.page import save_report
+
+    path, motion = read_motion(args.motion)
+    out = args.out or path.with_name("report.html")
+    with output_file(out) as file:
+        save_report(file, motion, video=args.video, command=args.command_line)
+    if not args.quiet:
+        print(f"written: {out} ({out.stat().st_size / 1e6:.1f} MB)")
+    return 0

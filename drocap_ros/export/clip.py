@@ -1,0 +1,140 @@
+"""A motion made ready for the formats of other tools: upright axes, a time line, its gaps known."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.motion import Motion, upright_joints
+from drocap_ros.tracks import MAX_FRAMES
+
+#: Stamps that stray from an even time line by less than this share of a frame count as even.
+EVEN_TOLERANCE = 0.05
+#: Times that differ by less than this share of a frame are the same.
+_SAME_FRAME = 1e-3
+#: What every format can hold as a name.
+_NAME = re.compile(r"[A-Za-z0-9_.-]{1,60}")
+#: glTF skins in one byte per joint, and what C3D readers accept.
+_MAX_JOINTS = 255
+#: Between two frames further apart than this nothing is known, and resampling leaves a gap.
+LONGEST_BRIDGE_S = 0.5
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Joints over time in the axes of an export.
+
+    positions : (F, P, 3) float64, m, NaN where unknown
+    joints, parents : P names; P parent indices, -1 at the root
+    times_s : (F,) s, 0 at the first frame
+    rate_hz : frames per second; of an uneven time line the inverse of its median step
+    up : "z" or "y"
+    notes : sentences on what was changed on the way
+    """
+
+    positions: np.ndarray
+    joints: tuple[str, ...]
+    parents: tuple[int, ...]
+    times_s: np.ndarray
+    rate_hz: float
+    up: str = "z"
+    notes: tuple[str, ...] = ()
+
+
+def clip_of(motion: Motion) -> Clip:
+    """Z-up clip of a motion.
+
+    Frame "world" keeps its axes (x east, y north, z up).  Frame "camera" (x right, y down, z forward) becomes
+    x right, y away from the camera, z up: its vertical is the camera's, and gravity is not known.
+
+    Raises
+    ------
+    InputError
+        When there are fewer than two frames, no joint is known in any of them, or joints are too many or
+        bear names that suit no format.
+    """
+    frames = len(motion.joints3d)
+    if frames < 2:
+        raise InputError(f"motion: expected at least 2 frames to animate, got {frames}; reconstruct a longer recording")
+    if not np.isfinite(motion.joints3d).all(axis=2).any():
+        raise InputError("motion: expected 3D joints in at least one frame, got NaN in all of them; see its report")
+    if len(motion.joints) > _MAX_JOINTS:
+        raise InputError(f"joints: expected at most {_MAX_JOINTS} joints, got {len(motion.joints)}; leave some out")
+    for name in motion.joints:
+        if not _NAME.fullmatch(name):
+            raise InputError(f"joints: expected names of letters, digits, _ . -, got {name[:60]!r}; rename the joint")
+    times = (motion.stamp_ns - motion.stamp_ns[0]) * 1e-9
+    step = float(np.median(np.diff(times)))
+    notes = []
+    if motion.frame == "camera":
+        notes.append("upright as the camera saw it: its vertical is the camera's, not gravity's")
+    if not motion.metric:
+        notes.append(f"scale from {motion.scale_source}, not measured")
+    return Clip(upright_joints(motion), motion.joints, motion.parents, times, 1.0 / step, notes=tuple(notes))
+
+
+def y_up(clip: Clip) -> Clip:
+    """The same clip with y up: (x, y, z) becomes (x, z, -y)."""
+    turned = clip.positions[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
+    return replace(clip, positions=turned, up="y")
+
+
+def at_constant_rate(clip: Clip) -> Clip:
+    """Clip on an even time line, for formats that know only a frame rate.
+
+    An uneven one is resampled, linearly, at the inverse of its median step; within gaps longer than
+    ``LONGEST_BRIDGE_S`` the result is NaN.
+
+    Raises
+    ------
+    InputError
+        When the even time line would need too many frames.
+    """
+    times, last = clip.times_s, float(clip.times_s[-1])
+    even_step = last / (len(times) - 1)
+    if np.abs(times - np.arange(len(times)) * even_step).max() <= EVEN_TOLERANCE * even_step:
+        return replace(clip, rate_hz=1.0 / even_step)
+    count = int(np.floor(last * clip.rate_hz + 1e-6)) + 1
+    if count > MAX_FRAMES:
+        raise InputError(
+            f"motion: expected at most {MAX_FRAMES} frames at a constant rate, its stamps span {last:.0f} s at"
+            f" {clip.rate_hz:.6g} Hz; export to csv or glb, or cut the recording"
+        )
+    even = np.arange(count) / clip.rate_hz
+    right = np.clip(np.searchsorted(times, even, side="left"), 1, len(times) - 1)
+    left, span = right - 1, times[right] - times[right - 1]
+    share = np.clip((even - times[left]) / span, 0.0, 1.0)
+    # A sample that falls on a frame is that frame, even where its neighbour is unknown or far.
+    on_left, on_right = (np.abs(even - times[i]) * clip.rate_hz < _SAME_FRAME for i in (left, right))
+    share = np.where(on_left, 0.0, np.where(on_right, 1.0, share))[:, None, None]
+    a, b = clip.positions[left], clip.positions[right]
+    mixed = np.where(share <= 0, a, np.where(share >= 1, b, (1 - share) * a + share * b))
+    mixed[(span > LONGEST_BRIDGE_S) & ~on_left & ~on_right] = np.nan
+    note = f"uneven stamps resampled, linearly, to {clip.rate_hz:.6g} Hz"
+    return replace(clip, positions=mixed, times_s=even, notes=(*clip.notes, note))
+
+
+def without_gaps(clip: Clip) -> Clip:
+    """Clip whose unknown joints are interpolated over time, held before the first and after the last known one.
+
+    Raises
+    ------
+    InputError
+        When a joint is never known.
+    """
+    known = np.isfinite(clip.positions).all(axis=2)
+    never = [name for name, seen in zip(clip.joints, known.any(axis=0), strict=True) if not seen]
+    if never:
+        raise InputError(f"motion: expected every joint in at least one frame, never known: {', '.join(never)}")
+    if known.all():
+        return clip
+    filled = clip.positions.copy()
+    for joint in np.flatnonzero(~known.all(axis=0)):
+        seen = known[:, joint]
+        for axis in range(3):
+            filled[:, joint, axis] = np.interp(clip.times_s, clip.times_s[seen], clip.positions[seen, joint, axis])
+    note = f"{np.count_nonzero(~known.all(axis=1))} frames with unknown joints interpolated over time"
+    return replace(clip, positions=filled, notes=(*clip.notes, note))

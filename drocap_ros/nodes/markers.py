@@ -1,0 +1,114 @@
+"""Poses and camera path as ``visualization_msgs/MarkerArray`` and TF: pure functions of messages."""
+
+from __future__ import annotations
+
+import numpy as np
+from builtin_interfaces.msg import Duration
+from geometry_msgs.msg import Point, Pose, Quaternion, TransformStamped, Vector3
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from drocap_ros.geometry.rotations import quaternion_from_matrix
+from drocap_ros.msg import Pose3D
+from drocap_ros.nodes.conversions import pose3d_from_ros, quaternion_to_ros
+from drocap_ros.skeleton import JointSet, joint_set
+
+_RIGHT, _LEFT, _MIDDLE = ((0.75, 0.22, 0.17), (0.14, 0.44, 0.64), (0.35, 0.35, 0.35))
+_UNCERTAIN = (0.95, 0.75, 0.1, 0.25)
+_PATH = (0.2, 0.7, 0.3, 0.9)
+#: Ellipsoids show two standard deviations.
+_SIGMAS = 2.0
+
+
+def pose_markers(message: Pose3D, lifetime_s: float) -> MarkerArray:
+    """Skeleton, joints and their uncertainty ellipsoids of one pose, in the pose's own frame, for a while.
+
+    Raises
+    ------
+    InputError
+        When the pose's arrays do not fit.
+    """
+    joints, _ = pose3d_from_ros(message)
+    if not len(joints):
+        return MarkerArray()
+    joints_of = joint_set(message.skeleton)
+    known = np.isfinite(joints).all(axis=1)
+    bones = [bone for bone in joints_of.bones if known[bone].all()]
+    lines = _marker(message.header, "skeleton", Marker.LINE_LIST)
+    lines.scale.x = 0.03
+    for bone in bones:
+        colour = _side_colour(joints_of, int(bone[1]))
+        lines.points += [_point(joints[i]) for i in bone]
+        lines.colors += [colour, colour]
+    balls = _marker(message.header, "joints", Marker.SPHERE_LIST)
+    balls.scale = Vector3(x=0.05, y=0.05, z=0.05)
+    for i in np.nonzero(known)[0]:
+        balls.points.append(_point(joints[i]))
+        balls.colors.append(_side_colour(joints_of, int(i)))
+    markers = [lines, balls, *_ellipsoids(message, joints, known)]
+    for marker in markers:
+        marker.lifetime = Duration(sec=int(lifetime_s), nanosec=int(lifetime_s % 1 * 1e9))
+    return MarkerArray(markers=markers)
+
+
+def _ellipsoids(message: Pose3D, joints: np.ndarray, known: np.ndarray) -> list[Marker]:
+    flat = np.array(message.covariance, np.float64)
+    if flat.size != 6 * len(joints):
+        return []
+    c = flat.reshape(-1, 6)
+    use = known & np.isfinite(c).all(axis=1)
+    matrices = c[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)[use]
+    variances, axes = np.linalg.eigh(matrices)
+    axes[np.linalg.det(axes) < 0, :, 0] *= -1.0  # a rotation, not a reflection
+    diameters = 2.0 * _SIGMAS * np.sqrt(np.maximum(variances, 1e-8))
+    markers = []
+    for number, xyzw, size in zip(np.nonzero(use)[0], quaternion_from_matrix(axes), diameters, strict=True):
+        ball = _marker(message.header, "uncertainty", Marker.SPHERE, int(number))
+        ball.pose = Pose(position=_point(joints[number]), orientation=quaternion_to_ros(xyzw))
+        ball.scale = Vector3(x=float(size[0]), y=float(size[1]), z=float(size[2]))
+        ball.color = _colour(*_UNCERTAIN)
+        markers.append(ball)
+    return markers
+
+
+def path_marker(header: Header, positions: np.ndarray) -> Marker:
+    """Path of the camera (N, 3) m in the header's frame, as a line."""
+    line = _marker(header, "camera_path", Marker.LINE_STRIP)
+    line.scale.x = 0.04
+    line.color = _colour(*_PATH)
+    line.points = [_point(p) for p in positions]
+    return line
+
+
+def body_transforms(message: Pose3D) -> list[TransformStamped]:
+    """One frame per joint, ``body_<id>/<joint>``, so that viewers without markers see the body too."""
+    joints, _ = pose3d_from_ros(message)
+    transforms = []
+    for name, p in zip(joint_set(message.skeleton).joints, joints, strict=False):
+        if np.isfinite(p).all():
+            transform = TransformStamped(header=message.header, child_frame_id=f"body_{message.track_id}/{name}")
+            transform.transform.translation = Vector3(x=float(p[0]), y=float(p[1]), z=float(p[2]))
+            transforms.append(transform)
+    return transforms
+
+
+def _marker(header: Header, namespace: str, kind: int, number: int = 0) -> Marker:
+    marker = Marker(header=header, ns=namespace, id=number, type=kind, action=Marker.ADD)
+    marker.pose.orientation = Quaternion(w=1.0)
+    marker.color = _colour(*_MIDDLE, 1.0)
+    return marker
+
+
+def _side_colour(joints: JointSet, joint: int) -> ColorRGBA:
+    if joints.mirror[joint] == joint:
+        return _colour(*_MIDDLE, 1.0)
+    right = joints.joints[joint].startswith("r")
+    return _colour(*(_RIGHT if right else _LEFT), 1.0)
+
+
+def _colour(red: float, green: float, blue: float, alpha: float) -> ColorRGBA:
+    return ColorRGBA(r=red, g=green, b=blue, a=alpha)
+
+
+def _point(p: np.ndarray) -> Point:
+    return Point(x=float(p[0]), y=float(p[1]), z=float(p[2]))

@@ -1,0 +1,93 @@
+"""Left and right legs kept apart over a whole recording.
+
+From the side both legs look alike, and networks exchange them for some images at a time.  Two hypotheses are
+followed through all images, that the network named the legs rightly and that it exchanged them: a change of
+hypothesis is a jump of the legs in the picture, and the second contradicts the network, the more the surer that
+is.  The cheapest course is found by dynamic programming (Viterbi), so what comes later helps to understand what
+came before; live, where there is no later, the network's own sides are published.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drocap_ros.skeleton import BODY_15
+
+_LEFT = np.array([BODY_15.index("lknee"), BODY_15.index("lankle")])
+_RIGHT = np.array([BODY_15.index("rknee"), BODY_15.index("rankle")])
+_HIPS = np.array([BODY_15.index("lhip"), BODY_15.index("rhip")])
+
+#: Standard deviation of a leg joint's step against the hips between two images, share of the box.
+_STEP_SIGMA = 0.04
+#: Most that one joint's step can cost: a gross error says nothing about sides.
+_MOST_COST = 8.0
+#: Price of contradicting the network, per pair of joints and unit of -log(1 - confidence).
+_CONTRADICTION = 0.12
+#: After such a gap nothing is known about where the legs were.
+_LONGEST_GAP_S = 0.25
+#: An exchanged leg was named wrongly by the network: it is a little less sure.
+_EXCHANGED_CONFIDENCE = 0.85
+
+
+def exchanged_legs(xy: np.ndarray, confidence: np.ndarray, stamp_ns: np.ndarray, box_size: np.ndarray) -> np.ndarray:
+    """Images in which the network most likely exchanged the legs.
+
+    Parameters
+    ----------
+    xy : (F, 15, 2) px of ``BODY_15``, NaN = not seen
+    confidence : (F, 15)
+    stamp_ns : (F,)
+    box_size : (F,) px, longer side of the person's box
+
+    Returns
+    -------
+    (F,) bool
+    """
+    step = _step_costs(xy, stamp_ns, box_size)
+    sure = np.minimum(confidence[:, _LEFT], confidence[:, _RIGHT])
+    price = -_CONTRADICTION * np.log1p(-np.clip(np.nan_to_num(sure), 0.0, 0.999)).sum(axis=1)
+    keep, change = step[:, 0].tolist(), step[:, 1].tolist()
+    right, wrong = 0.0, float(price[0])
+    origin = np.zeros((len(xy), 2), bool)  # per hypothesis: whether the image before was of the other one
+    for t in range(1, len(xy)):
+        origin[t] = wrong + change[t] < right + keep[t], right + change[t] < wrong + keep[t]
+        right, wrong = min(right + keep[t], wrong + change[t]), min(wrong + keep[t], right + change[t]) + price[t]
+    out = np.zeros(len(xy), bool)
+    now = wrong < right
+    for t in range(len(xy) - 1, -1, -1):
+        out[t] = now
+        now ^= origin[t, int(now)]
+    return out
+
+
+def _step_costs(xy: np.ndarray, stamp_ns: np.ndarray, box_size: np.ndarray) -> np.ndarray:
+    """(F, 2) cost of the legs' step to each image, with both images of one hypothesis and of different ones."""
+    relative = xy - xy[:, _HIPS].mean(axis=1, keepdims=True)
+    left, right = relative[:, _LEFT], relative[:, _RIGHT]
+    out = np.zeros((len(xy), 2))
+    scale = (_STEP_SIGMA * np.maximum(box_size[1:], 1.0))[:, None]
+
+    def cost(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        distance = np.linalg.norm(b[1:] - a[:-1], axis=2) / scale
+        return np.nan_to_num(np.minimum(0.5 * distance**2, _MOST_COST)).sum(axis=1)
+
+    out[1:, 0] = cost(left, left) + cost(right, right)
+    out[1:, 1] = cost(left, right) + cost(right, left)
+    out[1:][np.diff(stamp_ns) > _LONGEST_GAP_S * 1e9] = 0.0
+    return out
+
+
+def exchange(
+    xy: np.ndarray, covariance: np.ndarray, confidence: np.ndarray, exchanged: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Keypoints (F, 15, 2), covariance (F, 15, 3) and confidence (F, 15) with the legs of some images exchanged."""
+    order = np.arange(len(BODY_15))
+    order[_LEFT], order[_RIGHT] = _RIGHT, _LEFT
+    moved = order != np.arange(len(BODY_15))
+    lowered = confidence[:, order] * np.where(moved, _EXCHANGED_CONFIDENCE, 1.0)
+    which = exchanged[:, None]
+    return (
+        np.where(which[..., None], xy[:, order], xy),
+        np.where(which[..., None], covariance[:, order], covariance),
+        np.where(which, lowered, confidence),
+    )

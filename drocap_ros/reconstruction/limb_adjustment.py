@@ -1,0 +1,233 @@
+"""Refinement of the default method: poses of a window whose bones keep their lengths, by damped Gauss-Newton.
+
+The unknowns are the joints of all frames in camera axes, one length per bone, and how the person's size in the
+image changes over time (the zoom: 1 plus a piecewise linear function of time).  The cost is
+
+- a robust (Geman-McClure) distance of the projected joints from the 2D joints, weighted joint by joint,
+- the distance from the lifter's joints, weighted by its expected errors, robust in depth,
+- the deviation of every bone from its length times the zoom, as in the paper's articulation term,
+- the acceleration of the joints,
+- the change of the zoom.
+
+Its normal equations couple neighbouring frames only: a band, bordered by the lengths and the zoom.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drocap_ros.skeleton import BODY_15, RIGID_BONES, indices
+
+_CHAIN = BODY_15.bones
+#: Pairs of joints of (nearly) constant distance: the tree's bones, then the hips and the shoulders.
+SPANS = np.concatenate(
+    [_CHAIN, [indices(BODY_15.joints, ("rhip", "lhip")), indices(BODY_15.joints, ("lshoulder", "rshoulder"))]]
+)
+_RIGID = {tuple(indices(BODY_15.joints, pair)) for pair in RIGID_BONES} | {(0, 1), (0, 4)}
+#: Spread of each span's length on one person, mm: limbs are rigid, trunk and shoulder girdle are not.
+SPAN_STD_MM = np.array([4.0 if (p, c) in _RIGID else 20.0 for p, c in _CHAIN] + [4.0, 25.0])
+
+_SIZE = 3 * len(BODY_15)
+#: Squared residual, in standard deviations, at which a 2D joint is half believed.
+_BELIEF = 9.0
+_DEPTH_ROUNDING_MM = 15.0
+
+
+@dataclass(frozen=True)
+class LimbProblem:
+    """A window in mm of an ordinary person.
+
+    keypoints : (F, 15, 2); weight : (F, 15) 1/mm^2, 0 where not seen
+    prior : (F, 15, 3); prior_weight_xy : (F, 15) 1/mm^2; prior_weight_z : (F, 15) 1/mm
+    acceleration_weight : 1/mm^2, of second differences
+    zoom_basis : (F, K) value in each frame of the piecewise linear functions that the zoom is made of
+    zoom_precision : (K, K) inverse covariance of their coefficients
+    """
+
+    keypoints: np.ndarray
+    weight: np.ndarray
+    prior: np.ndarray
+    prior_weight_xy: np.ndarray
+    prior_weight_z: np.ndarray
+    acceleration_weight: float
+    zoom_basis: np.ndarray
+    zoom_precision: np.ndarray
+
+
+@dataclass(frozen=True)
+class LimbResult:
+    """joints (F, 15, 3) mm, lengths (16,) mm of :data:`SPANS`, zoom (F,), cost per term, iterations, stop reason."""
+
+    joints: np.ndarray
+    lengths: np.ndarray
+    zoom: np.ndarray
+    cost_terms: dict[str, float]
+    iterations: int
+    stop_reason: str
+
+
+def span_lengths(joints: np.ndarray) -> np.ndarray:
+    """(..., 16) distances over :data:`SPANS` of joints (..., 15, D)."""
+    return np.linalg.norm(joints[..., SPANS[:, 1], :] - joints[..., SPANS[:, 0], :], axis=-1)
+
+
+def zoom_model(frames: int, fps: float, std_per_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Basis (F, K) with a knot per second, and precision (K, K) of a random walk with a weak pull to zero."""
+    knots = max(int(np.ceil((frames - 1) / fps)) + 1, 2)
+    at = np.arange(frames) / fps
+    basis = np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(knots)))
+    step = np.diff(np.eye(knots), axis=0)
+    return basis, step.T @ step / std_per_s**2 + np.eye(knots) / (10 * std_per_s) ** 2
+
+
+class _Residuals:
+    """What the cost and its derivatives share at one point."""
+
+    def __init__(self, p: LimbProblem, joints: np.ndarray, lengths: np.ndarray, zooms: np.ndarray) -> None:
+        self.lengths = lengths
+        self.zoom = 1.0 + p.zoom_basis @ zooms
+        self.zoom_pull = p.zoom_precision @ zooms
+        self.image = joints[..., :2] - p.keypoints
+        square = np.square(self.image).sum(axis=-1) * p.weight
+        self.belief = 1.0 / (1.0 + square / _BELIEF)
+        self.flat = joints[..., :2] - p.prior[..., :2]
+        self.depth = joints[..., 2] - p.prior[..., 2]
+        self.rounded = np.sqrt(np.square(self.depth) + _DEPTH_ROUNDING_MM**2)
+        span = joints[:, SPANS[:, 1]] - joints[:, SPANS[:, 0]]
+        length = np.sqrt(np.square(span).sum(axis=-1) + 1e-6)
+        self.direction = span / length[..., None]
+        self.stretch = (length - self.zoom[:, None] * lengths) / SPAN_STD_MM
+        self.swing = joints[2:] - 2 * joints[1:-1] + joints[:-2]
+        self.terms = {
+            "reprojection": 0.5 * float((square * self.belief).sum()),
+            "lifter_image": 0.5 * float((p.prior_weight_xy * np.square(self.flat).sum(axis=-1)).sum()),
+            "lifter_depth": float((p.prior_weight_z * (self.rounded - _DEPTH_ROUNDING_MM)).sum()),
+            "articulation": 0.5 * float(np.square(self.stretch).sum()),
+            "acceleration": 0.5 * p.acceleration_weight * float(np.square(self.swing).sum()),
+            "zoom": 0.5 * float(zooms @ self.zoom_pull),
+        }
+        self.cost = sum(self.terms.values())
+
+
+def _gradient(p: LimbProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of the cost: (F, 15, 3) by the joints, (16 + K,) by the lengths and the zoom's coefficients."""
+    g = np.zeros(p.prior.shape)
+    g[..., :2] = (p.weight * np.square(r.belief))[..., None] * r.image + p.prior_weight_xy[..., None] * r.flat
+    g[..., 2] = p.prior_weight_z * r.depth / r.rounded
+    pull = (r.stretch / SPAN_STD_MM)[..., None] * r.direction
+    for k, (a, b) in enumerate(SPANS):
+        g[:, b] += pull[:, k]
+        g[:, a] -= pull[:, k]
+    swing = p.acceleration_weight * r.swing
+    g[2:] += swing
+    g[1:-1] -= 2 * swing
+    g[:-2] += swing
+    by_length = -(r.zoom[:, None] * r.stretch / SPAN_STD_MM).sum(axis=0)
+    by_zoom = r.zoom_pull - p.zoom_basis.T @ (r.stretch @ (r.lengths / SPAN_STD_MM))
+    return g, np.concatenate([by_length, by_zoom])
+
+
+def _band(p: LimbProblem, r: _Residuals) -> np.ndarray:
+    """Gauss-Newton matrix of the joints, (F * 45, 91): element [i, d] couples unknowns i and i + d."""
+    frames = len(p.prior)
+    diagonal = np.zeros(p.prior.shape)
+    diagonal[..., :2] = (p.weight * np.square(r.belief) + p.prior_weight_xy)[..., None]
+    diagonal[..., 2] = p.prior_weight_z / r.rounded
+    outer = r.direction[..., :, None] * r.direction[..., None, :] / np.square(SPAN_STD_MM)[:, None, None]
+    block = np.zeros((frames, len(BODY_15), 3, len(BODY_15), 3))
+    for k, (a, b) in enumerate(SPANS):
+        m = outer[:, k]
+        block[:, a, :, a] += m
+        block[:, b, :, b] += m
+        block[:, a, :, b] -= m
+        block[:, b, :, a] -= m
+    rows = block.reshape(frames, _SIZE, _SIZE)
+    band = np.zeros((frames, _SIZE, 2 * _SIZE + 1))
+    for i in range(_SIZE):
+        band[:, i, : _SIZE - i] = rows[:, i, i:]
+    band[:, :, 0] += diagonal.reshape(frames, _SIZE)
+    if frames > 2:
+        w = p.acceleration_weight
+        for offset, factor in ((0, 1.0), (1, 4.0), (2, 1.0)):
+            band[offset : frames - 2 + offset, :, 0] += factor * w
+        band[: frames - 2, :, _SIZE] -= 2 * w
+        band[1 : frames - 1, :, _SIZE] -= 2 * w
+        band[: frames - 2, :, 2 * _SIZE] += w
+    return band.reshape(frames * _SIZE, -1)
+
+
+def _border(p: LimbProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
+    """(16 + K, F * 45) coupling of lengths and zoom with the joints, and (16 + K, 16 + K) with each other."""
+    frames, knots = p.zoom_basis.shape
+    count = len(SPANS)
+    by_length = np.zeros((count, frames, len(BODY_15), 3))
+    by_size = np.zeros((frames, len(BODY_15), 3))
+    slope = r.direction / np.square(SPAN_STD_MM)[:, None]
+    for k, (a, b) in enumerate(SPANS):
+        pull = r.zoom[:, None] * slope[:, k]
+        by_length[k, :, b] = -pull
+        by_length[k, :, a] = pull
+        by_size[:, b] -= r.lengths[k] * slope[:, k]
+        by_size[:, a] += r.lengths[k] * slope[:, k]
+    by_zoom = p.zoom_basis.T[:, :, None] * by_size.reshape(1, frames, -1)
+    precision = 1.0 / np.square(SPAN_STD_MM)
+    corner = np.zeros((count + knots, count + knots))
+    corner[:count, :count] = np.diag(precision * np.square(r.zoom).sum())
+    # The product of the two unknowns bends the cost: its second derivative is left out, as in Gauss-Newton.
+    corner[:count, count:] = (precision * r.lengths)[:, None] * (r.zoom @ p.zoom_basis)
+    corner[count:, :count] = corner[:count, count:].T
+    corner[count:, count:] = (precision * np.square(r.lengths)).sum() * p.zoom_basis.T @ p.zoom_basis + p.zoom_precision
+    return np.concatenate([by_length.reshape(count, -1), by_zoom.reshape(knots, -1)]), corner
+
+
+def adjust_limbs(
+    problem: LimbProblem, joints: np.ndarray, lengths: np.ndarray, iterations: int, tolerance: float = 1e-3
+) -> LimbResult:
+    """Minimise the cost from a start.
+
+    Parameters
+    ----------
+    joints : (F, 15, 3) mm, the start; its bones should point to the right side of the image plane
+    lengths : (16,) mm of :data:`SPANS`
+    iterations : at most so many accepted steps
+    tolerance : relative decrease of the cost that ends the solve
+    """
+    from scipy.linalg.lapack import dpbtrf, dpbtrs
+
+    damping, stop = 1e-4, "iterations"
+    zooms = np.zeros(problem.zoom_basis.shape[1])
+    here = _Residuals(problem, joints, lengths, zooms)
+    done = 0
+    while done < iterations:
+        g, g_sizes = _gradient(problem, here)
+        band, (border, corner) = _band(problem, here), _border(problem, here)
+        right = np.concatenate([-g.reshape(1, -1), border])
+        accepted = False
+        for _ in range(8):
+            damped = band.copy()
+            damped[:, 0] = damped[:, 0] * (1 + damping) + 1e-2 * damping
+            factor, info = dpbtrf(damped.T, lower=1, overwrite_ab=1)
+            if info == 0:
+                x = dpbtrs(factor, right.T, lower=1)[0]
+                schur = corner + np.diag(damping * np.diag(corner)) - border @ x[:, 1:]
+                sizes = np.linalg.solve(schur, -g_sizes - border @ x[:, 0])
+                step = (x[:, 0] - x[:, 1:] @ sizes).reshape(joints.shape)
+                step_lengths, step_zooms = sizes[: len(SPANS)], sizes[len(SPANS) :]
+                there = _Residuals(problem, joints + step, lengths + step_lengths, zooms + step_zooms)
+                if there.cost <= here.cost:
+                    accepted = True
+                    break
+            damping = 10 * damping
+        if not accepted:
+            stop = "no descent"
+            break
+        decrease = here.cost - there.cost
+        joints, lengths, zooms, here = joints + step, lengths + step_lengths, zooms + step_zooms, there
+        damping *= 0.2
+        done += 1
+        if decrease <= tolerance * here.cost:
+            stop = "converged"
+            break
+    return LimbResult(joints, lengths, here.zoom, here.terms, done, stop)

@@ -1,0 +1,98 @@
+"""True scale from the camera's own motion: a foot on the ground stays where it is while the drone moves.
+
+Without a known length a monocular reconstruction is right up to a factor.  The camera's position is metric, so the
+factor is the one that keeps the feet still for as long as possible; only motion across the line of sight counts,
+which pixels measure well, not that along it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+#: Times over which a foot is compared with itself.
+LAGS_S = (0.15, 0.25, 0.4)
+
+#: Distance within which a foot counts as having stayed, m.
+STILL_M = 0.03
+
+#: Factors that are tried; people are not outside of it if the assumed height is that of a person.
+LOWEST, HIGHEST = 0.6, 1.6
+
+#: Pairs of frames that are looked at, spread over the recording.
+MOST_PAIRS = 4000
+
+
+@dataclass(frozen=True)
+class ScaleEstimate:
+    """Factor on the assumed scale, its relative standard deviation, and the share of feet that it keeps still."""
+
+    factor: float
+    std: float
+    support: float
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the motion of camera and feet fixes the scale: to 3 %, by a fifth of the pairs, off the limits."""
+        return self.std < 0.03 and self.support > 0.2 and LOWEST * 1.02 < self.factor < HIGHEST / 1.02
+
+
+def estimate_scale(feet: np.ndarray, camera_position: np.ndarray, stamp_ns: np.ndarray) -> ScaleEstimate | None:
+    """Scale that keeps feet still.
+
+    Parameters
+    ----------
+    feet : (F, N, 3) m at the assumed scale, camera to foot, world axes
+    camera_position : (F, 3) m, world axes
+    stamp_ns : (F,)
+
+    Returns
+    -------
+    ScaleEstimate, or None when the camera hardly moves or there are too few frames
+    """
+    gap, base = _pairs(feet, camera_position, stamp_ns)
+    # The camera has to move by more than a foot's uncertainty for its motion to say anything.
+    moved = np.linalg.norm(base, axis=1) > 5.0 * STILL_M
+    gap, base = gap[moved], base[moved]
+    if len(gap) < 50:
+        return None
+    # |base + factor * gap|^2 for all factors at once.
+    a, b, c = (np.sum(x * y, axis=1) for x, y in ((gap, gap), (gap, base), (base, base)))
+    factors = np.geomspace(LOWEST, HIGHEST, 200)
+    square = np.maximum(a[:, None] * factors**2 + 2.0 * b[:, None] * factors + c[:, None], 0.0)
+    score = np.exp(-0.5 * square / STILL_M**2).sum(0)
+    factor = float(factors[np.argmax(score)])
+    for _ in range(10):
+        weight = np.exp(-0.5 * np.maximum(a * factor**2 + 2.0 * b * factor + c, 0.0) / STILL_M**2)
+        if weight.sum() < 1e-9:
+            return None
+        factor = float(np.clip(-np.sum(weight * b) / np.sum(weight * a), LOWEST, HIGHEST))
+    support = float(weight.mean())
+    # Neighbouring pairs share their frames: as many independent ones as there are lags apart in time.
+    independent = max(support * len(gap) / 10.0, 1.0)
+    spread = np.sqrt(np.sum(weight * (a * factor**2 + 2.0 * b * factor + c)) / weight.sum() / 2.0)
+    lever = np.sqrt(np.sum(weight * a) / weight.sum())
+    return ScaleEstimate(factor, float(spread / (lever * factor * np.sqrt(independent))), support)
+
+
+def _pairs(feet: np.ndarray, camera: np.ndarray, stamp_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Changes (M, 3) of camera-to-foot vectors and of the camera over the lags, across the line of sight."""
+    gaps: list[np.ndarray] = []
+    bases: list[np.ndarray] = []
+    for lag_s in LAGS_S:
+        later = np.searchsorted(stamp_ns, stamp_ns + round(lag_s * 1e9))
+        first = np.flatnonzero(later < len(stamp_ns))
+        # A gap in the recording is no lag.
+        first = first[(stamp_ns[later[first]] - stamp_ns[first]) < 1.5e9 * lag_s]
+        stride = max(1, len(first) * feet.shape[1] * len(LAGS_S) // MOST_PAIRS)
+        first = first[::stride]
+        second = later[first]
+        sight = feet[first] + feet[second]
+        sight /= np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), 1e-9)
+        for out, change in (
+            (gaps, feet[second] - feet[first]),
+            (bases, np.broadcast_to((camera[second] - camera[first])[:, None], feet[first].shape)),
+        ):
+            out.append((change - np.sum(change * sight, axis=-1, keepdims=True) * sight).reshape(-1, 3))
+    return np.concatenate(gaps), np.concatenate(bases)

@@ -1,0 +1,33 @@
+"""Threads of the linear algebra while a solver runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from typing import Any
+
+
+@contextmanager
+def blas_threads(count: int) -> Iterator[None]:
+    """Hold BLAS to ``count`` threads.
+
+    The solvers multiply thousands of small matrices: a second thread brings nothing, costs a factor of twenty where
+    another process has the core (measured), and makes the last bits depend on the machine.  Without threadpoolctl
+    the environment's setting (``OMP_NUM_THREADS``) stays.
+    """
+    controller = _controller()
+    if controller is None:
+        yield
+    else:
+        with controller.limit(limits=count, user_api="blas"):
+            yield
+
+
+@lru_cache(maxsize=1)
+def _controller() -> Any:
+    try:
+        from threadpoolctl import ThreadpoolController
+    except ImportError:
+        return None
+    return ThreadpoolController()

@@ -1,0 +1,80 @@
+"""From ``Pose2D`` messages to observations, whoever decoded them: rclpy in the live graph, rosbags from a file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.perception.observation import PoseObservation
+from drocap_ros.skeleton import joint_set
+
+if TYPE_CHECKING:
+    from drocap_ros.recording.session import Session
+
+
+def observation_from_message(message: Any) -> PoseObservation:
+    """Message -> observation; its arrays stay float32, as they were sent.
+
+    Raises
+    ------
+    InputError
+        When the skeleton is unknown, an array has the wrong length, a value is infinite or the stamp is negative.
+    """
+    joints = joint_set(message.skeleton)
+    count = len(joints) if message.track_id else 0
+    stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+    if stamp_ns < 0:
+        raise InputError(f"stamp: expected a time after 1970, got {stamp_ns} ns; set the sender's clock")
+    if message.image_width < 1 or message.image_height < 1:
+        raise InputError(f"image size: expected at least 1x1 px, got {message.image_width}x{message.image_height}")
+    return PoseObservation(
+        stamp_ns=stamp_ns,
+        track_id=message.track_id,
+        joints=joints,
+        image_size=(message.image_width, message.image_height),
+        roi=np.array(message.roi, np.float32),
+        detection_score=message.detection_score,
+        keypoints=float_array(message.keypoints, (count, 2), "keypoints"),
+        covariance=float_array(message.covariance, (count, 3), "covariance"),
+        confidence=float_array(message.confidence, (count,), "confidence"),
+    )
+
+
+def float_array(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
+    """Flat ``float32[]`` of a message -> array of a shape.
+
+    Raises
+    ------
+    InputError
+        When the length does not fit or a value is infinite.
+    """
+    wanted = int(np.prod(shape))
+    if len(values) != wanted:
+        raise InputError(f"{name}: expected {wanted} values for shape {shape}, got {len(values)}")
+    result = np.array(values, np.float32).reshape(shape)
+    if np.isinf(result).any():
+        raise InputError(f"{name}: expected finite values or NaN where unknown, got infinity")
+    return result
+
+
+def read_observations(session: Session, topic: str) -> Iterator[PoseObservation]:
+    """Observations of a topic in the order of the recording; what a live node would refuse is left out."""
+    refused = 0
+    for _, message in session.messages((topic,)):
+        observation = _observation_or_none(message)
+        if observation is None:
+            refused += 1
+        else:
+            yield observation
+    if refused:
+        session.warn(f"{refused} messages on {topic} were refused, as the live graph does")
+
+
+def _observation_or_none(message: Any) -> PoseObservation | None:
+    try:
+        return observation_from_message(message)
+    except InputError:
+        return None

@@ -1,0 +1,81 @@
+"""What to know of a session years later: versions, revision, models, and where it was recorded."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import subprocess
+from collections.abc import Mapping
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from drocap_ros import __version__
+
+#: Keys of a session's metadata.
+CONFIGURATION, MODELS, CALIBRATION = "configuration", "models", "calibration"
+_PACKAGES = ("numpy", "scipy", "onnxruntime", "opencv-python-headless", "mcap", "pymavlink", "rclpy")
+_BLOCK = 1 << 20
+
+
+def session_provenance(namespace: str = "") -> dict[str, str]:
+    """Metadata of a session from the start: versions (JSON), git revision and namespace of the graph."""
+    values = {"versions": json.dumps(_versions(), sort_keys=True)}
+    revision = _git_revision()
+    if revision:
+        values["git_revision"] = revision
+    if namespace:
+        values["namespace"] = namespace
+    return values
+
+
+def configuration_text(sections: Mapping[str, Mapping[str, Any]]) -> str:
+    """Parameters by node as YAML, in the form of a configuration file."""
+    import yaml
+
+    content = {f"/**/{name}": {"ros__parameters": dict(values)} for name, values in sorted(sections.items())}
+    return str(yaml.safe_dump(content, sort_keys=True))
+
+
+def model_hashes(folder: str | Path) -> str:
+    """SHA-256 of the ONNX files in a folder, as JSON by name; ``{}`` where there are none."""
+    folder = Path(folder)
+    hashes = {}
+    for path in sorted(folder.glob("*.onnx")) if folder.is_dir() else []:
+        digest = hashlib.sha256()
+        with path.open("rb") as file:
+            while block := file.read(_BLOCK):
+                digest.update(block)
+        hashes[path.name] = digest.hexdigest()
+    return json.dumps(hashes, sort_keys=True)
+
+
+def dated_name(now_ns: int) -> str:
+    """Name of a new session, from the clock: ``session_20260131T235959Z``."""
+    moment = datetime.fromtimestamp(now_ns * 1e-9, tz=timezone.utc)
+    return f"session_{moment:%Y%m%dT%H%M%SZ}"
+
+
+def _versions() -> dict[str, str]:
+    from importlib.metadata import distributions
+
+    ours = {"drocap_ros": __version__, "python": platform.python_version(), "machine": platform.machine()}
+    there = {d.metadata["Name"]: d.version for d in distributions() if d.metadata["Name"] in _PACKAGES}
+    return {**ours, **there}
+
+
+def _git_revision() -> str:
+    """Revision of the source tree that runs, with ``+`` where it was changed since; empty outside one."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return ""
+
+    def git(*words: str) -> str:
+        done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, timeout=5, check=True)
+        return done.stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.SubprocessError):
+        return ""

@@ -1,0 +1,15 @@
+"""Parameters of what is drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drocap_ros.parameters import Parameters, param
+
+
+@dataclass(frozen=True)
+class VisualizerConfig(Parameters):
+    """What the visualizer draws of the camera's path."""
+
+    path_points: int = param(600, "points of the camera's path that are kept", minimum=2, maximum=100_000)
+    path_period_s: float = param(0.2, "time between two of them", unit="s", minimum=0.01, maximum=60)

@@ -1,0 +1,205 @@
+"""What can be said about a motion without a ground truth: the numbers behind the report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.geometry.alignment import torso_frame
+from drocap_ros.motion import Motion, upright_joints
+from drocap_ros.skeleton import RIGID_BONES, JointSet, indices
+
+#: Directions of view and of the body are averaged over this time.
+_SMOOTH_S = 0.5
+#: A knee counts as bent from this angle on; below it the side to which it bends is noise.
+_BENT_DEG = 25.0
+_TORSO = ("pelvis", "neck", "lhip", "rhip", "lshoulder", "rshoulder")
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Numbers of one motion of F frames, P joints, B rigid bones; NaN where nothing is known.
+
+    times_s : (F,) s from the first frame
+    seen : (F,) bool, any keypoint found
+    missing : (P,) share of frames without the joint's keypoint
+    error_px : (F,) root mean square over joints of the reprojection error
+    joint_error_px : (P,) the same over frames
+    rms_px, median_px : reprojection error of all joints in all frames
+    body_px : median diagonal of the keypoints' bounding box, at least 1
+    bones, bone_lengths_m : B names; (F, B) lengths
+    bone_spread : (B,) standard deviation over mean of each bone's length
+    view_deg : (F,) azimuth of the camera as the body sees it (0 in front, positive to its left), unwrapped
+    view_speed_dps, view_span_deg : median speed and range of that
+    heading_rad : (F,) direction into which the body faces, about the vertical
+    knees_forward : share of bent knees that bend forward; NaN where none is bent
+    bent_knees : number of bent knees that were judged
+    """
+
+    times_s: np.ndarray
+    seen: np.ndarray
+    missing: np.ndarray
+    error_px: np.ndarray
+    joint_error_px: np.ndarray
+    rms_px: float
+    median_px: float
+    body_px: float
+    bones: tuple[str, ...]
+    bone_lengths_m: np.ndarray
+    bone_spread: np.ndarray
+    view_deg: np.ndarray
+    view_speed_dps: float
+    view_span_deg: float
+    heading_rad: np.ndarray
+    knees_forward: float
+    bent_knees: int
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames per second, by the median step; 0 for a single frame."""
+        return float(1.0 / np.median(np.diff(self.times_s))) if len(self.times_s) > 1 else 0.0
+
+
+def measure(motion: Motion) -> Measures:
+    """Numbers of a motion.
+
+    Raises
+    ------
+    InputError
+        When the joints that define a torso are missing, or no joint is known in any frame.
+    """
+    indices(motion.joints, _TORSO)
+    if not np.isfinite(motion.joints3d).all(axis=2).any():
+        raise InputError(
+            "motion: expected 3D joints in at least one frame, got NaN in all of them; is the person in view?"
+        )
+    times = (motion.stamp_ns - motion.stamp_ns[0]) * 1e-9
+    found = np.isfinite(motion.keypoints).all(axis=2)
+    square = np.square(motion.reprojection_px)
+    joints = upright_joints(motion)
+    torso = _torso(joints, motion)
+    view = _view_azimuth(torso, camera_axes(motion)[:, 2], times)
+    speed = np.abs(np.gradient(view, times)) if len(times) > 1 else np.zeros(1)
+    bones, lengths = _bones(joints, motion)
+    forward, judged = _knees(joints, motion, torso[..., 0])
+    return Measures(
+        times_s=times,
+        seen=found.any(axis=1),
+        missing=1.0 - found.mean(axis=0),
+        error_px=np.sqrt(mean_known(square, 1)),
+        joint_error_px=np.sqrt(mean_known(square, 0)),
+        rms_px=float(np.sqrt(mean_known(square, None))),
+        median_px=_median(motion.reprojection_px),
+        body_px=_body_size(motion.keypoints),
+        bones=bones,
+        bone_lengths_m=lengths,
+        bone_spread=_spread(lengths),
+        view_deg=np.degrees(view),
+        view_speed_dps=float(np.degrees(np.median(speed))),
+        view_span_deg=float(np.degrees(np.ptp(view))),
+        heading_rad=_heading(torso, times),
+        knees_forward=forward,
+        bent_knees=judged,
+    )
+
+
+def mean_known(values: np.ndarray, axis: int | None) -> np.ndarray:
+    """Mean over the values that are not NaN; NaN where there are none."""
+    known = np.isfinite(values)
+    count = known.sum(axis=axis)
+    total = np.where(known, values, 0.0).sum(axis=axis)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def camera_axes(motion: Motion) -> np.ndarray:
+    """(F, 3, 3) rows right, down, forward of the camera in the axes of ``upright_joints``."""
+    if motion.frame == "world":
+        return motion.camera_rotation
+    return np.tile(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), (len(motion.joints3d), 1, 1))
+
+
+def smooth(values: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+    """Moving average over ``_SMOOTH_S`` along the first axis; shorter at the ends."""
+    if len(values) < 2:
+        return values
+    half = max(1, round(0.5 * _SMOOTH_S / float(np.median(np.diff(times_s)))))
+    total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
+    at = np.arange(len(values))
+    first, last = np.maximum(at - half, 0), np.minimum(at + half + 1, len(values))
+    return (total[last] - total[first]) / (last - first).reshape(-1, *[1] * (values.ndim - 1))
+
+
+def _torso(joints: np.ndarray, motion: Motion) -> np.ndarray:
+    """(F, 3, 3), columns forward, left, up; frames without a torso take the nearest one before or after."""
+    use = indices(motion.joints, _TORSO)
+    known = np.isfinite(joints[:, use]).all(axis=(1, 2))
+    if not known.any():
+        return np.tile(np.eye(3), (len(joints), 1, 1))
+    last = np.maximum.accumulate(np.where(known, np.arange(len(joints)), -1))
+    nearest = np.where(last >= 0, last, np.flatnonzero(known)[0])
+    return torso_frame(joints[nearest], JointSet("motion", motion.joints, motion.parents))
+
+
+def _view_azimuth(torso: np.ndarray, forward: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+    to_camera = -np.einsum("fij,fi->fj", torso, forward)
+    to_camera = smooth(to_camera, times_s)
+    return np.unwrap(np.arctan2(to_camera[:, 1], to_camera[:, 0]))
+
+
+def _heading(torso: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+    # Left across the vertical rather than forward: a body that bends forward keeps its left.
+    left = smooth(torso[..., 1], times_s)
+    return np.unwrap(np.arctan2(-left[:, 0], left[:, 1]))
+
+
+def _bones(joints: np.ndarray, motion: Motion) -> tuple[tuple[str, ...], np.ndarray]:
+    here = [(a, b) for a, b in RIGID_BONES if a in motion.joints and b in motion.joints]
+    ends = np.array([indices(motion.joints, bone) for bone in here])
+    lengths = np.linalg.norm(joints[:, ends[:, 1]] - joints[:, ends[:, 0]], axis=2)
+    return tuple(f"{a} - {b}" for a, b in here), lengths
+
+
+def _median(values: np.ndarray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else float("nan")
+
+
+def _spread(lengths: np.ndarray) -> np.ndarray:
+    """(B,) standard deviation over mean of lengths (F, B)."""
+    mean = mean_known(lengths, 0)
+    deviation = np.sqrt(mean_known(np.square(lengths - mean), 0))
+    return np.where(mean > 0, deviation / np.where(mean > 0, mean, 1.0), np.nan)
+
+
+def _body_size(keypoints: np.ndarray) -> float:
+    found = np.isfinite(keypoints).all(axis=2)
+    enough = found.sum(axis=1) >= 4
+    if not enough.any():
+        return float("nan")
+    points, known = keypoints[enough], found[enough][..., None]
+    high = np.where(known, points, -np.inf).max(axis=1)
+    low = np.where(known, points, np.inf).min(axis=1)
+    return max(float(np.median(np.linalg.norm(high - low, axis=1))), 1.0)
+
+
+def _knees(joints: np.ndarray, motion: Motion, forward: np.ndarray) -> tuple[float, int]:
+    """Share of bent knees that bend forward, and how many were bent."""
+    bent = ahead = 0
+    for side in "lr":
+        if not {f"{side}hip", f"{side}knee", f"{side}ankle"} <= set(motion.joints):
+            continue
+        hip, knee, ankle = np.moveaxis(
+            joints[:, indices(motion.joints, (f"{side}hip", f"{side}knee", f"{side}ankle"))], 1, 0
+        )
+        thigh, shank = _unit(knee - hip), _unit(ankle - knee)
+        # The knee lies off the line from hip to ankle, to the side of thigh minus shank.
+        judged = np.degrees(np.arccos(np.clip(np.sum(thigh * shank, axis=1), -1.0, 1.0))) > _BENT_DEG
+        bent += int(judged.sum())
+        ahead += int((np.sum((thigh - shank) * forward, axis=1)[judged] > 0).sum())
+    return (ahead / bent if bent else float("nan")), bent
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)

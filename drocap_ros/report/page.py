@@ -1,0 +1,173 @@
+"""``report.html``: one file that shows a motion and says how far to trust it; needs no network."""
+
+from __future__ import annotations
+
+import json
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from drocap_ros.motion import Motion
+from drocap_ros.report import plots
+from drocap_ros.report.findings import Finding, findings
+from drocap_ros.report.measures import Measures, mean_known, measure
+from drocap_ros.report.page_data import page_data, script_json
+from drocap_ros.report.pictures import Pictures, read_pictures
+from drocap_ros.skeleton import side_of
+
+_SCRIPTS = ("data.js", "scene.js", "picture.js", "player.js")
+
+
+def save_report(path: str | Path, motion: Motion, *, video: Path | None = None, command: str = "") -> None:
+    """Write the report of a motion.
+
+    Parameters
+    ----------
+    video : what the motion was reconstructed from, for its pictures; None = 2D keypoints alone
+    command : command line that made the report, shown beside the one in the motion's ``meta``
+
+    Raises
+    ------
+    InputError
+        When the motion holds no pose or lacks the joints of a torso, or the video cannot be used.
+    """
+    pictures = read_pictures(video, motion) if video is not None else None
+    Path(path).write_text(render_report(motion, pictures, command), encoding="utf-8")
+
+
+def render_report(motion: Motion, pictures: Pictures | None = None, command: str = "") -> str:
+    """HTML of the report; see :func:`save_report`."""
+    m = measure(motion)
+    folder = files("drocap_ros.report") / "page"
+    page = Template((folder / "page.html").read_text(encoding="utf-8"))
+    name = str(motion.meta.get("input", "motion"))
+    return page.substitute(
+        title=escape(name),
+        subtitle=escape(_subtitle(motion)),
+        style=(folder / "style.css").read_text(encoding="utf-8"),
+        tiles="".join(_tile(*tile) for tile in _tiles(motion, m)),
+        findings=_findings(findings(motion, m)),
+        plots="".join(_figure(*figure) for figure in _plots(motion, m)),
+        provenance=_provenance(motion, command),
+        parameters=escape(json.dumps(motion.meta, indent=1, sort_keys=True)),
+        data=script_json(page_data(motion, m, pictures)),
+        script="\n".join((folder / name).read_text(encoding="utf-8") for name in _SCRIPTS),
+    )
+
+
+def _subtitle(motion: Motion) -> str:
+    method = motion.meta.get("method", "unknown")
+    frame = "world frame, z up" if motion.frame == "world" else "camera frame"
+    return f"method {method} · {frame}"
+
+
+def _tile(value: str, unit: str, label: str) -> str:
+    return f'<div class="tile"><b>{escape(value)}<i>{escape(unit)}</i></b><span>{escape(label)}</span></div>'
+
+
+def _tiles(motion: Motion, m: Measures) -> list[tuple[str, str, str]]:
+    share = m.median_px / m.body_px
+    return [
+        (f"{m.times_s[-1]:.1f}", "s", f"{len(m.times_s)} frames at {m.rate_hz:.3g} Hz"),
+        (f"{100 * m.seen.mean():.0f}", "%", "of frames with a subject"),
+        (_number(m.median_px, ".1f"), "px", f"median reprojection error, {_number(100 * share, '.1f')} % of the body"),
+        (_number(100 * float(mean_known(m.bone_spread, None)), ".1f"), "%", "spread of bone lengths"),
+        (f"{m.view_speed_dps:.0f}", "°/s", f"view of the body, {m.view_span_deg:.0f}° in all"),
+        ("measured" if motion.metric else "assumed", "", f"scale, from {motion.scale_source.replace('_', ' ')}"),
+    ]
+
+
+def _number(value: float, form: str) -> str:
+    return format(value, form) if np.isfinite(value) else "-"
+
+
+def _findings(found: list[Finding]) -> str:
+    if not any(finding.level == "warning" for finding in found):
+        found = [Finding("good", "No warnings", "None of the automatic checks doubts this motion."), *found]
+    return "".join(
+        f'<li class="{finding.level}"><b>{escape(finding.title)}</b> {escape(finding.text)}</li>' for finding in found
+    )
+
+
+def _figure(title: str, caption: str, svg: str) -> str:
+    labelled = svg.replace("<svg ", f'<svg role="img" aria-label="{escape(title)}" ', 1)
+    return (
+        f'<figure><figcaption><b>{escape(title)}</b><output class="readout"></output></figcaption>'
+        f"{labelled}<p>{escape(caption)}</p></figure>"
+    )
+
+
+def _plots(motion: Motion, m: Measures) -> list[tuple[str, str, str]]:
+    sides = [side_of(joint, motion.joints) for joint in motion.joints]
+    bone_sides = [side_of(bone.split(" - ")[1], motion.joints) for bone in m.bones]
+    seconds = _stages(motion.meta.get("seconds"))
+    out = [
+        (
+            "Reprojection error",
+            "Distance of the projected 3D joints from the 2D keypoints, RMS over joints.",
+            plots.line_plot(m.times_s, m.error_px, unit="px", series="error"),
+        ),
+        (
+            "View of the body",
+            "Azimuth of the camera as the body sees it: 0° in front, 90° from its left. Its change is what makes"
+            " depth visible.",
+            plots.line_plot(m.times_s, m.view_deg, unit="°", series="view", from_zero=False),
+        ),
+        (
+            "Bone lengths",
+            "Median, and the range of 90 % of the frames. A bone that changes its length is a sign of depth errors.",
+            plots.range_plot(m.bones, 100 * m.bone_lengths_m, unit="cm", classes=bone_sides),
+        ),
+        (
+            "Confidence per joint",
+            "Mean over the frames, 0 to 1.",
+            plots.bar_plot(motion.joints, mean_known(motion.confidence, 0), form="{:.2f}", classes=sides, limit=1.0),
+        ),
+        (
+            "Error per joint",
+            "Reprojection error of each joint, RMS over the frames, px.",
+            plots.bar_plot(motion.joints, m.joint_error_px, form="{:.1f} px", classes=sides),
+        ),
+    ]
+    if seconds:
+        caption = "Seconds per stage; the total leaves the 2D poses out."
+        out.append(("Time", caption, plots.bar_plot(list(seconds), np.array([*seconds.values()]), form="{:.2f} s")))
+    return out
+
+
+def _stages(seconds: Any) -> dict[str, float]:
+    """Seconds per stage in the order in which the stages run; what is no number is left out."""
+    if not isinstance(seconds, dict):
+        return {}
+    known = ("pose2d", "initial", "ba", "total")
+    order = [*(k for k in known if k in seconds), *sorted(k for k in seconds if k not in known)]
+    return {k: float(seconds[k]) for k in order if isinstance(seconds[k], int | float)}
+
+
+def _provenance(motion: Motion, command: str) -> str:
+    meta = motion.meta
+    versions = meta.get("versions")
+    rows: list[tuple[str, Any]] = [
+        ("reconstructed by", meta.get("command")),
+        ("report by", command),
+        ("git revision", meta.get("git_revision")),
+        *(
+            (f"{name} version", version)
+            for name, version in sorted(versions.items() if isinstance(versions, dict) else ())
+        ),
+        ("solver", _solver(meta)),
+        ("scale", motion.scale_source.replace("_", " ")),
+    ]
+    return "".join(
+        f"<tr><th>{escape(name)}</th><td><code>{escape(str(value))}</code></td></tr>" for name, value in rows if value
+    )
+
+
+def _solver(meta: dict[str, Any]) -> str:
+    if "iterations" not in meta:
+        return ""
+    return f"{meta['iterations']} iterations, stopped by: {meta.get('stop_reason', 'unknown')}"

@@ -1,0 +1,76 @@
+"use strict";
+// The motion of the page: typed arrays in metres, seconds, radians and pixels, axes with z up.
+
+const motion = (() => {
+  const raw = JSON.parse(document.getElementById("motion").textContent);
+  const numbers = (list, unit) => Float32Array.from(list, (v) => (v === null ? NaN : v / unit));
+  return {
+    ...raw,
+    count: raw.frames.length,
+    root: raw.parents.indexOf(-1),
+    times: numbers(raw.times, 1000),
+    pose: numbers(raw.pose, 1000),
+    camera: numbers(raw.camera, 1000),
+    heading: numbers(raw.heading, 1000),
+    keypoints: numbers(raw.keypoints, 10),
+  };
+})();
+
+const vec = {
+  add: (a, b, s = 1) => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]],
+  dot: (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2],
+  cross: (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]],
+};
+
+const FOOT = 0.06; // m from the ankle to the floor
+
+const slice3 = (array, at) => [array[at], array[at + 1], array[at + 2]];
+const jointAt = (frame, joint) => slice3(motion.pose, 3 * (frame * motion.joints.length + joint));
+const keypointAt = (frame, joint) => {
+  const at = 2 * (frame * motion.joints.length + joint);
+  return [motion.keypoints[at], motion.keypoints[at + 1]];
+};
+const known = (point) => point.every(Number.isFinite);
+
+/** Axes of the camera in one frame. */
+function cameraAxes(frame) {
+  const right = slice3(motion.camera, 6 * frame), forward = slice3(motion.camera, 6 * frame + 3);
+  return { right, forward, down: vec.cross(forward, right) };
+}
+
+/** Mean of the known values of a list around a place. */
+function meanAround(list, place, half) {
+  const near = list.slice(Math.max(0, place - half), place + half + 1).filter(Number.isFinite);
+  return near.length ? near.reduce((sum, v) => sum + v, 0) / near.length : NaN;
+}
+
+/**
+ * Height of the floor in each frame. In the world it is one: where the lowest joints of most frames are.
+ * In the camera's frame the height of the body is not known, and it is shown standing on its lowest joint.
+ */
+const floors = (() => {
+  const lowest = Array.from({ length: motion.count }, (_, f) => {
+    const heights = motion.joints.map((_, j) => jointAt(f, j)[2]).filter(Number.isFinite);
+    return heights.length ? Math.min(...heights) : NaN;
+  });
+  const sorted = lowest.filter(Number.isFinite).sort((a, b) => a - b);
+  const usual = (sorted[Math.floor(sorted.length * 0.05)] ?? 0) - FOOT;
+  return lowest.map((_, f) => {
+    const here = motion.world ? NaN : meanAround(lowest, f, 1) - FOOT;
+    return Number.isFinite(here) ? here : usual;
+  });
+})();
+
+/** What the views look at in each frame: above the floor, where the root is, smoothed over time. */
+const targets = (() => {
+  const roots = Array.from({ length: motion.count }, (_, f) => jointAt(f, motion.root));
+  const columns = [0, 1].map((axis) => roots.map((p) => p[axis]));
+  const above = roots.map((p, f) => p[2] - floors[f]);
+  const height = (meanAround(above, 0, motion.count) || 0.9) - 0.02;
+  let last = [0, 0];
+  return roots.map((_, f) => {
+    const place = [0, 1].map((axis) => meanAround(columns[axis], f, 12));
+    if (place.every(Number.isFinite)) last = place;
+    return [...last, floors[f] + height];
+  });
+})();

@@ -1,0 +1,154 @@
+"""Studies and tables, on motions whose errors are known."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drocap_ros.cli import main
+from drocap_ros.errors import InputError
+from drocap_ros.evaluation.pair import compare, load_truth
+from drocap_ros.evaluation.rotation import measure, rotation_study
+from drocap_ros.evaluation.tables import study_markdown
+from drocap_ros.motion import Motion, save_motion
+from drocap_ros.reconstruction.protocol import protocol_sequences
+from drocap_ros.skeleton import BODY_15
+
+
+def stick(frames: int) -> np.ndarray:
+    """(F, 15, 3) m: a swaying figure."""
+    rng = np.random.default_rng(0)
+    body = np.zeros((15, 3))
+    for joint, parent in enumerate(BODY_15.parents):
+        if parent >= 0:
+            body[joint] = body[parent] + rng.normal(0, 0.1, 3) + (0, 0, 0.25 if joint >= 7 else -0.25)
+    time = np.arange(frames)[:, None, None]
+    return body + 0.05 * np.sin(0.2 * time + rng.uniform(0, 6, (1, 15, 3)))
+
+
+def motion(joints: np.ndarray, frame: str = "camera", fps: float = 24.0) -> Motion:
+    count = len(joints)
+    return Motion(
+        joints3d=joints,
+        joints=BODY_15.joints,
+        parents=BODY_15.parents,
+        stamp_ns=np.round(np.arange(count) * 1e9 / fps).astype(np.int64),
+        frame=frame,
+        metric=False,
+        scale_source="assumed_height",
+        camera_rotation=np.tile(np.eye(3), (count, 1, 1)),
+        confidence=np.ones((count, 15)),
+        keypoints=np.zeros((count, 15, 2)),
+        reprojection_px=np.zeros((count, 15)),
+    )
+
+
+def save_mocap(path, joints: np.ndarray, fps: float = 24.0) -> None:
+    np.savez(path, X=(1000 * joints).astype(np.float32), fps=fps, joints=np.array(BODY_15.joints))
+
+
+def test_a_perfect_motion_has_no_error_whatever_its_frame_and_scale(tmp_path):
+    x = stick(40)
+    save_mocap(tmp_path / "truth.npz", x)
+    angle = 0.7
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    errors = compare(motion(1.1 * x @ turn.T + 3.0), *load_truth(tmp_path / "truth.npz"))
+    assert errors.error_mm < 0.01
+    assert errors.scale_error == pytest.approx(0.1, abs=1e-4)
+    assert not errors.mirrored
+    assert np.isnan(errors.w_error_mm)
+    assert max(errors.per_group_mm.values()) < 0.01
+
+
+def test_a_mirrored_motion_is_called_mirrored():
+    x = stick(30)
+    errors = compare(motion(x * [1, 1, -1]), x, np.arange(30) / 24.0, "camera")
+    assert errors.mirrored
+    assert errors.mirrored_share == 1.0
+    assert errors.error_mm > 50.0
+
+
+def test_world_frames_give_world_errors_and_the_horizon():
+    x = stick(30)
+    tilt = np.radians(5.0)
+    turn = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    errors = compare(motion(x @ turn.T, "world"), x, np.arange(30) / 24.0, "world")
+    assert errors.horizon_deg == pytest.approx(5.0, abs=1e-3)
+    assert errors.w_error_mm < 1e-3
+
+
+def test_truth_at_another_rate_is_interpolated():
+    x = stick(61)
+    errors = compare(motion(x[::2], fps=12.0), x, np.arange(61) / 24.0, "camera")
+    assert errors.frames == 31
+    assert errors.error_mm < 1e-6
+
+
+def test_pairs_that_do_not_fit_are_refused(tmp_path):
+    x = stick(10)
+    with pytest.raises(InputError, match="finite"):
+        compare(motion(x), np.full_like(x, np.nan), np.arange(10) / 24.0, "camera")
+    with pytest.raises(InputError, match="found none"):
+        compare(motion(np.full_like(x, np.nan)), x, np.arange(10) / 24.0, "camera")
+    np.savez(tmp_path / "odd.npz", a=1)
+    with pytest.raises(InputError, match="expected MoCap"):
+        load_truth(tmp_path / "odd.npz")
+
+
+def test_pair_command_writes_its_files_and_refuses_bad_ones_with_status_2(tmp_path, capsys):
+    x = stick(30)
+    save_motion(tmp_path / "motion.npz", motion(x))
+    save_mocap(tmp_path / "truth.npz", x)
+    out = tmp_path / "out"
+    assert main(["evaluate", "pair", str(tmp_path), str(tmp_path / "truth.npz"), "--out", str(out)]) == 0
+    assert "| error mm |" in capsys.readouterr().out.replace("frames | error", "| error")
+    with (out / "pair.csv").open(encoding="utf-8") as file:
+        (line,) = csv.DictReader(file)
+    assert float(line["error_mm"]) < 0.01
+    assert line["mirrored"] == "False"
+    assert (out / "pair.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["evaluate", "pair", str(tmp_path / "none.npz"), str(tmp_path / "truth.npz")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "no such file" in said
+
+
+def test_rotation_command_over_a_small_folder(tmp_path, capsys):
+    save_mocap(tmp_path / "a.npz", stick(130))
+    save_mocap(tmp_path / "short.npz", stick(40))
+    out = tmp_path / "out"
+    words = ["evaluate", "rotation", str(tmp_path), "--speeds", "0", "25", "--methods", "ba", "initial", "--quiet"]
+    assert main([*words, "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert "mean over 1 sequences" in text
+    assert text == (out / "rotation.md").read_text(encoding="utf-8")
+    with (out / "rotation.csv").open(encoding="utf-8") as file:
+        lines = list(csv.DictReader(file))
+    assert [(r["method"], r["speed_deg_s"]) for r in lines] == [
+        ("ba", "0.0000"), ("ba", "25.0000"), ("initial", "0.0000"), ("initial", "25.0000"),
+    ]  # fmt: skip
+    assert (out / "rotation.png").read_bytes().startswith(b"\x89PNG")
+    assert main([*words[:2], str(tmp_path / "absent")]) == 2
+    assert main([*words, "--limit", "0"]) == 2
+    assert main(["evaluate", "rotation", str(tmp_path), "--speeds", "9999"]) == 2
+
+
+def test_rows_do_not_depend_on_the_number_of_processes(tmp_path):
+    save_mocap(tmp_path / "a.npz", stick(125))
+    one, two = (
+        rotation_study(tmp_path, speeds_deg_s=[25.0], methods=["initial"], processes=count, limit=1) for count in (1, 2)
+    )
+    assert [replace(r, seconds_initial=0.0, seconds_adjust=0.0) for r in one] == [
+        replace(r, seconds_initial=0.0, seconds_adjust=0.0) for r in two
+    ]
+    assert "single-view start" in study_markdown(one)
+
+
+def test_default_method_is_never_mirrored_on_unseen_people(shared):
+    for sequence in protocol_sequences(shared / "mocap" / "dev", limit=2):
+        row = measure(sequence, "ba", 25.0, noisy=True)
+        assert not row.mirrored
+        assert row.error_mm < 40.0

@@ -1,0 +1,154 @@
+"""Every format read back by an independent library: positions, names and rate are those of the motion."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from export_readers import READERS, gltf_array
+
+from drocap_ros.export import FORMATS, export_motion
+from drocap_ros.skeleton import BODY_15
+
+TOLERANCE_M = {"bvh": 0.005, "c3d": 0.001, "trc": 0.001, "csv": 0.001, "glb": 0.001}
+
+
+def written(motion, form, folder):
+    path = folder / f"motion.{form}"
+    notes = export_motion(motion, form, path)
+    return READERS[form](path), notes
+
+
+def in_order(back):
+    """Positions in the order of BODY_15: a hierarchy has its own."""
+    assert set(back.joints) == set(BODY_15.joints)
+    return back.positions[:, [back.joints.index(name) for name in BODY_15.joints]]
+
+
+def worst(back, truth):
+    return np.nanmax(np.linalg.norm(in_order(back) - truth, axis=-1))
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_positions_names_and_rate_are_kept(walker, tmp_path, form):
+    back, _ = written(walker, form, tmp_path)
+    assert back.positions.shape == (48, 15, 3)
+    assert worst(back, walker.joints3d) < TOLERANCE_M[form]
+    assert back.rate_hz == pytest.approx(24.0, rel=1e-5)
+    np.testing.assert_allclose(back.times_s, np.arange(48) / 24.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_motion_in_the_cameras_frame_stands_upright(in_camera, tmp_path, form):
+    back, notes = written(in_camera, form, tmp_path)
+    x, y, z = np.moveaxis(in_camera.joints3d, -1, 0)
+    assert worst(back, np.stack([x, z, -y], axis=-1)) < TOLERANCE_M[form]
+    positions = in_order(back)
+    assert (positions[:, BODY_15.index("head"), 2] > positions[:, BODY_15.index("rankle"), 2] + 1.0).all()
+    assert any("gravity" in note for note in notes)
+
+
+@pytest.mark.parametrize("form", ["c3d", "trc", "csv"])
+def test_gaps_stay_gaps_where_the_format_knows_them(with_gaps, tmp_path, form):
+    back, _ = written(with_gaps, form, tmp_path)
+    missing = np.isnan(with_gaps.joints3d).any(axis=2)
+    np.testing.assert_array_equal(np.isnan(in_order(back)).any(axis=2), missing)
+    assert worst(back, with_gaps.joints3d) < 0.001
+
+
+@pytest.mark.parametrize("form", ["bvh", "glb"])
+def test_gaps_are_bridged_where_the_format_has_no_word_for_them(walker, with_gaps, tmp_path, form):
+    back, notes = written(with_gaps, form, tmp_path)
+    error = np.linalg.norm(in_order(back) - walker.joints3d, axis=2)
+    known = np.isfinite(with_gaps.joints3d).all(axis=2)
+    # The bones are constant in the truth, not where a joint was interpolated along a chord.
+    assert error[known].max() < TOLERANCE_M[form]
+    assert error.max() < 0.15
+    assert any("10 frames with unknown joints interpolated" in note for note in notes)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_uneven_stamps(walker, tmp_path, form):
+    """A motion linear in time is resampled exactly; formats with their own stamps keep them."""
+    stamps = np.array([0, 40, 80, 125, 160, 200, 240, 300, 320, 360]) * 1_000_000
+    drift = np.arange(3)[None] * stamps[:, None] * 1e-9
+    joints = walker.joints3d[0] + drift[:, None]
+    frames = slice(0, len(stamps))
+    motion = dataclasses.replace(
+        walker,
+        joints3d=joints,
+        stamp_ns=stamps + 7_000_000_000,
+        camera_rotation=walker.camera_rotation[frames],
+        confidence=walker.confidence[frames],
+        keypoints=walker.keypoints[frames],
+        reprojection_px=walker.reprojection_px[frames],
+    )
+    back, notes = written(motion, form, tmp_path)
+    expected = walker.joints3d[0] + (np.arange(3)[None] * back.times_s[:, None])[:, None]
+    assert worst(back, expected) < TOLERANCE_M[form]
+    assert back.rate_hz == pytest.approx(25.0)
+    if form in ("csv", "glb"):
+        np.testing.assert_allclose(back.times_s, stamps * 1e-9, atol=1e-6)
+    else:
+        np.testing.assert_allclose(back.times_s, np.arange(10) * 0.04, atol=1e-5)
+        assert any("resampled" in note for note in notes)
+
+
+def test_nothing_is_invented_in_a_long_hole_between_frames(walker, tmp_path):
+    stamps = walker.stamp_ns.copy()
+    stamps[24:] += 2_000_000_000
+    motion = dataclasses.replace(walker, stamp_ns=stamps)
+    back, _ = written(motion, "trc", tmp_path)
+    missing = np.isnan(in_order(back)).all(axis=(1, 2))
+    hole = (back.times_s > stamps[23] * 1e-9 + 1e-6) & (back.times_s < stamps[24] * 1e-9 - 1e-6)
+    np.testing.assert_array_equal(missing, hole)
+    assert hole.sum() > 40
+
+
+def test_the_glb_holds_a_body_that_follows_the_joints(walker, tmp_path):
+    import pygltflib
+
+    export_motion(walker, "glb", tmp_path / "motion.glb")
+    document = pygltflib.GLTF2().load(str(tmp_path / "motion.glb"))
+    assert document.asset.extras["up_axis"] == "Y"
+    assert document.asset.extras["units"] == "m"
+    primitives = document.meshes[0].primitives
+    assert {document.materials[p.material].name for p in primitives} == {"left", "right", "middle"}
+    inverse = gltf_array(document, document.skins[0].inverseBindMatrices).reshape(-1, 4, 4)
+    rest = -inverse[:, 3, :3]
+    for primitive in primitives:
+        vertices = gltf_array(document, primitive.attributes.POSITION)
+        owner = gltf_array(document, primitive.attributes.JOINTS_0)[:, 0].astype(int)
+        normals = gltf_array(document, primitive.attributes.NORMAL)
+        assert len(vertices) % 3 == 0
+        np.testing.assert_allclose(gltf_array(document, primitive.attributes.WEIGHTS_0).sum(axis=1), 1.0)
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
+        assert np.linalg.norm(vertices - rest[owner], axis=1).max() < 0.12
+        # Faces look outwards: counter-clockwise corners turn as the normal says.
+        corners = vertices.reshape(-1, 3, 3)
+        turn = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert (np.sum(turn * normals[::3], axis=1) > 0).all()
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_the_same_motion_gives_the_same_bytes(walker, tmp_path, form):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        export_motion(walker, form, tmp_path / folder / f"motion.{form}")
+    assert (tmp_path / "a" / f"motion.{form}").read_bytes() == (tmp_path / "b" / f"motion.{form}").read_bytes()
+
+
+def test_ten_minutes_in_seconds(walker, tmp_path):
+    """14,400 frames: no loop over frames hides in the formats."""
+    import time
+
+    repeats = 300
+    many = {
+        name: np.concatenate([getattr(walker, name)] * repeats)
+        for name in ("joints3d", "camera_rotation", "confidence", "keypoints", "reprojection_px")
+    }
+    stamps = np.round(np.arange(48 * repeats) / 24.0 * 1e9).astype(np.int64)
+    long = dataclasses.replace(walker, **many, stamp_ns=stamps)
+    begin = time.process_time()
+    for form in ("bvh", "glb", "trc"):
+        export_motion(long, form, tmp_path / f"motion.{form}")
+    assert time.process_time() - begin < 20

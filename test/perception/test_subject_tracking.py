@@ -1,0 +1,201 @@
+"""The subject among others: painted persons with boxes as a detector would give them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drocap_ros.errors import ParameterError
+from drocap_ros.perception.config import PoseEstimatorConfig
+from drocap_ros.perception.tracking import SubjectTracker
+from drocap_ros.perception.tracking.search import inside, tiles, window_around
+
+SIZE = (640, 360)
+RED, BLUE, GREEN = ((40, 40, 200), (30, 30, 90)), ((200, 60, 30), (20, 20, 20)), ((60, 180, 60), (200, 200, 200))
+STEP = 33_333_333
+
+
+class Scene:
+    """Persons as coloured rectangles (shirt, trousers); later ones stand before earlier ones."""
+
+    def __init__(self, **config) -> None:
+        self.tracker = SubjectTracker(PoseEstimatorConfig(**config))
+        self.rng = np.random.default_rng(0)
+        self.index = 0
+
+    def show(self, persons, unseen=(), scores=None, roi=None):
+        """Persons: (x centre, y centre, height, colours); returns the subject."""
+        image = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
+        boxes = []
+        for x, y, height, (shirt, trousers) in persons:
+            width = 0.4 * height
+            x0, x1, y0, y1 = (int(v) for v in (x - width / 2, x + width / 2, y - height / 2, y + height / 2))
+            image[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = trousers
+            image[max(y0, 0) : max(int(y), 0), max(x0, 0) : max(x1, 0)] = shirt
+            boxes.append([x - width / 2, y - height / 2, x + width / 2, y + height / 2])
+        image = np.clip(image + self.rng.normal(0, 4, image.shape), 0, 255).astype(np.uint8)
+        boxes = np.clip(np.array(boxes, float).reshape(-1, 4), 0, [*SIZE, *SIZE])
+        seen = [i for i in range(len(persons)) if i not in unseen and boxes[i, 2] - boxes[i, 0] > 8]
+        boxes = boxes[seen] + self.rng.normal(0, 1.0, (len(seen), 4))
+        score = np.array([(scores or {}).get(i, 0.8) for i in seen])
+        stamp = self.index * STEP
+        self.index += 1
+        self.tracker.windows(SIZE, stamp)
+        return self.tracker.update(image, stamp, boxes, score, roi)
+
+
+def offset(subject, x: float, y: float = 180) -> float:
+    return float(np.hypot((subject.box[0] + subject.box[2]) / 2 - x, (subject.box[1] + subject.box[3]) / 2 - y))
+
+
+@pytest.mark.parametrize("front", [True, False], ids=["subject in front", "subject behind"])
+@pytest.mark.parametrize("speed", [4.0, 9.0])
+def test_a_crossing_keeps_the_subject(front, speed):
+    scene = Scene()
+    ids = set()
+    for t in range(int(440 / speed)):
+        x, other = 100 + speed * t, 540 - speed * t
+        subject_person, passer_by = (x, 180, 170, RED), (other, 180, 150, BLUE)
+        hidden = abs(x - other) < 45
+        if front:  # the detector sees the one in front only
+            subject = scene.show([passer_by, subject_person], unseen=(0,) if hidden else ())
+        else:
+            subject = scene.show([subject_person, passer_by], unseen=(0,) if hidden else ())
+        assert subject is not None
+        ids.add(subject.track_id)
+        if subject.score > 0:
+            assert offset(subject, x) < 30, t
+    assert ids == {1}
+    assert subject.score > 0
+
+
+def test_while_hidden_the_keypoints_would_be_somebody_elses():
+    scene = Scene()
+    for t in range(44):
+        scene.show([(300, 180, 185, RED), (80 + 4 * t, 180, 180, BLUE)])
+    states = [scene.show([(300, 180, 185, RED), (80 + 4 * t, 180, 180, BLUE)], unseen=(0,)) for t in range(44, 62)]
+    assert [(s.track_id, s.score) for s in states] == [(1, 0.0)] * 18
+    assert all(s.hidden for s in states[6:])  # from an overlap of a quarter on
+
+
+def test_missing_detections_are_bridged():
+    scene = Scene()
+    for t in range(60):
+        subject = scene.show([(100 + 5 * t, 180, 160, RED)], unseen=(0,) if t % 10 in (6, 7, 8) and t > 10 else ())
+        assert subject is not None
+        assert subject.track_id == 1
+        assert offset(subject, 100 + 5 * t) < 25
+
+
+def test_a_lost_subject_is_not_replaced_by_another_person():
+    scene = Scene()
+    for _ in range(20):
+        scene.show([(150, 180, 160, RED), (500, 180, 150, BLUE)])
+    after = [scene.show([(150 + 2 * t, 180, 160, BLUE)]) for t in range(120)]  # the other stands where the subject was
+    assert after[-1] is None
+    assert all(s is None or s.score == 0.0 for s in after)
+
+
+def test_a_lost_subject_is_taken_up_again_when_it_looks_the_same():
+    scene = Scene()
+    for _ in range(20):
+        scene.show([(300, 180, 160, RED)])
+    for _ in range(60):
+        scene.show([])
+    newcomers = [scene.show([(330, 180, 165, GREEN)]) for _ in range(10)]
+    assert newcomers[-1] is None
+    for _ in range(80):
+        scene.show([])
+    back = [scene.show([(340, 180, 160, RED)]) for _ in range(10)]
+    assert back[-1] is not None
+    assert back[-1].track_id == 1
+
+
+def test_who_left_the_picture_is_gone_and_the_next_has_another_number():
+    scene = Scene(on_loss="next")
+    for t in range(60):
+        scene.show([(300 + 8 * t, 180, 160, RED)])
+    assert scene.show([]) is None
+    newcomers = [scene.show([(40 + 6 * t, 180, 160, RED)]) for t in range(10)]
+    assert newcomers[-1].track_id == 2
+
+
+def test_waiting_means_waiting_until_somebody_chooses():
+    scene = Scene(on_loss="wait")
+    for t in range(60):
+        scene.show([(300 + 8 * t, 180, 160, RED)])
+    for t in range(60):
+        assert scene.show([(40 + 3 * t, 180, 160, BLUE)]) is None
+    scene.tracker.choose(np.array([200, 100, 270, 260]))
+    subject = scene.show([(223, 180, 160, BLUE)])
+    assert subject.track_id == 2
+    assert offset(subject, 223) < 10
+
+
+def test_the_largest_or_the_most_central_is_chosen():
+    persons = [(150, 180, 200, RED), (330, 180, 120, BLUE)]
+    assert offset(Scene(subject="largest").show(persons), 150) < 10
+    assert offset(Scene(subject="centre").show(persons), 330) < 10
+    boxed = Scene(subject="box", subject_box="300,120,360,240")
+    assert offset(boxed.show(persons), 330) < 10
+
+
+def test_the_drones_own_box_leads_and_carries_on():
+    scene = Scene(subject="roi")
+    persons = [(150, 180, 200, RED), (330, 180, 120, BLUE)]
+    assert scene.show(persons) is None  # nobody chosen yet
+    roi = np.array([300.0, 115, 360, 245])
+    assert offset(scene.show(persons, roi=roi), 330) < 10
+    for _ in range(40):  # the detector is blind, the drone is not
+        subject = scene.show(persons, unseen=(0, 1), roi=roi)
+        assert subject is not None
+    assert offset(subject, 330) < 10
+    moved = scene.show(persons, roi=np.array([110.0, 80, 190, 280]))
+    assert (moved.track_id, offset(moved, 150) < 10) == (2, True)
+
+
+def test_clutter_does_not_become_the_subject():
+    scene = Scene()
+    for _ in range(20):
+        scene.show([(300, 180, 160, RED)])
+    after = [scene.show([(320, 200, 140, GREEN)], scores={0: 0.22}) for _ in range(60)]
+    assert after[-1] is None
+
+
+def test_somebody_comes_into_the_picture_bit_by_bit():
+    scene = Scene(on_loss="next")
+    shown = [scene.show([(320, 360 + 80 - 12 * t, 200, RED)]) for t in range(20)]
+    assert {s.track_id for s in shown if s is not None} == {1}
+    assert sum(s is not None for s in shown) >= 15
+
+
+def test_two_runs_are_equal_to_the_bit():
+    runs = []
+    for _ in range(2):
+        scene = Scene()
+        boxes = [scene.show([(100 + 5 * t, 180, 160, RED), (500 - 5 * t, 180, 150, BLUE)]).box for t in range(60)]
+        runs.append(np.array(boxes))
+    assert (runs[0] == runs[1]).all()
+
+
+@pytest.mark.parametrize("text", ["", "1,2,3", "10,10,5,20", "a,b,c,d", "0,0,nan,5"])
+def test_a_wrong_subject_box_is_refused(text):
+    with pytest.raises(ParameterError, match="subject_box: expected x_min"):
+        SubjectTracker(PoseEstimatorConfig(subject="box", subject_box=text))
+
+
+def test_windows_lie_in_the_image_and_tiles_cover_it():
+    size = (1920, 1080)
+    for box in ([0, 0, 50, 120], [1880, 1000, 1920, 1080], [900, 500, 950, 620]):
+        x0, y0, x1, y1 = window_around(np.array(box, float), size)
+        assert 0 <= x0 < x1 <= 1920
+        assert 0 <= y0 < y1 <= 1080
+        assert x0 <= box[0]
+        assert x1 >= box[2]
+    covered = np.zeros((1080, 1920), bool)
+    for x0, y0, x1, y1 in tiles(size):
+        covered[y0:y1, x0:x1] = True
+    assert covered.all()
+    assert tiles((1280, 720)) == []
+    cut = inside(np.array([[100.0, 100, 200, 200], [300, 110, 400, 220]]), (100, 0, 500, 400), size)
+    assert cut.tolist() == [False, True]

@@ -1,0 +1,45 @@
+"""Writes a small ArduPilot DataFlash log: formats first, then messages in the order of time."""
+
+import struct
+
+import numpy as np
+
+HEAD = b"\xa3\x95"
+#: name -> type, format characters, struct codes, columns
+FORMATS = {
+    "FMT": (128, "BBnNZ", "<BB4s16s64s", "Type,Length,Name,Format,Columns"),
+    "GPS": (129, "QBIHLLf", "<QBIHiif", "TimeUS,Status,GMS,GWk,Lat,Lng,Alt"),
+    "ATT": (130, "Qfff", "<Qfff", "TimeUS,Roll,Pitch,Yaw"),
+    "POS": (131, "QLLf", "<Qiif", "TimeUS,Lat,Lng,Alt"),
+    "MNT": (132, "Qfff", "<Qfff", "TimeUS,Roll,Pitch,YawE"),
+}
+GPS_EPOCH_S = 315_964_800
+LEAP_S = 18
+START_UTC_S = 1_700_000_000
+
+
+def packed(name, *values):
+    number, _, codes, _ = FORMATS[name]
+    return HEAD + bytes([number]) + struct.pack(codes, *values)
+
+
+def write_dataflash(path, t, angles, geodetic=None, mount=None):
+    """Power-up 10 s before the first of times t (N,) s; angles roll pitch yaw rad; latitude, longitude, altitude."""
+    out = []
+    for name, (number, form, codes, columns) in FORMATS.items():
+        length = 3 + struct.calcsize(codes)
+        out.append(packed("FMT", number, length, name.encode(), form.encode(), columns.encode()))
+    for i, s in enumerate(t):
+        us = round((10 + s) * 1e6)
+        if geodetic is not None:
+            lat, lon = (round(v * 1e7) for v in geodetic[i, :2])
+            gps_s = START_UTC_S + s - GPS_EPOCH_S + LEAP_S
+            week, rest = divmod(gps_s, 604_800)
+            if i % 4 == 0:
+                out.append(packed("GPS", us, 3, round(rest * 1000), int(week), lat, lon, geodetic[i, 2]))
+            out.append(packed("POS", us, lat, lon, geodetic[i, 2]))
+        out.append(packed("ATT", us, *np.rad2deg(angles[i])))
+        if mount is not None:
+            out.append(packed("MNT", us, *np.rad2deg(mount[i])))
+    path.write_bytes(b"".join(out))
+    return path

@@ -1,0 +1,219 @@
+"""The report in a real browser: it draws, answers to keys, mouse and touch, and fits a narrow screen."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from browser import Browser, chromium
+
+from drocap_ros.report.page import render_report, save_report
+from drocap_ros.report.pictures import Pictures
+
+pytestmark = pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome on this machine")
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    browser = Browser(tmp_path_factory.mktemp("profile"))
+    yield browser
+    browser.close()
+
+
+@pytest.fixture(scope="module")
+def pages(walker, in_camera, one_frame, tmp_path_factory):
+    """A report with pictures, one without, one in the camera's frame, one of a single frame, one with gaps."""
+    import cv2
+
+    folder = tmp_path_factory.mktemp("pages")
+    grey = cv2.imencode(".jpg", np.full((200, 150, 3), 90, np.uint8))[1].tobytes()
+    low, high = np.nanmin(walker.keypoints, axis=(0, 1)), np.nanmax(walker.keypoints, axis=(0, 1))
+    box = (*(int(v) for v in low - 20), *(int(v) for v in high + 20))
+    pictures = Pictures(tuple(range(0, 60, 3)), (grey,) * 20, box, (150, 200))
+    (folder / "pictures.html").write_text(render_report(walker, pictures), encoding="utf-8")
+    joints = walker.joints3d.copy()
+    joints[10:20] = np.nan
+    joints[30, 3] = np.nan
+    for name, motion in (
+        ("plain", walker),
+        ("camera", in_camera),
+        ("single", one_frame),
+        ("gaps", dataclasses.replace(walker, joints3d=joints)),
+    ):
+        save_report(folder / f"{name}.html", motion)
+    return folder
+
+
+def drawn(browser, canvas):
+    """Number of pixels of a canvas that are not empty."""
+    return browser.run(
+        f"""(() => {{ const c = document.getElementById("{canvas}");
+        const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+        let n = 0; for (let i = 3; i < d.length; i += 4) n += d[i] > 0; return n; }})()"""
+    )
+
+
+def picture_of(browser, canvas):
+    return browser.run(f'document.getElementById("{canvas}").toDataURL()')
+
+
+def pressed(browser):
+    return browser.run('document.querySelector("[data-view][aria-pressed=true]").dataset.view')
+
+
+@pytest.mark.parametrize("name", ["pictures", "plain", "camera", "single", "gaps"])
+@pytest.mark.parametrize("width", [1280, 800, 400])
+def test_it_draws_without_errors_network_or_overflow(browser, pages, name, width):
+    browser.open(pages / f"{name}.html", width, 900)
+    for canvas in ("main", "front", "profile", "image"):
+        assert drawn(browser, canvas) > 300, canvas
+    assert browser.errors == []
+    assert all(url.startswith(("file:", "data:")) for url in browser.requests)
+    assert browser.run("document.documentElement.scrollWidth") <= width
+    assert browser.run("document.querySelectorAll('svg.plot').length") == 6
+
+
+def test_frames_without_a_pose_are_shown_empty(browser, pages):
+    browser.open(pages / "gaps.html", 1280, 900)
+    browser.run("show(9)")
+    browser.settle()
+    full = drawn(browser, "front")
+    browser.run("show(15)")
+    browser.settle()
+    assert drawn(browser, "front") < 0.6 * full  # the floor is left
+    assert browser.errors == []
+
+
+def test_keys(browser, pages):
+    browser.open(pages / "plain.html", 1280, 900)
+    frame = lambda: browser.run("state.frame")  # noqa: E731
+    assert (frame(), pressed(browser)) == (0, "novel")
+    browser.key("ArrowRight")
+    assert frame() == 1
+    browser.key("ArrowRight", modifiers=8)
+    assert frame() == 11
+    browser.key("ArrowLeft")
+    assert frame() == 10
+    browser.key("End")
+    assert frame() == 59
+    assert browser.run('document.getElementById("clock").textContent').startswith("3.93 s")
+    browser.key("Home")
+    assert frame() == 0
+    shots = set()
+    for key, view in (("1", "front"), ("2", "profile"), ("4", "camera"), ("3", "novel")):
+        browser.key(key)
+        assert pressed(browser) == view
+        shots.add(picture_of(browser, "main"))
+    assert len(shots) == 4
+    browser.key(" ")
+    assert browser.run("state.playing")
+    browser.run("new Promise((done) => setTimeout(done, 500))")
+    assert frame() > 2
+    browser.key(" ")
+    assert not browser.run("state.playing")
+    stopped = frame()
+    browser.run("new Promise((done) => setTimeout(done, 200))")
+    assert frame() == stopped
+    assert browser.errors == []
+
+
+def test_playing_keeps_the_motions_own_time(browser, pages):
+    browser.open(pages / "plain.html", 1280, 900)
+    moved = browser.run(
+        """(async () => { play(true); const begin = performance.now();
+        await new Promise((done) => setTimeout(done, 1500));
+        const shown = motion.times[state.frame]; play(false);
+        return [(performance.now() - begin) / 1000, shown]; })()"""
+    )
+    assert moved[1] == pytest.approx(moved[0], abs=0.3)
+
+
+def test_mouse_and_wheel(browser, pages):
+    browser.open(pages / "plain.html", 1280, 900)
+    box = browser.run('(({x, y, width, height}) => [x, y, width, height])(byId("main").getBoundingClientRect())')
+    x, y = box[0] + box[2] / 2, box[1] + box[3] / 2
+    before = picture_of(browser, "main")
+    browser.key("1")
+    browser.mouse("mousePressed", x, y, button="left", buttons=1, clickCount=1)
+    browser.mouse("mouseMoved", x + 120, y + 30, button="left", buttons=1)
+    browser.mouse("mouseReleased", x + 120, y + 30, button="left", clickCount=1)
+    browser.settle()
+    assert pressed(browser) == "novel"
+    turned = picture_of(browser, "main")
+    assert turned != before
+    browser.mouse("mouseWheel", x, y, deltaX=0, deltaY=-300)
+    browser.settle()
+    assert browser.run("state.zoom") > 1.2
+    assert picture_of(browser, "main") != turned
+    plot = browser.run(
+        """(() => { const s = document.querySelector("svg.time"); s.scrollIntoView();
+        const b = s.getBoundingClientRect(); return [b.x, b.y, b.width, b.height]; })()"""
+    )
+    browser.mouse(
+        "mousePressed", plot[0] + 0.7 * plot[2], plot[1] + plot[3] / 2, button="left", buttons=1, clickCount=1
+    )
+    browser.mouse("mouseReleased", plot[0] + 0.7 * plot[2], plot[1] + plot[3] / 2, button="left", clickCount=1)
+    browser.settle()
+    assert 33 <= browser.run("state.frame") <= 43
+    assert browser.errors == []
+
+
+def test_space_belongs_to_the_player_after_a_click_and_to_a_button_reached_by_keyboard(browser, pages):
+    browser.open(pages / "plain.html", 1280, 1400)
+    x, y = browser.run(
+        """(({x, y, width, height}) => [x + width / 2, y + height / 2])(
+        document.querySelector("[data-view=front]").getBoundingClientRect())"""
+    )
+    browser.mouse("mousePressed", x, y, button="left", buttons=1, clickCount=1)
+    browser.mouse("mouseReleased", x, y, button="left", clickCount=1)
+    browser.settle()
+    assert pressed(browser) == "front"
+    browser.key(" ")
+    assert browser.run("state.playing")
+    browser.key(" ")
+    browser.run('document.querySelector("[data-view=profile]").focus()')
+    browser.key(" ")
+    assert pressed(browser) == "profile"
+    assert not browser.run("state.playing")
+
+
+def test_two_fingers_zoom(browser, pages):
+    browser.open(pages / "plain.html", 400, 900)
+    x, y = browser.run(
+        '(({x, y, width, height}) => [x + width / 2, y + height / 2])(byId("main").getBoundingClientRect())'
+    )
+
+    def touch(kind, *spread):
+        points = [{"x": x + side * s, "y": y, "id": n} for s in spread for n, side in enumerate((-1, 1))]
+        browser.send("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+
+    touch("touchStart", 30)
+    touch("touchMove", 50)
+    touch("touchMove", 70)
+    touch("touchEnd")
+    browser.settle()
+    assert browser.run("state.zoom") > 1.5
+
+
+def test_the_picture_and_its_keypoints_stay_together(browser, pages):
+    browser.open(pages / "pictures.html", 1280, 900)
+    browser.run("show(31)")
+    browser.settle()
+    assert browser.run("pictures.places[pictures.nearest(31)]") == 30
+    with_overlay = picture_of(browser, "image")
+    browser.run('byId("overlay").click()')
+    browser.settle()
+    assert picture_of(browser, "image") != with_overlay
+    browser.run("show(30)")
+    browser.run('byId("overlay").click()')
+    browser.settle()
+    assert picture_of(browser, "image") == with_overlay
+
+
+def test_dark_and_light_differ(browser, pages):
+    grounds = []
+    for dark in (False, True):
+        browser.open(pages / "plain.html", 1280, 900, dark=dark)
+        grounds.append(browser.run("getComputedStyle(document.body).backgroundColor"))
+        assert browser.errors == []
+    assert grounds[0] != grounds[1]
+    assert len(browser.screenshot()) > 20_000

@@ -1,0 +1,71 @@
+"""``drocap report`` as a user runs it, and at the end of ``drocap reconstruct``."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from drocap_ros.cli import main
+from drocap_ros.motion import load_motion, save_motion
+from drocap_ros.simulation.capture import simulate_capture
+from drocap_ros.tracks import save_tracks
+
+
+@pytest.fixture
+def folder(walker, tmp_path):
+    save_motion(tmp_path / "motion.npz", walker)
+    return tmp_path
+
+
+def refused(arguments, folder, capsys, words):
+    before = sorted(folder.iterdir())
+    assert main([str(a) for a in arguments]) == 2
+    error = capsys.readouterr().err
+    assert len(error.strip().splitlines()) == 1
+    assert words in error
+    assert sorted(folder.iterdir()) == before
+
+
+def test_the_folder_of_a_motion_is_enough(folder, capsys):
+    assert main(["report", str(folder)]) == 0
+    assert "report.html" in capsys.readouterr().out
+    assert f"drocap report {folder}" in (folder / "report.html").read_text()
+
+
+def test_the_same_motion_gives_the_same_bytes(folder):
+    texts = []
+    for _ in range(2):
+        assert main(["report", str(folder), "--quiet"]) == 0
+        texts.append((folder / "report.html").read_bytes())
+    assert texts[0] == texts[1]
+
+
+def test_what_cannot_be_shown_is_refused(walker, folder, capsys):
+    (folder / "text.npz").write_text("no archive")
+    nothing = dataclasses.replace(walker, joints3d=np.full_like(walker.joints3d, np.nan))
+    save_motion(folder / "nothing.npz", nothing)
+    refused(["report", folder / "text.npz"], folder, capsys, "expected a readable .npz")
+    refused(["report", folder / "none.npz"], folder, capsys, "no such file")
+    refused(["report", folder / "nothing.npz"], folder, capsys, "NaN in all of them")
+    refused(["report", folder, "--video", folder / "none.mp4"], folder, capsys, "none.mp4")
+    refused(["report", folder, "--video", folder / "text.npz"], folder, capsys, "text.npz")
+
+
+def test_reconstruct_ends_in_a_report(tmp_path, capsys):
+    save_tracks(tmp_path / "tracks.npz", simulate_capture(1.0, 15.0, seed=1).tracks)
+    out = tmp_path / "out"
+    command = ["reconstruct", str(tmp_path / "tracks.npz"), "--out", str(out), "--method", "initial"]
+    assert main(command) == 0
+    assert "report.html" in capsys.readouterr().out
+    assert " ".join(["drocap", *command]) in (out / "report.html").read_text()
+    assert load_motion(out / "motion.npz").meta["command"] == " ".join(["drocap", *command])
+    bare = tmp_path / "bare"
+    assert main([*command[:3], str(bare), *command[4:], "--no-report", "--quiet"]) == 0
+    assert not (bare / "report.html").exists()
+
+
+def test_reconstruct_shows_the_pictures_of_its_video(shared, tmp_path):
+    video = shared / "media" / "pose_squats.mp4"
+    command = ["reconstruct", str(video), "--models", str(shared / "models"), "--out", str(tmp_path / "out"), "--quiet"]
+    assert main(command) == 0
+    assert (tmp_path / "out" / "report.html").read_text().count('"/9j/') == 65

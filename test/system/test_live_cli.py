@@ -1,0 +1,116 @@
+"""``drocap live`` and ``drocap record`` as commands, with a video that the test draws itself."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from drocap_ros.bringup import free_domain
+from drocap_ros.recording.session_reader import session_info
+
+ROOT = Path(__file__).resolve().parents[2]
+IMAGES = "/drocap/image/compressed"
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    path = tmp_path_factory.mktemp("video") / "square.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 20.0, (320, 240))
+    for i in range(40):
+        frame = np.full((240, 320, 3), 90, np.uint8)
+        cv2.rectangle(frame, (20 + 5 * i, 60), (60 + 5 * i, 180), (40, 200, 240), -1)
+        writer.write(frame)
+    writer.release()
+    return path
+
+
+def start(*arguments, log):
+    command = [sys.executable, "-m", "drocap_ros.cli", *map(str, arguments)]
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    return subprocess.Popen(command, env=env, stdout=log.open("w"), stderr=subprocess.STDOUT)
+
+
+def wait_for_running(log):
+    end = time.monotonic() + 60
+    while "running" not in log.read_text() and time.monotonic() < end:
+        time.sleep(0.1)
+
+
+def counts(session):
+    return {topic.name: topic.count for topic in session_info(session).topics}
+
+
+@pytest.mark.parametrize("option", [(), ("--one-process",)], ids=["processes", "one process"])
+def test_a_video_file_goes_live_into_a_session_and_the_command_ends_with_it(video, tmp_path, option):
+    config = ROOT / "config" / "video_file.yaml"
+    nodes = ("--nodes", "image_ingest", "session_recorder")
+    with free_domain() as domain:
+        common = ("--config", config, "--source", video, "--session", tmp_path / "session", "--domain-id", domain)
+        live = start("live", *common, *nodes, *option, log=tmp_path / "log")
+        assert live.wait(120) == 0, (tmp_path / "log").read_text()
+    assert "running image_ingest, session_recorder" in (tmp_path / "log").read_text()
+    # Pictures are best effort; on one machine at this size nearly all arrive.
+    assert 30 <= counts(tmp_path / "session")[IMAGES] <= 40
+
+
+def test_record_takes_what_another_graph_publishes_until_it_is_interrupted(video, tmp_path):
+    # The recorder joins a graph that runs: discovery may take seconds, so the video goes round.
+    config = tmp_path / "loop.yaml"
+    config.write_text(f"/**/image_ingest: {{ros__parameters: {{source: {video}, loop: true}}}}")
+    with free_domain() as domain:
+        common = ("--config", config, "--domain-id", domain, "--nodes", "image_ingest")
+        live = start("live", *common, log=tmp_path / "live.log")
+        record = start("record", "--out", tmp_path / "rec", "--domain-id", domain, log=tmp_path / "record.log")
+        for name in ("live", "record"):
+            wait_for_running(tmp_path / f"{name}.log")
+        end = time.monotonic() + 60
+        # Chunks are flushed while it records, so that the file can be read before it is closed.
+        while counts(tmp_path / "rec").get(IMAGES, 0) <= 20 and time.monotonic() < end:
+            time.sleep(0.5)
+        for process in (record, live):
+            process.send_signal(signal.SIGINT)
+        assert record.wait(60) == 0, (tmp_path / "record.log").read_text()
+        assert live.wait(60) == 0, (tmp_path / "live.log").read_text()
+    assert counts(tmp_path / "rec")[IMAGES] > 20
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--config", "none.yaml"), "none.yaml"),
+        (("--config", ROOT / "config" / "video_file.yaml", "--source", "none.mp4"), "none.mp4"),
+        (("--config", ROOT / "config" / "video_file.yaml", "--domain-id", "500"), "--domain-id: expected 0 to 101"),
+    ],
+)
+def test_what_cannot_run_is_refused_with_status_2(tmp_path, arguments, words):
+    with free_domain() as domain:
+        given = arguments if "--domain-id" in arguments else (*arguments, "--domain-id", domain)
+        live = start("live", *given, "--nodes", "image_ingest", log=tmp_path / "log")
+        assert live.wait(120) == 2
+    text = (tmp_path / "log").read_text().strip()
+    assert words in text
+    assert "Traceback" not in text
+
+
+def test_top_shows_the_nodes_of_a_running_graph(video, tmp_path):
+    config = ROOT / "config" / "video_file.yaml"
+    with free_domain() as domain:
+        nodes = ("--nodes", "session_recorder")
+        common = ("--config", config, "--session", tmp_path / "session", "--domain-id", domain)
+        live = start("live", *common, *nodes, log=tmp_path / "live.log")
+        try:
+            wait_for_running(tmp_path / "live.log")
+            top = start("top", "--once", "--domain-id", domain, log=tmp_path / "top.log")
+            assert top.wait(60) == 0, (tmp_path / "live.log").read_text()
+        finally:
+            live.send_signal(signal.SIGINT)
+            assert live.wait(60) == 0
+        assert "drocap/session_recorder" in (tmp_path / "top.log").read_text()
+        # Nobody is left to be heard.
+        assert start("top", "--once", "--domain-id", domain, log=tmp_path / "top.log").wait(60) == 1
