@@ -24,12 +24,12 @@ def settings_of(seed: int) -> LoopSettings:
             config = MavlinkBridgeConfig(
                 commands_enabled=True, mode_change_allowed=True, attitude_hz=25.0, position_hz=20.0,
                 radius_m=radius, height_m=rng.uniform(1.8, 6.0),
-                angular_speed_deg_s=rng.uniform(8, 40) * rng.choice([-1, 1]),
+                angular_speed_deg_s=float(rng.uniform(8, 40) * rng.choice([-1, 1])),
                 body_height_m=rng.uniform(1.6, 1.9), fence_radius_m=rng.uniform(20, 40),
             )  # fmt: skip
             break
         except InputError:
-            continue
+            continue  # too fast for this radius
     wind = rng.uniform(0, 8) * np.array([math.cos(a := rng.uniform(0, 6.28)), math.sin(a), 0.0])
     return LoopSettings(
         autopilot=str(rng.choice(["ardupilot", "px4"])), seed=seed, config=config, seconds=SECONDS + 1,
@@ -70,6 +70,7 @@ def breaches(settings: LoopSettings, loop: OrbitLoop) -> list[str]:
 
 
 def main() -> int:
+    sys.stdout.reconfigure(line_buffering=True)
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 300
     first = int(sys.argv[2]) if len(sys.argv) > 2 else 0
     bad, going, errors = 0, 0, []
@@ -81,7 +82,7 @@ def main() -> int:
         if quality.orbiting == 1.0:
             going += 1
             errors.append(quality.radius_error_m)
-        if found or seed % 25 == 0:
+        if found or seed % 10 == 0:
             end = loop.reasons[-1][2] if loop.reasons else ""
             print(seed, settings.autopilot, settings.action, "; ".join(found) or "no breach", "|", end, flush=True)
     mean = float(np.mean(errors)) if errors else math.nan
