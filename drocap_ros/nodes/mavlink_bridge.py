@@ -41,7 +41,7 @@ _STATUS_PERIOD_S = 0.2
 
 
 class MavlinkBridgeNode(ComponentNode):
-    """One thread owns the link, one steps the control loop, one watches that loop; the node turns states to messages."""
+    """One thread owns the link, one steps the control loop, one watches it; the node turns states to messages."""
 
     component = "mavlink_bridge"
 

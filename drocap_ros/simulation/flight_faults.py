@@ -250,7 +250,9 @@ FAULTS: tuple[Fault, ...] = (
     Fault("clock jumps 3 s ahead", _set(clock_jump_s=3.0), 0.05),
     Fault("clock jumps 3 s back", _set(clock_jump_s=-3.0), 0.05),
     Fault("telemetry frozen, clock goes on", _set(copter__frozen=True), 0.05, cause=_SILENCE),
-    Fault("telemetry frozen with its clock", _set(copter__frozen=True, copter__frozen_clock=True), 0.05, cause=_SILENCE),
+    Fault(
+        "telemetry frozen with its clock", _set(copter__frozen=True, copter__frozen_clock=True), 0.05, cause=_SILENCE
+    ),
     Fault("autopilot follows no more, says nothing", _set(copter__deaf=True), 0.2, cause=_GUID),
     Fault("storm of 500 commands", _storm),
     Fault("landing reported", _set(copter__landed_state=mavlink.MAV_LANDED_STATE_LANDING), _HEARTBEAT_S),

@@ -7,7 +7,6 @@ import time
 
 import numpy as np
 import pytest
-from drocap_ros.msg import OrbitStatus
 from sensor_msgs.msg import CameraInfo
 
 from drocap_ros.bringup import bringup
@@ -15,6 +14,7 @@ from drocap_ros.cli import main
 from drocap_ros.config import DrocapConfig
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.transport import open_transport
+from drocap_ros.msg import OrbitStatus
 from drocap_ros.nodes.conversions import pose2d_to_ros
 from drocap_ros.nodes.topics import TOPICS
 from drocap_ros.perception.observation import PoseObservation
