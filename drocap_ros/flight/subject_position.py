@@ -40,6 +40,7 @@ _STRIDE_M = 0.15  # standard deviation of the mean of the feet about the pelvis
 _STEEP = np.sin(np.deg2rad(75.0))
 _SHALLOW = np.sin(np.deg2rad(4.0))
 _MAX_RANGE_M = 200.0
+_RATIO_IMAGES = 45  # over which the ratio of the two ranges is learned
 
 
 class SubjectMeasurement(NamedTuple):
@@ -59,7 +60,11 @@ class SubjectMeasurement(NamedTuple):
 
 
 def locate_subject(
-    observation: PoseObservation, camera_matrix: np.ndarray, camera: CameraPose, config: SubjectConfig
+    observation: PoseObservation,
+    camera_matrix: np.ndarray,
+    camera: CameraPose,
+    config: SubjectConfig,
+    size_over_ground: float = float("nan"),
 ) -> SubjectMeasurement | None:
     """Locate the subject in one image.
 
@@ -68,6 +73,8 @@ def locate_subject(
     observation : keypoints of any joint set that maps to ``BODY_15``
     camera_matrix : (3, 3) px
     camera : pose at the stamp of the observation
+    size_over_ground : what the ratio of the two ranges has been over the last seconds; NaN = that of this image.
+        The two disagree slowly for what they assume, and quickly when the subject crouches: then the ground is right
 
     Returns
     -------
@@ -92,7 +99,7 @@ def locate_subject(
         return None
     size = _range_from_size(plane, seen, flat / length, config) * flat
     ground, ground_sd = _range_from_ground(rays, seen, camera.position, config)
-    distance, sd = _fuse(size, config.size_error * size, ground, ground_sd)
+    distance, sd = _fuse(size, config.size_error * size, ground, ground_sd, size_over_ground)
     if not 0.3 < distance < _MAX_RANGE_M:
         return None
     ahead = np.array([pelvis[0], pelvis[1], 0.0]) / flat
@@ -140,14 +147,21 @@ def _range_from_ground(
     down = -ankles[:, 2]
     if np.any(down < _SHALLOW * np.linalg.norm(ankles, axis=1)):
         return float("nan"), float("nan")
-    distance = float(np.mean(height * np.hypot(ankles[:, 0], ankles[:, 1]) / down))
+    ranges = height * np.hypot(ankles[:, 0], ankles[:, 1]) / down
+    # A lifted foot seems farther away than the one that stands.
+    distance = float(ranges.min() if np.ptp(ranges) > 0.3 * ranges.min() else ranges.mean())
     turn = np.deg2rad(config.attitude_error_deg)
     errors = (turn * (height**2 + distance**2) / height, config.height_error_m * distance / height, _STRIDE_M)
     return distance, float(np.linalg.norm(errors))
 
 
-def _fuse(a: float, a_sd: float, b: float, b_sd: float) -> tuple[float, float]:
-    """Mean by information.  Where the two contradict each other, body size alone, trusted half as much."""
+def _fuse(a: float, a_sd: float, b: float, b_sd: float, ratio: float = float("nan")) -> tuple[float, float]:
+    """Mean by information of size ``a`` and ground ``b``; ``ratio`` of the two is smoother than that of one image.
+
+    Where the two contradict each other for long, body size alone, trusted half as much.
+    """
+    if np.isfinite(ratio) and np.isfinite(b):
+        a, a_sd = ratio * b, a_sd if np.isfinite(a_sd) else b_sd
     if not np.isfinite(a):
         return b, b_sd
     if not np.isfinite(b):
@@ -192,6 +206,7 @@ class SubjectFilter:
         self._stamp_ns = 0
         self._track_id = 0
         self._last_keypoints: np.ndarray | None = None
+        self._ratio, self._ratio_count = float("nan"), 0
         self.rejected = 0
 
     def reset(self) -> None:
@@ -216,7 +231,7 @@ class SubjectFilter:
         self._last_keypoints = observation.keypoints
         if camera is None or frozen or not observation.has_subject:
             return False
-        measurement = locate_subject(observation, camera_matrix, camera, self._config)
+        measurement = locate_subject(observation, camera_matrix, camera, self._config, self._ratio)
         if measurement is None:
             return False
         gap_s = (observation.stamp_ns - self._stamp_ns) / _NS
@@ -245,6 +260,7 @@ class SubjectFilter:
         self._covariance = 0.5 * (covariance + covariance.T)
         self._systematic = measurement.systematic
         self._stamp_ns = observation.stamp_ns
+        self._learn_ratio(measurement)
         return True
 
     def estimate(self, now_ns: int) -> SubjectEstimate | None:
@@ -259,6 +275,17 @@ class SubjectFilter:
             position_sd_m=float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[-1])),
             stamp_ns=self._stamp_ns, age_s=age_s, track_id=self._track_id,
         )  # fmt: skip
+
+    def _learn_ratio(self, measurement: SubjectMeasurement) -> None:
+        """Follow the ratio of the two ranges, slowly and in small steps."""
+        ratio = measurement.range_size_m / measurement.range_ground_m
+        if not 0.5 < ratio < 2.0:  # NaN too
+            return
+        self._ratio_count = min(self._ratio_count + 1, _RATIO_IMAGES)
+        if self._ratio_count == 1:
+            self._ratio = ratio
+        step = min(max(ratio - self._ratio, -0.15), 0.15)
+        self._ratio += step / self._ratio_count
 
     def _start(self, observation: PoseObservation, measurement: SubjectMeasurement) -> None:
         self._state = np.concatenate([measurement.position, np.zeros(3)])
