@@ -40,7 +40,7 @@ _STRIDE_M = 0.15  # standard deviation of the mean of the feet about the pelvis
 _STEEP = np.sin(np.deg2rad(75.0))
 _SHALLOW = np.sin(np.deg2rad(4.0))
 _MAX_RANGE_M = 200.0
-_RATIO_IMAGES = 45  # over which the ratio of the two ranges is learned
+_RATIO_IMAGES = 28  # over which the ratio of the two ranges is learned
 
 
 class SubjectMeasurement(NamedTuple):
