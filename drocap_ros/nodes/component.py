@@ -67,7 +67,8 @@ class ComponentNode(Node):
 
     def output(self, topic: str) -> Publisher:
         """Publisher of a topic of the table."""
-        publisher = self.create_publisher(TOPICS[topic].message, topic, TOPICS[topic].qos)
+        entry = TOPICS[topic]
+        publisher = self.create_publisher(entry.message, topic, entry.offered or entry.qos)
         self._outputs.append((topic, publisher))
         return publisher
 
