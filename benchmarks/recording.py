@@ -95,7 +95,6 @@ def part_load(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         executor.add_node(node)
         sources = make_sources(node)
         graph.wait_until(lambda: all(p.get_subscription_count() for p, *_ in sources), 20, "the recorder to listen")
-        drops: list[int] = []
         usage = [process_usage(pid)]
         begin = time.monotonic()
         thread = threading.Thread(target=watch_process, args=(pid, begin, args.seconds, usage), daemon=True)
@@ -112,13 +111,26 @@ def part_load(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         "seconds": args.seconds,
         "sent": sent,
         "recorded": {name: counts.get(name.rsplit("/", 1)[-1], 0) for name in sent},
-        "warnings": [*info.warnings, *map(str, drops)],
+        "warnings": list(info.warnings),
         "cores_used": round((usage[-1][0] - usage[0][0]) / (len(usage) - 1 or 1), 3),
         "memory_mib_first_third": round(max(memory[:third]), 1),
         "memory_mib_last_third": round(max(memory[-third:]), 1),
+        "lost_on_the_way": lost_on_the_way(folder / "session"),
         "mib_written": round(sum(p.stat().st_size for p in (folder / "session").iterdir()) / 2**20, 1),
         "load_average": os.getloadavg()[0],
     }
+
+
+def lost_on_the_way(session_dir: Path) -> dict[str, str]:
+    """What the recorder itself said on /diagnostics, at the end."""
+    from drocap_ros.recording.session import open_session
+
+    told: dict[str, str] = {}
+    with open_session(session_dir) as session:
+        for _, message in session.messages(("/diagnostics",)):
+            for status in message.status:
+                told |= {v.key: v.value for v in status.values if v.key.startswith(("lost", "dropped"))}
+    return told
 
 
 def make_sources(node: Any) -> list[tuple[Any, Any, float, str]]:
@@ -130,13 +142,14 @@ def make_sources(node: Any) -> list[tuple[Any, Any, float, str]]:
     from drocap_ros.nodes.capture_simulator import observation_of
     from drocap_ros.nodes.conversions import header_at, pose2d_to_ros
     from drocap_ros.nodes.topics import TOPICS
+    from drocap_ros.perception.images import encode_jpeg
     from drocap_ros.simulation.capture import simulate_capture
 
     tracks = simulate_capture(2.0, 30.0, 0).tracks
     rng = np.random.default_rng(0)
-    scene = cv2.GaussianBlur(rng.integers(0, 255, (720, 1400, 3), dtype=np.uint8), (0, 0), 3)
+    scene = cv2.GaussianBlur(rng.integers(0, 255, (720, 1400, 3), dtype=np.uint8), (0, 0), 4)
     scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
-    jpegs = [cv2.imencode(".jpg", np.ascontiguousarray(scene[:, i : i + 1280]))[1].tobytes() for i in range(0, 100, 10)]
+    jpegs = [encode_jpeg(np.ascontiguousarray(scene[:, i : i + 1280]), 90) for i in range(0, 100, 10)]
 
     def image(i: int) -> Any:
         return TOPICS["image/compressed"].message(

@@ -150,7 +150,9 @@ def _watch(
         if progress is not None:
             progress("2D pose", next(done) / length if length else -1.0)
 
-    estimator = PoseEstimator(models_folder(models or config.pose_estimator.models_dir or None), config.pose_estimator)
+    # Nobody is there to choose again, and the whole recording is at hand: the subject seen longest is taken at the end.
+    settings = dataclasses.replace(config.pose_estimator, on_loss="next")
+    estimator = PoseEstimator(models_folder(models or settings.models_dir or None), settings)
     try:
         return tracks_from_observations(observe(frames, estimator, count))
     except InputError as error:

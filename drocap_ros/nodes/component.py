@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -66,12 +67,19 @@ class ComponentNode(Node):
 
     def output(self, topic: str) -> Publisher:
         """Publisher of a topic of the table."""
-        publisher = self.create_publisher(TOPICS[topic].message, topic, TOPICS[topic].qos)
+        entry = TOPICS[topic]
+        publisher = self.create_publisher(entry.message, topic, entry.offered or entry.qos)
         self._outputs.append((topic, publisher))
         return publisher
 
     def input(
-        self, topic: str, callback: Callable[..., None], *, raw: bool = False, qos: QoSProfile | None = None
+        self,
+        topic: str,
+        callback: Callable[..., None],
+        *,
+        raw: bool = False,
+        qos: QoSProfile | None = None,
+        events: SubscriptionEventCallbacks | None = None,
     ) -> Subscription:
         """Subscription to a topic of the table.  A message that the callback refuses is counted, not fatal."""
 
@@ -84,7 +92,7 @@ class ComponentNode(Node):
                 self.report(WARN, f"{topic}: {error}")
 
         subscription = self.create_subscription(
-            TOPICS[topic].message, topic, guarded, qos or TOPICS[topic].qos, raw=raw
+            TOPICS[topic].message, topic, guarded, qos or TOPICS[topic].qos, raw=raw, event_callbacks=events
         )
         self._inputs.append((topic, subscription))
         return subscription

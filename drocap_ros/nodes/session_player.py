@@ -19,7 +19,7 @@ from drocap_ros.errors import DrocapError, InputError
 from drocap_ros.nodes.component import ERROR, OK, ComponentNode
 from drocap_ros.nodes.conversions import stamp_to_ros
 from drocap_ros.nodes.run import node_main
-from drocap_ros.nodes.topics import IMAGE_QOS, RESULT_QOS, TOPICS
+from drocap_ros.nodes.topics import IMAGE_RECORDING_QOS, RESULT_QOS, TOPICS
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, RawMessage, Session, TopicInfo, open_session
 
 #: Topics that this graph publishes itself; those of the recording only when they are named.
@@ -68,7 +68,7 @@ class SessionPlayerNode(ComponentNode):
             return self.output(name)
         package, _, kind = topic.type_name.split("/")
         message = getattr(importlib.import_module(f"{package}.msg"), kind)
-        qos = IMAGE_QOS if topic.type_name in (IMAGE, COMPRESSED_IMAGE) else RESULT_QOS
+        qos = IMAGE_RECORDING_QOS if topic.type_name in (IMAGE, COMPRESSED_IMAGE) else RESULT_QOS
         return self.create_publisher(message, topic.name, qos)
 
     def _run(self) -> None:

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
 
@@ -51,12 +52,17 @@ class SessionRecorderNode(ComponentNode):
             self._writer.register(name, kind, schema_text(kind), image=image)
             qos = IMAGE_RECORDING_QOS if image else entry.qos
             take = self._on_camera_info if topic == "camera_info" else self._on_message
-            self.input(topic, partial(take, name), raw=True, qos=qos)
+            events = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, name))
+            self.input(topic, partial(take, name), raw=True, qos=qos, events=events)
         self.create_timer(1.0, self._on_second)
 
     def _on_message(self, name: str, data: bytes) -> None:
         self._writer.write(name, data, self.get_clock().now().nanoseconds)
         self.count("messages")
+
+    def _on_lost(self, name: str, event: Any) -> None:
+        """Count what the middleware lost on its way: pictures are best effort."""
+        self.count(f"lost on the way {name}", event.total_count_change)
 
     def _on_camera_info(self, name: str, data: bytes) -> None:
         self._on_message(name, data)

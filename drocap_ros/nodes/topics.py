@@ -18,8 +18,8 @@ except ImportError:  # not among the ROS wheels; `make setup` builds it, a ROS i
 
 #: A picture that comes late is worth nothing: the newest only, and no retransmission.
 IMAGE_QOS = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
-#: A recorder takes what a burst brings.
-IMAGE_RECORDING_QOS = QoSProfile(depth=30, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
+#: Offered reliably, so that a recorder on the same machine loses none; a best-effort reader costs no more for it.
+IMAGE_RECORDING_QOS = QoSProfile(depth=30, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 #: Results are small, and none may be lost: 10 s of them at 100 Hz.
 RESULT_QOS = QoSProfile(depth=1000, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 #: Handshake of nodes and bringup, for whoever comes later; as deep as there are nodes to speak.
@@ -37,10 +37,11 @@ class Topic:
 
     message: type
     qos: QoSProfile
+    offered: QoSProfile | None = None  # by the publisher, where it is more than subscribers ask for
 
 
 TOPICS: dict[str, Topic] = {
-    "image/compressed": Topic(CompressedImage, IMAGE_QOS),
+    "image/compressed": Topic(CompressedImage, IMAGE_QOS, IMAGE_RECORDING_QOS),
     "camera_info": Topic(CameraInfo, RESULT_QOS),
     "roi": Topic(RegionOfInterest, RESULT_QOS),
     "pose2d": Topic(Pose2D, RESULT_QOS),

@@ -56,7 +56,7 @@ class BundleAdjusterConfig(Parameters):
     window_s: float = param(12.0, "length of an adjustment window", unit="s", minimum=0.5, maximum=120.0)
     period_s: float = param(1.0, "time between two adjustments of the live node", unit="s", minimum=0.05, maximum=60.0)
     window_frames: int = param(480, "frames in a window at most", minimum=8, maximum=5000)
-    overlap_frames: int = param(60, "frames that neighbouring windows of a long recording share", minimum=0,
+    overlap_frames: int = param(30, "frames that neighbouring windows of a long recording share", minimum=0,
                                 maximum=2000)  # fmt: skip
     max_pending: int = param(120, "images that wait for their initial pose in the live node", minimum=1, maximum=10000)
     threads: int = param(1, "threads of the linear algebra; the matrices are small", minimum=1, maximum=64)

@@ -194,7 +194,7 @@ def adjust_limbs(
     iterations : at most so many accepted steps
     tolerance : relative decrease of the cost that ends the solve
     """
-    from scipy.linalg.lapack import dpbtrf, dpbtrs
+    from scipy.linalg.lapack import dpbtrf, dtbtrs
 
     damping, stop = 1e-4, "iterations"
     zooms = np.zeros(problem.zoom_basis.shape[1])
@@ -210,10 +210,11 @@ def adjust_limbs(
             damped[:, 0] = damped[:, 0] * (1 + damping) + 1e-2 * damping
             factor, info = dpbtrf(damped.T, lower=1, overwrite_ab=1)
             if info == 0:
-                x = dpbtrs(factor, right.T, lower=1)[0]
-                schur = corner + np.diag(damping * np.diag(corner)) - border @ x[:, 1:]
-                sizes = np.linalg.solve(schur, -g_sizes - border @ x[:, 0])
-                step = (x[:, 0] - x[:, 1:] @ sizes).reshape(joints.shape)
+                # Eliminate the joints: half of a solve for every column, the other half for the answer alone.
+                y = dtbtrs(factor, right.T, uplo="L")[0]
+                schur = corner + np.diag(damping * np.diag(corner)) - y[:, 1:].T @ y[:, 1:]
+                sizes = np.linalg.solve(schur, -g_sizes - y[:, 1:].T @ y[:, 0])
+                step = dtbtrs(factor, y[:, 0] - y[:, 1:] @ sizes, uplo="L", trans="T")[0].reshape(joints.shape)
                 step_lengths, step_zooms = sizes[: len(SPANS)], sizes[len(SPANS) :]
                 there = _Residuals(problem, joints + step, lengths + step_lengths, zooms + step_zooms)
                 if there.cost <= here.cost:

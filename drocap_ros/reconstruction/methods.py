@@ -265,11 +265,13 @@ def split(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def windows(frames: int, length: int, overlap: int) -> list[slice]:
-    """Windows of about equal length, at most ``length``, neighbours sharing ``overlap`` frames."""
+    """Windows of equal length, at most ``length``, neighbours sharing about ``overlap`` frames."""
     if frames <= length:
         return [slice(0, frames)]
     overlap = min(overlap, length // 2)
     count = int(np.ceil((frames - overlap) / (length - overlap)))
+    # No longer than the overlap needs: 1000 frames take three windows of 374, not of 480.
+    length = int(np.ceil((frames + (count - 1) * overlap) / count))
     starts = np.round(np.linspace(0, frames - length, count)).astype(int)
     return [slice(int(start), int(start) + length) for start in starts]
 

@@ -15,7 +15,9 @@ from drocap_ros import __version__
 from drocap_ros.errors import InputError
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.default_method import DefaultMethodConfig
 from drocap_ros.reconstruction.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
+from drocap_ros.reconstruction.lifter import Lifter
 from drocap_ros.reconstruction.methods import METHODS, CameraPoses, run_method
 from drocap_ros.reconstruction.placement import metres_per_px, place_in_world
 from drocap_ros.reconstruction.threads import blas_threads
@@ -78,6 +80,10 @@ def reconstruct(
         cost_terms=result.cost_terms,
         frames=len(tracks),
     )
+    if method == "ba":
+        own = DefaultMethodConfig()
+        motion.meta["parameters"]["default_method"] = dataclasses.asdict(own)
+        motion.meta["lifter"] = Lifter.load(own.lifter or None).origin
     return motion
 
 

@@ -25,6 +25,7 @@ from drocap_ros.reconstruction.single_view import sparse_from_dense
 from drocap_ros.reconstruction.sparse_fit import fit_sparse
 from drocap_ros.reconstruction.starts import DenseFit, fit_dense, image_scale, viewpoint_starts
 from drocap_ros.reconstruction.threads import blas_threads
+from drocap_ros.reconstruction.uncertainty import GaussianJoints
 from drocap_ros.skeleton import BODY_15
 
 #: Images over which the live start remembers the person's size.
@@ -32,6 +33,9 @@ MEMORY = 120
 
 #: Least standard deviations of an adjusted pose, in units of the 2D joints: across the image, along the ray.
 ACROSS_STD, DEPTH_STD = 0.02, 0.22
+
+#: Standard deviation of 2D joints about a start from the dictionary, in their unit.
+START_STD = 0.1
 
 #: Windows of fewer frames hold no second view worth adjusting to.
 MIN_WINDOW = 4
@@ -268,12 +272,16 @@ def adjust_window(
     n = normalize_tracks(keypoints, confidence, covariance)
     projection = Projection(n.w, n.information)
     scale = _scale_to_image(start, projection)
+    # What lies far from where the start has it is taken for an outlier, as the start's own E-step does.
+    expected = n.w + camera_residual(projection, start * scale)
+    _, information = GaussianJoints(n.w, n.information).expect(expected, START_STD)
+    projection = Projection(n.w, information)
     seen = n.weights > 0.0
     if frames < MIN_WINDOW:
         joints, iterations, terms, stop = start * scale, 0, dict[str, float](), "too short"
     else:
         with blas_threads(config.threads):
-            result = bundle_adjust(n.w, start * scale, config=config, information=n.information)
+            result = bundle_adjust(n.w, start * scale, config=config, information=information)
         joints, iterations = result.camera_shape, result.iterations
         terms, stop = result.cost_terms, result.stop_reason
     gap = camera_residual(projection, joints)

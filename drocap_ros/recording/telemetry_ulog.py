@@ -43,9 +43,16 @@ def read_ulog(path: Path) -> TelemetryLog:
     except Exception as error:  # pyulog lets through what its parsing raises
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{path}: expected a PX4 ULog that can be read; {reason}") from None
+    try:
+        return _to_log(path, log)
+    except (KeyError, IndexError, ValueError) as error:  # a damaged definition: fields are missing or of other types
+        raise InputError(f"{path}: expected the fields of PX4's topics, found a damaged log ({error})") from None
+
+
+def _to_log(path: Path, log: Any) -> TelemetryLog:
     series: dict[str, dict[str, np.ndarray]] = {}
     for data in log.data_list:
-        if data.multi_id == 0 or data.name not in series:
+        if "timestamp" in data.data and (data.multi_id == 0 or data.name not in series):
             series[data.name] = data.data
     attitude = series.get("vehicle_attitude")
     if attitude is None or not len(attitude["timestamp"]):

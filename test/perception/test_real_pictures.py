@@ -135,3 +135,19 @@ def test_somebody_who_moves_before_the_camera_keeps_one_track(models, shared):
                 ids.append(estimator.process(frame.image, frame.stamp_ns).track_id)
     assert set(ids[:8]) == {0}
     assert set(ids[14:]) == {1}
+
+
+@pytest.mark.parametrize(("size", "images"), [((1280, 720), 8), ((3840, 2160), 28)])
+def test_a_small_person_in_a_large_picture_is_searched_for_and_kept(models, shared, size, images):
+    import cv2
+
+    estimator = PoseEstimator(models)
+    with open_source(shared / "media" / "pose_squats.mp4") as source:
+        person = cv2.resize(source.read().image[100:760, 150:520], None, fx=0.15, fy=0.15, interpolation=cv2.INTER_AREA)
+    ground = np.random.default_rng(0).normal(110, 12, (size[1] // 8, size[0] // 8, 3)).clip(0, 255).astype(np.uint8)
+    picture = cv2.resize(ground, size, interpolation=cv2.INTER_LINEAR)
+    x, y = int(0.6 * size[0]), int(0.55 * size[1])
+    picture[y : y + person.shape[0], x : x + person.shape[1]] = person
+    ids = [estimator.process(picture, i * 33_000_000).track_id for i in range(images + 4)]
+    assert set(ids[images:]) == {1}
+    assert set(ids) <= {0, 1}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -26,8 +27,10 @@ from drocap_ros.reconstruction.limb_adjustment import (
     zoom_model,
 )
 from drocap_ros.reconstruction.metrics import pa_mpjpe
-from drocap_ros.reconstruction.protocol import PX_PER_MM, orbit_view, protocol_sequences
+from drocap_ros.reconstruction.protocol import PX_PER_MM, orbit_rotations, orbit_view, protocol_sequences
+from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.skeleton import BODY_15
+from drocap_ros.tracks import Tracks
 
 
 def problem(frames: int = 6, seed: int = 0) -> tuple[LimbProblem, np.ndarray, np.ndarray]:
@@ -233,6 +236,27 @@ def test_dropped_frames_get_their_place_back():
     # A long pause does not blow the grid up.
     slot, _ = even_slots(np.array([0, 40_000_000, 80_000_000, 3_600_000_000_000], dtype=np.int64))
     assert slot[-1] < 40
+
+
+def test_a_near_camera_of_known_lens_is_no_worse_than_a_far_one(shared):
+    """A camera 6 m away that looks at a fixed point while the person walks about: size and perspective change."""
+    (sequence,) = protocol_sequences(shared / "mocap" / "dev", limit=1)
+    x = sequence.x
+    rotation = orbit_rotations(len(x), 25.0)
+    position = x[:, 0].mean(axis=0) - 6000.0 * rotation[:, 2]
+    truth = np.einsum("fij,fpj->fpi", rotation, x - position[:, None])
+    focal_px = 1000.0
+    keypoints = focal_px * truth[..., :2] / truth[..., 2:] + np.array([640.0, 512.0])
+    matrix = np.array([[focal_px, 0.0, 640.0], [0.0, focal_px, 512.0], [0.0, 0.0, 1.0]])
+    stamp_ns = np.round(np.arange(len(x)) * 1e9 / 24.0).astype(np.int64)
+    tracks = Tracks(keypoints, BODY_15.joints, stamp_ns, (1280, 1024))
+
+    def found(tracks: Tracks) -> float:
+        return 1000.0 * float(pa_mpjpe(reconstruct(tracks).joints3d, truth / 1000.0).mean())
+
+    blind, known = found(tracks), found(replace(tracks, camera_matrix=matrix))
+    assert known < blind < 30.0
+    assert known < 20.0
 
 
 def test_unseen_people_clean_and_noisy(shared):

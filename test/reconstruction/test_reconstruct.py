@@ -250,7 +250,8 @@ def test_windows_cover_every_frame_and_overlap(frames: int, length: int, overlap
     assert all(w.stop - w.start <= length for w in found)
     for a, b in itertools.pairwise(found):
         assert b.start > a.start
-        assert a.stop - b.start >= min(overlap, length // 2)
+        assert a.stop - b.start >= min(overlap, length // 2) - 1
+    assert sum(w.stop - w.start for w in found) <= frames + (len(found) - 1) * (overlap + 2)
 
 
 def test_progress_is_reported(walk: Walk) -> None:

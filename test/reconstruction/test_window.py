@@ -153,3 +153,15 @@ def test_gaps_turn_with_the_body() -> None:
     torso = limb_lengths(filled)[:, 4]  # the line of the hips
     np.testing.assert_allclose(torso, 0.18, atol=0.005)
     assert pa_mpjpe(filled, 1000.0 * walk.in_camera)[20:40].mean() < 140.0
+
+
+def test_gross_outliers_hardly_move_the_window(live: tuple[Walk, list[InitialPose]]) -> None:
+    walk, poses = live
+    rng = np.random.default_rng(0)
+    keypoints = walk.keypoints.copy()
+    gross = rng.random(keypoints.shape[:2]) < 0.04
+    keypoints[gross] += rng.choice([-1.0, 1.0], (int(gross.sum()), 2)) * 150.0
+    truth = 1000.0 * walk.in_camera
+    clean = adjust_window(stamps(72), walk.keypoints, None, None, joints(poses))
+    hit = adjust_window(stamps(72), keypoints, None, None, joints(poses))
+    assert pa_mpjpe(hit.joints3d, truth).mean() < pa_mpjpe(clean.joints3d, truth).mean() + 10.0

@@ -19,7 +19,7 @@ from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.live_session import reconstruct_live, recorded_config
 from drocap_ros.nodes.conversions import stamp_from_ros
-from drocap_ros.nodes.topics import IMAGE_QOS, TOPICS
+from drocap_ros.nodes.topics import IMAGE_RECORDING_QOS, TOPICS
 from drocap_ros.pipeline import reconstruct_input
 from drocap_ros.recording.session import open_session
 from drocap_ros.recording.session_reader import read_pose2d
@@ -182,7 +182,7 @@ def test_a_disk_that_fills_up_is_told_and_the_others_live_on(small_disk):
         states, poses = [], []
         graph.node.create_subscription(TOPICS["/diagnostics"].message, "/diagnostics", states.append, 100)
         graph.node.create_subscription(TOPICS["pose2d"].message, "pose2d", poses.append, TOPICS["pose2d"].qos)
-        pictures = graph.node.create_publisher(CompressedImage, "image/compressed", IMAGE_QOS)
+        pictures = graph.node.create_publisher(CompressedImage, "image/compressed", IMAGE_RECORDING_QOS)
         picture = CompressedImage(format="jpeg", data=np.zeros(400_000, np.uint8).tobytes())
 
         def told():

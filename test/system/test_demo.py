@@ -31,7 +31,13 @@ def test_the_demo_ends_with_a_motion_near_the_truth(tmp_path, capsys):
     assert counts["/drocap/pose2d"] == 180
     assert counts["/drocap/vehicle/state"] > 200
     assert counts["/tf"] > 200
-    assert {path.name for path in Path(out).iterdir()} == {"motion.npz", "truth.npz", "preview.png", "session"}
+    assert {path.name for path in Path(out).iterdir()} == {
+        "motion.npz",
+        "truth.npz",
+        "preview.png",
+        "report.html",
+        "session",
+    }
 
 
 def test_a_flight_without_length_is_refused(tmp_path, capsys):

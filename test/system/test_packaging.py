@@ -16,6 +16,7 @@ PARTS = (
     "drocap_ros", "msg", "config", "resource",
 )  # fmt: skip
 NODES = ["image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
+EXECUTABLES = {"drocap", "visualizer", "session_player", *NODES}
 
 pytestmark = pytest.mark.skipif(
     not (PREFIX / "bin" / "colcon").exists(), reason="not in the environment that `make setup` makes"
@@ -60,7 +61,7 @@ def test_colcon_builds_a_workspace_in_which_messages_and_nodes_import(source, tm
     install = str(tmp_path / "install")
     assert lines[0].startswith(install)
     assert lines[1].startswith(install)
-    assert set(lines[2:]) == {"drocap", *NODES}
+    assert set(lines[2:]) == EXECUTABLES
     run("bash", "-c", ". install/setup.sh && install/drocap_ros/lib/drocap_ros/drocap --version", cwd=tmp_path, env=ros)
 
 

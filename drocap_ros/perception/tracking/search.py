@@ -32,7 +32,7 @@ def window_around(box: np.ndarray, image_size: tuple[int, int], tight: bool = Fa
 def tiles(image_size: tuple[int, int]) -> list[Window]:
     """Overlapping tiles that cover a large image; none for one that the detector takes in at a glance."""
     width, height = image_size
-    if max(width, height) <= 1.6 * _TILE:
+    if max(width, height) <= 1.25 * _TILE:
         return []
     side = max(_TILE, max(width, height) // 6)
 

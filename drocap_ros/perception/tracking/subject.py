@@ -37,6 +37,8 @@ _LEAVING_SPEED = 0.15
 _PART = 0.75
 #: Distance to the next person, lengths, from which nobody is near.
 _ALONE = 0.4
+#: A person found so recently is looked at again before the search goes on.
+_CANDIDATE_S = 0.3
 #: A bystander unseen for so long is forgotten.
 _BYSTANDER_S = 2.0
 #: Persons remembered at most; a crowd's rest is of no use.
@@ -93,8 +95,8 @@ class SubjectTracker:
     def windows(self, image_size: tuple[int, int], stamp_ns: int) -> list[Window | None]:
         """Parts of the next image to detect in; None = all of it.
 
-        Near the subject while it is in view, and over the whole at intervals; without it over the whole, and
-        one tile of a large image in turn.
+        Near the subject while it is in view, and over the whole at intervals; without it over the whole and
+        around somebody just found, else one tile of a large image in turn.
         """
         if self._wanted is not None:
             return list({window_around(self._wanted, image_size): None, None: None})
@@ -107,11 +109,24 @@ class SubjectTracker:
                 return list({near: None, None: None})
             return [near]
         self._full_ns = stamp_ns
+        if (near := self._candidate_window(image_size, stamp_ns)) is not None:
+            return [None, near]
         parts = tiles(image_size)
         if not parts:
             return [None]
         self._tile = (self._tile + 1) % len(parts)
         return [None, parts[self._tile]]
+
+    def _candidate_window(self, image_size: tuple[int, int], stamp_ns: int) -> Window | None:
+        """Window around somebody just found who may become the subject: the whole image may not show them again."""
+        lost = self._subject
+        recent = [p for p in self._persons if p is not lost and p.gap_s(stamp_ns) <= _CANDIDATE_S]
+        if lost is not None:  # who was in view together with the subject is not the subject come back
+            recent = [p for p in recent if p.first_ns > lost.sure_ns]
+        if not recent:
+            return None
+        best = max(recent, key=lambda p: (p.hits < self._config.confirm_frames, p.quality))
+        return window_around(best.motion.box_at(stamp_ns), image_size)
 
     def steady(self, image_size: tuple[int, int], stamp_ns: int) -> Subject | None:
         """The subject predicted, if it was seen in the last image, stands free of others and clear of the edges."""
