@@ -1,4 +1,4 @@
-"""Error measures of a reconstruction (INTERFACES, section 6); lengths keep the unit of the input."""
+"""Error measures of a reconstruction; lengths keep the unit of the input."""
 
 from __future__ import annotations
 
