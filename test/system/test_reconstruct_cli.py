@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -166,19 +167,7 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_work(tracks_file
 def test_help_lists_only_what_works(tmp_path):
     done = drocap("--help", cwd=tmp_path)
     assert done.returncode == 0
-    for command in (
-        "demo",
-        "live",
-        "record",
-        "replay",
-        "reconstruct",
-        "recover",
-        "export",
-        "info",
-        "models",
-        "learn-dictionary",
-    ):
-        assert command in done.stdout
+    commands = set(re.findall(r"^    ([a-z][a-z-]+)", done.stdout, re.MULTILINE))
+    assert commands >= {"demo", "live", "record", "reconstruct", "info", "models", "learn-dictionary"}
+    for command in commands:
         assert drocap(command, "--help", cwd=tmp_path).returncode == 0
-    for later in ("orbit",):
-        assert f"    {later} " not in done.stdout
