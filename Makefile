@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 CLEAN := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE -u LD_LIBRARY_PATH -u PYTHONPATH -u AMENT_PREFIX_PATH -u CMAKE_PREFIX_PATH
 SOURCES := $(shell find drocap_ros msg config resource -type f -not -path '*/__pycache__/*') setup.py CMakeLists.txt package.xml
 
-.PHONY: help setup demo test lint bench clean
+.PHONY: help setup demo test lint bench bench-flight clean
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
 
@@ -42,8 +42,11 @@ lint: setup  ## ruff and mypy
 	$(CLEAN) $(BIN)/ruff format --check .
 	$(CLEAN) $(BIN)/mypy
 
-bench: setup  ## benchmarks; results under benchmarks/results
-	for file in benchmarks/[a-z]*.py; do $(CLEAN) $(BIN)/python $$file || exit 1; done
+bench: setup  ## benchmarks (about an hour); results under benchmarks/results
+	for part in reconstruction perception recording; do $(CLEAN) $(BIN)/python benchmarks/$$part.py || exit 1; done
+
+bench-flight: setup  ## simulated faults, randomized orbits, fuzzing (hours)
+	for part in faults orbits fuzz; do $(CLEAN) $(BIN)/python benchmarks/flight_$$part.py || exit 1; done
 
 clean:  ## remove everything that was built
 	rm -rf $(VENV) build install log
