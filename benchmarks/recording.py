@@ -164,7 +164,12 @@ def make_sources(node: Any) -> list[tuple[Any, Any, float, str]]:
 
     kinds = (("image/compressed", image, 30.0), ("pose2d", pose, 30.0), ("vehicle/state", state, 50.0))
     return [
-        (node.create_publisher(TOPICS[topic].message, topic, TOPICS[topic].qos), make, hz, topic)
+        (
+            node.create_publisher(TOPICS[topic].message, topic, TOPICS[topic].offered or TOPICS[topic].qos),
+            make,
+            hz,
+            topic,
+        )
         for topic, make, hz in kinds
     ]
 
