@@ -23,7 +23,7 @@ from drocap_ros.nodes.component import ERROR, OK, WARN, ComponentNode
 from drocap_ros.nodes.conversions import header_at, stamp_from_ros
 from drocap_ros.nodes.run import node_main
 from drocap_ros.perception.calibration import CameraModel, camera_model
-from drocap_ros.perception.images import decode_image, encode_jpeg
+from drocap_ros.perception.images import encode_jpeg
 from drocap_ros.perception.sources import Frame, ImageSource, open_source
 from drocap_ros.recording.pictures import image_from_message
 
@@ -127,7 +127,7 @@ class ImageIngestNode(ComponentNode):
 
     def _take(self, message: Any, compressed: bool) -> None:
         stamp_ns = stamp_from_ros(message.header.stamp)
-        image = decode_image(message.data) if compressed else image_from_message(message, compressed=False)
+        image = image_from_message(message, compressed)
         if self._camera is None:
             self._camera = camera_model(self.config, (image.shape[1], image.shape[0]))
         header = Header(stamp=message.header.stamp, frame_id=message.header.frame_id or self.config.frame_id)

@@ -15,8 +15,8 @@ from drocap_ros.nodes.component import OK, WARN, ComponentNode
 from drocap_ros.nodes.conversions import pose2d_to_ros, stamp_from_ros
 from drocap_ros.nodes.run import node_main
 from drocap_ros.perception.estimator import PoseEstimator
-from drocap_ros.perception.images import decode_image
 from drocap_ros.perception.models import models_folder
+from drocap_ros.recording.pictures import image_from_message
 
 
 class PoseEstimatorNode(ComponentNode):
@@ -37,7 +37,7 @@ class PoseEstimatorNode(ComponentNode):
         self._roi = np.array([x, y, x + message.width, y + message.height], np.float64)
 
     def _on_image(self, message: CompressedImage) -> None:
-        image = decode_image(message.data)
+        image = image_from_message(message, compressed=True)
         observation = self._estimator.process(image, stamp_from_ros(message.header.stamp), self._roi)
         self._roi = None
         self._pose2d.publish(pose2d_to_ros(observation, message.header.frame_id))
