@@ -7,10 +7,12 @@ from array import array
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion
+from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_msgs.msg import Header
 
 from drocap_ros.flight.vehicle_state import VehicleState as VehicleStateData
 from drocap_ros.msg import Pose2D, Pose3D, VehicleState
+from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.recording.pose_messages import float_array, observation_from_message
 from drocap_ros.skeleton import joint_set
@@ -41,6 +43,26 @@ def quaternion_to_ros(xyzw: np.ndarray) -> Quaternion:
     """(4,) x y z w -> geometry_msgs/Quaternion."""
     x, y, z, w = (float(v) for v in xyzw)
     return Quaternion(x=x, y=y, z=z, w=w)
+
+
+def compressed_image_to_ros(header: Header, jpeg: bytes) -> CompressedImage:
+    """JPEG of a BGR picture -> sensor_msgs/CompressedImage."""
+    return CompressedImage(header=header, format="bgr8; jpeg compressed bgr8", data=array("B", jpeg))
+
+
+def camera_info_to_ros(header: Header, camera: CameraModel) -> CameraInfo:
+    """Pinhole camera -> sensor_msgs/CameraInfo, unrectified pictures."""
+    k = camera.matrix.ravel().tolist()
+    return CameraInfo(
+        header=header,
+        width=camera.width,
+        height=camera.height,
+        distortion_model=camera.distortion_model,
+        d=camera.distortion.tolist(),
+        k=k,
+        r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        p=[k[0], 0.0, k[2], 0.0, 0.0, k[4], k[5], 0.0, 0.0, 0.0, 1.0, 0.0],
+    )
 
 
 def pose2d_to_ros(observation: PoseObservation, frame_id: str) -> Pose2D:

@@ -10,17 +10,16 @@ from __future__ import annotations
 
 import threading
 import time
-from array import array
 from collections.abc import Iterator
 from typing import Any
 
 from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
 from drocap_ros.errors import DrocapError, InputError
 from drocap_ros.nodes.component import ERROR, OK, WARN, ComponentNode
-from drocap_ros.nodes.conversions import header_at, stamp_from_ros
+from drocap_ros.nodes.conversions import camera_info_to_ros, compressed_image_to_ros, header_at, stamp_from_ros
 from drocap_ros.nodes.run import node_main
 from drocap_ros.perception.calibration import CameraModel, camera_model
 from drocap_ros.perception.images import encode_jpeg
@@ -145,9 +144,9 @@ class ImageIngestNode(ComponentNode):
             return
         self._last_ns = frame.stamp_ns
         data = jpeg or encode_jpeg(frame.image, self.config.jpeg_quality)
-        self._images.publish(CompressedImage(header=header, format="bgr8; jpeg compressed bgr8", data=array("B", data)))
+        self._images.publish(compressed_image_to_ros(header, data))
         if self._camera is not None:
-            self._infos.publish(_camera_info(header, self._camera))
+            self._infos.publish(camera_info_to_ros(header, self._camera))
         self.count("images")
         self.produced(frame.stamp_ns)
         self._arrived_s = time.monotonic()
@@ -163,20 +162,6 @@ class ImageIngestNode(ComponentNode):
             self.report(
                 WARN, f"no image from {self.config.source} for {silence_s:.1f} s; check the camera and its link"
             )
-
-
-def _camera_info(header: Header, camera: CameraModel) -> CameraInfo:
-    k = camera.matrix.ravel().tolist()
-    return CameraInfo(
-        header=header,
-        width=camera.width,
-        height=camera.height,
-        distortion_model=camera.distortion_model,
-        d=camera.distortion.tolist(),
-        k=k,
-        r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        p=[k[0], 0.0, k[2], 0.0, 0.0, k[4], k[5], 0.0, 0.0, 0.0, 1.0, 0.0],
-    )
 
 
 def main() -> int:
