@@ -24,6 +24,7 @@ from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerCo
 from drocap_ros.recording.config import SessionPlayerConfig, SessionRecorderConfig
 from drocap_ros.report.config import VisualizerConfig
 from drocap_ros.simulation.config import SimulationConfig
+from drocap_ros.simulation.flight_config import FlightSimulatorConfig
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class DrocapConfig:
     session_player: SessionPlayerConfig = field(default_factory=SessionPlayerConfig)
     visualizer: VisualizerConfig = field(default_factory=VisualizerConfig)
     capture_simulator: SimulationConfig = field(default_factory=SimulationConfig)
+    flight_simulator: FlightSimulatorConfig = field(default_factory=FlightSimulatorConfig)
 
     def section(self, component: str) -> Parameters:
         """Parameters of one component by its node's name."""

@@ -59,8 +59,8 @@ def upright_joints(motion: Motion) -> np.ndarray:
     return motion.joints3d[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
 
 
-def save_motion(path: str | Path, motion: Motion) -> None:
-    """Write ``motion.npz``."""
+def save_motion(path: str | Path, motion: Motion, **further: np.ndarray) -> None:
+    """Write ``motion.npz``; ``further`` arrays stand beside the motion's, and :func:`load_motion` passes them over."""
     np.savez_compressed(
         path,
         joints3d=motion.joints3d.astype(np.float64),
@@ -75,6 +75,7 @@ def save_motion(path: str | Path, motion: Motion) -> None:
         keypoints=motion.keypoints,
         reprojection_px=motion.reprojection_px,
         meta=np.array(json.dumps(motion.meta, sort_keys=True)),
+        **further,  # type: ignore[arg-type]
     )
 
 

@@ -62,6 +62,7 @@ if TFMessage is not None:
 #: node -> (topics it publishes, topics it subscribes to).  The recorder takes all that anybody publishes.
 NODES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "image_ingest": (("image/compressed", "camera_info"), ()),
+    "flight_simulator": (("image/compressed", "camera_info"), ()),
     "pose_estimator": (("pose2d",), ("image/compressed", "roi")),
     "capture_simulator": (("pose2d", "camera_info"), ()),
     "initializer": (("pose3d/initial",), ("pose2d",)),

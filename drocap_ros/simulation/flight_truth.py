@@ -1,0 +1,140 @@
+"""What was really there during a simulated flight, and how good an orbit it was.
+
+The file is a motion (``drocap evaluate pair MOTION TRUTH`` takes it) with ``camera_position`` beside it.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.motion import Motion, load_motion, save_motion
+from drocap_ros.simulation.camera import project
+from drocap_ros.skeleton import BODY_15
+from drocap_ros.tracks import read_npz
+
+#: Exposures that are kept, the first ones: two hours at 15 Hz.
+MAX_EXPOSURES = 108_000
+
+
+@dataclass(frozen=True)
+class FlightTruth:
+    """Truth at F exposures, whether or not a picture came of them.
+
+    stamp_ns : (F,) int64, increasing
+    joints3d : (F, 15, 3) m ENU, order of ``BODY_15``
+    camera_rotation, camera_position : (F, 3, 3) world -> optical, (F, 3) m ENU, the vehicle's place
+    camera_matrix, image_size : (3, 3) px; width, height px
+    """
+
+    stamp_ns: np.ndarray
+    joints3d: np.ndarray
+    camera_rotation: np.ndarray
+    camera_position: np.ndarray
+    camera_matrix: np.ndarray
+    image_size: tuple[int, int]
+
+    @property
+    def keypoints(self) -> np.ndarray:
+        """(F, 15, 2) px, exact; NaN behind the camera."""
+        return project(self.joints3d, self.camera_rotation, self.camera_position, self.camera_matrix)
+
+
+def save_truth(path: Path, truth: FlightTruth) -> None:
+    """Write the file; it appears whole or not at all."""
+    frames, joints = truth.joints3d.shape[:2]
+    motion = Motion(
+        joints3d=truth.joints3d, joints=BODY_15.joints, parents=BODY_15.parents, stamp_ns=truth.stamp_ns,
+        frame="world", metric=True, scale_source="simulation", camera_rotation=truth.camera_rotation,
+        confidence=np.ones((frames, joints)), keypoints=truth.keypoints,
+        reprojection_px=np.zeros((frames, joints)), meta={"method": "truth of a simulated flight"},
+    )  # fmt: skip
+    work = path.with_name(f".{path.name}.part.npz")
+    try:
+        save_motion(
+            work, motion, camera_position=truth.camera_position, camera_matrix=truth.camera_matrix,
+            image_size=np.array(truth.image_size),
+        )  # fmt: skip
+        os.replace(work, path)
+    finally:
+        work.unlink(missing_ok=True)
+
+
+def load_truth_of_flight(path: Path) -> FlightTruth:
+    """Read what :func:`save_truth` wrote.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be used.
+    """
+    motion = load_motion(path)
+    more = read_npz(path, ("camera_position", "camera_matrix", "image_size"))
+    frames = len(motion.stamp_ns)
+    for name, shape in (("camera_position", (frames, 3)), ("camera_matrix", (3, 3)), ("image_size", (2,))):
+        if more[name].shape != shape or more[name].dtype.kind not in "fiu":
+            raise InputError(f"{path}: {name}: expected numbers of shape {shape}, got {more[name].shape}")
+    width, height = (int(v) for v in more["image_size"])
+    return FlightTruth(
+        motion.stamp_ns, motion.joints3d, motion.camera_rotation, more["camera_position"], more["camera_matrix"],
+        (width, height),
+    )  # fmt: skip
+
+
+class FlownOrbit(NamedTuple):
+    """An orbit against the truth: means of absolute errors, shares of the exposures, extremes.
+
+    in_middle_third : the middle of the person's extent lies in the middle third of the picture, both ways
+    turned_deg : angle that the vehicle covered round the person
+    """
+
+    exposures: int
+    radius_error_m: float
+    yaw_error_deg: float
+    in_middle_third: float
+    least_distance_m: float
+    top_speed_m_s: float
+    turned_deg: float
+
+
+def flown_orbit(truth: FlightTruth, within: np.ndarray, radius_m: float) -> FlownOrbit:
+    """Quality of the orbit over the exposures (F,) bool; angles and speeds come from pairs of neighbours within.
+
+    Raises
+    ------
+    InputError
+        When fewer than two exposures lie within.
+    """
+    if int(within.sum()) < 2:
+        raise InputError("orbit: expected at least two exposures within it, found fewer; fly longer")
+    sight = truth.joints3d[:, 0, :2] - truth.camera_position[:, :2]
+    distance = np.linalg.norm(sight, axis=1)
+    bearing = np.arctan2(sight[:, 1], sight[:, 0])
+    nose = np.arctan2(truth.camera_rotation[:, 2, 1], truth.camera_rotation[:, 2, 0])
+    yaw_error = np.abs(np.angle(np.exp(1j * (nose - bearing))))
+    pairs = within[1:] & within[:-1]
+    seconds = np.diff(truth.stamp_ns) * 1e-9
+    speed = np.linalg.norm(np.diff(truth.camera_position, axis=0), axis=1) / seconds
+    turned = np.abs(np.sum(np.angle(np.exp(1j * np.diff(bearing)))[pairs]))
+    return FlownOrbit(
+        int(within.sum()),
+        float(np.abs(distance - radius_m)[within].mean()),
+        float(np.degrees(yaw_error[within].mean())),
+        float(middle_third(truth)[within].mean()),
+        float(distance[within].min()),
+        float(speed[pairs].max()) if pairs.any() else float("nan"),
+        float(np.degrees(turned)),
+    )
+
+
+def middle_third(truth: FlightTruth) -> np.ndarray:
+    """(F,) bool, the middle of the person's extent is in the middle third of the picture; False where it is behind."""
+    px = truth.keypoints
+    size = np.array(truth.image_size, dtype=float)
+    middle = 0.5 * (px.min(axis=1) + px.max(axis=1)) - size / 2
+    return np.asarray(np.all(np.abs(middle) < size / 6, axis=1))
