@@ -30,7 +30,7 @@ _MODES = {
 }  # fmt: skip
 _CONTROL = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}
 #: Deceleration of the stop in each mode: the measured distances from 2 m/s, less what the lag takes.
-_BRAKING = {"BRAKE": 0.75, "LOITER": 1.7}
+_BRAKING = {"BRAKE": 0.92, "LOITER": 2.6}
 _PX4_STREAM_S, _PX4_GAP_S, _PX4_LOSS_S = 1.0, 0.5, 1.0
 _GPS_NOTICED_S, _EKF_NOTICED_S = 0.4, 7.4
 _HEALTHY, _CONSTANT_POSITION = 831, 831 & ~(8 | 16) | 128
