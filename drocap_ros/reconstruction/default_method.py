@@ -5,18 +5,22 @@
    opinion over the whole window (:mod:`depth_signs`).
 3. All joints and bone lengths are adjusted together (:mod:`limb_adjustment`).
 4. The lifter looks again, told the bone lengths, and steps 2 and 3 are done from its second opinion.
+
+Where the person's bone lengths and size in the image are known from the window before, the first look and the first
+adjustment are left out: a warm start costs half.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from drocap_ros.parameters import Parameters, param
 from drocap_ros.reconstruction.depth_signs import depth_signs
-from drocap_ros.reconstruction.lifter import Lifter
+from drocap_ros.reconstruction.lifter import LiftedMotion, Lifter
 from drocap_ros.reconstruction.lifter_input import LIFTER_FPS, nanmedian_small
 from drocap_ros.reconstruction.limb_adjustment import (
     LimbProblem,
@@ -26,6 +30,9 @@ from drocap_ros.reconstruction.limb_adjustment import (
     zoom_model,
 )
 from drocap_ros.skeleton import BODY_15
+
+#: Says whether an adjustment should end.
+Cancelled = Callable[[], bool]
 
 _BONES = BODY_15.bones
 #: Bones whose sum is the yardstick that turns image units into mm of an ordinary person.
@@ -59,6 +66,18 @@ class DefaultMethodConfig(Parameters):
 
 
 @dataclass(frozen=True)
+class KnownBody:
+    """What an earlier window knows of the person.
+
+    lengths_mm : (16,) of :data:`~drocap_ros.reconstruction.limb_adjustment.SPANS`, in mm of an ordinary person
+    unit_per_mm : (F,) the person's size in the image of each frame: units of the keypoints per such mm
+    """
+
+    lengths_mm: np.ndarray
+    unit_per_mm: np.ndarray
+
+
+@dataclass(frozen=True)
 class DefaultResult:
     """A window's result.
 
@@ -66,14 +85,18 @@ class DefaultResult:
         in the scale of the pelvis
     sigma : (F, 15, 2) the lifter's expected absolute error of x, y (each) and of depth, in the same unit
     lengths : (14,) bone lengths in the same unit (joint j to its parent at j - 1)
+    body : for a warm start of the next window
+    effort : steps that the first and the final adjustment took
     seconds : wall-clock of "initial" (the lifter) and of "ba" (the rest)
     """
 
     joints: np.ndarray
     sigma: np.ndarray
     lengths: np.ndarray
+    body: KnownBody
     cost_terms: dict[str, float]
     iterations: int
+    effort: tuple[int, int]
     stop_reason: str
     seconds: dict[str, float]
 
@@ -86,6 +109,8 @@ def default_start_and_refine(
     focal: float | None = None,
     config: DefaultMethodConfig | None = None,
     lifter: Lifter | None = None,
+    known: KnownBody | None = None,
+    cancelled: Cancelled | None = None,
 ) -> DefaultResult:
     """Poses of one window of evenly spaced frames.
 
@@ -97,6 +122,8 @@ def default_start_and_refine(
     fps : frames per second
     focal : focal length in the keypoints' unit; None = unknown, and the camera is taken to be far away
     config, lifter : the defaults if None
+    known : sizes from an earlier window, for a warm start
+    cancelled : asked before every step of the adjustments but the first; once it says True, they end
 
     Raises
     ------
@@ -105,10 +132,72 @@ def default_start_and_refine(
     """
     config = config or DefaultMethodConfig()
     lifter = lifter or Lifter.load(config.lifter or None)
-    clock = time.perf_counter()
-    lifted = lifter.lift(keypoints, confidence, fps)
-    seconds = {"initial": time.perf_counter() - clock, "ba": 0.0}
+    begin = time.perf_counter()
+    if known is None:
+        sized = _sized(keypoints, confidence, variance, fps, focal, config, lifter, cancelled)
+    else:
+        sized = _sized_by(known, keypoints, confidence, variance, fps, focal, config, lifter)
+    setting, mm, zoom = sized.setting, sized.mm, sized.zoom
 
+    clock = time.perf_counter()
+    found = _solve(
+        setting, sized.flat, sized.lifted.joints, sized.lifted.sigma, sized.lengths, config.iterations, cancelled
+    )
+    size = (zoom / mm)[:, None, None]
+    joints = found.joints.copy()
+    if focal is not None:
+        joints[..., :2] /= _magnification(joints[..., 2] - joints[:, :1, 2], focal * mm / zoom)
+    joints *= size
+    joints[..., :2] += sized.centre[:, None]
+    end = time.perf_counter()
+    adjusting = sized.seconds + end - clock
+    yardstick = _YARDSTICK_MM / max(float(found.lengths[_YARDSTICK].sum()), 1e-12)
+    return DefaultResult(
+        joints=joints,
+        sigma=sized.lifted.sigma * size,
+        lengths=found.lengths[: len(_BONES)] / mm,
+        body=KnownBody(found.lengths * yardstick, zoom * found.zoom / (mm * yardstick)),
+        cost_terms=found.cost_terms,
+        iterations=found.iterations,
+        effort=(sized.iterations, found.iterations),
+        stop_reason=found.stop_reason,
+        seconds={"initial": end - begin - adjusting, "ba": adjusting},
+    )
+
+
+@dataclass(frozen=True)
+class _Sized:
+    """A window whose person's size and bone lengths are known, before the final adjustment.
+
+    flat : (F, 15, 2) mm, the keypoints as a distant camera would see them about ``centre`` (F, 2)
+    lifted : what the lifter, told the lengths (16,) mm, makes of it
+    zoom : (F,) the person's relative size; ``mm`` per unit of the keypoints at zoom 1
+    seconds, iterations : spent on adjusting so far
+    """
+
+    setting: _Setting
+    flat: np.ndarray
+    lifted: LiftedMotion
+    lengths: np.ndarray
+    centre: np.ndarray
+    zoom: np.ndarray
+    mm: float
+    seconds: float
+    iterations: int
+
+
+def _sized(
+    keypoints: np.ndarray,
+    confidence: np.ndarray | None,
+    variance: np.ndarray | None,
+    fps: float,
+    focal: float | None,
+    config: DefaultMethodConfig,
+    lifter: Lifter,
+    cancelled: Cancelled | None,
+) -> _Sized:
+    """Sizes from the lifter's first opinion and a first adjustment."""
+    lifted = lifter.lift(keypoints, confidence, fps)
     clock = time.perf_counter()
     mm = _YARDSTICK_MM / max(float(np.median(_bone_lengths(lifted.joints), axis=0)[_YARDSTICK].sum()), 1e-12)
     weight, noise = _weights(keypoints * mm, confidence, variance, mm, config)
@@ -119,32 +208,39 @@ def default_start_and_refine(
     start[..., :2] -= centre[:, None]
     start *= mm / zoom[:, None, None]
     flat = _orthographic(keypoints, start[..., 2], centre, zoom, mm, focal)
-    found = _solve(setting, flat, start, lifted.sigma * mm, None, config.first_iterations)
+    found = _solve(setting, flat, start, lifted.sigma * mm, None, config.first_iterations, cancelled)
     zoom = zoom * found.zoom
     flat = _orthographic(keypoints, found.joints[..., 2] - found.joints[:, :1, 2], centre, zoom, mm, focal)
-    seconds["ba"] += time.perf_counter() - clock
-
-    clock = time.perf_counter()
+    seconds = time.perf_counter() - clock
     lifted = lifter.lift(flat, confidence, fps, found.lengths[: len(_BONES)])
-    seconds["initial"] += time.perf_counter() - clock
+    return _Sized(setting, flat, lifted, found.lengths, centre, zoom, mm, seconds, found.iterations)
 
-    clock = time.perf_counter()
-    found = _solve(setting, flat, lifted.joints, lifted.sigma, found.lengths, config.iterations)
-    size = (zoom / mm)[:, None, None]
-    joints = found.joints.copy()
-    if focal is not None:
-        joints[..., :2] /= _magnification(joints[..., 2] - joints[:, :1, 2], focal * mm / zoom)
-    joints *= size
-    joints[..., :2] += centre[:, None]
-    seconds["ba"] += time.perf_counter() - clock
-    return DefaultResult(
-        joints=joints,
-        sigma=lifted.sigma * size,
-        lengths=found.lengths[: len(_BONES)] / mm,
-        cost_terms=found.cost_terms,
-        iterations=found.iterations,
-        stop_reason=found.stop_reason,
-        seconds=seconds,
+
+def _sized_by(
+    known: KnownBody,
+    keypoints: np.ndarray,
+    confidence: np.ndarray | None,
+    variance: np.ndarray | None,
+    fps: float,
+    focal: float | None,
+    config: DefaultMethodConfig,
+    lifter: Lifter,
+) -> _Sized:
+    """Sizes of an earlier window."""
+    mm = 1.0 / float(np.median(known.unit_per_mm))
+    zoom = known.unit_per_mm * mm
+    lengths = known.lengths_mm[: len(_BONES)]
+    rough = _orthographic(keypoints, np.zeros(keypoints.shape[:2]), np.zeros((len(keypoints), 2)), zoom, mm, None)
+    lifted = lifter.lift(rough, confidence, fps, lengths)
+    middle = np.median(lifted.joints[..., :2], axis=1)
+    centre = middle * (zoom / mm)[:, None]
+    joints = lifted.joints.copy()
+    joints[..., :2] -= middle[:, None]
+    flat = _orthographic(keypoints, joints[..., 2], centre, zoom, mm, focal)
+    weight, noise = _weights(keypoints * mm, confidence, variance, mm, config)
+    setting = _Setting(weight, noise, fps, config, *zoom_model(len(keypoints), fps, config.zoom_std_per_s))
+    return _Sized(
+        setting, flat, LiftedMotion(joints, lifted.sigma), known.lengths_mm, centre, zoom, mm, seconds=0.0, iterations=0
     )
 
 
@@ -155,6 +251,8 @@ def default_poses(
     variance: np.ndarray | None,
     focal: float | None,
     config: DefaultMethodConfig,
+    known: KnownBody | None = None,
+    cancelled: Cancelled | None = None,
 ) -> DefaultResult:
     """:func:`default_start_and_refine` for frames at any increasing times ``stamp_ns`` (F,).
 
@@ -162,7 +260,9 @@ def default_poses(
     """
     slot, fps = even_slots(stamp_ns)
     if slot[-1] + 1 == len(slot):
-        return default_start_and_refine(keypoints, confidence, variance, fps, focal, config)
+        return default_start_and_refine(
+            keypoints, confidence, variance, fps, focal, config, known=known, cancelled=cancelled
+        )
 
     def spread(values: np.ndarray | None, empty: float) -> np.ndarray | None:
         if values is None:
@@ -173,8 +273,14 @@ def default_poses(
 
     points = spread(keypoints, np.nan)
     assert points is not None
-    r = default_start_and_refine(points, spread(confidence, 0.0), spread(variance, np.nan), fps, focal, config)
-    return replace(r, joints=r.joints[slot], sigma=r.sigma[slot])
+    if known is not None:
+        size = np.interp(np.arange(slot[-1] + 1), slot, known.unit_per_mm)
+        known = replace(known, unit_per_mm=size)
+    r = default_start_and_refine(
+        points, spread(confidence, 0.0), spread(variance, np.nan), fps, focal, config, known=known, cancelled=cancelled
+    )
+    body = replace(r.body, unit_per_mm=r.body.unit_per_mm[slot])
+    return replace(r, joints=r.joints[slot], sigma=r.sigma[slot], body=body)
 
 
 def even_slots(stamp_ns: np.ndarray) -> tuple[np.ndarray, float]:
@@ -272,6 +378,7 @@ def _solve(
     sigma: np.ndarray,
     lengths: np.ndarray | None,
     iterations: int,
+    cancelled: Cancelled | None,
 ) -> LimbResult:
     """Signs and adjustment of 2D joints (F, 15, 2) and the lifter's joints (F, 15, 3), all in mm."""
     config, weight, fps = setting.config, setting.weight, setting.fps
@@ -310,7 +417,9 @@ def _solve(
         zoom_basis=setting.zoom_basis,
         zoom_precision=setting.zoom_precision,
     )
-    return adjust_limbs(problem, np.concatenate([flat, depth[..., None]], axis=-1), lengths, iterations)
+    return adjust_limbs(
+        problem, np.concatenate([flat, depth[..., None]], axis=-1), lengths, iterations, cancelled=cancelled
+    )
 
 
 def _smooth(

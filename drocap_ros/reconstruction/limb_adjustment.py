@@ -14,6 +14,7 @@ Its normal equations couple neighbouring frames only: a band, bordered by the le
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -183,7 +184,12 @@ def _border(p: LimbProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
 
 
 def adjust_limbs(
-    problem: LimbProblem, joints: np.ndarray, lengths: np.ndarray, iterations: int, tolerance: float = 1e-3
+    problem: LimbProblem,
+    joints: np.ndarray,
+    lengths: np.ndarray,
+    iterations: int,
+    tolerance: float = 1e-3,
+    cancelled: Callable[[], bool] | None = None,
 ) -> LimbResult:
     """Minimise the cost from a start.
 
@@ -193,6 +199,7 @@ def adjust_limbs(
     lengths : (16,) mm of :data:`SPANS`
     iterations : at most so many accepted steps
     tolerance : relative decrease of the cost that ends the solve
+    cancelled : asked before every step but the first; True ends the solve with reason "deadline"
     """
     from scipy.linalg.lapack import dpbtrf, dtbtrs
 
@@ -201,6 +208,9 @@ def adjust_limbs(
     here = _Residuals(problem, joints, lengths, zooms)
     done = 0
     while done < iterations:
+        if done and cancelled is not None and cancelled():
+            stop = "deadline"
+            break
         g, g_sizes = _gradient(problem, here)
         band, (border, corner) = _band(problem, here), _border(problem, here)
         right = np.concatenate([-g.reshape(1, -1), border])
