@@ -118,6 +118,7 @@ setup(
         "c3d>=0.6",
     ],
     extras_require={
+        "view": ["rerun-sdk>=0.39,<0.40"],
         "train": ["torch>=2.9", "onnx>=1.16"],
         "test": [
             "pytest",

@@ -14,7 +14,7 @@ from drocap_ros import __version__
 from drocap_ros.errors import DrocapError
 
 COMMANDS = (
-    "demo", "live", "orbit", "record", "replay", "track", "reconstruct", "learn_dictionary",
+    "demo", "live", "view", "orbit", "record", "replay", "track", "reconstruct", "learn_dictionary",
     "export", "report", "info", "recover", "top", "models", "evaluate", "train_lifter",
 )  # fmt: skip
 

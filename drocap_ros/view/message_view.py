@@ -1,0 +1,254 @@
+"""The graph's messages in the viewer, whoever decoded them: rclpy from a running graph, rosbags from a file."""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.flight.frames import camera_rotation
+from drocap_ros.geometry.ellipsoids import unpack_covariance
+from drocap_ros.recording.pictures import image_from_message
+from drocap_ros.recording.pose_messages import float_array, observation_from_message
+from drocap_ros.skeleton import JointSet, joint_set
+from drocap_ros.view.camera import LEVEL_CAMERA, nominal_camera_matrix, place_cameras
+from drocap_ros.view.scene import Scene
+
+PLOTS = ("latency_ms", "reprojection_px", "orbit")
+#: Images whose keypoints are kept until their pose comes.
+_WAITING = 300
+#: Points of the camera's path that are kept, and the distance between two of them.
+_PATH_POINTS, _PATH_STEP_M = 600, 0.1
+#: A state of the vehicle further than this from an image says nothing of it.
+_NEAR_NS = 500_000_000
+#: A refined pose is drawn when later images can change it no more than a little.
+_REFINED_LAG_NS = 2 * 10**9
+#: A delay longer than this is that of another clock.
+_LONGEST_S = 60.0
+_LEVELS = {0: "INFO", 1: "WARN", 2: "ERROR", 3: "WARN"}
+_MAGIC = {b"\xff\xd8": "image/jpeg", b"\x89P": "image/png"}
+
+
+class MessageView:
+    """Draws messages as they come.
+
+    Poses in frame ``map`` are drawn where they are.  Others are in the camera's optical frame with the pelvis at the
+    origin: they are placed so that the body looks as in its picture, before the camera that the vehicle reports, or
+    before a level one, the pelvis at the origin, when it reports none.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._keypoints: OrderedDict[int, tuple[str, np.ndarray]] = OrderedDict()
+        self._matrix: np.ndarray | None = None
+        self._size: tuple[int, int] | None = None
+        self._cameras: deque[tuple[int, np.ndarray, np.ndarray]] = deque(maxlen=_WAITING)
+        self._path: deque[np.ndarray] = deque(maxlen=_PATH_POINTS)
+        self._now_ns: int | None = None
+        self._refined_ns = -(10**18)
+        self._pending: list[Any] = []
+        self._told: dict[str, tuple[int, str]] = {}
+        self.taken = self.refused = 0
+        #: Last part of a topic's name (two parts where one says too little) -> what draws its messages.
+        self.handlers: dict[str, Callable[[Any, int], None]] = {
+            "pose2d": self._on_pose2d,
+            "pose3d/initial": lambda message, at_ns: self._on_pose3d("initial", message, at_ns),
+            "pose3d/latest": lambda message, at_ns: self._on_pose3d("latest", message, at_ns),
+            "pose3d/refined": self._on_window,
+            "image/compressed": self._on_picture,
+            "camera_info": self._on_camera_info,
+            "vehicle/state": self._on_state,
+            "orbit/status": self._on_orbit,
+            "/diagnostics": self._on_diagnostics,
+        }
+
+    def take(self, topic: str, message: Any, received_ns: int) -> None:
+        """Draw a message of a topic of :attr:`handlers`; a malformed one is counted and not drawn."""
+        self.taken += 1
+        try:
+            self.handlers[topic](message, received_ns)
+        except InputError as error:
+            self.refused += 1
+            self._scene.say("view", f"{topic}: {error}", "WARN")
+
+    def finish(self) -> None:
+        """Draw what waited for later images."""
+        for pose in self._pending:
+            self._draw("refined", pose)
+        self._pending = []
+
+    # -- pictures and keypoints ------------------------------------------------------------------------
+
+    def _on_picture(self, message: Any, _: int) -> None:
+        data = bytes(message.data)
+        self._at(message)
+        if (kind := _MAGIC.get(data[:2])) is not None:
+            self._scene.jpeg(data, kind)
+        else:
+            self._scene.image(image_from_message(message, compressed=hasattr(message, "format")))
+
+    def _on_pose2d(self, message: Any, _: int) -> None:
+        observation = observation_from_message(message)
+        self._at(message)
+        if self._size != observation.image_size:
+            self._size = observation.image_size
+            self._calibrate()
+        if not observation.has_subject:
+            self._scene.no_keypoints()
+            return
+        self._scene.keypoints(observation.joints, observation.keypoints, observation.roi)
+        self._keypoints[observation.stamp_ns] = (observation.joints.name, observation.keypoints)
+        while len(self._keypoints) > _WAITING:
+            self._keypoints.popitem(last=False)
+
+    def _on_camera_info(self, message: Any, _: int) -> None:
+        matrix = np.asarray(getattr(message, "k", getattr(message, "K", ())), float)
+        if matrix.size != 9 or not np.isfinite(matrix).all() or matrix[0] <= 0 or matrix[4] <= 0:
+            raise InputError("k: expected a camera matrix with a positive focal length; calibrate the camera")
+        matrix = matrix.reshape(3, 3)
+        if self._matrix is None or not np.array_equal(matrix, self._matrix):
+            self._at(message)
+            self._matrix = matrix
+            self._size = (int(message.width), int(message.height))
+            self._calibrate()
+
+    def _calibrate(self) -> None:
+        if self._size is not None:
+            self._scene.calibration(self._camera_matrix(), self._size)
+
+    def _camera_matrix(self) -> np.ndarray:
+        if self._matrix is not None:
+            return self._matrix
+        return nominal_camera_matrix(*(self._size or (1280, 720)))
+
+    # -- the body --------------------------------------------------------------------------------------
+
+    def _on_pose3d(self, stage: str, message: Any, received_ns: int) -> None:
+        self._at(message)
+        self._draw(stage, message)
+        late_s = (received_ns - stamp_ns(message)) * 1e-9
+        if abs(late_s) < _LONGEST_S:
+            self._scene.plot(f"latency_ms/{stage}", 1e3 * late_s)
+        if message.track_id:
+            self._scene.plot(f"reprojection_px/{stage}", float(message.reprojection_rms))
+
+    def _on_window(self, message: Any, _: int) -> None:
+        newest_ns = stamp_ns(message)
+        fresh = [pose for pose in message.poses if stamp_ns(pose) > self._refined_ns]
+        settled = [pose for pose in fresh if stamp_ns(pose) <= newest_ns - _REFINED_LAG_NS]
+        for pose in settled:
+            self._draw("refined", pose)
+        if settled:
+            self._refined_ns = stamp_ns(settled[-1])
+        self._pending = fresh[len(settled) :]
+
+    def _draw(self, stage: str, message: Any) -> None:
+        self._scene.at(stamp_ns(message))
+        if not message.track_id:
+            self._scene.no_subject(stage)
+            return
+        joints_of = joint_set(message.skeleton)
+        count = len(joints_of)
+        joints = float_array(message.joints, (count, 3), "joints").astype(float)
+        covariance = None
+        if len(message.covariance) == 6 * count:
+            covariance = float_array(message.covariance, (count, 6), "covariance").astype(float)
+        if message.header.frame_id.rsplit("/", 1)[-1] != "map":
+            rotation, shift = self._place(message, joints_of, joints, draw_camera=stage != "refined")
+            joints = joints @ rotation + shift
+            covariance = None if covariance is None else _turned(covariance, rotation.T)
+        self._scene.pose(stage, joints_of, joints, covariance if stage != "refined" else None)
+
+    def _place(
+        self, message: Any, joints_of: JointSet, joints: np.ndarray, draw_camera: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Rotation world -> optical, and shift (3,) m in the world, of a pose in the optical frame."""
+        at_ns = stamp_ns(message)
+        measured = self._camera_at(at_ns)
+        rotation = LEVEL_CAMERA if measured is None else measured[1]
+        name, keypoints = self._keypoints.get(at_ns, ("", None))
+        if keypoints is None or name != joints_of.name:
+            return rotation, np.zeros(3)
+        world = joints @ rotation
+        camera = place_cameras(world[None], keypoints[None], rotation[None], self._camera_matrix())[0]
+        if not np.isfinite(camera).all():
+            return rotation, np.zeros(3)
+        if measured is not None:
+            return rotation, measured[0] - camera
+        if draw_camera:
+            self._scene.camera(camera, rotation)
+        return rotation, np.zeros(3)
+
+    def _camera_at(self, at_ns: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Position and rotation of the camera that the vehicle reported nearest to a time, None if none is near."""
+        near = min(self._cameras, key=lambda camera: abs(camera[0] - at_ns), default=None)
+        if near is None or abs(near[0] - at_ns) > _NEAR_NS:
+            return None
+        return near[1], near[2]
+
+    # -- the vehicle and the nodes ---------------------------------------------------------------------
+
+    def _on_state(self, message: Any, _: int) -> None:
+        position = np.asarray(message.position_enu_m, float)
+        if not np.isfinite(position).all():
+            return
+        self._at(message)
+        xyzw = _xyzw(message.gimbal_orientation)
+        if np.isfinite(xyzw).all() and xyzw.any():
+            rotation = camera_rotation(xyzw)
+            self._cameras.append((stamp_ns(message), position, rotation))
+            self._scene.camera(position, rotation)
+        if not self._path or np.linalg.norm(position - self._path[-1]) >= _PATH_STEP_M:
+            self._path.append(position)
+            self._scene.camera_path(np.array(self._path))
+
+    def _on_orbit(self, message: Any, _: int) -> None:
+        self._at_newest(message)
+        self._scene.plot("orbit/radius_error_m", float(message.radius_error_m))
+        self._scene.plot("orbit/yaw_error_deg", float(message.yaw_error_deg))
+        self._tell("orbit", int(message.state), message.reason, "INFO")
+
+    def _on_diagnostics(self, message: Any, _: int) -> None:
+        self._at_newest(message)
+        for status in message.status:
+            # rclpy gives the level as one byte.
+            level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+            self._tell(status.name, level, status.message, _LEVELS.get(level, "WARN"))
+
+    def _tell(self, who: str, state: int, text: str, level: str) -> None:
+        """Log what somebody says when it is something new."""
+        if self._told.get(who) != (state, text):
+            self._told[who] = (state, text)
+            self._scene.say(who.replace("/", "."), text, level)
+
+    # -- time ------------------------------------------------------------------------------------------
+
+    def _at(self, message: Any) -> None:
+        stamp = stamp_ns(message)
+        self._now_ns = stamp if self._now_ns is None else max(self._now_ns, stamp)
+        self._scene.at(stamp)
+
+    def _at_newest(self, message: Any) -> None:
+        """Words belong to the newest image: the pictures of a file may have another clock than the nodes."""
+        self._scene.at(self._now_ns if self._now_ns is not None else stamp_ns(message))
+
+
+def stamp_ns(message: Any) -> int:
+    """Stamp of a message with a header."""
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+def _xyzw(quaternion: Any) -> np.ndarray:
+    return np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], float)
+
+
+def _turned(packed: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Covariances (P, 6) of points that are turned by a rotation (3, 3)."""
+    full = rotation @ unpack_covariance(packed) @ rotation.T
+    return np.asarray(full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
+
+
+__all__ = ["PLOTS", "MessageView", "stamp_ns"]
