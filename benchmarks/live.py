@@ -1,0 +1,189 @@
+"""Figures of the live graph: `python benchmarks/live.py`, or some of its parts by name.
+
+load    a 1280x720 video at 30 fps round and round through all nodes, adjustment and recording on: rate, drops,
+        latency from the image's stamp to pose3d/initial, the adjustment's duration, processor time, in one process
+        and in a process each, with the adjuster and without (`--seconds 300`, `--one-process`, `--processes`,
+        `--no-adjuster` for one case)
+
+Needs ../shared (video, weights).  Results go to benchmarks/results/live.json.  Run it on a machine that does nothing
+else; the load average before each part stands beside its figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)]
+SHARED = ROOT.parent / "shared"
+PARTS = ("load",)
+NODES = ["image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
+#: Networks, discovery and the first window take their time: not part of the figures.
+WARM_S = 15.0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []])
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--one-process", action="store_true")
+    parser.add_argument("--processes", action="store_true")
+    parser.add_argument("--no-adjuster", action="store_true")
+    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    target = args.out / "live.json"
+    results = json.loads(target.read_text()) if target.exists() else {}
+    for part in args.parts or PARTS:
+        with tempfile.TemporaryDirectory(prefix="drocap_bench_") as folder:
+            results.setdefault(part, {}).update(globals()[f"part_{part}"](args, Path(folder)))
+        target.write_text(json.dumps(results, indent=1) + "\n")
+    return 0
+
+
+def say(what: str, figures: dict[str, Any]) -> None:
+    print(f"{what}:", *(f"  {key}: {value}" for key, value in figures.items()), sep="\n", flush=True)
+
+
+# -- the stream and the graph ------------------------------------------------------------------------------
+
+
+def stream(folder: Path) -> Path:
+    """The walk at 1280x720, 30 fps."""
+    import cv2
+
+    path = folder / "walk.mp4"
+    source = cv2.VideoCapture(str(SHARED / "media" / "outdoor_walk.mp4"))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 30.0, (1280, 720))
+    while (read := source.read())[0]:
+        writer.write(cv2.resize(read[1], (1280, 720), interpolation=cv2.INTER_AREA))
+    writer.release()
+    return path
+
+
+def graph_config(video: Path, session: Path, port: int) -> Any:
+    from drocap_ros.config import DrocapConfig
+
+    config = DrocapConfig().replace("image_ingest", source=str(video), horizontal_fov_deg=60.0, loop=True)
+    config = config.replace("pose_estimator", models_dir=str(SHARED / "models"), on_loss="next")
+    config = config.replace("mavlink_bridge", url=f"udpin:127.0.0.1:{port}")
+    return config.replace("session_recorder", session_dir=str(session))
+
+
+def usage(pid: int) -> tuple[float, float]:
+    """Processor seconds and resident MiB of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    page_mib = os.sysconf("SC_PAGE_SIZE") / 2**20
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"), pages * page_mib
+
+
+# -- load --------------------------------------------------------------------------------------------------
+
+
+def part_load(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Every asked case of the graph, one after the other."""
+    video = stream(folder)
+    results = {}
+    for processes in (False, True):
+        if (args.one_process or args.processes) and not (args.processes if processes else args.one_process):
+            continue
+        for adjuster in (True, False):
+            if args.no_adjuster and adjuster:
+                continue
+            name = ("processes" if processes else "one process") + ("" if adjuster else ", no adjuster")
+            load = os.getloadavg()[0]
+            results[name] = measure_load(video, folder / name.replace(" ", "_"), processes, adjuster, args.seconds)
+            results[name]["load average before"] = round(load, 2)
+            say(f"load, {name}, {args.seconds:g} s", results[name])
+    return results
+
+
+def measure_load(video: Path, session: Path, processes: bool, adjuster: bool, seconds: float) -> dict[str, Any]:
+    from drocap_ros.bringup import bringup
+    from drocap_ros.simulation.ports import free_udp_port
+
+    nodes = [name for name in NODES if adjuster or name != "bundle_adjuster"]
+    config = graph_config(video, session, free_udp_port())
+    with bringup(config, nodes, processes=processes) as graph:
+        graph.spin_for(WARM_S)
+        pids = {graph.pid(name): name if processes else "all nodes" for name in nodes}
+        before, begin_ns = {pid: usage(pid)[0] for pid in pids}, time.time_ns()
+        graph.spin_for(seconds)
+        after, end_ns = {pid: usage(pid) for pid in pids}, time.time_ns()
+    cpu = {pids[pid]: round(100 * (after[pid][0] - before[pid]) / ((end_ns - begin_ns) * 1e-9)) for pid in pids}
+    return {
+        **session_figures(session, begin_ns, end_ns),
+        "CPU %, of one core": {**cpu, "sum": sum(cpu.values())},
+        "resident MiB": {pids[pid]: round(after[pid][1]) for pid in pids},
+    }
+
+
+def session_figures(session: Path, begin_ns: int, end_ns: int) -> dict[str, Any]:
+    """What the recorded messages and the nodes' own counts say of a span of time.
+
+    Late is a message when the recorder's middleware received it after the image's stamp.
+    """
+    import numpy as np
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    stamps: dict[str, list[int]] = {}
+    late_ms: dict[str, list[float]] = {}
+    solve_s, frames = [], []
+    counts: dict[str, dict[str, str]] = {}
+    first: dict[str, dict[str, str]] = {}
+    for path in sorted(session.glob("*.mcap"), key=lambda p: int(p.stem.rsplit("_", 1)[1])):
+        with path.open("rb") as file:
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            for _, channel, record, message in reader.iter_decoded_messages(log_time_order=False):
+                topic = channel.topic.removeprefix("/drocap/")
+                if topic == "/diagnostics":
+                    name = message.status[0].name.rsplit("/", 1)[-1]
+                    values = {v.key: v.value for v in message.status[0].values}
+                    if record.log_time < begin_ns:
+                        first[name] = values
+                    elif record.log_time <= end_ns:
+                        counts[name] = values
+                elif begin_ns <= record.log_time <= end_ns and hasattr(message, "header"):
+                    stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+                    stamps.setdefault(topic, []).append(stamp_ns)
+                    late_ms.setdefault(topic, []).append((record.publish_time - stamp_ns) * 1e-6)
+                    if topic == "pose3d/refined":
+                        solve_s.append(message.solve_seconds)
+                        frames.append(len(message.poses))
+    seconds = (end_ns - begin_ns) * 1e-9
+    figures: dict[str, Any] = {
+        "per second": {topic: round(len(found) / seconds, 2) for topic, found in stamps.items()},
+        "late ms p50 / p95 / p99": {
+            topic: [round(float(v), 1) for v in np.percentile(late_ms[topic], [50, 95, 99])]
+            for topic in ("image/compressed", "pose2d", "pose3d/initial", "pose3d/latest")
+            if topic in late_ms
+        },
+    }
+    if solve_s:
+        figures["solve s p50 / p95"] = [round(float(v), 3) for v in np.percentile(solve_s, [50, 95])]
+        figures["frames per solve, median"] = int(np.median(frames))
+    lost = {
+        f"{name}: {key}": int(value) - int(first.get(name, {}).get(key, 0))
+        for name, values in counts.items()
+        for key, value in values.items()
+        if value.isdigit() and any(word in key for word in ("drop", "lost", "skipped", "refused", "late"))
+    }
+    figures["not passed on, by the nodes' own counts"] = {key: value for key, value in lost.items() if value}
+    seen = {name: int(values.get("images", 0)) for name, values in counts.items()}
+    figures["images counted"] = {
+        name: number - int(first.get(name, {}).get("images", 0)) for name, number in seen.items() if number
+    }
+    return figures
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
