@@ -95,12 +95,12 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _view_motion(recording: rerun.RecordingStream, args: argparse.Namespace) -> None:
-    from drocap_ros.report.pictures import read_pictures
+    from drocap_ros.report.pictures import each_picture
     from drocap_ros.view.motion_view import PLOTS, draw_motion
     from drocap_ros.view.scene import Scene
 
     _, motion = read_motion(args.input)
-    pictures = read_pictures(args.video, motion) if args.video else None
+    pictures = each_picture(args.video, motion) if args.video else ()
     with _shown(recording, PLOTS, args):
         draw_motion(Scene(recording), motion, pictures)
 

@@ -71,10 +71,29 @@ def read_pictures(path: Path, motion: Motion) -> Pictures:
             frames.append(index)
             jpegs.append(encode(image))
     if encode is None:
-        raise InputError(
-            f"{path}: expected pictures at the motion's times, found none; name the video it was made from"
-        )
+        raise _no_pictures(path)
     return Pictures(tuple(frames), tuple(jpegs), encode.box, encode.size)
+
+
+def each_picture(path: Path, motion: Motion) -> Iterator[tuple[int, np.ndarray]]:
+    """Frame of the motion and image (H, W, 3) uint8 BGR of it, for every frame that has one; matched as above.
+
+    Raises
+    ------
+    InputError
+        When there are no pictures, or none at the motion's times.
+    """
+    found = False
+    with _opened(path) as source:
+        for index, image in _matched(source, motion.stamp_ns, np.arange(len(motion.stamp_ns))):
+            found = True
+            yield index, image
+    if not found:
+        raise _no_pictures(path)
+
+
+def _no_pictures(path: Path) -> InputError:
+    return InputError(f"{path}: expected pictures at the motion's times, found none; name the video it was made from")
 
 
 @contextlib.contextmanager

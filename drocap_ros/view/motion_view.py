@@ -3,62 +3,71 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
 from drocap_ros.motion import Motion, upright_joints
-from drocap_ros.report.pictures import Pictures
 from drocap_ros.skeleton import JointSet
 from drocap_ros.view.camera import LEVEL_CAMERA, nominal_camera_matrix, place_cameras
 from drocap_ros.view.scene import Scene
 
 PLOTS = ("reprojection_px", "confidence")
+#: Pictures are shrunk to this: a minute of video then is a file of about 150 MB.
+_LONG_SIDE = 960
 
 
-def draw_motion(scene: Scene, motion: Motion, pictures: Pictures | None = None) -> None:
-    """Every frame of a motion at its stamp.
+def draw_motion(scene: Scene, motion: Motion, pictures: Iterable[tuple[int, np.ndarray]] = ()) -> None:
+    """Every frame of a motion at its stamp, and its pictures: frame and image (H, W, 3) uint8 BGR.
 
     A motion does not hold the camera's place: it is drawn from where the body would look as in its picture, with a
     nominal field of view (:func:`drocap_ros.view.camera.place_cameras`).
     """
+    size, zoom = _image_size(motion), 1.0
+    for index, image in pictures:
+        size = (image.shape[1], image.shape[0])
+        zoom = min(1.0, _LONG_SIDE / max(size))
+        scene.at(int(motion.stamp_ns[index]))
+        scene.image(_shrunk(image, zoom))
+    _draw_frames(scene, motion, motion.keypoints * zoom, (round(size[0] * zoom), round(size[1] * zoom)))
+
+
+def _draw_frames(scene: Scene, motion: Motion, keypoints: np.ndarray, size: tuple[int, int]) -> None:
     joints_of = JointSet("motion", motion.joints, motion.parents)
     joints = upright_joints(motion)
     rotation = motion.camera_rotation
     if motion.frame == "camera":
         rotation = np.broadcast_to(LEVEL_CAMERA, rotation.shape)
-    size, keypoints, matrix = _picture_axes(motion, pictures)
+    matrix = nominal_camera_matrix(*size)
     positions = place_cameras(joints, keypoints, rotation, matrix)
-    jpegs = {} if pictures is None else dict(zip(pictures.frames, pictures.jpegs, strict=True))
     error = motion.reprojection_px
     scene.at(int(motion.stamp_ns[0]))
     scene.calibration(matrix, size)
+    known = positions[np.isfinite(positions).all(1)]
+    if motion.frame == "world" and len(known) > 1:
+        scene.camera_path(known)
     for i, stamp_ns in enumerate(motion.stamp_ns):
         scene.at(int(stamp_ns))
         scene.pose("refined", joints_of, joints[i])
         scene.keypoints(joints_of, keypoints[i])
         if np.isfinite(positions[i]).all():
             scene.camera(positions[i], rotation[i])
-        if i in jpegs:
-            scene.jpeg(jpegs[i])
         seen = np.isfinite(error[i])
         scene.plot("reprojection_px/mean", float(error[i][seen].mean()) if seen.any() else math.nan)
         scene.plot("confidence/mean", float(np.nan_to_num(motion.confidence[i]).mean()))
-    known = positions[np.isfinite(positions).all(1)]
-    if motion.frame == "world" and len(known) > 1:
-        scene.at(int(motion.stamp_ns[0]))
-        scene.camera_path(known)
 
 
-def _picture_axes(motion: Motion, pictures: Pictures | None) -> tuple[tuple[int, int], np.ndarray, np.ndarray]:
-    """Size px, keypoints (F, P, 2) px and camera matrix of the pictures that are shown: the image, or cut from it."""
-    seen = np.isfinite(motion.keypoints).all(-1)
-    corner = motion.keypoints[seen].max(0) if seen.any() else np.array([640.0, 480.0])
-    width, height = (max(16, math.ceil(float(c))) for c in corner)
-    if pictures is None:
-        return (width, height), motion.keypoints, nominal_camera_matrix(width, height)
-    x0, y0, x1, y1 = pictures.box
-    zoom = np.array(pictures.size) / np.array([x1 - x0, y1 - y0])
-    matrix = nominal_camera_matrix(max(width, x1), max(height, y1))
-    matrix[:2, 2] -= (x0, y0)
-    matrix[:2] *= zoom[:, None]
-    return pictures.size, (motion.keypoints - np.array([x0, y0])) * zoom, matrix
+def _image_size(motion: Motion) -> tuple[int, int]:
+    """Width and height px that hold all keypoints: a motion does not say how large its images were."""
+    seen = motion.keypoints[np.isfinite(motion.keypoints).all(-1)]
+    corner = seen.max(0) if len(seen) else np.array([640.0, 480.0])
+    return max(16, math.ceil(float(corner[0]))), max(16, math.ceil(float(corner[1])))
+
+
+def _shrunk(image: np.ndarray, zoom: float) -> np.ndarray:
+    if zoom == 1.0:
+        return image
+    import cv2
+
+    size = (round(image.shape[1] * zoom), round(image.shape[0] * zoom))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
