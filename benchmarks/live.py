@@ -155,7 +155,7 @@ def session_figures(session: Path, begin_ns: int, end_ns: int) -> dict[str, Any]
                 elif begin_ns <= record.log_time <= end_ns and hasattr(message, "header"):
                     stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
                     stamps.setdefault(topic, []).append(stamp_ns)
-                    late_ms.setdefault(topic, []).append((record.publish_time - stamp_ns) * 1e-6)
+                    late_ms.setdefault(topic, []).append((record.log_time - stamp_ns) * 1e-6)
                     if topic == "pose3d/refined":
                         solve_s.append(message.solve_seconds)
                         frames.append(len(message.poses))

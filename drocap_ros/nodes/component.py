@@ -56,6 +56,8 @@ class ComponentNode(Node):
         self._text = "running"
         self._outputs: list[tuple[str, Publisher]] = []
         self._inputs: list[tuple[str, Subscription]] = []
+        #: Topic -> how many nodes of this process get its contents without DDS.
+        self.handed_over: dict[str, Callable[[], int]] = {}
         self._diagnostics = self.output("/diagnostics")
         self._ready = self.create_publisher(String, "graph/ready", GRAPH_QOS)
         self._finished = self.create_publisher(String, "graph/finished", GRAPH_QOS)
@@ -80,22 +82,66 @@ class ComponentNode(Node):
         raw: bool = False,
         qos: QoSProfile | None = None,
         events: SubscriptionEventCallbacks | None = None,
+        with_info: bool = False,
+        count_gaps: bool = False,
     ) -> Subscription:
-        """Subscription to a topic of the table.  A message that the callback refuses is counted, not fatal."""
+        """Subscription to a topic of the table.  A message that the callback refuses is counted, not fatal.
 
-        def guarded(message: Any) -> None:
+        Parameters
+        ----------
+        with_info : the callback's second argument is rclpy's message info
+        count_gaps : count what the publisher sent and this node never saw, being busy or for want of a link
+        """
+        guarded = self.guarded(topic, callback)
+        last: list[int] = [0]
+
+        def with_gaps(message: Any, info: dict[str, Any]) -> None:
+            number = info["publication_sequence_number"] or 0
+            if 0 < last[0] < number - 1:
+                self.missed(topic, number - 1 - last[0])
+            last[0] = number
+            guarded(message)
+
+        def alone(message: Any) -> None:
+            guarded(message)
+
+        def informed(message: Any, info: dict[str, Any]) -> None:
+            guarded(message, info)
+
+        # rclpy looks at the number of arguments, which its annotation does not say.
+        take: Any = with_gaps if count_gaps else informed if with_info else alone
+        subscription = self.create_subscription(
+            TOPICS[topic].message,
+            topic,
+            take,
+            qos or TOPICS[topic].qos,
+            raw=raw,
+            event_callbacks=events,
+        )
+        self._inputs.append((topic, subscription))
+        return subscription
+
+    def guarded(self, topic: str, callback: Callable[..., None]) -> Callable[..., None]:
+        """The callback, of which a refusal is counted and said instead of raised."""
+
+        def run(*arguments: Any) -> None:
             self.callbacks_done += 1
             try:
-                callback(message)
+                callback(*arguments)
             except InputError as error:
                 self.count("messages refused")
                 self.report(WARN, f"{topic}: {error}")
 
-        subscription = self.create_subscription(
-            TOPICS[topic].message, topic, guarded, qos or TOPICS[topic].qos, raw=raw, event_callbacks=events
-        )
-        self._inputs.append((topic, subscription))
-        return subscription
+        return run
+
+    def drop_input(self, subscription: Any) -> None:
+        """End a subscription."""
+        self._inputs = [entry for entry in self._inputs if entry[1] is not subscription]
+        self.destroy_subscription(subscription)
+
+    def missed(self, topic: str, amount: int) -> None:
+        """Count messages that were sent and that this node never saw."""
+        self.count(f"dropped {topic}: busy with the one before", amount)
 
     # -- start and end ---------------------------------------------------------------------------------
 
@@ -124,7 +170,8 @@ class ComponentNode(Node):
 
     def _matched(self) -> bool:
         return all(
-            publisher.get_subscription_count() >= subscribers_of(topic, self._peers)
+            publisher.get_subscription_count() + self.handed_over.get(topic, int)()
+            >= subscribers_of(topic, self._peers)
             for topic, publisher in self._outputs
         ) and all(
             subscription.get_publisher_count() >= _publishers(topic, self._peers)

@@ -1,6 +1,7 @@
 """Node ``image_ingest``: a video file, picture folder, camera, stream or image topic in, JPEG pictures out.
 
-Publishes ``image/compressed`` (sensor_msgs/CompressedImage) and, where the camera is known, ``camera_info``.
+Publishes ``image/compressed`` (sensor_msgs/CompressedImage) and, where the camera is known, ``camera_info``; nodes of
+the same process get the pictures as arrays.
 Stamps are the exposure times: those of the source, for a file counted from the node's start.
 With ``source = topic:NAME`` it subscribes to that topic: CompressedImage where the name ends in "compressed",
 else Image in one of the usual encodings; stamps are the messages'.
@@ -19,14 +20,17 @@ from std_msgs.msg import Header
 
 from drocap_ros.errors import DrocapError, InputError
 from drocap_ros.nodes.component import ERROR, OK, WARN, ComponentNode
-from drocap_ros.nodes.conversions import camera_info_to_ros, compressed_image_to_ros, header_at, stamp_from_ros
+from drocap_ros.nodes.conversions import camera_info_to_ros, header_at, stamp_from_ros
+from drocap_ros.nodes.picture_channel import PictureOutput
 from drocap_ros.nodes.run import node_main
 from drocap_ros.perception.calibration import CameraModel, camera_model
-from drocap_ros.perception.images import encode_jpeg
 from drocap_ros.perception.sources import Frame, ImageSource, open_source
+from drocap_ros.perception.sources.prefetch import prefetch
 from drocap_ros.recording.pictures import image_from_message
 
 _TOPIC = "topic:"
+#: A picture of a file that is this late when it has been read is not published any more.
+_LATE_S = 0.1
 
 
 class ImageIngestNode(ComponentNode):
@@ -36,7 +40,7 @@ class ImageIngestNode(ComponentNode):
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
-        self._images = self.output("image/compressed")
+        self._pictures = PictureOutput(self, self.config.jpeg_quality)
         self._infos = self.output("camera_info")
         self._camera: CameraModel | None = None
         self._last_ns: int | None = None
@@ -64,6 +68,7 @@ class ImageIngestNode(ComponentNode):
             self._source.close()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
+        self._pictures.close()
         if self._source is not None:
             self._source.close()
 
@@ -78,6 +83,7 @@ class ImageIngestNode(ComponentNode):
             self.report(OK, "the source has ended")
         except DrocapError as error:
             self.report(ERROR, str(error))
+        self._pictures.drain()
         if not self._stop.is_set():
             self.finish()
 
@@ -89,15 +95,31 @@ class ImageIngestNode(ComponentNode):
             return
         # Files are stamped from the moment of the start, so that their pictures fit the vehicle's telemetry.
         begin_ns = self.get_clock().now().nanoseconds
+        frames = prefetch(self._rounds())
+        try:
+            for frame in frames:
+                stamp_ns = begin_ns + frame.stamp_ns
+                if self.config.realtime:
+                    ahead_s = (stamp_ns - self.get_clock().now().nanoseconds) * 1e-9
+                    if self._stop.wait(max(0.0, ahead_s)):
+                        return
+                    if ahead_s < -_LATE_S:
+                        # As a camera would: what the machine cannot keep up with is lost, nothing comes late.
+                        self.count("images dropped: the source is read too slowly")
+                        continue
+                yield Frame(stamp_ns, frame.image)
+        finally:
+            frames.close()
+
+    def _rounds(self) -> Iterator[Frame]:
+        """Frames of a file, again and again where that is wanted; stamps from 0, increasing."""
+        assert self._source is not None
         offset_ns, last_ns, step_ns = 0, 0, 0
         while True:
             for frame in self._source:
                 step_ns = frame.stamp_ns + offset_ns - last_ns or step_ns
                 last_ns = frame.stamp_ns + offset_ns
-                ahead_ns = begin_ns + last_ns - self.get_clock().now().nanoseconds
-                if self.config.realtime and self._stop.wait(max(0.0, ahead_ns * 1e-9)):
-                    return
-                yield Frame(begin_ns + last_ns, frame.image)
+                yield Frame(last_ns, frame.image)
             if not self.config.loop or self._stop.is_set():
                 return
             offset_ns = last_ns + step_ns
@@ -143,8 +165,7 @@ class ImageIngestNode(ComponentNode):
             self.count("images skipped by max_rate_hz")
             return
         self._last_ns = frame.stamp_ns
-        data = jpeg or encode_jpeg(frame.image, self.config.jpeg_quality)
-        self._images.publish(compressed_image_to_ros(header, data))
+        self._pictures.publish(header, frame.image, jpeg)
         if self._camera is not None:
             self._infos.publish(camera_info_to_ros(header, self._camera))
         self.count("images")

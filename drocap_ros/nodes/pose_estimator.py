@@ -1,19 +1,24 @@
 """Node ``pose_estimator``: pictures in, the subject's keypoints out.
 
-Subscribes ``image/compressed`` (sensor_msgs/CompressedImage), ``roi`` (sensor_msgs/RegionOfInterest, the box
-of a drone's own tracker); publishes ``pose2d`` (drocap_ros/Pose2D), its header equal to the picture's.
+Subscribes ``image/compressed`` (sensor_msgs/CompressedImage; a camera of the same process hands over arrays), ``roi``
+(sensor_msgs/RegionOfInterest, the box of a drone's own tracker); publishes ``pose2d`` (drocap_ros/Pose2D), its header
+equal to the picture's.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
-from sensor_msgs.msg import CompressedImage, RegionOfInterest
+from sensor_msgs.msg import RegionOfInterest
+from std_msgs.msg import Header
 
 from drocap_ros.nodes.component import OK, WARN, ComponentNode
 from drocap_ros.nodes.conversions import pose2d_to_ros, stamp_from_ros
+from drocap_ros.nodes.picture_channel import PictureInput
 from drocap_ros.nodes.run import node_main
+from drocap_ros.nodes.topics import TOPICS
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.models import models_folder
 from drocap_ros.recording.pictures import image_from_message
@@ -29,18 +34,23 @@ class PoseEstimatorNode(ComponentNode):
         self._estimator = PoseEstimator(models_folder(self.config.models_dir or None), self.config)
         self._roi: np.ndarray | None = None
         self._pose2d = self.output("pose2d")
-        self.input("image/compressed", self._on_image)
+        self._pictures = PictureInput(
+            self, self._on_image, partial(image_from_message, compressed=True), TOPICS["image/compressed"].qos.depth
+        )
         self.input("roi", self._on_roi)
 
     def _on_roi(self, message: RegionOfInterest) -> None:
         x, y = message.x_offset, message.y_offset
         self._roi = np.array([x, y, x + message.width, y + message.height], np.float64)
 
-    def _on_image(self, message: CompressedImage) -> None:
-        image = image_from_message(message, compressed=True)
-        observation = self._estimator.process(image, stamp_from_ros(message.header.stamp), self._roi)
+    def close(self) -> None:
+        """Take no more pictures."""
+        self._pictures.close()
+
+    def _on_image(self, header: Header, image: np.ndarray) -> None:
+        observation = self._estimator.process(image, stamp_from_ros(header.stamp), self._roi)
         self._roi = None
-        self._pose2d.publish(pose2d_to_ros(observation, message.header.frame_id))
+        self._pose2d.publish(pose2d_to_ros(observation, header.frame_id))
         self.count("images")
         self.produced(observation.stamp_ns)
         self.report(*((OK, "following the subject") if observation.has_subject else (WARN, "no subject in view")))

@@ -10,8 +10,9 @@ import shutil
 import threading
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+from rclpy.clock import ROSClock
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
@@ -53,25 +54,31 @@ class SessionRecorderNode(ComponentNode):
             qos = IMAGE_RECORDING_QOS if image else entry.qos
             take = self._on_camera_info if topic == "camera_info" else self._on_message
             events = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, name))
-            self.input(topic, partial(take, name), raw=True, qos=qos, events=events)
+            self.input(topic, partial(take, name), raw=True, qos=qos, events=events, with_info=True)
         self.create_timer(1.0, self._on_second)
 
-    def _on_message(self, name: str, data: bytes) -> None:
-        self._writer.write(name, data, self.get_clock().now().nanoseconds)
+    def _on_message(self, name: str, data: bytes, info: dict[str, Any]) -> None:
+        """Log time is when the message reached this process, publish time when it was sent."""
+        log_ns = info["received_timestamp"]
+        sent_ns = info["source_timestamp"]
+        # Simulated time is nothing that the middleware knows.
+        if cast(ROSClock, self.get_clock()).ros_time_is_active or not log_ns:
+            log_ns = sent_ns = self.get_clock().now().nanoseconds
+        self._writer.write(name, data, log_ns, sent_ns or log_ns)
         self.count("messages")
 
     def _on_lost(self, name: str, event: Any) -> None:
         """Count what the middleware lost on its way: pictures are best effort."""
         self.count(f"lost on the way {name}", event.total_count_change)
 
-    def _on_camera_info(self, name: str, data: bytes) -> None:
-        self._on_message(name, data)
+    def _on_camera_info(self, name: str, data: bytes, info: dict[str, Any]) -> None:
+        self._on_message(name, data, info)
         if not self._calibrated:
             self._calibrated = True
-            info = deserialize_message(data, CameraInfo)
+            camera = deserialize_message(data, CameraInfo)
             text = (
-                f"width: {info.width}\nheight: {info.height}\nk: {[float(v) for v in info.k]}\n"
-                f"distortion_model: {info.distortion_model}\nd: {[float(v) for v in info.d]}\n"
+                f"width: {camera.width}\nheight: {camera.height}\nk: {[float(v) for v in camera.k]}\n"
+                f"distortion_model: {camera.distortion_model}\nd: {[float(v) for v in camera.d]}\n"
             )
             self._writer.add_metadata({CALIBRATION: text})
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from typing import Any
 
 from drocap_ros.perception.sources.base import Frame
@@ -12,7 +12,7 @@ from drocap_ros.perception.sources.base import Frame
 _END = object()
 
 
-def prefetch(frames: Iterable[Frame], ahead: int = 4) -> Iterator[Frame]:
+def prefetch(frames: Iterable[Frame], ahead: int = 4) -> Generator[Frame, None, None]:
     """The same frames in the same order, up to ``ahead`` of them decoded beforehand.
 
     An error of the source is raised where its frame would have come.  Leaving the loop early stops the thread.
