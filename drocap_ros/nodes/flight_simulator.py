@@ -7,6 +7,7 @@ the instants of exposure.  At its end it writes the truth to ``truth_file``.
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from pathlib import Path
@@ -14,10 +15,10 @@ from typing import Any
 
 from drocap_ros.flight.transport import open_transport
 from drocap_ros.nodes.component import OK, WARN, ComponentNode
-from drocap_ros.nodes.conversions import camera_info_to_ros, compressed_image_to_ros, header_at
+from drocap_ros.nodes.conversions import camera_info_to_ros, header_at
+from drocap_ros.nodes.picture_channel import PictureOutput
 from drocap_ros.nodes.run import node_main
 from drocap_ros.perception.calibration import CameraModel
-from drocap_ros.perception.images import encode_jpeg
 from drocap_ros.simulation.flight_truth import save_truth
 from drocap_ros.simulation.flight_world import Exposure, FlightWorld
 from drocap_ros.simulation.render import Renderer
@@ -33,7 +34,7 @@ class FlightSimulatorNode(ComponentNode):
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
-        self._images = self.output("image/compressed")
+        self._pictures = PictureOutput(self, self.config.jpeg_quality)
         self._infos = self.output("camera_info")
         self._world = FlightWorld(self.config, open_transport(self.config.vehicle_url))
         width, height = self.config.image_width, self.config.image_height
@@ -61,6 +62,7 @@ class FlightSimulatorNode(ComponentNode):
         for thread in self._threads:
             if thread.is_alive():
                 thread.join(timeout=5.0)
+        self._pictures.close()
         self._world.close()
         if flown and self.config.truth_file:
             save_truth(Path(self.config.truth_file), self._world.truth())
@@ -109,7 +111,7 @@ class FlightSimulatorNode(ComponentNode):
                 return
             picture = self._renderer.picture(exposure.joints3d, exposure.rotation, exposure.position)
             header = header_at(exposure.stamp_ns, FRAME_ID)
-            self._images.publish(compressed_image_to_ros(header, encode_jpeg(picture, self.config.jpeg_quality)))
+            self._pictures.publish(header, picture)
             self._infos.publish(camera_info_to_ros(header, self._camera))
             self.count("images")
             self.produced(exposure.stamp_ns)
@@ -127,6 +129,8 @@ class FlightSimulatorNode(ComponentNode):
 
 def main() -> int:
     """Run the node as a process."""
+    # Rendering is many short steps in Python: without this each telemetry message waits its 5 ms for the turn.
+    sys.setswitchinterval(0.0005)
     return node_main(FlightSimulatorNode)
 
 
