@@ -20,13 +20,14 @@ $(VENV)/.requirements: requirements.lock
 	@$(CLEAN) $(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
 	@touch $@
 
-# The wheels lack tf2_msgs, without which nobody can publish TF.
-$(VENV)/.tf2_msgs: $(VENV)/.requirements $(wildcard resource/tf2_msgs/*) resource/cmake/ros_wheels.cmake
-	@PATH="$(CURDIR)/$(BIN):$$PATH" AMENT_PREFIX_PATH=$(CURDIR)/$(VENV) CMAKE_PREFIX_PATH=$(CURDIR)/$(VENV) $(BIN)/cmake -S resource/tf2_msgs -B build/tf2_msgs -G Ninja -DCMAKE_INSTALL_PREFIX=$(CURDIR)/$(VENV) -DPython3_EXECUTABLE=$(CURDIR)/$(BIN)/python -DBUILD_TESTING=OFF > build/tf2_msgs.log
-	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/cmake --build build/tf2_msgs --target install >> build/tf2_msgs.log
+# The wheels lack tf2_msgs, without which nobody can publish TF, and hri_msgs, of which REP 155 has need.
+.SECONDEXPANSION:
+$(VENV)/.tf2_msgs $(VENV)/.hri_msgs: $(VENV)/.%: $(VENV)/.requirements resource/cmake/ros_wheels.cmake $$(wildcard resource/$$*/*) $$(wildcard resource/$$*/msg/*)
+	@PATH="$(CURDIR)/$(BIN):$$PATH" AMENT_PREFIX_PATH=$(CURDIR)/$(VENV) CMAKE_PREFIX_PATH=$(CURDIR)/$(VENV) $(BIN)/cmake -S resource/$* -B build/$* -G Ninja -DCMAKE_INSTALL_PREFIX=$(CURDIR)/$(VENV) -DPython3_EXECUTABLE=$(CURDIR)/$(BIN)/python -DBUILD_TESTING=OFF > build/$*.log
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/cmake --build build/$* --target install >> build/$*.log
 	@touch $@
 
-$(VENV)/.package: $(VENV)/.requirements $(VENV)/.tf2_msgs $(SOURCES)
+$(VENV)/.package: $(VENV)/.requirements $(VENV)/.tf2_msgs $(VENV)/.hri_msgs $(SOURCES)
 	@echo "setup: messages and package"
 	@$(CLEAN) DROCAP_BUILD_DIR=$(CURDIR)/build/pip $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps --force-reinstall .
 	@touch $@

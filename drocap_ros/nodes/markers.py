@@ -6,11 +6,11 @@ import numpy as np
 from builtin_interfaces.msg import Duration
 from geometry_msgs.msg import Point, Pose, Quaternion, TransformStamped, Vector3
 from std_msgs.msg import ColorRGBA, Header
-from visualization_msgs.msg import Marker, MarkerArray
+from visualization_msgs.msg import ImageMarker, Marker, MarkerArray
 
-from drocap_ros.geometry.rotations import quaternion_from_matrix
-from drocap_ros.msg import Pose3D
-from drocap_ros.nodes.conversions import pose3d_from_ros, quaternion_to_ros
+from drocap_ros.geometry.ellipsoids import ellipsoids, unpack_covariance
+from drocap_ros.msg import Pose2D, Pose3D
+from drocap_ros.nodes.conversions import pose2d_from_ros, pose3d_from_ros, quaternion_to_ros
 from drocap_ros.skeleton import JointSet, joint_set
 
 _RIGHT, _LEFT, _MIDDLE = ((0.75, 0.22, 0.17), (0.14, 0.44, 0.64), (0.35, 0.35, 0.35))
@@ -55,14 +55,11 @@ def _ellipsoids(message: Pose3D, joints: np.ndarray, known: np.ndarray) -> list[
     flat = np.array(message.covariance, np.float64)
     if flat.size != 6 * len(joints):
         return []
-    c = flat.reshape(-1, 6)
-    use = known & np.isfinite(c).all(axis=1)
-    matrices = c[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)[use]
-    variances, axes = np.linalg.eigh(matrices)
-    axes[np.linalg.det(axes) < 0, :, 0] *= -1.0  # a rotation, not a reflection
-    diameters = 2.0 * _SIGMAS * np.sqrt(np.maximum(variances, 1e-8))
+    covariance = flat.reshape(-1, 6)
+    use = known & np.isfinite(covariance).all(axis=1)
+    orientations, half_axes = ellipsoids(unpack_covariance(covariance[use]), _SIGMAS)
     markers = []
-    for number, xyzw, size in zip(np.nonzero(use)[0], quaternion_from_matrix(axes), diameters, strict=True):
+    for number, xyzw, size in zip(np.nonzero(use)[0], orientations, 2.0 * half_axes, strict=True):
         ball = _marker(message.header, "uncertainty", Marker.SPHERE, int(number))
         ball.pose = Pose(position=_point(joints[number]), orientation=quaternion_to_ros(xyzw))
         ball.scale = Vector3(x=float(size[0]), y=float(size[1]), z=float(size[2]))
@@ -80,13 +77,50 @@ def path_marker(header: Header, positions: np.ndarray) -> Marker:
     return line
 
 
-def body_transforms(message: Pose3D) -> list[TransformStamped]:
-    """One frame per joint, ``body_<id>/<joint>``, so that viewers without markers see the body too."""
+def keypoint_marker(message: Pose2D) -> ImageMarker:
+    """Bones and a cross on each keypoint, to be drawn over the picture; without a subject it removes the last.
+
+    One marker of lines, not one per joint: viewers keep only the last message of a topic of image markers.
+
+    Raises
+    ------
+    InputError
+        When the message's arrays do not fit.
+    """
+    observation = pose2d_from_ros(message)
+    marker = ImageMarker(header=message.header, ns="keypoints", type=ImageMarker.LINE_LIST, action=ImageMarker.ADD)
+    if not observation.has_subject:
+        marker.action = ImageMarker.REMOVE
+        return marker
+    joints_of, points = observation.joints, observation.keypoints.astype(np.float64)
+    known = np.isfinite(points).all(axis=1)
+    size = max(2.0, 0.004 * max(observation.image_size))
+    marker.scale = float(max(1.0, 0.4 * size))
+    marker.outline_color = _colour(*_MIDDLE, 1.0)
+    for bone in joints_of.bones:
+        if known[bone].all():
+            _line(marker, points[bone[0]], points[bone[1]], _side_colour(joints_of, int(bone[1])))
+    for i in np.nonzero(known)[0]:
+        colour = _side_colour(joints_of, int(i))
+        for arm in (np.array([size, 0.0]), np.array([0.0, size])):
+            _line(marker, points[i] - arm, points[i] + arm, colour)
+    return marker
+
+
+def _line(marker: ImageMarker, start: np.ndarray, end: np.ndarray, colour: ColorRGBA) -> None:
+    for p in (start, end):
+        marker.points.append(Point(x=float(p[0]), y=float(p[1])))
+        marker.outline_colors.append(colour)
+
+
+def body_transforms(message: Pose3D, frame_prefix: str = "") -> list[TransformStamped]:
+    """One frame per joint, ``<prefix>body_<id>/<joint>``, so that viewers without markers see the body too."""
     joints, _ = pose3d_from_ros(message)
     transforms = []
     for name, p in zip(joint_set(message.skeleton).joints, joints, strict=False):
         if np.isfinite(p).all():
-            transform = TransformStamped(header=message.header, child_frame_id=f"body_{message.track_id}/{name}")
+            child = f"{frame_prefix}body_{message.track_id}/{name}"
+            transform = TransformStamped(header=message.header, child_frame_id=child)
             transform.transform.translation = Vector3(x=float(p[0]), y=float(p[1]), z=float(p[2]))
             transforms.append(transform)
     return transforms

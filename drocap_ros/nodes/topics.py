@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, RegionOfInterest
-from visualization_msgs.msg import MarkerArray
+from visualization_msgs.msg import ImageMarker, MarkerArray
 
 from drocap_ros.msg import OrbitCommand, OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleState
 
@@ -51,6 +51,7 @@ TOPICS: dict[str, Topic] = {
     "vehicle/state": Topic(VehicleState, RESULT_QOS),
     "orbit/command": Topic(OrbitCommand, RESULT_QOS),
     "orbit/status": Topic(OrbitStatus, RESULT_QOS),
+    "markers/keypoints": Topic(ImageMarker, RESULT_QOS),
     "markers/initial": Topic(MarkerArray, RESULT_QOS),
     "markers/latest": Topic(MarkerArray, RESULT_QOS),
     "markers/camera_path": Topic(MarkerArray, RESULT_QOS),
@@ -72,8 +73,11 @@ NODES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("pose2d", "camera_info", "orbit/command"),
     ),
     "visualizer": (
-        ("markers/initial", "markers/latest", "markers/camera_path", *(("/tf",) if TFMessage is not None else ())),
-        ("pose3d/initial", "pose3d/latest", "vehicle/state"),
+        (
+            *("markers/keypoints", "markers/initial", "markers/latest", "markers/camera_path"),
+            *(("/tf",) if TFMessage is not None else ()),
+        ),
+        ("pose2d", "pose3d/initial", "pose3d/latest", "vehicle/state"),
     ),
     # What it publishes is what the session holds.
     "session_player": ((), ()),

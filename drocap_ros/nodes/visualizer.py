@@ -1,8 +1,9 @@
 """Node ``visualizer``: the body in RViz, Foxglove and Rerun.
 
-Subscribes ``pose3d/initial``, ``pose3d/latest`` and ``vehicle/state``; publishes ``markers/initial``,
-``markers/latest`` and ``markers/camera_path`` (visualization_msgs/MarkerArray) and the joints of the newest pose
-on TF.
+Subscribes ``pose2d``, ``pose3d/initial``, ``pose3d/latest`` and ``vehicle/state``; publishes ``markers/keypoints``
+(visualization_msgs/ImageMarker), ``markers/initial``, ``markers/latest`` and ``markers/camera_path``
+(visualization_msgs/MarkerArray) and the joints of the newest pose on TF.  With ``human_topics`` it also tells of the
+subject as REP 155 does, see :mod:`drocap_ros.nodes.humans`.
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ from collections import deque
 from typing import Any
 
 import numpy as np
+from geometry_msgs.msg import TransformStamped
 from visualization_msgs.msg import MarkerArray
 
-from drocap_ros.msg import Pose3D, VehicleState
-from drocap_ros.nodes.component import OK, ComponentNode
+from drocap_ros.msg import Pose2D, Pose3D, VehicleState
+from drocap_ros.nodes.component import OK, WARN, ComponentNode
 from drocap_ros.nodes.conversions import stamp_from_ros
-from drocap_ros.nodes.markers import body_transforms, path_marker, pose_markers
+from drocap_ros.nodes.humans import MISSING, HumanTopics, hri, human_transforms
+from drocap_ros.nodes.markers import body_transforms, keypoint_marker, path_marker, pose_markers
 from drocap_ros.nodes.run import node_main
 from drocap_ros.nodes.topics import TFMessage
 
@@ -31,22 +34,40 @@ class VisualizerNode(ComponentNode):
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
+        self._keypoints = self.output("markers/keypoints")
         self._initial = self.output("markers/initial")
         self._latest = self.output("markers/latest")
         self._paths = self.output("markers/camera_path")
         self._tf = self.output("/tf") if TFMessage is not None else None
         self._path: deque[np.ndarray] = deque(maxlen=self.config.path_points)
         self._path_ns = -(10**18)
+        self._humans = HumanTopics(self, self.config.frame_prefix) if self.config.human_topics and hri else None
+        if self.config.human_topics and hri is None:
+            self.get_logger().warning(MISSING)
+        self.input("pose2d", self._on_pose2d)
         self.input("pose3d/initial", self._on_initial)
         self.input("pose3d/latest", self._on_latest)
         self.input("vehicle/state", self._on_state)
 
+    def _on_pose2d(self, message: Pose2D) -> None:
+        self._keypoints.publish(keypoint_marker(message))
+        if self._humans is not None:
+            self._humans.publish(message)
+
     def _on_initial(self, message: Pose3D) -> None:
         self._initial.publish(pose_markers(message, INITIAL_LIFETIME_S))
-        if self._tf is not None and (transforms := body_transforms(message)):
+        if self._tf is not None and (transforms := self._transforms(message)):
             self._tf.publish(TFMessage(transforms=transforms))
         self.count("poses")
-        self.report(OK, "drawing")
+        if self.config.human_topics and self._humans is None:
+            self.report(WARN, f"drawing; {MISSING}")
+        else:
+            self.report(OK, "drawing")
+
+    def _transforms(self, message: Pose3D) -> list[TransformStamped]:
+        prefix = self.config.frame_prefix
+        human = human_transforms(message, prefix) if self.config.human_topics else []
+        return body_transforms(message, prefix) + human
 
     def _on_latest(self, message: Pose3D) -> None:
         self._latest.publish(pose_markers(message, LATEST_LIFETIME_S))

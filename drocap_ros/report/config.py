@@ -13,3 +13,5 @@ class VisualizerConfig(Parameters):
 
     path_points: int = param(600, "points of the camera's path that are kept", minimum=2, maximum=100_000)
     path_period_s: float = param(0.2, "time between two of them", unit="s", minimum=0.01, maximum=60)
+    frame_prefix: str = param("", "before the names of the body's TF frames, to tell two drones apart, e.g. drone2/")
+    human_topics: bool = param(False, "publish the subject as REP 155 does: /humans/bodies topics, frames body_<id>")
