@@ -28,6 +28,9 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
     )
     component_id: int = param(191, "own MAVLink component; 191 = onboard computer", minimum=2, maximum=250)
     target_system_id: int = param(0, "vehicle to read; 0 = the first autopilot heard", minimum=0, maximum=254)
+    signing_key_file: str = param(
+        "", "file with the 64 hexadecimal digits of the key by which packets are signed, both ways; empty = unsigned"
+    )
     heartbeat_hz: float = param(1.0, "rate of our heartbeat", unit="Hz", minimum=0.2, maximum=10)
     attitude_hz: float = param(50.0, "wanted rate of attitude", unit="Hz", minimum=1, maximum=200)
     position_hz: float = param(20.0, "wanted rate of local position", unit="Hz", minimum=1, maximum=100)
@@ -48,6 +51,11 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
     watchdog_s: float = param(
         0.2, "time without a step of the control loop after which the watchdog holds the vehicle", unit="s",
         minimum=0.1, maximum=2,
+    )  # fmt: skip
+    max_control_timeout_s: float = param(
+        0.5, "longest time-out after which the autopilot may stop by itself when our setpoints stay away "
+        "(GUID_TIMEOUT, COM_OF_LOSS_T, read from it): with a longer or unknown one nothing is flown; 0 = no matter",
+        unit="s", minimum=0, maximum=10,
     )  # fmt: skip
     gimbal_control: bool = param(False, "whether the mount's pitch is turned to the subject")
 

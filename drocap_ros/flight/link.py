@@ -16,9 +16,11 @@ from typing import Any, NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import InputError
+from drocap_ros.flight.autopilot_settings import AutopilotSettings
 from drocap_ros.flight.config import MavlinkBridgeConfig
 from drocap_ros.flight.dialects import DIALECTS
 from drocap_ros.flight.parser import MavlinkParser
+from drocap_ros.flight.signing import read_signing_key, sign_with, signing_time
 from drocap_ros.flight.state_estimator import VehicleStateEstimator
 from drocap_ros.flight.telemetry_request import TelemetryRequests
 from drocap_ros.flight.transport import LinkError, Transport, open_transport
@@ -27,7 +29,7 @@ from drocap_ros.flight.vehicle_state import VehicleState
 _NS = 1_000_000_000
 _STREAM_FALLBACK_S = 5.0
 _RECONNECT_S = 1.0
-SENDABLE = frozenset({"HEARTBEAT", "TIMESYNC", "COMMAND_LONG", "REQUEST_DATA_STREAM"})
+SENDABLE = frozenset({"HEARTBEAT", "TIMESYNC", "COMMAND_LONG", "REQUEST_DATA_STREAM", "PARAM_REQUEST_READ"})
 _COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL})
 MOTION = frozenset({"SET_POSITION_TARGET_LOCAL_NED", "COMMAND_LONG"})
 _MODES = frozenset(
@@ -45,7 +47,8 @@ class LinkStatus(NamedTuple):
     round_trip_s : of the best time synchronization, NaN without one
     rates_hz : (real, wanted) of each message asked for, by its name
     refused : MAV_RESULT of what the autopilot does not grant
-    bad_count : pieces of data that were no message
+    bad_count : pieces of data that were no message, or not signed as they must be
+    refused_count : of these, whole messages that were not signed with our key
     """
 
     connected: bool
@@ -54,6 +57,7 @@ class LinkStatus(NamedTuple):
     rates_hz: dict[str, tuple[float, float]]
     refused: dict[str, int]
     bad_count: int
+    refused_count: int = 0
 
 
 class MavlinkLink:
@@ -69,7 +73,7 @@ class MavlinkLink:
     Raises
     ------
     InputError
-        At construction, when the URL cannot be used.
+        At construction, when the URL or the file of the signing key cannot be used.
     """
 
     def __init__(
@@ -84,10 +88,18 @@ class MavlinkLink:
         self.estimator = VehicleStateEstimator(config.target_system_id)
         self._clock_ns = clock_ns
         self._monotonic_s = monotonic_s
+        key = read_signing_key(config.signing_key_file) if config.signing_key_file else None
         self._transport = transport or open_transport(config.url)
-        self._parser = MavlinkParser()
+        self._parser = MavlinkParser(key, clock_ns())
         self._requests = TelemetryRequests(config)
+        self.settings = AutopilotSettings()
         self._mav = mavlink.MAVLink(None, srcSystem=config.system_id, srcComponent=config.component_id)
+        # The watchdog packs with one of its own, so that it shares nothing with a loop that hangs; signed packets of
+        # one stream must not go back in time, so it signs as another stream.
+        self._last_mav = mavlink.MAVLink(None, srcSystem=config.system_id, srcComponent=config.component_id)
+        if key is not None:
+            sign_with(self._mav, key, clock_ns())
+            sign_with(self._last_mav, key, clock_ns(), link_id=1)
         self._autopilot: str | None = None
         self._heard_s: float | None = None  # monotonic
         self._due: dict[str, float] = {}
@@ -142,24 +154,29 @@ class MavlinkLink:
         AssertionError
             When motion is not enabled, or the message is not on the list: an error in the program.
         """
-        if not self.config.commands_enabled or not _is_motion(message):
-            raise AssertionError(f"this link sends no {message.get_type()}")
+        self.check_motion(message)
         with self._lock:
             self._transmit(message)
 
-    def send_unlocked(self, packet: bytes) -> None:
-        """Send what :meth:`pack_motion` made without waiting for anybody: for the watchdog of a loop that hangs."""
-        try:
-            self._transport.write(packet)
-        except LinkError as error:
-            logger.warning("the watchdog could not send: %s", error)
+    def check_motion(self, message: Any) -> Any:
+        """The message, if it is on the allow-list: to be left to the watchdog.
 
-    def pack_motion(self, message: Any) -> bytes:
-        """Bytes of a message of the allow-list, to be sent by :meth:`send_unlocked` if it comes to that."""
+        Raises
+        ------
+        AssertionError
+            As :meth:`send_motion`.
+        """
         if not self.config.commands_enabled or not _is_motion(message):
             raise AssertionError(f"this link sends no {message.get_type()}")
-        with self._lock:
-            return bytes(message.pack(self._mav))
+        return message
+
+    def send_unlocked(self, message: Any) -> None:
+        """Send a motion message without waiting for anybody: for the watchdog of a loop that hangs."""
+        self.check_motion(message)
+        try:
+            self._transport.write(self._pack(message, self._last_mav))
+        except LinkError as error:
+            logger.warning("the watchdog could not send: %s", error)
 
     def take_answers(self) -> list[tuple[int, int]]:
         """(command, MAV_RESULT) of the acknowledgements that came since the last call, telemetry's left out."""
@@ -183,6 +200,7 @@ class MavlinkLink:
             rates_hz=self._requests.rates_hz(now_ns),
             refused=self._requests.refused(),
             bad_count=self._parser.bad_count,
+            refused_count=self._parser.refused_count,
         )
 
     def _read(self, timeout_s: float) -> bytes:
@@ -226,9 +244,12 @@ class MavlinkLink:
             self._autopilot = _autopilot_kind(message)
             if self._autopilot is not None:
                 self._requests.set_autopilot(self._autopilot)
+                self.settings.set_autopilot(self._autopilot)
         self._requests.count(message.get_msgId(), now_ns)
         if name == "TIMESYNC":
             self._take_time_sync(message, now_ns)
+        elif name == "PARAM_VALUE":
+            self.settings.take(message)
         elif name == "COMMAND_ACK" and message.command in _COMMANDS:
             self._requests.acknowledge(message.result, now_ns)
         elif name == "COMMAND_ACK" and message.target_system in (0, self.config.system_id):
@@ -267,6 +288,9 @@ class MavlinkLink:
                         system, component, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, interval_us, 0, 0, 0, 0, 0
                     )
                 )
+        if config.commands_enabled:
+            for setting in self.settings.due(self._monotonic_s()):
+                self._send(self._mav.param_request_read_encode(system, component, setting.encode("ascii"), -1))
         if self._requests.unanswered() and self._is_due("streams", _STREAM_FALLBACK_S):
             # Autopilots and proxies too old for SET_MESSAGE_INTERVAL know this one.
             rate = round(min(config.position_hz, 50))
@@ -289,10 +313,18 @@ class MavlinkLink:
         if self._broken_s is not None:
             return
         try:
-            self._transport.write(message.pack(self._mav))
+            self._transport.write(self._pack(message, self._mav))
         except LinkError as error:
             self._break(error)
-        self._mav.seq = (self._mav.seq + 1) % 256
+
+    def _pack(self, message: Any, mav: Any) -> bytes:
+        if mav.signing.sign_outgoing:
+            # Never back, whatever our clock does, and never far behind what others sign.
+            heard = self._parser.signing.timestamp
+            mav.signing.timestamp = max(mav.signing.timestamp, signing_time(self._clock_ns()), heard)
+        packet = bytes(message.pack(mav))
+        mav.seq = (mav.seq + 1) % 256
+        return packet
 
 
 def _is_motion(message: Any) -> bool:

@@ -216,6 +216,7 @@ class OrbitController:
             subject_age_s=math.inf if estimate is None else estimate.age_s,
             subject_sd_m=math.inf if estimate is None else estimate.position_sd_m,
             subject_distance_m=distance, closing_m_s=closing, approach_m_s=approach, disturbance=disturbance,
+            settings_problem=self._link.settings.problem(self._config.max_control_timeout_s),
         )  # fmt: skip
 
     def _next_command(self, now_ns: int) -> tuple[Command | None, str]:
@@ -310,7 +311,7 @@ class OrbitController:
             mav, target = self._link.mav, self._link.target
             hold = setpoint_message(mav, target, hold_setpoint(seen.position, seen.yaw))
             mode = command_message(mav, target, _SET_MODE, 0, dialect.mode_parameters(True))
-            words = LastWords(self._link.pack_motion(hold), self._link.pack_motion(mode))
+            words = LastWords(self._link.check_motion(hold), self._link.check_motion(mode))
         self._watchdog.kick(now_s, words)
 
     def _status(self, seen: Observed, estimate: SubjectEstimate | None, answer: str, sent: Action) -> ControlStatus:

@@ -74,6 +74,7 @@ class Observed:
     subject_distance_m : horizontal
     closing_m_s, approach_m_s : how fast the vehicle moves towards the subject, and the subject towards the vehicle
     disturbance : something that ends motion and that no other field tells, in words
+    settings_problem : what in the autopilot's own settings forbids to fly, in words
     """
 
     autopilot: str = "other"
@@ -103,6 +104,7 @@ class Observed:
     closing_m_s: float = 0.0
     approach_m_s: float = 0.0
     disturbance: str = ""
+    settings_problem: str = ""
 
 
 class Limits(NamedTuple):
@@ -158,6 +160,8 @@ def vehicle_problem(seen: Observed, limits: Limits) -> str:
         return f"nothing heard from the autopilot {_ago(seen.link_age_s)}"
     if seen.autopilot not in ("ardupilot", "px4"):
         return f"the autopilot is {seen.autopilot!r}: only ArduPilot and PX4 are commanded"
+    if seen.settings_problem:
+        return seen.settings_problem
     if seen.heartbeat_age_s > safety.max_heartbeat_age_s:
         return f"flight mode last told {_ago(seen.heartbeat_age_s)}"
     if seen.state_age_s > safety.max_state_age_s:

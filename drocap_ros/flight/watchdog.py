@@ -5,18 +5,19 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 _PERIOD_S = 0.1
+_LOOK_S = 0.02
 _ASK_MODE_S = 3.0
 _GIVE_UP_S = 10.0
 
 
 class LastWords(NamedTuple):
-    """What to send if the loop is not heard of again: packets of the place to hold, and of the hold mode."""
+    """What to send if the loop is not heard of again: messages of the place to hold, and of the hold mode."""
 
-    hold: bytes
-    hold_mode: bytes
+    hold: Any
+    hold_mode: Any
 
 
 class Watchdog:
@@ -24,11 +25,11 @@ class Watchdog:
 
     Parameters
     ----------
-    send : sends a packet without waiting for any lock
+    send : sends a message without waiting for any lock
     limit_s : time without :meth:`kick`
     """
 
-    def __init__(self, send: Callable[[bytes], None], limit_s: float) -> None:
+    def __init__(self, send: Callable[[Any], None], limit_s: float) -> None:
         self._send, self._limit_s = send, limit_s
         self._left: tuple[float, LastWords | None] = (-1e18, None)  # replaced whole: no lock
         self._sent_s = -1e18
@@ -71,5 +72,5 @@ class Watchdog:
             self._thread.join(1.0)
 
     def _run(self) -> None:
-        while not self._stop.wait(0.05):
+        while not self._stop.wait(_LOOK_S):
             self.step(time.monotonic())

@@ -141,17 +141,26 @@ class MavlinkBridgeNode(ComponentNode):
         safety = self._controller.safety
         if not status.connected:
             silence = "never heard" if np.isinf(status.silence_s) else f"silent for {status.silence_s:.0f} s"
-            self.report(WARN, f"no autopilot on {self.config.url}: {silence}; check the link and its URL")
+            remedy = "check the link and its URL"
+            if status.refused_count:
+                remedy = f"{status.refused_count} messages came that are not signed with the key of signing_key_file"
+            self.report(WARN, f"no autopilot on {self.config.url}: {silence}; {remedy}")
         elif safety.state in (State.HOLDING, State.TAKEN_OVER, State.FAULT):
             self.report(ERROR if safety.state == State.FAULT else WARN, f"{safety.state.name.lower()}: {safety.reason}")
         elif status.refused:
             self.report(WARN, f"the autopilot refuses to send {', '.join(sorted(status.refused))}")
+        elif self._link.settings.warning():
+            self.report(WARN, self._link.settings.warning())
         else:
             doing = "reading telemetry" if not self.config.commands_enabled else safety.state.name.lower()
             self.report(OK, doing + ("" if self._tf else "; no tf2_msgs here, so no TF"))
         for name, (real, _) in status.rates_hz.items():
             self.details[f"{name} Hz"] = f"{real:.1f}"
         self.details["bad MAVLink data"] = str(status.bad_count)
+        if self.config.signing_key_file:
+            self.details["MAVLink messages not signed with our key"] = str(status.refused_count)
+        for name, value in self._link.settings.told().items():
+            self.details[name] = f"{value:g}"
 
     def _publish_status(self, status: ControlStatus, reason: str) -> None:
         x, y, z = (float(v) for v in status.subject_position)

@@ -31,7 +31,7 @@ _MODES = {
 _CONTROL = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}
 #: Deceleration of the stop in each mode: the measured distances from 2 m/s, less what the lag takes.
 _BRAKING = {"BRAKE": 0.92, "LOITER": 2.6}
-_PX4_STREAM_S, _PX4_GAP_S, _PX4_LOSS_S = 1.0, 0.5, 1.0
+_PX4_STREAM_S, _PX4_GAP_S = 1.0, 0.5
 _GPS_NOTICED_S, _EKF_NOTICED_S = 0.4, 7.4
 _HEALTHY, _CONSTANT_POSITION = 831, 831 & ~(8 | 16) | 128
 
@@ -44,6 +44,7 @@ class SimulatedCopter(SimulatedVehicle):
     position, yaw : where it hovers at the beginning, ENU, truth
     wind : (3,) m/s
     guid_timeout_s : ArduPilot's GUID_TIMEOUT
+    offboard_loss_s : PX4's COM_OF_LOSS_T; 1 s as PX4 ships
     gps_noise_m : of the slow error of the position; fine errors come on top
     """
 
@@ -51,13 +52,17 @@ class SimulatedCopter(SimulatedVehicle):
         self, transport: Transport, position: np.ndarray, yaw: float, autopilot: str = "ardupilot", *,
         wind: np.ndarray | None = None, seed: int = 0, gps_noise_m: float = 0.4, attitude_error_deg: float = 0.4,
         guid_timeout_s: float = 0.5, mode: str = "LOITER", gimbal: bool = True, gimbal_pitch_deg: float = -14.0,
-        system_id: int = 1,
+        system_id: int = 1, offboard_loss_s: float = 0.5, signing_key: bytes | None = None,
     ) -> None:  # fmt: skip
-        super().__init__("", _Nowhere(), autopilot, gimbal=gimbal, system_id=system_id, transport=transport)
+        super().__init__(
+            "", _Nowhere(), autopilot, gimbal=gimbal, system_id=system_id, transport=transport, signing_key=signing_key
+        )
         self.path = self
         self.body = PointMass(position, yaw, np.zeros(3) if wind is None else wind, seed)
         self.mode, self.armed, self.battery, self.landed_state = mode, True, 87, mavlink.MAV_LANDED_STATE_IN_AIR
-        self.guid_timeout_s = guid_timeout_s
+        self.guid_timeout_s, self.offboard_loss_s = guid_timeout_s, offboard_loss_s
+        timeout = {"COM_OF_LOSS_T": offboard_loss_s} if autopilot == "px4" else {"GUID_TIMEOUT": guid_timeout_s}
+        self.settings.update(timeout)
         self.denied_modes: frozenset[str] = frozenset()
         self.gps_lost_s = self.ekf_failed_s = math.inf
         self.frozen = False  # telemetry repeats its last values, with fresh or old stamps
@@ -164,7 +169,7 @@ class SimulatedCopter(SimulatedVehicle):
         return self._target
 
     def _failsafes(self) -> None:
-        if self.autopilot == "px4" and self.mode == "OFFBOARD" and self._t - self._seen_s > _PX4_LOSS_S:
+        if self.autopilot == "px4" and self.mode == "OFFBOARD" and self._t - self._seen_s > self.offboard_loss_s:
             self.set_mode("LOITER", "failsafe: offboard lost")
         if self._t > min(self.ekf_failed_s + 1.0, self.gps_lost_s + _EKF_NOTICED_S + 1.0) and self.mode != "LAND":
             self.set_mode("LAND", "failsafe: estimator")

@@ -62,6 +62,7 @@ class LoopSettings:
     seconds: float = 40.0
     start_mode: str = ""  # "" = the control mode: the pilot has switched to GUIDED or OFFBOARD
     guid_timeout_s: float = 0.5
+    offboard_loss_s: float = 0.5
     config: MavlinkBridgeConfig = field(
         default_factory=lambda: MavlinkBridgeConfig(
             commands_enabled=True, mode_change_allowed=True, attitude_hz=25.0, position_hz=20.0
@@ -106,6 +107,7 @@ class OrbitLoop:
         self.copter = SimulatedCopter(
             LoopbackTransport(self.up, self.down), start, bearing + math.pi, settings.autopilot,
             wind=np.array(settings.wind_m_s), seed=settings.seed, guid_timeout_s=settings.guid_timeout_s,
+            offboard_loss_s=settings.offboard_loss_s,
             mode=settings.start_mode or ("LOITER" if settings.autopilot == "px4" else control), gimbal_pitch_deg=pitch,
         )  # fmt: skip
         self.rows: list[Row] = []

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import struct
 import threading
 import time
 from collections.abc import Callable
@@ -24,6 +25,7 @@ from drocap_ros.flight.frames import (
     orientation_to_aviation,
 )
 from drocap_ros.flight.parser import MavlinkParser
+from drocap_ros.flight.signing import sign_with
 from drocap_ros.flight.transport import Transport, open_transport
 from drocap_ros.simulation.flight_path import FlightPath, VehiclePose, orbit_path
 
@@ -50,6 +52,7 @@ class SimulatedVehicle:
     max_rate_hz : what it delivers at most, whatever is asked and acknowledged (a slow link)
     boot_s : seconds since boot at path time 0
     transport : instead of that of the URL
+    signing_key : 32 bytes; then it signs, and hears only what is signed
 
     Raises
     ------
@@ -68,6 +71,7 @@ class SimulatedVehicle:
         max_rate_hz: float = 400.0,
         boot_s: float = 30.0,
         transport: Transport | None = None,
+        signing_key: bytes | None = None,
     ) -> None:
         if autopilot not in AUTOPILOTS:
             raise InputError(f"autopilot: expected one of {', '.join(AUTOPILOTS)}, got {autopilot!r}")
@@ -75,8 +79,14 @@ class SimulatedVehicle:
         self.received: list[str] = []  # names of what came in, for tests that nothing else was sent
         self._max_rate_hz, self._boot_s = max_rate_hz, boot_s
         self._transport = transport or open_transport(url)
-        self._parser = MavlinkParser()
+        self._parser = MavlinkParser(signing_key, time.time_ns())
+        #: Parameters of the autopilot by their names: a float, or an int.
+        self.settings: dict[str, float] = (
+            {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5} if autopilot == "px4" else {"GUID_TIMEOUT": 0.5}
+        )
         self._mav = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
+        if signing_key is not None:
+            sign_with(self._mav, signing_key, time.time_ns())
         self._period_s: dict[int, float] = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}
         if autopilot == "px4":  # PX4 streams a set by itself, ArduPilot almost nothing
             self._period_s[mavlink.MAVLINK_MSG_ID_ATTITUDE] = 0.05
@@ -133,6 +143,8 @@ class SimulatedVehicle:
         name = message.get_type()
         if name == "TIMESYNC" and message.tc1 == 0:
             self._send(self._mav.timesync_encode(int((t_s + self._boot_s) * 1e9), message.ts1))
+        elif name == "PARAM_REQUEST_READ":
+            self._tell_setting(message.param_id)
         elif name == "COMMAND_LONG":
             result = mavlink.MAV_RESULT_UNSUPPORTED
             if message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
@@ -142,6 +154,14 @@ class SimulatedVehicle:
                     message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
                 )
             )
+
+    def _tell_setting(self, name: str) -> None:
+        if name not in self.settings:
+            return
+        value, kind = self.settings[name], mavlink.MAV_PARAM_TYPE_REAL32
+        if isinstance(value, int):  # PX4's way: the integer's bytes in the place of the float
+            value, kind = struct.unpack("<f", struct.pack("<i", value))[0], mavlink.MAV_PARAM_TYPE_INT32
+        self._send(self._mav.param_value_encode(name.encode("ascii"), value, kind, len(self.settings), 0))
 
     def _set_interval(self, number: int, interval_us: float) -> int:
         if number not in self._known():

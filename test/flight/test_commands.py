@@ -126,7 +126,7 @@ def test_without_permission_the_link_sends_no_motion_at_all():
     with pytest.raises(AssertionError, match="sends no"):
         sender.send_motion(halt_message(sender.mav, (1, 1)))
     with pytest.raises(AssertionError, match="sends no"):
-        sender.pack_motion(halt_message(sender.mav, (1, 1)))
+        sender.check_motion(halt_message(sender.mav, (1, 1)))
 
 
 @pytest.mark.parametrize(
@@ -146,16 +146,16 @@ def test_contradicting_parameters_of_the_bridge_are_refused(values, word):
 def test_watchdog_says_the_last_words_of_a_loop_that_hangs_and_only_then():
     sent = []
     dog = Watchdog(sent.append, 0.2)
-    words = LastWords(b"hold", b"mode")
+    words = LastWords("hold", "mode")
     for i in range(20):
         dog.kick(0.05 * i, words)
         dog.step(0.05 * i + 0.02)
     assert sent == []
     for i in range(200):
         dog.step(0.95 + 0.05 * i)
-    assert sent[0] == b"hold"
-    assert sent.count(b"mode") == 1
-    assert 50 < sent.count(b"hold") < 110  # ten times a second, for ten seconds
+    assert sent[0] == "hold"
+    assert sent.count("mode") == 1
+    assert 50 < sent.count("hold") < 110  # ten times a second, for ten seconds
     assert dog.take_fired() == (True, True)
     assert dog.take_fired() == (False, False)
     sent.clear()
