@@ -1,12 +1,13 @@
 import numpy as np
 import pytest
-from visualization_msgs.msg import Marker
+from visualization_msgs.msg import ImageMarker, Marker
 
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.msg import Pose3D
-from drocap_ros.nodes.conversions import header_at, pose3d_to_ros
-from drocap_ros.nodes.markers import body_transforms, path_marker, pose_markers
+from drocap_ros.nodes.conversions import header_at, pose2d_to_ros, pose3d_to_ros
+from drocap_ros.nodes.markers import body_transforms, keypoint_marker, path_marker, pose_markers
+from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.skeleton import BODY_15
 
 
@@ -87,3 +88,47 @@ def test_path_keeps_its_points_and_stays():
     assert line.type == Marker.LINE_STRIP
     assert [p.z for p in line.points] == [2.0, 5.0, 8.0, 11.0]
     assert (line.lifetime.sec, line.lifetime.nanosec) == (0, 0)
+
+
+def keypoints(track_id=4, unknown=()):
+    points = np.random.default_rng(1).uniform(50, 400, (15, 2))
+    points[list(unknown)] = np.nan
+    seen = track_id > 0
+    observation = PoseObservation(
+        7,
+        track_id,
+        (640, 480),
+        roi=np.array([40.0, 40.0, 410.0, 410.0]),
+        detection_score=0.9,
+        keypoints=points if seen else points[:0],
+        covariance=np.ones((15 if seen else 0, 3)),
+        confidence=np.ones(15 if seen else 0),
+    )
+    return pose2d_to_ros(observation, "camera_optical"), points
+
+
+def test_keypoints_lie_over_the_picture_in_one_marker():
+    knee = BODY_15.index("rknee")
+    message, points = keypoints(unknown=[knee])
+    marker = keypoint_marker(message)
+    assert (marker.type, marker.action) == (ImageMarker.LINE_LIST, ImageMarker.ADD)
+    assert marker.header == message.header
+    drawn = np.array([(p.x, p.y) for p in marker.points]).reshape(-1, 2, 2)
+    bones = [bone for bone in BODY_15.bones if knee not in bone]
+    np.testing.assert_allclose(drawn[: len(bones)], points[bones], rtol=1e-6)
+    # Two arms of a cross on each joint that is known, its middle the joint.
+    crosses = drawn[len(bones) :].mean(1).reshape(-1, 2, 2)
+    np.testing.assert_allclose(crosses[:, 0], np.delete(points, knee, 0), rtol=1e-6)
+    np.testing.assert_allclose(crosses[:, 0], crosses[:, 1], rtol=1e-6)
+    assert len(marker.outline_colors) == len(marker.points)
+
+
+def test_without_a_subject_the_keypoints_go():
+    marker = keypoint_marker(keypoints(track_id=0)[0])
+    assert marker.action == ImageMarker.REMOVE
+    assert not marker.points
+
+
+def test_a_prefix_tells_the_frames_of_two_drones_apart():
+    message, _, _ = pose()
+    assert {t.child_frame_id.split("/")[0] for t in body_transforms(message, "drone2/")} == {"drone2"}
