@@ -170,11 +170,12 @@ def _shown(recording: rerun.RecordingStream, views: tuple[str, ...], args: argpa
     elif args.web or not has_screen():
         address = to_browser(recording, arranged, args.port, args.memory)
         _say(args, f"open {address} in a browser; Ctrl-C stops")
-        yield
-        recording.flush()
-        if not args.live:
-            with stop_signals() as stop:
-                stop.wait()
+        with contextlib.suppress(KeyboardInterrupt):
+            yield
+            recording.flush()
+            if not args.live:
+                with stop_signals() as stop:
+                    stop.wait()
     else:
         to_window(recording, arranged, args.memory)
         yield

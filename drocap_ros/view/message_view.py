@@ -137,6 +137,8 @@ class MessageView:
 
     def _on_window(self, message: Any, _: int) -> None:
         newest_ns = stamp_ns(message)
+        if newest_ns < self._refined_ns:  # time has jumped back: a recording played in a loop
+            self._refined_ns = -(10**18)
         fresh = [pose for pose in message.poses if stamp_ns(pose) > self._refined_ns]
         settled = [pose for pose in fresh if stamp_ns(pose) <= newest_ns - _REFINED_LAG_NS]
         for pose in settled:
