@@ -16,6 +16,7 @@ from drocap_ros.errors import DrocapError
 COMMANDS = (
     "demo", "live", "view", "orbit", "record", "replay", "track", "reconstruct", "learn_dictionary",
     "export", "report", "info", "recover", "top", "models", "evaluate", "train_lifter",
+    "train_simulation_models",
 )  # fmt: skip
 
 

@@ -47,7 +47,8 @@ class LifterTraining(Parameters):
     seed: int = param(0, "of the samples and of the first weights", minimum=0)
 
 
-def _torch() -> Any:
+def pytorch() -> Any:
+    """PyTorch, or an error that says how to get it."""
     try:
         import torch
     except ImportError:
@@ -57,7 +58,7 @@ def _torch() -> Any:
 
 def set_threads(count: int) -> None:
     """Threads of PyTorch."""
-    _torch().set_num_threads(count)
+    pytorch().set_num_threads(count)
 
 
 def describe_training(
@@ -78,7 +79,7 @@ def describe_training(
 
 def build_network(width: int) -> torch.nn.Module:
     """Network (B, T, 73) -> joints (B, T, 15, 3), log sigma (B, T, 15, 2) of x, y and of depth; T even."""
-    torch = _torch()
+    torch = pytorch()
     nn, functional = torch.nn, torch.nn.functional
     module: Any = nn.Module
 
@@ -135,7 +136,7 @@ def lifting_loss(joints: torch.Tensor, log_sigma: torch.Tensor, target: torch.Te
     Distance of the joints, of their displacements over one frame and of bone lengths, and the Laplace
     likelihood of the residuals, which only the uncertainties are fitted to.
     """
-    torch = _torch()
+    torch = pytorch()
     error = joints - target
     distance = torch.sqrt(error.square().sum(dim=-1) + 1e-8)
     weight = torch.full((_JOINTS,), 0.6)
@@ -160,7 +161,7 @@ def _rate(progress: float) -> float:
 
 def _optimisers(network: torch.nn.Module, options: LifterTraining) -> list[Any]:
     """AdamW for embedding, head, norms and biases; Muon, which halved the steps in a trial, for the rest."""
-    torch = _torch()
+    torch = pytorch()
     matrices: list[Any] = []
     others: list[Any] = []
     for name, weight in network.named_parameters():
@@ -183,7 +184,7 @@ def train(
 
     ``checkpoint(network, facts)`` is called now and then with the averaged weights.
     """
-    torch = _torch()
+    torch = pytorch()
     torch.manual_seed(options.seed)
     rng = np.random.default_rng(options.seed)
     network = build_network(options.width)
@@ -225,8 +226,27 @@ def train(
 
 
 def export_onnx(network: torch.nn.Module, path: Path, facts: dict[str, str]) -> None:
-    """Write the network as ONNX with weights in half precision (computed in single) and ``facts`` as metadata."""
-    torch = _torch()
+    """Write the lifter as ONNX, see :func:`write_onnx`."""
+    torch = pytorch()
+    names = (["features"], ["joints", "log_sigma"])
+    axes = {name: {0: "windows", 1: "frames"} for name in (*names[0], *names[1])}
+    write_onnx(network, torch.zeros(2, 16, FEATURES), path, *names, axes, facts)
+
+
+def write_onnx(
+    network: torch.nn.Module,
+    example: torch.Tensor,
+    path: Path,
+    inputs: list[str],
+    outputs: list[str],
+    axes: dict[str, dict[int, str]],
+    facts: dict[str, str],
+) -> None:
+    """Write a network as ONNX with weights in half precision (computed in single) and ``facts`` as metadata.
+
+    ``axes`` names the dimensions that may vary, per input and output.
+    """
+    torch = pytorch()
     try:
         import onnx
         from onnx import TensorProto, helper, numpy_helper
@@ -241,11 +261,11 @@ def export_onnx(network: torch.nn.Module, path: Path, facts: dict[str, str]) -> 
         warnings.simplefilter("ignore")
         torch.onnx.export(
             network,
-            (torch.zeros(2, 16, FEATURES),),
+            (example,),
             str(path),
-            input_names=["features"],
-            output_names=["joints", "log_sigma"],
-            dynamic_axes={name: {0: "windows", 1: "frames"} for name in ("features", "joints", "log_sigma")},
+            input_names=inputs,
+            output_names=outputs,
+            dynamic_axes=axes,
             opset_version=17,
             dynamo=False,
         )
