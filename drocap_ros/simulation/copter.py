@@ -84,6 +84,7 @@ class SimulatedCopter(SimulatedVehicle):
         self._stream_s = math.inf  # since when setpoints stream without a gap
         self._seen_s = 0.0  # last setpoint, accepted or not
         self._stop_velocity: np.ndarray | None = None
+        self._heading = yaw  # kept in the modes that no setpoint steers
         self._timed_out_at: Target | None = None
         self._report: VehiclePose | None = None
         self._report_s = -1.0
@@ -111,6 +112,7 @@ class SimulatedCopter(SimulatedVehicle):
             self.mode = mode
             self.mode_log.append((self._t, mode, by))
             self._stop_velocity = self.body.velocity.copy()
+            self._heading = self.body.yaw
             if mode == _CONTROL[self.autopilot] and self.autopilot == "ardupilot":
                 self._heard_s = -1e9  # GUIDED begins by holding
                 self._target = Target(yaw=self.body.yaw)
@@ -159,13 +161,13 @@ class SimulatedCopter(SimulatedVehicle):
         speed = float(np.linalg.norm(self._stop_velocity))
         if speed > 1e-3:
             self._stop_velocity = self._stop_velocity * max(1 - braking * dt / speed, 0.0)
-            self._target = Target(velocity=self._stop_velocity)
+            self._target = Target(velocity=self._stop_velocity, yaw=self._heading)
         elif self._target.position is None and float(np.linalg.norm(self.body.velocity)) < 0.2:
-            self._target = Target(position=self.body.position + self._gps_error)
+            self._target = Target(position=self.body.position + self._gps_error, yaw=self._heading)
         elif self._target.position is not None:
             return self._in_truth(self._target)
         else:
-            self._target = Target()
+            self._target = Target(yaw=self._heading)
         return self._target
 
     def _failsafes(self) -> None:

@@ -24,10 +24,6 @@ class FlightSimulatorConfig(Parameters):
         7.0, "horizontal distance from the person at which the vehicle takes off", unit="m", minimum=2, maximum=50
     )
     takeoff_height_m: float = param(3.0, "height at which the pilot hands over", unit="m", minimum=1.5, maximum=50)
-    gimbal_pitch_deg: float = param(
-        -14.0, "pitch of the camera's mount until somebody turns it, negative looks down", unit="deg", minimum=-90,
-        maximum=30,
-    )  # fmt: skip
     image_width: int = param(1280, "width of the pictures", unit="px", minimum=64, maximum=8192)
     image_height: int = param(720, "height of the pictures", unit="px", minimum=64, maximum=8192)
     horizontal_fov_deg: float = param(60.0, "horizontal field of view", unit="deg", minimum=5, maximum=150)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -28,12 +30,10 @@ class PilotedCopter(SimulatedCopter):
     """
 
     def __init__(
-        self, transport: Transport, ground: np.ndarray, yaw: float, autopilot: str, *, wind: np.ndarray, seed: int,
-        gimbal_pitch_deg: float,
-    ) -> None:  # fmt: skip
+        self, transport: Transport, ground: np.ndarray, yaw: float, autopilot: str, *, wind: np.ndarray, seed: int
+    ) -> None:
         super().__init__(
-            transport, np.array([*ground, _SKIDS_M]), yaw, autopilot, wind=wind, seed=seed,
-            mode=STICK_MODE[autopilot], gimbal_pitch_deg=gimbal_pitch_deg,
+            transport, np.array([*ground, _SKIDS_M]), yaw, autopilot, wind=wind, seed=seed, mode=STICK_MODE[autopilot],
         )  # fmt: skip
         self.armed, self.landed_state = False, mavlink.MAV_LANDED_STATE_ON_GROUND
         self.stick: np.ndarray = np.zeros(3)
@@ -48,18 +48,20 @@ class PilotedCopter(SimulatedCopter):
     def _present_target(self, dt: float) -> Target:
         if self.mode == STICK_MODE[self.autopilot] and self.stick.any():
             self._stop_velocity = None  # once the sticks are let go it stops from the speed it then has
-            return Target(velocity=self.stick.copy(), yaw=self.body.yaw)
+            return Target(velocity=self.stick.copy(), yaw=self._heading)
         return super()._present_target(dt)
 
 
 class SimulatedPilot:
-    """Arms, climbs to a height, hovers, hands over; then keeps the hands off.
+    """Arms, climbs to a height with the camera on the person, hovers, hands over; then keeps the hands off.
 
+    height_m : where to hover
+    aim : (3,) m ENU, where the camera is to look until the hand-over
     doing : in words
     """
 
-    def __init__(self, copter: PilotedCopter, height_m: float) -> None:
-        self._copter, self._height_m = copter, height_m
+    def __init__(self, copter: PilotedCopter, height_m: float, aim: np.ndarray) -> None:
+        self._copter, self._height_m, self._aim = copter, height_m, aim
         self.doing = "checking the vehicle"
         self._since_s = 0.0
 
@@ -71,6 +73,9 @@ class SimulatedPilot:
     def step(self, t_s: float) -> None:
         """Look at the vehicle at path time ``t_s`` and act."""
         copter = self._copter
+        if not self.handed_over:
+            sight = self._aim - copter.body.position
+            copter.camera_pitch = math.atan2(float(sight[2]), float(np.hypot(sight[0], sight[1])))
         if self.doing == "checking the vehicle" and t_s >= _READY_S:
             copter.armed, copter.landed_state = True, mavlink.MAV_LANDED_STATE_TAKEOFF
             copter.stick = np.array([0.0, 0.0, _CLIMB_M_S])

@@ -47,14 +47,15 @@ class FlightWorld:
         ground = config.start_distance_m * np.array([math.cos(bearing), math.sin(bearing)])
         self.copter = PilotedCopter(
             transport, ground, math.remainder(bearing + math.pi, 2 * math.pi), config.autopilot,
-            wind=np.array([config.wind_m_s, 0.0, 0.0]), seed=config.seed, gimbal_pitch_deg=config.gimbal_pitch_deg,
+            wind=np.array([config.wind_m_s, 0.0, 0.0]), seed=config.seed,
         )  # fmt: skip
-        self.pilot = SimulatedPilot(self.copter, config.takeoff_height_m)
+        self._take = _Take(config)
+        aim = self._take.at(0.0)[0]
+        self.pilot = SimulatedPilot(self.copter, config.takeoff_height_m, aim)
         self.forgotten = 0  # exposures beyond the limit
         self._t = 0.0
         self._begin_s = math.inf  # when the person begins to act
         self._rows: list[Exposure] = []
-        self._take = _Take(config)
 
     def step(self, t_s: float) -> None:
         """Go on to world time ``t_s``, which is the vehicle's path time too."""
