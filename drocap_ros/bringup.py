@@ -20,12 +20,14 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import rclpy
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -35,11 +37,16 @@ from std_msgs.msg import Empty, String
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import DrocapError, InputError, NodeError
 from drocap_ros.nodes.component import ComponentNode
-from drocap_ros.nodes.run import spin
-from drocap_ros.nodes.topics import GRAPH_QOS, NODES
+from drocap_ros.nodes.run import PARENT, spin, step_back
+from drocap_ros.nodes.topics import GRAPH_QOS, NODES, TOPICS
 
 #: Above the drain time of a node, and the time that its files may take to close.
 STOP_TIMEOUT_S = 20.0
+
+#: Pauses before a dead node is started again: the first, and the longest; each is twice the one before.
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 10.0
+#: A node that dies more often than this within a minute is given up, and the graph with it.
+MOST_RESTARTS = 5
 
 #: The matrices of a node are small: more BLAS threads cost more than they bring, the more so in six processes.
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -59,10 +66,19 @@ class Graph:
         self.names = names
         self.ready: set[str] = set()
         self.finished: set[str] = set()
+        self.restarts: Counter[str] = Counter()
+        #: What happened to nodes, in words, for whoever shows it; the newest last.
+        self.events: deque[str] = deque(maxlen=100)
         self._runners: list[_Runner] = []
+        self._make: Callable[[str], _Runner] | None = None
+        self._respawn = False
+        self._due_s: dict[str, float] = {}
+        self._died_s: dict[str, deque[float]] = {}
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._start = node.create_publisher(Empty, "graph/start", GRAPH_QOS)
+        entry = TOPICS["/diagnostics"]
+        self._diagnostics = node.create_publisher(entry.message, "/diagnostics", entry.qos)
         self._collect("graph/ready", self.ready)
         self._collect("graph/finished", self.finished)
 
@@ -73,15 +89,76 @@ class Graph:
         self.node.create_subscription(String, topic, add, GRAPH_QOS)
 
     def check(self) -> None:
-        """Raise what a node raised.
+        """Raise what a node raised; with ``respawn``, start it again instead, as long as that helps.
 
         Raises
         ------
         DrocapError
             The error itself from a node in this process; :class:`NodeError` with its words from another.
         """
-        for runner in self._runners:
-            runner.check()
+        for runner in list(self._runners):
+            if runner.name in self._due_s:
+                if time.monotonic() >= self._due_s[runner.name]:
+                    self.restart(runner.name)
+                continue
+            try:
+                runner.check()
+            except Exception as error:
+                if not self._respawn or not self._may_restart(runner.name, error):
+                    raise
+
+    def _may_restart(self, name: str, error: Exception) -> bool:
+        now_s = time.monotonic()
+        died_s = self._died_s.setdefault(name, deque(maxlen=MOST_RESTARTS))
+        if len(died_s) == MOST_RESTARTS and now_s - died_s[0] < 60.0:
+            return False
+        recent = sum(now_s - at < 60.0 for at in died_s)
+        died_s.append(now_s)
+        pause_s = min(FIRST_PAUSE_S * 2.0**recent, LONGEST_PAUSE_S)
+        self._due_s[name] = now_s + pause_s
+        self._tell(f"{error}; starting {name} again in {pause_s:g} s", DiagnosticStatus.WARN)
+        return True
+
+    def restart(self, name: str) -> None:
+        """Start a node anew: one that died, or a running one after it was stopped.
+
+        It finds its peers by itself; :meth:`wait_ready` waits for that.  A recorder goes on in a new folder beside
+        the session's, so that what was recorded stays as it is.
+
+        Raises
+        ------
+        InputError
+            When no such node was brought up here.
+        """
+        index = next((i for i, runner in enumerate(self._runners) if runner.name == name), None)
+        if index is None or self._make is None:
+            raise InputError(f"restart: expected one of {', '.join(self.names)}; got {name}")
+        self._due_s.pop(name, None)
+        self._runners[index].stop()
+        self.ready.discard(name)
+        self.finished.discard(name)
+        self.restarts[name] += 1
+        self._runners[index] = self._make(name)
+        self._tell(f"{name} started again, {self.restarts[name]} times so far", DiagnosticStatus.OK)
+
+    def wait_ready(self, *names: str, timeout_s: float = 60.0) -> None:
+        """Wait until the named nodes have found all their peers."""
+        self.wait_until(
+            lambda: self.ready >= set(names), timeout_s, f"the endpoints of {', '.join(names)} to be matched"
+        )
+
+    def _tell(self, text: str, level: bytes) -> None:
+        self.events.append(text)
+        status = DiagnosticStatus(
+            level=level,
+            name=f"{self.namespace.strip('/')}/bringup",
+            message=text,
+            hardware_id="drocap_ros",
+            values=[KeyValue(key=f"restarts of {name}", value=str(n)) for name, n in sorted(self.restarts.items())],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.node.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
 
     def wait_until(self, condition: Callable[[], bool], timeout_s: float, what: str = "the condition") -> None:
         """Serve the script's own callbacks until ``condition()`` holds.
@@ -124,6 +201,7 @@ def bringup(
     namespace: str = "/drocap",
     domain_id: int | None = None,
     timeout_s: float = 60.0,
+    respawn: bool = False,
 ) -> Iterator[Graph]:
     """Run the named nodes while the context lasts.
 
@@ -136,6 +214,8 @@ def bringup(
     domain_id : DDS domain; None takes a free one and keeps discovery on this machine, so that graphs side by
         side do not hear each other
     timeout_s : for all endpoints to be matched
+    respawn : start a node again that dies once the graph runs, after a growing pause, at most ``MOST_RESTARTS``
+        times a minute; ``Graph.events`` and ``/diagnostics`` tell it
 
     Raises
     ------
@@ -155,20 +235,27 @@ def bringup(
         graph = stack.enter_context(watch(namespace, domain_id, names))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="drocap_bringup_")))
         try:
-            for name in names:
-                runner: _Runner
+
+            def make(name: str) -> _Runner:
+                chosen = config
+                if graph.restarts["session_recorder"] and name == "session_recorder":
+                    chosen = config.replace(name, if_taken="next")
                 if processes:
-                    runner = _Process(name, config, names, namespace, domain_id, folder)
-                else:
-                    runner = _Thread(name, config, names, namespace, graph.node.context)
-                graph._runners.append(runner)
-            matched = f"the endpoints of {', '.join(names)} to be matched"
-            graph.wait_until(lambda: graph.ready >= set(names), timeout_s, matched)
+                    return _Process(name, chosen, names, namespace, domain_id, folder)
+                return _Thread(name, chosen, names, namespace, graph.node.context)
+
+            graph._make = make
+            for name in names:
+                graph._runners.append(make(name))
+            graph.wait_ready(*names, timeout_s=timeout_s)
             graph._start.publish(Empty())
+            graph._respawn = respawn
             yield graph
         finally:
+            graph._respawn = False
             for runner in graph._runners:
                 runner.stop()
+        graph._due_s.clear()
         graph.check()
 
 
@@ -209,18 +296,30 @@ class _Thread(_Runner):
         self.name, self.pid = name, os.getpid()
         self._error: BaseException | None = None
         self._stop = threading.Event()
-        node = node_class(name)(
-            config.section(name),
-            context=context,
-            namespace=namespace,
-            use_global_arguments=False,
-            parameter_overrides=[Parameter("graph_nodes", value=",".join(names))],
-        )
-        self._thread = threading.Thread(target=self._run, args=(node,), name=name, daemon=True)
-        self._thread.start()
+        self._made = threading.Event()
 
-    def _run(self, node: ComponentNode) -> None:
+        def make() -> ComponentNode:
+            return node_class(name)(
+                config.section(name),
+                context=context,
+                namespace=namespace,
+                use_global_arguments=False,
+                parameter_overrides=[Parameter("graph_nodes", value=",".join(names))],
+            )
+
+        # Made in its own thread, so that the threads it starts inherit that one's priority.
+        self._thread = threading.Thread(target=self._run, args=(make,), name=name, daemon=True)
+        self._thread.start()
+        self._made.wait()
+        self.check()
+
+    def _run(self, make: Callable[[], ComponentNode]) -> None:
         try:
+            try:
+                step_back(self.name)
+                node = make()
+            finally:
+                self._made.set()
             spin(node, self._stop)
         except BaseException as error:  # handed to the thread that waits for the graph
             self._error = error
@@ -248,11 +347,9 @@ class _Process(_Runner):
         self._log = folder / f"{name}.log"
         command = [sys.executable, "-m", f"drocap_ros.nodes.{name}", "--ros-args"]
         command += ["-r", f"__ns:={namespace}", "--params-file", str(parameters), "--disable-stdout-logs"]
-        with self._log.open("wb") as log:
-            self._process = subprocess.Popen(
-                command, env={**_ONE_THREAD, **os.environ, "ROS_DOMAIN_ID": str(domain_id)}, stderr=log,
-                start_new_session=True,
-            )  # fmt: skip
+        environment = {**_ONE_THREAD, **os.environ, "ROS_DOMAIN_ID": str(domain_id), PARENT: str(os.getpid())}
+        with self._log.open("ab") as log:
+            self._process = subprocess.Popen(command, env=environment, stderr=log, start_new_session=True)
         self.pid = self._process.pid
         self._stopping = False
 

@@ -41,6 +41,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("--session", metavar="DIR", type=Path, help="record to this new folder")
     parser.add_argument("--nodes", nargs="+", choices=NODES, default=list(NODES), metavar="NODE", help=", ".join(NODES))
     add_graph_options(parser)
+    parser.add_argument("--no-respawn", action="store_true", help="end when a node dies, instead of starting it again")
     parser.set_defaults(run=run)
     return parser
 
@@ -72,7 +73,12 @@ def run_graph(config: DrocapConfig, nodes: list[str], args: argparse.Namespace) 
     check_domain(args.domain_id)
     bringup = import_bringup().bringup
     with bringup(
-        config, nodes, processes=not args.one_process, namespace=args.namespace, domain_id=args.domain_id
+        config,
+        nodes,
+        processes=not args.one_process,
+        namespace=args.namespace,
+        domain_id=args.domain_id,
+        respawn=not args.no_respawn,
     ) as graph:
         if not args.quiet:
             print(f"running {', '.join(graph.names)} in {args.namespace}, domain {args.domain_id}; Ctrl-C stops")
@@ -81,6 +87,8 @@ def run_graph(config: DrocapConfig, nodes: list[str], args: argparse.Namespace) 
             while not stop.is_set() and not ("image_ingest" in nodes and "image_ingest" in graph.finished):
                 graph.spin_for(0.5)
                 draw()
+                while graph.events:
+                    print(f"drocap: {graph.events.popleft()}", file=sys.stderr, flush=True)
     return 0
 
 

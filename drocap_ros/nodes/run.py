@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
+import os
 import signal
 import sys
 import threading
@@ -17,6 +20,12 @@ from drocap_ros.nodes.component import ComponentNode
 #: After the order to stop, messages that have arrived are still worked off, for this long at most.
 DRAIN_S = 5.0
 
+#: How far a node steps back (Unix niceness) for those between the camera and the pose.
+NICENESS = {"bundle_adjuster": 10, "session_recorder": 5, "visualizer": 10}
+
+#: Names the process that started this node; when that one is gone, the node stops.
+PARENT = "DROCAP_PARENT_PID"
+
 
 def spin(node: ComponentNode, stop: threading.Event) -> None:
     """Run the node's callbacks until ``stop``, then work off what has arrived, and close the node.
@@ -25,9 +34,15 @@ def spin(node: ComponentNode, stop: threading.Event) -> None:
     """
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
+    # What stands now stays: without this, the collector walks through all modules again and again.
+    gc.collect()
+    gc.freeze()
+    parent = int(os.environ.get(PARENT, "0"))
     try:
         while not stop.is_set() and node.context.ok():
             executor.spin_once(timeout_sec=0.1)
+            if parent not in (0, os.getppid(), os.getpid()):
+                stop.set()
         _drain(executor, node)
         node.flush()
     except ExternalShutdownException:
@@ -36,6 +51,13 @@ def spin(node: ComponentNode, stop: threading.Event) -> None:
         node.close()
         executor.shutdown()
         node.destroy_node()
+
+
+def step_back(component: str) -> None:
+    """Give the calling thread, and those that it will start, the niceness of a node."""
+    # Not every system has priorities of threads, and one without this runs as well, if not as evenly.
+    with contextlib.suppress(OSError, AttributeError):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS.get(component, 0))
 
 
 def _drain(executor: SingleThreadedExecutor, node: ComponentNode) -> None:
@@ -55,6 +77,7 @@ def node_main(make: Callable[[], ComponentNode]) -> int:
         signal.signal(number, lambda *_: stop.set())
     rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
     try:
+        step_back(getattr(make, "component", ""))
         spin(make(), stop)
     except DrocapError as error:
         print(f"drocap: {error}", file=sys.stderr)

@@ -6,6 +6,7 @@ other nodes, the hashes of their models and the camera's calibration go into the
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import threading
 from functools import partial
@@ -42,8 +43,10 @@ class SessionRecorderNode(ComponentNode):
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
-        folder = self.config.session_dir or dated_name(self.get_clock().now().nanoseconds)
-        self._writer = SessionWriter(Path(folder), self.config, session_provenance(self.get_namespace()))
+        folder = Path(self.config.session_dir or dated_name(self.get_clock().now().nanoseconds))
+        if self.config.if_taken == "next":
+            folder = _free_name(folder)
+        self._writer = SessionWriter(folder, self.config, session_provenance(self.get_namespace()))
         self._survey = ParameterSurvey(self, self._on_parameters)
         self._calibrated = False
         for topic, entry in TOPICS.items():
@@ -114,6 +117,13 @@ class SessionRecorderNode(ComponentNode):
     def close(self) -> None:
         """Write what is queued and finish the files."""
         self._writer.close()
+
+
+def _free_name(folder: Path) -> Path:
+    """The folder itself where it is new or empty, else the first of ``folder_2``, ``folder_3``, ... that is."""
+    names = itertools.chain([folder.name], (f"{folder.name}_{number}" for number in itertools.count(2)))
+    candidates = (folder.with_name(name) for name in names)
+    return next(c for c in candidates if not c.exists() or (c.is_dir() and not any(c.iterdir())))
 
 
 def _free_mib(folder: Path) -> int | str:

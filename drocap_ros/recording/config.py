@@ -12,6 +12,11 @@ class SessionRecorderConfig(Parameters):
     """Where and how a session is written."""
 
     session_dir: str = param("", "folder to create; it must not exist, or be empty; empty = a new one named by date")
+    if_taken: str = param(
+        "refuse",
+        "when something lies in session_dir already: refuse, or take the next free name of the kind session_dir_2",
+        choices=("refuse", "next"),
+    )
     chunk_s: float = param(
         0.5, "time after which what has come is written and flushed", unit="s", minimum=0.05, maximum=10
     )
