@@ -18,7 +18,7 @@ from std_msgs.msg import Empty, String
 
 from drocap_ros.config import section_types
 from drocap_ros.errors import InputError
-from drocap_ros.nodes.latency import LATENCY, RATE, Latency
+from drocap_ros.nodes.latency import LATENCY, LATENCY_P95, RATE, Latency
 from drocap_ros.nodes.parameters import declare_parameters
 from drocap_ros.nodes.topics import GRAPH_QOS, TOPICS, publishers_of, subscribers_of
 from drocap_ros.parameters import Parameters
@@ -205,6 +205,7 @@ class ComponentNode(Node):
     def _publish_diagnostics(self) -> None:
         if late := self._latency.text_ms():
             self.details[LATENCY] = late
+            self.details[LATENCY_P95] = f"{self._latency.p95_ms():.1f}"
             self.details[RATE] = f"{self._latency.rate_hz(time.monotonic()):.1f}"
         values = {**self.details, **dict(sorted(self.counters.items()))}
         message = DiagnosticArray()

@@ -8,6 +8,8 @@ import numpy as np
 
 #: Keys of these figures on ``/diagnostics``.
 RATE, LATENCY = "rate Hz", "latency p50 / p95 / p99 ms"
+#: One number alone, for viewers that plot it.
+LATENCY_P95 = "latency p95 ms"
 
 
 class Latency:
@@ -32,3 +34,7 @@ class Latency:
         if not self._seconds:
             return ""
         return " / ".join(f"{1000 * value:.0f}" for value in np.percentile(np.array(self._seconds), [50, 95, 99]))
+
+    def p95_ms(self) -> float:
+        """95th percentile, NaN without measurements."""
+        return 1000.0 * float(np.percentile(np.array(self._seconds), 95)) if self._seconds else float("nan")
