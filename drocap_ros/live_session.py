@@ -6,9 +6,11 @@ import dataclasses
 import hashlib
 import logging
 import time
+from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from itertools import islice
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +18,7 @@ from drocap_ros.config import DrocapConfig, parse_config
 from drocap_ros.errors import InputError
 from drocap_ros.motion import Motion
 from drocap_ros.perception.observation import PoseObservation
+from drocap_ros.reconstruction.effort import Effort
 from drocap_ros.reconstruction.live_method import LivePose, LiveWindow, live_poses
 from drocap_ros.recording.pose_messages import read_observations
 from drocap_ros.recording.provenance import CONFIGURATION
@@ -84,7 +87,7 @@ def reconstruct_live(
         read_observations(session, topic.name),
         config.initializer,
         config.bundle_adjuster,
-        published.adjusted if published.windows else None,
+        published.adjusted if published.has_windows else None,
     )
     for done, result in enumerate(results):
         if isinstance(result, LivePose):
@@ -116,41 +119,58 @@ def reconstruct_live(
 
 
 class _Published:
-    """What the live graph published, by stamp."""
+    """What the live graph published; the same stamp may come again where a recording was played in a loop."""
 
     def __init__(self, session: Session, near: str) -> None:
         base = near.rsplit("/", 1)[0]
         # Fingerprints: the windows of half an hour overlap twelvefold.
-        self._initial: dict[int, bytes] = {}
-        self.windows: dict[int, bytes] = {}
+        self._initial: defaultdict[int, deque[bytes]] = defaultdict(deque)
+        self._windows: deque[_PublishedWindow] = deque()
+        self._current: _PublishedWindow | None = None
         self.agreement = Agreement()
         for topic in session.topics_of(POSE3D):
             if topic.name == f"{base}/pose3d/initial":
                 for _, m in session.messages((topic.name,)):
                     if m.stage == _INITIAL:
-                        self._initial[_stamp_ns(m)] = _fingerprint(_joints(m))
+                        self._initial[_stamp_ns(m)].append(_fingerprint(_joints(m)))
         for topic in session.topics_of(POSE3D_WINDOW):
             if topic.name == f"{base}/pose3d/refined":
                 for _, m in session.messages((topic.name,)):
                     stamps = np.array([_stamp_ns(pose) for pose in m.poses], np.int64)
                     joints = np.array([_joints(pose) for pose in m.poses])
-                    self.windows[_stamp_ns(m)] = _fingerprint(stamps, joints)
+                    published = _PublishedWindow(
+                        _stamp_ns(m), _fingerprint(stamps, joints), Effort.parse(m.stop_reason)
+                    )
+                    self._windows.append(published)
+        self.has_windows = bool(self._windows)
 
-    def adjusted(self, stamp_ns: int) -> bool:
-        """Whether a window that ends here was published."""
-        return stamp_ns in self.windows
+    def adjusted(self, stamp_ns: int) -> Effort | None:
+        """How the window that ends here, the next in order, was adjusted; None when it was not."""
+        ahead = next((i for i, w in enumerate(self._windows) if w.stamp_ns == stamp_ns), None)
+        if ahead is None or any(w.stamp_ns > stamp_ns for w in islice(self._windows, ahead)):
+            return None
+        for _ in range(ahead + 1):
+            self._current = self._windows.popleft()
+        assert self._current is not None
+        return self._current.effort
 
     def compare_initial(self, stamp_ns: int, joints: np.ndarray) -> None:
         """Count, and whether it is the same."""
-        theirs = self._initial.pop(stamp_ns, None)
-        if theirs is not None:
-            _count(self.agreement.initial, theirs == _fingerprint(joints))
+        theirs = self._initial.get(stamp_ns)
+        if theirs:
+            _count(self.agreement.initial, theirs.popleft() == _fingerprint(joints))
 
     def compare_window(self, window: LiveWindow) -> None:
-        """Count, and whether it is the same."""
-        theirs = self.windows.get(int(window.stamp_ns[-1]))
+        """Count, and whether it is the same as the one that :meth:`adjusted` told last."""
+        theirs, self._current = self._current, None
         if theirs is not None:
-            _count(self.agreement.windows, theirs == _fingerprint(window.stamp_ns, window.joints3d))
+            _count(self.agreement.windows, theirs.fingerprint == _fingerprint(window.stamp_ns, window.joints3d))
+
+
+class _PublishedWindow(NamedTuple):
+    stamp_ns: int
+    fingerprint: bytes
+    effort: Effort
 
 
 def _fingerprint(*arrays: np.ndarray) -> bytes:

@@ -1,7 +1,8 @@
 """Node ``bundle_adjuster``: refines the last seconds of poses together, again and again.
 
 Subscribes ``pose2d``, ``pose3d/initial`` and ``vehicle/state``; publishes ``pose3d/refined``
-(drocap_ros/Pose3DWindow) and ``pose3d/latest`` (drocap_ros/Pose3D, its newest pose).
+(drocap_ros/Pose3DWindow), and for every image ``pose3d/latest`` (drocap_ros/Pose3D): its initial pose with what the
+last window found, stage INITIAL until there is one.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from drocap_ros.errors import InputError
 from drocap_ros.msg import Pose2D, Pose3D, Pose3DWindow, VehicleState
 from drocap_ros.nodes.component import ERROR, OK, ComponentNode
 from drocap_ros.nodes.conversions import (
+    floats,
     header_at,
     pose2d_from_ros,
     pose3d_from_ros,
@@ -26,17 +27,20 @@ from drocap_ros.nodes.conversions import (
 from drocap_ros.nodes.run import node_main
 from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.reconstruction.adjustment_window import AdjustmentWindow, WindowArrays
-from drocap_ros.reconstruction.window import AdjustedWindow, adjust_window
+from drocap_ros.reconstruction.effort import Effort, EffortControl
+from drocap_ros.reconstruction.latest_pose import Correction, LatestPose
+from drocap_ros.reconstruction.stream_order import Arrival
+from drocap_ros.reconstruction.window import AdjustedWindow
+from drocap_ros.reconstruction.window_adjuster import SOLVER_ERRORS, WindowAdjuster
 from drocap_ros.skeleton import BODY_15
-
-#: Keypoints that wait for their initial pose; more of them means that no initializer runs.
-MAX_PENDING = 1000
 
 
 class BundleAdjusterNode(ComponentNode):
     """Collects a window of keypoints and initial poses and adjusts it in a worker every ``period_s``.
 
-    The period is counted in image stamps, so that a replay at another speed adjusts the same windows.
+    The period is counted in image stamps, so that a replay at another speed adjusts the same windows.  An adjustment
+    ends after the step in which ``max_solve_s`` is over; after a slow one the next takes fewer images.  What was left
+    out stands in the window's stop reason.
     """
 
     component = "bundle_adjuster"
@@ -44,13 +48,15 @@ class BundleAdjusterNode(ComponentNode):
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
         self._window = AdjustmentWindow(self.config)
+        self._adjuster = WindowAdjuster(self.config)
+        self._control = EffortControl(self.config.max_solve_s, self.config.max_stride)
+        self._latest_pose = LatestPose(self.config.blend_s)
         self._waiting: OrderedDict[int, PoseObservation] = OrderedDict()
-        self._early: OrderedDict[int, np.ndarray] = OrderedDict()
+        self._early: OrderedDict[int, Pose3D] = OrderedDict()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="bundle_adjuster")
-        self._job: Future[None] | None = None
+        self._job: Future[Correction | None] | None = None
+        self._job_subject = 0
         self._sequence = 0
-        self._frame_id = ""
-        self._track_id = 0
         self._refined = self.output("pose3d/refined")
         self._latest = self.output("pose3d/latest")
         self.input("pose2d", self._on_pose2d)
@@ -65,51 +71,101 @@ class BundleAdjusterNode(ComponentNode):
         observation = pose2d_from_ros(message)
         if not observation.has_subject:
             return
-        self._frame_id = message.header.frame_id
         # Two topics keep no order between them: either may come first, and both must take the same way.
-        joints = self._early.pop(observation.stamp_ns, None)
-        if joints is not None:
-            self._on_frame(observation, joints)
+        initial = self._early.pop(observation.stamp_ns, None)
+        if initial is not None:
+            self._on_frame(observation, initial)
             return
         self._waiting[observation.stamp_ns] = observation
-        while len(self._waiting) > MAX_PENDING:
+        while len(self._waiting) > self.config.max_pending:
             self._waiting.popitem(last=False)
             self.count("keypoints without an initial pose")
 
     def _on_initial(self, message: Pose3D) -> None:
-        joints, _ = pose3d_from_ros(message)
+        pose3d_from_ros(message)
         stamp_ns = stamp_from_ros(message.header.stamp)
         observation = self._waiting.pop(stamp_ns, None)
         if observation is not None:
-            self._on_frame(observation, joints)
+            self._on_frame(observation, message)
             return
-        self._early[stamp_ns] = joints
-        while len(self._early) > MAX_PENDING:
+        self._early[stamp_ns] = message
+        while len(self._early) > self.config.max_pending:
             self._early.popitem(last=False)
             self.count("initial poses without keypoints")
 
-    def _on_frame(self, observation: PoseObservation, joints: np.ndarray) -> None:
-        self._track_id = observation.track_id
+    def _on_frame(self, observation: PoseObservation, initial: Pose3D) -> None:
+        joints, _ = pose3d_from_ros(initial)
         due = self._window.push(observation, joints)
+        arrival = self._window.arrival
+        if arrival.dropped:
+            self.count(f"dropped: {arrival.value}")
+            return
+        if arrival is not Arrival.CONTINUED:
+            self.count(arrival.value)
+        if arrival.anew:
+            self._latest_pose.reset()
+        self._take_solution(observation.stamp_ns)
+        self._publish_latest(initial, observation.stamp_ns, joints)
         if not due:
             return
         if self._job is not None and not self._job.done():
             self.count("adjustments skipped: the last one is still running")
             return
-        self._job = self._worker.submit(self._adjust, self._window.snapshot(), self._frame_id, self._track_id)
+        self._take_solution(observation.stamp_ns)
+        self._job_subject = self._window.subject
+        header = initial.header
+        self._job = self._worker.submit(
+            self._adjust, self._window.snapshot(), header.frame_id, observation.track_id, self._control.stride
+        )
+
+    def _take_solution(self, stamp_ns: int) -> None:
+        """Hand a solution that has come since the last image to the latest pose."""
+        if self._job is None or not self._job.done():
+            return
+        job, self._job = self._job, None
+        correction = job.result()
+        if correction is not None and self._job_subject == self._window.subject:
+            self._latest_pose.solved(correction, stamp_ns)
+
+    def _publish_latest(self, initial: Pose3D, stamp_ns: int, joints: np.ndarray) -> None:
+        self._latest.publish(
+            Pose3D(
+                header=initial.header,
+                track_id=initial.track_id,
+                stage=Pose3D.REFINED if self._latest_pose.corrected else Pose3D.INITIAL,
+                skeleton=initial.skeleton,
+                joints=floats(self._latest_pose.pose(stamp_ns, joints)),
+                covariance=initial.covariance,
+                confidence=initial.confidence,
+                camera_orientation=initial.camera_orientation,
+                metric=initial.metric,
+                reprojection_rms=initial.reprojection_rms,
+            )
+        )
+        self.count("latest poses")
 
     def _on_vehicle_state(self, message: VehicleState) -> None:
         self.count("vehicle states")
 
-    def _adjust(self, snapshot: WindowArrays, frame_id: str, track_id: int) -> None:
+    def _adjust(self, arrays: WindowArrays, frame_id: str, track_id: int, stride: int) -> Correction | None:
+        """In the worker: adjust and publish; a failure leaves the last solution in use."""
         begin = time.perf_counter()
+        deadline = begin + self.config.max_solve_s
         try:
-            window = adjust_window(*snapshot, self.config)
-        except (InputError, np.linalg.LinAlgError, FloatingPointError) as error:
-            self.count("adjustments failed")
-            self.report(ERROR, f"adjustment failed: {error}")
-            return
-        self._publish(window, frame_id, track_id, time.perf_counter() - begin)
+            window = self._adjuster.adjust(arrays, Effort(stride), lambda: time.perf_counter() > deadline)
+        except SOLVER_ERRORS as error:
+            self.count("adjustments failed: the last solution stays")
+            self.report(ERROR, f"adjustment failed, the last solution stays: {error}")
+            return None
+        seconds = time.perf_counter() - begin
+        self._control.took(seconds)
+        if window.stop_reason.startswith("deadline"):
+            self.count("adjustments cut short: the time was over")
+        if stride > 1:
+            self.count("adjustments of fewer images: the one before was slow")
+        self._publish(window, frame_id, track_id, seconds)
+        initial = arrays.initial_joints[np.isin(arrays.stamp_ns, window.stamp_ns)]
+        return Correction.of(window.stamp_ns, window.joints3d, initial)
 
     def _publish(self, window: AdjustedWindow, frame_id: str, track_id: int, seconds: float) -> None:
         poses = [
@@ -136,7 +192,6 @@ class BundleAdjusterNode(ComponentNode):
                 solve_seconds=seconds,
             )
         )
-        self._latest.publish(poses[-1])
         self._sequence += 1
         self.count("adjustments")
         self.produced(int(window.stamp_ns[-1]))

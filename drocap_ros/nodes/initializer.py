@@ -1,6 +1,8 @@
 """Node ``initializer``: keypoints in, a first 3D pose of every image out.
 
 Subscribes ``pose2d``; publishes ``pose3d/initial`` (drocap_ros/Pose3D, stage INITIAL) in the camera's frame.
+Duplicate, late and stray stamps are dropped and counted with their reason; a jump of time, a gap and another subject
+are counted too (:mod:`drocap_ros.reconstruction.stream_order`).
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.nodes.component import OK, WARN, ComponentNode
 from drocap_ros.nodes.conversions import pose2d_from_ros, pose3d_to_ros
 from drocap_ros.nodes.run import node_main
+from drocap_ros.reconstruction.stream_order import Arrival
 from drocap_ros.reconstruction.window import SlidingWindowInitializer
 from drocap_ros.skeleton import BODY_15
 
@@ -38,7 +41,15 @@ class InitializerNode(ComponentNode):
             observation.keypoints.astype(np.float64),
             observation.confidence.astype(np.float64),
             observation.covariance.astype(np.float64),
+            observation.track_id,
         )
+        arrival = self._initializer.arrival
+        if pose is None:
+            self.count(f"dropped: {arrival.value}")
+            self.report(WARN, f"image dropped: {arrival.value}")
+            return
+        if arrival is not Arrival.CONTINUED:
+            self.count(arrival.value)
         self._initial.publish(
             pose3d_to_ros(
                 message.header,
@@ -53,7 +64,11 @@ class InitializerNode(ComponentNode):
         )
         self.count("poses")
         self.produced(observation.stamp_ns)
-        self.report(OK, "running")
+        if np.isfinite(pose.joints3d).all():
+            self.report(OK, "running")
+        else:
+            self.count("images that show too little of the person")
+            self.report(WARN, "the image shows too little of the person")
 
 
 def main() -> int:

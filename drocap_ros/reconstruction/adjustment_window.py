@@ -9,40 +9,66 @@ import numpy as np
 
 from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.reconstruction.config import BundleAdjusterConfig
+from drocap_ros.reconstruction.stream_order import Arrival, StreamOrder
 
 
 class WindowArrays(NamedTuple):
-    """Arguments of :func:`~drocap_ros.reconstruction.window.adjust_window`, F frames."""
+    """A window of F frames for :class:`~drocap_ros.reconstruction.window_adjuster.WindowAdjuster`.
+
+    stamp_ns : (F,) increasing; keypoints : (F, 15, 2) px; confidence : (F, 15); covariance : (F, 15, 3) px^2
+    initial_joints : (F, 15, 3) m, camera axes
+    subject : changes with the subject and with every new pass of time
+    """
 
     stamp_ns: np.ndarray
     keypoints: np.ndarray
     confidence: np.ndarray
     covariance: np.ndarray
     initial_joints: np.ndarray
+    subject: int = 0
+
+    def every(self, stride: int) -> WindowArrays:
+        """Every ``stride``-th frame, counted back from the newest."""
+        chosen = slice((len(self.stamp_ns) - 1) % stride, None, stride)
+        return WindowArrays(
+            self.stamp_ns[chosen],
+            self.keypoints[chosen],
+            self.confidence[chosen],
+            self.covariance[chosen],
+            self.initial_joints[chosen],
+            self.subject,
+        )
 
 
 class AdjustmentWindow:
     """The last ``window_s`` of keypoints and initial poses of one subject; says when an adjustment is due.
 
-    Time is that of the stamps.  A stamp that does not come after the last one, or another subject, starts the
-    window anew.
+    Time is that of the stamps.  ``arrival`` says what the last frame was to the stream: a duplicate or late one is
+    dropped; another subject, a jump of time or a gap longer than ``gap_s`` starts the window anew.
     """
 
     def __init__(self, config: BundleAdjusterConfig) -> None:
         self._config = config
         self._frames: deque[tuple[PoseObservation, np.ndarray]] = deque(maxlen=config.window_frames)
         self._last_due_ns: int | None = None
+        # The initializer has asked each jump for confirmation before it gave the pose that comes here.
+        self._order = StreamOrder(config.late_s, config.gap_s, confirm=False)
+        self.arrival = Arrival.STARTED
+        self.subject = 0
 
     def push(self, observation: PoseObservation, initial_joints: np.ndarray) -> bool:
         """Add a frame; True when ``period_s`` has passed since the last time this was True.
 
         initial_joints : (15, 3) m, camera axes
         """
-        if self._frames:
-            last = self._frames[-1][0]
-            if observation.stamp_ns <= last.stamp_ns or observation.track_id != last.track_id:
-                self._frames.clear()
-                self._last_due_ns = None
+        self.arrival = self._order.accept(observation.stamp_ns, observation.track_id)
+        if self.arrival.dropped:
+            return False
+        if self.arrival.anew:
+            self.subject += 1
+        if self.arrival is not Arrival.CONTINUED:
+            self._frames.clear()
+            self._last_due_ns = None
         self._frames.append((observation, initial_joints))
         oldest = observation.stamp_ns - round(self._config.window_s * 1e9)
         while self._frames[0][0].stamp_ns < oldest:
@@ -63,4 +89,5 @@ class AdjustmentWindow:
             np.array([o.confidence for o in observations], np.float64),
             np.array([o.covariance for o in observations], np.float64),
             np.array([joints for _, joints in self._frames], np.float64),
+            self.subject,
         )

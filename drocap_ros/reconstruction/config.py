@@ -34,6 +34,14 @@ class InitializerConfig(Parameters):
     coefficient_smoothness: float = param(0.3, "weight of the change of coefficients over time", minimum=0.0)
     rotation_smoothness: float = param(0.3, "weight of the change of rotation over time", minimum=0.0)
     switch_cost: float = param(1.0, "cost of a jump between hypotheses, per squared 2D std", minimum=0.0)
+    live_start: str = param("lifter", "what finds the pose of an image in the live node: the learned lifter, or the"
+                            " dictionary as offline", choices=("lifter", "dictionary"))  # fmt: skip
+    lifter: str = param("", "the live node's lifter, an ONNX file; empty for the shipped one")
+    past_s: float = param(2.7, "past that the lifter sees in the live node", unit="s", minimum=0.1, maximum=10.0)
+    late_s: float = param(1.0, "a stamp up to so long before the last one is late and dropped; further back, time has"
+                          " jumped", unit="s", minimum=0.0, maximum=60.0)  # fmt: skip
+    gap_s: float = param(1.0, "after a longer gap the live node starts anew, but for the person's size", unit="s",
+                         minimum=0.05, maximum=60.0)  # fmt: skip
     block_frames: int = param(500, "frames that are fitted together at most", minimum=16, maximum=20000)
     assumed_height_m: float = param(1.70, "stature that sets the scale when none is known", unit="m", minimum=0.3,
                                     maximum=3.0)  # fmt: skip
@@ -41,7 +49,14 @@ class InitializerConfig(Parameters):
 
 @dataclass(frozen=True)
 class BundleAdjusterConfig(Parameters):
-    """Bundle adjustment, the paper's equations (2) to (4)."""
+    """Bundle adjustment: the paper's equations (2) to (4), and what the default method and the live node add."""
+
+    method: str = param("ba", "what the live node adjusts by: the default method, or the paper's equations",
+                        choices=("ba", "paper"))  # fmt: skip
+    lifter: str = param("", "the default method's lifter, an ONNX file; empty for the shipped one")
+    limb_iterations_first: int = param(4, "steps of the default method that find the bone lengths", minimum=0,
+                                       maximum=1000)  # fmt: skip
+    limb_iterations: int = param(8, "steps of the default method's final adjustment", minimum=0, maximum=1000)
 
     alpha: float = param(0.1, "weight of the nuclear norm at 240 frames; grows with the root of the length",
                          minimum=0.0)  # fmt: skip
@@ -58,5 +73,13 @@ class BundleAdjusterConfig(Parameters):
     window_frames: int = param(480, "frames in a window at most", minimum=8, maximum=5000)
     overlap_frames: int = param(30, "frames that neighbouring windows of a long recording share", minimum=0,
                                 maximum=2000)  # fmt: skip
-    max_pending: int = param(120, "images that wait for their initial pose in the live node", minimum=1, maximum=10000)
+    max_solve_s: float = param(0.5, "an adjustment of the live node ends after the step in which this is over",
+                               unit="s", minimum=0.01, maximum=60.0)  # fmt: skip
+    max_stride: int = param(4, "the live node adjusts every n-th image at most when it is late", minimum=1, maximum=16)
+    blend_s: float = param(0.5, "time over which pose3d/latest takes over a new solution", unit="s", minimum=0.0,
+                           maximum=10.0)  # fmt: skip
+    late_s: float = param(1.0, "as the initializer's", unit="s", minimum=0.0, maximum=60.0)
+    gap_s: float = param(1.0, "after a longer gap the live window starts anew, but for the person's size", unit="s",
+                         minimum=0.05, maximum=60.0)  # fmt: skip
+    max_pending: int = param(1000, "images that wait for their initial pose in the live node", minimum=1, maximum=10000)
     threads: int = param(1, "threads of the linear algebra; the matrices are small", minimum=1, maximum=64)

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drocap_ros.parameters import Parameters, param
+from drocap_ros.reconstruction.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.depth_signs import depth_signs
 from drocap_ros.reconstruction.lifter import LiftedMotion, Lifter
 from drocap_ros.reconstruction.lifter_input import LIFTER_FPS, nanmedian_small
@@ -62,6 +63,13 @@ class DefaultMethodConfig(Parameters):
     )
     sign_acceleration_m_s2: float = param(
         14.4, "its acceleration that costs one sigma", unit="m/s^2", minimum=0.01, maximum=1000.0
+    )
+
+
+def default_config(adjuster: BundleAdjusterConfig) -> DefaultMethodConfig:
+    """The method's parameters where the adjuster's section sets them; weights are the defaults."""
+    return DefaultMethodConfig(
+        lifter=adjuster.lifter, first_iterations=adjuster.limb_iterations_first, iterations=adjuster.limb_iterations
     )
 
 

@@ -15,41 +15,53 @@ from drocap_ros.errors import InputError
 from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.reconstruction.adjustment_window import AdjustmentWindow
 from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.window import SlidingWindowInitializer, adjust_window
+from drocap_ros.reconstruction.effort import Effort
+from drocap_ros.reconstruction.window import AdjustedWindow, InitialPose, SlidingWindowInitializer
+from drocap_ros.reconstruction.window_adjuster import SOLVER_ERRORS, WindowAdjuster
 
 
 class LivePose(NamedTuple):
-    """What the initializer publishes for one image: joints (15, 3) float32 m in camera axes."""
+    """What the initializer publishes for one image: joints (15, 3) float32 m in camera axes.
+
+    anew : the subject or the pass of time is another than the image's before
+    """
 
     observation: PoseObservation
     joints3d: np.ndarray
+    pose: InitialPose
+    anew: bool
 
 
 class LiveWindow(NamedTuple):
-    """What the bundle adjuster publishes: stamps (F,) and joints (F, 15, 3) float32 m in camera axes."""
+    """What the bundle adjuster publishes: stamps (F,) and joints (F, 15, 3) float32 m in camera axes.
+
+    initial_joints : (F, 15, 3) float64 m, what it started from
+    """
 
     stamp_ns: np.ndarray
     joints3d: np.ndarray
     iterations: int
     stop_reason: str
+    window: AdjustedWindow
+    initial_joints: np.ndarray
 
 
 def live_poses(
     observations: Iterable[PoseObservation],
     initializer: InitializerConfig,
     adjuster: BundleAdjusterConfig,
-    adjusted: Callable[[int], bool] | None = None,
+    adjusted: Callable[[int], Effort | None] | None = None,
 ) -> Iterator[LivePose | LiveWindow]:
     """Poses and windows in the order in which the live graph comes to them; memory is that of one window.
 
     Parameters
     ----------
     observations : in the order of their messages; those without a subject, or of no person that the initializer can
-        use, are passed over as the nodes do
-    adjusted : tells by the stamp of a window's newest image whether the live graph adjusted it (it leaves one out
-        while the one before is still running); None = all that are due
+        use, are passed over as the nodes do, and so are late and duplicate ones
+    adjusted : tells by the stamp of a window's newest image how the live graph adjusted it, or None where it did not
+        (it leaves one out while the one before is still running); without it all that are due, with full effort
     """
-    start, window = SlidingWindowInitializer(initializer), AdjustmentWindow(adjuster)
+    start, window, solver = SlidingWindowInitializer(initializer), AdjustmentWindow(adjuster), WindowAdjuster(adjuster)
     for observation in observations:
         if not observation.has_subject:
             continue
@@ -59,16 +71,28 @@ def live_poses(
                 observation.keypoints.astype(np.float64),
                 observation.confidence.astype(np.float64),
                 observation.covariance.astype(np.float64),
+                observation.track_id,
             )
         except InputError:
             continue
+        if pose is None:
+            continue
         joints = pose.joints3d.astype(np.float32)
-        yield LivePose(observation, joints)
+        yield LivePose(observation, joints, pose, start.arrival.anew)
         due = window.push(observation, joints.astype(np.float64))
-        if not due or (adjusted is not None and not adjusted(observation.stamp_ns)):
+        effort = (Effort() if adjusted is None else adjusted(observation.stamp_ns)) if due else None
+        if effort is None:
             continue
+        arrays = window.snapshot()
         try:
-            result = adjust_window(*window.snapshot(), adjuster)
-        except (InputError, np.linalg.LinAlgError, FloatingPointError):
+            result = solver.adjust(arrays, effort)
+        except SOLVER_ERRORS:
             continue
-        yield LiveWindow(result.stamp_ns, result.joints3d.astype(np.float32), result.iterations, result.stop_reason)
+        yield LiveWindow(
+            result.stamp_ns,
+            result.joints3d.astype(np.float32),
+            result.iterations,
+            result.stop_reason,
+            result,
+            arrays.initial_joints[np.isin(arrays.stamp_ns, result.stamp_ns)],
+        )

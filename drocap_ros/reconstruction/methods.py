@@ -11,7 +11,7 @@ import numpy as np
 from drocap_ros.reconstruction.bundle_adjustment import bundle_adjust
 from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.data_term import Projection, frames_last, information_from
-from drocap_ros.reconstruction.default_method import DefaultMethodConfig, default_poses
+from drocap_ros.reconstruction.default_method import default_config, default_poses
 from drocap_ros.reconstruction.dictionary import Dictionary
 from drocap_ros.reconstruction.factorization import factorize
 from drocap_ros.reconstruction.normalize import MIN_JOINTS, NormalizedTracks, normalize_tracks
@@ -120,7 +120,7 @@ def _default(
     progress: Progress | None,
 ) -> CameraPoses:
     """The default method (:mod:`drocap_ros.reconstruction.default_method`), window by window."""
-    config = DefaultMethodConfig()
+    config = default_config(adjuster)
     seconds = {"initial": 0.0, "ba": 0.0}
     k = tracks.camera_matrix
     focal_px = None if k is None else 0.5 * float(k[0, 0] + k[1, 1])

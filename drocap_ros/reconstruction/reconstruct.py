@@ -15,7 +15,7 @@ from drocap_ros import __version__
 from drocap_ros.errors import InputError
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.default_method import DefaultMethodConfig
+from drocap_ros.reconstruction.default_method import default_config
 from drocap_ros.reconstruction.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
 from drocap_ros.reconstruction.lifter import Lifter
 from drocap_ros.reconstruction.methods import METHODS, CameraPoses, run_method
@@ -81,7 +81,7 @@ def reconstruct(
         frames=len(tracks),
     )
     if method == "ba":
-        own = DefaultMethodConfig()
+        own = default_config(adjuster)
         motion.meta["parameters"]["default_method"] = dataclasses.asdict(own)
         motion.meta["lifter"] = Lifter.load(own.lifter or None).origin
     return motion

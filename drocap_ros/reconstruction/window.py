@@ -12,23 +12,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.alignment import to_torso_frame
+from drocap_ros.geometry.alignment import to_torso_frame, torso_frame
 from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, slerp
 from drocap_ros.reconstruction.bundle_adjustment import bundle_adjust
 from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.data_term import Projection, frames_first, frames_last
 from drocap_ros.reconstruction.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
+from drocap_ros.reconstruction.lifted_start import LiftedStart
+from drocap_ros.reconstruction.lifter import Lifter
 from drocap_ros.reconstruction.metrics import limb_lengths
 from drocap_ros.reconstruction.normalize import MIN_JOINTS, NormalizedTracks, normalize_tracks
 from drocap_ros.reconstruction.pose_covariance import packed_covariance, pose_covariance
 from drocap_ros.reconstruction.single_view import sparse_from_dense
 from drocap_ros.reconstruction.sparse_fit import fit_sparse
 from drocap_ros.reconstruction.starts import DenseFit, fit_dense, image_scale, viewpoint_starts
+from drocap_ros.reconstruction.stream_order import Arrival, StreamOrder
 from drocap_ros.reconstruction.threads import blas_threads
 from drocap_ros.reconstruction.uncertainty import GaussianJoints
 from drocap_ros.skeleton import BODY_15
 
-#: Images over which the live start remembers the person's size.
+#: Images over which the live start from the dictionary remembers the person's size.
 MEMORY = 120
 
 #: Least standard deviations of an adjusted pose, in units of the 2D joints: across the image, along the ray.
@@ -77,8 +80,12 @@ class AdjustedWindow:
 class SlidingWindowInitializer:
     """Single-view initialization as the images come: warm-started, causal, bounded memory.
 
-    The hypotheses of the last image stay alive: their summed costs decide, so one ambiguous image does not flip
+    ``config.live_start`` "lifter": the learned lifter sees the last ``past_s`` (:mod:`lifted_start`).  "dictionary":
+    the hypotheses of the last image stay alive: their summed costs decide, so one ambiguous image does not flip
     the body.
+
+    ``arrival`` says what the last image was to the stream (:mod:`stream_order`): duplicates, late images and stray
+    stamps are dropped; another subject or a jump of time starts anew; a gap forgets all but the person's size.
     """
 
     def __init__(self, config: InitializerConfig | None = None, dictionary: Dictionary | None = None) -> None:
@@ -86,16 +93,32 @@ class SlidingWindowInitializer:
         # The start is warm and alone: two alternations take it where a batch from scratch needs six.
         self._refining = replace(self.config, sparse_rounds=min(self.config.sparse_rounds, 2))
         self.dictionary = dictionary or load_dictionary(self.config.dictionary or None)
-        self.reset()
+        self._lifted: LiftedStart | None = None
+        if self.config.live_start == "lifter":
+            lifter = Lifter.load(self.config.lifter or None)
+            self._lifted = LiftedStart(lifter, self.config.past_s, self.config.assumed_height_m)
+        self._order = StreamOrder(self.config.late_s, self.config.gap_s)
+        self.arrival = Arrival.STARTED
+        self._forget_person()
 
     def reset(self) -> None:
-        """Forget the subject."""
-        self._stamp_ns: int | None = None
+        """Forget the stream and the subject."""
+        self._order.reset()
+        self._forget_person()
+
+    def _forget_person(self) -> None:
+        if self._lifted is not None:
+            self._lifted.forget_person()
         self._spread: deque[tuple[float, int]] = deque(maxlen=MEMORY)
         self._metre_px: deque[float] = deque(maxlen=MEMORY)
+        self._unit_px = 1.0
+        self._forget_motion()
+
+    def _forget_motion(self) -> None:
+        if self._lifted is not None:
+            self._lifted.forget_motion()
         self._alive: DenseFit | None = None
         self._total = np.zeros(0)
-        self._unit_px = 1.0
 
     def push(
         self,
@@ -103,14 +126,16 @@ class SlidingWindowInitializer:
         keypoints: np.ndarray,
         confidence: np.ndarray | None = None,
         covariance: np.ndarray | None = None,
-    ) -> InitialPose:
-        """Pose of the next image.  A stamp before the last one starts anew (a replay that jumped back).
+        track_id: int = 1,
+    ) -> InitialPose | None:
+        """Pose of the next image, or None when the image is dropped; ``arrival`` says why.
 
         Parameters
         ----------
         keypoints : (15, 2) px, NaN where not seen
         confidence : (15,) in [0, 1], or None
-        covariance : (15, 3) px^2, or None
+        covariance : (15, 3) px^2; None, or NaN at every joint, when it is not known
+        track_id : the subject's
 
         Raises
         ------
@@ -119,13 +144,21 @@ class SlidingWindowInitializer:
         """
         confidence = np.isfinite(keypoints).all(-1).astype(float) if confidence is None else confidence
         _check_image(keypoints, confidence, covariance)
-        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
-            self.reset()
-        self._stamp_ns = stamp_ns
+        if covariance is not None and np.isnan(covariance).all():
+            covariance = None
+        self.arrival = self._order.accept(stamp_ns, track_id)
+        if self.arrival.dropped:
+            return None
+        if self.arrival.anew:
+            self._forget_person()
+        elif self.arrival is Arrival.GAP:
+            self._forget_motion()
         seen = np.isfinite(keypoints).all(-1) & (np.nan_to_num(confidence) > 0.0)
         extent = np.ptp(keypoints[seen], axis=0).max() if seen.any() else 0.0
         if seen.sum() < MIN_JOINTS or not extent > 1e-3:
             return _unknown(stamp_ns)
+        if self._lifted is not None:
+            return self._lift(self._lifted, stamp_ns, keypoints, confidence, covariance, seen)
         n = self._normalize(keypoints, confidence, covariance, seen)
         information = n.information
         scale = self._scale(n, information)
@@ -134,6 +167,32 @@ class SlidingWindowInitializer:
             best = self._decide(dense)
             self._metre_px.append(float(dense.coefficients[best, 0]) * n.scale_px)
             return self._result(stamp_ns, n, information, dense, best, np.where(seen, np.nan_to_num(confidence), 0.0))
+
+    def _lift(
+        self,
+        start: LiftedStart,
+        stamp_ns: int,
+        keypoints: np.ndarray,
+        confidence: np.ndarray,
+        covariance: np.ndarray | None,
+        seen: np.ndarray,
+    ) -> InitialPose:
+        # Refuses impossible covariances and confidences, as the dictionary's start does.
+        normalize_tracks(keypoints[None], confidence[None], None if covariance is None else covariance[None])
+        belief = np.where(seen, np.nan_to_num(confidence), 0.0)
+        points = np.where(seen[:, None], keypoints, np.nan)
+        joints, std, metres = start.push(stamp_ns, points, belief)
+        gap = joints[seen, :2] - keypoints[seen]
+        spread = np.zeros((len(BODY_15), 6))
+        spread[:, [0, 3, 5]] = std[:, [0, 0, 1]] ** 2
+        return InitialPose(
+            stamp_ns=stamp_ns,
+            joints3d=(joints - joints[BODY_15.index("pelvis")]) * metres,
+            covariance=spread * metres**2,
+            confidence=belief,
+            reprojection_rms_px=float(np.sqrt(np.mean(np.sum(gap**2, axis=-1)))),
+            rotation=torso_frame(joints),
+        )
 
     def _normalize(
         self, keypoints: np.ndarray, confidence: np.ndarray, covariance: np.ndarray | None, seen: np.ndarray

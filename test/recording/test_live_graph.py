@@ -30,7 +30,7 @@ FLIGHT = ("capture_simulator", "initializer", "bundle_adjuster", "session_record
 def flight_config(session_dir, seconds=4.0):
     config = DrocapConfig().replace("capture_simulator", seconds=seconds, rate_hz=15.0, seed=3)
     config = config.replace("initializer", azimuth_starts=2, start_iterations=4, sparse_rounds=1)
-    config = config.replace("bundle_adjuster", iterations=10, period_s=0.5)
+    config = config.replace("bundle_adjuster", limb_iterations=3, period_s=0.5)
     return config.replace("session_recorder", session_dir=str(session_dir))
 
 
@@ -54,7 +54,7 @@ def test_offline_gives_bit_for_bit_what_the_live_graph_published(flown):
     assert len(tracks) == len(motion.joints3d) == 60
     # A comparison that cannot fail would say the same of other parameters.
     with open_session(flown) as session:
-        other = config.replace("bundle_adjuster", iterations=9)
+        other = config.replace("bundle_adjuster", limb_iterations=2)
         _, _, agreement = reconstruct_live(session, other)
     assert agreement.initial == [60, 60]
     assert agreement.windows[1] < agreement.windows[0]
@@ -84,7 +84,7 @@ def test_one_thread_or_two_give_the_same_arrays(flown, tmp_path):
 
 def test_the_command_takes_the_recorded_parameters(flown):
     motion, _ = reconstruct_input(flown, method="live", config=DrocapConfig())
-    assert motion.meta["parameters"]["adjuster"]["iterations"] == 10
+    assert motion.meta["parameters"]["adjuster"]["limb_iterations"] == 3
     assert "60 of 60 initial poses" in motion.meta["live_agreement"]
     with pytest.raises(InputError, match="expected a recording with pose2d"):
         reconstruct_input(flown.parent / "none.mp4", method="live", config=DrocapConfig())
