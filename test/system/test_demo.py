@@ -1,46 +1,105 @@
-"""``drocap demo``: the whole capture flight, at small scale, as `make demo` runs it."""
+"""``drocap demo``: the whole capture flight with pictures, at small scale, as `make demo` runs it."""
 
+import os
 import re
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from drocap_ros.cli import main
+from drocap_ros.cli.demo_verdict import settled_orbit
+from drocap_ros.flight.safety import State
 from drocap_ros.motion import load_motion
-from drocap_ros.recording.session_reader import session_info
+from drocap_ros.recording.camera_telemetry import interpolate
+from drocap_ros.recording.session import open_session
+from drocap_ros.recording.session_reader import read_vehicle_track
+from drocap_ros.simulation.flight_truth import flown_orbit, load_truth_of_flight
 
 
-def test_the_demo_ends_with_a_motion_near_the_truth(tmp_path, capsys):
+def test_the_demo_flies_by_what_it_sees_and_ends_with_a_motion_near_the_truth(tmp_path, capsys):
     out = tmp_path / "demo"
-    assert main(["demo", "--seconds", "6", "--seed", "1", "--out", str(out), "--quiet"]) == 0
+    assert main(["demo", "--seconds", "8", "--seed", "1", "--out", str(out), "--quiet"]) == 0
     printed = capsys.readouterr().out
-    error = float(re.search(r"truth: ([\d.]+) mm", printed)[1])
     # A person who holds every joint right but the depth of one arm is 60 mm off; depth = 0 would give 125.
-    assert error < 100
-    motion = load_motion(out / "motion.npz")
+    assert float(re.search(r"truth: ([\d.]+) mm", printed)[1]) < 90
+    assert {path.name for path in out.iterdir()} == {
+        "motion.npz", "truth.npz", "pictures.jpg", "preview.png", "report.html", "session",
+    }  # fmt: skip
+    truth, motion = load_truth_of_flight(out / "truth.npz"), load_motion(out / "motion.npz")
     assert motion.frame == "world"
-    assert len(motion.joints3d) == 180
     assert np.isfinite(motion.joints3d).all()
-    with np.load(out / "truth.npz") as truth:
-        assert truth["joints3d"].shape == motion.joints3d.shape
-        # In the world frame the person stands where the simulated one stood, to what an assumed stature allows.
-        off = np.linalg.norm(motion.joints3d[:, 0] - truth["joints3d"][:, 0], axis=1)
-    assert np.median(off) < 1.0
-    info = session_info(out / "session")
-    counts = {topic.name: topic.count for topic in info.topics}
-    assert counts["/drocap/pose2d"] == 180
+    exposure = np.searchsorted(truth.stamp_ns, motion.stamp_ns)
+    np.testing.assert_array_equal(truth.stamp_ns[exposure], motion.stamp_ns)
+    with open_session(out / "session") as session:
+        counts = {topic.name: topic.count for topic in session.info.topics}
+        status = [
+            (m.header.stamp.sec * 10**9 + m.header.stamp.nanosec, m.state)
+            for _, m in session.messages(("/drocap/orbit/status",))
+        ]
+        vehicle = read_vehicle_track(session)
+    assert counts["/drocap/image/compressed"] >= counts["/drocap/pose2d"] >= len(motion.stamp_ns) > 100
     assert counts["/drocap/vehicle/state"] > 200
     assert counts["/tf"] > 200
-    assert {path.name for path in Path(out).iterdir()} == {
-        "motion.npz",
-        "truth.npz",
-        "preview.png",
-        "report.html",
-        "session",
-    }
+    orbiting = np.array([state == State.ORBITING for _, state in status])
+    first, last = np.flatnonzero(orbiting)[[0, -1]]
+    assert orbiting[first : last + 1].mean() > 0.8
+    assert status[last][0] - status[first][0] > 7e9
+    within = (truth.stamp_ns >= status[first][0]) & (truth.stamp_ns <= status[last][0])
+    flown = flown_orbit(truth, within, 6.0)
+    assert flown.turned_deg > 60
+    assert flown.least_distance_m > 3.0
+    # In the world frame the person stands where the simulated one stood, to what an assumed stature allows; the
+    # position that the vehicle tells has an error of its own.
+    told, _ = interpolate(vehicle.stamp_ns, vehicle.position, motion.stamp_ns, spherical=False)
+    off = motion.joints3d[:, 0] - truth.joints3d[exposure, 0] - (told - truth.camera_position[exposure])
+    assert np.nanmedian(np.linalg.norm(off, axis=1)) < 1.0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_demo_leaves_no_process_and_no_file(tmp_path, number):
+    command = [sys.executable, "-u", "-m", "drocap_ros.cli", "demo", "--out", str(tmp_path / "demo")]
+    mark = f"demo_{os.getpid()}_{number}"
+    environment = {**os.environ, "DROCAP_TEST_MARK": mark}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as demo:
+        for line in demo.stdout:
+            if "pilot" in line:
+                break
+        assert len(_marked(mark)) == 8
+        demo.send_signal(number)
+        demo.stdout.read()
+        error = demo.stderr.read()
+        assert demo.wait(60) == 130
+    assert error == "drocap: interrupted\n"
+    assert _marked(mark) == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def _marked(mark):
+    """Processes whose environment bears the mark."""
+    return [path.parent.name for path in Path("/proc").glob("[0-9]*/environ") if mark.encode() in _environment(path)]
+
+
+def _environment(path):
+    try:
+        return path.read_bytes()
+    except OSError:  # it has just ended
+        return b""
 
 
 def test_a_flight_without_length_is_refused(tmp_path, capsys):
     assert main(["demo", "--seconds", "-1", "--out", str(tmp_path / "demo")]) == 2
     assert "seconds: expected" in capsys.readouterr().err
     assert not (tmp_path / "demo").exists()
+
+
+def test_an_orbit_is_settled_after_its_ramp_and_each_start_has_one():
+    stamps = np.arange(60) * 10**9
+    orbit, hold = State.ORBITING, State.HOLDING
+    told = [(0, State.READY), (10, orbit), (11, orbit), (25, hold), (30, orbit), (33, hold), (40, orbit), (49, orbit)]
+    settled = settled_orbit(stamps, [(t * 10**9, state) for t, state in told])
+    assert np.flatnonzero(settled).tolist() == [*range(16, 25), *range(46, 49)]
+    assert not settled_orbit(stamps, []).any()
