@@ -57,12 +57,13 @@ def add_graph_options(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the graph until its source has ended or the user interrupts."""
     from drocap_ros.config import load_config
+    from drocap_ros.perception.models import models_folder
 
     config = load_config(args.config)
     if args.source:
         config = config.replace("image_ingest", source=args.source)
     if args.models:
-        config = config.replace("pose_estimator", models_dir=str(args.models.absolute()))
+        config = config.replace("pose_estimator", models_dir=str(models_folder(args.models).absolute()))
     if args.session:
         config = config.replace("session_recorder", session_dir=str(args.session.absolute()))
     return run_graph(config, args.nodes, args)

@@ -23,7 +23,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     fetching = actions.add_parser("fetch", help="download known models and verify them")
     checking = actions.add_parser("check", help="run the folder's models on a picture and draw the result")
     for sub in (listing, fetching, checking):
-        sub.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
+        sub.add_argument(
+            "--models",
+            metavar="DIR",
+            type=Path,
+            help="folder of ONNX models, or 'simulation' for those that ship for rendered pictures (default:"
+            " $DROCAP_MODELS)",
+        )
     fetching.add_argument("names", nargs="*", metavar="NAME", help="models by name (default: rtmdet-nano rtmpose-s)")
     fetching.add_argument("--unverified", action="store_true", help="allow models without a known checksum")
     fetching.add_argument("--quiet", action="store_true", help="no progress, only errors")
@@ -43,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
 
 def run_list(args: argparse.Namespace) -> int:
     """Print the registry and the folder's files."""
-    from drocap_ros.perception.models import models_folder
+    from drocap_ros.perception.models import SIMULATION, models_folder
     from drocap_ros.perception.registry import KNOWN_MODELS
 
     folder = models_folder(args.models)
@@ -62,12 +68,18 @@ def run_list(args: argparse.Namespace) -> int:
     print(f"\nfolder {folder}: " + ("" if present else "no models; `drocap models fetch` brings the default pair"))
     for path in present:
         print(f"  {describe(path)}")
+    shipped = models_folder(SIMULATION)
+    if folder != shipped:
+        print(f"\nshipped, used only when asked for with `--models {SIMULATION}`:")
+        for path in sorted(shipped.glob("*.onnx")):
+            print(f"  {describe(path)}")
     return 0
 
 
 def describe(path: Path) -> str:
     """One line on a model file: what it is, or why it cannot be used."""
     from drocap_ros.perception.model_spec import read_spec
+    from drocap_ros.perception.models import limited_use
     from drocap_ros.perception.runtime import OnnxModel
 
     size = path.stat().st_size / 1e6
@@ -79,7 +91,8 @@ def describe(path: Path) -> str:
     what = {"both": "detector and 2D pose"}.get(spec.task, "2D pose" if spec.task == "pose" else "detector")
     joints = f", {spec.skeleton}" if spec.skeleton else ""
     width, height = spec.input_size
-    return f"{path.name}  {size:.1f} MB  {what}, {spec.layout}, {width}x{height}{joints}, on {model.provider}"
+    use = f"; {limits}" if (limits := limited_use(model)) else ""
+    return f"{path.name}  {size:.1f} MB  {what}, {spec.layout}, {width}x{height}{joints}, on {model.provider}{use}"
 
 
 def run_fetch(args: argparse.Namespace) -> int:

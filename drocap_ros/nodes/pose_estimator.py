@@ -32,6 +32,8 @@ class PoseEstimatorNode(ComponentNode):
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
         self._estimator = PoseEstimator(models_folder(self.config.models_dir or None), self.config)
+        if self._estimator.limited_use:
+            self.details["networks"] = self._estimator.limited_use
         self._roi: np.ndarray | None = None
         self._pose2d = self.output("pose2d")
         self._pictures = PictureInput(

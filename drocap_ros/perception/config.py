@@ -39,7 +39,11 @@ class ImageIngestConfig(Parameters):
 class PoseEstimatorConfig(Parameters):
     """Models, thresholds and the choice of the subject."""
 
-    models_dir: str = param("", "folder of ONNX models; empty = DROCAP_MODELS, else the user's own")
+    models_dir: str = param(
+        "",
+        "folder of ONNX models, or simulation = those for rendered pictures that ship with the package;"
+        " empty = DROCAP_MODELS, else the user's own",
+    )
     detector: str = param("auto", "detector: file name in the models folder, or auto")
     pose_model: str = param("auto", "2D pose model: file name in the models folder, or auto")
     provider: str = param(

@@ -12,7 +12,7 @@ from drocap_ros.perception.config import PoseEstimatorConfig
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import suppress, whole
 from drocap_ros.perception.joint_maps import joint_map
-from drocap_ros.perception.models import load_detector, load_pose_model
+from drocap_ros.perception.models import limited_use, load_detector, load_pose_model
 from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.perception.pose import Keypoints
 from drocap_ros.perception.tracking import Subject, SubjectTracker
@@ -52,6 +52,10 @@ class PoseEstimator:
         self.config = config or PoseEstimatorConfig()
         self.pose_model = load_pose_model(models_dir, self.config)
         self.detector = load_detector(models_dir, self.config)
+        #: In words, when a network is not meant for pictures of real people; else empty.
+        self.limited_use = limited_use(self.pose_model.model) or limited_use(self.detector.model)
+        if self.limited_use:
+            log.warning("networks %s", self.limited_use)
         self.tracker = SubjectTracker(self.config)
         self._map = joint_map(self.pose_model.joints.name)
         self._last_ns: int | None = None

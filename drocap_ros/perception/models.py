@@ -20,17 +20,30 @@ T = TypeVar("T", Detector, PoseModel)
 DETECTOR_ORDER = ("rtmdet", "yolox", "yolo", "rtmo")
 POSE_ORDER = ("rtmpose", "tinypose", "vitpose", "hrnet", "hourglass", "movenet", "yolo", "rtmo")
 
+#: Named in place of a folder: the networks that ship with this package.  They were trained on its own renders and
+#: know no real person, so nothing falls back to them: they have to be asked for.
+SIMULATION = "simulation"
+_SHIPPED = Path(__file__).parents[1] / "data" / "simulation_models"
+
 _FETCH = "run `drocap models fetch` or name a folder with --models or DROCAP_MODELS"
 
 
 def models_folder(given: str | Path | None = None) -> Path:
-    """The folder of models: the one given, else ``DROCAP_MODELS``, else the user's own, where ``fetch`` puts them."""
-    if given:
-        return Path(given)
-    if named := os.environ.get("DROCAP_MODELS"):
-        return Path(named)
+    """The folder of models: the one given, else ``DROCAP_MODELS``, else the user's own, where ``fetch`` puts them.
+
+    ``simulation`` in place of a folder names the networks for rendered pictures that ship with the package.
+    """
+    if named := given or os.environ.get("DROCAP_MODELS"):
+        return _SHIPPED if str(named) == SIMULATION else Path(named)
     data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
     return Path(data) / "drocap_ros" / "models"
+
+
+def limited_use(model: OnnxModel) -> str:
+    """What a model says of itself where it is not for any picture, else nothing."""
+    if purpose := model.metadata.get("only_for", ""):
+        return f"for {purpose} only: {model.metadata.get('notice', 'its maker says so')}"
+    return ""
 
 
 def load_detector(models_dir: str | Path, config: PoseEstimatorConfig) -> Detector:
