@@ -55,7 +55,7 @@ class PoseEstimator:
         #: In words, when a network is not meant for pictures of real people; else empty.
         self.limited_use = limited_use(self.pose_model.model) or limited_use(self.detector.model)
         if self.limited_use:
-            log.warning("networks %s", self.limited_use)
+            log.warning("networks in use: %s", self.limited_use)
         self.tracker = SubjectTracker(self.config)
         self._map = joint_map(self.pose_model.joints.name)
         self._last_ns: int | None = None

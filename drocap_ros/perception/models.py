@@ -42,7 +42,7 @@ def models_folder(given: str | Path | None = None) -> Path:
 def limited_use(model: OnnxModel) -> str:
     """What a model says of itself where it is not for any picture, else nothing."""
     if purpose := model.metadata.get("only_for", ""):
-        return f"for {purpose} only: {model.metadata.get('notice', 'its maker says so')}"
+        return model.metadata.get("notice") or f"for {purpose} only"
     return ""
 
 
