@@ -34,23 +34,28 @@ def _draw_ground_and_sky(
     import cv2
 
     rays = rotation.T @ np.linalg.inv(matrix)  # pixel -> ray in the world
-    focal = 0.5 * float(matrix[0, 0] + matrix[1, 1])
-    above = max(float(position[2]), 0.05)
     rise = _affine(rays[2], width, height)
-    distance = np.float32(above) / np.maximum(-rise, np.float32(1e-4))  # along the ray, in units of its depth
-    near = _ground(scene.near, NEAR_M, rays, position, distance)
-    # What is far and coarse needs no fine sampling.
+    near = _ground(scene.near, NEAR_M, rays, position, _distance(rise, position))
+    # What changes slowly over the picture is made at a quarter of the resolution: far ground, haze, sky.
     coarse = matrix / 4
     coarse[2] = matrix[2]
-    rays_coarse = rotation.T @ np.linalg.inv(coarse)
-    small = (-(-width // 4), -(-height // 4))
-    far_away = np.float32(above) / np.maximum(-_affine(rays_coarse[2], *small), np.float32(1e-4))
-    far = cv2.resize(_ground(scene.far, FAR_M, rays_coarse, position, far_away), (width, height))
+    rays = rotation.T @ np.linalg.inv(coarse)
+    small_rise = _affine(rays[2], -(-width // 4), -(-height // 4))
+    distance = _distance(small_rise, position)
+    far = _ground(scene.far, FAR_M, rays, position, distance)
+    clear = np.exp(-distance / np.float32(scene.haze_m))
+    far = cv2.blendLinear(far, np.full_like(far, np.clip(scene.horizon, 0, 255).astype(np.uint8)), clear, 1 - clear)
     # The finer the picture samples the ground, the longer its pattern holds.
-    fine = np.exp(-distance * np.float32(600 / (_FADE_M * max(focal, 1.0))))
-    ground = cv2.blendLinear(near, far, fine, 1 - fine)
-    clear = np.exp(-distance / np.float32(scene.haze_m)) * (rise < 0)
-    return np.asarray(cv2.blendLinear(ground, _sky(scene, rise), clear, 1 - clear))
+    focal = max(0.5 * float(matrix[0, 0] + matrix[1, 1]), 1.0)
+    fine = cv2.resize(np.exp(-distance * np.float32(600 / (_FADE_M * focal))), (width, height))
+    picture = cv2.blendLinear(near, cv2.resize(far, (width, height)), fine, 1 - fine)
+    sky = cv2.resize(_sky(scene, small_rise), (width, height))
+    return np.asarray(cv2.copyTo(sky, (rise >= 0).view(np.uint8), picture))
+
+
+def _distance(rise: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """(h, w) float32 along rays that rise by ``rise`` m a unit to the ground; very far for those that do not fall."""
+    return np.float32(max(float(position[2]), 0.05)) / np.maximum(-rise, np.float32(1e-4))
 
 
 def _affine(row: np.ndarray, width: int, height: int) -> np.ndarray:
