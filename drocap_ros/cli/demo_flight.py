@@ -19,7 +19,8 @@ NODES = (
     "flight_simulator", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "visualizer",
     "session_recorder",
 )  # fmt: skip
-_TAKEOFF_S = 30.0
+#: What the flight simulator says once its pilot's hands are off.
+HANDED_OVER = "pilot: hands off"
 
 
 def fly(config: DrocapConfig, operator: Operator, say: Callable[[str], None]) -> dict[str, float]:
@@ -53,6 +54,7 @@ class _Desk:
 
         self._graph, self._operator, self._say = graph, operator, say
         self._told: dict[str, str] = {}
+        operator.cleared = False
         self._command = graph.node.create_publisher(
             TOPICS["orbit/command"].message, "orbit/command", TOPICS["orbit/command"].qos
         )
@@ -86,6 +88,7 @@ class _Desk:
             if name == "flight_simulator" and status.message != self._told.get(name):
                 self._told[name] = status.message
                 self._say(status.message)
+                self._operator.cleared = self._operator.cleared or status.message == HANDED_OVER
 
 
 def _processor_s(pid: int) -> float:

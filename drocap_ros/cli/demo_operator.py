@@ -39,6 +39,7 @@ class Operator:
 
     Attributes
     ----------
+    cleared : whether the pilot has handed over; nothing is started before
     orbited_s : time spent orbiting
     holds : reasons of the holds that nobody asked for
     failure : why the operator gave up, "" = not
@@ -48,6 +49,7 @@ class Operator:
     seconds: float
     restarts: int = 4
     takes_control: bool = False
+    cleared: bool = True
     phase: Phase = Phase.WAITING
     orbited_s: float = 0.0
     holds: list[str] = field(default_factory=list)
@@ -91,8 +93,9 @@ class Operator:
             self._say(f"fault: {reason}; acknowledged")
             return Command.STOP
         # A hold ends only by the operator's word: the bridge answers whether its conditions are met again.
-        if state not in (State.READY, State.HOLDING) or now_s < self._next_try_s:
-            self._say(f"not ready yet: {reason}", changed_only=True)
+        ready = state in (State.READY, State.HOLDING)
+        if not ready or not self.cleared or now_s < self._next_try_s:
+            self._say("waiting for the pilot" if ready and not self.cleared else f"not ready yet: {reason}", True)
             return None
         again = bool(self.holds)
         self._say("starting the orbit again" if again else "ready: starting the orbit")
@@ -133,6 +136,7 @@ class Operator:
         self.phase, self._since_s = phase, now_s
 
     def _say(self, words: str, changed_only: bool = False) -> None:
+        """Put into words; with ``changed_only`` not the same again."""
         # Numbers in a reason change all the time; the words before them tell what is the matter.
         kind = re.sub(r"[\d.]+", "#", words)
         if not changed_only or kind != self._last_words:

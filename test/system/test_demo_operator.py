@@ -47,6 +47,16 @@ def test_px4_is_asked_for_control_from_the_start():
     assert [command for _, command in desk.commands] == [Command.ENGAGE]
 
 
+def test_nothing_is_started_before_the_pilot_has_handed_over():
+    operator = Operator(5.0, cleared=False)
+    desk = Desk(operator)
+    desk.show(State.READY, "all conditions for motion hold", 3.0)
+    assert desk.commands == []
+    operator.cleared = True
+    desk.show(State.READY, "all conditions for motion hold")
+    assert [command for _, command in desk.commands] == [Command.START]
+
+
 def test_a_refused_start_is_tried_again_later():
     desk = Desk(Operator(5.0))
     desk.show(State.READY, "all conditions for motion hold")
