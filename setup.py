@@ -108,6 +108,7 @@ setup(
         "onnxruntime>=1.17",
         "opencv-python-headless>=4.8",
         "pymavlink>=2.4.40",
+        "pyserial>=3.5",
         "mcap>=1.6",
         "rosbags>=0.10",
         "pyulog>=1.0",
