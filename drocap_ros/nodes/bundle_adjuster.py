@@ -1,8 +1,8 @@
 """Node ``bundle_adjuster``: refines the last seconds of poses together, again and again.
 
 Subscribes ``pose2d``, ``pose3d/initial`` and ``vehicle/state``; publishes ``pose3d/refined``
-(drocap_ros/Pose3DWindow), and for every image ``pose3d/latest`` (drocap_ros/Pose3D): its initial pose with what the
-last window found, stage INITIAL until there is one.
+(drocap_ros/Pose3DWindow), and for every image ``pose3d/latest`` (drocap_ros/Pose3D): its initial pose with the
+bone lengths of the last window, stage INITIAL until there is one.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from drocap_ros.nodes.run import node_main
 from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.reconstruction.adjustment_window import AdjustmentWindow, WindowArrays
 from drocap_ros.reconstruction.effort import Effort, EffortControl
-from drocap_ros.reconstruction.latest_pose import Correction, LatestPose
+from drocap_ros.reconstruction.latest_pose import LatestPose, bone_lengths
 from drocap_ros.reconstruction.stream_order import Arrival
 from drocap_ros.reconstruction.window import AdjustedWindow
 from drocap_ros.reconstruction.window_adjuster import SOLVER_ERRORS, WindowAdjuster
@@ -54,7 +54,7 @@ class BundleAdjusterNode(ComponentNode):
         self._waiting: OrderedDict[int, PoseObservation] = OrderedDict()
         self._early: OrderedDict[int, Pose3D] = OrderedDict()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="bundle_adjuster")
-        self._job: Future[Correction | None] | None = None
+        self._job: Future[np.ndarray | None] | None = None
         self._job_subject = 0
         self._sequence = 0
         self._refined = self.output("pose3d/refined")
@@ -123,9 +123,9 @@ class BundleAdjusterNode(ComponentNode):
         if self._job is None or not self._job.done():
             return
         job, self._job = self._job, None
-        correction = job.result()
-        if correction is not None and self._job_subject == self._window.subject:
-            self._latest_pose.solved(correction, stamp_ns)
+        lengths = job.result()
+        if lengths is not None and self._job_subject == self._window.subject:
+            self._latest_pose.solved(lengths, stamp_ns)
 
     def _publish_latest(self, initial: Pose3D, stamp_ns: int, joints: np.ndarray) -> None:
         self._latest.publish(
@@ -147,8 +147,8 @@ class BundleAdjusterNode(ComponentNode):
     def _on_vehicle_state(self, message: VehicleState) -> None:
         self.count("vehicle states")
 
-    def _adjust(self, arrays: WindowArrays, frame_id: str, track_id: int, stride: int) -> Correction | None:
-        """In the worker: adjust and publish; a failure leaves the last solution in use."""
+    def _adjust(self, arrays: WindowArrays, frame_id: str, track_id: int, stride: int) -> np.ndarray | None:
+        """In the worker: adjust, publish, give the bone lengths; a failure leaves the last solution in use."""
         begin = time.perf_counter()
         deadline = begin + self.config.max_solve_s
         try:
@@ -164,8 +164,7 @@ class BundleAdjusterNode(ComponentNode):
         if stride > 1:
             self.count("adjustments of fewer images: the one before was slow")
         self._publish(window, frame_id, track_id, seconds)
-        initial = arrays.initial_joints[np.isin(arrays.stamp_ns, window.stamp_ns)]
-        return Correction.of(window.stamp_ns, window.joints3d, initial)
+        return bone_lengths(window.joints3d)
 
     def _publish(self, window: AdjustedWindow, frame_id: str, track_id: int, seconds: float) -> None:
         poses = [

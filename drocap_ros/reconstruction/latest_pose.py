@@ -1,55 +1,32 @@
-"""The newest pose at image rate: each image's initial pose, corrected by what the last adjustment found."""
+"""The newest pose at image rate: each image's initial pose with the bone lengths that the last adjustment found.
+
+What an adjusted window says beyond the lengths is no better than the initial pose by the time it is there: its newest
+poses err as much as the lifter's (it has no later images either), and their errors are others half a second on.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from drocap_ros.geometry.alignment import to_torso_frame
 from drocap_ros.skeleton import BODY_15
 
 _BONES = BODY_15.bones
 
-#: The offset is the mean over this end of a window: what the initial poses err in the same way for that long.
-OFFSET_S = 1.5
 
-#: While no new solution comes, the offset is held so long behind its window, then fades out.
-HOLD_S, FADE_S = 3.0, 2.0
-
-
-@dataclass(frozen=True)
-class Correction:
-    """What a solution says of the initial poses.
-
-    lengths : (14,) m, of the bones (joint j to its parent at j - 1)
-    offset : (15, 3) m, torso frame, refined less initial pose
-    stamp_ns : the window's newest image
-    """
-
-    lengths: np.ndarray
-    offset: np.ndarray
-    stamp_ns: int
-
-    @staticmethod
-    def of(stamp_ns: np.ndarray, refined: np.ndarray, initial: np.ndarray) -> Correction | None:
-        """From a window: stamps (F,), refined and initial joints (F, 15, 3) m; None where no pose is known."""
-        lengths = np.median(_lengths(refined), axis=0)
-        end = stamp_ns >= stamp_ns[-1] - round(OFFSET_S * 1e9)
-        end &= np.isfinite(refined).all(axis=(1, 2)) & np.isfinite(initial).all(axis=(1, 2))
-        if not end.any() or not np.isfinite(lengths).all():
-            return None
-        shape, _ = to_torso_frame(refined[end])
-        start, _ = to_torso_frame(initial[end])
-        return Correction(lengths, np.mean(shape - start, axis=0), int(stamp_ns[-1]))
+def bone_lengths(joints: np.ndarray) -> np.ndarray:
+    """Median length (14,) of each bone (joint j to its parent at j - 1) over the poses (F, 15, 3) of a window."""
+    way = joints[..., _BONES[:, 1], :] - joints[..., _BONES[:, 0], :]
+    lengths: np.ndarray = np.median(np.linalg.norm(way, axis=-1), axis=0)
+    return lengths
 
 
 class LatestPose:
-    """Applies the last correction, and takes a new one over within ``blend_s`` of stamps.
+    """Gives poses the bone lengths of the last solution, taken over along a straight line within ``blend_s`` of stamps.
 
-    The lengths and the offset in use move along a straight line from what they are when a solution comes to the new
-    ones: from one image to the next, ``dt`` later, a solution changes them by no more than ``dt / blend_s`` of the
-    difference, and the joints with them.  Before the first solution poses pass unchanged; it is blended in likewise.
+    From one image to the next, ``dt`` later, a new solution changes the length of a bone by no more than
+    ``dt / blend_s`` of the difference between the solutions, and moves a joint by no more than the sum of that over
+    the bones from the pelvis to it.  Before the first solution poses pass as they are; it comes in along a straight
+    line too.
     """
 
     def __init__(self, blend_s: float) -> None:
@@ -58,8 +35,8 @@ class LatestPose:
 
     def reset(self) -> None:
         """Forget the person."""
-        self._from: Correction | None = None
-        self._to: Correction | None = None
+        self._from: np.ndarray | None = None
+        self._to: np.ndarray | None = None
         self._begin_ns = 0
 
     @property
@@ -67,44 +44,38 @@ class LatestPose:
         """Whether a solution has come."""
         return self._to is not None
 
-    def solved(self, correction: Correction, stamp_ns: int) -> None:
-        """Take over a solution; stamp_ns : of the image published last."""
-        self._from = self._at(stamp_ns)
-        self._to, self._begin_ns = correction, stamp_ns
+    def solved(self, lengths: np.ndarray, stamp_ns: int) -> None:
+        """Take over a solution's bone lengths (14,) m, starting at the image of ``stamp_ns``."""
+        if not np.isfinite(lengths).all():
+            return
+        self._from = self._lengths(stamp_ns)
+        self._to, self._begin_ns = lengths, stamp_ns
 
     def pose(self, stamp_ns: int, joints: np.ndarray) -> np.ndarray:
-        """Corrected joints (15, 3) m in camera axes, pelvis at the origin, of an initial pose; NaN stays NaN."""
-        now = self._at(stamp_ns)
-        if now is None or not np.isfinite(joints).all():
+        """Joints (15, 3) m in camera axes, pelvis at the origin, from the image's initial ones; NaN stays NaN."""
+        lengths = self._lengths(stamp_ns)
+        if lengths is None or not np.isfinite(joints).all():
             return joints
-        shape, rotation = to_torso_frame(joints)
-        age_s = (stamp_ns - now.stamp_ns) * 1e-9
-        held = float(np.clip((HOLD_S + FADE_S - age_s) / FADE_S, 0.0, 1.0))
-        corrected = _with_lengths((shape + held * now.offset) @ rotation.T, now.lengths)
-        share = 1.0 if self._from is not None else self._share(stamp_ns)
-        return (1.0 - share) * joints + share * corrected
+        rigid = _with_lengths(joints, lengths)
+        if self._from is not None:
+            return rigid
+        share = self._share(stamp_ns)
+        return (1.0 - share) * joints + share * rigid
 
-    def _at(self, stamp_ns: int) -> Correction | None:
-        """The correction in use."""
+    def _lengths(self, stamp_ns: int) -> np.ndarray | None:
         if self._to is None or self._from is None:
             return self._to
         share = self._share(stamp_ns)
-        return Correction(
-            (1.0 - share) * self._from.lengths + share * self._to.lengths,
-            (1.0 - share) * self._from.offset + share * self._to.offset,
-            self._to.stamp_ns,
-        )
+        return (1.0 - share) * self._from + share * self._to
 
     def _share(self, stamp_ns: int) -> float:
-        return 1.0 if self._blend_ns == 0 else min(max((stamp_ns - self._begin_ns) / self._blend_ns, 0.0), 1.0)
-
-
-def _lengths(joints: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(joints[..., _BONES[:, 1], :] - joints[..., _BONES[:, 0], :], axis=-1)
+        if self._blend_ns == 0:
+            return 1.0
+        return min(max((stamp_ns - self._begin_ns) / self._blend_ns, 0.0), 1.0)
 
 
 def _with_lengths(joints: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Joints (15, 3) whose bones keep their direction and have these lengths (14,); pelvis at the origin."""
+    """Joints (15, 3) whose bones keep their directions and have these lengths (14,); pelvis at the origin."""
     way = joints[_BONES[:, 1]] - joints[_BONES[:, 0]]
     way *= (lengths / np.maximum(np.linalg.norm(way, axis=-1), 1e-9))[:, None]
     out = np.zeros_like(joints)

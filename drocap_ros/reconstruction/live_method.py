@@ -33,17 +33,13 @@ class LivePose(NamedTuple):
 
 
 class LiveWindow(NamedTuple):
-    """What the bundle adjuster publishes: stamps (F,) and joints (F, 15, 3) float32 m in camera axes.
-
-    initial_joints : (F, 15, 3) float64 m, what it started from
-    """
+    """What the bundle adjuster publishes: stamps (F,) and joints (F, 15, 3) float32 m in camera axes."""
 
     stamp_ns: np.ndarray
     joints3d: np.ndarray
     iterations: int
     stop_reason: str
     window: AdjustedWindow
-    initial_joints: np.ndarray
 
 
 def live_poses(
@@ -83,9 +79,8 @@ def live_poses(
         effort = (Effort() if adjusted is None else adjusted(observation.stamp_ns)) if due else None
         if effort is None:
             continue
-        arrays = window.snapshot()
         try:
-            result = solver.adjust(arrays, effort)
+            result = solver.adjust(window.snapshot(), effort)
         except SOLVER_ERRORS:
             continue
         yield LiveWindow(
@@ -94,5 +89,4 @@ def live_poses(
             result.iterations,
             result.stop_reason,
             result,
-            arrays.initial_joints[np.isin(arrays.stamp_ns, result.stamp_ns)],
         )

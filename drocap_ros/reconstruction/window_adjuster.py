@@ -31,7 +31,7 @@ WARM_FRAMES = 72
 
 #: Standard deviation of an adjusted pose over the lifter's expected errors, about the pelvis: across and along the
 #: ray (measured on mocap/train's HDM05 sequences, from which the lifter has not learned).
-ACROSS, ALONG = 1.0, 1.0
+ACROSS, ALONG = 1.2, 1.35
 
 
 class WindowAdjuster:

@@ -1,0 +1,214 @@
+"""The live method on simulated orbits: what is published when, beside the offline result on the same tracks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.perception.observation import PoseObservation
+from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.latest_pose import LatestPose, bone_lengths
+from drocap_ros.reconstruction.live_method import LivePose, LiveWindow, live_poses
+from drocap_ros.reconstruction.metrics import limb_lengths, pa_mpjpe
+from drocap_ros.reconstruction.protocol import OrbitView, Sequence, orbit_view, protocol_sequences
+from drocap_ros.reconstruction.reconstruct import reconstruct
+
+#: Age at which a refined pose is judged.
+REFINED_AFTER_S = 2.0
+
+
+@dataclass(frozen=True)
+class LiveRow:
+    """One sequence through the live method.
+
+    initial_mm, latest_mm : reconstruction error (12 limb joints) of ``pose3d/initial`` and ``pose3d/latest`` when they
+        are published, over all frames
+    refined_mm : of the newest refined pose 2 s after the image, over the frames that are so old at the end
+    offline_mm, offline_all_mm : of ``drocap reconstruct --method ba`` on the same tracks, over the same frames as
+        refined_mm, and over all
+    refined_std, initial_std : RMS of the standardized error, about the pelvis, at the true scale: 1 = honest
+    step_mm : the most that taking over solutions moves a joint of ``pose3d/latest`` from one image to the next
+    initial_ms, initial_p95_ms, solve_p95_s : wall-clock of one image's initial pose, of one adjustment
+    """
+
+    sequence: str
+    speed_deg_s: float
+    noisy: bool
+    frames: int
+    initial_mm: float
+    latest_mm: float
+    refined_mm: float
+    offline_mm: float
+    offline_all_mm: float
+    refined_std: float
+    initial_std: float
+    step_mm: float
+    initial_ms: float
+    initial_p95_ms: float
+    solve_p95_s: float
+
+
+def live_study(
+    folder: Path,
+    *,
+    speed_deg_s: float = 25.0,
+    noisy: bool = False,
+    delay_s: float = 0.5,
+    seed: int = 0,
+    limit: int | None = None,
+    initializer: InitializerConfig | None = None,
+    adjuster: BundleAdjusterConfig | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> list[LiveRow]:
+    """Every sequence of the protocol, one orbit each.
+
+    Parameters
+    ----------
+    delay_s : after its newest image a window's solution is there
+
+    Raises
+    ------
+    InputError
+        When the folder has no such sequence, or a number is impossible.
+    """
+    if not abs(speed_deg_s) <= 360.0:
+        raise InputError(f"--speed: expected -360 to 360 deg/s, got {speed_deg_s:g}; choose a slower orbit")
+    if not 0.0 <= delay_s <= 10.0:
+        raise InputError(f"--delay: expected 0 to 10 s, got {delay_s:g}; a solution takes less than a second")
+    if limit is not None and limit < 1:
+        raise InputError(f"--limit: expected at least 1, got {limit}")
+    sequences = protocol_sequences(folder, limit=limit)
+    rows = []
+    for sequence in sequences:
+        view = orbit_view(sequence.x, speed_deg_s, noisy=noisy, seed=seed)
+        flown = fly(view, delay_s, initializer or InitializerConfig(), adjuster or BundleAdjusterConfig())
+        rows.append(_row(sequence, speed_deg_s, noisy, view, flown))
+        if progress is not None:
+            progress("live study", len(rows) / len(sequences))
+    return rows
+
+
+def observations(view: OrbitView) -> Iterator[PoseObservation]:
+    """The view's keypoints as the pose estimator would publish them; their covariance is not known."""
+    t = view.tracks
+    keypoints = t.keypoints.astype(np.float32)
+    for i, stamp_ns in enumerate(t.stamp_ns.tolist()):
+        points = keypoints[i]
+        yield PoseObservation(
+            stamp_ns,
+            1,
+            t.image_size,
+            keypoints=points,
+            covariance=np.full((len(points), 3), np.nan, np.float32),
+            confidence=np.isfinite(points).all(axis=-1).astype(np.float32),
+        )
+
+
+@dataclass(frozen=True)
+class Flown:
+    """What the live method published: F frames, m, camera axes.
+
+    refined : (F, 15, 3) as :data:`REFINED_AFTER_S` later; NaN where the sequence ended before
+    initial_std_m, refined_std_m : (F, 15, 3) by its covariances
+    step_m : (F,) how far the change of the correction since the image before moves a joint at most
+    """
+
+    initial: np.ndarray
+    latest: np.ndarray
+    refined: np.ndarray
+    initial_std_m: np.ndarray
+    refined_std_m: np.ndarray
+    step_m: np.ndarray
+    initial_s: np.ndarray
+    solve_s: np.ndarray
+
+
+def fly(view: OrbitView, delay_s: float, initializer: InitializerConfig, adjuster: BundleAdjusterConfig) -> Flown:
+    """Run the live method over a view; a window's solution is there ``delay_s`` after its newest image."""
+    stamps = view.tracks.stamp_ns
+    place = {int(stamp): i for i, stamp in enumerate(stamps)}
+    shape = (len(stamps), 15, 3)
+    initial, latest, refined = (np.full(shape, np.nan) for _ in range(3))
+    initial_std, refined_std = np.full(shape, np.nan), np.full(shape, np.nan)
+    seconds: dict[type, list[float]] = {LivePose: [], LiveWindow: []}
+    steps = list[float]()
+    newest, under_way = LatestPose(adjuster.blend_s), list[LiveWindow]()
+    clock = time.perf_counter()
+    for result in live_poses(observations(view), initializer, adjuster):
+        seconds[type(result)].append(time.perf_counter() - clock)
+        if isinstance(result, LivePose):
+            now = result.observation.stamp_ns
+            i, joints = place[now], result.joints3d.astype(float)
+            # The same image with the correction as it was at the one before: what solutions move in between.
+            before = newest.pose(int(stamps[max(i - 1, 0)]), joints)
+            for window in [w for w in under_way if w.stamp_ns[-1] + delay_s * 1e9 <= now]:
+                under_way.remove(window)
+                newest.solved(bone_lengths(window.window.joints3d), now)
+            initial[i], initial_std[i] = joints, _std(result.pose.covariance)
+            latest[i] = newest.pose(now, joints)
+            steps.append(float(np.linalg.norm(latest[i] - before, axis=-1).max()))
+        else:
+            under_way.append(result)
+            age_s = (result.stamp_ns[-1] - result.stamp_ns) * 1e-9
+            rows = np.array([place[int(stamp)] for stamp in result.stamp_ns])
+            # Later windows overwrite, as long as they come in time.
+            chosen = (age_s + delay_s <= REFINED_AFTER_S) & (stamps[-1] - result.stamp_ns >= REFINED_AFTER_S * 1e9)
+            refined[rows[chosen]] = result.joints3d[chosen]
+            refined_std[rows[chosen]] = _std(result.window.covariance[chosen])
+        clock = time.perf_counter()
+    return Flown(
+        initial,
+        latest,
+        refined,
+        initial_std,
+        refined_std,
+        np.array(steps),
+        np.array(seconds[LivePose]),
+        np.array(seconds[LiveWindow]),
+    )
+
+
+def _row(sequence: Sequence, speed_deg_s: float, noisy: bool, view: OrbitView, flown: Flown) -> LiveRow:
+    old = np.isfinite(flown.refined).all(axis=(1, 2))
+    if not old.any():
+        raise InputError(f"{sequence.name}: expected a refined pose within {REFINED_AFTER_S:g} s, got none")
+    offline = pa_mpjpe(reconstruct(view.tracks, method="ba").joints3d * 1000.0, view.truth)
+    return LiveRow(
+        sequence=sequence.name,
+        speed_deg_s=float(speed_deg_s),
+        noisy=noisy,
+        frames=len(view.truth),
+        initial_mm=float(pa_mpjpe(flown.initial * 1000.0, view.truth).mean()),
+        latest_mm=float(pa_mpjpe(flown.latest * 1000.0, view.truth).mean()),
+        refined_mm=float(pa_mpjpe(flown.refined[old] * 1000.0, view.truth[old]).mean()),
+        offline_mm=float(offline[old].mean()),
+        offline_all_mm=float(offline.mean()),
+        refined_std=standardized_error(flown.refined[old], flown.refined_std_m[old], view.truth[old]),
+        initial_std=standardized_error(flown.initial, flown.initial_std_m, view.truth),
+        step_mm=float(np.nanmax(flown.step_m, initial=0.0) * 1000.0),
+        initial_ms=float(np.median(flown.initial_s) * 1000.0),
+        initial_p95_ms=float(np.quantile(flown.initial_s, 0.95) * 1000.0),
+        solve_p95_s=float(np.quantile(flown.solve_s, 0.95)),
+    )
+
+
+def standardized_error(
+    joints_m: np.ndarray, std_m: np.ndarray, truth_mm: np.ndarray, axes: slice | int = slice(None)
+) -> float:
+    """RMS over frames, joints but the pelvis, and axes of the error over its standard deviation.
+
+    joints_m, std_m : (F, 15, 3) camera axes, pelvis at the origin; truth_mm : (F, 15, 3).  The scale of a monocular
+    pose rests on an assumed stature, so the limbs' mean length over the sequence is made the true one.
+    """
+    scale = limb_lengths(truth_mm).mean() / limb_lengths(joints_m).mean()
+    gap = (joints_m * scale - truth_mm)[:, 1:] / (std_m[:, 1:] * scale)
+    return float(np.sqrt(np.mean(np.square(gap[..., axes]))))
+
+
+def _std(covariance: np.ndarray) -> np.ndarray:
+    return np.sqrt(covariance[..., [0, 3, 5]])
