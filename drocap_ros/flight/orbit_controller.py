@@ -5,6 +5,7 @@ The node and the simulation run this same object.  It reads no clock and owns no
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import threading
 from collections import deque
@@ -19,7 +20,7 @@ from drocap_ros.flight.commands import CommandQueue, command_message
 from drocap_ros.flight.config import MavlinkBridgeConfig
 from drocap_ros.flight.dialects import ARDUPILOT, DIALECTS, Dialect, halt_message, setpoint_message
 from drocap_ros.flight.link import MavlinkLink
-from drocap_ros.flight.orbit_planner import OrbitGoal, OrbitState, advance, begin_orbit, goal_of, setpoint_of
+from drocap_ros.flight.orbit_planner import OrbitGoal, OrbitState, advance, begin_orbit, goal_of, least_radius, setpoint_of
 from drocap_ros.flight.pose_history import PoseHistory
 from drocap_ros.flight.safety import (
     Action,
@@ -150,6 +151,8 @@ class OrbitController:
     def _step(self, now_ns: int, now_s: float) -> ControlStatus:
         disturbance, dt = self._disturbance(now_ns, now_s)
         estimate = self._subject.estimate(now_ns)
+        if estimate is not None:  # into the frame of the reported position, by which the setpoints are flown
+            estimate = dataclasses.replace(estimate, position=estimate.position + self._history.offset)
         seen = self._observe(estimate, disturbance, now_ns)
         kind, refusal = self._next_command(now_ns)
         dialect = DIALECTS.get(seen.autopilot, ARDUPILOT)
@@ -273,11 +276,14 @@ class OrbitController:
         setpoint: Setpoint | None = None
         if action == Action.ORBIT and self._orbit is not None and estimate is not None:
             config = self._config
+            speed = float(np.hypot(*estimate.velocity[:2]))
             self._orbit = advance(
                 self._orbit, self._goal, seen.position, estimate.position, estimate.velocity, config.ground_height_m,
-                dt, config,
+                dt, config, least_radius(config, estimate.position_sd_m, speed, config.braking_m_s2),
             )  # fmt: skip
-            setpoint = setpoint_of(self._orbit, seen.position, estimate.position, estimate.velocity, config)
+            setpoint = setpoint_of(
+                self._orbit, seen.position, estimate.position, estimate.velocity, config, seen.velocity
+            )
         elif action == Action.HOLD and self.safety.hold_position is not None:
             setpoint = hold_setpoint(self.safety.hold_position, self.safety.hold_yaw)
         if setpoint is not None and setpoint.is_finite():

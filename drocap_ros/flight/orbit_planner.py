@@ -18,9 +18,12 @@ from drocap_ros.flight.orbit_config import OrbitConfig, check_orbit
 from drocap_ros.flight.setpoint import Setpoint
 
 _TRIM_RATE, _MAX_TRIM_M = 0.15, 0.5  # 1/s, m
+_STANDING_M_S, _SURPRISE_S, _FLIGHT_ERROR_M = 0.3, 0.5, 0.3
 _FREE_LEAD = 0.6  # share of the greatest lead below which the reference does not wait
-_CENTRE_RATE = 3.0
-_CENTRE_ACCELERATION = 3.0
+_CENTRE_RATE = 4.0
+_CENTRE_ACCELERATION = 8.0
+_FORWARD = 1.0
+_DAMPING, _MAX_DAMPING = 2.0, 2.0  # 1/s, m/s^2
 
 
 class OrbitGoal(NamedTuple):
@@ -84,6 +87,17 @@ def goal_of(
     return OrbitGoal(radius, height, math.radians(speed))
 
 
+def least_radius(config: OrbitConfig, subject_sd_m: float, subject_speed_m_s: float, braking_m_s2: float) -> float:
+    """Radius (m) at which an orbit stays clear of the minimum distance.
+
+    The subject may be nearer than it seems (two standard deviations), and one that walks may turn towards the vehicle
+    or stop dead before it.
+    """
+    speed = min(max(subject_speed_m_s - _STANDING_M_S, 0.0), config.max_subject_speed_m_s)
+    surprise = max(_SURPRISE_S * speed, speed**2 / (2 * braking_m_s2))
+    return config.min_distance_m + 2 * subject_sd_m + surprise + _FLIGHT_ERROR_M
+
+
 def begin_orbit(vehicle: np.ndarray, velocity: np.ndarray, subject: np.ndarray, config: OrbitConfig) -> OrbitState:
     """Reference at the vehicle's own place: nothing jumps at the start.
 
@@ -110,11 +124,13 @@ def advance(
     ground_m: float,
     dt: float,
     config: OrbitConfig,
+    least_radius_m: float = 0.0,
 ) -> OrbitState:
     """The reference ``dt`` seconds later (at most 0.2 s of them).
 
     vehicle, subject, subject_velocity : (3,) ENU, as they are
     ground_m : height of the subject's ground in the map frame
+    least_radius_m : a smaller radius is not flown, whatever the goal
     """
     dt = min(max(dt, 0.0), 0.2)
     if dt == 0.0:
@@ -123,7 +139,8 @@ def advance(
     jerk = config.max_jerk_m_s3
     slow = min(0.5 * config.max_acceleration_m_s2, 1.0)
     approach = _approach_speed(state, config)
-    radius = _toward(state.radius, max(goal.radius_m, config.min_distance_m), approach, slow, jerk, dt)
+    wanted = max(goal.radius_m, config.min_distance_m, min(least_radius_m, config.max_distance_m))
+    radius = _toward(state.radius, wanted, approach, slow, jerk, dt)
     height = _toward(state.height, ground_m + goal.height_m, config.approach_speed_m_s, slow, jerk, dt)
     target = _allowed_speed(goal.angular_speed_rad_s, radius.value, float(np.hypot(*centre_velocity)), config)
     lead = float(np.linalg.norm(reference_position(state)[:2] - vehicle[:2]))
@@ -153,19 +170,31 @@ def reference_position(state: OrbitState) -> np.ndarray:
 
 
 def setpoint_of(
-    state: OrbitState, vehicle: np.ndarray, subject: np.ndarray, subject_velocity: np.ndarray, config: OrbitConfig
+    state: OrbitState,
+    vehicle: np.ndarray,
+    subject: np.ndarray,
+    subject_velocity: np.ndarray,
+    config: OrbitConfig,
+    vehicle_velocity: np.ndarray | None = None,
 ) -> Setpoint:
-    """What to send: the reference, never farther from the vehicle than the greatest lead."""
+    """What to send: the reference, never farther from the vehicle than the greatest lead.
+
+    vehicle_velocity : (3,) m/s; what it lacks of the reference's is asked for as acceleration too
+    """
     c, s = math.cos(state.phase), math.sin(state.phase)
     outward, along = np.array([c, s]), np.array([-s, c])
     r, omega = state.radius, state.omega
     flat_velocity = state.centre_velocity + r.rate * outward + r.value * omega.value * along
     flat_acceleration = (
-        state.centre_acceleration
+        _FORWARD * _shortened(state.centre_acceleration, 1.5)
         + (r.acceleration - omega.value**2 * r.value) * outward
         + (r.value * omega.rate + 2 * r.rate * omega.value) * along
     )
     velocity = _shortened(np.array([*flat_velocity, state.height.rate]), config.max_speed_m_s)
+    if vehicle_velocity is not None:
+        flat_acceleration = flat_acceleration + _shortened(
+            _DAMPING * (flat_velocity - vehicle_velocity[:2]), _MAX_DAMPING
+        )
     acceleration = _shortened(np.array([*flat_acceleration, state.height.acceleration]), config.max_acceleration_m_s2)
     position = vehicle + _shortened(reference_position(state) - vehicle, config.max_lead_m)
     sight = subject[:2] - vehicle[:2]

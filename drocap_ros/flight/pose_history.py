@@ -1,4 +1,9 @@
-"""The camera's pose at the instant of an image, from the vehicle's states around it."""
+"""The camera's pose at the instant of an image, from the vehicle's states around it.
+
+The reported position wanders by decimetres within seconds, the reported velocity hardly: places here are the
+integrated velocity, led back to the position slowly.  So what the subject seems to move is not the satellites' noise,
+and its range from the ground not that of the height.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +17,8 @@ from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import slerp
 
 _NS = 1_000_000_000
+_LED_BACK_S = 6.0
+_JUMP_M = 3.0  # beyond which the position is believed at once
 
 
 class CameraPose(NamedTuple):
@@ -36,6 +43,8 @@ class PoseHistory:
         self._mount = np.array([0.0, np.sin(half), 0.0, np.cos(half)])  # about FLU y: positive turns the nose down
         self._keep_ns, self._extrapolate_ns = int(keep_s * _NS), int(extrapolate_s * _NS)
         self._poses: deque[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = deque()
+        #: (3,) m, what the reported position is away from the steady one, now: of any place told here, add it.
+        self.offset: np.ndarray = np.zeros(3)
 
     def add(self, state: VehicleState) -> None:
         """Take a state; one without position or attitude is left out.  A stamp that goes back starts afresh."""
@@ -47,9 +56,23 @@ class PoseHistory:
         if self._poses and state.stamp_ns <= self._poses[-1][0]:
             self._poses.clear()
         velocity = np.nan_to_num(state.velocity_enu_m_s)
-        self._poses.append((state.stamp_ns, camera, state.position_enu_m, velocity))
+        steady = self._steady(state.stamp_ns, state.position_enu_m, velocity)
+        self.offset = state.position_enu_m - steady
+        self._poses.append((state.stamp_ns, camera, steady, velocity))
         while state.stamp_ns - self._poses[0][0] > self._keep_ns:
             self._poses.popleft()
+
+    def _steady(self, stamp_ns: int, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """(3,) m, where the velocity leads to from the last pose, a little towards the position."""
+        if not self._poses:
+            return position
+        before = self._poses[-1]
+        dt = (stamp_ns - before[0]) / _NS
+        moved: np.ndarray = before[2] + 0.5 * dt * (before[3] + velocity)
+        gap = position - moved
+        if float(np.linalg.norm(gap)) > _JUMP_M:
+            return position
+        return moved + (1 - np.exp(-dt / _LED_BACK_S)) * gap
 
     def at(self, stamp_ns: int) -> CameraPose | None:
         """Pose at an instant; None when the states do not reach there."""

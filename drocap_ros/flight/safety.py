@@ -226,9 +226,13 @@ def subject_problem(seen: Observed, limits: Limits) -> str:
     # stopped: its steps until a hold has begun count.  One that is followed may stop dead: its speed counts too.
     chase, approach = max(-seen.approach_m_s, 0.0), max(seen.approach_m_s, 0.0)
     own = max(seen.closing_m_s - chase, 0.0)
-    nearest = seen.subject_distance_m - _braking(own, safety) - _braking(chase, safety) - _REACTION_S * approach
-    if not nearest >= limits.orbit.min_distance_m:
-        return f"the subject is {seen.subject_distance_m:.1f} m away: at the limit of {limits.orbit.min_distance_m:g} m"
+    room = _braking(own, safety) + _braking(chase, safety) + _REACTION_S * approach
+    # The subject may be nearer than it seems.
+    if not seen.subject_distance_m - room - seen.subject_sd_m >= limits.orbit.min_distance_m:
+        return (
+            f"the subject is {seen.subject_distance_m:.1f} m away, give or take {seen.subject_sd_m:.1f} m: at the "
+            f"limit of {limits.orbit.min_distance_m:g} m"
+        )
     if seen.subject_distance_m > limits.orbit.max_distance_m:
         return f"the subject is {seen.subject_distance_m:.1f} m away: farther than {limits.orbit.max_distance_m:g} m"
     return ""

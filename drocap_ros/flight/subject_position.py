@@ -1,9 +1,14 @@
 """Where the subject is: bearing and range from one image, fused over time.
 
-Range comes from two independent sources.  *Body size*: the lengths of trunk, thighs and shanks in the image against
-those of a body of the assumed height; a crouching, bent or striding subject shortens some of them, never all.
-*Ground plane*: where the rays through the ankles meet level ground.  Both have errors that do not average out (the
-stature is what it is), so the fused covariance carries them beside the filter's own.
+Range comes from two independent sources.  *Body size*: the lengths of trunk, thighs and shanks, as a level camera
+would see them that looks straight at the subject, against those of a body of the assumed height; a crouching, bent or
+striding subject shortens some of them.  *Ground plane*: where the rays through the ankles meet level ground.  Both
+have errors that do not average out (the stature is what it is), so the fused covariance carries them beside the
+filter's own.
+
+The two disagree by what they assume, which stays, and by what the body does, which passes and only ever makes it look
+smaller, so farther.  So the ground tells where the subject is from image to image, and a low quantile of their ratio
+over some seconds what the body size says.
 """
 
 from __future__ import annotations
@@ -33,14 +38,20 @@ _ENDS_A, _ENDS_B = (np.array([bone[i] for bone in _BONES]) for i in (0, 1))
 _SHARES = np.array([bone[2] for bone in _BONES])
 _ANKLES = np.array([BODY_15.index("rankle"), BODY_15.index("lankle")])
 _TRUNK = np.array([BODY_15.index(name) for name in ("pelvis", "rhip", "lhip", "neck")])
-_PELVIS = BODY_15.index("pelvis")
+_NECK = BODY_15.index("neck")
 _ANKLE_HEIGHT = 0.055  # share of the stature; a swinging foot lifts the mean a little
 _CONFIDENCE = 0.25
 _STRIDE_M = 0.15  # standard deviation of the mean of the feet about the pelvis
 _STEEP = np.sin(np.deg2rad(75.0))
 _SHALLOW = np.sin(np.deg2rad(4.0))
 _MAX_RANGE_M = 200.0
-_RATIO_IMAGES = 28  # over which the ratio of the two ranges is learned
+_THIRD_LONGEST = 0.99  # of the true length
+_GROUND_NOISE, _SIZE_NOISE, _BEARING_NOISE = 0.025, 0.06, 0.008  # of one image, shares of the range
+_LIFTED, _APART_NOISE = 0.15, 0.1  # apart by this share, one foot is lifted; noise per distance between them
+_DRIFT = 0.05  # m/sqrt(s): the vehicle's own position and height wander, feet are set down: no motion of the subject
+_LEAN_RAD = 0.12  # standard deviation of the body's lean; looking down by a slope it changes lengths by as much
+_RATIO_NOISE, _RATIO_WANDER = 0.035, 0.02  # of the logarithm of size over ground: of one image; 1/sqrt(s)
+_BENDING_BY_NOISE = 0.1
 
 
 class SubjectMeasurement(NamedTuple):
@@ -50,6 +61,7 @@ class SubjectMeasurement(NamedTuple):
     noise : (3, 3) m^2, what changes from image to image
     systematic : (3, 3) m^2, what stays: assumed stature, height above ground, attitude
     range_size_m, range_ground_m : horizontal range of each source, NaN without
+    bending : how unequally the bones are foreshortened, logarithm of a ratio: about 0.1 by noise alone
     """
 
     position: np.ndarray
@@ -57,6 +69,7 @@ class SubjectMeasurement(NamedTuple):
     systematic: np.ndarray
     range_size_m: float
     range_ground_m: float
+    bending: float
 
 
 def locate_subject(
@@ -92,20 +105,25 @@ def locate_subject(
         return None
     plane = (np.where(seen[:, None], points, 0.0) - camera_matrix[:2, 2]) / np.diag(camera_matrix)[:2]
     rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1) @ camera.rotation
-    pelvis = rays[_PELVIS] if seen[_PELVIS] else rays[trunk].mean(axis=0)
+    # Of pelvis and hips the middle one: one wrong joint does not turn the bearing.
+    pelvis = np.median(rays[trunk[trunk != _NECK]], axis=0) if np.any(trunk != _NECK) else rays[_NECK]
     length = float(np.linalg.norm(pelvis))
     flat = float(np.hypot(pelvis[0], pelvis[1]))
     if flat < np.sqrt(1 - _STEEP**2) * length:
         return None
-    size = _range_from_size(plane, seen, flat / length, config) * flat
-    ground, ground_sd = _range_from_ground(rays, seen, camera.position, config)
-    distance, sd = _fuse(size, config.size_error * size, ground, ground_sd, size_over_ground)
+    slope = float(pelvis[2] / flat)
+    size, bending = _range_from_size(rays, seen, pelvis[:2] / flat, config)
+    size_error = float(np.hypot(config.size_error, _LEAN_RAD * slope))
+    ground, ground_sd, noise = _range_from_ground(rays, seen, camera.position, config)
+    if np.isfinite(size_over_ground) and np.isfinite(ground):
+        distance, sd = _fuse(size_over_ground * ground, size_error, ground, ground_sd)
+    else:
+        distance, sd = _fuse(size, size_error, ground, ground_sd)
     if not 0.3 < distance < _MAX_RANGE_M:
         return None
     ahead = np.array([pelvis[0], pelvis[1], 0.0]) / flat
     position = camera.position + distance * (pelvis / flat)
     aside = np.array([-ahead[1], ahead[0], 0.0])
-    slope = float(pelvis[2] / flat)
     along = ahead + np.array([0.0, 0.0, slope])
     turn = np.deg2rad(config.attitude_error_deg) * distance
     up = np.array([0.0, 0.0, 1.0])
@@ -117,59 +135,71 @@ def locate_subject(
             + (across_sd**2 + 1e-4) * np.outer(up, up)
         )
 
+    # Feet tell the range finely from image to image; the bones do not.
+    noise = noise if np.isfinite(noise) else _SIZE_NOISE * distance + 0.05
     return SubjectMeasurement(
-        position, spread(0.04 * distance + 0.05, 0.012 * distance + 0.04), spread(sd, turn), size, ground
+        position, spread(noise, _BEARING_NOISE * distance + 0.03), spread(sd, turn), size, ground, bending
     )
 
 
-def _range_from_size(plane: np.ndarray, seen: np.ndarray, upright: float, config: SubjectConfig) -> float:
-    """Depth along the optical axis over 1: from the third longest of the bones, each against its own length.
+def _range_from_size(
+    rays: np.ndarray, seen: np.ndarray, ahead: np.ndarray, config: SubjectConfig
+) -> tuple[float, float]:
+    """Horizontal range from the third longest of the bones, each against its own length; and their bending.
 
-    The longest may be made so by a wrong joint (which lengthens two bones at most), the shortest are foreshortened.
-    ``upright`` is by how much a vertical bone is foreshortened by looking down on it.
+    The bones are measured in the upright plane across the line of sight, at distance 1: looking down on the subject
+    does not shorten them.  The longest may be made so by a wrong joint (which lengthens two bones at most), the
+    shortest are foreshortened.
     """
-    bones = seen[_ENDS_A] & seen[_ENDS_B]
+    depth = rays[:, :2] @ ahead
+    usable = seen & (depth > 0.05)
+    bones = usable[_ENDS_A] & usable[_ENDS_B]
     if bones.sum() < 3:
-        return float("nan")
-    lengths = np.linalg.norm(plane[_ENDS_A] - plane[_ENDS_B], axis=1)[bones] / (_SHARES[bones] * config.body_height_m)
-    third = float(np.sort(lengths)[-3])
-    return 0.97 * upright / third if third > 1e-6 else float("nan")
+        return float("nan"), float("nan")
+    across = np.stack([rays[:, 1] * ahead[0] - rays[:, 0] * ahead[1], rays[:, 2]], axis=1)
+    across = across / np.where(usable, depth, 1.0)[:, None]
+    lengths = np.linalg.norm(across[_ENDS_A] - across[_ENDS_B], axis=1)[bones] / (_SHARES[bones] * config.body_height_m)
+    order = np.sort(lengths)[::-1]
+    if order[2] < 1e-6:
+        return float("nan"), float("nan")
+    return _THIRD_LONGEST / float(order[2]), float(np.log(order[1] / max(order[min(3, len(order) - 1)], 1e-6)))
 
 
 def _range_from_ground(
     rays: np.ndarray, seen: np.ndarray, position: np.ndarray, config: SubjectConfig
-) -> tuple[float, float]:
-    """Horizontal range of the ankles on level ground and its standard deviation; NaN without them."""
+) -> tuple[float, float, float]:
+    """Horizontal range of the ankles on level ground, its standard deviation and that of one image; NaN without."""
     ankles = rays[_ANKLES[seen[_ANKLES]]]
+    # A foot kicked up to the horizon says nothing; the other one stands.
+    ankles = ankles[-ankles[:, 2] >= _SHALLOW * np.linalg.norm(ankles, axis=1)]
     height = float(position[2]) - config.ground_height_m - _ANKLE_HEIGHT * config.body_height_m
     if not config.use_ground_plane or len(ankles) == 0 or height < 0.3:
-        return float("nan"), float("nan")
-    down = -ankles[:, 2]
-    if np.any(down < _SHALLOW * np.linalg.norm(ankles, axis=1)):
-        return float("nan"), float("nan")
-    ranges = height * np.hypot(ankles[:, 0], ankles[:, 1]) / down
-    # A lifted foot seems farther away than the one that stands.
-    distance = float(ranges.min() if np.ptp(ranges) > 0.3 * ranges.min() else ranges.mean())
+        return float("nan"), float("nan"), float("nan")
+    ranges = height * np.hypot(ankles[:, 0], ankles[:, 1]) / -ankles[:, 2]
+    apart, nearer = float(np.ptp(ranges)), float(ranges.min())
+    # A lifted foot seems farther away than the one that stands; feet a stride apart stand about the pelvis.
+    lifted = apart > _LIFTED * nearer
+    distance = nearer if lifted else float(ranges.mean())
     turn = np.deg2rad(config.attitude_error_deg)
     errors = (turn * (height**2 + distance**2) / height, config.height_error_m * distance / height, _STRIDE_M)
-    return distance, float(np.linalg.norm(errors))
+    noise = _GROUND_NOISE * distance + 0.05 + _APART_NOISE * min(apart, 0.5 * nearer)
+    return distance, float(np.linalg.norm(errors)), noise
 
 
-def _fuse(a: float, a_sd: float, b: float, b_sd: float, ratio: float = float("nan")) -> tuple[float, float]:
-    """Mean by information of size ``a`` and ground ``b``; ``ratio`` of the two is smoother than that of one image.
+def _fuse(size: float, size_error: float, ground: float, ground_sd: float) -> tuple[float, float]:
+    """Mean by information and its standard deviation; ``size_error`` is a share.
 
-    Where the two contradict each other for long, body size alone, trusted half as much.
+    Where the two contradict each other, body size alone, trusted half as much.
     """
-    if np.isfinite(ratio) and np.isfinite(b):
-        a, a_sd = ratio * b, a_sd if np.isfinite(a_sd) else b_sd
-    if not np.isfinite(a):
-        return b, b_sd
-    if not np.isfinite(b):
-        return a, a_sd
-    if abs(a - b) > 3 * np.hypot(a_sd, b_sd):
-        return a, 2 * a_sd
-    wa, wb = a_sd**-2, b_sd**-2
-    return (wa * a + wb * b) / (wa + wb), float((wa + wb) ** -0.5)
+    if not np.isfinite(size):
+        return ground, ground_sd
+    size_sd = size_error * size
+    if not np.isfinite(ground):
+        return size, size_sd
+    if abs(size - ground) > 3 * np.hypot(size_sd, ground_sd):
+        return size, 2 * size_sd
+    wa, wb = size_sd**-2, ground_sd**-2
+    return (wa * size + wb * ground) / (wa + wb), float((wa + wb) ** -0.5)
 
 
 @dataclass(frozen=True)
@@ -206,7 +236,8 @@ class SubjectFilter:
         self._stamp_ns = 0
         self._track_id = 0
         self._last_keypoints: np.ndarray | None = None
-        self._ratio, self._ratio_count = float("nan"), 0
+        self._ratio = float("nan")
+        self._ratio_variance = 0.0
         self.rejected = 0
 
     def reset(self) -> None:
@@ -260,7 +291,7 @@ class SubjectFilter:
         self._covariance = 0.5 * (covariance + covariance.T)
         self._systematic = measurement.systematic
         self._stamp_ns = observation.stamp_ns
-        self._learn_ratio(measurement)
+        self._learn_ratio(measurement, gap_s)
         return True
 
     def estimate(self, now_ns: int) -> SubjectEstimate | None:
@@ -276,16 +307,25 @@ class SubjectFilter:
             stamp_ns=self._stamp_ns, age_s=age_s, track_id=self._track_id,
         )  # fmt: skip
 
-    def _learn_ratio(self, measurement: SubjectMeasurement) -> None:
-        """Follow the ratio of the two ranges, slowly and in small steps."""
+    def _learn_ratio(self, measurement: SubjectMeasurement, gap_s: float) -> None:
+        """Follow the ratio of the two ranges: a Kalman filter of its logarithm, a random walk.
+
+        Bending makes the body look smaller, never larger, so what says "farther" and what comes from unequal bones
+        counts less.
+        """
         ratio = measurement.range_size_m / measurement.range_ground_m
         if not 0.5 < ratio < 2.0:  # NaN too
             return
-        self._ratio_count = min(self._ratio_count + 1, _RATIO_IMAGES)
-        if self._ratio_count == 1:
-            self._ratio = ratio
-        step = min(max(ratio - self._ratio, -0.15), 0.15)
-        self._ratio += step / self._ratio_count
+        bent = max(measurement.bending - _BENDING_BY_NOISE, 0.0)
+        if np.isnan(self._ratio):
+            self._ratio, self._ratio_variance = ratio, _RATIO_NOISE**2 + bent**2
+            return
+        innovation = float(np.log(ratio / self._ratio))
+        variance = _RATIO_NOISE**2 + bent**2 + max(innovation, 0.0) ** 2
+        self._ratio_variance += _RATIO_WANDER**2 * gap_s
+        gain = self._ratio_variance / (self._ratio_variance + variance)
+        self._ratio *= float(np.exp(gain * innovation))
+        self._ratio_variance *= 1 - gain
 
     def _start(self, observation: PoseObservation, measurement: SubjectMeasurement) -> None:
         self._state = np.concatenate([measurement.position, np.zeros(3)])
@@ -302,4 +342,5 @@ class SubjectFilter:
         # White acceleration of this standard deviation over a second: its power does not depend on the step.
         variance = self._config.subject_acceleration_m_s2**2 * np.array([1.0, 1.0, 0.1]) / max(dt, 1e-3)
         noise = push @ (variance[:, None] * push.T)
+        noise[:3, :3] += _DRIFT**2 * dt * np.eye(3)
         return move @ self._state, move @ self._covariance @ move.T + noise
