@@ -20,6 +20,7 @@ from drocap_ros.config import section_types
 from drocap_ros.errors import InputError
 from drocap_ros.nodes.latency import LATENCY, LATENCY_P95, RATE, Latency
 from drocap_ros.nodes.parameters import declare_parameters
+from drocap_ros.nodes.stamps import StampGate
 from drocap_ros.nodes.topics import GRAPH_QOS, TOPICS, publishers_of, subscribers_of
 from drocap_ros.parameters import Parameters
 
@@ -122,17 +123,26 @@ class ComponentNode(Node):
         return subscription
 
     def guarded(self, topic: str, callback: Callable[..., None]) -> Callable[..., None]:
-        """The callback, of which a refusal is counted and said instead of raised."""
+        """The callback, of which a refusal is counted and said instead of raised; stamps are checked first."""
+        gate = StampGate() if topic in TOPICS and TOPICS[topic].one_clock else None
 
         def run(*arguments: Any) -> None:
             self.callbacks_done += 1
             try:
+                if gate is not None and not isinstance(arguments[0], bytes):
+                    stamp = arguments[0].header.stamp
+                    gate.check(stamp.sec, stamp.nanosec)
                 callback(*arguments)
             except InputError as error:
-                self.count("messages refused")
-                self.report(WARN, f"{topic}: {error}")
+                self.refuse(f"{topic}: {error}")
 
         return run
+
+    def refuse(self, why: str) -> None:
+        """Count a message that cannot be used, and say why, also after better ones have come."""
+        self.count("messages refused")
+        self.details["last refused"] = why
+        self.report(WARN, why)
 
     def drop_input(self, subscription: Any) -> None:
         """End a subscription."""

@@ -23,6 +23,7 @@ from drocap_ros.nodes.component import ERROR, OK, WARN, ComponentNode
 from drocap_ros.nodes.conversions import camera_info_to_ros, header_at, stamp_from_ros
 from drocap_ros.nodes.picture_channel import PictureOutput
 from drocap_ros.nodes.run import node_main
+from drocap_ros.nodes.stamps import StampGate
 from drocap_ros.perception.calibration import CameraModel, camera_model
 from drocap_ros.perception.sources import Frame, ImageSource, open_source
 from drocap_ros.perception.sources.prefetch import prefetch
@@ -132,15 +133,16 @@ class ImageIngestNode(ComponentNode):
         if not topic:
             raise InputError(f"source: expected {_TOPIC}NAME of an image topic, got no name")
         compressed = topic.endswith("compressed")
+        gate = StampGate()
 
         def take(message: Any) -> None:
             if not self.started:
                 return
             try:
+                gate.check(message.header.stamp.sec, message.header.stamp.nanosec)
                 self._take(message, compressed)
             except InputError as error:
-                self.count("messages refused")
-                self.report(WARN, f"{topic}: {error}")
+                self.refuse(f"{topic}: {error}")
 
         kind = CompressedImage if compressed else Image
         self.create_subscription(kind, topic, take, qos_profile_sensor_data)

@@ -38,17 +38,18 @@ class Topic:
     message: type
     qos: QoSProfile
     offered: QoSProfile | None = None  # by the publisher, where it is more than subscribers ask for
+    one_clock: bool = False  # stamps are times of one clock, so that each lies near the one before
 
 
 TOPICS: dict[str, Topic] = {
-    "image/compressed": Topic(CompressedImage, IMAGE_QOS, IMAGE_RECORDING_QOS),
-    "camera_info": Topic(CameraInfo, RESULT_QOS),
+    "image/compressed": Topic(CompressedImage, IMAGE_QOS, IMAGE_RECORDING_QOS, one_clock=True),
+    "camera_info": Topic(CameraInfo, RESULT_QOS, one_clock=True),
     "roi": Topic(RegionOfInterest, RESULT_QOS),
-    "pose2d": Topic(Pose2D, RESULT_QOS),
-    "pose3d/initial": Topic(Pose3D, RESULT_QOS),
-    "pose3d/refined": Topic(Pose3DWindow, RESULT_QOS),
-    "pose3d/latest": Topic(Pose3D, RESULT_QOS),
-    "vehicle/state": Topic(VehicleState, RESULT_QOS),
+    "pose2d": Topic(Pose2D, RESULT_QOS, one_clock=True),
+    "pose3d/initial": Topic(Pose3D, RESULT_QOS, one_clock=True),
+    "pose3d/refined": Topic(Pose3DWindow, RESULT_QOS, one_clock=True),
+    "pose3d/latest": Topic(Pose3D, RESULT_QOS, one_clock=True),
+    "vehicle/state": Topic(VehicleState, RESULT_QOS, one_clock=True),
     "orbit/command": Topic(OrbitCommand, RESULT_QOS),
     "orbit/status": Topic(OrbitStatus, RESULT_QOS),
     "markers/keypoints": Topic(ImageMarker, RESULT_QOS),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,10 @@ import numpy as np
 from drocap_ros.errors import InputError
 
 _MAX_PIXELS = 200_000_000
+# A few bytes can claim to be a picture of gigabytes.  OpenCV reads its limit when it is loaded.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
+#: Where the end of a JPEG is looked for; cameras pad it.
+_JPEG_TAIL = 4096
 #: encoding -> (bytes per pixel, name of OpenCV's conversion to BGR)
 _ENCODINGS: dict[str, tuple[int, str | None]] = {
     "bgr8": (3, None),
@@ -46,6 +51,8 @@ def _decompressed(data: np.ndarray, form: str) -> np.ndarray:
     import cv2
 
     image = None
+    if data[:2].tobytes() == b"\xff\xd8" and b"\xff\xd9" not in data[-_JPEG_TAIL:].tobytes():
+        raise InputError(f"image: expected a whole JPEG, got {data.size} bytes without its end; check the link")
     if data.size:
         try:
             image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)

@@ -21,7 +21,8 @@ def observation_from_message(message: Any) -> PoseObservation:
     Raises
     ------
     InputError
-        When the skeleton is unknown, an array has the wrong length, a value is infinite or the stamp is negative.
+        When the skeleton is unknown, an array has the wrong length, a value is infinite or impossible, or the stamp
+        is negative.
     """
     joints = joint_set(message.skeleton)
     count = len(joints) if message.track_id else 0
@@ -30,6 +31,12 @@ def observation_from_message(message: Any) -> PoseObservation:
         raise InputError(f"stamp: expected a time after 1970, got {stamp_ns} ns; set the sender's clock")
     if message.image_width < 1 or message.image_height < 1:
         raise InputError(f"image size: expected at least 1x1 px, got {message.image_width}x{message.image_height}")
+    covariance = float_array(message.covariance, (count, 3), "covariance")
+    confidence = float_array(message.confidence, (count,), "confidence")
+    if (covariance[:, [0, 2]] < 0).any():
+        raise InputError(f"covariance: expected variances xx, yy of at least 0 px^2, got {np.nanmin(covariance):g}")
+    if ((confidence < 0) | (confidence > 1)).any():
+        raise InputError(f"confidence: expected 0 to 1, got {confidence.min():g} to {confidence.max():g}")
     return PoseObservation(
         stamp_ns=stamp_ns,
         track_id=message.track_id,
@@ -38,8 +45,8 @@ def observation_from_message(message: Any) -> PoseObservation:
         roi=np.array(message.roi, np.float32),
         detection_score=message.detection_score,
         keypoints=float_array(message.keypoints, (count, 2), "keypoints"),
-        covariance=float_array(message.covariance, (count, 3), "covariance"),
-        confidence=float_array(message.confidence, (count,), "confidence"),
+        covariance=covariance,
+        confidence=confidence,
     )
 
 
