@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 #: Of the web page; the next one carries the data.
 PORT = 9090
+#: A browser decodes no more pictures of a running graph than this; a file holds them all.
+LIVE_PICTURE_HZ = 10.0
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -128,7 +130,7 @@ def _view_live(recording: rerun.RecordingStream, args: argparse.Namespace) -> in
 
     namespace = args.namespace or "/drocap"
     with import_bringup().watch(namespace, args.domain_id) as graph, _shown(recording, (*PLOTS, "log"), args):
-        view = MessageView(Scene(recording))
+        view = MessageView(Scene(recording), picture_hz=None if args.save else LIVE_PICTURE_HZ)
         _subscribe(graph, view)
         end = math.inf if args.seconds is None else time.monotonic() + args.seconds
         with stop_signals() as stop:
@@ -168,7 +170,7 @@ def _shown(recording: rerun.RecordingStream, views: tuple[str, ...], args: argpa
                 recording.disconnect()
         _say(args, f"written: {args.save} ({args.save.stat().st_size / 1e6:.1f} MB); `rerun {args.save}` shows it")
     elif args.web or not has_screen():
-        address = to_browser(recording, arranged, args.port, args.memory)
+        address = to_browser(recording, arranged, args.port, args.memory, newest_first=args.live)
         _say(args, f"open {address} in a browser; Ctrl-C stops")
         with contextlib.suppress(KeyboardInterrupt):
             yield

@@ -38,10 +38,16 @@ class MessageView:
     Poses in frame ``map`` are drawn where they are.  Others are in the camera's optical frame with the pelvis at the
     origin: they are placed so that the body looks as in its picture, before the camera that the vehicle reports, or
     before a level one, the pelvis at the origin, when it reports none.
+
+    Parameters
+    ----------
+    picture_hz : pictures are thinned to this rate, for a viewer that must keep up; None = all
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, picture_hz: float | None = None) -> None:
         self._scene = scene
+        self._picture_period_ns = 0 if picture_hz is None else round(1e9 / picture_hz)
+        self._picture_ns: int | None = None
         self._keypoints: OrderedDict[int, tuple[str, np.ndarray]] = OrderedDict()
         self._matrix: np.ndarray | None = None
         self._size: tuple[int, int] | None = None
@@ -83,6 +89,11 @@ class MessageView:
     # -- pictures and keypoints ------------------------------------------------------------------------
 
     def _on_picture(self, message: Any, _: int) -> None:
+        at_ns, last_ns = stamp_ns(message), self._picture_ns
+        # A tenth of tolerance: pictures at 30 Hz thinned to 10 Hz are every third, whatever the jitter.
+        if last_ns is not None and 0 <= at_ns - last_ns < 0.9 * self._picture_period_ns:
+            return
+        self._picture_ns = at_ns
         data = bytes(message.data)
         self._at(message)
         if (kind := _MAGIC.get(data[:2])) is not None:

@@ -53,8 +53,12 @@ def to_window(recording: rerun.RecordingStream, layout: rrb.Blueprint, memory_li
         raise InputError(f"expected the Rerun viewer to start, it did not ({error}); use --web or --save") from None
 
 
-def to_browser(recording: rerun.RecordingStream, layout: rrb.Blueprint, port: int, memory_limit: str) -> str:
+def to_browser(
+    recording: rerun.RecordingStream, layout: rrb.Blueprint, port: int, memory_limit: str, *, newest_first: bool
+) -> str:
     """Serve the recording and a web viewer on two ports, ``port`` and the next; returns the page's address.
+
+    ``newest_first``: a page that is opened late begins with what is new.
 
     Raises
     ------
@@ -62,7 +66,9 @@ def to_browser(recording: rerun.RecordingStream, layout: rrb.Blueprint, port: in
         When a port is taken.
     """
     try:
-        source = recording.serve_grpc(grpc_port=port + 1, default_blueprint=layout, server_memory_limit=memory_limit)
+        source = recording.serve_grpc(
+            grpc_port=port + 1, default_blueprint=layout, server_memory_limit=memory_limit, newest_first=newest_first
+        )
         _rerun().serve_web_viewer(web_port=port, open_browser=has_screen(), connect_to=source)
     except (RuntimeError, OSError) as error:
         raise InputError(f"--port: expected {port} and {port + 1} to be free, found {error}; choose another") from None

@@ -13,14 +13,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from sensor_msgs.msg import CompressedImage
 
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.motion import Motion, load_motion, save_motion
+from drocap_ros.nodes.conversions import header_at
 from drocap_ros.recording.session import open_session
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.view.camera import nominal_camera_matrix, place_cameras
+from drocap_ros.view.message_view import MessageView
+from drocap_ros.view.output import new_recording
+from drocap_ros.view.scene import Scene
 
 pytest.importorskip("rerun", reason="no Rerun viewer here: `make setup` brings it")
 
@@ -250,3 +255,15 @@ def test_without_rerun_one_line_says_what_to_install(folder, tmp_path):
     assert done.returncode == 2
     assert "pip install 'rerun-sdk" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_pictures_for_a_viewer_that_must_keep_up_are_thinned(tmp_path):
+    recording = new_recording("thinned")
+    recording.save(tmp_path / "thinned.rrd")
+    jpeg = cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))[1].tobytes()
+    messages = MessageView(Scene(recording), picture_hz=10.0)
+    stamps = [10**12 + round(i * 1e9 / 30) + (i % 3) * 2_000_000 for i in range(30)]
+    for stamp in [*stamps, 10**11]:  # at the end the time jumps back, as in a loop
+        messages.take("image/compressed", CompressedImage(header=header_at(stamp, ""), data=jpeg), stamp)
+    recording.disconnect()
+    assert Drawn(tmp_path / "thinned.rrd").stamps("/world/camera/image") == [10**11, *stamps[::3]]
