@@ -41,6 +41,16 @@ def test_the_demo_flies_by_what_it_sees_and_ends_with_a_motion_near_the_truth(tm
             for _, m in session.messages(("/drocap/orbit/status",))
         ]
         vehicle = read_vehicle_track(session)
+    told = re.search(
+        r"pictures: (\d+) exposed .*, (\d+) rendered and recorded, (\d+) looked at, (\d+) with the subject; "
+        r"live: (\d+) poses, error ([\d.]+) mm", printed,
+    )  # fmt: skip
+    assert [int(told[i]) for i in range(1, 4)] == [
+        len(truth.stamp_ns), counts["/drocap/image/compressed"], counts["/drocap/pose2d"],
+    ]  # fmt: skip
+    assert int(told[4]) >= len(motion.stamp_ns) > 100
+    assert int(told[5]) > 50
+    assert float(told[6]) < 120
     assert counts["/drocap/image/compressed"] >= counts["/drocap/pose2d"] >= len(motion.stamp_ns) > 100
     assert counts["/drocap/vehicle/state"] > 200
     assert counts["/tf"] > 200
@@ -54,8 +64,8 @@ def test_the_demo_flies_by_what_it_sees_and_ends_with_a_motion_near_the_truth(tm
     assert flown.least_distance_m > 3.0
     # In the world frame the person stands where the simulated one stood, to what an assumed stature allows; the
     # position that the vehicle tells has an error of its own.
-    told, _ = interpolate(vehicle.stamp_ns, vehicle.position, motion.stamp_ns, spherical=False)
-    off = motion.joints3d[:, 0] - truth.joints3d[exposure, 0] - (told - truth.camera_position[exposure])
+    claimed, _ = interpolate(vehicle.stamp_ns, vehicle.position, motion.stamp_ns, spherical=False)
+    off = motion.joints3d[:, 0] - truth.joints3d[exposure, 0] - (claimed - truth.camera_position[exposure])
     assert np.nanmedian(np.linalg.norm(off, axis=1)) < 1.0
 
 
