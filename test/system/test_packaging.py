@@ -77,6 +77,7 @@ def test_pip_makes_a_wheel_with_the_messages_and_their_libraries(source, tmp_pat
         "drocap_ros/msg/_pose2_d.py",
         "drocap_ros/nodes/initializer.py",
         "drocap_ros/data/dictionary_cmu.npz",
+        "drocap_ros/data/simulation_models/person_pose.onnx",
         "drocap_ros/py.typed",
     ):
         assert wanted in names
