@@ -1,4 +1,4 @@
-"""``drocap evaluate``: the camera-motion study, and one motion against its truth."""
+"""``drocap evaluate``: the camera-motion study, the live method, and one motion against its truth."""
 
 from __future__ import annotations
 
@@ -44,6 +44,24 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     rotation.add_argument("--out", metavar="DIR", type=Path, help="also write rotation.csv, .md and .png there")
     rotation.add_argument("--quiet", action="store_true", help="no progress, only the tables")
     rotation.set_defaults(run=run)
+    live = kinds.add_parser(
+        "live",
+        help="error of what the live graph publishes, when it does, beside the offline result",
+        description="The sequences of MOCAP_DIR as in `evaluate rotation`, image by image through the live method:"
+        " the initial and the latest pose when they are published, and the refined pose 2 s after its image.",
+    )
+    live.add_argument("folder", metavar="MOCAP_DIR", type=Path, help="folder of MoCap .npz files")
+    live.add_argument("--speed", metavar="DEG_S", type=float, default=25.0, help="orbit speed (default 25)")
+    live.add_argument("--noisy", action="store_true", help="10 mm noise and 5 %% gross outliers in the 2D joints")
+    live.add_argument(
+        "--delay", metavar="S", type=float, default=0.5, help="time that an adjustment takes (default 0.5 s)"
+    )
+    live.add_argument("--config", metavar="FILE", type=Path, help="configuration file with other parameters")
+    live.add_argument("--limit", metavar="N", type=int, help="only the first N sequences")
+    live.add_argument("--seed", type=int, default=0, help="seed of the noise (default 0)")
+    live.add_argument("--out", metavar="DIR", type=Path, help="also write live.csv and live.md there")
+    live.add_argument("--quiet", action="store_true", help="no progress, only the tables")
+    live.set_defaults(run=run)
     return parser
 
 
@@ -55,7 +73,8 @@ def run(args: argparse.Namespace) -> int:
     InputError
         When an option or a file cannot be used.
     """
-    return _pair(args) if args.kind == "pair" else _rotation(args)
+    kinds = {"pair": _pair, "rotation": _rotation, "live": _live}
+    return kinds[args.kind](args)
 
 
 def _pair(args: argparse.Namespace) -> int:
@@ -105,4 +124,35 @@ def _rotation(args: argparse.Namespace) -> int:
             tables.save_csv(out / "rotation.csv", rows)
             (out / "rotation.md").write_text(text, encoding="utf-8")
             tables.save_curves(out / "rotation.png", rows)
+    return 0
+
+
+def _live(args: argparse.Namespace) -> int:
+    from drocap_ros.cli.output import check_output_folder, output_folder
+    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.config import DrocapConfig, load_config
+    from drocap_ros.evaluation.live import live_study
+    from drocap_ros.evaluation.live_table import live_markdown, save_live_csv
+
+    if args.out is not None:
+        check_output_folder(args.out)
+    config = DrocapConfig() if args.config is None else load_config(args.config)
+    with progress_bars(args.quiet) as progress:
+        rows = live_study(
+            args.folder,
+            speed_deg_s=args.speed,
+            noisy=args.noisy,
+            delay_s=args.delay,
+            seed=args.seed,
+            limit=args.limit,
+            initializer=config.initializer,
+            adjuster=config.bundle_adjuster,
+            progress=progress,
+        )
+    text = live_markdown(rows, args.delay)
+    print(text, end="")
+    if args.out is not None:
+        with output_folder(args.out) as out:
+            save_live_csv(out / "live.csv", rows)
+            (out / "live.md").write_text(text, encoding="utf-8")
     return 0

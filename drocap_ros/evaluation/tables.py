@@ -44,7 +44,7 @@ def study_markdown(rows: list[StudyRow]) -> str:
     count = len({r.sequence for r in rows})
     kind = "noisy" if rows[0].noisy else "clean"
     lines = [f"Reconstruction error in mm, mean over {count} sequences, {kind} 2D, by orbit speed in deg/s.", ""]
-    lines += _table(
+    lines += markdown_table(
         ["method", *(f"{s:g}" for s in speeds), "mirrored"],
         [
             [LABELS[m], *(f"{mean[m, s]:.1f}" for s in speeds), str(sum(r.mirrored for r in rows if r.method == m))]
@@ -53,7 +53,7 @@ def study_markdown(rows: list[StudyRow]) -> str:
     )
     speed = 25.0 if 25.0 in speeds else speeds[-1]
     lines += ["", f"Per joint group at {speed:g} deg/s, mm.", ""]
-    lines += _table(
+    lines += markdown_table(
         ["method", *JOINT_GROUPS],
         [
             [LABELS[m], *(f"{np.mean([getattr(r, f'{g}_mm') for r in at]):.1f}" for g in JOINT_GROUPS)]
@@ -63,7 +63,7 @@ def study_markdown(rows: list[StudyRow]) -> str:
     )
     lines += ["", f"Per sequence at {speed:g} deg/s, mm.", ""]
     by = {(r.sequence, r.method): r.error_mm for r in rows if r.speed_deg_s == speed}
-    lines += _table(
+    lines += markdown_table(
         ["sequence", *(LABELS[m] for m in methods)],
         [[q, *(f"{by[q, m]:.1f}" for m in methods)] for q in dict.fromkeys(r.sequence for r in rows)],
     )
@@ -82,7 +82,7 @@ def pair_markdown(name: str, e: PairErrors) -> str:
         f"{e.mirrored_share:.1%}",
         *("-" if np.isnan(v) else f"{v:.1f}" for v in (e.w_error_mm, e.horizon_deg)),
     ]
-    return "\n".join([*_table(head, [line]), "", *_table(more, [rest])]) + "\n"
+    return "\n".join([*markdown_table(head, [line]), "", *markdown_table(more, [rest])]) + "\n"
 
 
 def save_pair_csv(path: Path, name: str, e: PairErrors) -> None:
@@ -137,5 +137,6 @@ def save_joint_bars(path: Path, groups: dict[str, dict[str, float]]) -> None:
     figure.savefig(path, dpi=120)
 
 
-def _table(head: list[str], lines: list[list[str]]) -> list[str]:
+def markdown_table(head: list[str], lines: list[list[str]]) -> list[str]:
+    """Lines of a Markdown table."""
     return [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *lines)]

@@ -25,8 +25,8 @@ _BONES = BODY_15.bones
 MOST_IMAGES = 400
 
 #: Standard deviation of the start's errors, about the pelvis, over what the lifter expects: across and along the ray
-#: (measured on mocap/train's HDM05 sequences, from which it has not learned).
-ACROSS, ALONG = 1.35, 1.3
+#: (measured on the HDM05 sequences of mocap/train, from which it has not learned).
+ACROSS, ALONG = 1.35, 1.5
 
 
 class LiftedImage(NamedTuple):
@@ -46,13 +46,14 @@ class LiftedStart:
         self._limbs_m = height_m * LIMBS_PER_STATURE
         self._past: deque[tuple[int, np.ndarray, np.ndarray]] = deque(maxlen=MOST_IMAGES)
         self._proportions: deque[np.ndarray] = deque(maxlen=LOOKS)
-        self._until_look = LOOK_EVERY
+        self._since_look = 0
         self._limbs_px: deque[float] = deque(maxlen=SIZE)
 
     def forget_motion(self) -> None:
         """After a gap: the person is the same, where he or she was is worth nothing."""
         self._past.clear()
         self._limbs_px.clear()
+        self._since_look = 0
 
     def forget_person(self) -> None:
         """Another person, or another time."""
@@ -70,9 +71,9 @@ class LiftedStart:
         points[slot] = [k for _, k, _ in self._past]
         belief = np.zeros(points.shape[:2])
         belief[slot] = [c for _, _, c in self._past]
-        self._until_look -= 1
-        if self._until_look <= 0 and len(self._past) >= LOOK_EVERY:
-            self._until_look = LOOK_EVERY
+        self._since_look += 1
+        if self._since_look >= LOOK_EVERY:
+            self._since_look = 0
             self._look(points, belief, fps)
         lifted = self._lifter.lift_last(points, belief, fps, self._lengths_px())
         joints = lifted.joints[0]

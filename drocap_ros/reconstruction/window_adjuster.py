@@ -31,7 +31,7 @@ WARM_FRAMES = 72
 
 #: Standard deviation of an adjusted pose over the lifter's expected errors, about the pelvis: across and along the
 #: ray (measured on mocap/train's HDM05 sequences, from which the lifter has not learned).
-ACROSS, ALONG = 1.2, 1.35
+ACROSS, ALONG = 1.2, 1.5
 
 
 class WindowAdjuster:
@@ -75,9 +75,7 @@ class WindowAdjuster:
         config = self._config
         if effort.steps is not None:
             config = replace(config, iterations=max(min(config.iterations, sum(effort.steps)), 1))
-        return adjust_window(
-            w.stamp_ns, w.keypoints, w.confidence, w.covariance, w.initial_joints, config
-        ), effort.steps
+        return _by_equations(w, config), effort.steps
 
     def _by_default(
         self, w: WindowArrays, effort: Effort, cancelled: Cancelled | None
@@ -86,7 +84,7 @@ class WindowAdjuster:
         if effort.steps is not None:
             config = replace(config, first_iterations=effort.steps[0], iterations=effort.steps[1])
         if len(w.stamp_ns) < MIN_WINDOW:
-            return adjust_window(w.stamp_ns, w.keypoints, w.confidence, w.covariance, w.initial_joints), effort.steps
+            return _by_equations(w, self._config), effort.steps
         confidence = np.clip(np.nan_to_num(w.confidence), 0.0, 1.0)
         seen = np.isfinite(w.keypoints).all(axis=-1) & (confidence > 0.0)
         if seen.sum(axis=1).max(initial=0) < MIN_JOINTS:
@@ -101,10 +99,11 @@ class WindowAdjuster:
         )
         if not np.isfinite(found.joints).all():
             raise FloatingPointError("the solver found no finite poses")
+        result = _to_window(w, seen, confidence, found)
         if len(w.stamp_ns) * effort.stride >= WARM_FRAMES:
             self._known = (w.subject, w.stamp_ns, found.body)
         stopped = found.stop_reason == "deadline" or effort.steps is not None
-        return _to_window(w, seen, confidence, found), found.effort if stopped else None
+        return result, found.effort if stopped else None
 
     def _sizes(self, w: WindowArrays) -> KnownBody | None:
         if self._known is None or self._known[0] != w.subject:
@@ -113,6 +112,11 @@ class WindowAdjuster:
         begin = stamp_ns[0]
         size = np.interp((w.stamp_ns - begin) * 1e-9, (stamp_ns - begin) * 1e-9, body.unit_per_mm)
         return KnownBody(body.lengths_mm, size)
+
+
+def _by_equations(w: WindowArrays, config: BundleAdjusterConfig) -> AdjustedWindow:
+    covariance = None if np.isnan(w.covariance).all() else w.covariance
+    return adjust_window(w.stamp_ns, w.keypoints, w.confidence, covariance, w.initial_joints, config)
 
 
 def _to_window(w: WindowArrays, seen: np.ndarray, confidence: np.ndarray, found: DefaultResult) -> AdjustedWindow:
