@@ -36,12 +36,16 @@ from std_msgs.msg import Empty, String
 
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import DrocapError, InputError, NodeError
-from drocap_ros.nodes.component import ComponentNode
+from drocap_ros.nodes.component import HARDWARE_ID, ComponentNode
 from drocap_ros.nodes.run import PARENT, spin, step_back
 from drocap_ros.nodes.topics import GRAPH_QOS, NODES, TOPICS
 
 #: Above the drain time of a node, and the time that its files may take to close.
 STOP_TIMEOUT_S = 20.0
+
+#: In this namespace TF is where everybody looks for it; in another each graph has its own, ``NAMESPACE/tf``, as the
+#: frames of two drones bear the same names.
+DEFAULT_NAMESPACE = "/drocap"
 
 #: Pauses before a dead node is started again: the first, and the longest; each is twice the one before.
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 10.0
@@ -153,7 +157,7 @@ class Graph:
             level=level,
             name=f"{self.namespace.strip('/')}/bringup",
             message=text,
-            hardware_id="drocap_ros",
+            hardware_id=HARDWARE_ID,
             values=[KeyValue(key=f"restarts of {name}", value=str(n)) for name, n in sorted(self.restarts.items())],
         )
         message = DiagnosticArray(status=[status])
@@ -198,7 +202,7 @@ def bringup(
     nodes: Sequence[str],
     *,
     processes: bool = False,
-    namespace: str = "/drocap",
+    namespace: str = DEFAULT_NAMESPACE,
     domain_id: int | None = None,
     timeout_s: float = 60.0,
     respawn: bool = False,
@@ -210,7 +214,7 @@ def bringup(
     config : parameters of every component
     nodes : names out of ``nodes.topics.NODES``
     processes : one process each (True), or all in this one, a thread each
-    namespace : of the topics that have no leading slash
+    namespace : of the topics that have no leading slash; TF too lies in it, unless it is the default one
     domain_id : DDS domain; None takes a free one and keeps discovery on this machine, so that graphs side by
         side do not hear each other
     timeout_s : for all endpoints to be matched
@@ -304,6 +308,7 @@ class _Thread(_Runner):
                 context=context,
                 namespace=namespace,
                 use_global_arguments=False,
+                cli_args=["--ros-args", *_remaps(namespace)],
                 parameter_overrides=[Parameter("graph_nodes", value=",".join(names))],
             )
 
@@ -346,7 +351,14 @@ class _Process(_Runner):
         parameters.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}), encoding="utf-8")
         self._log = folder / f"{name}.log"
         command = [sys.executable, "-m", f"drocap_ros.nodes.{name}", "--ros-args"]
-        command += ["-r", f"__ns:={namespace}", "--params-file", str(parameters), "--disable-stdout-logs"]
+        command += [
+            "-r",
+            f"__ns:={namespace}",
+            *_remaps(namespace),
+            "--params-file",
+            str(parameters),
+            "--disable-stdout-logs",
+        ]
         environment = {**_ONE_THREAD, **os.environ, "ROS_DOMAIN_ID": str(domain_id), PARENT: str(os.getpid())}
         with self._log.open("ab") as log:
             self._process = subprocess.Popen(command, env=environment, stderr=log, start_new_session=True)
@@ -373,6 +385,11 @@ class _Process(_Runner):
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+
+
+def _remaps(namespace: str) -> list[str]:
+    """ROS arguments that keep one graph's TF from another's."""
+    return [] if namespace == DEFAULT_NAMESPACE else ["-r", f"/tf:={namespace.rstrip('/')}/tf"]
 
 
 def node_class(name: str) -> type[ComponentNode]:

@@ -32,7 +32,8 @@ class Dashboard:
 
     def heard(self, namespace: str = "") -> list[str]:
         """Names of the nodes heard so far in a namespace."""
-        return sorted(name for name in self._rows if name.startswith(namespace.strip("/")))
+        inside = f"{namespace.strip('/')}/" if namespace else ""
+        return sorted(name for name in self._rows if name.startswith(inside))
 
     def table(self, namespace: str = "") -> Table:
         """The table of the nodes heard so far in a namespace."""
@@ -48,13 +49,13 @@ class Dashboard:
 
 
 @contextlib.contextmanager
-def dashboard_on_terminal(show: bool) -> Iterator[tuple[Dashboard, Callable[[], None]]]:
-    """A dashboard and the function that draws it anew; draws nothing in a pipe or when ``show`` is false."""
+def dashboard_on_terminal(show: bool, namespace: str = "") -> Iterator[tuple[Dashboard, Callable[[], None]]]:
+    """A dashboard and the function that draws a namespace's nodes; it draws nothing in a pipe or without ``show``."""
     dashboard = Dashboard()
     if not show or not sys.stdout.isatty():
         yield dashboard, lambda: None
         return
     from rich.live import Live
 
-    with Live(dashboard.table(), auto_refresh=False) as live:
-        yield dashboard, lambda: live.update(dashboard.table(), refresh=True)
+    with Live(dashboard.table(namespace), auto_refresh=False) as live:
+        yield dashboard, lambda: live.update(dashboard.table(namespace), refresh=True)

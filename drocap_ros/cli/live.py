@@ -124,7 +124,7 @@ def dashboard_of(graph: Graph, show: bool) -> Iterator[tuple[Dashboard, Callable
     """Dashboard fed by the graph's ``/diagnostics``, and the function that draws it."""
     from drocap_ros.nodes.topics import TOPICS
 
-    with dashboard_on_terminal(show) as (dashboard, draw):
+    with dashboard_on_terminal(show, graph.namespace) as (dashboard, draw):
         entry = TOPICS["/diagnostics"]
         graph.node.create_subscription(entry.message, "/diagnostics", dashboard.take, entry.qos)
         yield dashboard, draw

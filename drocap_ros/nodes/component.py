@@ -24,6 +24,8 @@ from drocap_ros.nodes.stamps import StampGate
 from drocap_ros.nodes.topics import GRAPH_QOS, TOPICS, publishers_of, subscribers_of
 from drocap_ros.parameters import Parameters
 
+#: By which the statuses of this package's nodes are known on ``/diagnostics``.
+HARDWARE_ID = "drocap_ros"
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
@@ -225,7 +227,7 @@ class ComponentNode(Node):
                 level=self._level,
                 name=f"{self.get_namespace().strip('/')}/{self.component}",
                 message=self._text,
-                hardware_id="drocap_ros",
+                hardware_id=HARDWARE_ID,
                 values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
             )
         ]
@@ -237,4 +239,4 @@ def _publishers(topic: str, nodes: list[str]) -> int:
     return len(nodes) if topic == "/diagnostics" else publishers_of(topic, nodes)
 
 
-__all__ = ["ERROR", "OK", "WARN", "ComponentNode"]
+__all__ = ["ERROR", "HARDWARE_ID", "OK", "WARN", "ComponentNode"]

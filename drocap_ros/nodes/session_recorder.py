@@ -13,12 +13,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import ROSClock
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
 
-from drocap_ros.nodes.component import ERROR, OK, WARN, ComponentNode
+from drocap_ros.nodes.component import ERROR, HARDWARE_ID, OK, WARN, ComponentNode
 from drocap_ros.nodes.parameter_survey import ParameterSurvey
 from drocap_ros.nodes.run import node_main
 from drocap_ros.nodes.topics import IMAGE_RECORDING_QOS, TOPICS
@@ -49,13 +50,14 @@ class SessionRecorderNode(ComponentNode):
         self._writer = SessionWriter(folder, self.config, session_provenance(self.get_namespace()))
         self._survey = ParameterSurvey(self, self._on_parameters)
         self._calibrated = False
+        special = {"camera_info": self._on_camera_info, "/diagnostics": self._on_diagnostics}
         for topic, entry in TOPICS.items():
-            name = topic if topic.startswith("/") else f"{self.get_namespace().rstrip('/')}/{topic}"
+            name = self.resolve_topic_name(topic)
             kind = _type_name(entry.message)
             image = topic == "image/compressed"
             self._writer.register(name, kind, schema_text(kind), image=image)
             qos = IMAGE_RECORDING_QOS if image else entry.qos
-            take = self._on_camera_info if topic == "camera_info" else self._on_message
+            take = special.get(topic, self._on_message)
             events = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, name))
             self.input(topic, partial(take, name), raw=True, qos=qos, events=events, with_info=True)
         self.create_timer(1.0, self._on_second)
@@ -84,6 +86,13 @@ class SessionRecorderNode(ComponentNode):
                 f"distortion_model: {camera.distortion_model}\nd: {[float(v) for v in camera.d]}\n"
             )
             self._writer.add_metadata({CALIBRATION: text})
+
+    def _on_diagnostics(self, name: str, data: bytes, info: dict[str, Any]) -> None:
+        """Everybody's words but those of another drone's graph."""
+        ours = f"{self.get_namespace().strip('/')}/"
+        statuses = deserialize_message(data, DiagnosticArray).status
+        if not all(s.hardware_id == HARDWARE_ID and not s.name.startswith(ours) for s in statuses):
+            self._on_message(name, data, info)
 
     def _on_parameters(self, sections: dict[str, dict[str, Any]]) -> None:
         self._writer.add_metadata({CONFIGURATION: configuration_text(sections)})

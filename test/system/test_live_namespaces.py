@@ -1,0 +1,43 @@
+"""Two drones on one machine, in one DDS domain."""
+
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+
+from drocap_ros.bringup import bringup, free_domain
+from drocap_ros.config import DrocapConfig
+from drocap_ros.recording.session import open_session
+
+NODES = ["capture_simulator", "initializer", "bundle_adjuster", "visualizer", "session_recorder"]
+DRONES = ("drone1", "drone10")  # one name begins with the other
+
+
+@pytest.mark.parametrize("processes", [False, True], ids=["one process", "a process each"])
+def test_two_graphs_in_two_namespaces_do_not_mix(tmp_path, monkeypatch, processes):
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with free_domain() as domain, ExitStack() as stack:
+        graphs = []
+        for seed, drone in enumerate(DRONES):
+            config = DrocapConfig().replace("capture_simulator", seconds=2.0, seed=seed, rate_hz=10.0)
+            config = config.replace("initializer", azimuth_starts=2, start_iterations=4, sparse_rounds=1)
+            config = config.replace("session_recorder", session_dir=str(tmp_path / drone))
+            graphs.append(
+                stack.enter_context(
+                    bringup(config, NODES, processes=processes, namespace=f"/{drone}", domain_id=domain)
+                )
+            )
+        for graph in graphs:
+            graph.wait_finished("capture_simulator", timeout_s=60)
+            graph.spin_for(1.5)  # another report of each node
+    keypoints = []
+    for drone in DRONES:
+        with open_session(tmp_path / drone) as session:
+            topics = {t.name: t.count for t in session.info.topics if t.count}
+            keypoints.append([np.array(m.keypoints) for _, m in session.messages((f"/{drone}/pose2d",))])
+            names = {s.name for _, m in session.messages(("/diagnostics",)) for s in m.status}
+        assert all(name.startswith(f"/{drone}/") for name in topics if name != "/diagnostics"), topics
+        assert topics[f"/{drone}/tf"] >= topics[f"/{drone}/pose3d/initial"] == topics[f"/{drone}/pose2d"] == 20
+        assert names >= {f"{drone}/{node}" for node in NODES}
+        assert all(name.startswith(f"{drone}/") for name in names)
+    assert not np.array_equal(keypoints[0], keypoints[1], equal_nan=True)
