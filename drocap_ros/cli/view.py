@@ -8,6 +8,7 @@ import math
 import re
 import sys
 import time
+import webbrowser
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,6 +47,11 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("--save", metavar="FILE", type=Path, help="write an .rrd file instead of opening a viewer")
     parser.add_argument("--web", action="store_true", help="serve a page for a browser, also when there is a screen")
     parser.add_argument("--port", type=int, default=PORT, help=f"of --web, with the next one (default {PORT})")
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address of --web; 0.0.0.0 shows it to the whole network (default 127.0.0.1)",
+    )
     parser.add_argument("--video", metavar="VIDEO", type=Path, help="video or pictures that a motion was made from")
     parser.add_argument("--namespace", help="of the topics (default: /drocap live, that of the keypoints otherwise)")
     parser.add_argument("--domain-id", type=int, default=0, metavar="N", help="DDS domain, 0 to 101 (default 0)")
@@ -170,9 +176,11 @@ def _shown(recording: rerun.RecordingStream, views: tuple[str, ...], args: argpa
                 recording.disconnect()
         _say(args, f"written: {args.save} ({args.save.stat().st_size / 1e6:.1f} MB); `rerun {args.save}` shows it")
     elif args.web or not has_screen():
-        address = to_browser(recording, arranged, args.port, args.memory, newest_first=args.live)
-        _say(args, f"open {address} in a browser; Ctrl-C stops")
-        with contextlib.suppress(KeyboardInterrupt):
+        server = to_browser(recording, arranged, args.host, args.port, args.memory, newest_first=args.live)
+        with server as address, contextlib.suppress(KeyboardInterrupt):
+            _say(args, f"open {address} in a browser; Ctrl-C stops")
+            if has_screen():
+                webbrowser.open(address)
             yield
             recording.flush()
             if not args.live:

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from drocap_ros.errors import InputError
 
@@ -12,6 +20,8 @@ if TYPE_CHECKING:
     import rerun
     import rerun.blueprint as rrb
 
+#: Within which the web server starts.
+_START_S = 20.0
 INSTALL = "pip install 'rerun-sdk>=0.39,<0.40'"
 
 
@@ -53,32 +63,70 @@ def to_window(recording: rerun.RecordingStream, layout: rrb.Blueprint, memory_li
         raise InputError(f"expected the Rerun viewer to start, it did not ({error}); use --web or --save") from None
 
 
+@contextlib.contextmanager
 def to_browser(
-    recording: rerun.RecordingStream, layout: rrb.Blueprint, port: int, memory_limit: str, *, newest_first: bool
-) -> str:
-    """Serve the recording and a web viewer on two ports, ``port`` and the next; returns the page's address.
+    recording: rerun.RecordingStream,
+    layout: rrb.Blueprint,
+    host: str,
+    port: int,
+    memory_limit: str,
+    *,
+    newest_first: bool,
+) -> Iterator[str]:
+    """Serve the recording and a web viewer on two ports, ``port`` and the next, while the context lasts.
 
-    ``newest_first``: a page that is opened late begins with what is new.
+    Gives the page's address.  The server is Rerun's program and not its library, which serves the pictures of a
+    person to the whole network and cannot be told otherwise.
+
+    Parameters
+    ----------
+    host : address to serve on; 127.0.0.1 is this machine alone
+    newest_first : a page that is opened late begins with what is new
 
     Raises
     ------
     InputError
-        When a port is taken.
+        When a port is taken, or the address is not this machine's.
     """
+    _check_free(host, port, port + 1)
+    command = [sys.executable, "-m", "rerun_cli", "--serve-web", "--bind", host, "--port", str(port + 1)]
+    command += ["--web-viewer-port", str(port), "--server-memory-limit", memory_limit]
+    command += ["--newest-first"] if newest_first else []
+    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
-        source = recording.serve_grpc(
-            grpc_port=port + 1, default_blueprint=layout, server_memory_limit=memory_limit, newest_first=newest_first
-        )
-        _rerun().serve_web_viewer(web_port=port, open_browser=has_screen(), connect_to=source)
-    except (RuntimeError, OSError) as error:
-        raise InputError(f"--port: expected {port} and {port + 1} to be free, found {error}; choose another") from None
-    return f"http://127.0.0.1:{port}/?url={_quoted(source)}"
+        local = "127.0.0.1" if host == "0.0.0.0" else host
+        for number in (port, port + 1):
+            _wait_for(server, local, number)
+        source = f"rerun+http://{local}:{port + 1}/proxy"
+        recording.connect_grpc(source, default_blueprint=layout)
+        yield f"http://{local}:{port}/?url={quote(source, safe='')}"
+    finally:
+        recording.disconnect()
+        # The program is a child of Python's wrapper around it.
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(server.pid, signal.SIGTERM)
+        server.wait()
 
 
-def _quoted(text: str) -> str:
-    from urllib.parse import quote
+def _check_free(host: str, *ports: int) -> None:
+    for port in ports:
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((host, port))
+            except OSError as error:
+                raise InputError(
+                    f"--host, --port: expected to serve on {host}:{port}, cannot ({error.strerror}); choose another"
+                ) from None
 
-    return quote(text, safe="")
+
+def _wait_for(server: subprocess.Popen[bytes], host: str, port: int) -> None:
+    end = time.monotonic() + _START_S
+    while server.poll() is None and time.monotonic() < end:
+        with contextlib.suppress(OSError), socket.create_connection((host, port), timeout=1.0):
+            return
+        time.sleep(0.05)
+    raise InputError(f"--host, --port: expected Rerun's server on {host}:{port}, it did not start; choose another port")
 
 
 def _rerun() -> Any:

@@ -208,6 +208,17 @@ def two_free_ports():
                 return port
 
 
+def listening(port):
+    """Addresses on which this machine listens at a port."""
+    found = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            address, number = line.split()[1].split(":")
+            if line.split()[3] == "0A" and int(number, 16) == port:
+                found.add(socket.inet_ntoa(bytes.fromhex(address)[::-1]) if table == "tcp" else address)
+    return found
+
+
 def test_without_a_screen_a_browser_gets_a_page(folder):
     port = two_free_ports()
     server = subprocess.Popen(
@@ -222,10 +233,14 @@ def test_without_a_screen_a_browser_gets_a_page(folder):
         assert f"127.0.0.1%3A{port + 1}" in address
         with socket.create_connection(("127.0.0.1", port + 1), timeout=20):
             pass
+        # Pictures of a person are for this machine alone.
+        for number in (port, port + 1):
+            assert listening(number) == {"127.0.0.1"}
     finally:
         server.send_signal(signal.SIGINT)
         rest, _ = server.communicate(timeout=30)
     assert server.returncode == 0, line + rest
+    assert not listening(port)
 
 
 @pytest.mark.parametrize(
