@@ -1,18 +1,39 @@
-"""Randomized orbits in closed loop, no breach allowed: `python benchmarks/flight_orbits.py [COUNT] [FIRST_SEED]`."""
+"""Orbits in closed loop: randomized ones, where no limit may be broken, and how well the orbit of the protocol is kept.
+
+    python benchmarks/flight_orbits.py                      the 300 randomized orbits, those not flown yet
+    python benchmarks/flight_orbits.py --first 100 --count 50
+    python benchmarks/flight_orbits.py table                what has been flown, summed up
+    python benchmarks/flight_orbits.py quality              errors of radius, yaw and framing
+
+Each randomized orbit is a line of `benchmarks/results/flight_orbits.jsonl`; one that is there is not flown again
+(`--again` does).
+"""
 
 from __future__ import annotations
 
+import argparse
+import hashlib
+import itertools
+import json
 import math
 import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.config import MavlinkBridgeConfig
-from drocap_ros.simulation.orbit_loop import LoopSettings, OrbitLoop, orbit_quality
+from drocap_ros.flight.safety import Command, State
+from drocap_ros.simulation.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
 
 SECONDS = 24.0
 SETTLE_S = 4.0
+RETRY_S = 3.0
+RESULTS = Path(__file__).parent / "results" / "flight_orbits.jsonl"
+_SOURCES = Path(__file__).parents[1] / "drocap_ros"
 
 
 def settings_of(seed: int) -> LoopSettings:
@@ -26,6 +47,7 @@ def settings_of(seed: int) -> LoopSettings:
                 radius_m=radius, height_m=rng.uniform(1.8, 6.0),
                 angular_speed_deg_s=float(rng.uniform(8, 40) * rng.choice([-1, 1])),
                 body_height_m=rng.uniform(1.6, 1.9), fence_radius_m=rng.uniform(20, 40),
+                gimbal_control=bool(np.random.default_rng([seed, 1]).random() < 0.5),
             )  # fmt: skip
             break
         except InputError:
@@ -42,21 +64,35 @@ def settings_of(seed: int) -> LoopSettings:
 
 
 def fly(seed: int) -> tuple[LoopSettings, OrbitLoop]:
+    """Fly one; the operator starts at ``SETTLE_S`` and tries again whenever it did not go on for ``RETRY_S``."""
     settings = settings_of(seed)
     loop = OrbitLoop(settings)
     loop.down.loss = loop.up.loss = float(np.random.default_rng(seed + 10**6).choice([0.0, 0.0, 0.05]))
     loop.start(SETTLE_S)
-    loop.run(SECONDS)
+    waits_since = [SETTLE_S]
+
+    def operate(loop: OrbitLoop) -> None:
+        if loop.controller.safety.state == State.ORBITING:
+            waits_since[0] = loop.t
+        elif loop.t - waits_since[0] > RETRY_S:
+            waits_since[0] = loop.t
+            control = loop.copter.mode in ("GUIDED", "OFFBOARD")
+            loop.command(Command.START if control else Command.ENGAGE)
+
+    loop.run(SECONDS, operate)
     return settings, loop
 
 
 def breaches(settings: LoopSettings, loop: OrbitLoop) -> list[str]:
-    """Limits that the true vehicle broke after the start, with 0.6 m for the errors of its own position."""
+    """Limits that the true vehicle broke after the start.
+
+    Places in the map count with 0.6 m for the errors of the vehicle's own position; the distance from the person,
+    which does not depend on it, with nothing.
+    """
     config, rows = settings.config, [row for row in loop.rows if row.t_s > SETTLE_S]
     found = []
-    # To a vehicle that hovers a person may walk as close as he likes: what counts is while it moves.
-    nearest = min((row.distance_m for row in rows if np.linalg.norm(row.velocity) > 0.5), default=math.inf)
-    if nearest < config.min_distance_m - 0.6:
+    nearest = least_distance(loop)
+    if nearest < config.min_distance_m:
         found.append(f"distance {nearest:.2f} m")
     heights = [float(row.position[2]) for row in rows]
     if min(heights) < config.min_height_m - 0.6 or max(heights) > config.max_height_m + 0.6:
@@ -71,25 +107,137 @@ def breaches(settings: LoopSettings, loop: OrbitLoop) -> list[str]:
     return found
 
 
-def main() -> int:
-    sys.stdout.reconfigure(line_buffering=True)
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 300
-    first = int(sys.argv[2]) if len(sys.argv) > 2 else 0
-    bad, going, errors = 0, 0, []
+def least_distance(loop: OrbitLoop) -> float:
+    """From the person, m: to a vehicle that hovers he may walk as close as he likes, what counts is while it moves."""
+    moving = (row.distance_m for row in loop.rows if row.t_s > SETTLE_S and np.linalg.norm(row.velocity) > 0.5)
+    return min(moving, default=math.inf)
+
+
+def outcome(seed: int) -> dict[str, Any]:
+    """One orbit, as a line of the results."""
+    settings, loop = fly(seed)
+    rows = [row for row in loop.rows if row.t_s > SETTLE_S]
+    orbiting = [row.state == State.ORBITING for row in rows]
+    settled = [row.distance_m - settings.config.radius_m for row in rows if row.t_s > 14.0]
+    told = [(state, reason) for t, state, reason in loop.reasons if t > SETTLE_S]
+    stops = [
+        reason for (before, _), (state, reason) in itertools.pairwise(told)
+        if before == "ORBITING" and state != "ORBITING"
+    ]  # fmt: skip
+    refusals = [answer for _, answer in loop.answers if answer.startswith("refused")]
+    whole = all(row.state == State.ORBITING for row in rows if row.t_s > 14.0)
+    return {
+        "seed": seed, "code": code_version(), "autopilot": settings.autopilot, "action": settings.action,
+        "breaches": breaches(settings, loop), "least_distance_m": round(least_distance(loop), 3),
+        "orbiting": round(float(np.mean(orbiting)), 3), "flown": any(orbiting), "held": stops[:3],
+        "refused": refusals[:1] if not any(orbiting) else [],
+        "radius_error_m": round(float(np.mean(np.abs(settled))), 3) if whole else None,
+    }  # fmt: skip
+
+
+def code_version() -> str:
+    """Of everything that flies here."""
+    digest = hashlib.sha256()
+    for path in sorted([*(_SOURCES / "flight").glob("*.py"), *(_SOURCES / "simulation").glob("*.py")]):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def randomized(first: int, count: int, again: bool, seconds: float) -> int:
+    """Fly what has not been flown, for so long at most; the table of all of them."""
+    done = {} if again else {row["seed"] for row in _read()}
+    end_s = time.monotonic() + seconds
+    RESULTS.parent.mkdir(exist_ok=True)
     for seed in range(first, first + count):
-        settings, loop = fly(seed)
-        found = breaches(settings, loop)
-        bad += bool(found)
-        quality = orbit_quality(loop, settings.config.radius_m, 14.0)
-        if quality.orbiting == 1.0:
-            going += 1
-            errors.append(quality.radius_error_m)
-        if found or seed % 10 == 0:
-            end = loop.reasons[-1][2] if loop.reasons else ""
-            print(seed, settings.autopilot, settings.action, "; ".join(found) or "no breach", "|", end, flush=True)
-    mean = float(np.mean(errors)) if errors else math.nan
-    print(f"{count} orbits: {bad} with a breach; {going} went on to the end, mean radius error {mean:.2f} m")
+        if seed in done:
+            continue
+        if time.monotonic() > end_s:
+            print(f"time is up before seed {seed}: run it again to go on")
+            break
+        row = outcome(seed)
+        with RESULTS.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        if row["breaches"]:
+            print(seed, row["autopilot"], row["action"], "; ".join(row["breaches"]), row["held"], flush=True)
+    return table(first, count)
+
+
+def table(first: int, count: int) -> int:
+    """Sum up the results of these seeds."""
+    rows = list({row["seed"]: row for row in _read() if first <= row["seed"] < first + count}.values())
+    if not rows:
+        raise SystemExit("no results yet: fly first")
+    bad = [row for row in rows if row["breaches"]]
+    flown = [row for row in rows if row["flown"]]
+    errors = [row["radius_error_m"] for row in rows if row["radius_error_m"] is not None]
+    near = sorted(row["least_distance_m"] for row in flown)
+    print(f"{len(rows)} of {count} orbits, {len({row['code'] for row in rows})} version(s) of the code")
+    print(f"with a breach: {len(bad)}" + "".join(f"\n  seed {r['seed']}: {'; '.join(r['breaches'])}" for r in bad))
+    print(f"flown: {len(flown)}, of which {len(errors)} orbited without a stop from 14 s to the end")
+    print(f"time in ORBITING after the first start: {100 * np.mean([row['orbiting'] for row in rows]):.0f} %")
+    if errors:
+        print(f"radius error of those, m: mean {np.mean(errors):.2f}, worst {max(errors):.2f}")
+    if near:
+        print(f"least true distance, m: {near[0]:.2f}, {near[1]:.2f}, {near[2]:.2f} ..." if len(near) > 2 else near)
+    kinds = Counter(_kind(reason) for row in rows for reason in row["held"])
+    for reason, number in kinds.most_common():
+        print(f"  held {number} times: {reason}")
+    for reason, number in Counter(_kind(reason) for row in rows for reason in row["refused"]).most_common():
+        print(f"  never flown, {number}: {reason}")
     return 1 if bad else 0
+
+
+def _kind(reason: str) -> str:
+    """The reason without its figures."""
+    words = ["#" if any(c.isdigit() for c in word) else word for word in reason.split()]
+    return " ".join(words)[:90]
+
+
+def _read() -> list[dict[str, Any]]:
+    return [json.loads(line) for line in RESULTS.read_text().splitlines()] if RESULTS.exists() else []
+
+
+def quality(first: int, count: int) -> int:
+    """Orbit of 6 m at 2 m/s, 8 m/s wind, body height known, from 13 to 31 s: means over seeds, and the worst."""
+    print("mean (worst) of", count, "seeds    radius error, m   yaw error, deg   in the middle third, %   orbiting, %")
+    missed = 0
+    for autopilot in ("ardupilot", "px4"):
+        for action in ("stand", "walk"):
+            rows = np.array([quality_of(autopilot, action, seed) for seed in range(first, first + count)])
+            (radius, yaw, middle, orbiting), worst = rows.mean(axis=0), rows.max(axis=0)
+            least = rows.min(axis=0)
+            print(
+                f"{autopilot:10s} {action:6s}        {radius:12.2f} ({worst[0]:.2f}) {yaw:10.2f} ({worst[1]:.2f}) "
+                f"{100 * middle:14.1f} ({100 * least[2]:.1f}) {100 * orbiting:14.1f} ({100 * least[3]:.0f})"
+            )
+            missed += radius > 0.3 or yaw > 3.0 or middle < 0.95
+    return 1 if missed else 0
+
+
+def quality_of(autopilot: str, action: str, seed: int) -> tuple[float, float, float, float]:
+    """Radius error m, yaw error deg, share of time in the middle third, share of time orbiting."""
+    settings = LoopSettings(autopilot=autopilot, action=action, wind_m_s=(8.0, 0.0, 0.0), seed=seed, seconds=32)
+    loop = OrbitLoop(with_config(settings, body_height_m=settings.stature_m, size_error=0.04))
+    loop.start()
+    loop.run(31.0)
+    result = orbit_quality(loop, 6.0, 13.0)
+    return result.radius_error_m, result.yaw_error_deg, result.in_middle_third, result.orbiting
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="?", default="randomized", choices=["randomized", "table", "quality"])
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--count", type=int, help="number of seeds: 300, quality 10")
+    parser.add_argument("--again", action="store_true", help="fly those too that are in the results")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="begin no orbit after this time")
+    args = parser.parse_args()
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+    if args.what == "quality":
+        return quality(args.first, args.count or 10)
+    if args.what == "table":
+        return table(args.first, args.count or 300)
+    return randomized(args.first, args.count or 300, args.again, args.seconds)
 
 
 if __name__ == "__main__":

@@ -103,7 +103,11 @@ class OrbitLoop:
         start += np.array([*joints[0, 0, :2], settings.height_m])
         control = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}[settings.autopilot]
         aim = 0.53 * settings.stature_m
-        pitch = -math.degrees(math.atan2(settings.config.height_m - aim, settings.config.radius_m))
+        # A mount has been pointed at the person by hand; without one the camera is tilted for the orbit.
+        drop, away = settings.config.height_m - aim, settings.config.radius_m
+        if settings.config.gimbal_control:
+            drop, away = settings.height_m - aim, settings.distance_m
+        pitch = -math.degrees(math.atan2(drop, away))
         self.copter = SimulatedCopter(
             LoopbackTransport(self.up, self.down), start, bearing + math.pi, settings.autopilot,
             wind=np.array(settings.wind_m_s), seed=settings.seed, guid_timeout_s=settings.guid_timeout_s,
