@@ -84,6 +84,26 @@ def test_the_body_covers_its_joints_in_every_size_of_picture(size):
             assert mask[y, x].all()
 
 
+def test_a_near_person_drawn_at_half_the_resolution_has_the_same_outline():
+    joints, rotation, position = (v[0] for v in orbit(radius_m=2.6))
+    surfaces, _ = body(joints, dress(0))
+    ends = to_camera(surfaces.ends, rotation[None].repeat(len(surfaces.ends), 0), position[None])
+    _, box = draw(make_scene(0), dress(0), MATRIX, 1280, 720, joints, rotation, position)
+    assert np.prod(box[2:] - box[:2]) > 150_000
+    turned = surfaces._replace(
+        a=rotation @ surfaces.a @ rotation.T,
+        b=(surfaces.b + surfaces.a @ position) @ rotation.T,
+        c=surfaces.c + 2 * surfaces.b @ position + np.einsum("i,nij,j->n", position, surfaces.a, position),
+        axis=surfaces.axis @ rotation.T,
+        low=surfaces.low - surfaces.axis @ position,
+        high=surfaces.high - surfaces.axis @ position,
+        ends=ends,
+    )
+    rows, columns = np.nonzero((layer := see(turned, MATRIX, 1280, 720, LIGHT)).surface >= 0)
+    full = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]) + [layer.x, layer.y] * 2
+    assert np.abs(full - box).max() <= 2
+
+
 def test_the_outline_of_a_sphere_is_exact_to_a_pixel():
     centre, radius = np.array([0.4, -0.3, 5.0]), 0.5
     layer = see(sphere(centre, radius), MATRIX, 1280, 720, LIGHT)
