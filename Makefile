@@ -44,7 +44,7 @@ lint: setup  ## ruff and mypy
 	$(CLEAN) $(BIN)/mypy
 
 bench: setup  ## benchmarks (about an hour); results under benchmarks/results
-	for part in reconstruction perception recording; do $(CLEAN) $(BIN)/python benchmarks/$$part.py || exit 1; done
+	for part in reconstruction perception recording live; do $(CLEAN) $(BIN)/python benchmarks/$$part.py || exit 1; done
 
 bench-flight: setup  ## simulated faults, randomized orbits, fuzzing (hours)
 	for part in faults orbits fuzz; do $(CLEAN) $(BIN)/python benchmarks/flight_$$part.py || exit 1; done

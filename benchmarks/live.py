@@ -4,6 +4,8 @@ load    a 1280x720 video at 30 fps round and round through all nodes, adjustment
         latency from the image's stamp to pose3d/initial, the adjustment's duration, processor time, in one process
         and in a process each, with the adjuster and without (`--seconds 300`, `--one-process`, `--processes`,
         `--no-adjuster` for one case)
+memory  resident memory of every process against its value at minute 2 (`--minutes 30`)
+kills   SIGKILL of each node in turn: how long until it works again, what the recording lost
 
 Needs ../shared (video, weights).  Results go to benchmarks/results/live.json.  Run it on a machine that does nothing
 else; the load average before each part stands beside its figures.
@@ -12,18 +14,23 @@ else; the load average before each part stands beside its figures.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import itertools
 import json
 import os
+import signal
+import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 SHARED = ROOT.parent / "shared"
-PARTS = ("load",)
+PARTS = ("load", "memory", "kills")
 NODES = ["image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
 #: Networks, discovery and the first window take their time: not part of the figures.
 WARM_S = 15.0
@@ -33,6 +40,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []])
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--one-process", action="store_true")
     parser.add_argument("--processes", action="store_true")
     parser.add_argument("--no-adjuster", action="store_true")
@@ -77,6 +85,18 @@ def graph_config(video: Path, session: Path, port: int) -> Any:
     return config.replace("session_recorder", session_dir=str(session))
 
 
+@contextlib.contextmanager
+def vehicle(port: int) -> Iterator[None]:
+    """A simulated autopilot for the bridge, in a process of its own."""
+    command = [sys.executable, "-m", "drocap_ros.simulation.vehicle", "--url", f"udpout:127.0.0.1:{port}"]
+    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    try:
+        yield
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.wait()
+
+
 def usage(pid: int) -> tuple[float, float]:
     """Processor seconds and resident MiB of a process so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
@@ -111,8 +131,9 @@ def measure_load(video: Path, session: Path, processes: bool, adjuster: bool, se
     from drocap_ros.simulation.ports import free_udp_port
 
     nodes = [name for name in NODES if adjuster or name != "bundle_adjuster"]
-    config = graph_config(video, session, free_udp_port())
-    with bringup(config, nodes, processes=processes) as graph:
+    port = free_udp_port()
+    config = graph_config(video, session, port)
+    with vehicle(port), bringup(config, nodes, processes=processes) as graph:
         graph.spin_for(WARM_S)
         pids = {graph.pid(name): name if processes else "all nodes" for name in nodes}
         before, begin_ns = {pid: usage(pid)[0] for pid in pids}, time.time_ns()
@@ -183,6 +204,118 @@ def session_figures(session: Path, begin_ns: int, end_ns: int) -> dict[str, Any]
         name: number - int(first.get(name, {}).get("images", 0)) for name, number in seen.items() if number
     }
     return figures
+
+
+# -- memory ------------------------------------------------------------------------------------------------
+
+
+def part_memory(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Resident memory of each process of the whole graph, looked at every 5 s."""
+    from drocap_ros.bringup import bringup
+    from drocap_ros.simulation.ports import free_udp_port
+
+    video, session, port = stream(folder), folder / "session", free_udp_port()
+    # A file a minute, of which the old ones go: half an hour would fill a disk.
+    config = graph_config(video, session, port).replace("session_recorder", split_s=60.0)
+    nodes = [*NODES[:-1], "visualizer", "session_recorder"]
+    load = os.getloadavg()[0]
+    results: dict[str, Any] = {"minutes": args.minutes, "load average before": round(load, 2)}
+    with vehicle(port), bringup(config, nodes, processes=not args.one_process) as graph:
+        pids = {graph.pid(name): name if not args.one_process else "all nodes" for name in nodes}
+        seen: dict[int, list[tuple[float, float]]] = {pid: [] for pid in pids}
+        begin = time.monotonic()
+        while (now := time.monotonic() - begin) < 60 * args.minutes:
+            graph.spin_for(5.0)
+            for pid, values in seen.items():
+                values.append((now, usage(pid)[1]))
+            for old in sorted(session.glob("*.mcap"), key=lambda p: int(p.stem.rsplit("_", 1)[1]))[:-2]:
+                old.unlink()
+    good = True
+    for pid, values in seen.items():
+        at_two = next(mib for now, mib in values if now >= min(120.0, 30.0 * args.minutes))
+        later = [mib for now, mib in values if now >= min(120.0, 30.0 * args.minutes)]
+        far = max(later, key=lambda mib: abs(mib - at_two))
+        within = abs(far / at_two - 1) <= 0.05
+        good &= within
+        results[pids[pid]] = {
+            "MiB at minute 2": round(at_two, 1),
+            "at the end": round(values[-1][1], 1),
+            "farthest": f"{100 * (far / at_two - 1):+.1f} %",
+            "every minute": [round(mib) for now, mib in values if now % 60 < 5.0],
+        }
+    results["verdict"] = "within 5 % of minute 2" if good else "NOT within 5 % of minute 2"
+    say(f"memory, {args.minutes:g} minutes", results)
+    return results
+
+
+# -- kills -------------------------------------------------------------------------------------------------
+
+#: What shows that a node works again.
+SIGNS = {
+    "image_ingest": "camera_info",
+    "pose_estimator": "pose2d",
+    "initializer": "pose3d/initial",
+    "bundle_adjuster": "pose3d/refined",
+    "mavlink_bridge": "vehicle/state",
+}
+
+
+def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Every node killed once while all others run; bringup starts it again."""
+    import numpy as np
+
+    from drocap_ros.bringup import bringup
+    from drocap_ros.nodes.topics import TOPICS
+    from drocap_ros.recording.session import open_session
+    from drocap_ros.simulation.ports import free_udp_port
+
+    video, session, port = stream(folder), folder / "session", free_udp_port()
+    results: dict[str, Any] = {"load average before": round(os.getloadavg()[0], 2)}
+    heard: dict[str, list[float]] = {topic: [] for topic in SIGNS.values()}
+    killed: dict[str, tuple[int, int]] = {}
+    with (
+        vehicle(port),
+        bringup(graph_config(video, session, port), NODES, processes=True, respawn=True) as graph,
+    ):
+        for topic, times in heard.items():
+            entry = TOPICS[topic]
+            graph.node.create_subscription(
+                entry.message, topic, lambda _, times=times: times.append(time.monotonic()), entry.qos
+            )
+        graph.wait_until(lambda: all(heard.values()), 60, "every node to work")
+        graph.spin_for(5.0)
+        for name, topic in SIGNS.items():
+            begin, begin_ns = time.monotonic(), time.time_ns()
+            os.kill(graph.pid(name), signal.SIGKILL)
+            graph.wait_until(lambda name=name: graph.restarts[name] > 0, 30, f"{name} to be started")
+            begun = time.monotonic()
+            graph.wait_until(lambda topic=topic, t=begun: heard[topic][-1] > t, 60, f"{topic} again")
+            results[f"{name} killed, {topic} again after s"] = round(heard[topic][-1] - begin, 2)
+            killed[name] = (begin_ns, time.time_ns())
+            graph.spin_for(5.0)
+        begin = time.monotonic()
+        os.kill(graph.pid("session_recorder"), signal.SIGKILL)
+        second = session.with_name("session_2")
+        graph.wait_until(lambda: any(second.glob("*.mcap")), 60, "the recorder's next folder")
+        results["session_recorder killed, next file after s"] = round(time.monotonic() - begin, 2)
+        graph.spin_for(5.0)
+    for folder_ in (session, second):
+        with open_session(folder_) as opened:
+            info = {t.name.removeprefix("/drocap/"): t.count for t in opened.info.topics if t.count}
+            # Telemetry must go on while the nodes of the picture die, and pictures while the bridge does.
+            gaps = {}
+            for topic, dead in (("vehicle/state", "mavlink_bridge"), ("camera_info", "image_ingest")):
+                log = np.array([t for t, _ in opened.messages((f"/drocap/{topic}",))])
+                longest = [
+                    (int(b - a) * 1e-9)
+                    for a, b in itertools.pairwise(log)
+                    if not (dead in killed and a <= killed[dead][1] and b >= killed[dead][0])
+                ]
+                gaps[topic] = round(max(longest, default=float("nan")), 3)
+            results[f"{folder_.name}: messages"] = info
+            results[f"{folder_.name}: longest gap s, own death aside"] = gaps
+    say("kills", results)
+    return results
 
 
 if __name__ == "__main__":

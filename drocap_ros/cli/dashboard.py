@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from drocap_ros.nodes.latency import LATENCY, RATE
+from drocap_ros.nodes.latency import LAST_REFUSED, LATENCY, RATE, SUBJECT
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -42,7 +42,9 @@ class Dashboard:
         table = Table("node", "state", "Hz", "late, ms (p50 / p95 / p99)", "what it says", "counts", expand=True)
         for name in self.heard(namespace):
             level, text, values = self._rows[name]
-            counts = ", ".join(f"{key} {value}" for key, value in values.items() if value.isdigit())
+            counts = ", ".join(
+                f"{key} {value}" for key, value in values.items() if value.isdigit() or key in (SUBJECT, LAST_REFUSED)
+            )
             state = f"[{_COLOURS.get(level, 'white')}]{_LEVELS.get(level, str(level))}[/]"
             table.add_row(name, state, values.get(RATE, ""), values.get(LATENCY, ""), text, counts)
         return table

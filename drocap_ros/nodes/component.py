@@ -143,7 +143,7 @@ class ComponentNode(Node):
     def refuse(self, why: str) -> None:
         """Count a message that cannot be used, and say why, also after better ones have come."""
         self.count("messages refused")
-        self.details["last refused"] = why
+        self.details[LAST_REFUSED] = why
         self.report(WARN, why)
 
     def drop_input(self, subscription: Any) -> None:

@@ -8,6 +8,8 @@ import numpy as np
 
 #: Keys of these figures on ``/diagnostics``.
 RATE, LATENCY = "rate Hz", "latency p50 / p95 / p99 ms"
+#: Key of who is followed, and of why the last refused message was refused.
+SUBJECT, LAST_REFUSED = "subject", "last refused"
 #: One number alone, for viewers that plot it.
 LATENCY_P95 = "latency p95 ms"
 

@@ -115,6 +115,7 @@ class PictureOutput:
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="jpeg", daemon=True)
             self._thread.start()
+        self._node.details["images that wait to be encoded"] = str(self._waiting.qsize())
         try:
             self._waiting.put_nowait((picture, jpeg))
         except queue.Full:

@@ -16,6 +16,7 @@ from std_msgs.msg import Header
 
 from drocap_ros.nodes.component import OK, WARN, ComponentNode
 from drocap_ros.nodes.conversions import pose2d_to_ros, stamp_from_ros
+from drocap_ros.nodes.latency import SUBJECT
 from drocap_ros.nodes.picture_channel import PictureInput
 from drocap_ros.nodes.run import node_main
 from drocap_ros.nodes.topics import TOPICS
@@ -55,6 +56,13 @@ class PoseEstimatorNode(ComponentNode):
         self._pose2d.publish(pose2d_to_ros(observation, header.frame_id))
         self.count("images")
         self.produced(observation.stamp_ns)
+        if observation.has_subject:
+            seen = int(np.isfinite(observation.keypoints).all(axis=-1).sum())
+            self.details[SUBJECT] = (
+                f"{observation.track_id}, score {observation.detection_score:.2f}, {seen} of {len(observation.joints)} joints"
+            )
+        else:
+            self.details[SUBJECT] = "none"
         self.report(*((OK, "following the subject") if observation.has_subject else (WARN, "no subject in view")))
 
 
