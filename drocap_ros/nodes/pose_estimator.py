@@ -58,9 +58,8 @@ class PoseEstimatorNode(ComponentNode):
         self.produced(observation.stamp_ns)
         if observation.has_subject:
             seen = int(np.isfinite(observation.keypoints).all(axis=-1).sum())
-            self.details[SUBJECT] = (
-                f"{observation.track_id}, score {observation.detection_score:.2f}, {seen} of {len(observation.joints)} joints"
-            )
+            score, joints = observation.detection_score, len(observation.joints)
+            self.details[SUBJECT] = f"{observation.track_id}, score {score:.2f}, {seen} of {joints} joints"
         else:
             self.details[SUBJECT] = "none"
         self.report(*((OK, "following the subject") if observation.has_subject else (WARN, "no subject in view")))
