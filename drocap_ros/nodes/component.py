@@ -18,7 +18,7 @@ from std_msgs.msg import Empty, String
 
 from drocap_ros.config import section_types
 from drocap_ros.errors import InputError
-from drocap_ros.nodes.latency import LAST_REFUSED, LATENCY, RATE, Latency
+from drocap_ros.nodes.latency import LAST_REFUSED, LATENCY, LATENCY_P95, RATE, Latency
 from drocap_ros.nodes.parameters import declare_parameters
 from drocap_ros.nodes.stamps import StampGate
 from drocap_ros.nodes.topics import GRAPH_QOS, TOPICS, publishers_of, subscribers_of
