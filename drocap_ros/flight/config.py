@@ -33,14 +33,17 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
     )
     heartbeat_hz: float = param(1.0, "rate of our heartbeat", unit="Hz", minimum=0.2, maximum=10)
     attitude_hz: float = param(50.0, "wanted rate of attitude", unit="Hz", minimum=1, maximum=200)
-    position_hz: float = param(20.0, "wanted rate of local position", unit="Hz", minimum=1, maximum=100)
+    position_hz: float = param(30.0, "wanted rate of local position", unit="Hz", minimum=1, maximum=100)
     gimbal_hz: float = param(
         20.0, "wanted rate of the gimbal's attitude; 0 = do not ask", unit="Hz", minimum=0, maximum=100
     )
     status_hz: float = param(
         5.0, "wanted rate of GPS, battery, estimator and landed state", unit="Hz", minimum=0.2, maximum=20
     )
-    time_sync_hz: float = param(2.0, "rate of time synchronization", unit="Hz", minimum=0.1, maximum=20)
+    time_sync_hz: float = param(
+        10.0, "rate of time synchronization; its answers show that the link carries both ways", unit="Hz", minimum=0.1,
+        maximum=20,
+    )  # fmt: skip
     rate_window_s: float = param(3.0, "time over which the real rates are measured", unit="s", minimum=1, maximum=30)
     rate_shortfall: float = param(
         0.5, "share of the wanted rate below which a message is asked for again", minimum=0, maximum=1

@@ -8,6 +8,7 @@ neither arm, nor take off, nor ask for any mode but the control mode and the hol
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -103,7 +104,8 @@ class MavlinkLink:
         self._autopilot: str | None = None
         self._heard_s: float | None = None  # monotonic
         self._due: dict[str, float] = {}
-        self._sync_sent: dict[int, int] = {}
+        self._sync_sent: dict[int, float] = {}  # monotonic s by our stamp, ns
+        self._answered_s = math.nan  # monotonic time at which that was sent which was answered last
         self._broken_s: float | None = None
         self._lock = threading.Lock()
         self._answers: list[tuple[int, int]] = []
@@ -184,6 +186,10 @@ class MavlinkLink:
             answers, self._answers = self._answers, []
         return answers
 
+    def answer_age_s(self) -> float:
+        """Time since that was sent which the autopilot has answered last: the way both ways; NaN before the first."""
+        return self._monotonic_s() - self._answered_s
+
     def status(self) -> LinkStatus:
         """How the link does now."""
         with self._lock:
@@ -260,9 +266,10 @@ class MavlinkLink:
         if message.tc1 == 0:  # the autopilot asks
             self._send(self._mav.timesync_encode(now_ns, message.ts1))
             return
-        sent_ns = self._sync_sent.pop(message.ts1, None)
-        if sent_ns is not None:
-            self.estimator.clock.exchange(sent_ns, message.tc1, now_ns)
+        sent_s = self._sync_sent.pop(message.ts1, None)
+        if sent_s is not None:
+            self._answered_s = sent_s if math.isnan(self._answered_s) else max(self._answered_s, sent_s)
+            self.estimator.clock.exchange(message.ts1, message.tc1, now_ns)
 
     def _send_due(self) -> None:
         config = self.config
@@ -278,7 +285,7 @@ class MavlinkLink:
         if self._is_due("time_sync", 1.0 / config.time_sync_hz):
             if len(self._sync_sent) > 64:
                 self._sync_sent.clear()
-            self._sync_sent[now_ns] = now_ns
+            self._sync_sent[now_ns] = self._monotonic_s()
             self._send(self._mav.timesync_encode(0, now_ns))
         system, component = self.estimator.system_id, self.estimator.component_id
         if self._is_due("request", 0.02):

@@ -20,7 +20,15 @@ from drocap_ros.flight.commands import CommandQueue, command_message
 from drocap_ros.flight.config import MavlinkBridgeConfig
 from drocap_ros.flight.dialects import ARDUPILOT, DIALECTS, Dialect, halt_message, setpoint_message
 from drocap_ros.flight.link import MavlinkLink
-from drocap_ros.flight.orbit_planner import OrbitGoal, OrbitState, advance, begin_orbit, goal_of, least_radius, setpoint_of
+from drocap_ros.flight.orbit_planner import (
+    OrbitGoal,
+    OrbitState,
+    advance,
+    begin_orbit,
+    goal_of,
+    least_radius,
+    setpoint_of,
+)
 from drocap_ros.flight.pose_history import PoseHistory
 from drocap_ros.flight.safety import (
     Action,
@@ -43,6 +51,7 @@ from drocap_ros.perception.observation import PoseObservation
 _NS = 1_000_000_000
 _COMMAND_AGE_S = 2.0
 _CLOCK_JUMP_S = 0.25
+_POSITION_JUMP_M = 1.0
 _GIMBAL_PERIOD_S = 0.5
 _SET_MODE = mavlink.MAV_CMD_DO_SET_MODE
 _GIMBAL = mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW
@@ -98,6 +107,9 @@ class OrbitController:
         self._goal: OrbitGoal = goal_of(config)
         self._orbit: OrbitState | None = None
         self._before: tuple[int, float] | None = None
+        self._left: Setpoint | None = None  # what the watchdog holds if this loop hangs
+        self._jump_m = 0.0  # of the reported position, since the last step
+        self._keypoints: np.ndarray | None = None
         self._gimbal_s = -1e18
         self._start_s = 0.0
 
@@ -106,6 +118,7 @@ class OrbitController:
     def on_state(self, state: VehicleState) -> None:
         """Take a state of the vehicle."""
         with self._lock:
+            self._jump_m = max(self._jump_m, _jump_m(self._vehicle, state))
             self._vehicle = state
             self._history.add(state)
 
@@ -125,7 +138,10 @@ class OrbitController:
     def on_pose2d(self, observation: PoseObservation) -> None:
         """Take the keypoints of one image."""
         with self._lock:
-            if self._camera_matrix is not None:
+            # No two pictures from a flight give the same keypoints bit for bit: these are of one that is frozen.
+            before, self._keypoints = self._keypoints, observation.keypoints
+            frozen = before is not None and observation.has_subject and np.array_equal(before, observation.keypoints)
+            if self._camera_matrix is not None and not frozen:
                 camera = self._history.at(observation.stamp_ns)
                 locked = self.safety.state == State.ORBITING or not math.isnan(self.safety.engaging_s)
                 self._subject.update(observation, self._camera_matrix, camera, locked=locked)
@@ -149,7 +165,7 @@ class OrbitController:
             return self._step(now_ns, now_s)
 
     def _step(self, now_ns: int, now_s: float) -> ControlStatus:
-        disturbance, dt = self._disturbance(now_ns, now_s)
+        disturbance, dt, hung = self._disturbance(now_ns, now_s)
         estimate = self._subject.estimate(now_ns)
         if estimate is not None:  # into the frame of the reported position, by which the setpoints are flown
             estimate = dataclasses.replace(estimate, position=estimate.position + self._history.offset)
@@ -159,6 +175,9 @@ class OrbitController:
         before = self.safety
         limits = self._limits._replace(warm_up_s=dialect.warm_up_s)
         self.safety, decision = reduce(before, seen, now_s, kind, limits)
+        if hung and self.safety.state == State.HOLDING and self._left is not None:
+            # The watchdog has been holding a place already: another one, farther on, would let the vehicle go there.
+            self.safety = dataclasses.replace(self.safety, hold_position=self._left.position, hold_yaw=self._left.yaw)
         if self.safety.state != before.state:
             self._on_change(before, seen, estimate, now_s)
         self._request_mode(decision.mode_request, dialect, now_s)
@@ -167,21 +186,25 @@ class OrbitController:
         self._leave_words(seen, dialect, now_s)
         return self._status(seen, estimate, refusal or decision.answer, sent)
 
-    def _disturbance(self, now_ns: int, now_s: float) -> tuple[str, float]:
+    def _disturbance(self, now_ns: int, now_s: float) -> tuple[str, float, bool]:
+        """What is wrong with our own time, the time since the last step, and whether the watchdog has acted."""
         before, self._before = self._before, (now_ns, now_s)
         hung, asked = self._watchdog.take_fired() if self._watchdog else (False, False)
         if asked and self.safety.modes and self._vehicle is not None:
             dialect = DIALECTS.get(self._vehicle.autopilot, ARDUPILOT)
             self.safety = permit_mode(self.safety, dialect.hold_mode)
         if before is None:
-            return "", 0.0
+            return "", 0.0, hung
         dt = now_s - before[1]
         jump_s = (now_ns - before[0]) / _NS - dt
         if abs(jump_s) > _CLOCK_JUMP_S:
-            return f"our clock jumped by {jump_s:.1f} s", dt
+            return f"our clock jumped by {jump_s:.1f} s", dt, hung
+        moved_m, self._jump_m = self._jump_m, 0.0
+        if moved_m > 0:
+            return f"the reported position jumped by {moved_m:.1f} m", dt, hung
         if hung or dt > self._config.watchdog_s:
-            return f"the control loop stood still for {dt:.1f} s", dt
-        return "", dt
+            return f"the control loop stood still for {dt:.1f} s", dt, hung
+        return "", dt, hung
 
     def _observe(self, estimate: SubjectEstimate | None, disturbance: str, now_ns: int) -> Observed:
         vehicle, estimator = self._vehicle, self._link.estimator
@@ -201,17 +224,20 @@ class OrbitController:
             closing = -float(offset @ vehicle.velocity_enu_m_s[:2]) / max(distance, 1e-3)
             approach = float(offset @ estimate.velocity[:2]) / max(distance, 1e-3)
         echo = estimator.age_s(("POSITION_TARGET_LOCAL_NED",), now_ns)
-        trip = self._link.estimator.clock.round_trip_ns
+        heeded = True
         if not disturbance and self.safety.state == State.ORBITING and math.isfinite(echo):
             flown_s = (self._before[1] if self._before else 0.0) - self.safety.since_s
             if min(echo, flown_s) > self._config.max_echo_age_s:
+                # PX4 must be told another mode; ArduPilot's GUID_TIMEOUT has ended the motion by now, and BRAKE from
+                # there would take longer.
+                heeded = told.autopilot != "px4"
                 disturbance = f"the autopilot has not echoed a setpoint for {echo:.1f} s: it does not follow them"
         return Observed(
             autopilot=told.autopilot, mode=told.mode, in_control=told.mode == dialect.control_mode,
             in_hold=told.mode == dialect.hold_mode, armed=told.armed, landed_state=told.landed_state,
             link_age_s=told.link_age_s, heartbeat_age_s=estimator.age_s(("HEARTBEAT",), now_ns),
             state_age_s=abs(age_s), position_age_s=(now_ns - estimator.position_changed_ns) / _NS,
-            status_age_s=status_age, round_trip_s=math.nan if trip is None else trip / _NS, echo_age_s=echo,
+            status_age_s=status_age, round_trip_s=self._link.answer_age_s(), echo_age_s=echo,
             gps_fix_type=told.gps_fix_type, position_ok=told.position_ok, battery_fraction=told.battery_fraction,
             position=position, velocity=np.asarray(vehicle.velocity_enu_m_s, float), yaw=_yaw(vehicle),
             height_m=float(position[2]) - self._config.ground_height_m,
@@ -219,7 +245,7 @@ class OrbitController:
             subject_age_s=math.inf if estimate is None else estimate.age_s,
             subject_sd_m=math.inf if estimate is None else estimate.position_sd_m,
             subject_distance_m=distance, closing_m_s=closing, approach_m_s=approach, disturbance=disturbance,
-            settings_problem=self._link.settings.problem(self._config.max_control_timeout_s),
+            heeded=heeded, settings_problem=self._link.settings.problem(self._config.max_control_timeout_s),
         )  # fmt: skip
 
     def _next_command(self, now_ns: int) -> tuple[Command | None, str]:
@@ -315,7 +341,8 @@ class OrbitController:
         words = None
         if self.safety.state == State.ORBITING and np.isfinite(seen.position).all() and math.isfinite(seen.yaw):
             mav, target = self._link.mav, self._link.target
-            hold = setpoint_message(mav, target, hold_setpoint(seen.position, seen.yaw))
+            self._left = hold_setpoint(seen.position, seen.yaw)
+            hold = setpoint_message(mav, target, self._left)
             mode = command_message(mav, target, _SET_MODE, 0, dialect.mode_parameters(True))
             words = LastWords(self._link.check_motion(hold), self._link.check_motion(mode))
         self._watchdog.kick(now_s, words)
@@ -337,6 +364,18 @@ class OrbitController:
             radius_error_m=seen.subject_distance_m - self._goal.radius_m if orbiting else math.nan,
             yaw_error_deg=yaw_error, subject_position=subject, action=sent,
         )  # fmt: skip
+
+
+def _jump_m(before: VehicleState | None, state: VehicleState) -> float:
+    """How far the reported position is from where the last one was going; 0 = near enough."""
+    if before is None:
+        return 0.0
+    dt = (state.stamp_ns - before.stamp_ns) / _NS
+    if not 0 < dt < 0.5:
+        return 0.0
+    mean = 0.5 * (before.velocity_enu_m_s + state.velocity_enu_m_s)
+    jump = float(np.linalg.norm(state.position_enu_m - before.position_enu_m - mean * dt))
+    return jump if jump > _POSITION_JUMP_M else 0.0  # NaN is no jump
 
 
 def _yaw(vehicle: VehicleState) -> float:

@@ -22,6 +22,7 @@ _BLIND_MODE_REQUEST_S = 2.0
 _BLIND_STOP_S = 10.0
 _REACTION_S = 0.5
 _DEAD_RECKONING_S = 0.6
+_LEAST_SUBJECT_AGE_S = 0.25
 _HOLD_MODE_PATIENCE_S = 5.0
 _LANDED_BAD = {1: "on the ground", 3: "taking off", 4: "landing"}
 
@@ -73,7 +74,9 @@ class Observed:
     height_m : above the subject's ground
     subject_distance_m : horizontal
     closing_m_s, approach_m_s : how fast the vehicle moves towards the subject, and the subject towards the vehicle
+    round_trip_s : since the sending of what was answered last; NaN = nothing yet
     disturbance : something that ends motion and that no other field tells, in words
+    heeded : whether the autopilot follows our setpoints; if not, only a mode can stop it
     settings_problem : what in the autopilot's own settings forbids to fly, in words
     """
 
@@ -104,6 +107,7 @@ class Observed:
     closing_m_s: float = 0.0
     approach_m_s: float = 0.0
     disturbance: str = ""
+    heeded: bool = True
     settings_problem: str = ""
 
 
@@ -169,7 +173,7 @@ def vehicle_problem(seen: Observed, limits: Limits) -> str:
     if seen.position_age_s > safety.max_state_age_s:
         return f"the vehicle's position has not changed for {seen.position_age_s:.1f} s: telemetry lost or frozen"
     if seen.round_trip_s > safety.max_round_trip_s:
-        return f"the link's round trip takes {seen.round_trip_s:.1f} s"
+        return f"the autopilot has answered nothing that was sent within the last {seen.round_trip_s:.1f} s"
     if not (np.isfinite(seen.position).all() and np.isfinite(seen.velocity).all() and math.isfinite(seen.yaw)):
         return "the vehicle's position, velocity or heading is unknown"
     if not seen.armed:
@@ -218,7 +222,9 @@ def subject_problem(seen: Observed, limits: Limits) -> str:
     safety = limits.safety
     if seen.subject is None:
         return "no subject is tracked"
-    if not -0.2 < seen.subject_age_s <= safety.max_subject_age_s:
+    speed = float(np.linalg.norm(np.nan_to_num(seen.velocity)))
+    oldest_s = min(safety.max_subject_age_s, max(safety.max_blind_m / max(speed, 1e-3), _LEAST_SUBJECT_AGE_S))
+    if not -0.2 < seen.subject_age_s <= oldest_s:
         return f"the subject was last located {_ago(seen.subject_age_s)}"
     if not seen.subject_sd_m <= safety.max_subject_sd_m:
         return f"the subject's position is uncertain by {seen.subject_sd_m:.1f} m"
@@ -405,7 +411,8 @@ def _hold(state: SafetyState, reason: str, seen: Observed, now_s: float, blind: 
     behind_s = 0.0 if fresh else max(seen.position_age_s - seen.state_age_s, 0.0)
     place = seen.position + seen.velocity * behind_s if known else None
     return dataclasses.replace(
-        state, state=State.HOLDING, since_s=now_s, reason=reason, blind=blind and not fresh, rest_s=math.nan,
+        state, state=State.HOLDING, since_s=now_s, reason=reason, blind=blind and not fresh,
+        rest_s=math.nan if seen.heeded else now_s,
         hold_position=place, hold_yaw=seen.yaw,
     )  # fmt: skip
 

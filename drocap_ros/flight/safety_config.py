@@ -17,19 +17,26 @@ class SafetyConfig(Parameters):
         False, "whether the operator's `engage` may change the mode to GUIDED or OFFBOARD; `start` never does"
     )
     max_subject_age_s: float = param(0.4, "greatest age of the subject's position", unit="s", minimum=0.05, maximum=2)
+    max_blind_m: float = param(
+        0.85, "greatest distance flown on one sight of the subject: at speed its age is limited further, to this over "
+        "the speed, not below 0.25 s", unit="m", minimum=0.1, maximum=10,
+    )  # fmt: skip
     max_subject_sd_m: float = param(
         1.5, "greatest standard deviation of the subject's position", unit="m", minimum=0.05, maximum=10
     )
     max_state_age_s: float = param(
-        0.3, "greatest age of the vehicle's attitude and position", unit="s", minimum=0.05, maximum=2
+        0.2, "greatest age of the vehicle's attitude and position: 0.4 m at 2 m/s", unit="s", minimum=0.05, maximum=2
     )
     max_status_age_s: float = param(
         1.5, "greatest age of GPS, estimator and battery messages", unit="s", minimum=0.3, maximum=10
     )
     max_heartbeat_age_s: float = param(2.5, "greatest age of the flight mode", unit="s", minimum=0.3, maximum=10)
-    max_round_trip_s: float = param(0.5, "greatest round trip on the link", unit="s", minimum=0.02, maximum=5)
+    max_round_trip_s: float = param(
+        0.5, "greatest time since the sending of what the autopilot has answered last", unit="s", minimum=0.02,
+        maximum=5,
+    )  # fmt: skip
     max_echo_age_s: float = param(
-        1.5, "time without the autopilot's echo of our setpoints after which it is taken not to follow them",
+        0.5, "time without the autopilot's echo of our setpoints after which it is taken not to follow them",
         unit="s", minimum=0.3, maximum=10,
     )  # fmt: skip
     min_battery_fraction: float = param(0.25, "least charge of the battery", minimum=0, maximum=1)

@@ -11,7 +11,7 @@ from drocap_ros.flight.config import MavlinkBridgeConfig
 
 _NS = 1_000_000_000
 _FAST_HEARTBEAT_HZ = 5.0
-_ECHO_HZ = 5.0
+_ECHO_HZ = 10.0
 
 
 @dataclass

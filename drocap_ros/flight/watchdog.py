@@ -11,6 +11,7 @@ _PERIOD_S = 0.1
 _LOOK_S = 0.02
 _ASK_MODE_S = 3.0
 _GIVE_UP_S = 10.0
+_STOPPED_S = 0.5
 
 
 class LastWords(NamedTuple):
@@ -32,7 +33,8 @@ class Watchdog:
     def __init__(self, send: Callable[[Any], None], limit_s: float) -> None:
         self._send, self._limit_s = send, limit_s
         self._left: tuple[float, LastWords | None] = (-1e18, None)  # replaced whole: no lock
-        self._sent_s = -1e18
+        self._sent_s = self._looked_s = -1e18
+        self._stood_s = 0.0  # how long this thread itself stood still since the loop was last heard of
         self.fired = False
         self.mode_asked = False
         self._stop = threading.Event()
@@ -40,11 +42,16 @@ class Watchdog:
 
     def kick(self, now_s: float, words: LastWords | None) -> None:
         """The loop is alive; ``words`` is None while nothing is commanded."""
-        self._left = (now_s, words)
+        self._left, self._stood_s = (now_s, words), 0.0
 
     def step(self, now_s: float) -> None:
         """Look at the loop and act."""
         left_s, words = self._left
+        gap_s, self._looked_s = now_s - max(self._looked_s, left_s), now_s
+        if gap_s > self._limit_s:  # the whole process was stopped, the loop too: it comes back with us
+            self._stood_s += gap_s
+        if self._stood_s > _STOPPED_S:
+            return  # the autopilot's time-out has ended the motion; the place that was left is of another time
         silent_s = now_s - left_s
         if words is None or not self._limit_s < silent_s < _GIVE_UP_S or now_s - self._sent_s < _PERIOD_S:
             return

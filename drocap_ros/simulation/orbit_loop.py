@@ -171,6 +171,7 @@ class OrbitLoop:
             if not self.stopped:
                 for state in self.link.spin_once(0.0):
                     self.controller.on_state(state)
+                self.watchdog.step(self.t)
         if self.t < self._next_control - 1e-9:
             return
         self._next_control += 1.0 / self.settings.config.control_hz
@@ -184,8 +185,6 @@ class OrbitLoop:
             told = (status.state.name, status.reason)
             if not self.reasons or self.reasons[-1][1:] != told:
                 self.reasons.append((self.t, *told))
-        if not self.stopped:
-            self.watchdog.step(self.t)
         self._note(status)
 
     def _note(self, status: ControlStatus | None) -> None:
