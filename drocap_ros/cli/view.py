@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from drocap_ros.cli.live import check_domain, import_bringup, stop_signals
 from drocap_ros.cli.motion_input import read_motion
 from drocap_ros.cli.output import output_file
+from drocap_ros.cli.progress import progress_bars
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
@@ -110,7 +111,8 @@ def _view_motion(recording: rerun.RecordingStream, args: argparse.Namespace) -> 
     _, motion = read_motion(args.input)
     pictures = each_picture(args.video, motion) if args.video else ()
     with _shown(recording, PLOTS, args):
-        draw_motion(Scene(recording), motion, pictures)
+        with progress_bars(args.quiet) as progress:
+            draw_motion(Scene(recording), motion, pictures, progress)
 
 
 def _view_session(recording: rerun.RecordingStream, args: argparse.Namespace) -> None:
@@ -124,7 +126,8 @@ def _view_session(recording: rerun.RecordingStream, args: argparse.Namespace) ->
     with open_session(args.input) as session:
         with _shown(recording, (*PLOTS, "log"), args):
             view = MessageView(Scene(recording))
-            draw_session(view, session, args.namespace)
+            with progress_bars(args.quiet) as progress:
+                draw_session(view, session, args.namespace, progress)
         for warning in session.warnings:
             print(f"drocap: warning: {warning}", file=sys.stderr)
         _warn_refused(view)
@@ -137,6 +140,7 @@ def _view_live(recording: rerun.RecordingStream, args: argparse.Namespace) -> in
     namespace = args.namespace or "/drocap"
     with import_bringup().watch(namespace, args.domain_id) as graph, _shown(recording, (*PLOTS, "log"), args):
         view = MessageView(Scene(recording), picture_hz=None if args.save else LIVE_PICTURE_HZ)
+        view.namespace = namespace
         _subscribe(graph, view)
         end = math.inf if args.seconds is None else time.monotonic() + args.seconds
         with stop_signals() as stop:

@@ -28,6 +28,7 @@ _NEAR_NS = 500_000_000
 _REFINED_LAG_NS = 2 * 10**9
 #: A delay longer than this is that of another clock.
 _LONGEST_S = 60.0
+_OURS = "drocap_ros"
 _LEVELS = {0: "INFO", 1: "WARN", 2: "ERROR", 3: "WARN"}
 _MAGIC = {b"\xff\xd8": "image/jpeg", b"\x89P": "image/png"}
 
@@ -58,6 +59,8 @@ class MessageView:
         self._pending: list[Any] = []
         self._told: dict[str, tuple[int, str]] = {}
         self.taken = self.refused = 0
+        #: Nodes of ours in another namespace are not listened to; empty = all are.
+        self.namespace = ""
         #: Last part of a topic's name (two parts where one says too little) -> what draws its messages.
         self.handlers: dict[str, Callable[[Any, int], None]] = {
             "pose2d": self._on_pose2d,
@@ -226,7 +229,10 @@ class MessageView:
 
     def _on_diagnostics(self, message: Any, _: int) -> None:
         self._at_newest(message)
+        inside = self.namespace.strip("/") + "/" if self.namespace else ""
         for status in message.status:
+            if status.hardware_id == _OURS and not status.name.startswith(inside):
+                continue
             # rclpy gives the level as one byte.
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
             self._tell(status.name, level, status.message, _LEVELS.get(level, "WARN"))

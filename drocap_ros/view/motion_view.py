@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -17,7 +17,12 @@ PLOTS = ("reprojection_px", "confidence")
 _LONG_SIDE = 960
 
 
-def draw_motion(scene: Scene, motion: Motion, pictures: Iterable[tuple[int, np.ndarray]] = ()) -> None:
+def draw_motion(
+    scene: Scene,
+    motion: Motion,
+    pictures: Iterable[tuple[int, np.ndarray]] = (),
+    progress: Callable[[str, float], None] = lambda stage, done: None,
+) -> None:
     """Every frame of a motion at its stamp, and its pictures: frame and image (H, W, 3) uint8 BGR.
 
     A motion does not hold the camera's place: it is drawn from where the body would look as in its picture, with a
@@ -29,10 +34,13 @@ def draw_motion(scene: Scene, motion: Motion, pictures: Iterable[tuple[int, np.n
         zoom = min(1.0, _LONG_SIDE / max(size))
         scene.at(int(motion.stamp_ns[index]))
         scene.image(_shrunk(image, zoom))
-    _draw_frames(scene, motion, motion.keypoints * zoom, (round(size[0] * zoom), round(size[1] * zoom)))
+        progress("pictures", (index + 1) / len(motion.stamp_ns))
+    _draw_frames(scene, motion, motion.keypoints * zoom, (round(size[0] * zoom), round(size[1] * zoom)), progress)
 
 
-def _draw_frames(scene: Scene, motion: Motion, keypoints: np.ndarray, size: tuple[int, int]) -> None:
+def _draw_frames(
+    scene: Scene, motion: Motion, keypoints: np.ndarray, size: tuple[int, int], progress: Callable[[str, float], None]
+) -> None:
     joints_of = JointSet("motion", motion.joints, motion.parents)
     joints = upright_joints(motion)
     rotation = motion.camera_rotation
@@ -55,6 +63,7 @@ def _draw_frames(scene: Scene, motion: Motion, keypoints: np.ndarray, size: tupl
         seen = np.isfinite(error[i])
         scene.plot("reprojection_px/mean", float(error[i][seen].mean()) if seen.any() else math.nan)
         scene.plot("confidence/mean", float(np.nan_to_num(motion.confidence[i]).mean()))
+        progress("frames", (i + 1) / len(motion.stamp_ns))
 
 
 def _image_size(motion: Motion) -> tuple[int, int]:

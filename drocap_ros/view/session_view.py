@@ -2,31 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from drocap_ros.errors import InputError
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Session
 from drocap_ros.view.message_view import MessageView
 
 
-def draw_session(view: MessageView, session: Session, namespace: str | None = None) -> None:
+def draw_session(
+    view: MessageView,
+    session: Session,
+    namespace: str | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> None:
     """Every message of a recording that can be drawn, in the order of the recording.
 
     Parameters
     ----------
-    namespace : of the topics; None = that of the topic of keypoints, poses or pictures with most messages
+    namespace : of the topics; None = that with most keypoints, poses and pictures
+    progress : called with a name and the share that is drawn
 
     Raises
     ------
     InputError
         When there is nothing to draw.
     """
-    named = _topics(view, session, namespace)
+    named, view.namespace = _topics(view, session, namespace)
+    start_ns, duration_ns = session.info.start_ns or 0, max(session.info.duration_s * 1e9, 1.0)
     for raw, message in session.messages(tuple(named)):
         view.take(named[raw.topic], message, raw.log_time_ns)
+        if progress is not None:
+            progress("messages", (raw.log_time_ns - start_ns) / duration_ns)
     view.finish()
 
 
-def _topics(view: MessageView, session: Session, namespace: str | None) -> dict[str, str]:
-    """Topic of the recording -> its name in the graph."""
+def _topics(view: MessageView, session: Session, namespace: str | None) -> tuple[dict[str, str], str]:
+    """Topic of the recording -> its name in the graph, and the graph's namespace."""
     there = [topic for topic in session.info.topics if topic.count]
     spaces: dict[str, int] = {}
     for topic in there:
@@ -34,7 +45,7 @@ def _topics(view: MessageView, session: Session, namespace: str | None) -> dict[
             if topic.name.endswith("/" + name):
                 space = topic.name[: -len(name) - 1]
                 spaces[space] = spaces.get(space, 0) + topic.count
-    space = max(spaces, key=lambda s: (spaces[s], s), default="") if namespace is None else namespace.rstrip("/")
+    space = max(spaces, key=lambda s: (spaces[s], s), default="") if namespace is None else "/" + namespace.strip("/")
     named = {f"{space}/{name}": name for name in view.handlers if not name.startswith("/")}
     found = {topic.name: named[topic.name] for topic in there if topic.name in named}
     if not found and namespace is None:
@@ -47,4 +58,4 @@ def _topics(view: MessageView, session: Session, namespace: str | None) -> dict[
             f"{session.path}: expected keypoints, poses or pictures, found the topics {listed}; record some"
         )
     found.update({topic.name: topic.name for topic in there if topic.name == "/diagnostics"})
-    return found
+    return found, space
