@@ -13,8 +13,8 @@ from drocap_ros.reconstruction.lifter import Lifter
 from drocap_ros.reconstruction.metrics import limb_lengths
 from drocap_ros.skeleton import BODY_15
 
-#: The proportions are looked at anew after so many images; so many looks are remembered.
-LOOK_EVERY, LOOKS = 12, 40
+#: The proportions are looked at after so many images first, and then anew; so many looks are remembered.
+FIRST_LOOK, LOOK_EVERY, LOOKS = 12, 24, 40
 
 #: Images over which the size in the image is remembered.
 SIZE = 30
@@ -72,7 +72,7 @@ class LiftedStart:
         belief = np.zeros(points.shape[:2])
         belief[slot] = [c for _, _, c in self._past]
         self._since_look += 1
-        if self._since_look >= LOOK_EVERY:
+        if self._since_look >= (LOOK_EVERY if self._proportions else FIRST_LOOK):
             self._since_look = 0
             self._look(points, belief, fps)
         lifted = self._lifter.lift_last(points, belief, fps, self._lengths_px())

@@ -98,7 +98,7 @@ def test_a_gap_forgets_the_hypotheses_but_not_the_size(start: str, dictionary: D
     else:
         assert initializer._lifted is not None
         assert len(initializer._lifted._past) == 1
-        assert len(initializer._lifted._proportions) == 2
+        assert len(initializer._lifted._proportions) == 1
 
 
 def test_the_window_drops_duplicates_and_late_frames() -> None:

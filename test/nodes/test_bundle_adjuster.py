@@ -1,0 +1,132 @@
+"""Initializer and bundle adjuster in the running graph, through all that can happen to a stream."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drocap_ros.bringup import bringup
+from drocap_ros.config import DrocapConfig
+from drocap_ros.live_session import reconstruct_live, recorded_config
+from drocap_ros.nodes.conversions import pose2d_to_ros, stamp_from_ros
+from drocap_ros.nodes.topics import TOPICS
+from drocap_ros.perception.observation import PoseObservation
+from drocap_ros.recording.session import open_session
+from drocap_ros.simulation.capture import simulate_capture
+
+NODES = ("initializer", "bundle_adjuster", "session_recorder")
+S = 10**9
+BEGIN = 1_790_000_000 * S
+
+
+def observed(seconds, track_id=1, begin_ns=BEGIN, seed=0):
+    tracks = simulate_capture(seconds, 20.0, seed=seed).tracks
+    return [
+        PoseObservation(
+            begin_ns + int(stamp - tracks.stamp_ns[0]),
+            track_id,
+            tracks.image_size,
+            keypoints=tracks.keypoints[i].astype(np.float32),
+            covariance=tracks.covariance[i].astype(np.float32),
+            confidence=tracks.confidence[i].astype(np.float32),
+        )
+        for i, stamp in enumerate(tracks.stamp_ns)
+    ]
+
+
+def eventful():
+    """A stream with a duplicate, a late, a stray and a blind image, a gap, a second round and another subject."""
+    first = observed(3.0)
+    unseen = {"keypoints": np.full((15, 2), np.nan), "covariance": np.full((15, 3), np.nan), "confidence": np.zeros(15)}
+    unseen = {name: values.astype(np.float32) for name, values in unseen.items()}
+    blind = replace(first[29], stamp_ns=first[29].stamp_ns + 1, **unseen)
+    stray = observed(0.05, begin_ns=BEGIN + 600 * S)[:1]  # further away the door refuses it
+    gap = observed(2.0, begin_ns=BEGIN + 6 * S, seed=1)
+    other = observed(2.5, track_id=2, begin_ns=BEGIN + 3 * S, seed=2)
+    return [*first[:30], first[29], first[20], *stray, blind, *first[30:], *gap, *first, *other]
+
+
+def fly(folder, observations, pause_s=0.012, **adjuster):
+    """Publish the observations to a recorded graph; gives latest poses, windows and what /diagnostics counted."""
+    config = DrocapConfig().replace("session_recorder", session_dir=str(folder))
+    config = config.replace("bundle_adjuster", period_s=0.5, window_s=4.0, **adjuster)
+    seen = {topic: [] for topic in ("pose3d/initial", "pose3d/latest", "pose3d/refined", "/diagnostics")}
+    with bringup(config, NODES) as graph:
+        for topic, messages in seen.items():
+            graph.node.create_subscription(TOPICS[topic].message, topic, messages.append, TOPICS[topic].qos)
+        publisher = graph.node.create_publisher(TOPICS["pose2d"].message, "pose2d", TOPICS["pose2d"].qos)
+        graph.wait_until(lambda: publisher.get_subscription_count() == 3, 20, "the nodes to listen")
+        for observation in observations:
+            publisher.publish(pose2d_to_ros(observation, "camera"))
+            graph.spin_for(pause_s)
+        last = observations[-1].stamp_ns
+        graph.wait_until(
+            lambda: any(stamp_from_ros(m.header.stamp) == last for m in seen["pose3d/latest"][-1:]), 30, "the last pose"
+        )
+        reports = len(seen["/diagnostics"])
+        graph.wait_until(lambda: len(seen["/diagnostics"]) > reports + 6, 20, "the counts on /diagnostics")
+    counts = {}
+    for message in seen["/diagnostics"]:
+        for status in message.status:
+            counts.setdefault(status.name.rsplit("/", 1)[-1], {}).update({v.key: v.value for v in status.values})
+    return seen, counts
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("events") / "session"
+    return folder, *fly(folder, eventful())
+
+
+def test_each_event_is_counted_with_its_reason(flown):
+    _, _, counts = flown
+    found = counts["initializer"]
+    assert found["dropped: duplicate stamp"] == "1"
+    assert found["dropped: late: its stamp lies before the last one"] == "1"
+    # Ten minutes ahead, and the first image of the second round, which alone could be a stray as well.
+    assert found["dropped: stamp far from the stream's"] == "2"
+    assert found["time jumped: started anew"] == "1"
+    assert found["another subject"] == "1"
+    assert found["continued after a gap"] == "1"
+    assert found["images that show too little of the person"] == "1"
+    adjuster = counts["bundle_adjuster"]
+    assert adjuster["time jumped: started anew"] == "1"
+    assert adjuster["another subject"] == "1"
+    assert int(adjuster["adjustments"]) >= 6
+
+
+def test_every_initial_pose_has_its_latest(flown):
+    _, seen, _ = flown
+    stamps = [[stamp_from_ros(m.header.stamp) for m in seen[t]] for t in ("pose3d/initial", "pose3d/latest")]
+    assert stamps[0] == stamps[1]
+    # Of 60 + 40 + 60 + 50 images and the blind one, the second round's first was dropped.
+    assert len(stamps[0]) == 210
+    stages = {m.stage for m in seen["pose3d/latest"]}
+    assert stages == {TOPICS["pose3d/latest"].message.INITIAL, TOPICS["pose3d/latest"].message.REFINED}
+
+
+def test_no_window_mixes_subjects_or_rounds(flown):
+    _, seen, _ = flown
+    for window in seen["pose3d/refined"]:
+        stamps = np.array([stamp_from_ros(pose.header.stamp) for pose in window.poses])
+        assert (np.diff(stamps) > 0).all()
+        assert len({pose.track_id for pose in window.poses}) == 1
+        assert stamps[-1] - stamps[0] < 3 * S
+        assert np.diff(stamps).max() < S
+
+
+@pytest.mark.parametrize("hurry", [False, True], ids=["in time", "always late"])
+def test_the_recording_gives_the_same_bits_again(flown, tmp_path, hurry):
+    folder = flown[0]
+    if hurry:
+        folder = tmp_path / "session"
+        seen, counts = fly(folder, observed(4.0), pause_s=0.045, max_solve_s=0.01, max_stride=2)
+        assert int(counts["bundle_adjuster"]["adjustments cut short: the time was over"]) >= 2
+        assert any("deadline" in window.stop_reason for window in seen["pose3d/refined"])
+        assert any("every 2. image" in window.stop_reason for window in seen["pose3d/refined"])
+    with open_session(folder) as session:
+        _, _, agreement = reconstruct_live(session, recorded_config(session))
+    assert agreement.initial[0] == agreement.initial[1] >= 80
+    assert agreement.windows[0] == agreement.windows[1] >= 4
