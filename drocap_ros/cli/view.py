@@ -110,9 +110,8 @@ def _view_motion(recording: rerun.RecordingStream, args: argparse.Namespace) -> 
 
     _, motion = read_motion(args.input)
     pictures = each_picture(args.video, motion) if args.video else ()
-    with _shown(recording, PLOTS, args):
-        with progress_bars(args.quiet) as progress:
-            draw_motion(Scene(recording), motion, pictures, progress)
+    with _shown(recording, PLOTS, args), progress_bars(args.quiet) as progress:
+        draw_motion(Scene(recording), motion, pictures, progress)
 
 
 def _view_session(recording: rerun.RecordingStream, args: argparse.Namespace) -> None:
