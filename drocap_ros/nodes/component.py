@@ -54,6 +54,8 @@ class ComponentNode(Node):
         self.details: dict[str, str] = {}
         self._latency = Latency()
         self.started = False
+        #: Whether messages are taken; only a managed node is ever not active.
+        self.active = True
         self.callbacks_done = 0
         self._level = OK
         self._text = "running"
@@ -130,6 +132,8 @@ class ComponentNode(Node):
 
         def run(*arguments: Any) -> None:
             self.callbacks_done += 1
+            if not self.active:
+                return
             try:
                 if gate is not None and not isinstance(arguments[0], bytes):
                     stamp = arguments[0].header.stamp

@@ -15,12 +15,14 @@ from collections.abc import Iterator
 from typing import Any
 
 from rclpy.qos import qos_profile_sensor_data
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
 from drocap_ros.errors import DrocapError, InputError
-from drocap_ros.nodes.component import ERROR, OK, WARN, ComponentNode
+from drocap_ros.nodes.component import ERROR, OK, WARN
 from drocap_ros.nodes.conversions import camera_info_to_ros, header_at, stamp_from_ros
+from drocap_ros.nodes.managed import ManagedComponent
 from drocap_ros.nodes.picture_channel import PictureOutput
 from drocap_ros.nodes.run import node_main
 from drocap_ros.nodes.stamps import StampGate
@@ -34,10 +36,12 @@ _TOPIC = "topic:"
 _LATE_S = 0.1
 
 
-class ImageIngestNode(ComponentNode):
+class ImageIngestNode(ManagedComponent):
     """Reads its source in a thread of its own, so that a slow source never blocks the node."""
 
     component = "image_ingest"
+
+    begins_with_graph = True
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
@@ -48,30 +52,47 @@ class ImageIngestNode(ComponentNode):
         self._arrived_s = time.monotonic()
         self._stop = threading.Event()
         self._source: ImageSource | None = None
-        self._thread = threading.Thread(target=self._run, name="image_ingest", daemon=True)
+        self._topic: Any = None
+        self._thread: threading.Thread | None = None
+        self.create_timer(0.5, self._watch)
+        self.set_up()
+
+    def acquire(self) -> None:
+        """Open the source, or subscribe to the topic that is one."""
+        self._stop.clear()
         if self.config.source.startswith(_TOPIC):
-            self._subscribe(self.config.source.removeprefix(_TOPIC))
+            self._topic = self._subscribe(self.config.source.removeprefix(_TOPIC))
         else:
             self._source = open_source(self.config.source, self.config)
             self._camera = camera_model(self.config, self._source.size)
-        self.create_timer(0.5, self._watch)
 
-    def on_start(self) -> None:
-        """Begin to read."""
-        if self._source is not None:
+    def begin(self) -> None:
+        """Begin to read, or go on: a file has run on meanwhile, as a camera would."""
+        self._arrived_s = time.monotonic()
+        if self._source is not None and self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="image_ingest", daemon=True)
             self._thread.start()
 
-    def close(self) -> None:
+    def release(self) -> None:
         """Stop reading and release the source."""
         self._stop.set()
         # A live source waits for pictures and ends only by being closed; a file must not be closed while it is read.
         if self._source is not None and self._source.live:
             self._source.close()
-        if self._thread.is_alive():
+        if self._thread is not None:
             self._thread.join(timeout=5.0)
-        self._pictures.close()
+            self._thread = None
         if self._source is not None:
             self._source.close()
+            self._source = None
+        if self._topic is not None:
+            self.destroy_subscription(self._topic)
+            self._topic = None
+
+    def close(self) -> None:
+        """The end: nothing is held, all is sent."""
+        self.release()
+        self._pictures.close()
 
     # -- files, cameras, streams -----------------------------------------------------------------------
 
@@ -80,6 +101,8 @@ class ImageIngestNode(ComponentNode):
             for frame in self._frames():
                 if self._stop.is_set():
                     return
+                if not self.active:
+                    continue
                 self._publish(header_at(frame.stamp_ns, self.config.frame_id), frame)
             self.report(OK, "the source has ended")
         except DrocapError as error:
@@ -129,14 +152,14 @@ class ImageIngestNode(ComponentNode):
 
     # -- image topics ----------------------------------------------------------------------------------
 
-    def _subscribe(self, topic: str) -> None:
+    def _subscribe(self, topic: str) -> Subscription:
         if not topic:
             raise InputError(f"source: expected {_TOPIC}NAME of an image topic, got no name")
         compressed = topic.endswith("compressed")
         gate = StampGate()
 
         def take(message: Any) -> None:
-            if not self.started:
+            if not self.active:
                 return
             try:
                 gate.check(message.header.stamp.sec, message.header.stamp.nanosec)
@@ -145,8 +168,8 @@ class ImageIngestNode(ComponentNode):
                 self.refuse(f"{topic}: {error}")
 
         kind = CompressedImage if compressed else Image
-        self.create_subscription(kind, topic, take, qos_profile_sensor_data)
         self.report(WARN, f"waiting for {kind.__name__} on {topic}")
+        return self.create_subscription(kind, topic, take, qos_profile_sensor_data)
 
     def _take(self, message: Any, compressed: bool) -> None:
         stamp_ns = stamp_from_ros(message.header.stamp)
@@ -181,7 +204,7 @@ class ImageIngestNode(ComponentNode):
             self.count(f"source {event.kind}")
         waits_on_others = self._source is None or self._source.live
         silence_s = time.monotonic() - self._arrived_s
-        if self.started and waits_on_others and silence_s > self.config.stall_timeout_s:
+        if self.active and waits_on_others and silence_s > self.config.stall_timeout_s:
             self.report(
                 WARN, f"no image from {self.config.source} for {silence_s:.1f} s; check the camera and its link"
             )

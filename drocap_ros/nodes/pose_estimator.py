@@ -14,9 +14,10 @@ import numpy as np
 from sensor_msgs.msg import RegionOfInterest
 from std_msgs.msg import Header
 
-from drocap_ros.nodes.component import OK, WARN, ComponentNode
+from drocap_ros.nodes.component import OK, WARN
 from drocap_ros.nodes.conversions import pose2d_to_ros, stamp_from_ros
 from drocap_ros.nodes.latency import SUBJECT
+from drocap_ros.nodes.managed import ManagedComponent
 from drocap_ros.nodes.picture_channel import PictureInput
 from drocap_ros.nodes.run import node_main
 from drocap_ros.nodes.topics import TOPICS
@@ -25,22 +26,31 @@ from drocap_ros.perception.models import models_folder
 from drocap_ros.recording.pictures import image_from_message
 
 
-class PoseEstimatorNode(ComponentNode):
+class PoseEstimatorNode(ManagedComponent):
     """Runs detection, subject tracking and 2D pose on every picture that arrives while it is free."""
 
     component = "pose_estimator"
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
-        self._estimator = PoseEstimator(models_folder(self.config.models_dir or None), self.config)
-        if self._estimator.limited_use:
-            self.details["networks"] = self._estimator.limited_use
+        self._estimator: PoseEstimator | None = None
         self._roi: np.ndarray | None = None
         self._pose2d = self.output("pose2d")
         self._pictures = PictureInput(
             self, self._on_image, partial(image_from_message, compressed=True), TOPICS["image/compressed"].qos.depth
         )
         self.input("roi", self._on_roi)
+        self.set_up()
+
+    def acquire(self) -> None:
+        """Load the networks."""
+        self._estimator = PoseEstimator(models_folder(self.config.models_dir or None), self.config)
+        if self._estimator.limited_use:
+            self.details["networks"] = self._estimator.limited_use
+
+    def release(self) -> None:
+        """Forget the networks and the subject."""
+        self._estimator, self._roi = None, None
 
     def _on_roi(self, message: RegionOfInterest) -> None:
         x, y = message.x_offset, message.y_offset
@@ -51,6 +61,7 @@ class PoseEstimatorNode(ComponentNode):
         self._pictures.close()
 
     def _on_image(self, header: Header, image: np.ndarray) -> None:
+        assert self._estimator is not None, "no message is taken before the node is active"
         observation = self._estimator.process(image, stamp_from_ros(header.stamp), self._roi)
         self._roi = None
         self._pose2d.publish(pose2d_to_ros(observation, header.frame_id))

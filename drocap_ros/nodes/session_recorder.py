@@ -19,7 +19,8 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
 
-from drocap_ros.nodes.component import ERROR, HARDWARE_ID, OK, WARN, ComponentNode
+from drocap_ros.nodes.component import ERROR, HARDWARE_ID, OK, WARN
+from drocap_ros.nodes.managed import ManagedComponent
 from drocap_ros.nodes.parameter_survey import ParameterSurvey
 from drocap_ros.nodes.run import node_main
 from drocap_ros.nodes.topics import IMAGE_RECORDING_QOS, TOPICS
@@ -36,31 +37,52 @@ from drocap_ros.recording.provenance import (
 from drocap_ros.recording.schemas import schema_text
 from drocap_ros.recording.session_writer import SessionWriter
 
+_IMAGES = "image/compressed"
 
-class SessionRecorderNode(ComponentNode):
+
+class SessionRecorderNode(ManagedComponent):
     """Hands the bytes of every message to the writer's queue."""
 
     component = "session_recorder"
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
-        folder = Path(self.config.session_dir or dated_name(self.get_clock().now().nanoseconds))
-        if self.config.if_taken == "next":
-            folder = _free_name(folder)
-        self._writer = SessionWriter(folder, self.config, session_provenance(self.get_namespace()))
-        self._survey = ParameterSurvey(self, self._on_parameters)
+        self._writer: SessionWriter | None = None
+        self._survey: ParameterSurvey | None = None
         self._calibrated = False
+        self._sessions = 0
         special = {"camera_info": self._on_camera_info, "/diagnostics": self._on_diagnostics}
         for topic, entry in TOPICS.items():
             name = self.resolve_topic_name(topic)
-            kind = _type_name(entry.message)
-            image = topic == "image/compressed"
-            self._writer.register(name, kind, schema_text(kind), image=image)
-            qos = IMAGE_RECORDING_QOS if image else entry.qos
             take = special.get(topic, self._on_message)
+            qos = IMAGE_RECORDING_QOS if topic == _IMAGES else entry.qos
             events = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, name))
             self.input(topic, partial(take, name), raw=True, qos=qos, events=events, with_info=True)
         self.create_timer(1.0, self._on_second)
+        self.set_up()
+
+    def acquire(self) -> None:
+        """Begin a session; a second one of this node's life takes the next free name."""
+        folder = Path(self.config.session_dir or dated_name(self.get_clock().now().nanoseconds))
+        if self.config.if_taken == "next" or self._sessions:
+            folder = _free_name(folder)
+        writer = SessionWriter(folder, self.config, session_provenance(self.get_namespace()))
+        for topic, entry in TOPICS.items():
+            kind = _type_name(entry.message)
+            writer.register(self.resolve_topic_name(topic), kind, schema_text(kind), image=topic == _IMAGES)
+        self._writer, self._calibrated = writer, False
+        self._survey = ParameterSurvey(self, self._on_parameters)
+        self._sessions += 1
+
+    def release(self) -> None:
+        """Write what is queued and finish the files."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+    def close(self) -> None:
+        """The same, at the end."""
+        self.release()
 
     def _on_message(self, name: str, data: bytes, info: dict[str, Any]) -> None:
         """Log time is when the message reached this process, publish time when it was sent."""
@@ -69,8 +91,9 @@ class SessionRecorderNode(ComponentNode):
         # Simulated time is nothing that the middleware knows.
         if cast(ROSClock, self.get_clock()).ros_time_is_active or not log_ns:
             log_ns = sent_ns = self.get_clock().now().nanoseconds
-        self._writer.write(name, data, log_ns, sent_ns or log_ns)
-        self.count("messages")
+        if self._writer is not None:
+            self._writer.write(name, data, log_ns, sent_ns or log_ns)
+            self.count("messages")
 
     def _on_lost(self, name: str, event: Any) -> None:
         """Count what the middleware lost on its way: pictures are best effort."""
@@ -85,7 +108,7 @@ class SessionRecorderNode(ComponentNode):
                 f"width: {camera.width}\nheight: {camera.height}\nk: {[float(v) for v in camera.k]}\n"
                 f"distortion_model: {camera.distortion_model}\nd: {[float(v) for v in camera.d]}\n"
             )
-            self._writer.add_metadata({CALIBRATION: text})
+            self._add_metadata({CALIBRATION: text})
 
     def _on_diagnostics(self, name: str, data: bytes, info: dict[str, Any]) -> None:
         """Everybody's words but those of another drone's graph."""
@@ -95,7 +118,7 @@ class SessionRecorderNode(ComponentNode):
             self._on_message(name, data, info)
 
     def _on_parameters(self, sections: dict[str, dict[str, Any]]) -> None:
-        self._writer.add_metadata({CONFIGURATION: configuration_text(sections)})
+        self._add_metadata({CONFIGURATION: configuration_text(sections)})
         if "pose_estimator" in sections:
             folder = models_folder(sections["pose_estimator"].get("models_dir") or None)
             # Large networks take a while to read: not in the thread that receives.
@@ -103,13 +126,20 @@ class SessionRecorderNode(ComponentNode):
 
     def _hash_models(self, folder: Path) -> None:
         try:
-            self._writer.add_metadata({MODELS: model_hashes(folder)})
+            self._add_metadata({MODELS: model_hashes(folder)})
         except OSError as error:
             self.get_logger().warning(f"models: expected readable files; {error.strerror}")
 
+    def _add_metadata(self, values: dict[str, str]) -> None:
+        writer = self._writer  # another thread may end the session meanwhile
+        if writer is not None:
+            writer.add_metadata(values)
+
     def _on_second(self) -> None:
-        writer = self._writer
-        self._survey.look()
+        writer, survey = self._writer, self._survey
+        if writer is None or survey is None or not self.active:
+            return
+        survey.look()
         self.details["file"] = str(writer.path)
         self.details["written"] = str(writer.written)
         self.details["waiting_kib"] = str(writer.queued_bytes >> 10)
@@ -122,10 +152,6 @@ class SessionRecorderNode(ComponentNode):
             self.report(WARN, f"{writer.dropped} messages dropped: the disk is too slow; lower the pictures' quality")
         else:
             self.report(OK, f"recording to {writer.folder}")
-
-    def close(self) -> None:
-        """Write what is queued and finish the files."""
-        self._writer.close()
 
 
 def _free_name(folder: Path) -> Path:
