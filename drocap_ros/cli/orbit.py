@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 import time
 from typing import Any
 
+#: Parameter of the orbit behind each option: its range holds here, its limits against each other in the bridge.
+_PARAMETERS = {"--radius": "radius_m", "--height": "height_m", "--speed": "angular_speed_deg_s"}
 ACTIONS = {"stop": 0, "start": 1, "adjust": 2, "engage": 3}
 _STATES = ("idle", "ready", "orbiting", "holding", "taken over", "fault")
 
@@ -46,6 +49,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"{name}: expected a finite number, got {value:g}")
         if args.action in ("stop", "status") and not math.isnan(value):
             raise InputError(f"{name}: {args.action} takes no values; leave it out")
+        _check_range(name, value)
     try:
         import rclpy
         from rclpy.context import Context
@@ -98,6 +102,18 @@ def run(args: argparse.Namespace) -> int:
         executor.shutdown()
         node.destroy_node()
         context.try_shutdown()
+
+
+def _check_range(name: str, value: float) -> None:
+    from drocap_ros.errors import InputError
+    from drocap_ros.flight.orbit_config import OrbitConfig
+
+    meta = next(spec.metadata for spec in dataclasses.fields(OrbitConfig) if spec.name == _PARAMETERS[name])
+    low, high = meta["minimum"], meta["maximum"]
+    if value < low or value > high:
+        raise InputError(
+            f"{name}: expected {low:g} to {high:g} {meta['unit']}, got {value:g}; choose a value in the range"
+        )
 
 
 #: How the answers of the controller begin; a reason that the status repeats begins otherwise.

@@ -97,6 +97,9 @@ def test_the_operator_flies_an_orbit_from_the_command_line():
             1, "refused: radius_m: expected at least 3.5 m (min_distance_m and 0.5 m of room), got 2; "
             "choose a larger radius",
         )  # fmt: skip
+        status, answer = operator(graph, "start", "--speed", "40")
+        assert status == 1
+        assert answer.startswith("refused: angular_speed_deg_s: expected at most 33.1 deg/s at 6 m (max_acceleration")
         assert operator(graph, "start", "--speed", "15") == (0, "orbiting")
         begin = time.monotonic()
         graph.wait_until(lambda: time.monotonic() - begin > 6, 30)
@@ -126,12 +129,52 @@ def test_without_permission_nothing_moves():
 
 
 @pytest.mark.parametrize(
-    "words", [["start", "--radius", "inf"], ["stop", "--radius", "5"], ["status", "--timeout", "0"]]
+    "words",
+    [
+        ["start", "--radius", "inf"],
+        ["start", "--radius", "-3"],
+        ["adjust", "--speed", "500"],
+        ["start", "--height", "-1"],
+        ["stop", "--radius", "5"],
+        ["status", "--timeout", "0"],
+    ],
 )
 def test_options_that_cannot_be_used(words, capsys):
     assert main(["orbit", *words]) == 2
     error = capsys.readouterr().err
     assert "expected" in error or "takes no values" in error
+    assert error.count("\n") == 1
+
+
+def test_an_option_that_is_no_number(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["orbit", "start", "--radius", "six"])
+    assert stopped.value.code == 2
+    assert "--radius: invalid float value: 'six'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("radius_m: -3.0", "radius_m: expected 0 to 100 m, got -3.0"),
+        ("radius_m: 2.0", "radius_m: expected at least 3.5 m (min_distance_m and 0.5 m of room), got 2"),
+        ("angular_speed_deg_s: 40.0", "expected at most 33.1 deg/s at 6 m (max_acceleration_m_s2 2), got 40"),
+        ("angular_speed_deg_s: 50.0", "expected at most 43.0 deg/s at 6 m (max_speed_m_s 4.5), got 50"),
+        ("radius_m: six", "radius_m: expected float, got 'six'"),
+        ("angular_speed_deg_s: .nan", "angular_speed_deg_s: expected a finite number"),
+        ("url: http://localhost:1", "url: expected udpin:HOST:PORT"),
+        ("url: udpin:127.0.0.1:99999", "url: expected a port from 1 to 65535"),
+        ("system_id: 255", "system_id: expected 1 to 254"),
+        ("signing_key_file: /does/not/exist", "signing_key_file: expected a file that can be read"),
+        ("orbit_radius: 5.0", "unknown parameter 'orbit_radius'"),
+    ],
+)
+def test_a_configuration_that_cannot_be_flown_is_refused_at_the_door(line, words, tmp_path, capsys):
+    file = tmp_path / "config.yaml"
+    file.write_text(f"mavlink_bridge:\n  {line}\n")
+    assert main(["live", "--config", str(file), "--nodes", "mavlink_bridge", "--one-process", "--domain-id", "96"]) == 2
+    error = capsys.readouterr().err
+    assert words in error
     assert error.count("\n") == 1
 
 

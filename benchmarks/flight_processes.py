@@ -1,0 +1,369 @@
+"""The real `mavlink_bridge` process flies the simulated copter over UDP, in real time, and is killed, stopped and
+restarted, and so is its perception: `python benchmarks/flight_faults.py processes`.
+
+Three processes: the bridge (`bringup`, processes=True), the stand-in of the pose estimator (this file with
+`--perceive`), which publishes `pose2d` for what the camera sends it, and this one with the copter and its camera.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)]
+
+from drocap_ros.config import DrocapConfig  # noqa: E402
+from drocap_ros.errors import NodeError  # noqa: E402
+from drocap_ros.flight.frames import camera_rotation  # noqa: E402
+from drocap_ros.flight.safety import Command, State  # noqa: E402
+from drocap_ros.flight.transport import open_transport  # noqa: E402
+from drocap_ros.perception.observation import PoseObservation  # noqa: E402
+from drocap_ros.simulation.camera import pinhole_matrix, project  # noqa: E402
+from drocap_ros.simulation.copter import SimulatedCopter  # noqa: E402
+from drocap_ros.simulation.flight_faults import EXCURSION_M, MOTION_S, TIMEOUT, Bounds  # noqa: E402
+from drocap_ros.simulation.observation import observe_keypoints  # noqa: E402
+from drocap_ros.simulation.orbit_loop import LoopSettings  # noqa: E402
+from drocap_ros.simulation.person import simulate_person  # noqa: E402
+from drocap_ros.simulation.ports import free_udp_port  # noqa: E402
+
+RATE_HZ, WIDTH, HEIGHT, FIELD_DEG = 15.0, 1280, 720, 60.0
+CONTROL = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}
+MATRIX = pinhole_matrix(WIDTH, HEIGHT, FIELD_DEG)
+ORBIT_S, WATCH_S = 8.0, 6.0
+FRAME_S, LINK_S = 0.1, 0.05
+SCHEDULING_S = 0.05  # a signal, a packet and a step of the vehicle each wait for their turn on a busy machine
+
+
+def perceive(port: int) -> None:
+    """Publish keypoints for each pose of the camera that comes, until killed."""
+    import rclpy
+    from rclpy.executors import ExternalShutdownException
+    from sensor_msgs.msg import CameraInfo
+
+    from drocap_ros.nodes.conversions import pose2d_to_ros
+    from drocap_ros.nodes.topics import TOPICS
+
+    rclpy.init(args=[])
+    node = rclpy.create_node("perception_stand_in", namespace="/drocap")
+    poses = node.create_publisher(TOPICS["pose2d"].message, "pose2d", TOPICS["pose2d"].qos)
+    infos = node.create_publisher(CameraInfo, "camera_info", TOPICS["camera_info"].qos)
+    joints = simulate_person(np.zeros(1), "stand", 1)
+    camera = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    camera.bind(("127.0.0.1", port))
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+        for frame in range(10**9):
+            told = json.loads(camera.recv(4096))
+            rotation = camera_rotation(np.array(told["orientation"]))[None]
+            seen = observe_keypoints(project(joints, rotation, np.array([told["position"]]), MATRIX), None, frame)
+            observation = PoseObservation(
+                told["stamp_ns"], 1, (WIDTH, HEIGHT), keypoints=seen.keypoints[0].astype(np.float32),
+                covariance=seen.covariance[0].astype(np.float32), confidence=seen.confidence[0].astype(np.float32),
+            )  # fmt: skip
+            poses.publish(pose2d_to_ros(observation, "camera_optical"))
+            infos.publish(CameraInfo(width=WIDTH, height=HEIGHT, k=MATRIX.ravel()))
+
+
+class Drone:
+    """Copter on its UDP link and the camera, in real time.
+
+    seeing : whether the camera sends its poses
+    rows : (s of the flight, position (3,), setpoints accepted, mode)
+    """
+
+    def __init__(self, autopilot: str, port: int, camera_port: int, seed: int = 1) -> None:
+        mode = "LOITER" if autopilot == "px4" else "GUIDED"
+        self.copter = SimulatedCopter(
+            open_transport(f"udpout:127.0.0.1:{port}"), np.array([7.0, 0, 2.8]), np.pi, autopilot, mode=mode, seed=seed
+        )
+        self.autopilot, self.seeing, self.t = autopilot, True, 0.0
+        self.rows: list[tuple[float, np.ndarray, int, str]] = []
+        self._camera = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._camera_port = camera_port
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self) -> None:
+        begin, frame = time.monotonic(), 0
+        while not self._stop.wait(0.005):
+            self.t = time.monotonic() - begin
+            self.copter.fly(self.t)
+            self.rows.append(
+                (self.t, self.copter.body.position.copy(), self.copter.accepted_setpoints, self.copter.mode)
+            )
+            if self.t * RATE_HZ >= frame:
+                frame = int(self.t * RATE_HZ) + 1
+                if self.seeing:
+                    told = {
+                        "stamp_ns": time.time_ns(), "position": self.copter.body.position.tolist(),
+                        "orientation": self.copter.camera_orientation().tolist(),
+                    }  # fmt: skip
+                    self._camera.sendto(json.dumps(told).encode(), ("127.0.0.1", self._camera_port))
+
+    def __enter__(self) -> Drone:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(5.0)
+        self.copter.close()
+        self._camera.close()
+
+
+class Scene:
+    """All that flies: processes by their ids, what the bridge says, the operator's hand."""
+
+    def __init__(self, graph: Any, drone: Drone, perception: subprocess.Popen[bytes], config: DrocapConfig) -> None:
+        from drocap_ros.msg import OrbitCommand, OrbitStatus
+        from drocap_ros.nodes.topics import TOPICS
+
+        self.graph, self.drone, self.perception, self.config = graph, drone, perception, config
+        self.bridge = graph.pid("mavlink_bridge")
+        self.said: list[Any] = []
+        node = graph.node
+        node.create_subscription(OrbitStatus, "orbit/status", self.said.append, TOPICS["orbit/status"].qos)
+        self._commands = node.create_publisher(OrbitCommand, "orbit/command", TOPICS["orbit/command"].qos)
+
+    def listen(self, seconds: float) -> None:
+        """Let time pass, whatever becomes of the nodes."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.graph._executor.spin_once(timeout_sec=0.02)
+
+    def wait(self, state: State, timeout_s: float = 40.0) -> None:
+        """Listen until the bridge says this state."""
+        end = time.monotonic() + timeout_s
+        while not (self.said and self.said[-1].state == int(state)):
+            if time.monotonic() > end:
+                raise AssertionError(f"no {state.name} in {timeout_s:g} s: {[m.reason for m in self.said[-3:]]}")
+            self.listen(0.05)
+
+    def command(self, kind: Command) -> None:
+        """The operator's command."""
+        from drocap_ros.msg import OrbitCommand
+
+        nan = float("nan")
+        message = OrbitCommand(command=int(kind), radius_m=nan, height_m=nan, angular_speed_deg_s=nan)
+        self._commands.publish(message)
+
+    def orbit(self, seconds: float) -> None:
+        """Start the orbit and fly it for a while."""
+        self.wait(State.READY)
+        control = self.drone.copter.mode == CONTROL[self.drone.autopilot]
+        self.command(Command.START if control else Command.ENGAGE)
+        self.wait(State.ORBITING, 10.0)
+        self.listen(seconds)
+        if self.said[-1].state != int(State.ORBITING):
+            raise AssertionError(f"not orbiting before the fault: {self.said[-1].reason}")
+
+    @contextlib.contextmanager
+    def new_bridge(self) -> Iterator[None]:
+        """Another bridge process in the place of the dead one."""
+        from drocap_ros.bringup import bringup
+
+        self.said.clear()
+        with bringup(self.config, ["mavlink_bridge"], processes=True, domain_id=self.graph.domain_id):
+            yield
+
+
+@contextlib.contextmanager
+def scene(autopilot: str, seed: int = 1, **values: Any) -> Iterator[Scene]:
+    """Bridge, perception and drone, each in its process.  A bridge that was killed is no error at the end."""
+    from drocap_ros.bringup import bringup
+
+    port, camera_port = free_udp_port(), free_udp_port()
+    settings = {"commands_enabled": True, "mode_change_allowed": True, **values}
+    config = DrocapConfig().replace("mavlink_bridge", url=f"udpin:127.0.0.1:{port}", **settings)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_ended_by_us())
+        graph = stack.enter_context(bringup(config, ["mavlink_bridge"], processes=True))
+        environment = {
+            **os.environ, "ROS_DOMAIN_ID": str(graph.domain_id), "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT),
+        }  # fmt: skip
+        command = [sys.executable, str(Path(__file__).resolve()), "--perceive", str(camera_port)]
+        perception = subprocess.Popen(command, env=environment, start_new_session=True)
+        stack.callback(perception.wait)
+        stack.callback(perception.kill)
+        drone = stack.enter_context(Drone(autopilot, port, camera_port, seed))
+        yield Scene(graph, drone, perception, config)
+
+
+@contextlib.contextmanager
+def _ended_by_us() -> Iterator[None]:
+    try:
+        yield
+    except NodeError as error:
+        if not any(f"mavlink_bridge ended with status {status}" in str(error) for status in (-9, -2, 0)):
+            raise
+
+
+class Outcome(NamedTuple):
+    """What a fault of a process did; see ``simulation.flight_faults.FaultResult``."""
+
+    motion_s: float
+    excursion_m: float
+    speed_m_s: float
+    accepted_later: int  # setpoints taken from `quiet_s` after the fault on
+    mode: str
+    said: str
+
+
+def watch(flying: Scene, observable_s: float, quiet_s: float, begin_s: float, begin_said: int) -> Outcome:
+    """Measure from the instant of the fault to now."""
+    drone = flying.drone
+    rows = [row for row in list(drone.rows) if row[0] >= begin_s + observable_s]
+    place = rows[0][1]
+    ahead = next(row for row in rows if row[0] >= rows[0][0] + 0.05)
+    late = [row[2] for row in rows if row[0] >= begin_s + quiet_s]
+    new = flying.said[begin_said:]
+    said = f"{State(new[-1].state).name}: {new[-1].reason}" if new else "nothing"
+    return Outcome(
+        drone.copter.motion_until_s - rows[0][0], max(float(np.linalg.norm((r[1] - place)[:2])) for r in rows),
+        float(np.linalg.norm((ahead[1] - place)[:2])) / (ahead[0] - rows[0][0]), late[-1] - late[0] if late else 0,
+        drone.copter.mode, said,
+    )  # fmt: skip
+
+
+def _kill_bridge(flying: Scene) -> None:
+    os.kill(flying.bridge, signal.SIGKILL)
+    flying.listen(WATCH_S)
+
+
+def _stop_bridge(flying: Scene) -> None:
+    os.kill(flying.bridge, signal.SIGSTOP)
+    flying.listen(3.0)
+    os.kill(flying.bridge, signal.SIGCONT)
+    flying.listen(WATCH_S)
+
+
+def _end_bridge(flying: Scene) -> None:
+    os.kill(flying.bridge, signal.SIGINT)
+    flying.listen(WATCH_S)
+
+
+def _restart_bridge(flying: Scene) -> None:
+    os.kill(flying.bridge, signal.SIGKILL)
+    with flying.new_bridge():
+        flying.listen(WATCH_S)
+
+
+def _kill_perception(flying: Scene) -> None:
+    flying.perception.kill()
+    flying.listen(WATCH_S)
+
+
+def _stop_perception(flying: Scene) -> None:
+    """It comes back with three seconds of old pictures in its queue."""
+    flying.perception.send_signal(signal.SIGSTOP)
+    flying.listen(3.0)
+    flying.perception.send_signal(signal.SIGCONT)
+    flying.listen(WATCH_S)
+
+
+def _stop_camera(flying: Scene) -> None:
+    flying.drone.seeing = False
+    flying.listen(WATCH_S)
+
+
+class Case(NamedTuple):
+    """A fault of a process.
+
+    says : words of which the bridge must say one at the end
+    quiet_s : from when on no setpoint may be taken at all; infinite = the hold streams
+    """
+
+    name: str
+    make: Callable[[Scene], None]
+    observable_s: float
+    timeout: bool
+    says: tuple[str, ...]
+    quiet_s: float = float("inf")
+
+
+_STOOD = ("stood still", "another hand")
+CASES = (
+    Case("bridge killed (SIGKILL)", _kill_bridge, LINK_S, True, (), 0.2),
+    Case("bridge stopped for 3 s (SIGSTOP)", _stop_bridge, LINK_S, True, _STOOD),
+    Case("bridge ended (SIGINT)", _end_bridge, LINK_S, False, ()),
+    Case("bridge killed and started again", _restart_bridge, LINK_S, True, ("READY", "IDLE"), 0.2),
+    Case("perception killed (SIGKILL)", _kill_perception, FRAME_S, False, ("last located", "no subject")),
+    Case("perception stopped for 3 s (SIGSTOP)", _stop_perception, FRAME_S, False, ("last located", "no subject")),
+    Case("camera sends nothing", _stop_camera, FRAME_S, False, ("last located", "no subject")),
+)
+
+
+def fly(case: Case, autopilot: str, seed: int = 1) -> Outcome:
+    """Orbit, make the fault, measure."""
+    with scene(autopilot, seed) as flying:
+        flying.orbit(ORBIT_S)
+        begin_s, said = flying.drone.t, len(flying.said)
+        case.make(flying)
+        return watch(flying, case.observable_s, case.quiet_s, begin_s, min(said, len(flying.said)))
+
+
+def bounds(case: Case, autopilot: str, speed_m_s: float) -> Bounds:
+    """What must hold, stated before the flight."""
+    if not case.timeout:
+        return Bounds()
+    motion_s, excursion_m = TIMEOUT.bounds(LoopSettings(autopilot=autopilot), speed_m_s)
+    return Bounds(motion_s + SCHEDULING_S, excursion_m + SCHEDULING_S * speed_m_s)
+
+
+def failures(case: Case, autopilot: str, outcome: Outcome) -> list[str]:
+    """What does not hold, in words."""
+    limits, found = bounds(case, autopilot, outcome.speed_m_s), []
+    if outcome.motion_s > limits.motion_s:
+        found.append(f"motion for {outcome.motion_s:.2f} s, bound {limits.motion_s:.2f} s")
+    if outcome.excursion_m >= limits.excursion_m:
+        found.append(f"excursion of {outcome.excursion_m:.2f} m, bound {limits.excursion_m:.2f} m")
+    if outcome.accepted_later:
+        found.append(f"{outcome.accepted_later} setpoints after the end")
+    if case.says and not any(word in outcome.said for word in case.says):
+        found.append(f"said {outcome.said}")
+    return found
+
+
+def main() -> int:
+    """Print the table."""
+    print(f"  {'dialect':9} {'fault of a process':38} {'motion':>7} {'away':>6} {'bound':>6} {'bound':>6} {'speed':>5}")
+    bad = 0
+    for autopilot in ("ardupilot", "px4"):
+        for case in CASES:
+            outcome = fly(case, autopilot)
+            found = failures(case, autopilot, outcome)
+            bad += bool(found)
+            limits = bounds(case, autopilot, outcome.speed_m_s)
+            kept = outcome.motion_s <= MOTION_S and outcome.excursion_m < EXCURSION_M
+            note = f"NOT KEPT: {'; '.join(found)}. " if found else "" if kept else f"[{TIMEOUT.words}] "
+            print(
+                f"{'-' if found else '+' if kept else 'c'} {autopilot:9} {case.name:38} {outcome.motion_s:7.2f} "
+                f"{outcome.excursion_m:6.2f} {limits.motion_s:6.2f} {limits.excursion_m:6.2f} {outcome.speed_m_s:5.2f} "
+                f"{outcome.mode:8} {note}{outcome.said}",
+                flush=True,
+            )
+    print(f"{2 * len(CASES)} cases with real processes, in real time: {bad} not kept")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--perceive", type=int, metavar="PORT")
+    chosen = parser.parse_args()
+    if chosen.perceive:
+        perceive(chosen.perceive)
+    else:
+        raise SystemExit(main())
