@@ -46,6 +46,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("words", nargs="*", help="only cases whose names hold one of these; or `processes`")
     parser.add_argument("--seeds", type=int, default=1, help="flights of each case; the worst is printed")
+    parser.add_argument("--part", default="1/1", metavar="I/N", help="only the I-th of N parts of the cases")
     parser.add_argument("--autopilot", choices=("ardupilot", "px4"))
     args = parser.parse_args()
     if args.words == ["processes"]:
@@ -54,9 +55,10 @@ def main() -> int:
         return fly_processes()
     print(f"  {'dialect':9} {'fault':40} {'motion':>7} {'away':>6} {'bound':>6} {'bound':>6} {'speed':>5}")
     print(f"  {'':9} {'':40} {'s':>7} {'m':>6} {'s':>6} {'m':>6} {'m/s':>5} state      reason, or cause", flush=True)
-    marks = []
+    marks: list[str] = []
+    part, parts = (int(number) for number in args.part.split("/"))
     for autopilot in (args.autopilot,) if args.autopilot else ("ardupilot", "px4"):
-        for fault in FAULTS:
+        for fault in FAULTS[part - 1 :: parts]:
             if args.words and not any(word in fault.name for word in args.words):
                 continue
             results = [fly_fault(fault, autopilot, 4 + i) for i in range(args.seeds)]
