@@ -18,7 +18,7 @@ from drocap_ros.flight.orbit_config import OrbitConfig, check_orbit
 from drocap_ros.flight.setpoint import Setpoint
 
 _TRIM_RATE, _MAX_TRIM_M = 0.15, 0.5  # 1/s, m
-_STANDING_M_S, _SURPRISE_S, _FLIGHT_ERROR_M = 0.3, 0.5, 0.3
+_STANDING_M_S, _SURPRISE_S, _FLIGHT_ERROR_M = 0.3, 0.5, 0.5
 _FREE_LEAD = 0.6  # share of the greatest lead below which the reference does not wait
 _CENTRE_RATE = 4.0
 _CENTRE_ACCELERATION = 8.0

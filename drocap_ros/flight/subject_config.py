@@ -18,7 +18,10 @@ class SubjectConfig(Parameters):
     )  # fmt: skip
     use_ground_plane: bool = param(True, "take the range from the feet on level ground too; switch off on slopes")
     size_error: float = param(
-        0.08, "standard deviation of the range from body size, as a share of it", minimum=0.01, maximum=1
+        0.08,
+        "standard deviation of the range from body size, as a share of it: 0.04 where body_height_m is measured",
+        minimum=0.01,
+        maximum=1,
     )
     height_error_m: float = param(
         0.3, "standard deviation of the camera's height above the subject's ground", unit="m", minimum=0, maximum=20

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.orbit_config import OrbitConfig
-from drocap_ros.flight.orbit_planner import advance, begin_orbit, goal_of, reference_position, setpoint_of
+from drocap_ros.flight.orbit_planner import advance, begin_orbit, goal_of, least_radius, reference_position, setpoint_of
 
 DT = 0.05
 
@@ -68,6 +68,33 @@ def test_follows_a_walking_subject():
     subject = np.array([1.4 * (20 - DT), 0.0])
     assert np.linalg.norm(state.centre - subject) < 0.1
     assert np.linalg.norm(setpoint.position[:2] - subject) == pytest.approx(6.0, abs=0.15)
+
+
+def test_an_uncertain_or_walking_subject_is_given_more_room():
+    config = OrbitConfig(radius_m=3.8)
+    sure = least_radius(config, 0.1, 0.0, 1.3)
+    assert config.min_distance_m + 0.4 < sure < 3.8
+    assert least_radius(config, 0.4, 0.0, 1.3) == pytest.approx(sure + 0.6)
+    assert least_radius(config, 0.1, 1.5, 1.3) > sure + 0.5
+    state, vehicle = None, np.array([6.0, 0.0, 2.5])
+    state = begin_orbit(vehicle, np.zeros(3), np.zeros(3), config)
+    for _ in range(400):
+        state = advance(state, goal_of(config), vehicle, np.zeros(3), np.zeros(3), 0.0, DT, config, 4.5)
+        vehicle = reference_position(state)
+    assert state.radius.value == pytest.approx(4.5, abs=0.02)
+
+
+def test_a_vehicle_that_is_too_slow_is_asked_for_more():
+    config = OrbitConfig()
+    vehicle, zero = np.array([6.0, 0.0, 2.5]), np.zeros(3)
+    state = begin_orbit(vehicle, zero, zero, config)
+    for _ in range(100):
+        state = advance(state, goal_of(config), reference_position(state), zero, zero, 0.0, DT, config)
+    place = reference_position(state)
+    told = setpoint_of(state, place, zero, zero, config)
+    lags = setpoint_of(state, place, zero, zero, config, 0.9 * told.velocity)
+    assert np.allclose(setpoint_of(state, place, zero, zero, config, told.velocity).acceleration, told.acceleration)
+    assert (lags.acceleration - told.acceleration) @ told.velocity > 0
 
 
 def test_a_jump_of_the_subject_does_not_come_through():

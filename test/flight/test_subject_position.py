@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import ParameterError
+from drocap_ros.flight.frames import OPTICAL_FROM_FLU
 from drocap_ros.flight.pose_history import CameraPose, PoseHistory
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.flight.subject_position import SubjectFilter, locate_subject
 from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.config import SimulationConfig
@@ -42,6 +44,77 @@ def test_filter_finds_the_pelvis_of_a_moving_person(action, bound):
             errors.append(np.linalg.norm(estimate.position[:2] - capture.joints3d_world[i, 0, :2]))
             assert estimate.position_sd_m < 1.0
     assert np.mean(errors) < bound
+
+
+@pytest.mark.parametrize(("action", "bound"), [("stand", 0.25), ("squats", 0.3), ("kicking", 0.3)])
+def test_range_of_a_person_seen_from_steeply_above(action, bound):
+    capture = flight(action, radius_m=4.0, height_m=6.0)
+    subject = SubjectFilter(SubjectConfig())
+    errors, sizes = [], []
+    for i, pose, seen in observations(capture):
+        subject.update(seen, capture.tracks.camera_matrix, pose)
+        truth = np.linalg.norm(capture.joints3d_world[i, 0, :2] - pose.position[:2])
+        measured = locate_subject(seen, capture.tracks.camera_matrix, pose, SubjectConfig())
+        if measured is not None:
+            sizes.append(measured.range_size_m / truth)
+        if i > 20:
+            place = subject.estimate(seen.stamp_ns).position[:2]
+            errors.append(np.linalg.norm(place - pose.position[:2]) - truth)
+    assert np.mean(np.abs(errors)) < bound
+    assert np.max(errors) < 3 * bound  # what is farther than it is costs distance
+    if action == "stand":
+        assert np.nanmedian(sizes) == pytest.approx(1.0, abs=0.12)
+
+
+def test_one_wrong_joint_does_not_turn_the_bearing():
+    capture = flight("stand", noise_scale=0.0, outlier_fraction=0.0, missed_fraction=0.0, attitude_error_deg=0.0)
+    _, pose, seen = next(observations(capture))
+    keypoints = seen.keypoints.copy()
+    keypoints[0] += 100.0
+    places = [
+        locate_subject(dataclasses.replace(seen, keypoints=k), capture.tracks.camera_matrix, pose, SubjectConfig())
+        for k in (seen.keypoints, keypoints)
+    ]
+    assert np.linalg.norm(places[1].position - places[0].position) < 0.2
+
+
+def test_a_foot_kicked_to_the_horizon_leaves_the_range_to_the_other():
+    capture = flight("stand", noise_scale=0.0, outlier_fraction=0.0, missed_fraction=0.0, attitude_error_deg=0.0)
+    _, pose, seen = next(observations(capture))
+    ankle = seen.joints.index("rankle")
+    keypoints = seen.keypoints.copy()
+    keypoints[ankle, 1] = seen.keypoints[seen.joints.index("neck"), 1] - 80
+    kicked = locate_subject(
+        dataclasses.replace(seen, keypoints=keypoints), capture.tracks.camera_matrix, pose, SubjectConfig()
+    )
+    truth = np.linalg.norm(capture.joints3d_world[0, 0, :2] - pose.position[:2])
+    assert kicked.range_ground_m == pytest.approx(truth, rel=0.1)
+
+
+def test_velocity_of_a_standing_person_is_small_while_the_position_wanders():
+    capture = flight("stand")
+    rng = np.random.default_rng(0)
+    wander = np.cumsum(rng.normal(0, 0.03, (len(capture.tracks.stamp_ns), 3)), axis=0)
+    velocity = np.gradient(capture.camera_position, 1 / 15.0, axis=0)
+    history, subject, speeds, places = PoseHistory(), SubjectFilter(SubjectConfig()), [], []
+    for i, pose, seen in observations(capture):
+        reported = capture.camera_position[i] + wander[i]
+        forward_left_up = quaternion_from_matrix(pose.rotation.T @ OPTICAL_FROM_FLU)
+        history.add(
+            VehicleState(
+                seen.stamp_ns, position_enu_m=reported, velocity_enu_m_s=velocity[i],
+                orientation_xyzw=np.array([0.0, 0.0, 0.0, 1.0]), gimbal_orientation_xyzw=forward_left_up,
+            )
+        )  # fmt: skip
+        camera = history.at(seen.stamp_ns)
+        assert np.allclose(camera.position + history.offset, reported)
+        subject.update(seen, capture.tracks.camera_matrix, camera)
+        if i > 30:
+            estimate = subject.estimate(seen.stamp_ns)
+            speeds.append(np.linalg.norm(estimate.velocity[:2]))
+            places.append(estimate.position + history.offset - reported - capture.joints3d_world[i, 0] + pose.position)
+    assert np.mean(speeds) < 0.25  # 0.5 m/s by the position as reported
+    assert np.mean(np.linalg.norm(np.array(places)[:, :2], axis=1)) < 0.4
 
 
 def test_velocity_of_a_walking_person():

@@ -28,6 +28,21 @@ def test_orbit_of_a_person_in_wind(autopilot, action):
     assert quality.least_distance_m > 3.0
 
 
+def test_a_narrow_orbit_high_above_a_person_who_squats_keeps_the_distance():
+    # By a camera tilted down by 55 degrees the subject seemed at 5 m when it was at 3.
+    settings = LoopSettings(
+        autopilot="px4", action="squats", seed=523, stature_m=1.82, distance_m=4.3, height_m=5.0, latency_s=0.12,
+        wind_m_s=(0.9, -2.2, 0.0), bearing_deg=-157.0, seconds=25,
+    )  # fmt: skip
+    loop = OrbitLoop(with_config(settings, radius_m=3.9, height_m=5.9, angular_speed_deg_s=-19.0, body_height_m=1.8))
+    loop.start()
+    loop.run(24.0)
+    rows = [row for row in loop.rows if row.t_s > 6.0]
+    assert all(row.state == State.ORBITING for row in rows), loop.reasons[-2:]
+    assert min(row.distance_m for row in rows) > 3.0
+    assert np.mean([row.distance_m for row in rows if row.t_s > 14.0]) < 4.6
+
+
 def test_the_same_flight_twice_is_the_same_bit_for_bit():
     ends = []
     for _ in range(2):
