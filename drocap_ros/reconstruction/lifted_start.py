@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.perception.sides import exchange, exchanged_legs
 from drocap_ros.reconstruction.default_method import even_slots
 from drocap_ros.reconstruction.dictionary import LIMBS_PER_STATURE
 from drocap_ros.reconstruction.lifter import Lifter
@@ -68,9 +69,8 @@ class LiftedStart:
         stamps = np.array([stamp for stamp, _, _ in self._past], np.int64)
         slot, fps = even_slots(stamps)
         points = np.full((slot[-1] + 1, *keypoints.shape), np.nan)
-        points[slot] = [k for _, k, _ in self._past]
         belief = np.zeros(points.shape[:2])
-        belief[slot] = [c for _, _, c in self._past]
+        points[slot], belief[slot] = self._with_own_legs(stamps)
         self._since_look += 1
         if self._since_look >= (LOOK_EVERY if self._proportions else FIRST_LOOK):
             self._since_look = 0
@@ -80,6 +80,14 @@ class LiftedStart:
         self._limbs_px.append(max(float(limb_lengths(joints).sum()), 1e-9))
         metres = self._limbs_m / float(np.median(self._limbs_px))
         return LiftedImage(joints, lifted.sigma[0] * np.array([ACROSS, ALONG]), metres)
+
+    def _with_own_legs(self, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Keypoints and confidences of the past, the legs exchanged back where the network exchanged them."""
+        points = np.array([k for _, k, _ in self._past])
+        belief = np.array([c for _, _, c in self._past])
+        wrong = exchanged_legs(points, belief, stamps, person_size(points))
+        points, _, belief = exchange(points, np.zeros((*belief.shape, 3)), belief, wrong)
+        return points, belief
 
     def _look(self, points: np.ndarray, belief: np.ndarray, fps: float) -> None:
         # By a lifter that is told no lengths: told its own, it would believe itself more and more.
@@ -92,3 +100,12 @@ class LiftedStart:
             return None
         lengths: np.ndarray = np.median(np.array(self._proportions), axis=0) * np.median(self._limbs_px)
         return lengths
+
+
+def person_size(keypoints: np.ndarray) -> np.ndarray:
+    """(F,) px, the person's longer side in the images of keypoints (F, 15, 2), one for all: their median."""
+    low = np.fmin.reduce(keypoints, axis=1)
+    high = np.fmax.reduce(keypoints, axis=1)
+    size = (high - low).max(axis=-1)
+    known = size[np.isfinite(size)]
+    return np.full(len(keypoints), np.median(known) if len(known) else 1.0)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.perception.sides import exchange, exchanged_legs
 from drocap_ros.reconstruction.adjustment_window import WindowArrays
 from drocap_ros.reconstruction.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.default_method import (
@@ -17,6 +18,7 @@ from drocap_ros.reconstruction.default_method import (
     default_poses,
 )
 from drocap_ros.reconstruction.effort import Effort
+from drocap_ros.reconstruction.lifted_start import person_size
 from drocap_ros.reconstruction.metrics import limb_lengths
 from drocap_ros.reconstruction.normalize import MIN_JOINTS
 from drocap_ros.reconstruction.threads import blas_threads
@@ -62,7 +64,7 @@ class WindowAdjuster:
             When the window shows no person; what is known of the person stays.
         """
         effort = effort or Effort()
-        part = window.every(effort.stride)
+        part = _with_own_legs(window.every(effort.stride))
         with blas_threads(self._config.threads):
             if self._config.method == "paper":
                 result, steps = self._by_paper(part, effort)
@@ -112,6 +114,19 @@ class WindowAdjuster:
         begin = stamp_ns[0]
         size = np.interp((w.stamp_ns - begin) * 1e-9, (stamp_ns - begin) * 1e-9, body.unit_per_mm)
         return KnownBody(body.lengths_mm, size)
+
+
+def _with_own_legs(w: WindowArrays) -> WindowArrays:
+    """The window with the legs exchanged back where the network most likely exchanged them."""
+    seen = np.isfinite(w.keypoints).all(axis=-1)
+    if not seen.any():
+        return w
+    confidence = np.where(seen, np.nan_to_num(w.confidence), 0.0)
+    wrong = exchanged_legs(w.keypoints, confidence, w.stamp_ns, person_size(w.keypoints))
+    if not wrong.any():
+        return w
+    keypoints, covariance, confidence = exchange(w.keypoints, w.covariance, w.confidence, wrong)
+    return w._replace(keypoints=keypoints, covariance=covariance, confidence=confidence)
 
 
 def _by_equations(w: WindowArrays, config: BundleAdjusterConfig) -> AdjustedWindow:

@@ -14,6 +14,7 @@ from drocap_ros.reconstruction.adjustment_window import AdjustmentWindow
 from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.dictionary import Dictionary
 from drocap_ros.reconstruction.live_method import LivePose, LiveWindow, live_poses
+from drocap_ros.reconstruction.metrics import pa_mpjpe
 from drocap_ros.reconstruction.stream_order import Arrival
 from drocap_ros.reconstruction.window import SlidingWindowInitializer
 
@@ -99,6 +100,24 @@ def test_a_gap_forgets_the_hypotheses_but_not_the_size(start: str, dictionary: D
         assert initializer._lifted is not None
         assert len(initializer._lifted._past) == 1
         assert len(initializer._lifted._proportions) == 1
+
+
+SWAP = np.array([0, 1, 5, 6, 4, 2, 3, *range(7, 15)])
+
+
+def test_exchanged_legs_are_exchanged_back() -> None:
+    clean = observed(72)
+    wrong = {*range(20, 24), *range(45, 52)}
+    swapped = [replace(o, keypoints=o.keypoints[SWAP]) if i in wrong else o for i, o in enumerate(clean)]
+    truth = 1000.0 * make_walk(72).in_camera
+    errors = []
+    for stream in (clean, swapped):
+        poses, windows = run(stream)
+        initial = pa_mpjpe(np.array([p.joints3d for p in poses], float), truth)
+        place = np.searchsorted(stamps(72), windows[-1].stamp_ns)
+        errors.append((initial.mean(), pa_mpjpe(windows[-1].joints3d.astype(float), truth[place]).mean()))
+    assert errors[1][0] < errors[0][0] + 2.0
+    assert errors[1][1] < errors[0][1] + 2.0
 
 
 def test_the_window_drops_duplicates_and_late_frames() -> None:
