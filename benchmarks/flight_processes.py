@@ -134,6 +134,7 @@ class Scene:
         self.graph, self.drone, self.perception, self.config = graph, drone, perception, config
         self.bridge = graph.pid("mavlink_bridge")
         self.said: list[Any] = []
+        self.mark = 0  # how much it had said before the fault
         node = graph.node
         node.create_subscription(OrbitStatus, "orbit/status", self.said.append, TOPICS["orbit/status"].qos)
         self._commands = node.create_publisher(OrbitCommand, "orbit/command", TOPICS["orbit/command"].qos)
@@ -176,6 +177,7 @@ class Scene:
         from drocap_ros.bringup import bringup
 
         self.said.clear()
+        self.mark = 0
         with bringup(self.config, ["mavlink_bridge"], processes=True, domain_id=self.graph.domain_id):
             yield
 
@@ -222,14 +224,14 @@ class Outcome(NamedTuple):
     said: str
 
 
-def watch(flying: Scene, observable_s: float, quiet_s: float, begin_s: float, begin_said: int) -> Outcome:
+def watch(flying: Scene, observable_s: float, quiet_s: float, begin_s: float) -> Outcome:
     """Measure from the instant of the fault to now."""
     drone = flying.drone
     rows = [row for row in list(drone.rows) if row[0] >= begin_s + observable_s]
     place = rows[0][1]
     ahead = next(row for row in rows if row[0] >= rows[0][0] + 0.05)
     late = [row[2] for row in rows if row[0] >= begin_s + quiet_s]
-    new = flying.said[begin_said:]
+    new = flying.said[flying.mark :]
     said = f"{State(new[-1].state).name}: {new[-1].reason}" if new else "nothing"
     return Outcome(
         drone.copter.motion_until_s - rows[0][0], max(float(np.linalg.norm((r[1] - place)[:2])) for r in rows),
@@ -310,9 +312,9 @@ def fly(case: Case, autopilot: str, seed: int = 1) -> Outcome:
     """Orbit, make the fault, measure."""
     with scene(autopilot, seed) as flying:
         flying.orbit(ORBIT_S)
-        begin_s, said = flying.drone.t, len(flying.said)
+        begin_s, flying.mark = flying.drone.t, len(flying.said)
         case.make(flying)
-        return watch(flying, case.observable_s, case.quiet_s, begin_s, min(said, len(flying.said)))
+        return watch(flying, case.observable_s, case.quiet_s, begin_s)
 
 
 def bounds(case: Case, autopilot: str, speed_m_s: float) -> Bounds:

@@ -167,6 +167,9 @@ class ComponentNode(Node):
     def close(self) -> None:
         """Finish what is under way and let go of files, links and threads; called before destruction."""
 
+    def on_stop(self) -> None:
+        """The order to stop has come; what has arrived is still worked off after this."""
+
     def flush(self) -> None:
         """Wait until what was published has arrived, but not long."""
         for _, publisher in self._outputs:

@@ -72,11 +72,15 @@ class MavlinkBridgeNode(ComponentNode):
             thread.start()
         self._watchdog.start()
 
-    def close(self) -> None:
-        """End a running orbit by a hold, stop reading and give the port back."""
+    def on_stop(self) -> None:
+        """End a running orbit by a hold, before anything is waited for: whoever waits may stop the control loop."""
         if self._threads[1].is_alive() and self._controller.safety.state == State.ORBITING:
             self._controller.command(OperatorCommand(kind=OrbitCommand.STOP))
             time.sleep(3.0 / self.config.control_hz)
+
+    def close(self) -> None:
+        """End a running orbit, stop reading and give the port back."""
+        self.on_stop()
         self._stop.set()
         for thread in self._threads:
             if thread.is_alive():

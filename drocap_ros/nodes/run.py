@@ -43,6 +43,7 @@ def spin(node: ComponentNode, stop: threading.Event) -> None:
             executor.spin_once(timeout_sec=0.1)
             if parent not in (0, os.getppid(), os.getpid()):
                 stop.set()
+        node.on_stop()
         _drain(executor, node)
         node.flush()
     except ExternalShutdownException:
