@@ -138,7 +138,7 @@ def _view_live(recording: rerun.RecordingStream, args: argparse.Namespace) -> in
 
     namespace = args.namespace or "/drocap"
     with import_bringup().watch(namespace, args.domain_id) as graph, _shown(recording, (*PLOTS, "log"), args):
-        view = MessageView(Scene(recording), picture_hz=None if args.save else LIVE_PICTURE_HZ)
+        view = MessageView(Scene(recording), picture_hz=0.0 if args.save else LIVE_PICTURE_HZ)
         view.namespace = namespace
         _subscribe(graph, view)
         end = math.inf if args.seconds is None else time.monotonic() + args.seconds

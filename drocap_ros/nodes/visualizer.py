@@ -17,11 +17,12 @@ from visualization_msgs.msg import MarkerArray
 
 from drocap_ros.msg import Pose2D, Pose3D, VehicleState
 from drocap_ros.nodes.component import OK, WARN, ComponentNode
-from drocap_ros.nodes.conversions import stamp_from_ros
+from drocap_ros.nodes.conversions import pose3d_from_ros, stamp_from_ros
 from drocap_ros.nodes.humans import MISSING, HumanTopics, hri, human_transforms
 from drocap_ros.nodes.markers import body_transforms, keypoint_marker, path_marker, pose_markers
 from drocap_ros.nodes.run import node_main
 from drocap_ros.nodes.topics import TFMessage
+from drocap_ros.view.pace import Pace
 
 #: A pose that nobody renews disappears: initial poses come with each picture, refined ones about once a second.
 INITIAL_LIFETIME_S, LATEST_LIFETIME_S = 0.5, 3.0
@@ -39,6 +40,7 @@ class VisualizerNode(ComponentNode):
         self._latest = self.output("markers/latest")
         self._paths = self.output("markers/camera_path")
         self._tf = self.output("/tf") if TFMessage is not None else None
+        self._pace = {stage: Pace(self.config.marker_rate_hz) for stage in ("initial", "latest")}
         self._path: deque[np.ndarray] = deque(maxlen=self.config.path_points)
         self._path_ns = -(10**18)
         self._humans = HumanTopics(self, self.config.frame_prefix) if self.config.human_topics and hri else None
@@ -55,7 +57,9 @@ class VisualizerNode(ComponentNode):
             self._humans.publish(message)
 
     def _on_initial(self, message: Pose3D) -> None:
-        self._initial.publish(pose_markers(message, INITIAL_LIFETIME_S))
+        pose3d_from_ros(message)  # a malformed pose is refused whether it is drawn or not
+        if self._pace["initial"].due(stamp_from_ros(message.header.stamp)):
+            self._initial.publish(pose_markers(message, INITIAL_LIFETIME_S))
         if self._tf is not None and (transforms := self._transforms(message)):
             self._tf.publish(TFMessage(transforms=transforms))
         self.count("poses")
@@ -70,7 +74,9 @@ class VisualizerNode(ComponentNode):
         return body_transforms(message, prefix) + human
 
     def _on_latest(self, message: Pose3D) -> None:
-        self._latest.publish(pose_markers(message, LATEST_LIFETIME_S))
+        pose3d_from_ros(message)
+        if self._pace["latest"].due(stamp_from_ros(message.header.stamp)):
+            self._latest.publish(pose_markers(message, LATEST_LIFETIME_S))
 
     def _on_state(self, message: VehicleState) -> None:
         stamp_ns = stamp_from_ros(message.header.stamp)

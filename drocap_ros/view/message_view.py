@@ -15,6 +15,7 @@ from drocap_ros.recording.pictures import image_from_message
 from drocap_ros.recording.pose_messages import float_array, observation_from_message
 from drocap_ros.skeleton import JointSet, joint_set
 from drocap_ros.view.camera import LEVEL_CAMERA, nominal_camera_matrix, place_cameras
+from drocap_ros.view.pace import Pace
 from drocap_ros.view.scene import Scene
 
 PLOTS = ("latency_ms", "reprojection_px", "orbit")
@@ -42,13 +43,12 @@ class MessageView:
 
     Parameters
     ----------
-    picture_hz : pictures are thinned to this rate, for a viewer that must keep up; None = all
+    picture_hz : pictures are thinned to this rate, for a viewer that must keep up; 0 = all
     """
 
-    def __init__(self, scene: Scene, picture_hz: float | None = None) -> None:
+    def __init__(self, scene: Scene, picture_hz: float = 0.0) -> None:
         self._scene = scene
-        self._picture_period_ns = 0 if picture_hz is None else round(1e9 / picture_hz)
-        self._picture_ns: int | None = None
+        self._pictures = Pace(picture_hz)
         self._keypoints: OrderedDict[int, tuple[str, np.ndarray]] = OrderedDict()
         self._matrix: np.ndarray | None = None
         self._size: tuple[int, int] | None = None
@@ -92,11 +92,8 @@ class MessageView:
     # -- pictures and keypoints ------------------------------------------------------------------------
 
     def _on_picture(self, message: Any, _: int) -> None:
-        at_ns, last_ns = stamp_ns(message), self._picture_ns
-        # A tenth of tolerance: pictures at 30 Hz thinned to 10 Hz are every third, whatever the jitter.
-        if last_ns is not None and 0 <= at_ns - last_ns < 0.9 * self._picture_period_ns:
+        if not self._pictures.due(stamp_ns(message)):
             return
-        self._picture_ns = at_ns
         data = bytes(message.data)
         self._at(message)
         if (kind := _MAGIC.get(data[:2])) is not None:

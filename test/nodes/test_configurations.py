@@ -24,7 +24,7 @@ EXPECTED = {
         "max_acceleration_m_s2", "fence_radius_m", "min_height_m", "max_height_m", "min_battery_fraction",
         "body_height_m", "max_control_timeout_s", "gimbal_control",
     },
-    "visualizer": {"path_points", "frame_prefix", "human_topics"},
+    "visualizer": {"marker_rate_hz", "path_points", "frame_prefix", "human_topics"},
     "session_recorder": {"session_dir", "free_mib", "split_s"},
 }  # fmt: skip
 

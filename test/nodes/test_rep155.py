@@ -11,6 +11,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
+from visualization_msgs.msg import MarkerArray
 
 from drocap_ros.bringup import free_domain
 from drocap_ros.geometry.rotations import matrix_from_quaternion
@@ -179,3 +180,30 @@ def test_without_hri_msgs_the_frames_remain_and_diagnostics_say_why(capture, mon
         assert "body_7" in {t.child_frame_id for t in frames}
         assert node._text.endswith(humans.MISSING)
         assert not node.get_publishers_info_by_topic("/humans/bodies/tracked")
+
+
+def test_markers_come_at_their_rate_and_frames_with_every_pose(capture):
+    with graph(marker_rate_hz=10.0) as (node, other, until):
+        arrays, frames = [], []
+        other.create_subscription(MarkerArray, "markers/initial", arrays.append, RESULT_QOS)
+        other.create_subscription(TFMessage, "/tf", frames.append, RESULT_QOS)
+        poses = other.create_publisher(Pose3D, "pose3d/initial", RESULT_QOS)
+        until(
+            lambda: (
+                poses.get_subscription_count()
+                and node.count_subscribers("/tf")
+                and node.count_subscribers("/drocap/markers/initial")
+            )
+        )
+        for i in range(30):
+            message = pose3d(capture.joints3d_world[0])
+            message.header = header_at(10**12 + round(i * 1e9 / 30), "map")
+            poses.publish(message)
+        until(lambda: len(frames) == 30)
+        until(lambda: len(arrays) == 10)
+        broken = pose3d(capture.joints3d_world[0])
+        broken.header = header_at(10**12 + round(29 * 1e9 / 30), "map")
+        broken.joints = broken.joints[:7]
+        poses.publish(broken)
+        until(lambda: node.counters["messages refused"] == 1)
+        assert len(arrays) == 10
