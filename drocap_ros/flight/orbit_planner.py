@@ -18,12 +18,12 @@ from drocap_ros.flight.orbit_config import OrbitConfig, check_orbit
 from drocap_ros.flight.setpoint import Setpoint
 
 _TRIM_RATE, _MAX_TRIM_M = 0.15, 0.5  # 1/s, m
-_STANDING_M_S, _SURPRISE_S, _FLIGHT_ERROR_M = 0.3, 0.5, 0.5
 _FREE_LEAD = 0.6  # share of the greatest lead below which the reference does not wait
-_CENTRE_RATE = 4.0
-_CENTRE_ACCELERATION = 8.0
-_FORWARD = 1.0
-_DAMPING, _MAX_DAMPING = 2.0, 2.0  # 1/s, m/s^2
+_CENTRE_RATE = 4.0  # 1/s; fast, for the subject's estimate is steady: a slow centre is itself an error of the radius
+_CENTRE_ACCELERATION = 8.0  # m/s^2; above what a subject does, so that only jumps are limited
+_MAX_FORWARD = 1.5  # m/s^2 of the centre that are asked of the vehicle too: a walker's sharp turn
+_DAMPING, _MAX_DAMPING = 2.0, 2.0  # 1/s, m/s^2: how the vehicle's lack of velocity is made up for
+_STANDING_M_S, _SURPRISE_S, _FLIGHT_ERROR_M = 0.3, 0.5, 0.5  # of the least radius
 
 
 class OrbitGoal(NamedTuple):
@@ -186,7 +186,7 @@ def setpoint_of(
     r, omega = state.radius, state.omega
     flat_velocity = state.centre_velocity + r.rate * outward + r.value * omega.value * along
     flat_acceleration = (
-        _FORWARD * _shortened(state.centre_acceleration, 1.5)
+        _shortened(state.centre_acceleration, _MAX_FORWARD)
         + (r.acceleration - omega.value**2 * r.value) * outward
         + (r.value * omega.rate + 2 * r.rate * omega.value) * along
     )

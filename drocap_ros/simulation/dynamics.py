@@ -1,7 +1,7 @@
 """How the simulated vehicle moves: a point mass with lag under an autopilot's position and velocity loops, in wind.
 
-The loops are tuned to what was measured on ArduPilot Copter: stops from 2 m/s, errors of an orbit of 6 m at 2 m/s by what
-the setpoint holds, in wind and round a moving centre.  ``test/simulation/test_copter_measured.py`` prints both.
+The loops are tuned to what was measured on ArduPilot Copter: stops from 2 m/s, errors of an orbit of 6 m at 2 m/s by
+what the setpoint holds, in wind and round a moving centre.  ``test/simulation/test_copter_measured.py`` prints both.
 """
 
 from __future__ import annotations
