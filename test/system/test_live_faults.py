@@ -88,6 +88,7 @@ def kill_again_and_again(session):
             graph.wait_until(lambda number=number: graph.restarts["initializer"] > number, 30)
 
 
-def test_a_node_that_dies_again_and_again_is_given_up(tmp_path):
+def test_a_node_that_dies_again_and_again_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setattr("drocap_ros.bringup.FIRST_PAUSE_S", 0.05)
     with pytest.raises(NodeError, match="initializer ended with status -9"):
         kill_again_and_again(tmp_path / "session")
