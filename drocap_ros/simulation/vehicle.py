@@ -79,14 +79,14 @@ class SimulatedVehicle:
         self.received: list[str] = []  # names of what came in, for tests that nothing else was sent
         self._max_rate_hz, self._boot_s = max_rate_hz, boot_s
         self._transport = transport or open_transport(url)
-        self._parser = MavlinkParser(signing_key, time.time_ns())
+        self._parser = MavlinkParser()
         #: Parameters of the autopilot by their names: a float, or an int.
         self.settings: dict[str, float] = (
             {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5} if autopilot == "px4" else {"GUID_TIMEOUT": 0.5}
         )
         self._mav = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
         if signing_key is not None:
-            sign_with(self._mav, signing_key, time.time_ns())
+            self.use_key(signing_key, time.time_ns())
         self._period_s: dict[int, float] = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}
         if autopilot == "px4":  # PX4 streams a set by itself, ArduPilot almost nothing
             self._period_s[mavlink.MAVLINK_MSG_ID_ATTITUDE] = 0.05
@@ -100,6 +100,11 @@ class SimulatedVehicle:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def use_key(self, key: bytes, now_ns: int) -> None:
+        """Sign from now on, and hear only what is signed."""
+        self._parser = MavlinkParser(key, now_ns)
+        sign_with(self._mav, key, now_ns)
 
     def start(self, clock_s: Callable[[], float] = time.monotonic) -> None:
         """Fly in a thread, in real time; path time 0 is now."""
