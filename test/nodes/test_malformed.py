@@ -185,7 +185,12 @@ INPUTS = {
     CAMERA: (["image_ingest"], good_image, BAD_IMAGES, "image/compressed"),
     "image/compressed": (["pose_estimator"], good_image, BAD_IMAGES, "pose2d"),
     "roi": (["pose_estimator"], good_roi, {}, None),
-    "pose2d": (["initializer", "bundle_adjuster", "mavlink_bridge"], good_pose2d, BAD_POSE2D, "pose3d/initial"),
+    "pose2d": (
+        ["initializer", "bundle_adjuster", "mavlink_bridge", "visualizer"],
+        good_pose2d,
+        BAD_POSE2D,
+        "pose3d/initial",
+    ),
     "pose3d/initial": (["bundle_adjuster", "visualizer"], good_pose3d, BAD_POSE3D, "markers/initial"),
     "pose3d/latest": (["visualizer"], good_latest, BAD_POSE3D, "markers/latest"),
     "vehicle/state": (["bundle_adjuster", "visualizer"], good_state, {}, "markers/camera_path"),
