@@ -37,7 +37,7 @@ def observed(seconds, track_id=1, begin_ns=BEGIN, seed=0):
 
 
 def eventful():
-    """A stream with a duplicate, a late, a stray and a blind image, a gap, a second round and another subject."""
+    """A stream with a duplicate, a late, a stray and a blind image, a gap, a second round, other subjects."""
     first = observed(3.0)
     unseen = {"keypoints": np.full((15, 2), np.nan), "covariance": np.full((15, 3), np.nan), "confidence": np.zeros(15)}
     unseen = {name: values.astype(np.float32) for name, values in unseen.items()}
@@ -45,7 +45,8 @@ def eventful():
     stray = observed(0.05, begin_ns=BEGIN + 600 * S)[:1]  # further away the door refuses it
     gap = observed(2.0, begin_ns=BEGIN + 6 * S, seed=1)
     other = observed(2.5, track_id=2, begin_ns=BEGIN + 3 * S, seed=2)
-    return [*first[:30], first[29], first[20], *stray, blind, *first[30:], *gap, *first, *other]
+    hidden = [replace(o, track_id=3, stamp_ns=o.stamp_ns + 20 * S, **unseen) for o in first[:12]]
+    return [*first[:30], first[29], first[20], *stray, blind, *first[30:], *gap, *first, *other, *hidden]
 
 
 def fly(folder, observations, pause_s=0.012, **adjuster):
@@ -88,21 +89,23 @@ def test_each_event_is_counted_with_its_reason(flown):
     # Ten minutes ahead, and the first image of the second round, which alone could be a stray as well.
     assert found["dropped: stamp far from the stream's"] == "2"
     assert found["time jumped: started anew"] == "1"
-    assert found["another subject"] == "1"
+    assert found["another subject"] == "2"
     assert found["continued after a gap"] == "1"
-    assert found["images that show too little of the person"] == "1"
+    assert found["images that show too little of the person"] == "13"
     adjuster = counts["bundle_adjuster"]
     assert adjuster["time jumped: started anew"] == "1"
-    assert adjuster["another subject"] == "1"
+    assert adjuster["another subject"] == "2"
     assert int(adjuster["adjustments"]) >= 6
+    # Of somebody who is never seen there is nothing to adjust.
+    assert adjuster["adjustments failed: the last solution stays"] == "1"
 
 
 def test_every_initial_pose_has_its_latest(flown):
     _, seen, _ = flown
     stamps = [[stamp_from_ros(m.header.stamp) for m in seen[t]] for t in ("pose3d/initial", "pose3d/latest")]
     assert stamps[0] == stamps[1]
-    # Of 60 + 40 + 60 + 50 images and the blind one, the second round's first was dropped.
-    assert len(stamps[0]) == 210
+    # Of 60 + 40 + 60 + 50 + 12 images and the blind one, the second round's first was dropped.
+    assert len(stamps[0]) == 222
     stages = {m.stage for m in seen["pose3d/latest"]}
     assert stages == {TOPICS["pose3d/latest"].message.INITIAL, TOPICS["pose3d/latest"].message.REFINED}
 
