@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import functools
 import os
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -89,10 +91,16 @@ def to_browser(
         When a port is taken, or the address is not this machine's.
     """
     _check_free(host, port, port + 1)
-    command = [sys.executable, "-m", "rerun_cli", "--serve-web", "--bind", host, "--port", str(port + 1)]
+    command = [_program(), "--serve-web", "--bind", host, "--port", str(port + 1)]
     command += ["--web-viewer-port", str(port), "--server-memory-limit", memory_limit]
     command += ["--newest-first"] if newest_first else []
-    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    server = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,  # Ctrl-C is for us
+        preexec_fn=_end_with_parent(),
+    )
     try:
         local = "127.0.0.1" if host == "0.0.0.0" else host
         for number in (port, port + 1):
@@ -102,10 +110,22 @@ def to_browser(
         yield f"http://{local}:{port}/?url={quote(source, safe='')}"
     finally:
         recording.disconnect()
-        # The program is a child of Python's wrapper around it.
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(server.pid, signal.SIGTERM)
+        server.terminate()
         server.wait()
+
+
+def _program() -> str:
+    import rerun_cli
+
+    return str(Path(rerun_cli.__file__).with_name("rerun"))
+
+
+def _end_with_parent() -> Callable[[], object] | None:
+    """What a child calls first: a killed command must not leave a server on its ports (PR_SET_PDEATHSIG)."""
+    if sys.platform != "linux":
+        return None
+    # Looked up here: between fork and exec the child had better do nothing but call.
+    return functools.partial(ctypes.CDLL(None).prctl, 1, int(signal.SIGTERM))
 
 
 def _check_free(host: str, *ports: int) -> None:

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 import urllib.request
 from pathlib import Path
 
@@ -240,6 +241,19 @@ def test_without_a_screen_a_browser_gets_a_page(folder):
         server.send_signal(signal.SIGINT)
         rest, _ = server.communicate(timeout=30)
     assert server.returncode == 0, line + rest
+    assert not listening(port)
+
+
+def test_a_killed_command_leaves_no_server_behind(folder):
+    port = two_free_ports()
+    server = subprocess.Popen(command(folder, "--port", port), env=environment(), stdout=subprocess.PIPE, text=True)
+    server.stdout.readline()
+    assert listening(port)
+    server.kill()
+    server.communicate(timeout=30)
+    end = time.monotonic() + 20
+    while listening(port) and time.monotonic() < end:
+        time.sleep(0.05)
     assert not listening(port)
 
 
