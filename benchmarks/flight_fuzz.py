@@ -114,8 +114,9 @@ def main() -> int:
     total = Block(*(sum(values) for values in zip(*blocks, strict=True)))
     last = args.first_seed + len(blocks) - 1
     print(
-        f"{time.monotonic() - begin:.0f} s, seeds {args.first_seed} to {last}: {total.mutated} mutated and {total.random} "
-        f"random packets, {total.commands} commands ({total.answers} answered, each with a refusal), {total.bad} pieces "
+        f"{time.monotonic() - begin:.0f} s, seeds {args.first_seed} to {last}: "
+        f"{total.mutated} mutated and {total.random} "
+        f"random packets, {total.commands} commands ({total.answers} answered, each refused), {total.bad} pieces "
         f"of bad data counted, in {len(blocks)} flights of {_BLOCK_S:.0f} s: no crash, no motion; {total.flew} of "
         f"{len(blocks)} flew an orbit afterwards"
     )

@@ -1,0 +1,46 @@
+"""The real bridge process, stopped, killed and started again in flight; ``benchmarks/flight_faults.py processes`` flies
+the whole table with its bounds."""
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from drocap_ros.flight.safety import State
+from drocap_ros.simulation.flight_faults import TIMEOUT
+from drocap_ros.simulation.orbit_loop import LoopSettings
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+
+from flight_processes import SCHEDULING_S, scene
+
+
+def test_a_bridge_that_was_stopped_or_killed_never_goes_on_with_its_orbit():
+    with scene("ardupilot", max_state_age_s=0.5) as flying:  # this machine may be busy with other tests
+        flying.orbit(4.0)
+        copter = flying.drone.copter
+        assert np.linalg.norm(copter.body.velocity) > 0.8
+        os.kill(flying.bridge, signal.SIGSTOP)
+        place, first = copter.body.position.copy(), len(flying.drone.rows)
+        speed = max(np.linalg.norm(copter.body.velocity), np.linalg.norm(copter._target.velocity))
+        flying.listen(1.5)
+        os.kill(flying.bridge, signal.SIGCONT)
+        flying.wait(State.HOLDING, 5.0)
+        assert "stood still" in flying.said[-1].reason
+        flying.listen(1.0)
+        assert flying.said[-1].state == int(State.HOLDING)
+        assert copter.motion_until_s < flying.drone.t - 1.5  # by the autopilot's own time-out, and never again
+        os.kill(flying.bridge, signal.SIGKILL)
+        flying.listen(0.3)
+        taken = copter.accepted_setpoints
+        with flying.new_bridge():
+            flying.wait(State.READY)
+            flying.listen(1.0)
+        assert {m.state for m in flying.said} <= {int(State.IDLE), int(State.READY)}
+        assert copter.accepted_setpoints == taken
+        assert copter.mode in ("GUIDED", "BRAKE")
+        # Half a second of flight and the stop, as for any death of the process.
+        farthest = max(np.linalg.norm((row[1] - place)[:2]) for row in flying.drone.rows[first:])
+        assert farthest < TIMEOUT.bounds(LoopSettings(), speed).excursion_m + SCHEDULING_S * speed
