@@ -48,10 +48,11 @@ def test_the_demo_flies_by_what_it_sees_and_ends_with_a_motion_near_the_truth(tm
     assert [int(told[i]) for i in range(1, 4)] == [
         len(truth.stamp_ns), counts["/drocap/image/compressed"], counts["/drocap/pose2d"],
     ]  # fmt: skip
-    assert int(told[4]) >= len(motion.stamp_ns) > 100
+    assert int(told[4]) > 100
     assert int(told[5]) > 50
     assert float(told[6]) < 120
-    assert counts["/drocap/image/compressed"] >= counts["/drocap/pose2d"] >= len(motion.stamp_ns) > 100
+    assert counts["/drocap/image/compressed"] >= counts["/drocap/pose2d"]
+    assert len(motion.stamp_ns) > 0.95 * counts["/drocap/pose2d"]
     assert counts["/drocap/vehicle/state"] > 200
     assert counts["/tf"] > 200
     orbiting = np.array([state == State.ORBITING for _, state in status])
@@ -104,6 +105,13 @@ def test_a_flight_without_length_is_refused(tmp_path, capsys):
     assert main(["demo", "--seconds", "-1", "--out", str(tmp_path / "demo")]) == 2
     assert "seconds: expected" in capsys.readouterr().err
     assert not (tmp_path / "demo").exists()
+
+
+def test_a_demo_without_networks_is_refused_and_leaves_nothing(tmp_path, capsys):
+    words = ["demo", "--models", str(tmp_path / "none"), "--out", str(tmp_path / "demo"), "--quiet"]
+    assert main(words) == 2
+    assert "none: expected a folder with a" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_orbit_is_settled_after_its_ramp_and_each_start_has_one():
