@@ -22,6 +22,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument(
         "--steps", type=int, default=0, help="end after this many rounds instead, for the same result from a seed"
     )
+    parser.add_argument(
+        "--only", choices=("both", "detector", "pose"), default="both", help="which networks to train (default both)"
+    )
     parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch (default 1)")
     parser.add_argument("--seed", type=int, default=0, help="seed of renders and first weights (default 0)")
     parser.add_argument("--quiet", action="store_true", help="no progress, only errors")
@@ -44,16 +47,17 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--out: expected a folder, or a name in one that exists, got {args.out}")
     if not 1 <= args.threads <= 64:
         raise InputError(f"--threads: expected 1 to 64, got {args.threads}")
-    options = SimulationTraining(minutes=args.minutes, steps=args.steps, seed=args.seed)
+    options = SimulationTraining(minutes=args.minutes, steps=args.steps, seed=args.seed, only=args.only)
     set_threads(args.threads)
     length = f"--steps {args.steps}" if args.steps else f"--minutes {args.minutes:g}"
+    chosen = "" if args.only == "both" else f" --only {args.only}"
 
     def save(detector: Any, pose: Any, facts: dict[str, Any]) -> None:
         described = {
             "only_for": "simulation",
             "notice": "trained on this project's own renders, for simulation only, not for pictures of real people",
             "licence": "Apache-2.0",
-            "command": f"drocap train-simulation-models {length} --seed {args.seed} --out DIR",
+            "command": f"drocap train-simulation-models {length}{chosen} --seed {args.seed} --out DIR",
             **{name: str(value) for name, value in facts.items()},
         }
         export(detector, pose, args.out, described)

@@ -42,6 +42,7 @@ class SimulationTraining(Parameters):
 
     minutes: float = param(40.0, "wall-clock time of the training", unit="min", minimum=0.01, maximum=10000.0)
     steps: int = param(0, "end after this many rounds instead; the result then depends on the seed only", minimum=0)
+    only: str = param("both", "which networks to train", choices=("both", "detector", "pose"))
     batch: int = param(32, "pictures of a batch", minimum=2, maximum=1024)
     pose_batches: int = param(2, "batches of the pose network to one of the detector", minimum=1, maximum=16)
     pool: int = param(4096, "rendered pictures that are kept for further batches", minimum=8, maximum=100_000)
@@ -141,6 +142,8 @@ def train(
 
     ``checkpoint(detector, pose, facts)`` is called now and then.
 
+    Those that ``options.only`` leaves out come back as they were born, with no steps among the facts.
+
     Raises
     ------
     DrocapError
@@ -154,21 +157,24 @@ def train(
     pools = _Pool(detector_sample, options.pool), _Pool(pose_sample, options.pool)
     begin = time.monotonic()
     shown = saved = 0.0
+    rounds = 0
 
     def facts() -> dict[str, Any]:
         return {"detector_steps": detector.steps, "pose_steps": pose.steps, "batch": options.batch}
 
     while True:
         elapsed = (time.monotonic() - begin) / 60
-        progress = detector.steps / options.steps if options.steps else elapsed / options.minutes
+        progress = rounds / options.steps if options.steps else elapsed / options.minutes
         if progress >= 1:
             break
-        pictures, boxes = detector_batch(pools[0].batch(world, rng, options.batch), rng)
-        detector.step(*detector_loss(detector.network, _tensor(pictures), boxes), progress)
-        for _ in range(options.pose_batches):
+        if options.only != "pose":
+            pictures, boxes = detector_batch(pools[0].batch(world, rng, options.batch), rng)
+            detector.step(*detector_loss(detector.network, _tensor(pictures), boxes), progress)
+        for _ in range(options.pose_batches if options.only != "detector" else 0):
             crops, *truth = pose_batch(pools[1].batch(world, rng, options.batch), rng)
             pose.step(*pose_loss(pose.network, _tensor(crops), *truth), progress)
-        if detector.steps % _RENEW_EVERY == 0:
+        rounds += 1
+        if rounds % _RENEW_EVERY == 0:
             world.renew()
         if elapsed - shown > 0.5:
             shown = elapsed
@@ -199,16 +205,18 @@ def set_threads(count: int) -> None:
 
 
 def export(detector: torch.nn.Module, pose: torch.nn.Module, folder: Path, facts: dict[str, str]) -> None:
-    """Write both as ONNX into a folder, with weights in half precision and ``facts`` as metadata."""
+    """Write those with steps as ONNX into a folder, with weights in half precision and ``facts`` as metadata."""
     from drocap_ros.reconstruction.train_lifter import write_onnx
 
     torch = pytorch()
-    write_onnx(
-        detector, torch.zeros(1, 3, DETECTOR_SIZE[1], DETECTOR_SIZE[0]), folder / "person_detector.onnx",
-        ["picture"], ["grid"], {}, facts,
-    )  # fmt: skip
-    write_onnx(
-        pose, torch.zeros(1, 3, POSE_SIZE[1], POSE_SIZE[0]), folder / "person_pose.onnx",
-        ["picture"], ["columns", "rows"], {}, facts,
-    )  # fmt: skip
-    (folder / "person_pose.yaml").write_text("skeleton: body15\n", encoding="utf-8")
+    if int(facts["detector_steps"]):
+        write_onnx(
+            detector, torch.zeros(1, 3, DETECTOR_SIZE[1], DETECTOR_SIZE[0]), folder / "person_detector.onnx",
+            ["picture"], ["grid"], {}, facts,
+        )  # fmt: skip
+    if int(facts["pose_steps"]):
+        write_onnx(
+            pose, torch.zeros(1, 3, POSE_SIZE[1], POSE_SIZE[0]), folder / "person_pose.onnx",
+            ["picture"], ["columns", "rows"], {}, facts,
+        )  # fmt: skip
+        (folder / "person_pose.yaml").write_text("skeleton: body15\n", encoding="utf-8")

@@ -115,7 +115,8 @@ def detector_targets(boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     inside = ((middle > box[:, None, :2]) & (middle < box[:, None, 2:])).all(axis=2)
     central = (off < 1.25).all(axis=2) & (inside | (off < 0.51).all(axis=2))
     positive = of_size & central
-    free = there[:, None] & inside & ~positive & (off < 2.5).all(axis=2)
+    # Cells of another stride have no box of this size to offer: a score of theirs would make a second person.
+    free = of_size & inside & ~positive & (off < 2.5).all(axis=2)
     return positive, free
 
 
