@@ -1,0 +1,121 @@
+"""Pictures within a process."""
+
+import contextlib
+
+import cv2
+import numpy as np
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+
+from drocap_ros.bringup import free_domain
+from drocap_ros.nodes.conversions import compressed_image_to_ros, header_at, stamp_from_ros
+from drocap_ros.nodes.image_ingest import ImageIngestNode
+from drocap_ros.nodes.initializer import InitializerNode
+from drocap_ros.nodes.picture_channel import Picture, PictureInput, PictureReader
+from drocap_ros.nodes.topics import IMAGE_RECORDING_QOS, TOPICS
+from drocap_ros.perception.config import ImageIngestConfig
+from drocap_ros.perception.images import encode_jpeg
+from drocap_ros.recording.pictures import image_from_message
+
+
+@pytest.fixture
+def context():
+    with free_domain() as domain_id:
+        context = Context()
+        rclpy.init(args=[], context=context, domain_id=domain_id)
+        yield context
+        context.try_shutdown()
+
+
+@pytest.fixture
+def pictures(tmp_path):
+    rng = np.random.default_rng(0)
+    images = [rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(5)]
+    for i, image in enumerate(images):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), image)
+    return tmp_path, images
+
+
+@contextlib.contextmanager
+def spinning(context, *nodes):
+    executor = SingleThreadedExecutor(context=context)
+    for node in nodes:
+        executor.add_node(node)
+
+    def until(condition, rounds=400):
+        for _ in range(rounds):
+            if condition():
+                return
+            executor.spin_once(timeout_sec=0.05)
+        pytest.fail("it did not come")
+
+    try:
+        yield until
+    finally:
+        for node in nodes:
+            node.close()
+        executor.shutdown()
+        for node in nodes:
+            node.destroy_node()
+
+
+def test_an_array_arrives_as_it_was_and_jpeg_comes_from_elsewhere_only(context, pictures):
+    folder, images = pictures
+    config = ImageIngestConfig(source=str(folder), loop=True, folder_rate_hz=50.0)
+    camera = ImageIngestNode(config, context=context, use_global_arguments=False)
+    reader = InitializerNode(context=context, use_global_arguments=False)
+    got = []
+
+    def decode(message):
+        return image_from_message(message, compressed=True)
+
+    source = PictureInput(reader, lambda header, image: got.append((header, image)), decode, depth=1)
+    with spinning(context, camera, reader) as until:
+        until(lambda: len(got) >= 5)
+        # Noise does not survive JPEG: what arrived was never encoded.
+        assert all(any(np.array_equal(image, original) for original in images) for _, image in got)
+        assert camera.count_publishers("/drocap/image/compressed") == 1
+        assert reader.count_subscribers("/drocap/image/compressed") == 0
+
+        # The camera's node goes; another process publishes.
+        camera.close()
+        got.clear()
+        until(lambda: reader.count_subscribers("/drocap/image/compressed") == 1)
+        other = reader.create_publisher(TOPICS["image/compressed"].message, "image/compressed", IMAGE_RECORDING_QOS)
+        until(lambda: other.get_subscription_count() == 1)
+        flat = np.full((48, 64, 3), 90, np.uint8)
+        other.publish(compressed_image_to_ros(header_at(10**18, "c"), encode_jpeg(flat)))
+        until(lambda: got)
+        assert stamp_from_ros(got[-1][0].stamp) == 10**18
+        assert np.abs(got[-1][1].astype(int) - 90).max() <= 2
+        source.close()
+
+
+def test_a_recorder_gets_jpeg_while_a_reader_gets_arrays(context, pictures):
+    folder, _ = pictures
+    config = ImageIngestConfig(source=str(folder), loop=True, folder_rate_hz=50.0)
+    camera = ImageIngestNode(config, context=context, use_global_arguments=False)
+    reader = InitializerNode(context=context, use_global_arguments=False)
+    arrays, jpegs = [], []
+    PictureInput(reader, lambda header, _: arrays.append(stamp_from_ros(header.stamp)), lambda _: None, depth=1)
+    kind = TOPICS["image/compressed"].message
+    reader.create_subscription(kind, "image/compressed", jpegs.append, IMAGE_RECORDING_QOS)
+    with spinning(context, camera, reader) as until:
+        until(lambda: len(jpegs) > 10 and len(arrays) > 10)
+    shared = {stamp_from_ros(m.header.stamp) for m in jpegs} & set(arrays)
+    assert len(shared) > 5
+    assert bytes(jpegs[0].data[:2]) == b"\xff\xd8"
+
+
+def test_a_reader_that_is_busy_misses_the_oldest_and_knows_how_many():
+    woken = []
+    reader = PictureReader(lambda: woken.append(1), depth=2)
+    sent = [Picture(header_at(i, "c"), np.zeros((1, 1, 3), np.uint8)) for i in range(5)]
+    for picture in sent:
+        reader.put(picture)
+    assert reader.take() == (sent[3], 3)
+    assert reader.take() == (sent[4], 0)
+    assert reader.take() == (None, 0)
+    assert len(woken) == 6  # once more, as one was left after the first
