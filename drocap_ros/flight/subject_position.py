@@ -52,6 +52,7 @@ _DRIFT = 0.05  # m/sqrt(s): the vehicle's own position and height wander, feet a
 _LEAN_RAD = 0.12  # standard deviation of the body's lean; looking down by a slope it changes lengths by as much
 _RATIO_NOISE, _RATIO_WANDER = 0.035, 0.02  # of the logarithm of size over ground: of one image; 1/sqrt(s)
 _BENDING_BY_NOISE = 0.1
+_DOUBTED = 0.3  # share of the range
 
 
 class SubjectMeasurement(NamedTuple):
@@ -221,6 +222,25 @@ class SubjectEstimate:
     track_id: int
 
 
+def _doubt(
+    measurement: SubjectMeasurement, innovation: np.ndarray, covariance: np.ndarray, camera: np.ndarray
+) -> np.ndarray:
+    """(3, 3) m^2 to add to the noise of a range that surprises: a lifted foot, a wrong ankle.
+
+    The subject is where it is seen, only how far is doubted; what surprises beyond a share of the range is left to
+    the gate.
+    """
+    ray = measurement.position - camera
+    distance = float(np.hypot(ray[0], ray[1]))
+    along = ray / max(distance, 1e-6)
+    ahead = np.array([along[0], along[1], 0.0])
+    usual = 2.0 * float(np.sqrt(ahead @ (covariance + measurement.noise) @ ahead))
+    surprise = abs(float(innovation @ ahead)) - usual
+    if not 0.0 < surprise < _DOUBTED * distance:
+        return np.zeros((3, 3))
+    return surprise**2 * np.outer(along, along)
+
+
 class SubjectFilter:
     """Kalman filter of position and velocity, white acceleration; measurements must come in the order of stamps.
 
@@ -277,7 +297,8 @@ class SubjectFilter:
             return False
         state, covariance = self._predicted(min(gap_s, 5.0))
         innovation = measurement.position - state[:3]
-        spread = covariance[:3, :3] + measurement.noise
+        noise = measurement.noise + _doubt(measurement, innovation, covariance[:3, :3], camera.position)
+        spread = covariance[:3, :3] + noise
         inverse = np.linalg.inv(spread)
         if float(innovation @ inverse @ innovation) > self._config.subject_gate:
             self.rejected += 1
