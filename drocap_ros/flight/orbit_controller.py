@@ -323,13 +323,14 @@ class OrbitController:
     def _send_commands(self, seen: Observed, estimate: SubjectEstimate | None, now_s: float) -> None:
         for command, result in self._link.take_answers():
             self._queue.acknowledge(command, result, now_s)
+        if self._queue.failure(_GIMBAL):
+            self._gimbal_s = math.inf  # there is no mount: not asked again
         wanted = self._config.gimbal_control and self.safety.state == State.ORBITING and estimate is not None
         if wanted and estimate is not None and now_s - self._gimbal_s > _GIMBAL_PERIOD_S:
             drop = float(seen.position[2] - estimate.position[2])
             pitch = -math.degrees(math.atan2(drop, max(seen.subject_distance_m, 0.1)))
             nan = math.nan
-            if not self._queue.failure(_GIMBAL):  # without a mount it is refused, and not asked again
-                self._queue.request(_GIMBAL, (round(pitch, 1), 0.0, nan, nan, 0.0, 0.0, 0.0), "gimbal pitch", now_s)
+            self._queue.request(_GIMBAL, (round(pitch, 1), 0.0, nan, nan, 0.0, 0.0, 0.0), "gimbal pitch", now_s)
             self._gimbal_s = now_s
         for command, confirmation, parameters in self._queue.due(now_s):
             message = command_message(self._link.mav, self._link.target, command, confirmation, parameters)
