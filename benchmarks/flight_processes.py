@@ -164,6 +164,8 @@ class Scene:
     def orbit(self, seconds: float) -> None:
         """Start the orbit and fly it for a while."""
         self.wait(State.READY)
+        while not self._commands.get_subscription_count():  # discovery: what is said earlier is lost
+            self.listen(0.05)
         control = self.drone.copter.mode == CONTROL[self.drone.autopilot]
         self.command(Command.START if control else Command.ENGAGE)
         self.wait(State.ORBITING, 10.0)
