@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from drocap_ros.view.scene import PICTURE, WORLD
+from drocap_ros.view.scene import PICTURE, WORLD, subject_path
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -18,10 +18,13 @@ def layout(views: tuple[str, ...], *, follow: bool = False) -> rrb.Blueprint:
     Parameters
     ----------
     views : groups of curves, one view each; "log" is what the nodes say
-    follow : whether the newest image is shown, not the first
+    follow : whether the newest image is shown, not the first; refined poses are hidden then
     """
     import rerun.blueprint as rrb
 
+    contents = [f"+ /{WORLD}/**"]
+    if follow:  # a refined pose is two seconds old: beside the newest ones it would be a second body
+        contents.append(f"- /{subject_path('refined')}/**")
     below = [
         rrb.TextLogView(origin="log", name="log")
         if name == "log"
@@ -31,7 +34,9 @@ def layout(views: tuple[str, ...], *, follow: bool = False) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
-                rrb.Spatial3DView(origin=WORLD, name="3D", background=rrb.Background(color=_BACKGROUND)),
+                rrb.Spatial3DView(
+                    origin=WORLD, contents=contents, name="3D", background=rrb.Background(color=_BACKGROUND)
+                ),
                 rrb.Spatial2DView(origin=PICTURE, name="picture"),
                 column_shares=[3, 2],
             ),
