@@ -41,6 +41,7 @@ def main() -> int:
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []])
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--minutes", type=float, default=5.0)
+    parser.add_argument("--threads", type=int, default=2, help="of the networks, as in the configurations")
     parser.add_argument("--one-process", action="store_true")
     parser.add_argument("--processes", action="store_true")
     parser.add_argument("--no-adjuster", action="store_true")
@@ -76,11 +77,11 @@ def stream(folder: Path) -> Path:
     return path
 
 
-def graph_config(video: Path, session: Path, port: int) -> Any:
+def graph_config(video: Path, session: Path, port: int, threads: int = 2) -> Any:
     from drocap_ros.config import DrocapConfig
 
     config = DrocapConfig().replace("image_ingest", source=str(video), horizontal_fov_deg=60.0, loop=True)
-    config = config.replace("pose_estimator", models_dir=str(SHARED / "models"), on_loss="next")
+    config = config.replace("pose_estimator", models_dir=str(SHARED / "models"), on_loss="next", threads=threads)
     config = config.replace("mavlink_bridge", url=f"udpin:127.0.0.1:{port}")
     return config.replace("session_recorder", session_dir=str(session))
 
@@ -120,24 +121,26 @@ def part_load(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
                 continue
             name = ("processes" if processes else "one process") + ("" if adjuster else ", no adjuster")
             load = os.getloadavg()[0]
-            results[name] = measure_load(video, folder / name.replace(" ", "_"), processes, adjuster, args.seconds)
+            results[name] = measure_load(video, folder / name.replace(" ", "_"), processes, adjuster, args)
             results[name]["load average before"] = round(load, 2)
             say(f"load, {name}, {args.seconds:g} s", results[name])
     return results
 
 
-def measure_load(video: Path, session: Path, processes: bool, adjuster: bool, seconds: float) -> dict[str, Any]:
+def measure_load(
+    video: Path, session: Path, processes: bool, adjuster: bool, args: argparse.Namespace
+) -> dict[str, Any]:
     from drocap_ros.bringup import bringup
     from drocap_ros.simulation.ports import free_udp_port
 
     nodes = [name for name in NODES if adjuster or name != "bundle_adjuster"]
     port = free_udp_port()
-    config = graph_config(video, session, port)
+    config = graph_config(video, session, port, args.threads)
     with vehicle(port), bringup(config, nodes, processes=processes) as graph:
         graph.spin_for(WARM_S)
         pids = {graph.pid(name): name if processes else "all nodes" for name in nodes}
         before, begin_ns = {pid: usage(pid)[0] for pid in pids}, time.time_ns()
-        graph.spin_for(seconds)
+        graph.spin_for(args.seconds)
         after, end_ns = {pid: usage(pid) for pid in pids}, time.time_ns()
     cpu = {pids[pid]: round(100 * (after[pid][0] - before[pid]) / ((end_ns - begin_ns) * 1e-9)) for pid in pids}
     return {
@@ -181,6 +184,9 @@ def session_figures(session: Path, begin_ns: int, end_ns: int) -> dict[str, Any]
                         solve_s.append(message.solve_seconds)
                         frames.append(len(message.poses))
     seconds = (end_ns - begin_ns) * 1e-9
+    # Exactly, by stamps: which pictures were never looked at.
+    sent = {stamp for stamp in stamps["camera_info"] if stamp < end_ns - 10**9}
+    unseen = len(sent - set(stamps["pose2d"])) / len(sent)
     figures: dict[str, Any] = {
         "per second": {topic: round(len(found) / seconds, 2) for topic, found in stamps.items()},
         "late ms p50 / p95 / p99": {
@@ -189,6 +195,11 @@ def session_figures(session: Path, begin_ns: int, end_ns: int) -> dict[str, Any]
             if topic in late_ms
         },
     }
+    initial = figures["late ms p50 / p95 / p99"]["pose3d/initial"]
+    figures["pictures without keypoints %"] = round(100 * unseen, 2)
+    figures["within the bounds (60 / 120 / 200 ms, 1 %)"] = bool(
+        all(late <= bound for late, bound in zip(initial, (60, 120, 200), strict=True)) and unseen <= 0.01
+    )
     if solve_s:
         figures["solve s p50 / p95"] = [round(float(v), 3) for v in np.percentile(solve_s, [50, 95])]
         figures["frames per solve, median"] = int(np.median(frames))
