@@ -110,4 +110,7 @@ def check_flown(operator: Operator) -> None:
     """
     if operator.orbited_s < 0.5 * operator.seconds:
         why = operator.failure or "; ".join(operator.holds) or "nothing was said"
-        raise NodeError(f"demo: expected {operator.seconds:g} s of orbit, flew {operator.orbited_s:.1f} s: {why}")
+        busy = f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+        raise NodeError(
+            f"demo: expected {operator.seconds:g} s of orbit, flew {operator.orbited_s:.1f} s: {why} ({busy})"
+        )

@@ -11,6 +11,8 @@ from drocap_ros.flight.safety import Command, State
 
 #: How long the operator waits for the bridge to be ready, for an answer to a command, and between tries.
 READY_TIMEOUT_S, ANSWER_TIMEOUT_S, RETRY_S = 60.0, 10.0, 2.0
+#: Nobody starts at the first blink of a green light.
+STEADY_S = 1.0
 #: After the stop: the vehicle comes to rest.
 REST_S = 3.0
 
@@ -57,6 +59,7 @@ class Operator:
     said: list[str] = field(default_factory=list)
     _since_s: float = math.nan
     _before_s: float = math.nan
+    _ready_s: float = math.nan
     _next_try_s: float = -math.inf
     _last_words: str = ""
 
@@ -93,9 +96,16 @@ class Operator:
             self._say(f"fault: {reason}; acknowledged")
             return Command.STOP
         # A hold ends only by the operator's word: the bridge answers whether its conditions are met again.
-        ready = state in (State.READY, State.HOLDING)
+        if state != State.READY:
+            self._ready_s = math.nan
+        elif math.isnan(self._ready_s):
+            self._ready_s = now_s
+        ready = state == State.HOLDING or now_s - self._ready_s >= STEADY_S
         if not ready or not self.cleared or now_s < self._next_try_s:
-            self._say("waiting for the pilot" if ready and not self.cleared else f"not ready yet: {reason}", True)
+            if state != State.READY:
+                self._say(f"not ready yet: {reason}", changed_only=True)
+            elif not self.cleared:
+                self._say("waiting for the pilot", changed_only=True)
             return None
         again = bool(self.holds)
         self._say("starting the orbit again" if again else "ready: starting the orbit")

@@ -28,6 +28,10 @@ def test_it_waits_starts_watches_and_stops():
     desk = Desk(operator)
     desk.show(State.IDLE, "the motors are not armed", 3.0)
     assert desk.commands == []
+    desk.show(State.READY, "all conditions for motion hold", 0.8)
+    desk.show(State.IDLE, "the subject was last located 0.5 s ago")
+    desk.show(State.READY, "all conditions for motion hold", 1.0)
+    assert desk.commands == []
     desk.show(State.READY, "all conditions for motion hold", 0.4)
     assert [command for _, command in desk.commands] == [Command.START]
     desk.show(State.ORBITING, "orbiting the subject", 6.0)
@@ -43,7 +47,7 @@ def test_it_waits_starts_watches_and_stops():
 
 def test_px4_is_asked_for_control_from_the_start():
     desk = Desk(Operator(5.0, takes_control=True))
-    desk.show(State.READY, "all conditions for motion hold")
+    desk.show(State.READY, "all conditions for motion hold", 1.2)
     assert [command for _, command in desk.commands] == [Command.ENGAGE]
 
 
@@ -53,13 +57,13 @@ def test_nothing_is_started_before_the_pilot_has_handed_over():
     desk.show(State.READY, "all conditions for motion hold", 3.0)
     assert desk.commands == []
     operator.cleared = True
-    desk.show(State.READY, "all conditions for motion hold")
+    desk.show(State.READY, "all conditions for motion hold", 1.2)
     assert [command for _, command in desk.commands] == [Command.START]
 
 
 def test_a_refused_start_is_tried_again_later():
     desk = Desk(Operator(5.0))
-    desk.show(State.READY, "all conditions for motion hold")
+    desk.show(State.READY, "all conditions for motion hold", 1.2)
     desk.show(State.READY, "refused: the mode is LOITER; switch to GUIDED or OFFBOARD, or send engage")
     desk.show(State.READY, "all conditions for motion hold", 6.0)
     times = [t for t, command in desk.commands if command == Command.START]
@@ -70,7 +74,7 @@ def test_a_refused_start_is_tried_again_later():
 def test_after_a_hold_the_orbit_is_started_again_with_control_asked_for_and_its_time_goes_on():
     operator = Operator(6.0, restarts=2)
     desk = Desk(operator)
-    desk.show(State.READY, "all conditions for motion hold")
+    desk.show(State.READY, "all conditions for motion hold", 1.2)
     desk.show(State.ORBITING, "orbiting the subject", 4.0)
     desk.show(State.HOLDING, "the subject was last located 0.5 s ago", 4.0)
     assert [command for _, command in desk.commands] == [Command.START, Command.ENGAGE]
@@ -85,7 +89,7 @@ def test_after_a_hold_the_orbit_is_started_again_with_control_asked_for_and_its_
 def test_too_many_holds_end_the_flight():
     operator = Operator(60.0, restarts=1)
     desk = Desk(operator)
-    desk.show(State.READY, "all conditions for motion hold")
+    desk.show(State.READY, "all conditions for motion hold", 1.2)
     for _ in range(2):
         desk.show(State.ORBITING, "orbiting the subject", 2.0)
         desk.show(State.HOLDING, "the link's round trip takes 0.9 s", 4.0)
@@ -99,7 +103,7 @@ def test_too_many_holds_end_the_flight():
 def test_a_pilot_who_takes_over_ends_the_flight():
     operator = Operator(60.0)
     desk = Desk(operator)
-    desk.show(State.READY, "all conditions for motion hold")
+    desk.show(State.READY, "all conditions for motion hold", 1.2)
     desk.show(State.ORBITING, "orbiting the subject", 2.0)
     desk.show(State.TAKEN_OVER, "the mode became LOITER by another hand", 1.0)
     assert operator.failure == "the mode became LOITER by another hand"
@@ -107,7 +111,7 @@ def test_a_pilot_who_takes_over_ends_the_flight():
 
 def test_a_fault_is_acknowledged_before_the_next_start():
     desk = Desk(Operator(60.0))
-    desk.show(State.READY, "all conditions for motion hold")
+    desk.show(State.READY, "all conditions for motion hold", 1.2)
     desk.show(State.ORBITING, "orbiting the subject", 2.0)
     desk.show(State.FAULT, "the autopilot's hold mode does not come: take over by hand", 4.0)
     desk.show(State.READY, "all conditions for motion hold", 4.0)
