@@ -52,8 +52,9 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 10.0
 #: A node that dies more often than this within a minute is given up, and the graph with it.
 MOST_RESTARTS = 5
 
-#: The matrices of a node are small: more BLAS threads cost more than they bring, the more so in six processes.
-_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+#: The matrices of a node are small: more BLAS threads cost more than they bring, the more so in six processes.  The
+#: middleware's many threads would each keep an arena of their own, in which memory goes to pieces over hours.
+_LEAN = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
 
 
 class Graph:
@@ -359,7 +360,7 @@ class _Process(_Runner):
             str(parameters),
             "--disable-stdout-logs",
         ]
-        environment = {**_ONE_THREAD, **os.environ, "ROS_DOMAIN_ID": str(domain_id), PARENT: str(os.getpid())}
+        environment = {**_LEAN, **os.environ, "ROS_DOMAIN_ID": str(domain_id), PARENT: str(os.getpid())}
         with self._log.open("ab") as log:
             self._process = subprocess.Popen(command, env=environment, stderr=log, start_new_session=True)
         self.pid = self._process.pid
