@@ -36,6 +36,17 @@ RESULTS = Path(__file__).parent / "results" / "flight_orbits.jsonl"
 _SOURCES = Path(__file__).parents[1] / "drocap_ros"
 
 
+def _code_version() -> str:
+    """Of everything that flies here, as it was loaded."""
+    digest = hashlib.sha256()
+    for path in sorted([*(_SOURCES / "flight").glob("*.py"), *(_SOURCES / "simulation").glob("*.py")]):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+_CODE = _code_version()
+
+
 def settings_of(seed: int) -> LoopSettings:
     """A flight that the parameters allow: person, place, wind, orbit and link drawn at random."""
     rng = np.random.default_rng(seed)
@@ -127,20 +138,12 @@ def outcome(seed: int) -> dict[str, Any]:
     refusals = [answer for _, answer in loop.answers if answer.startswith("refused")]
     whole = all(row.state == State.ORBITING for row in rows if row.t_s > 14.0)
     return {
-        "seed": seed, "code": code_version(), "autopilot": settings.autopilot, "action": settings.action,
+        "seed": seed, "code": _CODE, "autopilot": settings.autopilot, "action": settings.action,
         "breaches": breaches(settings, loop), "least_distance_m": round(least_distance(loop), 3),
         "orbiting": round(float(np.mean(orbiting)), 3), "flown": any(orbiting), "held": stops[:3],
         "refused": refusals[:1] if not any(orbiting) else [],
         "radius_error_m": round(float(np.mean(np.abs(settled))), 3) if whole else None,
     }  # fmt: skip
-
-
-def code_version() -> str:
-    """Of everything that flies here."""
-    digest = hashlib.sha256()
-    for path in sorted([*(_SOURCES / "flight").glob("*.py"), *(_SOURCES / "simulation").glob("*.py")]):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]
 
 
 def randomized(first: int, count: int, again: bool, seconds: float) -> int:
