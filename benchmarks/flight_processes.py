@@ -150,7 +150,7 @@ class Scene:
         end = time.monotonic() + timeout_s
         while not (self.said and self.said[-1].state == int(state)):
             if time.monotonic() > end:
-                raise AssertionError(f"no {state.name} in {timeout_s:g} s: {[m.reason for m in self.said[-3:]]}")
+                raise AssertionError(f"no {state.name} in {timeout_s:g} s: {[m.reason for m in self.said[-9:]]}")
             self.listen(0.05)
 
     def command(self, kind: Command) -> None:
@@ -167,8 +167,12 @@ class Scene:
         while not self._commands.get_subscription_count():  # discovery: what is said earlier is lost
             self.listen(0.05)
         control = self.drone.copter.mode == CONTROL[self.drone.autopilot]
-        self.command(Command.START if control else Command.ENGAGE)
-        self.wait(State.ORBITING, 10.0)
+        for _ in range(5):  # an operator who is refused asks again
+            self.command(Command.START if control else Command.ENGAGE)
+            with contextlib.suppress(AssertionError):
+                self.wait(State.ORBITING, 4.0)
+                break
+        self.wait(State.ORBITING, 1.0)
         self.listen(seconds)
         if self.said[-1].state != int(State.ORBITING):
             raise AssertionError(f"not orbiting before the fault: {self.said[-1].reason}")
