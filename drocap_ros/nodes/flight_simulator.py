@@ -58,13 +58,12 @@ class FlightSimulatorNode(ComponentNode):
     def close(self) -> None:
         """End the flight and write what was really there."""
         self._end()
-        flown = self._threads[0].is_alive()
         for thread in self._threads:
             if thread.is_alive():
                 thread.join(timeout=5.0)
         self._pictures.close()
         self._world.close()
-        if flown and self.config.truth_file:
+        if self.config.truth_file and self.counters["exposures"]:
             save_truth(Path(self.config.truth_file), self._world.truth())
 
     def _end(self) -> None:
