@@ -162,3 +162,19 @@ def test_watchdog_says_the_last_words_of_a_loop_that_hangs_and_only_then():
     dog.kick(30.0, None)
     dog.step(40.0)
     assert sent == []
+
+
+def test_watchdog_that_stood_still_with_its_loop_leaves_the_old_place_alone():
+    sent = []
+    dog = Watchdog(sent.append, 0.2)
+    words = LastWords("hold", "mode")
+    dog.kick(1.0, words)
+    dog.step(1.02)
+    for i in range(100):  # stopped for three seconds, and the loop is not back yet
+        dog.step(4.02 + 0.02 * i)
+    assert sent == []
+    dog.kick(6.1, words)
+    dog.step(6.12)
+    for i in range(20):
+        dog.step(6.14 + 0.02 * i)
+    assert sent[0] == "hold"  # and watches again afterwards

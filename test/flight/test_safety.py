@@ -253,3 +253,31 @@ def test_reasons_are_all_different():
 def test_contradicting_limits_are_refused():
     with pytest.raises(ParameterError, match="max_height_m"):
         SafetyConfig(min_height_m=5.0, max_height_m=5.5)
+
+
+def test_at_speed_the_subject_must_have_been_seen_sooner():
+    def held(speed, age_s):
+        seen = dataclasses.replace(GOOD, velocity=np.array([0.0, speed, 0.0]), subject_age_s=age_s)
+        return reduce(orbiting(), seen, 1.0, None, LIMITS)[0].state == State.HOLDING
+
+    assert not held(2.0, 0.39)
+    assert held(2.0, 0.41)
+    assert held(2.5, 0.36)
+    assert not held(2.5, 0.33)
+    assert not held(4.4, 0.24)  # not below what a camera and a network take
+    assert held(4.4, 0.26)
+
+
+def test_an_autopilot_that_does_not_follow_is_told_the_hold_mode_at_once():
+    deaf = dataclasses.replace(GOOD, heeded=False, disturbance="no setpoint echoed")
+    _, decision = reduce(orbiting(), deaf, 1.0, None, LIMITS)
+    assert decision == (Action.HOLD, ModeRequest.HOLD, "")
+    _, decision = reduce(orbiting(), dataclasses.replace(deaf, heeded=True), 1.0, None, LIMITS)
+    assert decision == (Action.HOLD, ModeRequest.NONE, "")
+
+
+def test_settings_of_the_autopilot_that_forbid_to_fly():
+    seen = dataclasses.replace(GOOD, settings_problem="the autopilot would fly on for 3 s without us")
+    _, decision = reduce(SafetyState(), seen, 0.0, Command.START, LIMITS)
+    assert decision.answer == "refused: the autopilot would fly on for 3 s without us"
+    assert reduce(orbiting(), seen, 1.0, None, LIMITS)[0].state == State.HOLDING
