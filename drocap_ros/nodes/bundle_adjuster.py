@@ -200,8 +200,8 @@ class BundleAdjusterNode(ComponentNode):
 
 
 def _give_way() -> None:
-    """Run the calling thread at a lower priority: where cores are short, images go before adjustments."""
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 5)
+    """Run the calling thread at a slightly lower priority: where cores are short, images go before adjustments."""
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 2)
 
 
 def main() -> int:

@@ -73,6 +73,20 @@ def default_config(adjuster: BundleAdjusterConfig) -> DefaultMethodConfig:
     )
 
 
+def prepare(config: DefaultMethodConfig) -> None:
+    """Load what a first window would wait for.
+
+    Raises
+    ------
+    InputError
+        When ``config.lifter`` is no lifter.
+    """
+    import scipy.linalg.lapack
+    import scipy.ndimage  # noqa: F401
+
+    Lifter.load(config.lifter or None)
+
+
 @dataclass(frozen=True)
 class KnownBody:
     """What an earlier window knows of the person.

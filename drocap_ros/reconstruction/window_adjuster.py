@@ -16,6 +16,7 @@ from drocap_ros.reconstruction.default_method import (
     KnownBody,
     default_config,
     default_poses,
+    prepare,
 )
 from drocap_ros.reconstruction.effort import Effort
 from drocap_ros.reconstruction.lifted_start import person_size
@@ -44,6 +45,9 @@ class WindowAdjuster:
     """
 
     def __init__(self, config: BundleAdjusterConfig) -> None:
+        if config.method == "ba":
+            # A file that is no lifter is refused here, and the first window does not pay for loading.
+            prepare(default_config(config))
         self._config = config
         self._known: tuple[int, np.ndarray, KnownBody] | None = None
 

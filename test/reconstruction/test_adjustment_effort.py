@@ -66,6 +66,11 @@ def test_the_second_window_starts_from_the_first_one_s_sizes() -> None:
     assert first.iterations > warm.iterations
 
 
+def test_a_file_that_is_no_lifter_is_refused_at_once() -> None:
+    with pytest.raises(InputError, match="no such file"):
+        WindowAdjuster(BundleAdjusterConfig(lifter="none.onnx"))
+
+
 def test_another_subject_starts_cold() -> None:
     _, other = adjust_twice(WindowAdjuster(BundleAdjusterConfig()), subject=2)
     cold = WindowAdjuster(BundleAdjusterConfig()).adjust(window(24, 120))
