@@ -40,6 +40,10 @@ from drocap_ros.nodes.component import HARDWARE_ID, ComponentNode
 from drocap_ros.nodes.run import PARENT, spin, step_back
 from drocap_ros.nodes.topics import GRAPH_QOS, NODES, TOPICS
 
+#: In one process all nodes share Python's lock.  At its usual 5 ms the pose would wait that long for the adjuster after
+#: each call that lets the lock go, several times per picture.
+SWITCH_INTERVAL_S = 0.0005
+
 #: Above the drain time of a node, and the time that its files may take to close.
 STOP_TIMEOUT_S = 20.0
 
@@ -237,6 +241,8 @@ def bringup(
         if domain_id is None:
             domain_id = stack.enter_context(free_domain())
             stack.enter_context(_environment(ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST"))
+        if not processes:
+            stack.enter_context(_switch_interval(SWITCH_INTERVAL_S))
         graph = stack.enter_context(watch(namespace, domain_id, names))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="drocap_bringup_")))
         try:
@@ -420,6 +426,16 @@ def free_domain() -> Iterator[int]:
             yield domain_id
             return
     raise NodeError("expected a free DDS domain id between 1 and 100, found none; stop other graphs")
+
+
+@contextlib.contextmanager
+def _switch_interval(seconds: float) -> Iterator[None]:
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(min(seconds, before))
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
 
 
 @contextlib.contextmanager
