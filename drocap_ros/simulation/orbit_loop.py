@@ -219,22 +219,34 @@ class OrbitLoop:
         rotation = camera_rotation(self.copter.camera_orientation())[None]
         position = self.copter.body.position[None]
         exact = project(joints, rotation, position, self.matrix)
-        inside = np.all((exact >= -0.5) & (exact < np.array([_WIDTH, _HEIGHT]) - 0.5), axis=-1)
-        seen = np.where(inside[..., None], exact, np.nan)
         if np.isfinite(exact).all():
             middle = 0.5 * (exact[0].min(axis=0) + exact[0].max(axis=0)) - np.array([_WIDTH, _HEIGHT]) / 2
             self.framing.append((self.t, bool(np.all(np.abs(middle) < np.array([_WIDTH, _HEIGHT]) / 6))))
         else:
             self.framing.append((self.t, False))
-        hidden = occlusion(exact, to_camera(joints, rotation, position)[..., 2], self.matrix[0, 0])
-        noisy = observe_keypoints(seen, hidden, self.settings.seed * 1_000_003 + self._frame)
-        tracked = bool(np.isfinite(seen).any())
-        observation = PoseObservation(
-            self.clock_ns(), 1 if tracked else 0, (_WIDTH, _HEIGHT), keypoints=noisy.keypoints[0].astype(np.float32),
-            covariance=noisy.covariance[0].astype(np.float32), confidence=noisy.confidence[0].astype(np.float32),
-        )  # fmt: skip
+        observation = self.observe(joints[0], rotation[0], position[0])
         self._frame += 1
         self._waiting.append((self.t + self.settings.latency_s, observation))
+
+    def observe(self, joints: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> PoseObservation:
+        """What perception makes of the person now; from the joints' projections here.
+
+        Parameters
+        ----------
+        joints : (15, 3) m, truth
+        rotation, position : (3, 3) world -> optical, (3,) m, of the camera, truth
+        """
+        joints, rotation, position = joints[None], rotation[None], position[None]
+        exact = project(joints, rotation, position, self.matrix)
+        inside = np.all((exact >= -0.5) & (exact < np.array([_WIDTH, _HEIGHT]) - 0.5), axis=-1)
+        seen = np.where(inside[..., None], exact, np.nan)
+        hidden = occlusion(exact, to_camera(joints, rotation, position)[..., 2], self.matrix[0, 0])
+        noisy = observe_keypoints(seen, hidden, self.settings.seed * 1_000_003 + self._frame)
+        return PoseObservation(
+            self.clock_ns(), 1 if np.isfinite(seen).any() else 0, (_WIDTH, _HEIGHT),
+            keypoints=noisy.keypoints[0].astype(np.float32), covariance=noisy.covariance[0].astype(np.float32),
+            confidence=noisy.confidence[0].astype(np.float32),
+        )  # fmt: skip
 
     def _deliver(self) -> None:
         while self._waiting and self._waiting[0][0] <= self.t + 1e-9:
