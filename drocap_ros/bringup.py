@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import math
 import os
 import signal
 import socket
@@ -81,6 +82,8 @@ class Graph:
         self._runners: list[_Runner] = []
         self._make: Callable[[str], _Runner] | None = None
         self._respawn = False
+        self._status: DiagnosticStatus | None = None
+        self._told_s = -math.inf
         self._due_s: dict[str, float] = {}
         self._died_s: dict[str, deque[float]] = {}
         self._executor = SingleThreadedExecutor(context=node.context)
@@ -105,6 +108,7 @@ class Graph:
         DrocapError
             The error itself from a node in this process; :class:`NodeError` with its words from another.
         """
+        self._tell_again()
         for runner in list(self._runners):
             if runner.name in self._due_s:
                 if time.monotonic() >= self._due_s[runner.name]:
@@ -158,14 +162,22 @@ class Graph:
 
     def _tell(self, text: str, level: bytes) -> None:
         self.events.append(text)
-        status = DiagnosticStatus(
+        self._status = DiagnosticStatus(
             level=level,
             name=f"{self.namespace.strip('/')}/bringup",
             message=text,
             hardware_id=HARDWARE_ID,
             values=[KeyValue(key=f"restarts of {name}", value=str(n)) for name, n in sorted(self.restarts.items())],
         )
-        message = DiagnosticArray(status=[status])
+        self._told_s = -math.inf
+        self._tell_again()
+
+    def _tell_again(self) -> None:
+        """Once a second, as nodes do, so that whoever comes later reads it too."""
+        if self._status is None or time.monotonic() - self._told_s < 1.0:
+            return
+        self._told_s = time.monotonic()
+        message = DiagnosticArray(status=[self._status])
         message.header.stamp = self.node.get_clock().now().to_msg()
         self._diagnostics.publish(message)
 
