@@ -46,8 +46,8 @@ lint: setup  ## ruff and mypy
 bench: setup  ## benchmarks (about an hour); results under benchmarks/results
 	for part in reconstruction perception recording live; do $(CLEAN) $(BIN)/python benchmarks/$$part.py || exit 1; done
 
-bench-flight: setup  ## simulated faults, randomized orbits, fuzzing (hours)
-	for part in faults orbits fuzz; do $(CLEAN) $(BIN)/python benchmarks/flight_$$part.py || exit 1; done
+bench-flight: setup  ## simulated faults, orbits by keypoints and by pictures, fuzzing (hours)
+	for part in faults orbits pixels fuzz; do $(CLEAN) $(BIN)/python benchmarks/flight_$$part.py || exit 1; done
 
 clean:  ## remove everything that was built
 	rm -rf $(VENV) build install log
