@@ -21,6 +21,7 @@ _AT_REST_M_S = 0.35
 _BLIND_MODE_REQUEST_S = 2.0
 _BLIND_STOP_S = 10.0
 _REACTION_S = 0.5
+_NEAR_M, _STOPPING_S, _MAX_WAY_OUT_M = 5.0, 1.2, 1.5
 _DEAD_RECKONING_S = 0.6
 _LEAST_SUBJECT_AGE_S = 0.25
 _HOLD_MODE_PATIENCE_S = 5.0
@@ -410,6 +411,12 @@ def _hold(state: SafetyState, reason: str, seen: Observed, now_s: float, blind: 
     fresh = known and max(seen.link_age_s, age_s) <= 0.25
     behind_s = 0.0 if fresh else max(seen.position_age_s - seen.state_age_s, 0.0)
     place = seen.position + seen.velocity * behind_s if known else None
+    if place is not None and seen.subject is not None and seen.subject_distance_m < _NEAR_M and seen.closing_m_s < 0:
+        # On its way out from a subject that is near, and may come nearer, it does not come back to where it was.
+        outward = (seen.position - seen.subject)[:2] / max(seen.subject_distance_m, 1e-3)
+        way = min((max(seen.approach_m_s, 0.0) - seen.closing_m_s) * _STOPPING_S, _MAX_WAY_OUT_M)
+        aside = seen.velocity[:2] - (seen.velocity[:2] @ outward) * outward
+        place = place + np.append(way * outward + 0.5 * _STOPPING_S * aside, 0.0)
     return dataclasses.replace(
         state, state=State.HOLDING, since_s=now_s, reason=reason, blind=blind and not fresh,
         rest_s=math.nan if seen.heeded else now_s,
