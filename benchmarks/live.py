@@ -273,8 +273,6 @@ SIGNS = {
 
 def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Every node killed once while all others run; bringup starts it again."""
-    import numpy as np
-
     from drocap_ros.bringup import bringup
     from drocap_ros.nodes.topics import TOPICS
     from drocap_ros.recording.session import open_session
@@ -316,7 +314,7 @@ def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
             # Telemetry must go on while the nodes of the picture die, and pictures while the bridge does.
             gaps = {}
             for topic, dead in (("vehicle/state", "mavlink_bridge"), ("camera_info", "image_ingest")):
-                log = np.array([t for t, _ in opened.messages((f"/drocap/{topic}",))])
+                log = sorted(raw.log_time_ns for raw in opened.raw_messages((f"/drocap/{topic}",)))
                 longest = [
                     (int(b - a) * 1e-9)
                     for a, b in itertools.pairwise(log)
