@@ -22,6 +22,7 @@ _BLIND_MODE_REQUEST_S = 2.0
 _BLIND_STOP_S = 10.0
 _REACTION_S = 0.5
 _NEAR_M, _STOPPING_S, _MAX_WAY_OUT_M = 5.0, 1.2, 1.5
+_LEAD_S, _CLEAR_M, _MAX_LEAD_M = 1.5, 0.3, 3.0
 _DEAD_RECKONING_S = 0.6
 _LEAST_SUBJECT_AGE_S = 0.25
 _HOLD_MODE_PATIENCE_S = 5.0
@@ -127,6 +128,9 @@ class SafetyState:
     since_s : of the state
     reason : why it is in it
     hold_position, hold_yaw : latched place
+    gives_way : whether that place goes before a subject who walks up to it:
+        where nearness ended the orbit, and nothing else is wrong
+    moved_s : when it last did
     fence_centre : (2,) where the orbit began
     modes : modes that are no take-over at present; empty = any
     engaging_s : since when control is being asked for; NaN = it is not
@@ -139,6 +143,8 @@ class SafetyState:
     reason: str = "nothing known yet"
     hold_position: np.ndarray | None = None
     hold_yaw: float = math.nan
+    gives_way: bool = False
+    moved_s: float = -math.inf
     fence_centre: np.ndarray | None = None
     modes: frozenset[str] = frozenset()
     engaging_s: float = math.nan
@@ -229,19 +235,26 @@ def subject_problem(seen: Observed, limits: Limits) -> str:
         return f"the subject was last located {_ago(seen.subject_age_s)}"
     if not seen.subject_sd_m <= safety.max_subject_sd_m:
         return f"the subject's position is uncertain by {seen.subject_sd_m:.1f} m"
+    if near := nearness_problem(seen, limits):
+        return near
+    if seen.subject_distance_m > limits.orbit.max_distance_m:
+        return f"the subject is {seen.subject_distance_m:.1f} m away: farther than {limits.orbit.max_distance_m:g} m"
+    return ""
+
+
+def nearness_problem(seen: Observed, limits: Limits) -> str:
+    """Why a subject whose place is known is too near, counting what it takes to brake; "" = it is not."""
     # Braking takes the speed at which the distance shrinks.  A subject that walks towards the vehicle cannot be
     # stopped: its steps until a hold has begun count.  One that is followed may stop dead: its speed counts too.
     chase, approach = max(-seen.approach_m_s, 0.0), max(seen.approach_m_s, 0.0)
     own = max(seen.closing_m_s - chase, 0.0)
-    room = _braking(own, safety) + _braking(chase, safety) + _REACTION_S * approach
+    room = _braking(own, limits.safety) + _braking(chase, limits.safety) + _REACTION_S * approach
     # The subject may be nearer than it seems.
     if not seen.subject_distance_m - room - seen.subject_sd_m >= limits.orbit.min_distance_m:
         return (
             f"the subject is {seen.subject_distance_m:.1f} m away, give or take {seen.subject_sd_m:.1f} m: at the "
             f"limit of {limits.orbit.min_distance_m:g} m"
         )
-    if seen.subject_distance_m > limits.orbit.max_distance_m:
-        return f"the subject is {seen.subject_distance_m:.1f} m away: farther than {limits.orbit.max_distance_m:g} m"
     return ""
 
 
@@ -274,11 +287,14 @@ def reduce(
     state, answer = _obey(state, seen, now_s, command, problem, limits)
     if state.state == State.ORBITING:
         if problem:
-            state = _hold(state, problem, seen, now_s, bool(vehicle))
+            near = problem == nearness_problem(seen, limits)
+            state = _hold(state, problem, seen, now_s, bool(vehicle), gives_way=near)
     elif state.state in (State.IDLE, State.READY):
         state = _await(state, seen, now_s, problem, limits)
     elif state.state in (State.HOLDING, State.FAULT):
-        state = _at_rest(_settle(state, seen, now_s, bool(vehicle)), seen, now_s, limits.safety)
+        state = _settle(state, seen, now_s, bool(vehicle))
+        gave_way = state if vehicle or place else _give_way(state, seen, now_s, limits)
+        state = gave_way if gave_way is not state else _at_rest(state, seen, now_s, limits.safety)
     return state, Decision(*_what_to_send(state, seen, now_s, limits), answer)
 
 
@@ -383,8 +399,9 @@ def _at_rest(state: SafetyState, seen: Observed, now_s: float, config: SafetyCon
     """Note that the place has been reached, or waited for long enough, so that the hold mode may be asked for."""
     if state.state != State.HOLDING or not math.isnan(state.rest_s) or state.blind:
         return state
-    still = bool(np.linalg.norm(seen.velocity) < _AT_REST_M_S) and now_s - state.since_s > 0.5
-    if still or now_s - state.since_s > config.hold_s:
+    held_s = now_s - max(state.since_s, state.moved_s)
+    still = bool(np.linalg.norm(seen.velocity) < _AT_REST_M_S) and held_s > 0.5
+    if still or held_s > config.hold_s:
         return dataclasses.replace(state, rest_s=now_s)
     return state
 
@@ -402,7 +419,9 @@ def _orbit(seen: Observed, now_s: float) -> SafetyState:
     )  # fmt: skip
 
 
-def _hold(state: SafetyState, reason: str, seen: Observed, now_s: float, blind: bool) -> SafetyState:
+def _hold(
+    state: SafetyState, reason: str, seen: Observed, now_s: float, blind: bool, gives_way: bool = False
+) -> SafetyState:
     # Something may be wrong while the place is still known, or was until a moment ago: then a place is held, the
     # one that the last known velocity leads to.  A position setpoint stops sooner than velocity zero.
     age_s = max(seen.position_age_s, seen.state_age_s)
@@ -419,9 +438,33 @@ def _hold(state: SafetyState, reason: str, seen: Observed, now_s: float, blind: 
         place = place + np.append(way * outward + 0.5 * _STOPPING_S * aside, 0.0)
     return dataclasses.replace(
         state, state=State.HOLDING, since_s=now_s, reason=reason, blind=blind and not fresh,
-        rest_s=math.nan if seen.heeded else now_s,
-        hold_position=place, hold_yaw=seen.yaw,
+        rest_s=math.nan if seen.heeded else now_s, hold_position=place, hold_yaw=seen.yaw,
+        gives_way=gives_way, moved_s=-math.inf,
     )  # fmt: skip
+
+
+def _give_way(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> SafetyState:
+    """Holding, and the subject walks up to the vehicle: the place that is held goes before it, up to the fence.
+
+    Only what is known of the subject counts, and only until the autopilot's own hold mode has been asked for.
+    """
+    place, subject, safety = state.hold_position, seen.subject, limits.safety
+    settled = state.blind or not math.isnan(state.rest_s) or seen.in_hold
+    if settled or not state.gives_way or place is None or subject is None or state.fence_centre is None:
+        return state
+    if not -0.2 < seen.subject_age_s <= safety.max_subject_age_s or not seen.subject_sd_m <= safety.max_subject_sd_m:
+        return state
+    wanted = limits.orbit.min_distance_m + seen.subject_sd_m + _LEAD_S * max(seen.approach_m_s, 0.0) + _CLEAR_M
+    if not seen.subject_distance_m < wanted or np.hypot(*(place - subject)[:2]) >= wanted:
+        return state
+    outward = (seen.position - subject)[:2] / max(seen.subject_distance_m, 1e-3)
+    target = subject[:2] + wanted * outward
+    step = target - seen.position[:2]
+    target = seen.position[:2] + step * min(1.0, _MAX_LEAD_M / max(float(np.hypot(*step)), 1e-6))
+    offset = target - state.fence_centre
+    room = safety.fence_radius_m - _braking(limits.orbit.max_speed_m_s, safety)
+    target = state.fence_centre + offset * min(1.0, room / max(float(np.hypot(*offset)), 1e-6))
+    return dataclasses.replace(state, hold_position=np.append(target, place[2]), moved_s=now_s)
 
 
 def _enter(state: State, reason: str, now_s: float, **values: object) -> SafetyState:

@@ -219,6 +219,52 @@ def test_disarming_and_disabled_commands():
 _SEEN = [GOOD, LOITER, BRAKE, dataclasses.replace(GOOD, armed=False), *(bad(name) for name in BAD)]
 
 
+def near(distance_m, **values):
+    place = np.array([distance_m, 0, 2.5])
+    return dataclasses.replace(GOOD, position=place, subject_distance_m=distance_m, approach_m_s=1.3, **values)
+
+
+def test_a_hold_gives_way_to_a_subject_who_walks_up_to_it():
+    state = orbiting()
+    for step, distance in enumerate((4.0, 3.9, 3.8, 3.7)):
+        state, decision = reduce(state, near(distance, velocity=np.array([1.0, 0, 0])), 10.0 + step, None, LIMITS)
+        assert decision == (Action.HOLD, ModeRequest.NONE, "")
+    assert state.hold_position[0] > 3.7 + 1.0  # ahead of a vehicle that moves out, up to the fence
+    assert state.hold_position[2] == 2.5
+    # He stands: nothing moves any more, and the autopilot's own hold follows.
+    still = dataclasses.replace(near(6.5), approach_m_s=0.0)
+    after, _ = reduce(state, still, 14.0, None, LIMITS)
+    assert (after.hold_position == state.hold_position).all()
+    assert reduce(after, still, 15.0, None, LIMITS)[1].mode_request == ModeRequest.HOLD
+
+
+@pytest.mark.parametrize(
+    ("seen", "command"),
+    [
+        (GOOD, Command.STOP),
+        (dataclasses.replace(GOOD, subject_sd_m=2.0), None),
+        (dataclasses.replace(GOOD, subject_age_s=0.5), None),
+        (dataclasses.replace(GOOD, battery_fraction=0.1), None),
+    ],
+)
+def test_no_other_hold_moves(seen, command):
+    state, _ = reduce(orbiting(), seen, 10.0, command, LIMITS)
+    place = state.hold_position.copy()
+    state, decision = reduce(state, near(3.2), 10.2, None, LIMITS)
+    assert decision.action == Action.HOLD
+    assert (state.hold_position == place).all()
+
+
+@pytest.mark.parametrize(
+    "values", [{"subject_age_s": 0.5}, {"subject_sd_m": 2.0}, {"subject": None}, {"gps_fix_type": 1}]
+)
+def test_a_hold_gives_way_only_to_what_is_seen(values):
+    state, _ = reduce(orbiting(), near(4.0), 10.0, None, LIMITS)
+    place = state.hold_position.copy()
+    state, _ = reduce(state, near(3.2, **values), 10.2, None, LIMITS)
+    assert (state.hold_position == place).all()
+
+
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(_SEEN), st.sampled_from([None, None, *Command])), max_size=60))
 def test_in_any_history(history):
