@@ -17,7 +17,7 @@ class FlightSimulatorConfig(Parameters):
     vehicle_url: str = param("udpout:127.0.0.1:14540", "MAVLink URL that the simulated vehicle speaks on")
     autopilot: str = param("ardupilot", "whose dialect the vehicle speaks", choices=_SIMULATED_AUTOPILOTS)
     seed: int = param(0, "seed of person, take, wind, sensor errors and scenery", minimum=0)
-    action: str = param("mixed", "what the person does, from the first setpoint of the orbit on", choices=ACTIONS)
+    action: str = param("mixed", "what the person does, while the vehicle is flown by setpoints", choices=ACTIONS)
     stature_m: float = param(1.75, "height of the person", unit="m", minimum=0.5, maximum=2.5)
     wind_m_s: float = param(3.0, "mean wind, from the west; gusts come on top", unit="m/s", minimum=0, maximum=15)
     start_distance_m: float = param(

@@ -11,12 +11,14 @@ from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.transport import Transport
 from drocap_ros.simulation.camera import pinhole_matrix
 from drocap_ros.simulation.flight_config import FlightSimulatorConfig
-from drocap_ros.simulation.flight_pilot import PilotedCopter, SimulatedPilot
+from drocap_ros.simulation.flight_pilot import CONTROL_MODE, PilotedCopter, SimulatedPilot
 from drocap_ros.simulation.flight_truth import MAX_EXPOSURES, FlightTruth
 from drocap_ros.simulation.person import simulate_person
 
-#: The person stands from the first setpoint of the orbit for this long, until the vehicle has come near.
+#: The person stands until the vehicle has been flown by setpoints for this long and has come near, and waits, within
+#: a moment, whenever it is not: whoever is filmed sees the drone stop.
 BEGINS_AFTER_S = 3.0
+_GAP_S, _REACTION_S = 0.5, 0.3
 _TAKE_HZ, _TAKE_CHUNK_S = 100.0, 20.0
 
 
@@ -49,21 +51,29 @@ class FlightWorld:
             transport, ground, math.remainder(bearing + math.pi, 2 * math.pi), config.autopilot,
             wind=np.array([config.wind_m_s, 0.0, 0.0]), seed=config.seed,
         )  # fmt: skip
-        self._take = _Take(config)
+        self._take = Take(config)
         aim = self._take.at(0.0)[0]
         self.pilot = SimulatedPilot(self.copter, config.takeoff_height_m, aim)
         self.forgotten = 0  # exposures beyond the limit
-        self._t = 0.0
-        self._begin_s = math.inf  # when the person begins to act
+        self._t = self._take_s = 0.0
+        self._pace = 0.0  # of the person, 0 standing to 1 acting
+        self._setpoints = 0
+        self._heard_s = self._steered_s = -math.inf  # last setpoint; since when they come without a gap
         self._rows: list[Exposure] = []
 
     def step(self, t_s: float) -> None:
         """Go on to world time ``t_s``, which is the vehicle's path time too."""
-        self._t = t_s
+        passed_s, self._t = t_s - self._t, t_s
         self.copter.fly(t_s)
         self.pilot.step(t_s)
-        if self.copter.accepted_setpoints and math.isinf(self._begin_s):
-            self._begin_s = t_s + BEGINS_AFTER_S
+        if self.copter.mode == CONTROL_MODE[self.copter.autopilot] and self.copter.accepted_setpoints > self._setpoints:
+            if t_s - self._heard_s > _GAP_S:
+                self._steered_s = t_s
+            self._heard_s = t_s
+        self._setpoints = self.copter.accepted_setpoints
+        acts = t_s - self._heard_s <= _GAP_S and t_s - self._steered_s >= BEGINS_AFTER_S
+        self._pace += (float(acts) - self._pace) * (1 - math.exp(-passed_s / _REACTION_S))
+        self._take_s += self._pace * passed_s
 
     def expose(self, stamp_ns: int) -> Exposure:
         """What the camera sees now; ``stamp_ns`` is now by the clock of the stamps."""
@@ -93,10 +103,10 @@ class FlightWorld:
 
     def _person(self) -> np.ndarray:
         """(15, 3) m ENU, now."""
-        return self._take.at(max(self._t - self._begin_s, 0.0))
+        return self._take.at(self._take_s)
 
 
-class _Take:
+class Take:
     """The person's motion, worked out a piece at a time and linear within 10 ms."""
 
     def __init__(self, config: FlightSimulatorConfig) -> None:

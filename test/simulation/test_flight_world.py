@@ -9,7 +9,7 @@ from drocap_ros.motion import load_motion
 from drocap_ros.simulation.camera import look_at, pinhole_matrix
 from drocap_ros.simulation.flight_config import FlightSimulatorConfig
 from drocap_ros.simulation.flight_truth import FlightTruth, flown_orbit, load_truth_of_flight, save_truth
-from drocap_ros.simulation.flight_world import BEGINS_AFTER_S, FlightWorld
+from drocap_ros.simulation.flight_world import BEGINS_AFTER_S, FlightWorld, Take
 from drocap_ros.simulation.loopback import Channel, LoopbackTransport
 from drocap_ros.simulation.person import simulate_person
 
@@ -52,23 +52,36 @@ def test_the_pilot_takes_off_hovers_and_hands_over(autopilot, mode):
     assert np.linalg.norm(flight.copter.body.velocity) < 0.3
 
 
-def test_the_person_begins_when_the_orbit_does_and_the_truth_tells_it():
+def test_the_person_acts_while_setpoints_steer_the_vehicle_and_the_truth_tells_it():
     clock, flight = world(seed=1, action="walk")
+
+    def setpoint():
+        flight.copter.accepted_setpoints += 1
+
     fly(clock, flight, 8.0)
     before = flight.expose(1_000)
-    flight.copter.accepted_setpoints = 1
-    fly(clock, flight, 8.0 + BEGINS_AFTER_S)
+    fly(clock, flight, 8.0 + BEGINS_AFTER_S, setpoint)
     still = flight.expose(2_000)
-    begin = 8.01 + BEGINS_AFTER_S
-    fly(clock, flight, begin + 22.0)  # across the end of a piece
-    after = flight.expose(3_000)
     np.testing.assert_array_equal(before.joints3d, still.joints3d)
-    exact = simulate_person(np.array([22.0]), "walk", 1, 1.75)[0]
-    assert np.abs(after.joints3d - exact).max() < 0.002
+    fly(clock, flight, 8.0 + BEGINS_AFTER_S + 6.0, setpoint)
+    after = flight.expose(3_000)
+    walked = np.linalg.norm((after.joints3d - still.joints3d)[0, :2])
+    assert 2.0 < walked < 8.0
+    fly(clock, flight, clock.t + 3.0)  # nobody steers any more
+    waiting = flight.expose(4_000)
+    fly(clock, flight, clock.t + 1.0)
+    assert np.abs(flight.expose(5_000).joints3d - waiting.joints3d).max() < 0.005
     truth = flight.truth()
-    np.testing.assert_array_equal(truth.stamp_ns, [1_000, 2_000, 3_000])
+    np.testing.assert_array_equal(truth.stamp_ns, [1_000, 2_000, 3_000, 4_000, 5_000])
     np.testing.assert_array_equal(truth.camera_position[2], after.position)
     np.testing.assert_array_equal(truth.joints3d[2], after.joints3d)
+
+
+def test_the_take_is_the_person_s_motion_across_its_pieces():
+    config = FlightSimulatorConfig(seed=1, action="mixed")
+    take, times = Take(config), np.array([0.0, 0.123, 19.996, 20.0, 47.3])
+    exact = simulate_person(times, "mixed", 1, config.stature_m)
+    assert np.abs(np.array([take.at(t) for t in times]) - exact).max() < 0.002
 
 
 def orbit_truth(seconds=10.0, radius=6.0, speed_deg_s=20.0, off_deg=0.0, rate=10):
