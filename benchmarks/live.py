@@ -314,7 +314,8 @@ def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
             # Telemetry must go on while the nodes of the picture die, and pictures while the bridge does.
             gaps = {}
             for topic, dead in (("vehicle/state", "mavlink_bridge"), ("camera_info", "image_ingest")):
-                log = sorted(raw.log_time_ns for raw in opened.raw_messages((f"/drocap/{topic}",)))
+                stamps = (m.header.stamp for _, m in opened.messages((f"/drocap/{topic}",)))
+                log = sorted(stamp.sec * 10**9 + stamp.nanosec for stamp in stamps)
                 longest = [
                     (int(b - a) * 1e-9)
                     for a, b in itertools.pairwise(log)
