@@ -30,4 +30,7 @@ def _controller() -> Any:
         from threadpoolctl import ThreadpoolController
     except ImportError:
         return None
+    # The controller knows the libraries that are loaded by now: scipy brings a BLAS of its own beside numpy's.
+    import scipy.linalg  # noqa: F401
+
     return ThreadpoolController()
