@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -22,6 +23,8 @@ from drocap_ros.perception.images import encode_jpeg
 
 #: Pictures that wait to be encoded for others: a third of a second, then the oldest is dropped.
 _WAITING = 10
+#: A picture that is taken up so soon after the one before had been waiting.
+_AT_ONCE_S = 0.003
 
 
 class Picture(NamedTuple):
@@ -159,6 +162,10 @@ class PictureInput:
     node : the node that reads
     take : called in the node's thread with header and picture (H, W, 3) uint8 BGR
     decode : CompressedImage -> picture; may raise InputError
+
+    Attributes
+    ----------
+    waited : whether the picture that is being taken lay there while the one before was worked on
     """
 
     def __init__(
@@ -169,8 +176,10 @@ class PictureInput:
         depth: int,
     ) -> None:
         self._node = node
-        self._take = node.guarded("image/compressed", lambda picture: take(picture.header, picture.image))
-        self._decoded = lambda message: take(message.header, decode(message))
+        self.waited = False
+        self._done_s = -1.0
+        self._take = node.guarded("image/compressed", self._timed(lambda picture: take(picture.header, picture.image)))
+        self._decoded = self._timed(lambda message: take(message.header, decode(message)))
         self._channel = channel_of(node.context, node.resolve_topic_name("image/compressed"))
         self._guard = node.create_guard_condition(self._on_wake)
         self._reader = PictureReader(self._guard.trigger, depth)
@@ -188,6 +197,16 @@ class PictureInput:
             self._subscription = None
         elif not here and self._subscription is None:
             self._subscription = self._node.input("image/compressed", self._decoded, count_gaps=True)
+
+    def _timed(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
+        def timed(what: Any) -> None:
+            self.waited = time.monotonic() - self._done_s < _AT_ONCE_S
+            try:
+                callback(what)
+            finally:
+                self._done_s = time.monotonic()
+
+        return timed
 
     def close(self) -> None:
         """Take no more pictures."""

@@ -62,7 +62,10 @@ class PoseEstimatorNode(ManagedComponent):
 
     def _on_image(self, header: Header, image: np.ndarray) -> None:
         assert self._estimator is not None, "no message is taken before the node is active"
-        observation = self._estimator.process(image, stamp_from_ros(header.stamp), self._roi)
+        behind = self._pictures.waited
+        observation = self._estimator.process(image, stamp_from_ros(header.stamp), self._roi, hurried=behind)
+        if behind:
+            self.count("images in a hurry: without a second look")
         self._roi = None
         self._pose2d.publish(pose2d_to_ros(observation, header.frame_id))
         self.count("images")

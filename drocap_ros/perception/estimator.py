@@ -64,7 +64,9 @@ class PoseEstimator:
         #: The pose network's own keypoints of the last image, with further candidate peaks; None without a subject.
         self.keypoints: Keypoints | None = None
 
-    def process(self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None = None) -> PoseObservation:
+    def process(
+        self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None = None, hurried: bool = False
+    ) -> PoseObservation:
         """The subject in one image.
 
         Parameters
@@ -72,6 +74,7 @@ class PoseEstimator:
         image : (H, W, 3) uint8 BGR
         stamp_ns : exposure time; one earlier than the last image's begins anew, with a warning
         roi : (4,) x_min y_min x_max y_max px: the drone's own box of the person it tracks, or a user's choice
+        hurried : the next image waits already: no second look where the first shows the subject but dimly
         """
         image = _checked(image)
         if self._last_ns is not None and stamp_ns < self._last_ns:
@@ -84,7 +87,7 @@ class PoseEstimator:
         self.keypoints = None
         if roi is None and (carried := self._carry(image, stamp_ns)) is not None:
             return carried
-        found = self._detect(image, stamp_ns)
+        found = self._detect(image, stamp_ns, hurried)
         subject = self.tracker.update(image, stamp_ns, found.boxes, found.scores, roi)
         if subject is None:
             return PoseObservation(stamp_ns, 0, size)
@@ -138,13 +141,13 @@ class PoseEstimator:
             xy.astype(np.float32), covariance.astype(np.float32), confidence.astype(np.float32),
         )  # fmt: skip
 
-    def _detect(self, image: np.ndarray, stamp_ns: int) -> Detections:
+    def _detect(self, image: np.ndarray, stamp_ns: int, hurried: bool) -> Detections:
         """Detections of all windows together, one per person."""
         size = (image.shape[1], image.shape[0])
         found = Detections(np.empty((0, 4), np.float32), np.empty(0, np.float32))
         for window in self.tracker.windows(size, stamp_ns):
             found = self._merged(found, self._look(image, window))
-        closer = self.tracker.second_look(size, stamp_ns, found.boxes, found.scores)
+        closer = None if hurried else self.tracker.second_look(size, stamp_ns, found.boxes, found.scores)
         if closer is not None:
             found = self._merged(found, self._look(image, closer))
         kept = whole(found.boxes, found.scores)
