@@ -101,7 +101,9 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.10",
     packages=find_packages(include=["drocap_ros", "drocap_ros.*"]),
-    package_data={"drocap_ros": ["py.typed", "data/*", "data/*/*", "report/page/*", "config/*.yaml", "definitions/*.msg"]},
+    package_data={
+        "drocap_ros": ["py.typed", "data/*", "data/*/*", "report/page/*", "config/*.yaml", "definitions/*.msg"]
+    },
     install_requires=[
         "numpy>=1.26",
         "scipy>=1.11",

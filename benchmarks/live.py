@@ -42,6 +42,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--threads", type=int, default=2, help="of the networks, as in the configurations")
+    parser.add_argument("--pose-model", default="auto", help="file in the models folder; auto = the most accurate")
     parser.add_argument("--one-process", action="store_true")
     parser.add_argument("--processes", action="store_true")
     parser.add_argument("--no-adjuster", action="store_true")
@@ -77,11 +78,12 @@ def stream(folder: Path) -> Path:
     return path
 
 
-def graph_config(video: Path, session: Path, port: int, threads: int = 2) -> Any:
+def graph_config(video: Path, session: Path, port: int, threads: int = 2, pose_model: str = "auto") -> Any:
     from drocap_ros.config import DrocapConfig
 
     config = DrocapConfig().replace("image_ingest", source=str(video), horizontal_fov_deg=60.0, loop=True)
-    config = config.replace("pose_estimator", models_dir=str(SHARED / "models"), on_loss="next", threads=threads)
+    models = str(SHARED / "models")
+    config = config.replace("pose_estimator", models_dir=models, on_loss="next", threads=threads, pose_model=pose_model)
     config = config.replace("mavlink_bridge", url=f"udpin:127.0.0.1:{port}")
     return config.replace("session_recorder", session_dir=str(session))
 
@@ -135,7 +137,7 @@ def measure_load(
 
     nodes = [name for name in NODES if adjuster or name != "bundle_adjuster"]
     port = free_udp_port()
-    config = graph_config(video, session, port, args.threads)
+    config = graph_config(video, session, port, args.threads, args.pose_model)
     with vehicle(port), bringup(config, nodes, processes=processes) as graph:
         graph.spin_for(WARM_S)
         pids = {graph.pid(name): name if processes else "all nodes" for name in nodes}

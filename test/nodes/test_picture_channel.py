@@ -1,6 +1,7 @@
 """Pictures within a process."""
 
 import contextlib
+import time
 
 import cv2
 import numpy as np
@@ -119,3 +120,20 @@ def test_a_reader_that_is_busy_misses_the_oldest_and_knows_how_many():
     assert reader.take() == (sent[4], 0)
     assert reader.take() == (None, 0)
     assert len(woken) == 6  # once more, as one was left after the first
+
+
+@pytest.mark.parametrize(("work_s", "waited"), [(0.0, False), (0.06, True)])
+def test_a_reader_that_is_too_slow_knows_that_pictures_waited(context, pictures, work_s, waited):
+    config = ImageIngestConfig(source=str(pictures[0]), loop=True, folder_rate_hz=20.0)
+    camera = ImageIngestNode(config, context=context, use_global_arguments=False)
+    reader = InitializerNode(context=context, use_global_arguments=False)
+    told = []
+
+    def take(header, image):
+        told.append(source.waited)
+        time.sleep(work_s)
+
+    source = PictureInput(reader, take, lambda message: image_from_message(message, compressed=True), depth=2)
+    with spinning(context, camera, reader) as until:
+        until(lambda: len(told) >= 12)
+    assert np.mean(told[4:12]) == waited
