@@ -16,7 +16,7 @@ PARTS = (
     "drocap_ros", "msg", "config", "resource",
 )  # fmt: skip
 NODES = ["image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
-EXECUTABLES = {"drocap", "visualizer", "session_player", *NODES}
+EXECUTABLES = {"drocap", "flight_simulator", "visualizer", "session_player", *NODES}
 
 pytestmark = pytest.mark.skipif(
     not (PREFIX / "bin" / "colcon").exists(), reason="not in the environment that `make setup` makes"
