@@ -7,8 +7,6 @@ bone lengths of the last window, stage INITIAL until there is one.
 
 from __future__ import annotations
 
-import os
-import threading
 import time
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -55,7 +53,7 @@ class BundleAdjusterNode(ComponentNode):
         self._latest_pose = LatestPose(self.config.blend_s)
         self._waiting: OrderedDict[int, PoseObservation] = OrderedDict()
         self._early: OrderedDict[int, Pose3D] = OrderedDict()
-        self._worker = ThreadPoolExecutor(1, "bundle_adjuster", initializer=_give_way)
+        self._worker = ThreadPoolExecutor(1, "bundle_adjuster")
         self._job: Future[np.ndarray | None] | None = None
         self._job_subject = 0
         self._sequence = 0
@@ -197,11 +195,6 @@ class BundleAdjusterNode(ComponentNode):
         self.count("adjustments")
         self.produced(int(window.stamp_ns[-1]))
         self.report(OK, f"{len(poses)} poses in {seconds:.2f} s: {window.stop_reason}")
-
-
-def _give_way() -> None:
-    """Run the calling thread at a slightly lower priority: where cores are short, images go before adjustments."""
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 2)
 
 
 def main() -> int:
