@@ -1,9 +1,12 @@
 """The orbit through the real nodes, a real socket and the command line, in real time."""
 
 import contextlib
-import io
+import os
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,6 +27,7 @@ from drocap_ros.simulation.observation import observe_keypoints
 from drocap_ros.simulation.person import simulate_person
 from drocap_ros.simulation.ports import free_udp_port
 
+ROOT = Path(__file__).resolve().parents[2]
 MATRIX = pinhole_matrix(1280, 720, 60.0)
 
 
@@ -83,11 +87,15 @@ def flying(**values):
 
 
 def operator(graph, *words):
-    """Run ``drocap orbit`` as the operator does; returns the exit status and what it printed."""
-    out = io.StringIO()
-    with contextlib.redirect_stdout(out):
-        status = main(["orbit", *words, "--domain-id", str(graph.domain_id), "--timeout", "20"])
-    return status, out.getvalue().strip()
+    """Run ``drocap orbit`` as the operator does, beside the graph; returns the exit status and what it printed.
+
+    In a process of its own: a ROS context that is made in this one would hold up the drone's thread for a second.
+    """
+    command = [sys.executable, "-m", "drocap_ros.cli", "orbit", *words, "--domain-id", str(graph.domain_id)]
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen([*command, "--timeout", "20"], env=env, stdout=subprocess.PIPE, text=True) as process:
+        graph.wait_until(lambda: process.poll() is not None, 60, f"an answer to {words}")
+        return process.returncode, process.stdout.read().strip()
 
 
 def test_the_operator_flies_an_orbit_from_the_command_line():
@@ -101,6 +109,7 @@ def test_the_operator_flies_an_orbit_from_the_command_line():
         status, answer = operator(graph, "start", "--speed", "40")
         assert status == 1
         assert answer.startswith("refused: angular_speed_deg_s: expected at most 33.1 deg/s at 6 m (max_acceleration")
+        graph.wait_until(lambda: got[-1].state == OrbitStatus.READY, 20, "readiness")
         assert operator(graph, "start", "--speed", "15") == (0, "orbiting")
         begin = time.monotonic()
         graph.wait_until(lambda: time.monotonic() - begin > 6, 30)
