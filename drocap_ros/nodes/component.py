@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -43,6 +44,8 @@ class ComponentNode(Node):
     """
 
     component: ClassVar[str]
+    #: Pause between two turns of the executor, for nodes on whose answers nobody waits.
+    spin_pause_s: ClassVar[float] = 0.0
 
     def __init__(self, config: Parameters | None = None, **node_kwargs: Any) -> None:
         node_kwargs.setdefault("namespace", "/drocap")
@@ -51,6 +54,7 @@ class ComponentNode(Node):
         self._peers: list[str] = [name for name in peers.split(",") if name]
         self.config: Any = declare_parameters(self, config or section_types()[self.component]())
         self.counters: Counter[str] = Counter()
+        self._counting = threading.Lock()
         self.details: dict[str, str] = {}
         self._latency = Latency()
         self.started = False
@@ -89,6 +93,7 @@ class ComponentNode(Node):
         events: SubscriptionEventCallbacks | None = None,
         with_info: bool = False,
         count_gaps: bool = False,
+        in_batches: bool = False,
     ) -> Subscription:
         """Subscription to a topic of the table.  A message that the callback refuses is counted, not fatal.
 
@@ -96,6 +101,7 @@ class ComponentNode(Node):
         ----------
         with_info : the callback's second argument is rclpy's message info
         count_gaps : count what the publisher sent and this node never saw, being busy or for want of a link
+        in_batches : with a raw message, take all others that wait: for a node that spins with pauses (``spin_pause_s``)
         """
         guarded = self.guarded(topic, callback)
         last: list[int] = [0]
@@ -112,14 +118,22 @@ class ComponentNode(Node):
 
         def informed(message: Any, info: dict[str, Any]) -> None:
             guarded(message, info)
+            # One turn of the executor costs more than a message; it would take but one.
+            for _ in range(subscription_qos.depth if in_batches else 0):
+                with subscription.handle:
+                    taken = subscription.handle.take_message(TOPICS[topic].message, raw)
+                if taken is None:
+                    return
+                guarded(*taken)
 
         # rclpy looks at the number of arguments, which its annotation does not say.
         take: Any = with_gaps if count_gaps else informed if with_info else alone
+        subscription_qos = qos or TOPICS[topic].qos
         subscription = self.create_subscription(
             TOPICS[topic].message,
             topic,
             take,
-            qos or TOPICS[topic].qos,
+            subscription_qos,
             raw=raw,
             event_callbacks=events,
         )
@@ -205,8 +219,9 @@ class ComponentNode(Node):
     # -- diagnostics -----------------------------------------------------------------------------------
 
     def count(self, what: str, amount: int = 1) -> None:
-        """Add to a counter that ``/diagnostics`` shows."""
-        self.counters[what] += amount
+        """Add to a counter that ``/diagnostics`` shows; any thread may."""
+        with self._counting:
+            self.counters[what] += amount
 
     def produced(self, stamp_ns: int) -> None:
         """Note that the result of the image of this stamp has just been published."""

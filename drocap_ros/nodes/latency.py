@@ -28,7 +28,7 @@ class Latency:
 
     def rate_hz(self, now_s: float, window_s: float = 5.0) -> float:
         """Measurements per second over the last seconds."""
-        recent = sum(now_s - at <= window_s for at in self._at_s)
+        recent = sum(now_s - at <= window_s for at in tuple(self._at_s))  # another thread may add meanwhile
         return recent / window_s
 
     def text_ms(self) -> str:

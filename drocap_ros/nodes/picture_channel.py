@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import queue
 import threading
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -23,8 +22,6 @@ from drocap_ros.perception.images import encode_jpeg
 
 #: Pictures that wait to be encoded for others: a third of a second, then the oldest is dropped.
 _WAITING = 10
-#: A picture that is taken up so soon after the one before had been waiting.
-_AT_ONCE_S = 0.003
 
 
 class Picture(NamedTuple):
@@ -34,33 +31,57 @@ class Picture(NamedTuple):
     image: np.ndarray
 
 
+class Taken(NamedTuple):
+    """A picture, how many were missed since the one before, and whether it lay there while that was worked on."""
+
+    picture: Picture
+    missed: int
+    waited: bool
+
+
 class PictureReader:
     """What one node has not yet taken: at most ``depth`` pictures, the newest; the others are counted."""
 
-    def __init__(self, wake: Callable[[], None], depth: int) -> None:
-        self._wake = wake
+    def __init__(self, depth: int) -> None:
         self._depth = depth
         self._pictures: list[Picture] = []
         self._missed = 0
-        self._lock = threading.Lock()
+        self._busy = False
+        self._closed = False
+        self._changed = threading.Condition()
 
     def put(self, picture: Picture) -> None:
         """Hand over; called by the writer's thread."""
-        with self._lock:
+        with self._changed:
             self._pictures.append(picture)
             while len(self._pictures) > self._depth:
                 self._pictures.pop(0)
                 self._missed += 1
-        self._wake()
+            self._changed.notify_all()
 
-    def take(self) -> tuple[Picture | None, int]:
-        """Oldest picture that waits, or None, and how many were missed since the last call."""
-        with self._lock:
+    def take(self) -> Taken | None:
+        """Oldest picture that waits, or the next one; None at the end.  Asking again says that the last is done."""
+        with self._changed:
+            self._busy = False
+            self._changed.notify_all()
+            waited = bool(self._pictures)
+            self._changed.wait_for(lambda: self._pictures or self._closed)
+            if self._closed:
+                return None
+            self._busy = True
             missed, self._missed = self._missed, 0
-            picture = self._pictures.pop(0) if self._pictures else None
-            if self._pictures:
-                self._wake()
-            return picture, missed
+            return Taken(self._pictures.pop(0), missed, waited)
+
+    def settle(self, timeout_s: float) -> bool:
+        """Wait until nothing waits and nobody works on a picture; whether it came to that."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._closed or not (self._pictures or self._busy), timeout_s)
+
+    def close(self) -> None:
+        """Give out no more pictures."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
 
 
 class PictureChannel:
@@ -157,11 +178,15 @@ class PictureOutput:
 class PictureInput:
     """The same, read: from this process where its camera runs here, else from ``image/compressed``.
 
+    Pictures are worked on in a thread of their own: while one is, the node's thread decodes the next.
+
     Parameters
     ----------
     node : the node that reads
-    take : called in the node's thread with header and picture (H, W, 3) uint8 BGR
+    take : called in that thread with header and picture (H, W, 3) uint8 BGR; what it raises, but for a refusal, comes
+        out of the node's thread
     decode : CompressedImage -> picture; may raise InputError
+    depth : pictures that may wait
 
     Attributes
     ----------
@@ -177,16 +202,28 @@ class PictureInput:
     ) -> None:
         self._node = node
         self.waited = False
-        self._done_s = -1.0
-        self._take = node.guarded("image/compressed", self._timed(lambda picture: take(picture.header, picture.image)))
-        self._decoded = self._timed(lambda message: take(message.header, decode(message)))
+        self._take = node.guarded("image/compressed", lambda picture: take(picture.header, picture.image))
+        self._decode = decode
         self._channel = channel_of(node.context, node.resolve_topic_name("image/compressed"))
-        self._guard = node.create_guard_condition(self._on_wake)
-        self._reader = PictureReader(self._guard.trigger, depth)
+        self._reader = PictureReader(depth)
         self._subscription: object | None = None
+        self._error: BaseException | None = None
+        self._failed = node.create_guard_condition(self._raise)
+        self._thread = threading.Thread(target=self._run, name="pictures", daemon=True)
+        self._thread.start()
         self._choose()
         # A camera's node may come and go in this process.
         node.create_timer(1.0, self._choose)
+
+    def settle(self) -> None:
+        """Wait until the pictures that have arrived are worked off, but not long."""
+        self._reader.settle(timeout_s=5.0)
+
+    def close(self) -> None:
+        """Take no more pictures."""
+        self._channel.readers = tuple(r for r in self._channel.readers if r is not self._reader)
+        self._reader.close()
+        self._thread.join(timeout=5.0)
 
     def _choose(self) -> None:
         here = self._channel.writers > 0
@@ -196,25 +233,22 @@ class PictureInput:
             self._node.drop_input(self._subscription)
             self._subscription = None
         elif not here and self._subscription is None:
-            self._subscription = self._node.input("image/compressed", self._decoded, count_gaps=True)
+            self._subscription = self._node.input("image/compressed", self._on_message, count_gaps=True)
 
-    def _timed(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
-        def timed(what: Any) -> None:
-            self.waited = time.monotonic() - self._done_s < _AT_ONCE_S
-            try:
-                callback(what)
-            finally:
-                self._done_s = time.monotonic()
+    def _on_message(self, message: Any) -> None:
+        self._reader.put(Picture(message.header, self._decode(message)))
 
-        return timed
+    def _run(self) -> None:
+        try:
+            while (taken := self._reader.take()) is not None:
+                if taken.missed:
+                    self._node.missed("image/compressed", taken.missed)
+                self.waited = taken.waited
+                self._take(taken.picture)
+        except Exception as error:
+            self._error = error
+            self._failed.trigger()
 
-    def close(self) -> None:
-        """Take no more pictures."""
-        self._channel.readers = tuple(r for r in self._channel.readers if r is not self._reader)
-
-    def _on_wake(self) -> None:
-        picture, missed = self._reader.take()
-        if missed:
-            self._node.missed("image/compressed", missed)
-        if picture is not None:
-            self._take(picture)
+    def _raise(self) -> None:
+        if self._error is not None:
+            raise self._error

@@ -50,11 +50,17 @@ class PoseEstimatorNode(ManagedComponent):
 
     def release(self) -> None:
         """Forget the networks and the subject."""
+        self._pictures.settle()
         self._estimator, self._roi = None, None
 
     def _on_roi(self, message: RegionOfInterest) -> None:
         x, y = message.x_offset, message.y_offset
         self._roi = np.array([x, y, x + message.width, y + message.height], np.float64)
+
+    def flush(self) -> None:
+        """Finish the pictures that have arrived."""
+        self._pictures.settle()
+        super().flush()
 
     def close(self) -> None:
         """Take no more pictures."""
@@ -63,10 +69,10 @@ class PoseEstimatorNode(ManagedComponent):
     def _on_image(self, header: Header, image: np.ndarray) -> None:
         assert self._estimator is not None, "no message is taken before the node is active"
         behind = self._pictures.waited
-        observation = self._estimator.process(image, stamp_from_ros(header.stamp), self._roi, hurried=behind)
+        roi, self._roi = self._roi, None
+        observation = self._estimator.process(image, stamp_from_ros(header.stamp), roi, hurried=behind)
         if behind:
-            self.count("images in a hurry: without a second look")
-        self._roi = None
+            self.count("images in a hurry: detection only when due")
         self._pose2d.publish(pose2d_to_ros(observation, header.frame_id))
         self.count("images")
         self.produced(observation.stamp_ns)

@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -20,8 +21,18 @@ from drocap_ros.nodes.component import ComponentNode
 #: After the order to stop, messages that have arrived are still worked off, for this long at most.
 DRAIN_S = 5.0
 
-#: How far a node steps back (Unix niceness) for those between the camera and the pose.
-NICENESS = {"bundle_adjuster": 10, "session_recorder": 5, "visualizer": 10}
+#: How far a node steps back (Unix niceness) behind the one that most depends on time, the pose estimator: with one core
+#: busy for the networks alone, whatever breaks in on them costs pictures.
+NICENESS = {
+    "image_ingest": 5,
+    "initializer": 5,
+    "mavlink_bridge": 5,
+    "session_recorder": 10,
+    "bundle_adjuster": 15,
+    "visualizer": 15,
+}
+#: From here on a node does not even break in on others when something has come for it.
+_BACKGROUND = 10
 
 #: Names the process that started this node; when that one is gone, the node stops.
 PARENT = "DROCAP_PARENT_PID"
@@ -40,7 +51,10 @@ def spin(node: ComponentNode, stop: threading.Event) -> None:
     parent = int(os.environ.get(PARENT, "0"))
     try:
         while not stop.is_set() and node.context.ok():
-            executor.spin_once(timeout_sec=0.1)
+            if node.spin_pause_s == 0:
+                executor.spin_once(timeout_sec=0.1)
+            elif not _turn(executor, node, 0.0):
+                stop.wait(node.spin_pause_s)
             if parent not in (0, os.getppid(), os.getpid()):
                 stop.set()
         node.on_stop()
@@ -56,19 +70,33 @@ def spin(node: ComponentNode, stop: threading.Event) -> None:
 
 def step_back(component: str) -> None:
     """Give the calling thread, and those that it will start, the niceness of a node."""
-    # Not every system has priorities of threads, and one without this runs as well, if not as evenly.
+    niceness = NICENESS.get(component, 0)
+    # Not every system has priorities of threads, and one without them runs as well, if not as evenly.
     with contextlib.suppress(OSError, AttributeError):
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS.get(component, 0))
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
+        if niceness >= _BACKGROUND:
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
+def step_session_back(component: str) -> None:
+    """The same among sessions, where this process leads one: Linux's autogroups weigh niceness only within them."""
+    with contextlib.suppress(OSError, AttributeError):
+        if os.getsid(0) == os.getpid():
+            Path("/proc/self/autogroup").write_text(str(NICENESS.get(component, 0)))
 
 
 def _drain(executor: SingleThreadedExecutor, node: ComponentNode) -> None:
     clock = node.get_clock()
     end = clock.now().nanoseconds + int(DRAIN_S * 1e9)
-    idle = False
-    while not idle and clock.now().nanoseconds < end and node.context.ok():
-        before = node.callbacks_done
-        executor.spin_once(timeout_sec=0.05)
-        idle = node.callbacks_done == before
+    while clock.now().nanoseconds < end and node.context.ok() and _turn(executor, node, 0.05):
+        pass
+
+
+def _turn(executor: SingleThreadedExecutor, node: ComponentNode, timeout_s: float) -> bool:
+    """One callback, if any comes within the time; returns whether a message was taken."""
+    before = node.callbacks_done
+    executor.spin_once(timeout_sec=timeout_s)
+    return node.callbacks_done != before
 
 
 def node_main(make: Callable[[], ComponentNode]) -> int:
@@ -78,7 +106,9 @@ def node_main(make: Callable[[], ComponentNode]) -> int:
         signal.signal(number, lambda *_: stop.set())
     rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        step_back(getattr(make, "component", ""))
+        component = getattr(make, "component", "")
+        step_back(component)
+        step_session_back(component)
         spin(make(), stop)
     except DrocapError as error:
         print(f"drocap: {error}", file=sys.stderr)

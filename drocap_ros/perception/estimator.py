@@ -61,6 +61,9 @@ class PoseEstimator:
         self._last_ns: int | None = None
         self._margins: np.ndarray | None = None
         self._detected_ns = 0
+        self._searched_ns = 0
+        self._clear = False
+        self._in_vain = False
         #: The pose network's own keypoints of the last image, with further candidate peaks; None without a subject.
         self.keypoints: Keypoints | None = None
 
@@ -74,7 +77,9 @@ class PoseEstimator:
         image : (H, W, 3) uint8 BGR
         stamp_ns : exposure time; one earlier than the last image's begins anew, with a warning
         roi : (4,) x_min y_min x_max y_max px: the drone's own box of the person it tracks, or a user's choice
-        hurried : the next image waits already: no second look where the first shows the subject but dimly
+        hurried : the image has waited already: no second look where the first shows the subject but dimly, and
+            for ``detect_every_s`` after it no detection at all; where the detector finds nobody and the last image
+            showed no joints either, they are looked for in every other image
         """
         image = _checked(image)
         if self._last_ns is not None and stamp_ns < self._last_ns:
@@ -87,21 +92,27 @@ class PoseEstimator:
         self.keypoints = None
         if roi is None and (carried := self._carry(image, stamp_ns)) is not None:
             return carried
+        if roi is None and hurried and (glanced := self._glance(image, stamp_ns)) is not None:
+            return glanced
+        self._searched_ns, self._clear = stamp_ns, False
         found = self._detect(image, stamp_ns, hurried)
         subject = self.tracker.update(image, stamp_ns, found.boxes, found.scores, roi)
         if subject is None:
             return PoseObservation(stamp_ns, 0, size)
-        if subject.hidden:
+        if subject.hidden or (hurried and subject.score == 0 and self._in_vain):
+            self._in_vain = False
             return _unseen(stamp_ns, size, subject)
         self.keypoints = self.pose_model.estimate(image, subject.box)
         pose = self._in_our_joints(self.keypoints)
+        self._clear = bool(pose[2].mean() >= _STEADY_CONFIDENCE)
+        self._in_vain = bool(pose[2].mean() < _CONFIRM_CONFIDENCE)
         self._margins = None
         seen = _extent(pose)
         if subject.score < self.config.detection_threshold:
             if seen is not None and pose[2].mean() >= _CONFIRM_CONFIDENCE:
                 margin = 0.06 * (seen[2:] - seen[:2]).max()
                 self.tracker.confirm(seen + margin * np.array([-1, -1, 1, 1]), stamp_ns)
-        elif seen is not None and subject.score >= _STEADY_SCORE and pose[2].mean() >= _STEADY_CONFIDENCE:
+        elif seen is not None and subject.score >= _STEADY_SCORE and self._clear:
             self._margins = (subject.box - seen) / (seen[2:] - seen[:2]).max()
             self._detected_ns = stamp_ns
         return self._observation(stamp_ns, size, subject, pose)
@@ -127,6 +138,19 @@ class PoseEstimator:
         self.keypoints = keypoints
         subject = Subject(predicted.track_id, box, predicted.score, False)
         return self._observation(stamp_ns, (image.shape[1], image.shape[0]), subject, pose)
+
+    def _glance(self, image: np.ndarray, stamp_ns: int) -> PoseObservation | None:
+        """The subject where it is predicted, without detection; None when that is due or the last image was not clear.
+
+        The tracker learns nothing from it: in a crowd the joints may be another's, and the next detection decides.
+        """
+        predicted = self.tracker.in_view(stamp_ns) if self._clear else None
+        if predicted is None or (stamp_ns - self._searched_ns) * 1e-9 > self.config.detect_every_s - _SLACK_S:
+            return None
+        self.keypoints = self.pose_model.estimate(image, predicted.box)
+        pose = self._in_our_joints(self.keypoints)
+        self._clear = bool(pose[2].mean() >= _STEADY_CONFIDENCE)
+        return self._observation(stamp_ns, (image.shape[1], image.shape[0]), predicted, pose)
 
     def _observation(
         self, stamp_ns: int, size: tuple[int, int], subject: Subject, pose: tuple[np.ndarray, np.ndarray, np.ndarray]

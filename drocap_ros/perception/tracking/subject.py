@@ -128,13 +128,20 @@ class SubjectTracker:
         best = max(recent, key=lambda p: (p.hits < self._config.confirm_frames, p.quality))
         return window_around(best.motion.box_at(stamp_ns), image_size)
 
-    def steady(self, image_size: tuple[int, int], stamp_ns: int) -> Subject | None:
-        """The subject predicted, if it was seen in the last image, stands free of others and clear of the edges."""
+    def in_view(self, stamp_ns: int) -> Subject | None:
+        """The subject predicted, if it was surely seen in the last image that was searched."""
         subject = self._subject
         if subject is None or self._wanted is not None or self._last_ns is None or subject.sure_ns != self._last_ns:
             return None
+        return Subject(self._track_id, subject.motion.box_at(stamp_ns), subject.score, False)
+
+    def steady(self, image_size: tuple[int, int], stamp_ns: int) -> Subject | None:
+        """The subject predicted, if it was seen in the last image, stands free of others and clear of the edges."""
+        predicted, subject = self.in_view(stamp_ns), self._subject
+        if predicted is None or subject is None:
+            return None
         full_due = self._full_ns is None or stamp_ns - self._full_ns >= self._config.full_frame_every_s * 1e9
-        box = subject.motion.box_at(stamp_ns)
+        box = predicted.box
         reach = _ALONE * subject.motion.length
         around = box + reach * np.array([-1, -1, 1, 1])
         solid = [p for p in self._persons if p is not subject and p.quality >= _SOLID_QUALITY]
@@ -144,7 +151,7 @@ class SubjectTracker:
         at_edge = (box[:2] < edge).any() or (box[2:] > np.array(image_size) - edge).any()
         if full_due or near or at_edge:
             return None
-        return Subject(self._track_id, box, subject.score, False)
+        return predicted
 
     def carry(self, box: np.ndarray, stamp_ns: int) -> None:
         """Take the subject's box (4,) px from the pose network, in an image without detection."""
