@@ -41,7 +41,7 @@ def main() -> int:
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []])
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--minutes", type=float, default=5.0)
-    parser.add_argument("--threads", type=int, default=2, help="of the networks, as in the configurations")
+    parser.add_argument("--threads", type=int, default=1, help="of the networks: 1 is the best on two cores")
     parser.add_argument("--pose-model", default="auto", help="file in the models folder; auto = the most accurate")
     parser.add_argument("--one-process", action="store_true")
     parser.add_argument("--processes", action="store_true")
@@ -96,7 +96,7 @@ def vehicle(port: int) -> Iterator[None]:
     try:
         yield
     finally:
-        process.send_signal(signal.SIGINT)
+        process.terminate()
         process.wait()
 
 

@@ -202,7 +202,8 @@ class PictureInput:
     ) -> None:
         self._node = node
         self.waited = False
-        self._take = node.guarded("image/compressed", lambda picture: take(picture.header, picture.image))
+        # Stamps are checked where a message comes in; a camera of this process has checked its own.
+        self._take = node.guarded("image/compressed", lambda picture: take(*picture), stamps=False)
         self._decode = decode
         self._channel = channel_of(node.context, node.resolve_topic_name("image/compressed"))
         self._reader = PictureReader(depth)

@@ -1,6 +1,7 @@
 """Pictures within a process."""
 
 import contextlib
+import threading
 import time
 
 import cv2
@@ -11,6 +12,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
 from drocap_ros.bringup import free_domain
+from drocap_ros.errors import InputError
 from drocap_ros.nodes.conversions import compressed_image_to_ros, header_at, stamp_from_ros
 from drocap_ros.nodes.image_ingest import ImageIngestNode
 from drocap_ros.nodes.initializer import InitializerNode
@@ -111,15 +113,57 @@ def test_a_recorder_gets_jpeg_while_a_reader_gets_arrays(context, pictures):
 
 
 def test_a_reader_that_is_busy_misses_the_oldest_and_knows_how_many():
-    woken = []
-    reader = PictureReader(lambda: woken.append(1), depth=2)
+    reader = PictureReader(depth=2)
     sent = [Picture(header_at(i, "c"), np.zeros((1, 1, 3), np.uint8)) for i in range(5)]
     for picture in sent:
         reader.put(picture)
-    assert reader.take() == (sent[3], 3)
-    assert reader.take() == (sent[4], 0)
-    assert reader.take() == (None, 0)
-    assert len(woken) == 6  # once more, as one was left after the first
+    assert not reader.settle(timeout_s=0.0)
+    assert reader.take() == (sent[3], 3, True)
+    assert reader.take() == (sent[4], 0, True)
+    assert not reader.settle(timeout_s=0.0)  # the last is still being worked on
+    reader.close()
+    assert reader.take() is None
+    assert reader.settle(timeout_s=0.0)
+
+
+def test_a_reader_that_waits_gets_the_next_picture():
+    reader = PictureReader(depth=2)
+    sent = Picture(header_at(1, "c"), np.zeros((1, 1, 3), np.uint8))
+    threading.Timer(0.1, reader.put, [sent]).start()
+    assert reader.take() == (sent, 0, False)
+
+
+def test_what_goes_wrong_with_a_picture_comes_out_of_the_nodes_thread(context, pictures):
+    config = ImageIngestConfig(source=str(pictures[0]), loop=True, folder_rate_hz=50.0)
+    camera = ImageIngestNode(config, context=context, use_global_arguments=False)
+    reader = InitializerNode(context=context, use_global_arguments=False)
+
+    def take(header, image):
+        raise ZeroDivisionError("of the test")
+
+    source = PictureInput(reader, take, lambda _: None, depth=1)
+    with spinning(context, camera, reader) as until:
+        with pytest.raises(ZeroDivisionError, match="of the test"):
+            until(lambda: False)
+        source.close()
+
+
+def test_a_picture_that_cannot_be_used_is_counted_and_the_next_one_is_taken(context, pictures):
+    config = ImageIngestConfig(source=str(pictures[0]), loop=True, folder_rate_hz=50.0)
+    camera = ImageIngestNode(config, context=context, use_global_arguments=False)
+    reader = InitializerNode(context=context, use_global_arguments=False)
+    taken = []
+
+    def take(header, image):
+        taken.append(image)
+        if len(taken) == 2:
+            raise InputError("image: expected light, got darkness")
+
+    source = PictureInput(reader, take, lambda _: None, depth=1)
+    with spinning(context, camera, reader) as until:
+        until(lambda: len(taken) > 4)
+        source.close()
+    assert reader.counters["messages refused"] == 1
 
 
 @pytest.mark.parametrize(("work_s", "waited"), [(0.0, False), (0.06, True)])
