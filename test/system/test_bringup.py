@@ -3,6 +3,7 @@
 import os
 import time
 from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from drocap_ros.nodes.conversions import stamp_from_ros
 from drocap_ros.nodes.topics import NODES, RESULT_QOS, TOPICS
 from drocap_ros.simulation.ports import free_udp_port
 
+AUTOGROUP = Path("/proc/self/autogroup")
+OURS = AUTOGROUP.read_text().split()[1:] if AUTOGROUP.exists() else []
 CAPTURE = ["capture_simulator", "initializer", "bundle_adjuster"]
 
 
@@ -107,6 +110,16 @@ def test_the_bridge_refuses_to_fly_and_says_why():
         command.publish(OrbitCommand(command=OrbitCommand.START))
         graph.wait_until(lambda: any("no motion" in m.reason for m in got["orbit/status"]), 20, "a refusal")
     assert {m.state for m in got["orbit/status"]} == {OrbitStatus.IDLE}
+
+
+@pytest.mark.skipif(not AUTOGROUP.exists(), reason="this system does not schedule by sessions")
+def test_nodes_step_back_behind_the_estimator_in_a_session_of_their_own():
+    with bringup(short_flight(), ["capture_simulator", "bundle_adjuster"], processes=True) as graph:
+        adjuster, simulator = (Path(f"/proc/{graph.pid(name)}") for name in ("bundle_adjuster", "capture_simulator"))
+        assert (adjuster / "autogroup").read_text().split()[1:] == ["nice", "15"]
+        assert (simulator / "autogroup").read_text().split()[1:] == ["nice", "0"]
+        assert os.getpriority(os.PRIO_PROCESS, graph.pid("bundle_adjuster")) >= 15
+    assert AUTOGROUP.read_text().split()[1:] == OURS
 
 
 def test_stopping_takes_no_longer_than_it_should():
