@@ -52,6 +52,7 @@ class SessionRecorderNode(ManagedComponent):
         self._writer: SessionWriter | None = None
         self._survey: ParameterSurvey | None = None
         self._calibrated = False
+        self._heard = False  # anything but diagnostics
         self._sessions = 0
         special = {"camera_info": self._on_camera_info, "/diagnostics": self._on_diagnostics}
         for topic, entry in TOPICS.items():
@@ -72,14 +73,17 @@ class SessionRecorderNode(ManagedComponent):
         for topic, entry in TOPICS.items():
             kind = _type_name(entry.message)
             writer.register(self.resolve_topic_name(topic), kind, schema_text(kind), image=topic == _IMAGES)
-        self._writer, self._calibrated = writer, False
+        self._writer, self._calibrated, self._heard = writer, False, False
         self._survey = ParameterSurvey(self, self._on_parameters)
         self._sessions += 1
 
     def release(self) -> None:
-        """Write what is queued and finish the files."""
+        """Write what is queued and finish the files; of a graph that never began nothing is left."""
         if self._writer is not None:
-            self._writer.close()
+            if self.started or self._heard:
+                self._writer.close()
+            else:
+                self._writer.discard()
             self._writer = None
 
     def close(self) -> None:
@@ -93,6 +97,7 @@ class SessionRecorderNode(ManagedComponent):
         # Simulated time is nothing that the middleware knows.
         if cast(ROSClock, self.get_clock()).ros_time_is_active or not log_ns:
             log_ns = sent_ns = self.get_clock().now().nanoseconds
+        self._heard = self._heard or name != "/diagnostics"
         if self._writer is not None:
             self._writer.write(name, data, log_ns, sent_ns or log_ns)
             self.count("messages")

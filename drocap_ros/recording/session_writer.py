@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import shutil
 import threading
@@ -193,6 +194,14 @@ class SessionWriter:
                     self._write_description(current=False)
                 except OSError as error:
                     self._fail(error)
+
+    def discard(self) -> None:
+        """Close, and take the files and, where it then is empty, the folder away."""
+        self.close()
+        for name in (METADATA_FILE, *(record.name for record in self._finished)):
+            (self.folder / name).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
 
     def _run(self) -> None:
         while True:

@@ -98,6 +98,19 @@ def test_what_cannot_run_is_refused_with_status_2(tmp_path, arguments, words):
     assert "Traceback" not in text
 
 
+@pytest.mark.parametrize("option", [(), ("--one-process",)], ids=["processes", "one process"])
+def test_a_graph_that_cannot_begin_leaves_no_session(tmp_path, option):
+    config = ROOT / "config" / "video_file.yaml"
+    with free_domain() as domain:
+        live = start(
+            "live", "--config", config, "--source", "none.mp4", "--session", tmp_path / "flight",
+            "--nodes", "image_ingest", "session_recorder", "--domain-id", domain, *option, log=tmp_path / "log",
+        )  # fmt: skip
+        assert live.wait(120) == 2
+    assert "none.mp4" in (tmp_path / "log").read_text()
+    assert not (tmp_path / "flight").exists()
+
+
 def test_top_shows_the_nodes_of_a_running_graph(video, tmp_path):
     config = ROOT / "config" / "video_file.yaml"
     with free_domain() as domain:
