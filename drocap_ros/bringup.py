@@ -59,7 +59,14 @@ MOST_RESTARTS = 5
 
 #: The matrices of a node are small: more BLAS threads cost more than they bring, the more so in six processes.  The
 #: middleware's many threads would each keep an arena of their own, in which memory goes to pieces over hours.
-_LEAN = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+_LEAN = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MALLOC_ARENA_MAX": "2",
+    # What was needed once is kept: given back and asked for again, memory frays, and each new page costs time.
+    "MALLOC_TRIM_THRESHOLD_": str(1 << 28),
+    "MALLOC_MMAP_THRESHOLD_": str(1 << 25),
+}
 
 
 class Graph:

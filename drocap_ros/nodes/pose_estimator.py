@@ -7,6 +7,8 @@ equal to the picture's.
 
 from __future__ import annotations
 
+import math
+import time
 from functools import partial
 from typing import Any
 
@@ -25,6 +27,9 @@ from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.models import models_folder
 from drocap_ros.recording.pictures import image_from_message
 
+#: Time for which the estimator hurries after a picture had to wait; else the backlog that has just gone comes back.
+_HURRY_S = 1.0
+
 
 class PoseEstimatorNode(ManagedComponent):
     """Runs detection, subject tracking and 2D pose on every picture that arrives while it is free."""
@@ -35,6 +40,7 @@ class PoseEstimatorNode(ManagedComponent):
         super().__init__(config, **node_kwargs)
         self._estimator: PoseEstimator | None = None
         self._roi: np.ndarray | None = None
+        self._waited_s = -math.inf
         self._pose2d = self.output("pose2d")
         self._pictures = PictureInput(
             self, self._on_image, partial(image_from_message, compressed=True), TOPICS["image/compressed"].qos.depth
@@ -68,10 +74,13 @@ class PoseEstimatorNode(ManagedComponent):
 
     def _on_image(self, header: Header, image: np.ndarray) -> None:
         assert self._estimator is not None, "no message is taken before the node is active"
-        behind = self._pictures.waited
+        now_s = time.monotonic()
+        if self._pictures.waited:
+            self._waited_s = now_s
+        hurried = now_s - self._waited_s < _HURRY_S
         roi, self._roi = self._roi, None
-        observation = self._estimator.process(image, stamp_from_ros(header.stamp), roi, hurried=behind)
-        if behind:
+        observation = self._estimator.process(image, stamp_from_ros(header.stamp), roi, hurried=hurried)
+        if hurried:
             self.count("images in a hurry: detection only when due")
         self._pose2d.publish(pose2d_to_ros(observation, header.frame_id))
         self.count("images")
