@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import random
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -33,6 +35,7 @@ NICENESS = {
 }
 #: From here on a node does not even break in on others when something has come for it.
 _BACKGROUND = 10
+_AUTOGROUP_TRIES = 20
 
 #: Names the process that started this node; when that one is gone, the node stops.
 PARENT = "DROCAP_PARENT_PID"
@@ -80,9 +83,24 @@ def step_back(component: str) -> None:
 
 def step_session_back(component: str) -> None:
     """The same among sessions, where this process leads one: Linux's autogroups weigh niceness only within them."""
+    niceness = NICENESS.get(component, 0)
     with contextlib.suppress(OSError, AttributeError):
-        if os.getsid(0) == os.getpid():
-            Path("/proc/self/autogroup").write_text(str(NICENESS.get(component, 0)))
+        if niceness == 0 or os.getsid(0) != os.getpid():
+            return
+        for _ in range(_AUTOGROUP_TRIES):
+            if _ask_for(niceness):
+                return
+            # Whoever is not root has to leave 0.1 s between any two such requests on the machine.
+            time.sleep(0.11 + 0.05 * random.random())
+
+
+def _ask_for(niceness: int) -> bool:
+    """Niceness of this session; False when the request came too soon after another one."""
+    try:
+        Path("/proc/self/autogroup").write_text(str(niceness))
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _drain(executor: SingleThreadedExecutor, node: ComponentNode) -> None:

@@ -112,7 +112,7 @@ def test_the_bridge_refuses_to_fly_and_says_why():
     assert {m.state for m in got["orbit/status"]} == {OrbitStatus.IDLE}
 
 
-@pytest.mark.skipif(not AUTOGROUP.exists(), reason="this system does not schedule by sessions")
+@pytest.mark.skipif(not OURS, reason="this system does not schedule by sessions")
 def test_nodes_step_back_behind_the_estimator_in_a_session_of_their_own():
     with bringup(short_flight(), ["capture_simulator", "bundle_adjuster"], processes=True) as graph:
         adjuster, simulator = (Path(f"/proc/{graph.pid(name)}") for name in ("bundle_adjuster", "capture_simulator"))
