@@ -66,6 +66,8 @@ _LEAN = {
     # What was needed once is kept: given back and asked for again, memory frays, and each new page costs time.
     "MALLOC_TRIM_THRESHOLD_": str(1 << 28),
     "MALLOC_MMAP_THRESHOLD_": str(1 << 25),
+    # Another middleware, and whoever has a profile of their own, is not concerned.
+    "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).parent / "data" / "fastdds_discovery.xml"),
 }
 
 

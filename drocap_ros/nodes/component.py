@@ -101,7 +101,7 @@ class ComponentNode(Node):
         ----------
         with_info : the callback's second argument is rclpy's message info
         count_gaps : count what the publisher sent and this node never saw, being busy or for want of a link
-        in_batches : with a raw message, take all others that wait: for a node that spins with pauses (``spin_pause_s``)
+        in_batches : with ``with_info``: after a message take all others that wait, for a node that spins with pauses
         """
         guarded = self.guarded(topic, callback)
         last: list[int] = [0]
