@@ -35,6 +35,7 @@ NICENESS = {
 }
 #: From here on a node does not even break in on others when something has come for it.
 _BACKGROUND = 10
+#: A graph has at most eight nodes that ask at the same time.
 _AUTOGROUP_TRIES = 20
 
 #: Names the process that started this node; when that one is gone, the node stops.

@@ -198,9 +198,9 @@ class SessionWriter:
     def discard(self) -> None:
         """Close, and take the files and, where it then is empty, the folder away."""
         self.close()
-        for name in (METADATA_FILE, *(record.name for record in self._finished)):
-            (self.folder / name).unlink(missing_ok=True)
         with contextlib.suppress(OSError):
+            for name in (METADATA_FILE, *(record.name for record in self._finished)):
+                (self.folder / name).unlink(missing_ok=True)
             self.folder.rmdir()
 
     def _run(self) -> None:
