@@ -121,6 +121,7 @@ setup(
         "c3d>=0.6",
     ],
     extras_require={
+        "live": ["onnx>=1.16"],  # lets a detector take smaller inputs where time is short
         "view": ["rerun-sdk>=0.39,<0.40"],
         "train": ["torch>=2.9", "onnx>=1.16"],
         "test": [

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.geometry.rotations import matrix_from_quaternion
+from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
 
 _HALF = np.sqrt(0.5)
 #: Rotation NED -> ENU (and ENU -> NED), x y z w: half a turn about north-east.
@@ -54,15 +54,29 @@ def quaternion_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.concatenate([vector, aw * bw - np.sum(av * bv, axis=-1, keepdims=True)], axis=-1)
 
 
+def _as_matrix(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """(4, 4) m with ``q @ m`` = ``before`` q ``after``: one product of a few numbers instead of two of quaternions."""
+    return quaternion_multiply(quaternion_multiply(before, np.eye(4)), after)
+
+
+_BETWEEN_AVIATION_AND_ROS = _as_matrix(_NED_ENU, _FRD_FLU)
+_FLU_TO_OPTICAL = _as_matrix(np.array([0.0, 0.0, 0.0, 1.0]), quaternion_from_matrix(OPTICAL_FROM_FLU.T))
+
+
 def orientation_to_ros(frd_to_ned: np.ndarray) -> np.ndarray:
     """(..., 4) x y z w, rotation body FRD -> NED, to the rotation body FLU -> ENU; the w of the result is >= 0."""
-    q = quaternion_multiply(quaternion_multiply(_NED_ENU, frd_to_ned), _FRD_FLU)
+    q = frd_to_ned @ _BETWEEN_AVIATION_AND_ROS
     return np.where(q[..., 3:] < 0, -q, q)
 
 
 def orientation_to_aviation(flu_to_enu: np.ndarray) -> np.ndarray:
     """(..., 4) x y z w, rotation body FLU -> ENU, to the rotation body FRD -> NED; the w of the result is >= 0."""
     return orientation_to_ros(flu_to_enu)
+
+
+def optical_orientation(camera_flu_to_enu: np.ndarray) -> np.ndarray:
+    """(..., 4) x y z w, rotation camera body FLU -> ENU, to the rotation optical frame -> ENU."""
+    return camera_flu_to_enu @ _FLU_TO_OPTICAL
 
 
 def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> np.ndarray:

@@ -18,13 +18,12 @@ import numpy as np
 from geometry_msgs.msg import Point, TransformStamped, Vector3
 from sensor_msgs.msg import CameraInfo
 
-from drocap_ros.flight.frames import OPTICAL_FROM_FLU
+from drocap_ros.flight.frames import optical_orientation
 from drocap_ros.flight.link import MavlinkLink
 from drocap_ros.flight.orbit_controller import ControlStatus, OperatorCommand, OrbitController
 from drocap_ros.flight.safety import State
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.flight.watchdog import Watchdog
-from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from drocap_ros.msg import OrbitCommand, OrbitStatus, Pose2D
 from drocap_ros.nodes.component import ERROR, OK, WARN, ComponentNode
 from drocap_ros.nodes.conversions import (
@@ -187,17 +186,16 @@ def vehicle_transforms(state: VehicleState) -> list[TransformStamped]:
     """``map`` -> ``base_link`` and, with a mount, ``map`` -> ``camera_optical``; none while the position is unknown."""
     if not np.isfinite(state.position_enu_m).all():
         return []
+    x, y, z = state.position_enu_m.tolist()
     transforms = []
-    for child, xyzw, turn in (
-        ("base_link", state.orientation_xyzw, np.eye(3)),
-        ("camera_optical", state.gimbal_orientation_xyzw, OPTICAL_FROM_FLU.T),
+    for child, xyzw in (
+        ("base_link", state.orientation_xyzw),
+        ("camera_optical", optical_orientation(state.gimbal_orientation_xyzw)),
     ):
         if np.isfinite(xyzw).all():
             transform = TransformStamped(header=header_at(state.stamp_ns, "map"), child_frame_id=child)
-            x, y, z = (float(v) for v in state.position_enu_m)
             transform.transform.translation = Vector3(x=x, y=y, z=z)
-            rotation = quaternion_from_matrix(matrix_from_quaternion(xyzw) @ turn)
-            transform.transform.rotation = quaternion_to_ros(rotation)
+            transform.transform.rotation = quaternion_to_ros(xyzw)
             transforms.append(transform)
     return transforms
 

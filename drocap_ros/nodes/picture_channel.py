@@ -32,11 +32,14 @@ class Picture(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """A picture, how many were missed since the one before, and whether it lay there while that was worked on."""
+    """A picture, how many were missed since the one before, whether it lay there while that was worked on, and how
+    many lie there still.
+    """
 
     picture: Picture
     missed: int
     waited: bool
+    behind: int
 
 
 class PictureReader:
@@ -70,7 +73,7 @@ class PictureReader:
                 return None
             self._busy = True
             missed, self._missed = self._missed, 0
-            return Taken(self._pictures.pop(0), missed, waited)
+            return Taken(self._pictures.pop(0), missed, waited, len(self._pictures))
 
     def settle(self, timeout_s: float) -> bool:
         """Wait until nothing waits and nobody works on a picture; whether it came to that."""
@@ -191,6 +194,7 @@ class PictureInput:
     Attributes
     ----------
     waited : whether the picture that is being taken lay there while the one before was worked on
+    behind : how many lie there still
     """
 
     def __init__(
@@ -202,6 +206,7 @@ class PictureInput:
     ) -> None:
         self._node = node
         self.waited = False
+        self.behind = 0
         # Stamps are checked where a message comes in; a camera of this process has checked its own.
         self._take = node.guarded("image/compressed", lambda picture: take(*picture), stamps=False)
         self._decode = decode
@@ -244,7 +249,7 @@ class PictureInput:
             while (taken := self._reader.take()) is not None:
                 if taken.missed:
                     self._node.missed("image/compressed", taken.missed)
-                self.waited = taken.waited
+                self.waited, self.behind = taken.waited, taken.behind
                 self._take(taken.picture)
         except Exception as error:
             self._error = error

@@ -7,7 +7,6 @@ equal to the picture's.
 
 from __future__ import annotations
 
-import math
 import time
 from functools import partial
 from typing import Any
@@ -18,6 +17,7 @@ from std_msgs.msg import Header
 
 from drocap_ros.nodes.component import OK, WARN
 from drocap_ros.nodes.conversions import pose2d_to_ros, stamp_from_ros
+from drocap_ros.nodes.hurry import Hurry
 from drocap_ros.nodes.latency import SUBJECT
 from drocap_ros.nodes.managed import ManagedComponent
 from drocap_ros.nodes.picture_channel import PictureInput
@@ -26,9 +26,6 @@ from drocap_ros.nodes.topics import TOPICS
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.models import models_folder
 from drocap_ros.recording.pictures import image_from_message
-
-#: Time for which the estimator hurries after a picture had to wait; else the backlog that has just gone comes back.
-_HURRY_S = 1.0
 
 
 class PoseEstimatorNode(ManagedComponent):
@@ -40,7 +37,7 @@ class PoseEstimatorNode(ManagedComponent):
         super().__init__(config, **node_kwargs)
         self._estimator: PoseEstimator | None = None
         self._roi: np.ndarray | None = None
-        self._waited_s = -math.inf
+        self._hurry = Hurry(self.config.max_hurry)
         self._pose2d = self.output("pose2d")
         self._pictures = PictureInput(
             self, self._on_image, partial(image_from_message, compressed=True), TOPICS["image/compressed"].qos.depth
@@ -75,13 +72,13 @@ class PoseEstimatorNode(ManagedComponent):
     def _on_image(self, header: Header, image: np.ndarray) -> None:
         assert self._estimator is not None, "no message is taken before the node is active"
         now_s = time.monotonic()
-        if self._pictures.waited:
-            self._waited_s = now_s
-        hurried = now_s - self._waited_s < _HURRY_S
+        hurry = self._hurry.level(now_s, self._pictures.waited, self._pictures.behind)
         roi, self._roi = self._roi, None
-        observation = self._estimator.process(image, stamp_from_ros(header.stamp), roi, hurried=hurried)
-        if hurried:
+        observation = self._estimator.process(image, stamp_from_ros(header.stamp), roi, hurry)
+        if hurry:
             self.count("images in a hurry: detection only when due")
+        if self._estimator.carried:
+            self.count("images in a hurry: keypoints of the one before, carried on")
         self._pose2d.publish(pose2d_to_ros(observation, header.frame_id))
         self.count("images")
         self.produced(observation.stamp_ns)

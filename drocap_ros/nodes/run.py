@@ -27,7 +27,7 @@ DRAIN_S = 5.0
 #: busy for the networks alone, whatever breaks in on them costs pictures.
 NICENESS = {
     "image_ingest": 5,
-    "initializer": 5,
+    "initializer": 0,
     "mavlink_bridge": 5,
     "session_recorder": 10,
     "bundle_adjuster": 15,

@@ -16,9 +16,10 @@ try:
 except ImportError:  # not among the ROS wheels; `make setup` builds it, a ROS installation has it
     TFMessage = None
 
-#: A picture that comes late is worth nothing: no retransmission, and at most two wait.  With one, a single slow
-#: detection costs a picture; a third would only make a machine that is too slow later still.
-IMAGE_QOS = QoSProfile(depth=2, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
+#: A picture that comes late is worth nothing: no retransmission, and at most four wait.  With one, a single slow
+#: detection costs a picture; the others come in a rush when the camera's process has been held up, and are soon worked
+#: off, since who hurries carries keypoints on.
+IMAGE_QOS = QoSProfile(depth=4, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 #: Offered reliably, so that a recorder on the same machine loses none; a best-effort reader costs no more for it.
 IMAGE_RECORDING_QOS = QoSProfile(depth=30, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 #: Results are small, and none may be lost: 10 s of them at 100 Hz.

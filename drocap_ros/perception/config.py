@@ -87,6 +87,12 @@ class PoseEstimatorConfig(Parameters):
         "longest time between detections of a subject whom the pose network sees clearly and alone; 0 = every image",
         unit="s", minimum=0, maximum=10,
     )  # fmt: skip
+    max_hurry: int = param(
+        3,
+        "of a node that is too slow: images in sequence, after one that the networks see, whose keypoints are carried"
+        " on by optical flow; 0 = full work always, images are dropped instead",
+        minimum=0, maximum=10,
+    )  # fmt: skip
     full_frame_every_s: float = param(
         1.0,
         "interval of detection over the whole image while the subject is in view",

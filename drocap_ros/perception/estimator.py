@@ -11,12 +11,13 @@ from drocap_ros.errors import InputError
 from drocap_ros.perception.config import PoseEstimatorConfig
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import suppress, whole
+from drocap_ros.perception.flow import KeypointFlow
 from drocap_ros.perception.joint_maps import joint_map
 from drocap_ros.perception.models import limited_use, load_detector, load_pose_model
 from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.perception.pose import Keypoints
 from drocap_ros.perception.tracking import Subject, SubjectTracker
-from drocap_ros.perception.tracking.search import Window, inside
+from drocap_ros.perception.tracking.search import Window, inside, tiles
 from drocap_ros.perception.uncertainty import calibrate
 from drocap_ros.skeleton import BODY_15
 
@@ -27,6 +28,8 @@ _CONFIRM_CONFIDENCE = 0.5
 _STEADY_SCORE, _STEADY_CONFIDENCE = 0.6, 0.8
 #: A detection is due a little before its time: stamps are never even.
 _SLACK_S = 0.005
+#: In a hurry, side of the detector's input for a window around a subject that it has just shown clearly.
+_QUICK_NEAR_PX = 256
 #: Confidence of a joint that helps to place the box.
 _FINE_JOINT = 0.3
 
@@ -63,12 +66,15 @@ class PoseEstimator:
         self._detected_ns = 0
         self._searched_ns = 0
         self._clear = False
-        self._in_vain = False
+        self._shown = False
+        #: Images since the joints were looked for in vain, that one included.
+        self._in_vain = 0
+        self._flow = KeypointFlow()
         #: The pose network's own keypoints of the last image, with further candidate peaks; None without a subject.
         self.keypoints: Keypoints | None = None
 
     def process(
-        self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None = None, hurried: bool = False
+        self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None = None, hurry: int = 0
     ) -> PoseObservation:
         """The subject in one image.
 
@@ -77,35 +83,50 @@ class PoseEstimator:
         image : (H, W, 3) uint8 BGR
         stamp_ns : exposure time; one earlier than the last image's begins anew, with a warning
         roi : (4,) x_min y_min x_max y_max px: the drone's own box of the person it tracks, or a user's choice
-        hurried : the image has waited already: no second look where the first shows the subject but dimly, and
-            for ``detect_every_s`` after it no detection at all; where the detector finds nobody and the last image
-            showed no joints either, they are looked for in every other image
+        hurry : 0 = there is time.  Else the image has waited, and work is saved: after each image that the network has
+            seen the keypoints of up to ``hurry`` others are carried on by optical flow; one window and no second look
+            for a detection, and none at all for ``hurry * detect_every_s`` after one that showed the subject clearly;
+            where the network saw no joints and the detector does not see the subject clearly, they are not looked for
+            in the next ``hurry`` images
         """
         image = _checked(image)
         if self._last_ns is not None and stamp_ns < self._last_ns:
             log.warning("stamps went back by %.3f s: following anew", (self._last_ns - stamp_ns) * 1e-9)
             self.tracker.restart()
+            self._flow.begin(None, None)
             self._margins = None
         self._last_ns = stamp_ns
-        size = (image.shape[1], image.shape[0])
         roi = _checked_roi(roi)
         self.keypoints = None
-        if roi is None and (carried := self._carry(image, stamp_ns)) is not None:
-            return carried
-        if roi is None and hurried and (glanced := self._glance(image, stamp_ns)) is not None:
-            return glanced
+        observation = self._flow.carry(image, stamp_ns) if roi is None and self._flow.steps < hurry else None
+        if observation is not None:
+            self._in_vain = 0
+            return observation
+        if roi is None:
+            observation = self._carry(image, stamp_ns) or (self._glance(image, stamp_ns, hurry) if hurry else None)
+        if observation is None:
+            observation = self._search(image, stamp_ns, roi, hurry)
+        self._flow.begin(image if hurry else None, observation)
+        return observation
+
+    def _search(self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None, hurry: int) -> PoseObservation:
+        """The subject by detection, and its joints."""
+        size = (image.shape[1], image.shape[0])
         self._searched_ns, self._clear = stamp_ns, False
-        found = self._detect(image, stamp_ns, hurried)
+        found = self._detect(image, stamp_ns, hurry > 0)
         subject = self.tracker.update(image, stamp_ns, found.boxes, found.scores, roi)
+        self._shown = subject is not None and subject.score >= _STEADY_SCORE
         if subject is None:
             return PoseObservation(stamp_ns, 0, size)
-        if subject.hidden or (hurried and subject.score == 0 and self._in_vain):
-            self._in_vain = False
+        if subject.hidden:
+            return _unseen(stamp_ns, size, subject)
+        if subject.score < _STEADY_SCORE and 0 < self._in_vain <= hurry:
+            self._in_vain += 1
             return _unseen(stamp_ns, size, subject)
         self.keypoints = self.pose_model.estimate(image, subject.box)
         pose = self._in_our_joints(self.keypoints)
         self._clear = bool(pose[2].mean() >= _STEADY_CONFIDENCE)
-        self._in_vain = bool(pose[2].mean() < _CONFIRM_CONFIDENCE)
+        self._in_vain = int(pose[2].mean() < _CONFIRM_CONFIDENCE)
         self._margins = None
         seen = _extent(pose)
         if subject.score < self.config.detection_threshold:
@@ -116,6 +137,11 @@ class PoseEstimator:
             self._margins = (subject.box - seen) / (seen[2:] - seen[:2]).max()
             self._detected_ns = stamp_ns
         return self._observation(stamp_ns, size, subject, pose)
+
+    @property
+    def carried(self) -> bool:
+        """Whether the last image's keypoints are those of the one before, carried on."""
+        return self._flow.steps > 0
 
     def _carry(self, image: np.ndarray, stamp_ns: int) -> PoseObservation | None:
         """The subject without detection: where it stands alone and the pose network sees it clearly, or None.
@@ -139,13 +165,14 @@ class PoseEstimator:
         subject = Subject(predicted.track_id, box, predicted.score, False)
         return self._observation(stamp_ns, (image.shape[1], image.shape[0]), subject, pose)
 
-    def _glance(self, image: np.ndarray, stamp_ns: int) -> PoseObservation | None:
+    def _glance(self, image: np.ndarray, stamp_ns: int, hurry: int) -> PoseObservation | None:
         """The subject where it is predicted, without detection; None when that is due or the last image was not clear.
 
         The tracker learns nothing from it: in a crowd the joints may be another's, and the next detection decides.
         """
         predicted = self.tracker.in_view(stamp_ns) if self._clear else None
-        if predicted is None or (stamp_ns - self._searched_ns) * 1e-9 > self.config.detect_every_s - _SLACK_S:
+        due_s = hurry * self.config.detect_every_s
+        if predicted is None or (stamp_ns - self._searched_ns) * 1e-9 > due_s - _SLACK_S:
             return None
         self.keypoints = self.pose_model.estimate(image, predicted.box)
         pose = self._in_our_joints(self.keypoints)
@@ -169,18 +196,22 @@ class PoseEstimator:
         """Detections of all windows together, one per person."""
         size = (image.shape[1], image.shape[0])
         found = Detections(np.empty((0, 4), np.float32), np.empty(0, np.float32))
-        for window in self.tracker.windows(size, stamp_ns):
-            found = self._merged(found, self._look(image, window))
+        for window in self.tracker.windows(size, stamp_ns, one=hurried, quick=hurried and self._shown):
+            found = self._merged(found, self._look(image, window, hurried))
         closer = None if hurried else self.tracker.second_look(size, stamp_ns, found.boxes, found.scores)
         if closer is not None:
             found = self._merged(found, self._look(image, closer))
         kept = whole(found.boxes, found.scores)
         return Detections(found.boxes[kept], found.scores[kept])
 
-    def _look(self, image: np.ndarray, window: Window | None) -> Detections:
+    def _look(self, image: np.ndarray, window: Window | None, hurried: bool = False) -> Detections:
         """Detections in a window, without those that its edge cuts."""
-        found = self.detector.detect(image, window, self.config.low_threshold)
-        uncut = inside(found.boxes, window, (image.shape[1], image.shape[0]))
+        size = (image.shape[1], image.shape[0])
+        quick_px = max(self.detector.spec.input_size) if hurried else None
+        if hurried and self._shown and window is not None and window not in tiles(size):
+            quick_px = _QUICK_NEAR_PX
+        found = self.detector.detect(image, window, self.config.low_threshold, quick_px)
+        uncut = inside(found.boxes, window, size)
         return Detections(found.boxes[uncut], found.scores[uncut])
 
     def _merged(self, a: Detections, b: Detections) -> Detections:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.perception.free_size import with_free_size
 
 _PROVIDERS = {
     "cpu": "CPUExecutionProvider",
@@ -65,8 +66,9 @@ class OnnxModel:
         # A spinning thread pool starves the decoder and the other nodes of a small companion computer.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         providers = choose_providers(provider, ort.get_available_providers())
+        self._open = lambda source: ort.InferenceSession(source, options, providers=providers)
         try:
-            self._session: Any = ort.InferenceSession(str(self.path), options, providers=providers)
+            self._session: Any = self._open(str(self.path))
         except Exception as error:  # onnxruntime raises its own unrelated classes
             raise InputError(
                 f"{self.path}: expected an ONNX model that onnxruntime {ort.__version__} can run; {_first_line(error)};"
@@ -81,6 +83,25 @@ class OnnxModel:
             raise InputError(f"{self.path}: expected one image input (float, uint8 or int32), found {found}")
         self._dtype = _ELEMENT_TYPES[self.inputs[0].element_type]
         self._names = [t.name for t in self.outputs]
+
+    def free_size(self) -> bool:
+        """Let the input's height and width vary, where that can be done; whether they do now.
+
+        On the CPU only: other providers prepare themselves for each size anew.  The caller tries whether the outputs
+        follow, and calls :meth:`fix_size` where they do not.
+        """
+        source = with_free_size(self.path) if self.provider == _PROVIDERS["cpu"] else None
+        if source is None:
+            return False
+        try:
+            self._session = self._open(source)
+        except Exception:  # onnxruntime's own
+            return False
+        return True
+
+    def fix_size(self) -> None:
+        """Take back :meth:`free_size`."""
+        self._session = self._open(str(self.path))
 
     def __call__(self, tensor: np.ndarray) -> list[np.ndarray]:
         """Outputs, in order, for one input tensor.

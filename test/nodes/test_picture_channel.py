@@ -118,8 +118,8 @@ def test_a_reader_that_is_busy_misses_the_oldest_and_knows_how_many():
     for picture in sent:
         reader.put(picture)
     assert not reader.settle(timeout_s=0.0)
-    assert reader.take() == (sent[3], 3, True)
-    assert reader.take() == (sent[4], 0, True)
+    assert reader.take() == (sent[3], 3, True, 1)
+    assert reader.take() == (sent[4], 0, True, 0)
     assert not reader.settle(timeout_s=0.0)  # the last is still being worked on
     reader.close()
     assert reader.take() is None
@@ -130,7 +130,7 @@ def test_a_reader_that_waits_gets_the_next_picture():
     reader = PictureReader(depth=2)
     sent = Picture(header_at(1, "c"), np.zeros((1, 1, 3), np.uint8))
     threading.Timer(0.1, reader.put, [sent]).start()
-    assert reader.take() == (sent, 0, False)
+    assert reader.take() == (sent, 0, False, 0)
 
 
 def test_what_goes_wrong_with_a_picture_comes_out_of_the_nodes_thread(context, pictures):

@@ -8,21 +8,19 @@ from drocap_ros.perception.config import PoseEstimatorConfig
 from drocap_ros.perception.estimator import PoseEstimator
 
 
-@pytest.mark.parametrize("hurried", [False, True])
-def test_a_subject_shown_dimly_gets_a_second_look_only_where_there_is_time(shared, monkeypatch, hurried):
+@pytest.mark.parametrize("hurry", [0, 1])
+def test_a_subject_shown_dimly_gets_a_second_look_only_where_there_is_time(shared, monkeypatch, hurry):
     estimator = PoseEstimator(shared / "models")
     look, windows = estimator.detector.detect, []
-    monkeypatch.setattr(
-        estimator.detector, "detect", lambda image, w, least: windows.append(w) or look(image, w, least)
-    )
+    monkeypatch.setattr(estimator.detector, "detect", lambda image, w, *a: windows.append(w) or look(image, w, *a))
     clear = cv2.imread(str(shared / "media" / "skier.jpg"))
     dim = cv2.GaussianBlur(clear // 12, (0, 0), 9)
     for i in range(3):
         assert estimator.process(clear, i * 33_000_000).track_id == 1
     windows.clear()
-    observation = estimator.process(dim, 3 * 33_000_000, hurried=hurried)
+    observation = estimator.process(dim, 3 * 33_000_000, hurry=hurry)
     assert observation.track_id == 1
-    assert len(windows) == (1 if hurried else 2)
+    assert len(windows) == (1 if hurry else 2)
     assert None not in windows  # near the subject, not over the whole
 
 
@@ -32,24 +30,41 @@ def counted(monkeypatch, owner, name):
     return calls
 
 
-def test_in_a_hurry_a_clear_subject_is_detected_only_when_due(shared, monkeypatch):
+@pytest.mark.parametrize(
+    ("hurry", "expected"),
+    [  # D: detection and pose, P: pose alone, f: keypoints carried on
+        (0, "DDDDDDDD"),
+        (1, "PfDfPfDfPf"),
+        (3, "PfffPfffDfffPfffPfffD"),
+    ],
+)
+def test_in_a_hurry_a_clear_subject_is_detected_when_due_and_carried_on_in_between(
+    shared, monkeypatch, hurry, expected
+):
     estimator = PoseEstimator(shared / "models", PoseEstimatorConfig(detect_every_s=0.1))
     image = cv2.imread(str(shared / "media" / "skier.jpg"))
-    assert estimator.process(image, 0).track_id == 1
-    estimator._margins = None  # as with somebody near: the box cannot be carried on from the joints
+    first = estimator.process(image, 0)
+    assert first.track_id == 1
     detections = counted(monkeypatch, estimator.detector, "detect")
-    seen = []
-    for i in range(1, 7):
-        before = len(detections)
-        observation = estimator.process(image, i * 33_333_333, hurried=True)
-        estimator._margins = None
+    poses = counted(monkeypatch, estimator.pose_model, "estimate")
+    seen = ""
+    for i in range(1, len(expected) + 1):
+        estimator._margins = None  # as with somebody near: the box cannot be carried on from the joints
+        before = len(detections), len(poses)
+        observation = estimator.process(image, i * 33_333_333, hurry=hurry)
         assert observation.track_id == 1
+        assert observation.stamp_ns == i * 33_333_333
         assert observation.confidence.mean() > 0.8
-        seen.append(len(detections) - before)
-    assert seen == [0, 0, 1, 0, 0, 1]
+        size = (first.roi[2:] - first.roi[:2]).max()
+        assert np.nanmax(np.abs(observation.keypoints - first.keypoints)) < 0.03 * size
+        work = len(detections) - before[0], len(poses) - before[1]
+        seen += {(1, 1): "D", (0, 1): "P", (0, 0): "f"}[work]
+        assert estimator.carried == (seen[-1] == "f")
+    assert seen == expected
 
 
-def test_in_a_hurry_joints_that_nobody_sees_are_looked_for_in_every_other_image(shared, monkeypatch):
+@pytest.mark.parametrize(("hurry", "expected"), [(1, [0, 1, 0, 1]), (3, [0, 0, 0, 1, 0, 0, 0, 1])])
+def test_in_a_hurry_joints_that_nobody_sees_are_looked_for_in_some_images(shared, monkeypatch, hurry, expected):
     estimator = PoseEstimator(shared / "models")
     clear = cv2.imread(str(shared / "media" / "skier.jpg"))
     for i in range(3):
@@ -58,16 +73,29 @@ def test_in_a_hurry_joints_that_nobody_sees_are_looked_for_in_every_other_image(
     estimator.process(dark, 99_000_000)
     looks = counted(monkeypatch, estimator.pose_model, "estimate")
     seen = []
-    for i in range(4, 8):
+    for i in range(4, 4 + len(expected)):
         before = len(looks)
-        observation = estimator.process(dark, i * 33_000_000, hurried=True)
+        observation = estimator.process(dark, i * 33_000_000, hurry=hurry)
         assert observation.track_id == 1
         seen.append(len(looks) - before)
         assert seen[-1] or np.isnan(observation.keypoints).all()
-    assert seen == [0, 1, 0, 1]
+    assert seen == expected
 
 
-def test_in_a_hurry_throughout_the_subject_is_kept_through_a_somersault(shared, monkeypatch):
+def test_in_a_hurry_one_window_an_image_and_each_has_its_turn(shared, monkeypatch):
+    estimator = PoseEstimator(shared / "models")
+    look, windows = estimator.detector.detect, []
+    monkeypatch.setattr(estimator.detector, "detect", lambda image, w, *a: windows.append(w) or look(image, w, *a))
+    nobody = np.full((720, 1280, 3), 90, np.uint8)
+    for i in range(8):
+        assert estimator.process(nobody, i * 33_000_000, hurry=1).track_id == 0
+        assert len(windows) == i + 1
+    assert windows.count(None) == 4
+    assert len(set(windows)) > 2  # tiles, one after the other
+
+
+@pytest.mark.parametrize("hurry", [1, 3])
+def test_in_a_hurry_throughout_the_subject_is_kept_through_a_somersault(shared, monkeypatch, hurry):
     video = cv2.VideoCapture(str(shared / "media" / "outdoor_walk.mp4"))
     images = []
     for i in range(212):  # the jump's end
@@ -75,16 +103,18 @@ def test_in_a_hurry_throughout_the_subject_is_kept_through_a_somersault(shared, 
         if i >= 100:
             images.append(cv2.resize(image, (1280, 720), interpolation=cv2.INTER_AREA))
     boxes, runs = {}, {}
-    for hurried in (False, True):
+    for pace in (0, hurry):
         estimator = PoseEstimator(shared / "models")
-        detections = counted(monkeypatch, estimator.detector, "detect")
-        observations = [estimator.process(im, i * 33_333_333, hurried=hurried) for i, im in enumerate(images)]
+        work = [
+            counted(monkeypatch, *what) for what in ((estimator.detector, "detect"), (estimator.pose_model, "estimate"))
+        ]
+        observations = [estimator.process(im, i * 33_333_333, hurry=pace) for i, im in enumerate(images)]
         assert {o.track_id for o in observations} == {1}
-        boxes[hurried] = np.array([o.roi for o in observations])
-        runs[hurried] = len(detections)
-    assert runs[True] < 0.75 * runs[False]
-    low = np.maximum(boxes[False][:, :2], boxes[True][:, :2])
-    high = np.minimum(boxes[False][:, 2:], boxes[True][:, 2:])
+        boxes[pace] = np.array([o.roi for o in observations])
+        runs[pace] = sum(map(len, work))
+    assert runs[hurry] < {1: 0.6, 3: 0.45}[hurry] * runs[0]
+    low = np.maximum(boxes[0][:, :2], boxes[hurry][:, :2])
+    high = np.minimum(boxes[0][:, 2:], boxes[hurry][:, 2:])
     shared_area = np.prod(np.clip(high - low, 0, None), axis=1)
     areas = [np.prod(b[:, 2:] - b[:, :2], axis=1) for b in boxes.values()]
     overlap = shared_area / (areas[0] + areas[1] - shared_area)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
+from drocap_ros.errors import InputError
 from drocap_ros.perception.detection.decode import DECODERS
 from drocap_ros.perception.detection.letterbox import letterbox
 from drocap_ros.perception.detection.nms import suppress
-from drocap_ros.perception.model_spec import ModelSpec
+from drocap_ros.perception.model_spec import ModelSpec, map_grid
 from drocap_ros.perception.preprocess import Normalizer
 from drocap_ros.perception.runtime import OnnxModel
+
+#: Sides of an input are multiples of the coarsest map's stride, px.
+_STRIDE = 32
 
 
 @dataclass(frozen=True)
@@ -40,9 +45,14 @@ class Detector:
         self._nms_iou = nms_iou
         self._normalize = Normalizer(spec)
         self._decode = DECODERS[spec.layout]
+        self._any_size = spec.layout == "rtmdet-maps" and self._follows_its_input()
 
     def detect(
-        self, image: np.ndarray, window: tuple[int, int, int, int] | None = None, threshold: float = 0.3
+        self,
+        image: np.ndarray,
+        window: tuple[int, int, int, int] | None = None,
+        threshold: float = 0.3,
+        quick_px: int | None = None,
     ) -> Detections:
         """Persons in an image.
 
@@ -51,12 +61,16 @@ class Detector:
         image : (H, W, 3) uint8 BGR
         window : x_min, y_min, x_max, y_max px inside the image; None = all of it
         threshold : least score
+        quick_px : longer side of the network's input, where its size is free: less than its own, and no grey beside
+            the picture, takes less time
         """
         height, width = image.shape[:2]
-        canvas, place = letterbox(
-            image, window or (0, 0, width, height), self.spec.input_size, self.spec.letterbox == "centre"
-        )
-        raw = self._decode(self.model(self._normalize(canvas)), self.spec, threshold)
+        window = window or (0, 0, width, height)
+        spec = self.spec
+        if quick_px is not None and self._any_size:
+            spec = dataclasses.replace(spec, input_size=_quick_size(window, min(quick_px, *spec.input_size)))
+        canvas, place = letterbox(image, window, spec.input_size, spec.letterbox == "centre")
+        raw = self._decode(self.model(self._normalize(canvas)), spec, threshold)
         boxes = place.boxes_to_image(raw.boxes.astype(np.float32))
         boxes = np.clip(boxes, 0, np.array([width, height, width, height], np.float32))
         solid = (boxes[:, 2:] - boxes[:, :2]).min(axis=1, initial=np.inf) >= 1.0
@@ -67,3 +81,25 @@ class Detector:
             points = raw.keypoints[kept].astype(np.float32)
             keypoints = np.concatenate([place.to_image(points[..., :2]), points[..., 2:]], axis=-1)
         return Detections(boxes[kept], raw.scores[kept].astype(np.float32), keypoints)
+
+    def _follows_its_input(self) -> bool:
+        """Whether the network takes inputs of other sizes, with outputs to match."""
+        width, height = 6 * _STRIDE, 4 * _STRIDE
+        channels_last = self.spec.channels_last
+        if channels_last or not self.model.free_size():
+            return False
+        try:
+            outputs = self.model(np.zeros((1, 3, height, width), np.float32))
+        except InputError:
+            outputs = []
+        if outputs and all(map_grid(output.shape, (width, height)) for output in outputs):
+            return True
+        self.model.fix_size()
+        return False
+
+
+def _quick_size(window: tuple[int, int, int, int], longest: int) -> tuple[int, int]:
+    """(width, height) of the smallest input that holds a window whose longer side takes ``longest`` px."""
+    sides = np.array([window[2] - window[0], window[3] - window[1]])
+    sides = np.ceil(np.round(sides * longest / sides.max()) / _STRIDE).astype(int) * _STRIDE
+    return int(sides[0]), int(sides[1])

@@ -80,6 +80,7 @@ class SubjectTracker:
         self._wanted: np.ndarray | None = parse_box(config.subject_box) if config.subject == "box" else None
         self._full_ns: int | None = None
         self._tile = 0
+        self._turn = False
         self._started = False
         self._coast_s = config.coast_s
         self._last_ns: int | None = None
@@ -92,30 +93,37 @@ class SubjectTracker:
         """Make the person in this box (4,) px the subject from the next image on, under a new track_id."""
         self._wanted = np.asarray(box, float)
 
-    def windows(self, image_size: tuple[int, int], stamp_ns: int) -> list[Window | None]:
+    def windows(
+        self, image_size: tuple[int, int], stamp_ns: int, one: bool = False, quick: bool = False
+    ) -> list[Window | None]:
         """Parts of the next image to detect in; None = all of it.
 
         Near the subject while it is in view, and over the whole at intervals; without it over the whole and
-        around somebody just found, else one tile of a large image in turn.
+        around somebody just found, else one tile of a large image in turn.  With ``one`` there is time for one look:
+        then these take turns; with ``quick`` the window is closer around the subject.
         """
         if self._wanted is not None:
-            return list({window_around(self._wanted, image_size): None, None: None})
+            near = window_around(self._wanted, image_size)
+            return [near] if one else list({near: None, None: None})
         subject = self._subject
         if subject is not None and subject.unsure_s(stamp_ns) <= self._coast_s:
-            near = window_around(subject.motion.box_at(stamp_ns), image_size)
+            near = window_around(subject.motion.box_at(stamp_ns), image_size, quick=quick)
             due = self._full_ns is None or stamp_ns - self._full_ns >= self._config.full_frame_every_s * 1e9
             if near is None or due or stamp_ns < (self._full_ns or 0):
                 self._full_ns = stamp_ns
-                return list({near: None, None: None})
+                return [None] if one else list({near: None, None: None})
             return [near]
         self._full_ns = stamp_ns
-        if (near := self._candidate_window(image_size, stamp_ns)) is not None:
-            return [None, near]
-        parts = tiles(image_size)
-        if not parts:
+        self._turn = not self._turn
+        if one and not self._turn:
             return [None]
-        self._tile = (self._tile + 1) % len(parts)
-        return [None, parts[self._tile]]
+        near, tiled = self._candidate_window(image_size, stamp_ns), tiles(image_size)
+        if near is None and tiled:
+            self._tile = (self._tile + 1) % len(tiled)
+            near = tiled[self._tile]
+        if near is None:
+            return [None]
+        return [near] if one else [None, near]
 
     def _candidate_window(self, image_size: tuple[int, int], stamp_ns: int) -> Window | None:
         """Window around somebody just found who may become the subject: the whole image may not show them again."""

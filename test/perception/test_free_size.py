@@ -1,0 +1,84 @@
+"""Detectors that take inputs of other sizes than their export fixes."""
+
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from tiny_models import write_model
+
+from drocap_ros.perception.config import PoseEstimatorConfig
+from drocap_ros.perception.free_size import with_free_size
+from drocap_ros.perception.models import load_detector
+
+CONFIG = PoseEstimatorConfig(detector="rtmdet-nano")
+
+
+@pytest.fixture
+def walk(shared):
+    image = cv2.VideoCapture(str(shared / "media" / "outdoor_walk.mp4")).read()[1]
+    return cv2.resize(image, (1280, 720), interpolation=cv2.INTER_AREA)
+
+
+def sizes_seen(monkeypatch, detector):
+    seen, run = [], type(detector.model).__call__
+    monkeypatch.setattr(type(detector.model), "__call__", lambda self, x: seen.append(x.shape[:1:-1]) or run(self, x))
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("window", "quick_px", "size"),
+    [
+        (None, 320, (320, 192)),
+        (None, 640, (320, 192)),  # never more than its own
+        ((300, 0, 700, 400), 256, (256, 256)),
+        ((300, 0, 500, 400), 256, (128, 256)),
+    ],
+)
+def test_a_smaller_input_shows_the_same_person(shared, walk, monkeypatch, window, quick_px, size):
+    detector = load_detector(shared / "models", CONFIG)
+    whole = detector.detect(walk, window)
+    seen = sizes_seen(monkeypatch, detector)
+    quick = detector.detect(walk, window, quick_px=quick_px)
+    assert seen == [size]
+    length = (whole.boxes[0, 2:] - whole.boxes[0, :2]).max()
+    assert np.abs(quick.boxes[0] - whole.boxes[0]).max() < 0.08 * length
+    assert quick.scores[0] > 0.6
+
+
+def test_without_haste_the_network_sees_what_its_export_says(shared, walk, monkeypatch):
+    free, fixed = load_detector(shared / "models", CONFIG), load_detector(shared / "models", CONFIG)
+    fixed.model.fix_size()
+    seen = sizes_seen(monkeypatch, free)
+    a, b = free.detect(walk), fixed.detect(walk)
+    assert seen == [(320, 320)] * 2
+    np.testing.assert_array_equal(a.boxes, b.boxes)
+    np.testing.assert_array_equal(a.scores, b.scores)
+
+
+def tiny_maps():
+    return {f"map{s}": np.full((1, 96 // s, 128 // s, 5), -5, np.float32) for s in (8, 16, 32)}
+
+
+def test_a_network_whose_outputs_do_not_follow_keeps_its_size(tmp_path, monkeypatch):
+    write_model(tmp_path / "rtmdet-tiny.onnx", (1, 3, 96, 128), tiny_maps())
+    detector = load_detector(tmp_path, PoseEstimatorConfig())
+    seen = sizes_seen(monkeypatch, detector)
+    assert len(detector.detect(np.zeros((200, 300, 3), np.uint8), quick_px=64)) == 0
+    assert seen == [(128, 96)]
+
+
+def test_without_the_package_onnx_the_size_is_fixed(shared, walk, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    detector = load_detector(shared / "models", CONFIG)
+    seen = sizes_seen(monkeypatch, detector)
+    assert detector.detect(walk, quick_px=256).scores[0] > 0.6
+    assert seen == [(320, 320)]
+
+
+def test_what_is_no_model_has_no_free_size(tmp_path):
+    path = tmp_path / "broken.onnx"
+    for content in (b"", b"not a model", bytes(range(256)) * 9):
+        path.write_bytes(content)
+        assert with_free_size(path) is None
+    assert with_free_size(tmp_path / "missing.onnx") is None
