@@ -59,13 +59,26 @@ class BundleAdjusterNode(ComponentNode):
         self._sequence = 0
         self._refined = self.output("pose3d/refined")
         self._latest = self.output("pose3d/latest")
-        self.input("pose2d", self._on_pose2d)
+        # What comes with each initial pose, or is only counted, needs no turn of the executor of its own.
+        self._on_the_side = (
+            self.input("pose2d", self._on_pose2d, polled=True),
+            self.input("vehicle/state", self._on_vehicle_state, polled=True),
+        )
         self.input("pose3d/initial", self._on_initial)
-        self.input("vehicle/state", self._on_vehicle_state)
+        self.create_timer(1.0, self._look_aside)
+
+    def flush(self) -> None:
+        """Work off what came on the side."""
+        self._look_aside()
+        super().flush()
 
     def close(self) -> None:
         """Let the adjustment under way end."""
         self._worker.shutdown(wait=True, cancel_futures=True)
+
+    def _look_aside(self) -> None:
+        for subscription in self._on_the_side:
+            self.poll(subscription)
 
     def _on_pose2d(self, message: Pose2D) -> None:
         observation = pose2d_from_ros(message)
@@ -82,6 +95,7 @@ class BundleAdjusterNode(ComponentNode):
             self.count("keypoints without an initial pose")
 
     def _on_initial(self, message: Pose3D) -> None:
+        self._look_aside()
         pose3d_from_ros(message)
         stamp_ns = stamp_from_ros(message.header.stamp)
         observation = self._waiting.pop(stamp_ns, None)

@@ -9,8 +9,9 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.callback_groups import CallbackGroup
 from rclpy.duration import Duration
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -22,12 +23,25 @@ from drocap_ros.errors import InputError
 from drocap_ros.nodes.latency import LAST_REFUSED, LATENCY, LATENCY_P95, RATE, Latency
 from drocap_ros.nodes.parameters import declare_parameters
 from drocap_ros.nodes.stamps import StampGate
-from drocap_ros.nodes.topics import GRAPH_QOS, TOPICS, publishers_of, subscribers_of
+from drocap_ros.nodes.topics import FROM_OUTSIDE, GRAPH_QOS, RESULT_QOS, TOPICS, publishers_of, subscribers_of
 from drocap_ros.parameters import Parameters
 
 #: By which the statuses of this package's nodes are known on ``/diagnostics``.
 HARDWARE_ID = "drocap_ros"
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+class _Polled(CallbackGroup):
+    """Subscriptions for which the executor does not wake: the node looks after them when it is time."""
+
+    def can_execute(self, entity: Any) -> bool:
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        """Nothing begins."""
 
 
 class ComponentNode(Node):
@@ -67,6 +81,7 @@ class ComponentNode(Node):
         self._inputs: list[tuple[str, Subscription]] = []
         #: Topic -> how many nodes of this process get its contents without DDS.
         self.handed_over: dict[str, Callable[[], int]] = {}
+        self._polled = _Polled()
         self._diagnostics = self.output("/diagnostics")
         self._ready = self.create_publisher(String, "graph/ready", GRAPH_QOS)
         self._finished = self.create_publisher(String, "graph/finished", GRAPH_QOS)
@@ -79,7 +94,9 @@ class ComponentNode(Node):
     def output(self, topic: str) -> Publisher:
         """Publisher of a topic of the table."""
         entry = TOPICS[topic]
-        publisher = self.create_publisher(entry.message, topic, entry.offered or entry.qos)
+        # A subscriber that asks for more than is offered says so itself; each handler costs time at every turn.
+        silent = PublisherEventCallbacks(use_default_callbacks=False)
+        publisher = self.create_publisher(entry.message, topic, entry.offered or entry.qos, event_callbacks=silent)
         self._outputs.append((topic, publisher))
         return publisher
 
@@ -94,6 +111,7 @@ class ComponentNode(Node):
         with_info: bool = False,
         count_gaps: bool = False,
         in_batches: bool = False,
+        polled: bool = False,
     ) -> Subscription:
         """Subscription to a topic of the table.  A message that the callback refuses is counted, not fatal.
 
@@ -102,6 +120,7 @@ class ComponentNode(Node):
         with_info : the callback's second argument is rclpy's message info
         count_gaps : count what the publisher sent and this node never saw, being busy or for want of a link
         in_batches : with ``with_info``: after a message take all others that wait, for a node that spins with pauses
+        polled : messages wait until :meth:`poll` takes them, without a turn of the executor for each
         """
         guarded = self.guarded(topic, callback)
         last: list[int] = [0]
@@ -135,10 +154,20 @@ class ComponentNode(Node):
             take,
             subscription_qos,
             raw=raw,
-            event_callbacks=events,
+            event_callbacks=events or SubscriptionEventCallbacks(use_default_callbacks=topic in FROM_OUTSIDE),
+            callback_group=self._polled if polled else None,
         )
         self._inputs.append((topic, subscription))
         return subscription
+
+    def poll(self, subscription: Subscription) -> None:
+        """Take what waits on a subscription that was made with ``polled``."""
+        for _ in range(RESULT_QOS.depth):
+            with subscription.handle:
+                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            if taken is None:
+                return
+            subscription.callback(taken[0])
 
     def guarded(self, topic: str, callback: Callable[..., None], stamps: bool = True) -> Callable[..., None]:
         """The callback, of which a refusal is counted and said instead of raised; stamps are checked first."""

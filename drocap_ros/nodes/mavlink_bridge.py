@@ -53,7 +53,8 @@ class MavlinkBridgeNode(ComponentNode):
         self._statuses = self.output("orbit/status")
         self._tf = self.output("/tf") if TFMessage is not None else None
         self.input("pose2d", self._on_pose2d)
-        self.input("camera_info", self._on_camera_info)
+        # It comes with every picture and says the same: looked at with the keypoints, without a turn of its own.
+        self._camera_infos = self.input("camera_info", self._on_camera_info, polled=True)
         self.input("orbit/command", self._on_command)
         self.create_timer(1.0, self._on_second)
         self._stop = threading.Event()
@@ -121,6 +122,7 @@ class MavlinkBridgeNode(ComponentNode):
                 self._tf.publish(TFMessage(transforms=transforms))
 
     def _on_pose2d(self, message: Pose2D) -> None:
+        self.poll(self._camera_infos)
         observation = pose2d_from_ros(message)
         self._controller.on_pose2d(observation)
         if observation.has_subject:
@@ -140,6 +142,7 @@ class MavlinkBridgeNode(ComponentNode):
     def _on_second(self) -> None:
         if self._failure is not None:
             raise self._failure
+        self.poll(self._camera_infos)
         status = self._link.status()
         safety = self._controller.safety
         if not status.connected:

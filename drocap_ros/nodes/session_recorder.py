@@ -45,7 +45,7 @@ class SessionRecorderNode(ManagedComponent):
 
     component = "session_recorder"
     #: The middleware notes when each message came; 30 pictures may wait, half a second of a fast camera.
-    spin_pause_s = 0.03
+    spin_pause_s = 0.06
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
@@ -59,7 +59,7 @@ class SessionRecorderNode(ManagedComponent):
             name = self.resolve_topic_name(topic)
             take = special.get(topic, self._on_message)
             qos = IMAGE_RECORDING_QOS if topic == _IMAGES else entry.qos
-            events = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, name))
+            events = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, name), use_default_callbacks=False)
             self.input(topic, partial(take, name), raw=True, qos=qos, events=events, with_info=True, in_batches=True)
         self.create_timer(1.0, self._on_second)
         self.set_up()

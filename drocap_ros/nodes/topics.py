@@ -60,6 +60,8 @@ TOPICS: dict[str, Topic] = {
     "markers/camera_path": Topic(MarkerArray, RESULT_QOS),
     "/diagnostics": Topic(DiagnosticArray, RESULT_QOS),
 }
+#: Topics that others than this package's nodes may publish: what of their quality of service does not fit is said.
+FROM_OUTSIDE = frozenset({"image/compressed", "camera_info", "roi", "vehicle/state", "orbit/command"})
 if TFMessage is not None:
     TOPICS["/tf"] = Topic(TFMessage, RESULT_QOS)
 

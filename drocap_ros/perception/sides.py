@@ -68,8 +68,8 @@ def _step_costs(xy: np.ndarray, stamp_ns: np.ndarray, box_size: np.ndarray) -> n
     scale = (_STEP_SIGMA * np.maximum(box_size[1:], 1.0))[:, None]
 
     def cost(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        distance = np.linalg.norm(b[1:] - a[:-1], axis=2) / scale
-        return np.nan_to_num(np.minimum(0.5 * distance**2, _MOST_COST)).sum(axis=1)
+        squared = np.square((b[1:] - a[:-1]) / scale[..., None]).sum(axis=2)
+        return np.nan_to_num(np.minimum(0.5 * squared, _MOST_COST)).sum(axis=1)
 
     out[1:, 0] = cost(left, left) + cost(right, right)
     out[1:, 1] = cost(left, right) + cost(right, left)

@@ -86,6 +86,8 @@ class LiftedStart:
         points = np.array([k for _, k, _ in self._past])
         belief = np.array([c for _, _, c in self._past])
         wrong = exchanged_legs(points, belief, stamps, person_size(points))
+        if not wrong.any():
+            return points, belief
         points, _, belief = exchange(points, np.zeros((*belief.shape, 3)), belief, wrong)
         return points, belief
 

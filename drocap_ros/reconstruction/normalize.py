@@ -59,10 +59,7 @@ def normalize_tracks(
     seen = np.isfinite(keypoints).all(-1)
     weights = seen.astype(np.float64)
     if confidence is not None:
-        c = np.where(np.isfinite(confidence), confidence, 0.0)
-        if c.min(initial=0.0) < 0.0 or c.max(initial=0.0) > 1.0 + 1e-6:
-            raise InputError(f"confidence: expected values in [0, 1], got {c.min():g} to {c.max():g}; rescale them")
-        weights = weights * c
+        weights = weights * _checked_confidence(confidence)
     seen = weights > 0.0
     if seen.sum(1).max(initial=0) < MIN_JOINTS:
         raise InputError(
@@ -83,6 +80,26 @@ def normalize_tracks(
     units = None if covariance is None else covariance / scale_px**2
     information = information_from(np.where(seen[..., None], w, np.nan), weights, units)
     return NormalizedTracks(w, weights, information, filled(centre, count > 0), scale_px)
+
+
+def check_uncertainty(confidence: np.ndarray, covariance: np.ndarray | None, seen: np.ndarray) -> None:
+    """Refuse what :func:`normalize_tracks` would of one image: confidence (P,), covariance (P, 3), seen (P,) bool.
+
+    Raises
+    ------
+    InputError
+    """
+    _checked_confidence(confidence)
+    if covariance is not None:
+        _check_covariance(covariance[None], seen[None])
+
+
+def _checked_confidence(confidence: np.ndarray) -> np.ndarray:
+    """The confidence with 0 for NaN."""
+    c = np.where(np.isfinite(confidence), confidence, 0.0)
+    if c.min(initial=0.0) < 0.0 or c.max(initial=0.0) > 1.0 + 1e-6:
+        raise InputError(f"confidence: expected values in [0, 1], got {c.min():g} to {c.max():g}; rescale them")
+    return c
 
 
 def _check_covariance(covariance: np.ndarray, seen: np.ndarray) -> None:

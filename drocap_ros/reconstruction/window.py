@@ -21,7 +21,7 @@ from drocap_ros.reconstruction.dictionary import REFERENCE_STATURE_M, Dictionary
 from drocap_ros.reconstruction.lifted_start import LiftedStart
 from drocap_ros.reconstruction.lifter import Lifter
 from drocap_ros.reconstruction.metrics import limb_lengths
-from drocap_ros.reconstruction.normalize import MIN_JOINTS, NormalizedTracks, normalize_tracks
+from drocap_ros.reconstruction.normalize import MIN_JOINTS, NormalizedTracks, check_uncertainty, normalize_tracks
 from drocap_ros.reconstruction.pose_covariance import packed_covariance, pose_covariance
 from drocap_ros.reconstruction.single_view import sparse_from_dense
 from drocap_ros.reconstruction.sparse_fit import fit_sparse
@@ -51,7 +51,6 @@ class InitialPose:
     joints3d : (15, 3) m, camera axes, pelvis at the origin; NaN when the image shows too little
     covariance : (15, 6) m^2, xx xy xz yy yz zz
     confidence : (15,) in [0, 1], 0 where the joint was not seen and the model filled it in
-    rotation : (3, 3) torso -> camera
     """
 
     stamp_ns: int
@@ -59,7 +58,11 @@ class InitialPose:
     covariance: np.ndarray
     confidence: np.ndarray
     reprojection_rms_px: float
-    rotation: np.ndarray
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """(3, 3) torso -> camera."""
+        return torso_frame(self.joints3d)
 
 
 @dataclass(frozen=True)
@@ -177,8 +180,7 @@ class SlidingWindowInitializer:
         covariance: np.ndarray | None,
         seen: np.ndarray,
     ) -> InitialPose:
-        # Refuses impossible covariances and confidences, as the dictionary's start does.
-        normalize_tracks(keypoints[None], confidence[None], None if covariance is None else covariance[None])
+        check_uncertainty(confidence, covariance, seen)
         belief = np.where(seen, np.nan_to_num(confidence), 0.0)
         points = np.where(seen[:, None], keypoints, np.nan)
         joints, std, metres = start.push(stamp_ns, points, belief)
@@ -191,7 +193,6 @@ class SlidingWindowInitializer:
             covariance=spread * metres**2,
             confidence=belief,
             reprojection_rms_px=float(np.sqrt(np.mean(np.sum(gap**2, axis=-1)))),
-            rotation=torso_frame(joints),
         )
 
     def _normalize(
@@ -277,7 +278,6 @@ class SlidingWindowInitializer:
             covariance=packed_covariance(covariance[0]) * metres**2,
             confidence=confidence,
             reprojection_rms_px=float(rms),
-            rotation=fit.rotation[0],
         )
 
 
@@ -293,9 +293,7 @@ def _check_image(keypoints: np.ndarray, confidence: np.ndarray, covariance: np.n
 
 def _unknown(stamp_ns: int) -> InitialPose:
     p = len(BODY_15)
-    return InitialPose(
-        stamp_ns, np.full((p, 3), np.nan), np.full((p, 6), np.nan), np.zeros(p), float("nan"), np.full((3, 3), np.nan)
-    )
+    return InitialPose(stamp_ns, np.full((p, 3), np.nan), np.full((p, 6), np.nan), np.zeros(p), float("nan"))
 
 
 def adjust_window(
