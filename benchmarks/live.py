@@ -3,7 +3,7 @@
 load    a 1280x720 video at 30 fps round and round through all nodes, adjustment and recording on: rate, drops,
         latency from the image's stamp to pose3d/initial, the adjustment's duration, processor time, in one process
         and in a process each, with the adjuster and without (`--seconds 300`, `--one-process`, `--processes`,
-        `--no-adjuster` for one case)
+        `--no-adjuster` for one case; `--seamless`: no cuts, so that somebody is followed all the time)
 memory  resident memory of every process against its value at minute 2 (`--minutes 30`)
 kills   SIGKILL of each node in turn, a person in view all the time: how long until it works again, what the recording
         lost
@@ -47,6 +47,7 @@ def main() -> int:
     parser.add_argument("--one-process", action="store_true")
     parser.add_argument("--processes", action="store_true")
     parser.add_argument("--no-adjuster", action="store_true")
+    parser.add_argument("--seamless", action="store_true", help="the video there and back again, without cuts")
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
@@ -114,12 +115,18 @@ def usage(pid: int) -> tuple[float, float]:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"), pages * page_mib
 
 
+def taken_by_host() -> tuple[int, int]:
+    """Ticks of all processors that the host of this virtual machine gave to others, and ticks altogether."""
+    ticks = [int(v) for v in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
+    return ticks[7], sum(ticks)
+
+
 # -- load --------------------------------------------------------------------------------------------------
 
 
 def part_load(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Every asked case of the graph, one after the other."""
-    video = stream(folder)
+    video = stream(folder, args.seamless)
     results = {}
     for processes in (False, True):
         if (args.one_process or args.processes) and not (args.processes if processes else args.one_process):
@@ -148,12 +155,15 @@ def measure_load(
         graph.spin_for(WARM_S)
         pids = {graph.pid(name): name if processes else "all nodes" for name in nodes}
         before, begin_ns = {pid: usage(pid)[0] for pid in pids}, time.time_ns()
+        taken = taken_by_host()
         graph.spin_for(args.seconds)
+        taken = (taken_by_host()[0] - taken[0], taken_by_host()[1] - taken[1])
         after, end_ns = {pid: usage(pid) for pid in pids}, time.time_ns()
     cpu = {pids[pid]: round(100 * (after[pid][0] - before[pid]) / ((end_ns - begin_ns) * 1e-9)) for pid in pids}
     return {
         **session_figures(session, begin_ns, end_ns),
         "CPU %, of one core": {**cpu, "sum": sum(cpu.values())},
+        "processor time taken by the machine's host %": round(100 * taken[0] / max(taken[1], 1), 1),
         "resident MiB": {pids[pid]: round(after[pid][1]) for pid in pids},
     }
 

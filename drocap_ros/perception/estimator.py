@@ -17,7 +17,7 @@ from drocap_ros.perception.models import limited_use, load_detector, load_pose_m
 from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.perception.pose import Keypoints
 from drocap_ros.perception.tracking import Subject, SubjectTracker
-from drocap_ros.perception.tracking.search import Window, inside, tiles
+from drocap_ros.perception.tracking.search import Window, inside
 from drocap_ros.perception.uncertainty import calibrate
 from drocap_ros.skeleton import BODY_15
 
@@ -28,8 +28,8 @@ _CONFIRM_CONFIDENCE = 0.5
 _STEADY_SCORE, _STEADY_CONFIDENCE = 0.6, 0.8
 #: A detection is due a little before its time: stamps are never even.
 _SLACK_S = 0.005
-#: In a hurry, side of the detector's input for a window around a subject that it has just shown clearly.
-_QUICK_NEAR_PX = 256
+#: In a hurry, share of the detector's input that a window of the image is given.
+_QUICK = 0.8
 #: Confidence of a joint that helps to place the box.
 _FINE_JOINT = 0.3
 
@@ -207,10 +207,8 @@ class PoseEstimator:
     def _look(self, image: np.ndarray, window: Window | None, hurried: bool = False) -> Detections:
         """Detections in a window, without those that its edge cuts."""
         size = (image.shape[1], image.shape[0])
-        quick_px = max(self.detector.spec.input_size) if hurried else None
-        if hurried and self._shown and window is not None and window not in tiles(size):
-            quick_px = _QUICK_NEAR_PX
-        found = self.detector.detect(image, window, self.config.low_threshold, quick_px)
+        quick = None if not hurried else 1.0 if window is None else _QUICK
+        found = self.detector.detect(image, window, self.config.low_threshold, quick)
         uncut = inside(found.boxes, window, size)
         return Detections(found.boxes[uncut], found.scores[uncut])
 

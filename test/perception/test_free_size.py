@@ -27,23 +27,22 @@ def sizes_seen(monkeypatch, detector):
 
 
 @pytest.mark.parametrize(
-    ("window", "quick_px", "size"),
+    ("window", "quick", "size"),
     [
-        (None, 320, (320, 192)),
-        (None, 640, (320, 192)),  # never more than its own
-        ((300, 0, 700, 400), 256, (256, 256)),
-        ((300, 0, 500, 400), 256, (128, 256)),
+        (None, 1.0, (320, 192)),
+        ((300, 0, 700, 400), 0.8, (256, 256)),
+        ((300, 0, 500, 400), 0.8, (128, 256)),
     ],
 )
-def test_a_smaller_input_shows_the_same_person(shared, walk, monkeypatch, window, quick_px, size):
+def test_a_smaller_input_shows_the_same_person(shared, walk, monkeypatch, window, quick, size):
     detector = load_detector(shared / "models", CONFIG)
     whole = detector.detect(walk, window)
     seen = sizes_seen(monkeypatch, detector)
-    quick = detector.detect(walk, window, quick_px=quick_px)
+    found = detector.detect(walk, window, quick=quick)
     assert seen == [size]
     length = (whole.boxes[0, 2:] - whole.boxes[0, :2]).max()
-    assert np.abs(quick.boxes[0] - whole.boxes[0]).max() < 0.08 * length
-    assert quick.scores[0] > 0.6
+    assert np.abs(found.boxes[0] - whole.boxes[0]).max() < 0.08 * length
+    assert found.scores[0] > 0.6
 
 
 def test_without_haste_the_network_sees_what_its_export_says(shared, walk, monkeypatch):
@@ -64,7 +63,7 @@ def test_a_network_whose_outputs_do_not_follow_keeps_its_size(tmp_path, monkeypa
     write_model(tmp_path / "rtmdet-tiny.onnx", (1, 3, 96, 128), tiny_maps())
     detector = load_detector(tmp_path, PoseEstimatorConfig())
     seen = sizes_seen(monkeypatch, detector)
-    assert len(detector.detect(np.zeros((200, 300, 3), np.uint8), quick_px=64)) == 0
+    assert len(detector.detect(np.zeros((200, 300, 3), np.uint8), quick=0.5)) == 0
     assert seen == [(128, 96)]
 
 
@@ -72,7 +71,7 @@ def test_without_the_package_onnx_the_size_is_fixed(shared, walk, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
     detector = load_detector(shared / "models", CONFIG)
     seen = sizes_seen(monkeypatch, detector)
-    assert detector.detect(walk, quick_px=256).scores[0] > 0.6
+    assert detector.detect(walk, quick=0.8).scores[0] > 0.6
     assert seen == [(320, 320)]
 
 

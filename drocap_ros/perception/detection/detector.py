@@ -52,7 +52,7 @@ class Detector:
         image: np.ndarray,
         window: tuple[int, int, int, int] | None = None,
         threshold: float = 0.3,
-        quick_px: int | None = None,
+        quick: float | None = None,
     ) -> Detections:
         """Persons in an image.
 
@@ -61,14 +61,14 @@ class Detector:
         image : (H, W, 3) uint8 BGR
         window : x_min, y_min, x_max, y_max px inside the image; None = all of it
         threshold : least score
-        quick_px : longer side of the network's input, where its size is free: less than its own, and no grey beside
-            the picture, takes less time
+        quick : share of the network's input that the window's longer side is given, with no grey beside the picture:
+            less time, where the size of the input is free
         """
         height, width = image.shape[:2]
         window = window or (0, 0, width, height)
         spec = self.spec
-        if quick_px is not None and self._any_size:
-            spec = dataclasses.replace(spec, input_size=_quick_size(window, min(quick_px, *spec.input_size)))
+        if quick is not None and self._any_size:
+            spec = dataclasses.replace(spec, input_size=_quick_size(window, quick * min(spec.input_size)))
         canvas, place = letterbox(image, window, spec.input_size, spec.letterbox == "centre")
         raw = self._decode(self.model(self._normalize(canvas)), spec, threshold)
         boxes = place.boxes_to_image(raw.boxes.astype(np.float32))
@@ -98,7 +98,7 @@ class Detector:
         return False
 
 
-def _quick_size(window: tuple[int, int, int, int], longest: int) -> tuple[int, int]:
+def _quick_size(window: tuple[int, int, int, int], longest: float) -> tuple[int, int]:
     """(width, height) of the smallest input that holds a window whose longer side takes ``longest`` px."""
     sides = np.array([window[2] - window[0], window[3] - window[1]])
     sides = np.ceil(np.round(sides * longest / sides.max()) / _STRIDE).astype(int) * _STRIDE
