@@ -23,11 +23,10 @@ from drocap_ros.nodes.component import ComponentNode
 #: After the order to stop, messages that have arrived are still worked off, for this long at most.
 DRAIN_S = 5.0
 
-#: How far a node steps back (Unix niceness) behind the one that most depends on time, the pose estimator: with one core
-#: busy for the networks alone, whatever breaks in on them costs pictures.
+#: How far a node steps back (Unix niceness) behind those that most depend on time, pose estimator and initializer: with
+#: one core busy for the networks alone, whatever breaks in on them costs pictures.
 NICENESS = {
     "image_ingest": 5,
-    "initializer": 0,
     "mavlink_bridge": 5,
     "session_recorder": 10,
     "bundle_adjuster": 15,
@@ -35,6 +34,8 @@ NICENESS = {
 }
 #: From here on a node does not even break in on others when something has come for it.
 _BACKGROUND = 10
+#: From here on it takes only what the others leave, in a process of its own.
+_LAST = 15
 #: A graph has at most eight nodes that ask at the same time.
 _AUTOGROUP_TRIES = 20
 
@@ -72,14 +73,20 @@ def spin(node: ComponentNode, stop: threading.Event) -> None:
         node.destroy_node()
 
 
-def step_back(component: str) -> None:
-    """Give the calling thread, and those that it will start, the niceness of a node."""
+def step_back(component: str, own_process: bool = False) -> None:
+    """Give the calling thread, and those that it will start, the niceness of a node.
+
+    What comes last of all runs only where a processor has nothing else to do (SCHED_IDLE): whoever wakes takes its
+    place at once, which niceness alone does not give.  In a process of its own only: a thread that holds Python's lock
+    and is not let run holds up all others of its process.
+    """
     niceness = NICENESS.get(component, 0)
     # Not every system has priorities of threads, and one without them runs as well, if not as evenly.
     with contextlib.suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
         if niceness >= _BACKGROUND:
-            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+            idle = own_process and niceness >= _LAST
+            os.sched_setscheduler(0, os.SCHED_IDLE if idle else os.SCHED_BATCH, os.sched_param(0))
 
 
 def step_session_back(component: str) -> None:
@@ -126,7 +133,7 @@ def node_main(make: Callable[[], ComponentNode]) -> int:
     rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
     try:
         component = getattr(make, "component", "")
-        step_back(component)
+        step_back(component, own_process=True)
         step_session_back(component)
         spin(make(), stop)
     except DrocapError as error:

@@ -1,6 +1,7 @@
 """Priorities of the nodes' processes."""
 
 import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -35,3 +36,29 @@ def test_a_session_of_others_and_the_estimators_own_are_left_as_they_are(asked, 
     monkeypatch.setattr(os, "getsid", lambda _: os.getpid())
     run.step_session_back("pose_estimator")
     assert asked == []
+
+
+@pytest.mark.skipif(not hasattr(os, "SCHED_IDLE"), reason="Linux's policies")
+@pytest.mark.parametrize(
+    ("component", "own_process", "policy"),
+    [
+        ("pose_estimator", True, "SCHED_OTHER"),
+        ("initializer", True, "SCHED_OTHER"),
+        ("mavlink_bridge", True, "SCHED_OTHER"),
+        ("session_recorder", True, "SCHED_BATCH"),
+        ("bundle_adjuster", True, "SCHED_IDLE"),
+        # A thread that holds Python's lock must be let run.
+        ("bundle_adjuster", False, "SCHED_BATCH"),
+    ],
+)
+def test_what_comes_last_takes_what_others_leave_but_not_beside_them_in_a_process(component, own_process, policy):
+    found = []
+
+    def ask():
+        run.step_back(component, own_process)
+        found.append(os.sched_getscheduler(0))
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    thread.join()
+    assert found == [getattr(os, policy)]

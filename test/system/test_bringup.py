@@ -119,6 +119,8 @@ def test_nodes_step_back_behind_the_estimator_in_a_session_of_their_own():
         assert (adjuster / "autogroup").read_text().split()[1:] == ["nice", "15"]
         assert (simulator / "autogroup").read_text().split()[1:] == ["nice", "0"]
         assert os.getpriority(os.PRIO_PROCESS, graph.pid("bundle_adjuster")) >= 15
+        assert os.sched_getscheduler(graph.pid("bundle_adjuster")) == os.SCHED_IDLE
+        assert os.sched_getscheduler(graph.pid("capture_simulator")) == os.SCHED_OTHER
     assert AUTOGROUP.read_text().split()[1:] == OURS
 
 
