@@ -73,7 +73,7 @@ class BundleAdjusterConfig(Parameters):
     window_frames: int = param(480, "frames in a window at most", minimum=8, maximum=5000)
     overlap_frames: int = param(30, "frames that neighbouring windows of a long recording share", minimum=0,
                                 maximum=2000)  # fmt: skip
-    max_solve_s: float = param(0.6, "an adjustment of the live node ends after the step in which this is over",
+    max_solve_s: float = param(0.5, "an adjustment of the live node ends after the step in which this is over",
                                unit="s", minimum=0.01, maximum=60.0)  # fmt: skip
     max_stride: int = param(4, "the live node adjusts every n-th image at most when it is late", minimum=1, maximum=16)
     blend_s: float = param(0.5, "time over which pose3d/latest takes over a new solution", unit="s", minimum=0.0,

@@ -49,7 +49,7 @@ def eventful():
     return [*first[:30], first[29], first[20], *stray, blind, *first[30:], *gap, *first, *other, *hidden]
 
 
-def fly(folder, observations, pause_s=0.012, **adjuster):
+def fly(folder, observations, pause_s=0.035, **adjuster):
     """Publish the observations to a recorded graph; gives latest poses, windows and what /diagnostics counted."""
     config = DrocapConfig().replace("session_recorder", session_dir=str(folder))
     config = config.replace("bundle_adjuster", period_s=0.5, window_s=4.0, **adjuster)
