@@ -133,9 +133,12 @@ def node_main(make: Callable[[], ComponentNode]) -> int:
     rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
     try:
         component = getattr(make, "component", "")
-        step_back(component, own_process=True)
+        step_back(component)
         step_session_back(component)
-        spin(make(), stop)
+        node = make()
+        # Not before: a node that was started again is waited for.
+        step_back(component, own_process=True)
+        spin(node, stop)
     except DrocapError as error:
         print(f"drocap: {error}", file=sys.stderr)
         return error.exit_status
