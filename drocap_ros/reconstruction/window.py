@@ -61,8 +61,8 @@ class InitialPose:
 
     @property
     def rotation(self) -> np.ndarray:
-        """(3, 3) torso -> camera."""
-        return torso_frame(self.joints3d)
+        """(3, 3) torso -> camera; NaN when the image shows too little."""
+        return torso_frame(self.joints3d) if np.isfinite(self.joints3d).all() else np.full((3, 3), np.nan)
 
 
 @dataclass(frozen=True)
