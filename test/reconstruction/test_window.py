@@ -114,6 +114,7 @@ def test_an_image_without_the_person_is_unknown_not_zero(dictionary: Dictionary)
     for stamp_ns, keypoints in enumerate((np.full((15, 2), np.nan), np.full((15, 2), 40.0))):
         pose = push(initializer, stamp_ns, keypoints, ONES)
         assert np.isnan(pose.joints3d).all()
+        assert np.isnan(pose.rotation).all()
         assert np.all(pose.confidence == 0.0)
 
 
