@@ -35,8 +35,9 @@ $(VENV)/.package: $(VENV)/.requirements $(VENV)/.tf2_msgs $(VENV)/.hri_msgs $(SO
 demo: setup  ## a whole simulated capture, reconstructed and compared with its truth
 	@$(CLEAN) $(BIN)/drocap demo --out demo_out
 
-test: setup  ## the whole test suite
-	$(CLEAN) $(BIN)/python -m pytest
+test: setup  ## the whole test suite: two tests at a time, then those that watch a clock, alone
+	$(CLEAN) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not clock" -n 2 --dist loadfile
+	$(CLEAN) $(BIN)/python -m pytest -m clock
 
 lint: setup  ## ruff and mypy
 	$(CLEAN) $(BIN)/ruff check .

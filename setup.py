@@ -127,6 +127,7 @@ setup(
         "test": [
             "pytest",
             "pytest-timeout",
+            "pytest-xdist",
             "hypothesis",
             "mcap-ros2-support",
             "bvhio",

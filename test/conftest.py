@@ -8,6 +8,22 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
+#: Where nodes run, ports are listened to or time is measured, and what of it only computes.
+CLOCKED = (
+    "nodes", "system", "flight/test_link.py", "flight/test_signing.py", "flight/test_gimbal.py",
+    "perception/test_live_sources.py", "perception/test_models_fetch.py", "recording/test_bounded_queue.py",
+    "recording/test_live_graph.py", "recording/test_recover.py", "recording/test_session_writer.py",
+)  # fmt: skip
+COMPUTING = ("system/test_packaging.py", "system/test_reconstruct_cli.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what has to run alone."""
+    for item in items:
+        path = item.path.relative_to(ROOT / "test").as_posix()
+        if path.startswith(CLOCKED) and path not in COMPUTING:
+            item.add_marker("clock")
+
 
 @pytest.fixture(scope="session")
 def root() -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import Counter
@@ -160,14 +161,17 @@ class ComponentNode(Node):
         self._inputs.append((topic, subscription))
         return subscription
 
-    def poll(self, subscription: Subscription) -> None:
-        """Take what waits on a subscription that was made with ``polled``."""
+    def poll(self, subscription: Subscription, within_s: float = math.inf) -> None:
+        """Take what waits on a subscription that was made with ``polled``; what is not reached in time waits on."""
+        end_s = time.monotonic() + within_s
         for _ in range(RESULT_QOS.depth):
             with subscription.handle:
                 taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
             if taken is None:
                 return
             subscription.callback(taken[0])
+            if time.monotonic() > end_s:
+                return
 
     def guarded(self, topic: str, callback: Callable[..., None], stamps: bool = True) -> Callable[..., None]:
         """The callback, of which a refusal is counted and said instead of raised; stamps are checked first."""

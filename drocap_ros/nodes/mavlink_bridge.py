@@ -52,9 +52,9 @@ class MavlinkBridgeNode(ComponentNode):
         self._states = self.output("vehicle/state")
         self._statuses = self.output("orbit/status")
         self._tf = self.output("/tf") if TFMessage is not None else None
-        self.input("pose2d", self._on_pose2d)
-        # It comes with every picture and says the same: looked at with the keypoints, without a turn of its own.
+        # What comes with every picture is looked at when the control loop has need of it, and wakes nobody before.
         self._camera_infos = self.input("camera_info", self._on_camera_info, polled=True)
+        self._poses = self.input("pose2d", self._on_pose2d, polled=True)
         self.input("orbit/command", self._on_command)
         self.create_timer(1.0, self._on_second)
         self._stop = threading.Event()
@@ -94,6 +94,9 @@ class MavlinkBridgeNode(ComponentNode):
         due_s = time.monotonic()
         while not self._stop.is_set():
             try:
+                # A flood of messages must not keep the loop from its step.
+                for subscription in (self._camera_infos, self._poses):
+                    self.poll(subscription, within_s=0.2 * period_s)
                 status = self._controller.step(self.get_clock().now().nanoseconds, time.monotonic())
                 self._tell(status)
             except Exception as error:
@@ -122,7 +125,6 @@ class MavlinkBridgeNode(ComponentNode):
                 self._tf.publish(TFMessage(transforms=transforms))
 
     def _on_pose2d(self, message: Pose2D) -> None:
-        self.poll(self._camera_infos)
         observation = pose2d_from_ros(message)
         self._controller.on_pose2d(observation)
         if observation.has_subject:
@@ -142,7 +144,6 @@ class MavlinkBridgeNode(ComponentNode):
     def _on_second(self) -> None:
         if self._failure is not None:
             raise self._failure
-        self.poll(self._camera_infos)
         status = self._link.status()
         safety = self._controller.safety
         if not status.connected:

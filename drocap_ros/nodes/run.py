@@ -23,11 +23,11 @@ from drocap_ros.nodes.component import ComponentNode
 #: After the order to stop, messages that have arrived are still worked off, for this long at most.
 DRAIN_S = 5.0
 
-#: How far a node steps back (Unix niceness) behind those that most depend on time, pose estimator and initializer: with
-#: one core busy for the networks alone, whatever breaks in on them costs pictures.
+#: How far a node steps back (Unix niceness) behind those that most depend on time: the bridge, whose control loop a
+#: vehicle hangs on, pose estimator and initializer.  With one core busy for the networks alone, whatever else breaks in
+#: on them costs pictures.
 NICENESS = {
     "image_ingest": 5,
-    "mavlink_bridge": 5,
     "session_recorder": 10,
     "bundle_adjuster": 15,
     "visualizer": 15,

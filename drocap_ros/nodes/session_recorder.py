@@ -44,7 +44,7 @@ class SessionRecorderNode(ManagedComponent):
     """Hands the bytes of every message to the writer's queue."""
 
     component = "session_recorder"
-    #: The middleware notes when each message came; 30 pictures may wait, half a second of a fast camera.
+    #: The middleware notes when each message came, and pictures may wait for seconds.
     spin_pause_s = 0.06
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
@@ -54,7 +54,10 @@ class SessionRecorderNode(ManagedComponent):
         self._calibrated = False
         self._heard = False  # anything but diagnostics
         self._sessions = 0
-        special = {"camera_info": self._on_camera_info, "/diagnostics": self._on_diagnostics}
+        self._last_picture = 0
+        special = {
+            _IMAGES: self._on_picture, "camera_info": self._on_camera_info, "/diagnostics": self._on_diagnostics
+        }  # fmt: skip
         for topic, entry in TOPICS.items():
             name = self.resolve_topic_name(topic)
             take = special.get(topic, self._on_message)
@@ -102,8 +105,15 @@ class SessionRecorderNode(ManagedComponent):
             self._writer.write(name, data, log_ns, sent_ns or log_ns)
             self.count("messages")
 
+    def _on_picture(self, name: str, data: bytes, info: dict[str, Any]) -> None:
+        number = info["publication_sequence_number"] or 0
+        if 0 < self._last_picture < number - 1:
+            self.count(f"not recorded, too busy for too long {name}", number - 1 - self._last_picture)
+        self._last_picture = number
+        self._on_message(name, data, info)
+
     def _on_lost(self, name: str, event: Any) -> None:
-        """Count what the middleware lost on its way: pictures are best effort."""
+        """Count what the middleware lost on its way."""
         self.count(f"lost on the way {name}", event.total_count_change)
 
     def _on_camera_info(self, name: str, data: bytes, info: dict[str, Any]) -> None:

@@ -21,7 +21,9 @@ except ImportError:  # not among the ROS wheels; `make setup` builds it, a ROS i
 #: off, since who hurries carries keypoints on.
 IMAGE_QOS = QoSProfile(depth=4, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 #: Offered reliably, so that a recorder on the same machine loses none; a best-effort reader costs no more for it.
-IMAGE_RECORDING_QOS = QoSProfile(depth=30, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
+IMAGE_OFFERED_QOS = QoSProfile(depth=30, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
+#: The recorder comes last: on a busy machine, most of all at the start, it may not be let run for seconds.
+IMAGE_RECORDING_QOS = QoSProfile(depth=150, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 #: Results are small, and none may be lost: 10 s of them at 100 Hz.
 RESULT_QOS = QoSProfile(depth=1000, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 #: Handshake of nodes and bringup, for whoever comes later; as deep as there are nodes to speak.
@@ -44,7 +46,7 @@ class Topic:
 
 
 TOPICS: dict[str, Topic] = {
-    "image/compressed": Topic(CompressedImage, IMAGE_QOS, IMAGE_RECORDING_QOS, one_clock=True),
+    "image/compressed": Topic(CompressedImage, IMAGE_QOS, IMAGE_OFFERED_QOS, one_clock=True),
     "camera_info": Topic(CameraInfo, RESULT_QOS, one_clock=True),
     "roi": Topic(RegionOfInterest, RESULT_QOS),
     "pose2d": Topic(Pose2D, RESULT_QOS, one_clock=True),

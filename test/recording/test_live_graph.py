@@ -1,6 +1,8 @@
 """The recorder, the player and the live method, in the running graph."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -174,6 +176,35 @@ def test_replay_in_a_loop_until_it_is_stopped(flown):
         assert "session_player" not in graph.finished
     stamps = [stamp_from_ros(m.header.stamp) for m in seen]
     assert (np.diff(stamps) < 0).any()
+
+
+def test_pictures_wait_for_a_recorder_that_was_not_let_run_and_too_many_are_counted(tmp_path):
+    config = DrocapConfig().replace("session_recorder", session_dir=str(tmp_path / "s"))
+    with bringup(config, ["session_recorder"], processes=True) as graph:
+        states, recorder = [], graph.pid("session_recorder")
+        graph.node.create_subscription(TOPICS["/diagnostics"].message, "/diagnostics", states.append, 100)
+        pictures = graph.node.create_publisher(CompressedImage, "image/compressed", IMAGE_RECORDING_QOS)
+        graph.wait_until(lambda: pictures.get_subscription_count() == 1, 20, "the recorder")
+
+        def publish_while_it_stands(count):
+            os.kill(recorder, signal.SIGSTOP)
+            for _ in range(count):
+                pictures.publish(CompressedImage(format="jpeg", data=b"x"))
+            os.kill(recorder, signal.SIGCONT)
+
+        def told(key):
+            return [int(v.value) for m in states for s in m.status for v in s.values if key in v.key][-1:]
+
+        publish_while_it_stands(120)
+        graph.wait_until(lambda: told("messages") and told("messages")[0] >= 120, 20, "120 pictures")
+        assert not told("not recorded")
+        publish_while_it_stands(1000)
+        graph.wait_until(lambda: told("not recorded"), 20, "the count of what was too much")
+        graph.spin_for(2.1)
+        missed = told("not recorded")[0]
+    with open_session(tmp_path / "s") as session:
+        recorded = next(t.count for t in session.info.topics if t.name.endswith("image/compressed"))
+    assert recorded + missed == 1120
 
 
 def test_a_disk_that_fills_up_is_told_and_the_others_live_on(small_disk):
