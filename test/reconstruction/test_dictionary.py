@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -88,7 +89,7 @@ def test_learning_reduces_the_error_and_repeats_itself() -> None:
 
 def test_more_sparsity_means_fewer_active_atoms(dictionary: Dictionary) -> None:
     poses = normalize_poses(make_walk(50).shape)
-    dense, sparse = (quality(Dictionary(**{**vars(dictionary), "sparsity": weight}), poses) for weight in (0.005, 0.1))
+    dense, sparse = (quality(replace(dictionary, sparsity=weight), poses) for weight in (0.005, 0.1))
     assert sparse["mean_active_atoms"] < dense["mean_active_atoms"]
     assert sparse["reconstruction_error_mm"] > dense["reconstruction_error_mm"]
 
@@ -108,7 +109,7 @@ def test_files_that_are_no_dictionary_are_refused(tmp_path: Path, dictionary: Di
     np.savez(path, atoms=np.zeros(3))
     with pytest.raises(InputError, match="missing mean"):
         load_dictionary(path)
-    save_dictionary(path, Dictionary(**{**vars(dictionary), "atoms": np.full((4, 15, 3), np.nan)}))
+    save_dictionary(path, replace(dictionary, atoms=np.full((4, 15, 3), np.nan)))
     with pytest.raises(InputError, match="atoms: expected finite floats"):
         load_dictionary(path)
     save_dictionary(path, Dictionary(**{**vars(dictionary), "joints": ("a", "b")}))
