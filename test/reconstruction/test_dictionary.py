@@ -112,7 +112,7 @@ def test_files_that_are_no_dictionary_are_refused(tmp_path: Path, dictionary: Di
     save_dictionary(path, replace(dictionary, atoms=np.full((4, 15, 3), np.nan)))
     with pytest.raises(InputError, match="atoms: expected finite floats"):
         load_dictionary(path)
-    save_dictionary(path, Dictionary(**{**vars(dictionary), "joints": ("a", "b")}))
+    save_dictionary(path, replace(dictionary, joints=("a", "b")))
     with pytest.raises(InputError, match="joints: expected those of body15"):
         load_dictionary(path)
 
