@@ -67,6 +67,8 @@ class PoseEstimator:
         self._searched_ns = 0
         self._clear = False
         self._shown = False
+        #: Whether the keypoints of the last image that a network saw are likely the subject's.
+        self._certain = False
         #: Images since the joints were looked for in vain, that one included.
         self._in_vain = 0
         self._flow = KeypointFlow()
@@ -106,7 +108,8 @@ class PoseEstimator:
             observation = self._carry(image, stamp_ns) or (self._glance(image, stamp_ns, hurry) if hurry else None)
         if observation is None:
             observation = self._search(image, stamp_ns, roi, hurry)
-        self._flow.begin(image if hurry else None, observation)
+        # What may be no person at all is not carried on: it is looked for anew.
+        self._flow.begin(image if hurry and self._certain else None, observation)
         return observation
 
     def _search(self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None, hurry: int) -> PoseObservation:
@@ -127,6 +130,7 @@ class PoseEstimator:
         pose = self._in_our_joints(self.keypoints)
         self._clear = bool(pose[2].mean() >= _STEADY_CONFIDENCE)
         self._in_vain = int(pose[2].mean() < _CONFIRM_CONFIDENCE)
+        self._certain = not self._in_vain or subject.score >= self.config.detection_threshold
         self._margins = None
         seen = _extent(pose)
         if subject.score < self.config.detection_threshold:
@@ -161,6 +165,7 @@ class PoseEstimator:
         box = seen + self._margins * (seen[2:] - seen[:2]).max()
         box = np.clip(box, 0, np.array([image.shape[1], image.shape[0]] * 2, float))
         self.tracker.carry(box, stamp_ns)
+        self._certain = True
         self.keypoints = keypoints
         subject = Subject(predicted.track_id, box, predicted.score, False)
         return self._observation(stamp_ns, (image.shape[1], image.shape[0]), subject, pose)
@@ -177,6 +182,7 @@ class PoseEstimator:
         self.keypoints = self.pose_model.estimate(image, predicted.box)
         pose = self._in_our_joints(self.keypoints)
         self._clear = bool(pose[2].mean() >= _STEADY_CONFIDENCE)
+        self._certain = bool(pose[2].mean() >= _CONFIRM_CONFIDENCE)
         return self._observation(stamp_ns, (image.shape[1], image.shape[0]), predicted, pose)
 
     def _observation(

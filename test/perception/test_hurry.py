@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.perception.config import PoseEstimatorConfig
+from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.estimator import PoseEstimator
 
 
@@ -118,3 +119,21 @@ def test_in_a_hurry_throughout_the_subject_is_kept_through_a_somersault(shared, 
         both = np.prod(np.clip(high - low, 0, None), axis=1)
         either = sum(np.prod(boxes[k][:, 2:] - boxes[k][:, :2], axis=1) for k in (0, hurry)) - both
         assert (both / either > 0.3).mean() > 0.9
+
+
+def test_in_a_hurry_what_the_network_makes_of_an_empty_place_is_not_carried_on(shared, monkeypatch):
+    estimator = PoseEstimator(shared / "models")
+    image = cv2.imread(str(shared / "media" / "skier.jpg"))
+    for i in range(4):
+        assert estimator.process(image, i * 33_333_333, hurry=3).track_id == 1
+    assert estimator.carried
+    # The drone is thrown round: no detection where the person was, and joints that the network itself doubts.
+    nobody = Detections(np.empty((0, 4), np.float32), np.empty(0, np.float32))
+    monkeypatch.setattr(estimator.detector, "detect", lambda *_: nobody)
+    joints = estimator._in_our_joints
+    monkeypatch.setattr(estimator, "_in_our_joints", lambda k: (*(j := joints(k))[:2], 0.4 * j[2]))
+    carried = []
+    for i in range(4, 19):
+        estimator.process(image, i * 33_333_333, hurry=3)
+        carried.append(estimator.carried)
+    assert not any(carried[3:])  # three pictures may still come from what was seen well
