@@ -45,6 +45,19 @@ class _Polled(CallbackGroup):
         """Nothing begins."""
 
 
+class Gaps:
+    """Counts what the one publisher of a topic sent and a subscriber never saw."""
+
+    def __init__(self) -> None:
+        self._last = 0
+
+    def before(self, info: dict[str, Any]) -> int:
+        """How many were left out before the message of this info; a publisher that began anew left out none."""
+        number = info["publication_sequence_number"] or 0
+        last, self._last = self._last, number
+        return number - 1 - last if 0 < last < number - 1 else 0
+
+
 class ComponentNode(Node):
     """A node of the capture graph.
 
@@ -124,13 +137,11 @@ class ComponentNode(Node):
         polled : messages wait until :meth:`poll` takes them, without a turn of the executor for each
         """
         guarded = self.guarded(topic, callback)
-        last: list[int] = [0]
+        gaps = Gaps()
 
         def with_gaps(message: Any, info: dict[str, Any]) -> None:
-            number = info["publication_sequence_number"] or 0
-            if 0 < last[0] < number - 1:
-                self.missed(topic, number - 1 - last[0])
-            last[0] = number
+            if skipped := gaps.before(info):
+                self.missed(topic, skipped)
             guarded(message)
 
         def alone(message: Any) -> None:
@@ -294,4 +305,4 @@ def _publishers(topic: str, nodes: list[str]) -> int:
     return len(nodes) if topic == "/diagnostics" else publishers_of(topic, nodes)
 
 
-__all__ = ["ERROR", "HARDWARE_ID", "OK", "WARN", "ComponentNode"]
+__all__ = ["ERROR", "HARDWARE_ID", "OK", "WARN", "ComponentNode", "Gaps"]

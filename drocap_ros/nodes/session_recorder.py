@@ -19,7 +19,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
 
-from drocap_ros.nodes.component import ERROR, HARDWARE_ID, OK, WARN
+from drocap_ros.nodes.component import ERROR, HARDWARE_ID, OK, WARN, Gaps
 from drocap_ros.nodes.managed import ManagedComponent
 from drocap_ros.nodes.parameter_survey import ParameterSurvey
 from drocap_ros.nodes.run import node_main
@@ -54,7 +54,7 @@ class SessionRecorderNode(ManagedComponent):
         self._calibrated = False
         self._heard = False  # anything but diagnostics
         self._sessions = 0
-        self._last_picture = 0
+        self._picture_gaps = Gaps()
         special = {
             _IMAGES: self._on_picture, "camera_info": self._on_camera_info, "/diagnostics": self._on_diagnostics
         }  # fmt: skip
@@ -106,10 +106,8 @@ class SessionRecorderNode(ManagedComponent):
             self.count("messages")
 
     def _on_picture(self, name: str, data: bytes, info: dict[str, Any]) -> None:
-        number = info["publication_sequence_number"] or 0
-        if 0 < self._last_picture < number - 1:
-            self.count(f"not recorded, too busy for too long {name}", number - 1 - self._last_picture)
-        self._last_picture = number
+        if skipped := self._picture_gaps.before(info):
+            self.count(f"not recorded, too busy for too long {name}", skipped)
         self._on_message(name, data, info)
 
     def _on_lost(self, name: str, event: Any) -> None:
