@@ -6,7 +6,7 @@ load    a 1280x720 video at 30 fps round and round through all nodes, adjustment
         `--no-adjuster` for one case; `--seamless`: no cuts, so that somebody is followed all the time)
 memory  resident memory of every process against its value at minute 2 (`--minutes 30`)
 kills   SIGKILL of each node in turn, a person in view all the time: how long until it works again, what the recording
-        lost
+        lost (`--rounds 5`)
 
 Needs ../shared (video, weights).  Results go to benchmarks/results/live.json.  Run it on a machine that does nothing
 else; the load average before each part stands beside its figures.
@@ -42,6 +42,7 @@ def main() -> int:
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []])
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--minutes", type=float, default=5.0)
+    parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--threads", type=int, default=1, help="of the networks: 1 is the best on two cores")
     parser.add_argument("--pose-model", default="auto", help="file in the models folder; auto = the most accurate")
     parser.add_argument("--one-process", action="store_true")
@@ -305,7 +306,7 @@ SIGNS = {
 
 
 def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Every node killed once while all others run; bringup starts it again."""
+    """Every node killed while all others run, once in every round; bringup starts it again."""
     from drocap_ros.bringup import bringup
     from drocap_ros.nodes.topics import TOPICS
     from drocap_ros.recording.session import open_session
@@ -314,7 +315,8 @@ def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     video, session, port = stream(folder, seamless=True), folder / "session", free_udp_port()
     results: dict[str, Any] = {"load average before": round(os.getloadavg()[0], 2)}
     heard: dict[str, list[float]] = {topic: [] for topic in SIGNS.values()}
-    killed: dict[str, tuple[int, int]] = {}
+    killed: dict[str, list[tuple[int, int]]] = {name: [] for name in SIGNS}
+    took: dict[str, list[float]] = {name: [] for name in (*SIGNS, "session_recorder")}
     with (
         vehicle(port),
         bringup(graph_config(video, session, port), NODES, processes=True, respawn=True) as graph,
@@ -326,21 +328,24 @@ def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
             )
         graph.wait_until(lambda: all(heard.values()), 60, "every node to work")
         graph.spin_for(5.0)
-        for name, topic in SIGNS.items():
-            begin, begin_ns = time.monotonic(), time.time_ns()
-            os.kill(graph.pid(name), signal.SIGKILL)
-            graph.wait_until(lambda name=name: graph.restarts[name] > 0, 30, f"{name} to be started")
-            begun = time.monotonic()
-            graph.wait_until(lambda topic=topic, t=begun: heard[topic][-1] > t, 60, f"{topic} again")
-            results[f"{name} killed, {topic} again after s"] = round(heard[topic][-1] - begin, 2)
-            killed[name] = (begin_ns, time.time_ns())
-            graph.spin_for(5.0)
+        for done in range(args.rounds):
+            for name, topic in SIGNS.items():
+                begin, begin_ns = time.monotonic(), time.time_ns()
+                os.kill(graph.pid(name), signal.SIGKILL)
+                graph.wait_until(lambda name=name, done=done: graph.restarts[name] > done, 30, f"{name} to be started")
+                begun = time.monotonic()
+                graph.wait_until(lambda topic=topic, t=begun: heard[topic][-1] > t, 60, f"{topic} again")
+                took[name].append(round(heard[topic][-1] - begin, 2))
+                killed[name].append((begin_ns, time.time_ns()))
+                graph.spin_for(5.0)
         begin = time.monotonic()
         os.kill(graph.pid("session_recorder"), signal.SIGKILL)
         second = session.with_name("session_2")
         graph.wait_until(lambda: any(second.glob("*.mcap")), 60, "the recorder's next folder")
-        results["session_recorder killed, next file after s"] = round(time.monotonic() - begin, 2)
+        took["session_recorder"].append(round(time.monotonic() - begin, 2))
         graph.spin_for(5.0)
+    for name, seconds in took.items():
+        results[f"{name} killed, s until {SIGNS.get(name, 'the next file')}"] = seconds
     for folder_ in (session, second):
         with open_session(folder_) as opened:
             info = {t.name.removeprefix("/drocap/"): t.count for t in opened.info.topics if t.count}
@@ -352,7 +357,7 @@ def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
                 longest = [
                     (int(b - a) * 1e-9)
                     for a, b in itertools.pairwise(log)
-                    if not (dead in killed and a <= killed[dead][1] and b >= killed[dead][0])
+                    if not any(a <= end and b >= begin for begin, end in killed[dead])
                 ]
                 gaps[topic] = round(max(longest, default=float("nan")), 3)
             results[f"{folder_.name}: messages"] = info

@@ -52,7 +52,8 @@ STOP_TIMEOUT_S = 20.0
 #: frames of two drones bear the same names.
 DEFAULT_NAMESPACE = "/drocap"
 
-#: Pauses before a dead node is started again: the first, and the longest; each is twice the one before.
+#: A dead node is started again at once, and if it dies again, after pauses: the first, and the longest; each is twice
+#: the one before.
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 10.0
 #: A node that dies more often than this within a minute is given up, and the graph with it.
 MOST_RESTARTS = 5
@@ -67,7 +68,7 @@ _LEAN = {
     "MALLOC_TRIM_THRESHOLD_": str(1 << 28),
     "MALLOC_MMAP_THRESHOLD_": str(1 << 25),
     # Another middleware, and whoever has a profile of their own, is not concerned.
-    "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).parent / "data" / "fastdds_discovery.xml"),
+    "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).parent / "data" / "fastdds.xml"),
 }
 
 
@@ -136,9 +137,10 @@ class Graph:
             return False
         recent = sum(now_s - at < 60.0 for at in died_s)
         died_s.append(now_s)
-        pause_s = min(FIRST_PAUSE_S * 2.0**recent, LONGEST_PAUSE_S)
+        pause_s = min(FIRST_PAUSE_S * 2.0 ** (recent - 1), LONGEST_PAUSE_S) if recent else 0.0
         self._due_s[name] = now_s + pause_s
-        self._tell(f"{error}; starting {name} again in {pause_s:g} s", DiagnosticStatus.WARN)
+        when = f" in {pause_s:g} s" if pause_s else ""
+        self._tell(f"{error}; starting {name} again{when}", DiagnosticStatus.WARN)
         return True
 
     def restart(self, name: str) -> None:

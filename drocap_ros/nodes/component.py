@@ -85,6 +85,8 @@ class ComponentNode(Node):
         self._counting = threading.Lock()
         self.details: dict[str, str] = {}
         self._latency = Latency()
+        #: Whether all its peers are matched, if it waits for any.
+        self.ready = False
         self.started = False
         #: Whether messages are taken; only a managed node is ever not active.
         self.active = True
@@ -97,7 +99,7 @@ class ComponentNode(Node):
         self.handed_over: dict[str, Callable[[], int]] = {}
         self._polled = _Polled()
         self._diagnostics = self.output("/diagnostics")
-        self._ready = self.create_publisher(String, "graph/ready", GRAPH_QOS)
+        self._told_ready = self.create_publisher(String, "graph/ready", GRAPH_QOS)
         self._finished = self.create_publisher(String, "graph/finished", GRAPH_QOS)
         self.create_subscription(Empty, "graph/start", lambda _: self._start(), GRAPH_QOS)
         self.create_timer(1.0, self._publish_diagnostics)
@@ -238,12 +240,14 @@ class ComponentNode(Node):
         self._finished.publish(String(data=self.component))
 
     def _match(self) -> None:
-        if not self._peers:
-            self._handshake.cancel()
+        if self._peers and not self._matched():
+            return
+        self._handshake.cancel()
+        self.ready = True
+        if self._peers:
+            self._told_ready.publish(String(data=self.component))
+        else:
             self._start()
-        elif self._matched():
-            self._handshake.cancel()
-            self._ready.publish(String(data=self.component))
 
     def _matched(self) -> bool:
         return all(

@@ -43,10 +43,11 @@ _AUTOGROUP_TRIES = 20
 PARENT = "DROCAP_PARENT_PID"
 
 
-def spin(node: ComponentNode, stop: threading.Event) -> None:
+def spin(node: ComponentNode, stop: threading.Event, when_ready: Callable[[], None] | None = None) -> None:
     """Run the node's callbacks until ``stop``, then work off what has arrived, and close the node.
 
-    Whatever a callback raises comes out of here.
+    ``when_ready`` is called once, as soon as the node has found all its peers.  Whatever a callback raises comes out
+    of here.
     """
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
@@ -60,6 +61,9 @@ def spin(node: ComponentNode, stop: threading.Event) -> None:
                 executor.spin_once(timeout_sec=0.1)
             elif not _turn(executor, node, 0.0):
                 stop.wait(node.spin_pause_s)
+            if when_ready is not None and node.ready:
+                when_ready()
+                when_ready = None
             if parent not in (0, os.getppid(), os.getpid()):
                 stop.set()
         node.on_stop()
@@ -87,6 +91,21 @@ def step_back(component: str, own_process: bool = False) -> None:
         if niceness >= _BACKGROUND:
             idle = own_process and niceness >= _LAST
             os.sched_setscheduler(0, os.SCHED_IDLE if idle else os.SCHED_BATCH, os.sched_param(0))
+
+
+def step_process_back(component: str) -> None:
+    """The same for a process, with all the threads that it has by now, and among sessions."""
+    niceness = NICENESS.get(component, 0)
+    if niceness == 0:
+        return
+    with contextlib.suppress(OSError, AttributeError):
+        for thread in map(int, os.listdir("/proc/self/task")):
+            os.setpriority(os.PRIO_PROCESS, thread, niceness)
+            if niceness >= _BACKGROUND:
+                os.sched_setscheduler(thread, os.SCHED_BATCH, os.sched_param(0))
+    step_back(component, own_process=True)
+    # It may have to wait for its turn.
+    threading.Thread(target=step_session_back, args=(component,), name="autogroup", daemon=True).start()
 
 
 def step_session_back(component: str) -> None:
@@ -132,13 +151,8 @@ def node_main(make: Callable[[], ComponentNode]) -> int:
         signal.signal(number, lambda *_: stop.set())
     rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        component = getattr(make, "component", "")
-        step_back(component)
-        step_session_back(component)
-        node = make()
-        # Not before: a node that was started again is waited for.
-        step_back(component, own_process=True)
-        spin(node, stop)
+        # It steps back only when it is ready: a node that was started again is waited for.
+        spin(make(), stop, lambda: step_process_back(getattr(make, "component", "")))
     except DrocapError as error:
         print(f"drocap: {error}", file=sys.stderr)
         return error.exit_status

@@ -11,6 +11,9 @@ from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.reconstruction.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.stream_order import Arrival, StreamOrder
 
+#: The first adjustment of a window is due after this fraction of a period.
+_FIRST = 3
+
 
 class WindowArrays(NamedTuple):
     """A window of F frames for :class:`~drocap_ros.reconstruction.window_adjuster.WindowAdjuster`.
@@ -43,6 +46,9 @@ class WindowArrays(NamedTuple):
 class AdjustmentWindow:
     """The last ``window_s`` of keypoints and initial poses of one subject; says when an adjustment is due.
 
+    That is every ``period_s``, and the first time after a third of it: somebody who has just been found, or a node that
+    was started again, has no solution yet that could serve meanwhile, and so few frames are soon adjusted.
+
     Time is that of the stamps.  ``arrival`` says what the last frame was to the stream: a duplicate or late one is
     dropped; another subject, a jump of time or a gap longer than ``gap_s`` starts the window anew.
     """
@@ -50,14 +56,14 @@ class AdjustmentWindow:
     def __init__(self, config: BundleAdjusterConfig) -> None:
         self._config = config
         self._frames: deque[tuple[PoseObservation, np.ndarray]] = deque(maxlen=config.window_frames)
-        self._last_due_ns: int | None = None
+        self._due_ns: int | None = None
         # The initializer has asked each jump for confirmation before it gave the pose that comes here.
         self._order = StreamOrder(config.late_s, config.gap_s, confirm=False)
         self.arrival = Arrival.STARTED
         self.subject = 0
 
     def push(self, observation: PoseObservation, initial_joints: np.ndarray) -> bool:
-        """Add a frame; True when ``period_s`` has passed since the last time this was True.
+        """Add a frame; True when an adjustment is due.
 
         initial_joints : (15, 3) m, camera axes
         """
@@ -68,16 +74,17 @@ class AdjustmentWindow:
             self.subject += 1
         if self.arrival is not Arrival.CONTINUED:
             self._frames.clear()
-            self._last_due_ns = None
+            self._due_ns = None
         self._frames.append((observation, initial_joints))
         oldest = observation.stamp_ns - round(self._config.window_s * 1e9)
         while self._frames[0][0].stamp_ns < oldest:
             self._frames.popleft()
-        if self._last_due_ns is None:
-            self._last_due_ns = observation.stamp_ns
-        due = observation.stamp_ns - self._last_due_ns >= round(self._config.period_s * 1e9)
+        period_ns = round(self._config.period_s * 1e9)
+        if self._due_ns is None:
+            self._due_ns = observation.stamp_ns + period_ns // _FIRST
+        due = observation.stamp_ns >= self._due_ns
         if due:
-            self._last_due_ns = observation.stamp_ns
+            self._due_ns = observation.stamp_ns + period_ns
         return due
 
     def snapshot(self) -> WindowArrays:

@@ -124,10 +124,34 @@ def test_the_window_drops_duplicates_and_late_frames() -> None:
     window = AdjustmentWindow(ADJUSTER)
     frames = observed(10)
     joints = np.zeros((15, 3))
-    for o in (*frames, frames[9], frames[3]):
+    for o in frames:
+        window.push(o, joints)
+    for o in (frames[9], frames[3]):
         assert not window.push(o, joints)
     assert window.arrival is Arrival.LATE
     np.testing.assert_array_equal(window.snapshot().stamp_ns, stamps(10))
+
+
+@pytest.mark.parametrize("again", ["somebody else", "a gap"])
+def test_the_first_adjustment_is_due_after_a_third_of_a_period_and_then_one_every_period(again: str) -> None:
+    window = AdjustmentWindow(ADJUSTER)
+    start_s = 0.0
+    for _ in range(2):
+        due_s = [
+            (o.stamp_ns - stamps(60)[0]) * 1e-9
+            for o in observed(60)
+            if window.push(
+                replace(
+                    o,
+                    stamp_ns=o.stamp_ns + round(start_s * 1e9),
+                    track_id=int(start_s) if again == "somebody else" else o.track_id,
+                ),
+                np.zeros((15, 3)),
+            )
+        ]
+        # To the frame: 25 of them a second.
+        np.testing.assert_allclose(due_s, [1 / 6, 2 / 3, 7 / 6, 5 / 3, 13 / 6], atol=0.041)
+        start_s += 60.0 if again == "a gap" else 3.0
 
 
 def test_every_nth_frame_is_counted_from_the_newest() -> None:
