@@ -45,9 +45,9 @@ def test_a_solution_counts_from_when_it_is_there():
     np.testing.assert_array_equal(never.latest, never.initial)
     assert np.isnan(never.refined).all()
     soon = fly(view, 0.5, InitializerConfig(), BundleAdjusterConfig())
-    # The first window ends after one second and is there half a second later.
-    np.testing.assert_array_equal(soon.latest[:36], soon.initial[:36])
-    assert not np.array_equal(soon.latest[40:], soon.initial[40:])
+    # The first window ends after a third of a second, at the ninth image, and is there half a second later.
+    np.testing.assert_array_equal(soon.latest[:20], soon.initial[:20])
+    assert not np.array_equal(soon.latest[20:24], soon.initial[20:24])
     # The last two seconds have no refined pose of that age.
     np.testing.assert_array_equal(np.isfinite(soon.refined).all(axis=(1, 2)), np.arange(120) < 120 - 48)
     assert np.isfinite(soon.refined_std_m[:72]).all()
