@@ -25,6 +25,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -314,28 +315,31 @@ def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
     video, session, port = stream(folder, seamless=True), folder / "session", free_udp_port()
     results: dict[str, Any] = {"load average before": round(os.getloadavg()[0], 2)}
-    heard: dict[str, list[float]] = {topic: [] for topic in SIGNS.values()}
+    # Stamp of the newest message of each topic, ns, and when it came: what was sent before a death may come after it.
+    heard: dict[str, tuple[int, float]] = {}
     killed: dict[str, list[tuple[int, int]]] = {name: [] for name in SIGNS}
     took: dict[str, list[float]] = {name: [] for name in (*SIGNS, "session_recorder")}
     with (
         vehicle(port),
         bringup(graph_config(video, session, port), NODES, processes=True, respawn=True) as graph,
     ):
-        for topic, times in heard.items():
+
+        def hear(message: Any, topic: str) -> None:
+            stamp = message.header.stamp
+            heard[topic] = stamp.sec * 10**9 + stamp.nanosec, time.monotonic()
+
+        for topic in SIGNS.values():
             entry = TOPICS[topic]
-            graph.node.create_subscription(
-                entry.message, topic, lambda _, times=times: times.append(time.monotonic()), entry.qos
-            )
-        graph.wait_until(lambda: all(heard.values()), 60, "every node to work")
+            graph.node.create_subscription(entry.message, topic, partial(hear, topic=topic), entry.qos)
+        graph.wait_until(lambda: len(heard) == len(SIGNS), 60, "every node to work")
         graph.spin_for(5.0)
         for done in range(args.rounds):
             for name, topic in SIGNS.items():
                 begin, begin_ns = time.monotonic(), time.time_ns()
                 os.kill(graph.pid(name), signal.SIGKILL)
                 graph.wait_until(lambda name=name, done=done: graph.restarts[name] > done, 30, f"{name} to be started")
-                begun = time.monotonic()
-                graph.wait_until(lambda topic=topic, t=begun: heard[topic][-1] > t, 60, f"{topic} again")
-                took[name].append(round(heard[topic][-1] - begin, 2))
+                graph.wait_until(lambda topic=topic, t=begin_ns: heard[topic][0] > t, 60, f"{topic} again")
+                took[name].append(round(heard[topic][1] - begin, 2))
                 killed[name].append((begin_ns, time.time_ns()))
                 graph.spin_for(5.0)
         begin = time.monotonic()
