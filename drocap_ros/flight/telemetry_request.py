@@ -71,8 +71,11 @@ class TelemetryRequests:
         window_ns = int(self._config.rate_window_s * _NS)
         if self._since_ns is not None:
             window_ns = min(window_ns, max(now_ns - self._since_ns, 1))
-        recent = sum(1 for arrival in self._wanted[message_id].arrivals if now_ns - arrival <= window_ns)
-        return recent * _NS / window_ns
+        arrivals = self._wanted[message_id].arrivals
+        # This is asked for at every turn of the link: what is too old is looked at once.
+        while arrivals and now_ns - arrivals[0] > window_ns:
+            arrivals.popleft()
+        return len(arrivals) * _NS / window_ns
 
     def rates_hz(self, now_ns: int) -> dict[str, tuple[float, float]]:
         """(real, wanted) Hz of every wanted message by its name."""

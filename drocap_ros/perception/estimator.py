@@ -30,6 +30,8 @@ _STEADY_SCORE, _STEADY_CONFIDENCE = 0.6, 0.8
 _SLACK_S = 0.005
 #: In a hurry, share of the detector's input that a window of the image is given.
 _QUICK = 0.8
+#: In a hurry, most times as many images without a look at the joints as after the first in vain: at 30 Hz 0.4 s.
+_LONGEST_PAUSE = 4
 #: Confidence of a joint that helps to place the box.
 _FINE_JOINT = 0.3
 
@@ -69,8 +71,8 @@ class PoseEstimator:
         self._shown = False
         #: Whether the keypoints of the last image that a network saw are likely the subject's.
         self._certain = False
-        #: Images since the joints were looked for in vain, that one included.
-        self._in_vain = 0
+        #: How often in a row the joints were looked for in vain, and the images since then.
+        self._in_vain = self._not_looked = 0
         self._flow = KeypointFlow()
         #: The pose network's own keypoints of the last image, with further candidate peaks; None without a subject.
         self.keypoints: Keypoints | None = None
@@ -89,7 +91,7 @@ class PoseEstimator:
             seen the keypoints of up to ``hurry`` others are carried on by optical flow; one window and no second look
             for a detection, and none at all for ``hurry * detect_every_s`` after one that showed the subject clearly;
             where the network saw no joints and the detector does not see the subject clearly, they are not looked for
-            in the next ``hurry`` images
+            in the next ``hurry`` images, in twice and four times as many if they were not seen then either
         """
         image = _checked(image)
         if self._last_ns is not None and stamp_ns < self._last_ns:
@@ -120,16 +122,19 @@ class PoseEstimator:
         subject = self.tracker.update(image, stamp_ns, found.boxes, found.scores, roi)
         self._shown = subject is not None and subject.score >= _STEADY_SCORE
         if subject is None:
+            self._in_vain = 0
             return PoseObservation(stamp_ns, 0, size)
         if subject.hidden:
             return _unseen(stamp_ns, size, subject)
-        if subject.score < _STEADY_SCORE and 0 < self._in_vain <= hurry:
-            self._in_vain += 1
+        pause = hurry * min(2 ** (self._in_vain - 1), _LONGEST_PAUSE) if self._in_vain else 0
+        if subject.score < _STEADY_SCORE and self._not_looked < pause:
+            self._not_looked += 1
             return _unseen(stamp_ns, size, subject)
         self.keypoints = self.pose_model.estimate(image, subject.box)
         pose = self._in_our_joints(self.keypoints)
         self._clear = bool(pose[2].mean() >= _STEADY_CONFIDENCE)
-        self._in_vain = int(pose[2].mean() < _CONFIRM_CONFIDENCE)
+        self._in_vain = self._in_vain + 1 if pose[2].mean() < _CONFIRM_CONFIDENCE else 0
+        self._not_looked = 0
         self._certain = not self._in_vain or subject.score >= self.config.detection_threshold
         self._margins = None
         seen = _extent(pose)

@@ -45,18 +45,19 @@ def exchanged_legs(xy: np.ndarray, confidence: np.ndarray, stamp_ns: np.ndarray,
     """
     step = _step_costs(xy, stamp_ns, box_size)
     sure = np.minimum(confidence[:, _LEFT], confidence[:, _RIGHT])
-    price = -_CONTRADICTION * np.log1p(-np.clip(np.nan_to_num(sure), 0.0, 0.999)).sum(axis=1)
-    keep, change = step[:, 0].tolist(), step[:, 1].tolist()
-    right, wrong = 0.0, float(price[0])
-    origin = np.zeros((len(xy), 2), bool)  # per hypothesis: whether the image before was of the other one
-    for t in range(1, len(xy)):
-        origin[t] = wrong + change[t] < right + keep[t], right + change[t] < wrong + keep[t]
-        right, wrong = min(right + keep[t], wrong + change[t]), min(wrong + keep[t], right + change[t]) + price[t]
+    sure[np.isnan(sure)] = 0.0
+    prices = (-_CONTRADICTION * np.log1p(-np.clip(sure, 0.0, 0.999)).sum(axis=1)).tolist()
+    right, wrong = 0.0, prices[0]
+    origin = [(False, False)]  # per hypothesis: whether the image before was of the other one
+    for keep, change, price in zip(step[1:, 0].tolist(), step[1:, 1].tolist(), prices[1:], strict=True):
+        stay_right, to_right, stay_wrong, to_wrong = right + keep, wrong + change, wrong + keep, right + change
+        origin.append((to_right < stay_right, to_wrong < stay_wrong))
+        right, wrong = min(stay_right, to_right), min(stay_wrong, to_wrong) + price
     out = np.zeros(len(xy), bool)
     now = wrong < right
     for t in range(len(xy) - 1, -1, -1):
         out[t] = now
-        now ^= origin[t, int(now)]
+        now ^= origin[t][now]
     return out
 
 
@@ -69,7 +70,9 @@ def _step_costs(xy: np.ndarray, stamp_ns: np.ndarray, box_size: np.ndarray) -> n
 
     def cost(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         squared = np.square((b[1:] - a[:-1]) / scale[..., None]).sum(axis=2)
-        return np.nan_to_num(np.minimum(0.5 * squared, _MOST_COST)).sum(axis=1)
+        costs = np.minimum(0.5 * squared, _MOST_COST)
+        costs[np.isnan(costs)] = 0.0
+        return costs.sum(axis=1)
 
     out[1:, 0] = cost(left, left) + cost(right, right)
     out[1:, 1] = cost(left, right) + cost(right, left)

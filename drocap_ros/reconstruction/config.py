@@ -37,7 +37,7 @@ class InitializerConfig(Parameters):
     live_start: str = param("lifter", "what finds the pose of an image in the live node: the learned lifter, or the"
                             " dictionary as offline", choices=("lifter", "dictionary"))  # fmt: skip
     lifter: str = param("", "the live node's lifter, an ONNX file; empty for the shipped one")
-    past_s: float = param(2.7, "past that the lifter sees in the live node", unit="s", minimum=0.1, maximum=10.0)
+    past_s: float = param(1.4, "past that the lifter sees in the live node", unit="s", minimum=0.1, maximum=10.0)
     late_s: float = param(1.0, "a stamp up to so long before the last one is late and dropped; further back, time has"
                           " jumped", unit="s", minimum=0.0, maximum=60.0)  # fmt: skip
     gap_s: float = param(1.0, "after a longer gap the live node starts anew, but for the person's size", unit="s",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -78,7 +79,7 @@ class LiftedStart:
         lifted = self._lifter.lift_last(points, belief, fps, self._lengths_px())
         joints = lifted.joints[0]
         self._limbs_px.append(max(float(limb_lengths(joints).sum()), 1e-9))
-        metres = self._limbs_m / float(np.median(self._limbs_px))
+        metres = self._limbs_m / median(self._limbs_px)
         return LiftedImage(joints, lifted.sigma[0] * np.array([ACROSS, ALONG]), metres)
 
     def _with_own_legs(self, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -100,7 +101,7 @@ class LiftedStart:
     def _lengths_px(self) -> np.ndarray | None:
         if not self._proportions or not self._limbs_px:
             return None
-        lengths: np.ndarray = np.median(np.array(self._proportions), axis=0) * np.median(self._limbs_px)
+        lengths: np.ndarray = np.median(np.array(self._proportions), axis=0) * median(self._limbs_px)
         return lengths
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from drocap_ros.geometry.alignment import apply_similarity, similarity
@@ -68,9 +70,14 @@ def w_mpjpe(
     return out
 
 
+@lru_cache(maxsize=8)
+def _rigid_ends(joints: tuple[str, ...]) -> np.ndarray:
+    return np.array([indices(joints, bone) for bone in RIGID_BONES])
+
+
 def limb_lengths(s: np.ndarray, joints: tuple[str, ...] = BODY_15.joints) -> np.ndarray:
     """Length (..., 10) of each rigid bone of poses (..., P, 3)."""
-    ends = np.array([indices(joints, bone) for bone in RIGID_BONES])
+    ends = _rigid_ends(joints)
     return np.linalg.norm(s[..., ends[:, 1], :] - s[..., ends[:, 0], :], axis=-1)
 
 
