@@ -11,23 +11,20 @@ what has arrived, and what a node raised is raised here.
 from __future__ import annotations
 
 import contextlib
-import importlib
 import math
 import os
-import signal
 import socket
-import subprocess
 import sys
 import tempfile
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import rclpy
-import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -37,39 +34,31 @@ from std_msgs.msg import Empty, String
 
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import DrocapError, InputError, NodeError
+from drocap_ros.node_process import (
+    DEFAULT_NAMESPACE,
+    STOP_TIMEOUT_S,
+    NodeProcess,
+    Place,
+    Spare,
+    node_class,
+    remaps,
+)
 from drocap_ros.nodes.component import HARDWARE_ID, ComponentNode
-from drocap_ros.nodes.run import PARENT, spin, step_back
+from drocap_ros.nodes.run import spin, step_back
 from drocap_ros.nodes.topics import GRAPH_QOS, NODES, TOPICS
 
 #: In one process all nodes share Python's lock.  At its usual 5 ms the pose would wait that long for the adjuster after
 #: each call that lets the lock go, several times per picture.
 SWITCH_INTERVAL_S = 0.0005
 
-#: Above the drain time of a node, and the time that its files may take to close.
-STOP_TIMEOUT_S = 20.0
-
-#: In this namespace TF is where everybody looks for it; in another each graph has its own, ``NAMESPACE/tf``, as the
-#: frames of two drones bear the same names.
-DEFAULT_NAMESPACE = "/drocap"
-
 #: A dead node is started again at once, and if it dies again, after pauses: the first, and the longest; each is twice
 #: the one before.
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 10.0
 #: A node that dies more often than this within a minute is given up, and the graph with it.
 MOST_RESTARTS = 5
-
-#: The matrices of a node are small: more BLAS threads cost more than they bring, the more so in six processes.  The
-#: middleware's many threads would each keep an arena of their own, in which memory goes to pieces over hours.
-_LEAN = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MALLOC_ARENA_MAX": "2",
-    # What was needed once is kept: given back and asked for again, memory frays, and each new page costs time.
-    "MALLOC_TRIM_THRESHOLD_": str(1 << 28),
-    "MALLOC_MMAP_THRESHOLD_": str(1 << 25),
-    # Another middleware, and whoever has a profile of their own, is not concerned.
-    "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).parent / "data" / "fastdds.xml"),
-}
+#: A process in reserve is started this long after all nodes are there, whose first work it would hold up; one that died
+#: unused is replaced after a longer time.
+SPARE_REST_S, SPARE_PAUSE_S = 2.0, 60.0
 
 
 class Graph:
@@ -92,6 +81,9 @@ class Graph:
         self._runners: list[_Runner] = []
         self._make: Callable[[str], _Runner] | None = None
         self._respawn = False
+        self._reserve: Callable[[], Spare] | None = None
+        self._spare: Spare | None = None
+        self._spare_s = -math.inf
         self._status: DiagnosticStatus | None = None
         self._told_s = -math.inf
         self._due_s: dict[str, float] = {}
@@ -119,6 +111,7 @@ class Graph:
             The error itself from a node in this process; :class:`NodeError` with its words from another.
         """
         self._tell_again()
+        self._keep_spare()
         for runner in list(self._runners):
             if runner.name in self._due_s:
                 if time.monotonic() >= self._due_s[runner.name]:
@@ -164,6 +157,23 @@ class Graph:
         self.restarts[name] += 1
         self._runners[index] = self._make(name)
         self._tell(f"{name} started again, {self.restarts[name]} times so far", DiagnosticStatus.OK)
+
+    def _keep_spare(self) -> None:
+        """Have a process in reserve, but not while a node has yet to find its place."""
+        now_s = time.monotonic()
+        if self._reserve is None:
+            return
+        if self._spare is not None and self._spare.process.poll() is not None:
+            self._take_spare()
+            self._spare_s = now_s + SPARE_PAUSE_S
+        elif not self.ready >= set(self.names):
+            self._spare_s = max(self._spare_s, now_s + SPARE_REST_S)
+        elif self._spare is None and now_s >= self._spare_s:
+            self._spare = self._reserve()
+
+    def _take_spare(self) -> Spare | None:
+        spare, self._spare = self._spare, None
+        return spare
 
     def wait_ready(self, *names: str, timeout_s: float = 60.0) -> None:
         """Wait until the named nodes have found all their peers."""
@@ -269,13 +279,14 @@ def bringup(
         graph = stack.enter_context(watch(namespace, domain_id, names))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="drocap_bringup_")))
         try:
+            place = Place(names, namespace, domain_id, folder)
 
             def make(name: str) -> _Runner:
                 chosen = config
                 if graph.restarts["session_recorder"] and name == "session_recorder":
                     chosen = config.replace(name, if_taken="next")
                 if processes:
-                    return _Process(name, chosen, names, namespace, domain_id, folder)
+                    return NodeProcess(name, chosen, place, graph._take_spare())
                 return _Thread(name, chosen, names, namespace, graph.node.context)
 
             graph._make = make
@@ -284,9 +295,14 @@ def bringup(
             graph.wait_ready(*names, timeout_s=timeout_s)
             graph._start.publish(Empty())
             graph._respawn = respawn
+            graph._spare_s = time.monotonic() + SPARE_REST_S
+            graph._reserve = partial(Spare, place) if respawn and processes else None
             yield graph
         finally:
             graph._respawn = False
+            graph._reserve = None
+            if (spare := graph._take_spare()) is not None:
+                spare.close()
             for runner in graph._runners:
                 runner.stop()
         graph._due_s.clear()
@@ -308,7 +324,7 @@ def watch(namespace: str, domain_id: int, names: Sequence[str] = ()) -> Iterator
         context.try_shutdown()
 
 
-class _Runner:
+class _Runner(Protocol):
     """One node, wherever it runs."""
 
     name: str
@@ -316,11 +332,9 @@ class _Runner:
 
     def check(self) -> None:
         """Raise what the node raised."""
-        raise NotImplementedError
 
     def stop(self) -> None:
         """Ask the node to stop and wait for it."""
-        raise NotImplementedError
 
 
 class _Thread(_Runner):
@@ -338,7 +352,7 @@ class _Thread(_Runner):
                 context=context,
                 namespace=namespace,
                 use_global_arguments=False,
-                cli_args=["--ros-args", *_remaps(namespace)],
+                cli_args=["--ros-args", *remaps(namespace)],
                 parameter_overrides=[Parameter("graph_nodes", value=",".join(names))],
             )
 
@@ -366,71 +380,6 @@ class _Thread(_Runner):
     def stop(self) -> None:
         self._stop.set()
         self._thread.join(STOP_TIMEOUT_S)
-
-
-class _Process(_Runner):
-    """A node in a process of its own."""
-
-    def __init__(
-        self, name: str, config: DrocapConfig, names: list[str], namespace: str, domain_id: int, folder: Path
-    ) -> None:
-        self.name = name
-        parameters = folder / f"{name}.yaml"
-        section = config.to_parameter_file()[f"/**/{name}"]["ros__parameters"]
-        values = {**section, "graph_nodes": ",".join(names)}
-        parameters.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}), encoding="utf-8")
-        self._log = folder / f"{name}.log"
-        command = [sys.executable, "-m", f"drocap_ros.nodes.{name}", "--ros-args"]
-        command += [
-            "-r",
-            f"__ns:={namespace}",
-            *_remaps(namespace),
-            "--params-file",
-            str(parameters),
-            "--disable-stdout-logs",
-        ]
-        environment = {**_LEAN, **os.environ, "ROS_DOMAIN_ID": str(domain_id), PARENT: str(os.getpid())}
-        with self._log.open("ab") as log:
-            self._process = subprocess.Popen(command, env=environment, stderr=log, start_new_session=True)
-        self.pid = self._process.pid
-        self._stopping = False
-
-    def check(self) -> None:
-        status = self._process.poll()
-        if status is None or (self._stopping and status in (0, -signal.SIGINT)):
-            return
-        lines = self._log.read_text(errors="replace").strip().splitlines() or ["it said nothing"]
-        words = lines[-1].removeprefix("drocap: ")
-        if status == InputError.exit_status:
-            raise InputError(words)
-        raise NodeError(f"node {self.name} ended with status {status}: {words}")
-
-    def stop(self) -> None:
-        if self._process.poll() is not None:
-            return
-        self._stopping = True
-        self._process.send_signal(signal.SIGINT)
-        try:
-            self._process.wait(STOP_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-
-
-def _remaps(namespace: str) -> list[str]:
-    """ROS arguments that keep one graph's TF from another's."""
-    return [] if namespace == DEFAULT_NAMESPACE else ["-r", f"/tf:={namespace.rstrip('/')}/tf"]
-
-
-def node_class(name: str) -> type[ComponentNode]:
-    """Class of a node by its name; only the chosen ones are imported."""
-    module = importlib.import_module(f"drocap_ros.nodes.{name}")
-    found: type[ComponentNode] = next(
-        value
-        for value in vars(module).values()
-        if isinstance(value, type) and issubclass(value, ComponentNode) and value.__dict__.get("component") == name
-    )
-    return found
 
 
 @contextlib.contextmanager

@@ -146,13 +146,18 @@ def _turn(executor: SingleThreadedExecutor, node: ComponentNode, timeout_s: floa
 
 def node_main(make: Callable[[], ComponentNode]) -> int:
     """Run one node as a process until SIGINT or SIGTERM; returns the exit status."""
+    rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
+    return run_here(make, getattr(make, "component", ""))
+
+
+def run_here(make: Callable[[], ComponentNode], component: str) -> int:
+    """The same where rclpy is initialized already."""
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
     try:
         # It steps back only when it is ready: a node that was started again is waited for.
-        spin(make(), stop, lambda: step_process_back(getattr(make, "component", "")))
+        spin(make(), stop, lambda: step_process_back(component))
     except DrocapError as error:
         print(f"drocap: {error}", file=sys.stderr)
         return error.exit_status
