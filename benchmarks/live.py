@@ -153,7 +153,7 @@ def measure_load(
     nodes = [name for name in NODES if adjuster or name != "bundle_adjuster"]
     port = free_udp_port()
     config = graph_config(video, session, port, args.threads, args.pose_model)
-    with vehicle(port), bringup(config, nodes, processes=processes) as graph:
+    with vehicle(port), bringup(config, nodes, processes=processes, respawn=True) as graph:
         graph.spin_for(WARM_S)
         pids = {graph.pid(name): name if processes else "all nodes" for name in nodes}
         before, begin_ns = {pid: usage(pid)[0] for pid in pids}, time.time_ns()
@@ -266,7 +266,7 @@ def part_memory(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     nodes = [*NODES[:-1], "visualizer", "session_recorder"]
     load = os.getloadavg()[0]
     results: dict[str, Any] = {"minutes": args.minutes, "load average before": round(load, 2)}
-    with vehicle(port), bringup(config, nodes, processes=not args.one_process) as graph:
+    with vehicle(port), bringup(config, nodes, processes=not args.one_process, respawn=True) as graph:
         pids = {graph.pid(name): name if not args.one_process else "all nodes" for name in nodes}
         seen: dict[int, list[tuple[float, float]]] = {pid: [] for pid in pids}
         begin = time.monotonic()

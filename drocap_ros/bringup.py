@@ -302,9 +302,11 @@ def bringup(
             graph._respawn = False
             graph._reserve = None
             if (spare := graph._take_spare()) is not None:
-                spare.close()
+                spare.dismiss()
             for runner in graph._runners:
                 runner.stop()
+            if spare is not None:
+                spare.wait()
         graph._due_s.clear()
         graph.check()
 

@@ -87,24 +87,35 @@ class Spare:
 
     def become(self, name: str, parameters: Path) -> bool:
         """Run that node from now on; False when the process is no more."""
-        return self._say({"name": name, "parameters": str(parameters)}) and self.process.poll() is None
+        there = self._say({"name": name, "parameters": str(parameters)})
+        self._hang_up()
+        return there and self.process.poll() is None
 
     def _say(self, what: object) -> bool:
         assert self.process.stdin is not None
         try:
             self.process.stdin.write(json.dumps(what) + "\n")
             self.process.stdin.flush()
-        except OSError:
+        except (OSError, ValueError):  # dead, or hung up on
             return False
         return True
 
-    def close(self) -> None:
-        """End it without use."""
-        self.process.kill()
-        self.process.wait()
+    def _hang_up(self) -> None:
         assert self.process.stdin is not None
         with contextlib.suppress(OSError):
             self.process.stdin.close()
+
+    def dismiss(self) -> None:
+        """Let it end without use, as soon as it looks."""
+        self._hang_up()
+
+    def wait(self) -> None:
+        """Wait until it has ended."""
+        try:
+            self.process.wait(STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
 
 
 class NodeProcess:
