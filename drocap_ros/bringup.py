@@ -34,7 +34,8 @@ from std_msgs.msg import Empty, String
 
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import DrocapError, InputError, NodeError
-from drocap_ros.node_process import (
+from drocap_ros.nodes.component import HARDWARE_ID, ComponentNode
+from drocap_ros.nodes.processes import (
     DEFAULT_NAMESPACE,
     STOP_TIMEOUT_S,
     NodeProcess,
@@ -43,7 +44,6 @@ from drocap_ros.node_process import (
     node_class,
     remaps,
 )
-from drocap_ros.nodes.component import HARDWARE_ID, ComponentNode
 from drocap_ros.nodes.run import spin, step_back
 from drocap_ros.nodes.topics import GRAPH_QOS, NODES, TOPICS
 

@@ -19,8 +19,8 @@ import rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from drocap_ros.node_process import node_class
 from drocap_ros.nodes.component import ComponentNode
+from drocap_ros.nodes.processes import node_class
 from drocap_ros.nodes.run import run_here
 
 

@@ -12,7 +12,7 @@ from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.msg import Pose3D
-from drocap_ros.node_process import Place, Spare
+from drocap_ros.nodes.processes import Place, Spare
 from drocap_ros.nodes.topics import RESULT_QOS
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")

@@ -36,7 +36,7 @@ _LEAN = {
     "MALLOC_TRIM_THRESHOLD_": str(1 << 28),
     "MALLOC_MMAP_THRESHOLD_": str(1 << 25),
     # Another middleware, and whoever has a profile of their own, is not concerned.
-    "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).parent / "data" / "fastdds.xml"),
+    "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).parents[1] / "data" / "fastdds.xml"),
 }
 
 
