@@ -5,13 +5,10 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
-import random
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable
-from pathlib import Path
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -36,8 +33,6 @@ NICENESS = {
 _BACKGROUND = 10
 #: From here on it takes only what the others leave, in a process of its own.
 _LAST = 15
-#: A graph has at most eight nodes that ask at the same time.
-_AUTOGROUP_TRIES = 20
 
 #: Names the process that started this node; when that one is gone, the node stops.
 PARENT = "DROCAP_PARENT_PID"
@@ -94,7 +89,7 @@ def step_back(component: str, own_process: bool = False) -> None:
 
 
 def step_process_back(component: str) -> None:
-    """The same for a process, with all the threads that it has by now, and among sessions."""
+    """The same for a process, with all the threads that it has by now."""
     niceness = NICENESS.get(component, 0)
     if niceness == 0:
         return
@@ -104,30 +99,6 @@ def step_process_back(component: str) -> None:
             if niceness >= _BACKGROUND:
                 os.sched_setscheduler(thread, os.SCHED_BATCH, os.sched_param(0))
     step_back(component, own_process=True)
-    # It may have to wait for its turn.
-    threading.Thread(target=step_session_back, args=(component,), name="autogroup", daemon=True).start()
-
-
-def step_session_back(component: str) -> None:
-    """The same among sessions, where this process leads one: Linux's autogroups weigh niceness only within them."""
-    niceness = NICENESS.get(component, 0)
-    with contextlib.suppress(OSError, AttributeError):
-        if niceness == 0 or os.getsid(0) != os.getpid():
-            return
-        for _ in range(_AUTOGROUP_TRIES):
-            if _ask_for(niceness):
-                return
-            # Whoever is not root has to leave 0.1 s between any two such requests on the machine.
-            time.sleep(0.11 + 0.05 * random.random())
-
-
-def _ask_for(niceness: int) -> bool:
-    """Niceness of this session; False when the request came too soon after another one."""
-    try:
-        Path("/proc/self/autogroup").write_text(str(niceness))
-    except BlockingIOError:
-        return False
-    return True
 
 
 def _drain(executor: SingleThreadedExecutor, node: ComponentNode) -> None:

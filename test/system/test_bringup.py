@@ -16,8 +16,6 @@ from drocap_ros.nodes.conversions import stamp_from_ros
 from drocap_ros.nodes.topics import NODES, RESULT_QOS, TOPICS
 from drocap_ros.simulation.ports import free_udp_port
 
-AUTOGROUP = Path("/proc/self/autogroup")
-OURS = AUTOGROUP.read_text().split()[1:] if AUTOGROUP.exists() else []
 CAPTURE = ["capture_simulator", "initializer", "bundle_adjuster"]
 
 
@@ -112,20 +110,18 @@ def test_the_bridge_refuses_to_fly_and_says_why():
     assert {m.state for m in got["orbit/status"]} == {OrbitStatus.IDLE}
 
 
-@pytest.mark.skipif(not OURS, reason="this system does not schedule by sessions")
-def test_nodes_step_back_behind_the_estimator_in_a_session_of_their_own():
+def test_nodes_step_back_behind_the_estimator_in_the_session_of_their_command_out_of_reach_of_its_terminal():
     with bringup(short_flight(), ["capture_simulator", "bundle_adjuster"], processes=True) as graph:
-        adjuster, simulator = (Path(f"/proc/{graph.pid(name)}") for name in ("bundle_adjuster", "capture_simulator"))
-        # Only when they are ready, and then one after the other.
-        graph.wait_until(
-            lambda: (adjuster / "autogroup").read_text().split()[-1] == "15", 20, "the adjuster's niceness"
-        )
-        assert (simulator / "autogroup").read_text().split()[1:] == ["nice", "0"]
-        threads = [int(path.name) for path in (adjuster / "task").iterdir()]
+        adjuster, simulator = graph.pid("bundle_adjuster"), graph.pid("capture_simulator")
+        # Only when they are ready, and then one thread after the other.
+        graph.wait_until(lambda: os.sched_getscheduler(adjuster) == os.SCHED_IDLE, 20, "the adjuster's priority")
+        threads = [int(path.name) for path in Path(f"/proc/{adjuster}/task").iterdir()]
         assert min(os.getpriority(os.PRIO_PROCESS, thread) for thread in threads) == 15
-        assert os.sched_getscheduler(graph.pid("bundle_adjuster")) == os.SCHED_IDLE
-        assert os.sched_getscheduler(graph.pid("capture_simulator")) == os.SCHED_OTHER
-    assert AUTOGROUP.read_text().split()[1:] == OURS
+        assert os.sched_getscheduler(simulator) == os.SCHED_OTHER
+        assert os.getpriority(os.PRIO_PROCESS, simulator) == os.getpriority(os.PRIO_PROCESS, 0)
+        # Niceness weighs within a session only; Ctrl-C reaches the command's process group only.
+        assert os.getsid(adjuster) == os.getsid(simulator) == os.getsid(0)
+        assert {os.getpgid(adjuster), os.getpgid(simulator)} == {adjuster, simulator}
 
 
 @pytest.mark.skipif(
