@@ -2,40 +2,10 @@
 
 import os
 import threading
-from pathlib import Path
 
 import pytest
 
 from drocap_ros.nodes import run
-
-
-@pytest.fixture
-def asked(monkeypatch):
-    """What is asked of the system, which refuses the first two requests as coming too soon."""
-    requests = []
-
-    def write(path, text):
-        requests.append((str(path), text))
-        if len(requests) <= 2:
-            raise BlockingIOError
-
-    monkeypatch.setattr(Path, "write_text", write)
-    monkeypatch.setattr(run.time, "sleep", lambda _: None)
-    return requests
-
-
-def test_a_request_that_came_too_soon_is_made_again(asked, monkeypatch):
-    monkeypatch.setattr(os, "getsid", lambda _: os.getpid())
-    run.step_session_back("bundle_adjuster")
-    assert asked == [("/proc/self/autogroup", "15")] * 3
-
-
-def test_a_session_of_others_and_the_estimators_own_are_left_as_they_are(asked, monkeypatch):
-    monkeypatch.setattr(os, "getsid", lambda _: os.getpid() + 1)
-    run.step_session_back("bundle_adjuster")
-    monkeypatch.setattr(os, "getsid", lambda _: os.getpid())
-    run.step_session_back("pose_estimator")
-    assert asked == []
 
 
 @pytest.mark.skipif(not hasattr(os, "SCHED_IDLE"), reason="Linux's policies")
