@@ -117,15 +117,21 @@ def _turn(executor: SingleThreadedExecutor, node: ComponentNode, timeout_s: floa
 
 def node_main(make: Callable[[], ComponentNode]) -> int:
     """Run one node as a process until SIGINT or SIGTERM; returns the exit status."""
+    stop = stop_on_signal()
     rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
-    return run_here(make, getattr(make, "component", ""))
+    return run_here(make, getattr(make, "component", ""), stop)
 
 
-def run_here(make: Callable[[], ComponentNode], component: str) -> int:
-    """The same where rclpy is initialized already."""
+def stop_on_signal() -> threading.Event:
+    """What SIGINT and SIGTERM set from now on."""
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+def run_here(make: Callable[[], ComponentNode], component: str, stop: threading.Event) -> int:
+    """:func:`node_main` where rclpy is initialized already."""
     try:
         # It steps back only when it is ready: a node that was started again is waited for.
         spin(make(), stop, lambda: step_process_back(component))

@@ -21,7 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from drocap_ros.nodes.component import ComponentNode
 from drocap_ros.nodes.processes import node_class
-from drocap_ros.nodes.run import run_here
+from drocap_ros.nodes.run import run_here, stop_on_signal
 
 
 def main() -> int:
@@ -43,7 +43,7 @@ def main() -> int:
         place.destroy_node()
         return node
 
-    return run_here(make, name)
+    return run_here(make, name, stop_on_signal())
 
 
 def show_as(command: list[str]) -> None:
