@@ -35,12 +35,14 @@ from std_msgs.msg import Empty, String
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import DrocapError, InputError, NodeError
 from drocap_ros.nodes.component import HARDWARE_ID, ComponentNode
+from drocap_ros.nodes.middleware import PROFILE_FILE, PROFILE_VARIABLE
 from drocap_ros.nodes.processes import (
     DEFAULT_NAMESPACE,
     STOP_TIMEOUT_S,
     NodeProcess,
     Place,
     Spare,
+    hears_a_driver,
     node_class,
     remaps,
 )
@@ -283,11 +285,13 @@ def bringup(
 
             def make(name: str) -> _Runner:
                 chosen = config
-                if graph.restarts["session_recorder"] and name == "session_recorder":
+                anew = graph.restarts[name] > 0
+                if anew and name == "session_recorder":
                     chosen = config.replace(name, if_taken="next")
                 if processes:
-                    return NodeProcess(name, chosen, place, graph._take_spare())
-                return _Thread(name, chosen, names, namespace, graph.node.context)
+                    spare = None if hears_a_driver(name, chosen) else graph._take_spare()
+                    return NodeProcess(name, chosen, place, spare, anew)
+                return _Thread(name, chosen, names, namespace, graph.node.context, anew)
 
             graph._make = make
             for name in names:
@@ -317,7 +321,9 @@ def watch(namespace: str, domain_id: int, names: Sequence[str] = ()) -> Iterator
     context = Context()
     rclpy.init(args=[], context=context, domain_id=domain_id)
     try:
-        node = Node("bringup", context=context, namespace=namespace, use_global_arguments=False)
+        # The middleware reads it when the first node of the process comes to be.
+        with _environment(**{PROFILE_VARIABLE: str(PROFILE_FILE), **os.environ}):
+            node = Node("bringup", context=context, namespace=namespace, use_global_arguments=False)
         try:
             yield Graph(node, domain_id, namespace, list(names))
         finally:
@@ -342,7 +348,9 @@ class _Runner(Protocol):
 class _Thread(_Runner):
     """A node in a thread of this process."""
 
-    def __init__(self, name: str, config: DrocapConfig, names: list[str], namespace: str, context: Context) -> None:
+    def __init__(
+        self, name: str, config: DrocapConfig, names: list[str], namespace: str, context: Context, anew: bool
+    ) -> None:
         self.name, self.pid = name, os.getpid()
         self._error: BaseException | None = None
         self._stop = threading.Event()
@@ -355,7 +363,10 @@ class _Thread(_Runner):
                 namespace=namespace,
                 use_global_arguments=False,
                 cli_args=["--ros-args", *remaps(namespace)],
-                parameter_overrides=[Parameter("graph_nodes", value=",".join(names))],
+                parameter_overrides=[
+                    Parameter("graph_nodes", value=",".join(names)),
+                    Parameter("graph_runs", value=anew),
+                ],
             )
 
         # Made in its own thread, so that the threads it starts inherit that one's priority.

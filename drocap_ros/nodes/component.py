@@ -29,6 +29,8 @@ from drocap_ros.parameters import Parameters
 
 #: By which the statuses of this package's nodes are known on ``/diagnostics``.
 HARDWARE_ID = "drocap_ros"
+#: A node that was started again is waited for until it has its first results, this long after it has found its peers.
+SETTLING_S = 2.0
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
@@ -63,7 +65,8 @@ class ComponentNode(Node):
 
     Topics (beside its own, see ``topics.NODES``): publishes ``/diagnostics`` once a second; with parameter
     ``graph_nodes`` set, publishes its name on ``graph/ready`` as soon as all its peers are matched and
-    begins to produce only at ``graph/start``; ``graph/finished`` when its source has ended.
+    begins to produce only at ``graph/start``, or at once with ``graph_runs``; ``graph/finished`` when its
+    source has ended.
 
     Parameters
     ----------
@@ -79,6 +82,7 @@ class ComponentNode(Node):
         node_kwargs.setdefault("namespace", "/drocap")
         super().__init__(self.component, **node_kwargs)
         peers = self.declare_parameter("graph_nodes", "").value
+        self._graph_runs = bool(self.declare_parameter("graph_runs", False).value)
         self._peers: list[str] = [name for name in peers.split(",") if name]
         self.config: Any = declare_parameters(self, config or section_types()[self.component]())
         self.counters: Counter[str] = Counter()
@@ -87,6 +91,7 @@ class ComponentNode(Node):
         self._latency = Latency()
         #: Whether all its peers are matched, if it waits for any.
         self.ready = False
+        self._settled_s = math.inf
         self.started = False
         #: Whether messages are taken; only a managed node is ever not active.
         self.active = True
@@ -244,10 +249,16 @@ class ComponentNode(Node):
             return
         self._handshake.cancel()
         self.ready = True
+        self._settled_s = time.monotonic() + (SETTLING_S if self._graph_runs else 0.0)
         if self._peers:
             self._told_ready.publish(String(data=self.component))
-        else:
+        if self._graph_runs or not self._peers:
             self._start()
+
+    @property
+    def settled(self) -> bool:
+        """Whether nobody waits for this node to come up any more."""
+        return time.monotonic() >= self._settled_s
 
     def _matched(self) -> bool:
         return all(

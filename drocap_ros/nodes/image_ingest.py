@@ -26,12 +26,12 @@ from drocap_ros.nodes.managed import ManagedComponent
 from drocap_ros.nodes.picture_channel import PictureOutput
 from drocap_ros.nodes.run import node_main
 from drocap_ros.nodes.stamps import StampGate
+from drocap_ros.nodes.topics import TOPIC_SOURCE
 from drocap_ros.perception.calibration import CameraModel, camera_model
 from drocap_ros.perception.sources import Frame, ImageSource, open_source
 from drocap_ros.perception.sources.prefetch import prefetch
 from drocap_ros.recording.pictures import image_from_message
 
-_TOPIC = "topic:"
 #: A picture of a file that is this late when it has been read is not published any more.
 _LATE_S = 0.1
 
@@ -60,8 +60,8 @@ class ImageIngestNode(ManagedComponent):
     def acquire(self) -> None:
         """Open the source, or subscribe to the topic that is one."""
         self._stop.clear()
-        if self.config.source.startswith(_TOPIC):
-            self._topic = self._subscribe(self.config.source.removeprefix(_TOPIC))
+        if self.config.source.startswith(TOPIC_SOURCE):
+            self._topic = self._subscribe(self.config.source.removeprefix(TOPIC_SOURCE))
         else:
             self._source = open_source(self.config.source, self.config)
             self._camera = camera_model(self.config, self._source.size)
@@ -154,7 +154,7 @@ class ImageIngestNode(ManagedComponent):
 
     def _subscribe(self, topic: str) -> Subscription:
         if not topic:
-            raise InputError(f"source: expected {_TOPIC}NAME of an image topic, got no name")
+            raise InputError(f"source: expected {TOPIC_SOURCE}NAME of an image topic, got no name")
         compressed = topic.endswith("compressed")
         gate = StampGate()
 

@@ -18,6 +18,7 @@ from std_msgs.msg import Header
 
 from drocap_ros.nodes.component import ComponentNode
 from drocap_ros.nodes.conversions import compressed_image_to_ros
+from drocap_ros.nodes.middleware import largest_message
 from drocap_ros.perception.images import encode_jpeg
 
 #: Pictures that wait to be encoded for others: a third of a second, then the oldest is dropped.
@@ -124,6 +125,7 @@ class PictureOutput:
         self._channel = channel_of(node.context, self._publisher.topic_name)
         self._channel.writers += 1
         node.handed_over["image/compressed"] = lambda: len(self._channel.readers)
+        self._largest = largest_message()
         self._waiting: queue.Queue[tuple[Picture, bytes | None] | None] = queue.Queue(_WAITING)
         self._thread: threading.Thread | None = None
         self._closed = False
@@ -165,6 +167,14 @@ class PictureOutput:
 
     def _encode(self, picture: Picture, jpeg: bytes | None) -> None:
         data = jpeg or encode_jpeg(picture.image, self._quality)
+        if len(data) > self._largest:
+            self._node.count("pictures too large for the kernel's buffers")
+            self._node.get_logger().warning(
+                f"a picture of {len(data) >> 10} KiB is more than the kernel's buffers take at once"
+                f" ({int(self._largest) >> 10} KiB), and may be lost: sysctl -w net.core.rmem_max=4194304, or smaller"
+                f" pictures",
+                throttle_duration_sec=60.0,
+            )
         self._publisher.publish(compressed_image_to_ros(picture.header, data))
 
     def _run(self) -> None:

@@ -17,8 +17,10 @@ import yaml
 
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError, NodeError
+from drocap_ros.nodes import middleware
 from drocap_ros.nodes.component import ComponentNode
 from drocap_ros.nodes.run import PARENT
+from drocap_ros.nodes.topics import TOPIC_SOURCE
 
 #: In this namespace TF is where everybody looks for it; in another each graph has its own, ``NAMESPACE/tf``, as the
 #: frames of two drones bear the same names.
@@ -36,8 +38,6 @@ _LEAN = {
     # What was needed once is kept: given back and asked for again, memory frays, and each new page costs time.
     "MALLOC_TRIM_THRESHOLD_": str(1 << 28),
     "MALLOC_MMAP_THRESHOLD_": str(1 << 25),
-    # Another middleware, and whoever has a profile of their own, is not concerned.
-    "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).parents[1] / "data" / "fastdds.xml"),
 }
 #: Ctrl-C is for the command, which stops its nodes in order.  They stay in its session: where Linux shares processors
 #: out among sessions (autogroups), niceness means nothing between these, and what runs last of all in one keeps
@@ -56,19 +56,22 @@ class Place:
         self.names = names
         self.folder = folder
         self.ros_arguments = ["--ros-args", "-r", f"__ns:={namespace}", *remaps(namespace), "--disable-stdout-logs"]
-        self.environment = {**_LEAN, **os.environ, "ROS_DOMAIN_ID": str(domain_id), PARENT: str(os.getpid())}
+        self._environment = {**_LEAN, **os.environ, "ROS_DOMAIN_ID": str(domain_id), PARENT: str(os.getpid())}
 
-    def start(self, module: str, arguments: Sequence[str], log: Path, stdin: int | None = None) -> subprocess.Popen:
+    def start(
+        self, module: str, arguments: Sequence[str], log: Path, stdin: int | None = None, shared_memory: bool = False
+    ) -> subprocess.Popen:
         """Run a module of ``drocap_ros.nodes``, out of reach of the terminal's Ctrl-C."""
         command = [sys.executable, "-m", f"drocap_ros.nodes.{module}", *self.ros_arguments, *arguments]
+        environment = self._environment | middleware.settings(self.folder, shared_memory)
         with log.open("ab") as stderr:
-            return subprocess.Popen(command, env=self.environment, stdin=stdin, stderr=stderr, text=True, **_OWN_GROUP)
+            return subprocess.Popen(command, env=environment, stdin=stdin, stderr=stderr, text=True, **_OWN_GROUP)
 
-    def parameter_file(self, name: str, config: DrocapConfig) -> Path:
-        """Write a node's parameters."""
+    def parameter_file(self, name: str, config: DrocapConfig, anew: bool) -> Path:
+        """Write a node's parameters; one that starts anew finds the graph running and waits for no sign to begin."""
         path = self.folder / f"{name}.yaml"
         section = config.to_parameter_file()[f"/**/{name}"]["ros__parameters"]
-        values = {**section, "graph_nodes": ",".join(self.names)}
+        values = {**section, "graph_nodes": ",".join(self.names), "graph_runs": anew}
         path.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}), encoding="utf-8")
         return path
 
@@ -122,16 +125,19 @@ class Spare:
 
 
 class NodeProcess:
-    """A node in a process of its own."""
+    """A node in a process of its own; ``anew`` when the graph runs already."""
 
-    def __init__(self, name: str, config: DrocapConfig, place: Place, spare: Spare | None = None) -> None:
+    def __init__(
+        self, name: str, config: DrocapConfig, place: Place, spare: Spare | None = None, anew: bool = False
+    ) -> None:
         self.name = name
-        parameters = place.parameter_file(name, config)
+        parameters = place.parameter_file(name, config, anew)
         if spare is not None and spare.become(name, parameters):
             self._process, self._log = spare.process, spare.log
         else:
             self._log = place.folder / f"{name}.log"
-            self._process = place.start(name, ["--params-file", str(parameters)], self._log)
+            arguments = ["--params-file", str(parameters)]
+            self._process = place.start(name, arguments, self._log, shared_memory=hears_a_driver(name, config))
         self.pid = self._process.pid
         self._stopping = False
 
@@ -163,6 +169,11 @@ class NodeProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+
+
+def hears_a_driver(name: str, config: DrocapConfig) -> bool:
+    """Whether the node takes its pictures from a topic, as raw ones perhaps; no process in reserve can do that."""
+    return name == "image_ingest" and config.image_ingest.source.startswith(TOPIC_SOURCE)
 
 
 def remaps(namespace: str) -> list[str]:

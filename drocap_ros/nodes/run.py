@@ -38,11 +38,11 @@ _LAST = 15
 PARENT = "DROCAP_PARENT_PID"
 
 
-def spin(node: ComponentNode, stop: threading.Event, when_ready: Callable[[], None] | None = None) -> None:
+def spin(node: ComponentNode, stop: threading.Event, when_settled: Callable[[], None] | None = None) -> None:
     """Run the node's callbacks until ``stop``, then work off what has arrived, and close the node.
 
-    ``when_ready`` is called once, as soon as the node has found all its peers.  Whatever a callback raises comes out
-    of here.
+    ``when_settled`` is called once, as soon as nobody waits for the node any more.  Whatever a callback raises comes
+    out of here.
     """
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
@@ -56,9 +56,9 @@ def spin(node: ComponentNode, stop: threading.Event, when_ready: Callable[[], No
                 executor.spin_once(timeout_sec=0.1)
             elif not _turn(executor, node, 0.0):
                 stop.wait(node.spin_pause_s)
-            if when_ready is not None and node.ready:
-                when_ready()
-                when_ready = None
+            if when_settled is not None and node.settled:
+                when_settled()
+                when_settled = None
             if parent not in (0, os.getppid(), os.getpid()):
                 stop.set()
         node.on_stop()
@@ -133,7 +133,7 @@ def stop_on_signal() -> threading.Event:
 def run_here(make: Callable[[], ComponentNode], component: str, stop: threading.Event) -> int:
     """:func:`node_main` where rclpy is initialized already."""
     try:
-        # It steps back only when it is ready: a node that was started again is waited for.
+        # It steps back only then: a node that was started again is waited for.
         spin(make(), stop, lambda: step_process_back(component))
     except DrocapError as error:
         print(f"drocap: {error}", file=sys.stderr)

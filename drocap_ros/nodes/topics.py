@@ -16,6 +16,9 @@ try:
 except ImportError:  # not among the ROS wheels; `make setup` builds it, a ROS installation has it
     TFMessage = None
 
+#: A source of pictures that begins like this is a topic.
+TOPIC_SOURCE = "topic:"
+
 #: A picture that comes late is worth nothing: no retransmission, and at most four wait.  With one, a single slow
 #: detection costs a picture; the others come in a rush when the camera's process has been held up, and are soon worked
 #: off, since who hurries carries keypoints on.

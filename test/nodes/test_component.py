@@ -1,6 +1,7 @@
 """What every node shares, on live nodes."""
 
 import contextlib
+import time
 from array import array
 
 import numpy as np
@@ -118,3 +119,19 @@ def test_a_node_runs_without_a_bringup(context):
                 break
         executor.shutdown()
         assert node.started
+
+
+@pytest.mark.parametrize("runs", [False, True])
+def test_only_who_is_started_in_a_running_graph_begins_without_a_sign_to_all(context, runs):
+    # A sign to start that is lost on the way would be repeated, but a restarted node is waited for.
+    with initializer(context, graph_nodes="initializer", graph_runs=runs) as node:
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        end = time.monotonic() + 5.0
+        while not node.ready and time.monotonic() < end:
+            executor.spin_once(timeout_sec=0.05)
+        executor.shutdown()
+        assert node.ready
+        assert node.started is runs
+        # Whoever is waited for steps back behind the others later.
+        assert node.settled is not runs

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import Image
 
 from drocap_ros.bringup import bringup, free_domain
 from drocap_ros.config import DrocapConfig
@@ -129,11 +131,26 @@ def test_nodes_step_back_behind_the_estimator_in_the_session_of_their_command_ou
     or "FASTRTPS_DEFAULT_PROFILES_FILE" in os.environ,
     reason="another middleware, or somebody's own profile",
 )
-def test_messages_have_room_in_shared_memory_beside_what_killed_nodes_left_there():
-    with bringup(short_flight(), ["capture_simulator"], processes=True) as graph:
-        maps = Path(f"/proc/{graph.pid('capture_simulator')}/maps").read_text()
-    spans = [line.split()[0].split("-") for line in maps.splitlines() if "/dev/shm/fast" in line]
-    assert max(int(end, 16) - int(begin, 16) for begin, end in spans) >= 8 << 20
+def test_only_a_node_that_hears_a_camera_driver_uses_the_shared_memory_in_which_killed_processes_leave_others_waiting():
+    def uses_it(name):
+        return "/dev/shm/fast" in Path(f"/proc/{graph.pid(name)}/maps").read_text()
+
+    config = short_flight(seconds=10.0).replace("image_ingest", source="topic:camera/image_raw")
+    picture = Image(height=240, width=320, encoding="bgr8", step=3 * 320, data=bytes(3 * 320 * 240))
+    with bringup(config, ["image_ingest", "capture_simulator", "initializer"], processes=True) as graph:
+        got = collect(graph, "image/compressed")["image/compressed"]
+        driver = graph.node.create_publisher(Image, "camera/image_raw", qos_profile_sensor_data)
+        graph.wait_until(driver.get_subscription_count, 20, "the node to listen")
+        for _ in range(100):
+            picture.header.stamp = graph.node.get_clock().now().to_msg()
+            driver.publish(picture)
+            graph.spin_for(0.1)
+            if len(got) >= 5:
+                break
+        assert len(got) >= 5
+        assert uses_it("image_ingest")
+        assert not uses_it("capture_simulator")
+        assert not uses_it("initializer")
 
 
 def test_stopping_takes_no_longer_than_it_should():
