@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import math
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -69,10 +70,10 @@ def run(args: argparse.Namespace) -> int:
         if not args.quiet:
             print(f"{time.monotonic() - begin:6.1f} s  {text}", flush=True)
 
-    with _terminated_like_interrupted(), output_folder(args.out) as folder:
+    with interruptible() as interrupted, output_folder(args.out) as folder:
         config = demo_config(folder, args.seed, args.autopilot, args.models)
         say(f"starting {', '.join(NODES)}, a process each")
-        load = fly(config, operator, say)
+        load = fly(config, operator, say, interrupted)
         check_flown(operator)
         truth = load_truth_of_flight(folder / "truth.npz")
         with open_session(folder / "session") as session:
@@ -168,10 +169,21 @@ def _picture_words(verdict: FlightVerdict, truth: FlightTruth) -> str:
 
 
 @contextlib.contextmanager
-def _terminated_like_interrupted() -> Iterator[None]:
-    """SIGTERM ends the flight as Ctrl-C does: the nodes are stopped and nothing half-written stays."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+def interruptible() -> Iterator[threading.Event]:
+    """SIGTERM ends the flight as Ctrl-C does: the nodes are stopped and nothing half-written stays.
+
+    Both raise KeyboardInterrupt wherever the program is, and set the event: what is raised where Python cannot pass it
+    on, as in a destructor, is lost.
+    """
+    interrupted = threading.Event()
+
+    def interrupt(*_: object) -> None:
+        interrupted.set()
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield
+        yield interrupted
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

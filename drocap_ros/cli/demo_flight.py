@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -23,11 +24,15 @@ NODES = (
 HANDED_OVER = "pilot: hands off"
 
 
-def fly(config: DrocapConfig, operator: Operator, say: Callable[[str], None]) -> dict[str, float]:
+def fly(
+    config: DrocapConfig, operator: Operator, say: Callable[[str], None], interrupted: threading.Event
+) -> dict[str, float]:
     """Fly until the operator is done; returns the share of a processor core that each node took.
 
     Raises
     ------
+    KeyboardInterrupt
+        Soon after ``interrupted`` is set.
     DrocapError
         When the graph does not come up, a node fails, or the flight takes far longer than it can.
     """
@@ -39,7 +44,9 @@ def fly(config: DrocapConfig, operator: Operator, say: Callable[[str], None]) ->
         before = {name: _processor_s(graph.pid(name)) for name in NODES}
         # Every wait of the operator is bounded; this bounds the whole.
         limit_s = 3.0 * operator.seconds + 120.0 * (operator.restarts + 1)
-        graph.wait_until(lambda: operator.over, limit_s, "the end of the flight")
+        graph.wait_until(lambda: operator.over or interrupted.is_set(), limit_s, "the end of the flight")
+        if interrupted.is_set():
+            raise KeyboardInterrupt
         if operator.failure:
             graph.spin_for(REST_S)  # for the hold that the operator's last word asked for
         passed = time.monotonic() - begin

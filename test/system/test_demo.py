@@ -8,8 +8,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from drocap_ros.cli import main
+from drocap_ros.cli.demo import interruptible
 from drocap_ros.cli.demo_verdict import settled_orbit
 from drocap_ros.flight.safety import State
 from drocap_ros.motion import load_motion
@@ -86,6 +88,25 @@ def test_an_interrupted_demo_leaves_no_process_and_no_file(tmp_path):
     assert error == "drocap: interrupted\n"
     assert _marked(mark) == []
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_is_known_also_where_python_cannot_raise_it(number, monkeypatch):
+    class Interrupted:
+        def __del__(self):
+            os.kill(os.getpid(), number)
+            for _ in range(100):  # signals are looked for now and then
+                pass
+
+    lost = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda what: lost.append(what.exc_type))
+    before = signal.getsignal(number)
+    with interruptible() as interrupted:
+        assert not interrupted.is_set()
+        Interrupted()
+        assert interrupted.is_set()
+    assert lost == [KeyboardInterrupt]
+    assert signal.getsignal(number) is before
 
 
 def _marked(mark):
