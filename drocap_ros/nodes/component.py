@@ -83,7 +83,8 @@ class ComponentNode(Node):
         super().__init__(self.component, **node_kwargs)
         peers = self.declare_parameter("graph_nodes", "").value
         self._graph_runs = bool(self.declare_parameter("graph_runs", False).value)
-        self._peers: list[str] = [name for name in peers.split(",") if name]
+        #: All nodes of the graph, where a bringup has said so.
+        self.peers: list[str] = [name for name in peers.split(",") if name]
         self.config: Any = declare_parameters(self, config or section_types()[self.component]())
         self.counters: Counter[str] = Counter()
         self._counting = threading.Lock()
@@ -245,14 +246,14 @@ class ComponentNode(Node):
         self._finished.publish(String(data=self.component))
 
     def _match(self) -> None:
-        if self._peers and not self._matched():
+        if self.peers and not self._matched():
             return
         self._handshake.cancel()
         self.ready = True
         self._settled_s = time.monotonic() + (SETTLING_S if self._graph_runs else 0.0)
-        if self._peers:
+        if self.peers:
             self._told_ready.publish(String(data=self.component))
-        if self._graph_runs or not self._peers:
+        if self._graph_runs or not self.peers:
             self._start()
 
     @property
@@ -262,12 +263,10 @@ class ComponentNode(Node):
 
     def _matched(self) -> bool:
         return all(
-            publisher.get_subscription_count() + self.handed_over.get(topic, int)()
-            >= subscribers_of(topic, self._peers)
+            publisher.get_subscription_count() + self.handed_over.get(topic, int)() >= subscribers_of(topic, self.peers)
             for topic, publisher in self._outputs
         ) and all(
-            subscription.get_publisher_count() >= _publishers(topic, self._peers)
-            for topic, subscription in self._inputs
+            subscription.get_publisher_count() >= _publishers(topic, self.peers) for topic, subscription in self._inputs
         )
 
     def _start(self) -> None:

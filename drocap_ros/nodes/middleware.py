@@ -5,7 +5,6 @@ Another middleware, and whoever has a profile of their own, is left alone.
 
 from __future__ import annotations
 
-import math
 import os
 from pathlib import Path
 
@@ -16,7 +15,6 @@ PROFILE_FILE = Path(__file__).parents[1] / "data" / "fastdds.xml"
 _RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _UDP = "<type>UDPv4</type>"
 _SHARED_MEMORY = "<transport_id>shared_memory</transport_id>"
-_BUFFER_LIMIT = Path("/proc/sys/net/core/rmem_max")
 
 
 def settings(folder: Path, shared_memory: bool = False) -> dict[str, str]:
@@ -39,17 +37,3 @@ def settings(folder: Path, shared_memory: bool = False) -> dict[str, str]:
     path = folder / ("fastdds_shared_memory.xml" if shared_memory else "fastdds.xml")
     path.write_text(text, encoding="utf-8")
     return {**environment, PROFILE_VARIABLE: str(path)}
-
-
-def largest_message() -> float:
-    """Bytes of a message that gets through to whoever does not ask again: what the kernel's buffers hold.
-
-    Infinite where the profile has shared memory, and where the kernel does not say.
-    """
-    try:
-        if "<type>SHM<" in Path(os.environ[PROFILE_VARIABLE]).read_text(encoding="utf-8"):
-            return math.inf
-        # Linux gives twice what it allows, and books some of that as its own.
-        return 2.0 * 0.9 * int(_BUFFER_LIMIT.read_text())
-    except (KeyError, OSError, ValueError):
-        return math.inf

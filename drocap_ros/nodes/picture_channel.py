@@ -18,7 +18,7 @@ from std_msgs.msg import Header
 
 from drocap_ros.nodes.component import ComponentNode
 from drocap_ros.nodes.conversions import compressed_image_to_ros
-from drocap_ros.nodes.middleware import largest_message
+from drocap_ros.nodes.topics import IMAGE_IN_GRAPH_QOS, publishers_of
 from drocap_ros.perception.images import encode_jpeg
 
 #: Pictures that wait to be encoded for others: a third of a second, then the oldest is dropped.
@@ -125,7 +125,6 @@ class PictureOutput:
         self._channel = channel_of(node.context, self._publisher.topic_name)
         self._channel.writers += 1
         node.handed_over["image/compressed"] = lambda: len(self._channel.readers)
-        self._largest = largest_message()
         self._waiting: queue.Queue[tuple[Picture, bytes | None] | None] = queue.Queue(_WAITING)
         self._thread: threading.Thread | None = None
         self._closed = False
@@ -167,14 +166,6 @@ class PictureOutput:
 
     def _encode(self, picture: Picture, jpeg: bytes | None) -> None:
         data = jpeg or encode_jpeg(picture.image, self._quality)
-        if len(data) > self._largest:
-            self._node.count("pictures too large for the kernel's buffers")
-            self._node.get_logger().warning(
-                f"a picture of {len(data) >> 10} KiB is more than the kernel's buffers take at once"
-                f" ({int(self._largest) >> 10} KiB), and may be lost: sysctl -w net.core.rmem_max=4194304, or smaller"
-                f" pictures",
-                throttle_duration_sec=60.0,
-            )
         self._publisher.publish(compressed_image_to_ros(picture.header, data))
 
     def _run(self) -> None:
@@ -249,7 +240,8 @@ class PictureInput:
             self._node.drop_input(self._subscription)
             self._subscription = None
         elif not here and self._subscription is None:
-            self._subscription = self._node.input("image/compressed", self._on_message, count_gaps=True)
+            qos = IMAGE_IN_GRAPH_QOS if publishers_of("image/compressed", self._node.peers) else None
+            self._subscription = self._node.input("image/compressed", self._on_message, qos=qos, count_gaps=True)
 
     def _on_message(self, message: Any) -> None:
         self._reader.put(Picture(message.header, self._decode(message)))

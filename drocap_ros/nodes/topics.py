@@ -23,6 +23,9 @@ TOPIC_SOURCE = "topic:"
 #: detection costs a picture; the others come in a rush when the camera's process has been held up, and are soon worked
 #: off, since who hurries carries keypoints on.
 IMAGE_QOS = QoSProfile(depth=4, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
+#: In a graph, whose own nodes offer that, what found no room in the kernel's buffers at once is asked for again: a
+#: picture of 400 KiB and more, where Linux is as it comes.  That takes some 15 ms.
+IMAGE_IN_GRAPH_QOS = QoSProfile(depth=4, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 #: Offered reliably, so that a recorder on the same machine loses none; a best-effort reader costs no more for it.
 IMAGE_OFFERED_QOS = QoSProfile(depth=30, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 #: The recorder comes last: on a busy machine, most of all at the start, it may not be let run for seconds.

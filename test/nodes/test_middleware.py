@@ -1,7 +1,5 @@
 """How the middleware is set for the processes of a graph."""
 
-import math
-import os
 import xml.etree.ElementTree as ET
 
 import pytest
@@ -53,18 +51,3 @@ def test_somebodys_own_profile_is_left_alone(tmp_path, monkeypatch):
     monkeypatch.setenv(VARIABLE, "/home/me/fastdds.xml")
     monkeypatch.setenv(RANGE, "LOCALHOST")
     assert middleware.settings(tmp_path, shared_memory=True) == {}
-
-
-def test_the_largest_message_is_what_the_kernel_allows_twice_over_but_for_shared_memory(tmp_path, monkeypatch):
-    limit = tmp_path / "rmem_max"
-    limit.write_text("212992\n")
-    monkeypatch.setattr(middleware, "_BUFFER_LIMIT", limit)
-    assert middleware.largest_message() == math.inf  # Fast DDS' own profile
-    for shared_memory, bounds in ((True, (math.inf, math.inf)), (False, (300_000, 425_984))):
-        os.environ.update(middleware.settings(tmp_path, shared_memory))
-        try:
-            assert bounds[0] <= middleware.largest_message() <= bounds[1]
-        finally:
-            del os.environ[VARIABLE]
-    monkeypatch.setenv(VARIABLE, str(tmp_path / "nowhere.xml"))
-    assert middleware.largest_message() == math.inf

@@ -112,19 +112,6 @@ def test_a_recorder_gets_jpeg_while_a_reader_gets_arrays(context, pictures):
     assert bytes(jpegs[0].data[:2]) == b"\xff\xd8"
 
 
-def test_a_picture_larger_than_the_kernel_takes_at_once_is_counted(context, pictures, monkeypatch):
-    monkeypatch.setattr("drocap_ros.nodes.picture_channel.largest_message", lambda: 1000.0)
-    config = ImageIngestConfig(source=str(pictures[0]), loop=True, folder_rate_hz=50.0)
-    camera = ImageIngestNode(config, context=context, use_global_arguments=False)
-    jpegs = []
-    camera.create_subscription(
-        TOPICS["image/compressed"].message, "image/compressed", jpegs.append, IMAGE_RECORDING_QOS
-    )
-    with spinning(context, camera) as until:
-        until(lambda: len(jpegs) > 3)
-    assert camera.counters["pictures too large for the kernel's buffers"] >= 3
-
-
 def test_a_reader_that_is_busy_misses_the_oldest_and_knows_how_many():
     reader = PictureReader(depth=2)
     sent = [Picture(header_at(i, "c"), np.zeros((1, 1, 3), np.uint8)) for i in range(5)]

@@ -5,6 +5,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from rclpy.qos import qos_profile_sensor_data
@@ -151,6 +152,25 @@ def test_only_a_node_that_hears_a_camera_driver_uses_the_shared_memory_in_which_
         assert uses_it("image_ingest")
         assert not uses_it("capture_simulator")
         assert not uses_it("initializer")
+
+
+def test_pictures_larger_than_the_kernels_buffers_reach_the_estimator_in_its_process(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 255, (1000, 1400, 3), dtype=np.uint8)
+    for i in range(15):
+        cv2.imwrite(str(tmp_path / f"{i:02d}.jpg"), np.roll(noise, 10 * i, axis=1))
+    config = DrocapConfig().replace("image_ingest", source=str(tmp_path), folder_rate_hz=3.0, realtime=True)
+    config = config.replace("pose_estimator", models_dir="simulation")
+    with bringup(config, ["image_ingest", "pose_estimator"], processes=True) as graph:
+        got = collect(graph, "/diagnostics")["/diagnostics"]
+
+        def images(node):
+            counts = [v for m in got for s in m.status if node in s.name for v in s.values]
+            return max((int(v.value) for v in counts if v.key == "images"), default=0)
+
+        graph.wait_finished("image_ingest", timeout_s=60)
+        graph.spin_for(2.0)
+        graph.wait_until(lambda: images("pose_estimator") >= 0.6 * images("image_ingest"), 20, "most of the pictures")
+        assert images("image_ingest") >= 5
 
 
 def test_stopping_takes_no_longer_than_it_should():
