@@ -35,5 +35,6 @@ def settings(folder: Path, shared_memory: bool = False) -> dict[str, str]:
         text = text.replace("</transport_descriptors>", f"{descriptor}</transport_descriptors>")
         text = text.replace("<userTransports>", f"<userTransports>{_SHARED_MEMORY}")
     path = folder / ("fastdds_shared_memory.xml" if shared_memory else "fastdds.xml")
-    path.write_text(text, encoding="utf-8")
+    if not path.exists():  # processes that were started before may be reading it
+        path.write_text(text, encoding="utf-8")
     return {**environment, PROFILE_VARIABLE: str(path)}
