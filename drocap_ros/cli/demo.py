@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import math
-import signal
-import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,6 +49,7 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.cli.demo_flight import NODES, check_flown, fly
     from drocap_ros.cli.demo_operator import Operator
     from drocap_ros.cli.demo_verdict import judge_flight
+    from drocap_ros.cli.live import interruptible
     from drocap_ros.cli.output import check_output_folder, output_folder
     from drocap_ros.cli.reconstruct import summary
     from drocap_ros.errors import InputError
@@ -166,24 +163,3 @@ def _picture_words(verdict: FlightVerdict, truth: FlightTruth) -> str:
         f"{words}; live: {live.count} poses, error {1000 * live.error_m:.1f} mm (PA-MPJPE), scale error"
         f" {100 * live.scale_error:+.1f} %, frame {live.frame}"
     )
-
-
-@contextlib.contextmanager
-def interruptible() -> Iterator[threading.Event]:
-    """SIGTERM ends the flight as Ctrl-C does: the nodes are stopped and nothing half-written stays.
-
-    Both raise KeyboardInterrupt wherever the program is, and set the event: what is raised where Python cannot pass it
-    on, as in a destructor, is lost.
-    """
-    interrupted = threading.Event()
-
-    def interrupt(*_: object) -> None:
-        interrupted.set()
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield interrupted
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

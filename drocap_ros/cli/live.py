@@ -105,6 +105,27 @@ def stop_signals() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
+@contextlib.contextmanager
+def interruptible() -> Iterator[threading.Event]:
+    """SIGTERM ends what runs inside as Ctrl-C does: nothing half-written stays.
+
+    Both raise KeyboardInterrupt wherever the program is, and set the event: what is raised where Python cannot pass it
+    on, as in a destructor, is lost.
+    """
+    interrupted = threading.Event()
+
+    def interrupt(*_: object) -> None:
+        interrupted.set()
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield interrupted
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def check_domain(domain_id: int) -> None:
     """Refuse a DDS domain that does not exist."""
     if not 0 <= domain_id <= 101:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drocap_ros.cli.live import check_domain, import_bringup, stop_signals
+from drocap_ros.cli.live import check_domain, import_bringup, interruptible, stop_signals
 from drocap_ros.cli.motion_input import read_motion
 from drocap_ros.cli.output import output_file
 from drocap_ros.cli.progress import progress_bars
@@ -180,15 +180,14 @@ def _shown(recording: rerun.RecordingStream, views: tuple[str, ...], args: argpa
         _say(args, f"written: {args.save} ({args.save.stat().st_size / 1e6:.1f} MB); `rerun {args.save}` shows it")
     elif args.web or not has_screen():
         server = to_browser(recording, arranged, args.host, args.port, args.memory, newest_first=args.live)
-        with server as address, contextlib.suppress(KeyboardInterrupt):
+        with server as address, contextlib.suppress(KeyboardInterrupt), interruptible() as interrupted:
             _say(args, f"open {address} in a browser; Ctrl-C stops")
             if has_screen():
                 webbrowser.open(address)
             yield
             recording.flush()
             if not args.live:
-                with stop_signals() as stop:
-                    stop.wait()
+                interrupted.wait()
     else:
         to_window(recording, arranged, args.memory)
         yield

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from drocap_ros.cli import main
-from drocap_ros.cli.demo import interruptible
 from drocap_ros.cli.demo_verdict import settled_orbit
+from drocap_ros.cli.live import interruptible
 from drocap_ros.flight.safety import State
 from drocap_ros.motion import load_motion
 from drocap_ros.recording.camera_telemetry import interpolate
