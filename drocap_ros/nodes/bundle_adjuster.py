@@ -26,6 +26,7 @@ from drocap_ros.nodes.conversions import (
 )
 from drocap_ros.nodes.run import node_main
 from drocap_ros.perception.observation import PoseObservation
+from drocap_ros.reconstruction import default_method
 from drocap_ros.reconstruction.adjustment_window import AdjustmentWindow, WindowArrays
 from drocap_ros.reconstruction.effort import Effort, EffortControl
 from drocap_ros.reconstruction.latest_pose import LatestPose, bone_lengths
@@ -56,6 +57,7 @@ class BundleAdjusterNode(ComponentNode):
         self._worker = ThreadPoolExecutor(1, "bundle_adjuster")
         self._job: Future[np.ndarray | None] | None = None
         self._job_subject = 0
+        self._solved = False
         self._sequence = 0
         self._refined = self.output("pose3d/refined")
         self._latest = self.output("pose3d/latest")
@@ -66,6 +68,16 @@ class BundleAdjusterNode(ComponentNode):
         )
         self.input("pose3d/initial", self._on_initial)
         self.create_timer(1.0, self._look_aside)
+
+    @classmethod
+    def import_ahead(cls) -> None:
+        """The solvers, which are most of what its constructor takes."""
+        default_method.import_libraries()
+
+    @property
+    def settled(self) -> bool:
+        """Only its first solution tells that it is there, and costs more time than those after it."""
+        return super().settled and self._solved
 
     def flush(self) -> None:
         """Work off what came on the side."""
@@ -137,6 +149,7 @@ class BundleAdjusterNode(ComponentNode):
         if self._job is None or not self._job.done():
             return
         job, self._job = self._job, None
+        self._solved = True
         lengths = job.result()
         if lengths is not None and self._job_subject == self._window.subject:
             self._latest_pose.solved(lengths, stamp_ns)

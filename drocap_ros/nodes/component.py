@@ -111,6 +111,10 @@ class ComponentNode(Node):
         self.create_timer(1.0, self._publish_diagnostics)
         self._handshake = self.create_timer(0.05, self._match)
 
+    @classmethod
+    def import_ahead(cls) -> None:
+        """Import what its constructor and first results need; for a process that does not know yet which node it is."""
+
     # -- endpoints -------------------------------------------------------------------------------------
 
     def output(self, topic: str) -> Publisher:

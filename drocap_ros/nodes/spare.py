@@ -1,8 +1,9 @@
 """A process in reserve for whichever node of a graph dies.
 
-It imports the graph's nodes, opens its place in the middleware under the hidden name ``_spare``, so that all others
-know it, and waits.  Two lines come on its standard input: the names of the nodes that it may have to be, and, when one
-has died, ``{"name": ..., "parameters": FILE}``, by which it becomes that one.  The end of the input ends it.
+It opens its place in the middleware under the hidden name ``_spare``, so that all others know it, imports the graph's
+nodes, and waits.  Two lines come on its standard input: the names of the nodes that it may have to be, and, when one
+has died, ``{"name": ..., "parameters": FILE}``, by which it becomes that one, without the imports that others would
+need.  The end of the input ends it.
 """
 
 from __future__ import annotations
@@ -11,8 +12,10 @@ import contextlib
 import ctypes
 import json
 import os
+import queue
 import signal
 import sys
+import threading
 from pathlib import Path
 
 import rclpy
@@ -29,8 +32,13 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
     place = Node("_spare", enable_rosout=False, start_parameter_services=False)
-    classes = {name: node_class(name) for name in json.loads(sys.stdin.readline() or "[]")}
-    line = sys.stdin.readline()
+    names = json.loads(sys.stdin.readline() or "[]")
+    orders: queue.SimpleQueue[str] = queue.SimpleQueue()
+    threading.Thread(target=lambda: orders.put(sys.stdin.readline()), daemon=True).start()
+    for name in names:
+        if orders.empty():
+            node_class(name).import_ahead()
+    line = orders.get()
     if not line:
         rclpy.try_shutdown()
         return 0
@@ -39,7 +47,7 @@ def main() -> int:
     show_as([sys.executable, "-m", f"drocap_ros.nodes.{name}", *arguments])
 
     def make() -> ComponentNode:
-        node = classes[name](cli_args=arguments)
+        node = node_class(name)(cli_args=arguments)
         place.destroy_node()
         return node
 

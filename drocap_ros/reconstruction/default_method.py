@@ -81,10 +81,14 @@ def prepare(config: DefaultMethodConfig) -> None:
     InputError
         When ``config.lifter`` is no lifter.
     """
+    import_libraries()
+    Lifter.load(config.lifter or None)
+
+
+def import_libraries() -> None:
+    """Import what takes long and is not needed by those who only name the method."""
     import scipy.linalg.lapack
     import scipy.ndimage  # noqa: F401
-
-    Lifter.load(config.lifter or None)
 
 
 @dataclass(frozen=True)

@@ -114,9 +114,9 @@ def test_the_bridge_refuses_to_fly_and_says_why():
 
 
 def test_nodes_step_back_behind_the_estimator_in_the_session_of_their_command_out_of_reach_of_its_terminal():
-    with bringup(short_flight(), ["capture_simulator", "bundle_adjuster"], processes=True) as graph:
+    with bringup(short_flight(), CAPTURE, processes=True) as graph:
         adjuster, simulator = graph.pid("bundle_adjuster"), graph.pid("capture_simulator")
-        # Only when they are ready, and then one thread after the other.
+        # Only when they have something to show, and then one thread after the other.
         graph.wait_until(lambda: os.sched_getscheduler(adjuster) == os.SCHED_IDLE, 20, "the adjuster's priority")
         threads = [int(path.name) for path in Path(f"/proc/{adjuster}/task").iterdir()]
         assert min(os.getpriority(os.PRIO_PROCESS, thread) for thread in threads) == 15

@@ -77,6 +77,16 @@ def test_without_respawn_there_is_none():
         assert not spares()
 
 
+def test_it_has_imported_what_the_first_results_of_its_nodes_need(tmp_path):
+    spare = Spare(Place(["bundle_adjuster"], "/drocap", 101, tmp_path))
+    maps, end = Path(f"/proc/{spare.process.pid}/maps"), time.monotonic() + 20
+    while "_flapack" not in maps.read_text() and time.monotonic() < end:
+        time.sleep(0.1)
+    assert "_flapack" in maps.read_text()
+    spare.dismiss()
+    spare.wait()
+
+
 def test_it_ends_with_its_graph_and_refuses_what_its_node_refuses(tmp_path):
     place = Place(["bundle_adjuster"], "/drocap", 101, tmp_path)
     spare = Spare(place)
