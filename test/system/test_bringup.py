@@ -113,6 +113,12 @@ def test_the_bridge_refuses_to_fly_and_says_why():
     assert {m.state for m in got["orbit/status"]} == {OrbitStatus.IDLE}
 
 
+def test_an_adjuster_without_a_solution_yet_does_not_step_back():
+    with bringup(short_flight(), ["bundle_adjuster"], processes=True) as graph:
+        graph.spin_for(2.0)
+        assert os.sched_getscheduler(graph.pid("bundle_adjuster")) == os.SCHED_OTHER
+
+
 def test_nodes_step_back_behind_the_estimator_in_the_session_of_their_command_out_of_reach_of_its_terminal():
     with bringup(short_flight(), CAPTURE, processes=True) as graph:
         adjuster, simulator = graph.pid("bundle_adjuster"), graph.pid("capture_simulator")
