@@ -12,7 +12,7 @@ from pathlib import Path
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
 
-from drocap_ros.simulation.flight_faults import (  # noqa: E402
+from drocap_ros.simulation.closed_loop.faults import (  # noqa: E402
     EXCURSION_M,
     FAULTS,
     MOTION_S,

@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
 
-from drocap_ros.flight.orbit_controller import OperatorCommand  # noqa: E402
-from drocap_ros.flight.safety import Action, State  # noqa: E402
-from drocap_ros.simulation.orbit_loop import EPOCH_NS, LoopSettings, OrbitLoop, with_config  # noqa: E402
+from drocap_ros.flight.orbit.controller import OperatorCommand  # noqa: E402
+from drocap_ros.flight.orbit.safety import Action, State  # noqa: E402
+from drocap_ros.simulation.closed_loop.orbit_loop import EPOCH_NS, LoopSettings, OrbitLoop, with_config  # noqa: E402
 
 _ODD = [float("nan"), float("inf"), -float("inf"), 0.0, -0.0, -1e30, 1e30, 5.0, 1e-300, 3.4e38]
 _BAD_RADIUS = [0.0, -5.0, 1e30, float("inf"), -float("inf"), 3.49, 100.1]

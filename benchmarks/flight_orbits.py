@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.config import MavlinkBridgeConfig
-from drocap_ros.flight.safety import Command, State
-from drocap_ros.simulation.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.orbit.safety import Command, State
+from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
 
 SECONDS = 24.0
 SETTLE_S = 4.0

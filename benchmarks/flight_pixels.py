@@ -11,13 +11,13 @@ import time
 
 import numpy as np
 
-from drocap_ros.cli.demo_operator import Operator
-from drocap_ros.flight.safety import State
-from drocap_ros.perception.config import PoseEstimatorConfig
+from drocap_ros.cli.demo.operator import Operator
+from drocap_ros.flight.orbit.safety import State
 from drocap_ros.perception.estimator import PoseEstimator
-from drocap_ros.perception.models import models_folder
-from drocap_ros.simulation.flight_pixels import PixelOrbitLoop
-from drocap_ros.simulation.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
+from drocap_ros.perception.load_models import models_folder
+from drocap_ros.perception.perception_config import PoseEstimatorConfig
+from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
+from drocap_ros.simulation.closed_loop.pixel_loop import PixelOrbitLoop
 
 _RADIUS_M, _SETTLED_S = 6.0, 13.0
 

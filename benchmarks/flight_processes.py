@@ -29,16 +29,16 @@ sys.path[:0] = [str(ROOT)]
 from drocap_ros.config import DrocapConfig  # noqa: E402
 from drocap_ros.errors import NodeError  # noqa: E402
 from drocap_ros.flight.frames import camera_rotation  # noqa: E402
-from drocap_ros.flight.safety import Command, State  # noqa: E402
-from drocap_ros.flight.transport import open_transport  # noqa: E402
-from drocap_ros.perception.observation import PoseObservation  # noqa: E402
+from drocap_ros.flight.mavlink.transport import open_transport  # noqa: E402
+from drocap_ros.flight.orbit.safety import Command, State  # noqa: E402
+from drocap_ros.observation import PoseObservation  # noqa: E402
 from drocap_ros.simulation.camera import pinhole_matrix, project  # noqa: E402
-from drocap_ros.simulation.copter import SimulatedCopter  # noqa: E402
-from drocap_ros.simulation.flight_faults import EXCURSION_M, MOTION_S, TIMEOUT, Bounds  # noqa: E402
+from drocap_ros.simulation.closed_loop.faults import EXCURSION_M, MOTION_S, TIMEOUT, Bounds  # noqa: E402
+from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings  # noqa: E402
 from drocap_ros.simulation.observation import observe_keypoints  # noqa: E402
-from drocap_ros.simulation.orbit_loop import LoopSettings  # noqa: E402
 from drocap_ros.simulation.person import simulate_person  # noqa: E402
-from drocap_ros.simulation.ports import free_udp_port  # noqa: E402
+from drocap_ros.simulation.vehicle.copter import SimulatedCopter  # noqa: E402
+from drocap_ros.simulation.vehicle.ports import free_udp_port  # noqa: E402
 
 RATE_HZ, WIDTH, HEIGHT, FIELD_DEG = 15.0, 1280, 720, 60.0
 CONTROL = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}
@@ -54,8 +54,8 @@ def perceive(port: int) -> None:
     from rclpy.executors import ExternalShutdownException
     from sensor_msgs.msg import CameraInfo
 
-    from drocap_ros.nodes.conversions import pose2d_to_ros
-    from drocap_ros.nodes.topics import TOPICS
+    from drocap_ros.ros.conversions import pose2d_to_ros
+    from drocap_ros.ros.topics import TOPICS
 
     rclpy.init(args=[])
     node = rclpy.create_node("perception_stand_in", namespace="/drocap")
@@ -129,7 +129,7 @@ class Scene:
 
     def __init__(self, graph: Any, drone: Drone, perception: subprocess.Popen[bytes], config: DrocapConfig) -> None:
         from drocap_ros.msg import OrbitCommand, OrbitStatus
-        from drocap_ros.nodes.topics import TOPICS
+        from drocap_ros.ros.topics import TOPICS
 
         self.graph, self.drone, self.perception, self.config = graph, drone, perception, config
         self.bridge = graph.pid("mavlink_bridge")

@@ -100,7 +100,13 @@ def graph_config(video: Path, session: Path, port: int, threads: int = 2, pose_m
 @contextlib.contextmanager
 def vehicle(port: int) -> Iterator[None]:
     """A simulated autopilot for the bridge, in a process of its own."""
-    command = [sys.executable, "-m", "drocap_ros.simulation.vehicle", "--url", f"udpout:127.0.0.1:{port}"]
+    command = [
+        sys.executable,
+        "-m",
+        "drocap_ros.simulation.vehicle.mavlink_vehicle",
+        "--url",
+        f"udpout:127.0.0.1:{port}",
+    ]
     process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(ROOT)})
     try:
         yield
@@ -148,7 +154,7 @@ def measure_load(
     video: Path, session: Path, processes: bool, adjuster: bool, args: argparse.Namespace
 ) -> dict[str, Any]:
     from drocap_ros.bringup import bringup
-    from drocap_ros.simulation.ports import free_udp_port
+    from drocap_ros.simulation.vehicle.ports import free_udp_port
 
     nodes = [name for name in NODES if adjuster or name != "bundle_adjuster"]
     port = free_udp_port()
@@ -191,7 +197,7 @@ def session_figures(session: Path, begin_ns: int, end_ns: int) -> dict[str, Any]
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
-    from drocap_ros.reconstruction.effort import Effort
+    from drocap_ros.reconstruction.live.effort import Effort
 
     stamps: dict[str, list[int]] = {}
     late_ms: dict[str, list[float]] = {}
@@ -258,7 +264,7 @@ def session_figures(session: Path, begin_ns: int, end_ns: int) -> dict[str, Any]
 def part_memory(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Resident memory of each process of the whole graph, looked at every 5 s."""
     from drocap_ros.bringup import bringup
-    from drocap_ros.simulation.ports import free_udp_port
+    from drocap_ros.simulation.vehicle.ports import free_udp_port
 
     video, session, port = stream(folder), folder / "session", free_udp_port()
     # A file a minute, of which the old ones go: half an hour would fill a disk.
@@ -309,9 +315,9 @@ SIGNS = {
 def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Every node killed while all others run, once in every round; bringup starts it again."""
     from drocap_ros.bringup import bringup
-    from drocap_ros.nodes.topics import TOPICS
     from drocap_ros.recording.session import open_session
-    from drocap_ros.simulation.ports import free_udp_port
+    from drocap_ros.ros.topics import TOPICS
+    from drocap_ros.simulation.vehicle.ports import free_udp_port
 
     video, session, port = stream(folder, seamless=True), folder / "session", free_udp_port()
     results: dict[str, Any] = {"load average before": round(os.getloadavg()[0], 2)}

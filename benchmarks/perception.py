@@ -20,16 +20,16 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from drocap_ros.perception.config import PoseEstimatorConfig
 from drocap_ros.perception.detection import Detector
 from drocap_ros.perception.estimator import PoseEstimator
-from drocap_ros.perception.model_spec import read_spec
-from drocap_ros.perception.models import load_detector, load_pose_model
+from drocap_ros.perception.load_models import load_detector, load_pose_model
+from drocap_ros.perception.models.runtime import OnnxModel
+from drocap_ros.perception.models.spec import read_spec
+from drocap_ros.perception.perception_config import PoseEstimatorConfig
 from drocap_ros.perception.pose import Keypoints, PoseModel
-from drocap_ros.perception.runtime import OnnxModel
 from drocap_ros.perception.sources import open_source
 from drocap_ros.perception.sources.pictures import read_picture
-from drocap_ros.perception.tracking_run import observe, subjects
+from drocap_ros.perception.track_video import observe, subjects
 from drocap_ros.perception.uncertainty import CALIBRATIONS, Calibration, calibrate
 from drocap_ros.skeleton import COCO_17
 

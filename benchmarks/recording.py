@@ -140,9 +140,9 @@ def make_sources(node: Any) -> list[tuple[Any, Any, float, str]]:
 
     from drocap_ros.msg import VehicleState
     from drocap_ros.nodes.capture_simulator import observation_of
-    from drocap_ros.nodes.conversions import header_at, pose2d_to_ros
-    from drocap_ros.nodes.topics import TOPICS
-    from drocap_ros.perception.images import encode_jpeg
+    from drocap_ros.perception.jpeg import encode_jpeg
+    from drocap_ros.ros.conversions import header_at, pose2d_to_ros
+    from drocap_ros.ros.topics import TOPICS
     from drocap_ros.simulation.capture import simulate_capture
 
     tracks = simulate_capture(2.0, 30.0, 0).tracks
@@ -273,8 +273,8 @@ def use(kind: str, path: Path) -> tuple[int, str]:
     from drocap_ros.config import DrocapConfig
     from drocap_ros.errors import InputError
     from drocap_ros.pipeline import read_input
-    from drocap_ros.recording.camera_telemetry import camera_poses
-    from drocap_ros.recording.telemetry import read_telemetry
+    from drocap_ros.recording.telemetry.camera_poses import camera_poses
+    from drocap_ros.recording.telemetry.read import read_telemetry
 
     said, out = io.StringIO(), io.StringIO()
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(out):
@@ -300,7 +300,7 @@ def whole_file(kind: str, folder: Path) -> bytes:
     from recorded import START_NS, Messages, write_poses
     from test_telemetry import new_form, srt_text
 
-    from drocap_ros.recording.config import SessionRecorderConfig
+    from drocap_ros.recording.recording_config import SessionRecorderConfig
     from drocap_ros.simulation.capture import simulate_capture
     from drocap_ros.tracks import save_tracks
 
@@ -344,10 +344,10 @@ def cell_write_long(minutes: str, folder: str) -> dict[str, Any]:
     import numpy as np
     from recorded import NAMES, START_NS, Messages
 
-    from drocap_ros.recording.schemas import schema_text
-    from drocap_ros.recording.session_writer import SessionWriter
+    from drocap_ros.recording.mcap.schemas import schema_text
+    from drocap_ros.recording.mcap.writer import SessionWriter
     from drocap_ros.simulation.capture import simulate_capture
-    from drocap_ros.simulation.flight_path import SampledPath
+    from drocap_ros.simulation.vehicle.path import SampledPath
 
     messages, capture = Messages(), simulate_capture(60.0, 30.0, seed=5, start_ns=START_NS)
     tracks = capture.tracks
@@ -401,7 +401,7 @@ def cell_long(what: str, folder: str) -> dict[str, Any]:
 def part_live(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     from drocap_ros.bringup import bringup
     from drocap_ros.config import DrocapConfig
-    from drocap_ros.live_session import reconstruct_live, recorded_config
+    from drocap_ros.live_replay import reconstruct_live, recorded_config
     from drocap_ros.recording.session import open_session
 
     config = DrocapConfig().replace("capture_simulator", seconds=args.flight)

@@ -34,9 +34,9 @@ from std_msgs.msg import Empty, String
 
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import DrocapError, InputError, NodeError
-from drocap_ros.nodes.component import HARDWARE_ID, ComponentNode
-from drocap_ros.nodes.middleware import PROFILE_FILE, PROFILE_VARIABLE
-from drocap_ros.nodes.processes import (
+from drocap_ros.ros.component import HARDWARE_ID, ComponentNode
+from drocap_ros.ros.fastdds import PROFILE_FILE, PROFILE_VARIABLE
+from drocap_ros.ros.processes import (
     DEFAULT_NAMESPACE,
     STOP_TIMEOUT_S,
     NodeProcess,
@@ -46,8 +46,8 @@ from drocap_ros.nodes.processes import (
     node_class,
     remaps,
 )
-from drocap_ros.nodes.run import spin, step_back
-from drocap_ros.nodes.topics import GRAPH_QOS, NODES, TOPICS
+from drocap_ros.ros.spin import spin, step_back
+from drocap_ros.ros.topics import GRAPH_QOS, NODES, TOPICS
 
 #: In one process all nodes share Python's lock.  At its usual 5 ms the pose would wait that long for the adjuster after
 #: each call that lets the lock go, several times per picture.

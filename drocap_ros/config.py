@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from drocap_ros.errors import InputError, ParameterError
-from drocap_ros.flight.config import MavlinkBridgeConfig
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.parameters import Parameters
-from drocap_ros.perception.config import ImageIngestConfig, PoseEstimatorConfig
-from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.recording.config import SessionPlayerConfig, SessionRecorderConfig
-from drocap_ros.report.config import VisualizerConfig
-from drocap_ros.simulation.config import SimulationConfig
-from drocap_ros.simulation.flight_config import FlightSimulatorConfig
+from drocap_ros.perception.perception_config import ImageIngestConfig, PoseEstimatorConfig
+from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.recording.recording_config import SessionPlayerConfig, SessionRecorderConfig
+from drocap_ros.report.visualizer_config import VisualizerConfig
+from drocap_ros.simulation.capture_config import SimulationConfig
+from drocap_ros.simulation.flight.flight_simulator_config import FlightSimulatorConfig
 
 
 @dataclass(frozen=True)

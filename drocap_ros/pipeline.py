@@ -12,17 +12,17 @@ from pathlib import Path
 
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
-from drocap_ros.live_session import reconstruct_live, recorded_config
+from drocap_ros.live_replay import reconstruct_live, recorded_config
 from drocap_ros.motion import Motion
 from drocap_ros.perception.estimator import PoseEstimator
-from drocap_ros.perception.models import models_folder
+from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.sources import Frame, open_source
-from drocap_ros.perception.tracking_run import observe, tracks_from_observations
+from drocap_ros.perception.track_video import observe, tracks_from_observations
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording import session_reader
 from drocap_ros.recording.session import is_recording, open_session
-from drocap_ros.recording.telemetry import TelemetryLog, read_telemetry
-from drocap_ros.recording.video_time import find_offset
+from drocap_ros.recording.telemetry.read import TelemetryLog, read_telemetry
+from drocap_ros.recording.telemetry.time_offset import find_offset
 from drocap_ros.tracks import Tracks, load_tracks
 
 logger = logging.getLogger(__name__)

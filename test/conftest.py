@@ -8,13 +8,17 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
+#: Fixtures that several rooms' tests share; ``pythonpath`` in pyproject.toml names their folder.
+pytest_plugins = ["fixtures_export", "fixtures_recording", "fixtures_reconstruction", "fixtures_report"]
+
 #: Where nodes run, ports are listened to or time is measured, and what of it only computes.
 CLOCKED = (
-    "nodes", "system", "flight/test_link.py", "flight/test_signing.py", "flight/test_gimbal.py",
-    "perception/test_live_sources.py", "perception/test_models_fetch.py", "recording/test_bounded_queue.py",
-    "recording/test_live_graph.py", "recording/test_recover.py", "recording/test_session_writer.py",
+    "nodes", "ros", "system", "view", "cli/test_live_cli.py", "flight/mavlink/test_link.py",
+    "flight/mavlink/test_signing.py", "flight/mavlink/test_gimbal.py", "perception/test_live_sources.py",
+    "perception/models/test_models_fetch.py", "recording/mcap/test_bounded_queue.py",
+    "recording/test_live_graph.py", "recording/mcap/test_recover.py", "recording/mcap/test_session_writer.py",
 )  # fmt: skip
-COMPUTING = ("system/test_packaging.py", "system/test_reconstruct_cli.py")
+COMPUTING = ("system/test_packaging.py",)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -32,7 +32,7 @@ def test_every_topic_of_the_graph_is_in_the_readme(root):
 
     pytest.importorskip("drocap_ros.msg", reason="the messages are not built: `make setup` builds them")
     pytest.importorskip("rclpy", reason="no ROS here")
-    from drocap_ros.nodes.topics import TOPICS
+    from drocap_ros.ros.topics import TOPICS
 
     text = (root / "README.md").read_text()
     for topic in TOPICS:

@@ -13,10 +13,11 @@ from collections.abc import Sequence
 from drocap_ros import __version__
 from drocap_ros.errors import DrocapError
 
+#: Modules under ``drocap_ros.cli``, in the order of ``drocap --help``.
 COMMANDS = (
-    "demo", "live", "view", "orbit", "record", "replay", "track", "reconstruct", "learn_dictionary",
-    "export", "report", "info", "recover", "top", "models", "evaluate", "train_lifter",
-    "train_simulation_models",
+    "demo.command", "graph.live", "graph.view", "graph.orbit", "graph.record", "graph.replay", "track", "reconstruct",
+    "models.learn_dictionary", "export", "report", "info", "recover", "graph.top", "models.command", "evaluate",
+    "models.train_lifter", "models.train_simulation_models",
 )  # fmt: skip
 
 

@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
 def _pair(args: argparse.Namespace) -> int:
     from drocap_ros.cli.output import check_output_folder, output_folder
     from drocap_ros.evaluation import tables
-    from drocap_ros.evaluation.pair import compare, load_truth
+    from drocap_ros.evaluation.compare import compare, load_truth
     from drocap_ros.motion import load_motion
 
     if args.out is not None:

@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     import sys
 
     from drocap_ros.cli.progress import progress_bars
-    from drocap_ros.recording.recover import recover_session
+    from drocap_ros.recording.mcap.recover import recover_session
 
     with progress_bars(args.quiet) as progress:
         files = recover_session(args.session, progress)

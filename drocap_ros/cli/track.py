@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from drocap_ros.perception.config import PoseEstimatorConfig
-    from drocap_ros.perception.observation import PoseObservation
+    from drocap_ros.observation import PoseObservation
+    from drocap_ros.perception.perception_config import PoseEstimatorConfig
     from drocap_ros.perception.sources import Frame
 
 SUBJECTS = ("largest", "centre")
@@ -52,9 +52,9 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.cli.output import check_output_folder, output_folder
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.perception.estimator import PoseEstimator
-    from drocap_ros.perception.models import models_folder
+    from drocap_ros.perception.load_models import models_folder
     from drocap_ros.perception.sources import open_source
-    from drocap_ros.perception.tracking_run import observe, subjects, tracks_from_observations
+    from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
     from drocap_ros.tracks import save_tracks
 
     check_output_folder(args.out)

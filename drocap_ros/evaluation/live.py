@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.observation import PoseObservation
-from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.latest_pose import LatestPose, bone_lengths
-from drocap_ros.reconstruction.live_method import LivePose, LiveWindow, live_poses
+from drocap_ros.evaluation.protocol import OrbitView, Sequence, orbit_view, protocol_sequences
+from drocap_ros.observation import PoseObservation
+from drocap_ros.reconstruction.live.latest_pose import LatestPose, bone_lengths
+from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
 from drocap_ros.reconstruction.metrics import limb_lengths, pa_mpjpe
-from drocap_ros.reconstruction.protocol import OrbitView, Sequence, orbit_view, protocol_sequences
 from drocap_ros.reconstruction.reconstruct import reconstruct
+from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 
 #: Age at which a refined pose is judged.
 REFINED_AFTER_S = 2.0

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.evaluation.protocol import Sequence, orbit_view, protocol_sequences
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.metrics import (
     JOINT_GROUPS,
@@ -18,7 +19,6 @@ from drocap_ros.reconstruction.metrics import (
     mirrored_frames,
     pa_mpjpe,
 )
-from drocap_ros.reconstruction.protocol import Sequence, orbit_view, protocol_sequences
 from drocap_ros.reconstruction.reconstruct import reconstruct
 
 SPEEDS_DEG_S = (0.0, 10.0, 25.0, 50.0)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drocap_ros.evaluation.pair import PairErrors
+from drocap_ros.evaluation.compare import PairErrors
 from drocap_ros.evaluation.rotation import StudyRow, as_records
 from drocap_ros.reconstruction.metrics import JOINT_GROUPS
 

@@ -15,8 +15,16 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.msg import Pose2D, Pose3D, Pose3DWindow, VehicleState
-from drocap_ros.nodes.component import ERROR, OK, ComponentNode
-from drocap_ros.nodes.conversions import (
+from drocap_ros.observation import PoseObservation
+from drocap_ros.reconstruction.lifted import method as default_method
+from drocap_ros.reconstruction.live.adjuster import SOLVER_ERRORS, WindowAdjuster
+from drocap_ros.reconstruction.live.effort import Effort, EffortControl
+from drocap_ros.reconstruction.live.frame_buffer import AdjustmentWindow, WindowArrays
+from drocap_ros.reconstruction.live.initializer import AdjustedWindow
+from drocap_ros.reconstruction.live.latest_pose import LatestPose, bone_lengths
+from drocap_ros.reconstruction.live.stream_order import Arrival
+from drocap_ros.ros.component import ERROR, OK, ComponentNode
+from drocap_ros.ros.conversions import (
     floats,
     header_at,
     pose2d_from_ros,
@@ -24,15 +32,7 @@ from drocap_ros.nodes.conversions import (
     pose3d_to_ros,
     stamp_from_ros,
 )
-from drocap_ros.nodes.run import node_main
-from drocap_ros.perception.observation import PoseObservation
-from drocap_ros.reconstruction import default_method
-from drocap_ros.reconstruction.adjustment_window import AdjustmentWindow, WindowArrays
-from drocap_ros.reconstruction.effort import Effort, EffortControl
-from drocap_ros.reconstruction.latest_pose import LatestPose, bone_lengths
-from drocap_ros.reconstruction.stream_order import Arrival
-from drocap_ros.reconstruction.window import AdjustedWindow
-from drocap_ros.reconstruction.window_adjuster import SOLVER_ERRORS, WindowAdjuster
+from drocap_ros.ros.spin import node_main
 from drocap_ros.skeleton import BODY_15
 
 

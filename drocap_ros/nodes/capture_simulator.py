@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from sensor_msgs.msg import CameraInfo
 
-from drocap_ros.nodes.component import OK, ComponentNode
-from drocap_ros.nodes.conversions import header_at, pose2d_to_ros
-from drocap_ros.nodes.run import node_main
-from drocap_ros.perception.observation import PoseObservation
+from drocap_ros.observation import PoseObservation
+from drocap_ros.ros.component import OK, ComponentNode
+from drocap_ros.ros.conversions import header_at, pose2d_to_ros
+from drocap_ros.ros.spin import node_main
 from drocap_ros.simulation.capture import SimulatedCapture, simulate_capture
-from drocap_ros.simulation.flight_path import SampledPath
-from drocap_ros.simulation.vehicle import SimulatedVehicle
+from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle
+from drocap_ros.simulation.vehicle.path import SampledPath
 from drocap_ros.tracks import Tracks
 
 #: The drone hovers this long before the first picture: links come up and clocks get in step.

@@ -13,15 +13,15 @@ import time
 from pathlib import Path
 from typing import Any
 
-from drocap_ros.flight.transport import open_transport
-from drocap_ros.nodes.component import OK, WARN, ComponentNode
-from drocap_ros.nodes.conversions import camera_info_to_ros, header_at
-from drocap_ros.nodes.picture_channel import PictureOutput
-from drocap_ros.nodes.run import node_main
+from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.perception.calibration import CameraModel
-from drocap_ros.simulation.flight_truth import save_truth
-from drocap_ros.simulation.flight_world import Exposure, FlightWorld
-from drocap_ros.simulation.render import Renderer
+from drocap_ros.ros.component import OK, WARN, ComponentNode
+from drocap_ros.ros.conversions import camera_info_to_ros, header_at
+from drocap_ros.ros.image_transport import PictureOutput
+from drocap_ros.ros.spin import node_main
+from drocap_ros.simulation.flight.truth import save_truth
+from drocap_ros.simulation.flight.world import Exposure, FlightWorld
+from drocap_ros.simulation.render.renderer import Renderer
 
 FRAME_ID = "camera_optical"
 _STEP_S = 0.005

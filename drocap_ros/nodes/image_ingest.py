@@ -20,17 +20,17 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
 from drocap_ros.errors import DrocapError, InputError
-from drocap_ros.nodes.component import ERROR, OK, WARN
-from drocap_ros.nodes.conversions import camera_info_to_ros, header_at, stamp_from_ros
-from drocap_ros.nodes.managed import ManagedComponent
-from drocap_ros.nodes.picture_channel import PictureOutput
-from drocap_ros.nodes.run import node_main
-from drocap_ros.nodes.stamps import StampGate
-from drocap_ros.nodes.topics import TOPIC_SOURCE
 from drocap_ros.perception.calibration import CameraModel, camera_model
 from drocap_ros.perception.sources import Frame, ImageSource, open_source
 from drocap_ros.perception.sources.prefetch import prefetch
 from drocap_ros.recording.pictures import image_from_message
+from drocap_ros.ros.component import ERROR, OK, WARN
+from drocap_ros.ros.conversions import camera_info_to_ros, header_at, stamp_from_ros
+from drocap_ros.ros.image_transport import PictureOutput
+from drocap_ros.ros.lifecycle import ManagedComponent
+from drocap_ros.ros.spin import node_main
+from drocap_ros.ros.stamps import StampGate
+from drocap_ros.ros.topics import TOPIC_SOURCE
 
 #: A picture of a file that is this late when it has been read is not published any more.
 _LATE_S = 0.1

@@ -2,7 +2,7 @@
 
 Subscribes ``pose2d``; publishes ``pose3d/initial`` (drocap_ros/Pose3D, stage INITIAL) in the camera's frame.
 Duplicate, late and stray stamps are dropped and counted with their reason; a jump of time, a gap and another subject
-are counted too (:mod:`drocap_ros.reconstruction.stream_order`).
+are counted too (:mod:`drocap_ros.reconstruction.live.stream_order`).
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.msg import Pose2D, Pose3D
-from drocap_ros.nodes.component import OK, WARN, ComponentNode
-from drocap_ros.nodes.conversions import pose2d_from_ros, pose3d_to_ros
-from drocap_ros.nodes.run import node_main
-from drocap_ros.reconstruction.stream_order import Arrival
-from drocap_ros.reconstruction.window import SlidingWindowInitializer
+from drocap_ros.reconstruction.live.initializer import SlidingWindowInitializer
+from drocap_ros.reconstruction.live.stream_order import Arrival
+from drocap_ros.ros.component import OK, WARN, ComponentNode
+from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_to_ros
+from drocap_ros.ros.spin import node_main
 from drocap_ros.skeleton import BODY_15
 
 

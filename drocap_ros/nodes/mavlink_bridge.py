@@ -19,22 +19,22 @@ from geometry_msgs.msg import Point, TransformStamped, Vector3
 from sensor_msgs.msg import CameraInfo
 
 from drocap_ros.flight.frames import optical_orientation
-from drocap_ros.flight.link import MavlinkLink
-from drocap_ros.flight.orbit_controller import ControlStatus, OperatorCommand, OrbitController
-from drocap_ros.flight.safety import State
+from drocap_ros.flight.mavlink.link import MavlinkLink
+from drocap_ros.flight.orbit.controller import ControlStatus, OperatorCommand, OrbitController
+from drocap_ros.flight.orbit.safety import State
+from drocap_ros.flight.orbit.watchdog import Watchdog
 from drocap_ros.flight.vehicle_state import VehicleState
-from drocap_ros.flight.watchdog import Watchdog
 from drocap_ros.msg import OrbitCommand, OrbitStatus, Pose2D
-from drocap_ros.nodes.component import ERROR, OK, WARN, ComponentNode
-from drocap_ros.nodes.conversions import (
+from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
+from drocap_ros.ros.conversions import (
     header_at,
     pose2d_from_ros,
     quaternion_to_ros,
     stamp_from_ros,
     vehicle_state_to_ros,
 )
-from drocap_ros.nodes.run import node_main
-from drocap_ros.nodes.topics import TFMessage
+from drocap_ros.ros.spin import node_main
+from drocap_ros.ros.topics import TFMessage
 
 _STATUS_PERIOD_S = 0.2
 

@@ -15,17 +15,17 @@ import numpy as np
 from sensor_msgs.msg import RegionOfInterest
 from std_msgs.msg import Header
 
-from drocap_ros.nodes.component import OK, WARN
-from drocap_ros.nodes.conversions import pose2d_to_ros, stamp_from_ros
-from drocap_ros.nodes.hurry import Hurry
-from drocap_ros.nodes.latency import SUBJECT
-from drocap_ros.nodes.managed import ManagedComponent
-from drocap_ros.nodes.picture_channel import PictureInput
-from drocap_ros.nodes.run import node_main
-from drocap_ros.nodes.topics import TOPICS
 from drocap_ros.perception.estimator import PoseEstimator
-from drocap_ros.perception.models import models_folder
+from drocap_ros.perception.load_models import models_folder
+from drocap_ros.perception.load_shedding import Hurry
 from drocap_ros.recording.pictures import image_from_message
+from drocap_ros.ros.component import OK, WARN
+from drocap_ros.ros.conversions import pose2d_to_ros, stamp_from_ros
+from drocap_ros.ros.image_transport import PictureInput
+from drocap_ros.ros.latency import SUBJECT
+from drocap_ros.ros.lifecycle import ManagedComponent
+from drocap_ros.ros.spin import node_main
+from drocap_ros.ros.topics import TOPICS
 
 
 class PoseEstimatorNode(ManagedComponent):

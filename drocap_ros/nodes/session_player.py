@@ -16,11 +16,11 @@ from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 
 from drocap_ros.errors import DrocapError, InputError
-from drocap_ros.nodes.component import ERROR, OK, ComponentNode
-from drocap_ros.nodes.conversions import stamp_to_ros
-from drocap_ros.nodes.run import node_main
-from drocap_ros.nodes.topics import IMAGE_RECORDING_QOS, RESULT_QOS, TOPICS
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, RawMessage, Session, TopicInfo, open_session
+from drocap_ros.ros.component import ERROR, OK, ComponentNode
+from drocap_ros.ros.conversions import stamp_to_ros
+from drocap_ros.ros.spin import node_main
+from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, RESULT_QOS, TOPICS
 
 #: Topics that this graph publishes itself; those of the recording only when they are named.
 _OWN = ("/diagnostics", "/clock")

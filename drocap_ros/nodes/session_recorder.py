@@ -19,12 +19,9 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
 
-from drocap_ros.nodes.component import ERROR, HARDWARE_ID, OK, WARN, Gaps
-from drocap_ros.nodes.managed import ManagedComponent
-from drocap_ros.nodes.parameter_survey import ParameterSurvey
-from drocap_ros.nodes.run import node_main
-from drocap_ros.nodes.topics import IMAGE_RECORDING_QOS, TOPICS
-from drocap_ros.perception.models import models_folder
+from drocap_ros.perception.load_models import models_folder
+from drocap_ros.recording.mcap.schemas import schema_text
+from drocap_ros.recording.mcap.writer import SessionWriter
 from drocap_ros.recording.provenance import (
     CALIBRATION,
     CONFIGURATION,
@@ -34,8 +31,11 @@ from drocap_ros.recording.provenance import (
     model_hashes,
     session_provenance,
 )
-from drocap_ros.recording.schemas import schema_text
-from drocap_ros.recording.session_writer import SessionWriter
+from drocap_ros.ros.component import ERROR, HARDWARE_ID, OK, WARN, Gaps
+from drocap_ros.ros.lifecycle import ManagedComponent
+from drocap_ros.ros.parameter_survey import ParameterSurvey
+from drocap_ros.ros.spin import node_main
+from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, TOPICS
 
 _IMAGES = "image/compressed"
 

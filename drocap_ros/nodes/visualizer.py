@@ -3,7 +3,7 @@
 Subscribes ``pose2d``, ``pose3d/initial``, ``pose3d/latest`` and ``vehicle/state``; publishes ``markers/keypoints``
 (visualization_msgs/ImageMarker), ``markers/initial``, ``markers/latest`` and ``markers/camera_path``
 (visualization_msgs/MarkerArray) and the joints of the newest pose on TF.  With ``human_topics`` it also tells of the
-subject as REP 155 does, see :mod:`drocap_ros.nodes.humans`.
+subject as REP 155 does, see :mod:`drocap_ros.ros.rep155`.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from geometry_msgs.msg import TransformStamped
 from visualization_msgs.msg import MarkerArray
 
 from drocap_ros.msg import Pose2D, Pose3D, VehicleState
-from drocap_ros.nodes.component import OK, WARN, ComponentNode
-from drocap_ros.nodes.conversions import pose3d_from_ros, stamp_from_ros
-from drocap_ros.nodes.humans import MISSING, HumanTopics, hri, human_transforms
-from drocap_ros.nodes.markers import body_transforms, keypoint_marker, path_marker, pose_markers
-from drocap_ros.nodes.run import node_main
-from drocap_ros.nodes.topics import TFMessage
+from drocap_ros.ros.component import OK, WARN, ComponentNode
+from drocap_ros.ros.conversions import pose3d_from_ros, stamp_from_ros
+from drocap_ros.ros.markers import body_transforms, keypoint_marker, path_marker, pose_markers
+from drocap_ros.ros.rep155 import MISSING, HumanTopics, hri, human_transforms
+from drocap_ros.ros.spin import node_main
+from drocap_ros.ros.topics import TFMessage
 from drocap_ros.view.pace import Pace
 
 #: A pose that nobody renews disappears: initial poses come with each picture, refined ones about once a second.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.config import ImageIngestConfig
+from drocap_ros.perception.perception_config import ImageIngestConfig
 
 
 @dataclass(frozen=True)

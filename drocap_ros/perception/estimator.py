@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.config import PoseEstimatorConfig
+from drocap_ros.joint_maps import joint_map
+from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import suppress, whole
 from drocap_ros.perception.flow import KeypointFlow
-from drocap_ros.perception.joint_maps import joint_map
-from drocap_ros.perception.models import limited_use, load_detector, load_pose_model
-from drocap_ros.perception.observation import PoseObservation
+from drocap_ros.perception.load_models import limited_use, load_detector, load_pose_model
+from drocap_ros.perception.perception_config import PoseEstimatorConfig
 from drocap_ros.perception.pose import Keypoints
 from drocap_ros.perception.tracking import Subject, SubjectTracker
 from drocap_ros.perception.tracking.search import Window, inside

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.detection.letterbox import shrink
-from drocap_ros.perception.observation import PoseObservation
 
 #: The box's longer side is brought to this many px, no smaller picture is enlarged.
 _SIDE_PX = 192

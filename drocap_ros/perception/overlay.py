@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.perception.observation import PoseObservation
+from drocap_ros.observation import PoseObservation
 from drocap_ros.skeleton import BODY_15
 
 _LEFT, _RIGHT, _MIDDLE = (60, 60, 255), (255, 160, 40), (90, 220, 90)

@@ -8,15 +8,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drocap_ros.reconstruction.bundle_adjustment import bundle_adjust
-from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.data_term import Projection, frames_last, information_from
-from drocap_ros.reconstruction.default_method import default_config, default_poses
-from drocap_ros.reconstruction.dictionary import Dictionary
-from drocap_ros.reconstruction.factorization import factorize
-from drocap_ros.reconstruction.normalize import MIN_JOINTS, NormalizedTracks, normalize_tracks
-from drocap_ros.reconstruction.single_view import initialize
-from drocap_ros.reconstruction.window import MIN_WINDOW, fill_frames
+from drocap_ros.reconstruction.lifted.method import default_config, default_poses
+from drocap_ros.reconstruction.live.initializer import MIN_WINDOW, fill_frames
+from drocap_ros.reconstruction.paper.bundle_adjustment import bundle_adjust
+from drocap_ros.reconstruction.paper.dictionary import Dictionary
+from drocap_ros.reconstruction.paper.mf_nnm import factorize
+from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS, NormalizedTracks, normalize_tracks
+from drocap_ros.reconstruction.paper.reprojection import Projection, frames_last, information_from
+from drocap_ros.reconstruction.paper.single_view import initialize
+from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.tracks import Tracks
 
 #: "ba" is the best there is, the others are the paper's method and its ablations.
@@ -119,7 +119,7 @@ def _default(
     adjuster: BundleAdjusterConfig,
     progress: Progress | None,
 ) -> CameraPoses:
-    """The default method (:mod:`drocap_ros.reconstruction.default_method`), window by window."""
+    """The default method (:mod:`drocap_ros.reconstruction.lifted.method`), window by window."""
     config = default_config(adjuster)
     seconds = {"initial": 0.0, "ba": 0.0}
     k = tracks.camera_matrix
@@ -144,7 +144,7 @@ def _default(
 
 
 def shown_frames(keypoints: np.ndarray, confidence: np.ndarray | None) -> np.ndarray:
-    """(F,) bool, frames with at least :data:`~drocap_ros.reconstruction.normalize.MIN_JOINTS` joints apart."""
+    """(F,) bool, frames with at least :data:`~drocap_ros.reconstruction.paper.normalize.MIN_JOINTS` joints apart."""
     seen = np.isfinite(keypoints).all(-1)
     if confidence is not None:
         seen &= np.nan_to_num(confidence) > 0.0

@@ -14,13 +14,13 @@ import numpy as np
 from drocap_ros import __version__
 from drocap_ros.errors import InputError
 from drocap_ros.motion import Motion
-from drocap_ros.reconstruction.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.default_method import default_config
-from drocap_ros.reconstruction.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
-from drocap_ros.reconstruction.lifter import Lifter
+from drocap_ros.reconstruction.lifted.lifter import Lifter
+from drocap_ros.reconstruction.lifted.method import default_config
 from drocap_ros.reconstruction.methods import METHODS, CameraPoses, run_method
-from drocap_ros.reconstruction.placement import metres_per_px, place_in_world
+from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
+from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.threads import blas_threads
+from drocap_ros.reconstruction.world.placement import metres_per_px, place_in_world
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
 

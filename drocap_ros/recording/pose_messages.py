@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.observation import PoseObservation
+from drocap_ros.observation import PoseObservation
 from drocap_ros.skeleton import joint_set
 
 if TYPE_CHECKING:

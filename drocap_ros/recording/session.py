@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.bag_metadata import METADATA_FILE
-from drocap_ros.recording.mcap_stream import McapChannel, McapStream
+from drocap_ros.recording.mcap.metadata import METADATA_FILE
+from drocap_ros.recording.mcap.stream import McapChannel, McapStream
 
 POSE2D = "drocap_ros/msg/Pose2D"
 POSE3D = "drocap_ros/msg/Pose3D"
@@ -351,7 +351,7 @@ class RosbagsSession(Session):
         super().__init__(path)
         from rosbags.highlevel import AnyReader
 
-        from drocap_ros.recording.schemas import standard_types
+        from drocap_ros.recording.mcap.schemas import standard_types
 
         try:
             self._reader = AnyReader([path], default_typestore=standard_types())
@@ -407,7 +407,7 @@ def _typestore(channel: McapChannel) -> Any:
     """Types of one channel, from its embedded schema; from the standard ones where it has none."""
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-    from drocap_ros.recording.schemas import standard_types
+    from drocap_ros.recording.mcap.schemas import standard_types
 
     if not channel.schema:
         return standard_types()

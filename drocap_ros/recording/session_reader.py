@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.camera_telemetry import VehicleTrack, camera_poses
 from drocap_ros.recording.pictures import image_from_message
 from drocap_ros.recording.session import (
     CAMERA_INFO,
@@ -25,6 +24,7 @@ from drocap_ros.recording.session import (
     is_recording,
     open_session,
 )
+from drocap_ros.recording.telemetry.camera_poses import VehicleTrack, camera_poses
 from drocap_ros.skeleton import joint_set
 from drocap_ros.tracks import MAX_FRAMES, Tracks
 
@@ -61,7 +61,7 @@ def read_pose2d(session: Session, topic: str | None = None, mount_pitch_deg: flo
     """Tracks of the subject, keypoints exactly as in the recorded messages.
 
     Images without a subject are frames of NaN.  Where the recording tells the camera's pose at every picture (see
-    :func:`drocap_ros.recording.camera_telemetry.camera_poses`), the tracks carry it.  What was missing or left out
+    :func:`camera_poses`), the tracks carry it.  What was missing or left out
     stands in ``session.warnings``.
 
     Parameters
@@ -111,7 +111,7 @@ def with_camera(
     """Tracks with the camera's pose at each picture, and in words what is missing.
 
     Pictures at the start or end for which the vehicle's states tell nothing are left out, if most remain; see
-    :func:`drocap_ros.recording.camera_telemetry.camera_poses`.
+    :func:`drocap_ros.recording.telemetry.camera_poses.camera_poses`.
 
     Parameters
     ----------

@@ -13,10 +13,10 @@ import numpy as np
 
 from drocap_ros.motion import Motion
 from drocap_ros.report import plots
-from drocap_ros.report.findings import Finding, findings
-from drocap_ros.report.measures import Measures, mean_known, measure
+from drocap_ros.report.checks import Finding, findings
 from drocap_ros.report.page_data import page_data, script_json
 from drocap_ros.report.pictures import Pictures, read_pictures
+from drocap_ros.report.statistics import Measures, mean_known, measure
 from drocap_ros.skeleton import side_of
 
 _SCRIPTS = ("data.js", "scene.js", "picture.js", "player.js")

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.motion import Motion, upright_joints
-from drocap_ros.report.measures import Measures, camera_axes
 from drocap_ros.report.pictures import Pictures
+from drocap_ros.report.statistics import Measures, camera_axes
 from drocap_ros.skeleton import side_of
 
 #: Poses in the page; of longer motions every n-th is shown.

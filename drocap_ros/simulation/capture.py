@@ -8,7 +8,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.simulation.camera import orbit_camera, pinhole_matrix, project, to_camera
-from drocap_ros.simulation.config import SimulationConfig
+from drocap_ros.simulation.capture_config import SimulationConfig
 from drocap_ros.simulation.observation import Observation, observe_keypoints, occlusion
 from drocap_ros.simulation.person import simulate_person
 from drocap_ros.skeleton import BODY_15

@@ -10,11 +10,11 @@ import pytest
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
-from drocap_ros.evaluation.pair import compare, load_truth
+from drocap_ros.evaluation.compare import compare, load_truth
+from drocap_ros.evaluation.protocol import protocol_sequences
 from drocap_ros.evaluation.rotation import measure, rotation_study
 from drocap_ros.evaluation.tables import study_markdown
 from drocap_ros.motion import Motion, save_motion
-from drocap_ros.reconstruction.protocol import protocol_sequences
 from drocap_ros.skeleton import BODY_15
 
 

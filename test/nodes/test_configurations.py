@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from drocap_ros.config import load_config, section_types
-from drocap_ros.nodes.latency import LATENCY_P95, RATE
-from drocap_ros.nodes.topics import NODES, TOPICS
+from drocap_ros.ros.latency import LATENCY_P95, RATE
+from drocap_ros.ros.topics import NODES, TOPICS
 
 COMPANIONS = ("px4_companion", "ardupilot_companion")
 ALL = (*COMPANIONS, "ground_station")

@@ -10,8 +10,8 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
-from drocap_ros.nodes.conversions import header_at, stamp_from_ros
-from drocap_ros.nodes.topics import TOPICS
+from drocap_ros.ros.conversions import header_at, stamp_from_ros
+from drocap_ros.ros.topics import TOPICS
 
 
 def picture(value=60):

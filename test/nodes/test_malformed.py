@@ -15,10 +15,10 @@ from sensor_msgs.msg import CompressedImage, RegionOfInterest
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.msg import OrbitCommand, Pose2D, Pose3D, VehicleState
-from drocap_ros.nodes.conversions import camera_info_to_ros, header_at, stamp_to_ros
-from drocap_ros.nodes.topics import RESULT_QOS, TOPICS
 from drocap_ros.perception.calibration import CameraModel
-from drocap_ros.simulation.ports import free_udp_port
+from drocap_ros.ros.conversions import camera_info_to_ros, header_at, stamp_to_ros
+from drocap_ros.ros.topics import RESULT_QOS, TOPICS
+from drocap_ros.simulation.vehicle.ports import free_udp_port
 
 NODES = [
     "image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "visualizer",

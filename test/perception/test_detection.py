@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from tiny_models import write_model
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.config import PoseEstimatorConfig
 from drocap_ros.perception.detection.letterbox import letterbox
 from drocap_ros.perception.detection.nms import iou, shared, suppress, whole
-from drocap_ros.perception.model_spec import grid_centres
-from drocap_ros.perception.models import load_detector
+from drocap_ros.perception.load_models import load_detector
+from drocap_ros.perception.models.spec import grid_centres
+from drocap_ros.perception.perception_config import PoseEstimatorConfig
 
 #: The person that every tiny model sees, in its 128x96 input; the picture is twice as large.
 BOX = np.array([40.0, 20.0, 72.0, 84.0])

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
+from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.flow import KeypointFlow
-from drocap_ros.perception.observation import PoseObservation
 from drocap_ros.skeleton import BODY_15
 
 STEP_NS = 33_333_333

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from tiny_models import write_model
 
-from drocap_ros.perception.config import PoseEstimatorConfig
-from drocap_ros.perception.free_size import with_free_size
-from drocap_ros.perception.models import load_detector
+from drocap_ros.perception.load_models import load_detector
+from drocap_ros.perception.models.free_size import with_free_size
+from drocap_ros.perception.perception_config import PoseEstimatorConfig
 
 CONFIG = PoseEstimatorConfig(detector="rtmdet-nano")
 

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from drocap_ros.perception.config import PoseEstimatorConfig
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.estimator import PoseEstimator
+from drocap_ros.perception.perception_config import PoseEstimatorConfig
 
 
 @pytest.mark.parametrize("hurry", [0, 1])

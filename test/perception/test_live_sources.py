@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.config import ImageIngestConfig
+from drocap_ros.perception.perception_config import ImageIngestConfig
 from drocap_ros.perception.sources import open_source
 from drocap_ros.perception.sources.stamps import StreamClock
 

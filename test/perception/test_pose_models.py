@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from tiny_models import TensorProto, heatmaps, write_model
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.config import PoseEstimatorConfig
-from drocap_ros.perception.models import load_pose_model
+from drocap_ros.perception.load_models import load_pose_model
+from drocap_ros.perception.perception_config import PoseEstimatorConfig
 from drocap_ros.perception.pose.crop import crop_around, cut
 from drocap_ros.perception.pose.heatmap import decode_heatmaps
 from drocap_ros.perception.pose.simcc import decode_simcc

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drocap_ros.perception.config import PoseEstimatorConfig
 from drocap_ros.perception.estimator import PoseEstimator
+from drocap_ros.perception.perception_config import PoseEstimatorConfig
 from drocap_ros.perception.pose.keypoints import Keypoints
 from drocap_ros.perception.sources import open_source
 from drocap_ros.perception.uncertainty import calibrate

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.config import ImageIngestConfig
+from drocap_ros.perception.perception_config import ImageIngestConfig
 from drocap_ros.perception.sources import Frame, open_source
 from drocap_ros.perception.sources.pictures import read_picture
 from drocap_ros.perception.sources.prefetch import prefetch

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import ParameterError
-from drocap_ros.perception.config import PoseEstimatorConfig
+from drocap_ros.perception.perception_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking import SubjectTracker
 from drocap_ros.perception.tracking.search import inside, tiles, window_around
 

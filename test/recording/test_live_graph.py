@@ -19,12 +19,12 @@ from sensor_msgs.msg import CompressedImage
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
-from drocap_ros.live_session import reconstruct_live, recorded_config
-from drocap_ros.nodes.conversions import stamp_from_ros
-from drocap_ros.nodes.topics import IMAGE_RECORDING_QOS, TOPICS
+from drocap_ros.live_replay import reconstruct_live, recorded_config
 from drocap_ros.pipeline import reconstruct_input
 from drocap_ros.recording.session import open_session
 from drocap_ros.recording.session_reader import read_pose2d
+from drocap_ros.ros.conversions import stamp_from_ros
+from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, TOPICS
 
 FLIGHT = ("capture_simulator", "initializer", "bundle_adjuster", "session_recorder")
 

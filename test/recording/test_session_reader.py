@@ -5,10 +5,10 @@ from recorded import NAMES, START_NS, write_poses
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import OPTICAL_FROM_FLU
 from drocap_ros.geometry.rotations import angle_between, quaternion_from_matrix
-from drocap_ros.recording.schemas import schema_text
+from drocap_ros.recording.mcap.schemas import schema_text
+from drocap_ros.recording.mcap.writer import SessionWriter
 from drocap_ros.recording.session_reader import is_recording, open_session, read_images, read_pose2d, session_info
-from drocap_ros.recording.session_writer import SessionWriter
-from drocap_ros.simulation.flight_path import SampledPath
+from drocap_ros.simulation.vehicle.path import SampledPath
 
 POSE2D, STATE, INFO = NAMES["pose2d"], NAMES["state"], NAMES["info"]
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from drocap_ros.motion import upright_joints
-from drocap_ros.report.findings import findings
-from drocap_ros.report.measures import measure, smooth
+from drocap_ros.report.checks import findings
+from drocap_ros.report.statistics import measure, smooth
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15
 

@@ -8,9 +8,9 @@ from report_motions import first_frames
 
 from drocap_ros.errors import InputError
 from drocap_ros.report import pictures
-from drocap_ros.report.measures import measure
 from drocap_ros.report.page_data import page_data
 from drocap_ros.report.pictures import has_pictures, read_pictures
+from drocap_ros.report.statistics import measure
 
 cv2 = pytest.importorskip("cv2")
 

@@ -4,7 +4,7 @@ import pytest
 from drocap_ros.errors import InputError
 from drocap_ros.simulation.camera import look_at, orbit_camera, pinhole_matrix, project, to_camera
 from drocap_ros.simulation.capture import simulate_capture
-from drocap_ros.simulation.config import SimulationConfig
+from drocap_ros.simulation.capture_config import SimulationConfig
 from drocap_ros.simulation.observation import observe_keypoints, occlusion
 from drocap_ros.skeleton import BODY_15
 

@@ -15,9 +15,9 @@ from drocap_ros.bringup import bringup, free_domain
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError, NodeError
 from drocap_ros.msg import OrbitCommand, OrbitStatus, Pose2D, Pose3D, Pose3DWindow
-from drocap_ros.nodes.conversions import stamp_from_ros
-from drocap_ros.nodes.topics import NODES, RESULT_QOS, TOPICS
-from drocap_ros.simulation.ports import free_udp_port
+from drocap_ros.ros.conversions import stamp_from_ros
+from drocap_ros.ros.topics import NODES, RESULT_QOS, TOPICS
+from drocap_ros.simulation.vehicle.ports import free_udp_port
 
 CAPTURE = ["capture_simulator", "initializer", "bundle_adjuster"]
 

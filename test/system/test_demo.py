@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from drocap_ros.cli import main
-from drocap_ros.cli.demo_verdict import settled_orbit
-from drocap_ros.cli.live import interruptible
-from drocap_ros.flight.safety import State
+from drocap_ros.cli.demo.verdict import settled_orbit
+from drocap_ros.cli.graph.live import interruptible
+from drocap_ros.flight.orbit.safety import State
 from drocap_ros.motion import load_motion
-from drocap_ros.recording.camera_telemetry import interpolate
 from drocap_ros.recording.session import open_session
 from drocap_ros.recording.session_reader import read_vehicle_track
-from drocap_ros.simulation.flight_truth import flown_orbit, load_truth_of_flight
+from drocap_ros.recording.telemetry.camera_poses import interpolate
+from drocap_ros.simulation.flight.truth import flown_orbit, load_truth_of_flight
 
 
 def test_the_demo_flies_by_what_it_sees_and_ends_with_a_motion_near_the_truth(tmp_path, capsys):

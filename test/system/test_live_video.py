@@ -10,9 +10,9 @@ from drocap_ros.bringup import bringup
 from drocap_ros.cli import main
 from drocap_ros.config import DrocapConfig
 from drocap_ros.motion import load_motion
-from drocap_ros.nodes.conversions import stamp_from_ros
-from drocap_ros.nodes.topics import TOPICS
-from drocap_ros.simulation.ports import free_udp_port
+from drocap_ros.ros.conversions import stamp_from_ros
+from drocap_ros.ros.topics import TOPICS
+from drocap_ros.simulation.vehicle.ports import free_udp_port
 
 NODES = ["image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
 

@@ -16,16 +16,16 @@ from drocap_ros.bringup import bringup
 from drocap_ros.cli import main
 from drocap_ros.config import DrocapConfig
 from drocap_ros.flight.frames import camera_rotation
-from drocap_ros.flight.transport import open_transport
+from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.msg import OrbitStatus
-from drocap_ros.nodes.conversions import pose2d_to_ros
-from drocap_ros.nodes.topics import TOPICS
-from drocap_ros.perception.observation import PoseObservation
+from drocap_ros.observation import PoseObservation
+from drocap_ros.ros.conversions import pose2d_to_ros
+from drocap_ros.ros.topics import TOPICS
 from drocap_ros.simulation.camera import pinhole_matrix, project
-from drocap_ros.simulation.copter import SimulatedCopter
 from drocap_ros.simulation.observation import observe_keypoints
 from drocap_ros.simulation.person import simulate_person
-from drocap_ros.simulation.ports import free_udp_port
+from drocap_ros.simulation.vehicle.copter import SimulatedCopter
+from drocap_ros.simulation.vehicle.ports import free_udp_port
 
 ROOT = Path(__file__).resolve().parents[2]
 MATRIX = pinhole_matrix(1280, 720, 60.0)

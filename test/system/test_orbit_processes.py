@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from drocap_ros.flight.safety import State
-from drocap_ros.simulation.flight_faults import TIMEOUT
-from drocap_ros.simulation.orbit_loop import LoopSettings
+from drocap_ros.flight.orbit.safety import State
+from drocap_ros.simulation.closed_loop.faults import TIMEOUT
+from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.model_spec import ModelSpec, grid_centres, map_grid
+from drocap_ros.perception.models.spec import ModelSpec, grid_centres, map_grid
 
 
 class RawDetections(NamedTuple):

@@ -11,9 +11,9 @@ from drocap_ros.errors import InputError
 from drocap_ros.perception.detection.decode import DECODERS
 from drocap_ros.perception.detection.letterbox import letterbox
 from drocap_ros.perception.detection.nms import suppress
-from drocap_ros.perception.model_spec import ModelSpec, map_grid
-from drocap_ros.perception.preprocess import Normalizer
-from drocap_ros.perception.runtime import OnnxModel
+from drocap_ros.perception.models.preprocess import Normalizer
+from drocap_ros.perception.models.runtime import OnnxModel
+from drocap_ros.perception.models.spec import ModelSpec, map_grid
 
 #: Sides of an input are multiples of the coarsest map's stride, px.
 _STRIDE = 32

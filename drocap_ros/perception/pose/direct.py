@@ -6,7 +6,7 @@ import numpy as np
 
 from drocap_ros.perception.detection.decode import DECODERS
 from drocap_ros.perception.detection.nms import iou
-from drocap_ros.perception.model_spec import ModelSpec
+from drocap_ros.perception.models.spec import ModelSpec
 from drocap_ros.perception.pose.heatmap import CANDIDATES
 from drocap_ros.perception.pose.keypoints import Peaks
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.perception.model_spec import ModelSpec
+from drocap_ros.perception.models.preprocess import Normalizer
+from drocap_ros.perception.models.runtime import OnnxModel
+from drocap_ros.perception.models.spec import ModelSpec
 from drocap_ros.perception.pose.crop import crop_around, cut
 from drocap_ros.perception.pose.direct import decode_movenet, decode_one_stage
 from drocap_ros.perception.pose.heatmap import decode_heatmaps
 from drocap_ros.perception.pose.keypoints import Keypoints, Peaks
 from drocap_ros.perception.pose.simcc import decode_simcc
-from drocap_ros.perception.preprocess import Normalizer
-from drocap_ros.perception.runtime import OnnxModel
 from drocap_ros.skeleton import JointSet, joint_set
 
 

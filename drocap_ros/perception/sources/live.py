@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.config import ImageIngestConfig
+from drocap_ros.perception.perception_config import ImageIngestConfig
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent
 from drocap_ros.perception.sources.pictures import to_bgr
 from drocap_ros.perception.sources.stamps import StreamClock

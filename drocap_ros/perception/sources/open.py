@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.config import ImageIngestConfig
+from drocap_ros.perception.perception_config import ImageIngestConfig
 from drocap_ros.perception.sources.base import ImageSource
 from drocap_ros.perception.sources.pictures import SUFFIXES, PictureSource
 from drocap_ros.perception.sources.video import VideoSource

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.errors import ParameterError
-from drocap_ros.perception.config import PoseEstimatorConfig
 from drocap_ros.perception.detection.nms import iou, shared
+from drocap_ros.perception.perception_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.association import assign
 from drocap_ros.perception.tracking.person import Person

@@ -1,0 +1,1 @@
+"""``drocap demo``: a whole simulated capture flight."""

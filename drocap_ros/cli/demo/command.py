@@ -1,0 +1,165 @@
+"""``drocap demo``: a whole capture flight in simulation, with pictures, through the real nodes, judged by the truth."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from drocap_ros.cli.demo.operator import Operator
+    from drocap_ros.cli.demo.verdict import FlightVerdict
+    from drocap_ros.config import DrocapConfig
+    from drocap_ros.motion import Motion
+    from drocap_ros.simulation.flight.truth import FlightTruth
+
+#: The networks that this package brings along, for simulated pictures only.
+MODELS = "simulation"
+_LEAST_S, _MOST_S = 2.0, 3600.0
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the command's options; ``run`` is its action."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "demo",
+        help="fly a capture in simulation, reconstruct it, compare with the truth",
+        description="A simulated drone takes off and films a simulated person; the real nodes see the person in the"
+        " pictures and fly the orbit by what they see. Record it, reconstruct it, and print the errors against the"
+        " simulated truth. Exit status 1 when no orbit came of it.",
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("demo_out"), help="folder (default demo_out)")
+    parser.add_argument("--seconds", metavar="S", type=float, default=30.0, help="length of the orbit (default 30)")
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of person, wind and scenery (default 0)")
+    parser.add_argument(
+        "--autopilot", choices=("ardupilot", "px4"), default="ardupilot", help="which one is simulated (default"
+        " ardupilot)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--models", metavar="DIR", default=MODELS, help="folder of ONNX models instead of those for simulation"
+    )
+    parser.add_argument("--quiet", action="store_true", help="print only the result")
+    parser.set_defaults(run=run)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fly, record, reconstruct, compare."""
+    from drocap_ros.cli.demo.flight import NODES, check_flown, fly
+    from drocap_ros.cli.demo.operator import Operator
+    from drocap_ros.cli.demo.verdict import judge_flight
+    from drocap_ros.cli.graph.live import interruptible
+    from drocap_ros.cli.output import check_output_folder, output_folder
+    from drocap_ros.cli.reconstruct import summary
+    from drocap_ros.errors import InputError
+    from drocap_ros.evaluation.compare import compare
+    from drocap_ros.recording.session import open_session
+    from drocap_ros.simulation.flight.truth import load_truth_of_flight
+
+    if not (math.isfinite(args.seconds) and _LEAST_S <= args.seconds <= _MOST_S):
+        raise InputError(f"--seconds: expected {_LEAST_S:g} to {_MOST_S:g}, got {args.seconds:g}; choose another")
+    check_output_folder(args.out)
+    begin = time.monotonic()
+    operator = Operator(args.seconds, takes_control=args.autopilot == "px4")
+
+    def say(text: str) -> None:
+        if not args.quiet:
+            print(f"{time.monotonic() - begin:6.1f} s  {text}", flush=True)
+
+    with interruptible() as interrupted, output_folder(args.out) as folder:
+        config = demo_config(folder, args.seed, args.autopilot, args.models)
+        say(f"starting {', '.join(NODES)}, a process each")
+        load = fly(config, operator, say, interrupted)
+        check_flown(operator)
+        truth = load_truth_of_flight(folder / "truth.npz")
+        with open_session(folder / "session") as session:
+            verdict = judge_flight(session, truth, config.mavlink_bridge.radius_m)
+        say("landed; reconstructing from the recorded session")
+        motion = _reconstruct(folder, config, args)
+        errors = compare(motion, truth.joints3d, truth.stamp_ns * 1e-9, "world")
+        if not args.quiet:
+            print(summary(motion, "ba"))
+            print("processor: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in load.items()))
+    print(_flight_words(operator, verdict, config))
+    print(_picture_words(verdict, truth))
+    world = "" if math.isnan(errors.w_error_mm) else f", W-MPJPE {errors.w_error_mm:.1f} mm"
+    print(
+        f"reconstruction error against the simulated truth: {errors.error_mm:.1f} mm (PA-MPJPE, 12 limb joints,"
+        f" {errors.frames} frames){world}; scale error {100 * errors.scale_error:+.1f} % ({motion.scale_source}),"
+        f" frame {motion.frame}"
+    )
+    print(f"files in {args.out}: motion.npz, truth.npz, pictures.jpg, preview.png, report.html, session/")
+    say("done")
+    return 0
+
+
+def demo_config(folder: Path, seed: int, autopilot: str, models: str) -> DrocapConfig:
+    """The demo's graph: motion is allowed, of the simulated vehicle on a port of this machine."""
+    from drocap_ros.config import DrocapConfig
+    from drocap_ros.simulation.vehicle.ports import free_udp_port
+
+    address = f"127.0.0.1:{free_udp_port()}"
+    config = DrocapConfig().replace(
+        "flight_simulator", vehicle_url=f"udpout:{address}", autopilot=autopilot, seed=seed,
+        truth_file=str(folder / "truth.npz"),
+    )  # fmt: skip
+    config = config.replace(
+        "mavlink_bridge", url=f"udpin:{address}", commands_enabled=True, mode_change_allowed=True,
+        gimbal_control=True, body_height_m=config.flight_simulator.stature_m, attitude_hz=25.0,
+    )  # fmt: skip
+    # The operator has asked how tall the person is, as one does before a flight.
+    config = config.replace("initializer", assumed_height_m=config.flight_simulator.stature_m)
+    config = config.replace("pose_estimator", models_dir=models, on_loss="next")
+    return config.replace("session_recorder", session_dir=str(folder / "session"))
+
+
+def _reconstruct(folder: Path, config: DrocapConfig, args: argparse.Namespace) -> Motion:
+    """Motion of the recorded session, with the pictures of it."""
+    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.motion import save_motion
+    from drocap_ros.pipeline import reconstruct_input
+    from drocap_ros.recording.session import open_session
+    from drocap_ros.report.contact_sheet import save_contact_sheet
+    from drocap_ros.report.page import save_report
+    from drocap_ros.report.preview import save_preview
+
+    with progress_bars(args.quiet) as progress:
+        motion, _ = reconstruct_input(folder / "session", method="ba", config=config, progress=progress)
+    save_motion(folder / "motion.npz", motion)
+    save_preview(folder / "preview.png", motion)
+    with open_session(folder / "session") as session:
+        save_contact_sheet(folder / "pictures.jpg", session)
+    save_report(folder / "report.html", motion, video=folder / "session", command=args.command_line)
+    return motion
+
+
+def _flight_words(operator: Operator, verdict: FlightVerdict, config: DrocapConfig) -> str:
+    holds = f"held {len(operator.holds)} times ({'; '.join(operator.holds)})" if operator.holds else "never held"
+    words = f"orbit: {operator.orbited_s:.1f} s flown, {holds}"
+    if operator.failure:
+        words += f"; ended early: {operator.failure}"
+    if verdict.orbit is None:
+        return f"{words}; too short to judge after its ramp"
+    o = verdict.orbit
+    return (
+        f"{words}; against the truth after the ramp: mean radius error {o.radius_error_m:.2f} m of"
+        f" {config.mavlink_bridge.radius_m:g} m, mean yaw error {o.yaw_error_deg:.1f} deg, person in the middle third"
+        f" {100 * o.in_middle_third:.1f} %, {o.turned_deg:.0f} deg round, nearest {o.least_distance_m:.1f} m, at most"
+        f" {o.top_speed_m_s:.1f} m/s"
+    )
+
+
+def _picture_words(verdict: FlightVerdict, truth: FlightTruth) -> str:
+    seconds = (truth.stamp_ns[-1] - truth.stamp_ns[0]) * 1e-9
+    words = (
+        f"pictures: {verdict.exposures} exposed in {seconds:.0f} s, {verdict.pictures} rendered and recorded,"
+        f" {verdict.poses} looked at, {verdict.seen} with the subject"
+    )
+    if verdict.live is None:
+        return f"{words}; no live 3D pose"
+    live = verdict.live
+    return (
+        f"{words}; live: {live.count} poses, error {1000 * live.error_m:.1f} mm (PA-MPJPE), scale error"
+        f" {100 * live.scale_error:+.1f} %, frame {live.frame}"
+    )

@@ -1,0 +1,1 @@
+"""Commands around a running graph: live, orbit, record, replay, top, view."""

@@ -1,0 +1,63 @@
+"""What the nodes say of themselves, as a table on a terminal."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from drocap_ros.ros.latency import LAST_REFUSED, LATENCY, RATE, SUBJECT
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+_COLOURS = {0: "green", 1: "yellow", 2: "red", 3: "magenta"}
+_LEVELS = {0: "ok", 1: "warning", 2: "error", 3: "stale"}
+
+
+class Dashboard:
+    """Latest ``/diagnostics`` status of each node."""
+
+    def __init__(self) -> None:
+        self._rows: dict[str, tuple[int, str, dict[str, str]]] = {}
+
+    def take(self, message: Any) -> None:
+        """Remember the statuses of a diagnostic_msgs/DiagnosticArray."""
+        for status in message.status:
+            values = {value.key: value.value for value in status.values}
+            # rclpy gives the level as one byte.
+            level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+            self._rows[status.name] = (level, status.message, values)
+
+    def heard(self, namespace: str = "") -> list[str]:
+        """Names of the nodes heard so far in a namespace."""
+        inside = f"{namespace.strip('/')}/" if namespace else ""
+        return sorted(name for name in self._rows if name.startswith(inside))
+
+    def table(self, namespace: str = "") -> Table:
+        """The table of the nodes heard so far in a namespace."""
+        from rich.table import Table
+
+        table = Table("node", "state", "Hz", "late, ms (p50 / p95 / p99)", "what it says", "counts", expand=True)
+        for name in self.heard(namespace):
+            level, text, values = self._rows[name]
+            counts = ", ".join(
+                f"{key} {value}" for key, value in values.items() if value.isdigit() or key in (SUBJECT, LAST_REFUSED)
+            )
+            state = f"[{_COLOURS.get(level, 'white')}]{_LEVELS.get(level, str(level))}[/]"
+            table.add_row(name, state, values.get(RATE, ""), values.get(LATENCY, ""), text, counts)
+        return table
+
+
+@contextlib.contextmanager
+def dashboard_on_terminal(show: bool, namespace: str = "") -> Iterator[tuple[Dashboard, Callable[[], None]]]:
+    """A dashboard and the function that draws a namespace's nodes; it draws nothing in a pipe or without ``show``."""
+    dashboard = Dashboard()
+    if not show or not sys.stdout.isatty():
+        yield dashboard, lambda: None
+        return
+    from rich.live import Live
+
+    with Live(dashboard.table(namespace), auto_refresh=False) as live:
+        yield dashboard, lambda: live.update(dashboard.table(namespace), refresh=True)

@@ -1,0 +1,151 @@
+"""``drocap live``: bring the graph up on real hardware."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from drocap_ros.cli.graph.dashboard import Dashboard, dashboard_on_terminal
+from drocap_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from drocap_ros.bringup import Graph
+    from drocap_ros.config import DrocapConfig
+
+NODES = (
+    "image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "visualizer",
+    "session_recorder",
+)  # fmt: skip
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the command's options; ``run`` is its action."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "live",
+        help="bring the graph up on real hardware",
+        description="Start the nodes and run until the source ends or Ctrl-C. Each in a process of its own.",
+    )
+    parser.add_argument(
+        "--config", metavar="FILE", type=Path, required=True, help="parameters of the components (YAML)"
+    )
+    parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
+    parser.add_argument("--source", metavar="URI", help="instead of the configuration's image_ingest.source")
+    parser.add_argument("--session", metavar="DIR", type=Path, help="record to this new folder")
+    parser.add_argument("--nodes", nargs="+", choices=NODES, default=list(NODES), metavar="NODE", help=", ".join(NODES))
+    add_graph_options(parser)
+    parser.add_argument("--no-respawn", action="store_true", help="end when a node dies, instead of starting it again")
+    parser.set_defaults(run=run)
+    return parser
+
+
+def add_graph_options(parser: argparse.ArgumentParser) -> None:
+    """Options of every command that starts nodes."""
+    parser.add_argument("--namespace", default="/drocap", help="of all topics (default /drocap)")
+    parser.add_argument("--domain-id", type=int, default=0, metavar="N", help="DDS domain, 0 to 101 (default 0)")
+    parser.add_argument("--one-process", action="store_true", help="all nodes in this process, a thread each")
+    parser.add_argument("--quiet", action="store_true", help="no status line, only errors")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the graph until its source has ended or the user interrupts."""
+    from drocap_ros.config import load_config
+    from drocap_ros.perception.load_models import models_folder
+
+    config = load_config(args.config)
+    if args.source:
+        config = config.replace("image_ingest", source=args.source)
+    if args.models:
+        config = config.replace("pose_estimator", models_dir=str(models_folder(args.models).absolute()))
+    if args.session:
+        config = config.replace("session_recorder", session_dir=str(args.session.absolute()))
+    return run_graph(config, args.nodes, args)
+
+
+def run_graph(config: DrocapConfig, nodes: list[str], args: argparse.Namespace) -> int:
+    """Bring nodes up, show what they say, stop on Ctrl-C or when the source has ended."""
+    check_domain(args.domain_id)
+    bringup = import_bringup().bringup
+    with bringup(
+        config,
+        nodes,
+        processes=not args.one_process,
+        namespace=args.namespace,
+        domain_id=args.domain_id,
+        respawn=not args.no_respawn,
+    ) as graph:
+        if not args.quiet:
+            print(f"running {', '.join(graph.names)} in {args.namespace}, domain {args.domain_id}; Ctrl-C stops")
+            sys.stdout.flush()
+        with dashboard_of(graph, show=not args.quiet) as (_, draw), stop_signals() as stop:
+            while not stop.is_set() and not ("image_ingest" in nodes and "image_ingest" in graph.finished):
+                graph.spin_for(0.5)
+                draw()
+                while graph.events:
+                    print(f"drocap: {graph.events.popleft()}", file=sys.stderr, flush=True)
+    return 0
+
+
+@contextlib.contextmanager
+def stop_signals() -> Iterator[threading.Event]:
+    """An event that SIGINT and SIGTERM set, so that neither breaks into the middle of anything."""
+    stop = threading.Event()
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[threading.Event]:
+    """SIGTERM ends what runs inside as Ctrl-C does: nothing half-written stays.
+
+    Both raise KeyboardInterrupt wherever the program is, and set the event: what is raised where Python cannot pass it
+    on, as in a destructor, is lost.
+    """
+    interrupted = threading.Event()
+
+    def interrupt(*_: object) -> None:
+        interrupted.set()
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield interrupted
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def check_domain(domain_id: int) -> None:
+    """Refuse a DDS domain that does not exist."""
+    if not 0 <= domain_id <= 101:
+        raise InputError(f"--domain-id: expected 0 to 101, got {domain_id}")
+
+
+def import_bringup() -> ModuleType:
+    """The module that knows ROS, or one clear line where there is no ROS."""
+    try:
+        return importlib.import_module("drocap_ros.bringup")
+    except ImportError as error:
+        raise InputError(f"expected ROS 2 with drocap_ros's messages, found none ({error}); run `make setup`") from None
+
+
+@contextlib.contextmanager
+def dashboard_of(graph: Graph, show: bool) -> Iterator[tuple[Dashboard, Callable[[], None]]]:
+    """Dashboard fed by the graph's ``/diagnostics``, and the function that draws it."""
+    from drocap_ros.ros.topics import TOPICS
+
+    with dashboard_on_terminal(show, graph.namespace) as (dashboard, draw):
+        entry = TOPICS["/diagnostics"]
+        graph.node.create_subscription(entry.message, "/diagnostics", dashboard.take, entry.qos)
+        yield dashboard, draw

@@ -1,0 +1,204 @@
+"""``drocap view``: a motion, a recording or a running graph in the Rerun viewer."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import re
+import sys
+import time
+import webbrowser
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from drocap_ros.cli.graph.live import check_domain, import_bringup, interruptible, stop_signals
+from drocap_ros.cli.motion_input import read_motion
+from drocap_ros.cli.output import output_file
+from drocap_ros.cli.progress import progress_bars
+from drocap_ros.errors import InputError
+
+if TYPE_CHECKING:
+    import rerun
+
+    from drocap_ros.bringup import Graph
+    from drocap_ros.view.message_view import MessageView
+
+#: Of the web page; the next one carries the data.
+PORT = 9090
+#: A browser decodes no more pictures of a running graph than this; a file holds them all.
+LIVE_PICTURE_HZ = 10.0
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the command's options; ``run`` is its action."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "view",
+        help="a motion, a recording or a running graph in 3D",
+        description="Show a motion, a recording or a running graph in the Rerun viewer: body, uncertainty, camera and "
+        "picture over the time of the images, delays and errors. In a window, or in a browser where there is no "
+        "screen or with --web.",
+    )
+    parser.add_argument(
+        "input", metavar="INPUT", type=Path, nargs="?",
+        help="motion.npz or the folder that holds it; session folder, .mcap, .bag or rosbag2 folder",
+    )  # fmt: skip
+    parser.add_argument("--live", action="store_true", help="show a running graph until Ctrl-C")
+    parser.add_argument("--save", metavar="FILE", type=Path, help="write an .rrd file instead of opening a viewer")
+    parser.add_argument("--web", action="store_true", help="serve a page for a browser, also when there is a screen")
+    parser.add_argument("--port", type=int, default=PORT, help=f"of --web, with the next one (default {PORT})")
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address of --web; 0.0.0.0 shows it to the whole network (default 127.0.0.1)",
+    )
+    parser.add_argument("--video", metavar="VIDEO", type=Path, help="video or pictures that a motion was made from")
+    parser.add_argument("--namespace", help="of the topics (default: /drocap live, that of the keypoints otherwise)")
+    parser.add_argument("--domain-id", type=int, default=0, metavar="N", help="DDS domain, 0 to 101 (default 0)")
+    parser.add_argument("--seconds", type=float, metavar="S", help="end a --live view after so long")
+    parser.add_argument(
+        "--memory", default="1GB", help="of a viewer; beyond it the oldest data go (default 1GB; 25%% works too)"
+    )
+    parser.add_argument("--quiet", action="store_true", help="say nothing")
+    parser.set_defaults(run=run)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Draw the input, or the graph until the user interrupts."""
+    from drocap_ros.view.output import new_recording
+
+    _check(args)
+    if args.live:
+        return _view_live(new_recording("live"), args)
+    recording = new_recording(args.input.absolute().name or "input")
+    if is_session(args.input):
+        _view_session(recording, args)
+    else:
+        _view_motion(recording, args)
+    return 0
+
+
+def is_session(path: Path) -> bool:
+    """Whether the input is a recording; a folder of ours holds its motion beside its session."""
+    from drocap_ros.recording.session import is_recording
+
+    return path.exists() and is_recording(path) and not (path / "motion.npz").is_file()
+
+
+def _check(args: argparse.Namespace) -> None:
+    check_domain(args.domain_id)
+    if args.live == (args.input is not None):
+        raise InputError(f"expected INPUT or --live, found {'both' if args.live else 'neither'}; name what to show")
+    if args.live and args.video is not None:
+        raise InputError("--video: expected a motion with it, found --live; leave it out")
+    if args.seconds is not None and not (args.live and args.seconds > 0):
+        raise InputError("--seconds: expected more than 0, and --live with it; correct or leave it out")
+    if args.save is not None and args.web:
+        raise InputError("expected --save or --web, found both; choose one")
+    if not 1 <= args.port <= 65534:
+        raise InputError(f"--port: expected 1 to 65534, got {args.port}; choose another")
+    if not re.fullmatch(r"[0-9]+(\.[0-9]+)?(%|[kKMGT]i?B)", args.memory):
+        raise InputError(f"--memory: expected an amount like 1GB or 25%, got {args.memory!r}; correct it")
+
+
+def _view_motion(recording: rerun.RecordingStream, args: argparse.Namespace) -> None:
+    from drocap_ros.report.pictures import each_picture
+    from drocap_ros.view.motion_view import PLOTS, draw_motion
+    from drocap_ros.view.scene import Scene
+
+    _, motion = read_motion(args.input)
+    pictures = each_picture(args.video, motion) if args.video else ()
+    with _shown(recording, PLOTS, args), progress_bars(args.quiet) as progress:
+        draw_motion(Scene(recording), motion, pictures, progress)
+
+
+def _view_session(recording: rerun.RecordingStream, args: argparse.Namespace) -> None:
+    from drocap_ros.recording.session import open_session
+    from drocap_ros.view.message_view import PLOTS, MessageView
+    from drocap_ros.view.scene import Scene
+    from drocap_ros.view.session_view import draw_session
+
+    if args.video is not None:
+        raise InputError("--video: expected a motion with it, found a recording; leave it out")
+    with open_session(args.input) as session:
+        with _shown(recording, (*PLOTS, "log"), args):
+            view = MessageView(Scene(recording))
+            with progress_bars(args.quiet) as progress:
+                draw_session(view, session, args.namespace, progress)
+        for warning in session.warnings:
+            print(f"drocap: warning: {warning}", file=sys.stderr)
+        _warn_refused(view)
+
+
+def _view_live(recording: rerun.RecordingStream, args: argparse.Namespace) -> int:
+    from drocap_ros.view.message_view import PLOTS, MessageView
+    from drocap_ros.view.scene import Scene
+
+    namespace = args.namespace or "/drocap"
+    with import_bringup().watch(namespace, args.domain_id) as graph, _shown(recording, (*PLOTS, "log"), args):
+        view = MessageView(Scene(recording), picture_hz=0.0 if args.save else LIVE_PICTURE_HZ)
+        view.namespace = namespace
+        _subscribe(graph, view)
+        end = math.inf if args.seconds is None else time.monotonic() + args.seconds
+        with stop_signals() as stop:
+            while not stop.is_set() and (left := end - time.monotonic()) > 0:
+                graph.spin_for(min(0.2, left))
+        view.finish()
+    _warn_refused(view)
+    if not view.taken:
+        print(f"drocap: heard nothing of {namespace} in domain {args.domain_id}; is it running there?", file=sys.stderr)
+    return 0 if view.taken else 1
+
+
+def _subscribe(graph: Graph, view: MessageView) -> None:
+    from drocap_ros.ros.topics import TOPICS
+
+    def receiver(name: str) -> Callable[[Any], None]:
+        return lambda message: view.take(name, message, graph.node.get_clock().now().nanoseconds)
+
+    for name in view.handlers:
+        entry = TOPICS[name]
+        graph.node.create_subscription(entry.message, name, receiver(name), entry.qos)
+
+
+@contextlib.contextmanager
+def _shown(recording: rerun.RecordingStream, views: tuple[str, ...], args: argparse.Namespace) -> Iterator[None]:
+    """Take what is drawn inside to the file, window or browser that the user wants."""
+    from drocap_ros.view.layout import layout
+    from drocap_ros.view.output import has_screen, to_browser, to_file, to_window
+
+    arranged = layout(views, follow=args.live)
+    if args.save is not None:
+        with output_file(args.save) as file:
+            to_file(recording, file, arranged)
+            try:
+                yield
+            finally:
+                recording.disconnect()
+        _say(args, f"written: {args.save} ({args.save.stat().st_size / 1e6:.1f} MB); `rerun {args.save}` shows it")
+    elif args.web or not has_screen():
+        server = to_browser(recording, arranged, args.host, args.port, args.memory, newest_first=args.live)
+        with server as address, contextlib.suppress(KeyboardInterrupt), interruptible() as interrupted:
+            _say(args, f"open {address} in a browser; Ctrl-C stops")
+            if has_screen():
+                webbrowser.open(address)
+            yield
+            recording.flush()
+            if not args.live:
+                interrupted.wait()
+    else:
+        to_window(recording, arranged, args.memory)
+        yield
+        recording.flush()
+
+
+def _warn_refused(view: MessageView) -> None:
+    if view.refused:
+        print(f"drocap: warning: {view.refused} malformed messages were not drawn; see the log view", file=sys.stderr)
+
+
+def _say(args: argparse.Namespace, text: str) -> None:
+    if not args.quiet:
+        print(text, flush=True)

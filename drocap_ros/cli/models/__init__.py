@@ -1,0 +1,1 @@
+"""Commands around networks and dictionaries."""

@@ -1,0 +1,174 @@
+"""``drocap models``: which networks there are, getting them, trying them."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from drocap_ros.errors import DrocapError, InputError
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the command's options; ``run`` is its action."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "models",
+        help="list, fetch or check the networks",
+        description="The networks for person detection and 2D pose: list what is known and what is there, fetch from"
+        " the official homes, check one on a picture.",
+    )
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    listing = actions.add_parser("list", help="known models and those in the folder")
+    fetching = actions.add_parser("fetch", help="download known models and verify them")
+    checking = actions.add_parser("check", help="run the folder's models on a picture and draw the result")
+    for sub in (listing, fetching, checking):
+        sub.add_argument(
+            "--models",
+            metavar="DIR",
+            type=Path,
+            help="folder of ONNX models, or 'simulation' for those that ship for rendered pictures (default:"
+            " $DROCAP_MODELS)",
+        )
+    fetching.add_argument("names", nargs="*", metavar="NAME", help="models by name (default: rtmdet-nano rtmpose-s)")
+    fetching.add_argument("--unverified", action="store_true", help="allow models without a known checksum")
+    fetching.add_argument("--quiet", action="store_true", help="no progress, only errors")
+    checking.add_argument("picture", nargs="?", type=Path, metavar="PICTURE", help="picture with a person")
+    checking.add_argument("--detector", metavar="NAME", default="auto", help="detector (default: the best there)")
+    checking.add_argument("--pose", metavar="NAME", default="auto", help="2D pose model (default: the best there)")
+    checking.add_argument("--out", metavar="PNG", type=Path, help="where the drawing goes (default: PICTURE_check.png)")
+    parser.set_defaults(run=run)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the chosen action."""
+    actions = {"list": run_list, "fetch": run_fetch, "check": run_check}
+    return actions[args.action](args)
+
+
+def run_list(args: argparse.Namespace) -> int:
+    """Print the registry and the folder's files."""
+    from drocap_ros.perception.load_models import SIMULATION, models_folder
+    from drocap_ros.perception.models.registry import KNOWN_MODELS
+
+    folder = models_folder(args.models)
+    if args.models and not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder of models, found no such folder; check the path")
+    present = sorted(folder.glob("*.onnx")) if folder.is_dir() else []
+    rows = [("NAME", "TASK", "MB", "LICENCE", "TRAINED ON", "FROM", "FILE", "THERE")]
+    for model in KNOWN_MODELS:
+        here = any(p.name == model.file for p in present)
+        origin = model.home if model.url else f"{model.home} (no ONNX download)"
+        size, there = f"{model.size_mb:.1f}", "yes" if here else "-"
+        rows.append((model.name, model.task, size, model.licence, model.training_data, origin, model.file, there))
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    for row in rows:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    print(f"\nfolder {folder}: " + ("" if present else "no models; `drocap models fetch` brings the default pair"))
+    for path in present:
+        print(f"  {describe(path)}")
+    shipped = models_folder(SIMULATION)
+    if folder != shipped:
+        print(f"\nshipped, used only when asked for with `--models {SIMULATION}`:")
+        for path in sorted(shipped.glob("*.onnx")):
+            print(f"  {describe(path)}")
+    return 0
+
+
+def describe(path: Path) -> str:
+    """One line on a model file: what it is, or why it cannot be used."""
+    from drocap_ros.perception.load_models import limited_use
+    from drocap_ros.perception.models.runtime import OnnxModel
+    from drocap_ros.perception.models.spec import read_spec
+
+    size = path.stat().st_size / 1e6
+    try:
+        model = OnnxModel(path)
+        spec = read_spec(model)
+    except InputError as error:
+        return f"{path.name}  {size:.1f} MB  cannot be used: {error}"
+    what = {"both": "detector and 2D pose"}.get(spec.task, "2D pose" if spec.task == "pose" else "detector")
+    joints = f", {spec.skeleton}" if spec.skeleton else ""
+    width, height = spec.input_size
+    use = f"; {limits}" if (limits := limited_use(model)) else ""
+    return f"{path.name}  {size:.1f} MB  {what}, {spec.layout}, {width}x{height}{joints}, on {model.provider}{use}"
+
+
+def run_fetch(args: argparse.Namespace) -> int:
+    """Download the named models."""
+    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.perception.load_models import models_folder
+    from drocap_ros.perception.models.fetch import fetch
+    from drocap_ros.perception.models.registry import DEFAULT_FETCH, KNOWN_MODELS, known_model
+
+    folder = models_folder(args.models)
+    chosen = []
+    for name in args.names or DEFAULT_FETCH:
+        model = known_model(name)
+        if model is None:
+            raise InputError(
+                f"{name}: expected one of {', '.join(m.name for m in KNOWN_MODELS)}; see `drocap models list`"
+            )
+        chosen.append(model)
+    failed = 0
+    with progress_bars(args.quiet) as progress:
+        for model in chosen:
+            try:
+                path = fetch(
+                    model,
+                    folder,
+                    unverified=args.unverified,
+                    progress=lambda have, total, name=model.name: progress(name, have / total if total else -1.0),  # type: ignore[misc]
+                )
+            except InputError:
+                raise
+            except DrocapError as error:
+                print(f"drocap: {error}", file=sys.stderr)
+                failed += 1
+                continue
+            if not args.quiet:
+                verified = "SHA-256 verified" if model.sha256 else "checksum recorded, not verified"
+                print(f"{model.name}: {path} ({verified})")
+    return 1 if failed else 0
+
+
+def run_check(args: argparse.Namespace) -> int:
+    """Load the models, and on a picture run and draw them."""
+    from drocap_ros.perception.load_models import load_detector, load_pose_model, models_folder
+    from drocap_ros.perception.perception_config import PoseEstimatorConfig
+
+    folder = models_folder(args.models)
+    config = PoseEstimatorConfig(detector=args.detector, pose_model=args.pose)
+    if args.picture is None:
+        for loaded in (load_detector(folder, config), load_pose_model(folder, config)):
+            print(describe(loaded.model.path))
+        return 0
+    import cv2
+    import numpy as np
+
+    from drocap_ros.perception.estimator import PoseEstimator
+    from drocap_ros.perception.overlay import draw
+    from drocap_ros.perception.sources.pictures import read_picture
+
+    image = read_picture(args.picture)
+    estimator = PoseEstimator(folder, config)
+    observation = estimator.process(image, 0)
+    print(f"detector {estimator.detector.model.path.name}, pose {estimator.pose_model.model.path.name}")
+    if not observation.has_subject:
+        print(f"{args.picture}: no person found")
+        return 0
+    for name, point, variance, confidence in zip(
+        observation.joints.joints, observation.keypoints, observation.covariance, observation.confidence, strict=True
+    ):
+        sigma = (
+            float(np.sqrt(max((variance[0] + variance[2]) / 2, 0.0))) if np.isfinite(variance).all() else float("nan")
+        )
+        print(f"{name:<10} {point[0]:8.1f} {point[1]:8.1f} px  sigma {sigma:6.1f} px  confidence {confidence:.2f}")
+    out = args.out or args.picture.with_name(f"{args.picture.stem}_check.png")
+    if not out.parent.is_dir() or not cv2.imwrite(str(out), draw(image, observation)):
+        raise InputError(
+            f"--out {out}: expected a picture name (.png, .jpg) in a folder that can be written; choose another"
+        )
+    print(f"written: {out}")
+    return 0

@@ -1,0 +1,92 @@
+"""``drocap learn-dictionary``: a pose dictionary from a folder of MoCap files."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from drocap_ros.reconstruction.paper.dictionary import Dictionary
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the command's options; ``run`` is its action."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "learn-dictionary",
+        help="learn a pose dictionary from MoCap",
+        description="Learn a sparse pose dictionary from the MoCap .npz files of a folder.",
+    )
+    parser.add_argument("folder", metavar="MOCAP_DIR", type=Path, help="folder of MoCap .npz files")
+    parser.add_argument("--out", metavar="NPZ", type=Path, required=True, help="dictionary file to write")
+    parser.add_argument("--atoms", type=int, default=128, help="size of the dictionary (default 128)")
+    parser.add_argument(
+        "--sparsity", type=float, default=0.03, help="weight of the L1 norm in metres; larger = sparser (default 0.03)"
+    )
+    parser.add_argument("--include", metavar="GLOB", default="*", help="only files of this name, e.g. 'cmu_*'")
+    parser.add_argument("--every", type=int, default=3, help="take every n-th frame (default 3)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the batches (default 0)")
+    parser.set_defaults(run=run)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Learn, write, and print the quality.
+
+    Raises
+    ------
+    InputError
+        When an option or the folder cannot be used.
+    """
+    from drocap_ros.reconstruction.paper.dictionary import save_dictionary
+
+    for name, low, high in (("atoms", 8, 4096), ("every", 1, 1000)):
+        if not low <= getattr(args, name) <= high:
+            raise InputError(f"--{name}: expected {low} to {high}, got {getattr(args, name)}")
+    if not 0.0 < args.sparsity <= 10.0:
+        raise InputError(f"--sparsity: expected more than 0 up to 10, got {args.sparsity:g}")
+    if args.out.suffix != ".npz" or not args.out.absolute().parent.is_dir():
+        raise InputError(f"--out: expected a .npz in a folder that exists, got {args.out}")
+    dictionary = learn_from_folder(args.folder, args.include, args.every, args.atoms, args.sparsity, args.seed)
+    save_dictionary(args.out, dictionary)
+    m = dictionary.metadata
+    print(f"{args.out}: {args.atoms} atoms from {m['poses']} poses of {m['files']} files")
+    print(f"reconstruction error {m['reconstruction_error_mm']:.1f} mm, {m['mean_active_atoms']:.1f} active atoms")
+    return 0
+
+
+def learn_from_folder(folder: Path, include: str, every: int, atoms: int, sparsity: float, seed: int) -> Dictionary:
+    """Dictionary from the files ``include`` of a MoCap folder, every n-th frame."""
+    from drocap_ros.evaluation.protocol import load_mocap, mocap_files
+    from drocap_ros.reconstruction.paper.dictionary import learn, normalize_poses
+    from drocap_ros.tracks import read_npz
+
+    files = mocap_files(folder, include)
+    poses = np.concatenate([normalize_poses(load_mocap(path)[0][::every]) for path in files])
+    metadata = {
+        "files": len(files),
+        "frames": sum(len(load_mocap(path)[0]) for path in files),
+        "include": include,
+        "every": every,
+        "licence": sorted({str(a["licence"]) for path in files if "licence" in (a := read_npz(path, ()))}),
+        "origin": sorted({str(a["source"]) for path in files if "source" in (a := read_npz(path, ()))}),
+        "command": f"drocap learn-dictionary MOCAP_DIR --out NPZ --include '{include}' --every {every}"
+        f" --atoms {atoms} --sparsity {sparsity:g} --seed {seed}",
+    }
+    show = sys.stderr.isatty()
+    dictionary = learn(
+        poses,
+        atoms=atoms,
+        sparsity=sparsity,
+        seed=seed,
+        metadata=metadata,
+        progress=(lambda done: print(f"\rlearning {done:4.0%}", end="", file=sys.stderr)) if show else None,
+    )
+    if show:
+        print("\r", end="", file=sys.stderr)
+    return dictionary

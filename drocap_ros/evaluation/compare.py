@@ -1,0 +1,112 @@
+"""One motion against its truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.evaluation.protocol import load_mocap
+from drocap_ros.motion import Motion, load_motion
+from drocap_ros.reconstruction.metrics import (
+    group_errors,
+    horizon_error,
+    is_mirrored,
+    mirrored_frames,
+    pa_mpjpe,
+    scale_error,
+    w_mpjpe,
+)
+from drocap_ros.skeleton import BODY_15, indices
+from drocap_ros.tracks import read_npz
+
+
+@dataclass(frozen=True)
+class PairErrors:
+    """Errors of one motion.
+
+    error_mm : reconstruction error; per_group_mm after the same alignment
+    w_error_mm, horizon_deg : only where both are in world frames, else NaN
+    mirrored, mirrored_share : handedness over the sequence, and share of mirrored frames
+    scale_error : estimated over true mean limb length, less 1
+    """
+
+    frames: int
+    error_mm: float
+    per_group_mm: dict[str, float]
+    w_error_mm: float
+    horizon_deg: float
+    mirrored: bool
+    mirrored_share: float
+    scale_error: float
+    metric: bool
+
+
+def load_truth(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
+    """True joints (T, 15, 3) in m, their times (T,) in s and their frame, of a MoCap or motion ``.npz``.
+
+    Raises
+    ------
+    InputError
+        When the file is neither.
+    """
+    names = set(read_npz(path, ()))
+    if {"X", "fps", "joints"} <= names:
+        x, fps = load_mocap(path)
+        return x / 1000.0, np.arange(len(x)) / fps, "world"
+    if "joints3d" in names:
+        motion = load_motion(path)
+        joints = motion.joints3d[:, indices(motion.joints, BODY_15.joints)]
+        return joints, motion.stamp_ns * 1e-9, motion.frame
+    raise InputError(
+        f"{path}: expected MoCap (X, fps, joints) or a motion (joints3d, ...), got {', '.join(sorted(names))}"
+    )
+
+
+def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -> PairErrors:
+    """Errors of a motion against joints (T, 15, 3) m at increasing times (T,) s.
+
+    Times are absolute where both ranges overlap; otherwise both are counted from their first frame.  The truth
+    is interpolated at the motion's times; frames outside it are left out.
+
+    Raises
+    ------
+    InputError
+        When they do not overlap in time or no frame is finite.
+    """
+    estimate = motion.joints3d[:, indices(motion.joints, BODY_15.joints)]
+    at = motion.stamp_ns * 1e-9
+    if at[-1] < time_s[0] or at[0] > time_s[-1]:
+        at, time_s = at - at[0], time_s - time_s[0]
+    usable = (at >= time_s[0] - 1e-6) & (at <= time_s[-1] + 1e-6) & np.isfinite(estimate).all(axis=(1, 2))
+    if not usable.any():
+        raise InputError(
+            "evaluate pair: expected frames with a pose inside the truth's time, found none; check the pair"
+        )
+    estimate = estimate[usable]
+    true = _at_times(truth, time_s, at[usable])
+    if not np.isfinite(true).all():
+        raise InputError("evaluate pair: expected a truth of finite joints, got NaN or infinity; fill the gaps in")
+    world = motion.frame == "world" and frame == "world"
+    return PairErrors(
+        frames=len(estimate),
+        error_mm=1000.0 * float(pa_mpjpe(estimate, true).mean()),
+        per_group_mm={name: 1000.0 * value for name, value in group_errors(estimate, true).items()},
+        w_error_mm=1000.0 * float(w_mpjpe(estimate, true).mean()) if world else float("nan"),
+        horizon_deg=float(np.degrees(horizon_error(estimate, true)).mean()) if world else float("nan"),
+        mirrored=is_mirrored(estimate, true),
+        mirrored_share=float(mirrored_frames(estimate, true).mean()),
+        scale_error=scale_error(estimate, true),
+        metric=motion.metric,
+    )
+
+
+def _at_times(values: np.ndarray, time_s: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    if len(time_s) == 1:
+        return np.broadcast_to(values, (len(wanted), *values.shape[1:]))
+    after = np.clip(np.searchsorted(time_s, wanted, side="right"), 1, len(time_s) - 1)
+    share = (wanted - time_s[after - 1]) / (time_s[after] - time_s[after - 1])
+    share = np.clip(share, 0.0, 1.0)[:, None, None]
+    return values[after - 1] * (1 - share) + values[after] * share

@@ -1,0 +1,1 @@
+"""MAVLink: link, commands, dialects of the autopilots, and vehicle state."""

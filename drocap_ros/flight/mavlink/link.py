@@ -1,0 +1,351 @@
+"""The one owner of the connection to the autopilot.
+
+It reads telemetry, asks for it, keeps its heartbeat and the clocks in step.  What it may send is listed in
+``SENDABLE``, and with ``commands_enabled`` in ``MOTION`` and its modes too; nothing else leaves the port.  It can
+neither arm, nor take off, nor ask for any mode but the control mode and the hold mode of the dialect.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from drocap_ros.errors import InputError
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.mavlink.autopilot_settings import AutopilotSettings
+from drocap_ros.flight.mavlink.dialects import DIALECTS
+from drocap_ros.flight.mavlink.parser import MavlinkParser
+from drocap_ros.flight.mavlink.signing import read_signing_key, sign_with, signing_time
+from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
+from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
+from drocap_ros.flight.mavlink.transport import LinkError, Transport, open_transport
+from drocap_ros.flight.vehicle_state import VehicleState
+
+_NS = 1_000_000_000
+_STREAM_FALLBACK_S = 5.0
+_RECONNECT_S = 1.0
+SENDABLE = frozenset({"HEARTBEAT", "TIMESYNC", "COMMAND_LONG", "REQUEST_DATA_STREAM", "PARAM_REQUEST_READ"})
+_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL})
+MOTION = frozenset({"SET_POSITION_TARGET_LOCAL_NED", "COMMAND_LONG"})
+_MODES = frozenset(
+    (float(main), float(sub)) for d in DIALECTS.values() for main, sub in (d.control_numbers, d.hold_numbers)
+)
+
+logger = logging.getLogger(__name__)
+
+
+class LinkStatus(NamedTuple):
+    """How the link does.
+
+    connected : something of the vehicle was heard within the time-out
+    silence_s : since then; infinity before the first
+    round_trip_s : of the best time synchronization, NaN without one
+    rates_hz : (real, wanted) of each message asked for, by its name
+    refused : MAV_RESULT of what the autopilot does not grant
+    bad_count : pieces of data that were no message, or not signed as they must be
+    refused_count : of these, whole messages that were not signed with our key
+    """
+
+    connected: bool
+    silence_s: float
+    round_trip_s: float
+    rates_hz: dict[str, tuple[float, float]]
+    refused: dict[str, int]
+    bad_count: int
+    refused_count: int = 0
+
+
+class MavlinkLink:
+    """Link to one autopilot.  Use as a context manager, and either call :meth:`spin_once` or :meth:`run`.
+
+    Parameters
+    ----------
+    config : where to connect, what to ask for
+    clock_ns : our clock, ns; that of the stamps
+    monotonic_s : clock of the periods and of silence
+    transport : instead of that of ``config.url``
+
+    Raises
+    ------
+    InputError
+        At construction, when the URL or the file of the signing key cannot be used.
+    """
+
+    def __init__(
+        self,
+        config: MavlinkBridgeConfig,
+        clock_ns: Callable[[], int] = time.time_ns,
+        *,
+        monotonic_s: Callable[[], float] = time.monotonic,
+        transport: Transport | None = None,
+    ) -> None:
+        self.config = config
+        self.estimator = VehicleStateEstimator(config.target_system_id)
+        self._clock_ns = clock_ns
+        self._monotonic_s = monotonic_s
+        key = read_signing_key(config.signing_key_file) if config.signing_key_file else None
+        self._transport = transport or open_transport(config.url)
+        self._parser = MavlinkParser(key, clock_ns())
+        self._requests = TelemetryRequests(config)
+        self.settings = AutopilotSettings()
+        self._mav = mavlink.MAVLink(None, srcSystem=config.system_id, srcComponent=config.component_id)
+        # The watchdog packs with one of its own, so that it shares nothing with a loop that hangs; signed packets of
+        # one stream must not go back in time, so it signs as another stream.
+        self._last_mav = mavlink.MAVLink(None, srcSystem=config.system_id, srcComponent=config.component_id)
+        if key is not None:
+            sign_with(self._mav, key, clock_ns())
+            sign_with(self._last_mav, key, clock_ns(), link_id=1)
+        self._autopilot: str | None = None
+        self._heard_s: float | None = None  # monotonic
+        self._due: dict[str, float] = {}
+        self._sync_sent: dict[int, float] = {}  # monotonic s by our stamp, ns
+        self._answered_s = math.nan  # monotonic time at which that was sent which was answered last
+        self._broken_s: float | None = None
+        self._lock = threading.Lock()
+        self._answers: list[tuple[int, int]] = []
+
+    def __enter__(self) -> MavlinkLink:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._transport.close()
+
+    def run(self, on_state: Callable[[VehicleState], None], stop: threading.Event) -> None:
+        """Read until ``stop`` is set; the states go to the callback.  A broken link is opened again."""
+        while not stop.is_set():
+            for state in self.spin_once(0.05):
+                on_state(state)
+
+    def spin_once(self, timeout_s: float = 0.0) -> list[VehicleState]:
+        """Read what has come, waiting at most ``timeout_s``; send what is due.
+
+        Returns one state per attitude message.  Never raises on what comes in.
+        """
+        data = self._read(timeout_s)
+        now_ns = self._clock_ns()
+        with self._lock:
+            states = [self._take(message, now_ns) for message in (self._parser.feed(data) if data else [])]
+            self._send_due()
+        return [state for state in states if state is not None]
+
+    @property
+    def mav(self) -> Any:
+        """Encoder of messages in our name."""
+        return self._mav
+
+    @property
+    def target(self) -> tuple[int, int]:
+        """System and component of the autopilot."""
+        return self.estimator.system_id, self.estimator.component_id
+
+    def send_motion(self, message: Any) -> None:
+        """Send a setpoint or a command of the allow-list.
+
+        Raises
+        ------
+        AssertionError
+            When motion is not enabled, or the message is not on the list: an error in the program.
+        """
+        self.check_motion(message)
+        with self._lock:
+            self._transmit(message)
+
+    def check_motion(self, message: Any) -> Any:
+        """The message, if it is on the allow-list: to be left to the watchdog.
+
+        Raises
+        ------
+        AssertionError
+            As :meth:`send_motion`.
+        """
+        if not self.config.commands_enabled or not _is_motion(message):
+            raise AssertionError(f"this link sends no {message.get_type()}")
+        return message
+
+    def send_unlocked(self, message: Any) -> None:
+        """Send a motion message without waiting for anybody: for the watchdog of a loop that hangs."""
+        self.check_motion(message)
+        try:
+            self._transport.write(self._pack(message, self._last_mav))
+        except LinkError as error:
+            logger.warning("the watchdog could not send: %s", error)
+
+    def take_answers(self) -> list[tuple[int, int]]:
+        """(command, MAV_RESULT) of the acknowledgements that came since the last call, telemetry's left out."""
+        with self._lock:
+            answers, self._answers = self._answers, []
+        return answers
+
+    def answer_age_s(self) -> float:
+        """Time since that was sent which the autopilot has answered last: the way both ways; NaN before the first."""
+        return self._monotonic_s() - self._answered_s
+
+    def status(self) -> LinkStatus:
+        """How the link does now."""
+        with self._lock:
+            return self._status()
+
+    def _status(self) -> LinkStatus:
+        silence = float("inf") if self._heard_s is None else self._monotonic_s() - self._heard_s
+        trip = self.estimator.clock.round_trip_ns
+        now_ns = self._clock_ns()
+        return LinkStatus(
+            connected=silence < self.config.link_timeout_s,
+            silence_s=silence,
+            round_trip_s=float("nan") if trip is None else trip / _NS,
+            rates_hz=self._requests.rates_hz(now_ns),
+            refused=self._requests.refused(),
+            bad_count=self._parser.bad_count,
+            refused_count=self._parser.refused_count,
+        )
+
+    def _read(self, timeout_s: float) -> bytes:
+        if self._broken_s is not None and not self._reopened(timeout_s):
+            return b""
+        try:
+            return self._transport.read(timeout_s)
+        except LinkError as error:
+            self._break(error)
+            return b""
+
+    def _break(self, error: LinkError) -> None:
+        logger.warning("%s; trying again every %g s", error, _RECONNECT_S)
+        self._broken_s = self._monotonic_s()
+
+    def _reopened(self, timeout_s: float) -> bool:
+        if self._broken_s is None or self._monotonic_s() - self._broken_s < _RECONNECT_S:
+            time.sleep(min(timeout_s, _RECONNECT_S))
+            return False
+        self._transport.close()
+        try:
+            self._transport = open_transport(self.config.url)
+        except InputError:
+            self._broken_s = self._monotonic_s()
+            return False
+        self._broken_s = None
+        return True
+
+    def _take(self, message: Any, now_ns: int) -> VehicleState | None:
+        name = message.get_type()
+        try:
+            state = self.estimator.update(message, now_ns)
+        except (ValueError, TypeError, OverflowError, AttributeError) as error:  # values outside their enumerations
+            logger.debug("dropped %s: %s", name, error)
+            return None
+        if message.get_srcSystem() != self.estimator.system_id or self.estimator.component_id == 0:
+            return state
+        self._heard_s = self._monotonic_s()
+        self._transport.accept_peer()
+        if self._autopilot is None:
+            self._autopilot = _autopilot_kind(message)
+            if self._autopilot is not None:
+                self._requests.set_autopilot(self._autopilot)
+                self.settings.set_autopilot(self._autopilot)
+        self._requests.count(message.get_msgId(), now_ns)
+        if name == "TIMESYNC":
+            self._take_time_sync(message, now_ns)
+        elif name == "PARAM_VALUE":
+            self.settings.take(message)
+        elif name == "COMMAND_ACK" and message.command in _COMMANDS:
+            self._requests.acknowledge(message.result, now_ns)
+        elif name == "COMMAND_ACK" and message.target_system in (0, self.config.system_id):
+            self._answers = [*self._answers[-31:], (int(message.command), int(message.result))]
+        return state
+
+    def _take_time_sync(self, message: Any, now_ns: int) -> None:
+        if message.tc1 == 0:  # the autopilot asks
+            self._send(self._mav.timesync_encode(now_ns, message.ts1))
+            return
+        sent_s = self._sync_sent.pop(message.ts1, None)
+        if sent_s is not None:
+            self._answered_s = sent_s if math.isnan(self._answered_s) else max(self._answered_s, sent_s)
+            self.estimator.clock.exchange(message.ts1, message.tc1, now_ns)
+
+    def _send_due(self) -> None:
+        config = self.config
+        if self._is_due("heartbeat", 1.0 / config.heartbeat_hz):
+            self._send(
+                self._mav.heartbeat_encode(
+                    mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE
+                )
+            )
+        if self._autopilot is None:
+            return
+        now_ns = self._clock_ns()
+        if self._is_due("time_sync", 1.0 / config.time_sync_hz):
+            if len(self._sync_sent) > 64:
+                self._sync_sent.clear()
+            self._sync_sent[now_ns] = self._monotonic_s()
+            self._send(self._mav.timesync_encode(0, now_ns))
+        system, component = self.estimator.system_id, self.estimator.component_id
+        if self._is_due("request", 0.02):
+            for number, interval_us in self._requests.due(now_ns):
+                self._send(
+                    self._mav.command_long_encode(
+                        system, component, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, interval_us, 0, 0, 0, 0, 0
+                    )
+                )
+        if config.commands_enabled:
+            for setting in self.settings.due(self._monotonic_s()):
+                self._send(self._mav.param_request_read_encode(system, component, setting.encode("ascii"), -1))
+        if self._requests.unanswered() and self._is_due("streams", _STREAM_FALLBACK_S):
+            # Autopilots and proxies too old for SET_MESSAGE_INTERVAL know this one.
+            rate = round(min(config.position_hz, 50))
+            self._send(self._mav.request_data_stream_encode(system, component, mavlink.MAV_DATA_STREAM_ALL, rate, 1))
+
+    def _is_due(self, what: str, period_s: float) -> bool:
+        now = self._monotonic_s()
+        if now < self._due.get(what, 0.0):
+            return False
+        self._due[what] = now + period_s
+        return True
+
+    def _send(self, message: Any) -> None:
+        name = message.get_type()
+        if name not in SENDABLE or (name == "COMMAND_LONG" and message.command not in _COMMANDS):
+            raise AssertionError(f"this link sends no {name}")
+        self._transmit(message)
+
+    def _transmit(self, message: Any) -> None:
+        if self._broken_s is not None:
+            return
+        try:
+            self._transport.write(self._pack(message, self._mav))
+        except LinkError as error:
+            self._break(error)
+
+    def _pack(self, message: Any, mav: Any) -> bytes:
+        if mav.signing.sign_outgoing:
+            # Never back, whatever our clock does, and never far behind what others sign.
+            heard = self._parser.signing.timestamp
+            mav.signing.timestamp = max(mav.signing.timestamp, signing_time(self._clock_ns()), heard)
+        packet = bytes(message.pack(mav))
+        mav.seq = (mav.seq + 1) % 256
+        return packet
+
+
+def _is_motion(message: Any) -> bool:
+    """The narrow list: setpoints, the dialects' own modes, the mount's pitch."""
+    if message.get_type() not in MOTION:
+        return False
+    if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
+        return True
+    if message.command == mavlink.MAV_CMD_DO_SET_MODE:
+        return (float(message.param2), float(message.param3)) in _MODES
+    return bool(message.command == mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW)
+
+
+def _autopilot_kind(message: Any) -> str | None:
+    if message.get_type() != "HEARTBEAT":
+        return None
+    return "px4" if message.autopilot == mavlink.MAV_AUTOPILOT_PX4 else "ardupilot"

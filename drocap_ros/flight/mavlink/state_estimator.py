@@ -1,0 +1,342 @@
+"""From the autopilot's messages to :class:`VehicleState`: pure, so that live link and log replay share it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from drocap_ros.flight.frames import (
+    frd_to_flu,
+    geodetic_to_enu,
+    ned_to_enu,
+    orientation_to_ros,
+    quaternion_from_euler,
+    quaternion_multiply,
+    yaw_of,
+)
+from drocap_ros.flight.mavlink.clock_offset import ClockOffset
+from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.geometry.rotations import slerp
+
+_NS = 1_000_000_000
+_MS = 1_000_000
+
+# MAVLink's enumerations, by the names of its definition.
+_MAV_AUTOPILOT_INVALID = 8
+_AUTOPILOTS = {3: "ardupilot", 12: "px4"}
+_MAV_TYPE_GCS = 6
+_MAV_MODE_FLAG_SAFETY_ARMED = 128
+#: attitude, horizontal and vertical velocity, vertical position: all needed; horizontal position, relative or absolute.
+_ESTIMATOR_NEEDED = 1 | 2 | 4 | 32
+_ESTIMATOR_POSITION = 8 | 16
+_ESTIMATOR_CONSTANT_POSITION = 128
+_EKF_UNINITIALIZED = 1024  # EKF_STATUS_REPORT only; in ESTIMATOR_STATUS the bit is the GPS glitch
+_EKF_GPS_GLITCH = 32768
+_ESTIMATOR_GLITCH = 1024 | 2048  # GPS, accelerometer
+_GIMBAL_YAW_IN_VEHICLE_FRAME, _GIMBAL_YAW_IN_EARTH_FRAME, _GIMBAL_YAW_LOCK = 32, 64, 16
+
+_POSITION_STALE_S = 3.0
+_ESTIMATOR_STALE_S = 5.0
+_QUATERNION_PREFERRED_S = 1.0
+_GIMBAL_STALE_S = 3.0
+_GIMBAL_STEP_S = 0.25
+_EXTRAPOLATE_S = 0.5
+
+
+class VehicleStateEstimator:
+    """Reduces messages of one autopilot to its state.
+
+    The first autopilot heard (or the one asked for) is the vehicle; other systems are not listened to.  Nothing
+    here reads a clock: the caller says when each message came.
+
+    Parameters
+    ----------
+    target_system_id : MAVLink system of the vehicle; 0 = the first autopilot heard
+    """
+
+    def __init__(self, target_system_id: int = 0) -> None:
+        self.clock = ClockOffset()
+        self.system_id = target_system_id
+        self.component_id = 0
+        self.utc_minus_boot_ns: int | None = None
+        self._heard_ns: int | None = None
+        self._stamp_ns = -(10**18)
+        self._heartbeat: tuple[str, str, bool] | None = None
+        self._attitude: tuple[int, np.ndarray, np.ndarray] | None = None  # boot ns, FRD -> NED x y z w, rates FRD
+        self._quaternion_ns = -(10**18)
+        self._position: tuple[int, np.ndarray, np.ndarray] | None = None  # boot ns, ENU m, ENU m/s
+        self._local_position_ns = -(10**18)
+        self._origin: np.ndarray | None = None
+        self._estimator: tuple[int, bool] | None = None
+        self._attitude_received_ns = 0
+        self._gimbal: tuple[int, np.ndarray] | None = None  # reception, camera FRD -> NED x y z w
+        self._gimbal_before: tuple[int, np.ndarray] | None = None
+        self._values: dict[str, Any] = {}
+        #: When the latest message of each kind came from the vehicle, and when its position last changed: our clock.
+        self.received_ns: dict[str, int] = {}
+        self.position_changed_ns = -(10**18)
+
+    def update(self, message: Any, receive_time_ns: int) -> VehicleState | None:
+        """Take one decoded pymavlink message; a new state when it tells the attitude, else None.
+
+        Stamps increase, but after a jump of a clock by more than five seconds.
+        Values that cannot be (not finite, quaternion of no unit length) are dropped.
+        """
+        name = message.get_type()
+        if name == "HEARTBEAT":
+            self._take_heartbeat(message, receive_time_ns)
+            return None
+        if self._heartbeat is None or message.get_srcSystem() != self.system_id:
+            return None
+        from_autopilot = message.get_srcComponent() == self.component_id
+        if from_autopilot:
+            self._heard_ns = receive_time_ns
+            self.received_ns[name] = receive_time_ns
+        handler = _HANDLERS.get(name) if from_autopilot or name in _FROM_ANY_COMPONENT else None
+        if handler is None:
+            return None
+        if not handler(self, message, receive_time_ns):
+            return None
+        state = self.snapshot(receive_time_ns)
+        # The clock's offset becomes better with time: what would go back by a little is left out.
+        if state is None or 0 <= self._stamp_ns - state.stamp_ns < 5 * _NS:
+            return None
+        self._stamp_ns = state.stamp_ns
+        return state
+
+    def age_s(self, names: tuple[str, ...], now_ns: int) -> float:
+        """Time since the latest of these kinds of message came from the vehicle; infinity before the first."""
+        latest = max((self.received_ns[name] for name in names if name in self.received_ns), default=None)
+        return math.inf if latest is None else (now_ns - latest) / _NS
+
+    def snapshot(self, now_ns: int) -> VehicleState | None:
+        """The state as known at ``now_ns``; None before the first heartbeat and attitude."""
+        if self._heartbeat is None or self._attitude is None or self._heard_ns is None:
+            return None
+        autopilot, mode, armed = self._heartbeat
+        boot_ns, orientation, rates = self._attitude
+        position, velocity = self._position_at(boot_ns)
+        estimator_ok = False
+        if self._estimator is not None:
+            age_s = (self._heard_ns - self._estimator[0]) / _NS
+            estimator_ok = self._estimator[1] and age_s < _ESTIMATOR_STALE_S
+        return VehicleState(
+            stamp_ns=self.clock.to_local_ns(boot_ns, self._heard_ns),
+            autopilot=autopilot,
+            mode=mode,
+            armed=armed,
+            position_enu_m=position,
+            velocity_enu_m_s=velocity,
+            orientation_xyzw=orientation_to_ros(orientation),
+            angular_velocity_flu_rad_s=frd_to_flu(rates),
+            position_ok=estimator_ok and bool(np.isfinite(position).all()),
+            gimbal_orientation_xyzw=self._gimbal_at(self._attitude_received_ns),
+            link_age_s=max(0.0, (now_ns - self._heard_ns) / _NS),
+            **self._values,
+        )
+
+    def _take_heartbeat(self, message: Any, now_ns: int) -> None:
+        if message.autopilot == _MAV_AUTOPILOT_INVALID or message.type == _MAV_TYPE_GCS:
+            return
+        system = message.get_srcSystem()
+        if self.system_id not in (0, system):
+            return
+        if self._heartbeat is not None and message.get_srcComponent() != self.component_id:
+            return
+        self.system_id, self.component_id = system, message.get_srcComponent()
+        self._heard_ns = now_ns
+        self.received_ns["HEARTBEAT"] = now_ns
+        self._heartbeat = (
+            _AUTOPILOTS.get(message.autopilot, "other"),
+            mode_name(message),
+            bool(message.base_mode & _MAV_MODE_FLAG_SAFETY_ARMED),
+        )
+
+    def _boot_ns(self, message: Any, now_ns: int) -> int:
+        boot_ns = int(message.time_boot_ms) * _MS
+        self.clock.observe(boot_ns, now_ns)
+        return boot_ns
+
+    def _take_attitude(self, message: Any, now_ns: int) -> bool:
+        # Where both forms come, the quaternion counts, so that each instant gives one state.
+        if (now_ns - self._quaternion_ns) / _NS < _QUATERNION_PREFERRED_S:
+            return False
+        angles = (message.roll, message.pitch, message.yaw)
+        if not all(map(math.isfinite, angles)):
+            return False
+        return self._set_attitude(message, quaternion_from_euler(*angles), now_ns)
+
+    def _take_attitude_quaternion(self, message: Any, now_ns: int) -> bool:
+        quaternion = _unit_quaternion((message.q2, message.q3, message.q4, message.q1))
+        if quaternion is None:
+            return False
+        self._quaternion_ns = now_ns
+        return self._set_attitude(message, quaternion, now_ns)
+
+    def _set_attitude(self, message: Any, quaternion: np.ndarray, now_ns: int) -> bool:
+        self._attitude_received_ns = now_ns
+        rates = np.array([message.rollspeed, message.pitchspeed, message.yawspeed], dtype=float)
+        self._attitude = (self._boot_ns(message, now_ns), quaternion, np.where(np.isfinite(rates), rates, np.nan))
+        return True
+
+    def _take_local_position(self, message: Any, now_ns: int) -> bool:
+        ned = np.array([message.x, message.y, message.z], dtype=float)
+        velocity = np.array([message.vx, message.vy, message.vz], dtype=float)
+        if np.isfinite(ned).all() and np.isfinite(velocity).all():
+            self._local_position_ns = now_ns
+            position = ned_to_enu(ned)
+            # A real estimate never repeats bit for bit: one that does is frozen, however fresh its stamp.
+            if self._position is None or not np.array_equal(self._position[1], position):
+                self.position_changed_ns = now_ns
+            self._position = (self._boot_ns(message, now_ns), position, ned_to_enu(velocity))
+        return False
+
+    def _take_global_position(self, message: Any, now_ns: int) -> bool:
+        boot_ns = self._boot_ns(message, now_ns)
+        if message.lat == 0 and message.lon == 0:  # autopilots send zeros until they know better
+            return False
+        geodetic = np.array([message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3])
+        if abs(geodetic[0]) > 90 or abs(geodetic[1]) > 180:
+            return False
+        self._values.update(
+            latitude_deg=float(geodetic[0]), longitude_deg=float(geodetic[1]), altitude_amsl_m=float(geodetic[2])
+        )
+        if (now_ns - self._local_position_ns) / _NS < _POSITION_STALE_S:
+            return False
+        # No local position: a frame of our own, with its origin at the ground below the first position.
+        if self._origin is None:
+            self._origin = np.array([geodetic[0], geodetic[1], geodetic[2] - message.relative_alt * 1e-3])
+        velocity = np.array([message.vx, message.vy, message.vz]) * 1e-2
+        self._position = (boot_ns, geodetic_to_enu(geodetic, self._origin), ned_to_enu(velocity))
+        return False
+
+    def _take_gps(self, message: Any, _now_ns: int) -> bool:
+        self._values.update(gps_fix_type=int(message.fix_type), satellites=int(message.satellites_visible))
+        return False
+
+    def _take_sys_status(self, message: Any, _now_ns: int) -> bool:
+        volts, percent = message.voltage_battery, message.battery_remaining
+        self._values["battery_voltage_v"] = volts * 1e-3 if 0 < volts < 65535 else math.nan
+        self._values["battery_fraction"] = percent * 1e-2 if 0 <= percent <= 100 else math.nan
+        return False
+
+    def _take_ekf(self, message: Any, now_ns: int) -> bool:
+        bad = _ESTIMATOR_CONSTANT_POSITION | _EKF_UNINITIALIZED | _EKF_GPS_GLITCH
+        self._estimator = (now_ns, _estimator_ok(message.flags, bad))
+        return False
+
+    def _take_estimator(self, message: Any, now_ns: int) -> bool:
+        bad = _ESTIMATOR_CONSTANT_POSITION | _ESTIMATOR_GLITCH
+        self._estimator = (now_ns, _estimator_ok(message.flags, bad))
+        return False
+
+    def _take_extended_state(self, message: Any, _now_ns: int) -> bool:
+        self._values["landed_state"] = int(message.landed_state) if 0 <= message.landed_state <= 4 else 0
+        return False
+
+    def _take_gimbal(self, message: Any, now_ns: int) -> bool:
+        w, x, y, z = message.q
+        quaternion = _unit_quaternion((x, y, z, w))
+        if quaternion is None:
+            return False
+        flags = message.flags
+        earth = bool(flags & _GIMBAL_YAW_IN_EARTH_FRAME)
+        if not flags & (_GIMBAL_YAW_IN_EARTH_FRAME | _GIMBAL_YAW_IN_VEHICLE_FRAME):
+            earth = bool(flags & _GIMBAL_YAW_LOCK)
+        self._set_gimbal(quaternion, earth, now_ns)
+        return False
+
+    def _take_mount_orientation(self, message: Any, now_ns: int) -> bool:
+        absolute = message.yaw_absolute
+        # A v1 message has no absolute yaw and decodes it as 0: then the one relative to the vehicle counts.
+        earth = math.isfinite(absolute) and absolute != 0.0
+        angles = np.deg2rad([message.roll, message.pitch, absolute if earth else message.yaw])
+        if np.isfinite(angles).all():
+            self._set_gimbal(quaternion_from_euler(*angles), earth, now_ns)
+        return False
+
+    def _take_mount_status(self, message: Any, now_ns: int) -> bool:
+        pitch, roll, yaw = np.deg2rad(
+            np.array([message.pointing_a, message.pointing_b, message.pointing_c], dtype=float) * 1e-2
+        )
+        self._set_gimbal(quaternion_from_euler(roll, pitch, yaw), False, now_ns)
+        return False
+
+    def _set_gimbal(self, quaternion: np.ndarray, yaw_from_north: bool, now_ns: int) -> None:
+        """Keep the rotation camera FRD -> NED; a gimbal's roll and pitch are against the horizon in either case."""
+        if not yaw_from_north:
+            if self._attitude is None:
+                return
+            turn = quaternion_from_euler(0.0, 0.0, float(yaw_of(self._attitude[1])))
+            quaternion = quaternion_multiply(turn, quaternion)
+        self._gimbal_before, self._gimbal = self._gimbal, (now_ns, quaternion)
+
+    def _take_system_time(self, message: Any, now_ns: int) -> bool:
+        boot_ns = self._boot_ns(message, now_ns)
+        if message.time_unix_usec > 1_000_000_000_000_000:  # before 2001 it has no GPS time yet
+            self.utc_minus_boot_ns = int(message.time_unix_usec) * 1000 - boot_ns
+        return False
+
+    def _gimbal_at(self, received_ns: int) -> np.ndarray:
+        """(4,) x y z w camera FLU -> ENU at the attitude's reception, NaN when it is not known.
+
+        The gimbal's own messages come at other times, by a clock of its own: its last turn is carried on for as
+        long as it took, so that at 25 deg/s and 20 Hz the camera is not told a degree late.
+        """
+        if self._gimbal is None or (received_ns - self._gimbal[0]) / _NS > _GIMBAL_STALE_S:
+            return np.full(4, np.nan)
+        latest_ns, orientation = self._gimbal
+        if self._gimbal_before is not None:
+            before_ns, before = self._gimbal_before
+            step_ns = latest_ns - before_ns
+            if 0 < step_ns <= _GIMBAL_STEP_S * _NS:
+                part = min(max(received_ns - latest_ns, 0), step_ns) / step_ns
+                orientation = slerp(before, orientation, 1.0 + part)
+        return orientation_to_ros(orientation)
+
+    def _position_at(self, boot_ns: int) -> tuple[np.ndarray, np.ndarray]:
+        """Position and velocity (3,) ENU at an instant: carried on by the velocity for up to half a second."""
+        if self._position is None:
+            return np.full(3, np.nan), np.full(3, np.nan)
+        since, position, velocity = self._position
+        gap_s = (boot_ns - since) / _NS
+        if abs(gap_s) > _POSITION_STALE_S:
+            return np.full(3, np.nan), np.full(3, np.nan)
+        return position + velocity * min(max(gap_s, -_EXTRAPOLATE_S), _EXTRAPOLATE_S), velocity
+
+
+def mode_name(heartbeat: Any) -> str:
+    """Flight mode by the autopilot's own name, or its number where pymavlink knows none."""
+    from pymavlink import mavutil
+
+    return str(mavutil.mode_string_v10(heartbeat))
+
+
+def _estimator_ok(flags: int, bad: int) -> bool:
+    return flags & _ESTIMATOR_NEEDED == _ESTIMATOR_NEEDED and bool(flags & _ESTIMATOR_POSITION) and not flags & bad
+
+
+def _unit_quaternion(xyzw: tuple[float, float, float, float]) -> np.ndarray | None:
+    quaternion = np.array(xyzw, dtype=float)
+    length = float(np.linalg.norm(quaternion))
+    return quaternion / length if math.isfinite(length) and 0.9 < length < 1.1 else None
+
+
+_FROM_ANY_COMPONENT = frozenset({"GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS"})
+_HANDLERS = {
+    "ATTITUDE": VehicleStateEstimator._take_attitude,
+    "ATTITUDE_QUATERNION": VehicleStateEstimator._take_attitude_quaternion,
+    "LOCAL_POSITION_NED": VehicleStateEstimator._take_local_position,
+    "GLOBAL_POSITION_INT": VehicleStateEstimator._take_global_position,
+    "GPS_RAW_INT": VehicleStateEstimator._take_gps,
+    "SYS_STATUS": VehicleStateEstimator._take_sys_status,
+    "EKF_STATUS_REPORT": VehicleStateEstimator._take_ekf,
+    "ESTIMATOR_STATUS": VehicleStateEstimator._take_estimator,
+    "EXTENDED_SYS_STATE": VehicleStateEstimator._take_extended_state,
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": VehicleStateEstimator._take_gimbal,
+    "MOUNT_ORIENTATION": VehicleStateEstimator._take_mount_orientation,
+    "MOUNT_STATUS": VehicleStateEstimator._take_mount_status,
+    "SYSTEM_TIME": VehicleStateEstimator._take_system_time,
+}

@@ -1,0 +1,1 @@
+"""ONNX networks: which are known, how they are fetched, loaded and run."""

@@ -1,0 +1,159 @@
+"""Download of a known model: resumed where it was cut off, verified before it is put in place."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import urllib.error
+import urllib.request
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+from drocap_ros.errors import DrocapError, InputError
+from drocap_ros.perception.models.registry import KnownModel
+
+_CHUNK = 1 << 18
+_TIMEOUT_S = 30.0
+#: No model of the registry is larger; a server that sends more is not the right one.
+_MOST_BYTES = 2_000_000_000
+
+#: Called with the bytes received and the total, 0 where the server does not tell.
+Progress = Callable[[int, int], None]
+
+
+class FetchError(DrocapError):
+    """The download failed for a reason outside the command line: no network, server, disk."""
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file in hex."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(_CHUNK):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def fetch(model: KnownModel, folder: Path, *, unverified: bool = False, progress: Progress | None = None) -> Path:
+    """The model's file in ``folder``, downloaded unless it is there already.
+
+    The download goes to a ``.part`` file that the next attempt continues; the model appears under its name
+    only when its checksum is right.  A model without a known checksum is fetched only with ``unverified``,
+    and the checksum found is kept beside it, so that a later fetch of other bytes is noticed.
+
+    Raises
+    ------
+    InputError
+        When the model has no download, or no checksum and ``unverified`` is not set.
+    FetchError
+        When the network, the server or the checksum fails.
+    """
+    target = folder / model.file
+    expected = model.sha256 or _recorded(target)
+    if target.is_file() and expected and sha256_of(target) == expected:
+        return target
+    if not model.url:
+        raise InputError(
+            f"{model.name}: expected a model that its publisher offers as ONNX, {model.home} does not; export it"
+            f" yourself to {target}, or fetch another"
+        )
+    if not expected and not unverified:
+        raise InputError(
+            f"{model.name}: no checksum is known for it; fetch another, or add --unverified to trust {model.url}"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    part = folder / f"{Path(model.url).name}.part"
+    download(model.url, part, progress)
+    _install(model, part, target, expected)
+    return target
+
+
+def download(url: str, part: Path, progress: Progress | None = None) -> None:
+    """Bring ``url`` into ``part``, continuing what is there.
+
+    Raises
+    ------
+    FetchError
+        With the reason in words; what has come stays in ``part``.
+    """
+    have = part.stat().st_size if part.exists() else 0
+    request = urllib.request.Request(url, headers={"User-Agent": "drocap_ros", "Accept-Encoding": "identity"})
+    if have:
+        request.add_header("Range", f"bytes={have}-")
+    try:
+        with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
+            if have and answer.status != 206:  # the server cannot continue: from the beginning
+                have = 0
+            length = int(answer.headers.get("Content-Length") or 0)
+            total = have + length if length else 0
+            with part.open("ab" if have else "wb") as file:
+                while block := answer.read(_CHUNK):
+                    have += len(block)
+                    if have > _MOST_BYTES:
+                        raise FetchError(f"{url}: expected at most {_MOST_BYTES} bytes, got more; the address is wrong")
+                    file.write(block)
+                    if progress is not None:
+                        progress(have, total)
+    except urllib.error.HTTPError as error:
+        if error.code == 416 and have:  # nothing left to send: complete, or not ours; the checksum decides
+            return
+        raise FetchError(
+            f"{url}: expected the model, the server answered {error.code} {error.reason}; try later"
+        ) from None
+    except (urllib.error.URLError, OSError) as error:
+        reason = getattr(error, "reason", error)
+        raise FetchError(
+            f"{url}: no download ({reason}); check the network or proxy and run the command again, it continues at"
+            f" {have} bytes"
+        ) from None
+    if total and have < total:
+        raise FetchError(f"{url}: cut off after {have} of {total} bytes; run the command again to continue")
+
+
+def _install(model: KnownModel, part: Path, target: Path, expected: str) -> None:
+    fresh = target.with_suffix(".new")
+    try:
+        if model.member:
+            _extract(part, model.member, fresh)
+        else:
+            shutil.copyfile(part, fresh)
+        found = sha256_of(fresh)
+        if expected and found != expected:
+            raise FetchError(
+                f"{model.name}: expected SHA-256 {expected}, got {found}; the download was damaged or changed at its"
+                " home: nothing was kept, try again"
+            )
+        if not model.sha256:
+            _record_path(target).write_text(f"{found}  {target.name}\n", encoding="ascii")
+        os.replace(fresh, target)
+    finally:
+        fresh.unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
+
+
+def _extract(archive: Path, member: str, target: Path) -> None:
+    try:
+        with zipfile.ZipFile(archive) as files:
+            names = [n for n in files.namelist() if n == member or n.endswith("/" + member)]
+            if len(names) != 1:
+                raise FetchError(f"{archive.name}: expected one {member} in it, found {len(names)}; try again later")
+            if files.getinfo(names[0]).file_size > _MOST_BYTES:
+                raise FetchError(
+                    f"{archive.name}: expected a model of at most {_MOST_BYTES} bytes; the address is wrong"
+                )
+            with files.open(names[0]) as source, target.open("wb") as sink:
+                shutil.copyfileobj(source, sink, _CHUNK)
+    except zipfile.BadZipFile as error:
+        raise FetchError(f"{archive.name}: expected a ZIP archive; {error}; nothing was kept, try again") from None
+
+
+def _record_path(target: Path) -> Path:
+    return target.with_suffix(".onnx.sha256")
+
+
+def _recorded(target: Path) -> str:
+    """Checksum kept at the first unverified fetch, or an empty text."""
+    path = _record_path(target)
+    return path.read_text(encoding="ascii").split()[0] if path.is_file() and path.stat().st_size else ""

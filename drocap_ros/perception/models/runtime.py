@@ -1,0 +1,152 @@
+"""One ONNX model in onnxruntime: provider and threads chosen on purpose, every refusal in one line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.perception.models.free_size import with_free_size
+
+_PROVIDERS = {
+    "cpu": "CPUExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "tensorrt": "TensorrtExecutionProvider",
+    "openvino": "OpenVINOExecutionProvider",
+    "coreml": "CoreMLExecutionProvider",
+}
+#: TensorRT builds an engine for minutes at the first start, so ``auto`` leaves it to those who ask.
+_AUTO_ORDER = ("cuda", "cpu")
+
+_ELEMENT_TYPES = {
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+    "tensor(uint8)": np.uint8,
+    "tensor(int32)": np.int32,
+}
+
+
+@dataclass(frozen=True)
+class TensorInfo:
+    """Name, shape (None = dynamic) and element type of a model's input or output."""
+
+    name: str
+    shape: tuple[int | None, ...]
+    element_type: str
+
+
+class OnnxModel:
+    """A loaded model.
+
+    Parameters
+    ----------
+    path : the ``.onnx`` file
+    threads : intra-op threads on the CPU
+    provider : "auto" or a key of the execution providers; asking for one that is not offered is an error
+
+    Raises
+    ------
+    InputError
+        When the file is no model that onnxruntime can run.
+    """
+
+    def __init__(self, path: Path, threads: int = 1, provider: str = "auto") -> None:
+        import onnxruntime as ort
+
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise InputError(f"{self.path}: expected an ONNX model, found no such file; see `drocap models list`")
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 4
+        # A spinning thread pool starves the decoder and the other nodes of a small companion computer.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        providers = choose_providers(provider, ort.get_available_providers())
+        self._open = lambda source: ort.InferenceSession(source, options, providers=providers)
+        try:
+            self._session: Any = self._open(str(self.path))
+        except Exception as error:  # onnxruntime raises its own unrelated classes
+            raise InputError(
+                f"{self.path}: expected an ONNX model that onnxruntime {ort.__version__} can run; {_first_line(error)};"
+                " export or fetch it again"
+            ) from None
+        self.provider: str = self._session.get_providers()[0]
+        self.inputs = tuple(_info(t) for t in self._session.get_inputs())
+        self.outputs = tuple(_info(t) for t in self._session.get_outputs())
+        self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
+        if len(self.inputs) != 1 or self.inputs[0].element_type not in _ELEMENT_TYPES:
+            found = ", ".join(f"{t.name} {t.element_type}" for t in self.inputs)
+            raise InputError(f"{self.path}: expected one image input (float, uint8 or int32), found {found}")
+        self._dtype = _ELEMENT_TYPES[self.inputs[0].element_type]
+        self._names = [t.name for t in self.outputs]
+
+    def free_size(self) -> bool:
+        """Let the input's height and width vary, where that can be done; whether they do now.
+
+        On the CPU only: other providers prepare themselves for each size anew.  The caller tries whether the outputs
+        follow, and calls :meth:`fix_size` where they do not.
+        """
+        source = with_free_size(self.path) if self.provider == _PROVIDERS["cpu"] else None
+        if source is None:
+            return False
+        try:
+            self._session = self._open(source)
+        except Exception:  # onnxruntime's own
+            return False
+        return True
+
+    def fix_size(self) -> None:
+        """Take back :meth:`free_size`."""
+        self._session = self._open(str(self.path))
+
+    def __call__(self, tensor: np.ndarray) -> list[np.ndarray]:
+        """Outputs, in order, for one input tensor.
+
+        Raises
+        ------
+        InputError
+            When the model refuses the input or answers with something else than finite numbers.
+        """
+        try:
+            outputs = self._session.run(self._names, {self.inputs[0].name: tensor.astype(self._dtype, copy=False)})
+        except Exception as error:
+            raise InputError(f"{self.path}: the model stopped: {_first_line(error)}; check its input size") from None
+        for info, value in zip(self.outputs, outputs, strict=True):
+            # The sum is NaN or infinite whenever an element is: one pass, no temporary.
+            if value.dtype.kind == "f" and not np.isfinite(value.sum(dtype=np.float64)):
+                raise InputError(
+                    f"{self.path}: output {info.name}: expected finite numbers, got NaN or infinity; replace the model"
+                )
+        return list(outputs)
+
+
+def choose_providers(wanted: str, offered: list[str]) -> list[str]:
+    """Execution providers in order of use, always ending with the CPU.
+
+    Raises
+    ------
+    InputError
+        When the wanted provider is not offered by the installed onnxruntime.
+    """
+    if wanted == "auto":
+        return [_PROVIDERS[key] for key in _AUTO_ORDER if _PROVIDERS[key] in offered]
+    name = _PROVIDERS.get(wanted, wanted)
+    if name not in offered:
+        have = ", ".join(key for key, full in _PROVIDERS.items() if full in offered)
+        raise InputError(f"provider: expected one of {have} (offered by this onnxruntime), got {wanted!r}")
+    cpu = _PROVIDERS["cpu"]
+    return [name] if name == cpu else [name, cpu]
+
+
+def _info(tensor: Any) -> TensorInfo:
+    shape = tuple(d if isinstance(d, int) and d > 0 else None for d in tensor.shape)
+    return TensorInfo(tensor.name, shape, tensor.type)
+
+
+def _first_line(error: Exception) -> str:
+    text = str(error).strip().splitlines()
+    return text[0][:200] if text else type(error).__name__

@@ -1,0 +1,91 @@
+"""A whole recording: every image's observation, and the tracks of one subject from them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.leg_sides import exchange, exchanged_legs
+from drocap_ros.observation import PoseObservation
+from drocap_ros.perception.estimator import PoseEstimator
+from drocap_ros.perception.sources.base import Frame
+from drocap_ros.perception.sources.prefetch import prefetch
+from drocap_ros.skeleton import BODY_15
+from drocap_ros.tracks import Tracks
+
+
+def observe(
+    frames: Iterable[Frame],
+    estimator: PoseEstimator,
+    on_frame: Callable[[Frame, PoseObservation], None] | None = None,
+) -> list[PoseObservation]:
+    """Observations of all frames, decoding ahead in a second thread.
+
+    Parameters
+    ----------
+    frames : a source, or any frames in the order of time
+    estimator : its models and subject
+    on_frame : called with each frame and its observation, for progress and overlays
+    """
+    observations = []
+    for frame in prefetch(frames):
+        observation = estimator.process(frame.image, frame.stamp_ns)
+        observations.append(observation)
+        if on_frame is not None:
+            on_frame(frame, observation)
+    return observations
+
+
+def subjects(observations: Sequence[PoseObservation]) -> list[tuple[int, int]]:
+    """(track_id, number of images with keypoints) of every subject, the longest seen first."""
+    count = Counter(o.track_id for o in observations if o.track_id and np.isfinite(o.keypoints).any())
+    return sorted(count.items(), key=lambda item: (-item[1], item[0]))
+
+
+def tracks_from_observations(observations: Sequence[PoseObservation], track_id: int | None = None) -> Tracks:
+    """Tracks of one subject over all images; NaN where another or none was followed.
+
+    Legs that the network exchanged for some images are put right (:mod:`drocap_ros.leg_sides`).
+
+    Parameters
+    ----------
+    observations : in the order of time, of images of one size
+    track_id : the subject; None = the one seen in most images
+
+    Raises
+    ------
+    InputError
+        When there are no images, or the subject is in none of them.
+    """
+    if not observations:
+        raise InputError("images: expected at least one, got none")
+    if track_id is None:
+        found = subjects(observations)
+        track_id = found[0][0] if found else 0
+    mine = np.array([o.track_id == track_id and track_id > 0 for o in observations])
+    if not mine.any():
+        raise InputError(
+            f"expected a person in view, found none in {len(observations)} images; try another video or model"
+        )
+    shape = (len(observations), len(BODY_15))
+    keypoints = np.full((*shape, 2), np.nan)
+    covariance = np.full((*shape, 3), np.nan)
+    confidence = np.zeros(shape)
+    for i in np.nonzero(mine)[0]:
+        keypoints[i], covariance[i] = observations[i].keypoints, observations[i].covariance
+        confidence[i] = observations[i].confidence
+    stamp_ns = np.array([o.stamp_ns for o in observations], np.int64)
+    rois = np.array([o.roi for o in observations], float)
+    swapped = exchanged_legs(keypoints, confidence, stamp_ns, np.nan_to_num((rois[:, 2:] - rois[:, :2]).max(axis=1)))
+    keypoints, covariance, confidence = exchange(keypoints, covariance, confidence, swapped)
+    return Tracks(
+        keypoints=keypoints,
+        joints=BODY_15.joints,
+        stamp_ns=stamp_ns,
+        image_size=observations[0].image_size,
+        confidence=confidence,
+        covariance=covariance,
+    )

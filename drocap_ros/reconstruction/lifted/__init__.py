@@ -1,0 +1,1 @@
+"""The default method: a learned lifter, depth signs, and an adjustment with constant bone lengths."""

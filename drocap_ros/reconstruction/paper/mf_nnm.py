@@ -1,0 +1,204 @@
+"""Baseline MF+NNM: rotations by matrix factorization, shapes by nuclear norm minimization (Dai, Li and He 2012).
+
+It needs no start.  What the original leaves open or chooses with the truth in hand, the rank and the mirror image,
+is chosen here by how far the result is from the dictionary's poses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.geometry.alignment import to_torso_frame
+from drocap_ros.geometry.rotations import complete_rotation
+from drocap_ros.reconstruction.paper.bundle_adjustment import Objective, minimize
+from drocap_ros.reconstruction.paper.dictionary import Dictionary, normalize_poses
+from drocap_ros.reconstruction.paper.reprojection import Projection, frames_first, frames_last
+from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
+
+#: Candidates of K in the rank 3K of the factorization.
+BASIS_SHAPES = (2, 3)
+
+MIN_IMAGES = 3
+
+MIRROR = np.array([1.0, 1.0, -1.0])
+
+
+def factorize(
+    w: np.ndarray,
+    information: np.ndarray,
+    dictionary: Dictionary,
+    config: BundleAdjusterConfig,
+) -> tuple[np.ndarray, dict[str, float], int, str]:
+    """Poses of one window by MF+NNM.
+
+    Parameters
+    ----------
+    w, information : (F, P, 2) and (F, P, 3), normalized; missing joints are interpolated for the factorization
+
+    Returns
+    -------
+    poses (F, P, 3) in camera axes, cost per term, iterations, stop reason
+
+    Raises
+    ------
+    InputError
+        When there are too few images: two orthographic ones fix no rotation.
+    """
+    if len(w) < MIN_IMAGES:
+        raise InputError(
+            f"mf-nnm: expected at least {MIN_IMAGES} images that show the subject, got {len(w)}; choose another method"
+        )
+    full = fill_joints(w, information[..., 0] > 0.0)
+    full = full - full.mean(axis=1, keepdims=True)
+    config = replace(config, gamma=0.0)
+    found = []
+    for basis_shapes in BASIS_SHAPES:
+        rotation = rotations_by_factorization(full, basis_shapes)
+        shape, terms, outcome = minimize_nuclear_norm(w, information, rotation, config)
+        poses = shape @ np.swapaxes(rotation, 1, 2)
+        found += [(candidate, terms, outcome) for candidate in (poses, poses * MIRROR)]
+    poses, terms, outcome = min(found, key=lambda one: _strangeness(one[0], dictionary))
+    return poses, terms, int(outcome["iterations"]), str(outcome["stop_reason"])
+
+
+def minimize_nuclear_norm(
+    w: np.ndarray,
+    information: np.ndarray,
+    rotation: np.ndarray,
+    config: BundleAdjusterConfig,
+    *,
+    start: np.ndarray | None = None,
+) -> tuple[np.ndarray, dict[str, float], dict[str, Any]]:
+    """Shapes (F, P, 3) in the common frame for known rotations (F, 3, 3); cost per term; the solver's outcome.
+
+    The start is the pseudo-inverse: joints back-projected into the common frame without depth.
+    """
+    centred = w - w.mean(axis=1, keepdims=True)
+    s = frames_last(centred @ rotation[:, :2] if start is None else start)
+    fixed = _FixedCameras(Projection(w, information), np.ascontiguousarray(np.moveaxis(rotation, 0, -1)), config)
+    s, outcome = minimize(fixed, s)
+    return frames_first(s), fixed.terms(s), outcome
+
+
+class _FixedCameras(Objective):
+    """Equations (2) and (3) with the rotations held."""
+
+    def turn(self, s: np.ndarray) -> None:
+        """Nothing to do."""
+
+
+def rotations_by_factorization(w: np.ndarray, basis_shapes: int) -> np.ndarray:
+    """Camera rotations (F, 3, 3) of centred, complete tracks (F, P, 2), up to a common rotation and mirroring."""
+    frames, p = w.shape[:2]
+    stacked = np.swapaxes(w, 1, 2).reshape(2 * frames, p)
+    u, sigma, _ = np.linalg.svd(stacked, full_matrices=False)
+    rank = min(3 * basis_shapes, len(sigma), 2 * frames)
+    motion = (u[:, :rank] * np.sqrt(sigma[:rank])).reshape(frames, 2, rank)
+    upgrade = metric_upgrade(motion / np.sqrt(np.mean(motion**2)))
+    rotation = complete_rotation(motion @ upgrade)
+    return _continuous(rotation)
+
+
+def metric_upgrade(motion: np.ndarray, *, iterations: int = 300) -> np.ndarray:
+    """Corrective matrix G (3K, 3): the rows of ``motion[t] @ G`` (F, 2, 3K) become orthogonal and of equal length.
+
+    ``Q = G G^T`` is found by trace minimization over positive semidefinite matrices (Dai, Li and He 2012,
+    section 4.2) with accelerated proximal gradient steps, cut to rank 3, and refined by Gauss-Newton steps on G.
+    """
+    a, b = motion[:, 0], motion[:, 1]
+    rank = motion.shape[2]
+    equal = a[:, :, None] * a[:, None, :] - b[:, :, None] * b[:, None, :]
+    cross = a[:, :, None] * b[:, None, :]
+    size = a[:, :, None] * a[:, None, :] + b[:, :, None] * b[:, None, :]
+    rows = np.concatenate([equal, cross + np.swapaxes(cross, 1, 2)]).reshape(-1, rank * rank)
+    rows = rows / np.sqrt(len(a))
+    # One more row fixes the overall size, without which Q = 0 would do.
+    rows = np.concatenate([rows, size.mean(axis=0).reshape(1, -1)])
+    target = np.zeros(len(rows))
+    target[-1] = 2.0
+    gram, moment = rows.T @ rows, rows.T @ target
+    step = 1.0 / np.linalg.norm(gram, 2)
+    q = ahead = np.eye(rank) / rank
+    t, trace_weight = 1.0, 1e-3
+    for _ in range(iterations):
+        slope = (gram @ ahead.ravel() - moment).reshape(rank, rank)
+        values, vectors = np.linalg.eigh(_symmetric(ahead - step * slope))
+        new = (vectors * np.maximum(values - step * trace_weight, 0.0)) @ vectors.T
+        t_new = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * t * t))
+        ahead = new + ((t - 1.0) / t_new) * (new - q)
+        q, t = new, t_new
+    values, vectors = np.linalg.eigh(_symmetric(q))
+    g = vectors[:, -3:] * np.sqrt(np.maximum(values[-3:], 1e-9))
+    return _refine_upgrade(g, a, b)
+
+
+def _refine_upgrade(g: np.ndarray, a: np.ndarray, b: np.ndarray, *, steps: int = 30) -> np.ndarray:
+    """Gauss-Newton on ``|a G|^2 = |b G|^2``, ``a G G^T b = 0``, mean size 1; relative to each frame's size."""
+
+    def residuals(g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x, y = a @ g, b @ g
+        size = np.sum(x * x + y * y, axis=1) + 0.05
+        gap = np.concatenate([np.sum(x * x - y * y, axis=1) / size, 2.0 * np.sum(x * y, axis=1) / size])
+        dx = 2.0 * (a[:, :, None] * x[:, None] - b[:, :, None] * y[:, None]) / size[:, None, None]
+        dy = 2.0 * (a[:, :, None] * y[:, None] + b[:, :, None] * x[:, None]) / size[:, None, None]
+        mean = np.mean(np.sum(x * x + y * y, axis=1)) - 2.0
+        dm = np.mean(2.0 * (a[:, :, None] * x[:, None] + b[:, :, None] * y[:, None]), axis=0)
+        weight = np.sqrt(len(a))
+        return (
+            np.concatenate([gap, [weight * mean]]),
+            np.concatenate([dx, dy, weight * dm[None]]).reshape(2 * len(a) + 1, -1),
+        )
+
+    gap, jac = residuals(g)
+    damping = 1e-2
+    for _ in range(steps):
+        hessian = jac.T @ jac
+        move = np.linalg.solve(
+            hessian + damping * (np.trace(hessian) / len(hessian)) * np.eye(len(hessian)), jac.T @ gap
+        )
+        trial = g - move.reshape(g.shape)
+        new_gap, new_jac = residuals(trial)
+        if np.sum(new_gap**2) < np.sum(gap**2):
+            g, gap, jac, damping = trial, new_gap, new_jac, 0.3 * damping
+        else:
+            damping *= 5.0
+    return g
+
+
+def _symmetric(m: np.ndarray) -> np.ndarray:
+    return 0.5 * (m + m.T)
+
+
+def _continuous(rotation: np.ndarray) -> np.ndarray:
+    """Undo the sign ambiguity of each frame: of R and its half turn about the optical axis take the closer one."""
+    half_turn = np.array([-1.0, -1.0, 1.0])[:, None]
+    agrees = np.sum(rotation[1:] * rotation[:-1], axis=(1, 2)) >= np.sum(
+        rotation[1:] * rotation[:-1] * half_turn, axis=(1, 2)
+    )
+    sign = np.concatenate([[1.0], np.cumprod(np.where(agrees, 1.0, -1.0))])
+    return np.where(sign[:, None, None] > 0.0, rotation, rotation * half_turn)
+
+
+def fill_joints(w: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Tracks (F, P, 2) with unseen joints interpolated in time; a joint never seen takes the frame's centre."""
+    if seen.all():
+        return w
+    t, out = np.arange(len(w)), np.zeros_like(w)
+    for joint in range(w.shape[1]):
+        known = seen[:, joint]
+        if known.any():
+            for axis in range(2):
+                out[:, joint, axis] = np.interp(t, t[known], w[known, joint, axis])
+    return out
+
+
+def _strangeness(poses: np.ndarray, dictionary: Dictionary) -> float:
+    """Mean squared Mahalanobis distance of poses (F, P, 3) from the dictionary's poses."""
+    shape, _ = to_torso_frame(poses)
+    flat = (normalize_poses(shape) - dictionary.mean).reshape(len(poses), -1)
+    coordinates = flat @ dictionary.components.reshape(len(dictionary.components), -1).T
+    return float(np.mean((coordinates / np.maximum(dictionary.component_std, 1e-3)) ** 2))

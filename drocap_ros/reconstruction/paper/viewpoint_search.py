@@ -1,0 +1,186 @@
+"""Multi-start search of viewpoint and pose with a dense, few-parameter model of the dictionary's poses.
+
+Each frame is fitted from several viewpoints around the body by damped Gauss-Newton steps over rotation,
+translation, scale and the coefficients of the principal components, all frames and starts in one batch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.reconstruction.paper.dictionary import Dictionary
+from drocap_ros.reconstruction.reconstruction_config import InitializerConfig
+from drocap_ros.skeleton import BODY_15
+
+#: Poses fitted in one batch: their Jacobians fit the processor's cache.
+CHUNK = 256
+
+
+@dataclass(frozen=True)
+class DenseFit:
+    """Fits of N poses, in the unit of the 2D joints.
+
+    rotation : (N, 3, 3) torso -> camera
+    coefficients : (N, 1 + D): of the mean pose (the body's image scale) and of the components
+    translation : (N, 2)
+    camera_shape : (N, P, 3) poses in camera axes
+    cost : (N,) negative log posterior up to a constant, times 2
+    """
+
+    rotation: np.ndarray
+    coefficients: np.ndarray
+    translation: np.ndarray
+    camera_shape: np.ndarray
+    cost: np.ndarray
+
+
+def viewpoint_starts(w: np.ndarray, information: np.ndarray, azimuths: int, elevation_rad: float) -> np.ndarray:
+    """(A, F, 3, 3) torso -> camera: viewpoints around the body, rolled so that the trunk points as in the image."""
+    up = w[:, BODY_15.index("neck")] - w[:, BODY_15.index("pelvis")]
+    seen = (information[:, [BODY_15.index("neck"), BODY_15.index("pelvis")], 0] > 0.0).all(1)
+    roll = np.where(seen, np.arctan2(up[:, 0], -up[:, 1]), 0.0)
+    zero = np.zeros_like(roll)
+    rolled = exp_so3(np.stack([zero, zero, roll], axis=-1))
+    angle = 2.0 * np.pi * np.arange(azimuths) / azimuths
+    ce, se = np.cos(elevation_rad), np.sin(elevation_rad)
+    forward = -np.stack([np.cos(angle) * ce, np.sin(angle) * ce, np.full(azimuths, se)], axis=-1)
+    right = np.stack([-np.sin(angle), np.cos(angle), np.zeros(azimuths)], axis=-1)
+    views = np.stack([right, np.cross(forward, right), forward], axis=1)
+    return rolled @ views[:, None]
+
+
+def image_scale(w: np.ndarray, information: np.ndarray, dictionary: Dictionary) -> float:
+    """2D units per metre of the dictionary, from the extent of the joints in the image, robust over the frames."""
+    weight = information[..., 0]
+    count = np.sum(weight > 0.0, axis=1)
+    full: np.ndarray = count >= min(int(0.7 * w.shape[1]), int(count.max()))
+    share = weight[full] / weight[full].sum(1, keepdims=True)
+    mean = np.sum(share[..., None] * w[full], axis=1, keepdims=True)
+    spread = np.sum(share[..., None] * (w[full] - mean) ** 2, axis=(1, 2))
+    expected = np.sum(dictionary.mean[:, 1:] ** 2) / len(dictionary.mean)
+    return float(np.sqrt(np.percentile(spread, 75) / expected))
+
+
+def fit_dense(
+    w: np.ndarray,
+    information: np.ndarray,
+    rotation: np.ndarray,
+    coefficients: np.ndarray,
+    dictionary: Dictionary,
+    config: InitializerConfig,
+    *,
+    scale: float,
+    scale_std: float,
+    iterations: int,
+) -> DenseFit:
+    """Damped Gauss-Newton from given starts.
+
+    Parameters
+    ----------
+    w, information : (N, P, 2), (N, P, 3) one row per pose and start
+    rotation, coefficients : (N, 3, 3), (N, 1 + D) starts
+    scale, scale_std : expected coefficient of the mean pose and its relative spread
+    """
+    parts = [
+        _descend(
+            _Problem(w[rows], information[rows], dictionary, config, scale, scale_std),
+            rotation[rows],
+            coefficients[rows],
+            iterations,
+        )
+        for rows in (slice(first, first + CHUNK) for first in range(0, len(w), CHUNK))
+    ]
+    return DenseFit(*(np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True)))
+
+
+def _descend(problem: _Problem, rotation: np.ndarray, coefficients: np.ndarray, iterations: int) -> DenseFit:
+    state = problem.evaluate(rotation, coefficients, np.zeros((len(rotation), 2)))
+    damping: np.ndarray = np.full(len(rotation), 1e-2)
+    for _ in range(iterations):
+        trial = problem.step(state, damping)
+        better = trial.cost < state.cost
+        damping = np.where(better, np.maximum(0.2 * damping, 1e-6), np.minimum(5.0 * damping, 1e6))
+        state = DenseFit(
+            *(
+                np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+                for new, old in zip(vars(trial).values(), vars(state).values(), strict=True)
+            )
+        )
+    return state
+
+
+class _Problem:
+    """Cost, Jacobian and step for a batch; unknowns are rotation 3, translation 2, coefficients 1 + D."""
+
+    def __init__(
+        self,
+        w: np.ndarray,
+        information: np.ndarray,
+        dictionary: Dictionary,
+        config: InitializerConfig,
+        scale: float,
+        scale_std: float,
+    ) -> None:
+        size = min(config.start_components, len(dictionary.components))
+        basis = np.concatenate([dictionary.mean[None], dictionary.components[:size]])
+        self.w, self.outlier = w, config.outlier_std
+        self.shapes = basis.reshape(len(basis), -1)
+        self.columns = np.ascontiguousarray(basis.transpose(2, 1, 0)).reshape(3, -1)
+        self.prior_mean = np.concatenate([[scale], np.zeros(size)])
+        self.prior = np.concatenate(
+            [[1.0 / (scale_std * scale)], 1.0 / (scale * np.maximum(dictionary.component_std[:size], 1e-4))]
+        )
+        # Square root U of the information, U^T U = information, so that |U r|^2 is the cost of a residual.
+        xx, xy, yy = (information[..., i] / config.keypoint_std**2 for i in range(3))
+        a = np.sqrt(np.maximum(xx, 0.0))
+        b = xy / np.where(a > 0.0, a, 1.0)
+        self.root = np.stack([a, b, np.sqrt(np.maximum(yy - b * b, 0.0))], axis=-1)
+
+    def whiten(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        a, b, c = (self.root[..., i].reshape(*self.root.shape[:2], *[1] * (x.ndim - 2)) for i in range(3))
+        return a * x + b * y, c * y
+
+    def residual(self, x: np.ndarray, translation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        gap = x[..., :2] + translation[:, None] - self.w
+        return self.whiten(gap[..., 0], gap[..., 1])
+
+    def evaluate(self, rotation: np.ndarray, coefficients: np.ndarray, translation: np.ndarray) -> DenseFit:
+        x = (coefficients @ self.shapes).reshape(len(coefficients), -1, 3) @ np.swapaxes(rotation, 1, 2)
+        rx, ry = self.residual(x, translation)
+        square = rx * rx + ry * ry
+        if self.outlier > 0.0:
+            square = self.outlier**2 * square / (self.outlier**2 + square)
+        cost = square.sum(1) + np.sum(((coefficients - self.prior_mean) * self.prior) ** 2, axis=1)
+        return DenseFit(rotation, coefficients, translation, x, cost)
+
+    def step(self, state: DenseFit, damping: np.ndarray) -> DenseFit:
+        n, p = self.w.shape[:2]
+        x = state.camera_shape
+        j = np.zeros((2, n, p, 5 + len(self.prior)))
+        j[0, ..., 1], j[0, ..., 2], j[0, ..., 3] = x[..., 2], -x[..., 1], 1.0
+        j[1, ..., 0], j[1, ..., 2], j[1, ..., 4] = -x[..., 2], x[..., 0], 1.0
+        for row in range(2):
+            j[row, ..., 5:] = (state.rotation[:, row] @ self.columns).reshape(n, p, -1)
+        rx, ry = self.residual(x, state.translation)
+        jx, jy = self.whiten(j[0], j[1])
+        if self.outlier > 0.0:
+            # Geman-McClure: the weight of a joint falls with the fourth power of its residual.
+            root_weight = self.outlier**2 / (self.outlier**2 + rx * rx + ry * ry)
+            rx, ry = root_weight * rx, root_weight * ry
+            jx, jy = root_weight[..., None] * jx, root_weight[..., None] * jy
+        jac = np.concatenate([jx, jy], axis=1)
+        transposed = np.ascontiguousarray(np.swapaxes(jac, 1, 2))
+        a = transposed @ jac
+        b = -(transposed @ np.concatenate([rx, ry], axis=1)[..., None])[..., 0]
+        b[:, 5:] -= self.prior**2 * (state.coefficients - self.prior_mean)
+        diagonal = np.arange(a.shape[1])
+        a[:, diagonal[5:], diagonal[5:]] += self.prior**2
+        a[:, diagonal, diagonal] *= (1.0 + damping)[:, None]
+        a[:, diagonal, diagonal] += 1e-6
+        d = np.linalg.solve(a, b[..., None])[..., 0]
+        return self.evaluate(
+            exp_so3(d[:, :3]) @ state.rotation, state.coefficients + d[:, 5:], state.translation + d[:, 3:5]
+        )

@@ -1,0 +1,71 @@
+"""Scale and place of the reconstructed body: from px to metres, from the camera to the world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drocap_ros.reconstruction.metrics import limb_lengths
+from drocap_ros.reconstruction.paper.dictionary import LIMBS_PER_STATURE
+from drocap_ros.reconstruction.world.metric_scale import ScaleEstimate, estimate_scale
+from drocap_ros.skeleton import BODY_15
+from drocap_ros.tracks import Tracks
+
+#: Time over which the person's image size is averaged: a drone changes its range slowly.
+SIZE_SMOOTHING_S = 1.0
+
+
+def metres_per_px(joints_px: np.ndarray, stamp_ns: np.ndarray, height_m: float) -> np.ndarray:
+    """(F,) metres per px that give the body of poses (F, 15, 3) px the limb lengths of a person of ``height_m``."""
+    total = limb_lengths(joints_px).sum(-1)
+    return height_m * LIMBS_PER_STATURE / np.maximum(smooth_over_time(total, stamp_ns, SIZE_SMOOTHING_S), 1e-9)
+
+
+def smooth_over_time(values: np.ndarray, stamp_ns: np.ndarray, std_s: float) -> np.ndarray:
+    """Gaussian average (F, ...) over a standard deviation in time; shorter than a sample changes nothing."""
+    from scipy.ndimage import gaussian_filter1d
+
+    if len(values) < 2:
+        return values
+    step_s = float(np.median(np.diff(stamp_ns))) * 1e-9
+    # Stamps of nonsense (a counter for nanoseconds) must not make a kernel of a thousand million taps.
+    return gaussian_filter1d(values, min(std_s / step_s, len(values), 1000.0), axis=0, mode="nearest", truncate=3.0)
+
+
+@dataclass(frozen=True)
+class WorldPoses:
+    """Poses (F, 15, 3) m in the world, whether their scale was measured (how: ``scale_source``), and the estimate."""
+
+    joints: np.ndarray
+    metric: bool
+    scale_source: str
+    scale: ScaleEstimate | None
+
+
+def place_in_world(joints: np.ndarray, projected_px: np.ndarray, per_px: np.ndarray, tracks: Tracks) -> WorldPoses:
+    """Poses (F, 15, 3) m in camera axes, pelvis at the origin, turned and moved to the world (ENU, z up).
+
+    The pelvis lies at the weak-perspective range, focal length times metres per px, and every joint on the ray of
+    its own pixel (F, 15, 2), before or behind the pelvis as in the pose: this undoes the perspective that the
+    scaled orthographic model leaves out.  Without the camera's position and matrix the pelvis stays at the origin.
+    A camera that moves enough measures the scale.
+    """
+    to_world = tracks.camera_rotation
+    assert to_world is not None
+    if tracks.camera_position is None or tracks.camera_matrix is None:
+        return WorldPoses(joints @ to_world, False, "assumed_height", None)
+    k = tracks.camera_matrix
+    range_m = 0.5 * (k[0, 0] + k[1, 1]) * per_px
+    ray = np.concatenate(
+        [(projected_px - k[:2, 2]) / np.diagonal(k)[:2], np.ones((*projected_px.shape[:2], 1))], axis=-1
+    )
+    # A joint nearer than a tenth of the range is an error of the pose, not of the place.
+    depth = np.maximum(range_m[:, None] + joints[..., 2], 0.1 * range_m[:, None])
+    from_camera = (ray * depth[..., None]) @ to_world
+    feet = from_camera[:, [BODY_15.index("lankle"), BODY_15.index("rankle")]]
+    scale = estimate_scale(feet, tracks.camera_position, tracks.stamp_ns)
+    trusted = scale is not None and scale.trusted
+    factor = scale.factor if scale is not None and trusted else 1.0
+    placed = tracks.camera_position[:, None] + factor * from_camera
+    return WorldPoses(placed, trusted, "telemetry" if trusted else "assumed_height", scale)

@@ -1,0 +1,1 @@
+"""MCAP sessions: writing, streaming, recovery and their metadata."""

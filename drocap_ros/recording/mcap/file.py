@@ -1,0 +1,164 @@
+"""One storage file of a session: an MCAP that at every commit ends in whole chunks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+from drocap_ros.recording.mcap.committed_file import CommittedFile
+from drocap_ros.recording.mcap.metadata import FileRecord, TopicRecord, dump_yaml
+
+
+class McapFile:
+    """Writes messages of registered topics; knows nothing of threads, space or the folder around it.
+
+    topics : by name, with the number of their messages in this file
+    record : the file as ``metadata.yaml`` tells it
+
+    Parameters
+    ----------
+    path : to create
+    compression : "none", "lz4" or "zstd"
+    chunk_bytes : a chunk that has grown to this size is closed
+
+    Raises
+    ------
+    OSError
+        When the file exists or cannot be written.
+    """
+
+    def __init__(
+        self, path: Path, compression: str = "zstd", chunk_bytes: int = 1 << 20, profile: str = "ros2"
+    ) -> None:
+        from mcap.writer import CompressionType, Writer
+
+        self.path = path
+        self.topics: dict[str, TopicRecord] = {}
+        self.record = FileRecord(path.name)
+        self._in_open_chunk: Counter[str] = Counter()
+        self._in_closed_chunks: Counter[str] = Counter()
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[tuple[str, str], int] = {}
+        kinds = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
+        self._file = CommittedFile(path)
+        self._mcap = Writer(self._file, chunk_size=chunk_bytes, compression=kinds[compression])  # type: ignore[arg-type]
+        self._mcap.start(profile, _library())
+        self._file.commit()
+
+    @property
+    def size(self) -> int:
+        """Bytes so far, without the chunk that is being filled."""
+        return self._file.tell()
+
+    @property
+    def pending(self) -> int:
+        """Bytes of whole chunks that are not committed yet."""
+        return self._file.pending
+
+    def register(
+        self,
+        topic: TopicRecord,
+        schema: str,
+        *,
+        encoding: str = "cdr",
+        schema_encoding: str = "ros2msg",
+        metadata: Mapping[str, str] | None = None,
+        key: str = "",
+    ) -> None:
+        """Declare a topic before its first message; the counts of ``topic`` start from 0 in this file.
+
+        ``key`` is what :meth:`add` calls it, its name unless told.
+        """
+        kind = (topic.type_name, schema)
+        if kind not in self._schemas:
+            known = bool(schema or schema_encoding)
+            self._schemas[kind] = (
+                self._mcap.register_schema(topic.type_name, schema_encoding, schema.encode()) if known else 0
+            )
+        key = key or topic.name
+        self._channels[key] = self._mcap.register_channel(
+            topic=topic.name,
+            message_encoding=encoding,
+            schema_id=self._schemas[kind],
+            metadata=dict(metadata) if metadata is not None else {"offered_qos_profiles": dump_yaml(topic.qos)},
+        )
+        self.topics[key] = TopicRecord(topic.name, topic.type_name, topic.type_hash, topic.qos)
+
+    def add(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int) -> None:
+        """Append one serialized message."""
+        before = self._file.tell()
+        self._mcap.add_message(
+            self._channels[topic],
+            log_time=log_time_ns,
+            data=data,
+            publish_time=publish_time_ns,
+            sequence=sequence & 0xFFFFFFFF,
+        )
+        self.topics[topic].count += 1
+        self.record.count(log_time_ns)
+        self._in_open_chunk[topic] += 1
+        if self._file.tell() != before:
+            self._chunk_closed()
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Append a metadata record."""
+        self._mcap.add_metadata(name, dict(values))
+
+    def save(self, sync: bool) -> None:
+        """Close the chunk that is being filled and hand all to the disk.
+
+        Raises
+        ------
+        OSError
+            When it cannot be written; the file then ends where it ended before.
+        """
+        self._mcap.flush()
+        self._chunk_closed()
+        self.commit(sync)
+
+    def commit(self, sync: bool = False) -> None:
+        """Hand over the chunks that are whole.
+
+        Raises
+        ------
+        OSError
+            As :meth:`save`.
+        """
+        self._file.commit(sync)
+        self._in_closed_chunks.clear()
+
+    def finish(self, sync: bool) -> None:
+        """Write the summary and close.
+
+        Raises
+        ------
+        OSError
+            When it cannot be written; what was committed before stays.
+        """
+        self._mcap.finish()
+        self._chunk_closed()
+        self.commit(sync)
+        self._file.close()
+
+    def abandon(self) -> Counter[str]:
+        """Close as it is; tells by topic how many messages are lost, and takes them out of the counts."""
+        self._file.close()
+        lost = self._in_open_chunk + self._in_closed_chunks
+        for topic, count in lost.items():
+            self.topics[topic].count -= count
+        self.record.messages -= lost.total()
+        return lost
+
+    def _chunk_closed(self) -> None:
+        self._in_closed_chunks += self._in_open_chunk
+        self._in_open_chunk.clear()
+
+
+def _library() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return f"drocap_ros {version('drocap_ros')}; mcap {version('mcap')}"
+    except PackageNotFoundError:
+        return f"drocap_ros; mcap {version('mcap')}"

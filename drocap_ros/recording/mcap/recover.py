@@ -1,0 +1,248 @@
+"""Mend what a power cut left of a session, so that every reader of MCAP and rosbag2 opens it again.
+
+Each file that is cut off or damaged is written anew beside itself, read back and compared message by message, and
+only then takes its place; ``metadata.yaml`` is made from what the files hold.  Until then nothing is touched.  Where
+bytes in the middle of a file could not be read, the file as it was is kept, named ``*.damaged``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drocap_ros.errors import InputError
+from drocap_ros.recording.mcap.file import McapFile
+from drocap_ros.recording.mcap.metadata import (
+    METADATA_FILE,
+    FileRecord,
+    TopicRecord,
+    bag_metadata,
+    dump_yaml,
+    qos_profile,
+    sync_folder,
+    write_atomically,
+)
+from drocap_ros.recording.mcap.schemas import type_hash
+from drocap_ros.recording.mcap.stream import MAGIC, McapChannel, McapMessage, McapStream
+from drocap_ros.recording.session import read_bag_metadata, storage_files
+
+_BESIDE = ".recovering"
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class RecoveredFile:
+    """What was done to one file.
+
+    mended : False = it was whole and was left alone
+    messages : in it, and each of them read back
+    damage : in words, what could not be read
+    kept : the file as it was, where something in its middle could not be read
+    """
+
+    path: Path
+    mended: bool
+    messages: int
+    damage: tuple[str, ...]
+    kept: Path | None = None
+
+
+def recover_session(path: str | Path, progress: Progress | None = None) -> list[RecoveredFile]:
+    """Mend a session folder or a lone ``.mcap`` in place.
+
+    Raises
+    ------
+    InputError
+        When it is no MCAP session, nothing of it can be read, or there is no room for the mended file; then all is
+        as it was.
+    """
+    path = Path(path)
+    files, custom = _files(path)
+    done = []
+    topics: dict[str, TopicRecord] = {}
+    records: list[FileRecord] = []
+    try:
+        for number, file in enumerate(files):
+            if progress is not None:
+                progress("files", number / len(files))
+            done.append(_recover_file(file, len(files) > 1))
+            records.append(_describe(file, topics))
+        if path.is_dir():
+            ordered = [topics[name] for name in sorted(topics)]
+            write_atomically(path / METADATA_FILE, dump_yaml(bag_metadata(records, ordered, custom)))
+            for left in path.glob("*.tmp"):
+                left.unlink()
+    except OSError as error:
+        raise InputError(
+            f"{path}: expected to write a mended file beside the old one; {error.strerror or error}; the old one is as"
+            " it was: make room, or copy the session to another disk"
+        ) from None
+    if progress is not None:
+        progress("files", 1.0)
+    return done
+
+
+def _files(path: Path) -> tuple[list[Path], dict[str, str]]:
+    if not path.exists():
+        raise InputError(f"{path}: expected a session folder or .mcap, found no such file; check the path")
+    if path.is_file():
+        if path.suffix != ".mcap":
+            raise InputError(f"{path}: expected a session folder or .mcap, found another kind of file; check the path")
+        return [path], {}
+    description, _ = read_bag_metadata(path)
+    files = storage_files(path, description)
+    if not files or any(file.suffix != ".mcap" for file in files):
+        raise InputError(f"{path}: expected a session of MCAP files, found none or others; check the path")
+    custom = description.get("custom_data") or {}
+    custom = {str(k): str(v) for k, v in custom.items()} if isinstance(custom, dict) else {}
+    for file in files:
+        for key, value in McapStream(file).metadata().get("drocap_ros", {}).items():
+            custom.setdefault(key, value)
+    return files, custom
+
+
+class _Digest:
+    """Counts and fingerprint of a sequence of messages: equal only where every message is."""
+
+    def __init__(self) -> None:
+        self._hash = hashlib.blake2b()
+        self.counts: Counter[str] = Counter()
+
+    def add(self, message: McapMessage) -> None:
+        """Take one more message in."""
+        head = f"{message.channel.topic}|{message.channel.type_name}|{message.log_time_ns}|{message.publish_time_ns}|"
+        self._hash.update(f"{head}{message.sequence}|{len(message.data)}|".encode())
+        self._hash.update(message.data)
+        self.counts[message.channel.topic] += 1
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Digest) and self._hash.digest() == other._hash.digest()
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+def _recover_file(path: Path, one_of_several: bool) -> RecoveredFile:
+    beside = path.with_name(path.name + _BESIDE)
+    beside.unlink(missing_ok=True)  # of a recovery that was cut off itself
+    size = path.stat().st_size
+    if size < len(MAGIC):
+        if not one_of_several and size == 0:
+            raise InputError(f"{path}: expected an MCAP file, found 0 bytes; there is nothing in it to mend")
+        if not MAGIC.startswith(path.read_bytes()):
+            raise InputError(f"{path}: expected an MCAP file, found other content at its start; check the path")
+        return _replace(path, beside, _Digest(), ("it held no message",))
+    stream, before = McapStream(path, resync=True), _Digest()
+    for message in stream.messages():
+        before.add(message)
+    damage = tuple(stream.damage)
+    if not damage and _is_whole(stream, before):
+        return RecoveredFile(path, False, before.counts.total(), ())
+    return _replace(path, beside, before, damage or ("it had no summary",))
+
+
+def _is_whole(stream: McapStream, digest: _Digest) -> bool:
+    summary = stream.summary()
+    return (
+        summary is not None
+        and summary.statistics is not None
+        and summary.statistics.message_count == digest.counts.total()
+        and len(summary.chunk_indexes) == summary.statistics.chunk_count
+    )
+
+
+def _replace(path: Path, beside: Path, before: _Digest, damage: tuple[str, ...]) -> RecoveredFile:
+    try:
+        if before.counts or path.stat().st_size >= len(MAGIC):
+            _copy(McapStream(path, resync=True), beside)
+        else:
+            McapFile(beside).finish(sync=True)
+        again = _Digest()
+        stream = McapStream(beside)
+        for message in stream.messages():
+            again.add(message)
+        if stream.damage or again != before or not _is_whole(stream, again):
+            raise InputError(
+                f"{path}: expected the mended file to hold the same {before.counts.total()} messages, found "
+                f"{again.counts.total()}; the old one is as it was"
+            )
+        kept = None
+        if any("damaged chunks" in d or "skipped" in d or "unknown channels" in d for d in damage):
+            kept = path.with_name(path.name + ".damaged")
+            if not kept.exists():
+                os.link(path, kept)
+        os.replace(beside, path)
+        sync_folder(path.parent)
+    finally:
+        beside.unlink(missing_ok=True)
+    return RecoveredFile(path, True, before.counts.total(), damage, kept)
+
+
+def _copy(stream: McapStream, target: Path) -> None:
+    file = McapFile(target, profile=stream.profile())
+    channels: dict[McapChannel, str] = {}
+    try:
+        for name, values in stream.metadata().items():
+            if name != "rosbag2":  # counts of the file as it was
+                file.add_metadata(name, values)
+        for message in _with_channels(stream, file, channels):
+            file.add(
+                channels[message.channel], message.data, message.log_time_ns, message.publish_time_ns, message.sequence
+            )
+            if file.pending:
+                file.commit()
+        file.finish(sync=True)
+    except OSError:
+        file.abandon()
+        raise
+
+
+def _with_channels(stream: McapStream, file: McapFile, known: dict[McapChannel, str]) -> Iterator[McapMessage]:
+    for message in stream.messages():
+        channel = message.channel
+        if channel not in known:
+            # Two channels of one topic (two publishers) stay two.
+            key = channel.topic if channel.topic not in known.values() else f"{channel.topic}#{len(known)}"
+            known[channel] = key
+            file.register(
+                TopicRecord(channel.topic, channel.raw_type_name, "", []),
+                channel.schema,
+                encoding=channel.message_encoding,
+                schema_encoding=channel.schema_encoding,
+                metadata=dict(channel.metadata),
+                key=key,
+            )
+        yield message
+
+
+def _describe(path: Path, topics: dict[str, TopicRecord]) -> FileRecord:
+    """Add the counts of a whole file to those of the session."""
+    summary: Any = McapStream(path).summary()
+    statistics = summary.statistics
+    record = FileRecord(path.name)
+    if statistics.message_count:
+        record.start_ns, record.end_ns = statistics.message_start_time, statistics.message_end_time
+        record.messages = statistics.message_count
+    for number, channel in summary.channels.items():
+        schema = summary.schemas.get(channel.schema_id)
+        kind = schema.name if schema is not None else ""
+        text = schema.data.decode("utf-8", "replace") if schema is not None else ""
+        if channel.topic not in topics:
+            topics[channel.topic] = TopicRecord(channel.topic, kind, type_hash(kind, text), _qos(channel.metadata))
+        topics[channel.topic].count += statistics.channel_message_counts.get(number, 0)
+    return record
+
+
+def _qos(metadata: dict[str, str]) -> list[dict[str, Any]]:
+    import yaml
+
+    try:
+        profiles = yaml.safe_load(metadata.get("offered_qos_profiles", ""))
+    except yaml.YAMLError:
+        profiles = None
+    return profiles if isinstance(profiles, list) and profiles else qos_profile()

@@ -1,0 +1,103 @@
+"""Message definitions as text: the schemas embedded in a session, built without ROS.
+
+A schema is the ``ros2msg`` text that rosbag2 embeds: the definition itself, then each definition that it depends
+on behind a line of 80 ``=`` and ``MSG: package/Name``.  Definitions of drocap_ros are its own ``.msg`` files, with
+their comments; those of ROS come from the table that ``rosbags`` ships.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drocap_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+PACKAGE = "drocap_ros"
+_SEPARATOR = "=" * 80 + "\n"
+
+
+def definition_folders() -> list[Path]:
+    """Where this package's ``.msg`` files may be: beside the sources, in the installed package, in ROS's share."""
+    here = Path(__file__).resolve().parents[2]
+    prefixes = [Path(p) for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
+    shares = [prefix / "share" / PACKAGE / "msg" for prefix in (*prefixes, Path(sys.prefix))]
+    return [folder for folder in (here / "definitions", here.parent / "msg", *shares) if any(folder.glob("*.msg"))]
+
+
+def own_definitions() -> dict[str, str]:
+    """``drocap_ros/msg/Name`` -> text of its ``.msg`` file; empty when none are installed."""
+    folders = definition_folders()
+    if not folders:
+        return {}
+    return {f"{PACKAGE}/msg/{path.stem}": path.read_text(encoding="utf-8") for path in sorted(folders[0].glob("*.msg"))}
+
+
+@lru_cache(maxsize=1)
+def standard_types() -> Typestore:
+    """ROS 2 Jazzy's message types and this package's."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types = {}
+    for name, text in own_definitions().items():
+        types.update(get_types_from_msg(text, name))
+    store.register(types)
+    return store
+
+
+@lru_cache(maxsize=256)
+def schema_text(type_name: str) -> str:
+    """Definition of a message type (``package/msg/Name``) with all that it depends on.
+
+    Raises
+    ------
+    InputError
+        When the type is unknown.
+    """
+    done = {type_name: _definition(type_name)}
+    waiting = _dependencies(type_name)
+    while waiting:
+        name = waiting.pop(0)
+        if name not in done:
+            done[name] = _definition(name)
+            waiting += _dependencies(name)
+    first, *rest = done.items()
+    return first[1] + "".join(f"{_SEPARATOR}MSG: {name.replace('/msg/', '/')}\n{text}" for name, text in rest)
+
+
+def type_hash(type_name: str, schema: str) -> str:
+    """REP 2011 hash of a type from its schema text; empty when the text does not give one."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(get_types_from_msg(schema, type_name))
+        return store.hash_rihs01(type_name)
+    except Exception:  # a hash is a convenience: a reader does without
+        return ""
+
+
+def _definition(type_name: str) -> str:
+    own = own_definitions().get(type_name)
+    if own is not None:
+        return own if own.endswith("\n") else own + "\n"
+    try:
+        text, _ = standard_types().generate_msgdef(type_name, ros_version=2)
+    except Exception as error:
+        raise InputError(
+            f"message type: expected one of drocap_ros or of ROS 2 Jazzy, got {type_name!r} ({error}); "
+            "register it with its schema text"
+        ) from None
+    return str(text).split(_SEPARATOR)[0]
+
+
+def _dependencies(type_name: str) -> list[str]:
+    fields = standard_types().fielddefs[type_name][1]
+    return sorted(set(re.findall(r"[A-Za-z]\w*/msg/\w+", repr([kind for _, kind in fields]))), key=repr)

@@ -1,0 +1,359 @@
+"""Writes a session: a rosbag2 folder of MCAP files that survives whatever happens to the machine."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import shutil
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from drocap_ros.errors import InputError
+from drocap_ros.recording.mcap.bounded_queue import BoundedQueue, QueuedMessage
+from drocap_ros.recording.mcap.file import McapFile
+from drocap_ros.recording.mcap.metadata import (
+    METADATA_FILE,
+    FileRecord,
+    TopicRecord,
+    bag_metadata,
+    dump_yaml,
+    qos_profile,
+    sync_folder,
+    write_atomically,
+)
+from drocap_ros.recording.mcap.schemas import type_hash
+from drocap_ros.recording.recording_config import SessionRecorderConfig
+
+_MIB = 1 << 20
+#: Name of the metadata records that this package writes.
+RECORD = "drocap_ros"
+
+logger = logging.getLogger(__name__)
+
+
+class SessionWriter:
+    """Takes serialized messages from any thread and writes them in a thread of its own.
+
+    Chunks are compressed and handed to the disk at least every ``config.chunk_s``; a crash or power cut leaves
+    whole chunks up to then.  After ``config.split_mib`` or ``config.split_s`` a new file is begun; each stands by
+    itself.  ``write`` never waits and never raises: what the disk cannot take is dropped, pictures first, and
+    counted.  ``metadata.yaml`` stands from the start and is completed by :meth:`close`.  When less than
+    ``config.free_mib`` is left on the disk the files are finished while that is still possible, and ``error`` says so.
+
+    Parameters
+    ----------
+    folder : to create; it must not exist, or be empty
+    config : chunks, files, queue, free space
+    metadata : what to know of the session later: configuration, versions, model hashes
+
+    Raises
+    ------
+    InputError
+        When the folder holds something, cannot be created, or the disk is full already.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        config: SessionRecorderConfig | None = None,
+        metadata: Mapping[str, str] | None = None,
+    ) -> None:
+        self.folder = Path(folder)
+        self.config = config or SessionRecorderConfig()
+        self._make_folder()
+        self._custom = dict(metadata or {})
+        self._custom_news: dict[str, str] = {}
+        self._topics: dict[str, TopicRecord] = {}  # counts: of the files that are finished
+        self._schemas: dict[str, str] = {}
+        self._pictures: set[str] = set()
+        self._finished: list[FileRecord] = []
+        self._unsaved_s: float | None = None  # when the oldest message that is not yet on the disk came
+        self._space_checked_s = -1e9
+        self._description_changed = False
+        self._lock = threading.Lock()  # of the current file and of what describes the session
+        self._error: str | None = None
+        self._closed = False
+        self._queue = BoundedQueue(self.config.queue_mib * _MIB)
+        try:
+            self._file = self._new_file()
+            self._write_description()
+        except OSError as error:
+            raise self._cannot(error) from None
+        self._thread = threading.Thread(target=self._run, name="session-writer", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> SessionWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def path(self) -> Path:
+        """The file that is being written."""
+        return self._file.path
+
+    @property
+    def dropped(self) -> int:
+        """Messages that did not reach the file."""
+        return self._queue.drop_count()
+
+    @property
+    def dropped_by_topic(self) -> dict[str, int]:
+        """The same by topic."""
+        return dict(self._queue.dropped)
+
+    @property
+    def written(self) -> int:
+        """Messages handed to the files."""
+        return sum(record.messages for record in self._finished) + self._file.record.messages
+
+    @property
+    def queued_bytes(self) -> int:
+        """What waits for the disk."""
+        return self._queue.size
+
+    @property
+    def error(self) -> str | None:
+        """Why the recording ended before its time, in one line; None when it did not."""
+        return self._error
+
+    def register(
+        self,
+        topic: str,
+        type_name: str,
+        schema: str,
+        *,
+        image: bool = False,
+        qos: list[dict[str, Any]] | None = None,
+    ) -> None:
+        """Declare a topic before its first message; a second time changes nothing.
+
+        Parameters
+        ----------
+        type_name : ``package/msg/Name``
+        schema : its definition with all dependencies, see :func:`drocap_ros.recording.mcap.schemas.schema_text`
+        image : whether its messages may be dropped before others
+        qos : offered quality of service, see :func:`drocap_ros.recording.mcap.metadata.qos_profile`
+
+        Raises
+        ------
+        InputError
+            When the topic stands already with another type.
+        """
+        with self._lock:
+            known = self._topics.get(topic)
+            if known is not None:
+                if known.type_name != type_name:
+                    raise InputError(f"{topic}: expected type {known.type_name} as registered before, got {type_name}")
+                return
+            profile = qos or qos_profile(reliable=not image)
+            record = TopicRecord(topic, type_name, type_hash(type_name, schema), profile)
+            if self._error is None:
+                self._file.register(record, schema)
+            self._schemas[topic] = schema
+            self._topics[topic] = record
+            if image:
+                self._pictures.add(topic)
+            self._description_changed = True
+
+    def write(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int | None = None) -> bool:
+        """Queue one serialized (CDR) message; False when it was dropped.
+
+        Raises
+        ------
+        InputError
+            When the topic was not registered.
+        """
+        if topic not in self._topics:
+            raise InputError(f"{topic}: expected a registered topic; call register first")
+        published_ns = log_time_ns if publish_time_ns is None else publish_time_ns
+        return self._queue.put(QueuedMessage(topic, bytes(data), log_time_ns, published_ns), topic in self._pictures)
+
+    def add_metadata(self, values: Mapping[str, str]) -> None:
+        """Add to what is told of the session; it reaches the disk with the next chunk."""
+        with self._lock:
+            self._custom_news.update({k: v for k, v in values.items() if self._custom.get(k) != v})
+            if self._custom_news and self._unsaved_s is None:
+                self._unsaved_s = time.monotonic()
+
+    def close(self) -> None:
+        """Write what is queued, finish the file and ``metadata.yaml``.  A second call does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        self._queue.close()
+        self._thread.join()
+        with self._lock:
+            if self._error is None:
+                try:
+                    self._finish_file()
+                    self._write_description(current=False)
+                except OSError as error:
+                    self._fail(error)
+
+    def discard(self) -> None:
+        """Close, and take the files and, where it then is empty, the folder away."""
+        self.close()
+        with contextlib.suppress(OSError):
+            for name in (METADATA_FILE, *(record.name for record in self._finished)):
+                (self.folder / name).unlink(missing_ok=True)
+            self.folder.rmdir()
+
+    def _run(self) -> None:
+        while True:
+            message = self._queue.take(self._patience_s())
+            try:
+                with self._lock:
+                    if message is not None:
+                        self._add(message)
+                    self._save_if_due(ended=message is None and self._queue.closed)
+            except Exception as error:  # whatever it is, the graph lives on and the reason is told
+                self._fail(error)
+            if self._error is not None:
+                self._queue.drop_all()
+            if message is None and self._queue.closed:
+                return
+
+    def _patience_s(self) -> float:
+        """How long the thread may sleep before something must go to the disk."""
+        if self._unsaved_s is None:
+            return self.config.chunk_s
+        return max(0.0, self._unsaved_s + self.config.chunk_s - time.monotonic())
+
+    def _add(self, message: QueuedMessage) -> None:
+        if self._error is not None:
+            self._queue.dropped[message.topic] += 1
+            return
+        if self._file_is_full(message.log_time_ns):
+            self._finish_file()
+            self._file = self._new_file()
+            self._write_description()
+        number = self._topics[message.topic].count + self._file.topics[message.topic].count
+        self._file.add(message.topic, message.data, message.log_time_ns, message.publish_time_ns, number)
+        if self._unsaved_s is None:
+            self._unsaved_s = time.monotonic()
+
+    def _save_if_due(self, ended: bool) -> None:
+        if self._error is not None:
+            return
+        now = time.monotonic()
+        due = self._unsaved_s is not None and now - self._unsaved_s >= self.config.chunk_s
+        if due or ended:
+            if self._custom_news:
+                self._file.add_metadata(RECORD, self._custom_news)
+                self._custom.update(self._custom_news)
+                self._custom_news = {}
+                self._description_changed = True
+            self._file.save(self.config.sync)
+            self._unsaved_s = None
+            if self._description_changed:
+                self._description_changed = False
+                self._write_description()
+            if self._space_is_low(now):
+                self._end_early()
+        elif self._file.pending:
+            self._file.commit()
+
+    # -- files -----------------------------------------------------------------------------------------
+
+    def _new_file(self) -> McapFile:
+        path = self.folder / f"{self.folder.absolute().name}_{len(self._finished)}.mcap"
+        file = McapFile(path, self.config.compression, self.config.chunk_kib * 1024)
+        for name, topic in self._topics.items():
+            file.register(topic, self._schemas[name])
+        if self._custom:
+            file.add_metadata(RECORD, self._custom)
+        file.commit(self.config.sync)
+        sync_folder(self.folder)
+        return file
+
+    def _file_is_full(self, log_time_ns: int) -> bool:
+        record, config = self._file.record, self.config
+        if not record.messages or record.start_ns is None:
+            return False
+        old = config.split_s > 0 and (log_time_ns - record.start_ns) * 1e-9 >= config.split_s
+        return old or (config.split_mib > 0 and self._file.size >= config.split_mib * _MIB)
+
+    def _finish_file(self) -> None:
+        text = dump_yaml(self._description(current=True))
+        self._file.add_metadata("rosbag2", {"serialized_metadata": text})
+        self._file.finish(self.config.sync)
+        self._keep_counts()
+
+    def _keep_counts(self) -> None:
+        for name, topic in self._file.topics.items():
+            self._topics[name].count += topic.count
+            topic.count = 0
+        self._finished.append(self._file.record)
+        self._file.record = FileRecord("")
+
+    # -- what can go wrong -----------------------------------------------------------------------------
+
+    def _space_is_low(self, now: float) -> bool:
+        if now - self._space_checked_s < 1.0:
+            return False
+        self._space_checked_s = now
+        return shutil.disk_usage(self.folder).free < self.config.free_mib * _MIB
+
+    def _end_early(self) -> None:
+        """Finish the session while there is still room for that."""
+        self._finish_file()
+        self._write_description(current=False)
+        self._set_error(f"less than {self.config.free_mib} MiB left on the disk; the session is complete until then")
+
+    def _fail(self, error: Exception) -> None:
+        if self._error is not None:
+            return
+        reason = getattr(error, "strerror", None) or (str(error).splitlines() or [type(error).__name__])[0]
+        for topic, count in self._file.abandon().items():
+            self._queue.dropped[topic] += count
+        if self._file.record.name:
+            self._keep_counts()
+        self._set_error(f"{reason}; what was written before stays readable, `drocap recover` completes it")
+        try:
+            self._write_description(current=False)
+        except OSError:  # the files themselves tell the same, to whoever reads them
+            logger.debug("metadata.yaml of %s is not up to date", self.folder)
+
+    def _set_error(self, reason: str) -> None:
+        self._error = f"{self.folder}: the recording ended early: {reason}; make room and start a new session"
+        logger.error("%s", self._error)
+
+    # -- what describes the session --------------------------------------------------------------------
+
+    def _description(self, current: bool) -> dict[str, Any]:
+        topics = []
+        for name in sorted(self._topics):
+            topic = self._topics[name]
+            count = topic.count + (self._file.topics[name].count if current else 0)
+            topics.append(TopicRecord(name, topic.type_name, topic.type_hash, topic.qos, count))
+        files = [*self._finished, self._file.record] if current else self._finished
+        return bag_metadata(files, topics, self._custom)
+
+    def _write_description(self, current: bool = True) -> None:
+        write_atomically(self.folder / METADATA_FILE, dump_yaml(self._description(current)))
+
+    def _make_folder(self) -> None:
+        folder = self.folder
+        try:
+            if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+                raise InputError(
+                    f"{folder}: expected a new or empty folder for the session, found something in it; "
+                    "choose another name"
+                )
+            folder.mkdir(parents=True, exist_ok=True)
+            free_mib = shutil.disk_usage(folder).free // _MIB
+        except OSError as error:
+            raise self._cannot(error) from None
+        if free_mib < self.config.free_mib:
+            raise InputError(
+                f"{folder}: expected at least {self.config.free_mib} MiB free on the disk, found {free_mib}; "
+                "make room or lower session_recorder.free_mib"
+            )
+
+    def _cannot(self, error: OSError) -> InputError:
+        return InputError(f"{self.folder}: expected a folder to write to; {error.strerror or error}; choose another")

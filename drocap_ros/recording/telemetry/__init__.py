@@ -1,0 +1,1 @@
+"""Telemetry logs beside a video or in a session, as camera poses."""

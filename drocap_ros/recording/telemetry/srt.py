@@ -1,0 +1,141 @@
+"""States of the camera from the subtitles that a DJI drone writes beside its video.
+
+Known forms: bracketed ``[latitude: 47.3] [rel_alt: 10.0 abs_alt: 450.1] [gb_yaw: 12.3 gb_pitch: -20.0 gb_roll: 0.0]``;
+``F_PRY (..°, ..°, ..°), G_PRY (..)`` (flight and gimbal pitch, roll, yaw); and the older
+``GPS(lon,lat,n) BAROMETER:20.5``.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.flight.frames import geodetic_to_enu, orientation_to_ros, quaternion_from_euler
+from drocap_ros.recording.telemetry.read import VIDEO, TelemetryLog, make_log
+from drocap_ros.tracks import MAX_FRAMES
+
+_LINE = 8192
+_NUMBER = r"([-+]?\d{1,10}(?:\.\d{1,12})?)"
+_TIME = re.compile(r"(\d{1,3}):(\d{2}):(\d{2})[,.](\d{1,3})\s*-->")
+_VALUE = re.compile(
+    rf"\b(latitude|longitude|longtitude|rel_alt|abs_alt|altitude|gb_yaw|gb_pitch|gb_roll)\s*:\s*{_NUMBER}",
+    re.IGNORECASE,
+)
+_GPS = re.compile(rf"\bGPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER}")
+_BAROMETER = re.compile(rf"\bBAROMETER\s*:\s*{_NUMBER}|,\s*H\s*{_NUMBER}\s*m")
+_PRY = re.compile(rf"\b([FG])_PRY\s*\(\s*{_NUMBER}°?\s*,\s*{_NUMBER}°?\s*,\s*{_NUMBER}°?\s*\)")
+
+
+class _Entry(NamedTuple):
+    """One subtitle: time ns in the video, geodetic, and pitch, roll, yaw in degrees of gimbal and body."""
+
+    stamp_ns: int
+    latitude: float
+    longitude: float
+    height: float
+    gimbal: tuple[float, float, float]
+    body: tuple[float, float, float]
+
+
+_UNKNOWN = (math.nan, math.nan, math.nan)
+
+
+def read_srt(path: Path) -> TelemetryLog:
+    """Gimbal attitude and position of every subtitle, by the video's own clock.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read or holds no telemetry.
+    """
+    entries, heights = _entries(path)
+    if not entries:
+        raise InputError(f"{path}: expected DJI subtitles with telemetry, found none; check the path")
+    stamps = np.array([e.stamp_ns for e in entries], np.int64)
+    geodetic = np.array([(e.latitude, e.longitude, e.height) for e in entries])
+    impossible = (np.abs(geodetic[:, 0]) > 90) | (np.abs(geodetic[:, 1]) > 180)
+    nowhere = (geodetic[:, 0] == 0) & (geodetic[:, 1] == 0)
+    geodetic[impossible | nowhere] = np.nan
+    fixed = np.isfinite(geodetic).all(axis=1)
+    position = None
+    lacks = []
+    if fixed.any():
+        origin = geodetic[fixed][0].copy()
+        if heights == "rel_alt":
+            origin[2] = 0.0  # heights count from the place of take-off
+        else:
+            lacks.append(f"no height above take-off: heights count from the first {heights}")
+        position = geodetic_to_enu(geodetic, origin)
+    return make_log(
+        path,
+        "DJI subtitles",
+        stamps,
+        clock=VIDEO,
+        orientation=_attitude([e.body for e in entries]),
+        position=position,
+        gimbal=_attitude([e.gimbal for e in entries]),
+        lacks=tuple(lacks),
+    )
+
+
+def _attitude(pitch_roll_yaw: list[tuple[float, float, float]]) -> np.ndarray:
+    """(N, 4) x y z w FLU -> ENU; DJI's yaw is clockwise from north, its pitch positive up."""
+    pitch, roll, yaw = np.deg2rad(np.array(pitch_roll_yaw)).T
+    return orientation_to_ros(quaternion_from_euler(roll, pitch, yaw).T)
+
+
+def _entries(path: Path) -> tuple[list[_Entry], str]:
+    entries: list[_Entry] = []
+    kinds: set[str] = set()
+    stamp_ns, text = None, ""
+    try:
+        with path.open("r", encoding="utf-8", errors="replace") as file:
+            while line := file.readline(_LINE):
+                match = _TIME.search(line)
+                if match is None:
+                    text = (text + line)[:_LINE]
+                    continue
+                _add(entries, kinds, stamp_ns, text)
+                hours, minutes, seconds = (int(match[i]) for i in (1, 2, 3))
+                stamp_ns = ((hours * 60 + minutes) * 60 + seconds) * 10**9 + int(match[4].ljust(3, "0")) * 10**6
+                text = ""
+                if len(entries) > MAX_FRAMES:
+                    raise InputError(f"{path}: expected at most {MAX_FRAMES} subtitles; cut the file")
+    except OSError as error:
+        raise InputError(f"{path}: expected a readable file; {error.strerror}") from None
+    _add(entries, kinds, stamp_ns, text)
+    order = ("rel_alt", "barometer", "abs_alt", "altitude", "height")
+    return entries, next((kind for kind in order if kind in kinds), "height")
+
+
+def _add(entries: list[_Entry], kinds: set[str], stamp_ns: int | None, text: str) -> None:
+    if stamp_ns is None:
+        return
+    values = {name.lower(): float(number) for name, number in _VALUE.findall(text)}
+    angles = {kind: (float(p), float(r), float(y)) for kind, p, r, y in _PRY.findall(text)}
+    latitude = values.get("latitude", math.nan)
+    longitude = values.get("longitude", values.get("longtitude", math.nan))
+    heights = {name: values[name] for name in ("rel_alt", "abs_alt", "altitude") if name in values}
+    gps = _GPS.search(text)
+    if gps is not None and math.isnan(latitude):
+        longitude, latitude = float(gps[1]), float(gps[2])
+        heights["altitude"] = float(gps[3])
+    barometer = _BAROMETER.search(text)
+    if barometer is not None:
+        heights["barometer"] = float(barometer[1] or barometer[2])
+    order = ("rel_alt", "barometer", "abs_alt", "altitude")
+    kind = next((name for name in order if name in heights), None)
+    gimbal = angles.get("G", _UNKNOWN)
+    if "gb_yaw" in values and "gb_pitch" in values:
+        gimbal = (values["gb_pitch"], values.get("gb_roll", 0.0), values["gb_yaw"])
+    if kind is None and not angles and math.isnan(gimbal[0]):
+        return  # a subtitle of something else
+    if kind is not None:
+        kinds.add(kind)
+    height = heights[kind] if kind is not None else math.nan
+    entries.append(_Entry(stamp_ns, latitude, longitude, height, gimbal, angles.get("F", _UNKNOWN)))

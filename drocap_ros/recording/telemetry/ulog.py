@@ -1,0 +1,150 @@
+"""States of the vehicle from a PX4 ULog, through ``pyulog``."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.flight.frames import geodetic_to_enu, ned_to_enu, orientation_to_ros, quaternion_multiply, yaw_of
+from drocap_ros.recording.telemetry.read import BOOT, TelemetryLog, at_stamps, make_log
+
+_TOPICS = (
+    "vehicle_attitude", "vehicle_local_position", "vehicle_global_position", "gimbal_device_attitude_status",
+    "vehicle_gps_position", "sensor_gps",
+)  # fmt: skip
+_EARLIEST_UTC_US = 1_000_000_000_000_000
+_FIX_3D = 3
+_YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
+
+
+def read_ulog(path: Path) -> TelemetryLog:
+    """Attitude (``vehicle_attitude``), position and gimbal, counted from power-up; UTC from the GPS.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, is no ULog, or tells no attitude.
+    """
+    try:
+        from pyulog import ULog
+    except ImportError:
+        raise InputError(f"{path}: expected the package pyulog to read it, found none; pip install pyulog") from None
+    try:
+        # pyulog prints what it thinks of a damaged file.
+        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            log = ULog(str(path), list(_TOPICS), disable_str_exceptions=True)
+    except Exception as error:  # pyulog lets through what its parsing raises
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{path}: expected a PX4 ULog that can be read; {reason}") from None
+    try:
+        return _to_log(path, log)
+    except (KeyError, IndexError, ValueError) as error:  # a damaged definition: fields are missing or of other types
+        raise InputError(f"{path}: expected the fields of PX4's topics, found a damaged log ({error})") from None
+
+
+def _to_log(path: Path, log: Any) -> TelemetryLog:
+    series: dict[str, dict[str, np.ndarray]] = {}
+    for data in log.data_list:
+        if "timestamp" in data.data and (data.multi_id == 0 or data.name not in series):
+            series[data.name] = data.data
+    attitude = series.get("vehicle_attitude")
+    if attitude is None or not len(attitude["timestamp"]):
+        raise InputError(f"{path}: expected vehicle_attitude in the ULog, found none; log it")
+    lacks = [] if not log.dropouts else [f"{len(log.dropouts)} dropouts: parts of the flight were not logged"]
+    stamp_ns = _stamps(attitude)
+    frd_to_ned = _quaternion(attitude, "q")
+    position, words = _position(series, stamp_ns)
+    return make_log(
+        path,
+        "PX4 ULog",
+        stamp_ns,
+        clock=BOOT,
+        orientation=orientation_to_ros(frd_to_ned),
+        position=position,
+        gimbal=_gimbal(series, stamp_ns, frd_to_ned),
+        utc_minus_stamp_ns=_utc(series),
+        lacks=(*lacks, *words),
+    )
+
+
+def _position(series: dict[str, Any], stamp_ns: np.ndarray) -> tuple[np.ndarray | None, list[str]]:
+    """(N, 3) m ENU: the estimator's local position where it calls it valid, else its global one, else the GPS's."""
+    local = series.get("vehicle_local_position")
+    if local is not None and len(local["timestamp"]):
+        ned = np.stack([local[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        for flag, columns in (("xy_valid", [0, 1]), ("z_valid", [2])):
+            if flag in local:
+                ned[np.ix_(local[flag] == 0, columns)] = np.nan
+        if np.isfinite(ned).all(axis=1).any():
+            return at_stamps(_stamps(local), ned_to_enu(ned), stamp_ns, spherical=False), []
+    for name, read in (("vehicle_global_position", _global), ("vehicle_gps_position", _gps), ("sensor_gps", _gps)):
+        data = series.get(name)
+        geodetic = None if data is None else read(data)
+        if data is None or geodetic is None:
+            continue
+        known = np.isfinite(geodetic).all(axis=1)
+        if known.any():
+            enu = geodetic_to_enu(geodetic, geodetic[known][0])
+            words = f"no valid local position: metres count from the first of {name}"
+            return at_stamps(_stamps(data), enu, stamp_ns, spherical=False), [words]
+    return None, []
+
+
+def _global(data: dict[str, np.ndarray]) -> np.ndarray | None:
+    return np.stack([data[name] for name in ("lat", "lon", "alt")], axis=1).astype(np.float64)
+
+
+def _gps(data: dict[str, np.ndarray]) -> np.ndarray | None:
+    if "lat" in data:
+        geodetic = np.stack([data["lat"] * 1e-7, data["lon"] * 1e-7, data["alt"] * 1e-3], axis=1).astype(np.float64)
+    elif "latitude_deg" in data:
+        columns = ("latitude_deg", "longitude_deg", "altitude_msl_m")
+        geodetic = np.stack([data[name] for name in columns], axis=1).astype(np.float64)
+    else:
+        return None
+    geodetic[np.asarray(data["fix_type"]) < _FIX_3D] = np.nan
+    return geodetic
+
+
+def _gimbal(series: dict[str, Any], stamp_ns: np.ndarray, frd_to_ned: np.ndarray) -> np.ndarray | None:
+    """(N, 4) camera FLU -> ENU; the yaw of a gimbal that follows the vehicle counts from its nose."""
+    status = series.get("gimbal_device_attitude_status")
+    if status is None or not len(status["timestamp"]):
+        return None
+    camera = at_stamps(_stamps(status), _quaternion(status, "q"), stamp_ns, spherical=True)
+    flags = np.asarray(status.get("device_flags", np.zeros(len(status["timestamp"]), int))).astype(int)
+    nearest = flags[np.clip(np.searchsorted(_stamps(status), stamp_ns), 0, len(flags) - 1)]
+    earth = (nearest & _YAW_IN_EARTH > 0) | (
+        (nearest & (_YAW_IN_EARTH | _YAW_IN_VEHICLE) == 0) & (nearest & _YAW_LOCK > 0)
+    )
+    half = 0.5 * yaw_of(frd_to_ned)
+    turn = np.stack([np.zeros_like(half), np.zeros_like(half), np.sin(half), np.cos(half)], axis=1)
+    return orientation_to_ros(np.where(earth[:, None], camera, quaternion_multiply(turn, camera)))
+
+
+def _utc(series: dict[str, Any]) -> int | None:
+    for name in ("vehicle_gps_position", "sensor_gps"):
+        gps = series.get(name)
+        if gps is None or "time_utc_usec" not in gps:
+            continue
+        utc_us = np.asarray(gps["time_utc_usec"], dtype=np.int64)
+        known = utc_us > _EARLIEST_UTC_US
+        if known.any():
+            return int(np.median((utc_us - np.asarray(gps["timestamp"], np.int64))[known])) * 1000
+    return None
+
+
+def _stamps(data: dict[str, np.ndarray]) -> np.ndarray:
+    return np.asarray(data["timestamp"], dtype=np.int64) * 1000
+
+
+def _quaternion(data: dict[str, np.ndarray], name: str) -> np.ndarray:
+    """(N, 4) x y z w of PX4's w x y z."""
+    return np.stack([np.asarray(data[f"{name}[{i}]"], np.float64) for i in (1, 2, 3, 0)], axis=1)

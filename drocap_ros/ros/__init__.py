@@ -1,0 +1,1 @@
+"""What the nodes share: topics, conversions, parameters, life cycle, processes."""

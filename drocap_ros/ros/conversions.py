@@ -1,0 +1,160 @@
+"""Between messages and the core's types: pure functions, checked at the door."""
+
+from __future__ import annotations
+
+from array import array
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Quaternion
+from sensor_msgs.msg import CameraInfo, CompressedImage
+from std_msgs.msg import Header
+
+from drocap_ros.flight.vehicle_state import VehicleState as VehicleStateData
+from drocap_ros.msg import Pose2D, Pose3D, VehicleState
+from drocap_ros.observation import PoseObservation
+from drocap_ros.perception.calibration import CameraModel
+from drocap_ros.recording.pose_messages import float_array, observation_from_message
+from drocap_ros.skeleton import joint_set
+
+
+def stamp_to_ros(stamp_ns: int) -> Time:
+    """Integer nanoseconds -> builtin_interfaces/Time."""
+    seconds, nanoseconds = divmod(int(stamp_ns), 10**9)
+    return Time(sec=seconds, nanosec=nanoseconds)
+
+
+def stamp_from_ros(stamp: Time) -> int:
+    """builtin_interfaces/Time -> integer nanoseconds."""
+    return stamp.sec * 10**9 + stamp.nanosec
+
+
+def header_at(stamp_ns: int, frame_id: str) -> Header:
+    """Header of a stamp and a frame."""
+    return Header(stamp=stamp_to_ros(stamp_ns), frame_id=frame_id)
+
+
+def floats(values: np.ndarray) -> array:
+    """Any array -> flat row-major ``float32[]``, the fast way that rclpy knows."""
+    return array("f", np.ascontiguousarray(values, np.float32).tobytes())
+
+
+def quaternion_to_ros(xyzw: np.ndarray) -> Quaternion:
+    """(4,) x y z w -> geometry_msgs/Quaternion."""
+    x, y, z, w = (float(v) for v in xyzw)
+    return Quaternion(x=x, y=y, z=z, w=w)
+
+
+def compressed_image_to_ros(header: Header, jpeg: bytes) -> CompressedImage:
+    """JPEG of a BGR picture -> sensor_msgs/CompressedImage."""
+    return CompressedImage(header=header, format="bgr8; jpeg compressed bgr8", data=array("B", jpeg))
+
+
+def camera_info_to_ros(header: Header, camera: CameraModel) -> CameraInfo:
+    """Pinhole camera -> sensor_msgs/CameraInfo, unrectified pictures."""
+    k = camera.matrix.ravel().tolist()
+    return CameraInfo(
+        header=header,
+        width=camera.width,
+        height=camera.height,
+        distortion_model=camera.distortion_model,
+        d=camera.distortion.tolist(),
+        k=k,
+        r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        p=[k[0], 0.0, k[2], 0.0, 0.0, k[4], k[5], 0.0, 0.0, 0.0, 1.0, 0.0],
+    )
+
+
+def pose2d_to_ros(observation: PoseObservation, frame_id: str) -> Pose2D:
+    """Observation -> message; without a subject the arrays are empty."""
+    width, height = observation.image_size
+    return Pose2D(
+        header=header_at(observation.stamp_ns, frame_id),
+        track_id=observation.track_id,
+        skeleton=observation.joints.name,
+        image_width=width,
+        image_height=height,
+        roi=observation.roi.astype(np.float32),
+        detection_score=float(observation.detection_score),
+        keypoints=floats(observation.keypoints),
+        covariance=floats(observation.covariance),
+        confidence=floats(observation.confidence),
+    )
+
+
+def pose2d_from_ros(message: Pose2D) -> PoseObservation:
+    """Message -> observation.
+
+    Raises
+    ------
+    InputError
+        When the skeleton is unknown, an array has the wrong length, a value is infinite or the stamp is negative.
+    """
+    return observation_from_message(message)
+
+
+def pose3d_to_ros(
+    header: Header,
+    *,
+    track_id: int,
+    stage: int,
+    skeleton: str,
+    joints: np.ndarray,
+    covariance: np.ndarray,
+    confidence: np.ndarray,
+    reprojection_rms_px: float,
+    metric: bool = False,
+    camera_orientation_xyzw: np.ndarray | None = None,
+) -> Pose3D:
+    """Pose (P, 3) m with covariance (P, 6) m^2 -> message; the camera's orientation is NaN when not given."""
+    xyzw = np.full(4, np.nan) if camera_orientation_xyzw is None else camera_orientation_xyzw
+    return Pose3D(
+        header=header,
+        track_id=track_id,
+        stage=stage,
+        skeleton=skeleton,
+        joints=floats(joints),
+        covariance=floats(covariance),
+        confidence=floats(confidence),
+        camera_orientation=quaternion_to_ros(xyzw),
+        metric=metric,
+        reprojection_rms=float(reprojection_rms_px),
+    )
+
+
+def pose3d_from_ros(message: Pose3D) -> tuple[np.ndarray, np.ndarray]:
+    """Message -> joints (P, 3) m and confidence (P,), both float64, in the message's own frame.
+
+    Raises
+    ------
+    InputError
+        When the skeleton is unknown or an array has the wrong length or is infinite.
+    """
+    count = len(joint_set(message.skeleton)) if message.track_id else 0
+    joints = float_array(message.joints, (count, 3), "joints").astype(np.float64)
+    return joints, float_array(message.confidence, (count,), "confidence").astype(np.float64)
+
+
+def vehicle_state_to_ros(state: VehicleStateData) -> VehicleState:
+    """Vehicle state -> message; the two have the same fields."""
+    return VehicleState(
+        header=header_at(state.stamp_ns, "map"),
+        autopilot=state.autopilot,
+        mode=state.mode,
+        armed=state.armed,
+        landed_state=state.landed_state,
+        position_enu_m=np.asarray(state.position_enu_m, np.float64),
+        velocity_enu_m_s=np.asarray(state.velocity_enu_m_s, np.float32),
+        orientation=quaternion_to_ros(state.orientation_xyzw),
+        angular_velocity_flu_rad_s=np.asarray(state.angular_velocity_flu_rad_s, np.float32),
+        latitude_deg=float(state.latitude_deg),
+        longitude_deg=float(state.longitude_deg),
+        altitude_amsl_m=float(state.altitude_amsl_m),
+        gps_fix_type=state.gps_fix_type,
+        satellites=state.satellites,
+        position_ok=state.position_ok,
+        battery_fraction=float(state.battery_fraction),
+        battery_voltage_v=float(state.battery_voltage_v),
+        gimbal_orientation=quaternion_to_ros(state.gimbal_orientation_xyzw),
+        link_age_s=float(state.link_age_s),
+    )

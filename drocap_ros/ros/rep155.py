@@ -1,0 +1,148 @@
+"""The subject as REP 155 tells of bodies: ``/humans/bodies`` topics and TF frames.
+
+The messages are those of ``hri_msgs`` 2; ``make setup`` builds the four of them, a ROS installation has the package
+``ros-DISTRO-hri-msgs``.  Without them only the frames are published.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import TransformStamped, Vector3
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Header
+
+from drocap_ros.geometry.alignment import torso_frame
+from drocap_ros.geometry.rotations import quaternion_from_matrix
+from drocap_ros.msg import Pose2D, Pose3D
+from drocap_ros.observation import PoseObservation
+from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_from_ros, quaternion_to_ros
+from drocap_ros.skeleton import joint_set
+
+try:
+    import hri_msgs.msg as hri
+except ImportError:  # optional: see above
+    hri = None
+
+MISSING = "no hri_msgs here: only the frames of REP 155; install ros-$ROS_DISTRO-hri-msgs, or run `make setup`"
+_BODIES = "/humans/bodies"
+_QOS = QoSProfile(depth=10)
+
+_PARTS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+#: Our joint -> link of the human model.
+LINKS = {"head": "head", **{f"{side}{part}": f"{side}_{part}" for side in "rl" for part in _PARTS}}
+#: Our joint, and COCO's -> constant of Skeleton2D.
+_CODES = {
+    "neck": "NECK",
+    "nose": "NOSE",
+    **{f"{side}{part}": f"{word}_{part}".upper() for side, word in (("r", "right"), ("l", "left")) for part in _PARTS},
+    **{f"{w}_{part}": f"{w}_{part}".upper() for w in ("right", "left") for part in (*_PARTS, "eye", "ear")},
+}
+
+
+def body_id(track_id: int, frame_prefix: str = "") -> str:
+    """Identifier of a track; the prefix tells the bodies of two drones apart."""
+    return "_".join([*filter(None, frame_prefix.split("/")), str(track_id)])
+
+
+def human_transforms(message: Pose3D, frame_prefix: str = "") -> list[TransformStamped]:
+    """Frame ``body_<id>`` between the hips, x forward, z up along the trunk, and one per link of :data:`LINKS` in it.
+
+    The links have the axes of the body: joints alone do not show how a limb is turned about itself.
+
+    Raises
+    ------
+    InputError
+        When the pose's arrays do not fit.
+    """
+    joints, _ = pose3d_from_ros(message)
+    joints_of = joint_set(message.skeleton) if message.track_id else None
+    if joints_of is None or not {"lhip", "rhip", "lshoulder", "rshoulder", "pelvis", "neck"} <= set(joints_of.joints):
+        return []
+    trunk = [joints_of.index(name) for name in ("lhip", "rhip", "lshoulder", "rshoulder", "pelvis", "neck")]
+    if not np.isfinite(joints[trunk]).all():
+        return []
+    axes = torso_frame(joints, joints_of)
+    middle = joints[trunk[:2]].mean(0)
+    name = body_id(message.track_id, frame_prefix)
+    body = _transform(message.header, f"body_{name}", middle)
+    body.transform.rotation = quaternion_to_ros(quaternion_from_matrix(axes))
+    inside = (joints - middle) @ axes
+    header = Header(stamp=message.header.stamp, frame_id=f"body_{name}")
+    links = [
+        _transform(header, f"{LINKS[joint]}_{name}", p)
+        for joint, p in zip(joints_of.joints, inside, strict=True)
+        if joint in LINKS and np.isfinite(p).all()
+    ]
+    return [body, *links]
+
+
+def skeleton2d(observation: PoseObservation, header: Header) -> Any:
+    """Keypoints as ``hri_msgs/Skeleton2D``; what is unknown or outside the image has confidence 0."""
+    message = hri.Skeleton2D(header=header)
+    unit = observation.keypoints / np.array(observation.image_size)
+    known = np.isfinite(unit).all(1) & (unit >= 0).all(1) & (unit <= 1).all(1)
+    for i in np.nonzero(known)[0]:
+        code = _CODES.get(observation.joints.joints[i])
+        if code is not None:
+            point = message.skeleton[getattr(hri.Skeleton2D, code)]
+            point.x, point.y = (float(v) for v in unit[i])
+            point.c = float(np.clip(observation.confidence[i], 0.0, 1.0))
+    return message
+
+
+def region(observation: PoseObservation, header: Header) -> Any:
+    """Box as ``hri_msgs/NormalizedRegionOfInterest2D``."""
+    size = np.tile(observation.image_size, 2)
+    corners = np.clip(np.nan_to_num(observation.roi / size), 0.0, 1.0)
+    names = ("xmin", "ymin", "xmax", "ymax")
+    values = {name: float(v) for name, v in zip(names, corners, strict=True)}
+    return hri.NormalizedRegionOfInterest2D(
+        header=header, c=float(np.clip(observation.detection_score, 0.0, 1.0)), **values
+    )
+
+
+class HumanTopics:
+    """Publishers of the tracked bodies; those of a body go when it is tracked no more."""
+
+    def __init__(self, node: Node, frame_prefix: str = "") -> None:
+        self._node, self._prefix = node, frame_prefix
+        self._ids = node.create_publisher(hri.IdsList, f"{_BODIES}/tracked", _QOS)
+        self._now = ""
+        self._publishers: list[Any] = []
+
+    def publish(self, message: Pose2D) -> None:
+        """Tell who is tracked, and box and keypoints.
+
+        Raises
+        ------
+        InputError
+            When the message's arrays do not fit.
+        """
+        observation = pose2d_from_ros(message)
+        now = body_id(message.track_id, self._prefix) if observation.has_subject else ""
+        if now != self._now:
+            self._change(now)
+        self._ids.publish(hri.IdsList(header=message.header, ids=[now] if now else []))
+        if now:
+            skeletons, regions = self._publishers
+            skeletons.publish(skeleton2d(observation, message.header))
+            regions.publish(region(observation, message.header))
+
+    def _change(self, now: str) -> None:
+        for publisher in self._publishers:
+            self._node.destroy_publisher(publisher)
+        self._now, self._publishers = now, []
+        if now:
+            self._publishers = [
+                self._node.create_publisher(hri.Skeleton2D, f"{_BODIES}/{now}/skeleton2d", _QOS),
+                self._node.create_publisher(hri.NormalizedRegionOfInterest2D, f"{_BODIES}/{now}/roi", _QOS),
+            ]
+
+
+def _transform(header: Header, child: str, p: np.ndarray) -> TransformStamped:
+    transform = TransformStamped(header=header, child_frame_id=child)
+    transform.transform.translation = Vector3(x=float(p[0]), y=float(p[1]), z=float(p[2]))
+    return transform

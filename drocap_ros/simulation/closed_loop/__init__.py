@@ -1,0 +1,1 @@
+"""The closed flight loop in simulated time, with faults and with rendered images."""

@@ -1,0 +1,285 @@
+"""The closed loop in simulated time: vehicle, person, keypoints seen from its real pose, and the real controller.
+
+Link, parser, estimator, planner and safety are those that fly; only clocks, bytes' way and vehicle are simulated.
+Deterministic and much faster than real time.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.frames import camera_rotation
+from drocap_ros.flight.mavlink.link import MavlinkLink
+from drocap_ros.flight.orbit.controller import ControlStatus, OperatorCommand, OrbitController
+from drocap_ros.flight.orbit.safety import Action, Command, State
+from drocap_ros.flight.orbit.watchdog import Watchdog
+from drocap_ros.observation import PoseObservation
+from drocap_ros.simulation.camera import pinhole_matrix, project, to_camera
+from drocap_ros.simulation.observation import observe_keypoints, occlusion
+from drocap_ros.simulation.person import simulate_person
+from drocap_ros.simulation.vehicle.copter import SimulatedCopter
+from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
+
+EPOCH_NS = 1_700_000_000_000_000_000
+_STEP_S = 0.01
+_LINK_S = 0.02
+_WIDTH, _HEIGHT, _FIELD_DEG = 1280, 720, 60.0
+_GROUND = 0.0
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """One flight.
+
+    action : what the person does, of ``simulation.person.ACTIONS``
+    walking_m_s : mean speed of a walking person
+    moves_from_s : the person waits until then
+    bearing_deg, distance_m, height_m : where the vehicle hovers at the start, seen from the person
+    wind_m_s : (3,) mean
+    latency_s : from exposure to keypoints
+    seconds : longest flight
+    """
+
+    autopilot: str = "ardupilot"
+    seed: int = 0
+    action: str = "stand"
+    walking_m_s: float = 1.4
+    moves_from_s: float = 6.0
+    stature_m: float = 1.75
+    bearing_deg: float = 0.0
+    distance_m: float = 7.0
+    height_m: float = 3.0
+    wind_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    perception_hz: float = 15.0
+    latency_s: float = 0.1
+    seconds: float = 40.0
+    start_mode: str = ""  # "" = the control mode: the pilot has switched to GUIDED or OFFBOARD
+    guid_timeout_s: float = 0.5
+    offboard_loss_s: float = 0.5
+    config: MavlinkBridgeConfig = field(
+        default_factory=lambda: MavlinkBridgeConfig(
+            commands_enabled=True, mode_change_allowed=True, attitude_hz=25.0, position_hz=20.0
+        )
+    )
+
+
+class Row(NamedTuple):
+    """Truth at one step of the control loop: m, m/s, deg; ``distance_m`` horizontal from the pelvis."""
+
+    t_s: float
+    position: np.ndarray
+    velocity: np.ndarray
+    distance_m: float
+    yaw_error_deg: float
+    state: State
+    action: Action
+    mode: str
+
+
+class OrbitLoop:
+    """A flight that is stepped.  Faults are made by setting its attributes while it flies.
+
+    perceive : what becomes of each observation before it is delivered; None = lost
+    hung : the control loop does not run;  stopped : nor do link and watchdog (SIGSTOP, SIGKILL)
+    clock_jump_s : added to our clock of the stamps
+    """
+
+    def __init__(self, settings: LoopSettings) -> None:
+        self.settings, self.t = settings, 0.0
+        self.hung = self.stopped = False
+        self.clock_jump_s = 0.0
+        self.perceive: Callable[[PoseObservation], PoseObservation | None] = lambda seen: seen
+        self.down, self.up = (Channel(lambda: self.t, settings.seed + i) for i in (1, 2))
+        joints = self._person()
+        bearing = math.radians(settings.bearing_deg)
+        start = np.array([math.cos(bearing), math.sin(bearing), 0.0]) * settings.distance_m
+        start += np.array([*joints[0, 0, :2], settings.height_m])
+        control = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}[settings.autopilot]
+        aim = 0.53 * settings.stature_m
+        # A mount has been pointed at the person by hand; without one the camera is tilted for the orbit.
+        drop, away = settings.config.height_m - aim, settings.config.radius_m
+        if settings.config.gimbal_control:
+            drop, away = settings.height_m - aim, settings.distance_m
+        pitch = -math.degrees(math.atan2(drop, away))
+        self.copter = SimulatedCopter(
+            LoopbackTransport(self.up, self.down), start, bearing + math.pi, settings.autopilot,
+            wind=np.array(settings.wind_m_s), seed=settings.seed, guid_timeout_s=settings.guid_timeout_s,
+            offboard_loss_s=settings.offboard_loss_s,
+            mode=settings.start_mode or ("LOITER" if settings.autopilot == "px4" else control), gimbal_pitch_deg=pitch,
+        )  # fmt: skip
+        self.rows: list[Row] = []
+        self.answers: list[tuple[float, str]] = []
+        self.reasons: list[tuple[float, str, str]] = []
+        self.framing: list[tuple[float, bool]] = []
+        self.matrix = pinhole_matrix(_WIDTH, _HEIGHT, _FIELD_DEG)
+        self._joints = joints
+        self._frame = 0
+        self._waiting: list[tuple[float, PoseObservation]] = []
+        self._next_link = self._next_control = 0.0
+        self.restart()
+
+    def restart(self) -> None:
+        """A new process takes the old one's place."""
+        config = self.settings.config
+        transport = LoopbackTransport(self.down, self.up)
+        self.link = MavlinkLink(config, self.clock_ns, monotonic_s=lambda: self.t, transport=transport)
+        self.watchdog = Watchdog(self.link.send_unlocked, config.watchdog_s)
+        self.controller = OrbitController(self.link, config, self.watchdog)
+        self.controller.on_camera(self.matrix)
+
+    def clock_ns(self) -> int:
+        """Our clock of the stamps."""
+        return EPOCH_NS + round((self.t + self.clock_jump_s) * 1e9)
+
+    def command(self, kind: Command, **values: float) -> None:
+        """The operator's command, now."""
+        self.controller.command(OperatorCommand(int(kind), stamp_ns=self.clock_ns(), **values))
+
+    def pelvis(self, t_s: float | None = None) -> np.ndarray:
+        """(3,) m, truth."""
+        frame = (self.t if t_s is None else t_s) * self.settings.perception_hz
+        i = min(int(frame), len(self._joints) - 2)
+        part = min(frame - i, 1.0)
+        pelvis: np.ndarray = (1 - part) * self._joints[i, 0] + part * self._joints[i + 1, 0]
+        return pelvis
+
+    def run(self, until_s: float, each: Callable[[OrbitLoop], None] | None = None) -> None:
+        """Fly until a time; ``each`` is called before every step of the control loop."""
+        while self.t < until_s - 1e-9 and not self.copter.crashed:
+            self._step(each)
+
+    def start(self, settle_s: float = 4.0, **values: float) -> None:
+        """Let link and filter settle, then orbit; asks for control where the pilot has not given it."""
+        self.run(self.t + settle_s)
+        control = self.copter.mode in ("GUIDED", "OFFBOARD")
+        self.command(Command.START if control else Command.ENGAGE, **values)
+
+    def _step(self, each: Callable[[OrbitLoop], None] | None) -> None:
+        self.t = round(self.t + _STEP_S, 6)
+        self.copter.fly(self.t)
+        self._see()
+        self._deliver()
+        if self.t >= self._next_link - 1e-9:
+            self._next_link += _LINK_S
+            if not self.stopped:
+                for state in self.link.spin_once(0.0):
+                    self.controller.on_state(state)
+                self.watchdog.step(self.t)
+        if self.t < self._next_control - 1e-9:
+            return
+        self._next_control += 1.0 / self.settings.config.control_hz
+        if each is not None:
+            each(self)
+        status: ControlStatus | None = None
+        if not (self.hung or self.stopped):
+            status = self.controller.step(self.clock_ns(), self.t)
+            if status.answer:
+                self.answers.append((self.t, status.answer))
+            told = (status.state.name, status.reason)
+            if not self.reasons or self.reasons[-1][1:] != told:
+                self.reasons.append((self.t, *told))
+        self._note(status)
+
+    def _note(self, status: ControlStatus | None) -> None:
+        body, pelvis = self.copter.body, self.pelvis()
+        sight = pelvis[:2] - body.position[:2]
+        error = math.remainder(body.yaw - math.atan2(sight[1], sight[0]), 2 * math.pi)
+        self.rows.append(
+            Row(
+                self.t, body.position.copy(), body.velocity.copy(), float(np.hypot(*sight)), math.degrees(error),
+                self.controller.safety.state, status.action if status else Action.NOTHING, self.copter.mode,
+            )
+        )  # fmt: skip
+
+    def _person(self) -> np.ndarray:
+        """(F, 15, 3) m: the person at every frame, at the wanted walking speed."""
+        s = self.settings
+        t = np.arange(int((s.seconds + 1.0) * s.perception_hz) + 2) / s.perception_hz
+        t = np.maximum(t - s.moves_from_s, 0.0)
+        joints = simulate_person(t, s.action, s.seed, s.stature_m)
+        if s.action == "walk":
+            # The path is stretched to the wanted speed and keeps its turns: the feet slide a little.
+            trial = simulate_person(np.arange(2.0, 12.0, 0.1), s.action, s.seed, s.stature_m)[:, 0, :2]
+            speed = float(np.linalg.norm(np.diff(trial, axis=0), axis=1).mean() / 0.1)
+            joints[..., :2] += (s.walking_m_s / speed - 1.0) * joints[:, :1, :2]
+        return joints
+
+    def _see(self) -> None:
+        hz = self.settings.perception_hz
+        if self.t < self._frame / hz - 1e-9 or self._frame >= len(self._joints):
+            return
+        joints = self._joints[None, self._frame]
+        rotation = camera_rotation(self.copter.camera_orientation())[None]
+        position = self.copter.body.position[None]
+        exact = project(joints, rotation, position, self.matrix)
+        if np.isfinite(exact).all():
+            middle = 0.5 * (exact[0].min(axis=0) + exact[0].max(axis=0)) - np.array([_WIDTH, _HEIGHT]) / 2
+            self.framing.append((self.t, bool(np.all(np.abs(middle) < np.array([_WIDTH, _HEIGHT]) / 6))))
+        else:
+            self.framing.append((self.t, False))
+        observation = self.observe(joints[0], rotation[0], position[0])
+        self._frame += 1
+        self._waiting.append((self.t + self.settings.latency_s, observation))
+
+    def observe(self, joints: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> PoseObservation:
+        """What perception makes of the person now; from the joints' projections here.
+
+        Parameters
+        ----------
+        joints : (15, 3) m, truth
+        rotation, position : (3, 3) world -> optical, (3,) m, of the camera, truth
+        """
+        joints, rotation, position = joints[None], rotation[None], position[None]
+        exact = project(joints, rotation, position, self.matrix)
+        inside = np.all((exact >= -0.5) & (exact < np.array([_WIDTH, _HEIGHT]) - 0.5), axis=-1)
+        seen = np.where(inside[..., None], exact, np.nan)
+        hidden = occlusion(exact, to_camera(joints, rotation, position)[..., 2], self.matrix[0, 0])
+        noisy = observe_keypoints(seen, hidden, self.settings.seed * 1_000_003 + self._frame)
+        return PoseObservation(
+            self.clock_ns(), 1 if np.isfinite(seen).any() else 0, (_WIDTH, _HEIGHT),
+            keypoints=noisy.keypoints[0].astype(np.float32), covariance=noisy.covariance[0].astype(np.float32),
+            confidence=noisy.confidence[0].astype(np.float32),
+        )  # fmt: skip
+
+    def _deliver(self) -> None:
+        while self._waiting and self._waiting[0][0] <= self.t + 1e-9:
+            observation = self.perceive(self._waiting.pop(0)[1])
+            if observation is not None and not self.stopped:
+                self.controller.on_pose2d(observation)
+
+
+class OrbitQuality(NamedTuple):
+    """How an orbit went after its ramp."""
+
+    radius_error_m: float
+    yaw_error_deg: float
+    in_middle_third: float
+    least_distance_m: float
+    top_speed_m_s: float
+    orbiting: float
+
+
+def orbit_quality(loop: OrbitLoop, radius_m: float, after_s: float) -> OrbitQuality:
+    """Mean errors over the steps after a time, against the truth."""
+    rows = [row for row in loop.rows if row.t_s >= after_s]
+    framing = [inside for t, inside in loop.framing if t >= after_s]
+    return OrbitQuality(
+        float(np.mean([abs(row.distance_m - radius_m) for row in rows])),
+        float(np.mean([abs(row.yaw_error_deg) for row in rows])),
+        float(np.mean(framing)),
+        min(row.distance_m for row in rows),
+        max(float(np.linalg.norm(row.velocity)) for row in rows),
+        float(np.mean([row.state == State.ORBITING for row in rows])),
+    )
+
+
+def with_config(settings: LoopSettings, **values: object) -> LoopSettings:
+    """Settings with some parameters of the bridge changed."""
+    return dataclasses.replace(settings, config=dataclasses.replace(settings.config, **values))  # type: ignore[arg-type]

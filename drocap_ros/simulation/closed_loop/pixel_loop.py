@@ -1,0 +1,37 @@
+"""The closed loop in simulated time with pictures: rendered, and looked at by the real pose estimator."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drocap_ros.observation import PoseObservation
+from drocap_ros.perception.estimator import PoseEstimator
+from drocap_ros.simulation.camera import project
+from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop
+from drocap_ros.simulation.render.renderer import Renderer
+
+
+class PixelOrbitLoop(OrbitLoop):
+    """An orbit by what is seen in rendered pictures; as deterministic as the networks are.
+
+    errors : (15,) px per picture, distance of the keypoints from the truth; NaN where not seen
+    heights_px : of the person in each picture
+    """
+
+    def __init__(self, settings: LoopSettings, estimator: PoseEstimator) -> None:
+        super().__init__(settings)
+        self.errors: list[np.ndarray] = []
+        self.heights_px: list[float] = []
+        self._estimator = estimator
+        width, height = (round(2 * self.matrix[i, 2] + 1) for i in (0, 1))
+        self._renderer = Renderer(self.matrix, width, height, settings.seed)
+
+    def observe(self, joints: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> PoseObservation:
+        """Render and look."""
+        picture = self._renderer.picture(joints, rotation, position)
+        observation = self._estimator.process(picture, self.clock_ns())
+        exact = project(joints[None], rotation[None], position[None], self.matrix)[0]
+        seen = observation.keypoints if len(observation.keypoints) else np.full(exact.shape, np.nan)
+        self.errors.append(np.linalg.norm(seen - exact, axis=1))
+        self.heights_px.append(float(np.ptp(exact[:, 1])))
+        return observation

@@ -1,0 +1,1 @@
+"""The world of the demo: pilot, camera, truth."""

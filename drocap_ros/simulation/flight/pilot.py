@@ -1,0 +1,95 @@
+"""A simulated pilot with sticks: takes off, hovers, and gives control as the autopilot's dialect wants it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from drocap_ros.flight.mavlink.transport import Transport
+from drocap_ros.simulation.vehicle.copter import SimulatedCopter
+from drocap_ros.simulation.vehicle.dynamics import Target
+
+#: The mode in which the sticks command velocities.
+STICK_MODE = {"ardupilot": "LOITER", "px4": "POSCTL"}
+#: The mode in which setpoints steer.
+CONTROL_MODE = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}
+#: ArduPilot: the pilot switches to GUIDED, where it waits for setpoints.  PX4 takes OFFBOARD only while setpoints
+#: stream, so the pilot leaves it holding and the operator's `engage` asks for OFFBOARD.
+HANDED_OVER_MODE = {"ardupilot": "GUIDED", "px4": "LOITER"}
+_CLIMB_M_S, _BRAKING_M_S2, _LAG_S = 1.2, 1.45, 0.35
+_SKIDS_M = 0.1
+_READY_S, _HOVER_S = 1.0, 1.5
+
+
+class PilotedCopter(SimulatedCopter):
+    """A copter that stands on the ground until its pilot takes off.
+
+    ground : (2,) m ENU, where it stands
+    stick : (3,) m/s ENU, the velocity that the sticks ask for in ``STICK_MODE``
+    Further parameters are those of :class:`SimulatedCopter`.
+    """
+
+    def __init__(
+        self, transport: Transport, ground: np.ndarray, yaw: float, autopilot: str, *, wind: np.ndarray, seed: int
+    ) -> None:
+        super().__init__(
+            transport, np.array([*ground, _SKIDS_M]), yaw, autopilot, wind=wind, seed=seed, mode=STICK_MODE[autopilot],
+        )  # fmt: skip
+        self.armed, self.landed_state = False, mavlink.MAV_LANDED_STATE_ON_GROUND
+        self.stick: np.ndarray = np.zeros(3)
+        self._ground: np.ndarray = self.body.position.copy()
+
+    def fly(self, t_s: float) -> None:
+        """Fly up to path time ``t_s``, then speak and listen; on the ground it stays where it is."""
+        super().fly(t_s)
+        if self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND:
+            self.body.position, self.body.velocity = self._ground.copy(), np.zeros(3)
+
+    def _present_target(self, dt: float) -> Target:
+        if self.mode == STICK_MODE[self.autopilot] and self.stick.any():
+            self._stop_velocity = None  # once the sticks are let go it stops from the speed it then has
+            return Target(velocity=self.stick.copy(), yaw=self._heading)
+        return super()._present_target(dt)
+
+
+class SimulatedPilot:
+    """Arms, climbs to a height with the camera on the person, hovers, hands over; then keeps the hands off.
+
+    height_m : where to hover
+    aim : (3,) m ENU, where the camera is to look until the hand-over
+    doing : in words
+    """
+
+    def __init__(self, copter: PilotedCopter, height_m: float, aim: np.ndarray) -> None:
+        self._copter, self._height_m, self._aim = copter, height_m, aim
+        self.doing = "checking the vehicle"
+        self._since_s = 0.0
+
+    @property
+    def handed_over(self) -> bool:
+        """Whether the pilot's hands are off."""
+        return self.doing == "hands off"
+
+    def step(self, t_s: float) -> None:
+        """Look at the vehicle at path time ``t_s`` and act."""
+        copter = self._copter
+        if not self.handed_over:
+            sight = self._aim - copter.body.position
+            copter.camera_pitch = math.atan2(float(sight[2]), float(np.hypot(sight[0], sight[1])))
+        if self.doing == "checking the vehicle" and t_s >= _READY_S:
+            copter.armed, copter.landed_state = True, mavlink.MAV_LANDED_STATE_TAKEOFF
+            copter.stick = np.array([0.0, 0.0, _CLIMB_M_S])
+            self._next("climbing", t_s)
+        elif self.doing == "climbing":
+            climb = float(copter.body.velocity[2])
+            if copter.body.position[2] + climb * (_LAG_S + climb / (2 * _BRAKING_M_S2)) >= self._height_m:
+                copter.stick, copter.landed_state = np.zeros(3), mavlink.MAV_LANDED_STATE_IN_AIR
+                self._next("hovering", t_s)
+        elif self.doing == "hovering" and t_s - self._since_s >= _HOVER_S:
+            copter.set_mode(HANDED_OVER_MODE[copter.autopilot], "pilot")
+            self._next("hands off", t_s)
+
+    def _next(self, doing: str, t_s: float) -> None:
+        self.doing, self._since_s = doing, t_s

@@ -1,0 +1,128 @@
+"""One world for the flight simulator: copter with its pilot, person, camera.  No ROS, no clock of its own."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.flight.frames import camera_rotation
+from drocap_ros.flight.mavlink.transport import Transport
+from drocap_ros.simulation.camera import pinhole_matrix
+from drocap_ros.simulation.flight.flight_simulator_config import FlightSimulatorConfig
+from drocap_ros.simulation.flight.pilot import CONTROL_MODE, PilotedCopter, SimulatedPilot
+from drocap_ros.simulation.flight.truth import MAX_EXPOSURES, FlightTruth
+from drocap_ros.simulation.person import simulate_person
+
+#: The person stands until the vehicle has been flown by setpoints for this long and has come near, and waits, within
+#: a moment, whenever it is not: whoever is filmed sees the drone stop.
+BEGINS_AFTER_S = 3.0
+_GAP_S, _REACTION_S = 0.5, 0.3
+_TAKE_HZ, _TAKE_CHUNK_S = 100.0, 20.0
+
+
+class Exposure(NamedTuple):
+    """What the camera sees at one instant.
+
+    joints3d (15, 3) m ENU; rotation (3, 3) world -> optical; position (3,) m ENU
+    """
+
+    stamp_ns: int
+    joints3d: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+
+
+class FlightWorld:
+    """Stepped in time; exposures are kept as the truth.
+
+    Parameters
+    ----------
+    transport : the vehicle's end of the MAVLink link; closed by :meth:`close`
+    """
+
+    def __init__(self, config: FlightSimulatorConfig, transport: Transport) -> None:
+        self.config = config
+        self.camera_matrix = pinhole_matrix(config.image_width, config.image_height, config.horizontal_fov_deg)
+        bearing = float(np.random.default_rng([config.seed, 0xF5]).uniform(-math.pi, math.pi))
+        ground = config.start_distance_m * np.array([math.cos(bearing), math.sin(bearing)])
+        self.copter = PilotedCopter(
+            transport, ground, math.remainder(bearing + math.pi, 2 * math.pi), config.autopilot,
+            wind=np.array([config.wind_m_s, 0.0, 0.0]), seed=config.seed,
+        )  # fmt: skip
+        self._take = Take(config)
+        aim = self._take.at(0.0)[0]
+        self.pilot = SimulatedPilot(self.copter, config.takeoff_height_m, aim)
+        self.forgotten = 0  # exposures beyond the limit
+        self._t = self._take_s = 0.0
+        self._pace = 0.0  # of the person, 0 standing to 1 acting
+        self._setpoints = 0
+        self._heard_s = self._steered_s = -math.inf  # last setpoint; since when they come without a gap
+        self._rows: list[Exposure] = []
+
+    def step(self, t_s: float) -> None:
+        """Go on to world time ``t_s``, which is the vehicle's path time too."""
+        passed_s, self._t = t_s - self._t, t_s
+        self.copter.fly(t_s)
+        self.pilot.step(t_s)
+        if self.copter.mode == CONTROL_MODE[self.copter.autopilot] and self.copter.accepted_setpoints > self._setpoints:
+            if t_s - self._heard_s > _GAP_S:
+                self._steered_s = t_s
+            self._heard_s = t_s
+        self._setpoints = self.copter.accepted_setpoints
+        acts = t_s - self._heard_s <= _GAP_S and t_s - self._steered_s >= BEGINS_AFTER_S
+        self._pace += (float(acts) - self._pace) * (1 - math.exp(-passed_s / _REACTION_S))
+        self._take_s += self._pace * passed_s
+
+    def expose(self, stamp_ns: int) -> Exposure:
+        """What the camera sees now; ``stamp_ns`` is now by the clock of the stamps."""
+        rotation = camera_rotation(self.copter.camera_orientation())
+        exposure = Exposure(stamp_ns, self._person(), rotation, self.copter.body.position.copy())
+        if len(self._rows) < MAX_EXPOSURES:
+            self._rows.append(exposure)
+        else:
+            self.forgotten += 1
+        return exposure
+
+    def truth(self) -> FlightTruth:
+        """All exposures so far."""
+        rows = self._rows
+        return FlightTruth(
+            np.array([row.stamp_ns for row in rows], np.int64),
+            np.array([row.joints3d for row in rows]).reshape(-1, 15, 3),
+            np.array([row.rotation for row in rows]).reshape(-1, 3, 3),
+            np.array([row.position for row in rows]).reshape(-1, 3),
+            self.camera_matrix,
+            (self.config.image_width, self.config.image_height),
+        )
+
+    def close(self) -> None:
+        """Let go of the link."""
+        self.copter.close()
+
+    def _person(self) -> np.ndarray:
+        """(15, 3) m ENU, now."""
+        return self._take.at(self._take_s)
+
+
+class Take:
+    """The person's motion, worked out a piece at a time and linear within 10 ms."""
+
+    def __init__(self, config: FlightSimulatorConfig) -> None:
+        self._config = config
+        self._chunk = -1
+        self._joints: np.ndarray = np.empty((0, 15, 3))
+
+    def at(self, t_s: float) -> np.ndarray:
+        """(15, 3) m ENU."""
+        chunk = int(t_s // _TAKE_CHUNK_S)
+        if chunk != self._chunk:
+            samples = np.arange(round(_TAKE_CHUNK_S * _TAKE_HZ) + 2) / _TAKE_HZ + chunk * _TAKE_CHUNK_S
+            config = self._config
+            self._joints = simulate_person(samples, config.action, config.seed, config.stature_m)
+            self._chunk = chunk
+        place = (t_s - chunk * _TAKE_CHUNK_S) * _TAKE_HZ
+        i = int(place)
+        joints: np.ndarray = (1 - (place - i)) * self._joints[i] + (place - i) * self._joints[i + 1]
+        return joints

@@ -1,0 +1,171 @@
+"""The visible body of a simulated person: surfaces around the joints of ``BODY_15``, and what it wears."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from drocap_ros.simulation.render.quadrics import Quadrics, cones, ellipsoids, joined
+from drocap_ros.skeleton import BODY_15
+
+_Add = Callable[[str, np.ndarray, np.ndarray, tuple[float, float, float], float], None]
+
+_J = {name: i for i, name in enumerate(BODY_15.joints)}
+
+#: From joint, to joint, radius at both (m at 1.75 m stature), what covers it.
+_LIMBS = (
+    ("hip", "knee", 0.083, 0.056, "thigh"),
+    ("knee", "ankle", 0.056, 0.040, "shank"),
+    ("shoulder", "elbow", 0.050, 0.041, "upper_arm"),
+    ("elbow", "wrist", 0.041, 0.029, "forearm"),
+)
+#: Length of the bones below over which the radii are scaled, m at 1.75 m stature (both thighs and shanks).
+_LEG_M = 0.491 * 1.75
+
+
+@dataclass(frozen=True)
+class Look:
+    """Colours (3,) BGR 0-255 of the parts of a person, and how stout it is (1 = slim average)."""
+
+    colours: dict[str, np.ndarray]
+    girth: float
+
+
+_SKINS = ((180, 205, 240), (150, 185, 225), (120, 160, 210), (85, 125, 175), (60, 85, 130), (45, 60, 90))
+_HAIRS = ((30, 35, 45), (20, 20, 22), (40, 65, 105), (75, 130, 185), (120, 120, 125), (35, 50, 125))
+
+
+def dress(seed: int) -> Look:
+    """Look of a person; the same seed gives the same."""
+    rng = np.random.default_rng([seed, 0x5EE])
+    skin = np.array(_SKINS[rng.integers(len(_SKINS))], float)
+    hair = np.array(_HAIRS[rng.integers(len(_HAIRS))], float)
+    shirt, trousers, shoes, front = (_cloth(rng) for _ in range(4))
+    long_sleeves, long_legs = rng.random() < 0.5, rng.random() < 0.75
+    jacket = rng.random() < 0.5
+    colours = {
+        "skin": skin, "hair": hair, "shirt": shirt, "trousers": trousers, "shoes": shoes,
+        "front": front if jacket else shirt,
+        "nose": 0.85 * skin, "eyes": np.array([30.0, 30.0, 30.0]),
+        "upper_arm": shirt, "forearm": shirt if long_sleeves else skin,
+        "thigh": trousers, "shank": trousers if long_legs else skin,
+    }  # fmt: skip
+    return Look(colours, float(rng.uniform(0.85, 1.2)))
+
+
+def _cloth(rng: np.random.Generator) -> np.ndarray:
+    import colorsys
+
+    hue, saturation, value = rng.random(), rng.random() ** 1.5, rng.uniform(0.08, 0.95)
+    return 255 * np.array(colorsys.hsv_to_rgb(hue, saturation, value))[::-1]
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(float(np.linalg.norm(vector)), 1e-9)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Product of two vectors; ``np.cross`` takes ten times as long for one pair."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def _axes(left: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """(3, 3) rows forward, left, up of a body part."""
+    up = _unit(up)
+    forward = _unit(_cross(left, up))
+    return np.stack([forward, _cross(up, forward), up])
+
+
+def body(joints: np.ndarray, look: Look) -> tuple[Quadrics, list[str]]:
+    """Surfaces of one person in the frame of its joints, and the part of the look that colours each.
+
+    joints : (15, 3) m, ``BODY_15``, in a frame with z up
+    """
+    at = {name: joints[i] for name, i in _J.items()}
+    leg = sum(np.linalg.norm(at[s + a] - at[s + b]) for s in "lr" for a, b in (("hip", "knee"), ("knee", "ankle")))
+    unit = 0.5 * float(leg) / _LEG_M  # metres of this person per metre of one of 1.75 m
+    stout = unit * look.girth
+    names: list[str] = []
+    starts, ends, radii = [], [], []
+    for side in "lr":
+        for first, second, r0, r1, part in _LIMBS:
+            starts.append(at[side + first])
+            ends.append(at[side + second])
+            radii.append((r0 * stout, r1 * stout))
+            names.append(part)
+    starts.append(at["lshoulder"])
+    ends.append(at["rshoulder"])
+    radii.append((0.058 * stout, 0.058 * stout))
+    names.append("shirt")
+    up = _unit(at["neck"] - at["pelvis"])
+    starts.append(at["neck"] - 0.10 * unit * up)
+    ends.append(at["head"])
+    radii.append((0.062 * stout, 0.055 * stout))
+    names.append("skin")
+    radius = np.array(radii)
+    limbs = cones(np.array(starts), np.array(ends), radius[:, 0], radius[:, 1])
+
+    centres, axes, halves = [], [], []
+
+    def add(part: str, centre: np.ndarray, frame: np.ndarray, half: tuple[float, float, float], width: float) -> None:
+        centres.append(centre)
+        axes.append(frame)
+        halves.append(np.array(half) * width)
+        names.append(part)
+
+    straight = np.eye(3)
+    for side in "lr":
+        for joint, r, part in (
+            ("hip", 0.083, "thigh"), ("knee", 0.057, "shank"), ("ankle", 0.041, "shank"),
+            ("shoulder", 0.058, "upper_arm"), ("elbow", 0.041, "forearm"),
+        ):  # fmt: skip
+            add(part, at[side + joint], straight, (r, r, r), stout)
+    hips = _axes(at["lhip"] - at["rhip"], at["neck"] - at["pelvis"])
+    chest = _axes(at["lshoulder"] - at["rshoulder"], at["neck"] - at["pelvis"])
+    trunk = at["neck"] - at["pelvis"]
+    add("trousers", at["pelvis"] + 0.02 * unit * up, hips, (0.115, 0.165, 0.125), stout)
+    add("shirt", at["pelvis"] + 0.34 * trunk, hips, (0.108, 0.148, 0.21), stout)
+    add("shirt", at["pelvis"] + 0.62 * trunk, chest, (0.122, 0.178, 0.215), stout)
+    add("front", at["pelvis"] + 0.56 * trunk + 0.055 * stout * chest[0], chest, (0.072, 0.062, 0.21), stout)
+    _add_head(add, at, 0.5 * (hips + chest), unit)
+    for side in "lr":
+        _add_hand_and_foot(add, at, side, hips, unit)
+    return joined([limbs, ellipsoids(np.array(centres), np.array(axes), np.array(halves))]), names
+
+
+def _add_head(add: _Add, at: dict[str, np.ndarray], facing: np.ndarray, unit: float) -> None:
+    """Head that faces where the body does; hair behind and above leaves the face free."""
+    frame = _axes(facing[1], at["head"] - at["neck"])
+    forward, left, up = frame
+    head = at["head"]
+    for part, offset, half in (
+        ("skin", (0.008, 0.0, -0.015), (0.098, 0.078, 0.120)),
+        ("hair", (-0.024, 0.0, 0.018), (0.098, 0.085, 0.112)),
+        ("nose", (0.105, 0.0, -0.025), (0.018, 0.013, 0.020)),
+        ("eyes", (0.090, 0.032, 0.005), (0.014, 0.014, 0.010)),
+        ("eyes", (0.090, -0.032, 0.005), (0.014, 0.014, 0.010)),
+        ("skin", (0.0, 0.080, -0.015), (0.020, 0.012, 0.030)),
+        ("skin", (0.0, -0.080, -0.015), (0.020, 0.012, 0.030)),
+    ):
+        centre = head + unit * (offset[0] * forward + offset[1] * left + offset[2] * up)
+        add(part, centre, frame, half, unit)
+
+
+def _add_hand_and_foot(add: _Add, at: dict[str, np.ndarray], side: str, hips: np.ndarray, unit: float) -> None:
+    arm = _unit(at[side + "wrist"] - at[side + "elbow"])
+    across = _unit(_cross(arm, hips[0] + 0.01 * hips[2]))
+    hand = np.stack([arm, across, _cross(arm, across)])
+    add("skin", at[side + "wrist"] + 0.075 * unit * arm, hand, (0.095, 0.024, 0.045), unit)
+    ankle = at[side + "ankle"]
+    shank = _unit(ankle - at[side + "knee"])
+    toes = _unit(hips[0] - (hips[0] @ shank) * shank)
+    # The toes do not go through the ground.
+    drop = max((0.035 * unit - ankle[2]) / (0.19 * unit), -0.95)
+    if toes[2] < drop:
+        flat = _unit(np.array([toes[0], toes[1], 0.0]))
+        toes = np.append(flat[:2] * np.sqrt(1 - min(drop, 0.95) ** 2), min(drop, 0.95))
+    sole = _axes(_cross(-shank, toes), _cross(toes, _cross(-shank, toes)))
+    centre = ankle + unit * (0.062 * sole[0] - 0.038 * sole[2])
+    add("shoes", centre, sole, (0.135, 0.048, 0.045), unit)

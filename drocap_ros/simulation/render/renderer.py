@@ -1,0 +1,173 @@
+"""Pictures of a simulated person from any camera: a body of surfaces on a ground under a sky."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.simulation.render.background import draw_background, draw_shadow
+from drocap_ros.simulation.render.body import Look, body, dress
+from drocap_ros.simulation.render.quadrics import Layer, Quadrics, see
+from drocap_ros.simulation.render.scene import Scene, make_scene
+from drocap_ros.skeleton import BODY_15
+
+#: Pictures of more pixels than this get a background of half the resolution.
+_FULL_BACKGROUND_PX = 300_000
+#: A person whose box has more pixels than this is drawn at half the resolution.
+_FULL_PERSON_PX = 150_000
+_MOST_PX = 8192
+
+
+class Renderer:
+    """A camera in a simulated place; the same seed gives the same place and clothes, hence the same pictures.
+
+    Parameters
+    ----------
+    camera_matrix : (3, 3) px without skew, pixel centres at whole numbers
+    width, height : px of the pictures
+    seed : chooses the place and the look of the person
+
+    Raises
+    ------
+    InputError
+        When matrix or size cannot be used.
+    """
+
+    def __init__(self, camera_matrix: np.ndarray, width: int, height: int, seed: int = 0) -> None:
+        matrix = np.asarray(camera_matrix, float)
+        if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
+            raise InputError(f"camera_matrix: expected (3, 3), finite, positive focal lengths, got {matrix.tolist()}")
+        if not (1 <= width <= _MOST_PX and 1 <= height <= _MOST_PX):
+            raise InputError(f"width, height: expected 1 to {_MOST_PX} px, got {width} and {height}; choose a size")
+        self.camera_matrix, self.width, self.height = matrix, int(width), int(height)
+        self.scene = make_scene(seed)
+        self.look = dress(seed)
+
+    def picture(self, joints3d: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+        """(H, W, 3) uint8 BGR.
+
+        Parameters
+        ----------
+        joints3d : (15, 3) m, world ENU, order of ``BODY_15``
+        rotation : (3, 3) world -> camera (x right, y down, z forward)
+        position : (3,) m, of the camera, world ENU
+
+        Raises
+        ------
+        InputError
+            When an array has another shape or is not finite.
+        """
+        arrays = {
+            "joints3d": (joints3d, (len(BODY_15), 3)),
+            "rotation": (rotation, (3, 3)),
+            "position": (position, (3,)),
+        }
+        for name, (array, shape) in arrays.items():
+            if np.shape(array) != shape or not np.isfinite(array).all():
+                raise InputError(
+                    f"{name}: expected {shape} of finite numbers, got {np.shape(array)}; correct its source"
+                )
+        picture, _ = draw(
+            self.scene, self.look, self.camera_matrix, self.width, self.height,
+            np.asarray(joints3d, float), np.asarray(rotation, float), np.asarray(position, float),
+        )  # fmt: skip
+        return picture
+
+
+def draw(
+    scene: Scene,
+    look: Look,
+    matrix: np.ndarray,
+    width: int,
+    height: int,
+    joints: np.ndarray,
+    rotation: np.ndarray,
+    position: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Picture (H, W, 3) uint8 BGR, and the box (4,) px x_min y_min x_max y_max of what is seen of the person or None.
+
+    The arguments are those of :class:`Renderer`, not checked.
+    """
+    import cv2
+
+    surfaces, parts = body(joints, look)
+    coarse = 2 if width * height > _FULL_BACKGROUND_PX else 1
+    small = _scaled(matrix, 1 / coarse)
+    size = (-(-width // coarse), -(-height // coarse))
+    picture = draw_background(scene, small, *size, rotation, position)
+    draw_shadow(scene, picture, surfaces.ends, surfaces.reach, small, rotation, position)
+    if coarse > 1:
+        picture = cv2.resize(picture, (size[0] * coarse, size[1] * coarse), interpolation=cv2.INTER_LINEAR)
+        picture = np.ascontiguousarray(picture[:height, :width])
+    seen = _in_camera(surfaces, rotation, position)
+    colours = np.array([look.colours[part] for part in parts], np.float32)
+    light = rotation @ scene.sun
+    factor = 2 if _person_px(seen, matrix, width, height) > _FULL_PERSON_PX else 1
+    layer = see(seen, _scaled(matrix, 1 / factor), -(-width // factor), -(-height // factor), light)
+    if layer is None:
+        return picture, None
+    mask, painted = _painted(layer, colours, scene.sunlight, rotation)
+    if factor > 1:
+        double = (mask.shape[1] * factor, mask.shape[0] * factor)
+        mask = np.where(cv2.resize(mask, double, interpolation=cv2.INTER_LINEAR) > 127, np.uint8(255), np.uint8(0))
+        painted = cv2.resize(painted, double, interpolation=cv2.INTER_LINEAR)
+    return picture, _laid_over(picture, mask, painted, layer.x * factor, layer.y * factor)
+
+
+def _scaled(matrix: np.ndarray, scale: float) -> np.ndarray:
+    """Camera matrix of the picture shrunk by a factor; pixel centres stay at whole numbers."""
+    shrunk = matrix * scale
+    shrunk[:2, 2] = (matrix[:2, 2] + 0.5) * scale - 0.5
+    shrunk[2] = matrix[2]
+    return shrunk
+
+
+def _in_camera(q: Quadrics, rotation: np.ndarray, position: np.ndarray) -> Quadrics:
+    """Surfaces of the world in the camera's frame."""
+    # x_world = R' x_camera + position
+    a = rotation @ q.a @ rotation.T
+    moved = q.b + q.a @ position
+    c = q.c + 2 * q.b @ position + np.einsum("i,nij,j->n", position, q.a, position)
+    shift = q.axis @ position
+    return Quadrics(
+        a, moved @ rotation.T, c, q.axis @ rotation.T, q.low - shift, q.high - shift,
+        (q.ends - position) @ rotation.T, q.reach,
+    )  # fmt: skip
+
+
+def _person_px(seen: Quadrics, matrix: np.ndarray, width: int, height: int) -> float:
+    """About the number of pixels of the person's box."""
+    depth = np.maximum(seen.ends[..., 2], 0.2)
+    px = seen.ends[..., :2] / depth[..., None] * np.diag(matrix)[:2] + matrix[:2, 2]
+    px = np.clip(px.reshape(-1, 2), 0, [width, height])
+    return float(np.prod(np.ptp(px, axis=0)))
+
+
+def _painted(layer: Layer, colours: np.ndarray, sunlight: float, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mask (h, w) uint8 0 or 255 and colours (h, w, 3) uint8 of a layer."""
+    import cv2
+
+    direct = np.maximum(layer.light, 0)
+    bright = np.float32(0.62 - 0.25 * sunlight) + np.float32(0.12) * layer.light + np.float32(1.15 * sunlight) * direct
+    mask = (layer.surface >= 0).view(np.uint8) * np.uint8(255)
+    table = np.concatenate([colours, np.zeros((1, 3), np.float32)])  # -1 = none takes the last
+    painted = np.take(table, layer.surface, axis=0, mode="wrap")
+    painted *= bright[..., None]
+    return mask, cv2.convertScaleAbs(painted)
+
+
+def _laid_over(picture: np.ndarray, mask: np.ndarray, painted: np.ndarray, x: int, y: int) -> np.ndarray | None:
+    """Lay the person over the picture with the softness of a lens; returns its box (4,) px or None."""
+    import cv2
+
+    height, width = picture.shape[:2]
+    mask, painted = mask[: height - y, : width - x], painted[: height - y, : width - x]
+    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    if not columns.size:
+        return None
+    part = picture[y : y + mask.shape[0], x : x + mask.shape[1]]
+    cv2.copyTo(painted, mask, part)
+    y0, x0 = max(y - 1, 0), max(x - 1, 0)
+    edge = picture[y0 : y + mask.shape[0] + 1, x0 : x + mask.shape[1] + 1]
+    edge[:] = cv2.GaussianBlur(edge, (3, 3), 0.7)
+    return np.array([x + columns[0], y + rows[0], x + columns[-1] + 1, y + rows[-1] + 1], float)

@@ -1,0 +1,60 @@
+"""A link inside one process, in simulated time: with delay, loss, duplicates and packets out of order."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import random
+from collections.abc import Callable
+
+
+class Channel:
+    """One direction.  Deterministic: its randomness comes from a seed.
+
+    delay_s, jitter_s : of each packet; jitter above the packets' distance puts them out of order
+    loss, duplicate : shares of the packets
+    cut : whether nothing passes
+    """
+
+    def __init__(self, clock_s: Callable[[], float], seed: int = 0) -> None:
+        self._clock_s = clock_s
+        self._random = random.Random(seed)
+        self._order = itertools.count()
+        self._waiting: list[tuple[float, int, bytes]] = []
+        self.delay_s, self.jitter_s, self.loss, self.duplicate, self.cut = 0.01, 0.0, 0.0, 0.0, False
+
+    def write(self, data: bytes) -> None:
+        """Take a packet."""
+        for _ in range(1 + (self._random.random() < self.duplicate)):
+            if not self.cut and self._random.random() >= self.loss:
+                due = self._clock_s() + self.delay_s + self._random.uniform(0, self.jitter_s)
+                heapq.heappush(self._waiting, (due, next(self._order), data))
+
+    def read(self) -> bytes:
+        """All that has arrived."""
+        parts = []
+        while self._waiting and self._waiting[0][0] <= self._clock_s():
+            parts.append(heapq.heappop(self._waiting)[2])
+        return b"" if self.cut else b"".join(parts)
+
+
+class LoopbackTransport:
+    """A :class:`drocap_ros.flight.mavlink.transport.Transport` over two channels; it never waits."""
+
+    def __init__(self, incoming: Channel, outgoing: Channel) -> None:
+        self._incoming, self._outgoing = incoming, outgoing
+
+    def read(self, timeout_s: float) -> bytes:
+        """Whatever has come."""
+        return self._incoming.read()
+
+    def write(self, data: bytes) -> bool:
+        """Send."""
+        self._outgoing.write(data)
+        return True
+
+    def accept_peer(self) -> None:
+        """Nothing to choose: there is one peer."""
+
+    def close(self) -> None:
+        """Nothing to give back."""

@@ -1,0 +1,278 @@
+"""A vehicle that speaks MAVLink and flies a given path.
+
+It stands in for an autopilot: heartbeat, telemetry at the rates asked for, acknowledgements, time synchronization.
+``python -m drocap_ros.simulation.vehicle.mavlink_vehicle`` runs it as a process of its own (``--url``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import struct
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from drocap_ros.errors import InputError
+from drocap_ros.flight.frames import (
+    enu_to_geodetic,
+    enu_to_ned,
+    flu_to_frd,
+    orientation_to_aviation,
+)
+from drocap_ros.flight.mavlink.parser import MavlinkParser
+from drocap_ros.flight.mavlink.signing import sign_with
+from drocap_ros.flight.mavlink.transport import Transport, open_transport
+from drocap_ros.simulation.vehicle.path import FlightPath, VehiclePose, orbit_path
+
+AUTOPILOTS = ("ardupilot", "px4")
+#: Latitude deg, longitude deg, altitude m of the local frame's origin.
+HOME = np.array([47.397742, 8.545594, 488.0])
+_COPTER_GUIDED = 4
+_PX4_OFFBOARD = 6 << 16
+_ESTIMATOR_HEALTHY = 831
+_GIMBAL_FLAGS = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
+_GIMBAL_EARTH = _GIMBAL_FLAGS | mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
+
+
+class SimulatedVehicle:
+    """MAVLink vehicle on a link of its own.
+
+    Parameters
+    ----------
+    url : of :func:`drocap_ros.flight.mavlink.transport.open_transport`
+    path : where it flies
+    autopilot : "ardupilot" or "px4"
+    gimbal : whether it has one and tells its attitude
+    system_id : its MAVLink system
+    max_rate_hz : what it delivers at most, whatever is asked and acknowledged (a slow link)
+    boot_s : seconds since boot at path time 0
+    transport : instead of that of the URL
+    signing_key : 32 bytes; then it signs, and hears only what is signed
+
+    Raises
+    ------
+    InputError
+        When the autopilot is unknown or the URL cannot be used.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        path: FlightPath,
+        autopilot: str = "ardupilot",
+        *,
+        gimbal: bool = True,
+        system_id: int = 1,
+        max_rate_hz: float = 400.0,
+        boot_s: float = 30.0,
+        transport: Transport | None = None,
+        signing_key: bytes | None = None,
+    ) -> None:
+        if autopilot not in AUTOPILOTS:
+            raise InputError(f"autopilot: expected one of {', '.join(AUTOPILOTS)}, got {autopilot!r}")
+        self.path, self.autopilot, self.gimbal = path, autopilot, gimbal
+        self.received: list[str] = []  # names of what came in, for tests that nothing else was sent
+        self._max_rate_hz, self._boot_s = max_rate_hz, boot_s
+        self._transport = transport or open_transport(url)
+        self._parser = MavlinkParser()
+        #: Parameters of the autopilot by their names: a float, or an int.
+        self.settings: dict[str, float] = (
+            {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5} if autopilot == "px4" else {"GUID_TIMEOUT": 0.5}
+        )
+        self._mav = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
+        if signing_key is not None:
+            self.use_key(signing_key, time.time_ns())
+        self._period_s: dict[int, float] = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}
+        if autopilot == "px4":  # PX4 streams a set by itself, ArduPilot almost nothing
+            self._period_s[mavlink.MAVLINK_MSG_ID_ATTITUDE] = 0.05
+            self._period_s[mavlink.MAVLINK_MSG_ID_SYS_STATUS] = 1.0
+        self._due_s: dict[int, float] = {}
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def __enter__(self) -> SimulatedVehicle:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def use_key(self, key: bytes, now_ns: int) -> None:
+        """Sign from now on, and hear only what is signed."""
+        self._parser = MavlinkParser(key, now_ns)
+        sign_with(self._mav, key, now_ns)
+
+    def start(self, clock_s: Callable[[], float] = time.monotonic) -> None:
+        """Fly in a thread, in real time; path time 0 is now."""
+        self._thread = threading.Thread(target=self.run, args=(clock_s,), name="simulated-vehicle", daemon=True)
+        self._thread.start()
+
+    def run(self, clock_s: Callable[[], float] = time.monotonic, seconds: float = math.inf) -> None:
+        """Fly in real time until :meth:`close`, or for some seconds."""
+        start = clock_s()
+        while not self._stop.is_set() and clock_s() - start < seconds:
+            self.step(clock_s() - start, wait_s=0.004)
+
+    def step(self, t_s: float, wait_s: float = 0.0) -> None:
+        """Answer what has come (waiting at most ``wait_s``) and send what is due at path time ``t_s``."""
+        data = self._transport.read(wait_s)
+        if data:
+            for message in self._parser.feed(data):
+                self._transport.accept_peer()
+                self.received.append(message.get_type())
+                self._answer(message, t_s)
+        pose: VehiclePose | None = None
+        for number, period_s in self._period_s.items():
+            if t_s >= self._due_s.get(number, -math.inf):
+                due = self._due_s.get(number, t_s)
+                self._due_s[number] = due + period_s if t_s - due < period_s else t_s + period_s
+                pose = pose or self.path.at(t_s)
+                self._send(self._telemetry(number, t_s, pose))
+
+    def close(self) -> None:
+        """Stop and give the port back."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(2.0)
+        self._transport.close()
+
+    def _send(self, message: Any) -> None:
+        self._transport.write(message.pack(self._mav))
+        self._mav.seq = (self._mav.seq + 1) % 256
+
+    def _answer(self, message: Any, t_s: float) -> None:
+        name = message.get_type()
+        if name == "TIMESYNC" and message.tc1 == 0:
+            self._send(self._mav.timesync_encode(int((t_s + self._boot_s) * 1e9), message.ts1))
+        elif name == "PARAM_REQUEST_READ":
+            self._tell_setting(message.param_id)
+        elif name == "COMMAND_LONG":
+            result = mavlink.MAV_RESULT_UNSUPPORTED
+            if message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+                result = self._set_interval(int(message.param1), message.param2)
+            self._send(
+                self._mav.command_ack_encode(
+                    message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
+                )
+            )
+
+    def _tell_setting(self, name: str) -> None:
+        if name not in self.settings:
+            return
+        value, kind = self.settings[name], mavlink.MAV_PARAM_TYPE_REAL32
+        if isinstance(value, int):  # PX4's way: the integer's bytes in the place of the float
+            value, kind = struct.unpack("<f", struct.pack("<i", value))[0], mavlink.MAV_PARAM_TYPE_INT32
+        self._send(self._mav.param_value_encode(name.encode("ascii"), value, kind, len(self.settings), 0))
+
+    def _set_interval(self, number: int, interval_us: float) -> int:
+        if number not in self._known():
+            return int(mavlink.MAV_RESULT_DENIED)
+        if interval_us < 0:
+            self._period_s.pop(number, None)
+        else:
+            self._period_s[number] = max(interval_us * 1e-6, 1.0 / self._max_rate_hz)
+        return int(mavlink.MAV_RESULT_ACCEPTED)
+
+    def _known(self) -> frozenset[int]:
+        estimator = (
+            mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS
+            if self.autopilot == "px4"
+            else mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT
+        )
+        numbers = {
+            estimator,
+            mavlink.MAVLINK_MSG_ID_ATTITUDE,
+            mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+            mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+            mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+            mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
+            mavlink.MAVLINK_MSG_ID_SYS_STATUS,
+            mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
+            mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
+        }
+        return frozenset(numbers | ({mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS} if self.gimbal else set()))
+
+    def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> Any:
+        mav, boot_ms = self._mav, int((t_s + self._boot_s) * 1e3) % 2**32
+        if number == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+            return self._heartbeat()
+        if number in (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION):
+            return self._attitude(number, boot_ms, pose)
+        if number == mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
+            return mav.local_position_ned_encode(
+                boot_ms, *enu_to_ned(pose.position_enu_m), *enu_to_ned(pose.velocity_enu_m_s)
+            )
+        if number == mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS:
+            x, y, z, w = orientation_to_aviation(pose.gimbal_orientation_xyzw)
+            return mav.gimbal_device_attitude_status_encode(0, 0, boot_ms, _GIMBAL_EARTH, [w, x, y, z], 0, 0, 0, 0)
+        if number == mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT:
+            return mav.ekf_status_report_encode(_ESTIMATOR_HEALTHY, 0.1, 0.1, 0.1, 0.1, 0)
+        if number == mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS:
+            return mav.estimator_status_encode(boot_ms * 1000, _ESTIMATOR_HEALTHY, 0.1, 0.1, 0.1, 0.1, 0, 0, 0.3, 0.3)
+        if number == mavlink.MAVLINK_MSG_ID_SYS_STATUS:
+            return mav.sys_status_encode(0, 0, 0, 200, 15800, 1200, 87, 0, 0, 0, 0, 0, 0)
+        if number == mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE:
+            return mav.extended_sys_state_encode(mavlink.MAV_VTOL_STATE_UNDEFINED, mavlink.MAV_LANDED_STATE_IN_AIR)
+        if number == mavlink.MAVLINK_MSG_ID_SYSTEM_TIME:
+            return mav.system_time_encode(time.time_ns() // 1000, boot_ms)
+        return self._satellite_position(number, boot_ms, pose)
+
+    def _heartbeat(self) -> Any:
+        px4 = self.autopilot == "px4"
+        return self._mav.heartbeat_encode(
+            mavlink.MAV_TYPE_QUADROTOR,
+            mavlink.MAV_AUTOPILOT_PX4 if px4 else mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+            mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_SAFETY_ARMED,
+            _PX4_OFFBOARD if px4 else _COPTER_GUIDED,
+            mavlink.MAV_STATE_ACTIVE,
+        )
+
+    def _attitude(self, number: int, boot_ms: int, pose: VehiclePose) -> Any:
+        x, y, z, w = orientation_to_aviation(pose.orientation_xyzw)
+        rates = flu_to_frd(pose.angular_velocity_flu_rad_s)
+        if number == mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION:
+            return self._mav.attitude_quaternion_encode(boot_ms, w, x, y, z, *rates)
+        roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+        pitch = math.asin(min(1.0, max(-1.0, 2 * (w * y - z * x))))
+        yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return self._mav.attitude_encode(boot_ms, roll, pitch, yaw, *rates)
+
+    def _satellite_position(self, number: int, boot_ms: int, pose: VehiclePose) -> Any:
+        lat, lon, alt = enu_to_geodetic(pose.position_enu_m, HOME)
+        place = (round(lat * 1e7), round(lon * 1e7), round(alt * 1e3))
+        if number == mavlink.MAVLINK_MSG_ID_GPS_RAW_INT:
+            return self._mav.gps_raw_int_encode(
+                boot_ms * 1000, mavlink.GPS_FIX_TYPE_RTK_FIXED, *place, 60, 90, 0, 0, 17
+            )
+        velocity = np.round(enu_to_ned(pose.velocity_enu_m_s) * 100).astype(int)
+        return self._mav.global_position_int_encode(
+            boot_ms, *place, round(pose.position_enu_m[2] * 1e3), *(int(v) for v in velocity), 65535
+        )
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Fly an orbit as a process of its own."""
+    parser = argparse.ArgumentParser(prog="mavlink_vehicle", description=__doc__)
+    parser.add_argument("--url", default="udpout:127.0.0.1:14540", help="where the companion listens")
+    parser.add_argument("--autopilot", choices=AUTOPILOTS, default="ardupilot")
+    parser.add_argument("--seconds", type=float, default=3600.0, help="length of the flight, s")
+    parser.add_argument("--radius", type=float, default=6.0, help="of the orbit, m")
+    parser.add_argument("--height", type=float, default=2.5, help="above the ground, m")
+    parser.add_argument("--speed", type=float, default=25.0, help="deg/s, counter-clockwise from above")
+    args = parser.parse_args(arguments)
+    path = orbit_path(args.seconds, args.radius, args.height, args.speed)
+    try:
+        with SimulatedVehicle(args.url, path, args.autopilot) as vehicle:
+            vehicle.run(seconds=args.seconds)
+    except InputError as error:
+        parser.exit(2, f"{error}\n")
+    except KeyboardInterrupt:
+        pass
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,264 @@
+"""Rendered and spoilt pictures from which the networks of the simulation learn.
+
+A sample is a person of any build and clothes in any pose of the simulation, seen from any side, -5 to 60 degrees
+above and 2.5 to 25 m away, in any place; then noise, blur, JPEG, other light, things in the way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.perception.detection.letterbox import letterbox
+from drocap_ros.perception.pose.crop import crop_around, cut
+from drocap_ros.simulation.camera import look_at, project
+from drocap_ros.simulation.person import ACTIONS, simulate_person
+from drocap_ros.simulation.render.background import draw_background
+from drocap_ros.simulation.render.body import dress
+from drocap_ros.simulation.render.renderer import draw
+from drocap_ros.simulation.render.scene import Scene, make_scene
+from drocap_ros.skeleton import BODY_15
+
+#: Input sizes of the networks (width, height) px, and the pose crop's side over that of the box.
+DETECTOR_SIZE = (320, 192)
+POSE_SIZE = (96, 128)
+POSE_PADDING = 1.25
+#: Seeds of places, persons and clothes seen in training begin here: all below are unseen.
+FIRST_SEED = 1_000_000
+
+_TAKES_PER_ACTION = 16
+_POSES_PER_TAKE = 64
+_TAKE_S = 22.0
+
+
+class View(NamedTuple):
+    """A camera: matrix (3, 3) px, rotation (3, 3) world -> camera, position (3,) m, picture size (width, height)."""
+
+    matrix: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+    size: tuple[int, int]
+
+
+@dataclass
+class World:
+    """Poses (N, 15, 3) m, ground under the origin, and some places that are exchanged for new ones in turn."""
+
+    poses: np.ndarray
+    scenes: list[Scene]
+    next_seed: int
+
+    def renew(self) -> None:
+        """Put a new place for the oldest."""
+        self.scenes = [*self.scenes[1:], make_scene(self.next_seed)]
+        self.next_seed += 1
+
+
+class DetectorSample(NamedTuple):
+    """picture (192, 320, 3) uint8 BGR; box (4,) input px x_min y_min x_max y_max, NaN without a person."""
+
+    picture: np.ndarray
+    box: np.ndarray
+
+
+class PoseSample(NamedTuple):
+    """picture (128, 96, 3) uint8 BGR; joints (15, 2) px; seen (15,) bool inside picture and crop; box_px its side."""
+
+    picture: np.ndarray
+    joints: np.ndarray
+    seen: np.ndarray
+    box_px: float
+
+
+def make_world(rng: np.random.Generator, scenes: int = 12, takes: int = _TAKES_PER_ACTION) -> World:
+    """Poses of all actions by persons of 1.35 to 2 m, and places."""
+    first = FIRST_SEED + int(rng.integers(1_000_000_000))
+    poses = []
+    for take in range(takes):
+        for number, action in enumerate(ACTIONS):
+            t = rng.uniform(0, _TAKE_S, _POSES_PER_TAKE)
+            joints = simulate_person(t, action, first + take * len(ACTIONS) + number, rng.uniform(1.35, 2.0))
+            joints[..., :2] -= joints[:, :1, :2]
+            poses.append(joints)
+    return World(np.concatenate(poses), [make_scene(first + i) for i in range(scenes)], first + scenes)
+
+
+def _view(
+    rng: np.random.Generator, joints: np.ndarray, size: tuple[int, int], fraction: float, shift: np.ndarray
+) -> View:
+    """Camera that sees the person over a fraction of the picture's height, off the middle by a share of the picture."""
+    distance = 2.5 * 10 ** rng.uniform(0, 1)
+    tilt = np.deg2rad(rng.uniform(-5, 60))
+    bearing = rng.uniform(-np.pi, np.pi)
+    target = joints.mean(axis=0)
+    away = np.array([np.cos(tilt) * np.cos(bearing), np.cos(tilt) * np.sin(bearing), np.sin(tilt)])
+    position = target + distance * away
+    position[2] = max(position[2], 0.25)
+    rotation = look_at(position[None], target[None])[0]
+    roll = np.deg2rad(rng.normal(0, 4))
+    cos, sin = np.cos(roll), np.sin(roll)
+    rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ rotation
+    local = (joints - position) @ rotation.T
+    flat = local[:, :2] / np.maximum(local[:, 2:], 0.5)
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    side = max(high[1] - low[1], 0.6 * (high[0] - low[0]), 1e-3) * 1.15
+    focal = min(fraction * size[1] / side, 12.0 * max(size))
+    # The person is put off the middle by turning the camera, as a drone would.
+    middle = 0.5 * (low + high) - shift * np.array(size) / focal
+    turn = look_at(np.zeros((1, 3)), np.array([[middle[0], 1.0, -middle[1]]]))[0]
+    turn = turn @ np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
+    matrix = np.array([[focal, 0, 0.5 * (size[0] - 1)], [0, focal, 0.5 * (size[1] - 1)], [0, 0, 1.0]])
+    return View(matrix, turn @ rotation, position, size)
+
+
+def _scene(world: World, rng: np.random.Generator) -> Scene:
+    return world.scenes[int(rng.integers(len(world.scenes)))]
+
+
+def _person(world: World, rng: np.random.Generator) -> np.ndarray:
+    """(15, 3) m, a pose somewhere in the middle of the place."""
+    joints = world.poses[int(rng.integers(len(world.poses)))].copy()
+    turn = rng.uniform(-np.pi, np.pi)
+    cos, sin = np.cos(turn), np.sin(turn)
+    joints = joints @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1.0]])
+    joints[:, :2] += rng.uniform(-12, 12, 2)
+    return joints
+
+
+def detector_sample(world: World, rng: np.random.Generator) -> DetectorSample:
+    """One picture, whole or a window around the person, in the detector's input."""
+    joints = _person(world, rng)
+    whole = rng.random() < 0.5
+    if whole:
+        size = ((640, 360), (600, 400), (512, 384))[int(rng.choice(3, p=[0.7, 0.15, 0.15]))]
+        fraction = 0.07 * (1.15 / 0.07) ** rng.random()
+    else:
+        side = int(rng.integers(220, 400))
+        size, fraction = (side, side), 0.1 * 10 ** rng.random()
+    view = _view(rng, joints, size, fraction, rng.uniform(-0.48, 0.48, 2) * (1.0 if whole else 0.5))
+    scene = _scene(world, rng)
+    arguments = (view.matrix, *view.size, view.rotation, view.position)
+    box = None
+    if rng.random() < 0.1:
+        picture = draw_background(scene, *arguments)
+    else:
+        look = dress(FIRST_SEED + int(rng.integers(1_000_000_000)))
+        picture, box = draw(scene, look, view.matrix, *view.size, joints, view.rotation, view.position)
+    for _ in range(int(rng.integers(0, 4)) if rng.random() < 0.4 else 0):
+        _put_thing(rng, picture, box)
+    picture = spoil(rng, picture)
+    canvas, place = letterbox(picture, (0, 0, *view.size), DETECTOR_SIZE)
+    if box is None:
+        return DetectorSample(canvas, np.full(4, np.nan, np.float32))
+    in_canvas = (box.reshape(2, 2) * place.scale + np.array(place.offset)).reshape(4)
+    if min(in_canvas[2] - in_canvas[0], in_canvas[3] - in_canvas[1]) < 3:  # a sliver at the edge teaches nothing
+        return detector_sample(world, rng)
+    return DetectorSample(canvas, in_canvas.astype(np.float32))
+
+
+def pose_sample(world: World, rng: np.random.Generator) -> PoseSample:
+    """One crop around a person, by a box that is not exact."""
+    joints = _person(world, rng)
+    scale = 1.1 * (2.6 / 1.1) ** rng.random()
+    size = (int(1.7 * POSE_SIZE[0] * scale), int(1.5 * POSE_SIZE[1] * scale))
+    view = _view(rng, joints, size, 0.55, rng.uniform(-0.05, 0.05, 2))
+    look = dress(FIRST_SEED + int(rng.integers(1_000_000_000)))
+    picture, box = draw(_scene(world, rng), look, view.matrix, *size, joints, view.rotation, view.position)
+    if box is None:
+        return pose_sample(world, rng)
+    px = project(joints[None], view.rotation[None], view.position[None], view.matrix)[0]
+    if rng.random() < 0.15:
+        _put_thing(rng, picture, box)
+    picture = spoil(rng, picture)
+    box = _edge_of_picture(rng, picture, box)
+    extent = box[2:] - box[:2]
+    px_inside = (px > -0.5).all(axis=1) & (px < np.array(size) - 0.5).all(axis=1)
+    px_inside &= _shown(picture, px)
+    middle = 0.5 * (box[:2] + box[2:]) + rng.normal(0, 0.04, 2) * extent
+    half = 0.5 * extent * np.exp(rng.normal(0, 0.09, 2))
+    guess = np.concatenate([middle - half, middle + half])
+    crop = crop_around(guess, POSE_SIZE, POSE_PADDING)
+    at = (px + 0.5 - np.array(crop.centre)) * crop.scale + np.array(POSE_SIZE) / 2 - 0.5
+    seen = px_inside & (at > -0.5).all(axis=1) & (at < np.array(POSE_SIZE) - 0.5).all(axis=1)
+    return PoseSample(cut(picture, crop), at.astype(np.float32), seen, float(extent.max() * crop.scale))
+
+
+def _edge_of_picture(rng: np.random.Generator, picture: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """Now and then the camera's picture ends within the person: black beyond, and the box ends there."""
+    box = box.copy()
+    if rng.random() < 0.25:
+        side = int(rng.integers(4))
+        share = rng.uniform(0.05, 0.45)
+        x0, y0, x1, y1 = box
+        if side == 0:
+            box[0] = x0 + share * (x1 - x0)
+            picture[:, : int(box[0])] = 0
+        elif side == 1:
+            box[1] = y0 + share * (y1 - y0)
+            picture[: int(box[1])] = 0
+        elif side == 2:
+            box[2] = x1 - share * (x1 - x0)
+            picture[:, int(box[2]) :] = 0
+        else:
+            box[3] = y1 - share * (y1 - y0)
+            picture[int(box[3]) :] = 0
+    return box
+
+
+def _shown(picture: np.ndarray, px: np.ndarray) -> np.ndarray:
+    """(15,) bool, whether the picture is not black (beyond its edge) at points (15, 2) px."""
+    height, width = picture.shape[:2]
+    at = np.clip(np.round(np.nan_to_num(px)), 0, [width - 1, height - 1]).astype(int)
+    return picture[at[:, 1], at[:, 0]].any(axis=1)
+
+
+def _put_thing(rng: np.random.Generator, picture: np.ndarray, box: np.ndarray | None) -> None:
+    """A post, a board or a ball in the picture; over at most a part of the person."""
+    import cv2
+
+    height, width = picture.shape[:2]
+    colour = tuple(float(v) for v in rng.uniform(0, 255, 3))
+    centre = rng.uniform([0, 0], [width, height])
+    half = np.exp(rng.uniform(np.log(0.01), np.log(0.12), 2)) * height
+    if box is not None:
+        extent = box[2:] - box[:2]
+        inside = ((centre + half > box[:2]) & (centre - half < box[2:])).all()
+        if inside:
+            half = np.minimum(half, 0.18 * extent.max())
+    at = (int(centre[0]), int(centre[1]))
+    if rng.random() < 0.4:
+        cv2.ellipse(picture, at, (int(half[0]) + 1, int(half[1]) + 1), 0, 0, 360, colour, -1)
+    else:
+        low, high = (centre - half).astype(int), (centre + half).astype(int) + 1
+        cv2.rectangle(picture, tuple(low.tolist()), tuple(high.tolist()), colour, -1)
+
+
+def spoil(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
+    """Picture (H, W, 3) uint8 with other light and colours, blur, noise and JPEG, each now and then."""
+    import cv2
+
+    if rng.random() < 0.7:
+        gain = np.exp(rng.normal(0, 0.22)) * np.exp(rng.normal(0, 0.06, 3))
+        lift = rng.normal(0, 12)
+        level = np.arange(256)[:, None] / 255.0
+        table = 255 * level ** np.exp(rng.normal(0, 0.2)) * gain + lift
+        picture = np.asarray(cv2.LUT(picture, np.clip(table, 0, 255).astype(np.uint8)[None]))
+    if rng.random() < 0.2:
+        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.4, 1.6)))
+    elif rng.random() < 0.15:
+        length = int(rng.integers(2, 7))
+        kernel = np.zeros((length, length), np.float32)
+        kernel[length // 2] = 1 / length
+        picture = np.asarray(cv2.filter2D(picture, -1, kernel if rng.random() < 0.7 else kernel.T))
+    if rng.random() < 0.35:
+        noise = rng.standard_normal(picture.shape, np.float32) * np.float32(rng.uniform(1, 12))
+        picture = np.clip(picture + noise, 1, 255).astype(np.uint8)
+    if rng.random() < 0.4:
+        _, code = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 96))])
+        picture = np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR))
+    return np.maximum(picture, 1)  # black is left to what lies beyond the picture
+
+
+MIRROR = BODY_15.mirror

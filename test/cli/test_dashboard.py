@@ -1,0 +1,26 @@
+from types import SimpleNamespace
+
+from drocap_ros.cli.graph.dashboard import Dashboard
+
+
+def status(name, level, text, **values):
+    pairs = [SimpleNamespace(key=key, value=value) for key, value in values.items()]
+    return SimpleNamespace(name=name, level=level, message=text, values=pairs)
+
+
+def test_the_table_shows_each_node_once_with_its_latest_words():
+    from rich.console import Console
+
+    dashboard = Dashboard()
+    dashboard.take(SimpleNamespace(status=[status("drocap/initializer", b"\x00", "running", poses="3")]))
+    dashboard.take(SimpleNamespace(status=[status("drocap/pose_estimator", b"\x01", "no subject in view")]))
+    dashboard.take(SimpleNamespace(status=[status("drocap/initializer", b"\x02", "gone wrong", poses="7")]))
+    console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(dashboard.table())
+    text = console.export_text()
+    assert text.count("drocap/initializer") == 1
+    assert "poses 7" in text
+    assert "error" in text
+    assert "gone wrong" in text
+    assert "running" not in text
+    assert "warning" in text

@@ -1,0 +1,65 @@
+import numpy as np
+
+from drocap_ros.flight.mavlink.clock_offset import ClockOffset
+
+S = 1_000_000_000
+
+
+def test_exchange_gives_the_offset_within_half_the_asymmetry():
+    rng = np.random.default_rng(0)
+    clock, true = ClockOffset(), 1_700_000_000 * S
+    for i in range(100):
+        there, back = (int(rng.exponential(0.01) * S) + 1_000_000 for _ in range(2))
+        sent = true + i * S // 2
+        clock.exchange(sent, sent + there - true, sent + there + back)
+    assert abs(clock.offset_ns - true) < 3_000_000
+    assert clock.round_trip_ns < 12_000_000
+
+
+def test_one_way_is_late_by_the_shortest_delay():
+    rng = np.random.default_rng(1)
+    clock, true = ClockOffset(), 5 * S
+    for i in range(400):
+        remote = i * S // 50
+        clock.observe(remote, remote + true + 2_000_000 + int(rng.exponential(0.02) * S))
+    assert 2_000_000 <= clock.offset_ns - true < 4_000_000
+
+
+def test_restart_of_the_autopilot_starts_afresh():
+    clock = ClockOffset()
+    for i in range(50):
+        clock.observe(1000 * S + i * S // 10, 5000 * S + i * S // 10)
+    for i in range(5):
+        clock.observe(i * S // 10, 5010 * S + i * S // 10)
+    assert clock.offset_ns == 5010 * S
+
+
+def test_one_damaged_stamp_changes_nothing():
+    clock = ClockOffset()
+    for i in range(50):
+        clock.observe(i * S, 100 * S + i * S)
+    clock.observe(10**18, 151 * S)
+    assert clock.offset_ns == 100 * S
+    assert clock.to_local_ns(49 * S, 160 * S) == 160 * S  # 11 s late: not believed
+
+
+def test_jump_of_our_clock_is_followed():
+    clock = ClockOffset()
+    for i in range(10):
+        clock.exchange(100 * S + i * S, i * S, 100 * S + i * S)
+    clock.exchange(5000 * S, 10 * S, 5000 * S + 1000)
+    assert clock.offset_ns == 4990 * S + 500
+
+
+def test_stamp_is_never_later_than_its_reception():
+    clock = ClockOffset()
+    assert clock.to_local_ns(5, 77) == 77
+    clock.exchange(100 * S, 10 * S, 100 * S)
+    assert clock.to_local_ns(11 * S, 100 * S + S // 2) == 100 * S + S // 2
+
+
+def test_answers_from_nowhere_are_ignored():
+    clock = ClockOffset()
+    clock.exchange(100 * S, 0, 99 * S)
+    clock.exchange(100 * S, 0, 110 * S)
+    assert clock.offset_ns is None

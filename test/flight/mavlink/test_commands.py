@@ -1,0 +1,180 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from drocap_ros.errors import ParameterError
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.frames import ned_to_enu
+from drocap_ros.flight.mavlink.commands import CommandQueue
+from drocap_ros.flight.mavlink.dialects import ARDUPILOT, DIALECTS, PX4, halt_message, setpoint_message
+from drocap_ros.flight.mavlink.link import MavlinkLink
+from drocap_ros.flight.mavlink.parser import MavlinkParser
+from drocap_ros.flight.orbit.watchdog import LastWords, Watchdog
+from drocap_ros.flight.setpoint import Setpoint, hold_setpoint
+from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
+
+MAV = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
+SET_MODE = mavlink.MAV_CMD_DO_SET_MODE
+NUMBERS = st.floats(-100, 100, width=32)
+
+
+@given(st.lists(NUMBERS, min_size=9, max_size=9), st.floats(-math.pi, math.pi), st.floats(-1, 1))
+def test_setpoint_survives_the_wire(values, yaw, rate):
+    setpoint = Setpoint(*(np.array(values[i : i + 3]) for i in (0, 3, 6)), yaw, rate)
+    (got,) = MavlinkParser().feed(setpoint_message(MAV, (1, 1), setpoint).pack(MAV))
+    assert got.type_mask == 0
+    assert got.coordinate_frame == mavlink.MAV_FRAME_LOCAL_NED
+    assert np.allclose(ned_to_enu(np.array([got.x, got.y, got.z])), setpoint.position)
+    assert np.allclose(ned_to_enu(np.array([got.vx, got.vy, got.vz])), setpoint.velocity)
+    assert np.allclose(ned_to_enu(np.array([got.afx, got.afy, got.afz])), setpoint.acceleration)
+    nose = np.array([math.cos(got.yaw), math.sin(got.yaw), 0.0])  # north, east, down
+    assert np.allclose(ned_to_enu(nose), [math.cos(yaw), math.sin(yaw), 0], atol=1e-6)
+    assert got.yaw_rate == pytest.approx(-rate, abs=1e-6)
+
+
+@pytest.mark.parametrize("field", range(5))
+def test_a_setpoint_that_is_not_finite_is_never_sent(field):
+    good = hold_setpoint(np.zeros(3), 0.0)
+    values = list(good)
+    values[field] = np.array([0, math.nan, 0]) if field < 3 else math.inf
+    with pytest.raises(ValueError, match="finite"):
+        setpoint_message(MAV, (1, 1), Setpoint(*values))
+
+
+def test_halt_is_velocity_zero_and_nothing_else():
+    message = halt_message(MAV, (1, 1))
+    assert message.type_mask & (8 | 16 | 32 | 2048) == 0  # velocity and yaw rate count
+    assert message.type_mask & (1 | 2 | 4 | 64 | 128 | 256 | 1024) == 1479
+    assert (message.vx, message.vy, message.vz, message.yaw_rate) == (0, 0, 0, 0)
+
+
+def test_command_is_sent_until_answered_and_failure_is_in_words():
+    queue = CommandQueue()
+    queue.request(SET_MODE, ARDUPILOT.mode_parameters(False), "mode GUIDED", 0.0)
+    assert queue.due(0.0) == [(SET_MODE, 0, (1.0, 4.0, 0.0, 0.0, 0.0, 0.0, 0.0))]
+    assert queue.due(0.1) == []
+    assert queue.due(0.5)[0][1] == 1
+    queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_DENIED, 0.6)
+    assert queue.due(5.0) == []
+    assert queue.failure(SET_MODE) == "mode GUIDED: denied"
+    queue.request(SET_MODE, ARDUPILOT.mode_parameters(False), "mode GUIDED", 1.0)  # too soon
+    assert queue.due(5.0) == []
+    queue.request(SET_MODE, ARDUPILOT.mode_parameters(False), "mode GUIDED", 6.0)
+    assert len(queue.due(6.0)) == 1
+    queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_ACCEPTED, 6.1)
+    assert queue.failure(SET_MODE) == ""
+
+
+def test_command_without_an_answer_gives_up():
+    queue = CommandQueue()
+    queue.request(SET_MODE, PX4.mode_parameters(True), "mode LOITER", 0.0)
+    sent = sum(len(queue.due(0.5 * i)) for i in range(40))
+    assert sent == 5
+    assert "not answered after 5 tries" in queue.failure(SET_MODE)
+
+
+def test_temporary_rejection_is_tried_again_and_progress_waited_for():
+    queue = CommandQueue()
+    queue.request(SET_MODE, PX4.mode_parameters(False), "mode OFFBOARD", 0.0)
+    queue.due(0.0)
+    queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, 0.1)
+    assert len(queue.due(0.6)) == 1
+    queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_IN_PROGRESS, 0.7)
+    assert queue.due(2.0) == []
+    assert len(queue.due(4.0)) == 1
+    queue.cancel_all()
+    assert queue.due(9.0) == []
+
+
+def link(**values):
+    config = MavlinkBridgeConfig(commands_enabled=True, **values)
+    up = Channel(lambda: 10.0)
+    return MavlinkLink(config, lambda: 10**10, monotonic_s=lambda: 0.0, transport=LoopbackTransport(up, up))
+
+
+def test_the_link_sends_setpoints_and_the_modes_of_the_dialects_and_no_other_command():
+    sender = link()
+    sender.send_motion(halt_message(sender.mav, (1, 1)))
+    for dialect in DIALECTS.values():
+        for hold in (True, False):
+            message = sender.mav.command_long_encode(1, 1, SET_MODE, 0, *dialect.mode_parameters(hold))
+            sender.send_motion(message)
+    for command, values in (
+        (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (1, 0, 0, 0, 0, 0, 0)),
+        (mavlink.MAV_CMD_NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, 5)),
+        (mavlink.MAV_CMD_NAV_LAND, (0,) * 7),
+        (mavlink.MAV_CMD_DO_REPOSITION, (0,) * 7),
+        (SET_MODE, (1, 9, 0, 0, 0, 0, 0)),  # LAND
+        (SET_MODE, (1, 0, 0, 0, 0, 0, 0)),  # STABILIZE
+        (SET_MODE, (1, 4, 6, 0, 0, 0, 0)),  # PX4's AUTO.LAND
+    ):
+        with pytest.raises(AssertionError, match="sends no"):
+            sender.send_motion(sender.mav.command_long_encode(1, 1, command, 0, *values))
+    for name in ("manual_control_encode", "param_set_encode"):
+        values = (1, 0, 0, 0, 0, 0) if name.startswith("manual") else (1, 1, b"GUID_TIMEOUT", 3.0, 9)
+        with pytest.raises(AssertionError, match="sends no"):
+            sender.send_motion(getattr(sender.mav, name)(*values))
+
+
+def test_without_permission_the_link_sends_no_motion_at_all():
+    up = Channel(lambda: 0.0)
+    sender = MavlinkLink(MavlinkBridgeConfig(), transport=LoopbackTransport(up, up))
+    with pytest.raises(AssertionError, match="sends no"):
+        sender.send_motion(halt_message(sender.mav, (1, 1)))
+    with pytest.raises(AssertionError, match="sends no"):
+        sender.check_motion(halt_message(sender.mav, (1, 1)))
+
+
+@pytest.mark.parametrize(
+    ("values", "word"),
+    [
+        ({"height_m": 1.2}, "height_m"),
+        ({"fence_radius_m": 6.0}, "fence_radius_m"),
+        ({"commands_enabled": True, "status_hz": 0.5}, "status_hz"),
+        ({"commands_enabled": True, "attitude_hz": 2.0}, "attitude_hz"),
+    ],
+)
+def test_contradicting_parameters_of_the_bridge_are_refused(values, word):
+    with pytest.raises(ParameterError, match=word):
+        MavlinkBridgeConfig(**values)
+
+
+def test_watchdog_says_the_last_words_of_a_loop_that_hangs_and_only_then():
+    sent = []
+    dog = Watchdog(sent.append, 0.2)
+    words = LastWords("hold", "mode")
+    for i in range(20):
+        dog.kick(0.05 * i, words)
+        dog.step(0.05 * i + 0.02)
+    assert sent == []
+    for i in range(200):
+        dog.step(0.95 + 0.05 * i)
+    assert sent[0] == "hold"
+    assert sent.count("mode") == 1
+    assert 50 < sent.count("hold") < 110  # ten times a second, for ten seconds
+    assert dog.take_fired() == (True, True)
+    assert dog.take_fired() == (False, False)
+    sent.clear()
+    dog.kick(30.0, None)
+    dog.step(40.0)
+    assert sent == []
+
+
+def test_watchdog_that_stood_still_with_its_loop_leaves_the_old_place_alone():
+    sent = []
+    dog = Watchdog(sent.append, 0.2)
+    words = LastWords("hold", "mode")
+    dog.kick(1.0, words)
+    dog.step(1.02)
+    for i in range(100):  # stopped for three seconds, and the loop is not back yet
+        dog.step(4.02 + 0.02 * i)
+    assert sent == []
+    dog.kick(6.1, words)
+    dog.step(6.12)
+    for i in range(20):
+        dog.step(6.14 + 0.02 * i)
+    assert sent[0] == "hold"  # and watches again afterwards

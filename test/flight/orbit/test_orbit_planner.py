@@ -1,0 +1,184 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drocap_ros.errors import InputError
+from drocap_ros.flight.orbit.planner import advance, begin_orbit, goal_of, least_radius, reference_position, setpoint_of
+from drocap_ros.flight.orbit_config import OrbitConfig
+
+DT = 0.05
+
+
+def fly(seconds, subject=lambda t: np.zeros(3), config=None, start=(9.0, 0.0, 4.0), goal=None):
+    """Reference and setpoints of a vehicle that is always where it should be."""
+    config = config or OrbitConfig()
+    goal = goal or goal_of(config)
+    vehicle = np.array(start)
+    state = begin_orbit(vehicle, np.zeros(3), subject(0.0), config)
+    rows = []
+    for i in range(int(seconds / DT)):
+        t = i * DT
+        speed = (subject(t + 1e-3) - subject(t)) / 1e-3
+        state = advance(state, goal, vehicle, subject(t), speed, 0.0, DT, config)
+        setpoint = setpoint_of(state, vehicle, subject(t), speed, config)
+        vehicle = setpoint.position
+        rows.append((t, state, setpoint))
+    return rows
+
+
+def test_reaches_radius_height_and_angular_speed():
+    rows = fly(20)
+    _, state, setpoint = rows[-1]
+    assert state.radius.value == pytest.approx(6.0, abs=0.02)
+    assert state.height.value == pytest.approx(2.5, abs=0.02)
+    assert math.degrees(state.omega.value) == pytest.approx(19.0, abs=0.1)
+    assert np.linalg.norm(setpoint.velocity) == pytest.approx(6 * math.radians(19), rel=0.01)
+    outward = setpoint.position[:2] / np.linalg.norm(setpoint.position[:2])
+    assert setpoint.acceleration[:2] @ outward == pytest.approx(-(math.radians(19) ** 2) * 6, rel=0.02)
+    assert setpoint.yaw_rate == pytest.approx(math.radians(19), rel=0.02)
+
+
+def test_begins_where_the_vehicle_is():
+    _, _, first = fly(1, start=(0.0, 8.0, 5.0))[0]
+    assert np.allclose(first.position, [0, 8, 5], atol=0.02)
+    assert np.linalg.norm(first.velocity) < 0.2
+    assert first.yaw == pytest.approx(-math.pi / 2, abs=0.01)
+
+
+def test_angular_speed_ramps_in_about_three_seconds_without_overshoot():
+    omega = np.array([state.omega.value for _, state, _ in fly(10)])
+    top = math.radians(19)
+    assert omega.max() <= top * 1.01
+    assert 2.0 < np.argmax(omega > 0.95 * top) * DT < 4.0
+
+
+def test_velocity_and_acceleration_belong_to_the_path():
+    rows = fly(15, lambda t: np.array([1.4 * t, 0.3 * math.sin(t), 0.0]))
+    position = np.array([reference_position(state) for _, state, _ in rows])
+    velocity = np.array([setpoint.velocity for _, _, setpoint in rows])
+    moved = np.gradient(position, DT, axis=0)
+    assert np.abs(moved - velocity)[5:-5].max() < 0.15
+
+
+def test_follows_a_walking_subject():
+    _, state, setpoint = fly(20, lambda t: np.array([1.4 * t, 0.0, 0.0]))[-1]
+    subject = np.array([1.4 * (20 - DT), 0.0])
+    assert np.linalg.norm(state.centre - subject) < 0.1
+    assert np.linalg.norm(setpoint.position[:2] - subject) == pytest.approx(6.0, abs=0.15)
+
+
+def test_an_uncertain_or_walking_subject_is_given_more_room():
+    config = OrbitConfig(radius_m=3.8)
+    sure = least_radius(config, 0.1, 0.0, 1.3)
+    assert config.min_distance_m + 0.4 < sure < 3.8
+    assert least_radius(config, 0.4, 0.0, 1.3) == pytest.approx(sure + 0.6)
+    assert least_radius(config, 0.1, 1.5, 1.3) > sure + 0.5
+    state, vehicle = None, np.array([6.0, 0.0, 2.5])
+    state = begin_orbit(vehicle, np.zeros(3), np.zeros(3), config)
+    for _ in range(400):
+        state = advance(state, goal_of(config), vehicle, np.zeros(3), np.zeros(3), 0.0, DT, config, 4.5)
+        vehicle = reference_position(state)
+    assert state.radius.value == pytest.approx(4.5, abs=0.02)
+
+
+def test_a_vehicle_that_is_too_slow_is_asked_for_more():
+    config = OrbitConfig()
+    vehicle, zero = np.array([6.0, 0.0, 2.5]), np.zeros(3)
+    state = begin_orbit(vehicle, zero, zero, config)
+    for _ in range(100):
+        state = advance(state, goal_of(config), reference_position(state), zero, zero, 0.0, DT, config)
+    place = reference_position(state)
+    told = setpoint_of(state, place, zero, zero, config)
+    lags = setpoint_of(state, place, zero, zero, config, 0.9 * told.velocity)
+    assert np.allclose(setpoint_of(state, place, zero, zero, config, told.velocity).acceleration, told.acceleration)
+    assert (lags.acceleration - told.acceleration) @ told.velocity > 0
+
+
+def test_a_jump_of_the_subject_does_not_come_through():
+    rows = fly(12, lambda t: np.array([0.0 if t < 8 else 500.0, 0.0, 0.0]))
+    speeds = [np.linalg.norm(setpoint.velocity) for _, _, setpoint in rows]
+    steps = np.diff([setpoint.position for _, _, setpoint in rows], axis=0)
+    assert max(speeds) <= OrbitConfig().max_speed_m_s + 1e-9
+    assert np.linalg.norm(steps, axis=1).max() / DT < OrbitConfig().max_speed_m_s * 1.05
+
+
+def test_the_reference_waits_for_a_vehicle_that_stands_still():
+    config = OrbitConfig()
+    vehicle = np.array([6.0, 0.0, 2.5])
+    state = begin_orbit(vehicle, np.zeros(3), np.zeros(3), config)
+    for _ in range(400):
+        state = advance(state, goal_of(config), vehicle, np.zeros(3), np.zeros(3), 0.0, DT, config)
+    assert np.linalg.norm(reference_position(state) - vehicle) <= 1.3 * config.max_lead_m + 0.1
+    sent = setpoint_of(state, vehicle, np.zeros(3), np.zeros(3), config)
+    assert np.linalg.norm(sent.position - vehicle) <= config.max_lead_m + 1e-9
+
+
+def test_angular_speed_yields_to_the_acceleration_at_a_larger_radius():
+    config = OrbitConfig(radius_m=4.0, angular_speed_deg_s=40.0)
+    _, state, _ = fly(30, config=config, start=(15.0, 0, 2.5))[20]
+    assert abs(state.omega.value) ** 2 * state.radius.value <= config.max_acceleration_m_s2 * 1.02
+    _, state, _ = fly(40, config=config, start=(15.0, 0, 2.5))[-1]
+    assert math.degrees(state.omega.value) == pytest.approx(40, abs=0.5)
+
+
+def test_clockwise_is_the_mirror_image():
+    left = fly(10, start=(7.0, 0, 2.5))[-1][2]
+    right = fly(10, config=OrbitConfig(angular_speed_deg_s=-19.0), start=(7.0, 0, 2.5))[-1][2]
+    assert np.allclose(left.position * [1, -1, 1], right.position)
+    assert left.yaw_rate == pytest.approx(-right.yaw_rate)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.floats(-30, 30), st.floats(-30, 30), st.floats(0, 12), st.floats(3.5, 20), st.floats(-60, 60),
+    st.integers(0, 2**31),
+)  # fmt: skip
+def test_limits_hold_for_any_start_and_any_subject(x, y, z, radius, speed, seed):
+    config = OrbitConfig()
+    try:
+        goal = goal_of(config, radius, 3.0, speed)
+    except InputError:
+        return
+    rng = np.random.default_rng(seed)
+    places = np.cumsum(rng.normal(0, 0.3, (200, 3)), axis=0)
+    vehicle = np.array([x, y, z])
+    state = begin_orbit(vehicle, np.zeros(3), places[0], config)
+    for place in places:
+        state = advance(state, goal, vehicle, place, rng.normal(0, 3, 3), 0.0, DT, config)
+        sent = setpoint_of(state, vehicle, place, np.zeros(3), config)
+        assert sent.is_finite()
+        assert np.linalg.norm(sent.velocity) <= config.max_speed_m_s + 1e-9
+        assert np.linalg.norm(sent.acceleration) <= config.max_acceleration_m_s2 + 1e-9
+        assert np.linalg.norm(sent.position - vehicle) <= config.max_lead_m + 1e-9
+        vehicle = sent.position
+
+
+@pytest.mark.parametrize(
+    ("values", "word"),
+    [
+        ({"radius_m": -1.0}, "radius_m"),
+        ({"radius_m": 3.2}, "min_distance_m"),
+        ({"radius_m": 50.0}, "max_distance_m"),
+        ({"angular_speed_deg_s": 50.0}, "max_speed_m_s"),
+        ({"radius_m": 4.0, "angular_speed_deg_s": 45.0}, "max_acceleration_m_s2"),
+        ({"max_jerk_m_s3": 0.0}, "max_jerk_m_s3"),
+        ({"ramp_s": 0.0}, "ramp_s"),
+    ],
+)
+def test_contradictions_are_refused_at_construction(values, word):
+    with pytest.raises(InputError, match=word) as error:
+        OrbitConfig(**values)
+    assert "\n" not in str(error.value)
+
+
+def test_commands_are_checked_and_nan_keeps_the_present():
+    config = OrbitConfig()
+    goal = goal_of(config, radius_m=8.0)
+    assert goal.height_m == 2.5
+    assert goal_of(config, height_m=4.0, present=goal) == (8.0, 4.0, goal.angular_speed_rad_s)
+    for values in ({"radius_m": 1.0}, {"angular_speed_deg_s": math.inf}, {"angular_speed_deg_s": 59.0}):
+        with pytest.raises(InputError):
+            goal_of(config, **values)

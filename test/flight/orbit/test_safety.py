@@ -1,0 +1,329 @@
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drocap_ros.errors import ParameterError
+from drocap_ros.flight.orbit.safety import (
+    Action,
+    Command,
+    Limits,
+    ModeRequest,
+    Observed,
+    SafetyState,
+    State,
+    permit_mode,
+    reduce,
+)
+from drocap_ros.flight.orbit_config import OrbitConfig
+from drocap_ros.flight.safety_config import SafetyConfig
+
+LIMITS = Limits(SafetyConfig(commands_enabled=True, mode_change_allowed=True), OrbitConfig())
+GOOD = Observed(
+    autopilot="ardupilot", mode="GUIDED", in_control=True, armed=True, landed_state=2, link_age_s=0.02,
+    heartbeat_age_s=0.3, state_age_s=0.05, position_age_s=0.05, status_age_s=0.2, round_trip_s=0.02, echo_age_s=0.1,
+    gps_fix_type=3, position_ok=True, battery_fraction=0.8, position=np.array([6.0, 0, 2.5]), velocity=np.zeros(3),
+    yaw=math.pi, height_m=2.5, subject=np.zeros(3), subject_age_s=0.1, subject_sd_m=0.5, subject_distance_m=6.0,
+)  # fmt: skip
+LOITER = dataclasses.replace(GOOD, mode="LOITER", in_control=False)
+BRAKE = dataclasses.replace(GOOD, mode="BRAKE", in_control=False, in_hold=True)
+
+BAD = {
+    "disturbance": {"disturbance": "the clock jumped by 3 s"},
+    "link": {"link_age_s": 0.6},
+    "autopilot": {"autopilot": "other"},
+    "heartbeat": {"heartbeat_age_s": 3.0},
+    "attitude old": {"state_age_s": 0.5},
+    "position frozen": {"position_age_s": 0.5},
+    "round trip": {"round_trip_s": 1.9},
+    "position nan": {"position": np.array([np.nan, 0, 0])},
+    "heading nan": {"yaw": math.nan},
+    "landing": {"landed_state": 4},
+    "gps": {"gps_fix_type": 1},
+    "estimator": {"position_ok": False},
+    "status": {"status_age_s": 2.0},
+    "battery unknown": {"battery_fraction": math.nan},
+    "battery low": {"battery_fraction": 0.1},
+    "too fast": {"velocity": np.array([0.0, 7.0, 0.0])},
+    "too high": {"height_m": 21.0},
+    "climbing to the limit": {"height_m": 18.5, "velocity": np.array([0, 0, 2.5])},
+    "too low": {"height_m": 1.0},
+    "subject none": {"subject": None},
+    "subject old": {"subject_age_s": 0.5},
+    "subject from the future": {"subject_age_s": -1.0},
+    "subject uncertain": {"subject_sd_m": 2.0},
+    "subject uncertain beyond words": {"subject_sd_m": math.nan},
+    "subject near": {"subject_distance_m": 2.9},
+    "subject nearing": {"subject_distance_m": 4.0, "closing_m_s": 2.0},
+    "subject far": {"subject_distance_m": 25.0},
+    "subject nowhere": {"subject_distance_m": math.nan},
+}
+
+
+def orbiting(seen=GOOD):
+    state, _ = reduce(SafetyState(), seen, 0.0, None, LIMITS)
+    assert state.state == State.READY
+    state, decision = reduce(state, seen, 0.1, Command.START, LIMITS)
+    assert (state.state, decision.action, decision.answer) == (State.ORBITING, Action.ORBIT, "orbiting")
+    return state
+
+
+def bad(name, base=GOOD):
+    return dataclasses.replace(base, **BAD[name])
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_start_is_refused_with_the_reason(name):
+    state, decision = reduce(SafetyState(), bad(name), 0.0, Command.START, LIMITS)
+    assert state.state == State.IDLE
+    assert decision.action == Action.NOTHING
+    assert decision.answer == f"refused: {state.reason}"
+    assert len(state.reason) > 10
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_motion_ends_at_once_and_never_resumes_by_itself(name):
+    state, decision = reduce(orbiting(), bad(name), 1.0, None, LIMITS)
+    assert state.state == State.HOLDING
+    assert decision.action in (Action.HOLD, Action.HALT)
+    for i in range(100):
+        state, decision = reduce(state, GOOD, 1.1 + 0.05 * i, None, LIMITS)
+        assert decision.action == Action.HOLD
+    state, decision = reduce(state, GOOD, 7.0, Command.START, LIMITS)
+    assert state.state in (State.ORBITING, State.FAULT)  # the hold mode never came: then stop must acknowledge first
+
+
+def test_hold_latches_the_place_then_asks_for_the_hold_mode_then_is_silent():
+    moving = dataclasses.replace(GOOD, velocity=np.array([0.0, 2.0, 0.0]))
+    state, decision = reduce(orbiting(), dataclasses.replace(moving, subject=None), 1.0, None, LIMITS)
+    assert np.array_equal(state.hold_position, GOOD.position)
+    assert decision == (Action.HOLD, ModeRequest.NONE, "")
+    drifted = dataclasses.replace(moving, position=GOOD.position + 1.0)
+    state, decision = reduce(state, drifted, 2.0, None, LIMITS)
+    assert np.array_equal(state.hold_position, GOOD.position)
+    assert decision.mode_request == ModeRequest.NONE
+    state, decision = reduce(state, dataclasses.replace(drifted, velocity=np.zeros(3)), 2.1, None, LIMITS)
+    assert decision == (Action.HOLD, ModeRequest.HOLD, "")
+    state = permit_mode(state, "BRAKE")
+    state, decision = reduce(state, BRAKE, 2.5, None, LIMITS)
+    assert (state.state, decision.action, decision.mode_request) == (State.HOLDING, Action.NOTHING, ModeRequest.NONE)
+    state, _ = reduce(state, GOOD, 3.0, None, LIMITS)  # back to GUIDED: somebody else's choice
+    assert state.state == State.TAKEN_OVER
+
+
+def test_hold_mode_is_asked_for_even_when_the_vehicle_does_not_come_to_rest():
+    moving = dataclasses.replace(GOOD, velocity=np.array([0.0, 2.0, 0.0]), subject=None)
+    state, decision = reduce(orbiting(), moving, 1.0, None, LIMITS)
+    state, decision = reduce(state, moving, 4.5, None, LIMITS)
+    assert decision.mode_request == ModeRequest.HOLD
+    state, decision = reduce(state, moving, 10.0, None, LIMITS)
+    assert state.state == State.FAULT
+    assert "by hand" in state.reason
+    assert decision == (Action.HOLD, ModeRequest.HOLD, "")
+    state, decision = reduce(state, GOOD, 11.0, Command.START, LIMITS)
+    assert decision.answer.startswith("refused")
+    state, decision = reduce(state, GOOD, 12.0, Command.STOP, LIMITS)
+    assert state.state == State.READY
+
+
+def test_without_a_trustworthy_state_the_last_place_and_no_mode_while_it_cannot_be_seen():
+    lost = dataclasses.replace(GOOD, state_age_s=0.05, position_age_s=0.45)  # frozen
+    lost = dataclasses.replace(lost, velocity=np.array([0.0, 2.0, 0.0]))
+    state, decision = reduce(orbiting(), lost, 1.0, None, LIMITS)
+    assert decision == (Action.HOLD, ModeRequest.NONE, "")
+    assert np.allclose(state.hold_position, [6.0, 0.8, 2.5])  # carried on by the last velocity
+    lost = dataclasses.replace(lost, link_age_s=3.0)
+    _, decision = reduce(state, lost, 4.0, None, LIMITS)
+    assert decision == (Action.HOLD, ModeRequest.NONE, "")
+    _, decision = reduce(state, lost, 12.0, None, LIMITS)
+    assert decision == (Action.NOTHING, ModeRequest.NONE, "")
+    older = dataclasses.replace(lost, position_age_s=0.8)
+    state, decision = reduce(orbiting(), older, 1.0, None, LIMITS)
+    assert decision == (Action.HALT, ModeRequest.NONE, "")
+    back, decision = reduce(state, GOOD, 2.5, None, LIMITS)
+    assert decision.action == Action.HOLD
+    assert np.array_equal(back.hold_position, GOOD.position)
+
+
+def test_without_satellites_velocity_zero_then_the_hold_mode():
+    state, decision = reduce(orbiting(), bad("gps"), 1.0, None, LIMITS)
+    assert decision == (Action.HALT, ModeRequest.NONE, "")
+    _, decision = reduce(state, bad("gps"), 3.5, None, LIMITS)
+    assert decision == (Action.HALT, ModeRequest.HOLD, "")
+
+
+def test_fence_counts_what_it_takes_to_brake():
+    state = orbiting()
+    out = dataclasses.replace(GOOD, position=np.array([38.5, 0, 2.5]), velocity=np.array([2.0, 0, 0]))
+    held, _ = reduce(state, out, 1.0, None, LIMITS)
+    assert held.state == State.HOLDING
+    assert "fence" in held.reason
+    inward = dataclasses.replace(out, velocity=np.array([-2.0, 0, 0]))
+    assert reduce(state, inward, 1.0, None, LIMITS)[0].state == State.ORBITING
+
+
+@pytest.mark.parametrize("mode", ["LOITER", "STABILIZE", "RTL", "BRAKE", "LAND"])
+def test_any_uncommanded_mode_is_a_take_over_and_then_silence(mode):
+    other = dataclasses.replace(GOOD, mode=mode, in_control=False, in_hold=mode == "BRAKE")
+    held = reduce(orbiting(), bad("subject none"), 1.0, None, LIMITS)[0]
+    for state in (orbiting(), held):
+        state, decision = reduce(state, other, 2.0, None, LIMITS)
+        assert state.state == State.TAKEN_OVER
+        for i, seen in enumerate((other, GOOD, BRAKE, GOOD, bad("link"))):
+            for command in (None, Command.START, Command.ENGAGE, Command.ADJUST):
+                state, decision = reduce(state, seen, 3.0 + i, command, LIMITS)
+                assert (state.state, decision.action) == (State.TAKEN_OVER, Action.NOTHING)
+                assert decision.mode_request == ModeRequest.NONE
+                assert command is None or decision.answer.startswith("refused")
+        state, decision = reduce(state, GOOD, 10.0, Command.STOP, LIMITS)
+        assert state.state == State.READY
+
+
+def test_start_never_changes_the_mode_and_engage_only_when_allowed():
+    state, decision = reduce(SafetyState(), LOITER, 0.0, Command.START, LIMITS)
+    assert "LOITER" in decision.answer
+    assert decision.mode_request == ModeRequest.NONE
+    forbidden = LIMITS._replace(safety=SafetyConfig(commands_enabled=True))
+    state, decision = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, forbidden)
+    assert "mode_change_allowed" in decision.answer
+    assert decision.mode_request == ModeRequest.NONE
+    state, decision = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, LIMITS)
+    assert decision.mode_request == ModeRequest.CONTROL
+    state, decision = reduce(permit_mode(state, "GUIDED"), GOOD, 0.3, None, LIMITS)
+    assert (state.state, decision.action) == (State.ORBITING, Action.ORBIT)
+
+
+def test_engage_warms_up_times_out_and_yields_to_pilot_and_problems():
+    limits = LIMITS._replace(warm_up_s=1.2)
+    state, decision = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, limits)
+    assert decision == (Action.HOLD, ModeRequest.NONE, "asking the autopilot for control")
+    assert reduce(state, LOITER, 1.3, None, limits)[1].mode_request == ModeRequest.CONTROL
+    assert reduce(state, LOITER, 7.0, None, limits)[0].reason == "the autopilot did not grant control"
+    assert reduce(state, dataclasses.replace(LOITER, mode="LAND"), 1.0, None, limits)[0].state == State.TAKEN_OVER
+    assert reduce(state, bad("gps", LOITER), 1.0, None, limits)[1].action == Action.NOTHING
+    assert reduce(state, LOITER, 1.0, Command.STOP, limits)[1].action == Action.NOTHING
+
+
+def test_disarming_and_disabled_commands():
+    state, decision = reduce(orbiting(), dataclasses.replace(GOOD, armed=False), 1.0, None, LIMITS)
+    assert (state.state, decision.action) == (State.IDLE, Action.NOTHING)
+    off = LIMITS._replace(safety=SafetyConfig())
+    state, decision = reduce(SafetyState(), GOOD, 0.0, Command.START, off)
+    assert "commands_enabled" in decision.answer
+
+
+_SEEN = [GOOD, LOITER, BRAKE, dataclasses.replace(GOOD, armed=False), *(bad(name) for name in BAD)]
+
+
+def near(distance_m, **values):
+    place = np.array([distance_m, 0, 2.5])
+    return dataclasses.replace(GOOD, position=place, subject_distance_m=distance_m, approach_m_s=1.3, **values)
+
+
+def test_a_hold_gives_way_to_a_subject_who_walks_up_to_it():
+    state = orbiting()
+    for step, distance in enumerate((4.0, 3.9, 3.8, 3.7)):
+        state, decision = reduce(state, near(distance, velocity=np.array([1.0, 0, 0])), 10.0 + step, None, LIMITS)
+        assert decision == (Action.HOLD, ModeRequest.NONE, "")
+    assert state.hold_position[0] > 3.7 + 1.0  # ahead of a vehicle that moves out, up to the fence
+    assert state.hold_position[2] == 2.5
+    # He stands: nothing moves any more, and the autopilot's own hold follows.
+    still = dataclasses.replace(near(6.5), approach_m_s=0.0)
+    after, _ = reduce(state, still, 14.0, None, LIMITS)
+    assert (after.hold_position == state.hold_position).all()
+    assert reduce(after, still, 15.0, None, LIMITS)[1].mode_request == ModeRequest.HOLD
+
+
+@pytest.mark.parametrize(
+    ("seen", "command"),
+    [
+        (GOOD, Command.STOP),
+        (dataclasses.replace(GOOD, subject_sd_m=2.0), None),
+        (dataclasses.replace(GOOD, subject_age_s=0.5), None),
+        (dataclasses.replace(GOOD, battery_fraction=0.1), None),
+    ],
+)
+def test_no_other_hold_moves(seen, command):
+    state, _ = reduce(orbiting(), seen, 10.0, command, LIMITS)
+    place = state.hold_position.copy()
+    state, decision = reduce(state, near(3.2), 10.2, None, LIMITS)
+    assert decision.action == Action.HOLD
+    assert (state.hold_position == place).all()
+
+
+@pytest.mark.parametrize(
+    "values", [{"subject_age_s": 0.5}, {"subject_sd_m": 2.0}, {"subject": None}, {"gps_fix_type": 1}]
+)
+def test_a_hold_gives_way_only_to_what_is_seen(values):
+    state, _ = reduce(orbiting(), near(4.0), 10.0, None, LIMITS)
+    place = state.hold_position.copy()
+    state, _ = reduce(state, near(3.2, **values), 10.2, None, LIMITS)
+    assert (state.hold_position == place).all()
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from(_SEEN), st.sampled_from([None, None, *Command])), max_size=60))
+def test_in_any_history(history):
+    state, started = SafetyState(), False
+    for i, (seen, command) in enumerate(history):
+        before = state
+        state, decision = reduce(state, seen, 0.25 * i, command, LIMITS)
+        started = command in (Command.START, Command.ENGAGE)
+        if decision.action == Action.ORBIT:
+            assert not any(seen is s for s in _SEEN[1:])  # only with everything good
+            assert before.state == State.ORBITING or started or not math.isnan(before.engaging_s)
+        if before.state == State.TAKEN_OVER and command != Command.STOP:
+            assert state.state == State.TAKEN_OVER
+            assert decision[:2] == (Action.NOTHING, ModeRequest.NONE)
+        if state.state in (State.IDLE, State.TAKEN_OVER):
+            assert decision[:2] == (Action.NOTHING, ModeRequest.NONE)
+        if decision.mode_request == ModeRequest.CONTROL:
+            assert not math.isnan(state.engaging_s)
+        if decision.mode_request != ModeRequest.NONE:
+            wanted = "GUIDED" if decision.mode_request == ModeRequest.CONTROL else "BRAKE"
+            state = permit_mode(state, wanted)
+        assert state.reason
+
+
+def test_reasons_are_all_different():
+    reasons = [reduce(SafetyState(), bad(name), 0.0, None, LIMITS)[0].reason for name in BAD]
+    named = list(zip(BAD, reasons, strict=True))
+    for (a, reason_a), (b, reason_b) in itertools.combinations(named, 2):
+        assert reason_a != reason_b or {a, b} == {"position nan", "heading nan"}
+
+
+def test_contradicting_limits_are_refused():
+    with pytest.raises(ParameterError, match="max_height_m"):
+        SafetyConfig(min_height_m=5.0, max_height_m=5.5)
+
+
+def test_at_speed_the_subject_must_have_been_seen_sooner():
+    def held(speed, age_s):
+        seen = dataclasses.replace(GOOD, velocity=np.array([0.0, speed, 0.0]), subject_age_s=age_s)
+        return reduce(orbiting(), seen, 1.0, None, LIMITS)[0].state == State.HOLDING
+
+    assert not held(2.0, 0.39)
+    assert held(2.0, 0.41)
+    assert held(2.5, 0.36)
+    assert not held(2.5, 0.33)
+    assert not held(4.4, 0.24)  # not below what a camera and a network take
+    assert held(4.4, 0.26)
+
+
+def test_an_autopilot_that_does_not_follow_is_told_the_hold_mode_at_once():
+    deaf = dataclasses.replace(GOOD, heeded=False, disturbance="no setpoint echoed")
+    _, decision = reduce(orbiting(), deaf, 1.0, None, LIMITS)
+    assert decision == (Action.HOLD, ModeRequest.HOLD, "")
+    _, decision = reduce(orbiting(), dataclasses.replace(deaf, heeded=True), 1.0, None, LIMITS)
+    assert decision == (Action.HOLD, ModeRequest.NONE, "")
+
+
+def test_settings_of_the_autopilot_that_forbid_to_fly():
+    seen = dataclasses.replace(GOOD, settings_problem="the autopilot would fly on for 3 s without us")
+    _, decision = reduce(SafetyState(), seen, 0.0, Command.START, LIMITS)
+    assert decision.answer == "refused: the autopilot would fly on for 3 s without us"
+    assert reduce(orbiting(), seen, 1.0, None, LIMITS)[0].state == State.HOLDING

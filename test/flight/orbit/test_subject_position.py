@@ -1,0 +1,235 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from drocap_ros.errors import ParameterError
+from drocap_ros.flight.frames import OPTICAL_FROM_FLU
+from drocap_ros.flight.orbit.pose_history import CameraPose, PoseHistory
+from drocap_ros.flight.orbit.subject_position import SubjectFilter, locate_subject
+from drocap_ros.flight.subject_config import SubjectConfig
+from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.geometry.rotations import quaternion_from_matrix
+from drocap_ros.observation import PoseObservation
+from drocap_ros.simulation.capture import simulate_capture
+from drocap_ros.simulation.capture_config import SimulationConfig
+
+S = 1_000_000_000
+
+
+def flight(action, seconds=12.0, seed=3, **changes):
+    settings = {"attitude_error_deg": 0.3, "position_error_m": 0.0, "stature_m": 1.7, **changes}
+    return simulate_capture(seconds, 15.0, seed, SimulationConfig(action=action, **settings))
+
+
+def observations(capture, track_id=1):
+    tracks = capture.tracks
+    for i, stamp in enumerate(tracks.stamp_ns):
+        pose = CameraPose(tracks.camera_rotation[i], tracks.camera_position[i])
+        yield i, pose, PoseObservation(
+            int(stamp) + S, track_id, tracks.image_size,
+            keypoints=tracks.keypoints[i], covariance=tracks.covariance[i], confidence=tracks.confidence[i],
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize(("action", "bound"), [("stand", 0.4), ("walk", 0.45), ("squats", 0.6), ("boxing", 0.4)])
+def test_filter_finds_the_pelvis_of_a_moving_person(action, bound):
+    capture = flight(action)
+    subject = SubjectFilter(SubjectConfig())
+    errors = []
+    for i, pose, seen in observations(capture):
+        subject.update(seen, capture.tracks.camera_matrix, pose)
+        if i > 20:
+            estimate = subject.estimate(seen.stamp_ns)
+            errors.append(np.linalg.norm(estimate.position[:2] - capture.joints3d_world[i, 0, :2]))
+            assert estimate.position_sd_m < 1.0
+    assert np.mean(errors) < bound
+
+
+@pytest.mark.parametrize(("action", "bound"), [("stand", 0.25), ("squats", 0.3), ("kicking", 0.3)])
+def test_range_of_a_person_seen_from_steeply_above(action, bound):
+    capture = flight(action, radius_m=4.0, height_m=6.0)
+    subject = SubjectFilter(SubjectConfig())
+    errors, sizes = [], []
+    for i, pose, seen in observations(capture):
+        subject.update(seen, capture.tracks.camera_matrix, pose)
+        truth = np.linalg.norm(capture.joints3d_world[i, 0, :2] - pose.position[:2])
+        measured = locate_subject(seen, capture.tracks.camera_matrix, pose, SubjectConfig())
+        if measured is not None:
+            sizes.append(measured.range_size_m / truth)
+        if i > 20:
+            place = subject.estimate(seen.stamp_ns).position[:2]
+            errors.append(np.linalg.norm(place - pose.position[:2]) - truth)
+    assert np.mean(np.abs(errors)) < bound
+    assert np.max(errors) < 3 * bound  # what is farther than it is costs distance
+    if action == "stand":
+        assert np.nanmedian(sizes) == pytest.approx(1.0, abs=0.12)
+
+
+def test_one_wrong_joint_does_not_turn_the_bearing():
+    capture = flight("stand", noise_scale=0.0, outlier_fraction=0.0, missed_fraction=0.0, attitude_error_deg=0.0)
+    _, pose, seen = next(observations(capture))
+    keypoints = seen.keypoints.copy()
+    keypoints[0] += 100.0
+    places = [
+        locate_subject(dataclasses.replace(seen, keypoints=k), capture.tracks.camera_matrix, pose, SubjectConfig())
+        for k in (seen.keypoints, keypoints)
+    ]
+    assert np.linalg.norm(places[1].position - places[0].position) < 0.2
+
+
+def test_a_foot_kicked_to_the_horizon_leaves_the_range_to_the_other():
+    capture = flight("stand", noise_scale=0.0, outlier_fraction=0.0, missed_fraction=0.0, attitude_error_deg=0.0)
+    _, pose, seen = next(observations(capture))
+    ankle = seen.joints.index("rankle")
+    keypoints = seen.keypoints.copy()
+    keypoints[ankle, 1] = seen.keypoints[seen.joints.index("neck"), 1] - 80
+    kicked = locate_subject(
+        dataclasses.replace(seen, keypoints=keypoints), capture.tracks.camera_matrix, pose, SubjectConfig()
+    )
+    truth = np.linalg.norm(capture.joints3d_world[0, 0, :2] - pose.position[:2])
+    assert kicked.range_ground_m == pytest.approx(truth, rel=0.1)
+
+
+def test_velocity_of_a_standing_person_is_small_while_the_position_wanders():
+    capture = flight("stand")
+    rng = np.random.default_rng(0)
+    wander = np.cumsum(rng.normal(0, 0.03, (len(capture.tracks.stamp_ns), 3)), axis=0)
+    velocity = np.gradient(capture.camera_position, 1 / 15.0, axis=0)
+    history, subject, speeds, places = PoseHistory(), SubjectFilter(SubjectConfig()), [], []
+    for i, pose, seen in observations(capture):
+        reported = capture.camera_position[i] + wander[i]
+        forward_left_up = quaternion_from_matrix(pose.rotation.T @ OPTICAL_FROM_FLU)
+        history.add(
+            VehicleState(
+                seen.stamp_ns, position_enu_m=reported, velocity_enu_m_s=velocity[i],
+                orientation_xyzw=np.array([0.0, 0.0, 0.0, 1.0]), gimbal_orientation_xyzw=forward_left_up,
+            )
+        )  # fmt: skip
+        camera = history.at(seen.stamp_ns)
+        assert np.allclose(camera.position + history.offset, reported)
+        subject.update(seen, capture.tracks.camera_matrix, camera)
+        if i > 30:
+            estimate = subject.estimate(seen.stamp_ns)
+            speeds.append(np.linalg.norm(estimate.velocity[:2]))
+            places.append(estimate.position + history.offset - reported - capture.joints3d_world[i, 0] + pose.position)
+    assert np.mean(speeds) < 0.25  # 0.5 m/s by the position as reported
+    assert np.mean(np.linalg.norm(np.array(places)[:, :2], axis=1)) < 0.4
+
+
+def test_velocity_of_a_walking_person():
+    capture = flight("walk", noise_scale=0.5)
+    subject = SubjectFilter(SubjectConfig())
+    truth = np.gradient(capture.joints3d_world[:, 0, :2], 1 / 15.0, axis=0)
+    errors = []
+    for i, pose, seen in observations(capture):
+        subject.update(seen, capture.tracks.camera_matrix, pose)
+        if i > 30:
+            errors.append(np.linalg.norm(subject.estimate(seen.stamp_ns).velocity[:2] - truth[i]))
+    assert np.mean(errors) < 0.5
+    assert np.mean(np.linalg.norm(truth, axis=1)) > 0.8
+
+
+def test_each_source_alone_and_a_slope_that_contradicts():
+    capture = flight("stand", noise_scale=0.0, outlier_fraction=0.0, missed_fraction=0.0, attitude_error_deg=0.0)
+    _, pose, seen = next(observations(capture))
+    truth = np.linalg.norm(capture.joints3d_world[0, 0, :2] - pose.position[:2])
+    both = locate_subject(seen, capture.tracks.camera_matrix, pose, SubjectConfig())
+    assert both.range_size_m == pytest.approx(truth, rel=0.08)
+    assert both.range_ground_m == pytest.approx(truth, rel=0.08)
+    size_only = locate_subject(seen, capture.tracks.camera_matrix, pose, SubjectConfig(use_ground_plane=False))
+    assert np.isnan(size_only.range_ground_m)
+    wrong = locate_subject(seen, capture.tracks.camera_matrix, pose, SubjectConfig(ground_height_m=-6.0))
+    assert np.linalg.norm(wrong.position[:2] - pose.position[:2]) == pytest.approx(wrong.range_size_m)
+    assert wrong.systematic[0, 0] + wrong.systematic[1, 1] > size_only.systematic[0, 0] + size_only.systematic[1, 1]
+
+
+def test_what_gives_no_measurement():
+    capture = flight("stand")
+    _, pose, seen = next(observations(capture))
+    matrix, config = capture.tracks.camera_matrix, SubjectConfig()
+    assert locate_subject(PoseObservation(S, 0, (640, 480)), matrix, pose, config) is None
+    blind = dataclasses.replace(seen, keypoints=np.full((15, 2), np.nan, np.float32))
+    assert locate_subject(blind, matrix, pose, config) is None
+    down = CameraPose(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), np.array([0, 0, 10.0]))
+    assert locate_subject(seen, matrix, down, config) is None
+
+
+def accepted(subject, capture, count, **kwargs):
+    done = []
+    for i, pose, seen in observations(capture):
+        if i >= count:
+            break
+        done.append(subject.update(seen, capture.tracks.camera_matrix, pose, **kwargs))
+    return done
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda last, seen: dataclasses.replace(last, stamp_ns=seen.stamp_ns),
+        lambda last, seen: dataclasses.replace(seen, keypoints=seen.keypoints + np.float32(400)),
+        lambda last, seen: dataclasses.replace(seen, track_id=2),
+        lambda last, seen: dataclasses.replace(seen, keypoints=np.full((15, 2), np.nan, np.float32)),
+    ],
+    ids=["frozen", "jumped", "another", "nan"],
+)
+def test_age_grows_without_good_news(spoil):
+    capture = flight("stand")
+    subject = SubjectFilter(SubjectConfig())
+    assert sum(accepted(subject, capture, 30)) > 25
+    rows = list(observations(capture))
+    last = rows[29][2]
+    stamp = subject.estimate(last.stamp_ns).stamp_ns
+    for _, pose, seen in rows[30:45]:
+        assert not subject.update(spoil(last, seen), capture.tracks.camera_matrix, pose, locked=True)
+    estimate = subject.estimate(rows[44][2].stamp_ns)
+    assert estimate.stamp_ns == stamp
+    assert estimate.age_s == pytest.approx(1.0, abs=0.1)
+
+
+def test_unlocked_filter_follows_to_another_person():
+    capture, other = flight("stand"), flight("stand", seed=9)
+    subject = SubjectFilter(SubjectConfig())
+    accepted(subject, capture, 5)
+    _, pose, seen = list(observations(other, track_id=2))[6]
+    assert subject.update(seen, capture.tracks.camera_matrix, pose)
+    assert subject.estimate(seen.stamp_ns).track_id == 2
+
+
+def state(t_s, yaw_deg=0.0, **kwargs):
+    half = np.deg2rad(yaw_deg) / 2
+    return VehicleState(
+        int(t_s * S), position_enu_m=np.array([t_s, 0.0, 2.0]), velocity_enu_m_s=np.array([1.0, 0.0, 0.0]),
+        orientation_xyzw=np.array([0.0, 0.0, np.sin(half), np.cos(half)]), **kwargs,
+    )  # fmt: skip
+
+
+def test_pose_between_and_after_states():
+    history = PoseHistory()
+    assert history.at(S) is None
+    for i in range(20):
+        history.add(state(1 + 0.1 * i, 3.0 * i))
+    middle = history.at(int(1.55 * S))
+    assert np.allclose(middle.position, [1.55, 0, 2])
+    yaw = np.deg2rad(16.5)
+    assert np.allclose(middle.rotation[2], [np.cos(yaw), np.sin(yaw), 0])
+    after = history.at(int(3.0 * S))
+    yaw = np.deg2rad(60.0)
+    assert np.allclose(after.position, [3.0, 0, 2])
+    assert np.allclose(after.rotation[2], [np.cos(yaw), np.sin(yaw), 0])
+    assert history.at(int(3.3 * S)) is None
+    assert history.at(int(0.5 * S)) is None
+    history.add(state(0.2))  # the clock went back
+    assert history.at(int(1.5 * S)) is None
+
+
+def test_fixed_mount_looks_down():
+    history = PoseHistory(mount_pitch_deg=30.0)
+    history.add(state(1.0))
+    assert np.allclose(history.at(S).rotation[2], [np.cos(np.pi / 6), 0, -0.5])
+
+
+def test_bad_parameters_are_refused():
+    with pytest.raises(ParameterError, match="body_height_m"):
+        SubjectConfig(body_height_m=-1.0)

@@ -1,0 +1,198 @@
+"""Bundle adjustment: descent, invariances, exact recovery, missing joints, reasons to stop."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from walking import Walk, make_walk
+
+from drocap_ros.errors import InputError
+from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.reconstruction.metrics import limb_lengths, pa_mpjpe
+from drocap_ros.reconstruction.paper.bundle_adjustment import AdjustmentResult, bundle_adjust
+from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
+
+
+def units(walk: Walk) -> tuple[np.ndarray, float]:
+    """Measurements in units of their standard deviation, and units per metre."""
+    flat = walk.in_camera[..., :2]
+    flat = flat - flat.mean(1, keepdims=True)
+    return flat / flat.std(), 1.0 / flat.std()
+
+
+def disturbed(walk: Walk, scale: float, amount: float = 0.15) -> np.ndarray:
+    """A start in camera axes whose depths are wrong, each joint by a constant and a slow drift."""
+    rng = np.random.default_rng(0)
+    t = np.linspace(0.0, 6.0, len(walk.shape))
+    start = walk.in_camera * scale
+    wrong = rng.normal(size=15) + np.sin(t[:, None] + rng.uniform(0.0, 6.0, 15))
+    start[..., 2] += amount * wrong
+    return start
+
+
+@pytest.fixture(scope="module")
+def adjusted() -> tuple[Walk, np.ndarray, AdjustmentResult]:
+    walk = make_walk(120)
+    w, scale = units(walk)
+    start = disturbed(walk, scale)
+    return walk, start, bundle_adjust(w, start, config=BundleAdjusterConfig(iterations=500))
+
+
+def test_it_improves_a_bad_start(adjusted: tuple[Walk, np.ndarray, AdjustmentResult]) -> None:
+    walk, start, result = adjusted
+    before = pa_mpjpe(start, 1000.0 * walk.in_camera).mean()
+    after = pa_mpjpe(result.camera_shape, 1000.0 * walk.in_camera).mean()
+    assert before > 30.0
+    assert after < 6.0
+
+
+def test_the_cost_never_rises(adjusted: tuple[Walk, np.ndarray, AdjustmentResult]) -> None:
+    result = adjusted[2]
+    assert np.all(np.diff(result.history) <= 1e-9 * result.history[0])
+    assert result.cost == pytest.approx(sum(result.cost_terms.values()))
+    assert result.cost == pytest.approx(result.history[-1], rel=1e-6)
+
+
+def test_the_cost_never_rises_through_restarts() -> None:
+    walk = make_walk(60)
+    w, scale = units(walk)
+    config = BundleAdjusterConfig(iterations=600, gamma=0.0, alpha=3.0, tolerance=0.0, rotation_smoothness=1.0)
+    result = bundle_adjust(w, disturbed(walk, scale), config=config)
+    assert result.restarts > 0
+    assert np.all(np.diff(result.history) <= 1e-9 * result.history[0])
+
+
+def test_limb_ratios_become_constant(adjusted: tuple[Walk, np.ndarray, AdjustmentResult]) -> None:
+    _, start, result = adjusted
+
+    def wobble(s: np.ndarray) -> float:
+        lengths = limb_lengths(s)
+        return float((lengths / lengths.sum(1, keepdims=True)).std(0).mean())
+
+    assert wobble(result.shape) < 0.2 * wobble(start)
+
+
+def test_scale_of_the_image_does_not_matter() -> None:
+    """Units are the caller's: the same data in units twice as large, with the weights that go with them."""
+    walk = make_walk(40)
+    w, scale = units(walk)
+    start = disturbed(walk, scale)
+    plain = BundleAdjusterConfig(iterations=60)
+    double = BundleAdjusterConfig(iterations=60, alpha=2.0 * plain.alpha, gamma=0.25 * plain.gamma)
+    a, b = bundle_adjust(w, start, config=plain), bundle_adjust(2.0 * w, 2.0 * start, config=double)
+    np.testing.assert_allclose(b.camera_shape, 2.0 * a.camera_shape, atol=1e-6)
+
+
+def test_order_of_frames_in_time_and_a_roll_of_the_image_do_not_matter() -> None:
+    walk = make_walk(40)
+    w, scale = units(walk)
+    start = disturbed(walk, scale)
+    config = BundleAdjusterConfig(iterations=60)
+    result = bundle_adjust(w, start, config=config)
+    backwards = bundle_adjust(w[::-1], start[::-1], config=config)
+    np.testing.assert_allclose(backwards.camera_shape[::-1], result.camera_shape, atol=1e-7)
+    roll = exp_so3(np.array([0.0, 0.0, 0.7]))
+    rolled = bundle_adjust(w @ roll[:2, :2].T, start @ roll.T, config=config)
+    np.testing.assert_allclose(rolled.camera_shape, result.camera_shape @ roll.T, atol=1e-7)
+
+
+def test_the_frame_of_the_start_does_not_matter() -> None:
+    """World, body or camera: any start frame with the rotation that leads to the camera gives the same result."""
+    walk = make_walk(40)
+    w, scale = units(walk)
+    start = disturbed(walk, scale)
+    other = Rotation.random(40, random_state=0).as_matrix()
+    config = BundleAdjusterConfig(iterations=60)
+    a = bundle_adjust(w, start, config=config)
+    b = bundle_adjust(w, start @ other, other, config=config)
+    np.testing.assert_allclose(b.camera_shape, a.camera_shape, atol=1e-7)
+
+
+def test_what_stands_at_missing_joints_does_not_matter() -> None:
+    walk = make_walk(40)
+    w, scale = units(walk)
+    start = disturbed(walk, scale)
+    weights = np.ones((40, 15))
+    weights[5:20, 2] = 0.0
+    weights[30, 6:12] = 0.0
+    junk, unknown = w.copy(), w.copy()
+    junk[weights == 0.0] = 77.0
+    unknown[weights == 0.0] = np.nan
+    a, b, c = (bundle_adjust(x, start, None, weights) for x in (w, junk, unknown))
+    np.testing.assert_array_equal(a.camera_shape, b.camera_shape)
+    np.testing.assert_array_equal(a.camera_shape, c.camera_shape)
+
+
+def test_equal_covariances_are_no_covariances() -> None:
+    walk = make_walk(30)
+    w, scale = units(walk)
+    start = disturbed(walk, scale)
+    equal = np.broadcast_to(np.array([0.02, 0.0, 0.02]), (30, 15, 3))
+    a, b = bundle_adjust(w, start), bundle_adjust(w, start, covariance=equal)
+    np.testing.assert_allclose(b.camera_shape, a.camera_shape, atol=1e-9)
+
+
+def test_a_joint_of_large_covariance_is_hardly_believed() -> None:
+    walk = make_walk(60)
+    w, scale = units(walk)
+    w = w.copy()
+    w[:, 11] += 0.8 * np.random.default_rng(0).normal(size=(60, 2))
+    covariance = np.tile(np.array([0.001, 0.0, 0.001]), (60, 15, 1))
+    covariance[:, 11] = [0.6, 0.0, 0.6]
+    start = walk.in_camera * scale
+    truth = 1000.0 * walk.in_camera
+    blind = pa_mpjpe(bundle_adjust(w, start).camera_shape, truth).mean()
+    aware = pa_mpjpe(bundle_adjust(w, start, covariance=covariance).camera_shape, truth).mean()
+    assert aware < 0.5 * blind
+
+
+def test_it_says_why_it_stopped() -> None:
+    walk = make_walk(30)
+    w, scale = units(walk)
+    start = walk.in_camera * scale
+    short = bundle_adjust(w, start, config=BundleAdjusterConfig(iterations=7))
+    assert (short.stop_reason, short.iterations) == ("iterations", 7)
+    long = bundle_adjust(w, start, config=BundleAdjusterConfig(iterations=5000, tolerance=1e-4))
+    assert long.stop_reason == "converged"
+    assert long.iterations < 5000
+
+
+def test_the_same_call_gives_the_same_bits() -> None:
+    walk = make_walk(30)
+    w, scale = units(walk)
+    start = disturbed(walk, scale)
+    np.testing.assert_array_equal(bundle_adjust(w, start).shape, bundle_adjust(w, start).shape)
+
+
+@pytest.mark.parametrize(
+    ("w", "s0", "match"),
+    [
+        (np.zeros((15, 2)), np.zeros((5, 15, 3)), r"w: expected shape \(F, P, 2\)"),
+        (np.zeros((5, 15, 2)), np.zeros((4, 15, 3)), r"s0: expected finite values of shape \(5, 15, 3\)"),
+        (np.zeros((5, 15, 2)), np.full((5, 15, 3), np.nan), "s0: expected finite"),
+    ],
+)
+def test_wrong_shapes_are_refused(w: np.ndarray, s0: np.ndarray, match: str) -> None:
+    with pytest.raises(InputError, match=match):
+        bundle_adjust(w, s0)
+
+
+def test_a_window_of_nothing_but_noise_still_has_a_body() -> None:
+    rng = np.random.default_rng(0)
+    w, walk = rng.normal(size=(30, 15, 2)), make_walk(30)
+    result = bundle_adjust(w, walk.in_camera / 0.35)
+    assert np.isfinite(result.shape).all()
+    assert limb_lengths(result.shape).mean() > 0.1
+
+
+def test_noise_raises_the_weight_of_the_low_rank() -> None:
+    walk = make_walk(240)
+    w, scale = units(walk)
+    noisy = w + np.random.default_rng(0).normal(0.0, 0.04, w.shape)
+    start, truth = disturbed(walk, scale), 1000.0 * walk.in_camera
+    aware = bundle_adjust(noisy, start)
+    blind = bundle_adjust(noisy, start, config=BundleAdjusterConfig(noise_alpha=0.0))
+    assert pa_mpjpe(aware.camera_shape, truth).mean() < 0.9 * pa_mpjpe(blind.camera_shape, truth).mean()
+    clean = [bundle_adjust(w, start, config=BundleAdjusterConfig(noise_alpha=n)).shape for n in (0.0, 0.5)]
+    np.testing.assert_array_equal(clean[0], clean[1])

@@ -1,0 +1,78 @@
+"""Proximal steps by identity: Moreau decomposition, firm non-expansiveness, optimality."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from drocap_ros.reconstruction.paper.dictionary import soft_threshold
+from drocap_ros.reconstruction.paper.nuclear_norm import nuclear_norm, singular_value_threshold
+from drocap_ros.reconstruction.paper.spectral_norm import project_spectral_ball, shrink_spectral_norm, spectral_norm
+
+Step = Callable[[np.ndarray, float], np.ndarray]
+
+
+def low_rank(x: np.ndarray, tau: float) -> np.ndarray:
+    return singular_value_threshold(x, tau)[0]
+
+
+def project_on_nuclear_dual(x: np.ndarray, tau: float) -> np.ndarray:
+    """Projection on the matrices of spectral norm <= tau, the dual ball of the nuclear norm."""
+    u, s, vt = np.linalg.svd(x, full_matrices=False)
+    return (u * np.minimum(s, tau)) @ vt
+
+
+def project_on_box(x: np.ndarray, tau: float) -> np.ndarray:
+    return np.clip(x, -tau, tau)
+
+
+def project_on_nuclear_ball(x: np.ndarray, tau: float) -> np.ndarray:
+    """Projection of matrices (..., 2, 3) on nuclear norm <= tau, the dual ball of the spectral norm, by bisection."""
+    u, s, vt = np.linalg.svd(x, full_matrices=False)
+    low, high = np.zeros(s.shape[:-1]), s.max(-1)
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        over = np.maximum(s - middle[..., None], 0.0).sum(-1) > tau
+        low, high = np.where(over, middle, low), np.where(over, high, middle)
+    level = np.where(s.sum(-1) <= tau, 0.0, high)
+    return (u * np.maximum(s - level[..., None], 0.0)[..., None, :]) @ vt
+
+
+CASES: list[tuple[Step, Step, tuple[int, ...]]] = [
+    (soft_threshold, project_on_box, (30, 20)),
+    (low_rank, project_on_nuclear_dual, (45, 80)),
+    (low_rank, project_on_nuclear_dual, (45, 12)),
+    (shrink_spectral_norm, project_on_nuclear_ball, (40, 2, 3)),
+]
+
+
+@pytest.mark.parametrize(("prox", "dual", "shape"), CASES)
+@pytest.mark.parametrize("tau", [0.01, 0.7, 30.0])
+def test_moreau_decomposition(prox: Step, dual: Step, shape: tuple[int, ...], tau: float) -> None:
+    x = np.random.default_rng(0).normal(size=shape)
+    np.testing.assert_allclose(prox(x, tau) + dual(x, tau), x, atol=1e-9)
+
+
+@pytest.mark.parametrize(("prox", "dual", "shape"), CASES)
+def test_firm_non_expansiveness(prox: Step, dual: Step, shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(1)
+    for tau in (0.1, 1.0, 5.0):
+        x, y = rng.normal(size=shape), rng.normal(size=shape)
+        px, py = prox(x, tau), prox(y, tau)
+        assert np.vdot(px - py, px - py) <= np.vdot(px - py, x - y) + 1e-10
+
+
+def test_thresholding_reports_the_norm_of_its_result() -> None:
+    x = np.random.default_rng(2).normal(size=(3, 15, 60))
+    new, norm = singular_value_threshold(x, 2.0)
+    assert norm == pytest.approx(nuclear_norm(new), rel=1e-9)
+    assert nuclear_norm(x) == pytest.approx(np.linalg.svd(x.reshape(45, 60), compute_uv=False).sum(), rel=1e-9)
+
+
+def test_spectral_ball_projection_bounds_the_norm() -> None:
+    x = np.random.default_rng(2).normal(size=(100, 2, 3))
+    assert np.all(spectral_norm(project_spectral_ball(x, 0.5)) <= 0.5 + 1e-12)
+    inside = 0.1 * x / spectral_norm(x)[:, None, None]
+    np.testing.assert_allclose(project_spectral_ball(inside, 0.5), inside, atol=1e-12)

@@ -1,0 +1,103 @@
+from array import array
+
+import numpy as np
+import pytest
+
+from drocap_ros.errors import InputError
+from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.msg import Pose3D
+from drocap_ros.observation import PoseObservation
+from drocap_ros.ros import conversions as c
+from drocap_ros.skeleton import BODY_15
+
+
+def observation(seed=0):
+    rng = np.random.default_rng(seed)
+    keypoints = rng.uniform(0, 700, (15, 2)).astype(np.float32)
+    keypoints[3] = np.nan
+    return PoseObservation(
+        stamp_ns=1_700_000_000_123_456_789,
+        track_id=7,
+        image_size=(1280, 720),
+        roi=np.array([1, 2, 3, 4], np.float32),
+        detection_score=0.75,
+        keypoints=keypoints,
+        covariance=rng.uniform(1, 9, (15, 3)).astype(np.float32),
+        confidence=rng.uniform(0, 1, 15).astype(np.float32),
+    )
+
+
+def test_keypoints_survive_the_trip_through_a_message_bit_for_bit():
+    before = observation()
+    after = c.pose2d_from_ros(c.pose2d_to_ros(before, "camera"))
+    assert (after.stamp_ns, after.track_id, after.joints) == (before.stamp_ns, 7, BODY_15)
+    assert after.image_size == (1280, 720)
+    for name in ("keypoints", "covariance", "confidence", "roi"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+
+
+def test_no_subject_is_a_message_with_empty_arrays():
+    message = c.pose2d_to_ros(PoseObservation(5, 0, (640, 480)), "camera")
+    assert len(message.keypoints) == len(message.confidence) == 0
+    assert not c.pose2d_from_ros(message).has_subject
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("skeleton", "robot", "skeleton: expected one of"),
+        ("keypoints", array("f", [1.0] * 29), "keypoints: expected 30 values"),
+        ("keypoints", array("f", [float("inf")] * 30), "infinity"),
+        ("keypoints", array("f", [0.0] * 1_000_000), "keypoints: expected 30 values"),
+        ("covariance", array("f"), "covariance: expected 45"),
+        ("confidence", array("f", [1.0]), "confidence: expected 15"),
+        ("image_width", 0, "image size"),
+    ],
+)
+def test_a_malformed_message_is_refused_in_one_line(name, value, words):
+    message = c.pose2d_to_ros(observation(), "camera")
+    setattr(message, name, value)
+    with pytest.raises(InputError, match=words) as caught:
+        c.pose2d_from_ros(message)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_stamp_before_1970_is_refused():
+    message = c.pose2d_to_ros(observation(), "camera")
+    message.header.stamp.sec = -5
+    with pytest.raises(InputError, match="stamp"):
+        c.pose2d_from_ros(message)
+
+
+def test_pose_survives_the_trip():
+    rng = np.random.default_rng(1)
+    joints, confidence = rng.normal(size=(15, 3)).astype(np.float32), rng.uniform(size=15).astype(np.float32)
+    message = c.pose3d_to_ros(
+        c.header_at(9, "camera"),
+        track_id=1,
+        stage=Pose3D.INITIAL,
+        skeleton="body15",
+        joints=joints,
+        covariance=np.zeros((15, 6)),
+        confidence=confidence,
+        reprojection_rms_px=2.0,
+    )
+    back, sure = c.pose3d_from_ros(message)
+    np.testing.assert_array_equal(back, joints)
+    np.testing.assert_array_equal(sure, confidence)
+    assert np.isnan(message.camera_orientation.w)
+    message.joints = array("f", [0.0] * 44)
+    with pytest.raises(InputError, match="joints: expected 45"):
+        c.pose3d_from_ros(message)
+
+
+def test_unknown_vehicle_values_stay_nan():
+    message = c.vehicle_state_to_ros(VehicleState(stamp_ns=3))
+    assert np.isnan(message.position_enu_m).all()
+    assert np.isnan(message.battery_fraction)
+    assert message.header.frame_id == "map"
+
+
+def test_stamps_keep_every_nanosecond():
+    for stamp in (0, 1, 999_999_999, 10**9, 1_700_000_000_123_456_789):
+        assert c.stamp_from_ros(c.stamp_to_ros(stamp)) == stamp

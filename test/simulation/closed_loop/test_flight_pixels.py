@@ -1,0 +1,31 @@
+"""An orbit by rendered pictures: the shipped networks for simulation close the loop, in simulated time."""
+
+import numpy as np
+import pytest
+
+from drocap_ros.flight.orbit.safety import State
+from drocap_ros.perception.estimator import PoseEstimator
+from drocap_ros.perception.load_models import SIMULATION, models_folder
+from drocap_ros.perception.perception_config import PoseEstimatorConfig
+from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, orbit_quality, with_config
+from drocap_ros.simulation.closed_loop.pixel_loop import PixelOrbitLoop
+
+pytest.importorskip("onnxruntime")
+
+
+def test_the_orbit_is_held_by_what_is_seen_in_the_pictures():
+    settings = with_config(LoopSettings(seed=0, wind_m_s=(8.0, 0.0, 0.0), seconds=18.0), body_height_m=1.75)
+    loop = PixelOrbitLoop(settings, PoseEstimator(models_folder(SIMULATION), PoseEstimatorConfig()))
+    loop.start()
+    loop.run(18.0)
+    assert loop.controller.safety.state == State.ORBITING, loop.reasons
+    quality = orbit_quality(loop, 6.0, 13.0)
+    assert quality.radius_error_m < 0.3
+    assert quality.yaw_error_deg < 3.0
+    assert quality.in_middle_third > 0.95
+    errors = np.array(loop.errors) / np.array(loop.heights_px)[:, None]
+    assert np.isfinite(errors).all(axis=1).mean() > 0.95
+    assert np.nanmean(errors) < 0.03
+    # The vehicle has come from 7 m to 6 m and gone a good part of the way round: pictures from many sides.
+    bearings = np.unwrap([np.arctan2(*row.position[1::-1]) for row in loop.rows])
+    assert np.degrees(np.ptp(bearings)) > 150

@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drocap_ros.errors import InputError
+from drocap_ros.joint_maps import TABLES, joint_map
+from drocap_ros.skeleton import BODY_15, JOINT_SETS, LIMB_JOINTS, joint_set
+
+
+@pytest.mark.parametrize("name", sorted(TABLES))
+def test_weights_sum_to_one_and_sides_are_kept(name):
+    table, source = joint_map(name), joint_set(name)
+    np.testing.assert_allclose(table.weights.sum(axis=1), 1.0)
+    np.testing.assert_allclose(table.lines.sum(axis=1), 0.0, atol=1e-12)
+    for row, joint in enumerate(BODY_15.joints):
+        used = {source.joints[i] for i in np.nonzero(table.weights[row])[0]}
+        if joint in LIMB_JOINTS:
+            side = {"l": ("l", "left_"), "r": ("r", "right_")}[joint[0]]
+            assert len(used) == 1
+            name_there = used.pop()
+            assert name_there in (side[0] + joint[1:], side[1] + joint[1:])
+
+
+@pytest.mark.parametrize("name", sorted(JOINT_SETS))
+def test_joint_sets_are_trees_with_sides(name):
+    s = joint_set(name)
+    assert len(s.joints) == len(s.parents) == len(set(s.joints))
+    for start in range(len(s)):
+        joint, steps = start, 0
+        while s.parents[joint] >= 0:
+            joint, steps = s.parents[joint], steps + 1
+            assert steps <= len(s), f"{s.joints[start]} hangs in a circle"
+    assert (s.mirror[s.mirror] == np.arange(len(s))).all()
+    assert (s.mirror != np.arange(len(s))).sum() >= 12
+
+
+@pytest.mark.parametrize("name", ["coco17", "halpe26", "wholebody133", "mpii16", "h36m17"])
+def test_an_upright_person_is_the_same_in_every_set(name):
+    """Places in mm of one person standing before the camera, y down, in each set's own joints."""
+    places = {
+        "hip": (90, 0), "knee": (95, 420), "ankle": (100, 830), "shoulder": (170, -480), "elbow": (220, -190),
+        "wrist": (230, 60), "ear": (75, -670), "eye": (30, -690),
+    }  # fmt: skip
+    middle = {
+        "nose": (0, -660), "pelvis": (0, 0), "hip": (0, 0), "neck": (0, -615), "upper_neck": (0, -615),
+        "head": (0, -712), "head_top": (0, -790), "thorax": (0, -500), "spine": (0, -250),
+    }  # fmt: skip
+
+    def place(joint: str) -> tuple[float, float]:
+        for side, sign in (("left_", 1), ("right_", -1), ("l", 1), ("r", -1)):
+            if joint.startswith(side) and joint[len(side) :] in places:
+                x, y = places[joint[len(side) :]]
+                return sign * x, y
+        return middle.get(joint, (0.0, 0.0))
+
+    s = joint_set(name)
+    xy = np.array([place(j) for j in s.joints], float)
+    out, covariance, confidence = joint_map(name).apply(xy, np.ones((len(s), 3)), np.ones(len(s)), 1700.0)
+    expected = np.array([place(j) for j in BODY_15.joints], float)
+    np.testing.assert_allclose(out, expected, atol=12)
+    assert (covariance[:, 0] > 0).all()
+    assert (confidence > 0.8).all()
+
+
+def test_a_joint_without_one_of_its_parts_is_unknown():
+    s = joint_set("coco17")
+    xy, covariance, confidence = np.ones((17, 2)), np.ones((17, 3)), np.full(17, 0.9)
+    xy[s.index("left_ear")] = np.nan
+    out, out_covariance, out_confidence = joint_map("coco17").apply(xy, covariance, confidence, 100.0)
+    lost = [BODY_15.index("neck"), BODY_15.index("head")]
+    assert np.isnan(out[lost]).all()
+    assert np.isnan(out_covariance[lost]).all()
+    assert (out_confidence[lost] == 0).all()
+    assert np.isfinite(np.delete(out, lost, 0)).all()
+
+
+def test_extrapolated_joints_are_less_sure():
+    rng = np.random.default_rng(0)
+    table = joint_map("coco17")
+    true = rng.uniform(0, 100, (17, 2))
+    noisy = true + rng.normal(0, 2.0, (4000, 17, 2))
+    outs = np.array([table.apply(x, np.tile([4.0, 0, 4.0], (17, 1)), np.full(17, 0.9), 100.0)[0] for x in noisy])
+    _, covariance, confidence = table.apply(true, np.tile([4.0, 0, 4.0], (17, 1)), np.full(17, 0.9), 100.0)
+    sampled = outs.var(axis=0)
+    limbs = [BODY_15.index(j) for j in (*LIMB_JOINTS, "pelvis")]
+    np.testing.assert_allclose(covariance[limbs][:, [0, 2]], sampled[limbs], rtol=0.15)
+    head = BODY_15.index("head")
+    assert covariance[head, 0] > sampled[head, 0]  # the lean of the head comes on top
+    assert confidence[head] < confidence[limbs].min()
+
+
+def test_an_unknown_set_is_refused():
+    with pytest.raises(InputError, match="spider8"):
+        joint_map("spider8")

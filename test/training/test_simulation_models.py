@@ -1,0 +1,234 @@
+"""The networks for simulation: what they see of rendered orbits, what they say of themselves, how they are made."""
+
+import argparse
+import logging
+
+import numpy as np
+import pytest
+
+from drocap_ros.cli import main
+from drocap_ros.errors import InputError, ParameterError
+from drocap_ros.perception.estimator import PoseEstimator
+from drocap_ros.perception.load_models import limited_use, models_folder
+from drocap_ros.perception.models.runtime import OnnxModel
+from drocap_ros.perception.perception_config import PoseEstimatorConfig
+from drocap_ros.simulation.camera import orbit_camera, pinhole_matrix, project
+from drocap_ros.simulation.person import simulate_person
+from drocap_ros.simulation.render.body import dress
+from drocap_ros.simulation.render.renderer import draw
+from drocap_ros.simulation.render.scene import make_scene
+from drocap_ros.skeleton import BODY_15
+from drocap_ros.training.rendered_samples import (
+    DETECTOR_SIZE,
+    FIRST_SEED,
+    MIRROR,
+    POSE_SIZE,
+    detector_sample,
+    make_world,
+    pose_sample,
+)
+
+FOLDER = models_folder("simulation")
+SIDES = [i for i in range(len(BODY_15)) if MIRROR[i] != i]
+
+
+def overlap(a, b):
+    both = np.clip(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), 0, None).prod()
+    return both / ((a[2:] - a[:2]).prod() + (b[2:] - b[:2]).prod() - both)
+
+
+def as_received(picture):
+    """The picture after the JPEG of the camera's topic."""
+    import cv2
+
+    return cv2.imdecode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1], cv2.IMREAD_COLOR)
+
+
+class Flown:
+    """What the estimator made of orbits round persons in places that no training saw."""
+
+    def __init__(self, orbits=3, pictures=20):
+        matrix = pinhole_matrix(1280, 720, 60)
+        self.found, self.followed, self.off, self.exchanged, self.standard, self.confidence = [], [], [], [], [], []
+        for seed in range(orbits):
+            assert seed < FIRST_SEED
+            t = 0.7 + 14.4 / pictures * np.arange(pictures)  # once round at 25 deg/s
+            joints = simulate_person(t, "mixed", seed, 1.65 + 0.1 * seed)
+            centre = joints[:, 0] * [1, 1, 0] + [0, 0, 0.9]
+            rotation, position = orbit_camera(t, centre, 6.0, 2.5, 25.0, 70.0 * seed)
+            truth = project(joints, rotation, position, matrix)
+            estimator = PoseEstimator(FOLDER, PoseEstimatorConfig(detect_every_s=0.0))
+            scene, look = make_scene(seed), dress(seed)
+            for i in range(pictures):
+                picture, box = draw(scene, look, matrix, 1280, 720, joints[i], rotation[i], position[i])
+                picture = as_received(picture)
+                whole = estimator.detector.detect(picture, None, estimator.config.detection_threshold)
+                self.found.append(len(whole) > 0 and overlap(whole.boxes[0], box) > 0.5)
+                # Pictures 0.2 s apart for the tracker: the person moves as far in one as at 15 fps in three.
+                self._compare(estimator.process(picture, i * 200_000_000), truth[i], box)
+
+    def _compare(self, observation, truth, box):
+        self.followed.append(observation.has_subject)
+        if not observation.has_subject:
+            return
+        difference = observation.keypoints - truth
+        height = box[3] - box[1]
+        self.off.append(np.linalg.norm(difference, axis=1) / height)
+        mirrored = np.linalg.norm(observation.keypoints - truth[MIRROR], axis=1) / height
+        self.exchanged.append(np.nanmean(mirrored[SIDES]) < np.nanmean(self.off[-1][SIDES]))
+        self.standard.append(difference / np.sqrt(observation.covariance[:, [0, 2]]))
+        self.confidence.append(observation.confidence)
+
+
+@pytest.fixture(scope="module")
+def flown():
+    return Flown()
+
+
+def test_the_person_is_found_in_whole_pictures_and_followed(flown):
+    assert np.mean(flown.found) >= 0.99
+    assert np.mean(flown.followed) >= 0.99
+
+
+def test_keypoints_are_within_three_percent_of_the_box_on_average(flown):
+    off = np.array(flown.off)
+    assert np.isfinite(off).mean() > 0.95
+    assert np.nanmean(off) <= 0.03
+
+
+def test_left_and_right_are_told_apart(flown):
+    assert np.mean(flown.exchanged) < 0.01
+
+
+def test_the_covariance_says_how_far_off_they_are(flown):
+    standard = np.array(flown.standard)
+    sure = np.array(flown.confidence) > 0.5
+    assert 0.7 <= np.sqrt(np.nanmean(standard[sure] ** 2)) <= 1.5
+
+
+def test_an_empty_place_holds_nobody():
+    matrix = pinhole_matrix(1280, 720, 60)
+    estimator = PoseEstimator(FOLDER)
+    away = simulate_person(np.array([0.0]), "stand")[0] + np.array([0, -500.0, 0])
+    for seed in range(8):
+        position = np.array([[1.0, 2.0 + seed, 2.5]])
+        rotation = orbit_camera(np.zeros(1), np.zeros((1, 3)), 6.0, 2.5, 0.0, 90.0)[0][0]
+        picture, box = draw(make_scene(seed), dress(0), matrix, 1280, 720, away, rotation, position[0])
+        assert box is None
+        assert not estimator.process(picture, seed * 100_000_000).has_subject
+
+
+def test_both_files_together_are_small_and_say_what_they_are_for():
+    files = sorted(FOLDER.glob("*.onnx"))
+    assert [f.name for f in files] == ["person_detector.onnx", "person_pose.onnx"]
+    assert sum(f.stat().st_size for f in files) <= 3_000_000
+    for file in files:
+        model = OnnxModel(file)
+        assert model.metadata["only_for"] == "simulation"
+        assert "not for pictures of real people" in limited_use(model)
+        assert model.metadata["command"].startswith("drocap train-simulation-models")
+
+
+def test_who_uses_them_is_told(caplog, capsys):
+    with caplog.at_level(logging.WARNING):
+        estimator = PoseEstimator(FOLDER)
+    assert "for simulation only" in caplog.text
+    assert "for simulation only" in estimator.limited_use
+    assert main(["models", "list", "--models", "simulation"]) == 0
+    assert capsys.readouterr().out.count("for simulation only") == 2
+    assert main(["models", "check", "--models", "simulation"]) == 0
+    assert "body15" in capsys.readouterr().out
+
+
+def test_the_list_shows_them_apart_from_the_models_of_the_user(tmp_path, capsys):
+    assert main(["models", "list", "--models", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "no models" in out
+    assert out.index("used only when asked for") < out.index("person_detector.onnx")
+
+
+def test_nothing_falls_back_to_them(tmp_path, monkeypatch):
+    monkeypatch.delenv("DROCAP_MODELS", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    assert models_folder(None) != FOLDER
+    with pytest.raises(InputError, match="drocap models fetch"):
+        PoseEstimator(models_folder(None))
+    monkeypatch.setenv("DROCAP_MODELS", "simulation")
+    assert models_folder(None) == FOLDER
+    assert models_folder(tmp_path) == tmp_path
+
+
+def test_samples_agree_with_their_pictures():
+    """The box holds the joints, and joints said to be seen lie inside the crop."""
+    rng = np.random.default_rng(4)
+    world = make_world(rng, scenes=2, takes=1)
+    for _ in range(12):
+        sample = detector_sample(world, rng)
+        assert sample.picture.shape == (DETECTOR_SIZE[1], DETECTOR_SIZE[0], 3)
+        if np.isfinite(sample.box).all():
+            assert (sample.box >= 0).all()
+            assert (sample.box <= [*DETECTOR_SIZE, *DETECTOR_SIZE]).all()
+        crop = pose_sample(world, rng)
+        assert crop.picture.shape == (POSE_SIZE[1], POSE_SIZE[0], 3)
+        inside = ((crop.joints > -0.5) & (crop.joints < np.array(POSE_SIZE) - 0.5)).all(axis=1)
+        assert not (crop.seen & ~inside).any()
+    assert world.poses[..., 2].min() > 0
+
+
+def run_command(folder, *words):
+    from drocap_ros.cli import build_parser
+
+    args: argparse.Namespace = build_parser().parse_args(["train-simulation-models", "--out", str(folder), *words])
+    return args.run(args)
+
+
+@pytest.mark.parametrize("words", [["--threads", "0"], ["--minutes", "-1"], ["--steps", "-1"], ["--seed", "-2"]])
+def test_options_of_the_training_that_cannot_be_used_are_refused(tmp_path, words):
+    with pytest.raises((InputError, ParameterError), match="expected"):
+        run_command(tmp_path / "m", *words)
+    assert not (tmp_path / "m").exists()
+
+
+def test_a_short_training_gives_networks_that_run(tmp_path, capsys):
+    pytest.importorskip("torch", reason="the extra 'train' is not installed")
+    pytest.importorskip("onnx", reason="the extra 'train' is not installed")
+    assert run_command(tmp_path / "m", "--steps", "1", "--quiet") == 0
+    assert "1 batches of the detector, 2 of the pose network" in capsys.readouterr().out
+    estimator = PoseEstimator(tmp_path / "m")
+    assert estimator.limited_use
+    assert estimator.pose_model.joints is BODY_15
+    picture = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
+    assert estimator.pose_model.estimate(picture, np.array([50.0, 20, 150, 200])).xy.shape == (15, 2)
+
+
+def test_one_network_is_trained_alone(tmp_path, capsys):
+    pytest.importorskip("torch", reason="the extra 'train' is not installed")
+    pytest.importorskip("onnx", reason="the extra 'train' is not installed")
+    assert run_command(tmp_path / "m", "--steps", "1", "--only", "detector", "--quiet") == 0
+    assert "1 batches of the detector, 0 of the pose network" in capsys.readouterr().out
+    assert [f.name for f in (tmp_path / "m").iterdir()] == ["person_detector.onnx"]
+
+
+def test_cells_of_one_size_answer_for_a_box_and_those_of_others_stay_silent():
+    from drocap_ros.training.simulation_networks import detector_targets, grid
+
+    boxes = np.array([[100.0, 40, 140, 120], [10, 10, 22, 40], [0, 0, 190, 180], [np.nan] * 4], np.float32)
+    positive, free = detector_targets(boxes)
+    _, stride = grid()
+    for i, strides in enumerate(({16}, {8}, {32}, set())):
+        assert set(stride[positive[i]].astype(int)) == strides
+        assert set(stride[free[i]].astype(int)) <= strides
+    assert not (positive & free).any()
+
+
+def test_a_training_of_given_steps_depends_on_the_seed_only():
+    torch = pytest.importorskip("torch", reason="the extra 'train' is not installed")
+    from drocap_ros.training.simulation_models import SimulationTraining, train
+
+    def weights():
+        detector, pose, _ = train(
+            SimulationTraining(steps=2, batch=4, seed=3), lambda line: None, lambda *networks: None
+        )
+        return torch.cat([w.detach().ravel() for network in (detector, pose) for w in network.parameters()])
+
+    assert torch.equal(weights(), weights())

@@ -1,0 +1,300 @@
+"""``drocap view`` as a user runs it; what it wrote is read back with Rerun's own reader."""
+
+import contextlib
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from sensor_msgs.msg import CompressedImage
+
+from drocap_ros.bringup import bringup, free_domain, watch
+from drocap_ros.config import DrocapConfig
+from drocap_ros.motion import Motion, load_motion, save_motion
+from drocap_ros.recording.session import open_session
+from drocap_ros.ros.conversions import header_at
+from drocap_ros.simulation.capture import simulate_capture
+from drocap_ros.skeleton import BODY_15
+from drocap_ros.view.camera import nominal_camera_matrix, place_cameras
+from drocap_ros.view.message_view import MessageView
+from drocap_ros.view.output import new_recording
+from drocap_ros.view.scene import Scene
+
+pytest.importorskip("rerun", reason="no Rerun viewer here: `make setup` brings it")
+
+ROOT = Path(__file__).resolve().parents[2]
+FLIGHT = ("capture_simulator", "initializer", "bundle_adjuster", "session_recorder")
+
+
+def command(*arguments):
+    return [sys.executable, "-m", "drocap_ros.cli", "view", *map(str, arguments)]
+
+
+def environment(**more):
+    hidden = ("DISPLAY", "WAYLAND_DISPLAY")
+    kept = {name: value for name, value in os.environ.items() if name not in hidden}
+    return {**kept, "PYTHONPATH": str(ROOT), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", **more}
+
+
+def view(*arguments, **more):
+    return subprocess.run(command(*arguments), env=environment(**more), capture_output=True, text=True, timeout=120)
+
+
+class Drawn:
+    """Entities of an .rrd file: for each path, rows of component name -> values by image stamp."""
+
+    def __init__(self, path):
+        from rerun.chunk import RrdReader
+
+        self.rows = {}
+        for chunk in RrdReader(str(path)).stream().to_chunks():
+            batch = chunk.to_record_batch()
+            stamps = batch.column("image").cast("int64").to_pylist() if "image" in batch.schema.names else None
+            columns = {n: batch.column(n).to_pylist() for n in batch.schema.names if ":" in n}
+            for i in range(batch.num_rows):
+                row = {name: values[i] for name, values in columns.items() if values[i] is not None}
+                self.rows.setdefault(chunk.entity_path, []).append((stamps[i] if stamps else None, row))
+
+    def stamps(self, path):
+        return sorted(stamp for stamp, _ in self.rows.get(path, []) if stamp is not None)
+
+    def values(self, path, component):
+        """Stamp -> value of a component."""
+        return {stamp: np.array(row[component]) for stamp, row in self.rows[path] if component in row}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A motion of 10 frames in the world, one joint unknown in one, and the video it came from."""
+    folder = tmp_path_factory.mktemp("motion")
+    capture = simulate_capture(1.0, 10.0, seed=3)
+    joints = capture.joints3d_world.copy()
+    joints[4, BODY_15.index("rwrist")] = np.nan
+    motion = Motion(
+        joints3d=joints, joints=BODY_15.joints, parents=BODY_15.parents, stamp_ns=capture.tracks.stamp_ns,
+        frame="world", metric=True, scale_source="telemetry", camera_rotation=capture.camera_rotation,
+        confidence=np.full(joints.shape[:2], 0.8), keypoints=capture.keypoints_exact,
+        reprojection_px=np.full(joints.shape[:2], 3.0),
+    )  # fmt: skip
+    save_motion(folder / "motion.npz", motion)
+    writer = cv2.VideoWriter(str(folder / "walk.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (1280, 720))
+    for i in range(10):
+        writer.write(np.full((720, 1280, 3), 20 * i, np.uint8))
+    writer.release()
+    return folder
+
+
+def test_a_motion_is_drawn_whole_and_where_it_is(folder, tmp_path):
+    out = tmp_path / "motion.rrd"
+    done = view(folder, "--save", out, "--video", folder / "walk.mp4")
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"written: .*motion\.rrd \(\d+\.\d MB\)", done.stdout)
+    motion, drawn = load_motion(folder / "motion.npz"), Drawn(out)
+    stamps = motion.stamp_ns.tolist()
+    points = drawn.values("/world/subject/refined/joints", "Points3D:positions")
+    assert sorted(points) == stamps
+    for i, stamp in enumerate(stamps):
+        known = np.isfinite(motion.joints3d[i]).all(1)
+        np.testing.assert_allclose(points[stamp], motion.joints3d[i][known], atol=1e-5)
+    assert len(points[stamps[4]]) == 14
+    bones = drawn.values("/world/subject/refined/bones", "LineStrips3D:strips")
+    assert [len(bones[stamp]) for stamp in stamps] == [14, 14, 14, 14, 13, 14, 14, 14, 14, 14]
+    assert drawn.stamps("/plots/reprojection_px/mean")[-10:] == stamps
+    # The picture is 1280 px wide and shown at 960: the keypoints lie at three quarters.
+    pixels = drawn.values("/world/camera/image/keypoints", "Points2D:positions")
+    np.testing.assert_allclose(pixels[stamps[0]], 0.75 * motion.keypoints[0], rtol=1e-4)
+    pictures = drawn.values("/world/camera/image", "EncodedImage:blob")
+    assert len(pictures) == 10
+    jpeg = cv2.imdecode(np.asarray(pictures[stamps[5]], np.uint8).ravel(), cv2.IMREAD_COLOR)
+    assert jpeg.shape == (540, 960, 3)
+    assert abs(float(jpeg.mean()) - 100) < 4
+
+
+def test_the_camera_is_placed_where_its_picture_was_taken():
+    capture = simulate_capture(1.0, 10.0, seed=3)
+    matrix = capture.tracks.camera_matrix
+    found = place_cameras(capture.joints3d_world, capture.keypoints_exact, capture.camera_rotation, matrix)
+    truth = capture.tracks.camera_position
+    away = np.linalg.norm(truth - capture.joints3d_world[:, 0], axis=1)
+    # The model is orthographic: what is left is perspective, a few percent of the distance.
+    assert (np.linalg.norm(found - truth, axis=1) < 0.06 * away).all()
+    nothing = np.full_like(capture.keypoints_exact, np.nan)
+    empty = place_cameras(capture.joints3d_world, nothing, capture.camera_rotation, nominal_camera_matrix(640, 480))
+    assert np.isnan(empty).all()
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """A flight's session, and what a viewer saw of it while it flew."""
+    folder = tmp_path_factory.mktemp("flight")
+    config = DrocapConfig().replace("capture_simulator", seconds=3.0, rate_hz=15.0, seed=3)
+    config = config.replace("bundle_adjuster", period_s=0.5)
+    config = config.replace("session_recorder", session_dir=str(folder / "session"))
+    with pytest.MonkeyPatch.context() as patch, free_domain() as domain:
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        live = subprocess.Popen(
+            command("--live", "--domain-id", domain, "--save", folder / "live.rrd", "--seconds", 100),
+            env=environment(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+        try:
+            with watch("/drocap", domain) as graph:
+                graph.wait_until(lambda: graph.node.count_subscribers("pose2d") > 0, 60, "the viewer")
+            with bringup(config, FLIGHT, domain_id=domain) as graph:
+                graph.wait_finished("capture_simulator", timeout_s=60)
+                graph.spin_for(0.5)
+            live.send_signal(signal.SIGINT)
+            text, _ = live.communicate(timeout=60)
+        finally:
+            live.kill()
+    assert live.returncode == 0, text
+    return folder
+
+
+def test_a_session_is_drawn_at_the_stamps_of_its_images(flown, tmp_path):
+    done = view(flown / "session", "--save", tmp_path / "session.rrd")
+    assert done.returncode == 0, done.stderr
+    drawn = Drawn(tmp_path / "session.rrd")
+    recorded, windows = {}, []
+    with open_session(flown / "session") as session:
+        for raw, message in session.messages(("/drocap/pose2d", "/drocap/pose3d/initial", "/drocap/pose3d/refined")):
+            stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            recorded.setdefault(raw.topic, {})[stamp] = message
+            if raw.topic.endswith("refined"):
+                windows.append(message)
+    keypoints = drawn.values("/world/camera/image/keypoints", "Points2D:positions")
+    assert sorted(keypoints) == sorted(recorded["/drocap/pose2d"])
+    for stamp, message in recorded["/drocap/pose2d"].items():
+        sent = np.array(message.keypoints).reshape(-1, 2)
+        np.testing.assert_allclose(keypoints[stamp], sent[np.isfinite(sent).all(1)])
+    for part, component in (("joints", "Points3D:positions"), ("uncertainty", "Ellipsoids3D:half_sizes")):
+        assert sorted(drawn.values(f"/world/subject/initial/{part}", component)) == sorted(
+            recorded["/drocap/pose3d/initial"]
+        )
+    # Refined poses are drawn once each, those of the last window included.
+    refined = drawn.stamps("/world/subject/refined/joints")
+    last = windows[-1].poses[-1].header.stamp
+    assert refined == sorted(set(refined))
+    assert refined[-1] == last.sec * 10**9 + last.nanosec
+    # Upright: the head above the pelvis by about half a person.
+    points = drawn.values("/world/subject/initial/joints", "Points3D:positions")
+    assert all(0.3 < p[BODY_15.index("head"), 2] - p[0, 2] < 1.2 for p in points.values())
+    assert drawn.stamps("/plots/latency_ms/initial")[-1] == max(recorded["/drocap/pose3d/initial"])
+    assert any(path.startswith("/log/drocap") for path in drawn.rows)
+
+
+def test_a_running_graph_is_drawn_as_its_recording(flown, tmp_path):
+    view(flown / "session", "--save", tmp_path / "session.rrd")
+    live, offline = Drawn(flown / "live.rrd"), Drawn(tmp_path / "session.rrd")
+    path, component = "/world/subject/initial/joints", "Points3D:positions"
+    seen, recorded = live.values(path, component), offline.values(path, component)
+    assert len(seen) >= 0.8 * len(recorded)
+    for stamp, points in seen.items():
+        np.testing.assert_array_equal(points, recorded[stamp])
+
+
+def two_free_ports():
+    """A port that is free, and the next one too."""
+    while True:
+        with socket.socket() as first, socket.socket() as second:
+            first.bind(("127.0.0.1", 0))
+            port = first.getsockname()[1]
+            with contextlib.suppress(OSError, OverflowError):
+                second.bind(("127.0.0.1", port + 1))
+                return port
+
+
+def listening(port):
+    """Addresses on which this machine listens at a port."""
+    found = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            address, number = line.split()[1].split(":")
+            if line.split()[3] == "0A" and int(number, 16) == port:
+                found.add(socket.inet_ntoa(bytes.fromhex(address)[::-1]) if table == "tcp" else address)
+    return found
+
+
+def test_without_a_screen_a_browser_gets_a_page(folder):
+    port = two_free_ports()
+    server = subprocess.Popen(
+        command(folder, "--port", port), env=environment(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        line = server.stdout.readline()
+        address = re.search(r"open (http://\S+) in a browser", line)[1]
+        page = urllib.request.urlopen(address, timeout=20).read().decode()
+        assert "<title>Rerun" in page
+        # Where the page takes its data from.
+        assert f"127.0.0.1%3A{port + 1}" in address
+        with socket.create_connection(("127.0.0.1", port + 1), timeout=20):
+            pass
+        # Pictures of a person are for this machine alone.
+        for number in (port, port + 1):
+            assert listening(number) == {"127.0.0.1"}
+    finally:
+        server.send_signal(signal.SIGINT)
+        rest, _ = server.communicate(timeout=30)
+    assert server.returncode == 0, line + rest
+    assert not listening(port)
+
+
+def test_a_killed_command_leaves_no_server_behind(folder):
+    port = two_free_ports()
+    server = subprocess.Popen(command(folder, "--port", port), env=environment(), stdout=subprocess.PIPE, text=True)
+    server.stdout.readline()
+    assert listening(port)
+    server.kill()
+    server.communicate(timeout=30)
+    end = time.monotonic() + 20
+    while listening(port) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not listening(port)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), "expected INPUT or --live, found neither"),
+        (("x.npz", "--live"), "expected INPUT or --live, found both"),
+        (("none.npz",), "none.npz"),
+        ((ROOT / "README.md",), "README.md"),
+        (("x.npz", "--save", "a.rrd", "--web"), "expected --save or --web"),
+        (("x.npz", "--memory", "much"), "--memory: expected an amount like 1GB"),
+        (("--live", "--seconds", "-1"), "--seconds: expected more than 0"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused_in_one_line(arguments, words, tmp_path):
+    out = () if "--save" in arguments or "--live" in arguments else ("--save", tmp_path / "out.rrd")
+    done = view(*arguments, *out)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "out.rrd").exists()
+
+
+def test_without_rerun_one_line_says_what_to_install(folder, tmp_path):
+    (tmp_path / "rerun.py").write_text("raise ImportError('not here')")
+    done = view(folder, "--save", tmp_path / "x.rrd", PYTHONPATH=f"{tmp_path}:{ROOT}")
+    assert done.returncode == 2
+    assert "pip install 'rerun-sdk" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_pictures_for_a_viewer_that_must_keep_up_are_thinned(tmp_path):
+    recording = new_recording("thinned")
+    recording.save(tmp_path / "thinned.rrd")
+    jpeg = cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))[1].tobytes()
+    messages = MessageView(Scene(recording), picture_hz=10.0)
+    stamps = [10**12 + round(i * 1e9 / 30) + (i % 3) * 2_000_000 for i in range(30)]
+    for stamp in [*stamps, 10**11]:  # at the end the time jumps back, as in a loop
+        messages.take("image/compressed", CompressedImage(header=header_at(stamp, ""), data=jpeg), stamp)
+    recording.disconnect()
+    assert Drawn(tmp_path / "thinned.rrd").stamps("/world/camera/image") == [10**11, *stamps[::3]]
