@@ -12,8 +12,8 @@ from drocap_ros.tracks import save_tracks
 
 
 @pytest.fixture
-def folder(reported_walker, tmp_path):
-    save_motion(tmp_path / "motion.npz", reported_walker)
+def folder(person, tmp_path):
+    save_motion(tmp_path / "motion.npz", person)
     return tmp_path
 
 
@@ -40,9 +40,9 @@ def test_the_same_motion_gives_the_same_bytes(folder):
     assert texts[0] == texts[1]
 
 
-def test_what_cannot_be_shown_is_refused(reported_walker, folder, capsys):
+def test_what_cannot_be_shown_is_refused(person, folder, capsys):
     (folder / "text.npz").write_text("no archive")
-    nothing = dataclasses.replace(reported_walker, joints3d=np.full_like(reported_walker.joints3d, np.nan))
+    nothing = dataclasses.replace(person, joints3d=np.full_like(person.joints3d, np.nan))
     save_motion(folder / "nothing.npz", nothing)
     refused(["report", folder / "text.npz"], folder, capsys, "expected a readable .npz")
     refused(["report", folder / "none.npz"], folder, capsys, "no such file")

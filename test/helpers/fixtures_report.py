@@ -14,7 +14,7 @@ from drocap_ros.skeleton import BODY_15
 
 
 @pytest.fixture(scope="session")
-def reported_walker() -> Motion:
+def person() -> Motion:
     """Four seconds of a simulated person seen by an orbiting camera, 15 frames per second."""
     capture = simulate_capture(4.0, 15.0, seed=3)
     joints = capture.joints3d_world
@@ -46,15 +46,15 @@ def reported_walker() -> Motion:
 
 
 @pytest.fixture(scope="session")
-def reported_in_camera(reported_walker: Motion) -> Motion:
+def reported_in_camera(person: Motion) -> Motion:
     """The same person as each image saw it, pelvis at the origin."""
-    centred = reported_walker.joints3d - reported_walker.joints3d[:, :1]
-    joints = np.einsum("fij,fpj->fpi", reported_walker.camera_rotation, centred)
+    centred = person.joints3d - person.joints3d[:, :1]
+    joints = np.einsum("fij,fpj->fpi", person.camera_rotation, centred)
     identity = np.tile(np.eye(3), (len(joints), 1, 1))
-    return dataclasses.replace(reported_walker, joints3d=joints, frame="camera", camera_rotation=identity)
+    return dataclasses.replace(person, joints3d=joints, frame="camera", camera_rotation=identity)
 
 
 @pytest.fixture(scope="session")
-def one_frame(reported_walker: Motion) -> Motion:
+def one_frame(person: Motion) -> Motion:
     """A single frame."""
-    return first_frames(reported_walker, 1)
+    return first_frames(person, 1)

@@ -20,24 +20,24 @@ def browser(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def pages(reported_walker, reported_in_camera, one_frame, tmp_path_factory):
+def pages(person, reported_in_camera, one_frame, tmp_path_factory):
     """A report with pictures, one without, one in the camera's frame, one of a single frame, one with gaps."""
     import cv2
 
     folder = tmp_path_factory.mktemp("pages")
     grey = cv2.imencode(".jpg", np.full((200, 150, 3), 90, np.uint8))[1].tobytes()
-    low, high = np.nanmin(reported_walker.keypoints, axis=(0, 1)), np.nanmax(reported_walker.keypoints, axis=(0, 1))
+    low, high = np.nanmin(person.keypoints, axis=(0, 1)), np.nanmax(person.keypoints, axis=(0, 1))
     box = (*(int(v) for v in low - 20), *(int(v) for v in high + 20))
     pictures = Pictures(tuple(range(0, 60, 3)), (grey,) * 20, box, (150, 200))
-    (folder / "pictures.html").write_text(render_report(reported_walker, pictures), encoding="utf-8")
-    joints = reported_walker.joints3d.copy()
+    (folder / "pictures.html").write_text(render_report(person, pictures), encoding="utf-8")
+    joints = person.joints3d.copy()
     joints[10:20] = np.nan
     joints[30, 3] = np.nan
     for name, motion in (
-        ("plain", reported_walker),
+        ("plain", person),
         ("camera", reported_in_camera),
         ("single", one_frame),
-        ("gaps", dataclasses.replace(reported_walker, joints3d=joints)),
+        ("gaps", dataclasses.replace(person, joints3d=joints)),
     ):
         save_report(folder / f"{name}.html", motion)
     return folder

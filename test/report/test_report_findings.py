@@ -17,14 +17,14 @@ def titles(motion, level=None):
     return [f.title for f in found if level in (None, f.level)]
 
 
-def test_a_good_motion_has_no_warning(reported_walker):
-    assert titles(reported_walker, "warning") == []
-    assert "Scale assumed" in titles(reported_walker)
+def test_a_good_motion_has_no_warning(person):
+    assert titles(person, "warning") == []
+    assert "Scale assumed" in titles(person)
 
 
-def test_the_speed_of_the_orbit_is_measured(reported_walker):
-    m = measure(reported_walker)
-    look = -reported_walker.camera_rotation[:, 2]
+def test_the_speed_of_the_orbit_is_measured(person):
+    m = measure(person)
+    look = -person.camera_rotation[:, 2]
     orbit = np.degrees(np.abs(np.diff(np.unwrap(np.arctan2(look[:, 1], look[:, 0]))))).sum()
     turned = np.degrees(np.ptp(m.heading_rad))
     # The body turns as well: what it sees of the camera differs from the orbit by at most that.
@@ -32,7 +32,7 @@ def test_the_speed_of_the_orbit_is_measured(reported_walker):
     assert m.rate_hz == pytest.approx(15.0)
 
 
-def test_view_and_heading_are_those_of_a_body_that_looks_north(reported_walker):
+def test_view_and_heading_are_those_of_a_body_that_looks_north(person):
     """A standing body that faces north, the camera east of it: seen from its right."""
     body = np.zeros((5, 15, 3))
     at = {"neck": (0, 0, 0.6), "lhip": (-0.1, 0, 0), "rhip": (0.1, 0, 0), "lshoulder": (-0.2, 0, 0.5),
@@ -40,20 +40,18 @@ def test_view_and_heading_are_those_of_a_body_that_looks_north(reported_walker):
     for name, place in at.items():
         body[:, BODY_15.index(name)] = place
     towards_west = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
-    parts = {n: getattr(reported_walker, n)[:5] for n in ("stamp_ns", "confidence", "keypoints", "reprojection_px")}
-    motion = dataclasses.replace(
-        reported_walker, joints3d=body, camera_rotation=np.tile(towards_west, (5, 1, 1)), **parts
-    )
+    parts = {n: getattr(person, n)[:5] for n in ("stamp_ns", "confidence", "keypoints", "reprojection_px")}
+    motion = dataclasses.replace(person, joints3d=body, camera_rotation=np.tile(towards_west, (5, 1, 1)), **parts)
     m = measure(motion)
     np.testing.assert_allclose(np.degrees(m.heading_rad), 90.0, atol=1e-6)
     np.testing.assert_allclose(m.view_deg, -90.0, atol=1e-6)
 
 
-def test_a_still_camera_before_a_still_body_is_reported(reported_walker):
+def test_a_still_camera_before_a_still_body_is_reported(person):
     still = dataclasses.replace(
-        reported_walker,
-        joints3d=np.repeat(reported_walker.joints3d[:1], len(reported_walker.joints3d), axis=0),
-        camera_rotation=np.repeat(reported_walker.camera_rotation[:1], len(reported_walker.joints3d), axis=0),
+        person,
+        joints3d=np.repeat(person.joints3d[:1], len(person.joints3d), axis=0),
+        camera_rotation=np.repeat(person.camera_rotation[:1], len(person.joints3d), axis=0),
     )
     assert "Low camera motion" in titles(still, "warning")
     assert measure(still).view_span_deg == pytest.approx(0.0, abs=1e-6)
@@ -66,12 +64,12 @@ def test_a_body_that_turns_before_a_still_camera_is_motion_enough(reported_in_ca
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_body_mirrored_in_depth_is_noticed(reported_walker, seed):
+def test_a_body_mirrored_in_depth_is_noticed(person, seed):
     capture = simulate_capture(8.0, 15.0, seed=seed)
     joints = np.einsum("fij,fpj->fpi", capture.camera_rotation, capture.joints3d_world - capture.joints3d_world[:, :1])
     frames = len(joints)
     motion = dataclasses.replace(
-        reported_walker,
+        person,
         joints3d=joints,
         frame="camera",
         stamp_ns=capture.tracks.stamp_ns,
@@ -85,45 +83,43 @@ def test_a_body_mirrored_in_depth_is_noticed(reported_walker, seed):
     assert "Possibly mirrored in depth" in titles(mirrored, "warning")
 
 
-def test_missing_joints_are_named_with_their_share(reported_walker):
-    keypoints = reported_walker.keypoints.copy()
+def test_missing_joints_are_named_with_their_share(person):
+    keypoints = person.keypoints.copy()
     keypoints[::2, BODY_15.index("lwrist")] = np.nan
-    found = findings(motion := dataclasses.replace(reported_walker, keypoints=keypoints), measure(motion))
+    found = findings(motion := dataclasses.replace(person, keypoints=keypoints), measure(motion))
     (text,) = (f.text for f in found if f.title == "Many missing joints")
     share = np.isnan(keypoints[:, BODY_15.index("lwrist")]).any(axis=1).mean()
     assert f"lwrist {share:.0%}" in text
 
 
-def test_high_error_is_told_from_a_few_outliers(reported_walker):
-    size = measure(reported_walker).body_px
-    few = np.zeros_like(reported_walker.reprojection_px)
+def test_high_error_is_told_from_a_few_outliers(person):
+    size = measure(person).body_px
+    few = np.zeros_like(person.reprojection_px)
     few[::20] = 0.5 * size
-    assert titles(dataclasses.replace(reported_walker, reprojection_px=few), "warning") == []
-    assert "Outlying keypoints" in titles(dataclasses.replace(reported_walker, reprojection_px=few))
+    assert titles(dataclasses.replace(person, reprojection_px=few), "warning") == []
+    assert "Outlying keypoints" in titles(dataclasses.replace(person, reprojection_px=few))
     many = few.copy()
     many[::5] = 0.5 * size
-    assert "Outlying keypoints" in titles(dataclasses.replace(reported_walker, reprojection_px=many), "warning")
+    assert "Outlying keypoints" in titles(dataclasses.replace(person, reprojection_px=many), "warning")
     all_over = np.full_like(few, 0.03 * size)
-    assert "High reprojection error" in titles(
-        dataclasses.replace(reported_walker, reprojection_px=all_over), "warning"
-    )
+    assert "High reprojection error" in titles(dataclasses.replace(person, reprojection_px=all_over), "warning")
 
 
-def test_short_sequences_and_stretching_bones_are_reported(reported_walker, one_frame):
+def test_short_sequences_and_stretching_bones_are_reported(person, one_frame):
     assert "Short sequence" in titles(one_frame, "warning")
-    stretched = reported_walker.joints3d.copy()
+    stretched = person.joints3d.copy()
     knee, ankle = BODY_15.index("rknee"), BODY_15.index("rankle")
     stretched[::2, ankle] = stretched[::2, knee] + 1.5 * (stretched[::2, ankle] - stretched[::2, knee])
-    found = findings(motion := dataclasses.replace(reported_walker, joints3d=stretched), measure(motion))
+    found = findings(motion := dataclasses.replace(person, joints3d=stretched), measure(motion))
     (text,) = (f.text for f in found if f.title == "Bones change their length")
     assert "rknee - rankle" in text
     assert "20%" in text  # half of the frames 1, half 1.5: 0.25 / 1.25
 
 
-def test_frames_without_a_pose_are_counted(reported_walker):
-    joints = reported_walker.joints3d.copy()
+def test_frames_without_a_pose_are_counted(person):
+    joints = person.joints3d.copy()
     joints[5:9] = np.nan
-    found = findings(motion := dataclasses.replace(reported_walker, joints3d=joints), measure(motion))
+    found = findings(motion := dataclasses.replace(person, joints3d=joints), measure(motion))
     assert any(f.text.startswith("4 of 60 frames") for f in found)
 
 

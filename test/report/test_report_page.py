@@ -50,8 +50,8 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def html(reported_walker):
-    return render_report(reported_walker, command="drocap report walk_motion")
+def html(person):
+    return render_report(person, command="drocap report walk_motion")
 
 
 def data_of(html):
@@ -68,21 +68,19 @@ def test_it_is_one_file_that_asks_for_nothing(html):
     )
 
 
-def test_the_data_are_the_motion(html, reported_walker):
+def test_the_data_are_the_motion(html, person):
     data = data_of(html)
-    shape = reported_walker.joints3d.shape
-    np.testing.assert_allclose(np.reshape(data["pose"], shape) / 1000, reported_walker.joints3d, atol=0.00051)
-    np.testing.assert_allclose(
-        np.array(data["times"]) / 1000, (reported_walker.stamp_ns - reported_walker.stamp_ns[0]) * 1e-9, atol=6e-4
-    )
-    axes = np.reshape(data["camera"], (len(reported_walker.joints3d), 2, 3)) / 1000
-    np.testing.assert_allclose(axes, reported_walker.camera_rotation[:, [0, 2]], atol=0.00051)
+    shape = person.joints3d.shape
+    np.testing.assert_allclose(np.reshape(data["pose"], shape) / 1000, person.joints3d, atol=0.00051)
+    np.testing.assert_allclose(np.array(data["times"]) / 1000, (person.stamp_ns - person.stamp_ns[0]) * 1e-9, atol=6e-4)
+    axes = np.reshape(data["camera"], (len(person.joints3d), 2, 3)) / 1000
+    np.testing.assert_allclose(axes, person.camera_rotation[:, [0, 2]], atol=0.00051)
     assert data["sides"][BODY_15.index("rwrist")] == "right"
     assert data["sides"][BODY_15.index("lhip")] == "left"
     assert data["sides"][BODY_15.index("head")] == "middle"
 
 
-def test_words_commands_and_versions_are_on_the_page(html, reported_walker):
+def test_words_commands_and_versions_are_on_the_page(html, person):
     text = Page(html).text
     for words in (
         "walk.mp4",
@@ -99,14 +97,14 @@ def test_words_commands_and_versions_are_on_the_page(html, reported_walker):
         assert words in text
 
 
-def test_text_from_outside_cannot_become_markup(reported_walker):
+def test_text_from_outside_cannot_become_markup(person):
     evil = '</script><script>alert(1)</script><img src=x onerror="alert(2)">\u2028$title'
-    joints = tuple(evil if name == "head" else name for name in reported_walker.joints)
+    joints = tuple(evil if name == "head" else name for name in person.joints)
     motion = dataclasses.replace(
-        reported_walker,
+        person,
         joints=joints,
         scale_source=evil,
-        meta={**reported_walker.meta, "input": evil, "versions": {evil: evil}},
+        meta={**person.meta, "input": evil, "versions": {evil: evil}},
     )
     html = render_report(motion, command=evil)
     page = Page(html)
@@ -116,23 +114,21 @@ def test_text_from_outside_cannot_become_markup(reported_walker):
     assert evil in page.text
 
 
-def test_meta_of_other_makers_does_no_harm(reported_walker):
+def test_meta_of_other_makers_does_no_harm(person):
     odd = {"seconds": [1, 2], "versions": "all", "iterations": None, "input": 7, "method": None, "command": ["a"]}
-    assert "Bone lengths" in render_report(dataclasses.replace(reported_walker, meta=odd))
-    assert "Bone lengths" in render_report(dataclasses.replace(reported_walker, meta={}))
+    assert "Bone lengths" in render_report(dataclasses.replace(person, meta=odd))
+    assert "Bone lengths" in render_report(dataclasses.replace(person, meta={}))
 
 
-def test_unknown_joints_are_null_and_lines_are_broken(reported_walker):
-    joints, error = reported_walker.joints3d.copy(), reported_walker.reprojection_px.copy()
+def test_unknown_joints_are_null_and_lines_are_broken(person):
+    joints, error = person.joints3d.copy(), person.reprojection_px.copy()
     joints[20:25] = np.nan
     error[20:25] = np.nan
-    keypoints = reported_walker.keypoints.copy()
+    keypoints = person.keypoints.copy()
     keypoints[20:25] = np.nan
-    html = render_report(
-        dataclasses.replace(reported_walker, joints3d=joints, reprojection_px=error, keypoints=keypoints)
-    )
+    html = render_report(dataclasses.replace(person, joints3d=joints, reprojection_px=error, keypoints=keypoints))
     data = data_of(html)
-    pose = np.array(data["pose"], dtype=object).reshape(reported_walker.joints3d.shape)
+    pose = np.array(data["pose"], dtype=object).reshape(person.joints3d.shape)
     assert (pose[20:25] == None).all()  # noqa: E711
     assert data["series"]["error"][20:25] == [None] * 5
     path = re.search(r'data-series="error".*?class="line" d="([^"]*)"', html)[1]
@@ -144,41 +140,35 @@ def test_one_frame_is_a_report_too(one_frame):
     assert data_of(render_report(one_frame))["times"] == [0]
 
 
-def test_nothing_known_is_refused(reported_walker):
-    nothing = dataclasses.replace(reported_walker, joints3d=np.full_like(reported_walker.joints3d, np.nan))
+def test_nothing_known_is_refused(person):
+    nothing = dataclasses.replace(person, joints3d=np.full_like(person.joints3d, np.nan))
     with pytest.raises(InputError, match="NaN in all of them"):
         render_report(nothing)
     with pytest.raises(InputError, match="missing neck"):
-        render_report(
-            dataclasses.replace(
-                reported_walker, joints=tuple("nose" if j == "neck" else j for j in reported_walker.joints)
-            )
-        )
+        render_report(dataclasses.replace(person, joints=tuple("nose" if j == "neck" else j for j in person.joints)))
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-300, 1e5])
-def test_bodies_of_any_size_are_drawn(reported_walker, size):
-    assert "Bone lengths" in render_report(
-        dataclasses.replace(reported_walker, joints3d=size * reported_walker.joints3d)
-    )
+def test_bodies_of_any_size_are_drawn(person, size):
+    assert "Bone lengths" in render_report(dataclasses.replace(person, joints3d=size * person.joints3d))
 
 
-def test_no_keypoints_at_all(reported_walker):
-    unknown = np.full_like(reported_walker.keypoints, np.nan)
-    error = np.full_like(reported_walker.reprojection_px, np.nan)
-    html = render_report(dataclasses.replace(reported_walker, keypoints=unknown, reprojection_px=error))
+def test_no_keypoints_at_all(person):
+    unknown = np.full_like(person.keypoints, np.nan)
+    error = np.full_like(person.reprojection_px, np.nan)
+    html = render_report(dataclasses.replace(person, keypoints=unknown, reprojection_px=error))
     assert "Many missing joints" in html
 
 
-def test_an_hour_stays_small(reported_walker):
+def test_an_hour_stays_small(person):
     """108,000 frames: every n-th pose is shown, the plots average over all."""
     times = 1800
     many = {
-        name: np.concatenate([getattr(reported_walker, name)] * times)
+        name: np.concatenate([getattr(person, name)] * times)
         for name in ("joints3d", "camera_rotation", "confidence", "keypoints", "reprojection_px")
     }
     stamps = np.arange(60 * times) * 33_333_333
-    html = render_report(dataclasses.replace(reported_walker, **many, stamp_ns=stamps))
+    html = render_report(dataclasses.replace(person, **many, stamp_ns=stamps))
     assert len(html) < 2_000_000
     data = data_of(html)
     assert len(data["times"]) <= MAX_POSES

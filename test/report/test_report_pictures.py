@@ -34,40 +34,40 @@ def folder(tmp_path):
     return frames
 
 
-def seen_at(reported_walker, stamps):
+def seen_at(person, stamps):
     """A motion whose frames are at these stamps, its keypoints in the middle of a 320 x 240 image."""
-    motion = first_frames(reported_walker, len(stamps))
+    motion = first_frames(person, len(stamps))
     spread = np.random.default_rng(0).uniform(-20, 20, (len(stamps), 15, 2))
     return dataclasses.replace(motion, stamp_ns=np.asarray(stamps, np.int64), keypoints=np.array([160, 120]) + spread)
 
 
-def test_pictures_are_those_of_the_frames_by_their_stamps(reported_walker, folder):
+def test_pictures_are_those_of_the_frames_by_their_stamps(person, folder):
     stamps = np.round(np.arange(0, 40, 2) / 30.0 * 1e9)
-    found = read_pictures(folder, seen_at(reported_walker, stamps))
+    found = read_pictures(folder, seen_at(person, stamps))
     assert found.frames == tuple(range(20))
     assert [level(j) for j in found.jpegs] == pytest.approx([5 * n + 20 for n in range(0, 40, 2)], abs=1)
 
 
-def test_a_motion_with_another_clock_starts_with_the_first_picture(reported_walker, folder):
+def test_a_motion_with_another_clock_starts_with_the_first_picture(person, folder):
     stamps = np.round(np.arange(0, 40, 4) / 30.0 * 1e9) + 1_700_000_000_000_000_000
-    found = read_pictures(folder, seen_at(reported_walker, stamps))
+    found = read_pictures(folder, seen_at(person, stamps))
     assert [level(j) for j in found.jpegs] == pytest.approx([5 * n + 20 for n in range(0, 40, 4)], abs=1)
 
 
-def test_the_crop_holds_the_keypoints(reported_walker, folder):
-    motion = seen_at(reported_walker, np.round(np.arange(20) / 30.0 * 1e9))
+def test_the_crop_holds_the_keypoints(person, folder):
+    motion = seen_at(person, np.round(np.arange(20) / 30.0 * 1e9))
     x0, y0, x1, y1 = read_pictures(folder, motion).box
     inside = (motion.keypoints > (x0, y0)) & (motion.keypoints < (x1, y1))
     assert inside.all()
     assert (x1 - x0) * (y1 - y0) < 0.3 * 320 * 240
 
 
-def test_pictures_of_noise_stay_within_their_bytes(reported_walker, tmp_path, monkeypatch):
+def test_pictures_of_noise_stay_within_their_bytes(person, tmp_path, monkeypatch):
     monkeypatch.setattr(pictures, "MAX_BYTES", 200_000)
     rng = np.random.default_rng(0)
     for number in range(20):
         cv2.imwrite(str(tmp_path / f"{number:04d}.png"), rng.integers(0, 255, (480, 640, 3), np.uint8))
-    motion = seen_at(reported_walker, np.round(np.arange(20) / 30.0 * 1e9))
+    motion = seen_at(person, np.round(np.arange(20) / 30.0 * 1e9))
     keypoints = motion.keypoints * 2
     keypoints[:, 0], keypoints[:, 1] = (10, 10), (630, 470)
     motion = dataclasses.replace(motion, keypoints=keypoints)
@@ -77,23 +77,23 @@ def test_pictures_of_noise_stay_within_their_bytes(reported_walker, tmp_path, mo
     assert all(decoded(jpeg) is not None for jpeg in found.jpegs)
 
 
-def test_long_motions_have_few_pictures(reported_walker, folder, monkeypatch):
+def test_long_motions_have_few_pictures(person, folder, monkeypatch):
     monkeypatch.setattr(pictures, "MAX_PICTURES", 7)
-    found = read_pictures(folder, seen_at(reported_walker, np.round(np.arange(40) / 30.0 * 1e9)))
+    found = read_pictures(folder, seen_at(person, np.round(np.arange(40) / 30.0 * 1e9)))
     assert len(found.jpegs) == 7
     assert found.frames[0] == 0
     assert found.frames[-1] == 39
 
 
-def test_a_real_video_gives_each_frame_its_picture(reported_walker, shared):
+def test_a_real_video_gives_each_frame_its_picture(person, shared):
     count = 40
-    motion = seen_at(reported_walker, np.arange(count) * 200_000_000)
+    motion = seen_at(person, np.arange(count) * 200_000_000)
     motion = dataclasses.replace(motion, keypoints=motion.keypoints + np.array([200, 400]))
     found = read_pictures(shared / "media" / "pose_squats.mp4", motion)
     assert found.frames == tuple(range(count))
 
 
-def test_a_recordings_pictures_are_found(reported_walker, tmp_path):
+def test_a_recordings_pictures_are_found(person, tmp_path):
     """A ROS 1 bag written by rosbags, compressed images on a topic of its own."""
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
@@ -112,12 +112,12 @@ def test_a_recordings_pictures_are_found(reported_walker, tmp_path):
             message = image(header=at, format="jpeg", data=jpeg)
             bag.write(connection, stamp, store.serialize_ros1(message, image.__msgtype__))
     assert has_pictures(tmp_path / "flight.bag")
-    found = read_pictures(tmp_path / "flight.bag", seen_at(reported_walker, stamps[::2]))
+    found = read_pictures(tmp_path / "flight.bag", seen_at(person, stamps[::2]))
     assert [level(j) for j in found.jpegs] == pytest.approx([10 * n + 50 for n in range(0, 12, 2)], abs=1)
 
 
-def test_what_has_no_pictures_is_refused(reported_walker, tmp_path):
-    motion = first_frames(reported_walker, 5)
+def test_what_has_no_pictures_is_refused(person, tmp_path):
+    motion = first_frames(person, 5)
     (tmp_path / "text.mp4").write_text("no video")
     for name in ("none.mp4", "text.mp4"):
         with pytest.raises(InputError, match=name):

@@ -122,7 +122,8 @@ for ros in ("rclpy", "std_msgs", "sensor_msgs", "geometry_msgs", "rcl_interfaces
 import drocap_ros
 drocap_ros.__path__ = drocap_ros.__path__[:1]
 for module in pkgutil.walk_packages(drocap_ros.__path__, "drocap_ros."):
-    if not module.name.startswith(("drocap_ros.nodes", "drocap_ros.ros", "drocap_ros.bringup")) and "__main__" not in module.name:
+    needs_ros = module.name.startswith(("drocap_ros.nodes", "drocap_ros.ros", "drocap_ros.bringup"))
+    if not needs_ros and "__main__" not in module.name:
         if "train_lifter" not in module.name:
             importlib.import_module(module.name)
 print(drocap_ros.__file__)
