@@ -2,6 +2,15 @@
 
 A page names the machine, the date, the revision and the command, so that two pages can be compared.  Short runs belong
 elsewhere: `DROCAP_FIGURES=DIR` writes the pages to DIR instead of docs/figures.
+
+One page per part that can run alone:
+
+    accuracy.py         accuracy, accuracy_live, accuracy_perspective
+    reconstruction.py   reconstruction
+    perception.py       perception
+    recording.py        recording_load, recording_kills, recording_mutations, recording_long, recording_live
+    live.py             live_load, live_memory, live_kills
+    flight_*.py         flight_faults, flight_processes, flight_orbits, flight_quality, flight_pixels, flight_fuzz
 """
 
 from __future__ import annotations
@@ -43,8 +52,8 @@ def table(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
 
 
 def command() -> str:
-    """The command line of this benchmark, paths without their folders."""
-    words = (Path(word).name if "/" in word else word for word in sys.argv[1:])
+    """The command line of this benchmark, absolute paths without their folders."""
+    words = (Path(word).name if Path(word).is_absolute() else word for word in sys.argv[1:])
     return shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *words])
 
 
