@@ -32,11 +32,11 @@ from drocap_ros.flight.frames import camera_rotation  # noqa: E402
 from drocap_ros.flight.mavlink.transport import open_transport  # noqa: E402
 from drocap_ros.flight.orbit.safety import Command, State  # noqa: E402
 from drocap_ros.observation import PoseObservation  # noqa: E402
-from drocap_ros.simulation.camera import pinhole_matrix, project  # noqa: E402
 from drocap_ros.simulation.closed_loop.faults import EXCURSION_M, MOTION_S, TIMEOUT, Bounds  # noqa: E402
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings  # noqa: E402
-from drocap_ros.simulation.observation import observe_keypoints  # noqa: E402
-from drocap_ros.simulation.person import simulate_person  # noqa: E402
+from drocap_ros.simulation.keypoint_errors import noisy_keypoints  # noqa: E402
+from drocap_ros.simulation.orbit_camera import pinhole_matrix, project  # noqa: E402
+from drocap_ros.simulation.simulated_person import simulate_person  # noqa: E402
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter  # noqa: E402
 from drocap_ros.simulation.vehicle.ports import free_udp_port  # noqa: E402
 
@@ -68,7 +68,7 @@ def perceive(port: int) -> None:
         for frame in range(10**9):
             told = json.loads(camera.recv(4096))
             rotation = camera_rotation(np.array(told["orientation"]))[None]
-            seen = observe_keypoints(project(joints, rotation, np.array([told["position"]]), MATRIX), None, frame)
+            seen = noisy_keypoints(project(joints, rotation, np.array([told["position"]]), MATRIX), None, frame)
             observation = PoseObservation(
                 told["stamp_ns"], 1, (WIDTH, HEIGHT), keypoints=seen.keypoints[0].astype(np.float32),
                 covariance=seen.covariance[0].astype(np.float32), confidence=seen.confidence[0].astype(np.float32),

@@ -24,7 +24,7 @@ from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.recording.recording_config import SessionPlayerConfig, SessionRecorderConfig
 from drocap_ros.report.visualizer_config import VisualizerConfig
 from drocap_ros.simulation.capture_config import SimulationConfig
-from drocap_ros.simulation.flight.flight_simulator_config import FlightSimulatorConfig
+from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimulatorConfig
 
 
 @dataclass(frozen=True)

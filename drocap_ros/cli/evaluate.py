@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _pair(args: argparse.Namespace) -> int:
-    from drocap_ros.cli.output import check_output_folder, output_folder
+    from drocap_ros.cli.atomic_output import check_output_folder, output_folder
     from drocap_ros.evaluation import tables
     from drocap_ros.evaluation.compare import compare, load_truth
     from drocap_ros.motion import load_motion
@@ -99,7 +99,7 @@ def _pair(args: argparse.Namespace) -> int:
 
 
 def _rotation(args: argparse.Namespace) -> int:
-    from drocap_ros.cli.output import check_output_folder, output_folder
+    from drocap_ros.cli.atomic_output import check_output_folder, output_folder
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.evaluation import tables
     from drocap_ros.evaluation.rotation import rotation_study
@@ -128,7 +128,7 @@ def _rotation(args: argparse.Namespace) -> int:
 
 
 def _live(args: argparse.Namespace) -> int:
-    from drocap_ros.cli.output import check_output_folder, output_folder
+    from drocap_ros.cli.atomic_output import check_output_folder, output_folder
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.config import DrocapConfig, load_config
     from drocap_ros.evaluation.live import live_study

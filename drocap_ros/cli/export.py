@@ -28,7 +28,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> int:
     """Export and say what the file holds."""
-    from drocap_ros.cli.output import output_file
+    from drocap_ros.cli.atomic_output import output_file
     from drocap_ros.export import export_motion
 
     path, motion = read_motion(args.motion)

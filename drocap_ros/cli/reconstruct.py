@@ -65,7 +65,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> int:
     """Reconstruct and write the output folder."""
-    from drocap_ros.cli.output import check_output_folder, output_folder
+    from drocap_ros.cli.atomic_output import check_output_folder, output_folder
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.config import DrocapConfig, load_config
     from drocap_ros.motion import save_motion

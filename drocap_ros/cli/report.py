@@ -28,7 +28,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> int:
     """Write the report."""
-    from drocap_ros.cli.output import output_file
+    from drocap_ros.cli.atomic_output import output_file
     from drocap_ros.report.page import save_report
 
     path, motion = read_motion(args.motion)

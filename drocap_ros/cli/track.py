@@ -49,7 +49,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> int:
     """Track and write the output folder."""
-    from drocap_ros.cli.output import check_output_folder, output_folder
+    from drocap_ros.cli.atomic_output import check_output_folder, output_folder
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.perception.estimator import PoseEstimator
     from drocap_ros.perception.load_models import models_folder

@@ -19,8 +19,8 @@ from drocap_ros.ros.component import OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import camera_info_to_ros, header_at
 from drocap_ros.ros.image_transport import PictureOutput
 from drocap_ros.ros.spin import node_main
-from drocap_ros.simulation.flight.truth import save_truth
-from drocap_ros.simulation.flight.world import Exposure, FlightWorld
+from drocap_ros.simulation.flight_simulator.truth import save_flight_truth
+from drocap_ros.simulation.flight_simulator.world import Exposure, FlightWorld
 from drocap_ros.simulation.render.renderer import Renderer
 
 FRAME_ID = "camera_optical"
@@ -64,7 +64,7 @@ class FlightSimulatorNode(ComponentNode):
         self._pictures.close()
         self._world.close()
         if self.config.truth_file and self.counters["exposures"]:
-            save_truth(Path(self.config.truth_file), self._world.truth())
+            save_flight_truth(Path(self.config.truth_file), self._world.truth())
 
     def _end(self) -> None:
         self._stop.set()

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.simulation.camera import orbit_camera, pinhole_matrix, project, to_camera
 from drocap_ros.simulation.capture_config import SimulationConfig
-from drocap_ros.simulation.observation import Observation, observe_keypoints, occlusion
-from drocap_ros.simulation.person import simulate_person
+from drocap_ros.simulation.keypoint_errors import NoisyKeypoints, noisy_keypoints, occlusion
+from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project, to_camera
+from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import MAX_FRAMES, Tracks
 
@@ -31,7 +31,7 @@ class SimulatedCapture:
     camera_rotation: np.ndarray
     camera_position: np.ndarray
     keypoints_exact: np.ndarray
-    observation: Observation
+    observation: NoisyKeypoints
 
 
 def simulate_capture(
@@ -67,7 +67,7 @@ def simulate_capture(
     inside = np.all((exact >= -0.5) & (exact < np.array([config.image_width, config.image_height]) - 0.5), axis=-1)
     seen = np.where(inside[..., None], exact, np.nan)
     hidden = occlusion(exact, to_camera(joints, rotation, position)[..., 2], matrix[0, 0])
-    observation = observe_keypoints(
+    observation = noisy_keypoints(
         seen,
         hidden,
         seed,

@@ -13,12 +13,12 @@ import numpy as np
 
 from drocap_ros.perception.detection.letterbox import letterbox
 from drocap_ros.perception.pose.crop import crop_around, cut
-from drocap_ros.simulation.camera import look_at, project
-from drocap_ros.simulation.person import ACTIONS, simulate_person
+from drocap_ros.simulation.orbit_camera import look_at, project
 from drocap_ros.simulation.render.background import draw_background
 from drocap_ros.simulation.render.body import dress
 from drocap_ros.simulation.render.renderer import draw
-from drocap_ros.simulation.render.scene import Scene, make_scene
+from drocap_ros.simulation.render.scenery import Scenery, make_scenery
+from drocap_ros.simulation.simulated_person import ACTIONS, simulate_person
 from drocap_ros.skeleton import BODY_15
 
 #: Input sizes of the networks (width, height) px, and the pose crop's side over that of the box.
@@ -47,12 +47,12 @@ class World:
     """Poses (N, 15, 3) m, ground under the origin, and some places that are exchanged for new ones in turn."""
 
     poses: np.ndarray
-    scenes: list[Scene]
+    scenes: list[Scenery]
     next_seed: int
 
     def renew(self) -> None:
         """Put a new place for the oldest."""
-        self.scenes = [*self.scenes[1:], make_scene(self.next_seed)]
+        self.scenes = [*self.scenes[1:], make_scenery(self.next_seed)]
         self.next_seed += 1
 
 
@@ -82,7 +82,7 @@ def make_world(rng: np.random.Generator, scenes: int = 12, takes: int = _TAKES_P
             joints = simulate_person(t, action, first + take * len(ACTIONS) + number, rng.uniform(1.35, 2.0))
             joints[..., :2] -= joints[:, :1, :2]
             poses.append(joints)
-    return World(np.concatenate(poses), [make_scene(first + i) for i in range(scenes)], first + scenes)
+    return World(np.concatenate(poses), [make_scenery(first + i) for i in range(scenes)], first + scenes)
 
 
 def _view(
@@ -113,7 +113,7 @@ def _view(
     return View(matrix, turn @ rotation, position, size)
 
 
-def _scene(world: World, rng: np.random.Generator) -> Scene:
+def _scene(world: World, rng: np.random.Generator) -> Scenery:
     return world.scenes[int(rng.integers(len(world.scenes)))]
 
 

@@ -11,7 +11,7 @@ from drocap_ros.cli import main
 from drocap_ros.evaluation.live import fly, live_study, standardized_error
 from drocap_ros.evaluation.protocol import orbit_view
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.simulation.person import simulate_person
+from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15
 
 

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.simulation.camera import look_at, orbit_camera, pinhole_matrix, project, to_camera
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.capture_config import SimulationConfig
-from drocap_ros.simulation.observation import observe_keypoints, occlusion
+from drocap_ros.simulation.keypoint_errors import noisy_keypoints, occlusion
+from drocap_ros.simulation.orbit_camera import look_at, orbit_camera, pinhole_matrix, project, to_camera
 from drocap_ros.skeleton import BODY_15
 
 
@@ -128,7 +128,7 @@ def test_occlusion_hides_the_far_wrist_behind_the_trunk():
 
 def test_joints_outside_the_view_are_missing():
     px = np.full((3, 15, 2), np.nan)
-    obs = observe_keypoints(px, seed=1)
+    obs = noisy_keypoints(px, seed=1)
     assert np.isnan(obs.keypoints).all()
     assert (obs.confidence == 0).all()
 

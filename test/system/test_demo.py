@@ -18,7 +18,7 @@ from drocap_ros.motion import load_motion
 from drocap_ros.recording.session import open_session
 from drocap_ros.recording.session_reader import read_vehicle_track
 from drocap_ros.recording.telemetry.camera_poses import interpolate
-from drocap_ros.simulation.flight.truth import flown_orbit, load_truth_of_flight
+from drocap_ros.simulation.flight_simulator.truth import flown_orbit, load_flight_truth
 
 
 def test_the_demo_flies_by_what_it_sees_and_ends_with_a_motion_near_the_truth(tmp_path, capsys):
@@ -30,7 +30,7 @@ def test_the_demo_flies_by_what_it_sees_and_ends_with_a_motion_near_the_truth(tm
     assert {path.name for path in out.iterdir()} == {
         "motion.npz", "truth.npz", "pictures.jpg", "preview.png", "report.html", "session",
     }  # fmt: skip
-    truth, motion = load_truth_of_flight(out / "truth.npz"), load_motion(out / "motion.npz")
+    truth, motion = load_flight_truth(out / "truth.npz"), load_motion(out / "motion.npz")
     assert motion.frame == "world"
     assert np.isfinite(motion.joints3d).all()
     exposure = np.searchsorted(truth.stamp_ns, motion.stamp_ns)

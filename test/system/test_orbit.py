@@ -21,9 +21,9 @@ from drocap_ros.msg import OrbitStatus
 from drocap_ros.observation import PoseObservation
 from drocap_ros.ros.conversions import pose2d_to_ros
 from drocap_ros.ros.topics import TOPICS
-from drocap_ros.simulation.camera import pinhole_matrix, project
-from drocap_ros.simulation.observation import observe_keypoints
-from drocap_ros.simulation.person import simulate_person
+from drocap_ros.simulation.keypoint_errors import noisy_keypoints
+from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
+from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 
@@ -57,7 +57,7 @@ class Drone:
     def _see(self, frame):
         rotation = camera_rotation(self.copter.camera_orientation())[None]
         exact = project(self._joints, rotation, self.copter.body.position[None], MATRIX)
-        seen = observe_keypoints(exact, None, frame)
+        seen = noisy_keypoints(exact, None, frame)
         stamp = self.graph.node.get_clock().now().nanoseconds
         observation = PoseObservation(
             stamp, 1, (1280, 720), keypoints=seen.keypoints[0].astype(np.float32),

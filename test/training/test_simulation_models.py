@@ -12,11 +12,11 @@ from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import limited_use, models_folder
 from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.perception.perception_config import PoseEstimatorConfig
-from drocap_ros.simulation.camera import orbit_camera, pinhole_matrix, project
-from drocap_ros.simulation.person import simulate_person
+from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
 from drocap_ros.simulation.render.body import dress
 from drocap_ros.simulation.render.renderer import draw
-from drocap_ros.simulation.render.scene import make_scene
+from drocap_ros.simulation.render.scenery import make_scenery
+from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.training.rendered_samples import (
     DETECTOR_SIZE,
@@ -58,7 +58,7 @@ class Flown:
             rotation, position = orbit_camera(t, centre, 6.0, 2.5, 25.0, 70.0 * seed)
             truth = project(joints, rotation, position, matrix)
             estimator = PoseEstimator(FOLDER, PoseEstimatorConfig(detect_every_s=0.0))
-            scene, look = make_scene(seed), dress(seed)
+            scene, look = make_scenery(seed), dress(seed)
             for i in range(pictures):
                 picture, box = draw(scene, look, matrix, 1280, 720, joints[i], rotation[i], position[i])
                 picture = as_received(picture)
@@ -113,7 +113,7 @@ def test_an_empty_place_holds_nobody():
     for seed in range(8):
         position = np.array([[1.0, 2.0 + seed, 2.5]])
         rotation = orbit_camera(np.zeros(1), np.zeros((1, 3)), 6.0, 2.5, 0.0, 90.0)[0][0]
-        picture, box = draw(make_scene(seed), dress(0), matrix, 1280, 720, away, rotation, position[0])
+        picture, box = draw(make_scenery(seed), dress(0), matrix, 1280, 720, away, rotation, position[0])
         assert box is None
         assert not estimator.process(picture, seed * 100_000_000).has_subject
 

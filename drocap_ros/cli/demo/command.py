@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from drocap_ros.cli.demo.verdict import FlightVerdict
     from drocap_ros.config import DrocapConfig
     from drocap_ros.motion import Motion
-    from drocap_ros.simulation.flight.truth import FlightTruth
+    from drocap_ros.simulation.flight_simulator.truth import FlightTruth
 
 #: The networks that this package brings along, for simulated pictures only.
 MODELS = "simulation"
@@ -46,16 +46,16 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> int:
     """Fly, record, reconstruct, compare."""
+    from drocap_ros.cli.atomic_output import check_output_folder, output_folder
     from drocap_ros.cli.demo.flight import NODES, check_flown, fly
     from drocap_ros.cli.demo.operator import Operator
     from drocap_ros.cli.demo.verdict import judge_flight
     from drocap_ros.cli.graph.live import interruptible
-    from drocap_ros.cli.output import check_output_folder, output_folder
     from drocap_ros.cli.reconstruct import summary
     from drocap_ros.errors import InputError
     from drocap_ros.evaluation.compare import compare
     from drocap_ros.recording.session import open_session
-    from drocap_ros.simulation.flight.truth import load_truth_of_flight
+    from drocap_ros.simulation.flight_simulator.truth import load_flight_truth
 
     if not (math.isfinite(args.seconds) and _LEAST_S <= args.seconds <= _MOST_S):
         raise InputError(f"--seconds: expected {_LEAST_S:g} to {_MOST_S:g}, got {args.seconds:g}; choose another")
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
         say(f"starting {', '.join(NODES)}, a process each")
         load = fly(config, operator, say, interrupted)
         check_flown(operator)
-        truth = load_truth_of_flight(folder / "truth.npz")
+        truth = load_flight_truth(folder / "truth.npz")
         with open_session(folder / "session") as session:
             verdict = judge_flight(session, truth, config.mavlink_bridge.radius_m)
         say("landed; reconstructing from the recorded session")

@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from drocap_ros.cli.atomic_output import output_file
 from drocap_ros.cli.graph.live import check_domain, import_bringup, interruptible, stop_signals
 from drocap_ros.cli.motion_input import read_motion
-from drocap_ros.cli.output import output_file
 from drocap_ros.cli.progress import progress_bars
 from drocap_ros.errors import InputError
 

@@ -21,9 +21,9 @@ from drocap_ros.flight.orbit.controller import ControlStatus, OperatorCommand, O
 from drocap_ros.flight.orbit.safety import Action, Command, State
 from drocap_ros.flight.orbit.watchdog import Watchdog
 from drocap_ros.observation import PoseObservation
-from drocap_ros.simulation.camera import pinhole_matrix, project, to_camera
-from drocap_ros.simulation.observation import observe_keypoints, occlusion
-from drocap_ros.simulation.person import simulate_person
+from drocap_ros.simulation.keypoint_errors import noisy_keypoints, occlusion
+from drocap_ros.simulation.orbit_camera import pinhole_matrix, project, to_camera
+from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 
@@ -38,7 +38,7 @@ _GROUND = 0.0
 class LoopSettings:
     """One flight.
 
-    action : what the person does, of ``simulation.person.ACTIONS``
+    action : what the person does, of ``simulation.simulated_person.ACTIONS``
     walking_m_s : mean speed of a walking person
     moves_from_s : the person waits until then
     bearing_deg, distance_m, height_m : where the vehicle hovers at the start, seen from the person
@@ -241,7 +241,7 @@ class OrbitLoop:
         inside = np.all((exact >= -0.5) & (exact < np.array([_WIDTH, _HEIGHT]) - 0.5), axis=-1)
         seen = np.where(inside[..., None], exact, np.nan)
         hidden = occlusion(exact, to_camera(joints, rotation, position)[..., 2], self.matrix[0, 0])
-        noisy = observe_keypoints(seen, hidden, self.settings.seed * 1_000_003 + self._frame)
+        noisy = noisy_keypoints(seen, hidden, self.settings.seed * 1_000_003 + self._frame)
         return PoseObservation(
             self.clock_ns(), 1 if np.isfinite(seen).any() else 0, (_WIDTH, _HEIGHT),
             keypoints=noisy.keypoints[0].astype(np.float32), covariance=noisy.covariance[0].astype(np.float32),

@@ -6,8 +6,8 @@ import numpy as np
 
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
-from drocap_ros.simulation.camera import project
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop
+from drocap_ros.simulation.orbit_camera import project
 from drocap_ros.simulation.render.renderer import Renderer
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.simulation.render.scene import FAR_M, NEAR_M, Scene
+from drocap_ros.simulation.render.scenery import FAR_M, NEAR_M, Scenery
 
 #: Distance over which the fine pattern of the ground gives way to the coarse one.
 _FADE_M = 14.0
@@ -13,7 +13,7 @@ _CIRCLE = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.p
 
 
 def draw_background(
-    scene: Scene, matrix: np.ndarray, width: int, height: int, rotation: np.ndarray, position: np.ndarray
+    scene: Scenery, matrix: np.ndarray, width: int, height: int, rotation: np.ndarray, position: np.ndarray
 ) -> np.ndarray:
     """(height, width, 3) uint8 BGR of the place without the person.
 
@@ -29,7 +29,7 @@ def draw_background(
 
 
 def _draw_ground_and_sky(
-    scene: Scene, matrix: np.ndarray, width: int, height: int, rotation: np.ndarray, position: np.ndarray
+    scene: Scenery, matrix: np.ndarray, width: int, height: int, rotation: np.ndarray, position: np.ndarray
 ) -> np.ndarray:
     import cv2
 
@@ -89,7 +89,7 @@ def _ground(
     return np.asarray(cv2.cvtColor(packed.view(np.uint8).reshape(height, width, 4), cv2.COLOR_BGRA2BGR))
 
 
-def _sky(scene: Scene, rise: np.ndarray) -> np.ndarray:
+def _sky(scene: Scenery, rise: np.ndarray) -> np.ndarray:
     """Sky by the height over the horizon, through a table of 256 colours."""
     import cv2
 
@@ -108,14 +108,14 @@ def _seen(
     return (local @ matrix.T)[..., :2] / np.maximum(depth, 1e-3)[..., None], depth
 
 
-def _hazed(scene: Scene, colour: np.ndarray, distance: float, light: float) -> tuple[float, float, float]:
+def _hazed(scene: Scenery, colour: np.ndarray, distance: float, light: float) -> tuple[float, float, float]:
     clear = np.exp(-distance / scene.haze_m)
     mixed = np.clip(colour * light, 0, 255) * clear + scene.horizon * (1 - clear)
     return float(mixed[0]), float(mixed[1]), float(mixed[2])
 
 
 def _draw_trees(
-    scene: Scene, picture: np.ndarray, matrix: np.ndarray, rotation: np.ndarray, position: np.ndarray, light: float
+    scene: Scenery, picture: np.ndarray, matrix: np.ndarray, rotation: np.ndarray, position: np.ndarray, light: float
 ) -> None:
     import cv2
 
@@ -140,7 +140,7 @@ def _draw_trees(
 
 
 def _draw_houses(
-    scene: Scene, picture: np.ndarray, matrix: np.ndarray, rotation: np.ndarray, position: np.ndarray, light: float
+    scene: Scenery, picture: np.ndarray, matrix: np.ndarray, rotation: np.ndarray, position: np.ndarray, light: float
 ) -> None:
     import cv2
 
@@ -163,7 +163,7 @@ def _draw_houses(
 
 
 def draw_shadow(
-    scene: Scene,
+    scene: Scenery,
     picture: np.ndarray,
     ends: np.ndarray,
     reach: np.ndarray,

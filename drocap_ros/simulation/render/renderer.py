@@ -8,7 +8,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.simulation.render.background import draw_background, draw_shadow
 from drocap_ros.simulation.render.body import Look, body, dress
 from drocap_ros.simulation.render.quadrics import Layer, Quadrics, see
-from drocap_ros.simulation.render.scene import Scene, make_scene
+from drocap_ros.simulation.render.scenery import Scenery, make_scenery
 from drocap_ros.skeleton import BODY_15
 
 #: Pictures of more pixels than this get a background of half the resolution.
@@ -40,7 +40,7 @@ class Renderer:
         if not (1 <= width <= _MOST_PX and 1 <= height <= _MOST_PX):
             raise InputError(f"width, height: expected 1 to {_MOST_PX} px, got {width} and {height}; choose a size")
         self.camera_matrix, self.width, self.height = matrix, int(width), int(height)
-        self.scene = make_scene(seed)
+        self.scene = make_scenery(seed)
         self.look = dress(seed)
 
     def picture(self, joints3d: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
@@ -75,7 +75,7 @@ class Renderer:
 
 
 def draw(
-    scene: Scene,
+    scene: Scenery,
     look: Look,
     matrix: np.ndarray,
     width: int,

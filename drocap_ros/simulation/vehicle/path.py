@@ -8,7 +8,7 @@ import numpy as np
 
 from drocap_ros.flight.frames import OPTICAL_FROM_FLU
 from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, slerp
-from drocap_ros.simulation.camera import orbit_camera
+from drocap_ros.simulation.orbit_camera import orbit_camera
 
 
 class VehiclePose(NamedTuple):

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.simulation.camera import look_at, orbit_camera, pinhole_matrix, project, to_camera
-from drocap_ros.simulation.person import ACTIONS, simulate_person
+from drocap_ros.simulation.orbit_camera import look_at, orbit_camera, pinhole_matrix, project, to_camera
 from drocap_ros.simulation.render.body import body, dress
 from drocap_ros.simulation.render.quadrics import cones, ellipsoids, joined, see
 from drocap_ros.simulation.render.renderer import Renderer, draw
-from drocap_ros.simulation.render.scene import make_scene
+from drocap_ros.simulation.render.scenery import make_scenery
+from drocap_ros.simulation.simulated_person import ACTIONS, simulate_person
 from drocap_ros.skeleton import BODY_15
 
 MATRIX = pinhole_matrix(1280, 720, 60)
@@ -88,7 +88,7 @@ def test_a_near_person_drawn_at_half_the_resolution_has_the_same_outline():
     joints, rotation, position = (v[0] for v in orbit(radius_m=2.6))
     surfaces, _ = body(joints, dress(0))
     ends = to_camera(surfaces.ends, rotation[None].repeat(len(surfaces.ends), 0), position[None])
-    _, box = draw(make_scene(0), dress(0), MATRIX, 1280, 720, joints, rotation, position)
+    _, box = draw(make_scenery(0), dress(0), MATRIX, 1280, 720, joints, rotation, position)
     assert np.prod(box[2:] - box[:2]) > 150_000
     turned = surfaces._replace(
         a=rotation @ surfaces.a @ rotation.T,
@@ -152,7 +152,7 @@ def test_front_and_back_differ():
     joints = simulate_person(np.array([0.0]), "stand", 3)
     ahead = np.cross(joints[0, BODY_15.index("lhip")] - joints[0, BODY_15.index("rhip")], [0, 0, 1.0])
     ahead /= np.linalg.norm(ahead)
-    look, scene = dress(3), make_scene(3)
+    look, scene = dress(3), make_scenery(3)
     seen = {}
     for name, sign in (("front", 1), ("back", -1)):
         position = joints[0, 0] + sign * 4 * ahead + np.array([0, 0, 0.6])
@@ -189,7 +189,7 @@ def test_the_same_seed_gives_the_same_picture_and_another_one_another():
 
 def test_the_horizon_lies_where_the_camera_is_level():
     """Sky above, ground below, for a level camera and one that rolls."""
-    scene, look = make_scene(2), dress(2)
+    scene, look = make_scenery(2), dress(2)
     position = np.array([0.0, 0.0, 3.0])
     level = look_at(position[None], np.array([[0.0, 50.0, 3.0]]))[0]
     far = simulate_person(np.array([0.0]), "stand")[0] + np.array([0, -500.0, 0])
@@ -209,7 +209,7 @@ def test_the_horizon_lies_where_the_camera_is_level():
 
 def test_the_ground_keeps_its_place_while_the_camera_moves():
     """A mark of the ground is found at its own projection from two places."""
-    scene = make_scene(4)
+    scene = make_scenery(4)
     side, size = len(scene.near), 24.0
     near = np.full((side, side), 0x00808080, np.uint32)
     near[500:524, 300:324] = 0x000000FF  # pure blue (BGRX)
@@ -243,7 +243,7 @@ def test_a_person_partly_outside_outside_behind_or_at_the_lens_is_drawn_as_far_a
     for away in (sideways, behind, joints + (position - joints[BODY_15.index("head")])):
         picture = renderer.picture(away, rotation, position)
         assert picture.shape == (720, 1280, 3)
-    scene, look = make_scene(0), dress(0)
+    scene, look = make_scenery(0), dress(0)
     for away in (sideways, behind):
         assert draw(scene, look, MATRIX, 1280, 720, away, rotation, position)[1] is None
 

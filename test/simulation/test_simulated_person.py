@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.simulation.person import ACTIONS, action_weights, simulate_person, two_bone
+from drocap_ros.simulation.simulated_person import ACTIONS, action_weights, simulate_person, two_bone
 from drocap_ros.skeleton import BODY_15
 
 T = np.arange(0, 22, 1 / 60)

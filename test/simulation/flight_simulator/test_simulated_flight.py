@@ -6,11 +6,11 @@ import pytest
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.compare import compare, load_truth
 from drocap_ros.motion import load_motion
-from drocap_ros.simulation.camera import look_at, pinhole_matrix
-from drocap_ros.simulation.flight.flight_simulator_config import FlightSimulatorConfig
-from drocap_ros.simulation.flight.truth import FlightTruth, flown_orbit, load_truth_of_flight, save_truth
-from drocap_ros.simulation.flight.world import BEGINS_AFTER_S, FlightWorld, Take
-from drocap_ros.simulation.person import simulate_person
+from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimulatorConfig
+from drocap_ros.simulation.flight_simulator.truth import FlightTruth, flown_orbit, load_flight_truth, save_flight_truth
+from drocap_ros.simulation.flight_simulator.world import BEGINS_AFTER_S, FlightWorld, Take
+from drocap_ros.simulation.orbit_camera import look_at, pinhole_matrix
+from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 
 ON_GROUND, IN_AIR, TAKING_OFF = 1, 2, 3
@@ -116,9 +116,9 @@ def test_the_quality_of_an_orbit_is_what_was_flown():
 
 def test_the_truth_file_is_a_motion_that_can_be_compared(tmp_path):
     truth = orbit_truth()
-    save_truth(tmp_path / "truth.npz", truth)
+    save_flight_truth(tmp_path / "truth.npz", truth)
     assert [path.name for path in tmp_path.iterdir()] == ["truth.npz"]
-    again = load_truth_of_flight(tmp_path / "truth.npz")
+    again = load_flight_truth(tmp_path / "truth.npz")
     for name in ("stamp_ns", "joints3d", "camera_rotation", "camera_position", "camera_matrix", "image_size"):
         np.testing.assert_array_equal(getattr(again, name), getattr(truth, name))
     errors = compare(load_motion(tmp_path / "truth.npz"), *load_truth(tmp_path / "truth.npz"))
@@ -128,4 +128,4 @@ def test_the_truth_file_is_a_motion_that_can_be_compared(tmp_path):
         kept = {name: arrays[name] for name in arrays.files if name != "camera_position"}
     np.savez(tmp_path / "less.npz", **kept)
     with pytest.raises(InputError, match="camera_position"):
-        load_truth_of_flight(tmp_path / "less.npz")
+        load_flight_truth(tmp_path / "less.npz")

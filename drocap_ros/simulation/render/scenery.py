@@ -31,7 +31,7 @@ _SKIES = (  # at the horizon, overhead, share of direct sunlight
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scenery:
     """A place; z = 0 is the ground, m, ENU.
 
     near, far : (S, S) uint32, packed BGRX patterns of the ground that repeat every NEAR_M and FAR_M
@@ -55,7 +55,7 @@ class Scene:
     tree_colours: np.ndarray
 
 
-def make_scene(seed: int) -> Scene:
+def make_scenery(seed: int) -> Scenery:
     """A place; the same seed gives the same."""
     rng = np.random.default_rng([seed, 0x5CE])
     base, contrast, patch = _GROUNDS[rng.integers(len(_GROUNDS))]
@@ -68,7 +68,7 @@ def make_scene(seed: int) -> Scene:
     houses, house_colours = _houses(rng, int(rng.integers(2, 9)))
     trees, tree_colours = _trees(rng, int(rng.integers(6, 26)))
     far_colour = near.reshape(-1, 3).mean(axis=0)
-    return Scene(
+    return Scenery(
         _packed(near), _packed(_pattern(rng, _FAR_PX, far_colour, 12.0, 24)),
         np.array(horizon, float), np.array(zenith, float), sun, sunlight,
         float(rng.uniform(60, 220)), houses, house_colours, trees, tree_colours,

@@ -19,7 +19,7 @@ _OCCLUDED_NOISE = 2.2
 _CHUNK = 4096
 
 
-class Observation(NamedTuple):
+class NoisyKeypoints(NamedTuple):
     """Keypoints (F, P, 2) px, confidence (F, P), covariance (F, P, 3) px^2 and what was done to them (F, P) bool."""
 
     keypoints: np.ndarray
@@ -51,7 +51,7 @@ def occlusion(px: np.ndarray, depth: np.ndarray, focal_px: float, joint_set: Joi
     return hidden
 
 
-def observe_keypoints(
+def noisy_keypoints(
     px: np.ndarray,
     occluded: np.ndarray | None = None,
     seed: int = 0,
@@ -60,7 +60,7 @@ def observe_keypoints(
     outlier_fraction: float = 0.03,
     missed_fraction: float = 0.015,
     joint_set: JointSet = BODY_15,
-) -> Observation:
+) -> NoisyKeypoints:
     """Keypoints as a detector would report them.
 
     Noise is proportional to the height of the person's box, larger for wrists, ankles and occluded joints, and
@@ -105,7 +105,7 @@ def observe_keypoints(
     keypoints = np.where(missed[..., None], np.nan, keypoints)
     covariance = np.where(missed[..., None], np.nan, covariance)
     confidence = np.where(missed, 0.0, confidence)
-    return Observation(keypoints, confidence, covariance, hidden, outlier & ~missed)
+    return NoisyKeypoints(keypoints, confidence, covariance, hidden, outlier & ~missed)
 
 
 def _box_height(px: np.ndarray) -> np.ndarray:

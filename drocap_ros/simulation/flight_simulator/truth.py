@@ -14,7 +14,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.motion import Motion, load_motion, save_motion
-from drocap_ros.simulation.camera import project
+from drocap_ros.simulation.orbit_camera import project
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import read_npz
 
@@ -45,7 +45,7 @@ class FlightTruth:
         return project(self.joints3d, self.camera_rotation, self.camera_position, self.camera_matrix)
 
 
-def save_truth(path: Path, truth: FlightTruth) -> None:
+def save_flight_truth(path: Path, truth: FlightTruth) -> None:
     """Write the file; it appears whole or not at all."""
     frames, joints = truth.joints3d.shape[:2]
     motion = Motion(
@@ -65,8 +65,8 @@ def save_truth(path: Path, truth: FlightTruth) -> None:
         work.unlink(missing_ok=True)
 
 
-def load_truth_of_flight(path: Path) -> FlightTruth:
-    """Read what :func:`save_truth` wrote.
+def load_flight_truth(path: Path) -> FlightTruth:
+    """Read what :func:`save_flight_truth` wrote.
 
     Raises
     ------

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from drocap_ros.parameters import Parameters, param
-from drocap_ros.simulation.person import ACTIONS
+from drocap_ros.simulation.simulated_person import ACTIONS
 
 _SIMULATED_AUTOPILOTS = ("ardupilot", "px4")
 
