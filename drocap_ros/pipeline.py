@@ -21,7 +21,9 @@ from drocap_ros.perception.track_video import observe, tracks_from_observations
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording import session_reader
 from drocap_ros.recording.session import is_recording, open_session
-from drocap_ros.recording.telemetry.read import TelemetryLog, read_telemetry
+from drocap_ros.recording.telemetry.camera_poses import with_camera
+from drocap_ros.recording.telemetry.log import TelemetryLog
+from drocap_ros.recording.telemetry.read import read_telemetry
 from drocap_ros.recording.telemetry.time_offset import find_offset
 from drocap_ros.tracks import Tracks, load_tracks
 
@@ -106,12 +108,11 @@ def _with_telemetry(
         raise InputError(f"--telemetry: expected a video file as input, found {path}; recordings hold their telemetry")
     pitch = telemetry.mount_pitch_deg
     offset = find_offset(path, log, telemetry.time_offset_s, pitch, progress)
-    logger.warning("%s: %s; time offset %.2f s, %s", telemetry.path, log.kind, offset.seconds, offset.source)
-    for text in (*(f"the log tells {lack}" for lack in log.lacks), offset.warning):
-        if text:
-            logger.warning("%s: %s", telemetry.path, text)
+    logger.warning("%s: %s; %s", telemetry.path, log.kind, offset)
+    for lack in log.lacks:
+        logger.warning("%s: %s", telemetry.path, lack)
     at_ns = tracks.stamp_ns - tracks.stamp_ns[0] + int(log.track.stamp_ns[0]) + round(offset.seconds * 1e9)
-    tracks, reason = session_reader.with_camera(tracks, log.track, at_ns, pitch)
+    tracks, reason = with_camera(tracks, log.track, at_ns, pitch)
     if reason:
         logger.warning("%s: camera telemetry incomplete: %s", telemetry.path, reason)
     return tracks

@@ -94,6 +94,12 @@ def quaternion_from_matrix(r: np.ndarray) -> np.ndarray:
     return q / np.linalg.norm(q, axis=-1, keepdims=True)
 
 
+def unit_quaternions(q: np.ndarray) -> np.ndarray:
+    """Normalized quaternions (N, 4); NaN where the length differs from 1 by more than a tenth."""
+    length = np.linalg.norm(q, axis=1, keepdims=True)
+    return np.where(np.abs(length - 1.0) < 0.1, q / np.where(length > 0, length, 1.0), np.nan)
+
+
 def slerp(q0: np.ndarray, q1: np.ndarray, s: np.ndarray | float) -> np.ndarray:
     """Spherical interpolation (..., 4) from ``q0`` (s = 0) to ``q1`` (s = 1) along the shorter arc; x y z w."""
     q0 = q0 / np.linalg.norm(q0, axis=-1, keepdims=True)

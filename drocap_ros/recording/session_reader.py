@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.geometry.rotations import unit_quaternions
 from drocap_ros.recording.pictures import image_from_message
 from drocap_ros.recording.session import (
     CAMERA_INFO,
@@ -24,7 +24,8 @@ from drocap_ros.recording.session import (
     is_recording,
     open_session,
 )
-from drocap_ros.recording.telemetry.camera_poses import VehicleTrack, camera_poses
+from drocap_ros.recording.telemetry.camera_poses import with_camera
+from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack
 from drocap_ros.skeleton import joint_set
 from drocap_ros.tracks import MAX_FRAMES, Tracks
 
@@ -41,7 +42,6 @@ __all__ = [
     "read_pose2d",
     "read_vehicle_track",
     "session_info",
-    "with_camera",
 ]
 
 
@@ -105,27 +105,6 @@ def read_pose2d(session: Session, topic: str | None = None, mount_pitch_deg: flo
         raise InputError(f"{session.path}: {chosen.name}: {error}") from None
 
 
-def with_camera(
-    tracks: Tracks, vehicle: VehicleTrack, at_ns: np.ndarray, mount_pitch_deg: float | None = None
-) -> tuple[Tracks, str]:
-    """Tracks with the camera's pose at each picture, and in words what is missing.
-
-    Pictures at the start or end for which the vehicle's states tell nothing are left out, if most remain; see
-    :func:`drocap_ros.recording.telemetry.camera_poses.camera_poses`.
-
-    Parameters
-    ----------
-    at_ns : (F,) times of the pictures by the clock of the vehicle's states
-    """
-    poses = camera_poses(vehicle, at_ns, mount_pitch_deg)
-    arrays: dict[str, Any] = {}
-    for name in ("keypoints", "stamp_ns", "confidence", "covariance"):
-        value = getattr(tracks, name)
-        arrays[name] = None if value is None else value[poses.keep]
-    changed = dataclasses.replace(tracks, **arrays, camera_rotation=poses.rotation, camera_position=poses.position)
-    return changed, poses.reason
-
-
 def read_images(session: Session, topic: str | None = None) -> Iterator[Frame]:
     """Pictures of a recording, one at a time, with strictly increasing stamps.
 
@@ -179,7 +158,7 @@ def read_vehicle_track(session: Session, near: str = "") -> VehicleTrack | None:
         return None
     stamps = sorted(rows)
     position, orientation, gimbal = (np.array([rows[s][i] for s in stamps]) for i in range(3))
-    return VehicleTrack(np.array(stamps, dtype=np.int64), position, _unit(orientation), _unit(gimbal))
+    return VehicleTrack(np.array(stamps, dtype=np.int64), position, unit_quaternions(orientation), unit_quaternions(gimbal))
 
 
 def _pose_arrays(messages: list[Any]) -> dict[str, Any]:
@@ -251,8 +230,3 @@ def _stamp_ns(message: Any) -> int:
 def _xyzw(quaternion: Any) -> np.ndarray:
     return np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], dtype=np.float64)
 
-
-def _unit(quaternions: np.ndarray) -> np.ndarray:
-    """(N, 4) normalized; NaN where they are no rotations."""
-    length = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return np.where(np.abs(length - 1.0) < 0.1, quaternions / np.where(length > 0, length, 1.0), np.nan)

@@ -100,7 +100,7 @@ def test_without_a_gimbal_the_rotation_is_not_invented(tmp_path, messages, captu
         tracks = read_pose2d(session)
         assert tracks.camera_rotation is None
         assert tracks.camera_position is not None
-        assert any("tell no gimbal" in warning for warning in session.warnings)
+        assert any("hold no gimbal" in warning for warning in session.warnings)
 
 
 def test_camera_fixed_to_the_body_at_a_told_pitch(tmp_path, messages, capture):
@@ -138,7 +138,7 @@ def test_telemetry_that_starts_late(tmp_path, messages, capture):
     record(tmp_path / "b", flight_entries(messages, capture, start_s=3.0))
     with open_session(tmp_path / "a") as session:
         tracks = read_pose2d(session)
-        assert any("27 pictures at the start or end lie up to 1.0 s" in w for w in session.warnings)
+        assert any("27 images at the start or end are up to 1.0 s" in w for w in session.warnings)
     assert np.array_equal(tracks.stamp_ns, capture.tracks.stamp_ns[27:])
     assert np.array_equal(tracks.keypoints, capture.tracks.keypoints[27:].astype(np.float32), equal_nan=True)
     error = np.rad2deg(angle_between(tracks.camera_rotation, capture.camera_rotation[27:]))

@@ -17,7 +17,7 @@ from drocap_ros.flight.orbit.safety import State
 from drocap_ros.motion import load_motion
 from drocap_ros.recording.session import open_session
 from drocap_ros.recording.session_reader import read_vehicle_track
-from drocap_ros.recording.telemetry.camera_poses import interpolate
+from drocap_ros.recording.telemetry.vehicle_track import interpolate
 from drocap_ros.simulation.flight_simulator.truth import flown_orbit, load_flight_truth
 
 

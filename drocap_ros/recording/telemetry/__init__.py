@@ -1,1 +1,1 @@
-"""Telemetry logs beside a video or in a session, as camera poses."""
+"""Telemetry logs beside a video, and states of the vehicle as camera poses."""

@@ -11,10 +11,10 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import geodetic_to_enu, orientation_to_ros, quaternion_from_euler
-from drocap_ros.recording.telemetry.read import BOOT, TelemetryLog, at_stamps, make_log
+from drocap_ros.recording.telemetry.log import Clock, Lack, LogLack, TelemetryLog, at_stamps, make_log
 
 _EARLIEST_UTC_S = 1e9
-#: message -> fields that are read of it
+#: message -> fields used
 _FIELDS = {
     "ATT": ("Roll", "Pitch", "Yaw"),
     "POS": ("Lat", "Lng", "Alt"),
@@ -23,21 +23,21 @@ _FIELDS = {
 
 
 def read_dataflash(path: Path) -> TelemetryLog:
-    """Attitude (ATT), position (POS) and mount (MNT), counted from power-up; UTC from the GPS.
+    """Attitude (ATT), position (POS) and mount (MNT) by time since power-up; UTC from the GPS.
 
     Raises
     ------
     InputError
-        When the file cannot be read, is no DataFlash log, or tells no attitude.
+        When the file cannot be read, is no DataFlash log, or holds no attitude.
     """
     with path.open("rb") as file:
         if file.read(2) != b"\xa3\x95":
             raise InputError(f"{path}: expected an ArduPilot DataFlash log, found other content at its start")
     rows: dict[str, list[tuple[float, ...]]] = {name: [] for name in _FIELDS}
     utc_us: list[float] = []
-    lacks: list[str] = []
+    lacks: list[LogLack] = []
     try:
-        # pymavlink prints what it thinks of a damaged file.
+        # pymavlink prints remarks on damaged files.
         with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
             for message in _messages(path):
                 name = message.get_type()
@@ -45,11 +45,11 @@ def read_dataflash(path: Path) -> TelemetryLog:
                 rows[name].append((float(message.TimeUS), *values))
                 if name == "ATT" and message._timestamp > _EARLIEST_UTC_S:
                     utc_us.append(message._timestamp * 1e6 - message.TimeUS)
-    except Exception as error:  # pymavlink lets through what its parsing raises
+    except Exception as error:  # pymavlink passes on any error of its parser
         if not rows["ATT"]:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError(f"{path}: expected an ArduPilot DataFlash log that can be read; {reason}") from None
-        lacks.append("the log is damaged: read as far as it goes")
+        lacks.append(LogLack(Lack.DAMAGED))
     if not rows["ATT"]:
         raise InputError(f"{path}: expected ATT messages of an ArduPilot log, found none; is it a DataFlash .bin?")
     stamp_ns, angles = _series(rows["ATT"])
@@ -60,19 +60,19 @@ def read_dataflash(path: Path) -> TelemetryLog:
         if fixed.any():
             enu = geodetic_to_enu(geodetic, geodetic[fixed][0])
             position = at_stamps(known_ns[fixed], enu[fixed], stamp_ns, spherical=False)
-            lacks.append("no local position: metres count from the first global one")
+            lacks.append(LogLack(Lack.LOCAL_POSITION, "POS"))
     if rows["MNT"]:
         known_ns, mount = _series(rows["MNT"])
         camera = orientation_to_ros(quaternion_from_euler(*np.deg2rad(mount).T).T)
         if np.isfinite(camera).all(axis=1).any():
             gimbal = at_stamps(known_ns, camera, stamp_ns, spherical=True)
         else:
-            lacks.append("the mount's yaw is not told against north (MNT.YawE)")
+            lacks.append(LogLack(Lack.MOUNT_YAW, "MNT.YawE"))
     return make_log(
         path,
         "ArduPilot DataFlash log",
         stamp_ns,
-        clock=BOOT,
+        clock=Clock.BOOT,
         orientation=orientation_to_ros(quaternion_from_euler(*np.deg2rad(angles).T).T),
         position=position,
         gimbal=gimbal,
@@ -85,7 +85,7 @@ def _messages(path: Path) -> Any:
     from pymavlink.DFReader import DFReader_binary
 
     class Reader(DFReader_binary):
-        # The compiled index writes a line to the terminal for every byte that it does not understand.
+        # The compiled index prints a line for every byte that it cannot parse.
         def init_arrays_fast(self, progress_callback: Any = None) -> None:
             self.init_arrays(progress_callback=progress_callback)
 

@@ -1,7 +1,7 @@
 """States of the camera from the subtitles that a DJI drone writes beside its video.
 
-Known forms: bracketed ``[latitude: 47.3] [rel_alt: 10.0 abs_alt: 450.1] [gb_yaw: 12.3 gb_pitch: -20.0 gb_roll: 0.0]``;
-``F_PRY (..°, ..°, ..°), G_PRY (..)`` (flight and gimbal pitch, roll, yaw); and the older
+Supported forms: bracketed ``[latitude: 47.3] [rel_alt: 10.0 abs_alt: 450.1] [gb_yaw: 12.3 gb_pitch: -20.0
+gb_roll: 0.0]``; ``F_PRY (..°, ..°, ..°), G_PRY (..)`` (flight and gimbal pitch, roll, yaw); and the older
 ``GPS(lon,lat,n) BAROMETER:20.5``.
 """
 
@@ -16,10 +16,12 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import geodetic_to_enu, orientation_to_ros, quaternion_from_euler
-from drocap_ros.recording.telemetry.read import VIDEO, TelemetryLog, make_log
+from drocap_ros.recording.telemetry.log import Clock, Lack, LogLack, TelemetryLog, make_log
 from drocap_ros.tracks import MAX_FRAMES
 
 _LINE = 8192
+#: Sources of a height, the preferred one first.
+_HEIGHTS = ("rel_alt", "barometer", "abs_alt", "altitude")
 _NUMBER = r"([-+]?\d{1,10}(?:\.\d{1,12})?)"
 _TIME = re.compile(r"(\d{1,3}):(\d{2}):(\d{2})[,.](\d{1,3})\s*-->")
 _VALUE = re.compile(
@@ -63,19 +65,19 @@ def read_srt(path: Path) -> TelemetryLog:
     geodetic[impossible | nowhere] = np.nan
     fixed = np.isfinite(geodetic).all(axis=1)
     position = None
-    lacks = []
+    lacks: list[LogLack] = []
     if fixed.any():
         origin = geodetic[fixed][0].copy()
         if heights == "rel_alt":
-            origin[2] = 0.0  # heights count from the place of take-off
+            origin[2] = 0.0  # rel_alt is the height above take-off
         else:
-            lacks.append(f"no height above take-off: heights count from the first {heights}")
+            lacks.append(LogLack(Lack.HEIGHT, heights))
         position = geodetic_to_enu(geodetic, origin)
     return make_log(
         path,
         "DJI subtitles",
         stamps,
-        clock=VIDEO,
+        clock=Clock.VIDEO,
         orientation=_attitude([e.body for e in entries]),
         position=position,
         gimbal=_attitude([e.gimbal for e in entries]),
@@ -109,8 +111,7 @@ def _entries(path: Path) -> tuple[list[_Entry], str]:
     except OSError as error:
         raise InputError(f"{path}: expected a readable file; {error.strerror}") from None
     _add(entries, kinds, stamp_ns, text)
-    order = ("rel_alt", "barometer", "abs_alt", "altitude", "height")
-    return entries, next((kind for kind in order if kind in kinds), "height")
+    return entries, next((kind for kind in _HEIGHTS if kind in kinds), "height")
 
 
 def _add(entries: list[_Entry], kinds: set[str], stamp_ns: int | None, text: str) -> None:
@@ -128,13 +129,12 @@ def _add(entries: list[_Entry], kinds: set[str], stamp_ns: int | None, text: str
     barometer = _BAROMETER.search(text)
     if barometer is not None:
         heights["barometer"] = float(barometer[1] or barometer[2])
-    order = ("rel_alt", "barometer", "abs_alt", "altitude")
-    kind = next((name for name in order if name in heights), None)
+    kind = next((name for name in _HEIGHTS if name in heights), None)
     gimbal = angles.get("G", _UNKNOWN)
     if "gb_yaw" in values and "gb_pitch" in values:
         gimbal = (values["gb_pitch"], values.get("gb_roll", 0.0), values["gb_yaw"])
     if kind is None and not angles and math.isnan(gimbal[0]):
-        return  # a subtitle of something else
+        return  # a subtitle without telemetry
     if kind is not None:
         kinds.add(kind)
     height = heights[kind] if kind is not None else math.nan

@@ -1,15 +1,17 @@
-"""Where a video lies on the clock of the telemetry log beside it.
+"""Time offset between a video and the telemetry log beside it.
 
-The offset is the time from the log's first state to the video's first picture.  In this order: told by the user;
-known, where the log counts by the video (DJI subtitles); found by comparing how the image moves sideways with how
-the log says the camera turned; taken from the container's creation time, which is good to a second at best.  A
-camera that turns evenly, or not at all, cannot be placed by its turning: then the offset must be told.
+The offset is the time from the log's first state to the video's first image.  Its sources, in this order: the user;
+the log itself, where its clock is the video's (DJI subtitles); the correlation of the image's sideways motion with the
+camera's turning in the log; the container's creation time, accurate to a second at best.  A camera that turns evenly,
+or not at all, allows no correlation: without a creation time the user must give the offset.
 """
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
+from enum import Enum
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -17,19 +19,20 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import camera_rotation
-from drocap_ros.recording.telemetry.camera_poses import VehicleTrack, camera_attitude, interpolate
-from drocap_ros.recording.telemetry.read import VIDEO, TelemetryLog
+from drocap_ros.recording.telemetry.camera_poses import camera_attitude
+from drocap_ros.recording.telemetry.log import Clock, TelemetryLog
+from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack, interpolate
 
-#: Rate at which the two turnings are compared.
+#: Sampling rate of the correlation.
 RATE_HZ = 10.0
-#: As much of a video is looked at.
+#: Part of a video, from its start, that is used.
 MAX_VIDEO_S = 180.0
 MIN_VIDEO_S = 5.0
-#: Least correlation, and least distance from the next best place.
+#: Least correlation, and its least lead over the second best offset.
 MIN_CORRELATION, MIN_LEAD = 0.7, 0.1
-#: The log must say that the camera turned unevenly by at least so much, standard deviation.
+#: Least standard deviation of the camera's turning rate in the log.
 MIN_TURN_DEG_S = 1.5
-#: The container's time may be off by so much; within it the turning decides.
+#: Largest error of the container's creation time; the correlation searches within it.
 CREATION_SLACK_S = 5.0
 _WIDTH = 160
 _MP4_EPOCH_S = 2_082_844_800  # 1904 to 1970
@@ -37,18 +40,37 @@ _MP4_EPOCH_S = 2_082_844_800  # 1904 to 1970
 Progress = Callable[[str, float], None]
 
 
+class OffsetSource(Enum):
+    """Source of a time offset; the value is its text."""
+
+    GIVEN = "as given"
+    VIDEO_CLOCK = "the log's clock is the video's"
+    CORRELATION = "by the camera's turning"
+    CREATION_TIME = (
+        "by the container's creation time, accurate to a second at best, which at 25 deg/s is 25 deg of camera"
+        " rotation; give --time-offset"
+    )
+
+
 class TimeOffset(NamedTuple):
-    """Seconds from the log's first state to the video's first picture, how it is known, and what to say of it."""
+    """Seconds from the log's first state to the video's first image, and their source.
+
+    correlation : of the camera's turning with the image's motion; NaN for other sources
+    """
 
     seconds: float
-    source: str
-    warning: str
+    source: OffsetSource
+    correlation: float = math.nan
+
+    def __str__(self) -> str:
+        found = "" if math.isnan(self.correlation) else f" (correlation {self.correlation:.2f})"
+        return f"time offset {self.seconds:.2f} s, {self.source.value}{found}"
 
 
 def find_offset(
     video: Path,
     log: TelemetryLog,
-    told_s: float | None,
+    given_s: float | None,
     mount_pitch_deg: float | None = None,
     progress: Progress | None = None,
 ) -> TimeOffset:
@@ -57,29 +79,24 @@ def find_offset(
     Raises
     ------
     InputError
-        When it is not told and cannot be found.
+        When it is not given and cannot be estimated.
     """
-    if told_s is not None:
-        return TimeOffset(told_s, "told", "")
-    if log.clock == VIDEO:
-        return TimeOffset(0.0 - float(log.track.stamp_ns[0]) * 1e-9, "the log counts by the video", "")
+    if given_s is not None:
+        return TimeOffset(given_s, OffsetSource.GIVEN)
+    if log.clock is Clock.VIDEO:
+        return TimeOffset(0.0 - float(log.track.stamp_ns[0]) * 1e-9, OffsetSource.VIDEO_CLOCK)
     created_s = _offset_by_creation(video, log)
     moved = image_motion(video, progress)
     found = correlate_turning(log.track, *moved, mount_pitch_deg, near_s=created_s)
     if found is not None:
         seconds, correlation = found
-        return TimeOffset(seconds, f"the camera's turning (correlation {correlation:.2f})", "")
+        return TimeOffset(seconds, OffsetSource.CORRELATION, correlation)
     if created_s is not None:
-        return TimeOffset(
-            created_s,
-            "the container's creation time",
-            "the time offset is known to a second at best, which at 25 deg/s is 25 deg of camera rotation; give"
-            " --time-offset",
-        )
+        return TimeOffset(created_s, OffsetSource.CREATION_TIME)
     raise InputError(
         f"{video}: expected a time offset between the video and the log, found no way to estimate it (the camera turned"
         " too evenly or too little, or the log does not cover the video; no usable creation time); give"
-        " --time-offset S, the seconds from the log's first state to the video's first picture"
+        " --time-offset S, the seconds from the log's first state to the video's first image"
     )
 
 
@@ -88,12 +105,12 @@ def _offset_by_creation(video: Path, log: TelemetryLog) -> float | None:
     if created_ns is None or log.utc_minus_stamp_ns is None:
         return None
     seconds = (created_ns - log.utc_minus_stamp_ns - int(log.track.stamp_ns[0])) * 1e-9
-    # A camera that was set to local time, or never set, lies far outside the flight.
+    # A camera clock in local time, or never set, gives a time far outside the flight.
     return seconds if -CREATION_SLACK_S <= seconds <= log.duration_s else None
 
 
 def creation_time_ns(video: Path) -> int | None:
-    """Creation time (UTC ns) that an MP4 or MOV container tells in its ``mvhd`` box, None where it tells none."""
+    """Creation time (UTC ns) in the ``mvhd`` box of an MP4 or MOV container, None where there is none."""
     try:
         with video.open("rb") as file:
             size = file.seek(0, 2)
@@ -112,10 +129,10 @@ def creation_time_ns(video: Path) -> int | None:
 
 
 def _find_box(file: IO[bytes], start: int, end: int, names: tuple[bytes, ...]) -> int | None:
-    """Place of the content of a nested box."""
-    place, looked = start, 0
-    while place + 8 <= end and looked < 1000:
-        looked += 1
+    """Offset of the content of a nested box."""
+    place, boxes = start, 0
+    while place + 8 <= end and boxes < 1000:
+        boxes += 1
         file.seek(place)
         head = file.read(16)
         if len(head) < 8:
@@ -136,10 +153,10 @@ def _find_box(file: IO[bytes], start: int, end: int, names: tuple[bytes, ...]) -
 
 
 def image_motion(video: Path, progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Times (N,) s from the first picture and sideways motion (N,) of the image, widths per second, right positive.
+    """Times (N,) s from the first image and sideways motion (N,) of the image, widths per second, right positive.
 
-    By phase correlation of small grey pictures ``RATE_HZ`` apart: the background, which fills most of the picture,
-    decides.
+    Phase correlation of small grey images at ``RATE_HZ`` measures the motion of the background, which fills most of
+    the image.
     """
     import cv2
 
@@ -174,9 +191,9 @@ def image_motion(video: Path, progress: Progress | None = None) -> tuple[np.ndar
 
 
 def turning_rate(track: VehicleTrack, mount_pitch_deg: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Times (M,) s from the log's first state and turning (M,) rad/s to the left of the camera, or of the body.
+    """Times (M,) s from the log's first state and turning rate (M,) rad/s, left positive, of the camera.
 
-    A camera whose mount is not told still turns with the vehicle.
+    Without a camera attitude the body's turning rate replaces it.
     """
     attitude = camera_attitude(track, mount_pitch_deg)
     if not np.isfinite(attitude).all(axis=1).any():
@@ -201,14 +218,14 @@ def correlate_turning(
     mount_pitch_deg: float | None = None,
     near_s: float | None = None,
 ) -> tuple[float, float] | None:
-    """Offset in s at which the image's motion fits the log's turning best, and the correlation there.
+    """Offset in s with the highest correlation of the image's motion with the log's turning, and that correlation.
 
-    None where no place fits clearly better than all others; the log must cover the video.
+    None where no offset is clearly better than all others; the log must cover the video.
 
     Parameters
     ----------
     times, motion : (N,) of :func:`image_motion`
-    near_s : only places within ``CREATION_SLACK_S`` of this one
+    near_s : only offsets within ``CREATION_SLACK_S`` of this one
     """
     log_t, turning = turning_rate(track, mount_pitch_deg)
     if len(times) < 2 or times[-1] - times[0] < MIN_VIDEO_S or len(turning) < 2:
@@ -227,7 +244,7 @@ def correlate_turning(
     product = np.correlate(y, x, mode="valid") / n
     enough = variance > np.deg2rad(MIN_TURN_DEG_S) ** 2
     fit = np.where(enough, product / np.sqrt(np.maximum(variance * np.mean(x * x), 1e-30)), -1.0)
-    # Windows with a gap in the log tell nothing.
+    # Windows with gaps in the log are excluded.
     holes = np.concatenate([[0], np.cumsum(~np.isfinite(turning))])
     fit[holes[n:] - holes[:-n] > 0.1 * n] = -1.0
     offset = log_t[0] + np.arange(len(fit)) / RATE_HZ - grid[0]
@@ -247,7 +264,7 @@ def _smooth(values: np.ndarray) -> np.ndarray:
 
 
 def _peak(fit: np.ndarray, best: int) -> float:
-    """Place of the parabola's top through three neighbours, in steps from the middle one."""
+    """Vertex of the parabola through three neighbours, in steps from the middle one."""
     if not 0 < best < len(fit) - 1:
         return 0.0
     a, b, c = fit[best - 1 : best + 2]

@@ -1,33 +1,38 @@
-"""States of the vehicle from a MAVLink ``.tlog``, by the estimator that serves the live link."""
+"""States of the vehicle from a MAVLink ``.tlog``, through the estimator of the live link."""
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from drocap_ros.recording.telemetry.read import UTC, TelemetryLog, make_log
-from drocap_ros.recording.telemetry.tlog_packets import read_tlog
+from drocap_ros.errors import InputError
+from drocap_ros.recording.telemetry.log import Clock, TelemetryLog, make_log
 
 _MIN_UTC_NS = 1_000_000_000 * 10**9
+_EARLIEST_US, _LATEST_US = 0, 4_102_444_800_000_000  # to the year 2100
+_MAGIC_V1, _MAGIC_V2 = 0xFE, 0xFD
+_CHUNK = 1 << 20
 
 
-def read_tlog_track(path: Path) -> TelemetryLog:
+def read_tlog(path: Path) -> TelemetryLog:
     """Attitude, position and gimbal of the first autopilot in the log, by the ground station's clock.
 
     Raises
     ------
     InputError
-        When the file cannot be read, is no tlog, or tells no attitude.
+        When the file cannot be read, is no tlog, or holds no attitude.
     """
-    from drocap_ros.errors import InputError
     from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
 
     estimator, rows = VehicleStateEstimator(), []
-    for message, received_ns in read_tlog(path):
+    for message, received_ns in tlog_messages(path):
         try:
             state = estimator.update(message, received_ns)
-        except (ArithmeticError, ValueError):  # a damaged message that decodes all the same
+        except (ArithmeticError, ValueError):  # a damaged message that decodes nevertheless
             continue
         if state is not None:
             rows.append((state.stamp_ns, state.position_enu_m, state.orientation_xyzw, state.gimbal_orientation_xyzw))
@@ -38,10 +43,69 @@ def read_tlog_track(path: Path) -> TelemetryLog:
         path,
         "MAVLink tlog",
         stamps,
-        clock=UTC,
+        clock=Clock.UTC,
         orientation=orientation,
         position=position,
         gimbal=gimbal,
-        # A ground station without a clock begins at 1970.
+        # A ground station without a clock starts at 1970.
         utc_minus_stamp_ns=0 if stamps[0] > _MIN_UTC_NS else None,
     )
+
+
+def tlog_messages(path: str | Path) -> Iterator[tuple[Any, int]]:
+    """Messages of a log with their times of reception, ns; damaged parts are skipped.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read or holds no MAVLink message.
+    """
+    from drocap_ros.flight.mavlink.parser import MavlinkParser
+
+    path = Path(path)
+    parser, found = MavlinkParser(), False
+    try:
+        with path.open("rb") as file:
+            for stamp_us, packet in _packets(file):
+                for message in parser.feed(packet):
+                    found = True
+                    yield message, stamp_us * 1000
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the path") from None
+    except OSError as error:
+        raise InputError(f"{path}: expected a readable file; {error.strerror}") from None
+    if not found:
+        raise InputError(f"{path}: expected a MAVLink telemetry log, found no message in it; is it a .tlog?")
+
+
+def _packets(file: Any) -> Iterator[tuple[int, bytes]]:
+    """(time us, packet); in the file each packet follows its time, a big-endian 64-bit number."""
+    data = b""
+    while True:
+        more = file.read(_CHUNK)
+        data += more
+        place = 0
+        while True:
+            length = _packet_length(data, place)
+            if length is None:
+                break
+            if length == 0:
+                place += 1
+                continue
+            yield struct.unpack_from(">Q", data, place)[0], data[place + 8 : place + 8 + length]
+            place += 8 + length
+        data = data[place:]
+        if not more:
+            return
+
+
+def _packet_length(data: bytes, place: int) -> int | None:
+    """Length of the packet whose time is at ``place``; 0 when there is none, None when more data is needed."""
+    if len(data) < place + 8 + 3:
+        return None
+    stamp_us = struct.unpack_from(">Q", data, place)[0]
+    magic, payload, flags = data[place + 8], data[place + 9], data[place + 10]
+    if not _EARLIEST_US < stamp_us < _LATEST_US or magic not in (_MAGIC_V1, _MAGIC_V2):
+        return 0
+    length = payload + (8 if magic == _MAGIC_V1 else 12 + (13 if flags & 1 else 0))
+    return length if len(data) >= place + 8 + length else None

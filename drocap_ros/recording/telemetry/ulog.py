@@ -12,7 +12,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import geodetic_to_enu, ned_to_enu, orientation_to_ros, quaternion_multiply, yaw_of
-from drocap_ros.recording.telemetry.read import BOOT, TelemetryLog, at_stamps, make_log
+from drocap_ros.recording.telemetry.log import Clock, Lack, LogLack, TelemetryLog, at_stamps, make_log
 
 _TOPICS = (
     "vehicle_attitude", "vehicle_local_position", "vehicle_global_position", "gimbal_device_attitude_status",
@@ -24,23 +24,23 @@ _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
 
 
 def read_ulog(path: Path) -> TelemetryLog:
-    """Attitude (``vehicle_attitude``), position and gimbal, counted from power-up; UTC from the GPS.
+    """Attitude (``vehicle_attitude``), position and gimbal by time since power-up; UTC from the GPS.
 
     Raises
     ------
     InputError
-        When the file cannot be read, is no ULog, or tells no attitude.
+        When the file cannot be read, is no ULog, or holds no attitude.
     """
     try:
         from pyulog import ULog
     except ImportError:
         raise InputError(f"{path}: expected the package pyulog to read it, found none; pip install pyulog") from None
     try:
-        # pyulog prints what it thinks of a damaged file.
+        # pyulog prints remarks on damaged files.
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             log = ULog(str(path), list(_TOPICS), disable_str_exceptions=True)
-    except Exception as error:  # pyulog lets through what its parsing raises
+    except Exception as error:  # pyulog passes on any error of its parser
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{path}: expected a PX4 ULog that can be read; {reason}") from None
     try:
@@ -57,25 +57,25 @@ def _to_log(path: Path, log: Any) -> TelemetryLog:
     attitude = series.get("vehicle_attitude")
     if attitude is None or not len(attitude["timestamp"]):
         raise InputError(f"{path}: expected vehicle_attitude in the ULog, found none; log it")
-    lacks = [] if not log.dropouts else [f"{len(log.dropouts)} dropouts: parts of the flight were not logged"]
+    lacks = [LogLack(Lack.DROPOUTS, str(len(log.dropouts)))] if log.dropouts else []
     stamp_ns = _stamps(attitude)
     frd_to_ned = _quaternion(attitude, "q")
-    position, words = _position(series, stamp_ns)
+    position, position_lacks = _position(series, stamp_ns)
     return make_log(
         path,
         "PX4 ULog",
         stamp_ns,
-        clock=BOOT,
+        clock=Clock.BOOT,
         orientation=orientation_to_ros(frd_to_ned),
         position=position,
         gimbal=_gimbal(series, stamp_ns, frd_to_ned),
         utc_minus_stamp_ns=_utc(series),
-        lacks=(*lacks, *words),
+        lacks=(*lacks, *position_lacks),
     )
 
 
-def _position(series: dict[str, Any], stamp_ns: np.ndarray) -> tuple[np.ndarray | None, list[str]]:
-    """(N, 3) m ENU: the estimator's local position where it calls it valid, else its global one, else the GPS's."""
+def _position(series: dict[str, Any], stamp_ns: np.ndarray) -> tuple[np.ndarray | None, list[LogLack]]:
+    """(N, 3) m ENU: the estimator's local position where valid, else its global one, else the GPS's."""
     local = series.get("vehicle_local_position")
     if local is not None and len(local["timestamp"]):
         ned = np.stack([local[axis] for axis in "xyz"], axis=1).astype(np.float64)
@@ -92,8 +92,7 @@ def _position(series: dict[str, Any], stamp_ns: np.ndarray) -> tuple[np.ndarray 
         known = np.isfinite(geodetic).all(axis=1)
         if known.any():
             enu = geodetic_to_enu(geodetic, geodetic[known][0])
-            words = f"no valid local position: metres count from the first of {name}"
-            return at_stamps(_stamps(data), enu, stamp_ns, spherical=False), [words]
+            return at_stamps(_stamps(data), enu, stamp_ns, spherical=False), [LogLack(Lack.LOCAL_POSITION, name)]
     return None, []
 
 
@@ -114,7 +113,7 @@ def _gps(data: dict[str, np.ndarray]) -> np.ndarray | None:
 
 
 def _gimbal(series: dict[str, Any], stamp_ns: np.ndarray, frd_to_ned: np.ndarray) -> np.ndarray | None:
-    """(N, 4) camera FLU -> ENU; the yaw of a gimbal that follows the vehicle counts from its nose."""
+    """(N, 4) camera FLU -> ENU; the yaw of a gimbal that follows the vehicle is relative to its nose."""
     status = series.get("gimbal_device_attitude_status")
     if status is None or not len(status["timestamp"]):
         return None

@@ -7,7 +7,7 @@ import pytest
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import quaternion_from_euler, yaw_of
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
-from drocap_ros.recording.telemetry.tlog_packets import read_tlog
+from drocap_ros.recording.telemetry.tlog import tlog_messages
 
 SHARED = Path(__file__).parents[3].parent / "shared"
 TLOG = SHARED / "media" / "arduplane_vtol_sitl.tlog"
@@ -17,10 +17,10 @@ TLOG = SHARED / "media" / "arduplane_vtol_sitl.tlog"
 def messages():
     if not TLOG.exists():
         pytest.skip(f"{TLOG.name} is not there (../shared)")
-    return list(read_tlog(TLOG))
+    return list(tlog_messages(TLOG))
 
 
-def test_same_messages_as_pymavlink_reads(messages):
+def test_messages_equal_what_pymavlink_reads(messages):
     from pymavlink import mavutil
 
     log, theirs = mavutil.mavlink_connection(str(TLOG)), []
@@ -30,7 +30,7 @@ def test_same_messages_as_pymavlink_reads(messages):
     assert np.allclose([t * 1e-9 for _, t in messages], [t for _, t in theirs], rtol=0, atol=1e-6)
 
 
-def test_states_of_a_real_log(messages):
+def test_states_of_a_real_log_agree_with_its_attitude_and_velocity(messages):
     estimator, states, attitudes = VehicleStateEstimator(), [], []
     for message, received_ns in messages:
         state = estimator.update(message, received_ns)
@@ -38,8 +38,8 @@ def test_states_of_a_real_log(messages):
             states.append(state)
             attitudes.append((message.roll, message.pitch, message.yaw))
     names = [m.get_type() for m, _ in messages]
-    heard = names[names.index("HEARTBEAT") :].count("ATTITUDE")
-    assert heard - 3 <= len(states) <= heard  # stamps that would not increase are left out
+    received = names[names.index("HEARTBEAT") :].count("ATTITUDE")
+    assert received - 3 <= len(states) <= received  # stamps that do not increase are left out
     assert (states[-1].autopilot, states[0].armed) == ("ardupilot", True)
     stamps = np.array([s.stamp_ns for s in states])
     assert (np.diff(stamps) > 0).all()
@@ -51,7 +51,7 @@ def test_states_of_a_real_log(messages):
         forward_up = 2 * (ours[0] * ours[2] - ours[3] * ours[1])  # z of the nose
         assert math.isclose(forward_up, math.sin(angles[1]), abs_tol=1e-6)
         assert math.isclose(float(yaw_of(q)), angles[2], abs_tol=1e-6)
-    assert not any(s.position_ok for s in states)  # this simulator's estimator claims nothing: flags 0 throughout
+    assert not any(s.position_ok for s in states)  # this simulator's estimator reports flags 0 throughout
     flying = [s for s in states if np.isfinite(s.position_enu_m).all()]
     assert len(flying) > 800
     speed = np.array([np.linalg.norm(s.velocity_enu_m_s) for s in flying])
@@ -70,24 +70,24 @@ def test_files_without_messages_are_refused(tmp_path, content):
     path = tmp_path / "x.tlog"
     path.write_bytes(content)
     with pytest.raises(InputError, match="expected a MAVLink telemetry log") as error:
-        list(read_tlog(path))
+        list(tlog_messages(path))
     assert "\n" not in str(error.value)
 
 
-def test_missing_log(tmp_path):
+def test_missing_log_is_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
-        list(read_tlog(tmp_path / "x.tlog"))
+        list(tlog_messages(tmp_path / "x.tlog"))
 
 
-def test_damaged_log_is_read_as_far_as_it_goes(messages, tmp_path):
+def test_damaged_log_loses_only_damaged_messages(messages, tmp_path):
     data = bytearray(TLOG.read_bytes()[:300_000])
-    whole = len(list(read_tlog(_write(tmp_path, data))))
+    whole = len(list(tlog_messages(_write(tmp_path, data))))
     rng = np.random.default_rng(0)
     for place in rng.integers(0, len(data), 20):
         data[place] ^= 0xFF
-    damaged = len(list(read_tlog(_write(tmp_path, data))))
+    damaged = len(list(tlog_messages(_write(tmp_path, data))))
     assert whole - 60 < damaged <= whole
-    cut = len(list(read_tlog(_write(tmp_path, data[:150_003]))))
+    cut = len(list(tlog_messages(_write(tmp_path, data[:150_003]))))
     assert 0.4 * whole < cut < 0.6 * whole
 
 
