@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.skeleton import BODY_15
 
 _LEFT = np.array([BODY_15.index("lknee"), BODY_15.index("lankle")])
@@ -29,23 +30,23 @@ _LONGEST_GAP_S = 0.25
 _EXCHANGED_CONFIDENCE = 0.85
 
 
-def exchanged_legs(xy: np.ndarray, confidence: np.ndarray, stamp_ns: np.ndarray, box_size: np.ndarray) -> np.ndarray:
-    """Images in which the network most likely exchanged the legs.
+def with_own_legs(keypoints: Keypoints2D, stamp_ns: np.ndarray, box_size: np.ndarray) -> Keypoints2D:
+    """Keypoints with the legs exchanged back in the images in which the network most likely exchanged them.
 
     Parameters
     ----------
-    xy : (F, 15, 2) px of ``BODY_15``, NaN = not seen
-    confidence : (F, 15)
+    keypoints : of ``BODY_15``, px
     stamp_ns : (F,)
     box_size : (F,) px, longer side of the person's box
-
-    Returns
-    -------
-    (F,) bool
     """
+    return exchange_legs(keypoints, exchanged_legs(keypoints, stamp_ns, box_size))
+
+
+def exchanged_legs(keypoints: Keypoints2D, stamp_ns: np.ndarray, box_size: np.ndarray) -> np.ndarray:
+    """(F,) bool, images in which the network most likely exchanged the legs; arguments as :func:`with_own_legs`."""
+    xy, weights = keypoints.xy, keypoints.weights
     step = _step_costs(xy, stamp_ns, box_size)
-    sure = np.minimum(confidence[:, _LEFT], confidence[:, _RIGHT])
-    sure[np.isnan(sure)] = 0.0
+    sure = np.minimum(weights[:, _LEFT], weights[:, _RIGHT])
     prices = (-_CONTRADICTION * np.log1p(-np.clip(sure, 0.0, 0.999)).sum(axis=1)).tolist()
     right, wrong = 0.0, prices[0]
     origin = [(False, False)]  # per hypothesis: whether the image before was of the other one
@@ -80,17 +81,16 @@ def _step_costs(xy: np.ndarray, stamp_ns: np.ndarray, box_size: np.ndarray) -> n
     return out
 
 
-def exchange(
-    xy: np.ndarray, covariance: np.ndarray, confidence: np.ndarray, exchanged: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Keypoints (F, 15, 2), covariance (F, 15, 3) and confidence (F, 15) with the legs of some images exchanged."""
+def exchange_legs(keypoints: Keypoints2D, exchanged: np.ndarray) -> Keypoints2D:
+    """Keypoints with the legs of the images ``exchanged`` (F,) bool exchanged, and a lower confidence in them."""
+    if not exchanged.any():
+        return keypoints
     order = np.arange(len(BODY_15))
     order[_LEFT], order[_RIGHT] = _RIGHT, _LEFT
-    moved = order != np.arange(len(BODY_15))
-    lowered = confidence[:, order] * np.where(moved, _EXCHANGED_CONFIDENCE, 1.0)
-    which = exchanged[:, None]
-    return (
-        np.where(which[..., None], xy[:, order], xy),
-        np.where(which[..., None], covariance[:, order], covariance),
-        np.where(which, lowered, confidence),
+    trust = np.where(order != np.arange(len(BODY_15)), _EXCHANGED_CONFIDENCE, 1.0)
+    confidence, covariance, which = keypoints.confidence, keypoints.covariance, exchanged[:, None]
+    return Keypoints2D(
+        np.where(which[..., None], keypoints.xy[:, order], keypoints.xy),
+        None if confidence is None else np.where(which, confidence[:, order] * trust, confidence),
+        None if covariance is None else np.where(which[..., None], covariance[:, order], covariance),
     )

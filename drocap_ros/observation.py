@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.skeleton import BODY_15, JointSet
 
 
@@ -39,6 +40,12 @@ class PoseObservation:
     keypoints: np.ndarray = field(default_factory=lambda: _empty(0, 2))
     covariance: np.ndarray = field(default_factory=lambda: _empty(0, 3))
     confidence: np.ndarray = field(default_factory=lambda: _empty(0))
+
+    @property
+    def keypoints_2d(self) -> Keypoints2D:
+        """Keypoints, confidence and covariance as float64."""
+        arrays = (self.keypoints, self.confidence, self.covariance)
+        return Keypoints2D(*(array.astype(np.float64) for array in arrays))
 
     @property
     def has_subject(self) -> bool:

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.leg_sides import exchange, exchanged_legs
+from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.leg_sides import exchange_legs, exchanged_legs, with_own_legs
 from drocap_ros.skeleton import BODY_15
 
 FRAMES = 120
@@ -29,25 +30,24 @@ def test_exchanged_legs_are_found_and_put_right():
     wrong = np.zeros(FRAMES, bool)
     wrong[20:26] = wrong[55] = wrong[70:80] = True
     confidence[wrong] = 0.7
-    seen, _, sure = exchange(xy, np.zeros((FRAMES, 15, 3)), confidence, wrong)
-    found = exchanged_legs(seen, sure, stamps, size)
-    mended, _, _ = exchange(seen, np.zeros((FRAMES, 15, 3)), sure, found)
+    spoiled = exchange_legs(Keypoints2D(xy, confidence), wrong)
+    mended = with_own_legs(spoiled, stamps, size).xy
     ankles = [LEGS["l"][1], LEGS["r"][1]]
     apart = np.abs(xy[:, ankles[0], 0] - xy[:, ankles[1], 0]) > 30  # where the legs stand together sides mean nothing
     off = np.abs(mended[:, ankles] - xy[:, ankles]).max(axis=(1, 2)) > 20
     assert not (off & apart).any()
-    before = np.abs(seen[:, ankles] - xy[:, ankles]).max(axis=(1, 2)) > 20
+    before = np.abs(spoiled.xy[:, ankles] - xy[:, ankles]).max(axis=(1, 2)) > 20
     assert (before & apart).sum() >= 10
 
 
 def test_a_sure_network_is_believed():
     xy, confidence, stamps, size = walk_from_the_side(1)
-    assert not exchanged_legs(xy, confidence, stamps, size).any()
+    assert not exchanged_legs(Keypoints2D(xy, confidence), stamps, size).any()
 
 
 def test_unseen_legs_are_left_alone():
     xy, confidence, stamps, size = walk_from_the_side(2)
     xy[30:60] = np.nan
     confidence[30:60] = 0.0
-    assert not exchanged_legs(xy, confidence, stamps, size).any()
-    assert not exchanged_legs(np.full_like(xy, np.nan), np.zeros_like(confidence), stamps, size).any()
+    assert not exchanged_legs(Keypoints2D(xy, confidence), stamps, size).any()
+    assert not exchanged_legs(Keypoints2D(np.full_like(xy, np.nan)), stamps, size).any()

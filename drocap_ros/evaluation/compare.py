@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.evaluation.protocol import load_mocap
-from drocap_ros.motion import Motion, load_motion
-from drocap_ros.reconstruction.metrics import (
+from drocap_ros.evaluation.metrics import (
     group_errors,
     horizon_error,
     is_mirrored,
@@ -19,6 +17,8 @@ from drocap_ros.reconstruction.metrics import (
     scale_error,
     w_mpjpe,
 )
+from drocap_ros.mocap import load_mocap
+from drocap_ros.motion import Motion, load_motion
 from drocap_ros.skeleton import BODY_15, indices
 from drocap_ros.tracks import read_npz
 

@@ -10,11 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.evaluation.protocol import OrbitView, Sequence, orbit_view, protocol_sequences
+from drocap_ros.evaluation.metrics import pa_mpjpe
+from drocap_ros.evaluation.protocol import OrbitView, orbit_view, protocol_sequences
+from drocap_ros.geometry.bones import limb_lengths
+from drocap_ros.mocap import Sequence
 from drocap_ros.observation import PoseObservation
-from drocap_ros.reconstruction.live.latest_pose import LatestPose, bone_lengths
+from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
-from drocap_ros.reconstruction.metrics import limb_lengths, pa_mpjpe
+from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 
@@ -137,7 +140,7 @@ def fly(view: OrbitView, delay_s: float, initializer: InitializerConfig, adjuste
     initial_std, refined_std = np.full(shape, np.nan), np.full(shape, np.nan)
     seconds: dict[type, list[float]] = {LivePose: [], LiveWindow: []}
     steps = list[float]()
-    newest, under_way = LatestPose(adjuster.blend_s), list[LiveWindow]()
+    newest, pending = LatestPose(adjuster.blend_s), list[AdjustedWindow]()
     clock = time.perf_counter()
     for result in live_poses(observations(view), initializer, adjuster):
         seconds[type(result)].append(time.perf_counter() - clock)
@@ -146,20 +149,21 @@ def fly(view: OrbitView, delay_s: float, initializer: InitializerConfig, adjuste
             i, joints = place[now], result.joints3d.astype(float)
             # The same image with the correction as it was at the one before: what solutions move in between.
             before = newest.pose(int(stamps[max(i - 1, 0)]), joints)
-            for window in [w for w in under_way if w.stamp_ns[-1] + delay_s * 1e9 <= now]:
-                under_way.remove(window)
-                newest.solved(bone_lengths(window.window.joints3d), now)
+            for window in [w for w in pending if w.stamp_ns[-1] + delay_s * 1e9 <= now]:
+                pending.remove(window)
+                newest.set_solution(median_bone_lengths(window.joints3d), now)
             initial[i], initial_std[i] = joints, _std(result.pose.covariance)
             latest[i] = newest.pose(now, joints)
             steps.append(float(np.linalg.norm(latest[i] - before, axis=-1).max()))
         else:
-            under_way.append(result)
-            age_s = (result.stamp_ns[-1] - result.stamp_ns) * 1e-9
-            rows = np.array([place[int(stamp)] for stamp in result.stamp_ns])
+            window = result.window
+            pending.append(window)
+            age_s = (window.stamp_ns[-1] - window.stamp_ns) * 1e-9
+            rows = np.array([place[int(stamp)] for stamp in window.stamp_ns])
             # Later windows overwrite, as long as they come in time.
-            chosen = (age_s + delay_s <= REFINED_AFTER_S) & (stamps[-1] - result.stamp_ns >= REFINED_AFTER_S * 1e9)
+            chosen = (age_s + delay_s <= REFINED_AFTER_S) & (stamps[-1] - window.stamp_ns >= REFINED_AFTER_S * 1e9)
             refined[rows[chosen]] = result.joints3d[chosen]
-            refined_std[rows[chosen]] = _std(result.window.covariance[chosen])
+            refined_std[rows[chosen]] = _std(window.covariance[chosen])
         clock = time.perf_counter()
     return Flown(
         initial,

@@ -9,16 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.evaluation.protocol import Sequence, orbit_view, protocol_sequences
+from drocap_ros.evaluation.metrics import JOINT_GROUPS, group_errors, is_mirrored, mirrored_frames, pa_mpjpe
+from drocap_ros.evaluation.protocol import orbit_view, protocol_sequences
+from drocap_ros.geometry.bones import limb_lengths
+from drocap_ros.mocap import Sequence
 from drocap_ros.reconstruction.methods import METHODS
-from drocap_ros.reconstruction.metrics import (
-    JOINT_GROUPS,
-    group_errors,
-    is_mirrored,
-    limb_lengths,
-    mirrored_frames,
-    pa_mpjpe,
-)
 from drocap_ros.reconstruction.reconstruct import reconstruct
 
 SPEEDS_DEG_S = (0.0, 10.0, 25.0, 50.0)

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.evaluation.compare import PairErrors
+from drocap_ros.evaluation.metrics import JOINT_GROUPS
 from drocap_ros.evaluation.rotation import StudyRow, as_records
-from drocap_ros.reconstruction.metrics import JOINT_GROUPS
 
 LABELS = {
     "ba": "ours (default)",

@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.leg_sides import exchange, exchanged_legs
+from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.leg_sides import with_own_legs
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.sources.base import Frame
@@ -79,13 +80,13 @@ def tracks_from_observations(observations: Sequence[PoseObservation], track_id: 
         confidence[i] = observations[i].confidence
     stamp_ns = np.array([o.stamp_ns for o in observations], np.int64)
     rois = np.array([o.roi for o in observations], float)
-    swapped = exchanged_legs(keypoints, confidence, stamp_ns, np.nan_to_num((rois[:, 2:] - rois[:, :2]).max(axis=1)))
-    keypoints, covariance, confidence = exchange(keypoints, covariance, confidence, swapped)
+    box_size = np.nan_to_num((rois[:, 2:] - rois[:, :2]).max(axis=1))
+    corrected = with_own_legs(Keypoints2D(keypoints, confidence, covariance), stamp_ns, box_size)
     return Tracks(
-        keypoints=keypoints,
+        keypoints=corrected.xy,
         joints=BODY_15.joints,
         stamp_ns=stamp_ns,
         image_size=observations[0].image_size,
-        confidence=confidence,
-        covariance=covariance,
+        confidence=corrected.confidence,
+        covariance=corrected.covariance,
     )

@@ -8,15 +8,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drocap_ros.reconstruction.lifted.method import default_config, default_poses
-from drocap_ros.reconstruction.live.initializer import MIN_WINDOW, fill_frames
-from drocap_ros.reconstruction.paper.bundle_adjustment import bundle_adjust
+from drocap_ros.geometry.interpolation import fill_frames
+from drocap_ros.keypoints import Keypoints2D, isotropic_covariance
+from drocap_ros.reconstruction.lifted.method import lifted_config, solve_window
+from drocap_ros.reconstruction.paper.bundle_adjustment import MIN_WINDOW, bundle_adjust
 from drocap_ros.reconstruction.paper.dictionary import Dictionary
 from drocap_ros.reconstruction.paper.mf_nnm import factorize
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS, NormalizedTracks, normalize_tracks
 from drocap_ros.reconstruction.paper.reprojection import Projection, frames_last, information_from
 from drocap_ros.reconstruction.paper.single_view import initialize
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.stop_reason import START_ONLY, TOO_SHORT
 from drocap_ros.tracks import Tracks
 
 #: "ba" is the best there is, the others are the paper's method and its ablations.
@@ -49,9 +51,7 @@ class CameraPoses:
 def run_method(
     method: str,
     stamp_ns: np.ndarray,
-    keypoints: np.ndarray,
-    confidence: np.ndarray | None,
-    covariance: np.ndarray | None,
+    keypoints: Keypoints2D,
     tracks: Tracks,
     initializer: InitializerConfig,
     adjuster: BundleAdjusterConfig,
@@ -62,15 +62,13 @@ def run_method(
 
     Frames that show fewer than four joints take no part; their poses are interpolated from those around them.
     """
-    normalize_tracks(keypoints, confidence, covariance)  # refuses what no window can use
-    use = shown_frames(keypoints, confidence)
+    normalize_tracks(keypoints)  # refuses what no window can use
+    use = shown_frames(keypoints)
     if not use.all():
         found = run_method(
             method,
             stamp_ns[use],
             keypoints[use],
-            None if confidence is None else confidence[use],
-            None if covariance is None else covariance[use],
             select_frames(tracks, use),
             initializer,
             adjuster,
@@ -87,52 +85,47 @@ def run_method(
     if method == "mf-nnm":
         poses = over_windows(
             keypoints,
-            confidence,
-            covariance,
             adjuster,
             factorized,
             progress,
         )
         return replace(poses, seconds={"initial": 0.0, "ba": time.perf_counter() - clock})
     if method == "ba":
-        return _default(stamp_ns, keypoints, confidence, covariance, tracks, adjuster, progress)
-    joints, credit = initial_poses(keypoints, confidence, covariance, initializer, dictionary, progress)
+        return _default(stamp_ns, keypoints, tracks, adjuster, progress)
+    joints, credit = initial_poses(keypoints, initializer, dictionary, progress)
     seconds = {"initial": time.perf_counter() - clock, "ba": 0.0}
     if method == "initial":
-        weights = credit if confidence is None else credit * np.nan_to_num(confidence)
-        information = information_from(keypoints, weights, covariance)
-        return CameraPoses(*split(placed(joints, keypoints, information)), seconds, 0, "start only", {})
+        weights = credit if keypoints.confidence is None else credit * np.nan_to_num(keypoints.confidence)
+        information = information_from(keypoints.xy, weights, keypoints.covariance)
+        return CameraPoses(*split(placed(joints, keypoints.xy, information)), seconds, 0, START_ONLY, {})
     if method == "paper-no-articulation":
         adjuster = replace(adjuster, gamma=0.0)
     clock = time.perf_counter()
-    poses = adjust(keypoints, confidence, covariance, joints, adjuster, progress, credit=credit)
+    poses = adjust(keypoints, joints, adjuster, progress, credit=credit)
     seconds["ba"] = time.perf_counter() - clock
     return replace(poses, seconds=seconds)
 
 
 def _default(
     stamp_ns: np.ndarray,
-    keypoints: np.ndarray,
-    confidence: np.ndarray | None,
-    covariance: np.ndarray | None,
+    keypoints: Keypoints2D,
     tracks: Tracks,
     adjuster: BundleAdjusterConfig,
     progress: Progress | None,
 ) -> CameraPoses:
     """The default method (:mod:`drocap_ros.reconstruction.lifted.method`), window by window."""
-    config = default_config(adjuster)
+    config = lifted_config(adjuster)
     seconds = {"initial": 0.0, "ba": 0.0}
     k = tracks.camera_matrix
     focal_px = None if k is None else 0.5 * float(k[0, 0] + k[1, 1])
 
     def solve(rows: slice, n: NormalizedTracks) -> WindowResult:
         points = np.where((n.weights > 0.0)[..., None], n.w, np.nan)
-        variance = None if covariance is None else 0.5 * (covariance[rows, :, 0] + covariance[rows, :, 2])
-        found = default_poses(
+        variance = keypoints[rows].variance
+        covariance = None if variance is None else isotropic_covariance(variance / n.scale_px**2)
+        found = solve_window(
             stamp_ns[rows],
-            points,
-            n.weights,
-            None if variance is None else variance / n.scale_px**2,
+            Keypoints2D(points, n.weights, covariance),
             None if focal_px is None else focal_px / n.scale_px,
             config,
         )
@@ -140,18 +133,16 @@ def _default(
             seconds[stage] += value
         return found.joints, found.cost_terms, found.iterations, found.stop_reason
 
-    return replace(over_windows(keypoints, confidence, covariance, adjuster, solve, progress), seconds=seconds)
+    return replace(over_windows(keypoints, adjuster, solve, progress), seconds=seconds)
 
 
-def shown_frames(keypoints: np.ndarray, confidence: np.ndarray | None) -> np.ndarray:
+def shown_frames(keypoints: Keypoints2D) -> np.ndarray:
     """(F,) bool, frames with at least :data:`~drocap_ros.reconstruction.paper.normalize.MIN_JOINTS` joints apart."""
-    seen = np.isfinite(keypoints).all(-1)
-    if confidence is not None:
-        seen &= np.nan_to_num(confidence) > 0.0
-    low = np.where(seen[..., None], keypoints, np.inf).min(axis=1)
-    high = np.where(seen[..., None], keypoints, -np.inf).max(axis=1)
+    seen = keypoints.weights > 0.0
+    low = np.where(seen[..., None], keypoints.xy, np.inf).min(axis=1)
+    high = np.where(seen[..., None], keypoints.xy, -np.inf).max(axis=1)
     with np.errstate(invalid="ignore"):
-        apart = (high - low).max(axis=1) > 1e-6 * (1.0 + np.abs(np.nan_to_num(keypoints)).max())
+        apart = (high - low).max(axis=1) > 1e-6 * (1.0 + np.abs(np.nan_to_num(keypoints.xy)).max())
     return np.asarray((np.sum(seen, axis=1) >= MIN_JOINTS) & apart)
 
 
@@ -172,9 +163,7 @@ def _spread(found: CameraPoses, use: np.ndarray, stamp_ns: np.ndarray) -> Camera
 
 
 def initial_poses(
-    keypoints: np.ndarray,
-    confidence: np.ndarray | None,
-    covariance: np.ndarray | None,
+    keypoints: Keypoints2D,
     config: InitializerConfig,
     dictionary: Dictionary,
     progress: Progress | None = None,
@@ -186,9 +175,9 @@ def initial_poses(
     poses (F, 15, 3) px in camera axes, centred
     credit (F, 15) in [0, 1]: how far the last E-step believes each 2D joint
     """
-    out = np.zeros((*keypoints.shape[:2], 3))
-    credit = np.zeros(keypoints.shape[:2])
-    for rows, n in _blocks(keypoints, confidence, covariance, config.block_frames, 0):
+    out = np.zeros((*keypoints.xy.shape[:2], 3))
+    credit = np.zeros(keypoints.xy.shape[:2])
+    for rows, n in _blocks(keypoints, config.block_frames, 0):
         fit = initialize(n.w, n.information, dictionary, config)
         shape = fit.camera_shape
         given = n.information[..., 0] + n.information[..., 2]
@@ -201,9 +190,7 @@ def initial_poses(
 
 
 def adjust(
-    keypoints: np.ndarray,
-    confidence: np.ndarray | None,
-    covariance: np.ndarray | None,
+    keypoints: Keypoints2D,
     joints: np.ndarray,
     config: BundleAdjusterConfig,
     progress: Progress | None = None,
@@ -215,27 +202,25 @@ def adjust(
     def solve(rows: slice, n: NormalizedTracks) -> WindowResult:
         start = joints[rows] / n.scale_px
         if len(start) < MIN_WINDOW:
-            return placed(start, n.w, n.information), {}, 0, "too short"
+            return placed(start, n.w, n.information), {}, 0, TOO_SHORT
         information = n.information if credit is None else n.information * credit[rows][..., None]
         result = bundle_adjust(n.w, start, config=config, information=information)
         poses = placed(result.camera_shape, n.w, information)
         return poses, result.cost_terms, result.iterations, result.stop_reason
 
-    return over_windows(keypoints, confidence, covariance, config, solve, progress)
+    return over_windows(keypoints, config, solve, progress)
 
 
 def over_windows(
-    keypoints: np.ndarray,
-    confidence: np.ndarray | None,
-    covariance: np.ndarray | None,
+    keypoints: Keypoints2D,
     config: BundleAdjusterConfig,
     solve: Callable[[slice, NormalizedTracks], WindowResult],
     progress: Progress | None = None,
 ) -> CameraPoses:
     """Solve window by window and cross-fade the poses where windows overlap."""
-    out, weight = np.zeros((*keypoints.shape[:2], 3)), np.zeros(len(keypoints))
+    out, weight = np.zeros((*keypoints.xy.shape[:2], 3)), np.zeros(len(keypoints))
     iterations, terms, stops = 0, dict[str, float](), set[str]()
-    for rows, n in _blocks(keypoints, confidence, covariance, config.window_frames, config.overlap_frames):
+    for rows, n in _blocks(keypoints, config.window_frames, config.overlap_frames):
         found, cost_terms, steps, stop = solve(rows, n)
         fade = _fade(len(found), config.overlap_frames, rows.start > 0, rows.stop < len(keypoints))
         in_image = found * n.scale_px
@@ -276,13 +261,10 @@ def windows(frames: int, length: int, overlap: int) -> list[slice]:
     return [slice(int(start), int(start) + length) for start in starts]
 
 
-def _blocks(
-    keypoints: np.ndarray, confidence: np.ndarray | None, covariance: np.ndarray | None, length: int, overlap: int
-) -> Iterator[tuple[slice, NormalizedTracks]]:
+def _blocks(keypoints: Keypoints2D, length: int, overlap: int) -> Iterator[tuple[slice, NormalizedTracks]]:
     """Normalized tracks, window by window."""
     for rows in windows(len(keypoints), length, overlap):
-        part = [None if a is None else a[rows] for a in (confidence, covariance)]
-        yield rows, normalize_tracks(keypoints[rows], *part)
+        yield rows, normalize_tracks(keypoints[rows])
 
 
 def _fade(count: int, overlap: int, at_start: bool, at_end: bool) -> np.ndarray:

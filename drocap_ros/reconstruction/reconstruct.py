@@ -13,9 +13,10 @@ import numpy as np
 
 from drocap_ros import __version__
 from drocap_ros.errors import InputError
+from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.lifted.lifter import Lifter
-from drocap_ros.reconstruction.lifted.method import default_config
+from drocap_ros.reconstruction.lifted.method import lifted_config
 from drocap_ros.reconstruction.methods import METHODS, CameraPoses, run_method
 from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
@@ -61,13 +62,13 @@ def reconstruct(
     adjuster = adjuster or BundleAdjusterConfig()
     dictionary = dictionary or load_dictionary(initializer.dictionary or None)
     started = time.perf_counter()
-    keypoints, confidence, covariance = body_keypoints(tracks)
+    keypoints = body_keypoints(tracks)
     with blas_threads(adjuster.threads):
         result = run_method(
-            method, tracks.stamp_ns, keypoints, confidence, covariance, tracks, initializer, adjuster, dictionary,
+            method, tracks.stamp_ns, keypoints, tracks, initializer, adjuster, dictionary,
             progress,
         )  # fmt: skip
-    motion = _to_motion(tracks, keypoints, confidence, result, initializer)
+    motion = _to_motion(tracks, keypoints, result, initializer)
     motion.meta.update(
         method=method,
         versions=_versions(),
@@ -81,14 +82,14 @@ def reconstruct(
         frames=len(tracks),
     )
     if method == "ba":
-        own = default_config(adjuster)
+        own = lifted_config(adjuster)
         motion.meta["parameters"]["default_method"] = dataclasses.asdict(own)
         motion.meta["lifter"] = Lifter.load(own.lifter or None).origin
     return motion
 
 
-def body_keypoints(tracks: Tracks) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Keypoints (F, 15, 2) px, confidence (F, 15) and covariance (F, 15, 3) in BODY_15's order; NaN, 0 where absent.
+def body_keypoints(tracks: Tracks) -> Keypoints2D:
+    """Keypoints in BODY_15's order; joints that the tracks lack are NaN.
 
     Raises
     ------
@@ -116,20 +117,17 @@ def body_keypoints(tracks: Tracks) -> tuple[np.ndarray, np.ndarray | None, np.nd
         # A joint of unknown uncertainty counts as one that was not seen.
         if confidence is None:
             confidence = np.isfinite(keypoints).all(-1).astype(float)
-    return keypoints, confidence, covariance
+    return Keypoints2D(keypoints, confidence, covariance)
 
 
 def _to_motion(
     tracks: Tracks,
-    keypoints: np.ndarray,
-    confidence: np.ndarray | None,
+    keypoints: Keypoints2D,
     result: CameraPoses,
     config: InitializerConfig,
 ) -> Motion:
-    seen = np.isfinite(keypoints).all(-1)
-    shown = np.where(seen, 1.0 if confidence is None else np.nan_to_num(confidence), 0.0)
     projected = result.joints_px[..., :2] + result.translation_px[:, None]
-    reprojection = np.linalg.norm(projected - keypoints, axis=-1)
+    reprojection = np.linalg.norm(projected - keypoints.xy, axis=-1)
     pelvis = BODY_15.index("pelvis")
     per_px = metres_per_px(result.joints_px, tracks.stamp_ns, config.assumed_height_m)
     joints = (result.joints_px - result.joints_px[:, pelvis][:, None]) * per_px[:, None, None]
@@ -155,8 +153,8 @@ def _to_motion(
         metric=metric,
         scale_source=scale_source,
         camera_rotation=rotation,
-        confidence=shown,
-        keypoints=keypoints,
+        confidence=keypoints.weights,
+        keypoints=keypoints.xy,
         reprojection_px=reprojection,
         meta=meta,
     )

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.motion import load_motion
-from drocap_ros.reconstruction.metrics import pa_mpjpe
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import LIMB_JOINTS, indices
 from drocap_ros.tracks import save_tracks

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from walking import Walk
 
+from drocap_ros.evaluation import metrics
 from drocap_ros.geometry.rotations import exp_so3
-from drocap_ros.reconstruction import metrics
 from drocap_ros.skeleton import BODY_15
 
 

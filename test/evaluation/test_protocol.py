@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from walking import make_walk, write_mocap
 
+from drocap_ros import mocap
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation import protocol
 
@@ -44,7 +45,7 @@ def test_noise_is_as_described_and_seeded() -> None:
 def test_resampling_keeps_the_motion() -> None:
     t = np.arange(91) / 30.0
     x = np.sin(t)[:, None, None] * np.ones((1, 15, 3))
-    out = protocol.resample(x, 30.0, 24.0)
+    out = mocap.resample(x, 30.0, 24.0)
     assert len(out) == 73
     np.testing.assert_allclose(out[:, 0, 0], np.sin(np.arange(73) / 24.0), atol=1e-5)
 

@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
 def learn_from_folder(folder: Path, include: str, every: int, atoms: int, sparsity: float, seed: int) -> Dictionary:
     """Dictionary from the files ``include`` of a MoCap folder, every n-th frame."""
-    from drocap_ros.evaluation.protocol import load_mocap, mocap_files
+    from drocap_ros.mocap import load_mocap, mocap_files
     from drocap_ros.reconstruction.paper.dictionary import learn, normalize_poses
     from drocap_ros.tracks import read_npz
 

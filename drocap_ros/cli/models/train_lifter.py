@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
         When an option or the folder cannot be used.
     """
     from drocap_ros.errors import InputError
-    from drocap_ros.evaluation.protocol import mocap_files
+    from drocap_ros.mocap import mocap_files
     from drocap_ros.training.lifter import (
         LifterTraining,
         describe_training,

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drocap_ros.reconstruction.stop_reason import CONVERGED, DEADLINE, ITERATIONS, NO_DESCENT
 from drocap_ros.skeleton import BODY_15, RIGID_BONES, indices
 
 _CHAIN = BODY_15.bones
@@ -203,13 +204,13 @@ def adjust_limbs(
     """
     from scipy.linalg.lapack import dpbtrf, dtbtrs
 
-    damping, stop = 1e-4, "iterations"
+    damping, stop = 1e-4, ITERATIONS
     zooms = np.zeros(problem.zoom_basis.shape[1])
     here = _Residuals(problem, joints, lengths, zooms)
     done = 0
     while done < iterations:
         if done and cancelled is not None and cancelled():
-            stop = "deadline"
+            stop = DEADLINE
             break
         g, g_sizes = _gradient(problem, here)
         band, (border, corner) = _band(problem, here), _border(problem, here)
@@ -232,13 +233,13 @@ def adjust_limbs(
                     break
             damping = 10 * damping
         if not accepted:
-            stop = "no descent"
+            stop = NO_DESCENT
             break
         decrease = here.cost - there.cost
         joints, lengths, zooms, here = joints + step, lengths + step_lengths, zooms + step_zooms, there
         damping *= 0.2
         done += 1
         if decrease <= tolerance * here.cost:
-            stop = "converged"
+            stop = CONVERGED
             break
     return LimbResult(joints, lengths, here.zoom, here.terms, done, stop)

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.parameters import Parameters, param
 from drocap_ros.reconstruction.lifted.depth_signs import depth_signs
 from drocap_ros.reconstruction.lifted.lifter import LiftedMotion, Lifter
@@ -42,7 +43,7 @@ _YARDSTICK_MM = 1550.0
 
 
 @dataclass(frozen=True)
-class DefaultMethodConfig(Parameters):
+class LiftedConfig(Parameters):
     """Weights of the default method; "mm" are those of a person of ordinary size."""
 
     lifter: str = param("", "lifter's ONNX file; empty for the shipped one")
@@ -66,14 +67,14 @@ class DefaultMethodConfig(Parameters):
     )
 
 
-def default_config(adjuster: BundleAdjusterConfig) -> DefaultMethodConfig:
+def lifted_config(adjuster: BundleAdjusterConfig) -> LiftedConfig:
     """The method's parameters where the adjuster's section sets them; weights are the defaults."""
-    return DefaultMethodConfig(
+    return LiftedConfig(
         lifter=adjuster.lifter, first_iterations=adjuster.limb_iterations_first, iterations=adjuster.limb_iterations
     )
 
 
-def prepare(config: DefaultMethodConfig) -> None:
+def prepare(config: LiftedConfig) -> None:
     """Load what a first window would wait for.
 
     Raises
@@ -92,7 +93,7 @@ def import_libraries() -> None:
 
 
 @dataclass(frozen=True)
-class KnownBody:
+class BodySize:
     """What an earlier window knows of the person.
 
     lengths_mm : (16,) of :data:`~drocap_ros.reconstruction.lifted.limb_adjustment.SPANS`, in mm of an ordinary person
@@ -104,7 +105,7 @@ class KnownBody:
 
 
 @dataclass(frozen=True)
-class DefaultResult:
+class WindowSolution:
     """A window's result.
 
     joints : (F, 15, 3) in camera axes and the unit of the keypoints; x and y where the joint is in the image, depth
@@ -112,39 +113,35 @@ class DefaultResult:
     sigma : (F, 15, 2) the lifter's expected absolute error of x, y (each) and of depth, in the same unit
     lengths : (14,) bone lengths in the same unit (joint j to its parent at j - 1)
     body : for a warm start of the next window
-    effort : steps that the first and the final adjustment took
+    steps : that the first and the final adjustment took
     seconds : wall-clock of "initial" (the lifter) and of "ba" (the rest)
     """
 
     joints: np.ndarray
     sigma: np.ndarray
     lengths: np.ndarray
-    body: KnownBody
+    body: BodySize
     cost_terms: dict[str, float]
     iterations: int
-    effort: tuple[int, int]
+    steps: tuple[int, int]
     stop_reason: str
     seconds: dict[str, float]
 
 
-def default_start_and_refine(
-    keypoints: np.ndarray,
-    confidence: np.ndarray | None = None,
-    variance: np.ndarray | None = None,
+def solve_even_window(
+    keypoints: Keypoints2D,
     fps: float = LIFTER_FPS,
     focal: float | None = None,
-    config: DefaultMethodConfig | None = None,
+    config: LiftedConfig | None = None,
     lifter: Lifter | None = None,
-    known: KnownBody | None = None,
+    known: BodySize | None = None,
     cancelled: Cancelled | None = None,
-) -> DefaultResult:
+) -> WindowSolution:
     """Poses of one window of evenly spaced frames.
 
     Parameters
     ----------
-    keypoints : (F, 15, 2) of ``BODY_15``, any unit, y down; NaN where not seen
-    confidence : (F, 15) in [0, 1], or None
-    variance : (F, 15) of each coordinate in the keypoints' unit squared, or None (estimated from the sequence)
+    keypoints : of ``BODY_15``, any unit, y down; without a covariance the noise is estimated from the sequence
     fps : frames per second
     focal : focal length in the keypoints' unit; None = unknown, and the camera is taken to be far away
     config, lifter : the defaults if None
@@ -156,13 +153,13 @@ def default_start_and_refine(
     InputError
         When no joint is ever seen.
     """
-    config = config or DefaultMethodConfig()
+    config = config or LiftedConfig()
     lifter = lifter or Lifter.load(config.lifter or None)
     begin = time.perf_counter()
     if known is None:
-        sized = _sized(keypoints, confidence, variance, fps, focal, config, lifter, cancelled)
+        sized = _sized(keypoints, fps, focal, config, lifter, cancelled)
     else:
-        sized = _sized_by(known, keypoints, confidence, variance, fps, focal, config, lifter)
+        sized = _sized_by(known, keypoints, fps, focal, config, lifter)
     setting, mm, zoom = sized.setting, sized.mm, sized.zoom
 
     clock = time.perf_counter()
@@ -178,14 +175,14 @@ def default_start_and_refine(
     end = time.perf_counter()
     adjusting = sized.seconds + end - clock
     yardstick = _YARDSTICK_MM / max(float(found.lengths[_YARDSTICK].sum()), 1e-12)
-    return DefaultResult(
+    return WindowSolution(
         joints=joints,
         sigma=sized.lifted.sigma * size,
         lengths=found.lengths[: len(_BONES)] / mm,
-        body=KnownBody(found.lengths * yardstick, zoom * found.zoom / (mm * yardstick)),
+        body=BodySize(found.lengths * yardstick, zoom * found.zoom / (mm * yardstick)),
         cost_terms=found.cost_terms,
         iterations=found.iterations,
-        effort=(sized.iterations, found.iterations),
+        steps=(sized.iterations, found.iterations),
         stop_reason=found.stop_reason,
         seconds={"initial": end - begin - adjusting, "ba": adjusting},
     )
@@ -213,100 +210,92 @@ class _Sized:
 
 
 def _sized(
-    keypoints: np.ndarray,
-    confidence: np.ndarray | None,
-    variance: np.ndarray | None,
+    keypoints: Keypoints2D,
     fps: float,
     focal: float | None,
-    config: DefaultMethodConfig,
+    config: LiftedConfig,
     lifter: Lifter,
     cancelled: Cancelled | None,
 ) -> _Sized:
     """Sizes from the lifter's first opinion and a first adjustment."""
-    lifted = lifter.lift(keypoints, confidence, fps)
+    lifted = lifter.lift(keypoints.xy, keypoints.confidence, fps)
     clock = time.perf_counter()
     mm = _YARDSTICK_MM / max(float(np.median(_bone_lengths(lifted.joints), axis=0)[_YARDSTICK].sum()), 1e-12)
-    weight, noise = _weights(keypoints * mm, confidence, variance, mm, config)
+    weight, noise = _weights(keypoints, mm, config)
     setting = _Setting(weight, noise, fps, config, *zoom_model(len(keypoints), fps, config.zoom_std_per_s))
     centre = np.median(lifted.joints[..., :2], axis=1)
     zoom = _zoom_of(lifted.joints, fps)
     start = lifted.joints.copy()
     start[..., :2] -= centre[:, None]
     start *= mm / zoom[:, None, None]
-    flat = _orthographic(keypoints, start[..., 2], centre, zoom, mm, focal)
+    flat = _orthographic(keypoints.xy, start[..., 2], centre, zoom, mm, focal)
     found = _solve(setting, flat, start, lifted.sigma * mm, None, config.first_iterations, cancelled)
     zoom = zoom * found.zoom
-    flat = _orthographic(keypoints, found.joints[..., 2] - found.joints[:, :1, 2], centre, zoom, mm, focal)
+    flat = _orthographic(keypoints.xy, found.joints[..., 2] - found.joints[:, :1, 2], centre, zoom, mm, focal)
     seconds = time.perf_counter() - clock
-    lifted = lifter.lift(flat, confidence, fps, found.lengths[: len(_BONES)])
+    lifted = lifter.lift(flat, keypoints.confidence, fps, found.lengths[: len(_BONES)])
     return _Sized(setting, flat, lifted, found.lengths, centre, zoom, mm, seconds, found.iterations)
 
 
 def _sized_by(
-    known: KnownBody,
-    keypoints: np.ndarray,
-    confidence: np.ndarray | None,
-    variance: np.ndarray | None,
+    known: BodySize,
+    keypoints: Keypoints2D,
     fps: float,
     focal: float | None,
-    config: DefaultMethodConfig,
+    config: LiftedConfig,
     lifter: Lifter,
 ) -> _Sized:
     """Sizes of an earlier window."""
     mm = 1.0 / float(np.median(known.unit_per_mm))
     zoom = known.unit_per_mm * mm
     lengths = known.lengths_mm[: len(_BONES)]
-    rough = _orthographic(keypoints, np.zeros(keypoints.shape[:2]), np.zeros((len(keypoints), 2)), zoom, mm, None)
-    lifted = lifter.lift(rough, confidence, fps, lengths)
+    rough = _orthographic(keypoints.xy, np.zeros(keypoints.xy.shape[:2]), np.zeros((len(keypoints), 2)), zoom, mm, None)
+    lifted = lifter.lift(rough, keypoints.confidence, fps, lengths)
     middle = np.median(lifted.joints[..., :2], axis=1)
     centre = middle * (zoom / mm)[:, None]
     joints = lifted.joints.copy()
     joints[..., :2] -= middle[:, None]
-    flat = _orthographic(keypoints, joints[..., 2], centre, zoom, mm, focal)
-    weight, noise = _weights(keypoints * mm, confidence, variance, mm, config)
+    flat = _orthographic(keypoints.xy, joints[..., 2], centre, zoom, mm, focal)
+    weight, noise = _weights(keypoints, mm, config)
     setting = _Setting(weight, noise, fps, config, *zoom_model(len(keypoints), fps, config.zoom_std_per_s))
     return _Sized(
         setting, flat, LiftedMotion(joints, lifted.sigma), known.lengths_mm, centre, zoom, mm, seconds=0.0, iterations=0
     )
 
 
-def default_poses(
+def solve_window(
     stamp_ns: np.ndarray,
-    keypoints: np.ndarray,
-    confidence: np.ndarray | None,
-    variance: np.ndarray | None,
+    keypoints: Keypoints2D,
     focal: float | None,
-    config: DefaultMethodConfig,
-    known: KnownBody | None = None,
+    config: LiftedConfig,
+    known: BodySize | None = None,
     cancelled: Cancelled | None = None,
-) -> DefaultResult:
-    """:func:`default_start_and_refine` for frames at any increasing times ``stamp_ns`` (F,).
+) -> WindowSolution:
+    """:func:`solve_even_window` for frames at any increasing times ``stamp_ns`` (F,).
 
     Frames that were dropped are put back as frames without a joint, so that time runs evenly.
     """
     slot, fps = even_slots(stamp_ns)
     if slot[-1] + 1 == len(slot):
-        return default_start_and_refine(
-            keypoints, confidence, variance, fps, focal, config, known=known, cancelled=cancelled
-        )
-
-    def spread(values: np.ndarray | None, empty: float) -> np.ndarray | None:
-        if values is None:
-            return None
-        out = np.full((slot[-1] + 1, *values.shape[1:]), empty)
-        out[slot] = values
-        return out
-
-    points = spread(keypoints, np.nan)
-    assert points is not None
+        return solve_even_window(keypoints, fps, focal, config, known=known, cancelled=cancelled)
     if known is not None:
         size = np.interp(np.arange(slot[-1] + 1), slot, known.unit_per_mm)
         known = replace(known, unit_per_mm=size)
-    r = default_start_and_refine(
-        points, spread(confidence, 0.0), spread(variance, np.nan), fps, focal, config, known=known, cancelled=cancelled
+    even = Keypoints2D(
+        _spread(keypoints.xy, slot, np.nan),
+        None if keypoints.confidence is None else _spread(keypoints.confidence, slot, 0.0),
+        None if keypoints.covariance is None else _spread(keypoints.covariance, slot, np.nan),
     )
+    r = solve_even_window(even, fps, focal, config, known=known, cancelled=cancelled)
     body = replace(r.body, unit_per_mm=r.body.unit_per_mm[slot])
     return replace(r, joints=r.joints[slot], sigma=r.sigma[slot], body=body)
+
+
+def _spread(values: np.ndarray, slot: np.ndarray, empty: float) -> np.ndarray:
+    """Values (F, ...) at their slots of the even grid, ``empty`` elsewhere."""
+    out = np.full((slot[-1] + 1, *values.shape[1:]), empty)
+    out[slot] = values
+    return out
 
 
 def even_slots(stamp_ns: np.ndarray) -> tuple[np.ndarray, float]:
@@ -332,7 +321,7 @@ class _Setting:
     weight: np.ndarray
     noise_mm: float
     fps: float
-    config: DefaultMethodConfig
+    config: LiftedConfig
     zoom_basis: np.ndarray
     zoom_precision: np.ndarray
 
@@ -372,20 +361,19 @@ def _bone_lengths(joints: np.ndarray) -> np.ndarray:
 
 
 def _weights(
-    keypoints: np.ndarray,
-    confidence: np.ndarray | None,
-    variance: np.ndarray | None,
+    keypoints: Keypoints2D,
     mm: float,
-    config: DefaultMethodConfig,
+    config: LiftedConfig,
 ) -> tuple[np.ndarray, float]:
     """Weights (F, 15) of the 2D joints in 1/mm^2, 0 where not seen, and the sequence's noise in mm.
 
     Without variances the noise is what the third difference in time shows; motion hardly does.
     """
-    seen = np.isfinite(keypoints[..., 0])
+    points_mm, confidence, variance = keypoints.xy * mm, keypoints.confidence, keypoints.variance
+    seen = np.isfinite(points_mm[..., 0])
     noise = config.noise_mm
     if len(keypoints) > 3:
-        third = nanmedian_small(np.abs(np.diff(keypoints, n=3, axis=0)).reshape(-1), axis=0)
+        third = nanmedian_small(np.abs(np.diff(points_mm, n=3, axis=0)).reshape(-1), axis=0)
         noise = max(noise, 1.48 / np.sqrt(20) * float(np.nan_to_num(third)))
     square = np.full(seen.shape, noise**2)
     if variance is not None:

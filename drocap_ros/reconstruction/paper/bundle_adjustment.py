@@ -29,9 +29,13 @@ from drocap_ros.reconstruction.paper.reprojection import (
 )
 from drocap_ros.reconstruction.paper.rotations import rotation_change, update_rotations
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
+from drocap_ros.reconstruction.stop_reason import CONVERGED, ITERATIONS
 
 #: Length at which alpha is given: the protocol's 10 s at 24 fps.
 REFERENCE_FRAMES = 240
+
+#: Windows of fewer frames are not adjusted: their views are too similar.
+MIN_WINDOW = 4
 
 
 @dataclass(frozen=True)
@@ -221,7 +225,7 @@ def minimize(
     config, alpha = objective.config, objective.alpha
     cost = objective.value(s) + alpha * nuclear_norm(s)
     history = [cost]
-    ahead, t, mu, restarts, stop = s, 1.0, 4.0, 0, "iterations"
+    ahead, t, mu, restarts, stop = s, 1.0, 4.0, 0, ITERATIONS
     for k in range(config.iterations):
         if k % config.rotation_every == 0:
             before = objective.value(s)
@@ -240,7 +244,7 @@ def minimize(
         if progress is not None and k % 10 == 0:
             progress(k / config.iterations)
         if k >= 20 and history[-11] - cost <= config.tolerance * abs(cost):
-            stop = "converged"
+            stop = CONVERGED
             break
     return s, {
         "iterations": len(history) - 1,

@@ -13,16 +13,12 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.alignment import to_torso_frame
-from drocap_ros.reconstruction.metrics import limb_lengths
+from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import read_npz
 
 #: The dictionary that ships with the package.
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "dictionary_cmu.npz"
-
-#: Sum of the ten rigid limb lengths over stature: 1.876 over the head joint's standing height on the native CMU
-#: skeletons of the training set, and that joint lies about 9 cm below the top of the head.
-LIMBS_PER_STATURE = 1.78
 
 #: Poses are scaled to a person of this stature, m.
 REFERENCE_STATURE_M = 1.70

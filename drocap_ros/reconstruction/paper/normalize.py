@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.paper.reprojection import information_from
 
 #: Fewer joints than this in every image fix no pose.
@@ -36,9 +37,7 @@ class NormalizedTracks:
 
 
 def normalize_tracks(
-    keypoints: np.ndarray,
-    confidence: np.ndarray | None = None,
-    covariance: np.ndarray | None = None,
+    keypoints: Keypoints2D,
     *,
     scale_px: float | None = None,
 ) -> NormalizedTracks:
@@ -46,9 +45,7 @@ def normalize_tracks(
 
     Parameters
     ----------
-    keypoints : (F, P, 2) px, NaN where not seen
-    confidence : (F, P) in [0, 1]; NaN and 0 count as not seen
-    covariance : (F, P, 3) px^2, xx xy yy; must be positive definite where a joint is seen
+    keypoints : px; confidences of NaN and 0 count as not seen; covariances of seen joints must be positive definite
     scale_px : px per unit, where it is known from earlier images
 
     Raises
@@ -56,17 +53,16 @@ def normalize_tracks(
     InputError
         When no image shows enough joints, or the joints of every image coincide, or a covariance is impossible.
     """
-    seen = np.isfinite(keypoints).all(-1)
-    weights = seen.astype(np.float64)
-    if confidence is not None:
-        weights = weights * _checked_confidence(confidence)
+    weights = keypoints.seen.astype(np.float64)
+    if keypoints.confidence is not None:
+        weights = weights * _checked_confidence(keypoints.confidence)
     seen = weights > 0.0
     if seen.sum(1).max(initial=0) < MIN_JOINTS:
         raise InputError(
             f"keypoints: expected an image with at least {MIN_JOINTS} seen joints, got at most"
             f" {seen.sum(1).max(initial=0)}; check the 2D tracks"
         )
-    points = np.where(seen[..., None], keypoints, 0.0)
+    points = np.where(seen[..., None], keypoints.xy, 0.0)
     count = np.sum(seen, axis=1)
     centre = points.sum(1) / np.maximum(count, 1)[:, None]
     w = np.where(seen[..., None], points - centre[:, None], 0.0)
@@ -74,6 +70,7 @@ def normalize_tracks(
         scale_px = float(np.sqrt(np.sum(w * w) / (2.0 * count.sum())))
     if not scale_px > 1e-6 * (1.0 + np.abs(points).max()):
         raise InputError("keypoints: expected joints apart from each other, got all in one point; check the 2D tracks")
+    covariance = keypoints.covariance
     if covariance is not None:
         _check_covariance(covariance, seen)
     w = w / scale_px
@@ -82,16 +79,18 @@ def normalize_tracks(
     return NormalizedTracks(w, weights, information, filled(centre, count > 0), scale_px)
 
 
-def check_uncertainty(confidence: np.ndarray, covariance: np.ndarray | None, seen: np.ndarray) -> None:
-    """Refuse what :func:`normalize_tracks` would of one image: confidence (P,), covariance (P, 3), seen (P,) bool.
+def check_uncertainty(keypoints: Keypoints2D, seen: np.ndarray) -> None:
+    """Check confidence and covariance as :func:`normalize_tracks` does; ``seen`` (F, P) bool.
 
     Raises
     ------
     InputError
+        When a confidence is out of range or the covariance of a seen joint is not positive definite.
     """
-    _checked_confidence(confidence)
-    if covariance is not None:
-        _check_covariance(covariance[None], seen[None])
+    if keypoints.confidence is not None:
+        _checked_confidence(keypoints.confidence)
+    if keypoints.covariance is not None:
+        _check_covariance(keypoints.covariance, seen)
 
 
 def _checked_confidence(confidence: np.ndarray) -> np.ndarray:

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drocap_ros.reconstruction.metrics import limb_lengths
-from drocap_ros.reconstruction.paper.dictionary import LIMBS_PER_STATURE
+from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
 from drocap_ros.reconstruction.world.metric_scale import ScaleEstimate, estimate_scale
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
+from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.evaluation.protocol import PX_PER_MM, orbit_rotations, orbit_view, protocol_sequences
+from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.lifted.depth_signs import depth_signs
 from drocap_ros.reconstruction.lifted.limb_adjustment import (
     SPANS,
@@ -23,11 +25,10 @@ from drocap_ros.reconstruction.lifted.limb_adjustment import (
     zoom_model,
 )
 from drocap_ros.reconstruction.lifted.method import (
-    DefaultMethodConfig,
-    default_start_and_refine,
+    LiftedConfig,
     even_slots,
+    solve_even_window,
 )
-from drocap_ros.reconstruction.metrics import pa_mpjpe
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
@@ -152,7 +153,7 @@ def view():
 
 @pytest.fixture(scope="module")
 def plain(view):
-    return default_start_and_refine(view.tracks.keypoints)
+    return solve_even_window(Keypoints2D(view.tracks.keypoints))
 
 
 def error(result, view) -> float:
@@ -169,7 +170,7 @@ def test_a_person_of_rigid_limbs_is_found(view, plain):
 
 
 def test_image_scale_and_place_do_not_matter(view, plain):
-    moved = default_start_and_refine(2.5 * view.tracks.keypoints + np.array([100.0, -300.0]))
+    moved = solve_even_window(Keypoints2D(2.5 * view.tracks.keypoints + np.array([100.0, -300.0])))
     expected = 2.5 * plain.joints + np.array([100.0, -300.0, 0.0])
     np.testing.assert_allclose(moved.joints, expected, atol=2.0)
 
@@ -178,11 +179,11 @@ def test_the_azimuth_of_the_world_does_not_matter(view, plain):
     turned = sway(120) @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     # A world turned under an orbit that starts as far turned gives the same pictures, so compare errors only.
     other = orbit_view(turned, 25.0)
-    assert error(default_start_and_refine(other.tracks.keypoints), other) < 40.0
+    assert error(solve_even_window(Keypoints2D(other.tracks.keypoints)), other) < 40.0
 
 
 def test_the_same_input_gives_the_same_bits(view, plain):
-    again = default_start_and_refine(view.tracks.keypoints.copy())
+    again = solve_even_window(Keypoints2D(view.tracks.keypoints.copy()))
     assert np.array_equal(again.joints, plain.joints)
 
 
@@ -191,7 +192,7 @@ def test_gross_outliers_without_confidences_do_not_drag_the_shape(view, plain):
     points = view.tracks.keypoints.copy()
     gross = rng.random(points.shape[:2]) < 0.05
     points[gross] += rng.uniform(-300, 300, (gross.sum(), 2)) * PX_PER_MM
-    spoiled = default_start_and_refine(points)
+    spoiled = solve_even_window(Keypoints2D(points))
     assert error(spoiled, view) < error(plain, view) + 6.0
 
 
@@ -199,34 +200,34 @@ def test_missing_joints_are_filled_in(view, plain):
     points = view.tracks.keypoints.copy()
     points[30:50, BODY_15.index("rwrist")] = np.nan
     points[70] = np.nan
-    filled = default_start_and_refine(points)
+    filled = solve_even_window(Keypoints2D(points))
     assert np.isfinite(filled.joints).all()
     assert error(filled, view) < error(plain, view) + 10.0
     never = view.tracks.keypoints.copy()
     never[:, BODY_15.index("lankle")] = np.nan
-    assert np.isfinite(default_start_and_refine(never).joints).all()
+    assert np.isfinite(solve_even_window(Keypoints2D(never)).joints).all()
 
 
 def test_a_person_who_comes_nearer_keeps_the_shape(view, plain):
     zoom = np.linspace(0.8, 1.2, 120)[:, None, None]
     points = view.tracks.keypoints
     centre = points.mean(axis=1, keepdims=True)
-    nearer = default_start_and_refine(centre + (points - centre) * zoom)
+    nearer = solve_even_window(Keypoints2D(centre + (points - centre) * zoom))
     assert error(nearer, view) < error(plain, view) + 10.0
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3, 5])
 def test_short_windows_have_an_answer(view, frames):
-    result = default_start_and_refine(view.tracks.keypoints[:frames])
+    result = solve_even_window(Keypoints2D(view.tracks.keypoints[:frames]))
     assert result.joints.shape == (frames, 15, 3)
     assert np.isfinite(result.joints).all()
 
 
 def test_nothing_seen_is_refused():
     with pytest.raises(InputError, match="at least one seen joint"):
-        default_start_and_refine(np.full((5, 15, 2), np.nan))
+        solve_even_window(Keypoints2D(np.full((5, 15, 2), np.nan)))
     with pytest.raises(InputError, match="depth_weight"):
-        DefaultMethodConfig(depth_weight=-1.0)
+        LiftedConfig(depth_weight=-1.0)
 
 
 def test_dropped_frames_get_their_place_back():
@@ -263,5 +264,5 @@ def test_unseen_people_clean_and_noisy(shared):
     sequences = protocol_sequences(shared / "mocap" / "dev", limit=3)
     for noisy, most in ((False, 25.0), (True, 33.0)):
         views = [orbit_view(q.x, 25.0, noisy=noisy) for q in sequences]
-        found = [error(default_start_and_refine(v.tracks.keypoints), v) for v in views]
+        found = [error(solve_even_window(Keypoints2D(v.tracks.keypoints)), v) for v in views]
         assert np.mean(found) < most

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
+from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.evaluation.protocol import PX_PER_MM, orbit_view, protocol_sequences
 from drocap_ros.reconstruction.lifted.lifter import SHIPPED, Lifter
 from drocap_ros.reconstruction.lifted.lifter_input import FEATURES, nanmedian_small, normalise
-from drocap_ros.reconstruction.metrics import pa_mpjpe
 from drocap_ros.skeleton import BODY_15
 
 

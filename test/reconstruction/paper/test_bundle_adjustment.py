@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 from walking import Walk, make_walk
 
 from drocap_ros.errors import InputError
+from drocap_ros.evaluation.metrics import pa_mpjpe
+from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.geometry.rotations import exp_so3
-from drocap_ros.reconstruction.metrics import limb_lengths, pa_mpjpe
 from drocap_ros.reconstruction.paper.bundle_adjustment import AdjustmentResult, bundle_adjust
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 

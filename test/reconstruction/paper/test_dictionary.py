@@ -12,8 +12,8 @@ from walking import make_walk, write_mocap
 
 from drocap_ros.cli.models import learn_dictionary
 from drocap_ros.errors import InputError
-from drocap_ros.evaluation.protocol import load_mocap
-from drocap_ros.reconstruction.metrics import limb_lengths
+from drocap_ros.geometry.bones import limb_lengths
+from drocap_ros.mocap import load_mocap
 from drocap_ros.reconstruction.paper.dictionary import (
     Dictionary,
     learn,

@@ -7,7 +7,7 @@ import pytest
 from walking import Walk
 
 from drocap_ros.errors import InputError
-from drocap_ros.reconstruction.metrics import pa_mpjpe
+from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.reconstruction.paper.dictionary import Dictionary
 from drocap_ros.reconstruction.paper.expectation import GaussianJoints, HeatmapJoints, MixtureJoints
 from drocap_ros.reconstruction.paper.normalize import normalize_tracks
@@ -73,7 +73,7 @@ def test_a_heatmap_is_summed_against_the_model() -> None:
 
 def test_candidates_rescue_what_the_highest_peak_gets_wrong(walk: Walk, dictionary: Dictionary) -> None:
     """The larger peak of a wrist lies on the other wrist in every third frame; the true one is the smaller."""
-    n = normalize_tracks(walk.keypoints)
+    n = normalize_tracks(Keypoints2D(walk.keypoints))
     wrong = n.w.copy()
     frames = np.arange(len(wrong)) % 3 == 0
     wrong[frames, 11], wrong[frames, 14] = n.w[frames, 14], n.w[frames, 11]

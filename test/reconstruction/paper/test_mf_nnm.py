@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from walking import make_walk
 
+from drocap_ros.evaluation.metrics import is_mirrored, pa_mpjpe
 from drocap_ros.evaluation.protocol import orbit_rotations
 from drocap_ros.geometry.rotations import angle_between
-from drocap_ros.reconstruction.metrics import is_mirrored, pa_mpjpe
 from drocap_ros.reconstruction.paper.dictionary import Dictionary
 from drocap_ros.reconstruction.paper.mf_nnm import (
     factorize,
