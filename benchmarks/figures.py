@@ -5,7 +5,7 @@ elsewhere: `DROCAP_FIGURES=DIR` writes the pages to DIR instead of docs/figures.
 
 One page per part that can run alone:
 
-    accuracy.py         accuracy, accuracy_live, accuracy_perspective
+    accuracy.py         accuracy, accuracy_live, accuracy_perspective, accuracy_world
     reconstruction.py   reconstruction
     perception.py       perception
     recording.py        recording_load, recording_kills, recording_mutations, recording_long, recording_live

@@ -1,0 +1,140 @@
+"""Accuracy studies over MoCap and simulation: `python benchmarks/accuracy.py`, or some of its parts by name.
+
+rotation     every method at four orbit speeds, clean and noisy 2D (`drocap evaluate rotation`): page accuracy
+live         the live method beside the offline one, clean and noisy 2D (`drocap evaluate live`): page accuracy_live
+perspective  the default method with a camera 6 m and 10 m away, lens known and unknown: page accuracy_perspective
+world        placement and scale from telemetry, on simulated captures: page accuracy_world
+
+Needs ../shared/mocap/dev, `world` excepted.  `--limit 2` takes the first two sequences only (a minute in all).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from figures import ROOT, table, write_figures
+
+sys.path[:0] = [str(ROOT)]
+
+from drocap_ros.cli.progress import progress_bars  # noqa: E402
+from drocap_ros.evaluation.live import live_study  # noqa: E402
+from drocap_ros.evaluation.live_table import live_markdown  # noqa: E402
+from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error, w_mpjpe  # noqa: E402
+from drocap_ros.evaluation.protocol import (  # noqa: E402
+    FPS,
+    IMAGE_SIZE,
+    NOISE_MM,
+    PX_PER_MM,
+    orbit_rotations,
+    protocol_sequences,
+)  # fmt: skip
+from drocap_ros.evaluation.rotation import rotation_study  # noqa: E402
+from drocap_ros.evaluation.tables import study_markdown  # noqa: E402
+from drocap_ros.reconstruction.reconstruct import reconstruct  # noqa: E402
+from drocap_ros.simulation.capture import simulate_capture  # noqa: E402
+from drocap_ros.simulation.capture_config import SimulationConfig  # noqa: E402
+from drocap_ros.simulation.orbit_camera import project, to_camera  # noqa: E402
+from drocap_ros.skeleton import BODY_15, indices  # noqa: E402
+from drocap_ros.tracks import Tracks  # noqa: E402
+
+SPEED_DEG_S = 25.0
+SOLUTION_DELAY_S = 0.5
+
+
+def rotation(args: argparse.Namespace) -> None:
+    pages = []
+    for noisy in (False, True):
+        with progress_bars() as progress:
+            rows = rotation_study(
+                args.mocap, noisy=noisy, limit=args.limit, processes=args.processes, progress=progress
+            )  # fmt: skip
+        pages.append(f"## {'Noisy' if noisy else 'Clean'} 2D\n\n{study_markdown(rows)}")
+    write_figures("accuracy", "Accuracy of every method over the camera's orbit speed", "\n".join(pages))
+
+
+def live(args: argparse.Namespace) -> None:
+    pages = []
+    for noisy in (False, True):
+        rows = live_study(args.mocap, noisy=noisy, delay_s=SOLUTION_DELAY_S, limit=args.limit)
+        pages.append(f"## {'Noisy' if noisy else 'Clean'} 2D\n\n{live_markdown(rows, SOLUTION_DELAY_S)}")
+    write_figures("accuracy_live", "Accuracy of the live method beside the offline one", "\n".join(pages))
+
+
+def perspective_view(x: np.ndarray, distance_m: float, noise_px: float) -> tuple[Tracks, np.ndarray, np.ndarray]:
+    """Tracks, camera matrix (3, 3) and truth (F, 15, 3) mm of a camera that orbits the middle of the walked path.
+
+    The focal length gives the person the same size in the image as the protocol's orthographic camera does.
+    """
+    turn = orbit_rotations(len(x), SPEED_DEG_S)
+    position = x[:, 0].mean(axis=0) - 1000.0 * distance_m * turn[:, 2]
+    focal = PX_PER_MM * 1000.0 * distance_m
+    matrix = np.array([[focal, 0.0, IMAGE_SIZE[0] / 2], [0.0, focal, IMAGE_SIZE[1] / 2], [0.0, 0.0, 1.0]])
+    keypoints = project(x, turn, position, matrix)
+    keypoints += np.random.default_rng(0).normal(0.0, noise_px, keypoints.shape)
+    stamp_ns = np.round(np.arange(len(x)) * (1e9 / FPS)).astype(np.int64)
+    return Tracks(keypoints, BODY_15.joints, stamp_ns, IMAGE_SIZE), matrix, to_camera(x, turn, position)
+
+
+def perspective(args: argparse.Namespace) -> None:
+    sequences, rows = protocol_sequences(args.mocap, limit=args.limit), []
+    for distance_m in (6.0, 10.0):
+        for label, noise_px in (("clean", 0.0), (f"{NOISE_MM:g} mm noise", NOISE_MM * PX_PER_MM)):
+            errors = []
+            for sequence in sequences:
+                tracks, matrix, truth = perspective_view(sequence.x, distance_m, noise_px)
+                cases = ((tracks, "ba"), (replace(tracks, camera_matrix=matrix), "ba"), (tracks, "initial"))
+                motions = (reconstruct(case, method=method) for case, method in cases)
+                errors.append([pa_mpjpe(1000.0 * motion.joints3d, truth).mean() for motion in motions])
+            rows.append([f"{distance_m:g} m", label, *(f"{error:.1f}" for error in np.mean(errors, axis=0))])
+    head = ["distance", "2D", "ba, lens unknown", "ba, lens known (`camera_matrix`)", "initial"]
+    text = f"Reconstruction error in mm, mean over {len(sequences)} sequences, {SPEED_DEG_S:g} deg/s.\n\n"
+    write_figures("accuracy_perspective", "Accuracy with a camera nearby", text + table(head, rows))
+
+
+def world(args: argparse.Namespace) -> None:
+    """Error of the pelvis in the world, of the limbs' length, and W-MPJPE; a row per capture."""
+    rows = []
+    for label, attitude_deg, position_m in (("exact", 0.0, 0.0), ("off by 0.5 deg and 0.2 m (RMS)", 0.5, 0.2)):
+        config = SimulationConfig(radius_m=6.0, attitude_error_deg=attitude_deg, position_error_m=position_m)
+        for seed in range(3):
+            capture = simulate_capture(12.0, 30.0, seed, config)
+            motion = reconstruct(capture.tracks)
+            estimate = motion.joints3d[:, indices(motion.joints, BODY_15.joints)]
+            truth = capture.joints3d_world
+            away = np.linalg.norm(estimate[:, 0] - truth[:, 0], axis=1)
+            rows.append([
+                label, seed, f"{100 * away.mean():.1f}", f"{100 * scale_error(estimate, truth):+.1f}",
+                f"{1000 * w_mpjpe(estimate, truth).mean():.0f}", motion.scale_source,
+            ])  # fmt: skip
+    head = ["telemetry", "seed", "pelvis off by, cm", "limbs' length, %", "W-MPJPE, mm", "scale from"]
+    text = "Simulated captures of 12 s at 6 m, default method, realistic noise in the 2D keypoints.\n\n"
+    write_figures("accuracy_world", "Placement and scale in the world", text + table(head, rows))
+
+
+PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
+    "rotation": rotation, "live": live, "perspective": perspective, "world": world
+}  # fmt: skip
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []])
+    parser.add_argument("--mocap", type=Path, default=ROOT.parent / "shared" / "mocap" / "dev")
+    parser.add_argument("--limit", type=int, help="only the first N sequences")
+    parser.add_argument("--processes", type=int, default=1)
+    args = parser.parse_args()
+    for part in args.parts or PARTS:
+        if part != "world" and not args.mocap.is_dir():
+            print(f"accuracy: no {args.mocap.name} beside the checkout, {part} is left out")
+            continue
+        PARTS[part](args)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
