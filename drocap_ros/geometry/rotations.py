@@ -25,16 +25,6 @@ def exp_so3(v: np.ndarray) -> np.ndarray:
     return np.eye(3, dtype=v.dtype) + a * k + b * (k @ k)
 
 
-def log_so3(r: np.ndarray) -> np.ndarray:
-    """Rotation vectors (..., 3) in rad, angle in [0, pi], of rotation matrices (..., 3, 3)."""
-    q = quaternion_from_matrix(r)
-    q = np.where(q[..., 3:] < 0, -q, q)
-    sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, q[..., 3:])
-    small = sine < 1e-8
-    return q[..., :3] * np.where(small, 2.0, angle / np.where(small, 1.0, sine))
-
-
 def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angle (...) in rad of the rotation from ``a`` to ``b``, both (..., 3, 3)."""
     # Chordal distance |a - b|_F = 2 sqrt(2) sin(angle / 2) keeps its precision near zero; the trace does not.

@@ -204,7 +204,7 @@ def adjust(
         if len(start) < MIN_WINDOW:
             return placed(start, n.w, n.information), {}, 0, TOO_SHORT
         information = n.information if credit is None else n.information * credit[rows][..., None]
-        result = bundle_adjust(n.w, start, config=config, information=information)
+        result = bundle_adjust(n.w, information, start, config)
         poses = placed(result.camera_shape, n.w, information)
         return poses, result.cost_terms, result.iterations, result.stop_reason
 

@@ -9,24 +9,22 @@ from drocap_ros.parameters import Parameters, param
 
 @dataclass(frozen=True)
 class InitializerConfig(Parameters):
-    """Single-view initialization; lengths "2D std" are the standard deviation of the centred 2D joints."""
+    """Single-view initializer; lengths "2D std" are the standard deviation of the centred 2D joints."""
 
     dictionary: str = param("", "dictionary file; empty for the shipped one")
-    azimuth_starts: int = param(4, "viewpoints around the body that the fit starts from", minimum=1, maximum=64)
-    elevation_start_deg: float = param(15.0, "camera elevation of the starts", unit="deg", minimum=-89.0, maximum=89.0)
-    convex_start: bool = param(False, "add the convex relaxation (spectral norm, ADMM) to the starts")
+    search_azimuths: int = param(4, "viewpoints around the body in the viewpoint search", minimum=1, maximum=64)
+    search_elevation_deg: float = param(15.0, "camera elevation of these viewpoints", unit="deg", minimum=-89.0,
+                                        maximum=89.0)  # fmt: skip
+    convex_relaxation: bool = param(False, "add the viewpoint of the convex relaxation (spectral norm, ADMM)")
     convex_alpha: float = param(0.1, "weight of the spectral norms in the convex relaxation", unit="2D std",
                                 minimum=0.0)  # fmt: skip
     convex_iterations: int = param(100, "ADMM steps of the convex relaxation", minimum=1, maximum=10000)
-    start_components: int = param(20, "principal components in the search of the start", minimum=1, maximum=45)
-    start_iterations: int = param(14, "damped Gauss-Newton steps per start", minimum=1, maximum=200)
+    search_components: int = param(20, "principal components in the viewpoint search", minimum=1, maximum=45)
+    search_iterations: int = param(14, "damped Gauss-Newton steps per viewpoint", minimum=1, maximum=200)
     keypoint_std: float = param(0.1, "standard deviation of an ordinary 2D joint", unit="2D std", minimum=0.001)
     em_rounds: int = param(2, "E-steps over the uncertain 2D joints", minimum=0, maximum=50)
     outlier_share: float = param(0.05, "share of gross outliers among the 2D joints that the E-step expects",
                                  minimum=1e-6, maximum=0.5)  # fmt: skip
-    outlier_std: float = param(
-        0.0, "residual in standard deviations beyond which a joint is taken for an outlier; 0 = never", minimum=0.0
-    )
     scale_std: float = param(0.05, "relative change of the body's image size in the sequence", minimum=0.001, maximum=1)
     sparsity: float = param(0.05, "weight of the L1 norm of the coefficients (alpha)", unit="2D std", minimum=0.0)
     sparse_rounds: int = param(6, "alternations of sparse coefficients and rotation", minimum=0, maximum=100)
@@ -34,24 +32,22 @@ class InitializerConfig(Parameters):
     coefficient_smoothness: float = param(0.3, "weight of the change of coefficients over time", minimum=0.0)
     rotation_smoothness: float = param(0.3, "weight of the change of rotation over time", minimum=0.0)
     switch_cost: float = param(1.0, "cost of a jump between hypotheses, per squared 2D std", minimum=0.0)
-    live_start: str = param("lifter", "what finds the pose of an image in the live node: the learned lifter, or the"
-                            " dictionary as offline", choices=("lifter", "dictionary"))  # fmt: skip
     lifter: str = param("", "the live node's lifter, an ONNX file; empty for the shipped one")
-    past_s: float = param(1.4, "past that the lifter sees in the live node", unit="s", minimum=0.1, maximum=10.0)
-    late_s: float = param(1.0, "a stamp up to so long before the last one is late and dropped; further back, time has"
-                          " jumped", unit="s", minimum=0.0, maximum=60.0)  # fmt: skip
-    gap_s: float = param(1.0, "after a longer gap the live node starts anew, but for the person's size", unit="s",
+    past_s: float = param(1.4, "past that the live node gives the lifter", unit="s", minimum=0.1, maximum=10.0)
+    late_s: float = param(1.0, "stamps up to this long before the last one are late and dropped; earlier ones are a"
+                          " jump of time", unit="s", minimum=0.0, maximum=60.0)  # fmt: skip
+    gap_s: float = param(1.0, "after a longer gap the live node keeps only the person's proportions", unit="s",
                          minimum=0.05, maximum=60.0)  # fmt: skip
-    block_frames: int = param(500, "frames that are fitted together at most", minimum=16, maximum=20000)
+    block_frames: int = param(500, "most frames that are fitted together", minimum=16, maximum=20000)
     assumed_height_m: float = param(1.70, "stature that sets the scale when none is known", unit="m", minimum=0.3,
                                     maximum=3.0)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class BundleAdjusterConfig(Parameters):
-    """Bundle adjustment: the paper's equations (2) to (4), and what the default method and the live node add."""
+    """Bundle adjustment: the paper's equations (2) to (4), and the parameters of the default method and the live node."""
 
-    method: str = param("ba", "what the live node adjusts by: the default method, or the paper's equations",
+    method: str = param("ba", "the live node's method: the default method, or the paper's equations",
                         choices=("ba", "paper"))  # fmt: skip
     lifter: str = param("", "the default method's lifter, an ONNX file; empty for the shipped one")
     limb_iterations_first: int = param(4, "steps of the default method that find the bone lengths", minimum=0,
@@ -61,25 +57,24 @@ class BundleAdjusterConfig(Parameters):
     alpha: float = param(0.1, "weight of the nuclear norm at 240 frames; grows with the root of the length",
                          minimum=0.0)  # fmt: skip
     noise_alpha: float = param(0.5, "alpha is at least this share of the threshold that hides the 2D joints' noise"
-                               " (2 sigma (sqrt F + sqrt 2P)); 0 = alpha as given", minimum=0.0)  # fmt: skip
+                               " (2 sigma (sqrt F + sqrt 2P)); 0 = alpha unchanged", minimum=0.0)  # fmt: skip
     gamma: float = param(1.0, "weight of the articulation term; 0 leaves it out", minimum=0.0)
-    shape_smoothness: float = param(0.0, "weight of the change of shape over time", minimum=0.0)
-    rotation_smoothness: float = param(0.0, "weight of the change of rotation over time", minimum=0.0)
-    iterations: int = param(150, "proximal steps at most", minimum=1, maximum=100000)
+    iterations: int = param(150, "most proximal steps", minimum=1, maximum=100000)
     rotation_every: int = param(3, "proximal steps per update of the rotations", minimum=1, maximum=1000)
     tolerance: float = param(1e-5, "relative decrease of the cost over 10 steps that ends the solve", minimum=0.0)
     window_s: float = param(12.0, "length of an adjustment window", unit="s", minimum=0.5, maximum=120.0)
     period_s: float = param(1.0, "time between two adjustments of the live node", unit="s", minimum=0.05, maximum=60.0)
-    window_frames: int = param(480, "frames in a window at most", minimum=8, maximum=5000)
+    window_frames: int = param(480, "most frames in a window", minimum=8, maximum=5000)
     overlap_frames: int = param(30, "frames that neighbouring windows of a long recording share", minimum=0,
                                 maximum=2000)  # fmt: skip
-    max_solve_s: float = param(0.5, "an adjustment of the live node ends after the step in which this is over",
+    max_solve_s: float = param(0.5, "an adjustment of the live node ends after the first step that exceeds this time",
                                unit="s", minimum=0.01, maximum=60.0)  # fmt: skip
-    max_stride: int = param(4, "the live node adjusts every n-th image at most when it is late", minimum=1, maximum=16)
-    blend_s: float = param(0.5, "time over which pose3d/latest takes over a new solution", unit="s", minimum=0.0,
+    max_stride: int = param(4, "most images per image that the live node adjusts while it is late", minimum=1,
+                            maximum=16)  # fmt: skip
+    blend_s: float = param(0.5, "time in which pose3d/latest changes to a new solution", unit="s", minimum=0.0,
                            maximum=10.0)  # fmt: skip
     late_s: float = param(1.0, "as the initializer's", unit="s", minimum=0.0, maximum=60.0)
-    gap_s: float = param(1.0, "after a longer gap the live window starts anew, but for the person's size", unit="s",
-                         minimum=0.05, maximum=60.0)  # fmt: skip
-    max_pending: int = param(1000, "images that wait for their initial pose in the live node", minimum=1, maximum=10000)
+    gap_s: float = param(1.0, "after a longer gap the live window keeps only the person's bone lengths and size",
+                         unit="s", minimum=0.05, maximum=60.0)  # fmt: skip
+    max_pending: int = param(1000, "most images of the live node without their initial pose", minimum=1, maximum=10000)
     threads: int = param(1, "threads of the linear algebra; the matrices are small", minimum=1, maximum=64)

@@ -9,7 +9,6 @@ S is updated by the accelerated proximal gradient method with backtracking and r
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,15 +22,14 @@ from drocap_ros.reconstruction.paper.reprojection import (
     Projection,
     frames_first,
     frames_last,
-    information_from,
     noise_std,
     rotate,
 )
-from drocap_ros.reconstruction.paper.rotations import rotation_change, update_rotations
+from drocap_ros.reconstruction.paper.rotations import update_rotations
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.reconstruction.stop_reason import CONVERGED, ITERATIONS
 
-#: Length at which alpha is given: the protocol's 10 s at 24 fps.
+#: Window length for which alpha is given: the protocol's 10 s at 24 fps.
 REFERENCE_FRAMES = 240
 
 #: Windows of fewer frames are not adjusted: their views are too similar.
@@ -40,14 +38,14 @@ MIN_WINDOW = 4
 
 @dataclass(frozen=True)
 class AdjustmentResult:
-    """What the solver found and why it stopped.
+    """Poses, cost and stop reason of one window.
 
     shape : (F, P, 3) S, torso frame, centred, in the unit of W
     rotation : (F, 3, 3) R, torso -> camera; its first two rows are the paper's R_t
     translation : (F, 2) in the unit of W; ``W ~ shape @ rotation[:, :2]^T + translation``
-    cost : total; cost_terms : per term (reprojection, articulation, nuclear_norm, smoothness)
+    cost : total; cost_terms : per term (reprojection, articulation, nuclear_norm)
     history : (iterations + 1,) cost after each step
-    stop_reason : "converged" or "iterations"
+    stop_reason : CONVERGED or ITERATIONS
     """
 
     shape: np.ndarray
@@ -56,7 +54,6 @@ class AdjustmentResult:
     cost: float
     cost_terms: dict[str, float]
     iterations: int
-    restarts: int
     stop_reason: str
     history: np.ndarray = field(repr=False)
 
@@ -67,7 +64,7 @@ class AdjustmentResult:
 
 
 class Objective:
-    """Equations (2) and (3) for fixed measurements, shapes (3, P, F); R is a state that :meth:`turn` updates.
+    """Equations (2) and (3) for fixed measurements, shapes (3, P, F); R is a state that :meth:`update_rotation` updates.
 
     rotation : (3, 3, F)
     """
@@ -75,36 +72,28 @@ class Objective:
     def __init__(self, projection: Projection, rotation: np.ndarray, config: BundleAdjusterConfig) -> None:
         self.projection, self.rotation, self.config = projection, rotation, config
         self.alpha = effective_alpha(projection, config)
-        self._rotation_cost = config.rotation_smoothness * rotation_change(rotation)
 
     def value(self, s: np.ndarray) -> float:
         """F of equation (3), L at its optimum."""
-        value = self.projection.value(s, self.rotation) + self._rotation_cost
+        value = self.projection.value(s, self.rotation)
         if self.config.gamma > 0.0:
             value += self.config.gamma * articulation_value(s)
-        if self.config.shape_smoothness > 0.0:
-            value += self.config.shape_smoothness * shape_change(s)
         return value
 
     def value_and_gradient(self, s: np.ndarray) -> tuple[float, np.ndarray]:
         """F of equation (3), and its gradient (3, P, F) by centred S."""
         value, gradient = self.projection.value_and_gradient(s, self.rotation)
-        value += self._rotation_cost
         if self.config.gamma > 0.0:
             articulation, slope = articulation_term(s)
             value += self.config.gamma * articulation
             gradient += self.config.gamma * slope
-        if self.config.shape_smoothness > 0.0:
-            value += self.config.shape_smoothness * shape_change(s)
-            gradient += self.config.shape_smoothness * shape_change_gradient(s)
         # S stays centred: its centroid is the translation's.
         gradient -= gradient.mean(axis=1, keepdims=True)
         return value, gradient
 
-    def turn(self, s: np.ndarray) -> None:
+    def update_rotation(self, s: np.ndarray) -> None:
         """One downhill step of every rotation."""
-        self.rotation = update_rotations(self.projection, s, self.rotation, smoothness=self.config.rotation_smoothness)
-        self._rotation_cost = self.config.rotation_smoothness * rotation_change(self.rotation)
+        self.rotation = update_rotations(self.projection, s, self.rotation)
 
     def terms(self, s: np.ndarray) -> dict[str, float]:
         """Cost per term of equation (2), weighted."""
@@ -112,16 +101,15 @@ class Objective:
             "reprojection": self.projection.value(s, self.rotation),
             "articulation": self.config.gamma * articulation_value(s),
             "nuclear_norm": self.alpha * nuclear_norm(s),
-            "smoothness": self.config.shape_smoothness * shape_change(s) + self._rotation_cost,
         }
 
 
 def effective_alpha(projection: Projection, config: BundleAdjusterConfig) -> float:
     """Weight of the nuclear norm: ``config.alpha`` for the window's length, more where the 2D joints are noisy.
 
-    Noise of standard deviation sigma alone has singular values up to sigma (sqrt F + sqrt 2P); to hide it, the
-    threshold has to be of that size (the data term has no factor 1/2, hence the 2).  It stays below a tenth of what
-    the joints themselves have, so that a window of nothing but noise still has a body.
+    Noise of standard deviation sigma alone has singular values up to sigma (sqrt F + sqrt 2P); a threshold of that
+    size removes it (the reprojection term has no factor 1/2, hence the 2).  The upper bound, a tenth of the joints'
+    largest singular value, keeps the body in a window of pure noise.
     """
     w, information = frames_first(projection.w), frames_first(projection.information)
     frames, p = w.shape[:2]
@@ -130,65 +118,34 @@ def effective_alpha(projection: Projection, config: BundleAdjusterConfig) -> flo
     return float(max(config.alpha * np.sqrt(frames / REFERENCE_FRAMES), min(config.noise_alpha * hiding, most)))
 
 
-def shape_change(s: np.ndarray) -> float:
-    """Sum over time of the squared second difference of shape (..., F): steady motion is free."""
-    if s.shape[-1] < 3:
-        return 0.0
-    bend = s[..., 2:] - 2.0 * s[..., 1:-1] + s[..., :-2]
-    return float(np.vdot(bend, bend))
-
-
-def shape_change_gradient(s: np.ndarray) -> np.ndarray:
-    """Gradient of :func:`shape_change`."""
-    gradient = np.zeros_like(s)
-    if s.shape[-1] >= 3:
-        bend = 2.0 * (s[..., 2:] - 2.0 * s[..., 1:-1] + s[..., :-2])
-        gradient[..., 2:] += bend
-        gradient[..., 1:-1] -= 2.0 * bend
-        gradient[..., :-2] += bend
-    return gradient
-
-
 def bundle_adjust(
-    w: np.ndarray,
-    s0: np.ndarray,
-    r0: np.ndarray | None = None,
-    weights: np.ndarray | None = None,
-    covariance: np.ndarray | None = None,
-    config: BundleAdjusterConfig | None = None,
-    *,
-    information: np.ndarray | None = None,
-    progress: Callable[[float], None] | None = None,
+    w: np.ndarray, information: np.ndarray, s0: np.ndarray, config: BundleAdjusterConfig | None = None
 ) -> AdjustmentResult:
     """Refine poses over one window of frames.
 
     Parameters
     ----------
-    w : (F, P, 2) 2D joints of BODY_15, centred about the person, in units of their standard deviation; NaN where
-        not seen
-    s0 : (F, P, 3) start, in the unit of w, in any frame that ``r0`` leads from to the camera's axes
-    r0 : (F, 3, 3), or None when s0 is in camera axes (x right, y down, z forward)
-    weights : (F, P) >= 0 of the reprojection term, or None
-    covariance : (F, P, 3) xx, xy, yy of w, or None
+    w : (F, P, 2) 2D joints of BODY_15, centred about the person, in units of their standard deviation
+    information : (F, P, 3) of :func:`~drocap_ros.reconstruction.paper.reprojection.information_from`, 0 where not seen
+    s0 : (F, P, 3) initial poses in camera axes (x right, y down, z forward), in the unit of w
     config : weights of the terms and limits of the solver
-    information : (F, P, 3) in place of weights and covariance, as
-        :func:`~drocap_ros.reconstruction.paper.reprojection.information_from` makes it
 
     Raises
     ------
     InputError
-        When the shapes do not fit or the start is not finite.
+        When the shapes do not fit or the initial poses are not finite.
     """
     config = config or BundleAdjusterConfig()
-    _check(w, s0, r0)
-    r0 = np.broadcast_to(np.eye(3), (len(w), 3, 3)) if r0 is None else r0
+    if w.ndim != 3 or w.shape[2] != 2:
+        raise InputError(f"w: expected shape (F, P, 2), got {w.shape}; add or move the axes")
+    if s0.shape != (*w.shape[:2], 3) or not np.isfinite(s0).all():
+        raise InputError(f"s0: expected finite values of shape {(*w.shape[:2], 3)}, got {s0.shape}; fill the gaps in")
     # Low rank holds in a body-fixed frame only: in the camera's or the world's, a turning body is of high rank.
     body = torso_frame(s0)
     shape = (s0 - s0.mean(axis=1, keepdims=True)) @ body
-    projection = Projection(w, information_from(w, weights, covariance) if information is None else information)
-    rotation = np.ascontiguousarray(np.moveaxis(r0 @ body, 0, -1))
-    objective = Objective(projection, rotation, config)
-    s, outcome = minimize(objective, frames_last(shape), progress)
+    projection = Projection(w, information)
+    objective = Objective(projection, np.ascontiguousarray(np.moveaxis(body, 0, -1)), config)
+    s, outcome = minimize(objective, frames_last(shape))
     terms = objective.terms(s)
     return AdjustmentResult(
         shape=frames_first(s),
@@ -200,27 +157,16 @@ def bundle_adjust(
     )
 
 
-def _check(w: np.ndarray, s0: np.ndarray, r0: np.ndarray | None) -> None:
-    if w.ndim != 3 or w.shape[2] != 2:
-        raise InputError(f"w: expected shape (F, P, 2), got {w.shape}; add or move the axes")
-    if s0.shape != (*w.shape[:2], 3) or not np.isfinite(s0).all():
-        raise InputError(f"s0: expected finite values of shape {(*w.shape[:2], 3)}, got {s0.shape}; fill the gaps in")
-    if r0 is not None and r0.shape != (len(w), 3, 3):
-        raise InputError(f"r0: expected shape {(len(w), 3, 3)}, got {r0.shape}; give one rotation per frame")
-
-
-def minimize(
-    objective: Objective, s: np.ndarray, progress: Callable[[float], None] | None = None
-) -> tuple[np.ndarray, dict[str, Any]]:
+def minimize(objective: Objective, s: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
     """Accelerated proximal gradient steps (4) with backtracking; momentum restarts when the cost would rise.
 
     Parameters
     ----------
-    s : (3, P, F) start
+    s : (3, P, F) initial shapes
 
     Returns
     -------
-    shapes (3, P, F), and iterations, restarts, stop_reason and history of the cost
+    shapes (3, P, F), and iterations, stop_reason and history of the cost
     """
     config, alpha = objective.config, objective.alpha
     cost = objective.value(s) + alpha * nuclear_norm(s)
@@ -229,29 +175,22 @@ def minimize(
     for k in range(config.iterations):
         if k % config.rotation_every == 0:
             before = objective.value(s)
-            objective.turn(s)
+            objective.update_rotation(s)
             cost += objective.value(s) - before
         new, new_cost, mu = _proximal_step(objective, ahead, mu)
         if new_cost > cost and ahead is not s:
-            restarts, t = restarts + 1, 1.0
+            t = 1.0
             new, new_cost, mu = _proximal_step(objective, s, mu)
         t_new = 0.5 * (1.0 + float(np.sqrt(1.0 + 4.0 * t * t)))
         ahead = new + ((t - 1.0) / t_new) * (new - s)
         s, t, cost = new, t_new, new_cost
-        # Let the step grow again where the surface has become flatter.
+        # The step grows again where the surface has become flatter.
         mu *= 0.9
         history.append(cost)
-        if progress is not None and k % 10 == 0:
-            progress(k / config.iterations)
         if k >= 20 and history[-11] - cost <= config.tolerance * abs(cost):
             stop = CONVERGED
             break
-    return s, {
-        "iterations": len(history) - 1,
-        "restarts": restarts,
-        "stop_reason": stop,
-        "history": np.array(history),
-    }
+    return s, {"iterations": len(history) - 1, "stop_reason": stop, "history": np.array(history)}
 
 
 def _proximal_step(objective: Objective, at: np.ndarray, mu: float) -> tuple[np.ndarray, float, float]:

@@ -2,7 +2,8 @@
 
     min over M_k in R^(2 x 3) of  0.5 |W - sum_k M_k B_k|_F^2 + alpha sum_k |M_k|_2
 
-needs no viewpoint to start from; rotation and coefficients are read off its solution.
+needs no initial viewpoint; its solution gives rotation and coefficients.  Off by default, as it is slower and no
+better than the viewpoint search; kept as the paper's own initializer.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def convex_relaxation(
 def rotation_and_coefficients(m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotation (F, 3, 3) torso -> camera, and coefficients (F, 1 + K), from matrices M (F, 1 + K, 2, 3).
 
-    The mean pose's matrix has most of the norm: its closest orthonormal rows are the rotation.
+    The rotation is the closest orthonormal rows to the mean pose's matrix, which has most of the norm.
     """
     rotation = complete_rotation(m[:, 0] + 1e-9 * np.eye(2, 3))
     coefficients = 0.5 * np.einsum("fkij,fij->fk", m, rotation[:, :2])
@@ -76,7 +77,7 @@ def _split(m: np.ndarray) -> np.ndarray:
 
 
 def _shrink(m: np.ndarray, tau: float) -> np.ndarray:
-    """Spectral norms shrink, that of the mean pose, which every pose has, does not."""
+    """Spectral norms shrink, that of the mean pose a tenth as much: every pose contains it."""
     out = shrink_spectral_norm(m, tau)
     out[:, 0] = shrink_spectral_norm(m[:, 0], 0.1 * tau)
     return out

@@ -33,7 +33,7 @@ class Dictionary:
     joints : P names
     sparsity : weight of the L1 norm that the atoms were learned with, m
     components, component_std : (D, P, 3) orthonormal and (D,) m; principal directions of the same poses, the
-        dense few-parameter model that the starts are searched with
+        dense few-parameter model of the viewpoint search
     metadata : origin, licence, counts, command, and the fit's quality
     """
 
@@ -118,7 +118,7 @@ def learn(
 
     Parameters
     ----------
-    poses : (N, 15, 3) as :func:`normalize_poses` makes them; their mirror images are learned from as well
+    poses : (N, 15, 3) of :func:`normalize_poses`; their mirror images are added
     atoms : size K
     sparsity : weight of the L1 norm, m; larger means fewer active atoms
 
@@ -164,7 +164,7 @@ def learn(
 def _update_atoms(
     d: np.ndarray, gram: np.ndarray, cross: np.ndarray, x: np.ndarray, c: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """Block coordinate descent on the atoms; unused ones restart at the worst coded poses of the batch."""
+    """Block coordinate descent on the atoms; unused atoms are replaced by the worst coded poses of the batch."""
     d = d.copy()
     for k in range(len(d)):
         if gram[k, k] < 1e-8:
@@ -177,7 +177,7 @@ def _update_atoms(
 
 
 def _canonical(d: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Atoms in the order of their use, signed so that their coefficients are positive on the whole."""
+    """Atoms in the order of their use, signed so that the sum of their coefficients is positive."""
     return (d * np.where(c.sum(0) < 0, -1, 1)[:, None])[np.argsort(-np.abs(c).sum(0), kind="stable")]
 
 
@@ -234,6 +234,6 @@ def load_dictionary(path: str | Path | None = None) -> Dictionary:
         metadata = json.loads(str(a["metadata"]))
         sparsity = float(a["sparsity"])
     except (ValueError, TypeError):
-        raise InputError(f"{path}: expected JSON metadata and a number as sparsity; learn it anew") from None
+        raise InputError(f"{path}: expected JSON metadata and a number as sparsity; learn it again") from None
     floats = {name: a[name].astype(np.float64) for name in ("atoms", "mean", "components", "component_std")}
     return Dictionary(joints=joints, sparsity=sparsity, metadata=metadata, **floats)

@@ -1,7 +1,7 @@
 """Baseline MF+NNM: rotations by matrix factorization, shapes by nuclear norm minimization (Dai, Li and He 2012).
 
-It needs no start.  What the original leaves open or chooses with the truth in hand, the rank and the mirror image,
-is chosen here by how far the result is from the dictionary's poses.
+It needs no initial poses.  The original chooses the rank and the mirror image with the truth; here the candidate
+closest to the dictionary's poses wins.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def factorize(
         shape, terms, outcome = minimize_nuclear_norm(w, information, rotation, config)
         poses = shape @ np.swapaxes(rotation, 1, 2)
         found += [(candidate, terms, outcome) for candidate in (poses, poses * MIRROR)]
-    poses, terms, outcome = min(found, key=lambda one: _strangeness(one[0], dictionary))
+    poses, terms, outcome = min(found, key=lambda one: _distance(one[0], dictionary))
     return poses, terms, int(outcome["iterations"]), str(outcome["stop_reason"])
 
 
@@ -75,7 +75,7 @@ def minimize_nuclear_norm(
 ) -> tuple[np.ndarray, dict[str, float], dict[str, Any]]:
     """Shapes (F, P, 3) in the common frame for known rotations (F, 3, 3); cost per term; the solver's outcome.
 
-    The start is the pseudo-inverse: joints back-projected into the common frame without depth.
+    Without ``start`` the initial shapes are the joints back-projected into the common frame without depth.
     """
     centred = w - w.mean(axis=1, keepdims=True)
     s = frames_last(centred @ rotation[:, :2] if start is None else start)
@@ -85,10 +85,10 @@ def minimize_nuclear_norm(
 
 
 class _FixedCameras(Objective):
-    """Equations (2) and (3) with the rotations held."""
+    """Equations (2) and (3) with fixed rotations."""
 
-    def turn(self, s: np.ndarray) -> None:
-        """Nothing to do."""
+    def update_rotation(self, s: np.ndarray) -> None:
+        """The rotations stay."""
 
 
 def rotations_by_factorization(w: np.ndarray, basis_shapes: int) -> np.ndarray:
@@ -116,7 +116,7 @@ def metric_upgrade(motion: np.ndarray, *, iterations: int = 300) -> np.ndarray:
     size = a[:, :, None] * a[:, None, :] + b[:, :, None] * b[:, None, :]
     rows = np.concatenate([equal, cross + np.swapaxes(cross, 1, 2)]).reshape(-1, rank * rank)
     rows = rows / np.sqrt(len(a))
-    # One more row fixes the overall size, without which Q = 0 would do.
+    # One more row fixes the overall size: without it Q = 0 is a solution.
     rows = np.concatenate([rows, size.mean(axis=0).reshape(1, -1)])
     target = np.zeros(len(rows))
     target[-1] = 2.0
@@ -174,7 +174,7 @@ def _symmetric(m: np.ndarray) -> np.ndarray:
 
 
 def _continuous(rotation: np.ndarray) -> np.ndarray:
-    """Undo the sign ambiguity of each frame: of R and its half turn about the optical axis take the closer one."""
+    """Undo the sign ambiguity of each frame: R or its half turn about the optical axis, the closer to the neighbour."""
     half_turn = np.array([-1.0, -1.0, 1.0])[:, None]
     agrees = np.sum(rotation[1:] * rotation[:-1], axis=(1, 2)) >= np.sum(
         rotation[1:] * rotation[:-1] * half_turn, axis=(1, 2)
@@ -196,7 +196,7 @@ def fill_joints(w: np.ndarray, seen: np.ndarray) -> np.ndarray:
     return out
 
 
-def _strangeness(poses: np.ndarray, dictionary: Dictionary) -> float:
+def _distance(poses: np.ndarray, dictionary: Dictionary) -> float:
     """Mean squared Mahalanobis distance of poses (F, P, 3) from the dictionary's poses."""
     shape, _ = to_torso_frame(poses)
     flat = (normalize_poses(shape) - dictionary.mean).reshape(len(poses), -1)

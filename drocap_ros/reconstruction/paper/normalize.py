@@ -10,7 +10,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.paper.reprojection import information_from
 
-#: Fewer joints than this in every image fix no pose.
+#: Fewer joints in every image determine no pose.
 MIN_JOINTS = 4
 
 
@@ -20,9 +20,9 @@ class NormalizedTracks:
 
     w : (F, P, 2), 0 where not seen
     weights : (F, P) >= 0, 0 where not seen; the confidence
-    information : (F, P, 3) xx, xy, yy weight of each joint in the data term; 1, 0, 1 is an ordinary joint
+    information : (F, P, 3) xx, xy, yy weight of each joint in the reprojection term; 1, 0, 1 is an ordinary joint
     centre_px : (F, 2)
-    scale_px : px per unit; the standard deviation of all centred, visible coordinates
+    scale_px : px per unit; the standard deviation of all centred coordinates of seen joints
     """
 
     w: np.ndarray
@@ -31,22 +31,13 @@ class NormalizedTracks:
     centre_px: np.ndarray
     scale_px: float
 
-    def to_px(self, xy: np.ndarray) -> np.ndarray:
-        """Pixels (F, P, 2) of normalized image points."""
-        return xy * self.scale_px + self.centre_px[:, None]
 
-
-def normalize_tracks(
-    keypoints: Keypoints2D,
-    *,
-    scale_px: float | None = None,
-) -> NormalizedTracks:
-    """Centre each image's visible joints and scale the sequence to unit standard deviation.
+def normalize_tracks(keypoints: Keypoints2D) -> NormalizedTracks:
+    """Centre each image's seen joints and scale the sequence to unit standard deviation.
 
     Parameters
     ----------
     keypoints : px; confidences of NaN and 0 count as not seen; covariances of seen joints must be positive definite
-    scale_px : px per unit, where it is known from earlier images
 
     Raises
     ------
@@ -66,8 +57,7 @@ def normalize_tracks(
     count = np.sum(seen, axis=1)
     centre = points.sum(1) / np.maximum(count, 1)[:, None]
     w = np.where(seen[..., None], points - centre[:, None], 0.0)
-    if scale_px is None:
-        scale_px = float(np.sqrt(np.sum(w * w) / (2.0 * count.sum())))
+    scale_px = float(np.sqrt(np.sum(w * w) / (2.0 * count.sum())))
     if not scale_px > 1e-6 * (1.0 + np.abs(points).max()):
         raise InputError("keypoints: expected joints apart from each other, got all in one point; check the 2D tracks")
     covariance = keypoints.covariance
@@ -76,7 +66,7 @@ def normalize_tracks(
     w = w / scale_px
     units = None if covariance is None else covariance / scale_px**2
     information = information_from(np.where(seen[..., None], w, np.nan), weights, units)
-    return NormalizedTracks(w, weights, information, filled(centre, count > 0), scale_px)
+    return NormalizedTracks(w, weights, information, _filled(centre, count > 0), scale_px)
 
 
 def check_uncertainty(keypoints: Keypoints2D, seen: np.ndarray) -> None:
@@ -113,7 +103,7 @@ def _check_covariance(covariance: np.ndarray, seen: np.ndarray) -> None:
         )
 
 
-def filled(centre: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _filled(centre: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Centres of images without a joint, interpolated from their neighbours."""
     if known.all():
         return centre

@@ -1,7 +1,7 @@
 """Nuclear norm of the rearranged shape matrix S# and its proximal step.
 
-The solvers keep shapes as (3, P, F), frames last: then S# is ``s.reshape(3P, F)`` and costs nothing, and every
-elementwise operation runs along contiguous frames.
+Shapes are (3, P, F), frames last: S# is then the view ``s.reshape(3P, F)``, and elementwise operations run along
+contiguous frames.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ def information_from(
     w : (F, P, 2), NaN where not seen
     weights : (F, P) >= 0, or None
     covariance : (F, P, 3) xx, xy, yy in units of w squared; the median variance counts as ordinary
-    largest : bound on the gain of a joint that claims to be exact
+    largest : bound on the gain of a joint of vanishing variance
     """
     seen = np.isfinite(w).all(-1)
     base = seen.astype(np.float64) if weights is None else np.where(seen, weights, 0.0)
@@ -37,8 +37,8 @@ def information_from(
 def noise_std(w: np.ndarray, information: np.ndarray) -> float:
     """Standard deviation of white noise on the joints (F, P, 2), from their third differences in time.
 
-    A body is smooth over four images, noise is not: on clean MoCap at 24 fps this is 0.2 % of the unit.  Medians
-    over time and the quieter quarter of the joints keep gross outliers and fast hands out.
+    A body's motion is smooth over four images, noise is not: clean MoCap at 24 fps gives 0.2 % of the unit.  Medians
+    over time and the lower quartile of the joints exclude gross outliers and fast hands.
     """
     if len(w) < 8:
         return 0.0
@@ -54,7 +54,7 @@ def noise_std(w: np.ndarray, information: np.ndarray) -> float:
 
 
 def frames_last(a: np.ndarray) -> np.ndarray:
-    """(F, A, B) to contiguous (B, A, F): poses to the solvers' layout.  Rotations need a transpose before."""
+    """(F, A, B) to contiguous (B, A, F): poses to the solvers' layout.  Transpose rotations first."""
     return np.ascontiguousarray(np.swapaxes(a, 0, 2))
 
 
@@ -76,7 +76,7 @@ def rotate_back(r: np.ndarray, x: np.ndarray) -> np.ndarray:
 class Projection:
     """``R S + T - W`` with the translation T of each frame at its optimum.
 
-    w : (F, P, 2), anything where the information is 0
+    w : (F, P, 2), any value where the information is 0
     information : (F, P, 3)
     """
 

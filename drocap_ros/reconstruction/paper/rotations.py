@@ -1,4 +1,4 @@
-"""Update of the rotations R on SO(3) with the shapes held: Gauss-Newton steps that are taken only downhill.
+"""Update of the rotations R on SO(3) for fixed shapes: Gauss-Newton steps that only lower the cost.
 
 Shapes are (3, P, F) and rotations (3, 3, F), frames last.
 """
@@ -11,20 +11,16 @@ from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.paper.reprojection import Projection, rotate
 
 
-def rotation_gradient(projection: Projection, s: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """(3, F) derivative of each frame's reprojection cost by a left rotation vector, ``R <- exp(v) R``."""
-    return 2.0 * _moment(rotate(r, s), projection.inform(projection.residual(s, r)))
-
-
 def update_rotations(
     projection: Projection, s: np.ndarray, r: np.ndarray, *, steps: int = 1, smoothness: float = 0.0
 ) -> np.ndarray:
-    """Rotations (3, 3, F) of lower or equal cost: reprojection plus ``smoothness * rotation_change``.
+    """Rotations (3, 3, F) of lower or equal cost.
 
     Parameters
     ----------
-    s : (3, P, F) shapes, held
+    s : (3, P, F) shapes, fixed
     r : (3, 3, F) present rotations
+    smoothness : weight of the squared chordal distances of neighbouring rotations
     """
     for _ in range(steps):
         x = rotate(r, s)
@@ -42,7 +38,7 @@ def update_rotations(
         trace = np.trace(hessian, axis1=1, axis2=2)
         hessian += (1e-4 * trace + 1e-9)[:, None, None] * np.eye(3)
         move = -np.linalg.solve(hessian, gradient.T[..., None])[..., 0]
-        # Halve the step where it climbs; a frame that still climbs stays where it is.
+        # Halve the step where the cost rises; a frame whose cost still rises keeps its rotation.
         undecided = np.ones(r.shape[2], dtype=bool)
         for shrink in (1.0, 0.5, 0.25):
             turned = turn(r, shrink * move)
@@ -61,12 +57,6 @@ def turn(r: np.ndarray, v: np.ndarray) -> np.ndarray:
     """``exp(v) R`` for rotations (3, 3, F) and rotation vectors (F, 3)."""
     e = np.moveaxis(exp_so3(v), 0, -1)
     return np.stack([e[i, 0] * r[0] + e[i, 1] * r[1] + e[i, 2] * r[2] for i in range(3)])
-
-
-def rotation_change(r: np.ndarray) -> float:
-    """Sum over time of the squared chordal distance of neighbouring rotations (3, 3, F)."""
-    step = r[..., 1:] - r[..., :-1]
-    return float(np.vdot(step, step))
 
 
 def _moment(x: np.ndarray, force: np.ndarray) -> np.ndarray:
@@ -97,8 +87,8 @@ def _hessian(x: np.ndarray, information: np.ndarray) -> np.ndarray:
 def _neighbour_sum(r: np.ndarray) -> np.ndarray:
     """Sum of the mid-points to both neighbours.
 
-    ``|a - b|^2 <= 2 |a - m|^2 + 2 |b - m|^2`` with m the present mid-point decouples the frames: each may then be
-    updated by itself and the sum over time still falls.
+    ``|a - b|^2 <= 2 |a - m|^2 + 2 |b - m|^2`` with m the present mid-point decouples the frames: separate updates
+    still lower the sum over time.
     """
     middle = 0.5 * (r[..., 1:] + r[..., :-1])
     total = np.zeros_like(r)

@@ -3,8 +3,8 @@
     min over C, R of  0.5 sum_t |W_t - R_t (sum_k c_tk B_k)|^2 + alpha |C|_1
                       + beta/2 sum |c_t+1 - c_t|^2 + gamma/2 sum |R_t+1 - R_t|^2
 
-(Zhou et al. 2016, equation 9), alternating accelerated proximal gradient steps for C and downhill steps for R.
-The mean pose enters as one more atom that costs nothing: its coefficient is the body's image scale.
+(Zhou et al. 2016, equation 9), alternating accelerated proximal gradient steps for C and decreasing steps for R.
+The mean pose is one more atom without a penalty: its coefficient is the body's image scale.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ def fit_sparse(
     dictionary: Dictionary,
     config: InitializerConfig,
 ) -> SparseFit:
-    """Refine starts over one block of frames.
+    """Refine initial poses over one block of frames.
 
     Parameters
     ----------
-    rotation, coefficients : (F, 3, 3), (F, 1 + K) starts
+    rotation, coefficients : (F, 3, 3), (F, 1 + K) initial values
     """
     basis = dictionary.basis
     penalty = np.full((len(basis), 1), config.sparsity)

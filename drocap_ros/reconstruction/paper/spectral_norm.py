@@ -1,7 +1,7 @@
-"""Spectral norm of 2 x 3 matrices and its proximal step, in closed form (Zhou et al. 2015, section 4).
+"""Proximal step of the spectral norm of 2 x 3 matrices, in closed form (Zhou et al. 2015, section 4).
 
 The convex relaxation replaces coefficient times rotation by a free 2 x 3 matrix per atom; its spectral norm is
-the tightest convex stand-in for "a scaled pair of orthonormal rows".
+the tightest convex surrogate for "a scaled pair of orthonormal rows".
 """
 
 from __future__ import annotations
@@ -18,31 +18,20 @@ def singular_values(m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.sqrt(middle + spread), np.sqrt(np.maximum(middle - spread, 0.0))
 
 
-def spectral_norm(m: np.ndarray) -> np.ndarray:
-    """Largest singular value (...) of matrices (..., 2, 3)."""
-    return singular_values(m)[0]
-
-
 def shrink_spectral_norm(m: np.ndarray, tau: float) -> np.ndarray:
     """Proximal step of ``tau * sum of spectral norms`` on matrices (..., 2, 3).
 
-    The largest singular values fall until they have given up ``tau`` together.
+    The largest singular values decrease by ``tau`` in total.
     """
     s1, s2 = singular_values(m)
     level = np.where(s1 - s2 >= tau, s1 - tau, np.maximum(0.5 * (s1 + s2 - tau), 0.0))
     return _scale_singular_values(m, s1, s2, np.minimum(s1, level), np.minimum(s2, level))
 
 
-def project_spectral_ball(m: np.ndarray, radius: float) -> np.ndarray:
-    """Closest matrices (..., 2, 3) of spectral norm at most ``radius``."""
-    s1, s2 = singular_values(m)
-    return _scale_singular_values(m, s1, s2, np.minimum(s1, radius), np.minimum(s2, radius))
-
-
 def _scale_singular_values(
     m: np.ndarray, s1: np.ndarray, s2: np.ndarray, new1: np.ndarray, new2: np.ndarray
 ) -> np.ndarray:
-    """Exchange singular values: ``(p I + q M M^T) M`` with p, q chosen so that both come out right."""
+    """Replace the singular values: ``(p I + q M M^T) M`` with p, q from the two pairs of values."""
     g1 = new1 / np.where(s1 > 0.0, s1, 1.0)
     g2 = np.where(s2 > 1e-12 * s1, new2 / np.where(s2 > 0.0, s2, 1.0), g1)
     gap = s1 * s1 - s2 * s2

@@ -1,7 +1,7 @@
-"""Multi-start search of viewpoint and pose with a dense, few-parameter model of the dictionary's poses.
+"""Search of viewpoint and pose with a dense, few-parameter model of the dictionary's poses.
 
 Each frame is fitted from several viewpoints around the body by damped Gauss-Newton steps over rotation,
-translation, scale and the coefficients of the principal components, all frames and starts in one batch.
+translation, scale and the coefficients of the principal components, all frames and viewpoints in one batch.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class DenseFit:
     cost: np.ndarray
 
 
-def viewpoint_starts(w: np.ndarray, information: np.ndarray, azimuths: int, elevation_rad: float) -> np.ndarray:
-    """(A, F, 3, 3) torso -> camera: viewpoints around the body, rolled so that the trunk points as in the image."""
+def initial_viewpoints(w: np.ndarray, information: np.ndarray, azimuths: int, elevation_rad: float) -> np.ndarray:
+    """(A, F, 3, 3) torso -> camera: viewpoints around the body, rolled to the direction of the trunk in the image."""
     up = w[:, BODY_15.index("neck")] - w[:, BODY_15.index("pelvis")]
     seen = (information[:, [BODY_15.index("neck"), BODY_15.index("pelvis")], 0] > 0.0).all(1)
     roll = np.where(seen, np.arctan2(up[:, 0], -up[:, 1]), 0.0)
@@ -76,12 +76,12 @@ def fit_dense(
     scale_std: float,
     iterations: int,
 ) -> DenseFit:
-    """Damped Gauss-Newton from given starts.
+    """Damped Gauss-Newton steps.
 
     Parameters
     ----------
-    w, information : (N, P, 2), (N, P, 3) one row per pose and start
-    rotation, coefficients : (N, 3, 3), (N, 1 + D) starts
+    w, information : (N, P, 2), (N, P, 3) one row per pose and viewpoint
+    rotation, coefficients : (N, 3, 3), (N, 1 + D) initial values
     scale, scale_std : expected coefficient of the mean pose and its relative spread
     """
     parts = [
@@ -124,9 +124,9 @@ class _Problem:
         scale: float,
         scale_std: float,
     ) -> None:
-        size = min(config.start_components, len(dictionary.components))
+        size = min(config.search_components, len(dictionary.components))
         basis = np.concatenate([dictionary.mean[None], dictionary.components[:size]])
-        self.w, self.outlier = w, config.outlier_std
+        self.w = w
         self.shapes = basis.reshape(len(basis), -1)
         self.columns = np.ascontiguousarray(basis.transpose(2, 1, 0)).reshape(3, -1)
         self.prior_mean = np.concatenate([[scale], np.zeros(size)])
@@ -150,10 +150,7 @@ class _Problem:
     def evaluate(self, rotation: np.ndarray, coefficients: np.ndarray, translation: np.ndarray) -> DenseFit:
         x = (coefficients @ self.shapes).reshape(len(coefficients), -1, 3) @ np.swapaxes(rotation, 1, 2)
         rx, ry = self.residual(x, translation)
-        square = rx * rx + ry * ry
-        if self.outlier > 0.0:
-            square = self.outlier**2 * square / (self.outlier**2 + square)
-        cost = square.sum(1) + np.sum(((coefficients - self.prior_mean) * self.prior) ** 2, axis=1)
+        cost = (rx * rx + ry * ry).sum(1) + np.sum(((coefficients - self.prior_mean) * self.prior) ** 2, axis=1)
         return DenseFit(rotation, coefficients, translation, x, cost)
 
     def step(self, state: DenseFit, damping: np.ndarray) -> DenseFit:
@@ -166,11 +163,6 @@ class _Problem:
             j[row, ..., 5:] = (state.rotation[:, row] @ self.columns).reshape(n, p, -1)
         rx, ry = self.residual(x, state.translation)
         jx, jy = self.whiten(j[0], j[1])
-        if self.outlier > 0.0:
-            # Geman-McClure: the weight of a joint falls with the fourth power of its residual.
-            root_weight = self.outlier**2 / (self.outlier**2 + rx * rx + ry * ry)
-            rx, ry = root_weight * rx, root_weight * ry
-            jx, jy = root_weight[..., None] * jx, root_weight[..., None] * jy
         jac = np.concatenate([jx, jy], axis=1)
         transposed = np.ascontiguousarray(np.swapaxes(jac, 1, 2))
         a = transposed @ jac

@@ -1,4 +1,4 @@
-"""Choice among the hypotheses of each frame by the whole sequence (dynamic programming, Viterbi 1967)."""
+"""Choice among the hypotheses of each frame over the whole sequence (dynamic programming, Viterbi 1967)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ def choose_path(cost: np.ndarray, poses: np.ndarray, switch_cost: float) -> np.n
 
     Parameters
     ----------
-    cost : (H, F) of each hypothesis by itself
+    cost : (H, F) of each hypothesis alone
     poses : (H, F, P, 3) camera axes
     switch_cost : weight of the squared distance between the poses of neighbouring frames
     """
@@ -20,7 +20,6 @@ def choose_path(cost: np.ndarray, poses: np.ndarray, switch_cost: float) -> np.n
     change = switch_cost * np.maximum(square[:-1, :, None] + square[1:, None, :] - 2.0 * cross, 0.0)
     total, frames = cost[:, 0], cost.shape[1]
     came_from = np.zeros((frames, len(cost)), dtype=np.int64)
-    # Dynamic programming is sequential by nature; each of its steps is an (H, H) addition.
     for t in range(1, frames):
         sums = total[:, None] + change[t - 1]
         came_from[t] = np.argmin(sums, axis=0)

@@ -9,7 +9,7 @@ import pytest
 
 from drocap_ros.reconstruction.paper.dictionary import soft_threshold
 from drocap_ros.reconstruction.paper.nuclear_norm import nuclear_norm, singular_value_threshold
-from drocap_ros.reconstruction.paper.spectral_norm import project_spectral_ball, shrink_spectral_norm, spectral_norm
+from drocap_ros.reconstruction.paper.spectral_norm import shrink_spectral_norm
 
 Step = Callable[[np.ndarray, float], np.ndarray]
 
@@ -69,10 +69,3 @@ def test_thresholding_reports_the_norm_of_its_result() -> None:
     new, norm = singular_value_threshold(x, 2.0)
     assert norm == pytest.approx(nuclear_norm(new), rel=1e-9)
     assert nuclear_norm(x) == pytest.approx(np.linalg.svd(x.reshape(45, 60), compute_uv=False).sum(), rel=1e-9)
-
-
-def test_spectral_ball_projection_bounds_the_norm() -> None:
-    x = np.random.default_rng(2).normal(size=(100, 2, 3))
-    assert np.all(spectral_norm(project_spectral_ball(x, 0.5)) <= 0.5 + 1e-12)
-    inside = 0.1 * x / spectral_norm(x)[:, None, None]
-    np.testing.assert_allclose(project_spectral_ball(inside, 0.5), inside, atol=1e-12)
