@@ -1,42 +1,41 @@
-"""A recorded session through the live graph's own method, offline: ``drocap reconstruct SESSION --method live``."""
+"""Runs a recorded session through the live method offline: ``drocap reconstruct SESSION --method live``."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-import logging
+import re
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from drocap_ros.config import DrocapConfig, parse_config
+from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.motion import Motion
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.live.effort import Effort
 from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
+from drocap_ros.reconstruction.stop_reason import NO_WINDOW
 from drocap_ros.recording.pose_messages import read_observations
 from drocap_ros.recording.provenance import CONFIGURATION
 from drocap_ros.recording.session import POSE2D, POSE3D, POSE3D_WINDOW, Session
 from drocap_ros.skeleton import BODY_15, indices
 from drocap_ros.tracks import Tracks
 
-logger = logging.getLogger(__name__)
-
-_INITIAL = 1
+_INITIAL = 1  # Pose3D.INITIAL
 Progress = Callable[[str, float], None]
 
 
 @dataclass
 class Agreement:
-    """How what was computed offline compares with what the live graph published, bit for bit.
+    """Offline results compared with the published ones, bit for bit.
 
-    initial, windows : compared, and of these equal
+    initial, windows : number compared, number equal
     """
 
     initial: list[int] = field(default_factory=lambda: [0, 0])
@@ -50,27 +49,38 @@ class Agreement:
 
 
 def recorded_config(session: Session) -> DrocapConfig | None:
-    """The configuration that the session was recorded with; None where it tells none that this version knows."""
+    """The recorded parameters of the live method, defaults elsewhere; None when the session holds no usable ones.
+
+    Parameters that this version does not have are ignored with a warning.
+    """
     import yaml
 
     text = session.info.metadata.get(CONFIGURATION)
     if not text:
         return None
+    config = DrocapConfig()
     try:
-        return parse_config(yaml.safe_load(text) or {}, f"{session.path}: {CONFIGURATION}")
-    except (InputError, yaml.YAMLError) as error:
-        session.warn(f"the recorded configuration cannot be used ({error}); took the given one")
+        recorded = yaml.safe_load(text)
+        for name in ("initializer", "bundle_adjuster"):
+            values = recorded.get(f"/**/{name}", {}).get("ros__parameters", {})
+            known = {field.name for field in dataclasses.fields(config.section(name))}
+            if retired := sorted(f"{name}.{key}={values[key]}" for key in values.keys() - known):
+                session.warn(f"recorded parameters that this version does not have are ignored: {', '.join(retired)}")
+            config = config.replace(name, **{key: values[key] for key in values.keys() & known})
+    except (InputError, yaml.YAMLError, AttributeError) as error:
+        session.warn(f"the recorded configuration cannot be used ({error}); the given one is used")
         return None
+    return config
 
 
 def reconstruct_live(
     session: Session, config: DrocapConfig, progress: Progress | None = None
 ) -> tuple[Motion, Tracks, Agreement]:
-    """Motion by the sliding windows of the live graph, from the session's ``pose2d`` messages alone.
+    """Motion by the live method, from the session's ``pose2d`` messages alone.
 
     A frame's pose is that of the last window that holds it, else its initial one; in frame "camera", as the graph
-    publishes it.  The windows are those that the live graph adjusted where the session tells them, else all that are
-    due.  Memory: the poses themselves and one window.
+    publishes it.  The windows are those that the live graph adjusted where the session holds them, else all that are
+    due.  Memory: the poses and one window.
 
     Raises
     ------
@@ -81,13 +91,12 @@ def reconstruct_live(
     published = _Published(session, topic.name)
     begin = time.perf_counter()
     frames: dict[int, tuple[PoseObservation, np.ndarray]] = {}
-    last_window: LiveWindow | None = None
-    iterations = 0
+    stop_reason, iterations = NO_WINDOW, 0
     results = live_poses(
         read_observations(session, topic.name),
         config.initializer,
         config.bundle_adjuster,
-        published.adjusted if published.has_windows else None,
+        published.effort_at if published.has_windows else None,
     )
     for done, result in enumerate(results):
         if isinstance(result, LivePose):
@@ -96,9 +105,10 @@ def reconstruct_live(
             frames[stamp_ns] = (result.observation, result.joints3d)
         else:
             published.compare_window(result)
-            for stamp_ns, joints in zip(result.stamp_ns.tolist(), result.joints3d, strict=True):
+            window = result.window
+            for stamp_ns, joints in zip(window.stamp_ns.tolist(), result.joints3d, strict=True):
                 frames[stamp_ns] = (frames[stamp_ns][0], joints)
-            last_window, iterations = result, iterations + result.iterations
+            stop_reason, iterations = window.stop_reason, iterations + window.iterations
         if progress is not None and done % 50 == 0:
             progress("live", min(1.0, done / max(topic.count, 1)))
     tracks, joints3d = _arrays(session, frames)
@@ -111,7 +121,7 @@ def reconstruct_live(
         },
         frames=len(tracks),
         iterations=iterations,
-        stop_reason=last_window.stop_reason if last_window is not None else "no window was due",
+        stop_reason=stop_reason,
         live_agreement=str(published.agreement),
         seconds={"live": time.perf_counter() - begin},
     )
@@ -119,33 +129,26 @@ def reconstruct_live(
 
 
 class _Published:
-    """What the live graph published; the same stamp may come again where a recording was played in a loop."""
+    """Results of the live graph; a stamp repeats where a recording was played in a loop."""
 
     def __init__(self, session: Session, near: str) -> None:
         base = near.rsplit("/", 1)[0]
-        # Fingerprints: the windows of half an hour overlap twelvefold.
+        # Fingerprints save memory: the windows of half an hour overlap twelvefold.
         self._initial: defaultdict[int, deque[bytes]] = defaultdict(deque)
         self._windows: deque[_PublishedWindow] = deque()
         self._current: _PublishedWindow | None = None
         self.agreement = Agreement()
-        for topic in session.topics_of(POSE3D):
-            if topic.name == f"{base}/pose3d/initial":
-                for _, m in session.messages((topic.name,)):
-                    if m.stage == _INITIAL:
-                        self._initial[_stamp_ns(m)].append(_fingerprint(_joints(m)))
-        for topic in session.topics_of(POSE3D_WINDOW):
-            if topic.name == f"{base}/pose3d/refined":
-                for _, m in session.messages((topic.name,)):
-                    stamps = np.array([_stamp_ns(pose) for pose in m.poses], np.int64)
-                    joints = np.array([_joints(pose) for pose in m.poses])
-                    published = _PublishedWindow(
-                        _stamp_ns(m), _fingerprint(stamps, joints), Effort.parse(m.stop_reason)
-                    )
-                    self._windows.append(published)
+        for m in _messages(session, POSE3D, f"{base}/pose3d/initial"):
+            if m.stage == _INITIAL:
+                self._initial[_stamp_ns(m)].append(_fingerprint(_joints(m)))
+        for m in _messages(session, POSE3D_WINDOW, f"{base}/pose3d/refined"):
+            stamps = np.array([_stamp_ns(pose) for pose in m.poses], np.int64)
+            joints = np.array([_joints(pose) for pose in m.poses])
+            self._windows.append(_PublishedWindow(_stamp_ns(m), _fingerprint(stamps, joints), _effort(m)))
         self.has_windows = bool(self._windows)
 
-    def adjusted(self, stamp_ns: int) -> Effort | None:
-        """How the window that ends here, the next in order, was adjusted; None when it was not."""
+    def effort_at(self, stamp_ns: int) -> Effort | None:
+        """Effort of the window that ends here, the next in order; None when the graph adjusted none."""
         ahead = next((i for i, w in enumerate(self._windows) if w.stamp_ns == stamp_ns), None)
         if ahead is None or any(w.stamp_ns > stamp_ns for w in islice(self._windows, ahead)):
             return None
@@ -155,22 +158,38 @@ class _Published:
         return self._current.effort
 
     def compare_initial(self, stamp_ns: int, joints: np.ndarray) -> None:
-        """Count, and whether it is the same."""
+        """Compare with the published pose of the same stamp, if any."""
         theirs = self._initial.get(stamp_ns)
         if theirs:
             _count(self.agreement.initial, theirs.popleft() == _fingerprint(joints))
 
-    def compare_window(self, window: LiveWindow) -> None:
-        """Count, and whether it is the same as the one that :meth:`adjusted` told last."""
+    def compare_window(self, result: LiveWindow) -> None:
+        """Compare with the window that :meth:`effort_at` returned last."""
         theirs, self._current = self._current, None
         if theirs is not None:
-            _count(self.agreement.windows, theirs.fingerprint == _fingerprint(window.stamp_ns, window.joints3d))
+            equal = theirs.fingerprint == _fingerprint(result.window.stamp_ns, result.joints3d)
+            _count(self.agreement.windows, equal)
 
 
 class _PublishedWindow(NamedTuple):
     stamp_ns: int
     fingerprint: bytes
     effort: Effort
+
+
+def _effort(window: Any) -> Effort:
+    """Effort of a Pose3DWindow; recordings older than its field ``stride`` hold it in the stop reason."""
+    if hasattr(window, "stride"):
+        return Effort(int(window.stride), (int(window.steps[0]), int(window.steps[1])) if len(window.steps) else None)
+    stride = re.search(r"every (\d+)\. image", window.stop_reason)
+    steps = re.search(r"(\d+) \+ (\d+) steps", window.stop_reason)
+    return Effort(int(stride[1]) if stride else 1, (int(steps[1]), int(steps[2])) if steps else None)
+
+
+def _messages(session: Session, kind: str, name: str) -> Iterator[Any]:
+    """Messages of a topic, none when the session lacks it."""
+    if any(topic.name == name for topic in session.topics_of(kind)):
+        yield from (message for _, message in session.messages((name,)))
 
 
 def _fingerprint(*arrays: np.ndarray) -> bytes:
@@ -228,7 +247,7 @@ def _motion(tracks: Tracks, joints3d: np.ndarray, config: DrocapConfig) -> Motio
 
 
 def _reprojection_px(joints3d: np.ndarray, keypoints: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """(F, P) px to the keypoints, after the best scale and place of each image (weak perspective)."""
+    """(F, P) px to the keypoints, after the best scale and translation of each image (weak perspective)."""
     weight = seen[..., None].astype(np.float64)
     count = np.maximum(weight.sum(axis=1, keepdims=True), 1.0)
     target = np.where(seen[..., None], keypoints, 0.0)

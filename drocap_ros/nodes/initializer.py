@@ -1,8 +1,7 @@
-"""Node ``initializer``: keypoints in, a first 3D pose of every image out.
+"""Node ``initializer``: publishes a first 3D pose of every image.
 
-Subscribes ``pose2d``; publishes ``pose3d/initial`` (drocap_ros/Pose3D, stage INITIAL) in the camera's frame.
-Duplicate, late and stray stamps are dropped and counted with their reason; a jump of time, a gap and another subject
-are counted too (:mod:`drocap_ros.reconstruction.live.stream_order`).
+Subscribes ``pose2d``; publishes ``pose3d/initial`` (drocap_ros/Pose3D, stage INITIAL) in the camera's frame.  Events
+of the stream (:mod:`drocap_ros.reconstruction.live.stream_order`) are counted on ``/diagnostics``.
 """
 
 from __future__ import annotations
@@ -12,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.msg import Pose2D, Pose3D
-from drocap_ros.reconstruction.live.initializer import SlidingWindowInitializer
-from drocap_ros.reconstruction.live.stream_order import Arrival
+from drocap_ros.reconstruction.live.initializer import LiveInitializer
+from drocap_ros.reconstruction.live.stream_order import StreamEvent
 from drocap_ros.ros.component import OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_to_ros
 from drocap_ros.ros.spin import node_main
@@ -21,13 +20,13 @@ from drocap_ros.skeleton import BODY_15
 
 
 class InitializerNode(ComponentNode):
-    """Feeds every observation to the sliding-window initializer of the core."""
+    """Passes every observation to the live initializer."""
 
     component = "initializer"
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
-        self._initializer = SlidingWindowInitializer(self.config)
+        self._initializer = LiveInitializer(self.config)
         self._initial = self.output("pose3d/initial")
         self.input("pose2d", self._on_pose2d)
 
@@ -36,20 +35,13 @@ class InitializerNode(ComponentNode):
         if not observation.has_subject:
             self.report(WARN, "no subject in view")
             return
-        pose = self._initializer.push(
-            observation.stamp_ns,
-            observation.keypoints.astype(np.float64),
-            observation.confidence.astype(np.float64),
-            observation.covariance.astype(np.float64),
-            observation.track_id,
-        )
-        arrival = self._initializer.arrival
+        pose = self._initializer.push(observation)
+        event = self._initializer.event
+        if event is not StreamEvent.CONTINUED:
+            self.count(str(event))
         if pose is None:
-            self.count(f"dropped: {arrival.value}")
-            self.report(WARN, f"image dropped: {arrival.value}")
+            self.report(WARN, f"image {event}")
             return
-        if arrival is not Arrival.CONTINUED:
-            self.count(arrival.value)
         self._initial.publish(
             pose3d_to_ros(
                 message.header,
@@ -67,8 +59,8 @@ class InitializerNode(ComponentNode):
         if np.isfinite(pose.joints3d).all():
             self.report(OK, "running")
         else:
-            self.count("images that show too little of the person")
-            self.report(WARN, "the image shows too little of the person")
+            self.count("images with too few keypoints")
+            self.report(WARN, "too few keypoints in the image")
 
 
 def main() -> int:

@@ -13,3 +13,5 @@ DEADLINE = "deadline"
 TOO_SHORT = "too short"
 #: The method has no adjustment.
 START_ONLY = "start only"
+#: The recording is shorter than the live method's first window.
+NO_WINDOW = "no window was due"

@@ -1,4 +1,4 @@
-"""From ``Pose2D`` messages to observations, whoever decoded them: rclpy in the live graph, rosbags from a file."""
+"""Observations from ``Pose2D`` messages, decoded by rclpy in the live graph or by rosbags from a file."""
 
 from __future__ import annotations
 
@@ -68,20 +68,14 @@ def float_array(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
 
 
 def read_observations(session: Session, topic: str) -> Iterator[PoseObservation]:
-    """Observations of a topic in the order of the recording; what a live node would refuse is left out."""
+    """Observations of a topic in the order of the recording; messages that a live node refuses are skipped."""
     refused = 0
     for _, message in session.messages((topic,)):
-        observation = _observation_or_none(message)
-        if observation is None:
+        try:
+            observation = observation_from_message(message)
+        except InputError:
             refused += 1
-        else:
-            yield observation
+            continue
+        yield observation
     if refused:
-        session.warn(f"{refused} messages on {topic} were refused, as the live graph does")
-
-
-def _observation_or_none(message: Any) -> PoseObservation | None:
-    try:
-        return observation_from_message(message)
-    except InputError:
-        return None
+        session.warn(f"{refused} messages on {topic} were refused, as in the live graph")

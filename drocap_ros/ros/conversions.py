@@ -1,4 +1,4 @@
-"""Between messages and the core's types: pure functions, checked at the door."""
+"""Conversions between messages and the core's types: pure functions that validate their input."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_msgs.msg import Header
 
 from drocap_ros.flight.vehicle_state import VehicleState as VehicleStateData
-from drocap_ros.msg import Pose2D, Pose3D, VehicleState
+from drocap_ros.msg import Pose2D, Pose3D, Pose3DWindow, VehicleState
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.calibration import CameraModel
+from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.recording.pose_messages import float_array, observation_from_message
-from drocap_ros.skeleton import joint_set
+from drocap_ros.skeleton import BODY_15, joint_set
 
 
 def stamp_to_ros(stamp_ns: int) -> Time:
@@ -35,7 +36,7 @@ def header_at(stamp_ns: int, frame_id: str) -> Header:
 
 
 def floats(values: np.ndarray) -> array:
-    """Any array -> flat row-major ``float32[]``, the fast way that rclpy knows."""
+    """Any array -> flat row-major ``float32[]``; rclpy takes an ``array`` without a check per value."""
     return array("f", np.ascontiguousarray(values, np.float32).tobytes())
 
 
@@ -46,12 +47,12 @@ def quaternion_to_ros(xyzw: np.ndarray) -> Quaternion:
 
 
 def compressed_image_to_ros(header: Header, jpeg: bytes) -> CompressedImage:
-    """JPEG of a BGR picture -> sensor_msgs/CompressedImage."""
+    """JPEG of a BGR image -> sensor_msgs/CompressedImage."""
     return CompressedImage(header=header, format="bgr8; jpeg compressed bgr8", data=array("B", jpeg))
 
 
 def camera_info_to_ros(header: Header, camera: CameraModel) -> CameraInfo:
-    """Pinhole camera -> sensor_msgs/CameraInfo, unrectified pictures."""
+    """Pinhole camera -> sensor_msgs/CameraInfo, unrectified images."""
     k = camera.matrix.ravel().tolist()
     return CameraInfo(
         header=header,
@@ -82,15 +83,7 @@ def pose2d_to_ros(observation: PoseObservation, frame_id: str) -> Pose2D:
     )
 
 
-def pose2d_from_ros(message: Pose2D) -> PoseObservation:
-    """Message -> observation.
-
-    Raises
-    ------
-    InputError
-        When the skeleton is unknown, an array has the wrong length, a value is infinite or the stamp is negative.
-    """
-    return observation_from_message(message)
+pose2d_from_ros = observation_from_message
 
 
 def pose3d_to_ros(
@@ -119,6 +112,52 @@ def pose3d_to_ros(
         camera_orientation=quaternion_to_ros(xyzw),
         metric=metric,
         reprojection_rms=float(reprojection_rms_px),
+    )
+
+
+def latest_pose_to_ros(initial: Pose3D, joints: np.ndarray, *, refined: bool) -> Pose3D:
+    """The initial pose's message with other joints (P, 3) m."""
+    return Pose3D(
+        header=initial.header,
+        track_id=initial.track_id,
+        stage=Pose3D.REFINED if refined else Pose3D.INITIAL,
+        skeleton=initial.skeleton,
+        joints=floats(joints),
+        covariance=initial.covariance,
+        confidence=initial.confidence,
+        camera_orientation=initial.camera_orientation,
+        metric=initial.metric,
+        reprojection_rms=initial.reprojection_rms,
+    )
+
+
+def window_to_ros(
+    window: AdjustedWindow, frame_id: str, track_id: int, sequence: int, solve_seconds: float
+) -> Pose3DWindow:
+    """Adjusted window -> message."""
+    poses = [
+        pose3d_to_ros(
+            header_at(stamp_ns, frame_id),
+            track_id=track_id,
+            stage=Pose3D.REFINED,
+            skeleton=BODY_15.name,
+            joints=window.joints3d[i],
+            covariance=window.covariance[i],
+            confidence=window.confidence[i],
+            reprojection_rms_px=float(window.reprojection_rms_px[i]),
+        )
+        for i, stamp_ns in enumerate(window.stamp_ns)
+    ]
+    return Pose3DWindow(
+        header=poses[-1].header,
+        poses=poses,
+        window_seq=sequence,
+        iterations=window.iterations,
+        cost=float(window.cost),
+        stop_reason=window.stop_reason,
+        solve_seconds=solve_seconds,
+        stride=window.effort.stride,
+        steps=array("I", window.effort.steps or ()),
     )
 
 

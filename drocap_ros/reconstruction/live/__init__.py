@@ -1,1 +1,1 @@
-"""The live methods over sliding windows, as the nodes and the offline replay run them."""
+"""The live method, shared by the nodes and the offline replay: initial poses, window by window adjusted."""

@@ -1,32 +1,31 @@
-"""The newest pose at image rate: each image's initial pose with the bone lengths that the last adjustment found.
+"""The newest pose at image rate: each image's initial pose with the bone lengths of the last adjusted window.
 
-What an adjusted window says beyond the lengths is no better than the initial pose by the time it is there: its newest
-poses err as much as the lifter's (it has no later images either), and their errors are others half a second on.
+Only the lengths are taken over.  The newest poses of a window have no later images and err as much as initial poses,
+and half a second on their errors differ.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from drocap_ros.geometry.bones import bone_lengths
 from drocap_ros.skeleton import BODY_15
 
 _BONES = BODY_15.bones
 
 
-def bone_lengths(joints: np.ndarray) -> np.ndarray:
-    """Median length (14,) of each bone (joint j to its parent at j - 1) over the poses (F, 15, 3) of a window."""
-    way = joints[..., _BONES[:, 1], :] - joints[..., _BONES[:, 0], :]
-    lengths: np.ndarray = np.median(np.linalg.norm(way, axis=-1), axis=0)
+def median_bone_lengths(joints: np.ndarray) -> np.ndarray:
+    """Median length (14,) of each bone over the poses (F, 15, 3) of a window."""
+    lengths: np.ndarray = np.median(bone_lengths(joints), axis=0)
     return lengths
 
 
 class LatestPose:
-    """Gives poses the bone lengths of the last solution, taken over along a straight line within ``blend_s`` of stamps.
+    """Poses with the bone lengths of the last solution, blended in linearly within ``blend_s`` of stamps.
 
     From one image to the next, ``dt`` later, a new solution changes the length of a bone by no more than
     ``dt / blend_s`` of the difference between the solutions, and moves a joint by no more than the sum of that over
-    the bones from the pelvis to it.  Before the first solution poses pass as they are; it comes in along a straight
-    line too.
+    the bones from the pelvis to it.  Before the first solution poses stay unchanged; it is blended in as well.
     """
 
     def __init__(self, blend_s: float) -> None:
@@ -41,11 +40,11 @@ class LatestPose:
 
     @property
     def corrected(self) -> bool:
-        """Whether a solution has come."""
+        """Whether a solution has arrived."""
         return self._to is not None
 
-    def solved(self, lengths: np.ndarray, stamp_ns: int) -> None:
-        """Take over a solution's bone lengths (14,) m, starting at the image of ``stamp_ns``."""
+    def set_solution(self, lengths: np.ndarray, stamp_ns: int) -> None:
+        """Blend in a solution's bone lengths (14,) m from the image of ``stamp_ns`` on."""
         if not np.isfinite(lengths).all():
             return
         self._from = self._lengths(stamp_ns)

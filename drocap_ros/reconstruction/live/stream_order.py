@@ -1,87 +1,98 @@
-"""Order of the images of a live stream: which continue it, which begin anew, which are dropped."""
+"""Order of the images of a live stream: each image continues it, restarts it or is dropped."""
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import Enum, auto
 
-#: A stamp that leaps further ahead than this is believed only when the next one follows it.
+#: A stamp further ahead than this counts only when the next one follows it.
 LEAP_S = 60.0
 
-#: So many late images in a row mean that the clock was set back by less than ``late_s``.
+#: Late images in a row that prove a clock set back by less than ``late_s``.
 LATE_RUN = 10
 
 
-class Arrival(Enum):
-    """What an image is to the images before it; the value says it in words."""
+class StreamEvent(Enum):
+    """Relation of an image to the images before it."""
 
-    STARTED = "first image"
-    CONTINUED = "continued"
-    GAP = "continued after a gap"
-    NEW_SUBJECT = "another subject"
-    RESTARTED = "time jumped: started anew"
-    DUPLICATE = "duplicate stamp"
-    LATE = "late: its stamp lies before the last one"
-    STRAY = "stamp far from the stream's"
+    FIRST = auto()
+    CONTINUED = auto()
+    GAP = auto()
+    NEW_SUBJECT = auto()
+    TIME_JUMP = auto()
+    DUPLICATE = auto()
+    LATE = auto()
+    STRAY = auto()
+
+    def __str__(self) -> str:
+        return _WORDS[self]
 
     @property
     def dropped(self) -> bool:
         """The image takes no part."""
-        return self in (Arrival.DUPLICATE, Arrival.LATE, Arrival.STRAY)
+        return self in (StreamEvent.DUPLICATE, StreamEvent.LATE, StreamEvent.STRAY)
 
     @property
-    def anew(self) -> bool:
-        """Nothing of what was known holds: another person, or another pass of time."""
-        return self in (Arrival.STARTED, Arrival.NEW_SUBJECT, Arrival.RESTARTED)
+    def restarted(self) -> bool:
+        """Earlier state is void: another person, or another pass of time."""
+        return self in (StreamEvent.FIRST, StreamEvent.NEW_SUBJECT, StreamEvent.TIME_JUMP)
+
+
+_WORDS = {
+    StreamEvent.FIRST: "first image",
+    StreamEvent.CONTINUED: "continued",
+    StreamEvent.GAP: "continued after a gap",
+    StreamEvent.NEW_SUBJECT: "restarted: another subject",
+    StreamEvent.TIME_JUMP: "restarted: time jumped",
+    StreamEvent.DUPLICATE: "dropped: duplicate stamp",
+    StreamEvent.LATE: "dropped: late stamp",
+    StreamEvent.STRAY: "dropped: stray stamp",
+}
 
 
 class StreamOrder:
-    """Judges each image by its stamp and its subject.
+    """Classifies each image by its stamp and its subject.
 
     - The same stamp again: a duplicate, dropped.
     - Up to ``late_s`` before the last stamp: late, dropped; after :data:`LATE_RUN` in a row the clock was set back.
-    - Further back, or more than :data:`LEAP_S` ahead: dropped as a stray, unless it follows a stray, for then time
-      has jumped (a looped bag, a clock that was set) and the stream starts anew.  So one stamp of 1970 or 2100 does no
-      harm, and a stream that lives in 1970 or 2100 is as good as any.
-    - Another ``track_id``: starts anew.  More than ``gap_s`` later: a gap.
+    - Further back, or more than :data:`LEAP_S` ahead: a stray, dropped, unless it follows a stray; then time has
+      jumped (a looped bag, a clock that was set) and the stream restarts.  A single stamp of 1970 or 2100 does no
+      harm, and a whole stream in 1970 or 2100 works.
+    - Another ``track_id``: the stream restarts.  More than ``gap_s`` later: a gap.
 
     Parameters
     ----------
-    confirm : False believes every jump at once, for images that another order has let through
+    confirm : False accepts every jump at once, for images that another order has accepted
     """
 
     def __init__(self, late_s: float, gap_s: float, *, confirm: bool = True) -> None:
         self._late_ns, self._gap_ns, self._leap_ns = (round(s * 1e9) for s in (late_s, gap_s, LEAP_S))
         self._confirm = confirm
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the stream."""
         self._last: tuple[int, int] | None = None
         self._stray_ns: int | None = None
         self._late = 0
 
-    def accept(self, stamp_ns: int, track_id: int) -> Arrival:
-        """Judge the next image; what is dropped leaves no trace in the order of the others."""
-        arrival = self._judge(stamp_ns, track_id)
-        if arrival.dropped:
-            self._late += arrival is Arrival.LATE
-            if arrival is Arrival.STRAY:
+    def classify(self, stamp_ns: int, track_id: int) -> StreamEvent:
+        """Event of the next image; a dropped image does not change the order of the others."""
+        event = self._event(stamp_ns, track_id)
+        if event.dropped:
+            self._late += event is StreamEvent.LATE
+            if event is StreamEvent.STRAY:
                 self._stray_ns = stamp_ns
         else:
             self._last, self._stray_ns, self._late = (stamp_ns, track_id), None, 0
-        return arrival
+        return event
 
-    def _judge(self, stamp_ns: int, track_id: int) -> Arrival:
+    def _event(self, stamp_ns: int, track_id: int) -> StreamEvent:
         if self._last is None:
-            return Arrival.STARTED
+            return StreamEvent.FIRST
         step = stamp_ns - self._last[0]
         if step == 0:
-            return Arrival.DUPLICATE
+            return StreamEvent.DUPLICATE
         if -self._late_ns <= step < 0:
-            return Arrival.LATE if self._late < LATE_RUN else Arrival.RESTARTED
+            return StreamEvent.LATE if self._late < LATE_RUN else StreamEvent.TIME_JUMP
         if step < 0 or step > self._leap_ns:
             follows = self._stray_ns is not None and 0 < stamp_ns - self._stray_ns <= self._leap_ns
-            return Arrival.RESTARTED if follows or not self._confirm else Arrival.STRAY
+            return StreamEvent.TIME_JUMP if follows or not self._confirm else StreamEvent.STRAY
         if track_id != self._last[1]:
-            return Arrival.NEW_SUBJECT
-        return Arrival.GAP if step > self._gap_ns else Arrival.CONTINUED
+            return StreamEvent.NEW_SUBJECT
+        return StreamEvent.GAP if step > self._gap_ns else StreamEvent.CONTINUED

@@ -1,20 +1,22 @@
-"""The live adjustment: warm-started, cut short, coarser, failing; and the newest pose that follows from it."""
+"""The live adjuster: warm-started, cut short, coarser, failing; and the latest pose that follows from it."""
 
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from walking import make_walk, stamps
 
 from drocap_ros.errors import InputError
-from drocap_ros.reconstruction.live.adjuster import WindowAdjuster
+from drocap_ros.evaluation.metrics import pa_mpjpe
+from drocap_ros.geometry.bones import limb_lengths
+from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.live.adjuster import LiveAdjuster
 from drocap_ros.reconstruction.live.effort import Effort, EffortControl
-from drocap_ros.reconstruction.live.frame_buffer import WindowArrays
-from drocap_ros.reconstruction.live.initializer import AdjustedWindow
-from drocap_ros.reconstruction.live.latest_pose import LatestPose, bone_lengths
-from drocap_ros.reconstruction.metrics import limb_lengths, pa_mpjpe
+from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
+from drocap_ros.reconstruction.live.window import AdjustedWindow, Window
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 
 FRAMES = 120
@@ -23,31 +25,29 @@ TRUTH = 1000.0 * WALK.in_camera
 NOISE = np.random.default_rng(0).normal(0.0, 3.0, WALK.keypoints.shape)
 
 
-def window(begin: int = 0, end: int = FRAMES, subject: int = 1) -> WindowArrays:
+def window(begin: int = 0, end: int = FRAMES, subject: int = 1) -> Window:
     part = slice(begin, end)
     count = end - begin
-    start = WALK.in_camera[part] - WALK.in_camera[part, :1]
-    return WindowArrays(
+    initial = WALK.in_camera[part] - WALK.in_camera[part, :1]
+    return Window(
         stamps(FRAMES)[part],
-        (WALK.keypoints + NOISE)[part],
-        np.ones((count, 15)),
-        np.full((count, 15, 3), np.nan),
-        start,
+        Keypoints2D((WALK.keypoints + NOISE)[part], np.ones((count, 15)), np.full((count, 15, 3), np.nan)),
+        initial,
         subject,
     )
 
 
-def adjust_twice(adjuster: WindowAdjuster, **second: int) -> tuple[AdjustedWindow, AdjustedWindow]:
+def adjust_twice(adjuster: LiveAdjuster, **second: int) -> tuple[AdjustedWindow, AdjustedWindow]:
     return adjuster.adjust(window(0, 96)), adjuster.adjust(window(24, 120, **second))
 
 
 @pytest.mark.parametrize("method", ["ba", "paper"])
-def test_a_window_comes_near_the_truth(method: str) -> None:
-    result = WindowAdjuster(BundleAdjusterConfig(method=method)).adjust(window())
+def test_an_adjusted_window_is_near_the_truth(method: str) -> None:
+    result = LiveAdjuster(BundleAdjusterConfig(method=method)).adjust(window())
     assert pa_mpjpe(result.joints3d, TRUTH).mean() < (25.0 if method == "ba" else 60.0)
     assert result.stop_reason in ("converged", "iterations", "no descent")
     assert result.cost == pytest.approx(sum(result.cost_terms.values()))
-    # The scale is the start's, and with the default method each bone keeps its length.
+    # The scale is that of the initial poses, and with the default method each bone keeps its length.
     assert limb_lengths(result.joints3d).mean() == pytest.approx(limb_lengths(WALK.in_camera).mean(), rel=0.02)
     if method == "ba":
         spread = limb_lengths(result.joints3d).std(axis=0) / limb_lengths(result.joints3d).mean(axis=0)
@@ -56,9 +56,9 @@ def test_a_window_comes_near_the_truth(method: str) -> None:
         assert 1.0 < np.median(result.reprojection_rms_px) < 12.0
 
 
-def test_the_second_window_starts_from_the_first_one_s_sizes() -> None:
-    first, warm = adjust_twice(WindowAdjuster(BundleAdjusterConfig()))
-    cold = WindowAdjuster(BundleAdjusterConfig()).adjust(window(24, 120))
+def test_the_second_window_starts_from_the_sizes_of_the_first() -> None:
+    first, warm = adjust_twice(LiveAdjuster(BundleAdjusterConfig()))
+    cold = LiveAdjuster(BundleAdjusterConfig()).adjust(window(24, 120))
     # The warm one has no first adjustment, and is as good.
     assert warm.iterations < cold.iterations
     assert not np.array_equal(warm.joints3d, cold.joints3d)
@@ -66,70 +66,66 @@ def test_the_second_window_starts_from_the_first_one_s_sizes() -> None:
     assert first.iterations > warm.iterations
 
 
-def test_a_file_that_is_no_lifter_is_refused_at_once() -> None:
+def test_a_missing_lifter_is_refused_by_the_constructor() -> None:
     with pytest.raises(InputError, match="no such file"):
-        WindowAdjuster(BundleAdjusterConfig(lifter="none.onnx"))
+        LiveAdjuster(BundleAdjusterConfig(lifter="none.onnx"))
 
 
-def test_another_subject_starts_cold() -> None:
-    _, other = adjust_twice(WindowAdjuster(BundleAdjusterConfig()), subject=2)
-    cold = WindowAdjuster(BundleAdjusterConfig()).adjust(window(24, 120))
+def test_another_subject_has_a_cold_start() -> None:
+    _, other = adjust_twice(LiveAdjuster(BundleAdjusterConfig()), subject=2)
+    cold = LiveAdjuster(BundleAdjusterConfig()).adjust(window(24, 120))
     np.testing.assert_array_equal(other.joints3d, cold.joints3d)
 
 
-def test_a_failure_leaves_the_sizes_as_they_were() -> None:
-    adjuster = WindowAdjuster(BundleAdjusterConfig())
+def test_a_failure_keeps_the_known_sizes() -> None:
+    adjuster = LiveAdjuster(BundleAdjusterConfig())
     adjuster.adjust(window(0, 96))
     blind = window(24, 120)
     with pytest.raises(InputError, match="seen joints"):
-        adjuster.adjust(blind._replace(confidence=np.zeros((96, 15))))
+        adjuster.adjust(blind._replace(keypoints=replace(blind.keypoints, confidence=np.zeros((96, 15)))))
     with pytest.raises(InputError, match="a pose in at least one frame"):
         adjuster.adjust(blind._replace(initial_joints=np.full((96, 15, 3), np.nan)))
-    _, expected = adjust_twice(WindowAdjuster(BundleAdjusterConfig()))
+    _, expected = adjust_twice(LiveAdjuster(BundleAdjusterConfig()))
     np.testing.assert_array_equal(adjuster.adjust(blind).joints3d, expected.joints3d)
 
 
 @pytest.mark.parametrize("after", [0, 2, 5])
-def test_what_a_deadline_cut_short_is_told_and_can_be_redone(after: int) -> None:
+def test_the_effort_of_an_adjustment_cut_by_its_deadline_repeats_it(after: int) -> None:
     asked = itertools.count()
-    cut = WindowAdjuster(BundleAdjusterConfig()).adjust(window(), cancelled=lambda: next(asked) >= after)
-    whole = WindowAdjuster(BundleAdjusterConfig()).adjust(window())
-    assert cut.stop_reason.startswith("deadline; ")
+    cut = LiveAdjuster(BundleAdjusterConfig()).adjust(window(), cancelled=lambda: next(asked) >= after)
+    whole = LiveAdjuster(BundleAdjusterConfig()).adjust(window())
+    assert cut.stop_reason == "deadline"
     assert 2 <= cut.iterations < whole.iterations
-    effort = Effort.parse(cut.stop_reason)
+    assert whole.effort == Effort()
+    effort = cut.effort
     assert effort.steps is not None
     assert sum(effort.steps) == cut.iterations
-    again = WindowAdjuster(BundleAdjusterConfig()).adjust(window(), effort)
+    again = LiveAdjuster(BundleAdjusterConfig()).adjust(window(), effort)
     np.testing.assert_array_equal(again.joints3d, cut.joints3d)
     assert not np.array_equal(whole.joints3d, cut.joints3d)
 
 
-def test_what_a_deadline_cut_short_leaves_the_same_to_the_next_window() -> None:
-    live, redone = (WindowAdjuster(BundleAdjusterConfig()) for _ in range(2))
+def test_a_repeated_adjustment_hands_the_same_sizes_to_the_next_window() -> None:
+    live, repeated = (LiveAdjuster(BundleAdjusterConfig()) for _ in range(2))
     cut = live.adjust(window(0, 96), cancelled=lambda: True)
-    redone.adjust(window(0, 96), Effort.parse(cut.stop_reason))
-    both = [adjuster.adjust(window(24, 120)).joints3d for adjuster in (live, redone)]
+    repeated.adjust(window(0, 96), cut.effort)
+    both = [adjuster.adjust(window(24, 120)).joints3d for adjuster in (live, repeated)]
     np.testing.assert_array_equal(*both)
 
 
-def test_coarser_takes_every_second_image() -> None:
-    adjuster = WindowAdjuster(BundleAdjusterConfig())
+def test_stride_two_adjusts_every_second_image() -> None:
+    adjuster = LiveAdjuster(BundleAdjusterConfig())
     result = adjuster.adjust(window(), Effort(stride=2))
-    assert Effort.parse(result.stop_reason) == Effort(stride=2)
+    assert result.effort == Effort(stride=2)
     np.testing.assert_array_equal(result.stamp_ns, stamps(FRAMES)[1::2])
     assert pa_mpjpe(result.joints3d, TRUTH[1::2]).mean() < 40.0
 
 
-@pytest.mark.parametrize("effort", [Effort(), Effort(3), Effort(1, (4, 2)), Effort(2, (0, 8))])
-def test_an_effort_is_read_from_what_it_says(effort: Effort) -> None:
-    assert Effort.parse(f"deadline; {effort}") == effort
-
-
-def test_the_control_coarsens_when_late_and_refines_when_early() -> None:
+def test_the_stride_grows_when_late_and_shrinks_when_early() -> None:
     control = EffortControl(0.5, max_stride=3)
     strides = []
     for seconds in (0.2, 0.6, 0.6, 0.6, 0.3, 0.1, 0.1, 0.1):
-        control.took(seconds)
+        control.record(seconds)
         strides.append(control.stride)
     assert strides == [1, 2, 3, 3, 3, 2, 1, 1]
 
@@ -138,16 +134,16 @@ def poses_of(latest: LatestPose, solutions: dict[int, np.ndarray]) -> np.ndarray
     out = []
     for i, stamp in enumerate(stamps(FRAMES).tolist()):
         if i in solutions:
-            latest.solved(solutions[i], stamp)
+            latest.set_solution(solutions[i], stamp)
         out.append(latest.pose(stamp, WALK.in_camera[i] - WALK.in_camera[i, 0]))
     return np.array(out)
 
 
-def test_a_new_solution_moves_no_joint_by_more_than_the_blend_allows() -> None:
-    blend_s, lengths = 0.5, bone_lengths(WALK.in_camera)
+def test_blending_bounds_the_step_of_every_joint() -> None:
+    blend_s, lengths = 0.5, median_bone_lengths(WALK.in_camera)
     first, second = 1.1 * lengths, 0.9 * lengths
     without = poses_of(LatestPose(blend_s), {10: first})
-    # The third arrives while the second is being taken over.
+    # The third arrives while the second is being blended in.
     with_it = poses_of(LatestPose(blend_s), {10: first, 60: second, 66: first})
     np.testing.assert_array_equal(with_it[:61], without[:61])
     moved = np.linalg.norm(with_it - without, axis=-1)
@@ -155,13 +151,13 @@ def test_a_new_solution_moves_no_joint_by_more_than_the_blend_allows() -> None:
     step = np.abs(np.diff(moved, axis=0)).max()
     chain = np.abs(first - second).max() * 5
     assert 0.0 < step <= chain / (24.0 * blend_s)
-    # A jump would have been larger than that by far.
+    # Without blending the step is far larger.
     jump = poses_of(LatestPose(0.0), {10: first, 60: second})
     assert np.linalg.norm(jump - without, axis=-1)[60].max() > 5.0 * step
 
 
-def test_the_latest_pose_has_the_solution_s_bones_once_it_is_taken_over() -> None:
-    lengths = 1.2 * bone_lengths(WALK.in_camera)
+def test_the_latest_pose_has_the_bone_lengths_of_the_solution_after_blending() -> None:
+    lengths = 1.2 * median_bone_lengths(WALK.in_camera)
     latest = LatestPose(0.5)
     assert not latest.corrected
     poses = poses_of(latest, {48: lengths})
@@ -169,7 +165,7 @@ def test_the_latest_pose_has_the_solution_s_bones_once_it_is_taken_over() -> Non
     raw = WALK.in_camera - WALK.in_camera[:, :1]
     np.testing.assert_array_equal(poses[:48], raw[:48])
     np.testing.assert_allclose(poses[48], raw[48], atol=1e-12)
-    np.testing.assert_allclose(bone_lengths(poses[60:]), lengths, rtol=1e-9)
+    np.testing.assert_allclose(median_bone_lengths(poses[60:]), lengths, rtol=1e-9)
     assert np.isnan(latest.pose(10**12, np.full((15, 3), np.nan))).all()
     latest.reset()
     np.testing.assert_array_equal(latest.pose(10**12, raw[0]), raw[0])
