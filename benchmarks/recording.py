@@ -85,7 +85,7 @@ def part_load(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
     from drocap_ros.bringup import bringup
     from drocap_ros.config import DrocapConfig
-    from drocap_ros.recording.session_reader import session_info
+    from drocap_ros.recording.open_session import session_info
 
     config = DrocapConfig().replace("session_recorder", session_dir=str(folder / "session"))
     with bringup(config, ["session_recorder"], processes=True) as graph:
@@ -123,7 +123,7 @@ def part_load(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
 def lost_on_the_way(session_dir: Path) -> dict[str, str]:
     """What the recorder itself said on /diagnostics, at the end."""
-    from drocap_ros.recording.session import open_session
+    from drocap_ros.recording.open_session import open_session
 
     told: dict[str, str] = {}
     with open_session(session_dir) as session:
@@ -300,7 +300,7 @@ def whole_file(kind: str, folder: Path) -> bytes:
     from recorded import START_NS, Messages, write_poses
     from test_telemetry import new_form, srt_text
 
-    from drocap_ros.recording.recording_config import SessionRecorderConfig
+    from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
     from drocap_ros.simulation.capture import simulate_capture
     from drocap_ros.tracks import save_tracks
 
@@ -402,7 +402,7 @@ def part_live(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     from drocap_ros.bringup import bringup
     from drocap_ros.config import DrocapConfig
     from drocap_ros.live_replay import reconstruct_live, recorded_config
-    from drocap_ros.recording.session import open_session
+    from drocap_ros.recording.open_session import open_session
 
     config = DrocapConfig().replace("capture_simulator", seconds=args.flight)
     config = config.replace("session_recorder", session_dir=str(folder / "session"))

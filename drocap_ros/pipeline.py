@@ -19,8 +19,9 @@ from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.sources import Frame, open_source
 from drocap_ros.perception.track_video import observe, tracks_from_observations
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.recording import session_reader
-from drocap_ros.recording.session import is_recording, open_session
+from drocap_ros.recording.image_messages import read_images
+from drocap_ros.recording.open_session import is_recording, open_session
+from drocap_ros.recording.session_tracks import read_pose2d
 from drocap_ros.recording.telemetry.camera_poses import with_camera
 from drocap_ros.recording.telemetry.log import TelemetryLog
 from drocap_ros.recording.telemetry.read import read_telemetry
@@ -127,9 +128,9 @@ def read_input(path: Path, config: DrocapConfig, models: Path | None, progress: 
     if is_recording(path):
         with open_session(path) as session:
             if session.has_pose2d:
-                tracks = session_reader.read_pose2d(session)
+                tracks = read_pose2d(session)
             else:
-                tracks = _watch(session_reader.read_images(session), None, config, models, progress, str(path))
+                tracks = _watch(read_images(session), None, config, models, progress, str(path))
             for warning in session.warnings:
                 logger.warning("%s: %s", path, warning)
             return tracks

@@ -1,4 +1,4 @@
-"""``drocap info``: what a recording, a motion or a tracks file holds."""
+"""``drocap info``: content of a recording, motion or tracks file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from drocap_ros.errors import InputError
 
 
 class Summary(NamedTuple):
-    """What to print: facts by name, one table, warnings."""
+    """Facts by name, one table, and warnings."""
 
     facts: list[tuple[str, str]]
     columns: tuple[str, ...]
@@ -25,20 +25,20 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the command's options; ``run`` is its action."""
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "info",
-        help="what a recording, motion or tracks file holds",
-        description="Print what a recording (session folder, .mcap, .bag, rosbag2 folder), a motion.npz or a tracks "
-        ".npz holds: topics, types, counts, duration, shapes.",
+        help="print the content of a recording, motion or tracks file",
+        description="Print topics, types, counts and duration of a recording (session folder, .mcap, .bag, rosbag2 "
+        "folder), or arrays and shapes of a motion.npz or tracks .npz.",
     )
     parser.add_argument("session", metavar="SESSION", type=Path, help="recording, motion.npz or tracks .npz")
     parser.add_argument(
-        "--metadata", action="store_true", help="print the session's configuration and the like in full"
+        "--metadata", action="store_true", help="print the session's configuration and other metadata in full"
     )
     parser.set_defaults(run=run)
     return parser
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the summary: a table on a terminal, plain lines in a pipe."""
+    """Print the summary: tables on a terminal, plain lines in a pipe."""
     if args.metadata:
         return _print_metadata(args.session)
     summary = summarize(args.session)
@@ -52,12 +52,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def summarize(path: Path) -> Summary:
-    """What a file or folder holds.
+    """Content of a file or folder.
 
     Raises
     ------
     InputError
-        When it is missing, unreadable, or of no kind that drocap knows.
+        When it is missing, unreadable, or of an unknown kind.
     """
     if not path.exists():
         raise InputError(f"{path}: expected a recording, motion or tracks file, found no such file; check the path")
@@ -65,7 +65,7 @@ def summarize(path: Path) -> Summary:
 
 
 def _of_session(path: Path) -> Summary:
-    from drocap_ros.recording.session_reader import session_info
+    from drocap_ros.recording.open_session import session_info
 
     info = session_info(path)
     facts = [
@@ -86,7 +86,7 @@ def _short(value: str) -> str:
 
 
 def _print_metadata(path: Path) -> int:
-    from drocap_ros.recording.session_reader import session_info
+    from drocap_ros.recording.open_session import session_info
 
     for key, value in sorted(session_info(path).metadata.items()):
         print(f"# {key}\n{value.rstrip()}\n")

@@ -1,4 +1,4 @@
-"""``drocap recover``: mend what a power cut left of a session."""
+"""``drocap recover``: repair a session after a crash or power cut."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the command's options; ``run`` is its action."""
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "recover",
-        help="mend a session that a crash or power cut left unfinished",
-        description="Mend a session in place: every message that can be read stands in it afterwards, and every reader"
-        " of MCAP and rosbag2 opens it. The old file is replaced only after the mended one was read back.",
+        help="repair a session after a crash or power cut",
+        description="Repair a session in place for every reader of MCAP and rosbag2. A damaged file is replaced only"
+        " after all of its readable messages were read back from the repaired copy.",
     )
     parser.add_argument("session", metavar="SESSION", type=Path, help="session folder or .mcap")
     parser.add_argument("--quiet", action="store_true", help="print only warnings")
@@ -22,7 +22,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Mend and say what was done."""
+    """Repair and print the result of each file."""
     import sys
 
     from drocap_ros.cli.progress import progress_bars
@@ -32,10 +32,10 @@ def run(args: argparse.Namespace) -> int:
         files = recover_session(args.session, progress)
     for file in files:
         if not args.quiet:
-            what = "mended" if file.mended else "was whole, left as it is"
+            what = "repaired" if file.repaired else "was whole, unchanged"
             print(f"{file.path.name}: {what}; {file.messages} messages, each read back")
         for damage in file.damage:
             print(f"drocap: warning: {file.path.name}: {damage}", file=sys.stderr)
         if file.kept is not None:
-            print(f"drocap: warning: {file.path.name}: kept as it was in {file.kept.name}", file=sys.stderr)
+            print(f"drocap: warning: {file.path.name}: the damaged file is kept as {file.kept.name}", file=sys.stderr)
     return 0

@@ -1,4 +1,4 @@
-"""What to know of a session years later: versions, revision, models, and where it was recorded."""
+"""Provenance of a session: versions, revision, configuration and model hashes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _BLOCK = 1 << 20
 
 
 def session_provenance(namespace: str = "") -> dict[str, str]:
-    """Metadata of a session from the start: versions (JSON), git revision and namespace of the graph."""
+    """First metadata of a session: versions (JSON), git revision and namespace of the graph."""
     values = {"versions": json.dumps(_versions(), sort_keys=True)}
     revision = _git_revision()
     if revision:
@@ -66,7 +66,7 @@ def _versions() -> dict[str, str]:
 
 
 def _git_revision() -> str:
-    """Revision of the source tree that runs, with ``+`` where it was changed since; empty outside one."""
+    """Revision of the running source tree, with ``+`` after changes; empty outside a repository."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return ""

@@ -1,4 +1,4 @@
-"""Some recorded pictures with the keypoints that were seen in them, side by side in one picture."""
+"""Some recorded images with their keypoints, side by side in one image."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.overlay import draw
+from drocap_ros.recording.image_messages import read_images
 from drocap_ros.recording.pose_messages import read_observations
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, POSE2D, Session
-from drocap_ros.recording.session_reader import read_images
 
 _COLUMNS, _ROWS = 4, 3
 _WIDTH_PX = 640
 
 
 def save_contact_sheet(path: Path, session: Session) -> None:
-    """Twelve pictures spread over the time in which a subject was seen, read left to right.
+    """Twelve images spread over the time in which a subject was seen, read left to right.
 
     Raises
     ------
     InputError
-        When the session holds no picture in which somebody was seen, or the file cannot be written.
+        When the session holds no image with a subject, or the file cannot be written.
     """
     import cv2
 
@@ -33,7 +33,7 @@ def save_contact_sheet(path: Path, session: Session) -> None:
     wanted = {stamps[i] for i in np.linspace(0, len(stamps) - 1, count).round().astype(int)} if stamps else set()
     tiles = []
     for frame in read_images(session):
-        # Pictures may have been lost on their way to the recorder: the next one that was seen takes the place.
+        # The recorder may lack an image: the next one with a subject takes its place.
         due = [stamp for stamp in wanted if stamp <= frame.stamp_ns]
         if due and frame.stamp_ns in seen:
             wanted.difference_update(due)
@@ -43,8 +43,8 @@ def save_contact_sheet(path: Path, session: Session) -> None:
         if not wanted:
             break
     if not tiles:
-        raise InputError(f"{session.path}: expected pictures in which a subject was seen, found none; look at pose2d")
+        raise InputError(f"{session.path}: expected images with a subject, found none; check pose2d")
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % _COLUMNS)
     rows = [np.hstack(tiles[i : i + _COLUMNS]) for i in range(0, len(tiles), _COLUMNS)]
     if not cv2.imwrite(str(path), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 88]):
-        raise InputError(f"{path}: expected a place to write a picture to; is there space on the disk?")
+        raise InputError(f"{path}: expected a writable file; check the folder and the disk space")

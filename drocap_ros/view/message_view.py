@@ -11,7 +11,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.geometry.ellipsoids import unpack_covariance
-from drocap_ros.recording.pictures import image_from_message
+from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.recording.pose_messages import float_array, observation_from_message
 from drocap_ros.skeleton import JointSet, joint_set
 from drocap_ros.view.camera import LEVEL_CAMERA, nominal_camera_matrix, place_cameras

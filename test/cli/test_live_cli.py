@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.bringup import free_domain
-from drocap_ros.recording.session_reader import session_info
+from drocap_ros.recording.open_session import session_info
 
 ROOT = Path(__file__).resolve().parents[2]
 IMAGES = "/drocap/image/compressed"

@@ -79,3 +79,33 @@ def write_poses(folder, messages, tracks, config=None, absent=(), topic="/drocap
     assert writer.error is None
     assert writer.dropped == 0
     return writer.path
+
+
+def record(folder, entries):
+    """Session of entries (topic, message, log time, serialized message)."""
+    with SessionWriter(folder) as writer:
+        for topic, message, log_ns, cdr in entries:
+            writer.register(topic, message.__msgtype__, schema_text(message.__msgtype__))
+            writer.write(topic, cdr, log_ns)
+    return folder
+
+
+def random_image(seed, shape=(48, 64, 3)):
+    return np.random.default_rng(seed).integers(0, 255, shape, dtype=np.uint8)
+
+
+def image_message(messages, image, stamp_ns, encoding="bgr8", pad=0):
+    import cv2
+
+    convert = {
+        "rgb8": cv2.COLOR_BGR2RGB,
+        "mono8": cv2.COLOR_BGR2GRAY,
+        "bgra8": cv2.COLOR_BGR2BGRA,
+        "rgba8": cv2.COLOR_BGR2RGBA,
+    }
+    data = cv2.cvtColor(image, convert[encoding]) if encoding in convert else image
+    rows = np.pad(data.reshape(data.shape[0], -1), ((0, 0), (0, pad)))
+    return messages(
+        NAMES["image"], header=messages.header(stamp_ns), height=image.shape[0], width=image.shape[1],
+        encoding=encoding, step=rows.shape[1], data=rows.ravel(),
+    )  # fmt: skip

@@ -6,9 +6,9 @@ import time
 import numpy as np
 from recorded import NAMES, Messages
 
+from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
 from drocap_ros.recording.mcap.schemas import schema_text
 from drocap_ros.recording.mcap.writer import SessionWriter
-from drocap_ros.recording.recording_config import SessionRecorderConfig
 
 
 def write_until_killed(folder):

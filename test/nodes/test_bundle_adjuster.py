@@ -11,7 +11,7 @@ from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.live_replay import reconstruct_live, recorded_config
 from drocap_ros.observation import PoseObservation
-from drocap_ros.recording.session import open_session
+from drocap_ros.recording.open_session import open_session
 from drocap_ros.ros.conversions import pose2d_to_ros, stamp_from_ros
 from drocap_ros.ros.topics import TOPICS
 from drocap_ros.simulation.capture import simulate_capture

@@ -21,8 +21,8 @@ from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.live_replay import reconstruct_live, recorded_config
 from drocap_ros.pipeline import reconstruct_input
-from drocap_ros.recording.session import open_session
-from drocap_ros.recording.session_reader import read_pose2d
+from drocap_ros.recording.open_session import open_session
+from drocap_ros.recording.session_tracks import read_pose2d
 from drocap_ros.ros.conversions import stamp_from_ros
 from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, TOPICS
 

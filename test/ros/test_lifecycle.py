@@ -11,7 +11,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
-from drocap_ros.recording.session_reader import session_info
+from drocap_ros.recording.open_session import session_info
 from drocap_ros.ros.topics import TOPICS
 
 NAMES = {

@@ -9,7 +9,7 @@ from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError, NodeError
 from drocap_ros.msg import OrbitStatus, Pose3D, Pose3DWindow
-from drocap_ros.recording.session import open_session
+from drocap_ros.recording.open_session import open_session
 from drocap_ros.ros.conversions import stamp_from_ros
 from drocap_ros.ros.topics import RESULT_QOS, TOPICS
 from drocap_ros.simulation.vehicle.ports import free_udp_port

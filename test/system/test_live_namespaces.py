@@ -7,7 +7,7 @@ import pytest
 
 from drocap_ros.bringup import bringup, free_domain
 from drocap_ros.config import DrocapConfig
-from drocap_ros.recording.session import open_session
+from drocap_ros.recording.open_session import open_session
 
 NODES = ["capture_simulator", "initializer", "bundle_adjuster", "visualizer", "session_recorder"]
 DRONES = ("drone1", "drone10")  # one name begins with the other

@@ -19,7 +19,7 @@ from sensor_msgs.msg import CompressedImage
 from drocap_ros.bringup import bringup, free_domain, watch
 from drocap_ros.config import DrocapConfig
 from drocap_ros.motion import Motion, load_motion, save_motion
-from drocap_ros.recording.session import open_session
+from drocap_ros.recording.open_session import open_session
 from drocap_ros.ros.conversions import header_at
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15

@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.cli.reconstruct import summary
     from drocap_ros.errors import InputError
     from drocap_ros.evaluation.compare import compare
-    from drocap_ros.recording.session import open_session
+    from drocap_ros.recording.open_session import open_session
     from drocap_ros.simulation.flight_simulator.truth import load_flight_truth
 
     if not (math.isfinite(args.seconds) and _LEAST_S <= args.seconds <= _MOST_S):
@@ -119,7 +119,7 @@ def _reconstruct(folder: Path, config: DrocapConfig, args: argparse.Namespace) -
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.motion import save_motion
     from drocap_ros.pipeline import reconstruct_input
-    from drocap_ros.recording.session import open_session
+    from drocap_ros.recording.open_session import open_session
     from drocap_ros.report.contact_sheet import save_contact_sheet
     from drocap_ros.report.page import save_report
     from drocap_ros.report.preview import save_preview

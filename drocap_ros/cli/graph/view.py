@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
 
 def is_session(path: Path) -> bool:
     """Whether the input is a recording; a folder of ours holds its motion beside its session."""
-    from drocap_ros.recording.session import is_recording
+    from drocap_ros.recording.open_session import is_recording
 
     return path.exists() and is_recording(path) and not (path / "motion.npz").is_file()
 
@@ -104,18 +104,18 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _view_motion(recording: rerun.RecordingStream, args: argparse.Namespace) -> None:
-    from drocap_ros.report.pictures import each_picture
+    from drocap_ros.report.motion_images import each_image
     from drocap_ros.view.motion_view import PLOTS, draw_motion
     from drocap_ros.view.scene import Scene
 
     _, motion = read_motion(args.input)
-    pictures = each_picture(args.video, motion) if args.video else ()
+    pictures = each_image(args.video, motion) if args.video else ()
     with _shown(recording, PLOTS, args), progress_bars(args.quiet) as progress:
         draw_motion(Scene(recording), motion, pictures, progress)
 
 
 def _view_session(recording: rerun.RecordingStream, args: argparse.Namespace) -> None:
-    from drocap_ros.recording.session import open_session
+    from drocap_ros.recording.open_session import open_session
     from drocap_ros.view.message_view import PLOTS, MessageView
     from drocap_ros.view.scene import Scene
     from drocap_ros.view.session_view import draw_session

@@ -1,1 +1,1 @@
-"""MCAP sessions: writing, streaming, recovery and their metadata."""
+"""Sessions as rosbag2 folders of MCAP files: writing, streaming, recovery, metadata."""

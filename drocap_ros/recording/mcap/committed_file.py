@@ -1,4 +1,4 @@
-"""A file that grows by whole pieces: what is written counts only once it is committed."""
+"""A file that grows by whole commits."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 class CommittedFile:
     """Output stream of the MCAP writer.
 
-    ``write`` collects; ``commit`` hands the collected bytes to the system in one go, and if that fails (disk full)
-    cuts the file back to the last commit, so that it never ends in half a chunk.
+    ``write`` collects; ``commit`` writes the collected bytes.  If that fails (disk full), the file is cut back to the
+    last commit: it never ends in half a chunk.
 
     Raises
     ------
@@ -29,11 +29,11 @@ class CommittedFile:
         return len(data)
 
     def tell(self) -> int:
-        """Place of the next byte, counting what is collected."""
+        """Offset of the next byte, collected bytes included."""
         return self._committed + len(self._pending)
 
     def flush(self) -> None:
-        """Nothing: see :meth:`commit`."""
+        """No effect, see :meth:`commit`; the MCAP writer calls it."""
 
     @property
     def pending(self) -> int:
@@ -41,12 +41,12 @@ class CommittedFile:
         return len(self._pending)
 
     def commit(self, sync: bool = False) -> None:
-        """Write what is collected; with ``sync``, to the disk itself.
+        """Write the collected bytes; ``sync`` forces them to the disk.
 
         Raises
         ------
         OSError
-            When it cannot be written; the file then ends where it ended before.
+            When they cannot be written; the file then ends at the last commit.
         """
         view = memoryview(bytes(self._pending))
         self._pending.clear()
@@ -63,7 +63,7 @@ class CommittedFile:
         self._committed += len(view)
 
     def close(self) -> None:
-        """Close; what is not committed is lost."""
+        """Close; bytes that are not committed are lost."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1

@@ -1,4 +1,4 @@
-"""One storage file of a session: an MCAP that at every commit ends in whole chunks."""
+"""One storage file of a session: an MCAP file that ends in whole chunks after every commit."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from drocap_ros.recording.mcap.metadata import FileRecord, TopicRecord, dump_yam
 
 
 class McapFile:
-    """Writes messages of registered topics; knows nothing of threads, space or the folder around it.
+    """Writes messages of registered topics; threads, space and the folder are the caller's.
 
     topics : by name, with the number of their messages in this file
-    record : the file as ``metadata.yaml`` tells it
+    record : the file's entry in ``metadata.yaml``
 
     Parameters
     ----------
@@ -48,12 +48,12 @@ class McapFile:
 
     @property
     def size(self) -> int:
-        """Bytes so far, without the chunk that is being filled."""
+        """Bytes so far, without the open chunk."""
         return self._file.tell()
 
     @property
     def pending(self) -> int:
-        """Bytes of whole chunks that are not committed yet."""
+        """Bytes of whole chunks that are not committed."""
         return self._file.pending
 
     def register(
@@ -68,7 +68,7 @@ class McapFile:
     ) -> None:
         """Declare a topic before its first message; the counts of ``topic`` start from 0 in this file.
 
-        ``key`` is what :meth:`add` calls it, its name unless told.
+        ``key`` identifies it in :meth:`add`, by default its name.
         """
         kind = (topic.type_name, schema)
         if kind not in self._schemas:
@@ -106,19 +106,19 @@ class McapFile:
         self._mcap.add_metadata(name, dict(values))
 
     def save(self, sync: bool) -> None:
-        """Close the chunk that is being filled and hand all to the disk.
+        """Close the open chunk and commit all chunks.
 
         Raises
         ------
         OSError
-            When it cannot be written; the file then ends where it ended before.
+            When it cannot be written; the file then ends at the last commit.
         """
         self._mcap.flush()
         self._chunk_closed()
         self.commit(sync)
 
     def commit(self, sync: bool = False) -> None:
-        """Hand over the chunks that are whole.
+        """Commit the whole chunks.
 
         Raises
         ------
@@ -134,7 +134,7 @@ class McapFile:
         Raises
         ------
         OSError
-            When it cannot be written; what was committed before stays.
+            When it cannot be written; committed chunks stay.
         """
         self._mcap.finish()
         self._chunk_closed()
@@ -142,7 +142,7 @@ class McapFile:
         self._file.close()
 
     def abandon(self) -> Counter[str]:
-        """Close as it is; tells by topic how many messages are lost, and takes them out of the counts."""
+        """Close without the open chunk; returns the lost messages by topic and subtracts them from the counts."""
         self._file.close()
         lost = self._in_open_chunk + self._in_closed_chunks
         for topic, count in lost.items():

@@ -1,13 +1,16 @@
-"""``metadata.yaml`` of a rosbag2 folder, version 9, as ROS 2 Jazzy writes it."""
+"""``metadata.yaml`` of a rosbag2 folder: reading, and writing of version 9 (ROS 2 Jazzy)."""
 
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 METADATA_FILE = "metadata.yaml"
+#: Name of the metadata records that this package writes into MCAP files.
+METADATA_RECORD = "drocap_ros"
 _VERSION = 9
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 
@@ -36,7 +39,7 @@ class FileRecord:
     messages: int = 0
 
     def count(self, log_time_ns: int) -> None:
-        """Take note of one more message."""
+        """Add one message."""
         self.start_ns = log_time_ns if self.start_ns is None else min(self.start_ns, log_time_ns)
         self.end_ns = max(self.end_ns, log_time_ns)
         self.messages += 1
@@ -71,7 +74,7 @@ def dump_yaml(value: Any) -> str:
 
 
 def bag_metadata(files: list[FileRecord], topics: list[TopicRecord], custom: dict[str, str]) -> dict[str, Any]:
-    """Content of the file: its storage files, their topics, their time."""
+    """Content of the file: storage files, topics and times."""
     starts = [f.start_ns for f in files if f.start_ns is not None]
     start_ns = min(starts, default=None)
     return {
@@ -110,8 +113,48 @@ def _time(start_ns: int | None, end_ns: int) -> dict[str, Any]:
     }
 
 
+def read_metadata(folder: Path) -> tuple[dict[str, Any], list[str]]:
+    """The description in ``metadata.yaml``, empty where there is no usable one, and warnings."""
+    import yaml
+
+    path = folder / METADATA_FILE
+    if not path.exists():
+        return {}, [f"{METADATA_FILE} is missing; read the files in the folder"]
+    try:
+        content = yaml.load(path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        description = content["rosbag2_bagfile_information"]
+        if not isinstance(description, dict):
+            raise TypeError("no table")
+        return description, []
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError, RecursionError):
+        return {}, [f"{METADATA_FILE} cannot be read; read the files in the folder"]
+
+
+def custom_metadata(description: dict[str, Any]) -> dict[str, str]:
+    """The recorder's own entries of a description."""
+    custom = description.get("custom_data")
+    return {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
+
+
+def storage_files(folder: Path, description: dict[str, Any]) -> list[Path]:
+    """Files of a folder in their order, with MCAP files that a crash left out of the description."""
+    there = sorted((p for p in folder.iterdir() if p.suffix == ".mcap"), key=_by_number)
+    named = description.get("relative_file_paths")
+    if isinstance(named, list) and named:
+        files = [folder / Path(str(name)).name for name in named]
+        if all(file.is_file() for file in files):
+            beside = [p for p in there if p not in files] if all(f.suffix == ".mcap" for f in files) else []
+            return files + beside
+    return there
+
+
+def _by_number(path: Path) -> tuple[Any, ...]:
+    """``s_10`` comes after ``s_9``."""
+    return tuple(int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name))
+
+
 def write_atomically(path: Path, text: str) -> None:
-    """Replace a file so that a reader or a power cut finds the old content or the new, never half of it."""
+    """Replace a file; a reader, or a restart after a power cut, finds the old content or the new."""
     temporary = path.with_name(path.name + ".tmp")
     try:
         with temporary.open("w", encoding="utf-8") as file:
@@ -126,7 +169,7 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Force names that were made or replaced in a folder to the disk."""
+    """Force new and replaced names in a folder to the disk."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

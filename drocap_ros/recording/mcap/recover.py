@@ -1,8 +1,8 @@
-"""Mend what a power cut left of a session, so that every reader of MCAP and rosbag2 opens it again.
+"""Repairs a session after a crash or power cut, for every reader of MCAP and rosbag2.
 
-Each file that is cut off or damaged is written anew beside itself, read back and compared message by message, and
-only then takes its place; ``metadata.yaml`` is made from what the files hold.  Until then nothing is touched.  Where
-bytes in the middle of a file could not be read, the file as it was is kept, named ``*.damaged``.
+Each damaged file is copied, the copy is read back and compared message by message, and only then it replaces the file;
+``metadata.yaml`` is made from the files.  Where data in the middle of a file could not be read, the damaged file is
+kept, named ``*.damaged``.
 """
 
 from __future__ import annotations
@@ -16,20 +16,24 @@ from pathlib import Path
 from typing import Any
 
 from drocap_ros.errors import InputError
+from drocap_ros.recording.mcap.damage import Damage, DamageKind
 from drocap_ros.recording.mcap.file import McapFile
 from drocap_ros.recording.mcap.metadata import (
     METADATA_FILE,
+    METADATA_RECORD,
     FileRecord,
     TopicRecord,
     bag_metadata,
+    custom_metadata,
     dump_yaml,
     qos_profile,
+    read_metadata,
+    storage_files,
     sync_folder,
     write_atomically,
 )
 from drocap_ros.recording.mcap.schemas import type_hash
 from drocap_ros.recording.mcap.stream import MAGIC, McapChannel, McapMessage, McapStream
-from drocap_ros.recording.session import read_bag_metadata, storage_files
 
 _BESIDE = ".recovering"
 
@@ -38,29 +42,29 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class RecoveredFile:
-    """What was done to one file.
+    """Result for one file.
 
-    mended : False = it was whole and was left alone
-    messages : in it, and each of them read back
-    damage : in words, what could not be read
-    kept : the file as it was, where something in its middle could not be read
+    repaired : False = it was whole and is unchanged
+    messages : in it, each read back
+    damage : parts that could not be read
+    kept : the damaged file, where data in its middle could not be read
     """
 
     path: Path
-    mended: bool
+    repaired: bool
     messages: int
-    damage: tuple[str, ...]
+    damage: tuple[Damage, ...]
     kept: Path | None = None
 
 
 def recover_session(path: str | Path, progress: Progress | None = None) -> list[RecoveredFile]:
-    """Mend a session folder or a lone ``.mcap`` in place.
+    """Repair a session folder or a single ``.mcap`` in place.
 
     Raises
     ------
     InputError
-        When it is no MCAP session, nothing of it can be read, or there is no room for the mended file; then all is
-        as it was.
+        When it is no MCAP session, nothing of it can be read, or there is no space for the copy; then nothing has
+        changed.
     """
     path = Path(path)
     files, custom = _files(path)
@@ -80,8 +84,8 @@ def recover_session(path: str | Path, progress: Progress | None = None) -> list[
                 left.unlink()
     except OSError as error:
         raise InputError(
-            f"{path}: expected to write a mended file beside the old one; {error.strerror or error}; the old one is as"
-            " it was: make room, or copy the session to another disk"
+            f"{path}: expected space for a repaired copy; {error.strerror or error}; the session is unchanged: make"
+            " room, or copy the session to another disk"
         ) from None
     if progress is not None:
         progress("files", 1.0)
@@ -95,27 +99,26 @@ def _files(path: Path) -> tuple[list[Path], dict[str, str]]:
         if path.suffix != ".mcap":
             raise InputError(f"{path}: expected a session folder or .mcap, found another kind of file; check the path")
         return [path], {}
-    description, _ = read_bag_metadata(path)
+    description, _ = read_metadata(path)
     files = storage_files(path, description)
     if not files or any(file.suffix != ".mcap" for file in files):
         raise InputError(f"{path}: expected a session of MCAP files, found none or others; check the path")
-    custom = description.get("custom_data") or {}
-    custom = {str(k): str(v) for k, v in custom.items()} if isinstance(custom, dict) else {}
+    custom = custom_metadata(description)
     for file in files:
-        for key, value in McapStream(file).metadata().get("drocap_ros", {}).items():
+        for key, value in McapStream(file).metadata().get(METADATA_RECORD, {}).items():
             custom.setdefault(key, value)
     return files, custom
 
 
 class _Digest:
-    """Counts and fingerprint of a sequence of messages: equal only where every message is."""
+    """Counts and hash of a sequence of messages; equal only for equal messages."""
 
     def __init__(self) -> None:
         self._hash = hashlib.blake2b()
         self.counts: Counter[str] = Counter()
 
     def add(self, message: McapMessage) -> None:
-        """Take one more message in."""
+        """Add one message."""
         head = f"{message.channel.topic}|{message.channel.type_name}|{message.log_time_ns}|{message.publish_time_ns}|"
         self._hash.update(f"{head}{message.sequence}|{len(message.data)}|".encode())
         self._hash.update(message.data)
@@ -129,21 +132,21 @@ class _Digest:
 
 def _recover_file(path: Path, one_of_several: bool) -> RecoveredFile:
     beside = path.with_name(path.name + _BESIDE)
-    beside.unlink(missing_ok=True)  # of a recovery that was cut off itself
+    beside.unlink(missing_ok=True)  # of an interrupted recovery
     size = path.stat().st_size
     if size < len(MAGIC):
         if not one_of_several and size == 0:
-            raise InputError(f"{path}: expected an MCAP file, found 0 bytes; there is nothing in it to mend")
+            raise InputError(f"{path}: expected an MCAP file, found 0 bytes; there is nothing in it to repair")
         if not MAGIC.startswith(path.read_bytes()):
             raise InputError(f"{path}: expected an MCAP file, found other content at its start; check the path")
-        return _replace(path, beside, _Digest(), ("it held no message",))
+        return _replace(path, beside, _Digest(), (Damage(DamageKind.NO_MESSAGE),))
     stream, before = McapStream(path, resync=True), _Digest()
     for message in stream.messages():
         before.add(message)
     damage = tuple(stream.damage)
     if not damage and _is_whole(stream, before):
         return RecoveredFile(path, False, before.counts.total(), ())
-    return _replace(path, beside, before, damage or ("it had no summary",))
+    return _replace(path, beside, before, damage or (Damage(DamageKind.NO_SUMMARY),))
 
 
 def _is_whole(stream: McapStream, digest: _Digest) -> bool:
@@ -156,7 +159,7 @@ def _is_whole(stream: McapStream, digest: _Digest) -> bool:
     )
 
 
-def _replace(path: Path, beside: Path, before: _Digest, damage: tuple[str, ...]) -> RecoveredFile:
+def _replace(path: Path, beside: Path, before: _Digest, damage: tuple[Damage, ...]) -> RecoveredFile:
     try:
         if before.counts or path.stat().st_size >= len(MAGIC):
             _copy(McapStream(path, resync=True), beside)
@@ -168,11 +171,11 @@ def _replace(path: Path, beside: Path, before: _Digest, damage: tuple[str, ...])
             again.add(message)
         if stream.damage or again != before or not _is_whole(stream, again):
             raise InputError(
-                f"{path}: expected the mended file to hold the same {before.counts.total()} messages, found "
-                f"{again.counts.total()}; the old one is as it was"
+                f"{path}: expected the same {before.counts.total()} messages in the repaired copy, found "
+                f"{again.counts.total()}; the session is unchanged"
             )
         kept = None
-        if any("damaged chunks" in d or "skipped" in d or "unknown channels" in d for d in damage):
+        if any(d.keeps_data for d in damage):
             kept = path.with_name(path.name + ".damaged")
             if not kept.exists():
                 os.link(path, kept)
@@ -188,7 +191,7 @@ def _copy(stream: McapStream, target: Path) -> None:
     channels: dict[McapChannel, str] = {}
     try:
         for name, values in stream.metadata().items():
-            if name != "rosbag2":  # counts of the file as it was
+            if name != "rosbag2":  # holds the counts of the damaged file
                 file.add_metadata(name, values)
         for message in _with_channels(stream, file, channels):
             file.add(
@@ -206,7 +209,7 @@ def _with_channels(stream: McapStream, file: McapFile, known: dict[McapChannel, 
     for message in stream.messages():
         channel = message.channel
         if channel not in known:
-            # Two channels of one topic (two publishers) stay two.
+            # Two channels of one topic (two publishers) stay separate.
             key = channel.topic if channel.topic not in known.values() else f"{channel.topic}#{len(known)}"
             known[channel] = key
             file.register(

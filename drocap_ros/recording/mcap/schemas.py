@@ -1,8 +1,8 @@
-"""Message definitions as text: the schemas embedded in a session, built without ROS.
+"""Message definitions as text: the schemas embedded in a session, without ROS.
 
-A schema is the ``ros2msg`` text that rosbag2 embeds: the definition itself, then each definition that it depends
-on behind a line of 80 ``=`` and ``MSG: package/Name``.  Definitions of drocap_ros are its own ``.msg`` files, with
-their comments; those of ROS come from the table that ``rosbags`` ships.
+A schema is the ``ros2msg`` text that rosbag2 embeds: the definition, then each definition that it depends on after a
+line of 80 ``=`` and ``MSG: package/Name``.  Definitions of drocap_ros are its own ``.msg`` files, with their comments;
+those of ROS come from ``rosbags``.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ PACKAGE = "drocap_ros"
 _SEPARATOR = "=" * 80 + "\n"
 
 
-def definition_folders() -> list[Path]:
-    """Where this package's ``.msg`` files may be: beside the sources, in the installed package, in ROS's share."""
+def _definition_folders() -> list[Path]:
+    """Folders with this package's ``.msg`` files: beside the sources, in the installed package, in ROS's share."""
     here = Path(__file__).resolve().parents[2]
     prefixes = [Path(p) for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
     shares = [prefix / "share" / PACKAGE / "msg" for prefix in (*prefixes, Path(sys.prefix))]
@@ -33,7 +33,7 @@ def definition_folders() -> list[Path]:
 
 def own_definitions() -> dict[str, str]:
     """``drocap_ros/msg/Name`` -> text of its ``.msg`` file; empty when none are installed."""
-    folders = definition_folders()
+    folders = _definition_folders()
     if not folders:
         return {}
     return {f"{PACKAGE}/msg/{path.stem}": path.read_text(encoding="utf-8") for path in sorted(folders[0].glob("*.msg"))}
@@ -54,7 +54,7 @@ def standard_types() -> Typestore:
 
 @lru_cache(maxsize=256)
 def schema_text(type_name: str) -> str:
-    """Definition of a message type (``package/msg/Name``) with all that it depends on.
+    """Definition of a message type (``package/msg/Name``) with those of all types in it.
 
     Raises
     ------
@@ -73,14 +73,14 @@ def schema_text(type_name: str) -> str:
 
 
 def type_hash(type_name: str, schema: str) -> str:
-    """REP 2011 hash of a type from its schema text; empty when the text does not give one."""
+    """REP 2011 hash of a type from its schema text; empty for unusable text."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.EMPTY)
     try:
         store.register(get_types_from_msg(schema, type_name))
         return store.hash_rihs01(type_name)
-    except Exception:  # a hash is a convenience: a reader does without
+    except Exception:  # readers do without a hash
         return ""
 
 

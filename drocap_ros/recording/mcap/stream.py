@@ -1,7 +1,7 @@
-"""An MCAP file as a stream of messages: read from front to back, and as far as it can be read.
+"""An MCAP file as a stream of messages, read from front to back up to its damage.
 
-The summary at the end is used for counts only, so that a file without one (cut off by a crash) is read like any
-other.  Damaged chunks are skipped and counted; sizes are checked before anything is unpacked.
+The summary at the end serves for counts only: a file without one (after a crash) is read like any other.  Damaged
+chunks are skipped and counted; sizes are checked before unpacking.
 """
 
 from __future__ import annotations
@@ -10,11 +10,12 @@ import logging
 import re
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 from drocap_ros.errors import InputError
+from drocap_ros.recording.mcap.damage import Damage, DamageKind
 
 logger = logging.getLogger(__name__)
 
@@ -22,8 +23,6 @@ MAGIC = b"\x89MCAP0\r\n"
 _MAX_CHUNK = 512 << 20
 _FREE_EXPANSION = 64 << 20
 _MAX_EXPANSION = 1000
-
-
 _SEARCH = 1 << 20
 _CHUNK_OPCODE = 6
 #: opcode, length, start and end time, unpacked size, checksum, length of the compression's name
@@ -54,7 +53,7 @@ class McapMessage(NamedTuple):
 
 
 class _BoundedFile:
-    """A file of which no more can be asked than is there: a length that lies must not take memory."""
+    """A file that limits reads to its size: a wrong length in a damaged file must not take memory."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -71,13 +70,13 @@ class _BoundedFile:
 class McapStream:
     """Reads one file; see the module's text.
 
-    resync : after damage, look for the next whole chunk instead of ending there
-    damage : in words, what could not be read so far
+    resync : after damage, search the next whole chunk instead of ending there
+    damage : parts that could not be read so far
     """
 
     path: Path
     resync: bool = False
-    damage: list[str] = field(default_factory=list)
+    damage: list[Damage] = field(default_factory=list)
     _whole_until: int = 0
 
     def messages(self) -> Iterator[McapMessage]:
@@ -105,7 +104,7 @@ class McapStream:
                     continue
                 yield McapMessage(channel, record.log_time, record.data, record.publish_time, record.sequence)
         if lost:
-            self.damage.append(f"{lost} messages of unknown channels")
+            self.damage.append(Damage(DamageKind.UNKNOWN_CHANNELS, amount=lost))
 
     def summary(self) -> Any | None:
         """The file's own summary (mcap's ``Summary``), or None where there is no usable one."""
@@ -119,11 +118,11 @@ class McapStream:
                     return None
                 file.seek(0)
                 return SeekingReader(bounded, record_size_limit=bounded.size).get_summary()
-        except Exception:  # a damaged summary raises all kinds; the stream itself is the truth
+        except Exception:  # a damaged summary fails in many ways; the stream does without
             return None
 
     def profile(self) -> str:
-        """What the file says it is: "ros2", "ros1" or something else; "ros2" where it does not say."""
+        """Profile in the header: "ros2", "ros1" or another; "ros2" where it cannot be read."""
         from mcap.reader import SeekingReader
 
         try:
@@ -133,7 +132,7 @@ class McapStream:
             return "ros2"
 
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Metadata records by name, those of one name merged; without a summary the whole file is looked through."""
+        """Metadata records by name, those of one name merged; without a summary the whole file is read for them."""
         from mcap.reader import SeekingReader
 
         found: dict[str, dict[str, str]] = {}
@@ -144,7 +143,7 @@ class McapStream:
                 reader = SeekingReader(bounded, record_size_limit=bounded.size)
                 for record in reader.iter_metadata() if whole else self._loose_metadata(file):
                     found.setdefault(record.name, {}).update(record.metadata)
-        except Exception:  # what is told of a damaged file is a convenience
+        except Exception:  # messages can be read without metadata
             logger.debug("%s: metadata cannot be read", self.path)
         return found
 
@@ -185,7 +184,7 @@ class McapStream:
                     continue
                 yield from records
             if bad_chunks:
-                self.damage.append(f"{bad_chunks} damaged chunks")
+                self.damage.append(Damage(DamageKind.DAMAGED_CHUNKS, amount=bad_chunks))
 
     def _raw_records(self, bounded: Any, file: IO[bytes]) -> Iterator[Any]:
         from mcap.stream_reader import StreamReader
@@ -200,7 +199,7 @@ class McapStream:
             place = _next_chunk(file, self._whole_until + 1)
             if place is None:
                 return
-            self.damage[-1] = f"{place - self._whole_until} bytes skipped at byte {self._whole_until}"
+            self.damage[-1] = Damage(DamageKind.SKIPPED_BYTES, self._whole_until, place - self._whole_until)
             file.seek(place)
             skip = True
 
@@ -216,7 +215,7 @@ class McapStream:
                 return
             except Exception:  # mcap raises many kinds on cut or damaged records
                 if not ended:
-                    self.damage.append(f"cut off or damaged at byte {place} of {size}")
+                    self.damage.append(Damage(DamageKind.CUT_OFF, place, size))
                 return
             ended = ended or isinstance(record, Footer)
             place = file.tell()
@@ -224,7 +223,7 @@ class McapStream:
 
 
 def _next_chunk(file: IO[bytes], start: int) -> int | None:
-    """Place of the next record at or after ``start`` that looks like a chunk and fits into the file."""
+    """Offset of the next record at or after ``start`` that has the form of a chunk and fits into the file."""
     size = file.seek(0, 2)
     overlap = _CHUNK_HEAD.size
     place = start
@@ -246,7 +245,7 @@ def _channel(record: Any, schema: Any | None) -> McapChannel:
     text = schema.data.decode("utf-8", "replace") if schema is not None else ""
     return McapChannel(
         topic=record.topic,
-        type_name=_ros2_name(schema.name) if schema is not None else "",
+        type_name=ros2_name(schema.name) if schema is not None else "",
         message_encoding=record.message_encoding,
         schema_encoding=schema.encoding if schema is not None else "",
         schema=text,
@@ -255,24 +254,22 @@ def _channel(record: Any, schema: Any | None) -> McapChannel:
     )
 
 
-def _ros2_name(name: str) -> str:
+def ros2_name(name: str) -> str:
     """``package/Name`` (ROS 1, some writers) -> ``package/msg/Name``."""
     parts = name.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
 
 
 def _unpacked(chunk: Any) -> Any:
-    """The chunk with its records uncompressed; refuses sizes that no honest file has."""
-    import dataclasses
-
+    """The chunk with its records uncompressed; implausible sizes raise."""
     size = chunk.uncompressed_size
     if size > _MAX_CHUNK or size > max(_FREE_EXPANSION, _MAX_EXPANSION * len(chunk.data)):
         raise ValueError("chunk too large")
     if chunk.compression == "zstd":
         import zstandard
 
-        told = zstandard.get_frame_parameters(chunk.data).content_size
-        if told not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+        declared = zstandard.get_frame_parameters(chunk.data).content_size
+        if declared not in (size, zstandard.CONTENTSIZE_UNKNOWN):
             raise ValueError("chunk of two sizes")
         data = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)
     elif chunk.compression == "lz4":
@@ -282,7 +279,7 @@ def _unpacked(chunk: Any) -> Any:
     elif chunk.compression == "":
         data = chunk.data
     else:
-        raise struct.error("unknown compression")
+        raise ValueError("unknown compression")
     if len(data) != size:
         raise ValueError("chunk of two sizes")
-    return dataclasses.replace(chunk, compression="", data=data)
+    return replace(chunk, compression="", data=data)

@@ -1,4 +1,4 @@
-"""Writes a session: a rosbag2 folder of MCAP files that survives whatever happens to the machine."""
+"""Writes a session: a rosbag2 folder of MCAP files that survives crashes, power cuts and full disks."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from drocap_ros.recording.mcap.bounded_queue import BoundedQueue, QueuedMessage
 from drocap_ros.recording.mcap.file import McapFile
 from drocap_ros.recording.mcap.metadata import (
     METADATA_FILE,
+    METADATA_RECORD,
     FileRecord,
     TopicRecord,
     bag_metadata,
@@ -24,35 +25,33 @@ from drocap_ros.recording.mcap.metadata import (
     sync_folder,
     write_atomically,
 )
+from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
 from drocap_ros.recording.mcap.schemas import type_hash
-from drocap_ros.recording.recording_config import SessionRecorderConfig
 
 _MIB = 1 << 20
-#: Name of the metadata records that this package writes.
-RECORD = "drocap_ros"
 
 logger = logging.getLogger(__name__)
 
 
 class SessionWriter:
-    """Takes serialized messages from any thread and writes them in a thread of its own.
+    """Accepts serialized messages from any thread and writes them in its own thread.
 
-    Chunks are compressed and handed to the disk at least every ``config.chunk_s``; a crash or power cut leaves
-    whole chunks up to then.  After ``config.split_mib`` or ``config.split_s`` a new file is begun; each stands by
-    itself.  ``write`` never waits and never raises: what the disk cannot take is dropped, pictures first, and
-    counted.  ``metadata.yaml`` stands from the start and is completed by :meth:`close`.  When less than
-    ``config.free_mib`` is left on the disk the files are finished while that is still possible, and ``error`` says so.
+    Chunks are compressed and written at least every ``config.chunk_s``: a crash or power cut leaves whole chunks up to
+    then.  A new, independent file starts after ``config.split_mib`` or ``config.split_s``.  ``write`` never waits:
+    messages above the disk's rate are dropped, images first, and counted.  ``metadata.yaml`` exists from the start;
+    :meth:`close` completes it.  With less than ``config.free_mib`` left on the disk the session is finished early, and
+    ``error`` gives the reason.
 
     Parameters
     ----------
     folder : to create; it must not exist, or be empty
     config : chunks, files, queue, free space
-    metadata : what to know of the session later: configuration, versions, model hashes
+    metadata : configuration, versions, model hashes and the like
 
     Raises
     ------
     InputError
-        When the folder holds something, cannot be created, or the disk is full already.
+        When the folder is not empty, cannot be created, or the disk is full.
     """
 
     def __init__(
@@ -65,15 +64,15 @@ class SessionWriter:
         self.config = config or SessionRecorderConfig()
         self._make_folder()
         self._custom = dict(metadata or {})
-        self._custom_news: dict[str, str] = {}
-        self._topics: dict[str, TopicRecord] = {}  # counts: of the files that are finished
+        self._new_metadata: dict[str, str] = {}
+        self._topics: dict[str, TopicRecord] = {}  # counts: of the finished files
         self._schemas: dict[str, str] = {}
-        self._pictures: set[str] = set()
+        self._images: set[str] = set()
         self._finished: list[FileRecord] = []
-        self._unsaved_s: float | None = None  # when the oldest message that is not yet on the disk came
+        self._unsaved_s: float | None = None  # arrival of the oldest message that is not on the disk
         self._space_checked_s = -1e9
         self._description_changed = False
-        self._lock = threading.Lock()  # of the current file and of what describes the session
+        self._lock = threading.Lock()  # guards the current file and the description
         self._error: str | None = None
         self._closed = False
         self._queue = BoundedQueue(self.config.queue_mib * _MIB)
@@ -93,32 +92,32 @@ class SessionWriter:
 
     @property
     def path(self) -> Path:
-        """The file that is being written."""
+        """The current file."""
         return self._file.path
 
     @property
     def dropped(self) -> int:
-        """Messages that did not reach the file."""
+        """Messages that did not reach a file."""
         return self._queue.drop_count()
 
     @property
     def dropped_by_topic(self) -> dict[str, int]:
-        """The same by topic."""
+        """Messages that did not reach a file, by topic."""
         return dict(self._queue.dropped)
 
     @property
     def written(self) -> int:
-        """Messages handed to the files."""
+        """Messages written to the files."""
         return sum(record.messages for record in self._finished) + self._file.record.messages
 
     @property
     def queued_bytes(self) -> int:
-        """What waits for the disk."""
+        """Bytes in the queue to the disk."""
         return self._queue.size
 
     @property
     def error(self) -> str | None:
-        """Why the recording ended before its time, in one line; None when it did not."""
+        """Reason of an early end of the recording, one line; None without one."""
         return self._error
 
     def register(
@@ -130,7 +129,7 @@ class SessionWriter:
         image: bool = False,
         qos: list[dict[str, Any]] | None = None,
     ) -> None:
-        """Declare a topic before its first message; a second time changes nothing.
+        """Declare a topic before its first message; a repeated call has no effect.
 
         Parameters
         ----------
@@ -142,7 +141,7 @@ class SessionWriter:
         Raises
         ------
         InputError
-            When the topic stands already with another type.
+            When the topic is registered with another type.
         """
         with self._lock:
             known = self._topics.get(topic)
@@ -157,7 +156,7 @@ class SessionWriter:
             self._schemas[topic] = schema
             self._topics[topic] = record
             if image:
-                self._pictures.add(topic)
+                self._images.add(topic)
             self._description_changed = True
 
     def write(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int | None = None) -> bool:
@@ -171,17 +170,17 @@ class SessionWriter:
         if topic not in self._topics:
             raise InputError(f"{topic}: expected a registered topic; call register first")
         published_ns = log_time_ns if publish_time_ns is None else publish_time_ns
-        return self._queue.put(QueuedMessage(topic, bytes(data), log_time_ns, published_ns), topic in self._pictures)
+        return self._queue.put(QueuedMessage(topic, bytes(data), log_time_ns, published_ns), topic in self._images)
 
     def add_metadata(self, values: Mapping[str, str]) -> None:
-        """Add to what is told of the session; it reaches the disk with the next chunk."""
+        """Add metadata; it reaches the disk with the next chunk."""
         with self._lock:
-            self._custom_news.update({k: v for k, v in values.items() if self._custom.get(k) != v})
-            if self._custom_news and self._unsaved_s is None:
+            self._new_metadata.update({k: v for k, v in values.items() if self._custom.get(k) != v})
+            if self._new_metadata and self._unsaved_s is None:
                 self._unsaved_s = time.monotonic()
 
     def close(self) -> None:
-        """Write what is queued, finish the file and ``metadata.yaml``.  A second call does nothing."""
+        """Write the queue, finish the file and ``metadata.yaml``.  A repeated call has no effect."""
         if self._closed:
             return
         self._closed = True
@@ -196,7 +195,7 @@ class SessionWriter:
                     self._fail(error)
 
     def discard(self) -> None:
-        """Close, and take the files and, where it then is empty, the folder away."""
+        """Close and delete the files, and the folder if it is then empty."""
         self.close()
         with contextlib.suppress(OSError):
             for name in (METADATA_FILE, *(record.name for record in self._finished)):
@@ -205,21 +204,21 @@ class SessionWriter:
 
     def _run(self) -> None:
         while True:
-            message = self._queue.take(self._patience_s())
+            message = self._queue.take(self._wait_s())
             try:
                 with self._lock:
                     if message is not None:
                         self._add(message)
                     self._save_if_due(ended=message is None and self._queue.closed)
-            except Exception as error:  # whatever it is, the graph lives on and the reason is told
+            except Exception as error:  # the graph continues; diagnostics report the reason
                 self._fail(error)
             if self._error is not None:
                 self._queue.drop_all()
             if message is None and self._queue.closed:
                 return
 
-    def _patience_s(self) -> float:
-        """How long the thread may sleep before something must go to the disk."""
+    def _wait_s(self) -> float:
+        """Longest sleep of the thread until the next chunk is due."""
         if self._unsaved_s is None:
             return self.config.chunk_s
         return max(0.0, self._unsaved_s + self.config.chunk_s - time.monotonic())
@@ -243,10 +242,10 @@ class SessionWriter:
         now = time.monotonic()
         due = self._unsaved_s is not None and now - self._unsaved_s >= self.config.chunk_s
         if due or ended:
-            if self._custom_news:
-                self._file.add_metadata(RECORD, self._custom_news)
-                self._custom.update(self._custom_news)
-                self._custom_news = {}
+            if self._new_metadata:
+                self._file.add_metadata(METADATA_RECORD, self._new_metadata)
+                self._custom.update(self._new_metadata)
+                self._new_metadata = {}
                 self._description_changed = True
             self._file.save(self.config.sync)
             self._unsaved_s = None
@@ -258,15 +257,13 @@ class SessionWriter:
         elif self._file.pending:
             self._file.commit()
 
-    # -- files -----------------------------------------------------------------------------------------
-
     def _new_file(self) -> McapFile:
         path = self.folder / f"{self.folder.absolute().name}_{len(self._finished)}.mcap"
         file = McapFile(path, self.config.compression, self.config.chunk_kib * 1024)
         for name, topic in self._topics.items():
             file.register(topic, self._schemas[name])
         if self._custom:
-            file.add_metadata(RECORD, self._custom)
+            file.add_metadata(METADATA_RECORD, self._custom)
         file.commit(self.config.sync)
         sync_folder(self.folder)
         return file
@@ -291,8 +288,6 @@ class SessionWriter:
         self._finished.append(self._file.record)
         self._file.record = FileRecord("")
 
-    # -- what can go wrong -----------------------------------------------------------------------------
-
     def _space_is_low(self, now: float) -> bool:
         if now - self._space_checked_s < 1.0:
             return False
@@ -300,7 +295,7 @@ class SessionWriter:
         return shutil.disk_usage(self.folder).free < self.config.free_mib * _MIB
 
     def _end_early(self) -> None:
-        """Finish the session while there is still room for that."""
+        """Finish the session while the disk has space for it."""
         self._finish_file()
         self._write_description(current=False)
         self._set_error(f"less than {self.config.free_mib} MiB left on the disk; the session is complete until then")
@@ -313,17 +308,15 @@ class SessionWriter:
             self._queue.dropped[topic] += count
         if self._file.record.name:
             self._keep_counts()
-        self._set_error(f"{reason}; what was written before stays readable, `drocap recover` completes it")
+        self._set_error(f"{reason}; earlier messages stay readable, `drocap recover` completes the session")
         try:
             self._write_description(current=False)
-        except OSError:  # the files themselves tell the same, to whoever reads them
+        except OSError:  # readers use the files themselves
             logger.debug("metadata.yaml of %s is not up to date", self.folder)
 
     def _set_error(self, reason: str) -> None:
         self._error = f"{self.folder}: the recording ended early: {reason}; make room and start a new session"
         logger.error("%s", self._error)
-
-    # -- what describes the session --------------------------------------------------------------------
 
     def _description(self, current: bool) -> dict[str, Any]:
         topics = []

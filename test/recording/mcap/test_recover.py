@@ -13,11 +13,12 @@ from recorded import NAMES, START_NS, write_poses
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
+from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
 from drocap_ros.recording.mcap.recover import recover_session
 from drocap_ros.recording.mcap.schemas import schema_text
 from drocap_ros.recording.mcap.writer import SessionWriter
-from drocap_ros.recording.recording_config import SessionRecorderConfig
-from drocap_ros.recording.session_reader import open_session, read_pose2d, session_info
+from drocap_ros.recording.open_session import open_session, session_info
+from drocap_ros.recording.session_tracks import read_pose2d
 
 POSE2D = NAMES["pose2d"]
 
@@ -58,20 +59,20 @@ def test_a_file_that_was_cut_off(tmp_path, messages, capture, share):
     with open_session(folder) as session:
         before = [raw.log_time_ns for raw in session.raw_messages()]
     (file,) = recover_session(folder)
-    assert file.mended
+    assert file.repaired
     assert file.messages == len(before)
     assert file.kept is None
     assert read_by_all(folder).get("/drocap/pose2d", []) == before
     assert session_info(folder).warnings == ()
     assert sorted(p.name for p in folder.iterdir()) == ["metadata.yaml", "s_0.mcap"]
     (again,) = recover_session(folder)
-    assert not again.mended
+    assert not again.repaired
 
 
 def test_a_whole_session_is_left_alone(pose_session):
     before = (pose_session / "session_0.mcap").read_bytes()
     (file,) = recover_session(pose_session)
-    assert not file.mended
+    assert not file.repaired
     assert (pose_session / "session_0.mcap").read_bytes() == before
 
 
@@ -145,7 +146,7 @@ def test_no_room_for_the_mended_file(small_disk, messages, capture):
     assert path.read_bytes() == before
     assert len(list(folder.iterdir())) == 2
     (small_disk / "filler").unlink()
-    assert recover_session(folder)[0].mended
+    assert recover_session(folder)[0].repaired
 
 
 def test_what_is_no_session_is_refused(tmp_path, capsys):
@@ -164,7 +165,7 @@ def test_the_command_says_what_it_did(pose_session, capsys):
     path.write_bytes(path.read_bytes()[:-500])
     assert main(["recover", str(pose_session)]) == 0
     out, err = capsys.readouterr()
-    assert "session_0.mcap: mended; 120 messages, each read back" in out
+    assert "session_0.mcap: repaired; 120 messages, each read back" in out
     assert "cut off" in err
 
 

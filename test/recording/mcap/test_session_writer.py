@@ -13,10 +13,11 @@ from recorded import NAMES, START_NS, write_poses
 
 from drocap_ros.errors import InputError
 from drocap_ros.recording.mcap.committed_file import CommittedFile
+from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
 from drocap_ros.recording.mcap.schemas import schema_text
 from drocap_ros.recording.mcap.writer import SessionWriter
-from drocap_ros.recording.recording_config import SessionRecorderConfig
-from drocap_ros.recording.session_reader import open_session, read_pose2d, session_info
+from drocap_ros.recording.open_session import open_session, session_info
+from drocap_ros.recording.session_tracks import read_pose2d
 
 POSE2D = NAMES["pose2d"]
 
@@ -158,7 +159,7 @@ import sys, time
 sys.path[:0] = [{tests!r}]
 from recorded import *
 from drocap_ros.simulation.capture import simulate_capture
-from drocap_ros.recording.recording_config import SessionRecorderConfig
+from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
 messages, tracks = Messages(), simulate_capture(1, 30, seed=1).tracks
 writer = SessionWriter({folder!r}, SessionRecorderConfig(chunk_s=0.1))
 writer.register("/pose2d", NAMES["pose2d"], schema_text(NAMES["pose2d"]))

@@ -11,7 +11,8 @@ from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.geometry.rotations import angle_between
 from drocap_ros.recording.mcap.schemas import schema_text
 from drocap_ros.recording.mcap.writer import SessionWriter
-from drocap_ros.recording.session_reader import open_session, read_pose2d
+from drocap_ros.recording.open_session import open_session
+from drocap_ros.recording.session_tracks import read_pose2d
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle
 from drocap_ros.simulation.vehicle.path import SampledPath

@@ -1,95 +1,52 @@
-"""What reconstruction wants of a recording: keypoints with camera telemetry, or pictures."""
+"""Tracks from a recording: keypoints with camera telemetry."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.rotations import unit_quaternions
-from drocap_ros.recording.pictures import image_from_message
-from drocap_ros.recording.session import (
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    IMAGE,
-    POSE2D,
-    VEHICLE_STATE,
-    Session,
-    SessionInfo,
-    TopicInfo,
-    is_recording,
-    open_session,
-)
+from drocap_ros.recording.session import CAMERA_INFO, POSE2D, VEHICLE_STATE, Session, TopicInfo, header_stamp_ns
 from drocap_ros.recording.telemetry.camera_poses import with_camera
 from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack
 from drocap_ros.skeleton import joint_set
 from drocap_ros.tracks import MAX_FRAMES, Tracks
 
-if TYPE_CHECKING:
-    from drocap_ros.perception.sources import Frame
-
-__all__ = [
-    "Session",
-    "SessionInfo",
-    "TopicInfo",
-    "is_recording",
-    "open_session",
-    "read_images",
-    "read_pose2d",
-    "read_vehicle_track",
-    "session_info",
-]
-
-
-def session_info(path: str | Path) -> SessionInfo:
-    """Topics, types, counts, time and metadata of a recording.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read.
-    """
-    with open_session(path) as session:
-        return session.info
-
 
 def read_pose2d(session: Session, topic: str | None = None, mount_pitch_deg: float | None = None) -> Tracks:
     """Tracks of the subject, keypoints exactly as in the recorded messages.
 
-    Images without a subject are frames of NaN.  Where the recording tells the camera's pose at every picture (see
-    :func:`camera_poses`), the tracks carry it.  What was missing or left out
-    stands in ``session.warnings``.
+    Images without a subject are frames of NaN.  The tracks contain the camera's poses where the recording does, see
+    :func:`drocap_ros.recording.telemetry.camera_poses.camera_poses`.  Missing parts are in ``session.warnings``.
 
     Parameters
     ----------
-    topic : which ``Pose2D`` topic, by its name or the name's end; None = the one with most messages
-    mount_pitch_deg : pitch of a camera fixed to the body of a vehicle without a gimbal, negative looks down
+    topic : name of the ``Pose2D`` topic, or the name's end; None = the one with most messages
+    mount_pitch_deg : pitch of a camera fixed to the body of a vehicle without a gimbal, negative = down
 
     Raises
     ------
     InputError
-        When there are no keypoints, or those there cannot be used.
+        When there are no usable keypoints.
     """
     chosen = session.choose_topic(topic, POSE2D)
     poses: dict[int, Any] = {}
-    again = 0
+    repeated = 0
     for _, message in session.messages((chosen.name,)):
-        stamp_ns = _stamp_ns(message)
+        stamp_ns = header_stamp_ns(message)
         if stamp_ns in poses:
-            again += 1
+            repeated += 1
             if not message.track_id or poses[stamp_ns].track_id:
                 continue
         poses[stamp_ns] = message
         if len(poses) > MAX_FRAMES:
             raise InputError(f"{session.path}: expected at most {MAX_FRAMES} poses; cut the recording")
-    if again:
-        session.warn(f"{again} poses of images that had one already were left out")
+    if repeated:
+        session.warn(f"{repeated} repeated poses of the same images were left out")
     if not poses:
-        raise InputError(f"{session.path}: expected poses on {chosen.name}, none could be decoded; record it anew")
+        raise InputError(f"{session.path}: expected poses on {chosen.name}, none could be decoded; record it again")
     ordered = [poses[stamp] for stamp in sorted(poses)]
     try:
         stamps = np.array(sorted(poses), dtype=np.int64)
@@ -105,47 +62,10 @@ def read_pose2d(session: Session, topic: str | None = None, mount_pitch_deg: flo
         raise InputError(f"{session.path}: {chosen.name}: {error}") from None
 
 
-def read_images(session: Session, topic: str | None = None) -> Iterator[Frame]:
-    """Pictures of a recording, one at a time, with strictly increasing stamps.
-
-    Pictures that do not decode, or whose stamp is not later than the one before, are left out with a warning.
-
-    Raises
-    ------
-    InputError
-        When there are no pictures, or none decodes.
-    """
-    from drocap_ros.perception.sources.base import Frame
-
-    chosen = session.choose_topic(topic, IMAGE, COMPRESSED_IMAGE)
-    compressed = chosen.type_name == COMPRESSED_IMAGE
-    last_ns, given, unordered, problems = None, 0, 0, Counter[str]()
-    for _, message in session.messages((chosen.name,)):
-        stamp_ns = _stamp_ns(message)
-        if last_ns is not None and stamp_ns <= last_ns:
-            unordered += 1
-            continue
-        try:
-            image = image_from_message(message, compressed)
-        except InputError as error:
-            problems[str(error)] += 1
-            continue
-        last_ns = stamp_ns
-        given += 1
-        yield Frame(stamp_ns, image)
-    if unordered:
-        session.warn(f"{unordered} pictures on {chosen.name} with a stamp not later than the one before were left out")
-    if problems:
-        worst, _ = problems.most_common(1)[0]
-        session.warn(f"{sum(problems.values())} pictures on {chosen.name} were left out: {worst}")
-        if not given:
-            raise InputError(f"{session.path}: {chosen.name}: {worst}")
-
-
 def read_vehicle_track(session: Session, near: str = "") -> VehicleTrack | None:
     """States of the vehicle, or None where there are none.
 
-    ``near`` is a topic whose namespace is preferred.
+    The topic with the namespace of ``near`` is preferred.
     """
     topic = _nearest(session.topics_of(VEHICLE_STATE), near)
     if topic is None:
@@ -153,12 +73,13 @@ def read_vehicle_track(session: Session, near: str = "") -> VehicleTrack | None:
     rows: dict[int, tuple[np.ndarray, ...]] = {}
     for _, message in session.messages((topic.name,)):
         position = np.asarray(message.position_enu_m, dtype=np.float64)
-        rows[_stamp_ns(message)] = (position, _xyzw(message.orientation), _xyzw(message.gimbal_orientation))
+        rows[header_stamp_ns(message)] = (position, _xyzw(message.orientation), _xyzw(message.gimbal_orientation))
     if not rows:
         return None
     stamps = sorted(rows)
     position, orientation, gimbal = (np.array([rows[s][i] for s in stamps]) for i in range(3))
-    return VehicleTrack(np.array(stamps, dtype=np.int64), position, unit_quaternions(orientation), unit_quaternions(gimbal))
+    stamp_ns = np.array(stamps, dtype=np.int64)
+    return VehicleTrack(stamp_ns, position, unit_quaternions(orientation), unit_quaternions(gimbal))
 
 
 def _pose_arrays(messages: list[Any]) -> dict[str, Any]:
@@ -214,7 +135,7 @@ def _camera_matrix(session: Session, topic: str) -> np.ndarray | None:
 
 
 def _nearest(topics: list[TopicInfo], near: str) -> TopicInfo | None:
-    """The topic that shares the longest beginning of its name with another."""
+    """The topic whose namespace agrees most with that of ``near``."""
 
     def shared(topic: TopicInfo) -> int:
         return sum(a == b for a, b in zip(topic.name.split("/")[:-1], near.split("/")[:-1], strict=False))
@@ -222,11 +143,5 @@ def _nearest(topics: list[TopicInfo], near: str) -> TopicInfo | None:
     return max(topics, key=shared, default=None)
 
 
-def _stamp_ns(message: Any) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
-
-
 def _xyzw(quaternion: Any) -> np.ndarray:
     return np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], dtype=np.float64)
-

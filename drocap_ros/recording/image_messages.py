@@ -1,18 +1,24 @@
-"""From image messages to arrays."""
+"""Images from messages: one message to an array, or those of a recording one at a time."""
 
 from __future__ import annotations
 
 import os
-from typing import Any
+from collections import Counter
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Session, header_stamp_ns
+
+if TYPE_CHECKING:
+    from drocap_ros.perception.sources.base import Frame
 
 _MAX_PIXELS = 200_000_000
-# A few bytes can claim to be a picture of gigabytes.  OpenCV reads its limit when it is loaded.
+# The header of a small file can declare an image of gigabytes.  OpenCV reads this limit when it is imported.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
-#: Where the end of a JPEG is looked for; cameras pad it.
+#: Last bytes of a JPEG that must contain its end marker; cameras append padding.
 _JPEG_TAIL = 4096
 #: encoding -> (bytes per pixel, name of OpenCV's conversion to BGR)
 _ENCODINGS: dict[str, tuple[int, str | None]] = {
@@ -23,7 +29,7 @@ _ENCODINGS: dict[str, tuple[int, str | None]] = {
     "rgba8": (4, "COLOR_RGBA2BGR"),
     "mono8": (1, "COLOR_GRAY2BGR"),
     "8UC1": (1, "COLOR_GRAY2BGR"),
-    # ROS names a Bayer pattern by its first two pixels, OpenCV by the second row's.
+    # ROS names a Bayer pattern by its first two pixels, OpenCV by those of the second row.
     "bayer_rggb8": (1, "COLOR_BayerBG2BGR"),
     "bayer_bggr8": (1, "COLOR_BayerRG2BGR"),
     "bayer_gbrg8": (1, "COLOR_BayerGR2BGR"),
@@ -47,6 +53,42 @@ def image_from_message(message: Any, compressed: bool) -> np.ndarray:
     return _decompressed(data, str(message.format)) if compressed else _raw(message, data)
 
 
+def read_images(session: Session, topic: str | None = None) -> Iterator[Frame]:
+    """Images of a recording, one at a time, with strictly increasing stamps.
+
+    Images that do not decode, or with a stamp not later than the previous one, are left out with a warning.
+
+    Raises
+    ------
+    InputError
+        When there are no images, or none decodes.
+    """
+    from drocap_ros.perception.sources.base import Frame
+
+    chosen = session.choose_topic(topic, IMAGE, COMPRESSED_IMAGE)
+    compressed = chosen.type_name == COMPRESSED_IMAGE
+    last_ns, unordered, problems = None, 0, Counter[str]()
+    for _, message in session.messages((chosen.name,)):
+        stamp_ns = header_stamp_ns(message)
+        if last_ns is not None and stamp_ns <= last_ns:
+            unordered += 1
+            continue
+        try:
+            image = image_from_message(message, compressed)
+        except InputError as error:
+            problems[str(error)] += 1
+            continue
+        last_ns = stamp_ns
+        yield Frame(stamp_ns, image)
+    if unordered:
+        session.warn(f"{unordered} images on {chosen.name} with a stamp not later than the previous one were left out")
+    if problems:
+        worst, _ = problems.most_common(1)[0]
+        session.warn(f"{sum(problems.values())} images on {chosen.name} were left out: {worst}")
+        if last_ns is None:
+            raise InputError(f"{session.path}: {chosen.name}: {worst}")
+
+
 def _decompressed(data: np.ndarray, form: str) -> np.ndarray:
     import cv2
 
@@ -59,7 +101,7 @@ def _decompressed(data: np.ndarray, form: str) -> np.ndarray:
         except cv2.error:
             image = None
     if image is None:
-        raise InputError(f"image: expected JPEG, PNG or another picture, got format {form[:40]!r} that does not decode")
+        raise InputError(f"image: expected JPEG, PNG or another image, got format {form[:40]!r} that does not decode")
     return np.asarray(image)
 
 

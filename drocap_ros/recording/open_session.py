@@ -1,0 +1,68 @@
+"""Opens a recording: ours, rosbag2's (MCAP or sqlite3), a single ``.mcap``, or a rosbag1 ``.bag``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from drocap_ros.errors import InputError
+from drocap_ros.recording.mcap.metadata import METADATA_FILE, custom_metadata, read_metadata, storage_files
+from drocap_ros.recording.mcap_session import McapSession
+from drocap_ros.recording.rosbags_session import RosbagsSession
+from drocap_ros.recording.session import FORMS, Session, SessionInfo
+
+_SUFFIXES = (".mcap", ".bag", ".db3")
+
+
+def is_recording(path: str | Path) -> bool:
+    """Whether :func:`open_session` may read a path, by its name and the names in it."""
+    path = Path(path)
+    if path.is_dir():
+        return (path / METADATA_FILE).is_file() or any(p.suffix in (".mcap", ".db3") for p in path.iterdir())
+    return path.suffix in _SUFFIXES
+
+
+def open_session(path: str | Path) -> Session:
+    """Open a recording.
+
+    Raises
+    ------
+    InputError
+        When it is missing, of another kind, or unreadable.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: expected {FORMS}, found no such file; check the path")
+    if not is_recording(path):
+        raise InputError(f"{path}: expected {FORMS}, found something else; check the path")
+    try:
+        if path.suffix == ".mcap" and path.is_file():
+            return McapSession(path, [path], {})
+        return _open_folder(path) if path.is_dir() else RosbagsSession(path)
+    except OSError as error:
+        raise InputError(f"{path}: expected a readable recording; {error.strerror or error}") from None
+
+
+def session_info(path: str | Path) -> SessionInfo:
+    """Topics, types, counts, time and metadata of a recording.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read.
+    """
+    with open_session(path) as session:
+        return session.info
+
+
+def _open_folder(path: Path) -> Session:
+    description, warnings = read_metadata(path)
+    storage = description.get("storage_identifier", "")
+    packed = str(description.get("compression_mode", "")).lower() not in ("", "none")
+    files = storage_files(path, description)
+    session: Session
+    if files and storage in ("mcap", "") and not packed and all(f.suffix == ".mcap" for f in files):
+        session = McapSession(path, files, custom_metadata(description))
+    else:
+        session = RosbagsSession(path)
+    session.warnings += warnings
+    return session

@@ -1,0 +1,171 @@
+import numpy as np
+import pytest
+from recorded import NAMES, START_NS, record, write_poses
+
+from drocap_ros.errors import InputError
+from drocap_ros.flight.frames import OPTICAL_FROM_FLU
+from drocap_ros.geometry.rotations import angle_between, quaternion_from_matrix
+from drocap_ros.recording.open_session import open_session
+from drocap_ros.recording.session_tracks import read_pose2d
+from drocap_ros.simulation.vehicle.path import SampledPath
+
+POSE2D, STATE, INFO = NAMES["pose2d"], NAMES["state"], NAMES["info"]
+
+
+def test_keypoints_exactly_as_in_the_messages(pose_session, capture):
+    with open_session(pose_session) as session:
+        assert session.has_pose2d
+        assert not session.has_images
+        tracks = read_pose2d(session)
+        assert session.warnings == []
+    for name in ("keypoints", "confidence", "covariance"):
+        expected = getattr(capture.tracks, name).astype(np.float32).astype(np.float64)
+        assert np.array_equal(getattr(tracks, name), expected, equal_nan=True)
+    assert np.array_equal(tracks.stamp_ns, capture.tracks.stamp_ns)
+    assert tracks.image_size == capture.tracks.image_size
+    assert tracks.camera_rotation is None
+    assert tracks.camera_matrix is None
+
+
+def test_images_without_a_subject_are_frames_of_nan(tmp_path, messages, capture):
+    write_poses(tmp_path / "s", messages, capture.tracks, absent=(0, 5, 6))
+    with open_session(tmp_path / "s") as session:
+        tracks = read_pose2d(session)
+    assert len(tracks) == len(capture.tracks)
+    gone = np.isnan(tracks.keypoints).all(axis=(1, 2))
+    assert np.flatnonzero(gone).tolist() == [0, 5, 6]
+    assert (tracks.confidence[gone] == 0).all()
+
+
+def flight_entries(messages, capture, *, gimbal=True, rate_hz=50.0, skip_s=(9.0, 9.0), start_s=-0.5, lag_ns=0):
+    tracks = capture.tracks
+    t = (tracks.stamp_ns - START_NS) * 1e-9
+    path = SampledPath(t, capture.camera_rotation, capture.camera_position)
+    entries = []
+    for i, stamp in enumerate(tracks.stamp_ns.tolist()):
+        entries.append(("/drocap/pose2d", messages.pose2d(tracks, i, stamp), stamp))
+    width, height = tracks.image_size
+    k = tracks.camera_matrix.ravel()
+    entries.append(
+        (
+            "/drocap/camera_info",
+            messages(INFO, header=messages.header(START_NS), width=width, height=height, k=k),
+            START_NS,
+        )
+    )
+    for s in np.arange(start_s, t[-1] + 0.5, 1 / rate_hz):
+        if skip_s[0] < s < skip_s[1]:
+            continue
+        pose, stamp = path.at(s), START_NS + round(s * 1e9)
+        nan = np.full(4, np.nan)
+        state = messages(
+            STATE, header=messages.header(stamp, "map"), position_enu_m=pose.position_enu_m,
+            orientation=messages.quaternion(pose.orientation_xyzw),
+            gimbal_orientation=messages.quaternion(pose.gimbal_orientation_xyzw if gimbal else nan),
+        )  # fmt: skip
+        entries.append(("/drocap/vehicle/state", state, stamp + lag_ns))
+    entries.sort(key=lambda entry: entry[2])
+    return [(topic, message, log, messages.cdr(message)) for topic, message, log in entries]
+
+
+def test_telemetry_at_each_picture(tmp_path, messages, capture):
+    record(tmp_path / "s", flight_entries(messages, capture))
+    with open_session(tmp_path / "s") as session:
+        tracks = read_pose2d(session)
+        assert session.warnings == []
+    # The last picture lies between the last state of the moving path and the first of the standing one.
+    assert np.rad2deg(angle_between(tracks.camera_rotation, capture.camera_rotation))[:-1].max() < 0.01
+    assert np.linalg.norm(tracks.camera_position - capture.camera_position, axis=1)[:-1].max() < 0.001
+    assert np.array_equal(tracks.camera_matrix, capture.tracks.camera_matrix)
+
+
+def test_without_a_gimbal_the_rotation_is_not_invented(tmp_path, messages, capture):
+    record(tmp_path / "s", flight_entries(messages, capture, gimbal=False))
+    with open_session(tmp_path / "s") as session:
+        tracks = read_pose2d(session)
+        assert tracks.camera_rotation is None
+        assert tracks.camera_position is not None
+        assert any("hold no gimbal" in warning for warning in session.warnings)
+
+
+def test_camera_fixed_to_the_body_at_a_told_pitch(tmp_path, messages, capture):
+    record(tmp_path / "s", flight_entries(messages, capture, gimbal=False))
+    camera = quaternion_from_matrix(np.swapaxes(capture.camera_rotation, 1, 2) @ OPTICAL_FROM_FLU)
+    forward = np.swapaxes(capture.camera_rotation, 1, 2)[:, :, 2]
+    pitch = np.rad2deg(np.arcsin(forward[:, 2]))
+    with open_session(tmp_path / "s") as session:
+        tracks = read_pose2d(session, mount_pitch_deg=float(pitch.mean()))
+    assert camera.shape == (len(tracks), 4)
+    assert np.rad2deg(angle_between(tracks.camera_rotation, capture.camera_rotation)).max() < np.ptp(pitch) + 0.2
+
+
+def test_short_gap_in_the_telemetry_is_bridged_and_told(tmp_path, messages, capture):
+    record(tmp_path / "s", flight_entries(messages, capture, skip_s=(1.0, 2.5)))
+    with open_session(tmp_path / "s") as session:
+        tracks = read_pose2d(session)
+        assert len(tracks) == len(capture.tracks)
+        assert np.rad2deg(angle_between(tracks.camera_rotation, capture.camera_rotation))[:-1].max() < 2.0
+        assert any("the attitude was interpolated over gaps of up to 1.5 s" in w for w in session.warnings)
+
+
+def test_long_gap_in_the_telemetry_leaves_it_unknown(tmp_path, messages, capture):
+    record(tmp_path / "s", flight_entries(messages, capture, skip_s=(0.8, 3.2)))
+    with open_session(tmp_path / "s") as session:
+        tracks = read_pose2d(session)
+        assert len(tracks) == len(capture.tracks)
+        assert tracks.camera_rotation is None
+        assert tracks.camera_position is None
+        assert any("2.4 s from an attitude" in warning for warning in session.warnings)
+
+
+def test_telemetry_that_starts_late(tmp_path, messages, capture):
+    record(tmp_path / "a", flight_entries(messages, capture, start_s=1.0))
+    record(tmp_path / "b", flight_entries(messages, capture, start_s=3.0))
+    with open_session(tmp_path / "a") as session:
+        tracks = read_pose2d(session)
+        assert any("27 images at the start or end are up to 1.0 s" in w for w in session.warnings)
+    assert np.array_equal(tracks.stamp_ns, capture.tracks.stamp_ns[27:])
+    assert np.array_equal(tracks.keypoints, capture.tracks.keypoints[27:].astype(np.float32), equal_nan=True)
+    error = np.rad2deg(angle_between(tracks.camera_rotation, capture.camera_rotation[27:]))
+    assert error.max() < 3.0  # the first state holds for the three pictures right before it
+    assert np.median(error) < 0.01
+    with open_session(tmp_path / "b") as session:
+        tracks = read_pose2d(session)
+    assert tracks.camera_rotation is None
+    assert len(tracks) == len(capture.tracks)
+
+
+def test_out_of_order_and_repeated_poses(tmp_path, messages, capture):
+    tracks = capture.tracks
+    order = [3, 1, 2, 0, 2]
+    entries = [("/pose2d", messages.pose2d(tracks, i, START_NS + i), START_NS + k) for k, i in enumerate(order)]
+    record(tmp_path / "s", [(t, m, s, messages.cdr(m)) for t, m, s in entries])
+    with open_session(tmp_path / "s") as session:
+        read = read_pose2d(session)
+        assert np.array_equal(read.stamp_ns, START_NS + np.arange(4))
+        assert np.array_equal(read.keypoints, tracks.keypoints[:4].astype(np.float32), equal_nan=True)
+        assert any("repeated poses" in warning for warning in session.warnings)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"skeleton": "octopus"}, "skeleton: expected one of"),
+        ({"keypoints": np.zeros(7, np.float32)}, "keypoints: expected 30 values, got 7"),
+        ({"covariance": np.zeros(0, np.float32)}, "covariance: expected 45 values"),
+        ({"keypoints": np.full(30, np.inf, np.float32)}, "infinity"),
+        ({"image_width": 640}, "image size: expected"),
+    ],
+)
+def test_poses_that_cannot_be_used(tmp_path, messages, capture, change, text):
+    entries = []
+    for i in range(3):
+        message = messages.pose2d(capture.tracks, i, START_NS + i)
+        if i or "image_width" not in change:
+            for name, value in change.items():
+                setattr(message, name, value)
+        entries.append(("/pose2d", message, START_NS + i, messages.cdr(message)))
+    record(tmp_path / "s", entries)
+    with open_session(tmp_path / "s") as session, pytest.raises(InputError, match=text) as error:
+        read_pose2d(session)
+    assert "\n" not in str(error.value)
