@@ -1,7 +1,7 @@
-"""Node ``capture_simulator``: the keypoints of a simulated flight, in place of pictures and perception.
+"""Node ``capture_simulator``: the keypoints of a simulated flight, instead of images and perception.
 
-Publishes ``pose2d`` and ``camera_info`` at the pace of a camera, and flies a simulated MAVLink vehicle along
-the same orbit.  For the demo and the tests.
+Publishes ``pose2d`` and ``camera_info`` at the rate of a camera, and flies a simulated MAVLink vehicle along
+the same orbit.  For the tests.
 """
 
 from __future__ import annotations
@@ -15,21 +15,22 @@ import numpy as np
 from sensor_msgs.msg import CameraInfo
 
 from drocap_ros.observation import PoseObservation
-from drocap_ros.ros.component import OK, ComponentNode
 from drocap_ros.ros.conversions import header_at, pose2d_to_ros
+from drocap_ros.ros.diagnostics import Key
+from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.spin import node_main
 from drocap_ros.simulation.capture import SimulatedCapture, simulate_capture
 from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle
 from drocap_ros.simulation.vehicle.path import SampledPath
 from drocap_ros.tracks import Tracks
 
-#: The drone hovers this long before the first picture: links come up and clocks get in step.
+#: The drone hovers this long before the first image, until links are up and clocks synchronized.
 HOVER_S = 3.0
 FRAME_ID = "camera_optical"
 
 
-class CaptureSimulatorNode(ComponentNode):
-    """Plays a simulated capture against the clock."""
+class CaptureSimulatorNode(ManagedComponent):
+    """Plays a simulated capture in real time."""
 
     component = "capture_simulator"
 
@@ -41,17 +42,26 @@ class CaptureSimulatorNode(ComponentNode):
         self._pose2d = self.output("pose2d")
         self._infos = self.output("camera_info")
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="capture_simulator", daemon=True)
+        self._thread: threading.Thread | None = None
+        self.set_up()
 
-    def on_start(self) -> None:
-        """Take off."""
-        self._thread.start()
+    def begin(self) -> None:
+        """Take off; a flight under way has continued meanwhile."""
+        if self._thread is None:
+            self._stop.clear()
+            self._thread = threading.Thread(target=self._run, name="capture_simulator", daemon=True)
+            self._thread.start()
+
+    def release(self) -> None:
+        """End the flight."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(timeout=5.0)
+            self._thread = None
 
     def close(self) -> None:
         """End the flight."""
-        self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=5.0)
+        self.release()
 
     def _run(self) -> None:
         tracks = self._capture.tracks
@@ -65,10 +75,10 @@ class CaptureSimulatorNode(ComponentNode):
             for i, offset_ns in enumerate(tracks.stamp_ns):
                 if self._stop.wait(max(0.0, begin + offset_ns * 1e-9 - time.monotonic())):
                     return
-                self._publish(tracks, i, start_ns + int(offset_ns))
-            self._stop.wait(0.5)  # the telemetry around the last picture
-        self.report(OK, "the flight has ended")
-        self.finish()
+                if self.active:
+                    self._publish(tracks, i, start_ns + int(offset_ns))
+            self._stop.wait(0.5)  # the telemetry around the last image
+        self.end()
 
     def _publish(self, tracks: Tracks, i: int, stamp_ns: int) -> None:
         self._pose2d.publish(pose2d_to_ros(observation_of(tracks, i, stamp_ns), FRAME_ID))
@@ -76,7 +86,7 @@ class CaptureSimulatorNode(ComponentNode):
         k = tracks.camera_matrix.ravel().tolist()
         width, height = tracks.image_size
         self._infos.publish(CameraInfo(header=header_at(stamp_ns, FRAME_ID), width=width, height=height, k=k))
-        self.count("poses")
+        self.count(Key.POSES)
 
 
 def _delayed_path(tracks: Tracks) -> SampledPath:
@@ -88,7 +98,7 @@ def _delayed_path(tracks: Tracks) -> SampledPath:
 
 
 def observation_of(tracks: Tracks, i: int, stamp_ns: int) -> PoseObservation:
-    """One frame of simulated tracks as perception would tell it."""
+    """One frame of simulated tracks as an observation of perception."""
     keypoints = tracks.keypoints[i].astype(np.float32)
     seen = np.isfinite(keypoints).all(axis=1)
     if not seen.any() or tracks.covariance is None or tracks.confidence is None:

@@ -1,8 +1,8 @@
-"""Node ``flight_simulator``: a simulated drone with a camera and the person before it, in real time.
+"""Node ``flight_simulator``: a simulated drone with a camera, and a person, in real time.
 
-Takes the place of vehicle, autopilot, pilot and ``image_ingest``: speaks MAVLink on ``vehicle_url``, publishes
-``image/compressed`` and ``camera_info`` of the pictures that are rendered from the vehicle's real pose.  Stamps are
-the instants of exposure.  At its end it writes the truth to ``truth_file``.
+Replaces vehicle, autopilot, pilot and ``image_ingest``: sends and receives MAVLink on ``vehicle_url``, publishes
+``image/compressed`` and ``camera_info`` of images rendered from the vehicle's true pose.  Stamps are the instants of
+exposure.  At its end it writes the truth to ``truth_file``.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ from typing import Any
 
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.perception.calibration import CameraModel
-from drocap_ros.ros.component import OK, WARN, ComponentNode
-from drocap_ros.ros.conversions import camera_info_to_ros, header_at
-from drocap_ros.ros.image_transport import PictureOutput
+from drocap_ros.perception.jpeg import encode_jpeg
+from drocap_ros.ros.component import OK, WARN
+from drocap_ros.ros.conversions import camera_info_to_ros, compressed_image_to_ros, header_at
+from drocap_ros.ros.diagnostics import PILOT_FLIES, PILOT_HANDS_OFF, Key
+from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.spin import node_main
 from drocap_ros.simulation.flight_simulator.truth import save_flight_truth
 from drocap_ros.simulation.flight_simulator.world import Exposure, FlightWorld
@@ -27,14 +29,14 @@ FRAME_ID = "camera_optical"
 _STEP_S = 0.005
 
 
-class FlightSimulatorNode(ComponentNode):
-    """One thread flies and exposes, another renders: a slow picture never holds up the vehicle."""
+class FlightSimulatorNode(ManagedComponent):
+    """One thread flies and exposes, another renders: a slow image never delays the vehicle."""
 
     component = "flight_simulator"
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
-        self._pictures = PictureOutput(self, self.config.jpeg_quality)
+        self._images = self.output("image/compressed")
         self._infos = self.output("camera_info")
         self._world = FlightWorld(self.config, open_transport(self.config.vehicle_url))
         width, height = self.config.image_width, self.config.image_height
@@ -43,27 +45,27 @@ class FlightSimulatorNode(ComponentNode):
         self._waiting: Exposure | None = None
         self._exposed = threading.Condition()
         self._stop = threading.Event()
-        self._failure: BaseException | None = None
         self._threads = [
             threading.Thread(target=self._guarded, args=(body,), name=name, daemon=True)
             for name, body in (("flight", self._fly), ("camera", self._render))
         ]
         self.create_timer(0.5, self._on_timer)
+        self.set_up()
 
-    def on_start(self) -> None:
-        """The pilot takes off."""
+    def begin(self) -> None:
+        """Let the pilot take off; a flight under way has continued meanwhile."""
         for thread in self._threads:
-            thread.start()
+            if thread.ident is None:
+                thread.start()
 
     def close(self) -> None:
-        """End the flight and write what was really there."""
+        """End the flight and write the truth."""
         self._end()
         for thread in self._threads:
             if thread.is_alive():
                 thread.join(timeout=5.0)
-        self._pictures.close()
         self._world.close()
-        if self.config.truth_file and self.counters["exposures"]:
+        if self.config.truth_file and self.counters[Key.EXPOSURES]:
             save_flight_truth(Path(self.config.truth_file), self._world.truth())
 
     def _end(self) -> None:
@@ -74,8 +76,8 @@ class FlightSimulatorNode(ComponentNode):
     def _guarded(self, body: Any) -> None:
         try:
             body()
-        except BaseException as error:  # raised again where the node spins
-            self._failure = error
+        except BaseException as error:
+            self.failure = error
             self._end()
 
     def _fly(self) -> None:
@@ -92,15 +94,15 @@ class FlightSimulatorNode(ComponentNode):
 
     def _expose(self, stamp_ns: int) -> None:
         exposure = self._world.expose(stamp_ns)
-        self.count("exposures")
+        self.count(Key.EXPOSURES)
         with self._exposed:
             if self._waiting is not None:
-                self.count("pictures not rendered in time")
+                self.count(Key.IMAGES_UNRENDERED)
             self._waiting = exposure
             self._exposed.notify()
 
     def _render(self) -> None:
-        """Turn exposures into pictures; of several that wait, the newest."""
+        """Render exposures; of several that wait, the newest."""
         while not self._stop.is_set():
             with self._exposed:
                 while self._waiting is None and not self._stop.is_set():
@@ -108,22 +110,23 @@ class FlightSimulatorNode(ComponentNode):
                 exposure, self._waiting = self._waiting, None
             if exposure is None:
                 return
-            picture = self._renderer.picture(exposure.joints3d, exposure.rotation, exposure.position)
+            if not self.active:
+                continue
+            image = self._renderer.picture(exposure.joints3d, exposure.rotation, exposure.position)
             header = header_at(exposure.stamp_ns, FRAME_ID)
-            self._pictures.publish(header, picture)
+            self._images.publish(compressed_image_to_ros(header, encode_jpeg(image, self.config.jpeg_quality)))
             self._infos.publish(camera_info_to_ros(header, self._camera))
-            self.count("images")
+            self.count(Key.IMAGES)
             self.produced(exposure.stamp_ns)
 
     def _on_timer(self) -> None:
-        if self._failure is not None:
-            raise self._failure
-        copter = self._world.copter
-        self.details["mode"] = copter.mode
+        copter, pilot = self._world.copter, self._world.pilot
+        self.details[Key.VEHICLE_MODE] = copter.mode
+        self.details[Key.PILOT] = PILOT_HANDS_OFF if pilot.handed_over else PILOT_FLIES
         if copter.crashed:
             self.report(WARN, f"the vehicle has crashed: {copter.crashed}")
-        elif self.started:
-            self.report(OK, f"pilot: {self._world.pilot.doing}")
+        elif self.active:
+            self.report(OK, f"pilot: {pilot.doing}")
 
 
 def main() -> int:

@@ -1,10 +1,9 @@
-"""Node ``image_ingest``: a video file, picture folder, camera, stream or image topic in, JPEG pictures out.
+"""Node ``image_ingest``: a video file, image folder, camera, stream or image topic in, JPEG images out.
 
-Publishes ``image/compressed`` (sensor_msgs/CompressedImage) and, where the camera is known, ``camera_info``; nodes of
-the same process get the pictures as arrays.
-Stamps are the exposure times: those of the source, for a file counted from the node's start.
+Publishes ``image/compressed`` (sensor_msgs/CompressedImage) and, where the camera is known, ``camera_info``.
+Stamps are exposure times: those of the source; of a file, counted from the activation.
 With ``source = topic:NAME`` it subscribes to that topic: CompressedImage where the name ends in "compressed",
-else Image in one of the usual encodings; stamps are the messages'.
+else Image in one of the usual encodings; stamps are those of the messages.
 """
 
 from __future__ import annotations
@@ -21,18 +20,19 @@ from std_msgs.msg import Header
 
 from drocap_ros.errors import DrocapError, InputError
 from drocap_ros.perception.calibration import CameraModel, camera_model
+from drocap_ros.perception.jpeg import encode_jpeg
 from drocap_ros.perception.sources import Frame, ImageSource, open_source
 from drocap_ros.perception.sources.prefetch import prefetch
-from drocap_ros.recording.pictures import image_from_message
+from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.ros.component import ERROR, OK, WARN
-from drocap_ros.ros.conversions import camera_info_to_ros, header_at, stamp_from_ros
-from drocap_ros.ros.image_transport import PictureOutput
+from drocap_ros.ros.conversions import camera_info_to_ros, compressed_image_to_ros, header_at, stamp_from_ros
+from drocap_ros.ros.diagnostics import Key, of
 from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.spin import node_main
-from drocap_ros.ros.stamps import StampGate
+from drocap_ros.ros.stamps import StampValidator
 from drocap_ros.ros.topics import TOPIC_SOURCE
 
-#: A picture of a file that is this late when it has been read is not published any more.
+#: An image of a file that is this late when it has been read is dropped.
 _LATE_S = 0.1
 
 
@@ -41,11 +41,9 @@ class ImageIngestNode(ManagedComponent):
 
     component = "image_ingest"
 
-    begins_with_graph = True
-
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
-        self._pictures = PictureOutput(self, self.config.jpeg_quality)
+        self._images = self.output("image/compressed")
         self._infos = self.output("camera_info")
         self._camera: CameraModel | None = None
         self._last_ns: int | None = None
@@ -58,7 +56,7 @@ class ImageIngestNode(ManagedComponent):
         self.set_up()
 
     def acquire(self) -> None:
-        """Open the source, or subscribe to the topic that is one."""
+        """Open the source, or subscribe to its topic."""
         self._stop.clear()
         if self.config.source.startswith(TOPIC_SOURCE):
             self._topic = self._subscribe(self.config.source.removeprefix(TOPIC_SOURCE))
@@ -67,16 +65,16 @@ class ImageIngestNode(ManagedComponent):
             self._camera = camera_model(self.config, self._source.size)
 
     def begin(self) -> None:
-        """Begin to read, or go on: a file has run on meanwhile, as a camera would."""
+        """Start or continue to read; a file has advanced meanwhile, as a camera would."""
         self._arrived_s = time.monotonic()
         if self._source is not None and self._thread is None:
             self._thread = threading.Thread(target=self._run, name="image_ingest", daemon=True)
             self._thread.start()
 
     def release(self) -> None:
-        """Stop reading and release the source."""
+        """Stop reading and close the source."""
         self._stop.set()
-        # A live source waits for pictures and ends only by being closed; a file must not be closed while it is read.
+        # A live source that waits for an image ends by being closed; a file must not be closed while it is read.
         if self._source is not None and self._source.live:
             self._source.close()
         if self._thread is not None:
@@ -90,9 +88,8 @@ class ImageIngestNode(ManagedComponent):
             self._topic = None
 
     def close(self) -> None:
-        """The end: nothing is held, all is sent."""
+        """Close the source."""
         self.release()
-        self._pictures.close()
 
     # -- files, cameras, streams -----------------------------------------------------------------------
 
@@ -107,17 +104,16 @@ class ImageIngestNode(ManagedComponent):
             self.report(OK, "the source has ended")
         except DrocapError as error:
             self.report(ERROR, str(error))
-        self._pictures.drain()
         if not self._stop.is_set():
-            self.finish()
+            self.end()
 
     def _frames(self) -> Iterator[Frame]:
-        """Frames with the stamps that they are published with, at the pace that is wanted."""
+        """Frames with their final stamps, at the configured pace."""
         assert self._source is not None
         if self._source.live:
             yield from self._source
             return
-        # Files are stamped from the moment of the start, so that their pictures fit the vehicle's telemetry.
+        # Files are stamped from now on, so that their images fit the vehicle's telemetry.
         begin_ns = self.get_clock().now().nanoseconds
         frames = prefetch(self._rounds())
         try:
@@ -128,15 +124,15 @@ class ImageIngestNode(ManagedComponent):
                     if self._stop.wait(max(0.0, ahead_s)):
                         return
                     if ahead_s < -_LATE_S:
-                        # As a camera would: what the machine cannot keep up with is lost, nothing comes late.
-                        self.count("images dropped: the source is read too slowly")
+                        # As with a camera: images that the machine is too slow for are dropped, none is late.
+                        self.count(Key.IMAGES_LATE)
                         continue
                 yield Frame(stamp_ns, frame.image)
         finally:
             frames.close()
 
     def _rounds(self) -> Iterator[Frame]:
-        """Frames of a file, again and again where that is wanted; stamps from 0, increasing."""
+        """Frames of a file, in a loop if configured; stamps from 0, increasing."""
         assert self._source is not None
         offset_ns, last_ns, step_ns = 0, 0, 0
         while True:
@@ -156,13 +152,13 @@ class ImageIngestNode(ManagedComponent):
         if not topic:
             raise InputError(f"source: expected {TOPIC_SOURCE}NAME of an image topic, got no name")
         compressed = topic.endswith("compressed")
-        gate = StampGate()
+        validator = StampValidator()
 
         def take(message: Any) -> None:
             if not self.active:
                 return
             try:
-                gate.check(message.header.stamp.sec, message.header.stamp.nanosec)
+                validator.check(message.header.stamp.sec, message.header.stamp.nanosec)
                 self._take(message, compressed)
             except InputError as error:
                 self.refuse(f"{topic}: {error}")
@@ -177,7 +173,7 @@ class ImageIngestNode(ManagedComponent):
         if self._camera is None:
             self._camera = camera_model(self.config, (image.shape[1], image.shape[0]))
         header = Header(stamp=message.header.stamp, frame_id=message.header.frame_id or self.config.frame_id)
-        # What is JPEG already goes on as it came.
+        # A JPEG is passed on unchanged.
         jpeg = bytes(message.data) if compressed and "jp" in message.format.lower() else None
         self._publish(header, Frame(stamp_ns, image), jpeg)
 
@@ -185,26 +181,28 @@ class ImageIngestNode(ManagedComponent):
 
     def _publish(self, header: Header, frame: Frame, jpeg: bytes | None = None) -> None:
         rate = self.config.max_rate_hz
-        # A hundredth of slack: a source of just that rate keeps every picture.
+        # A hundredth of slack: a source of exactly that rate keeps every image.
         if rate > 0 and self._last_ns is not None and 0 <= frame.stamp_ns - self._last_ns < 0.99e9 / rate:
-            self.count("images skipped by max_rate_hz")
+            self.count(Key.IMAGES_SKIPPED)
             return
         self._last_ns = frame.stamp_ns
-        self._pictures.publish(header, frame.image, jpeg)
+        if self._images.get_subscription_count():
+            data = jpeg or encode_jpeg(frame.image, self.config.jpeg_quality)
+            self._images.publish(compressed_image_to_ros(header, data))
         if self._camera is not None:
             self._infos.publish(camera_info_to_ros(header, self._camera))
-        self.count("images")
+        self.count(Key.IMAGES)
         self.produced(frame.stamp_ns)
         self._arrived_s = time.monotonic()
         self.report(OK, "running")
 
     def _watch(self) -> None:
-        """Say within 2 s when a camera, stream or topic gives nothing."""
+        """Report a camera, stream or topic without images within 2 s."""
         for event in self._source.events() if self._source is not None else ():
-            self.count(f"source {event.kind}")
-        waits_on_others = self._source is None or self._source.live
+            self.count(of(Key.SOURCE_EVENT, event.kind))
+        is_live = self._source is None or self._source.live
         silence_s = time.monotonic() - self._arrived_s
-        if self.active and waits_on_others and silence_s > self.config.stall_timeout_s:
+        if self.active and is_live and silence_s > self.config.stall_timeout_s:
             self.report(
                 WARN, f"no image from {self.config.source} for {silence_s:.1f} s; check the camera and its link"
             )

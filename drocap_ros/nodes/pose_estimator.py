@@ -1,8 +1,7 @@
-"""Node ``pose_estimator``: pictures in, the subject's keypoints out.
+"""Node ``pose_estimator``: images in, the subject's keypoints out.
 
-Subscribes ``image/compressed`` (sensor_msgs/CompressedImage; a camera of the same process hands over arrays), ``roi``
-(sensor_msgs/RegionOfInterest, the box of a drone's own tracker); publishes ``pose2d`` (drocap_ros/Pose2D), its header
-equal to the picture's.
+Subscribes ``image/compressed`` (sensor_msgs/CompressedImage) and ``roi`` (sensor_msgs/RegionOfInterest, the box of a
+drone's own tracker); publishes ``pose2d`` (drocap_ros/Pose2D) with the image's header.
 """
 
 from __future__ import annotations
@@ -13,23 +12,22 @@ from typing import Any
 
 import numpy as np
 from sensor_msgs.msg import RegionOfInterest
-from std_msgs.msg import Header
 
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
-from drocap_ros.perception.load_shedding import Hurry
-from drocap_ros.recording.pictures import image_from_message
+from drocap_ros.perception.load_shedding import LoadShedding
+from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.ros.component import OK, WARN
 from drocap_ros.ros.conversions import pose2d_to_ros, stamp_from_ros
-from drocap_ros.ros.image_transport import PictureInput
-from drocap_ros.ros.latency import SUBJECT
+from drocap_ros.ros.diagnostics import Key
+from drocap_ros.ros.image_input import ImageInput, ImageSample
 from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import TOPICS
 
 
 class PoseEstimatorNode(ManagedComponent):
-    """Runs detection, subject tracking and 2D pose on every picture that arrives while it is free."""
+    """Runs detection, subject tracking and 2D pose on images, with less work for each while they queue."""
 
     component = "pose_estimator"
 
@@ -37,9 +35,9 @@ class PoseEstimatorNode(ManagedComponent):
         super().__init__(config, **node_kwargs)
         self._estimator: PoseEstimator | None = None
         self._roi: np.ndarray | None = None
-        self._hurry = Hurry(self.config.max_hurry)
+        self._load_shedding = LoadShedding(self.config.max_load_level)
         self._pose2d = self.output("pose2d")
-        self._pictures = PictureInput(
+        self._images = ImageInput(
             self, self._on_image, partial(image_from_message, compressed=True), TOPICS["image/compressed"].qos.depth
         )
         self.input("roi", self._on_roi)
@@ -49,11 +47,11 @@ class PoseEstimatorNode(ManagedComponent):
         """Load the networks."""
         self._estimator = PoseEstimator(models_folder(self.config.models_dir or None), self.config)
         if self._estimator.limited_use:
-            self.details["networks"] = self._estimator.limited_use
+            self.details[Key.NETWORKS] = self._estimator.limited_use
 
     def release(self) -> None:
-        """Forget the networks and the subject."""
-        self._pictures.settle()
+        """Drop the networks and the subject."""
+        self._images.wait_idle()
         self._estimator, self._roi = None, None
 
     def _on_roi(self, message: RegionOfInterest) -> None:
@@ -61,34 +59,35 @@ class PoseEstimatorNode(ManagedComponent):
         self._roi = np.array([x, y, x + message.width, y + message.height], np.float64)
 
     def flush(self) -> None:
-        """Finish the pictures that have arrived."""
-        self._pictures.settle()
+        """Process the images that have arrived."""
+        self._images.wait_idle()
         super().flush()
 
     def close(self) -> None:
-        """Take no more pictures."""
-        self._pictures.close()
+        """Process no more images."""
+        self._images.close()
 
-    def _on_image(self, header: Header, image: np.ndarray) -> None:
+    def _on_image(self, sample: ImageSample) -> None:
         assert self._estimator is not None, "no message is taken before the node is active"
-        now_s = time.monotonic()
-        hurry = self._hurry.level(now_s, self._pictures.waited, self._pictures.behind)
+        level = self._load_shedding.level(time.monotonic(), sample.waited, sample.behind)
         roi, self._roi = self._roi, None
-        observation = self._estimator.process(image, stamp_from_ros(header.stamp), roi, hurry)
-        if hurry:
-            self.count("images in a hurry: detection only when due")
+        header = sample.header
+        observation = self._estimator.process(sample.image, stamp_from_ros(header.stamp), roi, level)
+        if level:
+            self.count(Key.IMAGES_SHED)
         if self._estimator.carried:
-            self.count("images in a hurry: keypoints of the one before, carried on")
+            self.count(Key.IMAGES_PROPAGATED)
         self._pose2d.publish(pose2d_to_ros(observation, header.frame_id))
-        self.count("images")
+        self.count(Key.IMAGES)
         self.produced(observation.stamp_ns)
         if observation.has_subject:
-            seen = int(np.isfinite(observation.keypoints).all(axis=-1).sum())
+            valid = int(np.isfinite(observation.keypoints).all(axis=-1).sum())
             score, joints = observation.detection_score, len(observation.joints)
-            self.details[SUBJECT] = f"{observation.track_id}, score {score:.2f}, {seen} of {joints} joints"
+            self.details[Key.SUBJECT] = f"{observation.track_id}, score {score:.2f}, {valid} of {joints} joints"
+            self.report(OK, "following the subject")
         else:
-            self.details[SUBJECT] = "none"
-        self.report(*((OK, "following the subject") if observation.has_subject else (WARN, "no subject in view")))
+            self.details[Key.SUBJECT] = "none"
+            self.report(WARN, "no subject in view")
 
 
 def main() -> int:

@@ -1,7 +1,7 @@
-"""Node ``session_player``: publishes a recorded session again, byte for byte, at the pace of the recording.
+"""Node ``session_player``: publishes a recorded session again, byte for byte, at the speed of the recording.
 
 Publishes the topics of the session whose types are installed here, and ``/clock`` (rosgraph_msgs/Clock, the
-recording's time).  Topics of the namespace that was recorded come out in the node's own.
+recording's time).  Topics of the recorded namespace are published in the node's own.
 """
 
 from __future__ import annotations
@@ -16,19 +16,22 @@ from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 
 from drocap_ros.errors import DrocapError, InputError
-from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, RawMessage, Session, TopicInfo, open_session
-from drocap_ros.ros.component import ERROR, OK, ComponentNode
+from drocap_ros.recording.open_session import open_session
+from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, RawMessage, Session, TopicInfo
+from drocap_ros.ros.component import ERROR
 from drocap_ros.ros.conversions import stamp_to_ros
+from drocap_ros.ros.diagnostics import Key
+from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, RESULT_QOS, TOPICS
 
-#: Topics that this graph publishes itself; those of the recording only when they are named.
+#: Topics that this graph publishes itself; played only when they are named.
 _OWN = ("/diagnostics", "/clock")
 _CLOCK_PERIOD_S = 0.01
 
 
-class SessionPlayerNode(ComponentNode):
-    """Reads in a thread of its own; memory is that of one chunk."""
+class SessionPlayerNode(ManagedComponent):
+    """Reads in a thread of its own; holds one chunk in memory."""
 
     component = "session_player"
 
@@ -46,19 +49,28 @@ class SessionPlayerNode(ComponentNode):
                 f" got {self.config.start_s:g}"
             )
         self._clock_output = self.create_publisher(Clock, "/clock", 10) if self.config.clock else None
-        self._told_ns = 0
+        self._clock_ns = 0
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="session_player", daemon=True)
+        self._thread: threading.Thread | None = None
+        self.set_up()
 
-    def on_start(self) -> None:
-        """Begin to publish."""
-        self._thread.start()
+    def begin(self) -> None:
+        """Start to publish; a session under way has continued meanwhile."""
+        if self._thread is None:
+            self._stop.clear()
+            self._thread = threading.Thread(target=self._run, name="session_player", daemon=True)
+            self._thread.start()
+
+    def release(self) -> None:
+        """Stop."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(timeout=5.0)
+            self._thread = None
 
     def close(self) -> None:
         """Stop and close the session."""
-        self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=5.0)
+        self.release()
         self._session.close()
 
     def _publisher(self, topic: TopicInfo) -> Publisher:
@@ -77,29 +89,29 @@ class SessionPlayerNode(ComponentNode):
                 self._play_once()
                 if not self.config.loop or self._stop.is_set():
                     break
-                self.count("rounds")
-            self.report(OK, "the session has ended")
+                self.count(Key.ROUNDS)
         except DrocapError as error:
             self.report(ERROR, str(error))
         for warning in self._session.warnings:
             self.get_logger().warning(warning)
         if not self._stop.is_set():
             self.flush()
-            self.finish()
+            self.end()
 
     def _play_once(self) -> None:
         start_ns = self._session.info.start_ns or 0
         origin_ns = start_ns + round(self.config.start_s * 1e9)
         begin_s = time.monotonic()
-        self._told_ns = origin_ns - 1  # a new round goes back in time, nothing else does
+        self._clock_ns = origin_ns - 1  # only a new round goes back in time
         for raw in self._messages(origin_ns):
             due_s = begin_s + (raw.log_time_ns - origin_ns) * 1e-9 / self.config.rate
             self._wait_until(due_s, begin_s, origin_ns)
             if self._stop.is_set():
                 return
-            self._tell_time(raw.log_time_ns)
-            self._publishers_by_topic[raw.topic].publish(raw.data)
-            self.count("messages")
+            self._publish_clock(raw.log_time_ns)
+            if self.active:
+                self._publishers_by_topic[raw.topic].publish(raw.data)
+                self.count(Key.MESSAGES)
 
     def _messages(self, origin_ns: int) -> Iterator[RawMessage]:
         wanted = frozenset(self._publishers_by_topic)
@@ -107,11 +119,11 @@ class SessionPlayerNode(ComponentNode):
 
     def _wait_until(self, due_s: float, begin_s: float, origin_ns: int) -> None:
         while (left_s := due_s - time.monotonic()) > 0 and not self._stop.wait(min(left_s, _CLOCK_PERIOD_S)):
-            self._tell_time(origin_ns + round((time.monotonic() - begin_s) * self.config.rate * 1e9))
+            self._publish_clock(origin_ns + round((time.monotonic() - begin_s) * self.config.rate * 1e9))
 
-    def _tell_time(self, now_ns: int) -> None:
-        if self._clock_output is not None and now_ns > self._told_ns:
-            self._told_ns = now_ns
+    def _publish_clock(self, now_ns: int) -> None:
+        if self._clock_output is not None and now_ns > self._clock_ns:
+            self._clock_ns = now_ns
             self._clock_output.publish(Clock(clock=stamp_to_ros(now_ns)))
 
 

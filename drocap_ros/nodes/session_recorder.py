@@ -1,7 +1,7 @@
 """Node ``session_recorder``: every topic of the graph into a rosbag2 MCAP session.
 
-Subscribes to all topics of ``topics.TOPICS`` as serialized bytes and writes them as they are.  The parameters of the
-other nodes, the hashes of their models and the camera's calibration go into the session's metadata.
+Subscribes to all topics of ``topics.TOPICS`` as serialized bytes and writes them unchanged.  The session's metadata
+hold the parameters of all nodes, the hashes of the models and the camera's calibration.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from drocap_ros.recording.provenance import (
     session_provenance,
 )
 from drocap_ros.ros.component import ERROR, HARDWARE_ID, OK, WARN, Gaps
+from drocap_ros.ros.diagnostics import Key, node_of, of
 from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.parameter_survey import ParameterSurvey
 from drocap_ros.ros.spin import node_main
@@ -41,34 +42,32 @@ _IMAGES = "image/compressed"
 
 
 class SessionRecorderNode(ManagedComponent):
-    """Hands the bytes of every message to the writer's queue."""
+    """Appends the bytes of every message to the writer's queue."""
 
     component = "session_recorder"
-    #: The middleware notes when each message came, and pictures may wait for seconds.
-    spin_pause_s = 0.06
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
         self._writer: SessionWriter | None = None
         self._survey: ParameterSurvey | None = None
         self._calibrated = False
-        self._heard = False  # anything but diagnostics
+        self._received = False  # any message but diagnostics
         self._sessions = 0
-        self._picture_gaps = Gaps()
+        self._image_gaps = Gaps()
         special = {
-            _IMAGES: self._on_picture, "camera_info": self._on_camera_info, "/diagnostics": self._on_diagnostics
+            _IMAGES: self._on_image, "camera_info": self._on_camera_info, "/diagnostics": self._on_diagnostics
         }  # fmt: skip
         for topic, entry in TOPICS.items():
             name = self.resolve_topic_name(topic)
             take = special.get(topic, self._on_message)
             qos = IMAGE_RECORDING_QOS if topic == _IMAGES else entry.qos
             events = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, name), use_default_callbacks=False)
-            self.input(topic, partial(take, name), raw=True, qos=qos, events=events, with_info=True, in_batches=True)
+            self.input(topic, partial(take, name), raw=True, qos=qos, events=events, with_info=True)
         self.create_timer(1.0, self._on_second)
         self.set_up()
 
     def acquire(self) -> None:
-        """Begin a session; a second one of this node's life takes the next free name."""
+        """Open a session; a second one of this node takes the next free name."""
         folder = Path(self.config.session_dir or dated_name(self.get_clock().now().nanoseconds))
         if self.config.if_taken == "next" or self._sessions:
             folder = _free_name(folder)
@@ -76,43 +75,43 @@ class SessionRecorderNode(ManagedComponent):
         for topic, entry in TOPICS.items():
             kind = _type_name(entry.message)
             writer.register(self.resolve_topic_name(topic), kind, schema_text(kind), image=topic == _IMAGES)
-        self._writer, self._calibrated, self._heard = writer, False, False
+        self._writer, self._calibrated, self._received = writer, False, False
         self._survey = ParameterSurvey(self, self._on_parameters)
         self._sessions += 1
 
     def release(self) -> None:
-        """Write what is queued and finish the files; of a graph that never began nothing is left."""
+        """Write the queue and finish the files; discard the session of a graph that never started."""
         if self._writer is not None:
-            if self.started or self._heard:
+            if self.ready or self._received:
                 self._writer.close()
             else:
                 self._writer.discard()
             self._writer = None
 
     def close(self) -> None:
-        """The same, at the end."""
+        """Finish the files."""
         self.release()
 
     def _on_message(self, name: str, data: bytes, info: dict[str, Any]) -> None:
-        """Log time is when the message reached this process, publish time when it was sent."""
+        """Write a message; log time is its arrival in this process, publish time the time at which it was sent."""
         log_ns = info["received_timestamp"]
         sent_ns = info["source_timestamp"]
-        # Simulated time is nothing that the middleware knows.
+        # The middleware's times are not simulated ones.
         if cast(ROSClock, self.get_clock()).ros_time_is_active or not log_ns:
             log_ns = sent_ns = self.get_clock().now().nanoseconds
-        self._heard = self._heard or name != "/diagnostics"
+        self._received = self._received or name != "/diagnostics"
         if self._writer is not None:
             self._writer.write(name, data, log_ns, sent_ns or log_ns)
-            self.count("messages")
+            self.count(Key.MESSAGES)
 
-    def _on_picture(self, name: str, data: bytes, info: dict[str, Any]) -> None:
-        if skipped := self._picture_gaps.before(info):
-            self.count(f"not recorded, too busy for too long {name}", skipped)
+    def _on_image(self, name: str, data: bytes, info: dict[str, Any]) -> None:
+        if skipped := self._image_gaps.before(info):
+            self.missed(name, skipped)
         self._on_message(name, data, info)
 
     def _on_lost(self, name: str, event: Any) -> None:
-        """Count what the middleware lost on its way."""
-        self.count(f"lost on the way {name}", event.total_count_change)
+        """Count messages that the middleware lost."""
+        self.count(of(Key.LOST, name), event.total_count_change)
 
     def _on_camera_info(self, name: str, data: bytes, info: dict[str, Any]) -> None:
         self._on_message(name, data, info)
@@ -126,17 +125,17 @@ class SessionRecorderNode(ManagedComponent):
             self._add_metadata({CALIBRATION: text})
 
     def _on_diagnostics(self, name: str, data: bytes, info: dict[str, Any]) -> None:
-        """Everybody's words but those of another drone's graph."""
-        ours = f"{self.get_namespace().strip('/')}/"
+        """Record diagnostics, except those of another drone's graph."""
+        ours = self.get_namespace().strip("/")
         statuses = deserialize_message(data, DiagnosticArray).status
-        if not all(s.hardware_id == HARDWARE_ID and not s.name.startswith(ours) for s in statuses):
+        if not all(s.hardware_id == HARDWARE_ID and node_of(s)[0] != ours for s in statuses):
             self._on_message(name, data, info)
 
     def _on_parameters(self, sections: dict[str, dict[str, Any]]) -> None:
         self._add_metadata({CONFIGURATION: configuration_text(sections)})
         if "pose_estimator" in sections:
             folder = models_folder(sections["pose_estimator"].get("models_dir") or None)
-            # Large networks take a while to read: not in the thread that receives.
+            # Large networks take long to read: not in the thread that receives.
             threading.Thread(target=self._hash_models, args=(folder,), name="model-hashes", daemon=True).start()
 
     def _hash_models(self, folder: Path) -> None:
@@ -154,23 +153,23 @@ class SessionRecorderNode(ManagedComponent):
         writer, survey = self._writer, self._survey
         if writer is None or survey is None or not self.active:
             return
-        survey.look()
-        self.details["file"] = str(writer.path)
-        self.details["written"] = str(writer.written)
-        self.details["waiting_kib"] = str(writer.queued_bytes >> 10)
-        self.details["free_mib"] = str(_free_mib(writer.folder))
+        survey.ask_new_nodes()
+        self.details[Key.FILE] = str(writer.path)
+        self.details[Key.WRITTEN] = str(writer.written)
+        self.details[Key.WAITING_KIB] = str(writer.queued_bytes >> 10)
+        self.details[Key.FREE_MIB] = str(_free_mib(writer.folder))
         for topic, count in sorted(writer.dropped_by_topic.items()):
-            self.details[f"dropped {topic}"] = str(count)
+            self.details[of(Key.NOT_WRITTEN, topic)] = str(count)
         if writer.error is not None:
             self.report(ERROR, writer.error)
         elif writer.dropped:
-            self.report(WARN, f"{writer.dropped} messages dropped: the disk is too slow; lower the pictures' quality")
+            self.report(WARN, f"{writer.dropped} messages dropped: the disk is too slow; lower jpeg_quality")
         else:
             self.report(OK, f"recording to {writer.folder}")
 
 
 def _free_name(folder: Path) -> Path:
-    """The folder itself where it is new or empty, else the first of ``folder_2``, ``folder_3``, ... that is."""
+    """The folder if it is new or empty, else the first such of ``folder_2``, ``folder_3``, ..."""
     names = itertools.chain([folder.name], (f"{folder.name}_{number}" for number in itertools.count(2)))
     candidates = (folder.with_name(name) for name in names)
     return next(c for c in candidates if not c.exists() or (c.is_dir() and not any(c.iterdir())))

@@ -2,8 +2,8 @@
 
 Subscribes ``pose2d``, ``pose3d/initial``, ``pose3d/latest`` and ``vehicle/state``; publishes ``markers/keypoints``
 (visualization_msgs/ImageMarker), ``markers/initial``, ``markers/latest`` and ``markers/camera_path``
-(visualization_msgs/MarkerArray) and the joints of the newest pose on TF.  With ``human_topics`` it also tells of the
-subject as REP 155 does, see :mod:`drocap_ros.ros.rep155`.
+(visualization_msgs/MarkerArray) and the joints of the newest pose on TF.  With ``human_topics`` it also publishes the
+subject by REP 155, see :mod:`drocap_ros.ros.rep155`.
 """
 
 from __future__ import annotations
@@ -18,18 +18,19 @@ from visualization_msgs.msg import MarkerArray
 from drocap_ros.msg import Pose2D, Pose3D, VehicleState
 from drocap_ros.ros.component import OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import pose3d_from_ros, stamp_from_ros
+from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.markers import body_transforms, keypoint_marker, path_marker, pose_markers
 from drocap_ros.ros.rep155 import MISSING, HumanTopics, hri, human_transforms
 from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import TFMessage
 from drocap_ros.view.pace import Pace
 
-#: A pose that nobody renews disappears: initial poses come with each picture, refined ones about once a second.
+#: Time after which a marker without a successor disappears.
 INITIAL_LIFETIME_S, LATEST_LIFETIME_S = 0.5, 3.0
 
 
 class VisualizerNode(ComponentNode):
-    """Draws what the other nodes publish; nothing depends on it."""
+    """Publishes markers and TF of the poses; no other node depends on it."""
 
     component = "visualizer"
 
@@ -57,12 +58,12 @@ class VisualizerNode(ComponentNode):
             self._humans.publish(message)
 
     def _on_initial(self, message: Pose3D) -> None:
-        pose3d_from_ros(message)  # a malformed pose is refused whether it is drawn or not
+        pose3d_from_ros(message)  # refuses a malformed pose even when it is not drawn
         if self._pace["initial"].due(stamp_from_ros(message.header.stamp)):
             self._initial.publish(pose_markers(message, INITIAL_LIFETIME_S))
         if self._tf is not None and (transforms := self._transforms(message)):
             self._tf.publish(TFMessage(transforms=transforms))
-        self.count("poses")
+        self.count(Key.POSES)
         if self.config.human_topics and self._humans is None:
             self.report(WARN, f"drawing; {MISSING}")
         else:

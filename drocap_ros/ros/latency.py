@@ -1,17 +1,10 @@
-"""How late a node's results are."""
+"""Latency and rate of a node's results."""
 
 from __future__ import annotations
 
 from collections import deque
 
 import numpy as np
-
-#: Keys of these figures on ``/diagnostics``.
-RATE, LATENCY = "rate Hz", "latency p50 / p95 / p99 ms"
-#: Key of who is followed, and of why the last refused message was refused.
-SUBJECT, LAST_REFUSED = "subject", "last refused"
-#: One number alone, for viewers that plot it.
-LATENCY_P95 = "latency p95 ms"
 
 
 class Latency:
@@ -31,12 +24,8 @@ class Latency:
         recent = sum(now_s - at <= window_s for at in tuple(self._at_s))  # another thread may add meanwhile
         return recent / window_s
 
-    def text_ms(self) -> str:
-        """``p50 / p95 / p99 ms``, empty without measurements."""
+    def percentiles_ms(self) -> tuple[float, ...]:
+        """50th, 95th and 99th percentile, ms; empty without measurements."""
         if not self._seconds:
-            return ""
-        return " / ".join(f"{1000 * value:.0f}" for value in np.percentile(np.array(self._seconds), [50, 95, 99]))
-
-    def p95_ms(self) -> float:
-        """95th percentile, NaN without measurements."""
-        return 1000.0 * float(np.percentile(np.array(self._seconds), 95)) if self._seconds else float("nan")
+            return ()
+        return tuple(1000.0 * float(value) for value in np.percentile(np.array(self._seconds), [50, 95, 99]))

@@ -1,8 +1,10 @@
-"""Nodes that hold something: a camera, networks, a file.  They follow ROS's life cycle (``ros2 lifecycle``).
+"""Managed nodes (``ros2 lifecycle``): they hold a camera, networks or a file, or they are a source.
 
-``configure`` takes the resource, ``activate`` begins to work, ``deactivate`` is silence with the resource kept, and
-``cleanup`` gives it back.  With parameter ``autostart`` (the default) the node takes the first two steps by itself, so
-that a scripted bringup needs to know nothing of it.
+``configure`` acquires the resource, ``activate`` starts the work, ``deactivate`` stops the output and keeps the
+resource, ``cleanup`` releases it, ``shutdown`` ends the node's work for good.  With parameter ``autostart`` (default)
+a node configures and activates itself.  A source then waits until it is ready, and in a graph until the bringup
+activates it; parameter ``graph_running`` of a restarted one says that the graph needs no activation any more.  A source
+that has ended shuts down: its state is then ``finalized``.
 """
 
 from __future__ import annotations
@@ -14,34 +16,40 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 from drocap_ros.errors import DrocapError
 from drocap_ros.parameters import Parameters
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
+from drocap_ros.ros.diagnostics import Key
+from drocap_ros.ros.topics import NODES
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
-#: Key of the state on ``/diagnostics``.
-LIFECYCLE = "lifecycle"
+#: Values of ``Key.LIFECYCLE`` on ``/diagnostics``, as ROS names its states.
+UNCONFIGURED, INACTIVE, ACTIVE, FINALIZED = "unconfigured", "inactive", "active", "finalized"
 
 
 class ManagedComponent(LifecycleNodeMixin, ComponentNode):
-    """A component with a resource.
+    """A component with a life cycle.
 
-    A subclass declares its endpoints in its constructor, which ends with :meth:`set_up`, and says in
-    :meth:`acquire`, :meth:`begin`, :meth:`pause` and :meth:`release` what the transitions mean.  Messages that come
-    while it is not active are dropped.
+    A subclass declares its endpoints in its constructor, which ends with :meth:`set_up`, and implements the
+    transitions in :meth:`acquire`, :meth:`begin`, :meth:`pause` and :meth:`release`.  Messages that arrive while it is
+    not active are dropped.
     """
 
-    #: A source waits for the other nodes; what only listens begins at once.
-    begins_with_graph: ClassVar[bool] = False
+    component: ClassVar[str]
 
     def __init__(self, config: Parameters | None = None, **node_kwargs: Any) -> None:
         ComponentNode.__init__(self, config, **node_kwargs)
         LifecycleNodeMixin.__init__(self)
         self.active = False
-        self._failure: DrocapError | None = None
+        self._is_source = NODES[self.component].source
+        self._refusal: DrocapError | None = None
+        self._ended = False
         self._autostart: bool = self.declare_parameter("autostart", True).value
+        self._activates_itself = bool(self.declare_parameter("graph_running", False).value) or not self.peers
+        if self._is_source:
+            self.create_timer(0.1, self._shut_down_when_ended)
         service = self._service_change_state
         change = service.callback
 
         def guarded(request: Any, response: Any) -> Any:
-            # What the state does not allow is an error of the asker, not of this node.
+            # A transition that the state does not allow is an error of the client, not of this node.
             try:
                 return change(request, response)
             except Exception as error:
@@ -51,7 +59,7 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
 
         service.callback = guarded
 
-    # -- what a subclass does --------------------------------------------------------------------------
+    # -- what a subclass implements --------------------------------------------------------------------
 
     def acquire(self) -> None:
         """Take the resource.
@@ -59,89 +67,100 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
         Raises
         ------
         DrocapError
-            When it cannot be had; the node then stays unconfigured.
+            When it is not available; the node then stays unconfigured.
         """
 
     def begin(self) -> None:
-        """Begin to produce."""
+        """Start the output."""
 
     def pause(self) -> None:
-        """Produce nothing more, and keep the resource."""
+        """Stop the output and keep the resource."""
 
     def release(self) -> None:
-        """Give the resource back; also called at the end, and then perhaps a second time."""
+        """Release the resource; also called at the end, then perhaps a second time."""
 
     # -- transitions -----------------------------------------------------------------------------------
 
     def set_up(self) -> None:
-        """Last step of the constructor: with ``autostart``, configure, and activate unless the graph is waited for.
+        """Last step of the constructor: with ``autostart``, configure, and activate unless the node is a source.
 
         Raises
         ------
         DrocapError
-            What ``acquire`` raised.
+            Raised by ``acquire``.
         """
-        self._tell("unconfigured")
+        self._enter(UNCONFIGURED)
         if self._autostart:
             self.trigger_configure()
-            if self._failure is not None:
-                raise self._failure
-            if not self.begins_with_graph:
+            if self._refusal is not None:
+                raise self._refusal
+            if not self._is_source:
                 self.trigger_activate()
 
-    def on_start(self) -> None:
-        """All peers are matched."""
-        if self._autostart and self.begins_with_graph and not self.active:
+    def on_ready(self) -> None:
+        """Activate a source that no bringup activates."""
+        if self._autostart and self._is_source and self._activates_itself and not self.active:
             self.trigger_activate()
 
+    def end(self) -> None:
+        """Note that the source has nothing left to publish; any thread may call this."""
+        self._ended = True
+
+    def _shut_down_when_ended(self) -> None:
+        if self._ended:
+            self._ended = False
+            self.trigger_shutdown()
+
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take the resource."""
-        self._failure = None
+        """Acquire the resource."""
+        self._refusal = None
         try:
             self.acquire()
         except DrocapError as error:
-            self._failure = error
+            self._refusal = error
             self.report(ERROR, str(error))
             return FAILURE
-        self._tell("inactive")
+        self._enter(INACTIVE)
         return SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Begin to work."""
+        """Start the output."""
         self.active = True
         self.begin()
-        self.details[LIFECYCLE] = "active"
-        self.report(OK, "running")
+        self._enter(ACTIVE)
         return SUCCESS
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Fall silent."""
+        """Stop the output."""
         self.active = False
         self.pause()
-        self._tell("inactive")
+        self._enter(INACTIVE)
         return SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Give the resource back."""
+        """Release the resource."""
         self.release()
-        self._tell("unconfigured")
+        self._ended = False
+        self._enter(UNCONFIGURED)
         return SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Fall silent and give the resource back, for good."""
+        """Stop the output and release the resource for good."""
         self.active = False
         self.release()
-        self._tell("finalized")
+        self._enter(FINALIZED)
         return SUCCESS
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """After a transition that raised: give back what there is."""
+        """After a transition that raised: release the resource."""
         self.active = False
         self.release()
-        self._tell("unconfigured")
+        self._enter(UNCONFIGURED)
         return SUCCESS
 
-    def _tell(self, state: str) -> None:
-        self.details[LIFECYCLE] = state
-        if state != "active":
-            self.report(OK, state)
+    def _enter(self, state: str) -> None:
+        self.details[Key.LIFECYCLE] = state
+        # The error that ended a source stays readable.
+        if state != FINALIZED or self._level != ERROR:
+            self.report(OK, "running" if state == ACTIVE else state)
+        self.publish_diagnostics()

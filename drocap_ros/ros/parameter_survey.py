@@ -1,4 +1,4 @@
-"""Asks the other nodes of the graph for their parameters, as whatever started them set these."""
+"""Parameters of all nodes of a running graph."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from drocap_ros.config import section_types
 
 
 class ParameterSurvey:
-    """Parameters of every component of the graph, by node; asked for in the background.
+    """Requests the parameters of every component of the graph in the background.
 
-    done : called with all that is known whenever a node has answered
+    done : called with all parameters so far, by node, whenever a node has answered
     """
 
     def __init__(self, node: Node, done: Callable[[dict[str, dict[str, Any]]], None]) -> None:
@@ -28,8 +28,8 @@ class ParameterSurvey:
         self._asked: set[str] = set()
         self._sections: dict[str, dict[str, Any]] = {}
 
-    def look(self) -> None:
-        """Ask the nodes that have come since the last time; returns at once."""
+    def ask_new_nodes(self) -> None:
+        """Ask the nodes that appeared since the last call; returns at once."""
         for name, namespace in self._node.get_node_names_and_namespaces():
             if namespace == self._node.get_namespace() and name in self._types and name not in self._asked:
                 self._ask(name, f"{namespace.rstrip('/')}/{name}")

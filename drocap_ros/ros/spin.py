@@ -4,62 +4,55 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import multiprocessing
 import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
+from functools import partial
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.experimental import EventsExecutor
 from rclpy.signals import SignalHandlerOptions
 
 from drocap_ros.errors import DrocapError
 from drocap_ros.ros.component import ComponentNode
+from drocap_ros.ros.topics import NODES
 
-#: After the order to stop, messages that have arrived are still worked off, for this long at most.
+#: After the order to stop, messages that have arrived are still processed, for this long at most.
 DRAIN_S = 5.0
-
-#: How far a node steps back (Unix niceness) behind those that most depend on time: the bridge, whose control loop a
-#: vehicle hangs on, pose estimator and initializer.  With one core busy for the networks alone, whatever else breaks in
-#: on them costs pictures.
-NICENESS = {
-    "image_ingest": 5,
-    "session_recorder": 10,
-    "bundle_adjuster": 15,
-    "visualizer": 15,
-}
-#: From here on a node does not even break in on others when something has come for it.
-_BACKGROUND = 10
-#: From here on it takes only what the others leave, in a process of its own.
-_LAST = 15
-
-#: Names the process that started this node; when that one is gone, the node stops.
-PARENT = "DROCAP_PARENT_PID"
+#: A node has processed all messages when none was left for this long.
+_QUIET_S = 0.05
+#: At or above this niceness nodes use SCHED_BATCH: a message for them does not preempt other nodes.
+_BATCH = 10
 
 
-def spin(node: ComponentNode, stop: threading.Event, when_settled: Callable[[], None] | None = None) -> None:
-    """Run the node's callbacks until ``stop``, then work off what has arrived, and close the node.
+def spin(
+    node: ComponentNode, executor: Executor, stop: threading.Event, on_ready: Callable[[], None] | None = None
+) -> None:
+    """Run the node's callbacks until ``stop``, then process the messages that have arrived, and close the node.
 
-    ``when_settled`` is called once, as soon as nobody waits for the node any more.  Whatever a callback raises comes
-    out of here.
+    ``on_ready`` is called once, when the node is ready.  An error of a callback or of the node's threads is raised.
     """
-    executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    # What stands now stays: without this, the collector walks through all modules again and again.
+    # Without this, the garbage collector visits all modules again and again.
     gc.collect()
     gc.freeze()
-    parent = int(os.environ.get(PARENT, "0"))
+    parent, server = multiprocessing.parent_process(), os.getppid()
     try:
         while not stop.is_set() and node.context.ok():
-            if node.spin_pause_s == 0:
-                executor.spin_once(timeout_sec=0.1)
-            elif not _turn(executor, node, 0.0):
-                stop.wait(node.spin_pause_s)
-            if when_settled is not None and node.settled:
-                when_settled()
-                when_settled = None
-            if parent not in (0, os.getppid(), os.getpid()):
+            executor.spin_once(timeout_sec=0.1)
+            if node.failure is not None:
+                raise node.failure
+            if on_ready is not None and node.ready:
+                on_ready()
+                on_ready = None
+            # Without the bringup that started it a node stops, and without the server that forked it too: the bringup
+            # then learns of no end of the node and starts another.
+            if parent is not None and not (parent.is_alive() and os.getppid() == server):
                 stop.set()
         node.on_stop()
         _drain(executor, node)
@@ -72,72 +65,46 @@ def spin(node: ComponentNode, stop: threading.Event, when_settled: Callable[[], 
         node.destroy_node()
 
 
-def step_back(component: str, own_process: bool = False) -> None:
-    """Give the calling thread, and those that it will start, the niceness of a node.
-
-    What comes last of all runs only where a processor has nothing else to do (SCHED_IDLE): whoever wakes takes its
-    place at once, which niceness alone does not give.  In a process of its own only: a thread that holds Python's lock
-    and is not let run holds up all others of its process.
-    """
-    niceness = NICENESS.get(component, 0)
-    # Not every system has priorities of threads, and one without them runs as well, if not as evenly.
-    with contextlib.suppress(OSError, AttributeError):
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
-        if niceness >= _BACKGROUND:
-            idle = own_process and niceness >= _LAST
-            os.sched_setscheduler(0, os.SCHED_IDLE if idle else os.SCHED_BATCH, os.sched_param(0))
+def _drain(executor: Executor, node: ComponentNode) -> None:
+    begin_s = quiet_s = time.monotonic()
+    while node.context.ok() and (now_s := time.monotonic()) - quiet_s < _QUIET_S and now_s - begin_s < DRAIN_S:
+        before = node.callbacks_done
+        executor.spin_once(timeout_sec=_QUIET_S)
+        if node.callbacks_done != before:
+            quiet_s = time.monotonic()
 
 
-def step_process_back(component: str) -> None:
-    """The same for a process, with all the threads that it has by now."""
-    niceness = NICENESS.get(component, 0)
+def lower_priority(niceness: int) -> None:
+    """Give all threads of this process, and those that they start, a Unix niceness; from 10 on SCHED_BATCH too."""
     if niceness == 0:
         return
+    # Not every system has priorities of threads.
     with contextlib.suppress(OSError, AttributeError):
         for thread in map(int, os.listdir("/proc/self/task")):
             os.setpriority(os.PRIO_PROCESS, thread, niceness)
-            if niceness >= _BACKGROUND:
+            if niceness >= _BATCH:
                 os.sched_setscheduler(thread, os.SCHED_BATCH, os.sched_param(0))
-    step_back(component, own_process=True)
 
 
-def _drain(executor: SingleThreadedExecutor, node: ComponentNode) -> None:
-    clock = node.get_clock()
-    end = clock.now().nanoseconds + int(DRAIN_S * 1e9)
-    while clock.now().nanoseconds < end and node.context.ok() and _turn(executor, node, 0.05):
-        pass
-
-
-def _turn(executor: SingleThreadedExecutor, node: ComponentNode, timeout_s: float) -> bool:
-    """One callback, if any comes within the time; returns whether a message was taken."""
-    before = node.callbacks_done
-    executor.spin_once(timeout_sec=timeout_s)
-    return node.callbacks_done != before
-
-
-def node_main(make: Callable[[], ComponentNode]) -> int:
+def node_main(node_class: type[ComponentNode]) -> int:
     """Run one node as a process until SIGINT or SIGTERM; returns the exit status."""
-    stop = stop_on_signal()
-    rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
-    return run_here(make, getattr(make, "component", ""), stop)
-
-
-def stop_on_signal() -> threading.Event:
-    """What SIGINT and SIGTERM set from now on."""
     stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    return stop
-
-
-def run_here(make: Callable[[], ComponentNode], component: str, stop: threading.Event) -> int:
-    """:func:`node_main` where rclpy is initialized already."""
+    _stop_on_signal(stop)
+    rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
+    executor = EventsExecutor()
+    # Again: the executor has replaced the handlers by its own, which shut the context down before the node has stopped.
+    _stop_on_signal(stop)
     try:
-        # It steps back only then: a node that was started again is waited for.
-        spin(make(), stop, lambda: step_process_back(component))
+        # A restarted node keeps the usual priority until it is ready.
+        spin(node_class(), executor, stop, partial(lower_priority, NODES[node_class.component].niceness))
     except DrocapError as error:
         print(f"drocap: {error}", file=sys.stderr)
         return error.exit_status
     finally:
         rclpy.try_shutdown()
     return 0
+
+
+def _stop_on_signal(stop: threading.Event) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())

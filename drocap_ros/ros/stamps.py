@@ -1,19 +1,19 @@
-"""Stamps that cannot be: one picture from 1970 among pictures of today."""
+"""Validation of a stream's stamps."""
 
 from __future__ import annotations
 
 from drocap_ros.errors import InputError
 
-#: A stamp this far from the one before belongs to another time.
+#: A stamp this far from the previous one belongs to another time.
 JUMP_S = 3600.0
-#: So many in a row from that other time, and it is the time from now on: a replay has begun, a clock was set.
-BELIEVED_AFTER = 5
+#: Successive stamps of another time after which the stream has moved there: a replay began, a clock was set.
+CONFIRMED_AFTER = 5
 
 
-class StampGate:
-    """Lets a stream's stamps pass, but not those that lie an hour or more from the ones before.
+class StampValidator:
+    """Refuses stamps that lie an hour or more from the previous ones, such as one image of 1970.
 
-    Smaller steps, forward or back, are for the algorithms to judge.  No clock is asked: simulated time and replays
+    Smaller steps, forward or back, are for the algorithms to judge.  No clock is read: simulated time and replays
     are as good as today.
     """
 
@@ -37,7 +37,7 @@ class StampGate:
             agrees = self._other_ns is not None and not _far(stamp_ns, self._other_ns)
             self._others = self._others + 1 if agrees else 1
             self._other_ns = stamp_ns
-            if self._others < BELIEVED_AFTER:
+            if self._others < CONFIRMED_AFTER:
                 away_s = (stamp_ns - self._last_ns) * 1e-9
                 raise InputError(
                     f"stamp: expected a time near the last one, got one {away_s:+.0f} s away; check the sender's clock"

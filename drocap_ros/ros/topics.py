@@ -1,44 +1,37 @@
-"""Topics, their types and quality of service, and which node has which: the graph, in one table."""
+"""The graph in two tables: topics with types and quality of service, nodes with topics and priorities."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, RegionOfInterest
 from visualization_msgs.msg import ImageMarker, MarkerArray
 
-from drocap_ros.msg import OrbitCommand, OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleState
+from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleState
 
 try:
     from tf2_msgs.msg import TFMessage
-except ImportError:  # not among the ROS wheels; `make setup` builds it, a ROS installation has it
+except ImportError:  # missing from the ROS wheels; `make setup` builds it
     TFMessage = None
 
-#: A source of pictures that begins like this is a topic.
+#: Prefix of an image source that is a topic.
 TOPIC_SOURCE = "topic:"
 
-#: A picture that comes late is worth nothing: no retransmission, and at most four wait.  With one, a single slow
-#: detection costs a picture; the others come in a rush when the camera's process has been held up, and are soon worked
-#: off, since who hurries carries keypoints on.
+#: A late image has no value: no retransmission.  Four may wait, since a camera process that was held up sends several
+#: images at once, and load shedding soon works them off.
 IMAGE_QOS = QoSProfile(depth=4, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
-#: In a graph, whose own nodes offer that, what found no room in the kernel's buffers at once is asked for again: a
-#: picture of 400 KiB and more, where Linux is as it comes.  That takes some 15 ms.
+#: Within a graph, whose publishers offer it: fragments that the kernel's buffers dropped are sent again (15 ms), as
+#: images above 400 KiB need with Linux' default buffers.
 IMAGE_IN_GRAPH_QOS = QoSProfile(depth=4, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
-#: Offered reliably, so that a recorder on the same machine loses none; a best-effort reader costs no more for it.
+#: Offered reliably for a recorder on the same machine; a best-effort reader costs no more for it.
 IMAGE_OFFERED_QOS = QoSProfile(depth=30, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
-#: The recorder comes last: on a busy machine, most of all at the start, it may not be let run for seconds.
+#: The recorder has a low priority: a busy machine may keep it waiting for seconds.
 IMAGE_RECORDING_QOS = QoSProfile(depth=150, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 #: Results are small, and none may be lost: 10 s of them at 100 Hz.
 RESULT_QOS = QoSProfile(depth=1000, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
-#: Handshake of nodes and bringup, for whoever comes later; as deep as there are nodes to speak.
-GRAPH_QOS = QoSProfile(
-    depth=100,
-    history=HistoryPolicy.KEEP_LAST,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
 
 
 @dataclass(frozen=True)
@@ -47,8 +40,8 @@ class Topic:
 
     message: type
     qos: QoSProfile
-    offered: QoSProfile | None = None  # by the publisher, where it is more than subscribers ask for
-    one_clock: bool = False  # stamps are times of one clock, so that each lies near the one before
+    offered: QoSProfile | None = None  # by the publisher, where subscribers request less
+    one_clock: bool = False  # stamps are times of one clock: each is near the one before
 
 
 TOPICS: dict[str, Topic] = {
@@ -60,7 +53,6 @@ TOPICS: dict[str, Topic] = {
     "pose3d/refined": Topic(Pose3DWindow, RESULT_QOS, one_clock=True),
     "pose3d/latest": Topic(Pose3D, RESULT_QOS, one_clock=True),
     "vehicle/state": Topic(VehicleState, RESULT_QOS, one_clock=True),
-    "orbit/command": Topic(OrbitCommand, RESULT_QOS),
     "orbit/status": Topic(OrbitStatus, RESULT_QOS),
     "markers/keypoints": Topic(ImageMarker, RESULT_QOS),
     "markers/initial": Topic(MarkerArray, RESULT_QOS),
@@ -68,41 +60,57 @@ TOPICS: dict[str, Topic] = {
     "markers/camera_path": Topic(MarkerArray, RESULT_QOS),
     "/diagnostics": Topic(DiagnosticArray, RESULT_QOS),
 }
-#: Topics that others than this package's nodes may publish: what of their quality of service does not fit is said.
-FROM_OUTSIDE = frozenset({"image/compressed", "camera_info", "roi", "vehicle/state", "orbit/command"})
+#: Topics that nodes of other packages may publish: an incompatible quality of service is logged.
+FROM_OUTSIDE = frozenset({"image/compressed", "camera_info", "roi", "vehicle/state"})
 if TFMessage is not None:
     TOPICS["/tf"] = Topic(TFMessage, RESULT_QOS)
 
-#: node -> (topics it publishes, topics it subscribes to).  The recorder takes all that anybody publishes.
-NODES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "image_ingest": (("image/compressed", "camera_info"), ()),
-    "flight_simulator": (("image/compressed", "camera_info"), ()),
-    "pose_estimator": (("pose2d",), ("image/compressed", "roi")),
-    "capture_simulator": (("pose2d", "camera_info"), ()),
-    "initializer": (("pose3d/initial",), ("pose2d",)),
-    "bundle_adjuster": (("pose3d/refined", "pose3d/latest"), ("pose2d", "pose3d/initial", "vehicle/state")),
-    "mavlink_bridge": (
-        ("vehicle/state", "orbit/status", *(("/tf",) if TFMessage is not None else ())),
-        ("pose2d", "camera_info", "orbit/command"),
+_TF = ("/tf",) if TFMessage is not None else ()
+
+
+class NodeEntry(NamedTuple):
+    """A node: topics it publishes, topics it subscribes to, its place in the graph.
+
+    source : the node is activated when all other nodes are ready, and may end by itself
+    live : ``drocap live`` starts the node by default
+    niceness : Unix niceness of its process.  The flight loop, the pose estimator and the initializer have 0
+    """
+
+    publishes: tuple[str, ...] = ()
+    subscribes: tuple[str, ...] = ()
+    source: bool = False
+    live: bool = False
+    niceness: int = 0
+
+
+#: In the order in which nodes start and stop: from the sources downwards.
+NODES: dict[str, NodeEntry] = {
+    "image_ingest": NodeEntry(("image/compressed", "camera_info"), source=True, live=True, niceness=5),
+    "flight_simulator": NodeEntry(("image/compressed", "camera_info"), source=True),
+    "pose_estimator": NodeEntry(("pose2d",), ("image/compressed", "roi"), live=True),
+    "capture_simulator": NodeEntry(("pose2d", "camera_info"), source=True),
+    "initializer": NodeEntry(("pose3d/initial",), ("pose2d",), live=True),
+    "bundle_adjuster": NodeEntry(
+        ("pose3d/refined", "pose3d/latest"), ("pose2d", "pose3d/initial"), live=True, niceness=15
     ),
-    "visualizer": (
-        (
-            *("markers/keypoints", "markers/initial", "markers/latest", "markers/camera_path"),
-            *(("/tf",) if TFMessage is not None else ()),
-        ),
+    "mavlink_bridge": NodeEntry(("vehicle/state", "orbit/status", *_TF), ("pose2d", "camera_info"), live=True),
+    "visualizer": NodeEntry(
+        ("markers/keypoints", "markers/initial", "markers/latest", "markers/camera_path", *_TF),
         ("pose2d", "pose3d/initial", "pose3d/latest", "vehicle/state"),
+        live=True,
+        niceness=15,
     ),
-    # What it publishes is what the session holds.
-    "session_player": ((), ()),
-    "session_recorder": ((), tuple(TOPICS)),
+    # The topics that it publishes are those of the session.
+    "session_player": NodeEntry(source=True),
+    "session_recorder": NodeEntry((), tuple(TOPICS), live=True, niceness=10),
 }
 
 
 def publishers_of(topic: str, nodes: list[str]) -> int:
     """How many of the named nodes publish the topic."""
-    return sum(topic in NODES[name][0] for name in nodes)
+    return sum(topic in NODES[name].publishes for name in nodes)
 
 
 def subscribers_of(topic: str, nodes: list[str]) -> int:
     """How many of the named nodes subscribe to the topic."""
-    return sum(topic in NODES[name][1] for name in nodes)
+    return sum(topic in NODES[name].subscribes for name in nodes)

@@ -1,4 +1,4 @@
-"""What the nodes say of themselves, as a table on a terminal."""
+"""The nodes' diagnostics as a table on a terminal."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from drocap_ros.ros.latency import LAST_REFUSED, LATENCY, RATE, SUBJECT
+from drocap_ros.ros.diagnostics import Key, words
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 _COLOURS = {0: "green", 1: "yellow", 2: "red", 3: "magenta"}
+_LATENCY = (Key.LATENCY_P50, Key.LATENCY_P95, Key.LATENCY_P99)
+_SHOWN = (Key.SUBJECT, Key.LAST_REFUSED)
 _LEVELS = {0: "ok", 1: "warning", 2: "error", 3: "stale"}
 
 
@@ -23,7 +25,7 @@ class Dashboard:
         self._rows: dict[str, tuple[int, str, dict[str, str]]] = {}
 
     def take(self, message: Any) -> None:
-        """Remember the statuses of a diagnostic_msgs/DiagnosticArray."""
+        """Store the statuses of a diagnostic_msgs/DiagnosticArray."""
         for status in message.status:
             values = {value.key: value.value for value in status.values}
             # rclpy gives the level as one byte.
@@ -31,22 +33,23 @@ class Dashboard:
             self._rows[status.name] = (level, status.message, values)
 
     def heard(self, namespace: str = "") -> list[str]:
-        """Names of the nodes heard so far in a namespace."""
+        """Names of the nodes whose status has arrived, in a namespace."""
         inside = f"{namespace.strip('/')}/" if namespace else ""
         return sorted(name for name in self._rows if name.startswith(inside))
 
     def table(self, namespace: str = "") -> Table:
-        """The table of the nodes heard so far in a namespace."""
+        """Table of the nodes whose status has arrived, in a namespace."""
         from rich.table import Table
 
-        table = Table("node", "state", "Hz", "late, ms (p50 / p95 / p99)", "what it says", "counts", expand=True)
+        table = Table("node", "state", "Hz", "latency, ms (p50 / p95 / p99)", "status", "counts", expand=True)
         for name in self.heard(namespace):
             level, text, values = self._rows[name]
             counts = ", ".join(
-                f"{key} {value}" for key, value in values.items() if value.isdigit() or key in (SUBJECT, LAST_REFUSED)
+                f"{words(key)} {value}" for key, value in values.items() if value.isdigit() or key in _SHOWN
             )
             state = f"[{_COLOURS.get(level, 'white')}]{_LEVELS.get(level, str(level))}[/]"
-            table.add_row(name, state, values.get(RATE, ""), values.get(LATENCY, ""), text, counts)
+            latency = " / ".join(f"{float(values[key]):.0f}" for key in _LATENCY if key in values)
+            table.add_row(name, state, values.get(Key.RATE, ""), latency, text, counts)
         return table
 
 

@@ -20,11 +20,6 @@ if TYPE_CHECKING:
     from drocap_ros.bringup import Graph
     from drocap_ros.config import DrocapConfig
 
-NODES = (
-    "image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "visualizer",
-    "session_recorder",
-)  # fmt: skip
-
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the command's options; ``run`` is its action."""
@@ -37,11 +32,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "--config", metavar="FILE", type=Path, required=True, help="parameters of the components (YAML)"
     )
     parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
-    parser.add_argument("--source", metavar="URI", help="instead of the configuration's image_ingest.source")
+    parser.add_argument("--source", metavar="URI", help="replaces the configuration's image_ingest.source")
     parser.add_argument("--session", metavar="DIR", type=Path, help="record to this new folder")
-    parser.add_argument("--nodes", nargs="+", choices=NODES, default=list(NODES), metavar="NODE", help=", ".join(NODES))
+    parser.add_argument(
+        "--nodes", nargs="+", metavar="NODE", help="names of nodes (default: image_ingest to session_recorder)"
+    )
     add_graph_options(parser)
-    parser.add_argument("--no-respawn", action="store_true", help="end when a node dies, instead of starting it again")
+    parser.add_argument("--no-respawn", action="store_true", help="end when a node dies instead of restarting it")
     parser.set_defaults(run=run)
     return parser
 
@@ -50,7 +47,9 @@ def add_graph_options(parser: argparse.ArgumentParser) -> None:
     """Options of every command that starts nodes."""
     parser.add_argument("--namespace", default="/drocap", help="of all topics (default /drocap)")
     parser.add_argument("--domain-id", type=int, default=0, metavar="N", help="DDS domain, 0 to 101 (default 0)")
-    parser.add_argument("--one-process", action="store_true", help="all nodes in this process, a thread each")
+    parser.add_argument(
+        "--one-process", action="store_true", help="all nodes in this process, a thread each: for tests"
+    )
     parser.add_argument("--quiet", action="store_true", help="no status line, only errors")
 
 
@@ -66,11 +65,19 @@ def run(args: argparse.Namespace) -> int:
         config = config.replace("pose_estimator", models_dir=str(models_folder(args.models).absolute()))
     if args.session:
         config = config.replace("session_recorder", session_dir=str(args.session.absolute()))
-    return run_graph(config, args.nodes, args)
+    return run_graph(config, args.nodes or live_nodes(), args)
+
+
+def live_nodes() -> list[str]:
+    """Names of the nodes that run on real hardware."""
+    import_bringup()
+    from drocap_ros.ros.topics import NODES
+
+    return [name for name, entry in NODES.items() if entry.live]
 
 
 def run_graph(config: DrocapConfig, nodes: list[str], args: argparse.Namespace) -> int:
-    """Bring nodes up, show what they say, stop on Ctrl-C or when the source has ended."""
+    """Start nodes, show their diagnostics, stop on Ctrl-C or when the source has ended."""
     check_domain(args.domain_id)
     bringup = import_bringup().bringup
     with bringup(
@@ -85,7 +92,7 @@ def run_graph(config: DrocapConfig, nodes: list[str], args: argparse.Namespace) 
             print(f"running {', '.join(graph.names)} in {args.namespace}, domain {args.domain_id}; Ctrl-C stops")
             sys.stdout.flush()
         with dashboard_of(graph, show=not args.quiet) as (_, draw), stop_signals() as stop:
-            while not stop.is_set() and not ("image_ingest" in nodes and "image_ingest" in graph.finished):
+            while not stop.is_set() and "image_ingest" not in graph.finished:
                 graph.spin_for(0.5)
                 draw()
                 while graph.events:
@@ -95,7 +102,7 @@ def run_graph(config: DrocapConfig, nodes: list[str], args: argparse.Namespace) 
 
 @contextlib.contextmanager
 def stop_signals() -> Iterator[threading.Event]:
-    """An event that SIGINT and SIGTERM set, so that neither breaks into the middle of anything."""
+    """An event that SIGINT and SIGTERM set instead of interrupting the program."""
     stop = threading.Event()
     before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -107,10 +114,9 @@ def stop_signals() -> Iterator[threading.Event]:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[threading.Event]:
-    """SIGTERM ends what runs inside as Ctrl-C does: nothing half-written stays.
+    """SIGTERM interrupts the program as Ctrl-C does, so that no half-written file remains.
 
-    Both raise KeyboardInterrupt wherever the program is, and set the event: what is raised where Python cannot pass it
-    on, as in a destructor, is lost.
+    Both raise KeyboardInterrupt and set the event: an exception in a destructor, for one, is lost.
     """
     interrupted = threading.Event()
 
@@ -133,7 +139,7 @@ def check_domain(domain_id: int) -> None:
 
 
 def import_bringup() -> ModuleType:
-    """The module that knows ROS, or one clear line where there is no ROS."""
+    """The module that imports ROS, or an InputError where ROS is missing."""
     try:
         return importlib.import_module("drocap_ros.bringup")
     except ImportError as error:
@@ -142,7 +148,7 @@ def import_bringup() -> ModuleType:
 
 @contextlib.contextmanager
 def dashboard_of(graph: Graph, show: bool) -> Iterator[tuple[Dashboard, Callable[[], None]]]:
-    """Dashboard fed by the graph's ``/diagnostics``, and the function that draws it."""
+    """Dashboard of the graph's ``/diagnostics``, and the function that draws it."""
     from drocap_ros.ros.topics import TOPICS
 
     with dashboard_on_terminal(show, graph.namespace) as (dashboard, draw):

@@ -19,7 +19,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("--out", metavar="DIR", type=Path, help="new folder of the session (default: named by date)")
     parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
     add_graph_options(parser)
-    parser.add_argument("--no-respawn", action="store_true", help="end when a node dies, instead of starting it again")
+    parser.add_argument("--no-respawn", action="store_true", help="end when a node dies instead of restarting it")
     parser.set_defaults(run=run)
     return parser
 

@@ -1,4 +1,4 @@
-"""``drocap top``: what the nodes of a running graph say of themselves."""
+"""``drocap top``: the diagnostics of a running graph."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from drocap_ros.cli.graph.live import check_domain, dashboard_of, import_bringup, stop_signals
 
-#: How long ``--once`` waits for a first word.
+#: How long ``--once`` waits for a first status.
 ONCE_TIMEOUT_S = 8.0
 
 
@@ -21,13 +21,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     )
     parser.add_argument("--namespace", default="/drocap", help="of the graph (default /drocap)")
     parser.add_argument("--domain-id", type=int, default=0, metavar="N", help="DDS domain, 0 to 101 (default 0)")
-    parser.add_argument("--once", action="store_true", help="listen, print the table once, and end")
+    parser.add_argument("--once", action="store_true", help="print the table once and end")
     parser.set_defaults(run=run)
     return parser
 
 
 def run(args: argparse.Namespace) -> int:
-    """Listen and draw; status 1 with ``--once`` when no node was heard."""
+    """Subscribe and draw; status 1 with ``--once`` when no status arrived."""
     from rich.console import Console
 
     check_domain(args.domain_id)
@@ -37,13 +37,13 @@ def run(args: argparse.Namespace) -> int:
         stop_signals() as stop,
     ):
         if args.once:
-            # Discovery may take seconds; from the first word on, every node speaks once a second.
+            # Discovery may take seconds; then every node publishes its status once a second.
             for _ in range(int(ONCE_TIMEOUT_S)):
                 graph.spin_for(1.0)
                 if dashboard.heard(args.namespace):
                     graph.spin_for(1.5)
                     break
-            # In a pipe nobody sets a width: wide enough that no name is cut.
+            # A pipe has no width: wide enough that no name is cut.
             Console(width=None if sys.stdout.isatty() else 180).print(dashboard.table(args.namespace))
             return 0 if dashboard.heard(args.namespace) else 1
         while not stop.is_set():

@@ -1,0 +1,105 @@
+"""``/diagnostics`` as data: keys of counters and values, and the words for them.
+
+Programs compare keys and values of this module; sentences are made here, for people, in :func:`words`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from diagnostic_msgs.msg import DiagnosticStatus
+
+#: Levels of diagnostic_msgs/DiagnosticStatus, which the command line knows without ROS.
+OK, WARN, ERROR = b"\0", b"\1", b"\2"
+#: ``hardware_id`` of the statuses of this package's nodes.
+HARDWARE_ID = "drocap_ros"
+#: Values of ``Key.PILOT``.
+PILOT_FLIES, PILOT_HANDS_OFF = "flies", "hands_off"
+
+
+class Key:
+    """Keys on ``/diagnostics``; a key of one topic, event or node is ``KEY/NAME``, see :func:`of`."""
+
+    # state
+    READY = "ready"  # "true" when all publishers and subscriptions of the graph are matched
+    LIFECYCLE = "lifecycle"
+    RATE = "rate_hz"
+    LATENCY_P50, LATENCY_P95, LATENCY_P99 = "latency_p50_ms", "latency_p95_ms", "latency_p99_ms"
+    SUBJECT = "subject"
+    NETWORKS = "networks"
+    LAST_REFUSED = "last_refused"
+    PILOT, VEHICLE_MODE = "pilot", "vehicle_mode"
+    FILE, WRITTEN, WAITING_KIB, FREE_MIB = "file", "written", "waiting_kib", "free_mib"
+    # counters
+    IMAGES, POSES, MESSAGES, ROUNDS, EXPOSURES = "images", "poses", "messages", "rounds", "exposures"
+    MESSAGES_REFUSED = "messages_refused"
+    MISSED = "missed"  # messages that were published and that the busy subscriber never took
+    LOST = "lost"  # messages that the middleware lost
+    NOT_WRITTEN = "not_written"  # messages that the disk was too slow for
+    IMAGES_LATE = "images_late"  # images of a file that was read too slowly
+    IMAGES_SKIPPED = "images_skipped"  # by max_rate_hz
+    IMAGES_UNRENDERED = "images_unrendered"
+    IMAGES_SHED, IMAGES_PROPAGATED = "images_shed", "images_propagated"
+    SOURCE_EVENT = "source_event"
+    STREAM_EVENT = "stream_event"
+    IMAGES_INCOMPLETE = "images_incomplete"
+    KEYPOINTS_UNPAIRED, INITIAL_UNPAIRED = "keypoints_unpaired", "initial_unpaired"
+    LATEST_POSES = "latest_poses"
+    ADJUSTMENTS, ADJUSTMENTS_FAILED, ADJUSTMENTS_SKIPPED = "adjustments", "adjustments_failed", "adjustments_skipped"
+    ADJUSTMENTS_CUT, ADJUSTMENTS_STRIDED = "adjustments_cut", "adjustments_strided"
+    VEHICLE_STATES, SUBJECT_SEEN = "vehicle_states", "subject_seen"
+    ORBIT_COMMANDS, ORBIT_COMMANDS_REFUSED = "orbit_commands", "orbit_commands_refused"
+    STREAM_RATE = "stream_rate_hz"
+    MAVLINK_BAD, MAVLINK_UNSIGNED = "mavlink_bad", "mavlink_unsigned"
+    RESTARTS = "restarts"
+
+
+_WORDS = {
+    Key.MESSAGES_REFUSED: "messages refused",
+    Key.LAST_REFUSED: "last refused message",
+    Key.MISSED: "dropped while busy",
+    Key.LOST: "lost by the middleware",
+    Key.NOT_WRITTEN: "dropped: disk too slow",
+    Key.IMAGES_LATE: "images dropped: source read too slowly",
+    Key.IMAGES_SKIPPED: "images skipped by max_rate_hz",
+    Key.IMAGES_UNRENDERED: "images not rendered in time",
+    Key.IMAGES_SHED: "images with reduced detection",
+    Key.IMAGES_PROPAGATED: "images with propagated keypoints",
+    Key.IMAGES_INCOMPLETE: "images that show too little of the person",
+    Key.KEYPOINTS_UNPAIRED: "keypoints without an initial pose",
+    Key.INITIAL_UNPAIRED: "initial poses without keypoints",
+    Key.ADJUSTMENTS_FAILED: "failed adjustments",
+    Key.ADJUSTMENTS_SKIPPED: "adjustments skipped: the previous one was running",
+    Key.ADJUSTMENTS_CUT: "adjustments ended by their time limit",
+    Key.ADJUSTMENTS_STRIDED: "adjustments of fewer images",
+    Key.SUBJECT_SEEN: "images with the subject",
+    Key.ORBIT_COMMANDS_REFUSED: "orbit commands refused",
+    Key.MAVLINK_BAD: "malformed MAVLink packets",
+    Key.MAVLINK_UNSIGNED: "MAVLink packets without our signature",
+    Key.WAITING_KIB: "KiB waiting",
+    Key.FREE_MIB: "MiB free",
+}
+
+
+def of(key: str, name: str) -> str:
+    """Key of one topic, event or node."""
+    return f"{key}/{name.lstrip('/')}"
+
+
+def words(key: str) -> str:
+    """The key in words, for people."""
+    kind, _, name = key.partition("/")
+    text = _WORDS.get(kind, kind.replace("_", " "))
+    return f"{text}, {name.replace('_', ' ') if '/' not in name else name}" if name else text
+
+
+def values_of(status: DiagnosticStatus) -> dict[str, str]:
+    """Keys and values of a status."""
+    return {value.key: value.value for value in status.values}
+
+
+def node_of(status: DiagnosticStatus) -> tuple[str, str]:
+    """Namespace (without slashes at its ends) and node that a status is about."""
+    namespace, _, name = status.name.rpartition("/")
+    return namespace, name
