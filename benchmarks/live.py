@@ -197,8 +197,6 @@ def session_figures(session: Path, begin_ns: int, end_ns: int) -> dict[str, Any]
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
-    from drocap_ros.reconstruction.live.effort import Effort
-
     stamps: dict[str, list[int]] = {}
     late_ms: dict[str, list[float]] = {}
     received_ms: dict[str, list[float]] = {}
@@ -225,7 +223,7 @@ def session_figures(session: Path, begin_ns: int, end_ns: int) -> dict[str, Any]
                     if topic == "pose3d/refined":
                         solve_s.append(message.solve_seconds)
                         frames.append(len(message.poses))
-                        strides.append(Effort.parse(message.stop_reason).stride)
+                        strides.append(message.stride)
     seconds = (end_ns - begin_ns) * 1e-9
     # Exactly, by stamps: which pictures were never looked at.
     sent = {stamp for stamp in stamps["camera_info"] if stamp < end_ns - 10**9}
@@ -315,7 +313,7 @@ SIGNS = {
 def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Every node killed while all others run, once in every round; bringup starts it again."""
     from drocap_ros.bringup import bringup
-    from drocap_ros.recording.session import open_session
+    from drocap_ros.recording.open_session import open_session
     from drocap_ros.ros.topics import TOPICS
     from drocap_ros.simulation.vehicle.ports import free_udp_port
 

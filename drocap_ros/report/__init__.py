@@ -1,1 +1,1 @@
-"""Pictures and reports of a reconstructed motion."""
+"""Reports, previews and contact sheets of a reconstructed motion."""

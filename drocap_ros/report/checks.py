@@ -1,13 +1,14 @@
-"""What a person should know before trusting a motion, in words."""
+"""Automatic checks of a motion: reasons to doubt it, and notes on how to read it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum, auto
 
 import numpy as np
 
 from drocap_ros.motion import Motion
-from drocap_ros.report.statistics import Measures, mean_known
+from drocap_ros.report.statistics import Statistics, mean_known
 
 #: The paper's study of camera speed: little is gained below, and it flew at about 25 degrees per second.
 _SLOW_VIEW_DPS = 10.0
@@ -23,128 +24,186 @@ _BONE_SPREAD = 0.1
 _MIRRORED_SHARE, _MIRRORED_COUNT = 0.5, 10
 
 
+class Level(Enum):
+    """Consequence of a check: doubt the motion, or read it with care."""
+
+    WARNING = "warning"
+    NOTE = "note"
+
+
+class Check(Enum):
+    """The checks, in the order of the report."""
+
+    MISSING_POSES = auto()
+    MIRRORED = auto()
+    LOW_CAMERA_MOTION = auto()
+    HIGH_ERROR = auto()
+    OUTLIERS = auto()
+    MISSING_JOINTS = auto()
+    SHORT = auto()
+    BONE_LENGTHS = auto()
+    NO_VERTICAL = auto()
+    ASSUMED_SCALE = auto()
+
+
 @dataclass(frozen=True)
-class Finding:
-    """One remark: ``level`` "warning" (doubt the result) or "note" (know how to read it), a title, and a sentence."""
+class CheckResult:
+    """A check that applies; ``values`` fill in its words."""
 
-    level: str
-    title: str
-    text: str
+    check: Check
+    level: Level
+    values: dict[str, float | str]
 
+    @property
+    def title(self) -> str:
+        """A few words."""
+        return _WORDS[self.check][0]
 
-def findings(motion: Motion, m: Measures) -> list[Finding]:
-    """Remarks on a motion, warnings first."""
-    checks = (_absent, _mirrored, _view, _error, _outliers, _missing, _short, _bones, _vertical, _scale)
-    found = [finding for check in checks if (finding := check(motion, m)) is not None]
-    return sorted(found, key=lambda finding: finding.level != "warning")
-
-
-def _absent(motion: Motion, m: Measures) -> Finding | None:
-    known = np.isfinite(motion.joints3d).all(axis=2).any(axis=1)
-    if known.all():
-        return None
-    text = f"{np.count_nonzero(~known)} of {len(known)} frames have no 3D pose."
-    return Finding("warning", "Frames without a pose", text + " They are empty here and gaps in every export.")
+    @property
+    def text(self) -> str:
+        """One to three sentences."""
+        return _WORDS[self.check][1].format(**self.values)
 
 
-def _mirrored(_: Motion, m: Measures) -> Finding | None:
-    if m.bent_knees < _MIRRORED_COUNT or m.knees_forward > _MIRRORED_SHARE:
-        return None
-    backward = 1.0 - m.knees_forward
-    return Finding(
-        "warning",
+_WORDS: dict[Check, tuple[str, str]] = {
+    Check.MISSING_POSES: (
+        "Frames without a pose",
+        "{missing} of {frames} frames have no 3D pose. They are empty here and gaps in every export.",
+    ),
+    Check.MIRRORED: (
         "Possibly mirrored in depth",
-        f"{backward:.0%} of the {m.bent_knees} bent knees bend backward. A body mirrored in depth fits the image"
-        " just as well; compare with the video from the side, and check that left and right were not swapped in 2D.",
-    )
-
-
-def _view(_: Motion, m: Measures) -> Finding | None:
-    if m.view_speed_dps >= _SLOW_VIEW_DPS and m.view_span_deg >= _NARROW_VIEW_DEG:
-        return None
-    return Finding(
-        "warning",
+        "{backward:.0%} of the {bent} bent knees bend backward. A body mirrored in depth fits the image equally well;"
+        " compare with the video from the side, and check that left and right were not exchanged in 2D.",
+    ),
+    Check.LOW_CAMERA_MOTION: (
         "Low camera motion",
-        f"The view of the body turned by {m.view_span_deg:.0f}° in all, at {m.view_speed_dps:.0f}°/s (median). Then"
-        " depth rests mostly on what poses usually look like. Orbit faster: the paper flew at about 25°/s.",
-    )
-
-
-def _error(_: Motion, m: Measures) -> Finding | None:
-    # The median: a few gross outliers in 2D, which the method leaves aside, are no reason to doubt the rest.
-    share = m.median_px / m.body_px
-    if not share > _HIGH_ERROR:
-        return None
-    return Finding(
-        "warning",
+        "The view of the body turned by {span:.0f}° in all, at {speed:.0f}°/s (median). Depth then rests mostly on"
+        " ordinary poses. Orbit faster: the paper flew at about 25°/s.",
+    ),
+    Check.HIGH_ERROR: (
         "High reprojection error",
-        f"Half of the joints project more than {m.median_px:.1f} px from their keypoints, {share:.1%} of the body's"
-        " size in the image. The 2D keypoints are noisy, or the motion does not explain them.",
+        "Half of the joints project more than {px:.1f} px from their keypoints, {share:.1%} of the body's size in the"
+        " image. The 2D keypoints are noisy, or the motion does not explain them.",
+    ),
+    Check.OUTLIERS: (
+        "Outlying keypoints",
+        "{share:.1%} of the keypoints lie more than {limit:.0%} of the body's size from the projected joints. They"
+        " raise the RMS ({rms:.1f} px) far above the median ({median:.1f} px).",
+    ),
+    Check.MISSING_JOINTS: (
+        "Many missing joints",
+        "Keypoints missing in more than {limit:.0%} of the frames: {joints}. Their 3D is filled in.",
+    ),
+    Check.SHORT: (
+        "Short sequence",
+        "Frames: {frames}, over {seconds:.1f} s. Joint adjustment needs many views of a motion; such a result is close"
+        " to single-view estimation.",
+    ),
+    Check.BONE_LENGTHS: (
+        "Bones change their length",
+        "{bone} varies by {worst:.0%} (standard deviation), all by {mean:.0%} on average. No method fixes bone lengths"
+        " exactly; BVH export does.",
+    ),
+    Check.NO_VERTICAL: (
+        "Vertical and path not known",
+        "Without camera telemetry each pose is in the axes of its own image: up is the camera's up, and the body's"
+        " path is not known. The player stands it on its lowest joint.",
+    ),
+    Check.ASSUMED_SCALE: ("Scale assumed", "Metres come from {source}{height}, not from a measurement."),
+}
+
+
+def run_checks(motion: Motion, s: Statistics) -> list[CheckResult]:
+    """The checks that apply to a motion, warnings first."""
+    checks = (
+        _missing_poses,
+        _mirrored,
+        _low_camera_motion,
+        _high_error,
+        _outliers,
+        _missing_joints,
+        _short,
+        _bone_lengths,
+        _no_vertical,
+        _assumed_scale,
     )
+    results = [result for check in checks if (result := check(motion, s)) is not None]
+    return sorted(results, key=lambda result: result.level is not Level.WARNING)
 
 
-def _outliers(motion: Motion, m: Measures) -> Finding | None:
+def _warn(check: Check, **values: float | str) -> CheckResult:
+    return CheckResult(check, Level.WARNING, values)
+
+
+def _note(check: Check, **values: float | str) -> CheckResult:
+    return CheckResult(check, Level.NOTE, values)
+
+
+def _missing_poses(motion: Motion, s: Statistics) -> CheckResult | None:
+    missing = ~np.isfinite(motion.joints3d).all(axis=2).any(axis=1)
+    if not missing.any():
+        return None
+    return _warn(Check.MISSING_POSES, missing=np.count_nonzero(missing), frames=len(missing))
+
+
+def _mirrored(motion: Motion, s: Statistics) -> CheckResult | None:
+    if s.bent_knees < _MIRRORED_COUNT or s.knees_forward > _MIRRORED_SHARE:
+        return None
+    return _warn(Check.MIRRORED, backward=1.0 - s.knees_forward, bent=s.bent_knees)
+
+
+def _low_camera_motion(motion: Motion, s: Statistics) -> CheckResult | None:
+    if s.view_speed_dps >= _SLOW_VIEW_DPS and s.view_span_deg >= _NARROW_VIEW_DEG:
+        return None
+    return _warn(Check.LOW_CAMERA_MOTION, span=s.view_span_deg, speed=s.view_speed_dps)
+
+
+def _high_error(motion: Motion, s: Statistics) -> CheckResult | None:
+    # The median: a few gross outliers in 2D, which the method ignores, are no reason to doubt the rest.
+    share = s.median_px / s.body_px
+    return _warn(Check.HIGH_ERROR, px=s.median_px, share=share) if share > _HIGH_ERROR else None
+
+
+def _outliers(motion: Motion, s: Statistics) -> CheckResult | None:
     error = motion.reprojection_px[np.isfinite(motion.reprojection_px)]
-    share = float(np.mean(error > _OUTLYING * m.body_px)) if error.size else 0.0
+    share = float(np.mean(error > _OUTLYING * s.body_px)) if error.size else 0.0
     if not share > _SOME_OUTLIERS:
         return None
-    return Finding(
-        "warning" if share > _MANY_OUTLIERS else "note",
-        "Outlying keypoints",
-        f"{share:.1%} of the keypoints lie further than {_OUTLYING:.0%} of the body's size from where the motion puts"
-        f" them. They raise the RMS ({m.rms_px:.1f} px) far above the median ({m.median_px:.1f} px).",
-    )
+    result = _warn if share > _MANY_OUTLIERS else _note
+    return result(Check.OUTLIERS, share=share, limit=_OUTLYING, rms=s.rms_px, median=s.median_px)
 
 
-def _missing(motion: Motion, m: Measures) -> Finding | None:
-    worst = [int(j) for j in np.argsort(-m.missing, kind="stable") if m.missing[j] > _MISSING_SHARE]
+def _missing_joints(motion: Motion, s: Statistics) -> CheckResult | None:
+    worst = [int(j) for j in np.argsort(-s.missing, kind="stable") if s.missing[j] > _MISSING_SHARE]
     if not worst:
         return None
-    named = ", ".join(f"{motion.joints[j]} {m.missing[j]:.0%}" for j in worst[:4])
+    named = ", ".join(f"{motion.joints[j]} {s.missing[j]:.0%}" for j in worst[:4])
     more = f" and {len(worst) - 4} more" if len(worst) > 4 else ""
-    text = f"Keypoints missing in more than {_MISSING_SHARE:.0%} of the frames: {named}{more}. Their 3D is filled in."
-    return Finding("warning", "Many missing joints", text)
+    return _warn(Check.MISSING_JOINTS, limit=_MISSING_SHARE, joints=named + more)
 
 
-def _short(_: Motion, m: Measures) -> Finding | None:
-    frames, seconds = len(m.times_s), float(m.times_s[-1])
+def _short(motion: Motion, s: Statistics) -> CheckResult | None:
+    frames, seconds = len(s.times_s), float(s.times_s[-1])
     if frames >= _SHORT_FRAMES and seconds >= _SHORT_S:
         return None
-    return Finding(
-        "warning",
-        "Short sequence",
-        f"{frames} frame{'s' if frames > 1 else ''} over {seconds:.1f} s. Joint adjustment needs many views of a"
-        " motion; such a result is close to single-view estimation.",
-    )
+    return _warn(Check.SHORT, frames=frames, seconds=seconds)
 
 
-def _bones(_: Motion, m: Measures) -> Finding | None:
-    if len(m.times_s) < 2 or not np.nanmax(m.bone_spread, initial=0.0) > _BONE_SPREAD:
+def _bone_lengths(motion: Motion, s: Statistics) -> CheckResult | None:
+    if len(s.times_s) < 2 or not np.nanmax(s.bone_spread, initial=0.0) > _BONE_SPREAD:
         return None
-    worst = int(np.nanargmax(m.bone_spread))
-    return Finding(
-        "note",
-        "Bones change their length",
-        f"{m.bones[worst]} varies by {m.bone_spread[worst]:.0%} (standard deviation), all by"
-        f" {float(mean_known(m.bone_spread, None)):.0%} on average. Nothing in the method fixes them; BVH export does.",
-    )
+    worst = int(np.nanargmax(s.bone_spread))
+    mean = float(mean_known(s.bone_spread, None))
+    return _note(Check.BONE_LENGTHS, bone=s.bones[worst], worst=float(s.bone_spread[worst]), mean=mean)
 
 
-def _vertical(motion: Motion, _: Measures) -> Finding | None:
-    if motion.frame == "world":
-        return None
-    return Finding(
-        "note",
-        "Vertical and path not known",
-        "Without camera telemetry each pose is as its own image saw it: up is the camera's up, and the body's"
-        " path is not known. The player stands it on its lowest joint.",
-    )
+def _no_vertical(motion: Motion, s: Statistics) -> CheckResult | None:
+    return None if motion.frame == "world" else _note(Check.NO_VERTICAL)
 
 
-def _scale(motion: Motion, _: Measures) -> Finding | None:
+def _assumed_scale(motion: Motion, s: Statistics) -> CheckResult | None:
     if motion.metric:
         return None
     height = motion.meta.get("assumed_height_m")
     assumed = f" of {height:.2f} m" if isinstance(height, int | float) else ""
-    source = motion.scale_source.replace("_", " ")
-    return Finding("note", "Scale assumed", f"Metres come from {source}{assumed}, not from a measurement.")
+    return _note(Check.ASSUMED_SCALE, source=motion.scale_source.replace("_", " "), height=assumed)

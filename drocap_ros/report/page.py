@@ -1,4 +1,4 @@
-"""``report.html``: one file that shows a motion and says how far to trust it; needs no network."""
+"""``report.html``: one file with a motion, its statistics and checks; needs no network."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import numpy as np
 
 from drocap_ros.motion import Motion
 from drocap_ros.report import plots
-from drocap_ros.report.checks import Finding, findings
+from drocap_ros.report.checks import CheckResult, Level, run_checks
+from drocap_ros.report.motion_images import MotionImages, read_motion_images
 from drocap_ros.report.page_data import page_data, script_json
-from drocap_ros.report.pictures import Pictures, read_pictures
-from drocap_ros.report.statistics import Measures, mean_known, measure
+from drocap_ros.report.statistics import Statistics, mean_known, motion_statistics
 from drocap_ros.skeleton import side_of
 
-_SCRIPTS = ("data.js", "scene.js", "picture.js", "player.js")
+_SCRIPTS = ("data.js", "scene.js", "image.js", "player.js")
 
 
 def save_report(path: str | Path, motion: Motion, *, video: Path | None = None, command: str = "") -> None:
@@ -27,21 +27,21 @@ def save_report(path: str | Path, motion: Motion, *, video: Path | None = None, 
 
     Parameters
     ----------
-    video : what the motion was reconstructed from, for its pictures; None = 2D keypoints alone
-    command : command line that made the report, shown beside the one in the motion's ``meta``
+    video : source of the motion, for its images; None = 2D keypoints alone
+    command : command line of the report, shown beside the one in the motion's ``meta``
 
     Raises
     ------
     InputError
         When the motion holds no pose or lacks the joints of a torso, or the video cannot be used.
     """
-    pictures = read_pictures(video, motion) if video is not None else None
-    Path(path).write_text(render_report(motion, pictures, command), encoding="utf-8")
+    images = read_motion_images(video, motion) if video is not None else None
+    Path(path).write_text(render_report(motion, images, command), encoding="utf-8")
 
 
-def render_report(motion: Motion, pictures: Pictures | None = None, command: str = "") -> str:
+def render_report(motion: Motion, images: MotionImages | None = None, command: str = "") -> str:
     """HTML of the report; see :func:`save_report`."""
-    m = measure(motion)
+    s = motion_statistics(motion)
     folder = files("drocap_ros.report") / "page"
     page = Template((folder / "page.html").read_text(encoding="utf-8"))
     name = str(motion.meta.get("input", "motion"))
@@ -49,12 +49,12 @@ def render_report(motion: Motion, pictures: Pictures | None = None, command: str
         title=escape(name),
         subtitle=escape(_subtitle(motion)),
         style=(folder / "style.css").read_text(encoding="utf-8"),
-        tiles="".join(_tile(*tile) for tile in _tiles(motion, m)),
-        findings=_findings(findings(motion, m)),
-        plots="".join(_figure(*figure) for figure in _plots(motion, m)),
+        tiles="".join(_tile(*tile) for tile in _tiles(motion, s)),
+        checks=_checks(run_checks(motion, s)),
+        plots="".join(_figure(*figure) for figure in _plots(motion, s)),
         provenance=_provenance(motion, command),
         parameters=escape(json.dumps(motion.meta, indent=1, sort_keys=True)),
-        data=script_json(page_data(motion, m, pictures)),
+        data=script_json(page_data(motion, s, images)),
         script="\n".join((folder / name).read_text(encoding="utf-8") for name in _SCRIPTS),
     )
 
@@ -69,14 +69,14 @@ def _tile(value: str, unit: str, label: str) -> str:
     return f'<div class="tile"><b>{escape(value)}<i>{escape(unit)}</i></b><span>{escape(label)}</span></div>'
 
 
-def _tiles(motion: Motion, m: Measures) -> list[tuple[str, str, str]]:
-    share = m.median_px / m.body_px
+def _tiles(motion: Motion, s: Statistics) -> list[tuple[str, str, str]]:
+    share = s.median_px / s.body_px
     return [
-        (f"{m.times_s[-1]:.1f}", "s", f"{len(m.times_s)} frames at {m.rate_hz:.3g} Hz"),
-        (f"{100 * m.seen.mean():.0f}", "%", "of frames with a subject"),
-        (_number(m.median_px, ".1f"), "px", f"median reprojection error, {_number(100 * share, '.1f')} % of the body"),
-        (_number(100 * float(mean_known(m.bone_spread, None)), ".1f"), "%", "spread of bone lengths"),
-        (f"{m.view_speed_dps:.0f}", "°/s", f"view of the body, {m.view_span_deg:.0f}° in all"),
+        (f"{s.times_s[-1]:.1f}", "s", f"{len(s.times_s)} frames at {s.rate_hz:.3g} Hz"),
+        (f"{100 * s.seen.mean():.0f}", "%", "of frames with a subject"),
+        (_number(s.median_px, ".1f"), "px", f"median reprojection error, {_number(100 * share, '.1f')} % of the body"),
+        (_number(100 * float(mean_known(s.bone_spread, None)), ".1f"), "%", "spread of bone lengths"),
+        (f"{s.view_speed_dps:.0f}", "°/s", f"view of the body, {s.view_span_deg:.0f}° in all"),
         ("measured" if motion.metric else "assumed", "", f"scale, from {motion.scale_source.replace('_', ' ')}"),
     ]
 
@@ -85,12 +85,11 @@ def _number(value: float, form: str) -> str:
     return format(value, form) if np.isfinite(value) else "-"
 
 
-def _findings(found: list[Finding]) -> str:
-    if not any(finding.level == "warning" for finding in found):
-        found = [Finding("good", "No warnings", "None of the automatic checks doubts this motion."), *found]
-    return "".join(
-        f'<li class="{finding.level}"><b>{escape(finding.title)}</b> {escape(finding.text)}</li>' for finding in found
-    )
+def _checks(results: list[CheckResult]) -> str:
+    items = [(result.level.value, result.title, result.text) for result in results]
+    if not any(result.level is Level.WARNING for result in results):
+        items.insert(0, ("good", "No warnings", "No automatic check doubts this motion."))
+    return "".join(f'<li class="{kind}"><b>{escape(title)}</b> {escape(text)}</li>' for kind, title, text in items)
 
 
 def _figure(title: str, caption: str, svg: str) -> str:
@@ -101,26 +100,25 @@ def _figure(title: str, caption: str, svg: str) -> str:
     )
 
 
-def _plots(motion: Motion, m: Measures) -> list[tuple[str, str, str]]:
+def _plots(motion: Motion, s: Statistics) -> list[tuple[str, str, str]]:
     sides = [side_of(joint, motion.joints) for joint in motion.joints]
-    bone_sides = [side_of(bone.split(" - ")[1], motion.joints) for bone in m.bones]
+    bone_sides = [side_of(bone.split(" - ")[1], motion.joints) for bone in s.bones]
     seconds = _stages(motion.meta.get("seconds"))
     out = [
         (
             "Reprojection error",
             "Distance of the projected 3D joints from the 2D keypoints, RMS over joints.",
-            plots.line_plot(m.times_s, m.error_px, unit="px", series="error"),
+            plots.line_plot(s.times_s, s.error_px, unit="px", series="error"),
         ),
         (
             "View of the body",
-            "Azimuth of the camera as the body sees it: 0° in front, 90° from its left. Its change is what makes"
-            " depth visible.",
-            plots.line_plot(m.times_s, m.view_deg, unit="°", series="view", from_zero=False),
+            "Azimuth of the camera from the body: 0° in front, 90° from its left. Its change makes depth visible.",
+            plots.line_plot(s.times_s, s.view_deg, unit="°", series="view", from_zero=False),
         ),
         (
             "Bone lengths",
             "Median, and the range of 90 % of the frames. A bone that changes its length is a sign of depth errors.",
-            plots.range_plot(m.bones, 100 * m.bone_lengths_m, unit="cm", classes=bone_sides),
+            plots.range_plot(s.bones, 100 * s.bone_lengths_m, unit="cm", classes=bone_sides),
         ),
         (
             "Confidence per joint",
@@ -130,17 +128,17 @@ def _plots(motion: Motion, m: Measures) -> list[tuple[str, str, str]]:
         (
             "Error per joint",
             "Reprojection error of each joint, RMS over the frames, px.",
-            plots.bar_plot(motion.joints, m.joint_error_px, form="{:.1f} px", classes=sides),
+            plots.bar_plot(motion.joints, s.joint_error_px, form="{:.1f} px", classes=sides),
         ),
     ]
     if seconds:
-        caption = "Seconds per stage; the total leaves the 2D poses out."
+        caption = "Seconds per stage; the total excludes the 2D poses."
         out.append(("Time", caption, plots.bar_plot(list(seconds), np.array([*seconds.values()]), form="{:.2f} s")))
     return out
 
 
 def _stages(seconds: Any) -> dict[str, float]:
-    """Seconds per stage in the order in which the stages run; what is no number is left out."""
+    """Seconds per stage in the order of the stages; values that are no numbers are left out."""
     if not isinstance(seconds, dict):
         return {}
     known = ("pose2d", "initial", "ba", "total")

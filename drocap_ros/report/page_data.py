@@ -1,4 +1,4 @@
-"""The numbers that the page's player draws, rounded to what a screen can show."""
+"""The numbers that the page's player draws, rounded to the resolution of a screen."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.motion import Motion, upright_joints
-from drocap_ros.report.pictures import Pictures
-from drocap_ros.report.statistics import Measures, camera_axes
+from drocap_ros.report.motion_images import MotionImages
+from drocap_ros.report.statistics import Statistics, camera_axes
 from drocap_ros.skeleton import side_of
 
-#: Poses in the page; of longer motions every n-th is shown.
+#: Most poses in the page; of longer motions every n-th is shown.
 MAX_POSES = 3000
 
 
-def page_data(motion: Motion, m: Measures, pictures: Pictures | None) -> dict[str, Any]:
+def page_data(motion: Motion, s: Statistics, images: MotionImages | None) -> dict[str, Any]:
     """JSON-compatible data: integers, row-major, null where unknown.
 
     ``pose`` mm and ``camera`` (right, forward; thousandths) in axes with z up; ``keypoints`` tenths of a px;
@@ -31,31 +31,31 @@ def page_data(motion: Motion, m: Measures, pictures: Pictures | None) -> dict[st
         "sides": [side_of(name, motion.joints) for name in motion.joints],
         "world": motion.frame == "world",
         "frames": shown.tolist(),
-        "times": _integers(m.times_s[shown], 1000),
+        "times": _integers(s.times_s[shown], 1000),
         "pose": _integers(upright_joints(motion)[shown], 1000),
         "camera": _integers(axes, 1000),
-        "heading": _integers(m.heading_rad[shown], 1000),
+        "heading": _integers(s.heading_rad[shown], 1000),
         "keypoints": _integers(motion.keypoints[shown], 10),
-        "series": {"error": _numbers(m.error_px[shown]), "view": _numbers(m.view_deg[shown])},
-        "picture": None if pictures is None else _pictures(pictures, shown),
+        "series": {"error": _numbers(s.error_px[shown]), "view": _numbers(s.view_deg[shown])},
+        "image": None if images is None else _images(images, shown),
     }
 
 
 def script_json(data: Any) -> str:
-    """JSON that can stand inside a script element: nothing in it ends the element or a line."""
+    """JSON for a script element: no character ends the element or a line."""
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     for character in "<>&\u2028\u2029":
         text = text.replace(character, f"\\u{ord(character):04x}")
     return text
 
 
-def _pictures(pictures: Pictures, shown: np.ndarray) -> dict[str, Any]:
-    """Pictures with the place of their frame among those shown, each place once."""
-    places, first = np.unique(np.searchsorted(shown, pictures.frames).clip(0, len(shown) - 1), return_index=True)
+def _images(images: MotionImages, shown: np.ndarray) -> dict[str, Any]:
+    """Images with the index of their frame among those shown, each index once."""
+    places, first = np.unique(np.searchsorted(shown, images.frames).clip(0, len(shown) - 1), return_index=True)
     return {
-        "box": list(pictures.box),
+        "box": list(images.box),
         "places": places.tolist(),
-        "jpeg": [base64.b64encode(pictures.jpegs[i]).decode() for i in first],
+        "jpeg": [base64.b64encode(images.jpegs[i]).decode() for i in first],
     }
 
 

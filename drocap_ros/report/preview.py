@@ -1,4 +1,4 @@
-"""``preview.png``: a motion at a glance, as in the paper's figures."""
+"""``preview.png``: poses of a motion in rows, as in the paper's figures."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def save_preview(path: Path, motion: Motion) -> None:
             _draw(figure.add_subplot(grid[0, column]), flat * (1, -1), motion, None, f"{seconds:.1f} s")
             _draw(figure.add_subplot(grid[1, column]), body[frame][:, [0, 2]], motion, limit, "")
             _draw(figure.add_subplot(grid[2, column]), body[frame][:, [1, 2]], motion, limit, "")
-        for row, name in enumerate(("2D keypoints", "3D, as seen", "3D, from the side")):
+        for row, name in enumerate(("2D keypoints", "3D, camera's view", "3D, from the side")):
             figure.text(0.002, 0.86 - 0.265 * row, name, rotation=90, va="center", fontsize=9)
         _plot_error(figure.add_subplot(grid[3, :]), motion)
         figure.savefig(path, dpi=100)
@@ -46,7 +46,7 @@ def _upright_body(motion: Motion) -> tuple[np.ndarray, float]:
     if motion.frame == "camera":
         body = centred[..., [0, 2, 1]] * (1, 1, -1)
     else:
-        # Turn about the vertical only, so that the picture keeps gravity: right is the camera's right.
+        # Turn about the vertical only, so that the figure keeps gravity: right is the camera's right.
         right = motion.camera_rotation[:, 0] * (1, 1, 0)
         right = right / np.maximum(np.linalg.norm(right, axis=1, keepdims=True), 1e-9)
         up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), right.shape)

@@ -1,4 +1,4 @@
-"""What can be said about a motion without a ground truth: the numbers behind the report."""
+"""Statistics of a motion without a ground truth: the numbers behind the report."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from drocap_ros.skeleton import RIGID_BONES, JointSet, indices
 
 #: Directions of view and of the body are averaged over this time.
 _SMOOTH_S = 0.5
-#: A knee counts as bent from this angle on; below it the side to which it bends is noise.
+#: A knee counts as bent from this angle on; below it the direction of the bend is noise.
 _BENT_DEG = 25.0
 _TORSO = ("pelvis", "neck", "lhip", "rhip", "lshoulder", "rshoulder")
 
 
 @dataclass(frozen=True)
-class Measures:
-    """Numbers of one motion of F frames, P joints, B rigid bones; NaN where nothing is known.
+class Statistics:
+    """Statistics of one motion of F frames, P joints, B rigid bones; NaN where nothing is known.
 
-    times_s : (F,) s from the first frame
+    times_s : (F,) s since the first frame
     seen : (F,) bool, any keypoint found
     missing : (P,) share of frames without the joint's keypoint
     error_px : (F,) root mean square over joints of the reprojection error
@@ -31,11 +31,11 @@ class Measures:
     body_px : median diagonal of the keypoints' bounding box, at least 1
     bones, bone_lengths_m : B names; (F, B) lengths
     bone_spread : (B,) standard deviation over mean of each bone's length
-    view_deg : (F,) azimuth of the camera as the body sees it (0 in front, positive to its left), unwrapped
+    view_deg : (F,) azimuth of the camera from the body (0 in front, positive to its left), unwrapped
     view_speed_dps, view_span_deg : median speed and range of that
-    heading_rad : (F,) direction into which the body faces, about the vertical
+    heading_rad : (F,) direction that the body faces, about the vertical
     knees_forward : share of bent knees that bend forward; NaN where none is bent
-    bent_knees : number of bent knees that were judged
+    bent_knees : number of bent knees
     """
 
     times_s: np.ndarray
@@ -62,8 +62,8 @@ class Measures:
         return float(1.0 / np.median(np.diff(self.times_s))) if len(self.times_s) > 1 else 0.0
 
 
-def measure(motion: Motion) -> Measures:
-    """Numbers of a motion.
+def motion_statistics(motion: Motion) -> Statistics:
+    """Statistics of a motion.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def measure(motion: Motion) -> Measures:
     indices(motion.joints, _TORSO)
     if not np.isfinite(motion.joints3d).all(axis=2).any():
         raise InputError(
-            "motion: expected 3D joints in at least one frame, got NaN in all of them; is the person in view?"
+            "motion: expected 3D joints in at least one frame, got NaN in all of them; check that the person is in view"
         )
     times = (motion.stamp_ns - motion.stamp_ns[0]) * 1e-9
     found = np.isfinite(motion.keypoints).all(axis=2)
@@ -84,7 +84,7 @@ def measure(motion: Motion) -> Measures:
     speed = np.abs(np.gradient(view, times)) if len(times) > 1 else np.zeros(1)
     bones, lengths = _bones(joints, motion)
     forward, judged = _knees(joints, motion, torso[..., 0])
-    return Measures(
+    return Statistics(
         times_s=times,
         seen=found.any(axis=1),
         missing=1.0 - found.mean(axis=0),
@@ -149,7 +149,7 @@ def _view_azimuth(torso: np.ndarray, forward: np.ndarray, times_s: np.ndarray) -
 
 
 def _heading(torso: np.ndarray, times_s: np.ndarray) -> np.ndarray:
-    # Left across the vertical rather than forward: a body that bends forward keeps its left.
+    # Left, not forward: a body that bends forward keeps its left.
     left = smooth(torso[..., 1], times_s)
     return np.unwrap(np.arctan2(-left[:, 0], left[:, 1]))
 
@@ -194,7 +194,7 @@ def _knees(joints: np.ndarray, motion: Motion, forward: np.ndarray) -> tuple[flo
             joints[:, indices(motion.joints, (f"{side}hip", f"{side}knee", f"{side}ankle"))], 1, 0
         )
         thigh, shank = _unit(knee - hip), _unit(ankle - knee)
-        # The knee lies off the line from hip to ankle, to the side of thigh minus shank.
+        # The knee lies off the line from hip to ankle, in the direction of thigh minus shank.
         judged = np.degrees(np.arccos(np.clip(np.sum(thigh * shank, axis=1), -1.0, 1.0))) > _BENT_DEG
         bent += int(judged.sum())
         ahead += int((np.sum((thigh - shank) * forward, axis=1)[judged] > 0).sum())

@@ -18,7 +18,7 @@ from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.nodes import visualizer
 from drocap_ros.observation import PoseObservation
-from drocap_ros.report.visualizer_config import VisualizerConfig
+from drocap_ros.view.visualizer_config import VisualizerConfig
 from drocap_ros.ros import rep155 as humans
 from drocap_ros.ros.conversions import header_at, pose2d_to_ros, pose3d_to_ros
 from drocap_ros.ros.topics import RESULT_QOS, TFMessage

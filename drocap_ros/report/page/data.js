@@ -45,8 +45,8 @@ function meanAround(list, place, half) {
 }
 
 /**
- * Height of the floor in each frame. In the world it is one: where the lowest joints of most frames are.
- * In the camera's frame the height of the body is not known, and it is shown standing on its lowest joint.
+ * Height of the floor in each frame. In the world it is constant, below the lowest joints of most frames.
+ * In the camera's frame the height of the body is not known; it stands on its lowest joint.
  */
 const floors = (() => {
   const lowest = Array.from({ length: motion.count }, (_, f) => {
@@ -61,7 +61,7 @@ const floors = (() => {
   });
 })();
 
-/** What the views look at in each frame: above the floor, where the root is, smoothed over time. */
+/** Target of the views in each frame: above the floor at the root, smoothed over time. */
 const targets = (() => {
   const roots = Array.from({ length: motion.count }, (_, f) => jointAt(f, motion.root));
   const columns = [0, 1].map((axis) => roots.map((p) => p[axis]));

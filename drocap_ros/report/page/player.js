@@ -5,7 +5,7 @@ const state = { frame: 0, playing: false, speed: 1, overlay: true, view: "novel"
 const turned = { azimuth: motion.heading[0] + 0.75, elevation: 0.3 };
 const ELEVATION = 0.09;
 
-/** Direction from which a named view looks in a frame. */
+/** Viewing direction of a named view in a frame. */
 function viewOf(name, frame) {
   const heading = motion.heading[frame];
   if (name === "front") return { azimuth: heading, elevation: ELEVATION };
@@ -22,7 +22,7 @@ function draw() {
   drawScene(byId("main"), frame, { ...viewOf(state.view, frame), zoom: state.zoom }, colours);
   drawScene(byId("front"), frame, viewOf("front", frame), colours);
   drawScene(byId("profile"), frame, viewOf("profile", frame), colours);
-  drawPicture(byId("image"), frame, state.overlay, colours, redraw);
+  drawImagePane(byId("image"), frame, state.overlay, colours, redraw);
   byId("scrub").value = frame;
   byId("clock").textContent = `${motion.times[frame].toFixed(2)} s · frame ${motion.frames[frame]}`;
   for (const plot of plots) plot.move(frame);
@@ -38,7 +38,7 @@ function show(frame) {
   redraw();
 }
 
-/** Last frame that has begun at a time. */
+/** Last frame at or before a time. */
 function frameAt(seconds) {
   let low = 0, high = motion.count - 1;
   while (low < high) {
@@ -59,7 +59,7 @@ function play(on) {
     if (expected >= 0 && expected !== state.frame) clock = motion.times[state.frame]; // moved by hand
     clock += ((now - before) / 1000) * state.speed;
     before = now;
-    // The last frame stays as long as the others do.
+    // The last frame lasts as long as the others.
     if (clock > last + last / (motion.count - 1)) clock = 0;
     expected = frameAt(clock);
     if (expected !== state.frame) show(expected);
@@ -77,7 +77,7 @@ function setView(name) {
   redraw();
 }
 
-/** Turning by hand starts from what is seen and leaves the named views. */
+/** Turning by hand starts from the present view and switches to the free one. */
 function turn(dx, dy) {
   if (state.view !== "novel") {
     const { azimuth, elevation } = viewOf(state.view, state.frame);
@@ -148,7 +148,7 @@ function listen() {
   byId("overlay").addEventListener("change", (event) => { state.overlay = event.target.checked; redraw(); });
   for (const button of document.querySelectorAll("[data-view]")) button.addEventListener("click", () => setView(button.dataset.view));
 
-  // A button that was clicked gives the keys back to the player; one reached by keyboard keeps them.
+  // A clicked button returns the keys to the player; a button focused by keyboard keeps them.
   document.addEventListener("click", (event) => {
     const active = document.activeElement;
     if (event.detail && active.matches("button, [type=checkbox]")) active.blur();
@@ -182,7 +182,7 @@ function listen() {
 }
 
 listen();
-if (!pictures) {
+if (!images) {
   byId("image-tag").textContent = "2D keypoints";
   byId("overlay").closest("label").hidden = true;
 }

@@ -6,7 +6,7 @@ const THICKNESS = { hip: 0.05, knee: 0.075, ankle: 0.055, neck: 0.055, head: 0.0
 
 const thicknessOf = (name) => THICKNESS[name.replace(/^[lr]/, "")] ?? THICKNESS[name] ?? 0.04;
 
-/** Colours of the style sheet as they are now, light or dark. */
+/** Present colours of the style sheet, light or dark. */
 function palette() {
   const style = getComputedStyle(document.documentElement);
   const read = (name) => style.getPropertyValue(`--${name}`).trim();
@@ -95,7 +95,7 @@ function drawShadow(context, project, frame, colours) {
   context.restore();
 }
 
-/** The body's parts in one frame, each with how near it is and how to draw it. */
+/** The body's parts in one frame, each with its nearness and its drawing function. */
 function bodyParts(context, project, frame, colours) {
   const parts = [];
   const places = motion.joints.map((_, joint) => {

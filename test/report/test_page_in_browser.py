@@ -1,4 +1,4 @@
-"""The report in a real browser: it draws, answers to keys, mouse and touch, and fits a narrow screen."""
+"""The report in a real browser: it draws, reacts to keys, mouse and touch, and fits a narrow screen."""
 
 import dataclasses
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from browser import Browser, chromium
 
+from drocap_ros.report.motion_images import MotionImages
 from drocap_ros.report.page import render_report, save_report
-from drocap_ros.report.pictures import Pictures
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="no Chromium or Chrome on this machine")
 
@@ -21,15 +21,15 @@ def browser(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pages(person, reported_in_camera, one_frame, tmp_path_factory):
-    """A report with pictures, one without, one in the camera's frame, one of a single frame, one with gaps."""
+    """A report with images, one without, one in the camera's frame, one of a single frame, one with gaps."""
     import cv2
 
     folder = tmp_path_factory.mktemp("pages")
     grey = cv2.imencode(".jpg", np.full((200, 150, 3), 90, np.uint8))[1].tobytes()
     low, high = np.nanmin(person.keypoints, axis=(0, 1)), np.nanmax(person.keypoints, axis=(0, 1))
     box = (*(int(v) for v in low - 20), *(int(v) for v in high + 20))
-    pictures = Pictures(tuple(range(0, 60, 3)), (grey,) * 20, box, (150, 200))
-    (folder / "pictures.html").write_text(render_report(person, pictures), encoding="utf-8")
+    images = MotionImages(tuple(range(0, 60, 3)), (grey,) * 20, box, (150, 200))
+    (folder / "images.html").write_text(render_report(person, images), encoding="utf-8")
     joints = person.joints3d.copy()
     joints[10:20] = np.nan
     joints[30, 3] = np.nan
@@ -52,7 +52,7 @@ def drawn(browser, canvas):
     )
 
 
-def picture_of(browser, canvas):
+def pixels_of(browser, canvas):
     return browser.run(f'document.getElementById("{canvas}").toDataURL()')
 
 
@@ -60,9 +60,9 @@ def pressed(browser):
     return browser.run('document.querySelector("[data-view][aria-pressed=true]").dataset.view')
 
 
-@pytest.mark.parametrize("name", ["pictures", "plain", "camera", "single", "gaps"])
+@pytest.mark.parametrize("name", ["images", "plain", "camera", "single", "gaps"])
 @pytest.mark.parametrize("width", [1280, 800, 400])
-def test_it_draws_without_errors_network_or_overflow(browser, pages, name, width):
+def test_the_page_draws_without_errors_network_or_overflow(browser, pages, name, width):
     browser.open(pages / f"{name}.html", width, 900)
     for canvas in ("main", "front", "profile", "image"):
         assert drawn(browser, canvas) > 300, canvas
@@ -83,7 +83,7 @@ def test_frames_without_a_pose_are_shown_empty(browser, pages):
     assert browser.errors == []
 
 
-def test_keys(browser, pages):
+def test_keys_step_play_and_choose_views(browser, pages):
     browser.open(pages / "plain.html", 1280, 900)
     frame = lambda: browser.run("state.frame")  # noqa: E731
     assert (frame(), pressed(browser)) == (0, "novel")
@@ -102,7 +102,7 @@ def test_keys(browser, pages):
     for key, view in (("1", "front"), ("2", "profile"), ("4", "camera"), ("3", "novel")):
         browser.key(key)
         assert pressed(browser) == view
-        shots.add(picture_of(browser, "main"))
+        shots.add(pixels_of(browser, "main"))
     assert len(shots) == 4
     browser.key(" ")
     assert browser.run("state.playing")
@@ -116,7 +116,7 @@ def test_keys(browser, pages):
     assert browser.errors == []
 
 
-def test_playing_keeps_the_motions_own_time(browser, pages):
+def test_playing_keeps_the_time_of_the_motion(browser, pages):
     browser.open(pages / "plain.html", 1280, 900)
     moved = browser.run(
         """(async () => { play(true); const begin = performance.now();
@@ -127,23 +127,23 @@ def test_playing_keeps_the_motions_own_time(browser, pages):
     assert moved[1] == pytest.approx(moved[0], abs=0.3)
 
 
-def test_mouse_and_wheel(browser, pages):
+def test_mouse_turns_and_wheel_zooms(browser, pages):
     browser.open(pages / "plain.html", 1280, 900)
     box = browser.run('(({x, y, width, height}) => [x, y, width, height])(byId("main").getBoundingClientRect())')
     x, y = box[0] + box[2] / 2, box[1] + box[3] / 2
-    before = picture_of(browser, "main")
+    before = pixels_of(browser, "main")
     browser.key("1")
     browser.mouse("mousePressed", x, y, button="left", buttons=1, clickCount=1)
     browser.mouse("mouseMoved", x + 120, y + 30, button="left", buttons=1)
     browser.mouse("mouseReleased", x + 120, y + 30, button="left", clickCount=1)
     browser.settle()
     assert pressed(browser) == "novel"
-    turned = picture_of(browser, "main")
+    turned = pixels_of(browser, "main")
     assert turned != before
     browser.mouse("mouseWheel", x, y, deltaX=0, deltaY=-300)
     browser.settle()
     assert browser.run("state.zoom") > 1.2
-    assert picture_of(browser, "main") != turned
+    assert pixels_of(browser, "main") != turned
     plot = browser.run(
         """(() => { const s = document.querySelector("svg.time"); s.scrollIntoView();
         const b = s.getBoundingClientRect(); return [b.x, b.y, b.width, b.height]; })()"""
@@ -194,19 +194,19 @@ def test_two_fingers_zoom(browser, pages):
     assert browser.run("state.zoom") > 1.5
 
 
-def test_the_picture_and_its_keypoints_stay_together(browser, pages):
-    browser.open(pages / "pictures.html", 1280, 900)
+def test_keypoints_are_drawn_on_their_own_image(browser, pages):
+    browser.open(pages / "images.html", 1280, 900)
     browser.run("show(31)")
     browser.settle()
-    assert browser.run("pictures.places[pictures.nearest(31)]") == 30
-    with_overlay = picture_of(browser, "image")
+    assert browser.run("images.places[images.nearest(31)]") == 30
+    with_overlay = pixels_of(browser, "image")
     browser.run('byId("overlay").click()')
     browser.settle()
-    assert picture_of(browser, "image") != with_overlay
+    assert pixels_of(browser, "image") != with_overlay
     browser.run("show(30)")
     browser.run('byId("overlay").click()')
     browser.settle()
-    assert picture_of(browser, "image") == with_overlay
+    assert pixels_of(browser, "image") == with_overlay
 
 
 def test_dark_and_light_differ(browser, pages):

@@ -1,4 +1,4 @@
-"""The report's file: one piece, valid, safe, without a link to anywhere."""
+"""The report's file: one piece, valid, safe, without links."""
 
 import dataclasses
 import json
@@ -58,7 +58,7 @@ def data_of(html):
     return json.loads(Page(html).scripts["motion"])
 
 
-def test_it_is_one_file_that_asks_for_nothing(html):
+def test_the_page_is_one_file_without_requests(html):
     page = Page(html)
     names = {name for name, _ in page.attributes}
     assert not names & {"src", "href", "srcset", "action"}
@@ -68,7 +68,7 @@ def test_it_is_one_file_that_asks_for_nothing(html):
     )
 
 
-def test_the_data_are_the_motion(html, person):
+def test_the_data_equal_the_motion(html, person):
     data = data_of(html)
     shape = person.joints3d.shape
     np.testing.assert_allclose(np.reshape(data["pose"], shape) / 1000, person.joints3d, atol=0.00051)
@@ -80,7 +80,7 @@ def test_the_data_are_the_motion(html, person):
     assert data["sides"][BODY_15.index("head")] == "middle"
 
 
-def test_words_commands_and_versions_are_on_the_page(html, person):
+def test_checks_commands_and_versions_are_on_the_page(html, person):
     text = Page(html).text
     for words in (
         "walk.mp4",
@@ -97,7 +97,7 @@ def test_words_commands_and_versions_are_on_the_page(html, person):
         assert words in text
 
 
-def test_text_from_outside_cannot_become_markup(person):
+def test_text_of_the_motion_is_escaped(person):
     evil = '</script><script>alert(1)</script><img src=x onerror="alert(2)">\u2028$title'
     joints = tuple(evil if name == "head" else name for name in person.joints)
     motion = dataclasses.replace(
@@ -114,7 +114,7 @@ def test_text_from_outside_cannot_become_markup(person):
     assert evil in page.text
 
 
-def test_meta_of_other_makers_does_no_harm(person):
+def test_unusual_meta_is_rendered(person):
     odd = {"seconds": [1, 2], "versions": "all", "iterations": None, "input": 7, "method": None, "command": ["a"]}
     assert "Bone lengths" in render_report(dataclasses.replace(person, meta=odd))
     assert "Bone lengths" in render_report(dataclasses.replace(person, meta={}))
@@ -136,11 +136,11 @@ def test_unknown_joints_are_null_and_lines_are_broken(person):
     assert "NaN" not in html.split("<script")[0]
 
 
-def test_one_frame_is_a_report_too(one_frame):
+def test_a_single_frame_is_rendered(one_frame):
     assert data_of(render_report(one_frame))["times"] == [0]
 
 
-def test_nothing_known_is_refused(person):
+def test_a_motion_without_poses_or_torso_is_refused(person):
     nothing = dataclasses.replace(person, joints3d=np.full_like(person.joints3d, np.nan))
     with pytest.raises(InputError, match="NaN in all of them"):
         render_report(nothing)
@@ -153,14 +153,14 @@ def test_bodies_of_any_size_are_drawn(person, size):
     assert "Bone lengths" in render_report(dataclasses.replace(person, joints3d=size * person.joints3d))
 
 
-def test_no_keypoints_at_all(person):
+def test_a_motion_without_keypoints_is_rendered(person):
     unknown = np.full_like(person.keypoints, np.nan)
     error = np.full_like(person.reprojection_px, np.nan)
     html = render_report(dataclasses.replace(person, keypoints=unknown, reprojection_px=error))
     assert "Many missing joints" in html
 
 
-def test_an_hour_stays_small(person):
+def test_an_hour_gives_a_page_of_less_than_two_megabytes(person):
     """108,000 frames: every n-th pose is shown, the plots average over all."""
     times = 1800
     many = {

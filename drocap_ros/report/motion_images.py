@@ -1,4 +1,4 @@
-"""Pictures of the subject for a report: few, cropped, small."""
+"""Images of the subject out of the source of a motion: few, cropped and small for a report, or all."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.motion import Motion
 from drocap_ros.perception.sources import Frame, open_source
-from drocap_ros.recording import session_reader
-from drocap_ros.recording.session import is_recording, open_session
+from drocap_ros.recording.image_messages import read_images
+from drocap_ros.recording.open_session import is_recording, open_session
 
-MAX_PICTURES = 300
-#: Of all pictures together, as base64 in the page.
+MAX_IMAGES = 300
+#: Of all images together, as base64 in the page.
 MAX_BYTES = 8_000_000
 _LONG_SIDE = 640
 _QUALITIES = (75, 60, 45, 30)
-#: Room around the subject, as a share of the size of where it goes.
+#: Margin of the crop, as a share of its size.
 _MARGIN = 0.12
 
 
 @dataclass(frozen=True)
-class Pictures:
-    """JPEG pictures of some frames of a motion.
+class MotionImages:
+    """JPEG images of some frames of a motion.
 
-    frames : index of each picture's frame in the motion, increasing
+    frames : index of each image's frame in the motion, increasing
     jpegs : as many JPEG files
-    box : x_min, y_min, x_max, y_max px of the part of the image that they show
-    size : width, height px of the pictures
+    box : x_min, y_min, x_max, y_max px of the crop
+    size : width, height px of the JPEG images
     """
 
     frames: tuple[int, ...]
@@ -40,8 +40,8 @@ class Pictures:
     size: tuple[int, int]
 
 
-def has_pictures(path: Path) -> bool:
-    """Whether an input of ``drocap reconstruct`` holds pictures that a report can show."""
+def has_images(path: Path) -> bool:
+    """Whether an input of ``drocap reconstruct`` holds images for a report."""
     if path.suffix == ".npz":
         return False
     if not is_recording(path):
@@ -50,17 +50,17 @@ def has_pictures(path: Path) -> bool:
         return session.has_images
 
 
-def read_pictures(path: Path, motion: Motion) -> Pictures:
-    """Pictures of a motion out of the video, folder or recording that it was reconstructed from.
+def read_motion_images(path: Path, motion: Motion) -> MotionImages:
+    """Images of a motion out of its video, folder or recording.
 
-    Frames are matched by their stamps; where the two clocks share nothing, both start with their first frame.
+    Frames are matched by their stamps; without a common clock both start with their first frame.
 
     Raises
     ------
     InputError
-        When there are no pictures, or none at the motion's times.
+        When there are no images, or none at the motion's times.
     """
-    count = min(MAX_PICTURES, len(motion.stamp_ns))
+    count = min(MAX_IMAGES, len(motion.stamp_ns))
     wanted = np.unique(np.linspace(0, len(motion.stamp_ns) - 1, count).round().astype(int))
     encode = None
     frames: list[int] = []
@@ -71,17 +71,17 @@ def read_pictures(path: Path, motion: Motion) -> Pictures:
             frames.append(index)
             jpegs.append(encode(image))
     if encode is None:
-        raise _no_pictures(path)
-    return Pictures(tuple(frames), tuple(jpegs), encode.box, encode.size)
+        raise _no_images(path)
+    return MotionImages(tuple(frames), tuple(jpegs), encode.box, encode.size)
 
 
-def each_picture(path: Path, motion: Motion) -> Iterator[tuple[int, np.ndarray]]:
-    """Frame of the motion and image (H, W, 3) uint8 BGR of it, for every frame that has one; matched as above.
+def each_image(path: Path, motion: Motion) -> Iterator[tuple[int, np.ndarray]]:
+    """Index and image (H, W, 3) uint8 BGR of every frame that has one; matched as in :func:`read_motion_images`.
 
     Raises
     ------
     InputError
-        When there are no pictures, or none at the motion's times.
+        When there are no images, or none at the motion's times.
     """
     found = False
     with _opened(path) as source:
@@ -89,11 +89,11 @@ def each_picture(path: Path, motion: Motion) -> Iterator[tuple[int, np.ndarray]]
             found = True
             yield index, image
     if not found:
-        raise _no_pictures(path)
+        raise _no_images(path)
 
 
-def _no_pictures(path: Path) -> InputError:
-    return InputError(f"{path}: expected pictures at the motion's times, found none; name the video it was made from")
+def _no_images(path: Path) -> InputError:
+    return InputError(f"{path}: expected images at the motion's times, found none; name the source of the motion")
 
 
 @contextlib.contextmanager
@@ -102,21 +102,21 @@ def _opened(path: Path) -> Iterator[Iterable[Frame]]:
         raise InputError(f"{path}: no such file or folder; check the path")
     if is_recording(path):
         with open_session(path) as session:
-            yield session_reader.read_images(session)
+            yield read_images(session)
     else:
         with open_source(path) as source:
             yield source
 
 
 def _matched(source: Iterable[Frame], stamp_ns: np.ndarray, wanted: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Images of the wanted frames, each the nearest to its stamp and no further from it than half a frame."""
+    """Images of the wanted frames: the nearest to each stamp within half a frame."""
     half = int(np.median(np.diff(stamp_ns)) / 2) if len(stamp_ns) > 1 else 50_000_000
-    left = [int(index) for index in wanted]
+    waiting = [int(index) for index in wanted]
     offset: int | None = None
     before: tuple[int, np.ndarray] | None = None
 
     def nearest(candidates: list[tuple[int, np.ndarray] | None]) -> Iterator[tuple[int, np.ndarray]]:
-        index = left.pop(0)
+        index = waiting.pop(0)
         target = int(stamp_ns[index])
         near = [c for c in candidates if c is not None and abs(c[0] - target) <= half]
         if near:
@@ -127,12 +127,12 @@ def _matched(source: Iterable[Frame], stamp_ns: np.ndarray, wanted: np.ndarray) 
             elsewhere = not stamp_ns[0] - half <= frame.stamp_ns <= stamp_ns[-1] + half
             offset = int(stamp_ns[0]) - frame.stamp_ns if elsewhere else 0
         now = (frame.stamp_ns + offset, frame.image)
-        while left and now[0] >= int(stamp_ns[left[0]]):
+        while waiting and now[0] >= int(stamp_ns[waiting[0]]):
             yield from nearest([before, now])
-        if not left:
+        if not waiting:
             return
         before = now
-    if left:
+    if waiting:
         yield from nearest([before])
 
 
@@ -154,7 +154,7 @@ class _Encoder:
         x0, y0, x1, y1 = self.box
         small = cv2.resize(image[y0:y1, x0:x1], self.size, interpolation=cv2.INTER_AREA)
         data = b""
-        # Coarser, then smaller: a picture that is still too big at the lowest quality loses pixels.
+        # Quality first, then size.
         for shrink in (1, 2, 4):
             size = (max(1, self.size[0] // shrink), max(1, self.size[1] // shrink))
             reduced = small if shrink == 1 else cv2.resize(small, size, interpolation=cv2.INTER_AREA)
@@ -166,7 +166,7 @@ class _Encoder:
 
 
 def _crop(keypoints: np.ndarray, width: int, height: int) -> tuple[int, int, int, int]:
-    """Where the subject goes, outliers left aside, with a margin; the whole image where it is not known."""
+    """Bounding box of the subject over all frames, without outliers, with a margin; the whole image if unknown."""
     known = keypoints[np.isfinite(keypoints).all(axis=2)]
     if len(known) < 4:
         return 0, 0, width, height

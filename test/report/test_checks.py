@@ -1,4 +1,4 @@
-"""The report's remarks, on motions of which we know what is wrong with them."""
+"""The report's checks, on motions with known faults."""
 
 import dataclasses
 
@@ -6,33 +6,41 @@ import numpy as np
 import pytest
 
 from drocap_ros.motion import upright_joints
-from drocap_ros.report.checks import findings
-from drocap_ros.report.statistics import measure, smooth
+from drocap_ros.report.checks import _WORDS, Check, Level, run_checks
+from drocap_ros.report.statistics import motion_statistics, smooth
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15
 
 
-def titles(motion, level=None):
-    found = findings(motion, measure(motion))
-    return [f.title for f in found if level in (None, f.level)]
+def results(motion):
+    return run_checks(motion, motion_statistics(motion))
+
+
+def checks(motion, level=None):
+    return [r.check for r in results(motion) if level in (None, r.level)]
+
+
+def result_of(motion, check):
+    (result,) = (r for r in results(motion) if r.check is check)
+    return result
 
 
 def test_a_good_motion_has_no_warning(person):
-    assert titles(person, "warning") == []
-    assert "Scale assumed" in titles(person)
+    assert checks(person, Level.WARNING) == []
+    assert Check.ASSUMED_SCALE in checks(person)
 
 
-def test_the_speed_of_the_orbit_is_measured(person):
-    m = measure(person)
+def test_the_view_span_is_that_of_the_orbit(person):
+    m = motion_statistics(person)
     look = -person.camera_rotation[:, 2]
     orbit = np.degrees(np.abs(np.diff(np.unwrap(np.arctan2(look[:, 1], look[:, 0]))))).sum()
     turned = np.degrees(np.ptp(m.heading_rad))
-    # The body turns as well: what it sees of the camera differs from the orbit by at most that.
+    # The body turns as well: the view differs from the orbit by at most that.
     assert m.view_span_deg == pytest.approx(orbit, abs=turned + 8.0)
     assert m.rate_hz == pytest.approx(15.0)
 
 
-def test_view_and_heading_are_those_of_a_body_that_looks_north(person):
+def test_view_and_heading_of_a_body_that_faces_north(person):
     """A standing body that faces north, the camera east of it: seen from its right."""
     body = np.zeros((5, 15, 3))
     at = {"neck": (0, 0, 0.6), "lhip": (-0.1, 0, 0), "rhip": (0.1, 0, 0), "lshoulder": (-0.2, 0, 0.5),
@@ -42,29 +50,29 @@ def test_view_and_heading_are_those_of_a_body_that_looks_north(person):
     towards_west = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
     parts = {n: getattr(person, n)[:5] for n in ("stamp_ns", "confidence", "keypoints", "reprojection_px")}
     motion = dataclasses.replace(person, joints3d=body, camera_rotation=np.tile(towards_west, (5, 1, 1)), **parts)
-    m = measure(motion)
+    m = motion_statistics(motion)
     np.testing.assert_allclose(np.degrees(m.heading_rad), 90.0, atol=1e-6)
     np.testing.assert_allclose(m.view_deg, -90.0, atol=1e-6)
 
 
-def test_a_still_camera_before_a_still_body_is_reported(person):
+def test_a_still_camera_and_a_still_body_are_low_camera_motion(person):
     still = dataclasses.replace(
         person,
         joints3d=np.repeat(person.joints3d[:1], len(person.joints3d), axis=0),
         camera_rotation=np.repeat(person.camera_rotation[:1], len(person.joints3d), axis=0),
     )
-    assert "Low camera motion" in titles(still, "warning")
-    assert measure(still).view_span_deg == pytest.approx(0.0, abs=1e-6)
+    assert Check.LOW_CAMERA_MOTION in checks(still, Level.WARNING)
+    assert motion_statistics(still).view_span_deg == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_body_that_turns_before_a_still_camera_is_motion_enough(reported_in_camera):
-    """What counts is the motion of the camera relative to the body: the camera's frame shows the same."""
-    assert "Low camera motion" not in titles(reported_in_camera)
-    assert "Vertical and path not known" in titles(reported_in_camera, "note")
+def test_a_body_that_turns_is_enough_camera_motion(reported_in_camera):
+    """Only the motion of the camera relative to the body counts: the camera's frame shows the same."""
+    assert Check.LOW_CAMERA_MOTION not in checks(reported_in_camera)
+    assert Check.NO_VERTICAL in checks(reported_in_camera, Level.NOTE)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_body_mirrored_in_depth_is_noticed(person, seed):
+def test_a_body_mirrored_in_depth_is_a_warning(person, seed):
     capture = simulate_capture(8.0, 15.0, seed=seed)
     joints = np.einsum("fij,fpj->fpi", capture.camera_rotation, capture.joints3d_world - capture.joints3d_world[:, :1])
     frames = len(joints)
@@ -78,49 +86,49 @@ def test_a_body_mirrored_in_depth_is_noticed(person, seed):
         keypoints=capture.tracks.keypoints,
         reprojection_px=np.zeros((frames, 15)),
     )
-    assert "Possibly mirrored in depth" not in titles(motion)
+    assert Check.MIRRORED not in checks(motion)
     mirrored = dataclasses.replace(motion, joints3d=joints * np.array([1.0, 1.0, -1.0]))
-    assert "Possibly mirrored in depth" in titles(mirrored, "warning")
+    assert Check.MIRRORED in checks(mirrored, Level.WARNING)
 
 
 def test_missing_joints_are_named_with_their_share(person):
     keypoints = person.keypoints.copy()
     keypoints[::2, BODY_15.index("lwrist")] = np.nan
-    found = findings(motion := dataclasses.replace(person, keypoints=keypoints), measure(motion))
-    (text,) = (f.text for f in found if f.title == "Many missing joints")
+    text = result_of(dataclasses.replace(person, keypoints=keypoints), Check.MISSING_JOINTS).text
     share = np.isnan(keypoints[:, BODY_15.index("lwrist")]).any(axis=1).mean()
     assert f"lwrist {share:.0%}" in text
 
 
-def test_high_error_is_told_from_a_few_outliers(person):
-    size = measure(person).body_px
+def test_a_few_outliers_are_no_high_error(person):
+    size = motion_statistics(person).body_px
     few = np.zeros_like(person.reprojection_px)
     few[::20] = 0.5 * size
-    assert titles(dataclasses.replace(person, reprojection_px=few), "warning") == []
-    assert "Outlying keypoints" in titles(dataclasses.replace(person, reprojection_px=few))
+    assert checks(dataclasses.replace(person, reprojection_px=few), Level.WARNING) == []
+    assert Check.OUTLIERS in checks(dataclasses.replace(person, reprojection_px=few))
     many = few.copy()
     many[::5] = 0.5 * size
-    assert "Outlying keypoints" in titles(dataclasses.replace(person, reprojection_px=many), "warning")
+    assert Check.OUTLIERS in checks(dataclasses.replace(person, reprojection_px=many), Level.WARNING)
     all_over = np.full_like(few, 0.03 * size)
-    assert "High reprojection error" in titles(dataclasses.replace(person, reprojection_px=all_over), "warning")
+    assert Check.HIGH_ERROR in checks(dataclasses.replace(person, reprojection_px=all_over), Level.WARNING)
 
 
-def test_short_sequences_and_stretching_bones_are_reported(person, one_frame):
-    assert "Short sequence" in titles(one_frame, "warning")
+def test_short_sequences_are_warned_of_and_stretching_bones_noted(person, one_frame):
+    assert Check.SHORT in checks(one_frame, Level.WARNING)
     stretched = person.joints3d.copy()
     knee, ankle = BODY_15.index("rknee"), BODY_15.index("rankle")
     stretched[::2, ankle] = stretched[::2, knee] + 1.5 * (stretched[::2, ankle] - stretched[::2, knee])
-    found = findings(motion := dataclasses.replace(person, joints3d=stretched), measure(motion))
-    (text,) = (f.text for f in found if f.title == "Bones change their length")
-    assert "rknee - rankle" in text
-    assert "20%" in text  # half of the frames 1, half 1.5: 0.25 / 1.25
+    result = result_of(dataclasses.replace(person, joints3d=stretched), Check.BONE_LENGTHS)
+    assert result.values["bone"] == "rknee - rankle"
+    assert result.values["worst"] == pytest.approx(0.2, abs=0.005)  # half of the frames 1, half 1.5: 0.25 / 1.25
+    assert "rknee - rankle varies by 20%" in result.text
 
 
 def test_frames_without_a_pose_are_counted(person):
     joints = person.joints3d.copy()
     joints[5:9] = np.nan
-    found = findings(motion := dataclasses.replace(person, joints3d=joints), measure(motion))
-    assert any(f.text.startswith("4 of 60 frames") for f in found)
+    result = result_of(dataclasses.replace(person, joints3d=joints), Check.MISSING_POSES)
+    assert result.values == {"missing": 4, "frames": 60}
+    assert result.text.startswith("4 of 60 frames")
 
 
 def test_upright_joints_of_the_cameras_frame_stand(reported_in_camera):
@@ -135,3 +143,7 @@ def test_smoothing_keeps_constants_and_means():
     np.testing.assert_allclose(smooth(np.full((40, 2), 3.0), times), 3.0)
     ramp = smooth(times, times)
     np.testing.assert_allclose(ramp[5:-5], times[5:-5])
+
+
+def test_every_check_has_words():
+    assert {check: bool(title and text) for check, (title, text) in _WORDS.items()} == dict.fromkeys(Check, True)

@@ -1,4 +1,4 @@
-"""Pictures for the report out of videos and folders: the right ones, cropped, within their bytes."""
+"""Images for the report out of videos and folders: the right ones, cropped, within their bytes."""
 
 import dataclasses
 
@@ -7,10 +7,10 @@ import pytest
 from report_motions import first_frames
 
 from drocap_ros.errors import InputError
-from drocap_ros.report import pictures
+from drocap_ros.report import motion_images
+from drocap_ros.report.motion_images import has_images, read_motion_images
 from drocap_ros.report.page_data import page_data
-from drocap_ros.report.pictures import has_pictures, read_pictures
-from drocap_ros.report.statistics import measure
+from drocap_ros.report.statistics import motion_statistics
 
 cv2 = pytest.importorskip("cv2")
 
@@ -20,13 +20,13 @@ def decoded(jpeg):
 
 
 def level(jpeg):
-    """Grey level of a picture, which tells its frame."""
+    """Grey level of an image, which identifies its frame."""
     return round(decoded(jpeg).mean())
 
 
 @pytest.fixture
 def folder(tmp_path):
-    """Forty pictures at 30 per second, each of one grey level."""
+    """Forty images at 30 per second, each of one grey level."""
     frames = tmp_path / "frames"
     frames.mkdir()
     for number in range(40):
@@ -41,29 +41,29 @@ def seen_at(person, stamps):
     return dataclasses.replace(motion, stamp_ns=np.asarray(stamps, np.int64), keypoints=np.array([160, 120]) + spread)
 
 
-def test_pictures_are_those_of_the_frames_by_their_stamps(person, folder):
+def test_images_match_the_frames_by_their_stamps(person, folder):
     stamps = np.round(np.arange(0, 40, 2) / 30.0 * 1e9)
-    found = read_pictures(folder, seen_at(person, stamps))
+    found = read_motion_images(folder, seen_at(person, stamps))
     assert found.frames == tuple(range(20))
     assert [level(j) for j in found.jpegs] == pytest.approx([5 * n + 20 for n in range(0, 40, 2)], abs=1)
 
 
-def test_a_motion_with_another_clock_starts_with_the_first_picture(person, folder):
+def test_a_motion_with_another_clock_starts_with_the_first_image(person, folder):
     stamps = np.round(np.arange(0, 40, 4) / 30.0 * 1e9) + 1_700_000_000_000_000_000
-    found = read_pictures(folder, seen_at(person, stamps))
+    found = read_motion_images(folder, seen_at(person, stamps))
     assert [level(j) for j in found.jpegs] == pytest.approx([5 * n + 20 for n in range(0, 40, 4)], abs=1)
 
 
 def test_the_crop_holds_the_keypoints(person, folder):
     motion = seen_at(person, np.round(np.arange(20) / 30.0 * 1e9))
-    x0, y0, x1, y1 = read_pictures(folder, motion).box
+    x0, y0, x1, y1 = read_motion_images(folder, motion).box
     inside = (motion.keypoints > (x0, y0)) & (motion.keypoints < (x1, y1))
     assert inside.all()
     assert (x1 - x0) * (y1 - y0) < 0.3 * 320 * 240
 
 
-def test_pictures_of_noise_stay_within_their_bytes(person, tmp_path, monkeypatch):
-    monkeypatch.setattr(pictures, "MAX_BYTES", 200_000)
+def test_images_of_noise_stay_within_their_bytes(person, tmp_path, monkeypatch):
+    monkeypatch.setattr(motion_images, "MAX_BYTES", 200_000)
     rng = np.random.default_rng(0)
     for number in range(20):
         cv2.imwrite(str(tmp_path / f"{number:04d}.png"), rng.integers(0, 255, (480, 640, 3), np.uint8))
@@ -71,29 +71,29 @@ def test_pictures_of_noise_stay_within_their_bytes(person, tmp_path, monkeypatch
     keypoints = motion.keypoints * 2
     keypoints[:, 0], keypoints[:, 1] = (10, 10), (630, 470)
     motion = dataclasses.replace(motion, keypoints=keypoints)
-    found = read_pictures(tmp_path, motion)
-    data = page_data(motion, measure(motion), found)
-    assert sum(len(text) for text in data["picture"]["jpeg"]) <= 200_000
+    found = read_motion_images(tmp_path, motion)
+    data = page_data(motion, motion_statistics(motion), found)
+    assert sum(len(text) for text in data["image"]["jpeg"]) <= 200_000
     assert all(decoded(jpeg) is not None for jpeg in found.jpegs)
 
 
-def test_long_motions_have_few_pictures(person, folder, monkeypatch):
-    monkeypatch.setattr(pictures, "MAX_PICTURES", 7)
-    found = read_pictures(folder, seen_at(person, np.round(np.arange(40) / 30.0 * 1e9)))
+def test_long_motions_have_few_images(person, folder, monkeypatch):
+    monkeypatch.setattr(motion_images, "MAX_IMAGES", 7)
+    found = read_motion_images(folder, seen_at(person, np.round(np.arange(40) / 30.0 * 1e9)))
     assert len(found.jpegs) == 7
     assert found.frames[0] == 0
     assert found.frames[-1] == 39
 
 
-def test_a_real_video_gives_each_frame_its_picture(person, shared):
+def test_every_frame_of_a_real_video_has_its_image(person, shared):
     count = 40
     motion = seen_at(person, np.arange(count) * 200_000_000)
     motion = dataclasses.replace(motion, keypoints=motion.keypoints + np.array([200, 400]))
-    found = read_pictures(shared / "media" / "pose_squats.mp4", motion)
+    found = read_motion_images(shared / "media" / "pose_squats.mp4", motion)
     assert found.frames == tuple(range(count))
 
 
-def test_a_recordings_pictures_are_found(person, tmp_path):
+def test_the_images_of_a_recording_are_found(person, tmp_path):
     """A ROS 1 bag written by rosbags, compressed images on a topic of its own."""
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
@@ -111,16 +111,16 @@ def test_a_recordings_pictures_are_found(person, tmp_path):
             at = header(seq=number, stamp=time(sec=stamp // 10**9, nanosec=stamp % 10**9), frame_id="camera")
             message = image(header=at, format="jpeg", data=jpeg)
             bag.write(connection, stamp, store.serialize_ros1(message, image.__msgtype__))
-    assert has_pictures(tmp_path / "flight.bag")
-    found = read_pictures(tmp_path / "flight.bag", seen_at(person, stamps[::2]))
+    assert has_images(tmp_path / "flight.bag")
+    found = read_motion_images(tmp_path / "flight.bag", seen_at(person, stamps[::2]))
     assert [level(j) for j in found.jpegs] == pytest.approx([10 * n + 50 for n in range(0, 12, 2)], abs=1)
 
 
-def test_what_has_no_pictures_is_refused(person, tmp_path):
+def test_inputs_without_images_are_refused(person, tmp_path):
     motion = first_frames(person, 5)
     (tmp_path / "text.mp4").write_text("no video")
     for name in ("none.mp4", "text.mp4"):
         with pytest.raises(InputError, match=name):
-            read_pictures(tmp_path / name, motion)
-    assert not has_pictures(tmp_path / "tracks.npz")
-    assert has_pictures(tmp_path / "text.mp4")
+            read_motion_images(tmp_path / name, motion)
+    assert not has_images(tmp_path / "tracks.npz")
+    assert has_images(tmp_path / "text.mp4")

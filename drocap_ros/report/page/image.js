@@ -1,9 +1,9 @@
 // The image of a frame with its 2D keypoints; without images the keypoints alone.
 
-const pictures = motion.picture && {
-  ...motion.picture,
+const images = motion.image && {
+  ...motion.image,
   loaded: new Map(),
-  /** Index of the picture nearest to a frame. */
+  /** Index of the image nearest to a frame. */
   nearest(frame) {
     let low = 0, high = this.places.length - 1;
     while (low < high) {
@@ -12,14 +12,14 @@ const pictures = motion.picture && {
     }
     return low > 0 && frame - this.places[low - 1] < this.places[low] - frame ? low - 1 : low;
   },
-  /** The picture, or null while it is being decoded; `done` is called then. */
-  image(index, done) {
+  /** The image, or null while it is being decoded; `done` is called then. */
+  decoded(index, done) {
     if (!this.loaded.has(index)) {
       const image = new Image();
       this.loaded.set(index, image);
       image.onload = done;
       image.src = `data:image/jpeg;base64,${this.jpeg[index]}`;
-      // Few decoded pictures at a time: memory stays small on a phone.
+      // Few decoded images at a time: memory stays small on a phone.
       if (this.loaded.size > 60) this.loaded.delete(this.loaded.keys().next().value);
     }
     const image = this.loaded.get(index);
@@ -28,8 +28,8 @@ const pictures = motion.picture && {
 };
 
 /** Part of the image that is shown: x_min, y_min, x_max, y_max px. */
-const pictureBox = (() => {
-  if (pictures) return pictures.box;
+const imageBox = (() => {
+  if (images) return images.box;
   let box = [Infinity, Infinity, -Infinity, -Infinity];
   for (let i = 0; i < motion.keypoints.length; i += 2) {
     const x = motion.keypoints[i], y = motion.keypoints[i + 1];
@@ -39,27 +39,27 @@ const pictureBox = (() => {
   return [box[0] - room, box[1] - room, box[2] + room, box[3] + room];
 })();
 
-function drawPicture(canvas, frame, showKeypoints, colours, redraw) {
+function drawImagePane(canvas, frame, showKeypoints, colours, redraw) {
   const { context, width, height } = prepared(canvas);
-  const [x0, y0, x1, y1] = pictureBox;
+  const [x0, y0, x1, y1] = imageBox;
   if (!(x1 > x0)) return;
   const scale = Math.min(width / (x1 - x0), height / (y1 - y0));
   const left = (width - scale * (x1 - x0)) / 2, top = (height - scale * (y1 - y0)) / 2;
   let shown = frame;
-  if (pictures) {
-    const index = pictures.nearest(frame);
-    // Keypoints are drawn on the picture that they belong to, also where not every frame has one.
-    shown = pictures.places[index];
-    const image = pictures.image(index, redraw);
+  if (images) {
+    const index = images.nearest(frame);
+    // Keypoints are drawn on their own image, also where not every frame has one.
+    shown = images.places[index];
+    const image = images.decoded(index, redraw);
     if (image) context.drawImage(image, left, top, scale * (x1 - x0), scale * (y1 - y0));
   }
-  if (!showKeypoints && pictures) return;
+  if (!showKeypoints && images) return;
   const place = ([x, y]) => [left + scale * (x - x0), top + scale * (y - y0)];
   const thick = Math.max(2.5, 0.0085 * height);
   motion.parents.forEach((parent, joint) => {
     const b = keypointAt(shown, joint), a = parent < 0 ? b : keypointAt(shown, parent);
     if (known(a) && known(b)) {
-      if (pictures) line(context, [place(a), place(b)], "rgb(0 0 0 / .45)", thick + 2.5);
+      if (images) line(context, [place(a), place(b)], "rgb(0 0 0 / .45)", thick + 2.5);
       line(context, [place(a), place(b)], colours[motion.sides[joint]], thick);
     }
   });
