@@ -1,11 +1,10 @@
-"""From 2D tracks to a motion: the whole offline reconstruction, method by method."""
+"""Offline reconstruction: 2D tracks to a motion by one of the methods."""
 
 from __future__ import annotations
 
 import dataclasses
 import subprocess
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +14,17 @@ from drocap_ros import __version__
 from drocap_ros.errors import InputError
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
+from drocap_ros.reconstruction.lifted.lifted_config import lifted_config
 from drocap_ros.reconstruction.lifted.lifter import Lifter
-from drocap_ros.reconstruction.lifted.method import lifted_config
-from drocap_ros.reconstruction.methods import METHODS, CameraPoses, run_method
+from drocap_ros.reconstruction.methods import METHODS
+from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput, Progress
+from drocap_ros.reconstruction.methods.run import run_method
 from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.threads import blas_threads
 from drocap_ros.reconstruction.world.placement import metres_per_px, place_in_world
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
-
-Progress = Callable[[str, float], None]
 
 
 def reconstruct(
@@ -41,20 +40,19 @@ def reconstruct(
 
     Parameters
     ----------
-    tracks : joints are taken by the names of BODY_15; others are ignored, missing ones filled in by the model
-    method : "ba" the best there is; "paper" single-view start and equations (2)-(4); "paper-no-articulation" with
-        gamma = 0; "initial" the start alone; "mf-nnm" factorization and nuclear norm minimization
-    progress : called with a stage and the fraction of it that is done
+    tracks : joints by the names of BODY_15; the model estimates missing ones, others are ignored
+    method : a name in :data:`~drocap_ros.reconstruction.methods.METHODS`
+    progress : called with a stage and its fraction done
 
     Returns
     -------
     Motion
-        In frame "world" when the tracks know the camera's rotation, else in frame "camera".
+        In frame "world" when the tracks hold the camera's rotation, else in frame "camera".
 
     Raises
     ------
     InputError
-        When the method is unknown or the tracks show too little.
+        When the method is unknown or too few joints are seen.
     """
     if method not in METHODS:
         raise InputError(f"method: expected one of {', '.join(METHODS)}, got {method!r}; choose one of them")
@@ -63,11 +61,18 @@ def reconstruct(
     dictionary = dictionary or load_dictionary(initializer.dictionary or None)
     started = time.perf_counter()
     keypoints = body_keypoints(tracks)
+    k = tracks.camera_matrix
+    data = MethodInput(
+        stamp_ns=tracks.stamp_ns,
+        keypoints=keypoints,
+        focal_px=None if k is None else 0.5 * float(k[0, 0] + k[1, 1]),
+        initializer=initializer,
+        adjuster=adjuster,
+        dictionary=dictionary,
+        progress=progress or (lambda stage, fraction: None),
+    )
     with blas_threads(adjuster.threads):
-        result = run_method(
-            method, tracks.stamp_ns, keypoints, tracks, initializer, adjuster, dictionary,
-            progress,
-        )  # fmt: skip
+        result = run_method(method, data)
     motion = _to_motion(tracks, keypoints, result, initializer)
     motion.meta.update(
         method=method,
@@ -114,7 +119,6 @@ def body_keypoints(tracks: Tracks) -> Keypoints2D:
     if tracks.covariance is not None:
         covariance = np.full((frames, p, 3), np.nan)
         covariance[:, ours] = tracks.covariance[:, theirs]
-        # A joint of unknown uncertainty counts as one that was not seen.
         if confidence is None:
             confidence = np.isfinite(keypoints).all(-1).astype(float)
     return Keypoints2D(keypoints, confidence, covariance)

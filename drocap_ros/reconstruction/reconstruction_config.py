@@ -45,7 +45,7 @@ class InitializerConfig(Parameters):
 
 @dataclass(frozen=True)
 class BundleAdjusterConfig(Parameters):
-    """Bundle adjustment: the paper's equations (2) to (4), and the parameters of the default method and the live node."""
+    """Bundle adjustment: the paper's equations (2) to (4), the default method and the live node."""
 
     method: str = param("ba", "the live node's method: the default method, or the paper's equations",
                         choices=("ba", "paper"))  # fmt: skip

@@ -16,7 +16,8 @@ from drocap_ros.evaluation.metrics import horizon_error, is_mirrored, pa_mpjpe
 from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.motion import Motion, load_motion, save_motion
-from drocap_ros.reconstruction.methods import METHODS, windows
+from drocap_ros.reconstruction.methods import METHODS
+from drocap_ros.reconstruction.methods.windows import windows
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.skeleton import BODY_15

@@ -1,9 +1,9 @@
-"""Which end of each bone is nearer to the camera, decided over the whole sequence.
+"""Signs of the bones' depth differences, decided over the whole sequence.
 
-Under a distant camera a bone of known length reaches sqrt(L^2 - l^2) in depth, l its length in the image; only
-the sign is open, and in a single image nothing but experience tells it.  Over time the sign can change only
-where the bone is parallel to the image, and the bone then swings through at constant speed instead of bouncing
-back.  So the signs of a bone are the cheapest path through the sequence.
+Under a distant camera a bone of length L reaches sqrt(L^2 - l^2) in depth, l its length in the image; a single image
+leaves the sign open.  Over time the sign changes only where the bone is parallel to the image, and the bone then
+swings through at constant speed instead of bouncing back.  The signs of a bone are the cheapest path through the
+sequence.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ def depth_signs(
 
     Parameters
     ----------
-    reach : (F, L) >= 0, how far bone l reaches in depth
-    depth : (F, L) depth difference that the lifter expects, with its expected absolute error ``sigma`` (F, L)
-    speed, acceleration : change of depth difference per frame, and change of that, that cost as much as one sigma
+    reach : (F, L) >= 0, depth difference of bone l without its sign
+    depth, sigma : (F, L) the lifter's depth difference and its expected absolute error
+    speed, acceleration : first and second difference of the depth per frame that cost as much as one sigma
 
     Returns
     -------
@@ -38,7 +38,7 @@ def depth_signs(
         return signs[unary[0].argmin(axis=-1)][None]
     move = np.abs(state[1:, :, None, :] - state[:-1, :, :, None]) / speed
     swing = state[2:, :, None, None, :] - 2 * state[1:-1, :, None, :, None] + state[:-2, :, :, None, None]
-    # A gross error of the image length must not buy a wrong sign for the rest of the sequence.
+    # The bound keeps a gross error of the image length from turning the signs of the rest of the sequence.
     swing = np.minimum(np.abs(swing) / acceleration, 4.0)
     cost = unary[0][:, :, None] + unary[1][:, None, :] + move[0]
     back = np.zeros((frames, bones, 2, 2), np.int8)

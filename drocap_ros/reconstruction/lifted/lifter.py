@@ -1,4 +1,4 @@
-"""The learned start: 2D joints of a sequence to 3D joints, by a small temporal network run by onnxruntime."""
+"""The lifter: 2D joints of a sequence to 3D joints, by a small temporal network in onnxruntime."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _JOINTS = len(BODY_15)
 _PARTS = np.cumsum([2 * _JOINTS, _JOINTS, _JOINTS - 1])
 #: Frames of one window and overlap of neighbouring windows; about the length of the training windows.
 _WINDOW, _OVERLAP = 240, 80
-#: Frame rates, in units of LIFTER_FPS, that the network was trained to take as they are.
+#: Frame rates, in units of LIFTER_FPS, of the network's training.
 _SLOWEST, _FASTEST = 0.7, 1.4
 #: Weights that give the end of the least-squares line through five values: 1 mm better than the last one alone.
 _LINE = np.array([-0.2, 0.0, 0.2, 0.4, 0.6])
@@ -31,7 +31,7 @@ class LiftedMotion:
     """Result of the lifter.
 
     joints : (F, 15, 3) in the camera frame (x right, y down, z forward) and the unit of the keypoints; x and y
-        where the joint should be in the image, outliers and gaps corrected; depth relative to the pelvis
+        in the image, outliers and gaps corrected; depth relative to the pelvis
     sigma : (F, 15, 2) expected absolute error of x, y (each) and of depth, in the same unit
     """
 
@@ -58,7 +58,7 @@ class Lifter:
 
     @property
     def origin(self) -> dict[str, str]:
-        """What the network says of itself: data, command, samples seen."""
+        """The network's metadata: data, command, samples seen."""
         return dict(self._session.get_modelmeta().custom_metadata_map)
 
     def lift(
@@ -73,7 +73,7 @@ class Lifter:
         Parameters
         ----------
         keypoints : (F, 15, 2) of ``BODY_15``, any unit, y down; NaN where not seen
-        confidence : (F, 15) in [0, 1]; None = all visible joints alike
+        confidence : (F, 15) in [0, 1]; None = all seen joints alike
         fps : frames per second, 1 to 1000
         lengths : (14,) of the bones (joint j to its parent at j - 1) in the keypoints' unit, where known
 
@@ -99,8 +99,8 @@ class Lifter:
     ) -> LiftedMotion:
         """The newest frame of a short sequence, in half the time: arguments as of :meth:`lift`, F = 1 in the result.
 
-        Of the two ways of pairing frames only that is taken which leaves the last one alone: nothing comes after it.
-        The pose is the end of the straight line through the network's last five.
+        Of the two ways of pairing frames it uses the one in which the last frame has no partner.  The pose is the end
+        of the straight line through the network's last five.
         """
         keypoints, confidence = _checked(keypoints, confidence, fps)
         pace = fps / LIFTER_FPS
@@ -120,7 +120,7 @@ class Lifter:
     def _lift_fast(
         self, keypoints: np.ndarray, confidence: np.ndarray, lengths: np.ndarray | None, stride: int
     ) -> LiftedMotion:
-        """Every ``stride``-th frame makes a sequence of its own, so that no frame is interpolated."""
+        """Every ``stride``-th frame is a separate sequence: no frame is interpolated."""
         joints = np.empty((*keypoints.shape[:2], 3))
         sigma = np.empty((*keypoints.shape[:2], 2))
         for phase in range(min(stride, len(keypoints))):
@@ -131,7 +131,7 @@ class Lifter:
     def _lift_slow(
         self, keypoints: np.ndarray, confidence: np.ndarray, lengths: np.ndarray | None, factor: int
     ) -> LiftedMotion:
-        """Frames are put between frames; each is lifted on, and only the real ones are returned."""
+        """Lifts with interpolated frames between the real ones, and returns the real ones."""
         dense = _between(keypoints, factor)
         result = self._lift_long(dense, _between(confidence, factor), lengths)
         return LiftedMotion(result.joints[::factor], result.sigma[::factor])
@@ -185,7 +185,7 @@ class Lifter:
 
 
 def _between(values: np.ndarray, factor: int) -> np.ndarray:
-    """(F, ...) with ``factor - 1`` interpolated frames put between neighbours; the real ones stay as they are."""
+    """(F, ...) with ``factor - 1`` interpolated frames between neighbours; the real ones are unchanged."""
     share = (np.arange(factor) / factor).reshape(1, -1, *(1,) * (values.ndim - 1))
     dense = values[:-1, None] * (1 - share) + values[1:, None] * share
     dense = np.concatenate([dense.reshape(-1, *values.shape[1:]), values[-1:]])
@@ -235,7 +235,7 @@ def _load(path: str) -> Lifter:
     try:
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     except Exception as error:
-        # onnxruntime has no common exception class that it documents; whatever it says, the file is at fault.
+        # onnxruntime documents no common exception class.
         raise InputError(f"{path}: expected an ONNX network; {str(error).splitlines()[0][:120]}") from None
     inputs = [(i.name, i.shape[-1]) for i in session.get_inputs()]
     outputs = [o.name for o in session.get_outputs()]

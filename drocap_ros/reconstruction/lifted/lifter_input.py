@@ -1,7 +1,4 @@
-"""What the temporal lifter sees: 2D joints centred and scaled so that neither position nor size matters.
-
-Shared by training and inference, so that both see the same numbers.
-"""
+"""Input features of the lifter: 2D joints without position and size; the same for training and inference."""
 
 from __future__ import annotations
 
@@ -9,9 +6,9 @@ import numpy as np
 
 from drocap_ros.skeleton import BODY_15, indices
 
-#: Frame rate that the network works at; other rates are resampled.
+#: Frame rate of the network; other rates are resampled.
 LIFTER_FPS = 24.0
-#: Bones whose lengths the network may be told: that of joint j to its parent stands at j - 1.
+#: Bones whose lengths are input features: that of joint j to its parent stands at j - 1.
 BONES = BODY_15.bones
 #: Input features of a frame: x, y and confidence of every joint, length and depth range of every bone.
 FEATURES = 3 * len(BODY_15) + 2 * len(BONES)
@@ -30,7 +27,7 @@ def nanmedian_small(values: np.ndarray, axis: int) -> np.ndarray:
 
 
 def centre_of(keypoints: np.ndarray) -> np.ndarray:
-    """(..., F, 2) median of the visible torso joints of (..., F, 15, 2); gaps in time are filled from neighbours."""
+    """(..., F, 2) median of the seen torso joints of (..., F, 15, 2); gaps in time are filled from neighbours."""
     centre = nanmedian_small(keypoints[..., _TORSO, :], axis=-2)
     missing = ~np.isfinite(centre[..., 0])
     if missing.any():
@@ -73,7 +70,7 @@ def normalise(
     Returns
     -------
     features : (..., F, 73) float32: x, y of every joint (0 where not seen), its confidence, then the length of
-        every bone and how far it must reach in depth to have that length (0 where unknown)
+        every bone and its reach in depth at that length (0 where unknown)
     centre : (..., F, 2) of every frame
     scale : (...) one for the window
     """

@@ -64,7 +64,7 @@ class AdjustmentResult:
 
 
 class Objective:
-    """Equations (2) and (3) for fixed measurements, shapes (3, P, F); R is a state that :meth:`update_rotation` updates.
+    """Equations (2) and (3) for fixed measurements, shapes (3, P, F); :meth:`update_rotation` updates R.
 
     rotation : (3, 3, F)
     """
@@ -171,7 +171,7 @@ def minimize(objective: Objective, s: np.ndarray) -> tuple[np.ndarray, dict[str,
     config, alpha = objective.config, objective.alpha
     cost = objective.value(s) + alpha * nuclear_norm(s)
     history = [cost]
-    ahead, t, mu, restarts, stop = s, 1.0, 4.0, 0, ITERATIONS
+    ahead, t, mu, stop = s, 1.0, 4.0, ITERATIONS
     for k in range(config.iterations):
         if k % config.rotation_every == 0:
             before = objective.value(s)

@@ -1,7 +1,7 @@
-"""Refinement of the default method: poses of a window whose bones keep their lengths, by damped Gauss-Newton.
+"""Adjustment of the default method: poses of a window with constant bone lengths, by damped Gauss-Newton.
 
-The unknowns are the joints of all frames in camera axes, one length per bone, and how the person's size in the
-image changes over time (the zoom: 1 plus a piecewise linear function of time).  The cost is
+The unknowns are the joints of all frames in camera axes, one length per bone, and the zoom: the person's relative
+size in the image, 1 plus a piecewise linear function of time.  The cost is
 
 - a robust (Geman-McClure) distance of the projected joints from the 2D joints, weighted joint by joint,
 - the distance from the lifter's joints, weighted by its expected errors, robust in depth,
@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drocap_ros.geometry.bones import pair_lengths
 from drocap_ros.reconstruction.stop_reason import CONVERGED, DEADLINE, ITERATIONS, NO_DESCENT
 from drocap_ros.skeleton import BODY_15, RIGID_BONES, indices
 
@@ -32,19 +33,19 @@ _RIGID = {tuple(indices(BODY_15.joints, pair)) for pair in RIGID_BONES} | {(0, 1
 SPAN_STD_MM = np.array([4.0 if (p, c) in _RIGID else 20.0 for p, c in _CHAIN] + [4.0, 25.0])
 
 _SIZE = 3 * len(BODY_15)
-#: Squared residual, in standard deviations, at which a 2D joint is half believed.
-_BELIEF = 9.0
+#: Squared residual, in standard deviations, at which a 2D joint has half its weight.
+_OUTLIER_SQUARE = 9.0
 _DEPTH_ROUNDING_MM = 15.0
 
 
 @dataclass(frozen=True)
-class LimbProblem:
+class AdjustmentProblem:
     """A window in mm of an ordinary person.
 
     keypoints : (F, 15, 2); weight : (F, 15) 1/mm^2, 0 where not seen
     prior : (F, 15, 3); prior_weight_xy : (F, 15) 1/mm^2; prior_weight_z : (F, 15) 1/mm
     acceleration_weight : 1/mm^2, of second differences
-    zoom_basis : (F, K) value in each frame of the piecewise linear functions that the zoom is made of
+    zoom_basis : (F, K) value in each frame of the zoom's piecewise linear basis functions
     zoom_precision : (K, K) inverse covariance of their coefficients
     """
 
@@ -59,7 +60,7 @@ class LimbProblem:
 
 
 @dataclass(frozen=True)
-class LimbResult:
+class AdjustmentSolution:
     """joints (F, 15, 3) mm, lengths (16,) mm of :data:`SPANS`, zoom (F,), cost per term, iterations, stop reason."""
 
     joints: np.ndarray
@@ -72,7 +73,7 @@ class LimbResult:
 
 def span_lengths(joints: np.ndarray) -> np.ndarray:
     """(..., 16) distances over :data:`SPANS` of joints (..., 15, D)."""
-    return np.linalg.norm(joints[..., SPANS[:, 1], :] - joints[..., SPANS[:, 0], :], axis=-1)
+    return pair_lengths(joints, SPANS)
 
 
 def zoom_model(frames: int, fps: float, std_per_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -85,15 +86,15 @@ def zoom_model(frames: int, fps: float, std_per_s: float) -> tuple[np.ndarray, n
 
 
 class _Residuals:
-    """What the cost and its derivatives share at one point."""
+    """Residuals at one point, shared by the cost and its derivatives."""
 
-    def __init__(self, p: LimbProblem, joints: np.ndarray, lengths: np.ndarray, zooms: np.ndarray) -> None:
+    def __init__(self, p: AdjustmentProblem, joints: np.ndarray, lengths: np.ndarray, zooms: np.ndarray) -> None:
         self.lengths = lengths
         self.zoom = 1.0 + p.zoom_basis @ zooms
         self.zoom_pull = p.zoom_precision @ zooms
         self.image = joints[..., :2] - p.keypoints
         square = np.square(self.image).sum(axis=-1) * p.weight
-        self.belief = 1.0 / (1.0 + square / _BELIEF)
+        self.robust = 1.0 / (1.0 + square / _OUTLIER_SQUARE)
         self.flat = joints[..., :2] - p.prior[..., :2]
         self.depth = joints[..., 2] - p.prior[..., 2]
         self.rounded = np.sqrt(np.square(self.depth) + _DEPTH_ROUNDING_MM**2)
@@ -103,7 +104,7 @@ class _Residuals:
         self.stretch = (length - self.zoom[:, None] * lengths) / SPAN_STD_MM
         self.swing = joints[2:] - 2 * joints[1:-1] + joints[:-2]
         self.terms = {
-            "reprojection": 0.5 * float((square * self.belief).sum()),
+            "reprojection": 0.5 * float((square * self.robust).sum()),
             "lifter_image": 0.5 * float((p.prior_weight_xy * np.square(self.flat).sum(axis=-1)).sum()),
             "lifter_depth": float((p.prior_weight_z * (self.rounded - _DEPTH_ROUNDING_MM)).sum()),
             "articulation": 0.5 * float(np.square(self.stretch).sum()),
@@ -113,10 +114,10 @@ class _Residuals:
         self.cost = sum(self.terms.values())
 
 
-def _gradient(p: LimbProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
+def _gradient(p: AdjustmentProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives of the cost: (F, 15, 3) by the joints, (16 + K,) by the lengths and the zoom's coefficients."""
     g = np.zeros(p.prior.shape)
-    g[..., :2] = (p.weight * np.square(r.belief))[..., None] * r.image + p.prior_weight_xy[..., None] * r.flat
+    g[..., :2] = (p.weight * np.square(r.robust))[..., None] * r.image + p.prior_weight_xy[..., None] * r.flat
     g[..., 2] = p.prior_weight_z * r.depth / r.rounded
     pull = (r.stretch / SPAN_STD_MM)[..., None] * r.direction
     for k, (a, b) in enumerate(SPANS):
@@ -131,11 +132,11 @@ def _gradient(p: LimbProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
     return g, np.concatenate([by_length, by_zoom])
 
 
-def _band(p: LimbProblem, r: _Residuals) -> np.ndarray:
+def _band(p: AdjustmentProblem, r: _Residuals) -> np.ndarray:
     """Gauss-Newton matrix of the joints, (F * 45, 91): element [i, d] couples unknowns i and i + d."""
     frames = len(p.prior)
     diagonal = np.zeros(p.prior.shape)
-    diagonal[..., :2] = (p.weight * np.square(r.belief) + p.prior_weight_xy)[..., None]
+    diagonal[..., :2] = (p.weight * np.square(r.robust) + p.prior_weight_xy)[..., None]
     diagonal[..., 2] = p.prior_weight_z / r.rounded
     outer = r.direction[..., :, None] * r.direction[..., None, :] / np.square(SPAN_STD_MM)[:, None, None]
     block = np.zeros((frames, len(BODY_15), 3, len(BODY_15), 3))
@@ -160,7 +161,7 @@ def _band(p: LimbProblem, r: _Residuals) -> np.ndarray:
     return band.reshape(frames * _SIZE, -1)
 
 
-def _border(p: LimbProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
+def _border(p: AdjustmentProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
     """(16 + K, F * 45) coupling of lengths and zoom with the joints, and (16 + K, 16 + K) with each other."""
     frames, knots = p.zoom_basis.shape
     count = len(SPANS)
@@ -184,23 +185,23 @@ def _border(p: LimbProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([by_length.reshape(count, -1), by_zoom.reshape(knots, -1)]), corner
 
 
-def adjust_limbs(
-    problem: LimbProblem,
+def adjust(
+    problem: AdjustmentProblem,
     joints: np.ndarray,
     lengths: np.ndarray,
     iterations: int,
     tolerance: float = 1e-3,
     cancelled: Callable[[], bool] | None = None,
-) -> LimbResult:
-    """Minimise the cost from a start.
+) -> AdjustmentSolution:
+    """Minimise the cost.
 
     Parameters
     ----------
-    joints : (F, 15, 3) mm, the start; its bones should point to the right side of the image plane
-    lengths : (16,) mm of :data:`SPANS`
-    iterations : at most so many accepted steps
+    joints : (F, 15, 3) mm, initial; the signs of depth stay as they are
+    lengths : (16,) mm of :data:`SPANS`, initial
+    iterations : most accepted steps
     tolerance : relative decrease of the cost that ends the solve
-    cancelled : asked before every step but the first; True ends the solve with reason "deadline"
+    cancelled : called before every step but the first; True ends the solve with reason DEADLINE
     """
     from scipy.linalg.lapack import dpbtrf, dtbtrs
 
@@ -242,4 +243,4 @@ def adjust_limbs(
         if decrease <= tolerance * here.cost:
             stop = CONVERGED
             break
-    return LimbResult(joints, lengths, here.zoom, here.terms, done, stop)
+    return AdjustmentSolution(joints, lengths, here.zoom, here.terms, done, stop)

@@ -1,0 +1,138 @@
+"""Size of the person: mm per unit of the keypoints, bone lengths, and the zoom (relative size in the image over time).
+
+A new person is measured by the lifter and a first adjustment; a known person's sizes come from an earlier window.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from drocap_ros.geometry.bones import bone_lengths
+from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
+from drocap_ros.reconstruction.lifted.lifter import LiftedMotion, Lifter
+from drocap_ros.reconstruction.lifted.window_solver import (
+    Cancelled,
+    WindowModel,
+    solve_signs_and_adjust,
+    window_model,
+)
+from drocap_ros.skeleton import BODY_15
+
+_BONES = BODY_15.bones
+#: Bones whose total length defines the mm of an ordinary person.
+YARDSTICK = [0, 1, 2, 6, 7]
+YARDSTICK_MM = 1550.0
+
+
+@dataclass(frozen=True)
+class BodySize:
+    """Sizes that an earlier window found.
+
+    lengths_mm : (16,) of :data:`~drocap_ros.reconstruction.lifted.adjustment.SPANS`, in mm of an ordinary person
+    unit_per_mm : (F,) size in the image of each frame: units of the keypoints per such mm
+    """
+
+    lengths_mm: np.ndarray
+    unit_per_mm: np.ndarray
+
+
+@dataclass(frozen=True)
+class SizedWindow:
+    """A window with known size and bone lengths, before the final adjustment.
+
+    flat : (F, 15, 2) mm, the keypoints in a distant camera about ``centre`` (F, 2)
+    lifted : the lifter's joints in mm, from ``flat`` and the lengths (16,) mm
+    zoom : (F,) the person's relative size; ``mm`` per unit of the keypoints at zoom 1
+    seconds, iterations : of the first adjustment
+    """
+
+    model: WindowModel
+    flat: np.ndarray
+    lifted: LiftedMotion
+    lengths: np.ndarray
+    centre: np.ndarray
+    zoom: np.ndarray
+    mm: float
+    seconds: float
+    iterations: int
+
+
+def measure_size(
+    keypoints: Keypoints2D,
+    fps: float,
+    focal: float | None,
+    config: LiftedConfig,
+    lifter: Lifter,
+    cancelled: Cancelled | None,
+) -> SizedWindow:
+    """Size of a new person: lift, adjust, and lift again with the lengths found."""
+    lifted = lifter.lift(keypoints.xy, keypoints.confidence, fps)
+    clock = time.perf_counter()
+    mm = YARDSTICK_MM / max(float(np.median(bone_lengths(lifted.joints), axis=0)[YARDSTICK].sum()), 1e-12)
+    model = window_model(keypoints, mm, fps, config)
+    centre = np.median(lifted.joints[..., :2], axis=1)
+    zoom = _zoom_of(lifted.joints, fps)
+    prior = lifted.joints.copy()
+    prior[..., :2] -= centre[:, None]
+    prior *= mm / zoom[:, None, None]
+    flat = _orthographic(keypoints.xy, prior[..., 2], centre, zoom, mm, focal)
+    found = solve_signs_and_adjust(model, flat, prior, lifted.sigma * mm, None, config.first_iterations, cancelled)
+    zoom = zoom * found.zoom
+    flat = _orthographic(keypoints.xy, found.joints[..., 2] - found.joints[:, :1, 2], centre, zoom, mm, focal)
+    seconds = time.perf_counter() - clock
+    lifted = lifter.lift(flat, keypoints.confidence, fps, found.lengths[: len(_BONES)])
+    return SizedWindow(model, flat, lifted, found.lengths, centre, zoom, mm, seconds, found.iterations)
+
+
+def apply_size(
+    known: BodySize, keypoints: Keypoints2D, fps: float, focal: float | None, config: LiftedConfig, lifter: Lifter
+) -> SizedWindow:
+    """Size from an earlier window: one lift, no first adjustment."""
+    mm = 1.0 / float(np.median(known.unit_per_mm))
+    zoom = known.unit_per_mm * mm
+    lengths = known.lengths_mm[: len(_BONES)]
+    frames, joints_count = keypoints.xy.shape[:2]
+    rough = _orthographic(keypoints.xy, np.zeros((frames, joints_count)), np.zeros((frames, 2)), zoom, mm, None)
+    lifted = lifter.lift(rough, keypoints.confidence, fps, lengths)
+    middle = np.median(lifted.joints[..., :2], axis=1)
+    centre = middle * (zoom / mm)[:, None]
+    joints = lifted.joints.copy()
+    joints[..., :2] -= middle[:, None]
+    flat = _orthographic(keypoints.xy, joints[..., 2], centre, zoom, mm, focal)
+    model = window_model(keypoints, mm, fps, config)
+    lifted = LiftedMotion(joints, lifted.sigma)
+    return SizedWindow(model, flat, lifted, known.lengths_mm, centre, zoom, mm, seconds=0.0, iterations=0)
+
+
+def magnification(depth_mm: np.ndarray, distance_mm: np.ndarray) -> np.ndarray:
+    """(F, 15, 1) true over seen distance from the axis, for joints behind a pelvis at the distance (F,) mm."""
+    return np.maximum(1.0 + depth_mm / distance_mm[:, None], 0.2)[..., None]
+
+
+def _orthographic(
+    keypoints: np.ndarray, depth_mm: np.ndarray, centre: np.ndarray, zoom: np.ndarray, mm: float, focal: float | None
+) -> np.ndarray:
+    """(F, 15, 2) mm, positions in a distant camera about each frame's centre (F, 2).
+
+    ``mm`` per unit of the keypoints at zoom 1.  With the focal length the scale gives the pelvis' distance: joints
+    ``depth_mm`` (F, 15) behind the pelvis move outwards, those before it inwards.
+    """
+    flat = (keypoints - centre[:, None]) * (mm / zoom)[:, None, None]
+    if focal is None:
+        return flat
+    return flat * magnification(depth_mm, focal * mm / zoom)
+
+
+def _zoom_of(joints: np.ndarray, fps: float) -> np.ndarray:
+    """(F,) relative size of the lifter's bodies (F, 15, 3) over time, smooth, of median 1."""
+    from scipy.ndimage import gaussian_filter1d
+
+    size = bone_lengths(joints).sum(axis=-1)
+    smooth = gaussian_filter1d(size, 1.0 * fps, mode="nearest", truncate=3.0)
+    change = np.log(np.maximum(smooth / max(float(np.median(smooth)), 1e-12), 1e-3))
+    # The lifter's sizes err by some percent: the adjustment finds small changes better.
+    return np.exp(np.sign(change) * np.maximum(np.abs(change) - 0.03, 0.0))

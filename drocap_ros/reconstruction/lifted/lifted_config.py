@@ -1,0 +1,40 @@
+"""Parameters of the default method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drocap_ros.parameters import Parameters, param
+from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
+
+
+@dataclass(frozen=True)
+class LiftedConfig(Parameters):
+    """Weights of the default method; "mm" are those of a person of ordinary size."""
+
+    lifter: str = param("", "lifter's ONNX file; empty for the shipped one")
+    first_iterations: int = param(4, "steps that find the bone lengths", minimum=0, maximum=1000)
+    iterations: int = param(8, "steps of the final adjustment", minimum=0, maximum=1000)
+    noise_mm: float = param(2.0, "least standard deviation of a 2D joint", unit="mm", minimum=0.01, maximum=100.0)
+    depth_weight: float = param(0.2, "weight of the lifter's depth", minimum=0.0, maximum=100.0)
+    image_weight: float = param(1.0, "weight of the lifter's image position", minimum=0.0, maximum=100.0)
+    acceleration_std_m_s2: float = param(8.4, "ordinary acceleration", unit="m/s^2", minimum=0.01, maximum=1000.0)
+    smoothing_std_m_s2: float = param(
+        10.0, "ordinary acceleration in the image for the outlier check", unit="m/s^2", minimum=0.01, maximum=1000.0
+    )
+    zoom_std_per_s: float = param(
+        0.01, "relative change of the person's size in the image per second", minimum=1e-6, maximum=1.0
+    )
+    sign_speed_m_s: float = param(
+        1.44, "speed of a bone's end in depth that costs one sigma", unit="m/s", minimum=0.01, maximum=100.0
+    )
+    sign_acceleration_m_s2: float = param(
+        14.4, "its acceleration that costs one sigma", unit="m/s^2", minimum=0.01, maximum=1000.0
+    )
+
+
+def lifted_config(adjuster: BundleAdjusterConfig) -> LiftedConfig:
+    """The parameters that the bundle adjuster's section sets; the weights keep their defaults."""
+    return LiftedConfig(
+        lifter=adjuster.lifter, first_iterations=adjuster.limb_iterations_first, iterations=adjuster.limb_iterations
+    )

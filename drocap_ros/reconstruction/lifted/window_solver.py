@@ -1,0 +1,144 @@
+"""Depth signs and adjustment of one window, in mm of an ordinary person.
+
+The image positions are smoothed without outliers, every bone gets its depth from its length and its sign, and the
+adjustment refines the result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.lifted.adjustment import (
+    AdjustmentProblem,
+    AdjustmentSolution,
+    adjust,
+    span_lengths,
+    zoom_model,
+)
+from drocap_ros.reconstruction.lifted.depth_signs import depth_signs
+from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
+from drocap_ros.reconstruction.lifted.lifter_input import nanmedian_small
+from drocap_ros.skeleton import BODY_15
+
+#: Returns True when an adjustment should end.
+Cancelled = Callable[[], bool]
+
+_BONES = BODY_15.bones
+
+
+@dataclass(frozen=True)
+class WindowModel:
+    """Weights and priors common to both adjustments of a window.
+
+    weight : (F, 15) 1/mm^2 of the 2D joints, 0 where not seen
+    """
+
+    weight: np.ndarray
+    noise_mm: float
+    fps: float
+    config: LiftedConfig
+    zoom_basis: np.ndarray
+    zoom_precision: np.ndarray
+
+
+def window_model(keypoints: Keypoints2D, mm: float, fps: float, config: LiftedConfig) -> WindowModel:
+    """Model of a window whose keypoints have ``mm`` per unit.
+
+    Without a covariance the noise comes from the third difference in time, to which motion contributes little.
+    """
+    points_mm, confidence, variance = keypoints.xy * mm, keypoints.confidence, keypoints.variance
+    seen = np.isfinite(points_mm[..., 0])
+    noise = config.noise_mm
+    if len(keypoints) > 3:
+        third = nanmedian_small(np.abs(np.diff(points_mm, n=3, axis=0)).reshape(-1), axis=0)
+        noise = max(noise, 1.48 / np.sqrt(20) * float(np.nan_to_num(third)))
+    square = np.full(seen.shape, noise**2)
+    if variance is not None:
+        square = np.where(np.isfinite(variance), np.maximum(variance * mm**2, config.noise_mm**2), square)
+        noise = float(np.sqrt(np.median(square[seen]))) if seen.any() else noise
+    weight = np.where(seen, 1.0 / square, 0.0)
+    if confidence is not None:
+        weight = weight * np.clip(np.nan_to_num(confidence), 0.0, 1.0)
+    return WindowModel(weight, noise, fps, config, *zoom_model(len(keypoints), fps, config.zoom_std_per_s))
+
+
+def solve_signs_and_adjust(
+    model: WindowModel,
+    keypoints: np.ndarray,
+    prior: np.ndarray,
+    sigma: np.ndarray,
+    lengths: np.ndarray | None,
+    iterations: int,
+    cancelled: Cancelled | None,
+) -> AdjustmentSolution:
+    """Adjusted joints from the 2D joints (F, 15, 2) and the lifter's joints (F, 15, 3), all in mm.
+
+    Parameters
+    ----------
+    sigma : (F, 15, 2) the lifter's expected errors of x, y (each) and of depth
+    lengths : (16,) of the adjustment's spans; None = from the 2D joints and the lifter's depths
+    """
+    config, weight, fps = model.config, model.weight, model.fps
+    points = np.where(weight[..., None] > 0, np.nan_to_num(keypoints), 0.0)
+    prior_xy = config.image_weight / (2 * np.square(sigma[..., 0]) + 5.0**2)
+    gap = np.square(points - prior[..., :2]).sum(axis=-1)
+    inlier = gap < 9 * (2 * model.noise_mm**2 + 2 * np.square(sigma[..., 0]) + 8.0**2)
+    smoothing = (1000 * config.smoothing_std_m_s2 / fps**2) ** -2
+    flat = _smooth(points, weight * inlier, prior[..., :2], prior_xy, smoothing)
+
+    image = span_lengths(flat)
+    if lengths is None:
+        seen_lengths = np.median(span_lengths(np.concatenate([flat, prior[..., 2:]], axis=-1)), axis=0)
+        # A bone is at least as long as its image, up to the noise.
+        lengths = np.maximum(seen_lengths, np.quantile(image, 0.97, axis=0))
+    reach = np.sqrt(np.maximum(np.square(lengths) - np.square(image), 0.0))[:, : len(_BONES)]
+    parent, child = _BONES[:, 0], _BONES[:, 1]
+    spread = np.hypot(sigma[:, parent, 1], sigma[:, child, 1])
+    sign = depth_signs(
+        reach,
+        prior[:, child, 2] - prior[:, parent, 2],
+        np.maximum(spread, 1e-3),
+        1000 * config.sign_speed_m_s / fps,
+        1000 * config.sign_acceleration_m_s2 / fps**2,
+    )
+    depth = np.zeros(flat.shape[:2])
+    for bone, (p, c) in enumerate(_BONES):
+        depth[:, c] = depth[:, p] + sign[:, bone] * reach[:, bone]
+    problem = AdjustmentProblem(
+        keypoints=points,
+        weight=weight,
+        prior=prior,
+        prior_weight_xy=prior_xy,
+        prior_weight_z=config.depth_weight / np.maximum(sigma[..., 1], 10.0),
+        acceleration_weight=(1000 * config.acceleration_std_m_s2 / fps**2) ** -2,
+        zoom_basis=model.zoom_basis,
+        zoom_precision=model.zoom_precision,
+    )
+    return adjust(problem, np.concatenate([flat, depth[..., None]], axis=-1), lengths, iterations, cancelled=cancelled)
+
+
+def _smooth(
+    points: np.ndarray, weight: np.ndarray, other: np.ndarray, other_weight: np.ndarray, smoothing: float
+) -> np.ndarray:
+    """Least-squares fit (F, 15, 2) to two noisy tracks with small accelerations: a banded solve per joint."""
+    from scipy.linalg import solveh_banded
+
+    frames, joints, _ = points.shape
+    band = np.zeros((3, frames))
+    if frames > 2:
+        for offset, factor in ((0, 1.0), (1, 4.0), (2, 1.0)):
+            band[2, offset : frames - 2 + offset] += factor * smoothing
+        band[1, 1:-1] -= 2 * smoothing
+        band[1, 2:] -= 2 * smoothing
+        band[0, 2:] += smoothing
+    out = np.empty_like(points)
+    for j in range(joints):
+        matrix = band.copy()
+        matrix[2] += weight[:, j] + other_weight[:, j]
+        right = weight[:, j, None] * points[:, j] + other_weight[:, j, None] * other[:, j]
+        out[:, j] = solveh_banded(matrix, right)
+    return out

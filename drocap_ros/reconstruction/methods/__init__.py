@@ -1,0 +1,29 @@
+"""The methods of ``drocap reconstruct``: ``--method NAME`` runs ``METHODS[NAME].run``.
+
+``live`` is no entry: it needs a recording of the live graph and runs in :mod:`drocap_ros.live_replay`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from drocap_ros.reconstruction.methods import ba, initial, mf_nnm, paper
+from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method of reconstruction and its help text."""
+
+    run: Callable[[MethodInput], CameraPoses]
+    summary: str
+
+
+METHODS = {
+    "ba": Method(ba.run, "the default: learned lifter, depth signs, adjustment with constant bone lengths"),
+    "paper": Method(paper.run, "single-view initializer and equations (2) to (4) of the paper"),
+    "paper-no-articulation": Method(paper.run_without_articulation, "paper with gamma = 0"),
+    "initial": Method(initial.run, "the paper's single-view initializer alone"),
+    "mf-nnm": Method(mf_nnm.run, "baseline: matrix factorization and nuclear norm minimization"),
+}

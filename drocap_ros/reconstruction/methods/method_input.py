@@ -1,0 +1,54 @@
+"""Input and result of every method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.paper.dictionary import Dictionary
+from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class MethodInput:
+    """Keypoints of one person and the parameters of the methods.
+
+    stamp_ns : (F,) increasing
+    keypoints : of BODY_15, px
+    focal_px : of the camera, None = unknown
+    progress : called with a stage and its fraction done
+    """
+
+    stamp_ns: np.ndarray
+    keypoints: Keypoints2D
+    focal_px: float | None
+    initializer: InitializerConfig
+    adjuster: BundleAdjusterConfig
+    dictionary: Dictionary
+    progress: Progress
+
+    def frames(self, use: np.ndarray) -> MethodInput:
+        """The input of the frames ``use`` (F,) bool."""
+        return replace(self, stamp_ns=self.stamp_ns[use], keypoints=self.keypoints[use])
+
+
+@dataclass(frozen=True)
+class CameraPoses:
+    """Poses in camera axes, in px, and the solver's report.
+
+    joints_px : (F, 15, 3), centred; ``keypoints ~ joints_px[..., :2] + translation_px``
+    translation_px : (F, 2)
+    seconds : wall-clock per stage
+    """
+
+    joints_px: np.ndarray
+    translation_px: np.ndarray
+    seconds: dict[str, float]
+    iterations: int
+    stop_reason: str
+    cost_terms: dict[str, float]

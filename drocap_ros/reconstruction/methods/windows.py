@@ -1,0 +1,79 @@
+"""Recordings of any length in overlapping windows: linear time, bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput
+from drocap_ros.reconstruction.paper.normalize import NormalizedTracks, normalize_tracks
+from drocap_ros.reconstruction.paper.reprojection import Projection, frames_last
+
+
+class WindowResult(NamedTuple):
+    """Poses (F, 15, 3) in camera axes, x and y in the window's normalized image; the solver's report."""
+
+    poses: np.ndarray
+    cost_terms: dict[str, float]
+    iterations: int
+    stop_reason: str
+
+
+def over_windows(data: MethodInput, solve: Callable[[slice, NormalizedTracks], WindowResult]) -> CameraPoses:
+    """Solve window by window and cross-fade the poses where windows overlap."""
+    keypoints, overlap = data.keypoints, data.adjuster.overlap_frames
+    out, weight = np.zeros((*keypoints.xy.shape[:2], 3)), np.zeros(len(keypoints))
+    iterations, terms, stops = 0, dict[str, float](), set[str]()
+    for rows, n in normalized_windows(keypoints, data.adjuster.window_frames, overlap):
+        found = solve(rows, n)
+        fade = _fade(len(found.poses), overlap, rows.start > 0, rows.stop < len(keypoints))
+        in_image = found.poses * n.scale_px
+        in_image[..., :2] += n.centre_px[:, None]
+        out[rows] += fade[:, None, None] * in_image
+        weight[rows] += fade
+        iterations += found.iterations
+        stops.add(found.stop_reason)
+        for name, value in found.cost_terms.items():
+            terms[name] = terms.get(name, 0.0) + value
+        data.progress("ba", rows.stop / len(keypoints))
+    return CameraPoses(*split(out / weight[:, None, None]), {}, iterations, ", ".join(sorted(stops)), terms)
+
+
+def placed(poses: np.ndarray, w: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Poses (F, P, 3) translated in the image to fit the joints ``w`` (F, P, 2) best."""
+    moved = poses.copy()
+    moved[..., :2] += Projection(w, information).translation(frames_last(poses[..., :2])).T[:, None]
+    return moved
+
+
+def split(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centred poses (F, P, 3), and their centres in the image (F, 2)."""
+    middle = poses.mean(axis=1, keepdims=True)
+    return poses - middle, middle[:, 0, :2]
+
+
+def windows(frames: int, length: int, overlap: int) -> list[slice]:
+    """Windows of equal length, at most ``length``; neighbours share about ``overlap`` frames."""
+    if frames <= length:
+        return [slice(0, frames)]
+    overlap = min(overlap, length // 2)
+    count = int(np.ceil((frames - overlap) / (length - overlap)))
+    # No longer than the overlap needs: 1000 frames take three windows of 374, not of 480.
+    length = int(np.ceil((frames + (count - 1) * overlap) / count))
+    begins = np.round(np.linspace(0, frames - length, count)).astype(int)
+    return [slice(int(begin), int(begin) + length) for begin in begins]
+
+
+def normalized_windows(keypoints: Keypoints2D, length: int, overlap: int) -> Iterator[tuple[slice, NormalizedTracks]]:
+    """Normalized tracks, window by window."""
+    for rows in windows(len(keypoints), length, overlap):
+        yield rows, normalize_tracks(keypoints[rows])
+
+
+def _fade(count: int, overlap: int, at_start: bool, at_end: bool) -> np.ndarray:
+    """Weights (count,) that rise over the overlap with the window before and fall over that with the next."""
+    ramp = np.minimum(np.arange(1, count + 1) / (overlap + 1.0), 1.0)
+    return (ramp if at_start else np.ones(count)) * (ramp[::-1] if at_end else np.ones(count))
