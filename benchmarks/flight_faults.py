@@ -12,33 +12,38 @@ from pathlib import Path
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
 
-from drocap_ros.simulation.closed_loop.faults import (  # noqa: E402
+from drocap_ros.simulation.closed_loop.fault_flight import (  # noqa: E402
     EXCURSION_M,
-    FAULTS,
     MOTION_S,
     Fault,
     FaultResult,
     failures,
     fly_fault,
-    keeps,
-    settings_of,
+    within_protocol,
 )
+from drocap_ros.simulation.closed_loop.fault_table import FAULTS  # noqa: E402
 
 
 def row(fault: Fault, autopilot: str, result: FaultResult) -> tuple[str, str]:
     """Mark and line of a case: + bounds of the protocol kept, c those of the stated cause, h harmless, - not kept."""
     bad = failures(fault, autopilot, result)
-    mark = "-" if bad else "h" if fault.harmless else "+" if keeps(result) else "c"
+    mark = "-" if bad else "h" if fault.harmless else "+" if within_protocol(result) else "c"
     going = fault.harmless and result.state.name == "ORBITING"
     bounds = "     -      -"
     if not fault.harmless:
-        limits = fault.bounds(settings_of(fault, autopilot), result.speed_m_s)
+        limits = fault.bounds(autopilot, result.speed_m_s)
         bounds = f"{limits.motion_s:6.2f} {limits.excursion_m:6.2f}"
     motion = "goes on" if going else f"{result.motion_s:7.2f}"
-    note = f"NOT KEPT: {'; '.join(bad)}. " if bad else f"[{fault.cause.words}] " if mark == "c" and fault.cause else ""
+    note = (
+        f"NOT KEPT: {'; '.join(bad)}. "
+        if bad
+        else f"[{fault.cause.description}] "
+        if mark == "c" and fault.cause
+        else ""
+    )
     return mark, (
         f"{mark} {autopilot:9} {fault.name:40} {motion} {result.excursion_m:6.2f} {bounds} {result.speed_m_s:5.2f} "
-        f"{result.state.name:10} {note}{result.reason}"
+        f"{result.state.name:10} {note}{result.condition}"
     )
 
 

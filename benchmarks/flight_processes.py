@@ -30,9 +30,10 @@ from drocap_ros.config import DrocapConfig  # noqa: E402
 from drocap_ros.errors import NodeError  # noqa: E402
 from drocap_ros.flight.frames import camera_rotation  # noqa: E402
 from drocap_ros.flight.mavlink.transport import open_transport  # noqa: E402
-from drocap_ros.flight.orbit.safety import Command, State  # noqa: E402
+from drocap_ros.flight.orbit.states import Command, State  # noqa: E402
 from drocap_ros.observation import PoseObservation  # noqa: E402
-from drocap_ros.simulation.closed_loop.faults import EXCURSION_M, MOTION_S, TIMEOUT, Bounds  # noqa: E402
+from drocap_ros.simulation.closed_loop.fault_causes import TIMEOUT  # noqa: E402
+from drocap_ros.simulation.closed_loop.fault_flight import EXCURSION_M, MOTION_S, Bounds  # noqa: E402
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings  # noqa: E402
 from drocap_ros.simulation.keypoint_errors import noisy_keypoints  # noqa: E402
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project  # noqa: E402
@@ -356,7 +357,7 @@ def main() -> int:
             bad += bool(found)
             limits = bounds(case, autopilot, outcome.speed_m_s)
             kept = outcome.motion_s <= MOTION_S and outcome.excursion_m < EXCURSION_M
-            note = f"NOT KEPT: {'; '.join(found)}. " if found else "" if kept else f"[{TIMEOUT.words}] "
+            note = f"NOT KEPT: {'; '.join(found)}. " if found else "" if kept else f"[{TIMEOUT.description}] "
             print(
                 f"{'-' if found else '+' if kept else 'c'} {autopilot:9} {case.name:38} {outcome.motion_s:7.2f} "
                 f"{outcome.excursion_m:6.2f} {limits.motion_s:6.2f} {limits.excursion_m:6.2f} {outcome.speed_m_s:5.2f} "

@@ -1,4 +1,4 @@
-"""A whole simulated capture: person, orbiting camera, observed keypoints, telemetry, and the truth."""
+"""A simulated capture flight: person, orbiting camera, detected keypoints, telemetry, and the truth."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.simulation.capture_config import SimulationConfig
-from drocap_ros.simulation.keypoint_errors import NoisyKeypoints, noisy_keypoints, occlusion
-from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project, to_camera
+from drocap_ros.simulation.keypoint_errors import NoisyKeypoints, detect_person
+from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import MAX_FRAMES, Tracks
@@ -17,13 +17,13 @@ from drocap_ros.tracks import MAX_FRAMES, Tracks
 
 @dataclass(frozen=True)
 class SimulatedCapture:
-    """What a flight would have recorded, and what was really there.
+    """Recording of a flight, and its truth.
 
     tracks : keypoints with noise, and camera telemetry with its slow errors
     joints3d_world : (F, 15, 3) m ENU, truth
     camera_rotation, camera_position : (F, 3, 3) world -> camera, (F, 3) m ENU, truth
     keypoints_exact : (F, 15, 2) px, truth
-    observation : which keypoints were occluded or made outliers
+    detection : the noisy keypoints, with the occluded ones and the outliers marked
     """
 
     tracks: Tracks
@@ -31,7 +31,7 @@ class SimulatedCapture:
     camera_rotation: np.ndarray
     camera_position: np.ndarray
     keypoints_exact: np.ndarray
-    observation: NoisyKeypoints
+    detection: NoisyKeypoints
 
 
 def simulate_capture(
@@ -41,20 +41,20 @@ def simulate_capture(
 
     Parameters
     ----------
-    seconds, fps : length and picture rate; at least one frame
+    seconds, fps : length and image rate; at least one frame
     seed : person, take and noise
-    start_ns : stamp of the first picture
+    start_ns : stamp of the first image
 
     Raises
     ------
     InputError
-        When length or rate cannot be used.
+        When length or rate is out of range.
     """
     config = config or SimulationConfig()
     if not (np.isfinite(fps) and 0 < fps <= 1000):
-        raise InputError(f"fps: expected above 0 and at most 1000, got {fps!r}; choose a picture rate")
+        raise InputError(f"fps: expected above 0 and at most 1000, got {fps!r}; choose an image rate")
     if not (np.isfinite(seconds) and 0 < seconds <= 36_000) or seconds * fps > MAX_FRAMES:
-        raise InputError(f"seconds: expected above 0 and at most {MAX_FRAMES} pictures, got {seconds!r} s at {fps:g}/s")
+        raise InputError(f"seconds: expected above 0 and at most {MAX_FRAMES} images, got {seconds!r} s at {fps:g}/s")
     t = np.arange(max(1, round(seconds * fps))) / fps
     joints = simulate_person(t, config.action, seed, config.stature_m)
     centre = _aim(t, seed, config)
@@ -64,34 +64,28 @@ def simulate_capture(
     )
     matrix = pinhole_matrix(config.image_width, config.image_height, config.horizontal_fov_deg)
     exact = project(joints, rotation, position, matrix)
-    inside = np.all((exact >= -0.5) & (exact < np.array([config.image_width, config.image_height]) - 0.5), axis=-1)
-    seen = np.where(inside[..., None], exact, np.nan)
-    hidden = occlusion(exact, to_camera(joints, rotation, position)[..., 2], matrix[0, 0])
-    observation = noisy_keypoints(
-        seen,
-        hidden,
-        seed,
-        noise_scale=config.noise_scale,
-        outlier_fraction=config.outlier_fraction,
-        missed_fraction=config.missed_fraction,
-    )
-    told_rotation, told_position = _telemetry(t, rotation, position, rng, config)
+    size = (config.image_width, config.image_height)
+    detection = detect_person(
+        joints, rotation, position, matrix, size, seed, noise_scale=config.noise_scale,
+        outlier_fraction=config.outlier_fraction, missed_fraction=config.missed_fraction,
+    )  # fmt: skip
+    reported_rotation, reported_position = _telemetry(t, rotation, position, rng, config)
     tracks = Tracks(
-        keypoints=observation.keypoints,
+        keypoints=detection.keypoints,
         joints=BODY_15.joints,
         stamp_ns=start_ns + np.round(t * 1e9).astype(np.int64),
-        image_size=(config.image_width, config.image_height),
-        confidence=observation.confidence,
-        covariance=observation.covariance,
-        camera_rotation=told_rotation,
-        camera_position=told_position,
+        image_size=size,
+        confidence=detection.confidence,
+        covariance=detection.covariance,
+        camera_rotation=reported_rotation,
+        camera_position=reported_position,
         camera_matrix=matrix,
     )
-    return SimulatedCapture(tracks, joints, rotation, position, exact, observation)
+    return SimulatedCapture(tracks, joints, rotation, position, exact, detection)
 
 
 def _aim(t: np.ndarray, seed: int, config: SimulationConfig) -> np.ndarray:
-    """(F, 3) m, the point that the drone circles: the person's place as a follower sees it, 0.3 s late and smooth."""
+    """(F, 3) m, the centre of the orbit: the person's position as a follower estimates it, 0.3 s late and smoothed."""
     late = np.maximum(t[:, None] - 0.3 + np.linspace(-0.3, 0.3, 7), 0.0)
     pelvis = simulate_person(late.ravel(), config.action, seed, config.stature_m)[:, 0].reshape(*late.shape, 3)
     aim = pelvis.mean(axis=1)
@@ -102,11 +96,11 @@ def _aim(t: np.ndarray, seed: int, config: SimulationConfig) -> np.ndarray:
 def _telemetry(
     t: np.ndarray, rotation: np.ndarray, position: np.ndarray, rng: np.random.Generator, config: SimulationConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Camera pose as the autopilot would report it: with slow errors of the configured size (RMS over axes)."""
+    """Camera pose as reported by the autopilot: with slow errors of the configured size (RMS over axes)."""
     from scipy.spatial.transform import Rotation
 
     rate = rng.uniform(0.02, 0.2, (2, 3))
     phase = rng.uniform(0, 2 * np.pi, (2, 3))
     wave = np.sin(2 * np.pi * rate[:, None] * t[:, None] + phase[:, None]) * np.sqrt(2 / 3)
-    turn = Rotation.from_rotvec(np.deg2rad(config.attitude_error_deg) * wave[0]).as_matrix()
-    return turn @ rotation, position + config.position_error_m * wave[1]
+    error = Rotation.from_rotvec(np.deg2rad(config.attitude_error_deg) * wave[0]).as_matrix()
+    return error @ rotation, position + config.position_error_m * wave[1]

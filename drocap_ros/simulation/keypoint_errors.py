@@ -1,4 +1,4 @@
-"""What a 2D pose detector makes of the simulated person: noise, outliers, missed joints, confidence, covariance."""
+"""Errors of a 2D pose detector on the simulated person: noise, outliers, misses, confidence and covariance."""
 
 from __future__ import annotations
 
@@ -6,38 +6,65 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.skeleton import BODY_15, JointSet
+from drocap_ros.simulation.orbit_camera import project, to_camera
+from drocap_ros.skeleton import BODY_15
 
 #: Standard deviation over the box height, per kind of joint (detectors are worst at the ends of the limbs).
 _SPREAD = {
     "pelvis": 0.007, "hip": 0.008, "knee": 0.007, "ankle": 0.010, "neck": 0.006, "head": 0.006,
     "shoulder": 0.006, "elbow": 0.008, "wrist": 0.011,
 }  # fmt: skip
-_CORRELATION = 0.6  # of the noise of one image with that of the image before
+_CORRELATION = 0.6  # of the noise of one image with that of the previous one
 _LIMB_RADIUS_M = 0.07
 _OCCLUDED_NOISE = 2.2
 _CHUNK = 4096
 
 
 class NoisyKeypoints(NamedTuple):
-    """Keypoints (F, P, 2) px, confidence (F, P), covariance (F, P, 3) px^2 and what was done to them (F, P) bool."""
+    """Keypoints (F, 15, 2) px, confidence (F, 15), covariance (F, 15, 3) px^2, and (F, 15) bool of what was simulated.
+
+    visible : inside the image, found or not
+    """
 
     keypoints: np.ndarray
     confidence: np.ndarray
     covariance: np.ndarray
     occluded: np.ndarray
     outlier: np.ndarray
+    visible: np.ndarray
 
 
-def occlusion(px: np.ndarray, depth: np.ndarray, focal_px: float, joint_set: JointSet = BODY_15) -> np.ndarray:
-    """(F, P) bool, joints behind another limb or the trunk.
+def detect_person(
+    joints: np.ndarray,
+    rotation: np.ndarray,
+    position: np.ndarray,
+    camera_matrix: np.ndarray,
+    image_size: tuple[int, int],
+    seed: int,
+    **errors: float,
+) -> NoisyKeypoints:
+    """Keypoints of joints (F, 15, 3) m ENU in a camera, with self-occlusion; NaN outside the image.
 
-    px (F, P, 2), depth (F, P) m.  Limbs are capsules of 7 cm radius, the trunk of 14 cm.
+    Parameters
+    ----------
+    rotation, position : (F, 3, 3) world -> camera, (F, 3) m ENU
+    errors : keywords of :func:`noisy_keypoints`
+    """
+    exact = project(joints, rotation, position, camera_matrix)
+    inside = np.all((exact >= -0.5) & (exact < np.array(image_size) - 0.5), axis=-1)
+    occluded = occlusion(exact, to_camera(joints, rotation, position)[..., 2], camera_matrix[0, 0])
+    return noisy_keypoints(np.where(inside[..., None], exact, np.nan), occluded, seed, **errors)
+
+
+def occlusion(px: np.ndarray, depth: np.ndarray, focal_px: float) -> np.ndarray:
+    """(F, 15) bool, joints behind another limb or the trunk.
+
+    px (F, 15, 2), depth (F, 15) m.  Limbs are capsules of 7 cm radius, the trunk of 14 cm.
     """
     hidden = np.zeros(depth.shape, dtype=bool)
-    parent, child = joint_set.bones.T
-    radius = np.where((parent == 0) & (child == joint_set.index("neck")), 2 * _LIMB_RADIUS_M, _LIMB_RADIUS_M)
-    own = (np.arange(len(joint_set))[:, None] == parent) | (np.arange(len(joint_set))[:, None] == child)
+    parent, child = BODY_15.bones.T
+    radius = np.where((parent == 0) & (child == BODY_15.index("neck")), 2 * _LIMB_RADIUS_M, _LIMB_RADIUS_M)
+    own = (np.arange(len(BODY_15))[:, None] == parent) | (np.arange(len(BODY_15))[:, None] == child)
     for start in range(0, len(px), _CHUNK):
         part = slice(start, start + _CHUNK)
         a, b = px[part, None, parent], px[part, None, child]
@@ -45,8 +72,8 @@ def occlusion(px: np.ndarray, depth: np.ndarray, focal_px: float, joint_set: Joi
         along = np.sum((px[part, :, None] - a) * axis, axis=-1) / np.maximum(np.sum(axis**2, axis=-1), 1e-9)
         along = np.clip(along, 0.0, 1.0)
         gap = np.linalg.norm(px[part, :, None] - a - along[..., None] * axis, axis=-1)
-        near = depth[part, None, parent] * (1 - along) + depth[part, None, child] * along
-        covered = (gap * near < radius * focal_px) & (near < depth[part, :, None] - radius) & ~own
+        limb_depth = depth[part, None, parent] * (1 - along) + depth[part, None, child] * along
+        covered = (gap * limb_depth < radius * focal_px) & (limb_depth < depth[part, :, None] - radius) & ~own
         hidden[part] = covered.any(axis=2)
     return hidden
 
@@ -59,18 +86,17 @@ def noisy_keypoints(
     noise_scale: float = 1.0,
     outlier_fraction: float = 0.03,
     missed_fraction: float = 0.015,
-    joint_set: JointSet = BODY_15,
 ) -> NoisyKeypoints:
-    """Keypoints as a detector would report them.
+    """Exact keypoints with the errors of a detector.
 
     Noise is proportional to the height of the person's box, larger for wrists, ankles and occluded joints, and
-    correlated over time; gross outliers and misses are three times as frequent among occluded joints.  The
-    reported covariance is right on average but not per keypoint; outliers get a lower confidence, most of them.
+    correlated over time; outliers and misses are three times as frequent among occluded joints.  The reported
+    covariance is right on average, not per keypoint; most outliers have a lower confidence.
 
     Parameters
     ----------
-    px : (F, P, 2) exact projections, NaN outside the view
-    occluded : (F, P) bool, see :func:`occlusion`
+    px : (F, 15, 2) exact projections, NaN outside the image
+    occluded : (F, 15) bool, see :func:`occlusion`
     """
     from scipy.signal import lfilter
 
@@ -78,7 +104,7 @@ def noisy_keypoints(
     frames, joints = px.shape[:2]
     hidden = np.zeros((frames, joints), bool) if occluded is None else occluded
     height = _box_height(px)
-    share = np.array([_SPREAD[name.lstrip("lr") if name[1:] in _SPREAD else name] for name in joint_set.joints])
+    share = np.array([_SPREAD[name.lstrip("lr") if name[1:] in _SPREAD else name] for name in BODY_15.joints])
     sigma = height[:, None] * share * np.where(hidden, _OCCLUDED_NOISE, 1.0)
     white = rng.standard_normal((frames, joints, 2))
     white[1:] *= np.sqrt(1 - _CORRELATION**2)
@@ -98,14 +124,15 @@ def noisy_keypoints(
     mixed = 0.2 * rng.uniform(-1, 1, (frames, joints)) * np.sqrt(variance[..., 0] * variance[..., 1])
     covariance = np.stack([variance[..., 0], mixed, variance[..., 1]], axis=-1)
 
-    good = rng.beta(14, 2.5, (frames, joints)) * np.where(hidden, 0.75, 1.0)
-    confidence = np.where(outlier, rng.beta(3, 4.5, (frames, joints)), good)
+    inlier_confidence = rng.beta(14, 2.5, (frames, joints)) * np.where(hidden, 0.75, 1.0)
+    confidence = np.where(outlier, rng.beta(3, 4.5, (frames, joints)), inlier_confidence)
 
-    missed = missed | ~np.isfinite(px).all(axis=-1)
+    visible = np.isfinite(px).all(axis=-1)
+    missed = missed | ~visible
     keypoints = np.where(missed[..., None], np.nan, keypoints)
     covariance = np.where(missed[..., None], np.nan, covariance)
     confidence = np.where(missed, 0.0, confidence)
-    return NoisyKeypoints(keypoints, confidence, covariance, hidden, outlier & ~missed)
+    return NoisyKeypoints(keypoints, confidence, covariance, hidden, outlier & ~missed, visible)
 
 
 def _box_height(px: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The camera of the simulated drone: orbit, look-at, pinhole projection."""
+"""The pinhole camera of the simulated drone: orbit, orientation, projection."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 
 
 def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """(F, 3, 3) world (ENU) -> camera (x right, y down, z forward), level, looking from position to target (F, 3) m.
+    """(F, 3, 3) world (ENU) -> camera (x right, y down, z forward), level, from position towards target (F, 3) m.
 
-    A camera straight above or below its target has no level; it then keeps world x as its right.
+    A camera straight above or below its target has no level; its right is then world x.
     """
     forward = target - position
     forward = forward / np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), 1e-9)
@@ -26,14 +26,14 @@ def orbit_camera(
     speed_deg_s: float,
     start_deg: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Camera that circles a (moving) centre and looks at it.
+    """Pose of a camera that circles a moving centre and points at it.
 
     Parameters
     ----------
     t : (F,) s
-    centre : (F, 3) m ENU, what it looks at
+    centre : (F, 3) m ENU
     radius_m, height_m : horizontal distance from the centre; height above the ground (z = 0)
-    speed_deg_s : positive = counter-clockwise seen from above
+    speed_deg_s : positive = counter-clockwise from above
     start_deg : bearing of the camera from the centre at t = 0, 0 = east
 
     Returns

@@ -9,7 +9,7 @@ from drocap_ros.simulation.orbit_camera import look_at, orbit_camera, pinhole_ma
 from drocap_ros.skeleton import BODY_15
 
 
-def test_camera_looks_at_its_target_and_is_level():
+def test_camera_points_at_its_target_and_is_level():
     rng = np.random.default_rng(1)
     position, target = rng.normal(size=(2, 50, 3)) * 5
     rotation = look_at(position, target)
@@ -22,13 +22,13 @@ def test_camera_looks_at_its_target_and_is_level():
     assert (rotation[:, 1, 2] < 0).all()  # image y points down
 
 
-def test_straight_down_is_still_a_rotation():
+def test_camera_straight_above_its_target_has_a_rotation():
     rotation = look_at(np.array([[0.0, 0.0, 5.0]]), np.zeros((1, 3)))
     assert np.allclose(rotation[0] @ rotation[0].T, np.eye(3))
     assert np.isclose(np.linalg.det(rotation[0]), 1)
 
 
-def test_orbit_keeps_radius_and_angular_speed():
+def test_orbit_has_constant_radius_and_angular_speed():
     t = np.linspace(0, 4, 101)
     centre = np.stack([t, 0.2 * t, np.ones_like(t)], axis=1)
     _, position = orbit_camera(t, centre, 6.0, 3.0, 25.0, start_deg=90)
@@ -39,7 +39,7 @@ def test_orbit_keeps_radius_and_angular_speed():
     assert np.allclose(away[0, :2], [0, 6])
 
 
-def test_projection_against_the_definition():
+def test_projection_equals_its_definition():
     matrix = pinhole_matrix(640, 480, 90.0)
     assert np.isclose(matrix[0, 0], 320.0)
     point = np.array([[[1.0, 0.5, 2.0], [0.0, 0.0, -1.0]]])
@@ -53,7 +53,7 @@ def capture():
     return simulate_capture(20, 30, seed=11)
 
 
-def test_capture_is_consistent(capture):
+def test_keypoints_are_projections_of_the_joints(capture):
     tracks = capture.tracks
     assert tracks.joints == BODY_15.joints
     assert len(tracks) == 600
@@ -63,8 +63,8 @@ def test_capture_is_consistent(capture):
     assert inside.mean() > 0.99
 
 
-def test_noise_has_the_shape_of_a_detectors(capture):
-    tracks, obs = capture.tracks, capture.observation
+def test_noise_outliers_and_misses_have_the_statistics_of_a_detector(capture):
+    tracks, obs = capture.tracks, capture.detection
     error = np.linalg.norm(tracks.keypoints - capture.keypoints_exact, axis=2)
     height = np.ptp(capture.keypoints_exact[..., 1], axis=1)[:, None]
     seen = np.isfinite(error)
@@ -82,7 +82,7 @@ def test_noise_has_the_shape_of_a_detectors(capture):
 
 
 def test_reported_covariance_is_right_on_average(capture):
-    tracks, obs = capture.tracks, capture.observation
+    tracks, obs = capture.tracks, capture.detection
     error = tracks.keypoints - capture.keypoints_exact
     clean = np.isfinite(error).all(axis=2) & ~obs.outlier
     xx, xy, yy = np.moveaxis(tracks.covariance[clean], -1, 0)
@@ -111,7 +111,7 @@ def test_telemetry_error_has_the_configured_size():
     assert 0.25 < np.sqrt(np.mean(error**2)) < 0.8
 
 
-def test_occlusion_hides_the_far_wrist_behind_the_trunk():
+def test_wrist_behind_the_trunk_is_occluded():
     px = np.zeros((1, 15, 2))
     px[0, BODY_15.index("neck")] = [0, -100]
     px[0] += 1000
@@ -126,14 +126,14 @@ def test_occlusion_hides_the_far_wrist_behind_the_trunk():
     assert not occlusion(px, depth, 1000.0).any()
 
 
-def test_joints_outside_the_view_are_missing():
+def test_joints_outside_the_image_are_missing():
     px = np.full((3, 15, 2), np.nan)
     obs = noisy_keypoints(px, seed=1)
     assert np.isnan(obs.keypoints).all()
     assert (obs.confidence == 0).all()
 
 
-def test_same_seed_same_capture():
+def test_capture_depends_on_the_seed_alone():
     a, b, c = (simulate_capture(3, 24, s).tracks for s in (3, 3, 4))
     assert np.array_equal(a.keypoints, b.keypoints, equal_nan=True)
     assert np.array_equal(a.camera_rotation, b.camera_rotation)
@@ -141,10 +141,10 @@ def test_same_seed_same_capture():
 
 
 @pytest.mark.parametrize(("seconds", "fps"), [(0, 30), (1, 0), (np.nan, 30), (1, np.inf), (36000, 1000)])
-def test_bad_lengths_are_refused(seconds, fps):
+def test_lengths_and_rates_out_of_range_are_refused(seconds, fps):
     with pytest.raises(InputError, match="expected above 0"):
         simulate_capture(seconds, fps)
 
 
-def test_one_picture_is_enough():
+def test_shortest_capture_has_one_image():
     assert len(simulate_capture(0.01, 30).tracks) == 1

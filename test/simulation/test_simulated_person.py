@@ -20,7 +20,7 @@ def test_bone_lengths_are_constant_and_motion_is_smooth(action):
     assert joints[:, BODY_15.index("head"), 2].max() < 1.85
 
 
-def test_left_is_left_of_forward():
+def test_left_hip_is_left_of_the_walking_direction():
     joints = simulate_person(T, "walk", seed=1)
     step = joints[2:, 0, :2] - joints[:-2, 0, :2]
     walking = np.linalg.norm(step, axis=1) * 30 > 0.5
@@ -30,14 +30,14 @@ def test_left_is_left_of_forward():
     assert (side[walking] > 0).all()
 
 
-def test_walk_covers_ground_and_turns():
+def test_walk_is_long_and_turns():
     pelvis = simulate_person(T, "walk", seed=2)[:, 0]
     path = np.linalg.norm(np.diff(pelvis[:, :2], axis=0), axis=1).sum()
     assert 15 < path < 30
     assert np.linalg.norm(pelvis[-1, :2] - pelvis[0, :2]) < 0.9 * path
 
 
-def test_standing_foot_does_not_slide():
+def test_stance_foot_does_not_slide():
     joints = simulate_person(T, "walk", seed=3)
     ankle = joints[:, BODY_15.index("rankle")]
     low = ankle[:, 2] < ankle[:, 2].min() + 0.005
@@ -45,7 +45,7 @@ def test_standing_foot_does_not_slide():
     assert np.median(speed[low[1:] & low[:-1]]) < 0.1
 
 
-def test_each_action_does_what_its_name_says():
+def test_actions_have_their_characteristic_motion():
     def reach(action, joint, root):
         j = simulate_person(T, action, seed=5)
         return j[:, BODY_15.index(joint)] - j[:, BODY_15.index(root)]
@@ -57,20 +57,20 @@ def test_each_action_does_what_its_name_says():
     assert np.ptp(np.linalg.norm(reach("stand", "rwrist", "rshoulder"), axis=1)) < 0.01
 
 
-def test_pose_at_an_instant_does_not_depend_on_the_other_instants():
+def test_pose_does_not_depend_on_other_instants():
     whole = simulate_person(T, "mixed", seed=6)
     assert np.allclose(simulate_person(T[100:101], "mixed", seed=6), whole[100:101], atol=1e-12)
     assert np.array_equal(whole, simulate_person(T, "mixed", seed=6))
     assert not np.allclose(whole, simulate_person(T, "mixed", seed=7))
 
 
-def test_weights_of_mixed_cover_every_action_and_are_continuous():
+def test_mixed_weights_are_continuous_and_reach_every_action():
     weight = action_weights(T, "mixed")
     assert (weight.max(axis=0) > 0.999).all()
     assert np.abs(np.diff(weight, axis=0)).max() < 0.06
 
 
-def test_two_bone_reaches_what_is_in_reach_and_keeps_lengths():
+def test_two_bone_limb_reaches_goals_in_reach_with_constant_lengths():
     rng = np.random.default_rng(0)
     start, goal, pole = rng.normal(size=(3, 200, 3))
     middle, end = two_bone(start, goal, pole, 0.7, 0.5)
@@ -83,7 +83,7 @@ def test_two_bone_reaches_what_is_in_reach_and_keeps_lengths():
 
 
 @pytest.mark.parametrize("t", [np.array([-1.0]), np.array([np.nan]), np.zeros((2, 2)), np.array([1e9])])
-def test_bad_times_are_refused(t):
+def test_times_out_of_range_are_refused(t):
     with pytest.raises(InputError, match="seconds"):
         simulate_person(t)
 
@@ -93,5 +93,5 @@ def test_unknown_action_is_refused():
         simulate_person(T, "dance")
 
 
-def test_no_instants_give_no_poses():
+def test_empty_times_give_empty_poses():
     assert simulate_person(np.array([])).shape == (0, 15, 3)

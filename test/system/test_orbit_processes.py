@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drocap_ros.flight.orbit.safety import State
-from drocap_ros.simulation.closed_loop.faults import TIMEOUT
+from drocap_ros.flight.orbit.states import State
+from drocap_ros.simulation.closed_loop.fault_causes import TIMEOUT
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
@@ -25,7 +25,7 @@ def test_a_bridge_that_was_stopped_or_killed_never_goes_on_with_its_orbit():
         assert np.linalg.norm(copter.body.velocity) > 0.8
         os.kill(flying.bridge, signal.SIGSTOP)
         place, first = copter.body.position.copy(), len(flying.drone.rows)
-        speed = max(np.linalg.norm(copter.body.velocity), np.linalg.norm(copter._target.velocity))
+        speed = max(np.linalg.norm(copter.body.velocity), np.linalg.norm(copter.target.velocity))
         flying.listen(1.5)
         os.kill(flying.bridge, signal.SIGCONT)
         flying.wait(State.HOLDING, 5.0)

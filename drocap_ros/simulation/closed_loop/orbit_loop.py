@@ -1,6 +1,6 @@
-"""The closed loop in simulated time: vehicle, person, keypoints seen from its real pose, and the real controller.
+"""The closed loop in simulated time: vehicle, person, keypoints from the vehicle's true pose, the real controller.
 
-Link, parser, estimator, planner and safety are those that fly; only clocks, bytes' way and vehicle are simulated.
+Link, parser, estimator, planner and safety are the flown ones; clocks, transport and vehicle are simulated.
 Deterministic and much faster than real time.
 """
 
@@ -17,34 +17,34 @@ import numpy as np
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.orbit.controller import ControlStatus, OperatorCommand, OrbitController
-from drocap_ros.flight.orbit.safety import Action, Command, State
+from drocap_ros.flight.orbit.controller import ControlStatus, OrbitController
+from drocap_ros.flight.orbit.states import Action, Command, CommandAnswer, OperatorCommand, State
 from drocap_ros.flight.orbit.watchdog import Watchdog
 from drocap_ros.observation import PoseObservation
-from drocap_ros.simulation.keypoint_errors import noisy_keypoints, occlusion
-from drocap_ros.simulation.orbit_camera import pinhole_matrix, project, to_camera
+from drocap_ros.simulation.keypoint_errors import detect_person
+from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
-from drocap_ros.simulation.vehicle.copter import SimulatedCopter
+from drocap_ros.simulation.vehicle.copter import CONTROL_MODE, SimulatedCopter
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 
 EPOCH_NS = 1_700_000_000_000_000_000
 _STEP_S = 0.01
 _LINK_S = 0.02
-_WIDTH, _HEIGHT, _FIELD_DEG = 1280, 720, 60.0
-_GROUND = 0.0
+_SIZE, _FIELD_DEG = (1280, 720), 60.0
 
 
 @dataclass(frozen=True)
 class LoopSettings:
     """One flight.
 
-    action : what the person does, of ``simulation.simulated_person.ACTIONS``
+    action : of the person, one of ``ACTIONS``
     walking_m_s : mean speed of a walking person
-    moves_from_s : the person waits until then
-    bearing_deg, distance_m, height_m : where the vehicle hovers at the start, seen from the person
+    moves_from_s : the person stands until then
+    bearing_deg, distance_m, height_m : initial position of the vehicle, from the person
     wind_m_s : (3,) mean
     latency_s : from exposure to keypoints
     seconds : longest flight
+    start_mode : "" = the mode in which the pilot hands over: GUIDED, or LOITER for PX4
     """
 
     autopilot: str = "ardupilot"
@@ -60,7 +60,7 @@ class LoopSettings:
     perception_hz: float = 15.0
     latency_s: float = 0.1
     seconds: float = 40.0
-    start_mode: str = ""  # "" = the control mode: the pilot has switched to GUIDED or OFFBOARD
+    start_mode: str = ""
     guid_timeout_s: float = 0.5
     offboard_loss_s: float = 0.5
     config: MavlinkBridgeConfig = field(
@@ -84,11 +84,12 @@ class Row(NamedTuple):
 
 
 class OrbitLoop:
-    """A flight that is stepped.  Faults are made by setting its attributes while it flies.
+    """A stepped flight.  Faults are injected by setting its attributes during the flight.
 
-    perceive : what becomes of each observation before it is delivered; None = lost
-    hung : the control loop does not run;  stopped : nor do link and watchdog (SIGSTOP, SIGKILL)
-    clock_jump_s : added to our clock of the stamps
+    perceive : changes each observation before its delivery; None = lost
+    hung : the control loop does not run;  stopped : link and watchdog do not run either (SIGSTOP, SIGKILL)
+    clock_jump_s : added to the bridge's clock of the stamps
+    status : of the last step of the controller
     """
 
     def __init__(self, settings: LoopSettings) -> None:
@@ -101,24 +102,24 @@ class OrbitLoop:
         bearing = math.radians(settings.bearing_deg)
         start = np.array([math.cos(bearing), math.sin(bearing), 0.0]) * settings.distance_m
         start += np.array([*joints[0, 0, :2], settings.height_m])
-        control = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}[settings.autopilot]
         aim = 0.53 * settings.stature_m
-        # A mount has been pointed at the person by hand; without one the camera is tilted for the orbit.
+        # A gimbal already points at the person; a fixed camera is tilted for the orbit.
         drop, away = settings.config.height_m - aim, settings.config.radius_m
         if settings.config.gimbal_control:
             drop, away = settings.height_m - aim, settings.distance_m
         pitch = -math.degrees(math.atan2(drop, away))
+        handed_over = "LOITER" if settings.autopilot == "px4" else CONTROL_MODE[settings.autopilot]
         self.copter = SimulatedCopter(
             LoopbackTransport(self.up, self.down), start, bearing + math.pi, settings.autopilot,
             wind=np.array(settings.wind_m_s), seed=settings.seed, guid_timeout_s=settings.guid_timeout_s,
-            offboard_loss_s=settings.offboard_loss_s,
-            mode=settings.start_mode or ("LOITER" if settings.autopilot == "px4" else control), gimbal_pitch_deg=pitch,
+            offboard_loss_s=settings.offboard_loss_s, mode=settings.start_mode or handed_over, gimbal_pitch_deg=pitch,
         )  # fmt: skip
         self.rows: list[Row] = []
-        self.answers: list[tuple[float, str]] = []
+        self.answers: list[tuple[float, CommandAnswer]] = []
         self.reasons: list[tuple[float, str, str]] = []
         self.framing: list[tuple[float, bool]] = []
-        self.matrix = pinhole_matrix(_WIDTH, _HEIGHT, _FIELD_DEG)
+        self.status: ControlStatus | None = None
+        self.matrix = pinhole_matrix(*_SIZE, _FIELD_DEG)
         self._joints = joints
         self._frame = 0
         self._waiting: list[tuple[float, PoseObservation]] = []
@@ -126,7 +127,7 @@ class OrbitLoop:
         self.restart()
 
     def restart(self) -> None:
-        """A new process takes the old one's place."""
+        """Replace the bridge's process by a new one."""
         config = self.settings.config
         transport = LoopbackTransport(self.down, self.up)
         self.link = MavlinkLink(config, self.clock_ns, monotonic_s=lambda: self.t, transport=transport)
@@ -135,20 +136,24 @@ class OrbitLoop:
         self.controller.on_camera(self.matrix)
 
     def clock_ns(self) -> int:
-        """Our clock of the stamps."""
+        """The bridge's clock of the stamps."""
         return EPOCH_NS + round((self.t + self.clock_jump_s) * 1e9)
 
     def command(self, kind: Command, **values: float) -> None:
-        """The operator's command, now."""
+        """Send a command of the operator now."""
         self.controller.command(OperatorCommand(int(kind), stamp_ns=self.clock_ns(), **values))
 
     def pelvis(self, t_s: float | None = None) -> np.ndarray:
-        """(3,) m, truth."""
+        """(3,) m, truth; now, or at a time."""
         frame = (self.t if t_s is None else t_s) * self.settings.perception_hz
         i = min(int(frame), len(self._joints) - 2)
         part = min(frame - i, 1.0)
         pelvis: np.ndarray = (1 - part) * self._joints[i, 0] + part * self._joints[i + 1, 0]
         return pelvis
+
+    def future_joints(self) -> np.ndarray:
+        """(F, 15, 3) m, the person at the present and every later frame; changes of it take effect."""
+        return self._joints[int(self.t * self.settings.perception_hz) :]
 
     def run(self, until_s: float, each: Callable[[OrbitLoop], None] | None = None) -> None:
         """Fly until a time; ``each`` is called before every step of the control loop."""
@@ -156,15 +161,30 @@ class OrbitLoop:
             self._step(each)
 
     def start(self, settle_s: float = 4.0, **values: float) -> None:
-        """Let link and filter settle, then orbit; asks for control where the pilot has not given it."""
+        """Let link and filter settle, then start the orbit; request control where the pilot has not given it."""
         self.run(self.t + settle_s)
-        control = self.copter.mode in ("GUIDED", "OFFBOARD")
-        self.command(Command.START if control else Command.ENGAGE, **values)
+        in_control = self.copter.mode in CONTROL_MODE.values()
+        self.command(Command.START if in_control else Command.ENGAGE, **values)
+
+    def observe(self, joints: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> PoseObservation:
+        """Observation of the person now; here from the projections of the joints.
+
+        Parameters
+        ----------
+        joints : (15, 3) m, truth
+        rotation, position : (3, 3) world -> optical, (3,) m, of the camera, truth
+        """
+        seed = self.settings.seed * 1_000_003 + self._frame
+        found = detect_person(joints[None], rotation[None], position[None], self.matrix, _SIZE, seed)
+        return PoseObservation(
+            self.clock_ns(), 1 if found.visible.any() else 0, _SIZE, keypoints=found.keypoints[0].astype(np.float32),
+            covariance=found.covariance[0].astype(np.float32), confidence=found.confidence[0].astype(np.float32),
+        )  # fmt: skip
 
     def _step(self, each: Callable[[OrbitLoop], None] | None) -> None:
         self.t = round(self.t + _STEP_S, 6)
         self.copter.fly(self.t)
-        self._see()
+        self._expose()
         self._deliver()
         if self.t >= self._next_link - 1e-9:
             self._next_link += _LINK_S
@@ -177,24 +197,24 @@ class OrbitLoop:
         self._next_control += 1.0 / self.settings.config.control_hz
         if each is not None:
             each(self)
-        status: ControlStatus | None = None
-        if not (self.hung or self.stopped):
-            status = self.controller.step(self.clock_ns(), self.t)
-            if status.answer:
-                self.answers.append((self.t, status.answer))
-            told = (status.state.name, status.reason)
-            if not self.reasons or self.reasons[-1][1:] != told:
-                self.reasons.append((self.t, *told))
-        self._note(status)
+        self._control()
 
-    def _note(self, status: ControlStatus | None) -> None:
+    def _control(self) -> None:
+        runs = not (self.hung or self.stopped)
+        if runs:
+            self.status = status = self.controller.step(self.clock_ns(), self.t)
+            self.answers += [(self.t, answer) for _, answer in status.answers]
+            reason = (status.state.name, status.reason)
+            if not self.reasons or self.reasons[-1][1:] != reason:
+                self.reasons.append((self.t, *reason))
         body, pelvis = self.copter.body, self.pelvis()
         sight = pelvis[:2] - body.position[:2]
         error = math.remainder(body.yaw - math.atan2(sight[1], sight[0]), 2 * math.pi)
         self.rows.append(
             Row(
                 self.t, body.position.copy(), body.velocity.copy(), float(np.hypot(*sight)), math.degrees(error),
-                self.controller.safety.state, status.action if status else Action.NOTHING, self.copter.mode,
+                self.controller.safety.state, self.status.action if runs and self.status else Action.NOTHING,
+                self.copter.mode,
             )
         )  # fmt: skip
 
@@ -205,48 +225,23 @@ class OrbitLoop:
         t = np.maximum(t - s.moves_from_s, 0.0)
         joints = simulate_person(t, s.action, s.seed, s.stature_m)
         if s.action == "walk":
-            # The path is stretched to the wanted speed and keeps its turns: the feet slide a little.
+            # The path is stretched to the wanted speed and keeps its turns, so the feet slide a little.
             trial = simulate_person(np.arange(2.0, 12.0, 0.1), s.action, s.seed, s.stature_m)[:, 0, :2]
             speed = float(np.linalg.norm(np.diff(trial, axis=0), axis=1).mean() / 0.1)
             joints[..., :2] += (s.walking_m_s / speed - 1.0) * joints[:, :1, :2]
         return joints
 
-    def _see(self) -> None:
-        hz = self.settings.perception_hz
-        if self.t < self._frame / hz - 1e-9 or self._frame >= len(self._joints):
+    def _expose(self) -> None:
+        if self.t < self._frame / self.settings.perception_hz - 1e-9 or self._frame >= len(self._joints):
             return
-        joints = self._joints[None, self._frame]
-        rotation = camera_rotation(self.copter.camera_orientation())[None]
-        position = self.copter.body.position[None]
-        exact = project(joints, rotation, position, self.matrix)
-        if np.isfinite(exact).all():
-            middle = 0.5 * (exact[0].min(axis=0) + exact[0].max(axis=0)) - np.array([_WIDTH, _HEIGHT]) / 2
-            self.framing.append((self.t, bool(np.all(np.abs(middle) < np.array([_WIDTH, _HEIGHT]) / 6))))
-        else:
-            self.framing.append((self.t, False))
-        observation = self.observe(joints[0], rotation[0], position[0])
+        joints = self._joints[self._frame]
+        rotation, position = camera_rotation(self.copter.camera_orientation()), self.copter.body.position
+        exact = project(joints[None], rotation[None], position[None], self.matrix)[0]
+        middle = 0.5 * (exact.min(axis=0) + exact.max(axis=0)) - np.array(_SIZE) / 2  # NaN behind the camera
+        self.framing.append((self.t, bool(np.all(np.abs(middle) < np.array(_SIZE) / 6))))
+        observation = self.observe(joints, rotation, position)
         self._frame += 1
         self._waiting.append((self.t + self.settings.latency_s, observation))
-
-    def observe(self, joints: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> PoseObservation:
-        """What perception makes of the person now; from the joints' projections here.
-
-        Parameters
-        ----------
-        joints : (15, 3) m, truth
-        rotation, position : (3, 3) world -> optical, (3,) m, of the camera, truth
-        """
-        joints, rotation, position = joints[None], rotation[None], position[None]
-        exact = project(joints, rotation, position, self.matrix)
-        inside = np.all((exact >= -0.5) & (exact < np.array([_WIDTH, _HEIGHT]) - 0.5), axis=-1)
-        seen = np.where(inside[..., None], exact, np.nan)
-        hidden = occlusion(exact, to_camera(joints, rotation, position)[..., 2], self.matrix[0, 0])
-        noisy = noisy_keypoints(seen, hidden, self.settings.seed * 1_000_003 + self._frame)
-        return PoseObservation(
-            self.clock_ns(), 1 if np.isfinite(seen).any() else 0, (_WIDTH, _HEIGHT),
-            keypoints=noisy.keypoints[0].astype(np.float32), covariance=noisy.covariance[0].astype(np.float32),
-            confidence=noisy.confidence[0].astype(np.float32),
-        )  # fmt: skip
 
     def _deliver(self) -> None:
         while self._waiting and self._waiting[0][0] <= self.t + 1e-9:
@@ -256,7 +251,7 @@ class OrbitLoop:
 
 
 class OrbitQuality(NamedTuple):
-    """How an orbit went after its ramp."""
+    """Quality of an orbit after its ramp: mean absolute errors, shares of the time, extremes."""
 
     radius_error_m: float
     yaw_error_deg: float
@@ -267,7 +262,7 @@ class OrbitQuality(NamedTuple):
 
 
 def orbit_quality(loop: OrbitLoop, radius_m: float, after_s: float) -> OrbitQuality:
-    """Mean errors over the steps after a time, against the truth."""
+    """Quality over the steps after a time, against the truth."""
     rows = [row for row in loop.rows if row.t_s >= after_s]
     framing = [inside for t, inside in loop.framing if t >= after_s]
     return OrbitQuality(

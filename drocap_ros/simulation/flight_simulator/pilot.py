@@ -13,8 +13,6 @@ from drocap_ros.simulation.vehicle.dynamics import Target
 
 #: The mode in which the sticks command velocities.
 STICK_MODE = {"ardupilot": "LOITER", "px4": "POSCTL"}
-#: The mode in which setpoints steer.
-CONTROL_MODE = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}
 #: ArduPilot: the pilot switches to GUIDED, where it waits for setpoints.  PX4 takes OFFBOARD only while setpoints
 #: stream, so the pilot leaves it holding and the operator's `engage` asks for OFFBOARD.
 HANDED_OVER_MODE = {"ardupilot": "GUIDED", "px4": "LOITER"}

@@ -9,11 +9,12 @@ import numpy as np
 
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.mavlink.transport import Transport
-from drocap_ros.simulation.flight_simulator.pilot import CONTROL_MODE, PilotedCopter, SimulatedPilot
+from drocap_ros.simulation.flight_simulator.pilot import PilotedCopter, SimulatedPilot
 from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimulatorConfig
 from drocap_ros.simulation.flight_simulator.truth import MAX_EXPOSURES, FlightTruth
 from drocap_ros.simulation.orbit_camera import pinhole_matrix
 from drocap_ros.simulation.simulated_person import simulate_person
+from drocap_ros.simulation.vehicle.copter import CONTROL_MODE
 
 #: The person stands until the vehicle has been flown by setpoints for this long and has come near, and waits, within
 #: a moment, whenever it is not: whoever is filmed sees the drone stop.

@@ -28,7 +28,8 @@ _MODES = {
         "LAND": 4 << 16 | 6 << 24, "ALTCTL": 2 << 16,
     },
 }  # fmt: skip
-_CONTROL = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}
+#: The mode in which setpoints steer.
+CONTROL_MODE = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}
 #: Deceleration of the stop in each mode: the measured distances from 2 m/s, less what the lag takes.
 _BRAKING = {"BRAKE": 0.92, "LOITER": 2.6}
 _PX4_STREAM_S, _PX4_GAP_S = 1.0, 0.5
@@ -77,9 +78,9 @@ class SimulatedCopter(SimulatedVehicle):
         self._t = 0.0
         self._rng = np.random.default_rng([seed, 0xC0])
         self._gps_noise_m = gps_noise_m
-        self._gps_error = gps_noise_m * self._rng.standard_normal(3) * np.array([1, 1, 0.5])
+        self.gps_error = gps_noise_m * self._rng.standard_normal(3) * np.array([1, 1, 0.5])
         self._attitude_error = math.radians(attitude_error_deg) * self._rng.standard_normal(3)
-        self._target = Target(position=position.astype(float).copy(), yaw=yaw)
+        self.target = Target(position=position.astype(float).copy(), yaw=yaw)
         self._heard_s = -1e9  # last accepted setpoint
         self._stream_s = math.inf  # since when setpoints stream without a gap
         self._seen_s = 0.0  # last setpoint, accepted or not
@@ -100,9 +101,9 @@ class SimulatedCopter(SimulatedVehicle):
             self.body.step(self._present_target(dt), dt)
             decay = math.exp(-dt / 20.0)
             noise = self._gps_noise_m * math.sqrt(1 - decay**2)
-            self._gps_error = decay * self._gps_error + noise * self._rng.standard_normal(3) * np.array([1, 1, 0.5])
+            self.gps_error = decay * self.gps_error + noise * self._rng.standard_normal(3) * np.array([1, 1, 0.5])
             if self._t > self.gps_lost_s:
-                self._gps_error = self._gps_error + 0.15 * dt * np.array([1.0, 0.5, 0.0])  # dead reckoning drifts
+                self.gps_error = self.gps_error + 0.15 * dt * np.array([1.0, 0.5, 0.0])  # dead reckoning drifts
         if not self.crashed:
             self.step(t_s)
 
@@ -113,35 +114,35 @@ class SimulatedCopter(SimulatedVehicle):
             self.mode_log.append((self._t, mode, by))
             self._stop_velocity = self.body.velocity.copy()
             self._heading = self.body.yaw
-            if mode == _CONTROL[self.autopilot] and self.autopilot == "ardupilot":
+            if mode == CONTROL_MODE[self.autopilot] and self.autopilot == "ardupilot":
                 self._heard_s = -1e9  # GUIDED begins by holding
-                self._target = Target(yaw=self.body.yaw)
+                self.target = Target(yaw=self.body.yaw)
 
     @property
     def estimate(self) -> np.ndarray:
         """(3,) where the autopilot believes it is."""
-        return self.body.position + self._gps_error
+        return self.body.position + self.gps_error
 
     def camera_orientation(self) -> np.ndarray:
         """(4,) camera FLU -> ENU, truth: level, in the vehicle's heading, at the mount's pitch."""
         return _level(self.body.yaw, self.camera_pitch)
 
     def _present_target(self, dt: float) -> Target:
-        if self.mode == _CONTROL[self.autopilot]:
+        if self.mode == CONTROL_MODE[self.autopilot]:
             silent_s = self._t - self._heard_s
             expired = self.autopilot == "ardupilot" and silent_s > self.guid_timeout_s
-            if float(np.linalg.norm(self._target.velocity)) > 0.05 and not expired:
+            if float(np.linalg.norm(self.target.velocity)) > 0.05 and not expired:
                 self.motion_until_s = self._t
             if self.autopilot == "ardupilot":
                 if silent_s <= self.guid_timeout_s:
-                    if self._target.position is not None:
-                        self._target.position = self._target.position + self._target.velocity * dt
+                    if self.target.position is not None:
+                        self.target.position = self.target.position + self.target.velocity * dt
                     self._timed_out_at = None
-                    return self._in_truth(self._target)
+                    return self._in_truth(self.target)
                 if self._timed_out_at is None:
                     self._timed_out_at = Target(position=self.estimate, yaw=self.body.yaw)
                 return self._in_truth(self._timed_out_at)
-            return self._in_truth(self._target)
+            return self._in_truth(self.target)
         if self.mode in ("LAND", "RTL"):
             target = self._stopping(1.45, dt)
             target.velocity = np.array([target.velocity[0], target.velocity[1], -0.5 if self.mode == "LAND" else 0.5])
@@ -151,7 +152,7 @@ class SimulatedCopter(SimulatedVehicle):
 
     def _in_truth(self, target: Target) -> Target:
         """The loops close on the estimate: in terms of the truth its error shifts the target."""
-        position = None if target.position is None else target.position - self._gps_error
+        position = None if target.position is None else target.position - self.gps_error
         return Target(position, target.velocity, target.acceleration, target.yaw, target.yaw_rate)
 
     def _stopping(self, braking: float, dt: float) -> Target:
@@ -161,14 +162,14 @@ class SimulatedCopter(SimulatedVehicle):
         speed = float(np.linalg.norm(self._stop_velocity))
         if speed > 1e-3:
             self._stop_velocity = self._stop_velocity * max(1 - braking * dt / speed, 0.0)
-            self._target = Target(velocity=self._stop_velocity, yaw=self._heading)
-        elif self._target.position is None and float(np.linalg.norm(self.body.velocity)) < 0.2:
-            self._target = Target(position=self.body.position + self._gps_error, yaw=self._heading)
-        elif self._target.position is not None:
-            return self._in_truth(self._target)
+            self.target = Target(velocity=self._stop_velocity, yaw=self._heading)
+        elif self.target.position is None and float(np.linalg.norm(self.body.velocity)) < 0.2:
+            self.target = Target(position=self.body.position + self.gps_error, yaw=self._heading)
+        elif self.target.position is not None:
+            return self._in_truth(self.target)
         else:
-            self._target = Target(yaw=self._heading)
-        return self._target
+            self.target = Target(yaw=self._heading)
+        return self.target
 
     def _failsafes(self) -> None:
         if self.autopilot == "px4" and self.mode == "OFFBOARD" and self._t - self._seen_s > self.offboard_loss_s:
@@ -218,19 +219,19 @@ class SimulatedCopter(SimulatedVehicle):
         if self._t - self._seen_s > _PX4_GAP_S:
             self._stream_s = self._t
         self._seen_s = self._t
-        if self.mode != _CONTROL[self.autopilot] or self.deaf:
+        if self.mode != CONTROL_MODE[self.autopilot] or self.deaf:
             return  # silently ignored
         if not all(math.isfinite(v) for v in (*values[:3], m.yaw)):
             self.crashed = "a setpoint with NaN"
             return
         if not all(map(math.isfinite, values)) or m.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED:
-            self._target = Target(yaw=self.body.yaw)
+            self.target = Target(yaw=self.body.yaw)
             return
         mask = m.type_mask
         vectors = [ned_to_enu(np.array(values[i : i + 3])) for i in (0, 3, 6)]
         keep = [not mask & bit for bit in (1, 8, 64)]
         yaw = None if mask & 1024 else math.remainder(math.pi / 2 - m.yaw, 2 * math.pi)
-        self._target = Target(
+        self.target = Target(
             vectors[0] if keep[0] else None, vectors[1] if keep[1] else np.zeros(3),
             vectors[2] if keep[2] else np.zeros(3), yaw, 0.0 if mask & 2048 else -m.yaw_rate,
         )  # fmt: skip
@@ -263,7 +264,7 @@ class SimulatedCopter(SimulatedVehicle):
 
     def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> Any:
         told_s = self._report_s if self.frozen and self.frozen_clock else t_s
-        boot_ms = int((told_s + self._boot_s) * 1e3) % 2**32
+        boot_ms = int((told_s + self.boot_s) * 1e3) % 2**32
         mav = self._mav
         if number == mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED:
             if self._t - self._heard_s > 0.5:

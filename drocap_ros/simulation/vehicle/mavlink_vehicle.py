@@ -77,7 +77,7 @@ class SimulatedVehicle:
             raise InputError(f"autopilot: expected one of {', '.join(AUTOPILOTS)}, got {autopilot!r}")
         self.path, self.autopilot, self.gimbal = path, autopilot, gimbal
         self.received: list[str] = []  # names of what came in, for tests that nothing else was sent
-        self._max_rate_hz, self._boot_s = max_rate_hz, boot_s
+        self._max_rate_hz, self.boot_s = max_rate_hz, boot_s
         self._transport = transport or open_transport(url)
         self._parser = MavlinkParser()
         #: Parameters of the autopilot by their names: a float, or an int.
@@ -147,7 +147,7 @@ class SimulatedVehicle:
     def _answer(self, message: Any, t_s: float) -> None:
         name = message.get_type()
         if name == "TIMESYNC" and message.tc1 == 0:
-            self._send(self._mav.timesync_encode(int((t_s + self._boot_s) * 1e9), message.ts1))
+            self._send(self._mav.timesync_encode(int((t_s + self.boot_s) * 1e9), message.ts1))
         elif name == "PARAM_REQUEST_READ":
             self._tell_setting(message.param_id)
         elif name == "COMMAND_LONG":
@@ -197,7 +197,7 @@ class SimulatedVehicle:
         return frozenset(numbers | ({mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS} if self.gimbal else set()))
 
     def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> Any:
-        mav, boot_ms = self._mav, int((t_s + self._boot_s) * 1e3) % 2**32
+        mav, boot_ms = self._mav, int((t_s + self.boot_s) * 1e3) % 2**32
         if number == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
             return self._heartbeat()
         if number in (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION):

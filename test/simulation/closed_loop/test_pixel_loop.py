@@ -1,19 +1,19 @@
-"""An orbit by rendered pictures: the shipped networks for simulation close the loop, in simulated time."""
+"""The closed loop by rendered images and the shipped simulation networks, in simulated time."""
 
 import numpy as np
 import pytest
 
-from drocap_ros.flight.orbit.safety import State
+from drocap_ros.flight.orbit.states import State
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import SIMULATION, models_folder
-from drocap_ros.perception.perception_config import PoseEstimatorConfig
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, orbit_quality, with_config
 from drocap_ros.simulation.closed_loop.pixel_loop import PixelOrbitLoop
 
 pytest.importorskip("onnxruntime")
 
 
-def test_the_orbit_is_held_by_what_is_seen_in_the_pictures():
+def test_orbit_by_rendered_images_keeps_radius_and_heading():
     settings = with_config(LoopSettings(seed=0, wind_m_s=(8.0, 0.0, 0.0), seconds=18.0), body_height_m=1.75)
     loop = PixelOrbitLoop(settings, PoseEstimator(models_folder(SIMULATION), PoseEstimatorConfig()))
     loop.start()
@@ -26,6 +26,6 @@ def test_the_orbit_is_held_by_what_is_seen_in_the_pictures():
     errors = np.array(loop.errors) / np.array(loop.heights_px)[:, None]
     assert np.isfinite(errors).all(axis=1).mean() > 0.95
     assert np.nanmean(errors) < 0.03
-    # The vehicle has come from 7 m to 6 m and gone a good part of the way round: pictures from many sides.
+    # Images from many sides: a large part of a turn.
     bearings = np.unwrap([np.arctan2(*row.position[1::-1]) for row in loop.rows])
     assert np.degrees(np.ptp(bearings)) > 150
