@@ -11,8 +11,8 @@ import numpy as np
 from drocap_ros.geometry.bones import LIMBS_PER_STATURE, bone_lengths, limb_lengths
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
+from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.lifted.lifter import Lifter
-from drocap_ros.reconstruction.lifted.method import even_slots
 
 #: Images before the first estimate of the proportions, images between two estimates, and estimates kept.
 FIRST_ESTIMATE, ESTIMATE_EVERY, ESTIMATES = 12, 24, 40
