@@ -53,7 +53,7 @@ def image_from_message(message: Any, compressed: bool) -> np.ndarray:
     return _decompressed(data, str(message.format)) if compressed else _raw(message, data)
 
 
-def read_images(session: Session, topic: str | None = None) -> Iterator[Frame]:
+def read_images(session: Session) -> Iterator[Frame]:
     """Images of a recording, one at a time, with strictly increasing stamps.
 
     Images that do not decode, or with a stamp not later than the previous one, are left out with a warning.
@@ -65,7 +65,7 @@ def read_images(session: Session, topic: str | None = None) -> Iterator[Frame]:
     """
     from drocap_ros.perception.sources.base import Frame
 
-    chosen = session.choose_topic(topic, IMAGE, COMPRESSED_IMAGE)
+    chosen = session.choose_topic(IMAGE, COMPRESSED_IMAGE)
     compressed = chosen.type_name == COMPRESSED_IMAGE
     last_ns, unordered, problems = None, 0, Counter[str]()
     for _, message in session.messages((chosen.name,)):

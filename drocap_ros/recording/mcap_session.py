@@ -109,19 +109,10 @@ def _count_by_summary(stream: McapStream, counts: dict[tuple[str, str], int], ti
 
 def _typestore(channel: McapChannel) -> Any:
     """Types of one channel, from its embedded schema; without one the standard types."""
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     if not channel.schema:
         return standard_types()
     store = get_typestore(Stores.EMPTY)
-    if channel.schema_encoding == "ros2idl":
-        types: dict[str, Any] = {}
-        line = "=" * 80 + "\n"
-        for part in channel.schema.split(line):
-            text = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
-            if text.strip():
-                types.update(get_types_from_idl(text))
-        store.register(types)
-    else:
-        store.register(get_types_from_msg(channel.schema, channel.type_name))
+    store.register(get_types_from_msg(channel.schema, channel.type_name))
     return store

@@ -111,8 +111,8 @@ class Session(ABC):
         found = [topic for topic in self.info.topics if topic.type_name in type_names and topic.count]
         return sorted(found, key=lambda topic: (-topic.count, topic.name))
 
-    def choose_topic(self, wanted: str | None, *type_names: str) -> TopicInfo:
-        """The topic of some types with a name (its end suffices), by default the one with most messages.
+    def choose_topic(self, *type_names: str) -> TopicInfo:
+        """The topic of some types with most messages.
 
         Raises
         ------
@@ -124,17 +124,9 @@ class Session(ABC):
         if not found:
             there = ", ".join(f"{t.name} ({t.type_name})" for t in self.info.topics) or "no topics"
             raise InputError(f"{self.path}: expected a topic of type {kinds}, found {there}; record one")
-        if wanted is None:
-            if len(found) > 1:
-                self.warn(f"several topics of type {kinds}: {', '.join(t.name for t in found)}; took {found[0].name}")
-            return found[0]
-        named = [t for t in found if t.name == wanted or t.name.endswith("/" + wanted.lstrip("/"))]
-        if not named:
-            raise InputError(
-                f"{self.path}: expected topic {wanted!r} of type {kinds}, found {', '.join(t.name for t in found)}; "
-                "name one of these"
-            )
-        return named[0]
+        if len(found) > 1:
+            self.warn(f"several topics of type {kinds}: {', '.join(t.name for t in found)}; took {found[0].name}")
+        return found[0]
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[RawMessage, Any]]:
         """Decoded messages of some topics; messages that cannot be decoded are left out with a warning."""

@@ -15,23 +15,18 @@ from drocap_ros.skeleton import joint_set
 from drocap_ros.tracks import MAX_FRAMES, Tracks
 
 
-def read_pose2d(session: Session, topic: str | None = None, mount_pitch_deg: float | None = None) -> Tracks:
+def read_pose2d(session: Session) -> Tracks:
     """Tracks of the subject, keypoints exactly as in the recorded messages.
 
     Images without a subject are frames of NaN.  The tracks contain the camera's poses where the recording does, see
     :func:`drocap_ros.recording.telemetry.camera_poses.camera_poses`.  Missing parts are in ``session.warnings``.
-
-    Parameters
-    ----------
-    topic : name of the ``Pose2D`` topic, or the name's end; None = the one with most messages
-    mount_pitch_deg : pitch of a camera fixed to the body of a vehicle without a gimbal, negative = down
 
     Raises
     ------
     InputError
         When there are no usable keypoints.
     """
-    chosen = session.choose_topic(topic, POSE2D)
+    chosen = session.choose_topic(POSE2D)
     poses: dict[int, Any] = {}
     repeated = 0
     for _, message in session.messages((chosen.name,)):
@@ -54,7 +49,7 @@ def read_pose2d(session: Session, topic: str | None = None, mount_pitch_deg: flo
         vehicle = read_vehicle_track(session, chosen.name)
         if vehicle is None:
             return tracks
-        tracks, reason = with_camera(tracks, vehicle, tracks.stamp_ns, mount_pitch_deg)
+        tracks, reason = with_camera(tracks, vehicle, tracks.stamp_ns)
         if reason:
             session.warn(f"camera telemetry incomplete: {reason}")
         return tracks

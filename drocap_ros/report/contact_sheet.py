@@ -26,8 +26,8 @@ def save_contact_sheet(path: Path, session: Session) -> None:
     """
     import cv2
 
-    seen = {o.stamp_ns: o for o in read_observations(session, session.choose_topic(None, POSE2D).name) if o.has_subject}
-    session.choose_topic(None, IMAGE, COMPRESSED_IMAGE)
+    seen = {o.stamp_ns: o for o in read_observations(session, session.choose_topic(POSE2D).name) if o.has_subject}
+    session.choose_topic(IMAGE, COMPRESSED_IMAGE)
     stamps = sorted(seen)
     count = min(_COLUMNS * _ROWS, len(stamps))
     wanted = {stamps[i] for i in np.linspace(0, len(stamps) - 1, count).round().astype(int)} if stamps else set()

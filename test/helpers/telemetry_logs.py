@@ -7,7 +7,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from drocap_ros.flight.frames import orientation_to_aviation
-from drocap_ros.recording.telemetry.log import Clock, TelemetryLog
+from drocap_ros.recording.telemetry.log import TelemetryLog
 from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack
 
 
@@ -70,7 +70,7 @@ def heading_at(t, even=False):
     return 0.4 * t + (0 if even else CubicSpline(np.arange(200), knots)(t))
 
 
-def turning_log(seconds, even=False, clock=Clock.BOOT):
+def turning_log(seconds, even=False):
     t = np.arange(0, seconds, 0.05)
     heading = heading_at(t, even)
     half = 0.5 * heading
@@ -78,7 +78,7 @@ def turning_log(seconds, even=False, clock=Clock.BOOT):
     stamp_ns = 5 * 10**9 + np.round(t * 1e9).astype(np.int64)
     nan = np.full((len(t), 4), np.nan)
     utc = 1_700_000_000 * 10**9 - 5 * 10**9
-    return TelemetryLog("test", VehicleTrack(stamp_ns, np.zeros((len(t), 3)), orientation, nan), clock, utc, ())
+    return TelemetryLog("test", VehicleTrack(stamp_ns, np.zeros((len(t), 3)), orientation, nan), utc)
 
 
 def turning_video(path, start_s, seconds, even=False):

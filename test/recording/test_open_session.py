@@ -152,7 +152,3 @@ def test_several_topics_the_named_one_counts(tmp_path, messages, capture):
     with open_session(tmp_path / "s") as session:
         assert len(read_pose2d(session)) == 5
         assert any("several topics" in warning for warning in session.warnings)
-        assert len(read_pose2d(session, "/a/pose2d")) == 3
-        assert len(read_pose2d(session, "a/pose2d")) == 3
-        with pytest.raises(InputError, match="name one of these"):
-            read_pose2d(session, "/c/pose2d")

@@ -3,8 +3,7 @@ import pytest
 from recorded import NAMES, START_NS, record, write_poses
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.frames import OPTICAL_FROM_FLU
-from drocap_ros.geometry.rotations import angle_between, quaternion_from_matrix
+from drocap_ros.geometry.rotations import angle_between
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_pose2d
 from drocap_ros.simulation.vehicle.path import SampledPath
@@ -86,17 +85,6 @@ def test_without_a_gimbal_the_rotation_is_not_invented(tmp_path, messages, captu
         assert tracks.camera_rotation is None
         assert tracks.camera_position is not None
         assert any("hold no gimbal" in warning for warning in session.warnings)
-
-
-def test_camera_fixed_to_the_body_at_a_told_pitch(tmp_path, messages, capture):
-    record(tmp_path / "s", flight_entries(messages, capture, gimbal=False))
-    camera = quaternion_from_matrix(np.swapaxes(capture.camera_rotation, 1, 2) @ OPTICAL_FROM_FLU)
-    forward = np.swapaxes(capture.camera_rotation, 1, 2)[:, :, 2]
-    pitch = np.rad2deg(np.arcsin(forward[:, 2]))
-    with open_session(tmp_path / "s") as session:
-        tracks = read_pose2d(session, mount_pitch_deg=float(pitch.mean()))
-    assert camera.shape == (len(tracks), 4)
-    assert np.rad2deg(angle_between(tracks.camera_rotation, capture.camera_rotation)).max() < np.ptp(pitch) + 0.2
 
 
 def test_short_gap_in_the_telemetry_is_bridged_and_told(tmp_path, messages, capture):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from importlib.metadata import version
 from pathlib import Path
 
+from drocap_ros import __version__
 from drocap_ros.recording.mcap.committed_file import CommittedFile
 from drocap_ros.recording.mcap.metadata import FileRecord, TopicRecord, dump_yaml
 
@@ -43,7 +45,7 @@ class McapFile:
         kinds = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
         self._file = CommittedFile(path)
         self._mcap = Writer(self._file, chunk_size=chunk_bytes, compression=kinds[compression])  # type: ignore[arg-type]
-        self._mcap.start(profile, _library())
+        self._mcap.start(profile, f"drocap_ros {__version__}; mcap {version('mcap')}")
         self._file.commit()
 
     @property
@@ -118,13 +120,7 @@ class McapFile:
         self.commit(sync)
 
     def commit(self, sync: bool = False) -> None:
-        """Commit the whole chunks.
-
-        Raises
-        ------
-        OSError
-            As :meth:`save`.
-        """
+        """Commit the whole chunks; errors as :meth:`save`."""
         self._file.commit(sync)
         self._in_closed_chunks.clear()
 
@@ -153,12 +149,3 @@ class McapFile:
     def _chunk_closed(self) -> None:
         self._in_closed_chunks += self._in_open_chunk
         self._in_open_chunk.clear()
-
-
-def _library() -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return f"drocap_ros {version('drocap_ros')}; mcap {version('mcap')}"
-    except PackageNotFoundError:
-        return f"drocap_ros; mcap {version('mcap')}"

@@ -7,10 +7,9 @@ kept, named ``*.damaged``.
 
 from __future__ import annotations
 
-import hashlib
+import itertools
 import os
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,7 @@ from drocap_ros.recording.mcap.metadata import (
     write_atomically,
 )
 from drocap_ros.recording.mcap.schemas import type_hash
-from drocap_ros.recording.mcap.stream import MAGIC, McapChannel, McapMessage, McapStream
+from drocap_ros.recording.mcap.stream import MAGIC, McapChannel, McapStream
 
 _BESIDE = ".recovering"
 
@@ -110,69 +109,46 @@ def _files(path: Path) -> tuple[list[Path], dict[str, str]]:
     return files, custom
 
 
-class _Digest:
-    """Counts and hash of a sequence of messages; equal only for equal messages."""
-
-    def __init__(self) -> None:
-        self._hash = hashlib.blake2b()
-        self.counts: Counter[str] = Counter()
-
-    def add(self, message: McapMessage) -> None:
-        """Add one message."""
-        head = f"{message.channel.topic}|{message.channel.type_name}|{message.log_time_ns}|{message.publish_time_ns}|"
-        self._hash.update(f"{head}{message.sequence}|{len(message.data)}|".encode())
-        self._hash.update(message.data)
-        self.counts[message.channel.topic] += 1
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Digest) and self._hash.digest() == other._hash.digest()
-
-    __hash__ = None  # type: ignore[assignment]
-
-
 def _recover_file(path: Path, one_of_several: bool) -> RecoveredFile:
     beside = path.with_name(path.name + _BESIDE)
     beside.unlink(missing_ok=True)  # of an interrupted recovery
+    stream = McapStream(path, resync=True)
     size = path.stat().st_size
     if size < len(MAGIC):
         if not one_of_several and size == 0:
             raise InputError(f"{path}: expected an MCAP file, found 0 bytes; there is nothing in it to repair")
         if not MAGIC.startswith(path.read_bytes()):
             raise InputError(f"{path}: expected an MCAP file, found other content at its start; check the path")
-        return _replace(path, beside, _Digest(), (Damage(DamageKind.NO_MESSAGE),))
-    stream, before = McapStream(path, resync=True), _Digest()
-    for message in stream.messages():
-        before.add(message)
+        return _replace(stream, beside, 0, (Damage(DamageKind.NO_MESSAGE),))
+    count = sum(1 for _ in stream.messages())
     damage = tuple(stream.damage)
-    if not damage and _is_whole(stream, before):
-        return RecoveredFile(path, False, before.counts.total(), ())
-    return _replace(path, beside, before, damage or (Damage(DamageKind.NO_SUMMARY),))
+    if not damage and _is_whole(stream, count):
+        return RecoveredFile(path, False, count, ())
+    return _replace(stream, beside, count, damage or (Damage(DamageKind.NO_SUMMARY),))
 
 
-def _is_whole(stream: McapStream, digest: _Digest) -> bool:
+def _is_whole(stream: McapStream, count: int) -> bool:
     summary = stream.summary()
     return (
         summary is not None
         and summary.statistics is not None
-        and summary.statistics.message_count == digest.counts.total()
+        and summary.statistics.message_count == count
         and len(summary.chunk_indexes) == summary.statistics.chunk_count
     )
 
 
-def _replace(path: Path, beside: Path, before: _Digest, damage: tuple[Damage, ...]) -> RecoveredFile:
+def _replace(stream: McapStream, beside: Path, count: int, damage: tuple[Damage, ...]) -> RecoveredFile:
+    path = stream.path
     try:
-        if before.counts or path.stat().st_size >= len(MAGIC):
-            _copy(McapStream(path, resync=True), beside)
+        if count:
+            _copy(stream, beside)
         else:
-            McapFile(beside).finish(sync=True)
-        again = _Digest()
-        stream = McapStream(beside)
-        for message in stream.messages():
-            again.add(message)
-        if stream.damage or again != before or not _is_whole(stream, again):
+            McapFile(beside, profile=stream.profile).finish(sync=True)
+        copy = McapStream(beside)
+        pairs = itertools.zip_longest(stream.messages() if count else (), copy.messages())
+        if not all(ours == theirs for ours, theirs in pairs) or copy.damage or not _is_whole(copy, count):
             raise InputError(
-                f"{path}: expected the same {before.counts.total()} messages in the repaired copy, found "
-                f"{again.counts.total()}; the session is unchanged"
+                f"{path}: expected the same {count} messages in the repaired copy; the session is unchanged"
             )
         kept = None
         if any(d.keeps_data for d in damage):
@@ -183,44 +159,35 @@ def _replace(path: Path, beside: Path, before: _Digest, damage: tuple[Damage, ..
         sync_folder(path.parent)
     finally:
         beside.unlink(missing_ok=True)
-    return RecoveredFile(path, True, before.counts.total(), damage, kept)
+    return RecoveredFile(path, True, count, damage, kept)
 
 
 def _copy(stream: McapStream, target: Path) -> None:
-    file = McapFile(target, profile=stream.profile())
-    channels: dict[McapChannel, str] = {}
+    file = McapFile(target, profile=stream.profile)
+    keys: dict[McapChannel, str] = {}
     try:
         for name, values in stream.metadata().items():
             if name != "rosbag2":  # holds the counts of the damaged file
                 file.add_metadata(name, values)
-        for message in _with_channels(stream, file, channels):
-            file.add(
-                channels[message.channel], message.data, message.log_time_ns, message.publish_time_ns, message.sequence
-            )
+        for channel, log_ns, data, publish_ns, sequence in stream.messages():
+            if channel not in keys:
+                # Two channels of one topic (two publishers) stay separate.
+                keys[channel] = channel.topic if channel.topic not in keys.values() else f"{channel.topic}#{len(keys)}"
+                file.register(
+                    TopicRecord(channel.topic, channel.raw_type_name, "", []),
+                    channel.schema,
+                    encoding=channel.message_encoding,
+                    schema_encoding=channel.schema_encoding,
+                    metadata=dict(channel.metadata),
+                    key=keys[channel],
+                )
+            file.add(keys[channel], data, log_ns, publish_ns, sequence)
             if file.pending:
                 file.commit()
         file.finish(sync=True)
     except OSError:
         file.abandon()
         raise
-
-
-def _with_channels(stream: McapStream, file: McapFile, known: dict[McapChannel, str]) -> Iterator[McapMessage]:
-    for message in stream.messages():
-        channel = message.channel
-        if channel not in known:
-            # Two channels of one topic (two publishers) stay separate.
-            key = channel.topic if channel.topic not in known.values() else f"{channel.topic}#{len(known)}"
-            known[channel] = key
-            file.register(
-                TopicRecord(channel.topic, channel.raw_type_name, "", []),
-                channel.schema,
-                encoding=channel.message_encoding,
-                schema_encoding=channel.schema_encoding,
-                metadata=dict(channel.metadata),
-                key=key,
-            )
-        yield message
 
 
 def _describe(path: Path, topics: dict[str, TopicRecord]) -> FileRecord:

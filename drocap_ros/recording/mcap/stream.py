@@ -70,6 +70,7 @@ class _BoundedFile:
 class McapStream:
     """Reads one file; see the module's text.
 
+    profile : of the header, once messages are read: "ros2", "ros1" or another
     resync : after damage, search the next whole chunk instead of ending there
     damage : parts that could not be read so far
     """
@@ -77,6 +78,7 @@ class McapStream:
     path: Path
     resync: bool = False
     damage: list[Damage] = field(default_factory=list)
+    profile: str = "ros2"
     _whole_until: int = 0
 
     def messages(self) -> Iterator[McapMessage]:
@@ -87,7 +89,7 @@ class McapStream:
         InputError
             When the file is no MCAP or cannot be opened.
         """
-        from mcap.records import Channel, Message, Schema
+        from mcap.records import Channel, Header, Message, Schema
 
         schemas: dict[int, Any] = {}
         channels: dict[int, McapChannel] = {}
@@ -103,6 +105,8 @@ class McapStream:
                     lost += 1
                     continue
                 yield McapMessage(channel, record.log_time, record.data, record.publish_time, record.sequence)
+            elif isinstance(record, Header):
+                self.profile = record.profile
         if lost:
             self.damage.append(Damage(DamageKind.UNKNOWN_CHANNELS, amount=lost))
 
@@ -120,16 +124,6 @@ class McapStream:
                 return SeekingReader(bounded, record_size_limit=bounded.size).get_summary()
         except Exception:  # a damaged summary fails in many ways; the stream does without
             return None
-
-    def profile(self) -> str:
-        """Profile in the header: "ros2", "ros1" or another; "ros2" where it cannot be read."""
-        from mcap.reader import SeekingReader
-
-        try:
-            with self.path.open("rb") as file:
-                return str(SeekingReader(file).get_header().profile)
-        except Exception:
-            return "ros2"
 
     def metadata(self) -> dict[str, dict[str, str]]:
         """Metadata records by name, those of one name merged; without a summary the whole file is read for them."""

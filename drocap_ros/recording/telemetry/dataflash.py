@@ -11,7 +11,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import geodetic_to_enu, orientation_to_ros, quaternion_from_euler
-from drocap_ros.recording.telemetry.log import Clock, Lack, LogLack, TelemetryLog, at_stamps, make_log
+from drocap_ros.recording.telemetry.log import Lack, LogLack, TelemetryLog, at_stamps, make_log
 
 _EARLIEST_UTC_S = 1e9
 #: message -> fields used
@@ -72,7 +72,6 @@ def read_dataflash(path: Path) -> TelemetryLog:
         path,
         "ArduPilot DataFlash log",
         stamp_ns,
-        clock=Clock.BOOT,
         orientation=orientation_to_ros(quaternion_from_euler(*np.deg2rad(angles).T).T),
         position=position,
         gimbal=gimbal,

@@ -15,14 +15,6 @@ from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack, interpola
 _SERIES_GAP_S = 1.0
 
 
-class Clock(Enum):
-    """Clock of a log's stamps: UTC, time since power-up, or time since the video's start."""
-
-    UTC = "utc"
-    BOOT = "boot"
-    VIDEO = "video"
-
-
 class Lack(Enum):
     """A limitation of a log; the value is its text, ``{}`` stands for :attr:`LogLack.detail`."""
 
@@ -52,13 +44,14 @@ class TelemetryLog(NamedTuple):
     track : states by the log's clock, at the times of its attitude (DJI: of its subtitles)
     utc_minus_stamp_ns : added to a stamp gives UTC; None where unknown
     lacks : limitations of the log
+    video_clock : whether stamps start with the video
     """
 
     kind: str
     track: VehicleTrack
-    clock: Clock
     utc_minus_stamp_ns: int | None
-    lacks: tuple[LogLack, ...]
+    lacks: tuple[LogLack, ...] = ()
+    video_clock: bool = False
 
     @property
     def duration_s(self) -> float:
@@ -71,12 +64,12 @@ def make_log(
     kind: str,
     stamp_ns: np.ndarray,
     *,
-    clock: Clock,
     orientation: np.ndarray | None = None,
     position: np.ndarray | None = None,
     gimbal: np.ndarray | None = None,
     utc_minus_stamp_ns: int | None = None,
     lacks: tuple[LogLack, ...] = (),
+    video_clock: bool = False,
 ) -> TelemetryLog:
     """Log from its series (N, ...) at ``stamp_ns``; states are sorted, missing series are NaN and listed as lacks.
 
@@ -108,7 +101,7 @@ def make_log(
     missing = [LogLack(lack) for lack, values in found.items() if not np.isfinite(values).all(axis=1).any()]
     if len(missing) == len(found):
         raise InputError(f"{path}: expected attitude or position in the {kind}, found neither; check the log")
-    return TelemetryLog(kind, track, clock, utc_minus_stamp_ns, (*missing, *lacks))
+    return TelemetryLog(kind, track, utc_minus_stamp_ns, (*missing, *lacks), video_clock)
 
 
 def at_stamps(known_ns: np.ndarray, values: np.ndarray, stamp_ns: np.ndarray, *, spherical: bool) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import geodetic_to_enu, orientation_to_ros, quaternion_from_euler
-from drocap_ros.recording.telemetry.log import Clock, Lack, LogLack, TelemetryLog, make_log
+from drocap_ros.recording.telemetry.log import Lack, LogLack, TelemetryLog, make_log
 from drocap_ros.tracks import MAX_FRAMES
 
 _LINE = 8192
@@ -77,7 +77,7 @@ def read_srt(path: Path) -> TelemetryLog:
         path,
         "DJI subtitles",
         stamps,
-        clock=Clock.VIDEO,
+        video_clock=True,
         orientation=_attitude([e.body for e in entries]),
         position=position,
         gimbal=_attitude([e.gimbal for e in entries]),

@@ -20,7 +20,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.recording.telemetry.camera_poses import camera_attitude
-from drocap_ros.recording.telemetry.log import Clock, TelemetryLog
+from drocap_ros.recording.telemetry.log import TelemetryLog
 from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack, interpolate
 
 #: Sampling rate of the correlation.
@@ -83,7 +83,7 @@ def find_offset(
     """
     if given_s is not None:
         return TimeOffset(given_s, OffsetSource.GIVEN)
-    if log.clock is Clock.VIDEO:
+    if log.video_clock:
         return TimeOffset(0.0 - float(log.track.stamp_ns[0]) * 1e-9, OffsetSource.VIDEO_CLOCK)
     created_s = _offset_by_creation(video, log)
     moved = image_motion(video, progress)

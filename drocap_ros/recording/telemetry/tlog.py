@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.telemetry.log import Clock, TelemetryLog, make_log
+from drocap_ros.recording.telemetry.log import TelemetryLog, make_log
 
 _MIN_UTC_NS = 1_000_000_000 * 10**9
 _EARLIEST_US, _LATEST_US = 0, 4_102_444_800_000_000  # to the year 2100
@@ -43,7 +43,6 @@ def read_tlog(path: Path) -> TelemetryLog:
         path,
         "MAVLink tlog",
         stamps,
-        clock=Clock.UTC,
         orientation=orientation,
         position=position,
         gimbal=gimbal,

@@ -12,7 +12,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import geodetic_to_enu, ned_to_enu, orientation_to_ros, quaternion_multiply, yaw_of
-from drocap_ros.recording.telemetry.log import Clock, Lack, LogLack, TelemetryLog, at_stamps, make_log
+from drocap_ros.recording.telemetry.log import Lack, LogLack, TelemetryLog, at_stamps, make_log
 
 _TOPICS = (
     "vehicle_attitude", "vehicle_local_position", "vehicle_global_position", "gimbal_device_attitude_status",
@@ -31,10 +31,8 @@ def read_ulog(path: Path) -> TelemetryLog:
     InputError
         When the file cannot be read, is no ULog, or holds no attitude.
     """
-    try:
-        from pyulog import ULog
-    except ImportError:
-        raise InputError(f"{path}: expected the package pyulog to read it, found none; pip install pyulog") from None
+    from pyulog import ULog
+
     try:
         # pyulog prints remarks on damaged files.
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
@@ -65,7 +63,6 @@ def _to_log(path: Path, log: Any) -> TelemetryLog:
         path,
         "PX4 ULog",
         stamp_ns,
-        clock=Clock.BOOT,
         orientation=orientation_to_ros(frd_to_ned),
         position=position,
         gimbal=_gimbal(series, stamp_ns, frd_to_ned),
