@@ -30,6 +30,7 @@ from drocap_ros.ros.conversions import (
     stamp_from_ros,
     window_to_ros,
 )
+from drocap_ros.ros.diagnostics import Key, of
 from drocap_ros.ros.spin import node_main
 
 
@@ -74,15 +75,15 @@ class BundleAdjusterNode(ComponentNode):
 
     def _on_pair(self, pair: tuple[PoseObservation, Pose3D] | None) -> None:
         if pair is None:
-            self.counters["keypoints without an initial pose"] = self._join.dropped_first
-            self.counters["initial poses without keypoints"] = self._join.dropped_second
+            self.counters[Key.KEYPOINTS_UNPAIRED] = self._join.dropped_first
+            self.counters[Key.INITIAL_UNPAIRED] = self._join.dropped_second
             return
         observation, initial = pair
         joints, _ = pose3d_from_ros(initial)
         due = self._buffer.push(observation, joints)
         event = self._buffer.event
         if event is not StreamEvent.CONTINUED:
-            self.count(str(event))
+            self.count(of(Key.STREAM_EVENT, event.name.lower()))
         if event.dropped:
             return
         if event.restarted:
@@ -90,11 +91,11 @@ class BundleAdjusterNode(ComponentNode):
         self._take_solution(observation.stamp_ns)
         latest = self._latest_pose.pose(observation.stamp_ns, joints)
         self._latest.publish(latest_pose_to_ros(initial, latest, refined=self._latest_pose.corrected))
-        self.count("latest poses")
+        self.count(Key.LATEST_POSES)
         if not due:
             return
         if self._job is not None and not self._job.done():
-            self.count("adjustments skipped: the last one is still running")
+            self.count(Key.ADJUSTMENTS_SKIPPED)
             return
         self._take_solution(observation.stamp_ns)
         self._job_subject = self._buffer.subject
@@ -117,22 +118,22 @@ class BundleAdjusterNode(ComponentNode):
         try:
             adjusted = self._adjuster.adjust(window, Effort(stride), lambda: time.perf_counter() > deadline)
         except SOLVER_ERRORS as error:
-            self.count("adjustments failed: the last solution stays")
+            self.count(Key.ADJUSTMENTS_FAILED)
             self.report(ERROR, f"adjustment failed, the last solution stays: {error}")
             return None
         seconds = time.perf_counter() - begin
         self._control.record(seconds)
         if adjusted.effort.steps is not None:
-            self.count("adjustments cut short: the time was over")
+            self.count(Key.ADJUSTMENTS_CUT)
         if stride > 1:
-            self.count("adjustments of fewer images: the one before was slow")
+            self.count(Key.ADJUSTMENTS_STRIDED)
         self._publish(adjusted, frame_id, track_id, seconds)
         return median_bone_lengths(adjusted.joints3d)
 
     def _publish(self, window: AdjustedWindow, frame_id: str, track_id: int, seconds: float) -> None:
         self._refined.publish(window_to_ros(window, frame_id, track_id, self._sequence, seconds))
         self._sequence += 1
-        self.count("adjustments")
+        self.count(Key.ADJUSTMENTS)
         self.produced(int(window.stamp_ns[-1]))
         self.report(OK, f"{len(window.stamp_ns)} poses in {seconds:.2f} s: {window.stop_reason}")
 

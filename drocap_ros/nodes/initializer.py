@@ -15,6 +15,7 @@ from drocap_ros.reconstruction.live.initializer import LiveInitializer
 from drocap_ros.reconstruction.live.stream_order import StreamEvent
 from drocap_ros.ros.component import OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_to_ros
+from drocap_ros.ros.diagnostics import Key, of
 from drocap_ros.ros.spin import node_main
 from drocap_ros.skeleton import BODY_15
 
@@ -38,7 +39,7 @@ class InitializerNode(ComponentNode):
         pose = self._initializer.push(observation)
         event = self._initializer.event
         if event is not StreamEvent.CONTINUED:
-            self.count(str(event))
+            self.count(of(Key.STREAM_EVENT, event.name.lower()))
         if pose is None:
             self.report(WARN, f"image {event}")
             return
@@ -54,12 +55,12 @@ class InitializerNode(ComponentNode):
                 reprojection_rms_px=pose.reprojection_rms_px,
             )
         )
-        self.count("poses")
+        self.count(Key.POSES)
         self.produced(observation.stamp_ns)
         if np.isfinite(pose.joints3d).all():
             self.report(OK, "running")
         else:
-            self.count("images with too few keypoints")
+            self.count(Key.IMAGES_INCOMPLETE)
             self.report(WARN, "too few keypoints in the image")
 
 

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from drocap_ros.config import load_config, section_types
-from drocap_ros.ros.latency import LATENCY_P95, RATE
+from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import NODES, TOPICS
 
 COMPANIONS = ("px4_companion", "ardupilot_companion")
@@ -93,7 +93,7 @@ def test_the_foxglove_layout_names_topics_and_fields_that_exist(root):
             r'/diagnostics\.status\[:\]\{name=="drocap/(\w+)"\}\.values\[:\]\{key=="([^"]+)"\}\.value', path
         ).groups()
         assert node in NODES
-        assert key in (LATENCY_P95, RATE)
+        assert key in (Key.LATENCY_P95, Key.RATE)
 
 
 def panels_of(place):

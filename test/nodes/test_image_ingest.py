@@ -11,6 +11,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.ros.conversions import header_at, stamp_from_ros
+from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import TOPICS
 
 
@@ -61,10 +62,10 @@ def test_a_looped_folder_keeps_its_stamps_increasing_and_tells_the_camera(folder
 
 def test_max_rate_skips_and_counts(folder):
     config = {"source": str(folder), "loop": True, "folder_rate_hz": 60.0, "max_rate_hz": 20.0}
-    images, _, reports = run(config, lambda i, _n, r: len(i) >= 20 and "images skipped by max_rate_hz" in values(r))
+    images, _, reports = run(config, lambda i, _n, r: len(i) >= 20 and Key.IMAGES_SKIPPED in values(r))
     stamps = np.array([stamp_from_ros(m.header.stamp) for m in images])
     assert np.diff(stamps).min() >= 0.049e9
-    assert int(values(reports)["images skipped by max_rate_hz"]) > 10
+    assert int(values(reports)[Key.IMAGES_SKIPPED]) > 10
 
 
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8"])
@@ -98,7 +99,7 @@ def test_a_compressed_topic_goes_on_as_it_came_and_rubbish_is_refused():
     topic = "/front/image_raw/compressed"
     images, _, _ = run(
         {"source": f"topic:{topic}"},
-        lambda i, _n, r: i and "messages refused" in values(r),
+        lambda i, _n, r: i and Key.MESSAGES_REFUSED in values(r),
         [bad, good],
         CompressedImage,
         topic,

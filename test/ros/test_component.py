@@ -1,6 +1,7 @@
-"""What every node shares, on live nodes."""
+"""Base class of all nodes, on live nodes."""
 
 import contextlib
+import signal
 import time
 from array import array
 
@@ -9,6 +10,7 @@ import pytest
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
 
 from drocap_ros.bringup import bringup, free_domain
@@ -18,6 +20,7 @@ from drocap_ros.nodes.initializer import InitializerNode
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.reconstruction_config import InitializerConfig
 from drocap_ros.ros.conversions import pose2d_to_ros
+from drocap_ros.ros.diagnostics import Key, values_of
 from drocap_ros.ros.topics import RESULT_QOS, TOPICS
 from drocap_ros.simulation.capture import simulate_capture
 
@@ -43,26 +46,26 @@ def initializer(context, config=None, **overrides):
 
 
 def test_parameters_are_declared_from_the_dataclass_with_range_and_description(context):
-    with initializer(context, InitializerConfig(azimuth_starts=5)) as node:
-        assert node.get_parameter("azimuth_starts").value == 5
-        descriptor = node.describe_parameter("azimuth_starts")
+    with initializer(context, InitializerConfig(search_azimuths=5)) as node:
+        assert node.get_parameter("search_azimuths").value == 5
+        descriptor = node.describe_parameter("search_azimuths")
         assert "viewpoints" in descriptor.description
         assert (descriptor.integer_range[0].from_value, descriptor.integer_range[0].to_value) == (1, 64)
         assert "[m]" in node.describe_parameter("assumed_height_m").description
 
 
-def test_an_override_goes_before_the_configuration(context):
-    with initializer(context, InitializerConfig(azimuth_starts=5), azimuth_starts=3) as node:
-        assert node.config.azimuth_starts == 3
+def test_override_takes_precedence_over_the_configuration(context):
+    with initializer(context, InitializerConfig(search_azimuths=5), search_azimuths=3) as node:
+        assert node.config.search_azimuths == 3
 
 
-@pytest.mark.parametrize(("name", "value"), [("azimuth_starts", 0), ("azimuth_starts", "many"), ("sparsity", -1.0)])
-def test_an_override_outside_its_range_is_refused_at_construction(context, name, value):
+@pytest.mark.parametrize(("name", "value"), [("search_azimuths", 0), ("search_azimuths", "many"), ("sparsity", -1.0)])
+def test_override_outside_its_range_is_refused_at_construction(context, name, value):
     with pytest.raises(ParameterError, match=name), initializer(context, **{name: value}):
         pass
 
 
-def test_malformed_messages_are_counted_explained_and_survived():
+def test_malformed_messages_are_counted_and_the_next_good_one_is_processed():
     capture = simulate_capture(0.2, 10.0, seed=0).tracks
     good = pose2d_to_ros(
         PoseObservation(
@@ -101,37 +104,62 @@ def test_malformed_messages_are_counted_explained_and_survived():
         graph.wait_until(lambda: poses, 20, "a pose from the good message")
 
         def counted():
-            values = {v.key: v.value for m in reports for v in m.status[0].values}
-            return values.get("messages refused") == str(len(bad))
+            values = [values_of(m.status[0]) for m in reports]
+            return any(v.get(Key.MESSAGES_REFUSED) == str(len(bad)) for v in values)
 
         graph.wait_until(counted, 20, "the refusals on /diagnostics")
     assert len(poses) == 1
 
 
-def test_a_node_runs_without_a_bringup(context):
-    # As with `ros2 run`: no peers are named, so it starts at once.
+def spin_until_ready(context, node, seconds):
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    end = time.monotonic() + seconds
+    while not node.ready and time.monotonic() < end:
+        executor.spin_once(timeout_sec=0.05)
+    executor.shutdown()
+
+
+def test_node_without_a_bringup_is_ready_at_once(context):
     with initializer(context) as node:
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(node)
-        for _ in range(100):
-            executor.spin_once(timeout_sec=0.05)
-            if node.started:
-                break
-        executor.shutdown()
-        assert node.started
-
-
-@pytest.mark.parametrize("runs", [False, True])
-def test_only_who_is_started_in_a_running_graph_begins_without_a_sign_to_all(context, runs):
-    # A sign to start that is lost on the way would be repeated, but a restarted node is waited for.
-    with initializer(context, graph_nodes="initializer", graph_runs=runs) as node:
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(node)
-        end = time.monotonic() + 5.0
-        while not node.ready and time.monotonic() < end:
-            executor.spin_once(timeout_sec=0.05)
-        executor.shutdown()
+        spin_until_ready(context, node, 5.0)
         assert node.ready
-        assert node.started is runs
-        # Whoever is waited for steps back behind the others later.
-        assert node.settled is not runs
+
+
+def test_node_of_a_graph_is_not_ready_without_its_peers(context):
+    with initializer(context, graph_nodes="capture_simulator,initializer") as node:
+        spin_until_ready(context, node, 0.5)
+        assert not node.ready
+        assert node.details[Key.READY] == "false"
+
+
+class EveryInfo(InitializerNode):
+    """Counts what a subscription with message info receives."""
+
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.infos = []
+        self.input("pose3d/latest", lambda message, info: self.infos.append(info), with_info=True)
+
+
+@pytest.mark.parametrize("kind", [SingleThreadedExecutor, EventsExecutor])
+def test_message_info_reaches_the_callback_under_either_executor(context, kind):
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    node = EveryInfo(context=context, use_global_arguments=False)
+    executor = kind(context=context)
+    executor.add_node(node)
+    publisher = node.create_publisher(TOPICS["pose3d/latest"].message, "pose3d/latest", RESULT_QOS)
+    try:
+        end = time.monotonic() + 10.0
+        while len(node.infos) < 3 and time.monotonic() < end:
+            publisher.publish(TOPICS["pose3d/latest"].message())
+            executor.spin_once(timeout_sec=0.05)
+    finally:
+        node.close()
+        executor.shutdown()
+        node.destroy_node()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    first, second, third = (info["publication_sequence_number"] for info in node.infos[:3])
+    assert (second, third) == (first + 1, first + 2)
+    assert node.infos[0]["received_timestamp"] > 0

@@ -1,53 +1,60 @@
-"""How the middleware is set for the processes of a graph."""
+"""Fast DDS profiles of a graph's processes."""
 
 import xml.etree.ElementTree as ET
 
 import pytest
 import rclpy
 
-from drocap_ros.ros import fastdds as middleware
+from drocap_ros.ros import fastdds
+from drocap_ros.ros.fastdds import PROFILE_VARIABLE, RANGE_VARIABLE
 
-VARIABLE, RANGE = middleware.PROFILE_VARIABLE, "ROS_AUTOMATIC_DISCOVERY_RANGE"
-FAST_DDS = {"dds": "{http://www.eprosima.com}"}
 pytestmark = pytest.mark.skipif(
     not rclpy.get_rmw_implementation_identifier().startswith("rmw_fastrtps"), reason="another middleware"
 )
+NAME = "{http://www.eprosima.com}"
 
 
 @pytest.fixture(autouse=True)
-def _nobodys_own_settings(monkeypatch):
-    monkeypatch.delenv(VARIABLE, raising=False)
-    monkeypatch.delenv(RANGE, raising=False)
+def _no_profile_of_the_user(monkeypatch):
+    monkeypatch.delenv(PROFILE_VARIABLE, raising=False)
+    monkeypatch.delenv(RANGE_VARIABLE, raising=False)
 
 
 def transports(environment):
-    """Transport types that the profile defines and uses."""
-    name = "{http://www.eprosima.com}"
-    root = ET.parse(environment[VARIABLE]).getroot()
-    kinds = {d.findtext(f"{name}transport_id"): d for d in root.iter(f"{name}transport_descriptor")}
-    used = [t.text for t in root.find(f".//{name}userTransports")]
+    """Transport types that the profile defines and uses, with the addresses that they are restricted to."""
+    root = ET.parse(environment[PROFILE_VARIABLE]).getroot()
+    kinds = {d.findtext(f"{NAME}transport_id"): d for d in root.iter(f"{NAME}transport_descriptor")}
+    used = [t.text for t in root.find(f".//{NAME}userTransports")]
     assert sorted(used) == sorted(kinds)
-    return {d.findtext(f"{name}type"): [a.text for a in d.iter(f"{name}address")] for d in kinds.values()}
+    return {d.findtext(f"{NAME}type"): [a.text for a in d.iter(f"{NAME}address")] for d in kinds.values()}
 
 
-def test_processes_talk_over_udp_and_on_every_interface_that_ros_may_use(tmp_path):
-    environment = middleware.settings(tmp_path)
+def test_processes_use_udp_on_every_interface():
+    environment = fastdds.environment()
     assert transports(environment) == {"UDPv4": []}
-    assert RANGE not in environment
+    assert RANGE_VARIABLE not in environment
 
 
-def test_who_is_to_stay_on_this_machine_stays_without_shared_memory(tmp_path, monkeypatch):
-    monkeypatch.setenv(RANGE, "LOCALHOST")
-    environment = middleware.settings(tmp_path)
+def test_localhost_range_stays_on_this_machine_without_shared_memory(monkeypatch):
+    monkeypatch.setenv(RANGE_VARIABLE, "LOCALHOST")
+    environment = fastdds.environment()
     assert transports(environment) == {"UDPv4": ["127.0.0.1"]}
-    assert environment[RANGE] == "SYSTEM_DEFAULT"
+    assert environment[RANGE_VARIABLE] == "SYSTEM_DEFAULT"
 
 
-def test_who_hears_a_camera_driver_has_shared_memory_too(tmp_path):
-    assert transports(middleware.settings(tmp_path, shared_memory=True)) == {"UDPv4": [], "SHM": []}
+def test_the_two_profiles_differ_in_the_addresses_only(monkeypatch):
+    texts = []
+    for value in ("SUBNET", "LOCALHOST"):
+        monkeypatch.setenv(RANGE_VARIABLE, value)
+        root = ET.parse(fastdds.environment()[PROFILE_VARIABLE]).getroot()
+        for descriptor in root.iter(f"{NAME}transport_descriptor"):
+            for addresses in descriptor.findall(f"{NAME}interfaceWhiteList"):
+                descriptor.remove(addresses)
+        texts.append(" ".join(ET.tostring(root, encoding="unicode").split()))
+    assert texts[0] == texts[1]
 
 
-def test_somebodys_own_profile_is_left_alone(tmp_path, monkeypatch):
-    monkeypatch.setenv(VARIABLE, "/home/me/fastdds.xml")
-    monkeypatch.setenv(RANGE, "LOCALHOST")
-    assert middleware.settings(tmp_path, shared_memory=True) == {}
+def test_profile_of_the_user_is_left_alone(monkeypatch):
+    monkeypatch.setenv(PROFILE_VARIABLE, "/home/me/fastdds.xml")
+    monkeypatch.setenv(RANGE_VARIABLE, "LOCALHOST")
+    assert fastdds.environment() == {}

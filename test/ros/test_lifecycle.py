@@ -1,4 +1,4 @@
-"""The life cycle of nodes that hold something."""
+"""Life cycle of managed nodes."""
 
 import os
 from pathlib import Path
@@ -53,7 +53,7 @@ def holds(pid, path):
     return any(os.path.realpath(fd) == str(path) for fd in Path(f"/proc/{pid}/fd").iterdir())
 
 
-def test_camera_and_file_are_given_back_and_taken_again(video, tmp_path):
+def test_source_and_session_are_released_and_acquired_again(video, tmp_path):
     config = DrocapConfig().replace("image_ingest", source=str(video), loop=True)
     config = config.replace("session_recorder", session_dir=str(tmp_path / "session"))
     images = []
@@ -74,7 +74,7 @@ def test_camera_and_file_are_given_back_and_taken_again(video, tmp_path):
         assert change(graph, "image_ingest", "activate")
         graph.wait_until(lambda: images, 10, "pictures again")
 
-        # What the state does not allow is refused, and the node lives on.
+        # A transition that the state does not allow is refused, and the node lives on.
         assert not change(graph, "image_ingest", "activate")
         assert not change(graph, "image_ingest", "cleanup")
 
@@ -103,7 +103,7 @@ def test_camera_and_file_are_given_back_and_taken_again(video, tmp_path):
     assert counts["/drocap/image/compressed"] > 5
 
 
-def test_networks_are_given_back_and_loaded_again(video, shared):
+def test_networks_are_released_and_loaded_again(video, shared):
     config = DrocapConfig().replace("image_ingest", source=str(video), loop=True)
     config = config.replace("pose_estimator", models_dir=str(shared / "models"))
     poses = []
@@ -119,3 +119,20 @@ def test_networks_are_given_back_and_loaded_again(video, shared):
         for transition in ("configure", "activate"):
             assert change(graph, "pose_estimator", transition)
         graph.wait_until(lambda: poses, 10, "keypoints again")
+
+
+@pytest.mark.parametrize("processes", [False, True], ids=["one process", "a process each"])
+def test_source_that_has_ended_is_finalized(video, processes):
+    config = DrocapConfig().replace("image_ingest", source=str(video))
+    with bringup(config, ["image_ingest"], processes=processes) as graph:
+        graph.wait_finished("image_ingest", timeout_s=20)
+        assert state(graph, "image_ingest") == "finalized"
+
+
+def test_deactivated_source_has_not_finished(video):
+    config = DrocapConfig().replace("image_ingest", source=str(video), loop=True)
+    with bringup(config, ["image_ingest"]) as graph:
+        assert change(graph, "image_ingest", "deactivate")
+        graph.spin_for(1.5)
+        assert state(graph, "image_ingest") == "inactive"
+        assert not graph.finished

@@ -18,12 +18,13 @@ from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.nodes import visualizer
 from drocap_ros.observation import PoseObservation
-from drocap_ros.view.visualizer_config import VisualizerConfig
 from drocap_ros.ros import rep155 as humans
 from drocap_ros.ros.conversions import header_at, pose2d_to_ros, pose3d_to_ros
+from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import RESULT_QOS, TFMessage
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15
+from drocap_ros.view.visualizer_config import VisualizerConfig
 
 hri = pytest.importorskip("hri_msgs.msg", reason="no hri_msgs here: `make setup` builds it")
 
@@ -206,5 +207,5 @@ def test_markers_come_at_their_rate_and_frames_with_every_pose(capture):
         broken.header = header_at(10**12 + round(29 * 1e9 / 30), "map")
         broken.joints = broken.joints[:7]
         poses.publish(broken)
-        until(lambda: node.counters["messages refused"] == 1)
+        until(lambda: node.counters[Key.MESSAGES_REFUSED] == 1)
         assert len(arrays) == 10

@@ -1,34 +1,32 @@
 """Priorities of the nodes' processes."""
 
 import os
-import threading
+import subprocess
+import sys
 
 import pytest
 
-from drocap_ros.ros import spin as run
+from drocap_ros.ros.topics import NODES
+
+SCRIPT = """
+import os, sys, threading
+from drocap_ros.ros.spin import lower_priority
+before, release = threading.Event(), threading.Event()
+thread = threading.Thread(target=release.wait, daemon=True)
+thread.start()
+lower_priority(int(sys.argv[1]))
+print(*{(os.getpriority(os.PRIO_PROCESS, t), os.sched_getscheduler(t)) for t in (thread.native_id, 0)}, sep=";")
+"""
 
 
-@pytest.mark.skipif(not hasattr(os, "SCHED_IDLE"), reason="Linux's policies")
-@pytest.mark.parametrize(
-    ("component", "own_process", "policy"),
-    [
-        ("pose_estimator", True, "SCHED_OTHER"),
-        ("initializer", True, "SCHED_OTHER"),
-        ("mavlink_bridge", True, "SCHED_OTHER"),
-        ("session_recorder", True, "SCHED_BATCH"),
-        ("bundle_adjuster", True, "SCHED_IDLE"),
-        # A thread that holds Python's lock must be let run.
-        ("bundle_adjuster", False, "SCHED_BATCH"),
-    ],
-)
-def test_what_comes_last_takes_what_others_leave_but_not_beside_them_in_a_process(component, own_process, policy):
-    found = []
+@pytest.mark.skipif(not hasattr(os, "SCHED_BATCH"), reason="Linux's policies")
+@pytest.mark.parametrize(("niceness", "policy"), [(0, "SCHED_OTHER"), (5, "SCHED_OTHER"), (15, "SCHED_BATCH")])
+def test_all_threads_of_a_process_get_its_priority(niceness, policy):
+    run = subprocess.run([sys.executable, "-c", SCRIPT, str(niceness)], capture_output=True, text=True, check=True)
+    expected = max(niceness, os.getpriority(os.PRIO_PROCESS, 0)) if niceness else os.getpriority(os.PRIO_PROCESS, 0)
+    assert run.stdout.strip() == str((expected, getattr(os, policy)))
 
-    def ask():
-        run.step_back(component, own_process)
-        found.append(os.sched_getscheduler(0))
 
-    thread = threading.Thread(target=ask)
-    thread.start()
-    thread.join()
-    assert found == [getattr(os, policy)]
+def test_flight_loop_and_pose_precede_all_other_nodes():
+    first = {name for name, node in NODES.items() if node.live and node.niceness == 0}
+    assert first == {"mavlink_bridge", "pose_estimator", "initializer"}

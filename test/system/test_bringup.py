@@ -11,8 +11,8 @@ import pytest
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
 
-from drocap_ros.bringup import bringup, free_domain
-from drocap_ros.config import DrocapConfig
+from drocap_ros.bringup import bringup, free_domain, node_class
+from drocap_ros.config import DrocapConfig, section_types
 from drocap_ros.errors import InputError, NodeError
 from drocap_ros.msg import OrbitCommand, OrbitStatus, Pose2D, Pose3D, Pose3DWindow
 from drocap_ros.ros.conversions import stamp_from_ros
@@ -23,9 +23,8 @@ CAPTURE = ["capture_simulator", "initializer", "bundle_adjuster"]
 
 
 def short_flight(seconds=3.0, seed=0, **adjuster):
-    # Small starts and short solves: these tests are about the graph, not about accuracy.
+    # Short solves: these tests are about the graph, not about accuracy.
     config = DrocapConfig().replace("capture_simulator", seconds=seconds, seed=seed, rate_hz=15.0)
-    config = config.replace("initializer", azimuth_starts=2, start_iterations=4, sparse_rounds=1)
     return config.replace("bundle_adjuster", **{"iterations": 10, **adjuster})
 
 
@@ -62,7 +61,7 @@ def test_nothing_is_lost_at_the_start_and_every_keypoint_becomes_a_pose(processe
     assert stages[-1] == Pose3D.REFINED
 
 
-def test_two_graphs_side_by_side_do_not_hear_each_other():
+def test_two_graphs_side_by_side_receive_their_own_messages_only():
     with ExitStack() as stack:
         graphs = [stack.enter_context(bringup(short_flight(2.0, seed), CAPTURE[:2])) for seed in (0, 1)]
         assert graphs[0].domain_id != graphs[1].domain_id
@@ -74,13 +73,13 @@ def test_two_graphs_side_by_side_do_not_hear_each_other():
     assert not np.array_equal(first, second)
 
 
-def test_a_free_domain_is_not_given_twice():
+def test_free_domain_is_given_once():
     with free_domain() as first, free_domain() as second:
         assert first != second
 
 
 @pytest.mark.parametrize("processes", [False, True], ids=["one process", "a process each"])
-def test_what_a_node_refuses_is_raised_here(processes, tmp_path):
+def test_refusal_of_a_node_is_raised_by_the_bringup(processes, tmp_path):
     config = DrocapConfig().replace("image_ingest", source=str(tmp_path / "none.mp4"))
     with pytest.raises(InputError, match=r"none\.mp4"), bringup(config, ["image_ingest"], processes=processes):
         pytest.fail("the graph came up without its source")
@@ -92,12 +91,12 @@ def kill_a_node_in_flight():
         graph.wait_until(lambda: False, 20)
 
 
-def test_a_killed_process_is_noticed_and_the_rest_still_stops():
+def test_killed_process_ends_the_graph_and_the_others_stop():
     with pytest.raises(NodeError, match="initializer ended with status -9"):
         kill_a_node_in_flight()
 
 
-def test_an_unknown_node_is_refused():
+def test_unknown_node_is_refused():
     with pytest.raises(InputError, match="expected some of"), bringup(DrocapConfig(), ["pose_estimater"]):
         pass
 
@@ -113,22 +112,15 @@ def test_the_bridge_refuses_to_fly_and_says_why():
     assert {m.state for m in got["orbit/status"]} == {OrbitStatus.IDLE}
 
 
-def test_an_adjuster_without_a_solution_yet_does_not_step_back():
-    with bringup(short_flight(), ["bundle_adjuster"], processes=True) as graph:
-        graph.spin_for(2.0)
-        assert os.sched_getscheduler(graph.pid("bundle_adjuster")) == os.SCHED_OTHER
-
-
-def test_nodes_step_back_behind_the_estimator_in_the_session_of_their_command_out_of_reach_of_its_terminal():
+def test_priority_of_a_process_follows_the_table_in_the_session_and_out_of_the_group_of_the_command():
     with bringup(short_flight(), CAPTURE, processes=True) as graph:
         adjuster, simulator = graph.pid("bundle_adjuster"), graph.pid("capture_simulator")
-        # Only when they have something to show, and then one thread after the other.
-        graph.wait_until(lambda: os.sched_getscheduler(adjuster) == os.SCHED_IDLE, 20, "the adjuster's priority")
+        graph.wait_until(lambda: os.sched_getscheduler(adjuster) == os.SCHED_BATCH, 20, "the adjuster's priority")
         threads = [int(path.name) for path in Path(f"/proc/{adjuster}/task").iterdir()]
-        assert min(os.getpriority(os.PRIO_PROCESS, thread) for thread in threads) == 15
+        assert min(os.getpriority(os.PRIO_PROCESS, thread) for thread in threads) == NODES["bundle_adjuster"].niceness
         assert os.sched_getscheduler(simulator) == os.SCHED_OTHER
         assert os.getpriority(os.PRIO_PROCESS, simulator) == os.getpriority(os.PRIO_PROCESS, 0)
-        # Niceness weighs within a session only; Ctrl-C reaches the command's process group only.
+        # Niceness acts within a session only; Ctrl-C reaches the command's process group only.
         assert os.getsid(adjuster) == os.getsid(simulator) == os.getsid(0)
         assert {os.getpgid(adjuster), os.getpgid(simulator)} == {adjuster, simulator}
 
@@ -138,7 +130,7 @@ def test_nodes_step_back_behind_the_estimator_in_the_session_of_their_command_ou
     or "FASTRTPS_DEFAULT_PROFILES_FILE" in os.environ,
     reason="another middleware, or somebody's own profile",
 )
-def test_only_a_node_that_hears_a_camera_driver_uses_the_shared_memory_in_which_killed_processes_leave_others_waiting():
+def test_only_a_node_that_reads_a_camera_driver_uses_shared_memory():
     def uses_it(name):
         return "/dev/shm/fast" in Path(f"/proc/{graph.pid(name)}/maps").read_text()
 
@@ -160,7 +152,7 @@ def test_only_a_node_that_hears_a_camera_driver_uses_the_shared_memory_in_which_
         assert not uses_it("initializer")
 
 
-def test_pictures_larger_than_the_kernels_buffers_reach_the_estimator_in_its_process(tmp_path):
+def test_images_larger_than_the_kernels_buffers_reach_the_estimator(tmp_path):
     noise = np.random.default_rng(0).integers(0, 255, (1000, 1400, 3), dtype=np.uint8)
     for i in range(15):
         cv2.imwrite(str(tmp_path / f"{i:02d}.jpg"), np.roll(noise, 10 * i, axis=1))
@@ -179,12 +171,18 @@ def test_pictures_larger_than_the_kernels_buffers_reach_the_estimator_in_its_pro
         assert images("image_ingest") >= 5
 
 
-def test_stopping_takes_no_longer_than_it_should():
+def test_graph_stops_within_fifteen_seconds():
     with bringup(short_flight(30.0), CAPTURE[:2]):
         begin = time.monotonic()
     assert time.monotonic() - begin < 15
 
 
-def test_the_table_of_the_graph_names_topics_that_exist():
-    for publishes, subscribes in NODES.values():
-        assert set(publishes) | set(subscribes) <= set(TOPICS)
+def test_table_of_the_nodes_names_existing_topics():
+    for entry in NODES.values():
+        assert set(entry.publishes) | set(entry.subscribes) <= set(TOPICS)
+
+
+def test_every_node_has_a_module_and_a_section_of_the_configuration():
+    assert set(NODES) == set(section_types())
+    for name in NODES:
+        assert node_class(name).component == name

@@ -1,0 +1,95 @@
+"""Nodes in processes: forks of a preloaded server, restarts, ends."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from drocap_ros.bringup import bringup
+from drocap_ros.config import DrocapConfig
+from drocap_ros.errors import InputError
+from drocap_ros.msg import Pose3D
+from drocap_ros.ros.processes import LaunchContext, NodeProcess
+from drocap_ros.ros.topics import RESULT_QOS
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+NODES = ["capture_simulator", "initializer"]
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def flight():
+    return DrocapConfig().replace("capture_simulator", seconds=60.0, rate_hz=15.0)
+
+
+def name_of(pid):
+    try:
+        return Path(f"/proc/{pid}/comm").read_text().strip()
+    except OSError:
+        return None
+
+
+def test_killed_node_restarts_and_works_within_six_seconds():
+    with bringup(flight(), NODES, processes=True, respawn=True) as graph:
+        poses = []
+        graph.node.create_subscription(Pose3D, "pose3d/initial", poses.append, RESULT_QOS)
+        graph.wait_until(lambda: poses, 30, "poses")
+        for restarts in (1, 2):
+            begin = time.monotonic()
+            killed = graph.pid("initializer")
+            os.kill(killed, signal.SIGKILL)
+            graph.wait_until(lambda n=restarts: graph.restarts["initializer"] == n, 10, "the restart")
+            assert graph.pid("initializer") != killed
+            graph.wait_ready("initializer", timeout_s=20)
+            poses.clear()
+            graph.wait_until(lambda: poses, 10, "poses again")
+            assert time.monotonic() - begin < 6.0
+
+
+def test_process_has_the_name_of_its_node():
+    with bringup(flight(), NODES, processes=True) as graph:
+        assert {name: name_of(graph.pid(name)) for name in NODES} == {name: name[:15] for name in NODES}
+
+
+COMMAND = """
+import time
+from drocap_ros.bringup import bringup
+from drocap_ros.config import DrocapConfig
+if __name__ == "__main__":
+    config = DrocapConfig().replace("capture_simulator", seconds=60.0, rate_hz=15.0)
+    with bringup(config, ["capture_simulator", "initializer"], processes=True) as graph:
+        print(*(graph.pid(name) for name in graph.names), flush=True)
+        time.sleep(60.0)
+"""
+
+
+def test_nodes_stop_when_the_process_that_started_them_is_killed(tmp_path):
+    script = tmp_path / "graph.py"
+    script.write_text(COMMAND)
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = subprocess.Popen([sys.executable, script], env=env, stdout=subprocess.PIPE, text=True)
+    pids = [int(word) for word in command.stdout.readline().split()]
+    assert {name_of(pid) for pid in pids} == {"capture_simulat", "initializer"}
+    command.kill()
+    end = time.monotonic() + 15.0
+    while any(name_of(pid) for pid in pids) and time.monotonic() < end:
+        time.sleep(0.1)
+    assert not any(name_of(pid) for pid in pids)
+
+
+def run_until_it_ends(node):
+    end = time.monotonic() + 20.0
+    while time.monotonic() < end:
+        node.check()
+        time.sleep(0.1)
+
+
+def test_refused_parameter_of_a_node_is_the_error_of_its_process(tmp_path, monkeypatch):
+    section = {"/**/initializer": {"ros__parameters": {"gap_s": -1.0}}}
+    monkeypatch.setattr(DrocapConfig, "to_parameter_file", lambda _: section)
+    node = NodeProcess("initializer", DrocapConfig(), LaunchContext(["initializer"], "/drocap", 101, tmp_path))
+    with pytest.raises(InputError, match="gap_s"):
+        run_until_it_ends(node)
