@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 # A parent process that already runs in a ROS environment must not leak its libraries into ours.
 CLEAN := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE -u LD_LIBRARY_PATH -u PYTHONPATH -u AMENT_PREFIX_PATH -u CMAKE_PREFIX_PATH
-SOURCES := $(shell find drocap_ros msg config resource -type f -not -path '*/__pycache__/*') setup.py CMakeLists.txt package.xml
+SOURCES := $(shell find drocap_ros msg srv config resource -type f -not -path '*/__pycache__/*') setup.py CMakeLists.txt package.xml
 
 .PHONY: help setup demo test lint bench bench-flight clean
 help:  ## this list

@@ -72,7 +72,8 @@ class BuildPy(build_py):
     def _take(self, stage: Path) -> None:
         target = Path(self.build_lib) / "drocap_ros"
         (generated,) = stage.glob("**/site-packages/drocap_ros")
-        shutil.copytree(generated / "msg", target / "msg", dirs_exist_ok=True)
+        for kind in ("msg", "srv"):
+            shutil.copytree(generated / kind, target / kind, dirs_exist_ok=True)
         for library in generated.glob("*.so"):
             shutil.copy2(library, target)
         # The rest goes where the ROS wheels put theirs: libraries to PREFIX/lib, the ament index and the

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
 
-from drocap_ros.flight.orbit.controller import OperatorCommand  # noqa: E402
-from drocap_ros.flight.orbit.safety import Action, State  # noqa: E402
+from drocap_ros.flight.orbit.conditions import ConditionCode  # noqa: E402
+from drocap_ros.flight.orbit.states import Action, OperatorCommand, State  # noqa: E402
 from drocap_ros.simulation.closed_loop.orbit_loop import EPOCH_NS, LoopSettings, OrbitLoop, with_config  # noqa: E402
 
 _ODD = [float("nan"), float("inf"), -float("inf"), 0.0, -0.0, -1e30, 1e30, 5.0, 1e-300, 3.4e38]
@@ -91,7 +91,7 @@ def fuzz(seed: int, key_file: Path, block_s: float = _BLOCK_S) -> Block:
     moved = any(row.action != Action.NOTHING for row in loop.rows)
     if moved or "SET_POSITION_TARGET_LOCAL_NED" in loop.copter.received:
         raise AssertionError(f"seed {seed}: motion was commanded")
-    if any(not answer.startswith(("refused", "not orbiting")) for _, answer in loop.answers):
+    if any(answer.accepted and answer.condition.code != ConditionCode.NOT_ORBITING for _, answer in loop.answers):
         raise AssertionError(f"seed {seed}: a command was obeyed: {loop.answers[-3:]}")
     answers, bad_count = len(loop.answers), loop.link.status().bad_count
     loop.start(4.0)

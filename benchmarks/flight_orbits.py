@@ -26,7 +26,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
-from drocap_ros.flight.orbit.safety import Command, State
+from drocap_ros.flight.orbit.states import Command, State
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
 
 SECONDS = 24.0
@@ -135,7 +135,7 @@ def outcome(seed: int) -> dict[str, Any]:
         reason for (before, _), (state, reason) in itertools.pairwise(told)
         if before == "ORBITING" and state != "ORBITING"
     ]  # fmt: skip
-    refusals = [answer for _, answer in loop.answers if answer.startswith("refused")]
+    refusals = [str(answer) for _, answer in loop.answers if not answer.accepted]
     whole = all(row.state == State.ORBITING for row in rows if row.t_s > 14.0)
     return {
         "seed": seed, "code": _CODE, "autopilot": settings.autopilot, "action": settings.action,

@@ -12,10 +12,10 @@ import time
 import numpy as np
 
 from drocap_ros.cli.demo.operator import Operator
-from drocap_ros.flight.orbit.safety import State
+from drocap_ros.flight.orbit.states import State
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
-from drocap_ros.perception.perception_config import PoseEstimatorConfig
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
 from drocap_ros.simulation.closed_loop.pixel_loop import PixelOrbitLoop
 
@@ -53,12 +53,14 @@ def flown(autopilot: str, action: str, seed: int, seconds: float, models: str) -
         body_height_m=1.75,
     )  # fmt: skip
     loop = PixelOrbitLoop(settings, PoseEstimator(models_folder(models), PoseEstimatorConfig()))
-    operator = Operator(seconds, restarts=100, takes_control=autopilot == "px4")
+    operator = Operator(seconds, restarts=100, requests_control=autopilot == "px4")
 
     def operate(flying: OrbitLoop) -> None:
         safety = flying.controller.safety
-        answered = bool(flying.answers) and flying.t - flying.answers[-1][0] < 0.1
-        command = operator.look(safety.state, flying.answers[-1][1] if answered else safety.reason, flying.t)
+        if flying.answers and flying.t - flying.answers[-1][0] < 0.1:
+            accepted, condition = flying.answers[-1][1]
+            operator.on_answer(accepted, condition.code, str(condition), flying.t)
+        command = operator.on_status(safety.state, safety.condition.code, safety.reason, flying.t)
         if command is not None:
             flying.command(command)
 

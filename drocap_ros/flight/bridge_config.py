@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from drocap_ros.errors import ParameterError
 from drocap_ros.flight.orbit_config import OrbitConfig
-from drocap_ros.flight.safety_config import SafetyConfig
+from drocap_ros.flight.safety_config import SafetyConfig, height_condition
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.parameters import param
 
@@ -64,12 +64,8 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        low, high = self.min_height_m + 0.3, self.max_height_m - 0.5
-        if not low <= self.height_m <= high:
-            raise ParameterError(
-                f"height_m: expected {low:g} to {high:g} m (inside min_height_m and max_height_m), "
-                f"got {self.height_m:g}; change one of them"
-            )
+        if (refusal := height_condition(self, self.height_m)) is not None:
+            raise ParameterError(str(refusal))
         if self.radius_m + 1.0 > self.fence_radius_m:
             raise ParameterError(
                 f"fence_radius_m: expected at least radius_m and 1 m, {self.radius_m + 1.0:g}, "

@@ -1,4 +1,4 @@
-"""Parameters of the orbit and what the vehicle may be asked."""
+"""Parameters of the orbit and the limits of every setpoint."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ import math
 from dataclasses import dataclass
 
 from drocap_ros.errors import ParameterError
+from drocap_ros.flight.orbit.conditions import Condition, ConditionCode, condition
 from drocap_ros.parameters import Parameters, param
+
+_ROOM_M = 0.5
 
 
 @dataclass(frozen=True)
 class OrbitConfig(Parameters):
-    """The orbit that is flown when nothing else is commanded, and the limits of every orbit.
+    """The orbit that is flown unless a command changes it, and the limits of every orbit.
 
     Raises
     ------
@@ -47,36 +50,27 @@ class OrbitConfig(Parameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_orbit(self, self.radius_m, self.angular_speed_deg_s)
+        if (refusal := orbit_condition(self, self.radius_m, self.angular_speed_deg_s)) is not None:
+            raise ParameterError(str(refusal))
 
 
-def check_orbit(config: OrbitConfig, radius_m: float, angular_speed_deg_s: float) -> None:
-    """Refuse an orbit that its limits do not allow.
-
-    Raises
-    ------
-    ParameterError
-    """
-    if radius_m < config.min_distance_m + 0.5:
-        raise ParameterError(
-            f"radius_m: expected at least {config.min_distance_m + 0.5:g} m (min_distance_m and 0.5 m of room), "
-            f"got {radius_m:g}; choose a larger radius"
-        )
+def orbit_condition(config: OrbitConfig, radius_m: float, angular_speed_deg_s: float) -> Condition | None:
+    """Which limit of ``config`` forbids this orbit; None = none."""
+    least = config.min_distance_m + _ROOM_M
+    if radius_m < least:
+        return condition(ConditionCode.RADIUS_TOO_SMALL, value=radius_m, limit=least)
     if radius_m > config.max_distance_m:
-        raise ParameterError(
-            f"radius_m: expected at most {config.max_distance_m:g} m (max_distance_m), got {radius_m:g}; "
-            "choose a smaller radius"
-        )
+        return condition(ConditionCode.RADIUS_TOO_LARGE, value=radius_m, limit=config.max_distance_m)
     omega = abs(math.radians(angular_speed_deg_s))
     if omega * radius_m > config.max_speed_m_s:
-        fastest = math.degrees(config.max_speed_m_s / radius_m)
-        raise ParameterError(
-            f"angular_speed_deg_s: expected at most {fastest:.1f} deg/s at {radius_m:g} m (max_speed_m_s "
-            f"{config.max_speed_m_s:g}), got {angular_speed_deg_s:g}; fly slower or closer"
-        )
+        return condition(
+            ConditionCode.SPEED_ABOVE_LIMIT, value=angular_speed_deg_s, radius_m=radius_m,
+            limit=math.degrees(config.max_speed_m_s / radius_m), max_speed_m_s=config.max_speed_m_s,
+        )  # fmt: skip
     if omega**2 * radius_m > config.max_acceleration_m_s2:
-        fastest = math.degrees(math.sqrt(config.max_acceleration_m_s2 / radius_m))
-        raise ParameterError(
-            f"angular_speed_deg_s: expected at most {fastest:.1f} deg/s at {radius_m:g} m (max_acceleration_m_s2 "
-            f"{config.max_acceleration_m_s2:g}), got {angular_speed_deg_s:g}; fly slower or closer"
-        )
+        return condition(
+            ConditionCode.ACCELERATION_ABOVE_LIMIT, value=angular_speed_deg_s, radius_m=radius_m,
+            limit=math.degrees(math.sqrt(config.max_acceleration_m_s2 / radius_m)),
+            max_acceleration_m_s2=config.max_acceleration_m_s2,
+        )  # fmt: skip
+    return None

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from drocap_ros.errors import ParameterError
+from drocap_ros.flight.orbit.conditions import Condition, ConditionCode, condition
 from drocap_ros.parameters import Parameters, param
 
 
 @dataclass(frozen=True)
 class SafetyConfig(Parameters):
-    """When motion may be commanded, and how it is ended."""
+    """Limits within which motion may be commanded, and how motion ends."""
 
     commands_enabled: bool = param(False, "whether motion may be commanded at all")
     mode_change_allowed: bool = param(
@@ -67,3 +68,11 @@ class SafetyConfig(Parameters):
                 f"max_height_m: expected at least min_height_m and 1 m, {self.min_height_m + 1.0:g}, "
                 f"got {self.max_height_m:g}; leave room to fly in"
             )
+
+
+def height_condition(config: SafetyConfig, height_m: float) -> Condition | None:
+    """Whether an orbit at this height leaves too little room to the limits; None = enough."""
+    low, high = config.min_height_m + 0.3, config.max_height_m - 0.5
+    if low <= height_m <= high:
+        return None
+    return condition(ConditionCode.HEIGHT_OUT_OF_RANGE, value=height_m, low=low, high=high)

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PREFIX = Path(sys.prefix)
 PARTS = (
     "CMakeLists.txt", "package.xml", "setup.py", "pyproject.toml", "README.md",
-    "drocap_ros", "msg", "config", "resource",
+    "drocap_ros", "msg", "srv", "config", "resource",
 )  # fmt: skip
 NODES = ["image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
 EXECUTABLES = {"drocap", "flight_simulator", "visualizer", "session_player", *NODES}

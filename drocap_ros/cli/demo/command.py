@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--seconds: expected {_LEAST_S:g} to {_MOST_S:g}, got {args.seconds:g}; choose another")
     check_output_folder(args.out)
     begin = time.monotonic()
-    operator = Operator(args.seconds, takes_control=args.autopilot == "px4")
+    operator = Operator(args.seconds, requests_control=args.autopilot == "px4")
 
     def say(text: str) -> None:
         if not args.quiet:

@@ -1,4 +1,4 @@
-"""The demo's flight: the whole graph with the flight simulator in the place of drone and camera."""
+"""The demo's flight: the whole graph, with the flight simulator instead of drone and camera."""
 
 from __future__ import annotations
 
@@ -20,14 +20,12 @@ NODES = (
     "flight_simulator", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "visualizer",
     "session_recorder",
 )  # fmt: skip
-#: What the flight simulator says once its pilot's hands are off.
-HANDED_OVER = "pilot: hands off"
 
 
 def fly(
     config: DrocapConfig, operator: Operator, say: Callable[[str], None], interrupted: threading.Event
 ) -> dict[str, float]:
-    """Fly until the operator is done; returns the share of a processor core that each node took.
+    """Fly until the operator is done; returns the share of a processor core that each node used.
 
     Raises
     ------
@@ -48,58 +46,67 @@ def fly(
         if interrupted.is_set():
             raise KeyboardInterrupt
         if operator.failure:
-            graph.spin_for(REST_S)  # for the hold that the operator's last word asked for
+            graph.spin_for(REST_S)  # for the hold after the operator's last command
         passed = time.monotonic() - begin
         return {name: (_processor_s(graph.pid(name)) - before[name]) / passed for name in NODES}
 
 
 class _Desk:
-    """The operator's desk: what the bridge and the others say, and the button."""
+    """Connects the operator with the graph: status and diagnostics in, commands out."""
 
     def __init__(self, graph: Graph, operator: Operator, say: Callable[[str], None]) -> None:
-        from drocap_ros.ros.topics import TOPICS
+        from drocap_ros.ros.topics import RESULT_QOS, TOPICS
+        from drocap_ros.srv import OrbitCommand
 
         self._graph, self._operator, self._say = graph, operator, say
-        self._told: dict[str, str] = {}
+        self._pilot = ""
         operator.cleared = False
-        self._command = graph.node.create_publisher(
-            TOPICS["orbit/command"].message, "orbit/command", TOPICS["orbit/command"].qos
-        )
+        self._commands = graph.node.create_client(OrbitCommand, "orbit/command", qos_profile=RESULT_QOS)
         for topic, take in (("orbit/status", self._on_status), ("/diagnostics", self._on_diagnostics)):
             graph.node.create_subscription(TOPICS[topic].message, topic, take, TOPICS[topic].qos)
 
     def _on_status(self, message: Any) -> None:
-        from std_msgs.msg import Header
+        from drocap_ros.flight.orbit.states import State
 
-        from drocap_ros.flight.orbit.safety import State
-        from drocap_ros.msg import OrbitCommand
-
-        operator = self._operator
-        command = operator.look(State(message.state), message.reason, time.monotonic())
-        for words in operator.said:
-            self._say(f"operator: {words}")
-        operator.said.clear()
+        command = self._operator.on_status(State(message.state), message.condition, message.reason, time.monotonic())
         if command is not None:
-            nan = float("nan")
-            now = self._graph.node.get_clock().now().to_msg()
-            self._command.publish(
-                OrbitCommand(
-                    header=Header(stamp=now), command=int(command), radius_m=nan, height_m=nan, angular_speed_deg_s=nan
-                )
-            )
+            self._send(int(command))
+        self._print_remarks()
+
+    def _send(self, command: int) -> None:
+        from drocap_ros.srv import OrbitCommand
+
+        nan = float("nan")
+        now = self._graph.node.get_clock().now().to_msg()
+        request = OrbitCommand.Request(stamp=now, command=command, radius_m=nan, height_m=nan, angular_speed_deg_s=nan)
+        self._commands.call_async(request).add_done_callback(self._on_answer)
+
+    def _on_answer(self, future: Any) -> None:
+        answer = future.result()
+        self._operator.on_answer(answer.accepted, answer.condition, answer.words, time.monotonic())
+        self._print_remarks()
+
+    def _print_remarks(self) -> None:
+        for words in self._operator.remarks:
+            self._say(f"operator: {words}")
+        self._operator.remarks.clear()
 
     def _on_diagnostics(self, message: Any) -> None:
-        """Pass on what the pilot does."""
+        """Print what the pilot does, and clear the operator once the pilot has handed over."""
+        from drocap_ros.ros.diagnostics import PILOT_HANDS_OFF, Key, node_of, values_of
+
         for status in message.status:
-            name = status.name.rsplit("/", 1)[-1]
-            if name == "flight_simulator" and status.message != self._told.get(name):
-                self._told[name] = status.message
+            if node_of(status)[1] != "flight_simulator":
+                continue
+            if values_of(status).get(Key.PILOT) == PILOT_HANDS_OFF:
+                self._operator.cleared = True
+            if status.message != self._pilot:
+                self._pilot = status.message
                 self._say(status.message)
-                self._operator.cleared = self._operator.cleared or status.message == HANDED_OVER
 
 
 def _processor_s(pid: int) -> float:
-    """Time that a process has spent on the processor so far, s; NaN once it is gone."""
+    """Processor time of a process so far, s; NaN after its end."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
     except OSError:
@@ -108,7 +115,7 @@ def _processor_s(pid: int) -> float:
 
 
 def check_flown(operator: Operator) -> None:
-    """Refuse a flight of which less than half of the wanted orbit was flown.
+    """Refuse a flight with less than half of the wanted orbit.
 
     Raises
     ------
@@ -116,7 +123,7 @@ def check_flown(operator: Operator) -> None:
         With the reason.
     """
     if operator.orbited_s < 0.5 * operator.seconds:
-        why = operator.failure or "; ".join(operator.holds) or "nothing was said"
+        why = operator.failure or "; ".join(operator.holds) or "no hold was reported"
         busy = f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
         raise NodeError(
             f"demo: expected {operator.seconds:g} s of orbit, flew {operator.orbited_s:.1f} s: {why} ({busy})"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error
-from drocap_ros.flight.orbit.safety import State
+from drocap_ros.flight.orbit.states import State
 from drocap_ros.recording.session import COMPRESSED_IMAGE, POSE2D, POSE3D, Session
 from drocap_ros.simulation.flight_simulator.truth import FlightTruth, FlownOrbit, flown_orbit
 

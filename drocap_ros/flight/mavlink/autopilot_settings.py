@@ -1,6 +1,6 @@
-"""What the autopilot is set to do when our setpoints stop coming: read from it, and judged in words.
+"""The autopilot's own settings for the loss of setpoints, read from it.
 
-After the bridge's own death only the autopilot's time-out ends the motion, so its length is a condition for flying.
+After the death of the bridge only the autopilot's time-out ends the motion, so its length is a condition for motion.
 """
 
 from __future__ import annotations
@@ -8,50 +8,60 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 _TIMEOUT = {"ardupilot": "GUID_TIMEOUT", "px4": "COM_OF_LOSS_T"}
 _ACTION = "COM_OBL_RC_ACT"
 _READ = {"ardupilot": ("GUID_TIMEOUT",), "px4": ("COM_OF_LOSS_T", _ACTION)}
-_FATAL = {6: "flight is terminated", 7: "the motors are stopped"}
 _DRIFTING = {1: "altitude mode", 2: "manual flight"}
 _RETRY_S, _TRIES, _AGAIN_S = 0.7, 10, 10.0
-_ROUNDING_S = 1e-3
+
+
+class LossSettings(NamedTuple):
+    """Reaction to the loss of setpoints: time-out in s and number of the action, with their parameters' names.
+
+    NaN = not reported.
+    """
+
+    timeout_name: str
+    timeout_s: float
+    action_name: str
+    action: float
 
 
 @dataclass
 class _Setting:
     value: float = math.nan
-    asked_s: float = -math.inf
+    requested_s: float = -math.inf
     tries: int = 0
 
 
 class AutopilotSettings:
-    """The parameters of one autopilot that decide what becomes of it without us.  Time is an argument."""
+    """The parameters of one autopilot that decide its flight without setpoints.  Time is an argument."""
 
     def __init__(self) -> None:
         self._autopilot = ""
         self._settings: dict[str, _Setting] = {}
 
     def set_autopilot(self, autopilot: str) -> None:
-        """Which autopilot it is: "ardupilot" or "px4"."""
+        """Set the autopilot: "ardupilot" or "px4"."""
         self._autopilot = autopilot
         self._settings = {name: _Setting() for name in _READ.get(autopilot, ())}
 
     def due(self, now_s: float) -> list[str]:
-        """Parameters to ask for now: until they are told, then ever more rarely, and once in a while again."""
+        """Parameters to request now: often until they are reported or the tries are used up, then every 10 s."""
         names = []
         for name, setting in self._settings.items():
             patient = setting.tries >= _TRIES or not math.isnan(setting.value)
-            if now_s - setting.asked_s >= (_AGAIN_S if patient else _RETRY_S):
-                setting.asked_s, setting.tries = now_s, setting.tries + 1
+            if now_s - setting.requested_s >= (_AGAIN_S if patient else _RETRY_S):
+                setting.requested_s, setting.tries = now_s, setting.tries + 1
                 names.append(name)
         return names
 
     def take(self, message: Any) -> None:
-        """A PARAM_VALUE has come."""
+        """Take a PARAM_VALUE."""
         setting = self._settings.get(str(message.param_id).rstrip("\0"))
         if setting is None:
             return
@@ -60,32 +70,24 @@ class AutopilotSettings:
             value = float(struct.unpack("<i", struct.pack("<f", value))[0])  # PX4 sends integers byte by byte
         setting.value = value if math.isfinite(value) else math.nan
 
-    def problem(self, longest_s: float) -> str:
-        """Why the vehicle must not be flown as it is set, in words; "" = it may.  ``longest_s`` 0 = no matter."""
+    def loss_settings(self) -> LossSettings | None:
+        """Reaction to the loss of setpoints; None for an autopilot without such settings."""
         name = _TIMEOUT.get(self._autopilot)
-        if name is None or longest_s == 0:
-            return ""
-        value = self._settings[name].value
-        remedy = f"set {name} to {longest_s:g} on the autopilot, or change max_control_timeout_s"
-        if math.isnan(value):
-            return f"the autopilot has not told its {name}, how long it flies on without us; {remedy}"
-        if value > longest_s + _ROUNDING_S:
-            return f"the autopilot would fly on for {value:g} s without us; {remedy}"
-        action = self._settings[_ACTION].value if _ACTION in self._settings else math.nan
-        if action in _FATAL:
-            return f"without us {_FATAL[int(action)]} ({_ACTION} {action:g}); set it to 5, hold, on the autopilot"
-        return ""
+        if name is None:
+            return None
+        values = self.reported()
+        return LossSettings(name, values[name], _ACTION, values.get(_ACTION, math.nan))
 
     def warning(self) -> str:
-        """What is not as it should be and does not forbid to fly, in words; "" = nothing."""
-        action = self._settings[_ACTION].value if _ACTION in self._settings else math.nan
-        if action in _DRIFTING:
+        """A setting that should change and does not forbid motion, as a sentence; "" = none."""
+        settings = self.loss_settings()
+        if settings is not None and settings.action in _DRIFTING:
             return (
-                f"without us the vehicle drifts in {_DRIFTING[int(action)]} ({_ACTION} {action:g}); "
-                "set it to 5, hold, on the autopilot"
+                f"without setpoints the vehicle drifts in {_DRIFTING[int(settings.action)]} "
+                f"({settings.action_name} {settings.action:g}); set it to 5, hold, on the autopilot"
             )
         return ""
 
-    def told(self) -> dict[str, float]:
-        """Values by their names, NaN = not told."""
+    def reported(self) -> dict[str, float]:
+        """Values by their names, NaN = not reported."""
         return {name: setting.value for name, setting in self._settings.items()}

@@ -1,4 +1,4 @@
-"""Commands with their acknowledgements: sent again until answered, and the answer in words."""
+"""MAVLink commands with retries until they are acknowledged."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 _RETRY_S = 0.4
 _TRIES = 5
 _PROGRESS_S = 3.0
-_AGAIN_S = 1.5
-RESULT_WORDS = {
+_REPEAT_S = 1.5
+_NOT_ANSWERED = -1
+_RESULTS = {
     mavlink.MAV_RESULT_ACCEPTED: "accepted",
     mavlink.MAV_RESULT_TEMPORARILY_REJECTED: "rejected for now",
     mavlink.MAV_RESULT_DENIED: "denied",
@@ -19,6 +20,7 @@ RESULT_WORDS = {
     mavlink.MAV_RESULT_FAILED: "failed",
     mavlink.MAV_RESULT_IN_PROGRESS: "in progress",
     6: "cancelled",
+    _NOT_ANSWERED: f"not answered after {_TRIES} tries",
 }
 
 
@@ -28,56 +30,55 @@ class _Pending:
     label: str
     tries: int = 0
     sent_s: float = -1e9
-    outcome: str = ""
+    result: int | None = None  # MAV_RESULT, or _NOT_ANSWERED
     answered_s: float = -1e9
 
 
 class CommandQueue:
-    """At most one command of each kind is under way; time is an argument."""
+    """At most one command of each kind is pending; time is an argument."""
 
     def __init__(self) -> None:
         self._pending: dict[int, _Pending] = {}
 
     def request(self, command: int, parameters: tuple[float, ...], label: str, now_s: float) -> None:
-        """Send a command until it is answered; another takes its place.
+        """Send a command until it is answered; it replaces another one of its kind.
 
-        The same one, asked for again, waits a while after its answer: whoever repeats a mode that has been granted
-        before it is seen takes it back from a pilot who has just chosen another.
+        The same command is repeated only a while after its answer: a mode that is granted but not yet visible must not
+        be requested again, because the pilot may have just chosen another one.
         """
         present = self._pending.get(command)
         same = present is not None and present.parameters == parameters
-        if present is None or not same or (present.outcome and now_s - present.answered_s > _AGAIN_S):
+        if present is None or not same or (present.result is not None and now_s - present.answered_s > _REPEAT_S):
             self._pending[command] = _Pending(parameters, label)
 
     def cancel(self, command: int) -> None:
-        """Send it no more."""
+        """Stop sending the command."""
         self._pending.pop(command, None)
 
     def cancel_all(self) -> None:
-        """Send nothing more: the pilot has taken over."""
+        """Stop sending all commands: the pilot has taken over."""
         self._pending.clear()
 
     def acknowledge(self, command: int, result: int, now_s: float) -> None:
-        """An answer has come."""
+        """Take an acknowledgement."""
         pending = self._pending.get(command)
-        if pending is None or pending.outcome or pending.tries == 0:
+        if pending is None or pending.result is not None or pending.tries == 0:
             return
         if result == mavlink.MAV_RESULT_IN_PROGRESS:
             pending.sent_s = now_s + _PROGRESS_S - _RETRY_S
         elif result == mavlink.MAV_RESULT_TEMPORARILY_REJECTED and pending.tries < _TRIES:
-            pending.sent_s = now_s  # tried again after the usual time
+            pending.sent_s = now_s  # retried after the usual time
         else:
-            pending.outcome = RESULT_WORDS.get(result, f"answered with result {result}")
-            pending.answered_s = now_s
+            pending.result, pending.answered_s = result, now_s
 
     def due(self, now_s: float) -> list[tuple[int, int, tuple[float, ...]]]:
         """(command, confirmation, parameters) to send now."""
         ready = []
         for command, pending in self._pending.items():
-            if pending.outcome or now_s - pending.sent_s < _RETRY_S:
+            if pending.result is not None or now_s - pending.sent_s < _RETRY_S:
                 continue
             if pending.tries >= _TRIES:
-                pending.outcome, pending.answered_s = f"not answered after {pending.tries} tries", now_s
+                pending.result, pending.answered_s = _NOT_ANSWERED, now_s
                 continue
             ready.append((command, pending.tries, pending.parameters))
             pending.sent_s = now_s
@@ -85,11 +86,12 @@ class CommandQueue:
         return ready
 
     def failure(self, command: int) -> str:
-        """In words, why the last command of this kind did not succeed; "" while that is not so."""
+        """Why the last command of this kind failed, as a sentence; "" = it is pending or succeeded."""
         pending = self._pending.get(command)
-        if pending is None or pending.outcome in ("", "accepted"):
+        if pending is None or pending.result in (None, mavlink.MAV_RESULT_ACCEPTED):
             return ""
-        return f"{pending.label}: {pending.outcome}"
+        words = _RESULTS.get(pending.result, f"answered with result {pending.result}")
+        return f"{pending.label}: {words}"
 
 
 def command_message(

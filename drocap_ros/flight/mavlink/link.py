@@ -1,8 +1,7 @@
 """The one owner of the connection to the autopilot.
 
-It reads telemetry, asks for it, keeps its heartbeat and the clocks in step.  What it may send is listed in
-``SENDABLE``, and with ``commands_enabled`` in ``MOTION`` and its modes too; nothing else leaves the port.  It can
-neither arm, nor take off, nor ask for any mode but the control mode and the hold mode of the dialect.
+It reads and requests telemetry, sends a heartbeat and synchronizes the clocks.  Only messages of the allow-list
+(``allowed_messages.py``) leave the port.
 """
 
 from __future__ import annotations
@@ -18,8 +17,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.mavlink.allowed_messages import TELEMETRY_COMMANDS, is_motion, is_telemetry
 from drocap_ros.flight.mavlink.autopilot_settings import AutopilotSettings
-from drocap_ros.flight.mavlink.dialects import DIALECTS
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.signing import read_signing_key, sign_with, signing_time
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
@@ -30,25 +29,19 @@ from drocap_ros.flight.vehicle_state import VehicleState
 _NS = 1_000_000_000
 _STREAM_FALLBACK_S = 5.0
 _RECONNECT_S = 1.0
-SENDABLE = frozenset({"HEARTBEAT", "TIMESYNC", "COMMAND_LONG", "REQUEST_DATA_STREAM", "PARAM_REQUEST_READ"})
-_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL})
-MOTION = frozenset({"SET_POSITION_TARGET_LOCAL_NED", "COMMAND_LONG"})
-_MODES = frozenset(
-    (float(main), float(sub)) for d in DIALECTS.values() for main, sub in (d.control_numbers, d.hold_numbers)
-)
 
 logger = logging.getLogger(__name__)
 
 
 class LinkStatus(NamedTuple):
-    """How the link does.
+    """State of the link.
 
-    connected : something of the vehicle was heard within the time-out
-    silence_s : since then; infinity before the first
+    connected : a message of the vehicle arrived within the time-out
+    silence_s : since that message; infinity before the first
     round_trip_s : of the best time synchronization, NaN without one
-    rates_hz : (real, wanted) of each message asked for, by its name
-    refused : MAV_RESULT of what the autopilot does not grant
-    bad_count : pieces of data that were no message, or not signed as they must be
+    rates_hz : (real, wanted) of each requested message, by its name
+    refused : MAV_RESULT of the messages that the autopilot does not grant
+    bad_count : pieces of data that were no message, or not signed correctly
     refused_count : of these, whole messages that were not signed with our key
     """
 
@@ -66,7 +59,7 @@ class MavlinkLink:
 
     Parameters
     ----------
-    config : where to connect, what to ask for
+    config : where to connect, what to request
     clock_ns : our clock, ns; that of the stamps
     monotonic_s : clock of the periods and of silence
     transport : instead of that of ``config.url``
@@ -95,17 +88,17 @@ class MavlinkLink:
         self._requests = TelemetryRequests(config)
         self.settings = AutopilotSettings()
         self._mav = mavlink.MAVLink(None, srcSystem=config.system_id, srcComponent=config.component_id)
-        # The watchdog packs with one of its own, so that it shares nothing with a loop that hangs; signed packets of
-        # one stream must not go back in time, so it signs as another stream.
-        self._last_mav = mavlink.MAVLink(None, srcSystem=config.system_id, srcComponent=config.component_id)
+        # The watchdog packs with an encoder of its own and so shares nothing with a loop that hangs.  It signs as
+        # another stream, because signed packets of one stream must not go back in time.
+        self._watchdog_mav = mavlink.MAVLink(None, srcSystem=config.system_id, srcComponent=config.component_id)
         if key is not None:
             sign_with(self._mav, key, clock_ns())
-            sign_with(self._last_mav, key, clock_ns(), link_id=1)
+            sign_with(self._watchdog_mav, key, clock_ns(), link_id=1)
         self._autopilot: str | None = None
         self._heard_s: float | None = None  # monotonic
         self._due: dict[str, float] = {}
         self._sync_sent: dict[int, float] = {}  # monotonic s by our stamp, ns
-        self._answered_s = math.nan  # monotonic time at which that was sent which was answered last
+        self._answered_s = math.nan  # when the message was sent that was answered last, monotonic
         self._broken_s: float | None = None
         self._lock = threading.Lock()
         self._answers: list[tuple[int, int]] = []
@@ -117,7 +110,7 @@ class MavlinkLink:
         self.close()
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         self._transport.close()
 
     def run(self, on_state: Callable[[VehicleState], None], stop: threading.Event) -> None:
@@ -127,9 +120,9 @@ class MavlinkLink:
                 on_state(state)
 
     def spin_once(self, timeout_s: float = 0.0) -> list[VehicleState]:
-        """Read what has come, waiting at most ``timeout_s``; send what is due.
+        """Read for at most ``timeout_s``, then send what is due.
 
-        Returns one state per attitude message.  Never raises on what comes in.
+        Returns one state per attitude message.  No input raises.
         """
         data = self._read(timeout_s)
         now_ns = self._clock_ns()
@@ -140,7 +133,7 @@ class MavlinkLink:
 
     @property
     def mav(self) -> Any:
-        """Encoder of messages in our name."""
+        """Encoder of our own messages."""
         return self._mav
 
     @property
@@ -161,37 +154,37 @@ class MavlinkLink:
             self._transmit(message)
 
     def check_motion(self, message: Any) -> Any:
-        """The message, if it is on the allow-list: to be left to the watchdog.
+        """The message itself, if it is on the allow-list; for the watchdog.
 
         Raises
         ------
         AssertionError
             As :meth:`send_motion`.
         """
-        if not self.config.commands_enabled or not _is_motion(message):
+        if not self.config.commands_enabled or not is_motion(message):
             raise AssertionError(f"this link sends no {message.get_type()}")
         return message
 
     def send_unlocked(self, message: Any) -> None:
-        """Send a motion message without waiting for anybody: for the watchdog of a loop that hangs."""
+        """Send a motion message without any lock: for the watchdog of a loop that hangs."""
         self.check_motion(message)
         try:
-            self._transport.write(self._pack(message, self._last_mav))
+            self._transport.write(self._pack(message, self._watchdog_mav))
         except LinkError as error:
             logger.warning("the watchdog could not send: %s", error)
 
     def take_answers(self) -> list[tuple[int, int]]:
-        """(command, MAV_RESULT) of the acknowledgements that came since the last call, telemetry's left out."""
+        """(command, MAV_RESULT) of the acknowledgements since the last call, without those of telemetry."""
         with self._lock:
             answers, self._answers = self._answers, []
         return answers
 
     def answer_age_s(self) -> float:
-        """Time since that was sent which the autopilot has answered last: the way both ways; NaN before the first."""
+        """Time in s since the sending of the message that was answered last: it covers both directions; NaN before."""
         return self._monotonic_s() - self._answered_s
 
     def status(self) -> LinkStatus:
-        """How the link does now."""
+        """State of the link now."""
         with self._lock:
             return self._status()
 
@@ -256,14 +249,14 @@ class MavlinkLink:
             self._take_time_sync(message, now_ns)
         elif name == "PARAM_VALUE":
             self.settings.take(message)
-        elif name == "COMMAND_ACK" and message.command in _COMMANDS:
+        elif name == "COMMAND_ACK" and message.command in TELEMETRY_COMMANDS:
             self._requests.acknowledge(message.result, now_ns)
         elif name == "COMMAND_ACK" and message.target_system in (0, self.config.system_id):
             self._answers = [*self._answers[-31:], (int(message.command), int(message.result))]
         return state
 
     def _take_time_sync(self, message: Any, now_ns: int) -> None:
-        if message.tc1 == 0:  # the autopilot asks
+        if message.tc1 == 0:  # a request of the autopilot
             self._send(self._mav.timesync_encode(now_ns, message.ts1))
             return
         sent_s = self._sync_sent.pop(message.ts1, None)
@@ -299,7 +292,7 @@ class MavlinkLink:
             for setting in self.settings.due(self._monotonic_s()):
                 self._send(self._mav.param_request_read_encode(system, component, setting.encode("ascii"), -1))
         if self._requests.unanswered() and self._is_due("streams", _STREAM_FALLBACK_S):
-            # Autopilots and proxies too old for SET_MESSAGE_INTERVAL know this one.
+            # Autopilots and proxies too old for SET_MESSAGE_INTERVAL support this one.
             rate = round(min(config.position_hz, 50))
             self._send(self._mav.request_data_stream_encode(system, component, mavlink.MAV_DATA_STREAM_ALL, rate, 1))
 
@@ -311,9 +304,8 @@ class MavlinkLink:
         return True
 
     def _send(self, message: Any) -> None:
-        name = message.get_type()
-        if name not in SENDABLE or (name == "COMMAND_LONG" and message.command not in _COMMANDS):
-            raise AssertionError(f"this link sends no {name}")
+        if not is_telemetry(message):
+            raise AssertionError(f"this link sends no {message.get_type()}")
         self._transmit(message)
 
     def _transmit(self, message: Any) -> None:
@@ -326,23 +318,12 @@ class MavlinkLink:
 
     def _pack(self, message: Any, mav: Any) -> bytes:
         if mav.signing.sign_outgoing:
-            # Never back, whatever our clock does, and never far behind what others sign.
+            # Never backwards, whatever our clock does, and never far behind the time that others sign.
             heard = self._parser.signing.timestamp
             mav.signing.timestamp = max(mav.signing.timestamp, signing_time(self._clock_ns()), heard)
         packet = bytes(message.pack(mav))
         mav.seq = (mav.seq + 1) % 256
         return packet
-
-
-def _is_motion(message: Any) -> bool:
-    """The narrow list: setpoints, the dialects' own modes, the mount's pitch."""
-    if message.get_type() not in MOTION:
-        return False
-    if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
-        return True
-    if message.command == mavlink.MAV_CMD_DO_SET_MODE:
-        return (float(message.param2), float(message.param3)) in _MODES
-    return bool(message.command == mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW)
 
 
 def _autopilot_kind(message: Any) -> str | None:

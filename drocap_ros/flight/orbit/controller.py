@@ -1,4 +1,4 @@
-"""From what is seen to what is sent: subject, safety, planner and commands in one step of the control loop.
+"""One step of the control loop: subject, safety, planner and setpoint.
 
 The node and the simulation run this same object.  It reads no clock and owns no thread.
 """
@@ -9,17 +9,19 @@ import dataclasses
 import math
 import threading
 from collections import deque
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drocap_ros.errors import InputError, ParameterError
+from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.commands import CommandQueue, command_message
 from drocap_ros.flight.mavlink.dialects import ARDUPILOT, DIALECTS, Dialect, halt_message, setpoint_message
 from drocap_ros.flight.mavlink.link import MavlinkLink
+from drocap_ros.flight.orbit.command_checks import command_condition, commanded_goal
+from drocap_ros.flight.orbit.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.orbit.observer import observe, position_jump_m
 from drocap_ros.flight.orbit.planner import (
     OrbitGoal,
     OrbitState,
@@ -30,51 +32,42 @@ from drocap_ros.flight.orbit.planner import (
     setpoint_of,
 )
 from drocap_ros.flight.orbit.pose_history import PoseHistory
-from drocap_ros.flight.orbit.safety import (
+from drocap_ros.flight.orbit.safety import permit_mode, reduce
+from drocap_ros.flight.orbit.states import (
     Action,
     Command,
+    CommandAnswer,
     Limits,
     ModeRequest,
     Observed,
+    OperatorCommand,
     SafetyState,
     State,
-    permit_mode,
-    reduce,
 )
-from drocap_ros.flight.orbit.subject_position import SubjectEstimate, SubjectFilter
-from drocap_ros.flight.orbit.watchdog import LastWords, Watchdog
+from drocap_ros.flight.orbit.subject_filter import SubjectEstimate, SubjectFilter
+from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
 from drocap_ros.flight.setpoint import Setpoint, hold_setpoint
 from drocap_ros.flight.vehicle_state import VehicleState
-from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.observation import PoseObservation
 
 _NS = 1_000_000_000
-_COMMAND_AGE_S = 2.0
 _CLOCK_JUMP_S = 0.25
-_POSITION_JUMP_M = 1.0
 _GIMBAL_PERIOD_S = 0.5
 _SET_MODE = mavlink.MAV_CMD_DO_SET_MODE
 _GIMBAL = mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW
-_COMMANDS_KEPT = 16
-
-
-@dataclass(frozen=True)
-class OperatorCommand:
-    """A command of the operator; NaN = as at present or as configured.  ``stamp_ns`` 0 = of now."""
-
-    kind: int
-    radius_m: float = math.nan
-    height_m: float = math.nan
-    angular_speed_deg_s: float = math.nan
-    stamp_ns: int = 0
+_MAX_WAITING_COMMANDS = 16
 
 
 class ControlStatus(NamedTuple):
-    """What one step did: the fields of ``msg/OrbitStatus.msg``, the answer to a command, and what was sent."""
+    """Outcome of one step: the fields of ``msg/OrbitStatus.msg``, the commands it answered, and what was sent.
+
+    mode_failure : why the autopilot did not enter the requested mode, as a sentence; "" = it did, or none was requested
+    """
 
     state: State
-    reason: str
-    answer: str
+    condition: Condition
+    mode_failure: str
+    answers: list[tuple[OperatorCommand, CommandAnswer]]
     radius_m: float
     height_m: float
     angular_speed_deg_s: float
@@ -83,6 +76,11 @@ class ControlStatus(NamedTuple):
     subject_position: np.ndarray
     action: Action
 
+    @property
+    def reason(self) -> str:
+        """Why the controller is in its state, as a sentence."""
+        return f"{self.condition} ({self.mode_failure})" if self.mode_failure else str(self.condition)
+
 
 class OrbitController:
     """Flies the orbit through a link.  States, images and commands may come from other threads than the steps.
@@ -90,44 +88,44 @@ class OrbitController:
     Parameters
     ----------
     link : to the autopilot; it sends motion only with ``commands_enabled``
-    watchdog : told of every step, when given
+    watchdog : gets the fallback commands of every step, when given
     """
 
     def __init__(self, link: MavlinkLink, config: MavlinkBridgeConfig, watchdog: Watchdog | None = None) -> None:
         self._link, self._config, self._watchdog = link, config, watchdog
-        self._limits = Limits(config, config)
+        self._limits = Limits(config, config, max_control_timeout_s=config.max_control_timeout_s)
         self._history = PoseHistory(config.camera_mount_pitch_deg)
         self._subject = SubjectFilter(config)
         self._camera_matrix: np.ndarray | None = None
         self._vehicle: VehicleState | None = None
-        self._commands: deque[OperatorCommand] = deque(maxlen=_COMMANDS_KEPT)
+        self._commands: deque[OperatorCommand] = deque()
+        self._answers: list[tuple[OperatorCommand, CommandAnswer]] = []
         self._queue = CommandQueue()
         self._lock = threading.Lock()
         self.safety = SafetyState()
         self._goal: OrbitGoal = goal_of(config)
         self._orbit: OrbitState | None = None
         self._before: tuple[int, float] | None = None
-        self._left: Setpoint | None = None  # what the watchdog holds if this loop hangs
+        self._fallback: Setpoint | None = None  # what the watchdog holds if this loop hangs
         self._jump_m = 0.0  # of the reported position, since the last step
-        self._keypoints: np.ndarray | None = None
         self._gimbal_s = -1e18
-        self._start_s = 0.0
 
-    # -- what comes in ---------------------------------------------------------------------------------
+    # -- inputs ----------------------------------------------------------------------------------------
 
     def on_state(self, state: VehicleState) -> None:
         """Take a state of the vehicle."""
         with self._lock:
-            self._jump_m = max(self._jump_m, _jump_m(self._vehicle, state))
+            self._jump_m = max(self._jump_m, position_jump_m(self._vehicle, state))
             self._vehicle = state
             self._history.add(state)
 
     def on_camera(self, camera_matrix: np.ndarray) -> None:
-        """Take the camera matrix (3, 3) px; one that cannot be is refused.
+        """Take the camera matrix (3, 3) px.
 
         Raises
         ------
         InputError
+            When a value is not finite or a focal length is not positive.
         """
         focal = np.diag(camera_matrix)[:2]
         if not np.isfinite(camera_matrix).all() or np.any(focal <= 0):
@@ -138,18 +136,21 @@ class OrbitController:
     def on_pose2d(self, observation: PoseObservation) -> None:
         """Take the keypoints of one image."""
         with self._lock:
-            # No two pictures from a flight give the same keypoints bit for bit: these are of one that is frozen.
-            before, self._keypoints = self._keypoints, observation.keypoints
-            frozen = before is not None and observation.has_subject and np.array_equal(before, observation.keypoints)
-            if self._camera_matrix is not None and not frozen:
+            if self._camera_matrix is not None:
                 camera = self._history.at(observation.stamp_ns)
-                locked = self.safety.state == State.ORBITING or not math.isnan(self.safety.engaging_s)
+                locked = self.safety.state == State.ORBITING or self.safety.requesting
                 self._subject.update(observation, self._camera_matrix, camera, locked=locked)
 
     def command(self, command: OperatorCommand) -> None:
-        """Take a command; the next step answers.  Of a storm the latest are kept, and any stop goes first."""
+        """Take a command; a step answers it.  Each step answers one, and a stop before all others."""
         with self._lock:
             self._commands.append(command)
+            if len(self._commands) > _MAX_WAITING_COMMANDS:
+                # The oldest that is no stop: a stop is never dropped for another command.
+                index = next((i for i, c in enumerate(self._commands) if c.kind != Command.STOP), 0)
+                dropped = self._commands[index]
+                del self._commands[index]
+                self._refuse(dropped, condition(ConditionCode.TOO_MANY_COMMANDS, limit=_MAX_WAITING_COMMANDS))
 
     # -- one step --------------------------------------------------------------------------------------
 
@@ -169,120 +170,81 @@ class OrbitController:
         estimate = self._subject.estimate(now_ns)
         if estimate is not None:  # into the frame of the reported position, by which the setpoints are flown
             estimate = dataclasses.replace(estimate, position=estimate.position + self._history.offset)
-        seen = self._observe(estimate, disturbance, now_ns)
-        kind, refusal = self._next_command(now_ns)
+        orbiting_s = now_s - self.safety.since_s if self.safety.state == State.ORBITING else 0.0
+        seen = observe(self._link, self._config, self._vehicle, estimate, disturbance, orbiting_s, now_ns)
+        command, kind = self._next_command(now_ns)
         dialect = DIALECTS.get(seen.autopilot, ARDUPILOT)
         before = self.safety
         limits = self._limits._replace(warm_up_s=dialect.warm_up_s)
         self.safety, decision = reduce(before, seen, now_s, kind, limits)
-        if hung and self.safety.state == State.HOLDING and self._left is not None:
-            # The watchdog has been holding a place already: another one, farther on, would let the vehicle go there.
-            self.safety = dataclasses.replace(self.safety, hold_position=self._left.position, hold_yaw=self._left.yaw)
+        if command is not None and decision.answer is not None:
+            self._answers.append((command, decision.answer))
+        if hung and self.safety.state == State.HOLDING and self._fallback is not None:
+            # The watchdog already holds a position: a new one, farther on, would let the vehicle move on.
+            self.safety = dataclasses.replace(
+                self.safety, hold_position=self._fallback.position, hold_yaw=self._fallback.yaw
+            )
         if self.safety.state != before.state:
-            self._on_change(before, seen, estimate, now_s)
+            self._on_change(seen, estimate)
         self._request_mode(decision.mode_request, dialect, now_s)
         sent = self._send(decision.action, seen, estimate, dt)
         self._send_commands(seen, estimate, now_s)
-        self._leave_words(seen, dialect, now_s)
-        return self._status(seen, estimate, refusal or decision.answer, sent)
+        self._leave_fallback(seen, dialect, now_s)
+        return self._status(seen, estimate, sent)
 
-    def _disturbance(self, now_ns: int, now_s: float) -> tuple[str, float, bool]:
-        """What is wrong with our own time, the time since the last step, and whether the watchdog has acted."""
+    def _disturbance(self, now_ns: int, now_s: float) -> tuple[Condition | None, float, bool]:
+        """Disturbance of our own time or of the position, time since the last step, whether the watchdog has acted."""
         before, self._before = self._before, (now_ns, now_s)
-        hung, asked = self._watchdog.take_fired() if self._watchdog else (False, False)
-        if asked and self.safety.modes and self._vehicle is not None:
+        hung, requested = self._watchdog.take_fired() if self._watchdog else (False, False)
+        if requested and self.safety.modes and self._vehicle is not None:
             dialect = DIALECTS.get(self._vehicle.autopilot, ARDUPILOT)
             self.safety = permit_mode(self.safety, dialect.hold_mode)
         if before is None:
-            return "", 0.0, hung
+            return None, 0.0, hung
         dt = now_s - before[1]
         jump_s = (now_ns - before[0]) / _NS - dt
         if abs(jump_s) > _CLOCK_JUMP_S:
-            return f"our clock jumped by {jump_s:.1f} s", dt, hung
-        moved_m, self._jump_m = self._jump_m, 0.0
-        if moved_m > 0:
-            return f"the reported position jumped by {moved_m:.1f} m", dt, hung
+            return condition(ConditionCode.CLOCK_JUMPED, jump_s=jump_s), dt, hung
+        jump_m, self._jump_m = self._jump_m, 0.0
+        if jump_m > 0:
+            return condition(ConditionCode.POSITION_JUMPED, jump_m=jump_m), dt, hung
         if hung or dt > self._config.watchdog_s:
-            return f"the control loop stood still for {dt:.1f} s", dt, hung
-        return "", dt, hung
+            return condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=dt), dt, hung
+        return None, dt, hung
 
-    def _observe(self, estimate: SubjectEstimate | None, disturbance: str, now_ns: int) -> Observed:
-        vehicle, estimator = self._vehicle, self._link.estimator
-        if vehicle is None:
-            return Observed(disturbance=disturbance)
-        age_s = (now_ns - vehicle.stamp_ns) / _NS
-        # The state is at the attitude's stamp; a moment later the vehicle is a little farther.
-        position = vehicle.position_enu_m + np.nan_to_num(vehicle.velocity_enu_m_s) * min(max(age_s, 0.0), 0.3)
-        told = estimator.snapshot(now_ns) or vehicle  # mode and health are newer than the attitude
-        dialect = DIALECTS.get(told.autopilot, ARDUPILOT)
-        health = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
-        status_age = max(estimator.age_s(names, now_ns) for names in (("GPS_RAW_INT",), health, ("SYS_STATUS",)))
-        distance, closing, approach = math.nan, 0.0, 0.0
-        if estimate is not None:
-            offset = position[:2] - estimate.position[:2]
-            distance = float(np.hypot(*offset))
-            closing = -float(offset @ vehicle.velocity_enu_m_s[:2]) / max(distance, 1e-3)
-            approach = float(offset @ estimate.velocity[:2]) / max(distance, 1e-3)
-        echo = estimator.age_s(("POSITION_TARGET_LOCAL_NED",), now_ns)
-        heeded = True
-        if not disturbance and self.safety.state == State.ORBITING and math.isfinite(echo):
-            flown_s = (self._before[1] if self._before else 0.0) - self.safety.since_s
-            if min(echo, flown_s) > self._config.max_echo_age_s:
-                # PX4 must be told another mode; ArduPilot's GUID_TIMEOUT has ended the motion by now, and BRAKE from
-                # there would take longer.
-                heeded = told.autopilot != "px4"
-                disturbance = f"the autopilot has not echoed a setpoint for {echo:.1f} s: it does not follow them"
-        return Observed(
-            autopilot=told.autopilot, mode=told.mode, in_control=told.mode == dialect.control_mode,
-            in_hold=told.mode == dialect.hold_mode, armed=told.armed, landed_state=told.landed_state,
-            link_age_s=told.link_age_s, heartbeat_age_s=estimator.age_s(("HEARTBEAT",), now_ns),
-            state_age_s=abs(age_s), position_age_s=(now_ns - estimator.position_changed_ns) / _NS,
-            status_age_s=status_age, round_trip_s=self._link.answer_age_s(), echo_age_s=echo,
-            gps_fix_type=told.gps_fix_type, position_ok=told.position_ok, battery_fraction=told.battery_fraction,
-            position=position, velocity=np.asarray(vehicle.velocity_enu_m_s, float), yaw=_yaw(vehicle),
-            height_m=float(position[2]) - self._config.ground_height_m,
-            subject=None if estimate is None else estimate.position,
-            subject_age_s=math.inf if estimate is None else estimate.age_s,
-            subject_sd_m=math.inf if estimate is None else estimate.position_sd_m,
-            subject_distance_m=distance, closing_m_s=closing, approach_m_s=approach, disturbance=disturbance,
-            heeded=heeded, settings_problem=self._link.settings.problem(self._config.max_control_timeout_s),
-        )  # fmt: skip
-
-    def _next_command(self, now_ns: int) -> tuple[Command | None, str]:
-        """The command to obey in this step, or why it is refused before anything looks at it."""
+    def _next_command(self, now_ns: int) -> tuple[OperatorCommand | None, Command | None]:
+        """The command to execute in this step; an invalid one is refused here."""
         if not self._commands:
-            return None, ""
-        if any(c.kind == Command.STOP for c in self._commands):
+            return None, None
+        stop = next((c for c in self._commands if c.kind == Command.STOP), None)
+        if stop is not None:
+            overruled = condition(ConditionCode.OVERRULED_BY_STOP)
+            self._answers += [
+                (c, CommandAnswer(c.kind == Command.STOP, overruled)) for c in self._commands if c is not stop
+            ]
             self._commands.clear()
-            return Command.STOP, ""
+            return stop, Command.STOP
         command = self._commands.popleft()
-        if command.kind not in list(Command):
-            return None, f"refused: no command has the number {command.kind}"
-        age_s = (now_ns - command.stamp_ns) / _NS
-        if command.stamp_ns and abs(age_s) > _COMMAND_AGE_S:
-            return None, f"refused: the command is {age_s:.1f} s old; commands of the past are not obeyed"
+        if (refusal := command_condition(command, now_ns)) is not None:
+            self._refuse(command, refusal)
+            return None, None
         kind = Command(command.kind)
-        if kind == Command.ADJUST and self.safety.state != State.ORBITING:
-            return kind, ""
-        if kind != Command.ADJUST and (self.safety.state == State.ORBITING or not math.isnan(self.safety.engaging_s)):
-            return kind, ""
-        try:
-            goal = goal_of(
-                self._config, command.radius_m, command.height_m, command.angular_speed_deg_s,
-                self._goal if kind == Command.ADJUST else None,
-            )  # fmt: skip
-            low, high = self._config.min_height_m + 0.3, self._config.max_height_m - 0.5
-            if not low <= goal.height_m <= high:
-                raise ParameterError(f"height_m: expected {low:g} to {high:g} m, got {goal.height_m:g}")
-        except ParameterError as error:
-            return None, f"refused: {error}"
+        running = self.safety.state == State.ORBITING
+        if (kind == Command.ADJUST and not running) or (kind != Command.ADJUST and (running or self.safety.requesting)):
+            return command, kind  # the state decides, and the goal stays
+        goal = commanded_goal(self._config, command, self._goal if kind == Command.ADJUST else None)
+        if isinstance(goal, Condition):
+            self._refuse(command, goal)
+            return None, None
         self._goal = goal
-        return kind, ""
+        return command, kind
 
-    def _on_change(self, before: SafetyState, seen: Observed, estimate: SubjectEstimate | None, now_s: float) -> None:
+    def _refuse(self, command: OperatorCommand, refusal: Condition) -> None:
+        self._answers.append((command, CommandAnswer(False, refusal)))
+
+    def _on_change(self, seen: Observed, estimate: SubjectEstimate | None) -> None:
         if self.safety.state == State.ORBITING and estimate is not None:
             self._orbit = begin_orbit(seen.position, seen.velocity, estimate.position, self._config)
-            self._start_s = now_s
         else:
             self._orbit = None
         if self.safety.state in (State.TAKEN_OVER, State.IDLE):
@@ -324,7 +286,7 @@ class OrbitController:
         for command, result in self._link.take_answers():
             self._queue.acknowledge(command, result, now_s)
         if self._queue.failure(_GIMBAL):
-            self._gimbal_s = math.inf  # there is no mount: not asked again
+            self._gimbal_s = math.inf  # there is no mount: no further requests
         wanted = self._config.gimbal_control and self.safety.state == State.ORBITING and estimate is not None
         if wanted and estimate is not None and now_s - self._gimbal_s > _GIMBAL_PERIOD_S:
             drop = float(seen.position[2] - estimate.position[2])
@@ -336,19 +298,19 @@ class OrbitController:
             message = command_message(self._link.mav, self._link.target, command, confirmation, parameters)
             self._link.send_motion(message)
 
-    def _leave_words(self, seen: Observed, dialect: Dialect, now_s: float) -> None:
+    def _leave_fallback(self, seen: Observed, dialect: Dialect, now_s: float) -> None:
         if self._watchdog is None:
             return
-        words = None
+        commands = None
         if self.safety.state == State.ORBITING and np.isfinite(seen.position).all() and math.isfinite(seen.yaw):
             mav, target = self._link.mav, self._link.target
-            self._left = hold_setpoint(seen.position, seen.yaw)
-            hold = setpoint_message(mav, target, self._left)
+            self._fallback = hold_setpoint(seen.position, seen.yaw)
+            hold = setpoint_message(mav, target, self._fallback)
             mode = command_message(mav, target, _SET_MODE, 0, dialect.mode_parameters(True))
-            words = LastWords(self._link.check_motion(hold), self._link.check_motion(mode))
-        self._watchdog.kick(now_s, words)
+            commands = FallbackCommands(self._link.check_motion(hold), self._link.check_motion(mode))
+        self._watchdog.kick(now_s, commands)
 
-    def _status(self, seen: Observed, estimate: SubjectEstimate | None, answer: str, sent: Action) -> ControlStatus:
+    def _status(self, seen: Observed, estimate: SubjectEstimate | None, sent: Action) -> ControlStatus:
         subject = np.full(3, np.nan)
         yaw_error = omega = math.nan
         if estimate is not None:
@@ -358,30 +320,10 @@ class OrbitController:
             bearing = math.atan2(-sight[1], -sight[0])
             yaw_error = math.degrees(math.remainder(seen.yaw - bearing, 2 * math.pi)) if sight.any() else math.nan
         orbiting = self.safety.state == State.ORBITING
-        reason, failure = self.safety.reason, self._queue.failure(_SET_MODE)
+        answers, self._answers = self._answers, []
         return ControlStatus(
-            state=self.safety.state, reason=f"{reason} ({failure})" if failure else reason, answer=answer,
-            radius_m=seen.subject_distance_m, height_m=seen.height_m, angular_speed_deg_s=omega,
+            state=self.safety.state, condition=self.safety.condition, mode_failure=self._queue.failure(_SET_MODE),
+            answers=answers, radius_m=seen.subject_distance_m, height_m=seen.height_m, angular_speed_deg_s=omega,
             radius_error_m=seen.subject_distance_m - self._goal.radius_m if orbiting else math.nan,
             yaw_error_deg=yaw_error, subject_position=subject, action=sent,
         )  # fmt: skip
-
-
-def _jump_m(before: VehicleState | None, state: VehicleState) -> float:
-    """How far the reported position is from where the last one was going; 0 = near enough."""
-    if before is None:
-        return 0.0
-    dt = (state.stamp_ns - before.stamp_ns) / _NS
-    if not 0 < dt < 0.5:
-        return 0.0
-    mean = 0.5 * (before.velocity_enu_m_s + state.velocity_enu_m_s)
-    jump = float(np.linalg.norm(state.position_enu_m - before.position_enu_m - mean * dt))
-    return jump if jump > _POSITION_JUMP_M else 0.0  # NaN is no jump
-
-
-def _yaw(vehicle: VehicleState) -> float:
-    """Yaw of the nose, rad from east."""
-    if not np.isfinite(vehicle.orientation_xyzw).all():
-        return math.nan
-    nose = matrix_from_quaternion(vehicle.orientation_xyzw)[:, 0]
-    return math.atan2(float(nose[1]), float(nose[0]))

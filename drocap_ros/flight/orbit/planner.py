@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.errors import ParameterError
-from drocap_ros.flight.orbit_config import OrbitConfig, check_orbit
+from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.setpoint import Setpoint
 
 _TRIM_RATE, _MAX_TRIM_M = 0.15, 0.5  # 1/s, m
@@ -69,21 +68,11 @@ def goal_of(
     angular_speed_deg_s: float = math.nan,
     present: OrbitGoal | None = None,
 ) -> OrbitGoal:
-    """Goal from a command; NaN = as at present, or as configured.
-
-    Raises
-    ------
-    ParameterError
-        When the limits do not allow it.
-    """
+    """Goal of a command, not validated; NaN = as at present, or as configured."""
     base = present or OrbitGoal(config.radius_m, config.height_m, math.radians(config.angular_speed_deg_s))
-    for name, value in (("radius_m", radius_m), ("height_m", height_m), ("angular_speed_deg_s", angular_speed_deg_s)):
-        if math.isinf(value):
-            raise ParameterError(f"{name}: expected a finite number or NaN (as it is), got {value!r}")
     radius = base.radius_m if math.isnan(radius_m) else radius_m
     height = base.height_m if math.isnan(height_m) else height_m
     speed = math.degrees(base.angular_speed_rad_s) if math.isnan(angular_speed_deg_s) else angular_speed_deg_s
-    check_orbit(config, radius, speed)
     return OrbitGoal(radius, height, math.radians(speed))
 
 

@@ -8,21 +8,21 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 _PERIOD_S = 0.1
-_LOOK_S = 0.02
-_ASK_MODE_S = 3.0
+_CHECK_S = 0.02
+_REQUEST_MODE_S = 3.0
 _GIVE_UP_S = 10.0
 _STOPPED_S = 0.5
 
 
-class LastWords(NamedTuple):
-    """What to send if the loop is not heard of again: messages of the place to hold, and of the hold mode."""
+class FallbackCommands(NamedTuple):
+    """Messages to send if the loop hangs: the position to hold, and the hold mode."""
 
     hold: Any
     hold_mode: Any
 
 
 class Watchdog:
-    """Sends the last words that the loop left, once it has not come back for ``limit_s``.
+    """Sends the fallback commands of the last step once the loop has not stepped for ``limit_s``.
 
     Parameters
     ----------
@@ -32,39 +32,39 @@ class Watchdog:
 
     def __init__(self, send: Callable[[Any], None], limit_s: float) -> None:
         self._send, self._limit_s = send, limit_s
-        self._left: tuple[float, LastWords | None] = (-1e18, None)  # replaced whole: no lock
-        self._sent_s = self._looked_s = -1e18
-        self._stood_s = 0.0  # how long this thread itself stood still since the loop was last heard of
+        self._latest: tuple[float, FallbackCommands | None] = (-1e18, None)  # replaced whole: no lock
+        self._sent_s = self._checked_s = -1e18
+        self._stood_s = 0.0  # how long this thread itself stood still since the last step of the loop
         self.fired = False
-        self.mode_asked = False
+        self.mode_requested = False
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
-    def kick(self, now_s: float, words: LastWords | None) -> None:
-        """The loop is alive; ``words`` is None while nothing is commanded."""
-        self._left, self._stood_s = (now_s, words), 0.0
+    def kick(self, now_s: float, commands: FallbackCommands | None) -> None:
+        """Note a step of the loop; ``commands`` is None while nothing is commanded."""
+        self._latest, self._stood_s = (now_s, commands), 0.0
 
     def step(self, now_s: float) -> None:
-        """Look at the loop and act."""
-        left_s, words = self._left
-        gap_s, self._looked_s = now_s - max(self._looked_s, left_s), now_s
-        if gap_s > self._limit_s:  # the whole process was stopped, the loop too: it comes back with us
+        """Check the loop and act."""
+        step_s, commands = self._latest
+        gap_s, self._checked_s = now_s - max(self._checked_s, step_s), now_s
+        if gap_s > self._limit_s:  # the whole process was stopped, the loop too: both resume together
             self._stood_s += gap_s
         if self._stood_s > _STOPPED_S:
-            return  # the autopilot's time-out has ended the motion; the place that was left is of another time
-        silent_s = now_s - left_s
-        if words is None or not self._limit_s < silent_s < _GIVE_UP_S or now_s - self._sent_s < _PERIOD_S:
+            return  # the autopilot's time-out has ended the motion; the position of the last step is outdated
+        silent_s = now_s - step_s
+        if commands is None or not self._limit_s < silent_s < _GIVE_UP_S or now_s - self._sent_s < _PERIOD_S:
             return
         self.fired, self._sent_s = True, now_s
-        self._send(words.hold)
-        if silent_s > _ASK_MODE_S and not self.mode_asked:
-            self.mode_asked = True
-            self._send(words.hold_mode)
+        self._send(commands.hold)
+        if silent_s > _REQUEST_MODE_S and not self.mode_requested:
+            self.mode_requested = True
+            self._send(commands.hold_mode)
 
     def take_fired(self) -> tuple[bool, bool]:
-        """Whether it has acted, and asked for the hold mode, since the last call."""
-        result = (self.fired, self.mode_asked)
-        self.fired = self.mode_asked = False
+        """Whether it has acted, and requested the hold mode, since the last call."""
+        result = (self.fired, self.mode_requested)
+        self.fired = self.mode_requested = False
         return result
 
     def start(self) -> None:
@@ -79,5 +79,5 @@ class Watchdog:
             self._thread.join(1.0)
 
     def _run(self) -> None:
-        while not self._stop.wait(_LOOK_S):
+        while not self._stop.wait(_CHECK_S):
             self.step(time.monotonic())

@@ -4,7 +4,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.mavlink.autopilot_settings import AutopilotSettings
-from drocap_ros.flight.orbit.safety import Action, State
+from drocap_ros.flight.orbit.conditions import ConditionCode
+from drocap_ros.flight.orbit.motion_checks import loss_condition
+from drocap_ros.flight.orbit.states import Action, State
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, with_config
 
 MAV = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -25,50 +27,52 @@ def settings(autopilot, **values):
 
 
 @pytest.mark.parametrize(
-    ("autopilot", "values", "words"),
+    ("autopilot", "values", "code"),
     [
-        ("ardupilot", {}, "has not told its GUID_TIMEOUT"),
-        ("ardupilot", {"GUID_TIMEOUT": math.nan}, "has not told"),
-        ("ardupilot", {"GUID_TIMEOUT": 3.0}, "fly on for 3 s without us; set GUID_TIMEOUT to 0.5"),
-        ("ardupilot", {"GUID_TIMEOUT": 0.5}, ""),
-        ("px4", {"COM_OBL_RC_ACT": 5}, "has not told its COM_OF_LOSS_T"),
-        ("px4", {"COM_OF_LOSS_T": 1.0}, "fly on for 1 s without us; set COM_OF_LOSS_T"),
-        ("px4", {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 7}, "the motors are stopped"),
-        ("px4", {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 6}, "terminated"),
-        ("px4", {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5}, ""),
-        ("other", {}, ""),
+        ("ardupilot", {}, ConditionCode.TIMEOUT_UNKNOWN),
+        ("ardupilot", {"GUID_TIMEOUT": math.nan}, ConditionCode.TIMEOUT_UNKNOWN),
+        ("ardupilot", {"GUID_TIMEOUT": 3.0}, ConditionCode.TIMEOUT_TOO_LONG),
+        ("ardupilot", {"GUID_TIMEOUT": 0.5}, None),
+        ("px4", {"COM_OBL_RC_ACT": 5}, ConditionCode.TIMEOUT_UNKNOWN),
+        ("px4", {"COM_OF_LOSS_T": 1.0}, ConditionCode.TIMEOUT_TOO_LONG),
+        ("px4", {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 7}, ConditionCode.LOSS_ACTION_FATAL),
+        ("px4", {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 6}, ConditionCode.LOSS_ACTION_FATAL),
+        ("px4", {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5}, None),
+        ("other", {}, None),
     ],
 )
-def test_what_forbids_to_fly(autopilot, values, words):
-    known = settings(autopilot, **values)
-    found = known.problem(0.5)
-    assert words in found
-    assert bool(found) == bool(words)
-    assert known.problem(0.0) == ""
+def test_settings_that_forbid_motion(autopilot, values, code):
+    known = settings(autopilot, **values).loss_settings()
+    found = loss_condition(known, 0.5)
+    assert (found and found.code) == code
+    assert loss_condition(known, 0.0) is None
+    if code == ConditionCode.TIMEOUT_TOO_LONG:
+        assert f"set {known.timeout_name} to 0.5" in str(found)
 
 
-def test_drift_is_a_warning():
+def test_drift_without_setpoints_is_a_warning():
     assert "altitude" in settings("px4", COM_OF_LOSS_T=0.5, COM_OBL_RC_ACT=1).warning()
     assert settings("px4", COM_OF_LOSS_T=0.5, COM_OBL_RC_ACT=5).warning() == ""
     assert settings("ardupilot", GUID_TIMEOUT=0.5).warning() == ""
 
 
-def test_asked_until_told_and_then_rarely():
+def test_settings_are_requested_until_reported_and_then_rarely():
     known = settings("ardupilot")
     asked = [t for t in range(0, 60_000, 10) if known.due(t / 1000)]
     assert len([t for t in asked if t < 7000]) == 10
     assert len(asked) < 20
-    told = settings("ardupilot", GUID_TIMEOUT=0.5)
-    assert len([t for t in range(0, 60_000, 10) if told.due(t / 1000)]) == 6
+    reported = settings("ardupilot", GUID_TIMEOUT=0.5)
+    assert len([t for t in range(0, 60_000, 10) if reported.due(t / 1000)]) == 6
 
 
 @pytest.mark.parametrize(("autopilot", "name"), [("ardupilot", "GUID_TIMEOUT"), ("px4", "COM_OF_LOSS_T")])
-def test_a_vehicle_that_would_fly_on_is_not_flown(autopilot, name):
+def test_orbit_is_refused_when_the_autopilot_flies_on_without_setpoints(autopilot, name):
     loop = OrbitLoop(LoopSettings(autopilot=autopilot, seconds=10, guid_timeout_s=3.0, offboard_loss_s=1.0))
     loop.start()
     loop.run(7.0)
-    assert name in loop.answers[0][1]
-    assert loop.answers[0][1].startswith("refused")
+    answer = loop.answers[0][1]
+    assert not answer.accepted
+    assert answer.condition.values["name"] == name
     assert all(row.action == Action.NOTHING for row in loop.rows)
     allowed = OrbitLoop(with_config(loop.settings, max_control_timeout_s=3.0))
     allowed.start()

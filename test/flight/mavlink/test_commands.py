@@ -13,7 +13,7 @@ from drocap_ros.flight.mavlink.commands import CommandQueue
 from drocap_ros.flight.mavlink.dialects import ARDUPILOT, DIALECTS, PX4, halt_message, setpoint_message
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.parser import MavlinkParser
-from drocap_ros.flight.orbit.watchdog import LastWords, Watchdog
+from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
 from drocap_ros.flight.setpoint import Setpoint, hold_setpoint
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 
@@ -52,7 +52,7 @@ def test_halt_is_velocity_zero_and_nothing_else():
     assert (message.vx, message.vy, message.vz, message.yaw_rate) == (0, 0, 0, 0)
 
 
-def test_command_is_sent_until_answered_and_failure_is_in_words():
+def test_command_is_sent_until_answered_and_a_failure_is_reported():
     queue = CommandQueue()
     queue.request(SET_MODE, ARDUPILOT.mode_parameters(False), "mode GUIDED", 0.0)
     assert queue.due(0.0) == [(SET_MODE, 0, (1.0, 4.0, 0.0, 0.0, 0.0, 0.0, 0.0))]
@@ -143,12 +143,12 @@ def test_contradicting_parameters_of_the_bridge_are_refused(values, word):
         MavlinkBridgeConfig(**values)
 
 
-def test_watchdog_says_the_last_words_of_a_loop_that_hangs_and_only_then():
+def test_watchdog_sends_the_fallback_commands_only_when_the_loop_hangs():
     sent = []
     dog = Watchdog(sent.append, 0.2)
-    words = LastWords("hold", "mode")
+    commands = FallbackCommands("hold", "mode")
     for i in range(20):
-        dog.kick(0.05 * i, words)
+        dog.kick(0.05 * i, commands)
         dog.step(0.05 * i + 0.02)
     assert sent == []
     for i in range(200):
@@ -164,16 +164,16 @@ def test_watchdog_says_the_last_words_of_a_loop_that_hangs_and_only_then():
     assert sent == []
 
 
-def test_watchdog_that_stood_still_with_its_loop_leaves_the_old_place_alone():
+def test_watchdog_that_stood_still_with_its_loop_sends_no_outdated_position():
     sent = []
     dog = Watchdog(sent.append, 0.2)
-    words = LastWords("hold", "mode")
-    dog.kick(1.0, words)
+    commands = FallbackCommands("hold", "mode")
+    dog.kick(1.0, commands)
     dog.step(1.02)
     for i in range(100):  # stopped for three seconds, and the loop is not back yet
         dog.step(4.02 + 0.02 * i)
     assert sent == []
-    dog.kick(6.1, words)
+    dog.kick(6.1, commands)
     dog.step(6.12)
     for i in range(20):
         dog.step(6.14 + 0.02 * i)

@@ -14,7 +14,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.errors import InputError, ParameterError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.frames import camera_rotation
-from drocap_ros.flight.mavlink.link import SENDABLE, MavlinkLink
+from drocap_ros.flight.mavlink.allowed_messages import TELEMETRY
+from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
 from drocap_ros.flight.mavlink.transport import open_transport
@@ -73,7 +74,7 @@ def test_state_of_a_simulated_vehicle(port, autopilot):
         assert state.mode == {"ardupilot": "GUIDED", "px4": "OFFBOARD"}[autopilot]
         assert abs(state.latitude_deg - HOME[0]) < 1e-4
         assert all(b.stamp_ns > a.stamp_ns for a, b in itertools.pairwise(states))
-        assert set(vehicle.received) <= SENDABLE - {"REQUEST_DATA_STREAM"}
+        assert set(vehicle.received) <= TELEMETRY - {"REQUEST_DATA_STREAM"}
         status = link.status()
         assert status.connected
         assert status.round_trip_s < 0.5

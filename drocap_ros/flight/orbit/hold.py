@@ -1,0 +1,96 @@
+"""The hold: which position is latched, when it retreats from the subject, when the hold mode is requested."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from drocap_ros.flight.orbit.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.orbit.motion_checks import braking_distance, subject_located
+from drocap_ros.flight.orbit.states import Limits, Observed, SafetyState, State
+from drocap_ros.flight.safety_config import SafetyConfig
+
+_AT_REST_M_S, _AT_REST_S = 0.35, 0.5
+_DEAD_RECKONING_S = 0.6
+_FRESH_S = 0.25
+_NEAR_M, _STOPPING_S, _MAX_WAY_OUT_M = 5.0, 1.2, 1.5
+_LEAD_S, _CLEAR_M, _MAX_LEAD_M = 1.5, 0.3, 3.0
+_HOLD_MODE_PATIENCE_S = 5.0
+
+
+def begin_hold(
+    state: SafetyState, reason: Condition, seen: Observed, now_s: float, blind: bool, retreats: bool = False
+) -> SafetyState:
+    """Enter HOLDING at the present position.
+
+    A position that was known a moment ago is extrapolated by the last velocity and held: a position setpoint stops the
+    vehicle sooner than velocity zero.
+
+    blind : whether the vehicle's state is not to be trusted
+    retreats : see :class:`SafetyState`
+    """
+    age_s = max(seen.position_age_s, seen.state_age_s)
+    finite = bool(np.isfinite(seen.position).all() and np.isfinite(seen.velocity).all()) and math.isfinite(seen.yaw)
+    known = finite and seen.position_ok and seen.gps_fix_type >= 3 and age_s <= _DEAD_RECKONING_S
+    fresh = known and max(seen.link_age_s, age_s) <= _FRESH_S
+    behind_s = 0.0 if fresh else max(seen.position_age_s - seen.state_age_s, 0.0)
+    place = seen.position + seen.velocity * behind_s if known else None
+    if place is not None and seen.subject is not None and seen.subject_distance_m < _NEAR_M and seen.closing_m_s < 0:
+        # A vehicle that moves away from a near subject does not return to where it was: the subject may follow.
+        outward = (seen.position - seen.subject)[:2] / max(seen.subject_distance_m, 1e-3)
+        way = min((max(seen.approach_m_s, 0.0) - seen.closing_m_s) * _STOPPING_S, _MAX_WAY_OUT_M)
+        aside = seen.velocity[:2] - (seen.velocity[:2] @ outward) * outward
+        place = place + np.append(way * outward + 0.5 * _STOPPING_S * aside, 0.0)
+    return dataclasses.replace(
+        state, state=State.HOLDING, since_s=now_s, condition=reason, blind=blind and not fresh,
+        hold_mode_s=math.nan if seen.followed else now_s, hold_position=place, hold_yaw=seen.yaw,
+        retreats=retreats, retreated_s=-math.inf,
+    )  # fmt: skip
+
+
+def update_hold(state: SafetyState, seen: Observed, now_s: float, blind: bool) -> SafetyState:
+    """Latch a position that has become known, and enter FAULT when the hold mode is not granted."""
+    if state.blind and not blind:
+        state = dataclasses.replace(state, blind=False, since_s=now_s, hold_mode_s=math.nan)
+        if state.hold_position is None:
+            state = dataclasses.replace(state, hold_position=seen.position.copy(), hold_yaw=seen.yaw)
+    late = not math.isnan(state.hold_mode_s) and now_s - state.hold_mode_s > _HOLD_MODE_PATIENCE_S
+    if state.state == State.HOLDING and late and not seen.in_hold:
+        reason = condition(ConditionCode.HOLD_MODE_MISSING, cause=state.condition)
+        return dataclasses.replace(state, state=State.FAULT, since_s=now_s, condition=reason)
+    return state
+
+
+def retreat(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> SafetyState:
+    """Move the hold position away from an approaching subject, at most to the fence.
+
+    Only a subject that is located counts, and only until the autopilot's hold mode has been requested.
+    """
+    place, subject, safety = state.hold_position, seen.subject, limits.safety
+    settled = state.blind or not math.isnan(state.hold_mode_s) or seen.in_hold
+    if settled or not state.retreats or place is None or subject is None or state.fence_centre is None:
+        return state
+    if not subject_located(seen, safety):
+        return state
+    wanted = limits.orbit.min_distance_m + seen.subject_sd_m + _LEAD_S * max(seen.approach_m_s, 0.0) + _CLEAR_M
+    if not seen.subject_distance_m < wanted or np.hypot(*(place - subject)[:2]) >= wanted:
+        return state
+    outward = (seen.position - subject)[:2] / max(seen.subject_distance_m, 1e-3)
+    target = subject[:2] + wanted * outward
+    step = target - seen.position[:2]
+    target = seen.position[:2] + step * min(1.0, _MAX_LEAD_M / max(float(np.hypot(*step)), 1e-6))
+    offset = target - state.fence_centre
+    room = safety.fence_radius_m - braking_distance(limits.orbit.max_speed_m_s, safety)
+    target = state.fence_centre + offset * min(1.0, room / max(float(np.hypot(*offset)), 1e-6))
+    return dataclasses.replace(state, hold_position=np.append(target, place[2]), retreated_s=now_s)
+
+
+def request_hold_mode(state: SafetyState, seen: Observed, now_s: float, config: SafetyConfig) -> SafetyState:
+    """Allow the request of the hold mode once the vehicle is at rest, or after ``hold_s``."""
+    if state.state != State.HOLDING or not math.isnan(state.hold_mode_s) or state.blind:
+        return state
+    held_s = now_s - max(state.since_s, state.retreated_s)
+    still = bool(np.linalg.norm(seen.velocity) < _AT_REST_M_S) and held_s > _AT_REST_S
+    return dataclasses.replace(state, hold_mode_s=now_s) if still or held_s > config.hold_s else state

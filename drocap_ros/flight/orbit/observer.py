@@ -1,0 +1,101 @@
+"""Gathers what the safety machine decides by: vehicle, link and subject at the instant of one step."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.mavlink.dialects import ARDUPILOT, DIALECTS
+from drocap_ros.flight.mavlink.link import MavlinkLink
+from drocap_ros.flight.orbit.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.orbit.states import Observed
+from drocap_ros.flight.orbit.subject_filter import SubjectEstimate
+from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.geometry.rotations import matrix_from_quaternion
+
+_NS = 1_000_000_000
+_MAX_EXTRAPOLATION_S = 0.3
+_POSITION_JUMP_M, _JUMP_PERIOD_S = 1.0, 0.5
+_STATUS_MESSAGES = (("GPS_RAW_INT",), ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"), ("SYS_STATUS",))
+
+
+def observe(
+    link: MavlinkLink,
+    config: MavlinkBridgeConfig,
+    vehicle: VehicleState | None,
+    estimate: SubjectEstimate | None,
+    disturbance: Condition | None,
+    orbiting_s: float,
+    now_ns: int,
+) -> Observed:
+    """The observation of one step.
+
+    Parameters
+    ----------
+    vehicle : latest state
+    estimate : of the subject, in the frame of the reported position
+    disturbance : of our own time or of the reported position
+    orbiting_s : how long the orbit has been flown; 0 = it is not
+    """
+    if vehicle is None:
+        return Observed(disturbance=disturbance)
+    estimator = link.estimator
+    age_s = (now_ns - vehicle.stamp_ns) / _NS
+    # The state is at the attitude's stamp; a moment later the vehicle is a little farther.
+    position = vehicle.position_enu_m + np.nan_to_num(vehicle.velocity_enu_m_s) * min(
+        max(age_s, 0.0), _MAX_EXTRAPOLATION_S
+    )
+    latest = estimator.snapshot(now_ns) or vehicle  # mode and health are newer than the attitude
+    dialect = DIALECTS.get(latest.autopilot, ARDUPILOT)
+    status_age = max(estimator.age_s(names, now_ns) for names in _STATUS_MESSAGES)
+    distance, closing, approach = math.nan, 0.0, 0.0
+    if estimate is not None:
+        offset = position[:2] - estimate.position[:2]
+        distance = float(np.hypot(*offset))
+        closing = -float(offset @ vehicle.velocity_enu_m_s[:2]) / max(distance, 1e-3)
+        approach = float(offset @ estimate.velocity[:2]) / max(distance, 1e-3)
+    followed = True
+    if disturbance is None:
+        echo_age = estimator.age_s(("POSITION_TARGET_LOCAL_NED",), now_ns)
+        if math.isfinite(echo_age) and min(echo_age, orbiting_s) > config.max_echo_age_s:
+            # PX4 needs another mode; ArduPilot's GUID_TIMEOUT has ended the motion by now, and BRAKE from there would
+            # take longer.
+            followed = latest.autopilot != "px4"
+            disturbance = condition(ConditionCode.SETPOINTS_NOT_FOLLOWED, age_s=echo_age)
+    return Observed(
+        autopilot=latest.autopilot, mode=latest.mode, in_control=latest.mode == dialect.control_mode,
+        in_hold=latest.mode == dialect.hold_mode, armed=latest.armed, landed_state=latest.landed_state,
+        link_age_s=latest.link_age_s, heartbeat_age_s=estimator.age_s(("HEARTBEAT",), now_ns),
+        state_age_s=abs(age_s), position_age_s=(now_ns - estimator.position_changed_ns) / _NS,
+        status_age_s=status_age, round_trip_s=link.answer_age_s(),
+        gps_fix_type=latest.gps_fix_type, position_ok=latest.position_ok, battery_fraction=latest.battery_fraction,
+        position=position, velocity=np.asarray(vehicle.velocity_enu_m_s, float), yaw=_yaw(vehicle),
+        height_m=float(position[2]) - config.ground_height_m,
+        subject=None if estimate is None else estimate.position,
+        subject_age_s=math.inf if estimate is None else estimate.age_s,
+        subject_sd_m=math.inf if estimate is None else estimate.position_sd_m,
+        subject_distance_m=distance, closing_m_s=closing, approach_m_s=approach, disturbance=disturbance,
+        followed=followed, loss_settings=link.settings.loss_settings(),
+    )  # fmt: skip
+
+
+def position_jump_m(before: VehicleState | None, state: VehicleState) -> float:
+    """Distance in m of the reported position from where the state before it led; 0 = near enough."""
+    if before is None:
+        return 0.0
+    dt = (state.stamp_ns - before.stamp_ns) / _NS
+    if not 0 < dt < _JUMP_PERIOD_S:
+        return 0.0
+    mean = 0.5 * (before.velocity_enu_m_s + state.velocity_enu_m_s)
+    jump = float(np.linalg.norm(state.position_enu_m - before.position_enu_m - mean * dt))
+    return jump if jump > _POSITION_JUMP_M else 0.0  # NaN is no jump
+
+
+def _yaw(vehicle: VehicleState) -> float:
+    """Yaw of the nose, rad from east."""
+    if not np.isfinite(vehicle.orientation_xyzw).all():
+        return math.nan
+    nose = matrix_from_quaternion(vehicle.orientation_xyzw)[:, 0]
+    return math.atan2(float(nose[1]), float(nose[0]))

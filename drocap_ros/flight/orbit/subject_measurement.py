@@ -1,0 +1,195 @@
+"""Bearing and range of the subject from one image.
+
+Range comes from two independent sources.  *Body size*: the lengths of trunk, thighs and shanks, as a level camera
+that looks straight at the subject would see them, against those of a body of the assumed height.  *Ground plane*: the
+intersection of the rays through the ankles with level ground.  Both have systematic errors (assumed stature, height,
+attitude), which the measurement carries apart from its noise.
+
+The two ranges disagree by their assumptions, which are constant, and by posture, which passes and only makes the body
+look smaller, so farther.  So the ground gives the range of each image, and the ratio of the two over some seconds, see
+``subject_filter.py``, the correction by body size.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.flight.orbit.pose_history import CameraPose
+from drocap_ros.flight.subject_config import SubjectConfig
+from drocap_ros.joint_maps import joint_map
+from drocap_ros.observation import PoseObservation
+from drocap_ros.skeleton import BODY_15
+
+#: Lengths as shares of the stature (Winter, Biomechanics and Motor Control of Human Movement; trunk: hips to the
+#: top of the neck): the long bones of each side and the trunk.
+_BONES = tuple(
+    (BODY_15.index(a), BODY_15.index(b), share)
+    for a, b, share in (
+        ("pelvis", "neck", 0.367), ("rhip", "rknee", 0.245), ("lhip", "lknee", 0.245),
+        ("rknee", "rankle", 0.246), ("lknee", "lankle", 0.246),
+    )
+)  # fmt: skip
+_ENDS_A, _ENDS_B = (np.array([bone[i] for bone in _BONES]) for i in (0, 1))
+_SHARES = np.array([bone[2] for bone in _BONES])
+_ANKLES = np.array([BODY_15.index("rankle"), BODY_15.index("lankle")])
+_TRUNK = np.array([BODY_15.index(name) for name in ("pelvis", "rhip", "lhip", "neck")])
+_NECK = BODY_15.index("neck")
+_ANKLE_HEIGHT = 0.055  # share of the stature; a swinging foot lifts the mean a little
+_CONFIDENCE = 0.25
+_STRIDE_M = 0.15  # standard deviation of the mean of the feet about the pelvis
+_STEEP = np.sin(np.deg2rad(75.0))
+_SHALLOW = np.sin(np.deg2rad(4.0))
+_MAX_RANGE_M = 200.0
+_THIRD_LONGEST = 0.99  # of the true length
+_GROUND_NOISE, _SIZE_NOISE, _BEARING_NOISE = 0.025, 0.06, 0.008  # of one image, shares of the range
+_LIFTED, _APART_NOISE = 0.15, 0.1  # apart by this share, one foot is lifted; noise per distance between them
+_LEAN_RAD = 0.12  # standard deviation of the body's lean; looking down by a slope it changes lengths by as much
+
+
+class SubjectMeasurement(NamedTuple):
+    """The subject's pelvis from one image.
+
+    position : (3,) m ENU
+    noise : (3, 3) m^2, independent from image to image
+    systematic : (3, 3) m^2, constant: assumed stature, height above ground, attitude
+    range_size_m, range_ground_m : horizontal range of each source, NaN without
+    bending : foreshortening of unequal bones, logarithm of a ratio; about 0.1 by noise alone
+    """
+
+    position: np.ndarray
+    noise: np.ndarray
+    systematic: np.ndarray
+    range_size_m: float
+    range_ground_m: float
+    bending: float
+
+
+def locate_subject(
+    observation: PoseObservation,
+    camera_matrix: np.ndarray,
+    camera: CameraPose,
+    config: SubjectConfig,
+    size_over_ground: float = float("nan"),
+) -> SubjectMeasurement | None:
+    """Locate the subject in one image.
+
+    Parameters
+    ----------
+    observation : keypoints of any joint set that maps to ``BODY_15``
+    camera_matrix : (3, 3) px
+    camera : pose at the stamp of the observation
+    size_over_ground : ratio of the two ranges over the last seconds; NaN = that of this image.  It changes slowly by
+        the assumptions, and quickly when the subject crouches: then the ground is right
+
+    Returns
+    -------
+    None without a subject, with too few visible joints, or when the camera looks straight down on it.
+    """
+    if not observation.has_subject or len(observation.keypoints) == 0:
+        return None
+    points, _, confidence = joint_map(observation.joints.name).apply(
+        observation.keypoints.astype(float), observation.covariance.astype(float),
+        observation.confidence.astype(float), float(observation.image_size[1]),
+    )  # fmt: skip
+    seen = np.isfinite(points).all(axis=1) & (confidence >= _CONFIDENCE)
+    trunk = _TRUNK[seen[_TRUNK]]
+    if len(trunk) == 0:
+        return None
+    plane = (np.where(seen[:, None], points, 0.0) - camera_matrix[:2, 2]) / np.diag(camera_matrix)[:2]
+    rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1) @ camera.rotation
+    # The median of pelvis and hips: one wrong joint does not turn the bearing.
+    pelvis = np.median(rays[trunk[trunk != _NECK]], axis=0) if np.any(trunk != _NECK) else rays[_NECK]
+    length = float(np.linalg.norm(pelvis))
+    flat = float(np.hypot(pelvis[0], pelvis[1]))
+    if flat < np.sqrt(1 - _STEEP**2) * length:
+        return None
+    slope = float(pelvis[2] / flat)
+    size, bending = _range_from_size(rays, seen, pelvis[:2] / flat, config)
+    size_error = float(np.hypot(config.size_error, _LEAN_RAD * slope))
+    ground, ground_sd, noise = _range_from_ground(rays, seen, camera.position, config)
+    if np.isfinite(size_over_ground) and np.isfinite(ground):
+        distance, sd = _fuse(size_over_ground * ground, size_error, ground, ground_sd)
+    else:
+        distance, sd = _fuse(size, size_error, ground, ground_sd)
+    if not 0.3 < distance < _MAX_RANGE_M:
+        return None
+    ahead = np.array([pelvis[0], pelvis[1], 0.0]) / flat
+    position = camera.position + distance * (pelvis / flat)
+    aside = np.array([-ahead[1], ahead[0], 0.0])
+    along = ahead + np.array([0.0, 0.0, slope])
+    turn = np.deg2rad(config.attitude_error_deg) * distance
+    up = np.array([0.0, 0.0, 1.0])
+
+    def spread(range_sd: float, across_sd: float) -> np.ndarray:
+        return (
+            range_sd**2 * np.outer(along, along)
+            + across_sd**2 * np.outer(aside, aside)
+            + (across_sd**2 + 1e-4) * np.outer(up, up)
+        )
+
+    # Feet give a precise range from image to image, bones do not.
+    noise = noise if np.isfinite(noise) else _SIZE_NOISE * distance + 0.05
+    return SubjectMeasurement(
+        position, spread(noise, _BEARING_NOISE * distance + 0.03), spread(sd, turn), size, ground, bending
+    )
+
+
+def _range_from_size(
+    rays: np.ndarray, seen: np.ndarray, ahead: np.ndarray, config: SubjectConfig
+) -> tuple[float, float]:
+    """Horizontal range from the third longest bone relative to its own length, and the bending.
+
+    The bones are measured in the upright plane across the line of sight, at distance 1, so a camera that looks down
+    does not shorten them.  A wrong joint lengthens two bones at most; the shortest bones are foreshortened.
+    """
+    depth = rays[:, :2] @ ahead
+    usable = seen & (depth > 0.05)
+    bones = usable[_ENDS_A] & usable[_ENDS_B]
+    if bones.sum() < 3:
+        return float("nan"), float("nan")
+    across = np.stack([rays[:, 1] * ahead[0] - rays[:, 0] * ahead[1], rays[:, 2]], axis=1)
+    across = across / np.where(usable, depth, 1.0)[:, None]
+    lengths = np.linalg.norm(across[_ENDS_A] - across[_ENDS_B], axis=1)[bones] / (_SHARES[bones] * config.body_height_m)
+    order = np.sort(lengths)[::-1]
+    if order[2] < 1e-6:
+        return float("nan"), float("nan")
+    return _THIRD_LONGEST / float(order[2]), float(np.log(order[1] / max(order[min(3, len(order) - 1)], 1e-6)))
+
+
+def _range_from_ground(
+    rays: np.ndarray, seen: np.ndarray, position: np.ndarray, config: SubjectConfig
+) -> tuple[float, float, float]:
+    """Horizontal range of the ankles on level ground, its standard deviation and that of one image; NaN without."""
+    ankles = rays[_ANKLES[seen[_ANKLES]]]
+    # A foot kicked up to the horizon is left out; the other one stands.
+    ankles = ankles[-ankles[:, 2] >= _SHALLOW * np.linalg.norm(ankles, axis=1)]
+    height = float(position[2]) - config.ground_height_m - _ANKLE_HEIGHT * config.body_height_m
+    if not config.use_ground_plane or len(ankles) == 0 or height < 0.3:
+        return float("nan"), float("nan"), float("nan")
+    ranges = height * np.hypot(ankles[:, 0], ankles[:, 1]) / -ankles[:, 2]
+    apart, nearer = float(np.ptp(ranges)), float(ranges.min())
+    # A lifted foot appears farther than the one that stands; feet a stride apart stand about the pelvis.
+    lifted = apart > _LIFTED * nearer
+    distance = nearer if lifted else float(ranges.mean())
+    turn = np.deg2rad(config.attitude_error_deg)
+    errors = (turn * (height**2 + distance**2) / height, config.height_error_m * distance / height, _STRIDE_M)
+    noise = _GROUND_NOISE * distance + 0.05 + _APART_NOISE * min(apart, 0.5 * nearer)
+    return distance, float(np.linalg.norm(errors)), noise
+
+
+def _fuse(size: float, size_error: float, ground: float, ground_sd: float) -> tuple[float, float]:
+    """Information-weighted mean and its standard deviation; ``size_error`` is a share.
+
+    Contradicting ranges give body size alone, with twice its standard deviation.
+    """
+    if not np.isfinite(size):
+        return ground, ground_sd
+    size_sd = size_error * size
+    if not np.isfinite(ground):
+        return size, size_sd
+    if abs(size - ground) > 3 * np.hypot(size_sd, ground_sd):
+        return size, 2 * size_sd
+    wa, wb = size_sd**-2, ground_sd**-2
+    return (wa * size + wb * ground) / (wa + wb), float((wa + wb) ** -0.5)

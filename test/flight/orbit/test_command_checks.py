@@ -1,0 +1,91 @@
+import math
+
+import pytest
+
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.orbit.command_checks import command_condition, commanded_goal
+from drocap_ros.flight.orbit.conditions import Condition, ConditionCode
+from drocap_ros.flight.orbit.planner import OrbitGoal
+from drocap_ros.flight.orbit.states import Command, OperatorCommand
+from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop
+
+CONFIG = MavlinkBridgeConfig()
+NOW_NS = 1_700_000_000_000_000_000
+START = int(Command.START)
+
+
+@pytest.mark.parametrize(
+    ("command", "code"),
+    [
+        (OperatorCommand(4), ConditionCode.UNKNOWN_COMMAND),
+        (OperatorCommand(255), ConditionCode.UNKNOWN_COMMAND),
+        (OperatorCommand(START, stamp_ns=NOW_NS - 3_000_000_000), ConditionCode.COMMAND_OUTDATED),
+        (OperatorCommand(START, stamp_ns=NOW_NS + 3_000_000_000), ConditionCode.COMMAND_OUTDATED),
+        (OperatorCommand(START, stamp_ns=-1), ConditionCode.COMMAND_OUTDATED),
+        (OperatorCommand(START, stamp_ns=NOW_NS - 1_000_000_000), None),
+        (OperatorCommand(START), None),
+    ],
+)
+def test_unknown_and_outdated_commands_are_refused(command, code):
+    found = command_condition(command, NOW_NS)
+    assert (found and found.code) == code
+
+
+@pytest.mark.parametrize(
+    ("values", "code"),
+    [
+        ({"radius_m": math.inf}, ConditionCode.VALUE_NOT_FINITE),
+        ({"height_m": -math.inf}, ConditionCode.VALUE_NOT_FINITE),
+        ({"angular_speed_deg_s": math.inf}, ConditionCode.VALUE_NOT_FINITE),
+        ({"radius_m": -5.0}, ConditionCode.RADIUS_TOO_SMALL),
+        ({"radius_m": 0.0}, ConditionCode.RADIUS_TOO_SMALL),
+        ({"radius_m": 1e30}, ConditionCode.RADIUS_TOO_LARGE),
+        ({"height_m": 1e30}, ConditionCode.HEIGHT_OUT_OF_RANGE),
+        ({"height_m": 1.3}, ConditionCode.HEIGHT_OUT_OF_RANGE),
+        ({"angular_speed_deg_s": 1e30}, ConditionCode.SPEED_ABOVE_LIMIT),
+        ({"angular_speed_deg_s": -1e30}, ConditionCode.SPEED_ABOVE_LIMIT),
+        ({"angular_speed_deg_s": 40.0}, ConditionCode.ACCELERATION_ABOVE_LIMIT),
+    ],
+)
+def test_values_outside_the_limits_are_refused(values, code):
+    found = commanded_goal(CONFIG, OperatorCommand(START, **values), None)
+    assert isinstance(found, Condition)
+    assert found.code == code
+    assert next(iter(values)) in str(found)
+
+
+def test_nan_keeps_the_present_or_the_configured_value():
+    present = OrbitGoal(8.0, 3.0, 0.2)
+    assert commanded_goal(CONFIG, OperatorCommand(int(Command.ADJUST)), present) == pytest.approx(present)
+    goal = commanded_goal(CONFIG, OperatorCommand(START, height_m=4.0), None)
+    assert goal == pytest.approx((CONFIG.radius_m, 4.0, math.radians(CONFIG.angular_speed_deg_s)))
+
+
+def answers_of(commands):
+    loop = OrbitLoop(LoopSettings(seconds=3))
+    loop.run(1.0)
+    for command in commands:
+        loop.controller.command(command)
+    found = []
+    for i in range(len(commands) + 1):
+        found += loop.controller.step(loop.clock_ns() + i, loop.t + 0.001 * i).answers
+    return found
+
+
+def test_every_command_gets_exactly_one_answer():
+    commands = [OperatorCommand(kind) for kind in (1, 2, 9, 1, 3)]
+    found = answers_of(commands)
+    assert [command for command, _ in found] == commands
+    assert all(found[i][0] is commands[i] for i in range(len(commands)))
+
+
+def test_stop_precedes_all_waiting_commands_and_is_never_dropped():
+    stop = OperatorCommand(int(Command.STOP))
+    commands = [OperatorCommand(START), stop, *(OperatorCommand(START) for _ in range(40))]
+    found = answers_of(commands)
+    assert len(found) == len(commands)
+    codes = [answer.condition.code for _, answer in found]
+    assert codes.count(ConditionCode.TOO_MANY_COMMANDS) == 26
+    assert codes.count(ConditionCode.OVERRULED_BY_STOP) == 15
+    (answer,) = (answer for command, answer in found if command is stop)
+    assert answer.accepted
