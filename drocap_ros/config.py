@@ -1,4 +1,4 @@
-"""The configuration of the whole system: one section per component, from one YAML file.
+"""Configuration of all components from one YAML file, one section per node.
 
 The file has the form of a ROS 2 parameter file, so that ``drocap live --config FILE`` and
 ``ros2 run drocap_ros NODE --ros-args --params-file FILE`` read the same one::
@@ -19,17 +19,19 @@ from typing import Any, get_type_hints
 from drocap_ros.errors import InputError, ParameterError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.parameters import Parameters
-from drocap_ros.perception.perception_config import ImageIngestConfig, PoseEstimatorConfig
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
+from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.recording.recording_config import SessionPlayerConfig, SessionRecorderConfig
-from drocap_ros.report.visualizer_config import VisualizerConfig
+from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
+from drocap_ros.recording.player_config import SessionPlayerConfig
+from drocap_ros.view.visualizer_config import VisualizerConfig
 from drocap_ros.simulation.capture_config import SimulationConfig
 from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimulatorConfig
 
 
 @dataclass(frozen=True)
 class DrocapConfig:
-    """Parameters of every component; each field bears the name of its node."""
+    """Parameters of every component; each field has the name of its node."""
 
     image_ingest: ImageIngestConfig = field(default_factory=ImageIngestConfig)
     pose_estimator: PoseEstimatorConfig = field(default_factory=PoseEstimatorConfig)
@@ -43,12 +45,12 @@ class DrocapConfig:
     flight_simulator: FlightSimulatorConfig = field(default_factory=FlightSimulatorConfig)
 
     def section(self, component: str) -> Parameters:
-        """Parameters of one component by its node's name."""
+        """Parameters of the component with this node name."""
         value: Parameters = getattr(self, component)
         return value
 
     def replace(self, component: str, **values: Any) -> DrocapConfig:
-        """Copy with some values of one component changed (and checked)."""
+        """Copy with some values of one component changed; the values are validated."""
         changes: dict[str, Any] = {component: dataclasses.replace(self.section(component), **values)}
         return dataclasses.replace(self, **changes)
 
@@ -66,12 +68,12 @@ def section_types() -> dict[str, type[Parameters]]:
 
 
 def load_config(path: str | Path) -> DrocapConfig:
-    """Read a configuration file; sections and values that it leaves out keep their defaults.
+    """Read a configuration file; missing sections and values keep their defaults.
 
     Raises
     ------
     InputError
-        When the file is missing, is no YAML, or names an unknown component or parameter.
+        When the file is missing, is not YAML, or has an unknown component or parameter.
     """
     import yaml
 
@@ -89,7 +91,7 @@ def load_config(path: str | Path) -> DrocapConfig:
 
 
 def parse_config(data: Any, where: str) -> DrocapConfig:
-    """Configuration from the mapping that a parameter file holds."""
+    """Configuration from the content of a parameter file; ``where`` names the file in errors."""
     if not isinstance(data, Mapping):
         raise InputError(f"{where}: expected a mapping of components, found {type(data).__name__}")
     types = section_types()
@@ -101,7 +103,7 @@ def parse_config(data: Any, where: str) -> DrocapConfig:
         values = body.get("ros__parameters", body) if isinstance(body, Mapping) else body
         if not isinstance(values, Mapping):
             raise ParameterError(f"{where}: {key}: expected 'ros__parameters:' with values, found {body!r}")
-        # ROS's own parameters may stand in the same file; they are not ours to check.
+        # A ROS parameter, not one of the component.
         ours = {str(k): v for k, v in values.items() if k != "use_sim_time"}
         sections[name] = types[name].from_mapping(ours, f"{where}: {name}")
     return DrocapConfig(**sections)  # type: ignore[arg-type]

@@ -1,10 +1,13 @@
-"""``drocap evaluate``: the camera-motion study, the live method, and one motion against its truth."""
+"""``drocap evaluate``: a motion against its truth, the camera-motion study, the study of the live method."""
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+from drocap_ros.cli.motion_input import HELP, read_motion
 
 METHODS = ("ba", "paper", "paper-no-articulation", "initial", "mf-nnm")
 
@@ -13,92 +16,86 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the command's options; ``run`` is its action."""
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "evaluate",
-        help="errors of a motion; the camera-motion study",
-        description="Measure accuracy: of one motion against its truth, or of every method over MoCap.",
+        help="errors of a motion; accuracy studies over MoCap",
+        description="Measure accuracy: of one motion against its truth, of every method over MoCap, of the live graph.",
     )
-    kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True)
-    pair = kinds.add_parser(
-        "pair",
+    kinds = parser.add_subparsers(metavar="KIND", required=True)
+    comparison = kinds.add_parser(
+        "compare",
+        aliases=["pair"],
         help="one motion against its truth",
         description="Errors of MOTION: per joint group, world frame, handedness, scale.",
     )
-    pair.add_argument("motion", metavar="MOTION", type=Path, help="motion.npz, or the folder that holds it")
-    pair.add_argument("truth", metavar="TRUTH", type=Path, help="MoCap .npz or another motion.npz")
-    pair.add_argument("--out", metavar="DIR", type=Path, help="also write pair.csv, pair.md and pair.png there")
-    pair.set_defaults(run=run)
-    rotation = kinds.add_parser(
+    comparison.add_argument("motion", metavar="MOTION", type=Path, help=HELP)
+    comparison.add_argument("truth", metavar="TRUTH", type=Path, help="MoCap .npz or another motion.npz")
+    comparison.add_argument(
+        "--out", metavar="DIR", type=Path, help="also write compare.csv, compare.md and compare.png to DIR"
+    )
+    comparison.set_defaults(run=_compare)
+    rotation = _study_parser(
+        kinds,
         "rotation",
         help="error over the speed of the orbit, for every method",
         description="All sequences of at least 5 s in MOCAP_DIR, their first 10 s at 24 fps, seen by a virtual"
         " orthographic camera that orbits the subject.",
+        files="rotation.csv, rotation.md and rotation.png",
     )
-    rotation.add_argument("folder", metavar="MOCAP_DIR", type=Path, help="folder of MoCap .npz files")
     rotation.add_argument(
         "--speeds", metavar="DEG_S", type=float, nargs="+", default=[0.0, 10.0, 25.0, 50.0], help="orbit speeds"
     )
-    rotation.add_argument("--noisy", action="store_true", help="10 mm noise and 5 %% gross outliers in the 2D joints")
     rotation.add_argument("--methods", choices=METHODS, nargs="+", default=list(METHODS), help="default: all")
-    rotation.add_argument("--limit", metavar="N", type=int, help="only the first N sequences")
-    rotation.add_argument("--seed", type=int, default=0, help="seed of the noise (default 0)")
-    rotation.add_argument("--processes", metavar="N", type=int, default=1, help="work in N processes (default 1)")
-    rotation.add_argument("--out", metavar="DIR", type=Path, help="also write rotation.csv, .md and .png there")
-    rotation.add_argument("--quiet", action="store_true", help="no progress, only the tables")
-    rotation.set_defaults(run=run)
-    live = kinds.add_parser(
+    rotation.add_argument("--processes", metavar="N", type=int, default=1, help="number of processes (default 1)")
+    rotation.set_defaults(run=_rotation)
+    live = _study_parser(
+        kinds,
         "live",
-        help="error of what the live graph publishes, when it does, beside the offline result",
-        description="The sequences of MOCAP_DIR as in `evaluate rotation`, image by image through the live method:"
-        " the initial and the latest pose when they are published, and the refined pose 2 s after its image.",
+        help="error of the live graph's poses at their publication, beside the offline result",
+        description="The sequences of `evaluate rotation`, image by image through the live method: errors of the"
+        " initial and the latest pose at publication, and of the refined pose 2 s after its image.",
+        files="live.csv and live.md",
     )
-    live.add_argument("folder", metavar="MOCAP_DIR", type=Path, help="folder of MoCap .npz files")
     live.add_argument("--speed", metavar="DEG_S", type=float, default=25.0, help="orbit speed (default 25)")
-    live.add_argument("--noisy", action="store_true", help="10 mm noise and 5 %% gross outliers in the 2D joints")
-    live.add_argument(
-        "--delay", metavar="S", type=float, default=0.5, help="time that an adjustment takes (default 0.5 s)"
-    )
-    live.add_argument("--config", metavar="FILE", type=Path, help="configuration file with other parameters")
-    live.add_argument("--limit", metavar="N", type=int, help="only the first N sequences")
-    live.add_argument("--seed", type=int, default=0, help="seed of the noise (default 0)")
-    live.add_argument("--out", metavar="DIR", type=Path, help="also write live.csv and live.md there")
-    live.add_argument("--quiet", action="store_true", help="no progress, only the tables")
-    live.set_defaults(run=run)
+    live.add_argument("--delay", metavar="S", type=float, default=0.5, help="duration of an adjustment (default 0.5 s)")
+    live.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
+    live.set_defaults(run=_live)
     return parser
 
 
-def run(args: argparse.Namespace) -> int:
-    """Measure, print the Markdown table, and write the files.
+def _study_parser(kinds: Any, name: str, help: str, description: str, files: str) -> argparse.ArgumentParser:
+    """Parser of a study, with the options that all studies have."""
+    parser: argparse.ArgumentParser = kinds.add_parser(name, help=help, description=description)
+    parser.add_argument("folder", metavar="MOCAP_DIR", type=Path, help="folder of MoCap .npz files")
+    parser.add_argument("--noisy", action="store_true", help="10 mm noise and 5 %% gross outliers in the 2D joints")
+    parser.add_argument("--limit", metavar="N", type=int, help="only the first N sequences")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the noise (default 0)")
+    parser.add_argument("--out", metavar="DIR", type=Path, help=f"also write {files} to DIR")
+    parser.add_argument("--quiet", action="store_true", help="no progress, only the tables")
+    return parser
 
-    Raises
-    ------
-    InputError
-        When an option or a file cannot be used.
-    """
-    kinds = {"pair": _pair, "rotation": _rotation, "live": _live}
-    return kinds[args.kind](args)
 
-
-def _pair(args: argparse.Namespace) -> int:
+def _compare(args: argparse.Namespace) -> int:
+    """Compare MOTION with TRUTH, print the table and write the files."""
     from drocap_ros.cli.atomic_output import check_output_folder, output_folder
     from drocap_ros.evaluation import tables
     from drocap_ros.evaluation.compare import compare, load_truth
-    from drocap_ros.motion import load_motion
 
     if args.out is not None:
         check_output_folder(args.out)
-    path = args.motion / "motion.npz" if args.motion.is_dir() else args.motion
-    errors = compare(load_motion(path), *load_truth(args.truth))
+    path, motion = read_motion(args.motion)
+    errors = compare(motion, *load_truth(args.truth))
     name = path.parent.name if path.name == "motion.npz" else path.stem
-    text = tables.pair_markdown(name, errors)
+    text = tables.comparison_markdown(name, errors)
     print(text, end="")
     if args.out is not None:
         with output_folder(args.out) as out:
-            tables.save_pair_csv(out / "pair.csv", name, errors)
-            (out / "pair.md").write_text(text, encoding="utf-8")
-            tables.save_joint_bars(out / "pair.png", {name: errors.per_group_mm})
+            tables.save_csv(out / "compare.csv", [tables.comparison_record(name, errors)])
+            (out / "compare.md").write_text(text, encoding="utf-8")
+            tables.save_group_bars(out / "compare.png", errors)
     return 0
 
 
 def _rotation(args: argparse.Namespace) -> int:
+    """Run the camera-motion study, print the tables and write the files."""
     from drocap_ros.cli.atomic_output import check_output_folder, output_folder
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.evaluation import tables
@@ -121,18 +118,20 @@ def _rotation(args: argparse.Namespace) -> int:
     print(text, end="")
     if args.out is not None:
         with output_folder(args.out) as out:
-            tables.save_csv(out / "rotation.csv", rows)
+            tables.save_csv(out / "rotation.csv", [asdict(row) for row in rows])
             (out / "rotation.md").write_text(text, encoding="utf-8")
             tables.save_curves(out / "rotation.png", rows)
     return 0
 
 
 def _live(args: argparse.Namespace) -> int:
+    """Run the study of the live method, print the tables and write the files."""
     from drocap_ros.cli.atomic_output import check_output_folder, output_folder
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.config import DrocapConfig, load_config
     from drocap_ros.evaluation.live import live_study
-    from drocap_ros.evaluation.live_table import live_markdown, save_live_csv
+    from drocap_ros.evaluation.live_table import live_markdown
+    from drocap_ros.evaluation.tables import save_csv
 
     if args.out is not None:
         check_output_folder(args.out)
@@ -153,6 +152,6 @@ def _live(args: argparse.Namespace) -> int:
     print(text, end="")
     if args.out is not None:
         with output_folder(args.out) as out:
-            save_live_csv(out / "live.csv", rows)
+            save_csv(out / "live.csv", [asdict(row) for row in rows])
             (out / "live.md").write_text(text, encoding="utf-8")
     return 0

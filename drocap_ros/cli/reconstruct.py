@@ -1,4 +1,4 @@
-"""``drocap reconstruct``: from a video, recording or tracks file to a 3D motion."""
+"""``drocap reconstruct``: 3D motion from a video, recording or tracks file."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "--method",
         choices=METHODS,
         default="ba",
-        help="ba: the best we have (default); paper: the paper as written; paper-no-articulation: without its rank-1"
-        " term; initial: the paper's single-view start alone; mf-nnm: factorization and nuclear norm (Dai 2012);"
-        " live: the live graph's sliding windows, from a recording's pose2d",
+        help="ba: the most accurate (default); paper: the paper as written; paper-no-articulation: without its rank-1"
+        " term; initial: the paper's single-view initialization alone; mf-nnm: factorization and nuclear norm (Dai"
+        " 2012); live: the live graph's sliding windows, from a recording's pose2d",
     )
     parser.add_argument(
         "--telemetry",
@@ -46,7 +46,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "--time-offset",
         metavar="S",
         type=float,
-        help="seconds from the log's first state to the video's first picture (default: estimated where that can be)",
+        help="seconds from the log's first state to the video's first image (default: estimated where possible)",
     )
     parser.add_argument(
         "--mount-pitch",
@@ -57,7 +57,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
     parser.add_argument("--dictionary", metavar="NPZ", type=Path, help="pose dictionary instead of the shipped one")
     parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
-    parser.add_argument("--no-report", action="store_true", help="leave report.html out")
+    parser.add_argument("--no-report", action="store_true", help="do not write report.html")
     parser.add_argument("--quiet", action="store_true", help="no progress, only errors")
     parser.set_defaults(run=run)
     return parser
@@ -70,8 +70,8 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.config import DrocapConfig, load_config
     from drocap_ros.motion import save_motion
     from drocap_ros.pipeline import reconstruct_input
+    from drocap_ros.report.motion_images import has_images
     from drocap_ros.report.page import save_report
-    from drocap_ros.report.pictures import has_pictures
     from drocap_ros.report.preview import save_preview
     from drocap_ros.tracks import save_tracks
 
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
         save_tracks(folder / "tracks.npz", tracks)
         save_preview(folder / "preview.png", motion)
         if not args.no_report:
-            save_report(folder / "report.html", motion, video=args.input if has_pictures(args.input) else None)
+            save_report(folder / "report.html", motion, video=args.input if has_images(args.input) else None)
     if not args.quiet:
         print(summary(motion, args.method))
         print(f"written: {out}/motion.npz, tracks.npz, preview.png" + ("" if args.no_report else ", report.html"))
@@ -112,14 +112,14 @@ def _telemetry(args: argparse.Namespace) -> Any:
         if value is None:
             continue
         if args.telemetry is None:
-            raise InputError(f"{name}: expected --telemetry LOG with it, found none; name the log")
+            raise InputError(f"{name}: expected --telemetry LOG with it, found none; add the log")
         if not math.isfinite(value):
             raise InputError(f"{name}: expected a finite number, got {value}; correct the value")
     return Telemetry(args.telemetry, args.time_offset, args.mount_pitch) if args.telemetry else None
 
 
 def summary(motion: Motion, method: str) -> str:
-    """What a person wants to know at the end of a reconstruction."""
+    """Two lines: frames, method, frame and scale; reprojection error and seconds per stage."""
     import numpy as np
 
     seen = np.isfinite(motion.keypoints).all(axis=2)

@@ -1,4 +1,4 @@
-"""``drocap report``: one HTML file that shows a motion and says how far to trust it."""
+"""``drocap report``: one HTML file with a motion, its plots and its warnings."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("motion", metavar="MOTION", type=Path, help=HELP)
     parser.add_argument("--out", metavar="FILE", type=Path, help="file to write (default: report.html beside MOTION)")
     parser.add_argument(
-        "--video", metavar="VIDEO", type=Path, help="video, picture folder or recording of MOTION, for its pictures"
+        "--video", metavar="VIDEO", type=Path, help="video, image folder or recording of MOTION, for its images"
     )
-    parser.add_argument("--quiet", action="store_true", help="say nothing")
+    parser.add_argument("--quiet", action="store_true", help="no output, only errors")
     parser.set_defaults(run=run)
     return parser
 

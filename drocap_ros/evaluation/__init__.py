@@ -1,1 +1,1 @@
-"""Studies of accuracy: the camera-motion study over MoCap, and one result against its truth.  No ROS."""
+"""Accuracy: error measures, comparison of a motion with its truth, studies over MoCap.  No ROS."""

@@ -1,4 +1,4 @@
-"""One motion against its truth."""
+"""Comparison of one motion with its truth: ``drocap evaluate compare``."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ from drocap_ros.tracks import read_npz
 
 
 @dataclass(frozen=True)
-class PairErrors:
+class MotionErrors:
     """Errors of one motion.
 
-    error_mm : reconstruction error; per_group_mm after the same alignment
-    w_error_mm, horizon_deg : only where both are in world frames, else NaN
-    mirrored, mirrored_share : handedness over the sequence, and share of mirrored frames
+    error_mm, per_group_mm : reconstruction error (PA-MPJPE), over all limb joints and per joint group
+    w_error_mm, horizon_deg : W-MPJPE and horizon error where both motions are in world frames, else NaN
+    mirrored, mirrored_share : handedness of the whole sequence, share of mirrored frames
     scale_error : estimated over true mean limb length, less 1
+    metric : the motion's scale is measured, not assumed
     """
 
     frames: int
@@ -65,16 +66,16 @@ def load_truth(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
     )
 
 
-def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -> PairErrors:
+def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -> MotionErrors:
     """Errors of a motion against joints (T, 15, 3) m at increasing times (T,) s.
 
-    Times are absolute where both ranges overlap; otherwise both are counted from their first frame.  The truth
-    is interpolated at the motion's times; frames outside it are left out.
+    Times are absolute where both ranges overlap; otherwise both start at zero.  The truth is interpolated at the
+    motion's times; frames outside its range are ignored.
 
     Raises
     ------
     InputError
-        When they do not overlap in time or no frame is finite.
+        When no finite frame lies within the truth's range, or the truth is not finite.
     """
     estimate = motion.joints3d[:, indices(motion.joints, BODY_15.joints)]
     at = motion.stamp_ns * 1e-9
@@ -83,14 +84,14 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
     usable = (at >= time_s[0] - 1e-6) & (at <= time_s[-1] + 1e-6) & np.isfinite(estimate).all(axis=(1, 2))
     if not usable.any():
         raise InputError(
-            "evaluate pair: expected frames with a pose inside the truth's time, found none; check the pair"
+            "evaluate compare: expected poses within the truth's time, found none; check that the files belong together"
         )
     estimate = estimate[usable]
     true = _at_times(truth, time_s, at[usable])
     if not np.isfinite(true).all():
-        raise InputError("evaluate pair: expected a truth of finite joints, got NaN or infinity; fill the gaps in")
+        raise InputError("evaluate compare: expected a truth of finite joints, got NaN or infinity; fill the gaps in")
     world = motion.frame == "world" and frame == "world"
-    return PairErrors(
+    return MotionErrors(
         frames=len(estimate),
         error_mm=1000.0 * float(pa_mpjpe(estimate, true).mean()),
         per_group_mm={name: 1000.0 * value for name, value in group_errors(estimate, true).items()},

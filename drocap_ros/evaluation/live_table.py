@@ -1,24 +1,11 @@
-"""Results of the live study as Markdown and CSV."""
+"""Results of the live study as Markdown."""
 
 from __future__ import annotations
-
-import csv
-from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 
 from drocap_ros.evaluation.live import REFINED_AFTER_S, LiveRow
 from drocap_ros.evaluation.tables import markdown_table
-
-
-def save_live_csv(path: Path, rows: list[LiveRow]) -> None:
-    """One line per sequence."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(asdict(rows[0])))
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({k: f"{v:.4f}" if isinstance(v, float) else v for k, v in asdict(row).items()})
 
 
 def live_markdown(rows: list[LiveRow], delay_s: float) -> str:

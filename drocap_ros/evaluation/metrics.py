@@ -1,4 +1,7 @@
-"""Error measures of a reconstruction; lengths keep the unit of the input."""
+"""Error measures of a reconstruction against the truth; lengths keep the unit of the input.
+
+Poses are (F, 15, 3) in the joint order of BODY_15 unless said otherwise.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import numpy as np
 
 from drocap_ros.geometry.alignment import apply_similarity, similarity
 from drocap_ros.geometry.bones import limb_lengths
-from drocap_ros.skeleton import BODY_15, LIMB_JOINTS, JointSet, indices
+from drocap_ros.skeleton import BODY_15, LIMB_JOINTS, indices
 
 #: The groups of the paper's table of errors per joint.
 JOINT_GROUPS = {
@@ -17,88 +20,63 @@ JOINT_GROUPS = {
     "knee": ("lknee", "rknee"),
     "ankle": ("lankle", "rankle"),
 }
-
-
-def limb_indices(joints: tuple[str, ...] = BODY_15.joints) -> np.ndarray:
-    """(12,) int, places of the twelve joints of the paper's tables."""
-    return indices(joints, LIMB_JOINTS)
+_LIMBS = indices(BODY_15.joints, LIMB_JOINTS)
+_MIRROR = np.array([1.0, 1.0, -1.0])
 
 
 def aligned_error(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Distance (..., P) of each joint after the best similarity transformation per pose (no reflection).
-
-    Parameters
-    ----------
-    estimate, truth : (..., P, 3)
-    """
+    """Distance (..., P) of each joint (..., P, 3) after the best similarity transformation per pose, no reflection."""
     return np.linalg.norm(apply_similarity(estimate, *similarity(estimate, truth)) - truth, axis=-1)
 
 
 def pa_mpjpe(estimate: np.ndarray, truth: np.ndarray, joints: tuple[str, ...] = BODY_15.joints) -> np.ndarray:
-    """The paper's reconstruction error per frame: :func:`aligned_error` averaged over the twelve limb joints.
+    """The paper's reconstruction error (F,): :func:`aligned_error` averaged over the twelve limb joints.
 
-    Parameters
-    ----------
-    estimate, truth : (F, P, 3)
-
-    Returns
-    -------
-    (F,) in the unit of ``truth``
+    ``joints`` names the joints of both poses (F, P, 3).
     """
-    use = limb_indices(joints)
+    use = _LIMBS if joints == BODY_15.joints else indices(joints, LIMB_JOINTS)
     return aligned_error(estimate[..., use, :], truth[..., use, :]).mean(-1)
 
 
-def w_mpjpe(
-    estimate: np.ndarray, truth: np.ndarray, joints: tuple[str, ...] = BODY_15.joints, segment: int = 100
-) -> np.ndarray:
-    """Error per frame (F,) after one rigid alignment per segment of 100 frames, on its first two frames, no scale.
+def w_mpjpe(estimate: np.ndarray, truth: np.ndarray, segment: int = 100) -> np.ndarray:
+    """W-MPJPE (F,) of poses in world frames.
 
-    Parameters
-    ----------
-    estimate, truth : (F, P, 3) in world frames
+    One rigid alignment per segment of 100 frames, on the segment's first two frames, without scale.
     """
-    use = limb_indices(joints)
     out = np.empty(len(truth))
     for first in range(0, len(truth), segment):
-        est, tru = estimate[first : first + segment, use], truth[first : first + segment, use]
+        est, tru = estimate[first : first + segment, _LIMBS], truth[first : first + segment, _LIMBS]
         fit = similarity(est[:2].reshape(-1, 3), tru[:2].reshape(-1, 3), with_scale=False)
         moved = apply_similarity(est.reshape(-1, 3), *fit).reshape(est.shape)
         out[first : first + segment] = np.linalg.norm(moved - tru, axis=-1).mean(-1)
     return out
 
 
-def scale_error(estimate: np.ndarray, truth: np.ndarray, joints: tuple[str, ...] = BODY_15.joints) -> float:
+def scale_error(estimate: np.ndarray, truth: np.ndarray) -> float:
     """Mean estimated over mean true limb length, less 1."""
-    return float(limb_lengths(estimate, joints).mean() / limb_lengths(truth, joints).mean() - 1.0)
+    return float(limb_lengths(estimate).mean() / limb_lengths(truth).mean() - 1.0)
 
 
-def mirrored_frames(estimate: np.ndarray, truth: np.ndarray, joints: tuple[str, ...] = BODY_15.joints) -> np.ndarray:
-    """(F,) bool: the mirror image of the estimate is closer to the truth than the estimate itself.
+def mirrored_frames(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """(F,) bool: the mirror image of the estimate is closer to the truth than the estimate.
 
-    A mirrored body can have a perfect reprojection error, so this has to be asked of the 3D poses.
+    The reprojection error of a mirrored body can be zero, so the 3D poses have to be compared.
     """
-    return pa_mpjpe(estimate * np.array([1.0, 1.0, -1.0]), truth, joints) < pa_mpjpe(estimate, truth, joints)
+    return pa_mpjpe(estimate * _MIRROR, truth) < pa_mpjpe(estimate, truth)
 
 
-def is_mirrored(estimate: np.ndarray, truth: np.ndarray, joints: tuple[str, ...] = BODY_15.joints) -> bool:
-    """Whether a sequence as a whole is mirrored: its mirror image has the lower mean error."""
-    flipped = estimate * np.array([1.0, 1.0, -1.0])
-    return bool(pa_mpjpe(flipped, truth, joints).mean() < pa_mpjpe(estimate, truth, joints).mean())
+def is_mirrored(estimate: np.ndarray, truth: np.ndarray) -> bool:
+    """Whether the mirror image of the whole sequence has the lower mean error."""
+    return bool(pa_mpjpe(estimate * _MIRROR, truth).mean() < pa_mpjpe(estimate, truth).mean())
 
 
-def horizon_error(estimate: np.ndarray, truth: np.ndarray, joints: JointSet = BODY_15) -> np.ndarray:
-    """(F,) rad, angle between the vertical of the estimate and the true one, both poses in z-up world frames.
-
-    The estimate is rotated on the truth; how far that rotation tilts z is the error.
-    """
-    use = limb_indices(joints.joints)
-    _, rotation, _ = similarity(estimate[:, use], truth[:, use])
+def horizon_error(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """(F,) rad, tilt of the vertical in the rotation that aligns the estimate with the truth, both z-up."""
+    _, rotation, _ = similarity(estimate[:, _LIMBS], truth[:, _LIMBS])
     return np.arccos(np.clip(rotation[:, 2, 2], -1.0, 1.0))
 
 
-def group_errors(estimate: np.ndarray, truth: np.ndarray, joints: tuple[str, ...] = BODY_15.joints) -> dict[str, float]:
-    """Mean error per joint group of the paper's table, after the alignment over the twelve limb joints."""
-    errors = aligned_error(estimate[:, limb_indices(joints)], truth[:, limb_indices(joints)]).mean(0)
-    place = {name: i for i, name in enumerate(LIMB_JOINTS)}
-    return {group: float(np.mean([errors[place[j]] for j in members])) for group, members in JOINT_GROUPS.items()}
+def group_errors(estimate: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """Mean error per group of :data:`JOINT_GROUPS`, after the alignment over the twelve limb joints."""
+    errors = dict(zip(LIMB_JOINTS, aligned_error(estimate[:, _LIMBS], truth[:, _LIMBS]).mean(0), strict=True))
+    return {group: float(np.mean([errors[joint] for joint in members])) for group, members in JOINT_GROUPS.items()}

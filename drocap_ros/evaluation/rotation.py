@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from itertools import starmap
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +24,9 @@ SPEEDS_DEG_S = (0.0, 10.0, 25.0, 50.0)
 class StudyRow:
     """One sequence, seen at one speed, by one method.
 
-    error_mm : reconstruction error, mean over frames and the twelve limb joints; then per joint group
-    mirrored : the mirror image of the result is closer to the truth, over the sequence; in a share of its frames
-    limb_spread : standard deviation over mean of each limb's length, averaged; 0 on a rigid skeleton
+    error_mm : reconstruction error, mean over frames and the twelve limb joints; the others per joint group
+    mirrored, mirrored_share : handedness of the whole sequence, share of mirrored frames
+    limb_spread : standard deviation over mean of each limb's length, averaged; 0 for a rigid skeleton
     seconds_initial, seconds_adjust : wall-clock of the two stages
     """
 
@@ -72,10 +73,6 @@ def measure(sequence: Sequence, method: str, speed_deg_s: float, noisy: bool, se
     )
 
 
-def _measure(job: tuple[Sequence, str, float, bool, int]) -> StudyRow:
-    return measure(*job)
-
-
 def rotation_study(
     folder: Path,
     *,
@@ -116,16 +113,11 @@ def rotation_study(
 
 def _results(jobs: list[tuple[Sequence, str, float, bool, int]], processes: int) -> Iterator[StudyRow]:
     if processes == 1:
-        yield from map(_measure, jobs)
+        yield from starmap(measure, jobs)
         return
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
-    # Forked children would share the locks of onnxruntime's and BLAS's threads.
+    # Forked children would inherit locked mutexes of onnxruntime's and BLAS's threads.
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(_measure, jobs)
-
-
-def as_records(rows: list[StudyRow]) -> list[dict[str, object]]:
-    """Rows as mappings, for tables."""
-    return [asdict(row) for row in rows]
+        yield from pool.map(measure, *zip(*jobs, strict=True))

@@ -1,28 +1,39 @@
-"""Results of a study as CSV, Markdown and curves."""
+"""Results of the studies as CSV, Markdown and plots."""
 
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drocap_ros.evaluation.compare import PairErrors
+from drocap_ros.evaluation.compare import MotionErrors
 from drocap_ros.evaluation.metrics import JOINT_GROUPS
-from drocap_ros.evaluation.rotation import StudyRow, as_records
+from drocap_ros.evaluation.rotation import StudyRow
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 LABELS = {
-    "ba": "ours (default)",
+    "ba": "default (`ba`)",
     "paper": "paper: bundle adjustment",
     "paper-no-articulation": "paper without articulation",
-    "initial": "paper: single-view start",
+    "initial": "paper: single-view initialization",
     "mf-nnm": "MF+NNM",
 }
 
 
-def save_csv(path: Path, rows: list[StudyRow]) -> None:
-    """One line per sequence, method and speed."""
-    records = as_records(rows)
+def markdown_table(head: list[str], lines: list[list[str]]) -> list[str]:
+    """Lines of a Markdown table."""
+    return [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *lines)]
+
+
+def save_csv(path: Path, records: Sequence[Mapping[str, object]]) -> None:
+    """One line per record under a head; floats with four decimals."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(records[0]))
         writer.writeheader()
@@ -70,7 +81,7 @@ def study_markdown(rows: list[StudyRow]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def pair_markdown(name: str, e: PairErrors) -> str:
+def comparison_markdown(name: str, e: MotionErrors) -> str:
     """Errors of one motion as Markdown."""
     head = ["motion", "frames", "error mm", *(f"{g} mm" for g in JOINT_GROUPS)]
     line = [name, str(e.frames), f"{e.error_mm:.1f}", *(f"{e.per_group_mm[g]:.1f}" for g in JOINT_GROUPS)]
@@ -85,58 +96,41 @@ def pair_markdown(name: str, e: PairErrors) -> str:
     return "\n".join([*markdown_table(head, [line]), "", *markdown_table(more, [rest])]) + "\n"
 
 
-def save_pair_csv(path: Path, name: str, e: PairErrors) -> None:
-    """The same as one CSV line under a head."""
-    values: dict[str, object] = {"motion": name, "frames": e.frames, "error_mm": f"{e.error_mm:.4f}"}
-    values |= {f"{g}_mm": f"{e.per_group_mm[g]:.4f}" for g in JOINT_GROUPS}
-    values |= {"w_error_mm": f"{e.w_error_mm:.4f}", "horizon_deg": f"{e.horizon_deg:.4f}"}
-    values |= {"mirrored": e.mirrored, "mirrored_share": f"{e.mirrored_share:.4f}"}
-    values |= {"scale_error": f"{e.scale_error:.4f}", "metric": e.metric}
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(values))
-        writer.writeheader()
-        writer.writerow(values)
+def comparison_record(name: str, e: MotionErrors) -> dict[str, object]:
+    """Errors of one motion as a record for :func:`save_csv`."""
+    record: dict[str, object] = {"motion": name, **asdict(e)}
+    del record["per_group_mm"]
+    return record | {f"{group}_mm": value for group, value in e.per_group_mm.items()}
 
 
 def save_curves(path: Path, rows: list[StudyRow]) -> None:
     """Error over orbit speed, one curve per method, as PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
+    figure, axes = _plot(6.4, 4.2)
     mean = mean_errors(rows)
     for method in dict.fromkeys(r.method for r in rows):
         speeds = sorted({r.speed_deg_s for r in rows if r.method == method})
         axes.plot(speeds, [mean[method, s] for s in speeds], marker="o", label=LABELS[method])
-    axes.set_xlabel("orbit speed, deg/s")
-    axes.set_ylabel("reconstruction error, mm")
+    axes.set(xlabel="orbit speed, deg/s", ylabel="reconstruction error, mm")
     axes.set_title(f"{len({r.sequence for r in rows})} sequences, {'noisy' if rows[0].noisy else 'clean'} 2D")
     axes.set_ylim(bottom=0)
-    axes.grid(alpha=0.3)
     axes.legend()
     figure.savefig(path, dpi=120)
 
 
-def save_joint_bars(path: Path, groups: dict[str, dict[str, float]]) -> None:
-    """Error per joint group, one set of bars per label, as PNG."""
+def save_group_bars(path: Path, e: MotionErrors) -> None:
+    """Error per joint group as PNG."""
+    figure, axes = _plot(6.4, 3.6)
+    axes.bar(list(JOINT_GROUPS), [e.per_group_mm[g] for g in JOINT_GROUPS])
+    axes.set_ylabel("error, mm")
+    figure.savefig(path, dpi=120)
+
+
+def _plot(width: float, height: float) -> tuple[Figure, Axes]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(6.4, 3.6), layout="constrained")
+    figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    width = 0.8 / len(groups)
-    for k, (label, errors) in enumerate(groups.items()):
-        axes.bar(np.arange(len(errors)) + k * width, list(errors.values()), width, label=label)
-    axes.set_xticks(np.arange(len(JOINT_GROUPS)) + 0.4 - width / 2, list(JOINT_GROUPS))
-    axes.set_ylabel("error, mm")
-    axes.grid(axis="y", alpha=0.3)
-    axes.legend()
-    figure.savefig(path, dpi=120)
-
-
-def markdown_table(head: list[str], lines: list[list[str]]) -> list[str]:
-    """Lines of a Markdown table."""
-    return [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *lines)]
+    axes.grid(alpha=0.3)
+    return figure, axes

@@ -1,4 +1,4 @@
-"""Studies and tables, on motions whose errors are known."""
+"""Comparison and studies on motions whose errors are known."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def save_mocap(path, joints: np.ndarray, fps: float = 24.0) -> None:
     np.savez(path, X=(1000 * joints).astype(np.float32), fps=fps, joints=np.array(BODY_15.joints))
 
 
-def test_a_perfect_motion_has_no_error_whatever_its_frame_and_scale(tmp_path):
+def test_perfect_motion_has_no_error_in_any_frame_and_scale(tmp_path):
     x = stick(40)
     save_mocap(tmp_path / "truth.npz", x)
     angle = 0.7
@@ -63,7 +63,7 @@ def test_a_perfect_motion_has_no_error_whatever_its_frame_and_scale(tmp_path):
     assert max(errors.per_group_mm.values()) < 0.01
 
 
-def test_a_mirrored_motion_is_called_mirrored():
+def test_mirrored_motion_is_reported():
     x = stick(30)
     errors = compare(motion(x * [1, 1, -1]), x, np.arange(30) / 24.0, "camera")
     assert errors.mirrored
@@ -71,7 +71,7 @@ def test_a_mirrored_motion_is_called_mirrored():
     assert errors.error_mm > 50.0
 
 
-def test_world_frames_give_world_errors_and_the_horizon():
+def test_world_frames_give_world_error_and_horizon_error():
     x = stick(30)
     tilt = np.radians(5.0)
     turn = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
@@ -87,7 +87,7 @@ def test_truth_at_another_rate_is_interpolated():
     assert errors.error_mm < 1e-6
 
 
-def test_pairs_that_do_not_fit_are_refused(tmp_path):
+def test_compare_refuses_unusable_truth_or_motion(tmp_path):
     x = stick(10)
     with pytest.raises(InputError, match="finite"):
         compare(motion(x), np.full_like(x, np.nan), np.arange(10) / 24.0, "camera")
@@ -98,25 +98,26 @@ def test_pairs_that_do_not_fit_are_refused(tmp_path):
         load_truth(tmp_path / "odd.npz")
 
 
-def test_pair_command_writes_its_files_and_refuses_bad_ones_with_status_2(tmp_path, capsys):
+@pytest.mark.parametrize("kind", ["compare", "pair"])
+def test_compare_command_writes_files_and_refuses_missing_ones_with_status_2(tmp_path, capsys, kind):
     x = stick(30)
     save_motion(tmp_path / "motion.npz", motion(x))
     save_mocap(tmp_path / "truth.npz", x)
     out = tmp_path / "out"
-    assert main(["evaluate", "pair", str(tmp_path), str(tmp_path / "truth.npz"), "--out", str(out)]) == 0
+    assert main(["evaluate", kind, str(tmp_path), str(tmp_path / "truth.npz"), "--out", str(out)]) == 0
     assert "| error mm |" in capsys.readouterr().out.replace("frames | error", "| error")
-    with (out / "pair.csv").open(encoding="utf-8") as file:
+    with (out / "compare.csv").open(encoding="utf-8") as file:
         (line,) = csv.DictReader(file)
     assert float(line["error_mm"]) < 0.01
     assert line["mirrored"] == "False"
-    assert (out / "pair.png").read_bytes().startswith(b"\x89PNG")
-    assert main(["evaluate", "pair", str(tmp_path / "none.npz"), str(tmp_path / "truth.npz")]) == 2
+    assert (out / "compare.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["evaluate", kind, str(tmp_path / "none.npz"), str(tmp_path / "truth.npz")]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "no such file" in said
 
 
-def test_rotation_command_over_a_small_folder(tmp_path, capsys):
+def test_rotation_command_writes_its_tables(tmp_path, capsys):
     save_mocap(tmp_path / "a.npz", stick(130))
     save_mocap(tmp_path / "short.npz", stick(40))
     out = tmp_path / "out"
@@ -136,7 +137,7 @@ def test_rotation_command_over_a_small_folder(tmp_path, capsys):
     assert main(["evaluate", "rotation", str(tmp_path), "--speeds", "9999"]) == 2
 
 
-def test_rows_do_not_depend_on_the_number_of_processes(tmp_path):
+def test_study_rows_are_independent_of_the_number_of_processes(tmp_path):
     save_mocap(tmp_path / "a.npz", stick(125))
     one, two = (
         rotation_study(tmp_path, speeds_deg_s=[25.0], methods=["initial"], processes=count, limit=1) for count in (1, 2)
@@ -144,10 +145,10 @@ def test_rows_do_not_depend_on_the_number_of_processes(tmp_path):
     assert [replace(r, seconds_initial=0.0, seconds_adjust=0.0) for r in one] == [
         replace(r, seconds_initial=0.0, seconds_adjust=0.0) for r in two
     ]
-    assert "single-view start" in study_markdown(one)
+    assert "single-view initialization" in study_markdown(one)
 
 
-def test_default_method_is_never_mirrored_on_unseen_people(shared):
+def test_default_method_is_accurate_and_unmirrored_on_unseen_people(shared):
     for sequence in protocol_sequences(shared / "mocap" / "dev", limit=2):
         row = measure(sequence, "ba", 25.0, noisy=True)
         assert not row.mirrored

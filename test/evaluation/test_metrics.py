@@ -1,4 +1,4 @@
-"""Error measures on cases whose answer is known."""
+"""Error measures on motions whose errors are known."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ def test_reconstruction_error_ignores_similarity_but_not_mirroring(walk: Walk) -
     assert not metrics.mirrored_frames(truth, truth).any()
 
 
-def test_it_is_taken_over_the_twelve_limb_joints(walk: Walk) -> None:
+def test_reconstruction_error_uses_the_twelve_limb_joints(walk: Walk) -> None:
     other = 1000.0 * walk.shape
     other[:, BODY_15.index("head")] += 500.0
     np.testing.assert_allclose(metrics.pa_mpjpe(other, 1000.0 * walk.shape), 0.0, atol=1e-9)
 
 
-def test_no_similarity_fits_better(walk: Walk) -> None:
+def test_alignment_is_the_best_similarity(walk: Walk) -> None:
     rng = np.random.default_rng(0)
     truth = 1000.0 * walk.shape[:5]
     estimate = truth + rng.normal(0.0, 60.0, truth.shape)
@@ -44,21 +44,21 @@ def test_world_error_aligns_on_the_first_two_frames(walk: Walk) -> None:
     drift = truth + np.arange(120.0)[:, None, None] * np.array([10.0, 0.0, 0.0])
     error = metrics.w_mpjpe(drift, truth)
     np.testing.assert_allclose(error[99], 985.0, atol=20.0)
-    assert error[100] < 20.0  # a new segment is aligned anew
+    assert error[100] < 20.0  # every segment has its own alignment
 
 
-def test_scale_error(walk: Walk) -> None:
+def test_scale_error_is_relative_to_the_truth(walk: Walk) -> None:
     assert metrics.scale_error(1.1 * walk.shape, walk.shape) == pytest.approx(0.1)
 
 
-def test_horizon_error_is_the_tilt(walk: Walk) -> None:
+def test_horizon_error_is_the_tilt_of_the_vertical(walk: Walk) -> None:
     world = walk.in_camera @ walk.camera
     heading, tilt = exp_so3(np.array([0.0, 0.0, 2.0])), exp_so3(np.array([0.25, 0.0, 0.0]))
     np.testing.assert_allclose(metrics.horizon_error(world @ heading.T, world), 0.0, atol=1e-6)
     np.testing.assert_allclose(metrics.horizon_error(world @ (tilt @ heading).T, world), 0.25, atol=1e-6)
 
 
-def test_groups_average_to_the_whole(walk: Walk) -> None:
+def test_group_errors_average_to_the_reconstruction_error(walk: Walk) -> None:
     rng = np.random.default_rng(0)
     truth = 1000.0 * walk.shape
     estimate = truth + rng.normal(0.0, 30.0, truth.shape)

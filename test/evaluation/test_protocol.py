@@ -13,7 +13,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.evaluation import protocol
 
 
-def test_the_camera_orbits_at_its_speed_and_looks_down() -> None:
+def test_camera_orbits_at_its_speed_and_looks_down() -> None:
     r = protocol.orbit_rotations(241, 36.0)
     np.testing.assert_allclose(r @ np.swapaxes(r, 1, 2), np.broadcast_to(np.eye(3), r.shape), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(r), 1.0)
@@ -22,7 +22,7 @@ def test_the_camera_orbits_at_its_speed_and_looks_down() -> None:
     assert np.all(r[:, 1, 2] < 0.0)  # up in the world is up in the image
 
 
-def test_clean_views_are_projections_of_the_truth() -> None:
+def test_clean_view_is_the_projection_of_the_truth() -> None:
     x = 1000.0 * make_walk(30).in_camera
     view = protocol.orbit_view(x, 25.0)
     px = (view.tracks.keypoints - np.array(protocol.IMAGE_SIZE) / 2.0) / protocol.PX_PER_MM
@@ -30,7 +30,7 @@ def test_clean_views_are_projections_of_the_truth() -> None:
     np.testing.assert_allclose(view.truth @ view.rotation, x - x[:, :1], atol=1e-9)
 
 
-def test_noise_is_as_described_and_seeded() -> None:
+def test_noise_has_its_stated_size_and_is_seeded() -> None:
     x = 1000.0 * make_walk(400).in_camera
     clean, noisy = protocol.orbit_view(x, 10.0), protocol.orbit_view(x, 10.0, noisy=True)
     gap = (noisy.tracks.keypoints - clean.tracks.keypoints) / protocol.PX_PER_MM
@@ -50,7 +50,7 @@ def test_resampling_keeps_the_motion() -> None:
     np.testing.assert_allclose(out[:, 0, 0], np.sin(np.arange(73) / 24.0), atol=1e-5)
 
 
-def test_sequences_are_cut_and_filtered(tmp_path: Path) -> None:
+def test_short_sequences_are_left_out_and_long_ones_cut(tmp_path: Path) -> None:
     write_mocap(tmp_path, "long", frames=400)
     write_mocap(tmp_path, "short", frames=100)
     found = protocol.protocol_sequences(tmp_path)
@@ -58,7 +58,7 @@ def test_sequences_are_cut_and_filtered(tmp_path: Path) -> None:
     assert found[0].x.shape == (240, 15, 3)
 
 
-def test_the_real_set_has_its_sequences(shared: Path) -> None:
+def test_development_set_has_23_sequences(shared: Path) -> None:
     assert len(protocol.protocol_sequences(shared / "mocap" / "dev")) == 23
 
 
