@@ -23,7 +23,7 @@ from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_pos
 from drocap_ros.reconstruction.stop_reason import NO_WINDOW
 from drocap_ros.recording.pose_messages import read_observations
 from drocap_ros.recording.provenance import CONFIGURATION
-from drocap_ros.recording.session import POSE2D, POSE3D, POSE3D_WINDOW, Session
+from drocap_ros.recording.session import POSE2D, POSE3D, POSE3D_WINDOW, Session, header_stamp_ns
 from drocap_ros.skeleton import BODY_15, indices
 from drocap_ros.tracks import Tracks
 
@@ -87,7 +87,7 @@ def reconstruct_live(
     InputError
         When the session holds no keypoints of a person.
     """
-    topic = session.choose_topic(None, POSE2D)
+    topic = session.choose_topic(POSE2D)
     published = _Published(session, topic.name)
     begin = time.perf_counter()
     frames: dict[int, tuple[PoseObservation, np.ndarray]] = {}
@@ -140,11 +140,11 @@ class _Published:
         self.agreement = Agreement()
         for m in _messages(session, POSE3D, f"{base}/pose3d/initial"):
             if m.stage == _INITIAL:
-                self._initial[_stamp_ns(m)].append(_fingerprint(_joints(m)))
+                self._initial[header_stamp_ns(m)].append(_fingerprint(_joints(m)))
         for m in _messages(session, POSE3D_WINDOW, f"{base}/pose3d/refined"):
-            stamps = np.array([_stamp_ns(pose) for pose in m.poses], np.int64)
+            stamps = np.array([header_stamp_ns(pose) for pose in m.poses], np.int64)
             joints = np.array([_joints(pose) for pose in m.poses])
-            self._windows.append(_PublishedWindow(_stamp_ns(m), _fingerprint(stamps, joints), _effort(m)))
+            self._windows.append(_PublishedWindow(header_stamp_ns(m), _fingerprint(stamps, joints), _effort(m)))
         self.has_windows = bool(self._windows)
 
     def effort_at(self, stamp_ns: int) -> Effort | None:
@@ -256,10 +256,6 @@ def _reprojection_px(joints3d: np.ndarray, keypoints: np.ndarray, seen: np.ndarr
     scale = (weight * x * y).sum(axis=(1, 2)) / np.maximum((weight * x * x).sum(axis=(1, 2)), 1e-12)
     gap = np.linalg.norm(scale[:, None, None] * x - y, axis=-1)
     return np.where(seen, gap, np.nan)
-
-
-def _stamp_ns(message: Any) -> int:
-    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
 
 
 def _joints(message: Any) -> np.ndarray:

@@ -23,7 +23,7 @@ from drocap_ros.ros.markers import body_transforms, keypoint_marker, path_marker
 from drocap_ros.ros.rep155 import MISSING, HumanTopics, hri, human_transforms
 from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import TFMessage
-from drocap_ros.view.pace import Pace
+from drocap_ros.view.rate_limit import RateLimit
 
 #: Time after which a marker without a successor disappears.
 INITIAL_LIFETIME_S, LATEST_LIFETIME_S = 0.5, 3.0
@@ -41,7 +41,7 @@ class VisualizerNode(ComponentNode):
         self._latest = self.output("markers/latest")
         self._paths = self.output("markers/camera_path")
         self._tf = self.output("/tf") if TFMessage is not None else None
-        self._pace = {stage: Pace(self.config.marker_rate_hz) for stage in ("initial", "latest")}
+        self._pace = {stage: RateLimit(self.config.marker_rate_hz) for stage in ("initial", "latest")}
         self._path: deque[np.ndarray] = deque(maxlen=self.config.path_points)
         self._path_ns = -(10**18)
         self._humans = HumanTopics(self, self.config.frame_prefix) if self.config.human_topics and hri else None

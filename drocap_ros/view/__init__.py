@@ -1,5 +1,5 @@
-"""The Rerun viewer's window on a motion, a recording or a running graph: the room behind ``drocap view``.
+"""Motions, recordings and running graphs in the Rerun viewer (``drocap view``).
 
-One :class:`~drocap_ros.view.scene.Scene` holds what is drawn and where; ``motion_view``, ``session_view`` and the live
-command fill it, the latter two through the same ``message_view``.
+``motion_view`` fills a :class:`~drocap_ros.view.rerun_scene.Scene` from a motion, ``message_view`` from messages of a
+recording (``session_view``) or of a running graph.
 """

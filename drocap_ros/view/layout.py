@@ -1,10 +1,10 @@
-"""Which views the window has."""
+"""Arrangement of the views."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from drocap_ros.view.scene import PICTURE, WORLD, subject_path
+from drocap_ros.view.rerun_scene import IMAGE, WORLD, subject_path
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -13,17 +13,17 @@ _BACKGROUND = (238, 240, 243)
 
 
 def layout(views: tuple[str, ...], *, follow: bool = False) -> rrb.Blueprint:
-    """The body in its world beside the picture with its keypoints, over curves and the log.
+    """The body in its world beside the image with its keypoints, above curves and the log.
 
     Parameters
     ----------
-    views : groups of curves, one view each; "log" is what the nodes say
-    follow : whether the newest image is shown, not the first; refined poses are hidden then
+    views : groups of curves, one view each; "log" for the messages of the nodes
+    follow : show the newest image instead of the first, and hide refined poses
     """
     import rerun.blueprint as rrb
 
     contents = [f"+ /{WORLD}/**"]
-    if follow:  # a refined pose is two seconds old: beside the newest ones it would be a second body
+    if follow:  # two seconds old, it would be a second body
         contents.append(f"- /{subject_path('refined')}/**")
     below = [
         rrb.TextLogView(origin="log", name="log")
@@ -37,7 +37,7 @@ def layout(views: tuple[str, ...], *, follow: bool = False) -> rrb.Blueprint:
                 rrb.Spatial3DView(
                     origin=WORLD, contents=contents, name="3D", background=rrb.Background(color=_BACKGROUND)
                 ),
-                rrb.Spatial2DView(origin=PICTURE, name="picture"),
+                rrb.Spatial2DView(origin=IMAGE, name="image"),
                 column_shares=[3, 2],
             ),
             rrb.Horizontal(*below),

@@ -1,4 +1,4 @@
-"""The graph's messages in the viewer, whoever decoded them: rclpy from a running graph, rosbags from a file."""
+"""The graph's messages in the viewer, decoded by rclpy from a running graph or by rosbags from a file."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.recording.pose_messages import float_array, observation_from_message
+from drocap_ros.recording.session import header_stamp_ns
 from drocap_ros.skeleton import JointSet, joint_set
-from drocap_ros.view.camera import LEVEL_CAMERA, nominal_camera_matrix, place_cameras
-from drocap_ros.view.pace import Pace
-from drocap_ros.view.scene import Scene
+from drocap_ros.view.camera_placement import LEVEL_CAMERA, nominal_camera_matrix, place_cameras
+from drocap_ros.view.rate_limit import RateLimit
+from drocap_ros.view.rerun_scene import Scene
 
 PLOTS = ("latency_ms", "reprojection_px", "orbit")
-#: Images whose keypoints are kept until their pose comes.
+#: Images whose keypoints wait for their pose.
 _WAITING = 300
-#: Points of the camera's path that are kept, and the distance between two of them.
+#: Points kept of the camera's path, and the distance between two of them.
 _PATH_POINTS, _PATH_STEP_M = 600, 0.1
-#: A state of the vehicle further than this from an image says nothing of it.
+#: Farthest state of the vehicle that is used for an image.
 _NEAR_NS = 500_000_000
-#: A refined pose is drawn when later images can change it no more than a little.
+#: A refined pose is drawn when later images hardly change it.
 _REFINED_LAG_NS = 2 * 10**9
-#: A delay longer than this is that of another clock.
+#: A longer delay comes from a different clock.
 _LONGEST_S = 60.0
 _OURS = "drocap_ros"
 _LEVELS = {0: "INFO", 1: "WARN", 2: "ERROR", 3: "WARN"}
@@ -35,20 +36,20 @@ _MAGIC = {b"\xff\xd8": "image/jpeg", b"\x89P": "image/png"}
 
 
 class MessageView:
-    """Draws messages as they come.
+    """Draws messages in the order of their arrival.
 
-    Poses in frame ``map`` are drawn where they are.  Others are in the camera's optical frame with the pelvis at the
-    origin: they are placed so that the body looks as in its picture, before the camera that the vehicle reports, or
-    before a level one, the pelvis at the origin, when it reports none.
+    Poses in frame ``map`` are drawn in place.  Others are in the camera's optical frame with the pelvis at the origin:
+    they are placed so that the body projects to its keypoints, seen from the camera that the vehicle reports; without
+    a report from a level camera, the pelvis at the origin.
 
     Parameters
     ----------
-    picture_hz : pictures are thinned to this rate, for a viewer that must keep up; 0 = all
+    image_hz : images are thinned to this rate for a viewer in real time; 0 = all
     """
 
-    def __init__(self, scene: Scene, picture_hz: float = 0.0) -> None:
+    def __init__(self, scene: Scene, image_hz: float = 0.0) -> None:
         self._scene = scene
-        self._pictures = Pace(picture_hz)
+        self._image_rate = RateLimit(image_hz)
         self._keypoints: OrderedDict[int, tuple[str, np.ndarray]] = OrderedDict()
         self._matrix: np.ndarray | None = None
         self._size: tuple[int, int] | None = None
@@ -57,17 +58,17 @@ class MessageView:
         self._now_ns: int | None = None
         self._refined_ns = -(10**18)
         self._pending: list[Any] = []
-        self._told: dict[str, tuple[int, str]] = {}
+        self._last_text: dict[str, tuple[int, str]] = {}
         self.taken = self.refused = 0
-        #: Nodes of ours in another namespace are not listened to; empty = all are.
+        #: Diagnostics of this package's nodes in other namespaces are ignored; empty = none are.
         self.namespace = ""
-        #: Last part of a topic's name (two parts where one says too little) -> what draws its messages.
+        #: Name of a topic in the graph -> drawing function of its messages.
         self.handlers: dict[str, Callable[[Any, int], None]] = {
             "pose2d": self._on_pose2d,
             "pose3d/initial": lambda message, at_ns: self._on_pose3d("initial", message, at_ns),
             "pose3d/latest": lambda message, at_ns: self._on_pose3d("latest", message, at_ns),
             "pose3d/refined": self._on_window,
-            "image/compressed": self._on_picture,
+            "image/compressed": self._on_image,
             "camera_info": self._on_camera_info,
             "vehicle/state": self._on_state,
             "orbit/status": self._on_orbit,
@@ -76,23 +77,23 @@ class MessageView:
 
     def take(self, topic: str, message: Any, received_ns: int) -> None:
         """Draw a message of a topic of :attr:`handlers`; a malformed one is counted and not drawn."""
-        self.taken += not topic.startswith("/")  # what everybody hears says nothing of this graph
+        self.taken += not topic.startswith("/")  # /diagnostics is shared by all graphs
         try:
             self.handlers[topic](message, received_ns)
         except InputError as error:
             self.refused += 1
-            self._scene.say("view", f"{topic}: {error}", "WARN")
+            self._scene.log_text("view", f"{topic}: {error}", "WARN")
 
     def finish(self) -> None:
-        """Draw what waited for later images."""
+        """Draw the poses that waited for later images."""
         for pose in self._pending:
             self._draw("refined", pose)
         self._pending = []
 
-    # -- pictures and keypoints ------------------------------------------------------------------------
+    # -- images and keypoints ------------------------------------------------------------------------
 
-    def _on_picture(self, message: Any, _: int) -> None:
-        if not self._pictures.due(stamp_ns(message)):
+    def _on_image(self, message: Any, _: int) -> None:
+        if not self._image_rate.due(header_stamp_ns(message)):
             return
         data = bytes(message.data)
         self._at(message)
@@ -140,26 +141,26 @@ class MessageView:
     def _on_pose3d(self, stage: str, message: Any, received_ns: int) -> None:
         self._at(message)
         self._draw(stage, message)
-        late_s = (received_ns - stamp_ns(message)) * 1e-9
+        late_s = (received_ns - header_stamp_ns(message)) * 1e-9
         if abs(late_s) < _LONGEST_S:
             self._scene.plot(f"latency_ms/{stage}", 1e3 * late_s)
         if message.track_id:
             self._scene.plot(f"reprojection_px/{stage}", float(message.reprojection_rms))
 
     def _on_window(self, message: Any, _: int) -> None:
-        newest_ns = stamp_ns(message)
-        if newest_ns < self._refined_ns:  # time has jumped back: a recording played in a loop
+        newest_ns = header_stamp_ns(message)
+        if newest_ns < self._refined_ns:  # a recording played in a loop
             self._refined_ns = -(10**18)
-        fresh = [pose for pose in message.poses if stamp_ns(pose) > self._refined_ns]
-        settled = [pose for pose in fresh if stamp_ns(pose) <= newest_ns - _REFINED_LAG_NS]
-        for pose in settled:
+        fresh = [pose for pose in message.poses if header_stamp_ns(pose) > self._refined_ns]
+        final = [pose for pose in fresh if header_stamp_ns(pose) <= newest_ns - _REFINED_LAG_NS]
+        for pose in final:
             self._draw("refined", pose)
-        if settled:
-            self._refined_ns = stamp_ns(settled[-1])
-        self._pending = fresh[len(settled) :]
+        if final:
+            self._refined_ns = header_stamp_ns(final[-1])
+        self._pending = fresh[len(final) :]
 
     def _draw(self, stage: str, message: Any) -> None:
-        self._scene.at(stamp_ns(message))
+        self._scene.at(header_stamp_ns(message))
         if not message.track_id:
             self._scene.no_subject(stage)
             return
@@ -179,7 +180,7 @@ class MessageView:
         self, message: Any, joints_of: JointSet, joints: np.ndarray, draw_camera: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         """Rotation world -> optical, and shift (3,) m in the world, of a pose in the optical frame."""
-        at_ns = stamp_ns(message)
+        at_ns = header_stamp_ns(message)
         measured = self._camera_at(at_ns)
         rotation = LEVEL_CAMERA if measured is None else measured[1]
         name, keypoints = self._keypoints.get(at_ns, ("", None))
@@ -196,7 +197,7 @@ class MessageView:
         return rotation, np.zeros(3)
 
     def _camera_at(self, at_ns: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """Position and rotation of the camera that the vehicle reported nearest to a time, None if none is near."""
+        """Position and rotation of the camera in the vehicle state nearest to a time, None if none is near."""
         near = min(self._cameras, key=lambda camera: abs(camera[0] - at_ns), default=None)
         if near is None or abs(near[0] - at_ns) > _NEAR_NS:
             return None
@@ -212,7 +213,7 @@ class MessageView:
         xyzw = _xyzw(message.gimbal_orientation)
         if np.isfinite(xyzw).all() and xyzw.any():
             rotation = camera_rotation(xyzw)
-            self._cameras.append((stamp_ns(message), position, rotation))
+            self._cameras.append((header_stamp_ns(message), position, rotation))
             self._scene.camera(position, rotation)
         if not self._path or np.linalg.norm(position - self._path[-1]) >= _PATH_STEP_M:
             self._path.append(position)
@@ -222,7 +223,7 @@ class MessageView:
         self._at_newest(message)
         self._scene.plot("orbit/radius_error_m", float(message.radius_error_m))
         self._scene.plot("orbit/yaw_error_deg", float(message.yaw_error_deg))
-        self._tell("orbit", int(message.state), message.reason, "INFO")
+        self._log_change("orbit", int(message.state), message.reason, "INFO")
 
     def _on_diagnostics(self, message: Any, _: int) -> None:
         self._at_newest(message)
@@ -232,29 +233,24 @@ class MessageView:
                 continue
             # rclpy gives the level as one byte.
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
-            self._tell(status.name, level, status.message, _LEVELS.get(level, "WARN"))
+            self._log_change(status.name, level, status.message, _LEVELS.get(level, "WARN"))
 
-    def _tell(self, who: str, state: int, text: str, level: str) -> None:
-        """Log what somebody says when it is something new."""
-        if self._told.get(who) != (state, text):
-            self._told[who] = (state, text)
-            self._scene.say(who.replace("/", "."), text, level)
+    def _log_change(self, source: str, state: int, text: str, level: str) -> None:
+        """Log a source's text when its state or text has changed."""
+        if self._last_text.get(source) != (state, text):
+            self._last_text[source] = (state, text)
+            self._scene.log_text(source.replace("/", "."), text, level)
 
     # -- time ------------------------------------------------------------------------------------------
 
     def _at(self, message: Any) -> None:
-        stamp = stamp_ns(message)
+        stamp = header_stamp_ns(message)
         self._now_ns = stamp if self._now_ns is None else max(self._now_ns, stamp)
         self._scene.at(stamp)
 
     def _at_newest(self, message: Any) -> None:
-        """Words belong to the newest image: the pictures of a file may have another clock than the nodes."""
-        self._scene.at(self._now_ns if self._now_ns is not None else stamp_ns(message))
-
-
-def stamp_ns(message: Any) -> int:
-    """Stamp of a message with a header."""
-    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+        """Use the newest image's stamp: the images of a file may have another clock than the nodes."""
+        self._scene.at(self._now_ns if self._now_ns is not None else header_stamp_ns(message))
 
 
 def _xyzw(quaternion: Any) -> np.ndarray:
@@ -265,6 +261,3 @@ def _turned(packed: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Covariances (P, 6) of points that are turned by a rotation (3, 3)."""
     full = rotation @ unpack_covariance(packed) @ rotation.T
     return np.asarray(full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
-
-
-__all__ = ["PLOTS", "MessageView", "stamp_ns"]

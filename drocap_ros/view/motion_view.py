@@ -9,32 +9,32 @@ import numpy as np
 
 from drocap_ros.motion import Motion, upright_joints
 from drocap_ros.skeleton import JointSet
-from drocap_ros.view.camera import LEVEL_CAMERA, nominal_camera_matrix, place_cameras
-from drocap_ros.view.scene import Scene
+from drocap_ros.view.camera_placement import LEVEL_CAMERA, nominal_camera_matrix, place_cameras
+from drocap_ros.view.rerun_scene import Scene
 
 PLOTS = ("reprojection_px", "confidence")
-#: Pictures are shrunk to this: a minute of video then is a file of about 150 MB.
+#: Images are shrunk to this: a minute of video then gives a file of about 150 MB.
 _LONG_SIDE = 960
 
 
 def draw_motion(
     scene: Scene,
     motion: Motion,
-    pictures: Iterable[tuple[int, np.ndarray]] = (),
+    images: Iterable[tuple[int, np.ndarray]] = (),
     progress: Callable[[str, float], None] = lambda stage, done: None,
 ) -> None:
-    """Every frame of a motion at its stamp, and its pictures: frame and image (H, W, 3) uint8 BGR.
+    """Every frame of a motion at its stamp, and its images: frame and (H, W, 3) uint8 BGR.
 
-    A motion does not hold the camera's place: it is drawn from where the body would look as in its picture, with a
-    nominal field of view (:func:`drocap_ros.view.camera.place_cameras`).
+    A motion holds no camera position: the camera is placed so that the body projects to its keypoints, with a nominal
+    field of view (:func:`drocap_ros.view.camera_placement.place_cameras`).
     """
     size, zoom = _image_size(motion), 1.0
-    for index, image in pictures:
+    for index, image in images:
         size = (image.shape[1], image.shape[0])
         zoom = min(1.0, _LONG_SIDE / max(size))
         scene.at(int(motion.stamp_ns[index]))
         scene.image(_shrunk(image, zoom))
-        progress("pictures", (index + 1) / len(motion.stamp_ns))
+        progress("images", (index + 1) / len(motion.stamp_ns))
     _draw_frames(scene, motion, motion.keypoints * zoom, (round(size[0] * zoom), round(size[1] * zoom)), progress)
 
 
@@ -67,7 +67,7 @@ def _draw_frames(
 
 
 def _image_size(motion: Motion) -> tuple[int, int]:
-    """Width and height px that hold all keypoints: a motion does not say how large its images were."""
+    """Width and height px that hold all keypoints: a motion holds no image size."""
     seen = motion.keypoints[np.isfinite(motion.keypoints).all(-1)]
     corner = seen.max(0) if len(seen) else np.array([640.0, 480.0])
     return max(16, math.ceil(float(corner[0]))), max(16, math.ceil(float(corner[1])))

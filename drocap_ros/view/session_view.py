@@ -15,17 +15,17 @@ def draw_session(
     namespace: str | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> None:
-    """Every message of a recording that can be drawn, in the order of the recording.
+    """Draw a recording's messages in the order of the recording.
 
     Parameters
     ----------
-    namespace : of the topics; None = that with most keypoints, poses and pictures
-    progress : called with a name and the share that is drawn
+    namespace : of the topics; None = that with most keypoints, poses and images
+    progress : called with a name and the share done
 
     Raises
     ------
     InputError
-        When there is nothing to draw.
+        When the recording holds nothing to draw.
     """
     named, view.namespace = _topics(view, session, namespace)
     start_ns, duration_ns = session.info.start_ns or 0, max(session.info.duration_s * 1e9, 1.0)
@@ -38,24 +38,24 @@ def draw_session(
 
 def _topics(view: MessageView, session: Session, namespace: str | None) -> tuple[dict[str, str], str]:
     """Topic of the recording -> its name in the graph, and the graph's namespace."""
-    there = [topic for topic in session.info.topics if topic.count]
+    present = [topic for topic in session.info.topics if topic.count]
     spaces: dict[str, int] = {}
-    for topic in there:
+    for topic in present:
         for name in ("pose2d", "pose3d/initial", "pose3d/latest", "pose3d/refined", "image/compressed"):
             if topic.name.endswith("/" + name):
                 space = topic.name[: -len(name) - 1]
                 spaces[space] = spaces.get(space, 0) + topic.count
     space = max(spaces, key=lambda s: (spaces[s], s), default="") if namespace is None else "/" + namespace.strip("/")
     named = {f"{space}/{name}": name for name in view.handlers if not name.startswith("/")}
-    found = {topic.name: named[topic.name] for topic in there if topic.name in named}
+    found = {topic.name: named[topic.name] for topic in present if topic.name in named}
     if not found and namespace is None:
-        # No recording of ours: pictures at least.
+        # Not a recording of this package: its images.
         images = session.topics_of(COMPRESSED_IMAGE, IMAGE)
         found = {images[0].name: "image/compressed"} if images else {}
     if not found:
-        listed = ", ".join(t.name for t in there) or "none"
+        listed = ", ".join(t.name for t in present) or "none"
         raise InputError(
-            f"{session.path}: expected keypoints, poses or pictures, found the topics {listed}; record some"
+            f"{session.path}: expected keypoints, poses or images, found the topics {listed}; record one of them"
         )
-    found.update({topic.name: topic.name for topic in there if topic.name == "/diagnostics"})
+    found.update({topic.name: topic.name for topic in present if topic.name == "/diagnostics"})
     return found, space

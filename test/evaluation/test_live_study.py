@@ -1,4 +1,4 @@
-"""``drocap evaluate live``: what is published when, beside the offline result."""
+"""``drocap evaluate live``: published poses beside the offline result."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def test_the_command_prints_its_tables_and_writes_them(mocap, tmp_path, capsys):
         assert f"{option}: expected" in capsys.readouterr().err
 
 
-def test_a_solution_counts_from_when_it_is_there():
+def test_a_solution_counts_from_its_arrival():
     view = orbit_view(walk_mm(5.0), 25.0)
     never = fly(view, 10.0, InitializerConfig(), BundleAdjusterConfig())
     np.testing.assert_array_equal(never.latest, never.initial)
     assert np.isnan(never.refined).all()
     soon = fly(view, 0.5, InitializerConfig(), BundleAdjusterConfig())
-    # The first window ends after a third of a second, at the ninth image, and is there half a second later.
+    # The first window ends after a third of a second, at the ninth image; its solution arrives half a second later.
     np.testing.assert_array_equal(soon.latest[:20], soon.initial[:20])
     assert not np.array_equal(soon.latest[20:24], soon.initial[20:24])
     # The last two seconds have no refined pose of that age.

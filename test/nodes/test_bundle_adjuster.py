@@ -1,4 +1,4 @@
-"""Initializer and bundle adjuster in the running graph, through all that can happen to a stream."""
+"""Initializer and bundle adjuster in the running graph, through all events of a stream."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def eventful():
     unseen = {"keypoints": np.full((15, 2), np.nan), "covariance": np.full((15, 3), np.nan), "confidence": np.zeros(15)}
     unseen = {name: values.astype(np.float32) for name, values in unseen.items()}
     blind = replace(first[29], stamp_ns=first[29].stamp_ns + 1, **unseen)
-    stray = observed(0.05, begin_ns=BEGIN + 600 * S)[:1]  # further away the door refuses it
+    stray = observed(0.05, begin_ns=BEGIN + 600 * S)[:1]  # farther away StampValidator refuses it
     gap = observed(2.0, begin_ns=BEGIN + 6 * S, seed=1)
     other = observed(2.5, track_id=2, begin_ns=BEGIN + 3 * S, seed=2)
     hidden = [replace(o, track_id=3, stamp_ns=o.stamp_ns + 20 * S, **unseen) for o in first[:12]]
@@ -82,7 +82,7 @@ def flown(tmp_path_factory):
     return folder, *fly(folder, eventful())
 
 
-def test_each_event_is_counted_with_its_reason(flown):
+def test_each_event_is_counted_by_its_key(flown):
     _, _, counts = flown
     found = counts["initializer"]
     assert found["stream_event/duplicate"] == "1"
@@ -97,11 +97,11 @@ def test_each_event_is_counted_with_its_reason(flown):
     assert adjuster["stream_event/time_jump"] == "1"
     assert adjuster["stream_event/new_subject"] == "2"
     assert int(adjuster[Key.ADJUSTMENTS]) >= 6
-    # Of somebody who is never seen there is nothing to adjust.
+    # A window without keypoints cannot be adjusted.
     assert adjuster[Key.ADJUSTMENTS_FAILED] == "1"
 
 
-def test_every_initial_pose_has_its_latest(flown):
+def test_every_initial_pose_has_a_latest_pose(flown):
     _, seen, _ = flown
     stamps = [[stamp_from_ros(m.header.stamp) for m in seen[t]] for t in ("pose3d/initial", "pose3d/latest")]
     assert stamps[0] == stamps[1]
@@ -122,7 +122,7 @@ def test_no_window_mixes_subjects_or_rounds(flown):
 
 
 @pytest.mark.parametrize("late", [False, True], ids=["in time", "always late"])
-def test_the_recording_gives_the_same_bits_again(flown, tmp_path, late):
+def test_the_recording_repeats_the_windows_bit_for_bit(flown, tmp_path, late):
     folder = flown[0]
     if late:
         folder = tmp_path / "session"

@@ -1,4 +1,4 @@
-"""``drocap view`` as a user runs it; what it wrote is read back with Rerun's own reader."""
+"""``drocap view`` as a user runs it; its files are read back with Rerun's own reader."""
 
 import contextlib
 import os
@@ -23,10 +23,10 @@ from drocap_ros.recording.open_session import open_session
 from drocap_ros.ros.conversions import header_at
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15
-from drocap_ros.view.camera import nominal_camera_matrix, place_cameras
+from drocap_ros.view.camera_placement import nominal_camera_matrix, place_cameras
 from drocap_ros.view.message_view import MessageView
-from drocap_ros.view.output import new_recording
-from drocap_ros.view.scene import Scene
+from drocap_ros.view.rerun_output import new_recording
+from drocap_ros.view.rerun_scene import Scene
 
 pytest.importorskip("rerun", reason="no Rerun viewer here: `make setup` brings it")
 
@@ -92,7 +92,7 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_a_motion_is_drawn_whole_and_where_it_is(folder, tmp_path):
+def test_every_frame_of_a_motion_is_drawn_in_place(folder, tmp_path):
     out = tmp_path / "motion.rrd"
     done = view(folder, "--save", out, "--video", folder / "walk.mp4")
     assert done.returncode == 0, done.stderr
@@ -108,23 +108,23 @@ def test_a_motion_is_drawn_whole_and_where_it_is(folder, tmp_path):
     bones = drawn.values("/world/subject/refined/bones", "LineStrips3D:strips")
     assert [len(bones[stamp]) for stamp in stamps] == [14, 14, 14, 14, 13, 14, 14, 14, 14, 14]
     assert drawn.stamps("/plots/reprojection_px/mean")[-10:] == stamps
-    # The picture is 1280 px wide and shown at 960: the keypoints lie at three quarters.
+    # The image is 1280 px wide and drawn at 960: the keypoints are scaled by three quarters.
     pixels = drawn.values("/world/camera/image/keypoints", "Points2D:positions")
     np.testing.assert_allclose(pixels[stamps[0]], 0.75 * motion.keypoints[0], rtol=1e-4)
-    pictures = drawn.values("/world/camera/image", "EncodedImage:blob")
-    assert len(pictures) == 10
-    jpeg = cv2.imdecode(np.asarray(pictures[stamps[5]], np.uint8).ravel(), cv2.IMREAD_COLOR)
+    images = drawn.values("/world/camera/image", "EncodedImage:blob")
+    assert len(images) == 10
+    jpeg = cv2.imdecode(np.asarray(images[stamps[5]], np.uint8).ravel(), cv2.IMREAD_COLOR)
     assert jpeg.shape == (540, 960, 3)
     assert abs(float(jpeg.mean()) - 100) < 4
 
 
-def test_the_camera_is_placed_where_its_picture_was_taken():
+def test_cameras_are_placed_near_their_true_positions():
     capture = simulate_capture(1.0, 10.0, seed=3)
     matrix = capture.tracks.camera_matrix
     found = place_cameras(capture.joints3d_world, capture.keypoints_exact, capture.camera_rotation, matrix)
     truth = capture.tracks.camera_position
     away = np.linalg.norm(truth - capture.joints3d_world[:, 0], axis=1)
-    # The model is orthographic: what is left is perspective, a few percent of the distance.
+    # The model is orthographic: the remaining error is perspective, a few percent of the distance.
     assert (np.linalg.norm(found - truth, axis=1) < 0.06 * away).all()
     nothing = np.full_like(capture.keypoints_exact, np.nan)
     empty = place_cameras(capture.joints3d_world, nothing, capture.camera_rotation, nominal_camera_matrix(640, 480))
@@ -133,7 +133,7 @@ def test_the_camera_is_placed_where_its_picture_was_taken():
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
-    """A flight's session, and what a viewer saw of it while it flew."""
+    """A flight's session, and the file of a viewer that watched it live."""
     folder = tmp_path_factory.mktemp("flight")
     config = DrocapConfig().replace("capture_simulator", seconds=3.0, rate_hz=15.0, seed=3)
     config = config.replace("bundle_adjuster", period_s=0.5)
@@ -222,7 +222,7 @@ def listening(port):
     return found
 
 
-def test_without_a_screen_a_browser_gets_a_page(folder):
+def test_without_a_screen_a_page_is_served_on_this_machine_alone(folder):
     port = two_free_ports()
     server = subprocess.Popen(
         command(folder, "--port", port), env=environment(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -232,11 +232,11 @@ def test_without_a_screen_a_browser_gets_a_page(folder):
         address = re.search(r"open (http://\S+) in a browser", line)[1]
         page = urllib.request.urlopen(address, timeout=20).read().decode()
         assert "<title>Rerun" in page
-        # Where the page takes its data from.
+        # The source of the page's data.
         assert f"127.0.0.1%3A{port + 1}" in address
         with socket.create_connection(("127.0.0.1", port + 1), timeout=20):
             pass
-        # Pictures of a person are for this machine alone.
+        # Images of a person stay on this machine.
         for number in (port, port + 1):
             assert listening(number) == {"127.0.0.1"}
     finally:
@@ -246,7 +246,7 @@ def test_without_a_screen_a_browser_gets_a_page(folder):
     assert not listening(port)
 
 
-def test_a_killed_command_leaves_no_server_behind(folder):
+def test_a_killed_command_ends_its_server(folder):
     port = two_free_ports()
     server = subprocess.Popen(command(folder, "--port", port), env=environment(), stdout=subprocess.PIPE, text=True)
     server.stdout.readline()
@@ -271,7 +271,7 @@ def test_a_killed_command_leaves_no_server_behind(folder):
         (("--live", "--seconds", "-1"), "--seconds: expected more than 0"),
     ],
 )
-def test_what_cannot_be_shown_is_refused_in_one_line(arguments, words, tmp_path):
+def test_unusable_inputs_are_refused_in_one_line(arguments, words, tmp_path):
     out = () if "--save" in arguments or "--live" in arguments else ("--save", tmp_path / "out.rrd")
     done = view(*arguments, *out)
     assert done.returncode == 2
@@ -280,7 +280,7 @@ def test_what_cannot_be_shown_is_refused_in_one_line(arguments, words, tmp_path)
     assert not (tmp_path / "out.rrd").exists()
 
 
-def test_without_rerun_one_line_says_what_to_install(folder, tmp_path):
+def test_without_rerun_one_line_names_the_package_to_install(folder, tmp_path):
     (tmp_path / "rerun.py").write_text("raise ImportError('not here')")
     done = view(folder, "--save", tmp_path / "x.rrd", PYTHONPATH=f"{tmp_path}:{ROOT}")
     assert done.returncode == 2
@@ -288,11 +288,11 @@ def test_without_rerun_one_line_says_what_to_install(folder, tmp_path):
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_pictures_for_a_viewer_that_must_keep_up_are_thinned(tmp_path):
+def test_images_are_thinned_to_the_rate_of_a_live_viewer(tmp_path):
     recording = new_recording("thinned")
     recording.save(tmp_path / "thinned.rrd")
     jpeg = cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))[1].tobytes()
-    messages = MessageView(Scene(recording), picture_hz=10.0)
+    messages = MessageView(Scene(recording), image_hz=10.0)
     stamps = [10**12 + round(i * 1e9 / 30) + (i % 3) * 2_000_000 for i in range(30)]
     for stamp in [*stamps, 10**11]:  # at the end the time jumps back, as in a loop
         messages.take("image/compressed", CompressedImage(header=header_at(stamp, ""), data=jpeg), stamp)

@@ -67,7 +67,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> int:
     """Draw the input, or the graph until the user interrupts."""
-    from drocap_ros.view.output import new_recording
+    from drocap_ros.view.rerun_output import new_recording
 
     _check(args)
     if args.live:
@@ -106,7 +106,7 @@ def _check(args: argparse.Namespace) -> None:
 def _view_motion(recording: rerun.RecordingStream, args: argparse.Namespace) -> None:
     from drocap_ros.report.motion_images import each_image
     from drocap_ros.view.motion_view import PLOTS, draw_motion
-    from drocap_ros.view.scene import Scene
+    from drocap_ros.view.rerun_scene import Scene
 
     _, motion = read_motion(args.input)
     pictures = each_image(args.video, motion) if args.video else ()
@@ -117,7 +117,7 @@ def _view_motion(recording: rerun.RecordingStream, args: argparse.Namespace) -> 
 def _view_session(recording: rerun.RecordingStream, args: argparse.Namespace) -> None:
     from drocap_ros.recording.open_session import open_session
     from drocap_ros.view.message_view import PLOTS, MessageView
-    from drocap_ros.view.scene import Scene
+    from drocap_ros.view.rerun_scene import Scene
     from drocap_ros.view.session_view import draw_session
 
     if args.video is not None:
@@ -134,11 +134,11 @@ def _view_session(recording: rerun.RecordingStream, args: argparse.Namespace) ->
 
 def _view_live(recording: rerun.RecordingStream, args: argparse.Namespace) -> int:
     from drocap_ros.view.message_view import PLOTS, MessageView
-    from drocap_ros.view.scene import Scene
+    from drocap_ros.view.rerun_scene import Scene
 
     namespace = args.namespace or "/drocap"
     with import_bringup().watch(namespace, args.domain_id) as graph, _shown(recording, (*PLOTS, "log"), args):
-        view = MessageView(Scene(recording), picture_hz=0.0 if args.save else LIVE_PICTURE_HZ)
+        view = MessageView(Scene(recording), image_hz=0.0 if args.save else LIVE_PICTURE_HZ)
         view.namespace = namespace
         _subscribe(graph, view)
         end = math.inf if args.seconds is None else time.monotonic() + args.seconds
@@ -167,7 +167,7 @@ def _subscribe(graph: Graph, view: MessageView) -> None:
 def _shown(recording: rerun.RecordingStream, views: tuple[str, ...], args: argparse.Namespace) -> Iterator[None]:
     """Take what is drawn inside to the file, window or browser that the user wants."""
     from drocap_ros.view.layout import layout
-    from drocap_ros.view.output import has_screen, to_browser, to_file, to_window
+    from drocap_ros.view.rerun_output import has_screen, to_browser, to_file, to_window
 
     arranged = layout(views, follow=args.live)
     if args.save is not None:

@@ -1,4 +1,4 @@
-"""Where the drawing goes: a file, the desktop viewer, or a browser."""
+"""Outputs of a Rerun recording: a file, the desktop viewer, or a browser."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     import rerun
     import rerun.blueprint as rrb
 
-#: Within which the web server starts.
+#: Start of the web server at most.
 _START_S = 20.0
 INSTALL = "pip install 'rerun-sdk>=0.39,<0.40'"
 
 
 def new_recording(name: str) -> rerun.RecordingStream:
-    """An empty recording of a name.
+    """An empty named recording.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def to_file(recording: rerun.RecordingStream, path: Path, layout: rrb.Blueprint)
 
 
 def to_window(recording: rerun.RecordingStream, layout: rrb.Blueprint, memory_limit: str) -> None:
-    """Send the recording to the desktop viewer, which is started if it does not run yet.
+    """Send the recording to the desktop viewer, started if necessary.
 
     Raises
     ------
@@ -77,18 +77,18 @@ def to_browser(
 ) -> Iterator[str]:
     """Serve the recording and a web viewer on two ports, ``port`` and the next, while the context lasts.
 
-    Gives the page's address.  The server is Rerun's program and not its library, which serves the pictures of a
-    person to the whole network and cannot be told otherwise.
+    Gives the page's address.  The server is Rerun's program, not its library: the library serves the images of a
+    person to the whole network.
 
     Parameters
     ----------
-    host : address to serve on; 127.0.0.1 is this machine alone
-    newest_first : a page that is opened late begins with what is new
+    host : address to serve on; 127.0.0.1 = this machine alone
+    newest_first : a page that is opened late starts with the newest data
 
     Raises
     ------
     InputError
-        When a port is taken, or the address is not this machine's.
+        When a port is in use, or the address is not this machine's.
     """
     _check_free(host, port, port + 1)
     command = [_program(), "--serve-web", "--bind", host, "--port", str(port + 1)]
@@ -98,7 +98,7 @@ def to_browser(
         command,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        start_new_session=True,  # Ctrl-C is for us
+        start_new_session=True,  # Ctrl-C is for this process
         preexec_fn=_end_with_parent(),
     )
     try:
@@ -121,10 +121,10 @@ def _program() -> str:
 
 
 def _end_with_parent() -> Callable[[], object] | None:
-    """What a child calls first: a killed command must not leave a server on its ports (PR_SET_PDEATHSIG)."""
+    """First call of the child: it ends with a killed parent (PR_SET_PDEATHSIG) and frees the ports."""
     if sys.platform != "linux":
         return None
-    # Looked up here: between fork and exec the child had better do nothing but call.
+    # Looked up here: between fork and exec the child must only call.
     return functools.partial(ctypes.CDLL(None).prctl, 1, int(signal.SIGTERM))
 
 

@@ -1,4 +1,4 @@
-"""What is drawn, and under which name: arrays in, Rerun entities out."""
+"""Rerun entities of a capture, from arrays."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ if TYPE_CHECKING:
 TIMELINE = "image"
 WORLD = "world"
 CAMERA = "world/camera"
-PICTURE = "world/camera/image"
+IMAGE = "world/camera/image"
 CAMERA_PATH = "world/camera_path"
-STAGES = ("initial", "latest", "refined")
 
 _COLOURS = {"left": (36, 112, 163), "right": (191, 56, 43), "middle": (90, 90, 90)}
-#: How the stages of a pose are told apart: opacity and width.
+#: The stages of a pose differ in opacity and width.
 _OPACITY = {"initial": 90, "latest": 255, "refined": 200}
 _WIDTH_M = {"initial": 0.008, "latest": 0.018, "refined": 0.012}
 _UNCERTAIN = (200, 150, 20, 40)
@@ -39,7 +38,7 @@ def subject_path(stage: str) -> str:
 class Scene:
     """A Rerun recording of one capture.
 
-    Stamps are integer nanoseconds of the image; positions are m in axes with z up; unknown is NaN and is not drawn.
+    Stamps are integer nanoseconds of the image; positions are m in axes with z up; NaN = unknown, not drawn.
     """
 
     def __init__(self, recording: rerun.RecordingStream) -> None:
@@ -51,7 +50,7 @@ class Scene:
         self._log(WORLD, rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def at(self, stamp_ns: int) -> None:
-        """Everything that follows belongs to the image of this stamp."""
+        """Set the stamp of all that follows."""
         self.recording.set_time(TIMELINE, timestamp=np.datetime64(int(stamp_ns), "ns"))
 
     def pose(self, stage: str, joints_of: JointSet, joints: np.ndarray, covariance: np.ndarray | None = None) -> None:
@@ -81,45 +80,45 @@ class Scene:
         self._log(f"{path}/uncertainty", drawn)
 
     def no_subject(self, *stages: str) -> None:
-        """The subject is not in this image."""
+        """Clear the subject's poses of these stages."""
         for stage in stages:
             self._log(subject_path(stage), self._rr.Clear(recursive=True))
 
     def keypoints(self, joints_of: JointSet, keypoints: np.ndarray, box: np.ndarray | None = None) -> None:
-        """Keypoints (P, 2) px over the picture, and the subject's box x_min y_min x_max y_max px."""
+        """Keypoints (P, 2) px over the image, and the subject's box x_min y_min x_max y_max px."""
         rr = self._rr
         seen = np.isfinite(keypoints).all(1)
         colours = _joint_colours(joints_of, 255)
         bones = joints_of.bones[seen[joints_of.bones].all(1)]
         self._log(
-            f"{PICTURE}/keypoints", rr.Points2D(keypoints[seen], colors=colours[seen], radii=rr.Radius.ui_points(4))
+            f"{IMAGE}/keypoints", rr.Points2D(keypoints[seen], colors=colours[seen], radii=rr.Radius.ui_points(4))
         )
         self._log(
-            f"{PICTURE}/bones",
+            f"{IMAGE}/bones",
             rr.LineStrips2D(keypoints[bones], colors=colours[bones[:, 1]], radii=rr.Radius.ui_points(1.5)),
         )
         if box is not None and np.isfinite(box).all():
-            self._log(f"{PICTURE}/box", rr.Boxes2D(array=box[None], array_format=rr.Box2DFormat.XYXY, colors=_BOX))
+            self._log(f"{IMAGE}/box", rr.Boxes2D(array=box[None], array_format=rr.Box2DFormat.XYXY, colors=_BOX))
 
     def no_keypoints(self) -> None:
-        """The subject is not in this picture."""
+        """Clear keypoints and box."""
         for name in ("keypoints", "bones", "box"):
-            self._log(f"{PICTURE}/{name}", self._rr.Clear(recursive=False))
+            self._log(f"{IMAGE}/{name}", self._rr.Clear(recursive=False))
 
     def jpeg(self, data: bytes, media_type: str = "image/jpeg") -> None:
-        """An encoded picture."""
-        self._log(PICTURE, self._rr.EncodedImage(contents=data, media_type=media_type))
+        """An encoded image."""
+        self._log(IMAGE, self._rr.EncodedImage(contents=data, media_type=media_type))
 
     def image(self, bgr: np.ndarray) -> None:
-        """A picture (H, W, 3) uint8 BGR."""
-        self._log(PICTURE, self._rr.Image(bgr, color_model="BGR").compress(jpeg_quality=80))
+        """An image (H, W, 3) uint8 BGR."""
+        self._log(IMAGE, self._rr.Image(bgr, color_model="BGR").compress(jpeg_quality=80))
 
     def calibration(self, camera_matrix: np.ndarray, size: tuple[int, int]) -> None:
-        """Camera matrix (3, 3) px of a picture of a size, from now on."""
+        """Camera matrix (3, 3) px of the following images of a size (width, height)."""
         pinhole = self._rr.Pinhole(
             image_from_camera=camera_matrix, resolution=size, image_plane_distance=1.0, color=_PATH
         )
-        self._log(PICTURE, pinhole)
+        self._log(IMAGE, pinhole)
 
     def camera(self, position: np.ndarray, rotation: np.ndarray) -> None:
         """Position (3,) m of the camera and its rotation (3, 3), world -> optical."""
@@ -130,7 +129,7 @@ class Scene:
         self._log(CAMERA_PATH, self._rr.LineStrips3D([positions], colors=_PATH, radii=0.01))
 
     def plot(self, name: str, value: float) -> None:
-        """One number of a curve, ``group/name``; NaN is left out."""
+        """One value of a curve ``group/name``; NaN is not drawn."""
         if not np.isfinite(value):
             return
         last = name.rsplit("/", 1)[-1]
@@ -139,12 +138,12 @@ class Scene:
             self._log(f"plots/{name}", self._rr.SeriesLines(names=last, colors=_CURVES.get(last)), static=True)
         self._log(f"plots/{name}", self._rr.Scalars(value))
 
-    def say(self, who: str, text: str, level: str = "INFO") -> None:
+    def log_text(self, source: str, text: str, level: str = "INFO") -> None:
         """A line of the log."""
-        self._log(f"log/{who}", self._rr.TextLog(text, level=level))
+        self._log(f"log/{source}", self._rr.TextLog(text, level=level))
 
-    def _log(self, path: str, what: Any, static: bool = False) -> None:
-        self._rr.log(path, what, static=static, recording=self.recording)
+    def _log(self, path: str, entity: Any, static: bool = False) -> None:
+        self._rr.log(path, entity, static=static, recording=self.recording)
 
 
 def _joint_colours(joints_of: JointSet, opacity: int) -> np.ndarray:
