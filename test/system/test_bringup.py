@@ -14,10 +14,11 @@ from sensor_msgs.msg import Image
 from drocap_ros.bringup import bringup, free_domain, node_class
 from drocap_ros.config import DrocapConfig, section_types
 from drocap_ros.errors import InputError, NodeError
-from drocap_ros.msg import OrbitCommand, OrbitStatus, Pose2D, Pose3D, Pose3DWindow
+from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, Pose3DWindow
 from drocap_ros.ros.conversions import stamp_from_ros
-from drocap_ros.ros.topics import NODES, RESULT_QOS, TOPICS
+from drocap_ros.ros.topics import NODES, TOPICS
 from drocap_ros.simulation.vehicle.ports import free_udp_port
+from drocap_ros.srv import OrbitCommand
 
 CAPTURE = ["capture_simulator", "initializer", "bundle_adjuster"]
 
@@ -101,14 +102,16 @@ def test_unknown_node_is_refused():
         pass
 
 
-def test_the_bridge_refuses_to_fly_and_says_why():
+def test_bridge_without_permission_refuses_to_start_an_orbit():
     config = DrocapConfig().replace("mavlink_bridge", url=f"udpin:127.0.0.1:{free_udp_port()}")
     with bringup(config, ["mavlink_bridge"]) as graph:
         got = collect(graph, "orbit/status")
-        command = graph.node.create_publisher(OrbitCommand, "orbit/command", RESULT_QOS)
-        graph.wait_until(command.get_subscription_count, 20, "the bridge to listen")
-        command.publish(OrbitCommand(command=OrbitCommand.START))
-        graph.wait_until(lambda: any("no motion" in m.reason for m in got["orbit/status"]), 20, "a refusal")
+        client = graph.node.create_client(OrbitCommand, "orbit/command")
+        graph.wait_until(client.service_is_ready, 20, "the bridge's service")
+        answer = client.call_async(OrbitCommand.Request(command=OrbitCommand.Request.START))
+        graph.wait_until(answer.done, 20, "an answer")
+        assert not answer.result().accepted
+        graph.wait_until(lambda: got["orbit/status"], 20, "a status")
     assert {m.state for m in got["orbit/status"]} == {OrbitStatus.IDLE}
 
 
