@@ -1,16 +1,16 @@
-"""The exceptions of drocap_ros and the exit status that each ends a command with."""
+"""The exceptions of drocap_ros and their exit statuses."""
 
 from __future__ import annotations
 
 
 class DrocapError(Exception):
-    """Root of every error that drocap_ros raises on purpose; ends a command with status 1."""
+    """Root of the errors that drocap_ros raises; a command ends with status 1."""
 
     exit_status = 1
 
 
 class InputError(DrocapError):
-    """An input, option, message or parameter cannot be used; ends a command with status 2.
+    """An input, option, message or parameter cannot be used; a command ends with status 2.
 
     The text is one line: what was expected, what was found, what to do.
     """

@@ -1,10 +1,10 @@
-"""From the joint sets of public networks to ``BODY_15``: positions, covariance and confidence.
+"""Maps from the joint sets of public networks to ``BODY_15``: positions, covariance and confidence.
 
-Each of our joints is a weighted mean of a network's joints.  Most are one joint, the pelvis is the middle
-of the hips where the network has none, and ``neck`` and ``head`` are extrapolated along the line from the
-middle of the shoulders: in the MoCap convention the neck lies 135 mm and the head 232 mm above it, the ears
-about 190 mm.  Extrapolated joints carry an extra variance for what a line cannot know (where the head
-leans), in units of the network's own shoulder-to-ear or neck-to-crown distance, and less confidence.
+Each joint of ``BODY_15`` is a weighted mean of a network's joints.  Most are one joint; the pelvis is the middle of
+the hips where the network has none; ``neck`` and ``head`` are extrapolated along the line from the middle of the
+shoulders: in the MoCap convention the neck lies 135 mm and the head 232 mm above it, the ears about 190 mm.
+Extrapolated joints have an extra variance for the lean of the head, in units of the network's own shoulder-to-ear or
+neck-to-crown distance, and less confidence.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ def _coco_like(pelvis: Weights | None = None) -> dict[str, Weights]:
     }
 
 
-#: Our joint -> weights of the network's joints, which sum to 1.
+#: Joint of BODY_15 -> weights of the network's joints; they sum to 1.
 TABLES: dict[str, dict[str, Weights]] = {
     "body15": {name: {name: 1.0} for name in BODY_15.joints},
     "coco17": _coco_like(),
     "wholebody133": _coco_like(),
     "halpe26": _coco_like(pelvis={"left_hip": 0.5, "right_hip": 0.5}),
-    # MPII's upper neck is ours; the crown lies about 310 mm above the middle of the shoulders.
+    # MPII's upper neck is BODY_15's neck; the crown lies about 310 mm above the middle of the shoulders.
     "mpii16": _limbs_by_side() | {
         "pelvis": {"left_hip": 0.5, "right_hip": 0.5},
         "neck": {"upper_neck": 1.0},
@@ -98,24 +98,24 @@ class JointMap:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Keypoints (P, 2) px, covariance (P, 3) px^2 and confidence (P,) -> the same for ``BODY_15``.
 
-        A joint is NaN, its confidence 0, where one of its parts is NaN.  The line's length is at least 5 %
-        of ``box_size``: a person seen from above has a short one, yet a head that is no better known.
+        A joint is NaN, its confidence 0, where one of its parts is NaN.  The line's length is at least 5 % of
+        ``box_size``: a view from above shortens the line, not the uncertainty of the head.
         """
         seen = np.isfinite(xy).all(axis=1)
         used = self.weights != 0
-        fine = ~(used & ~seen).any(axis=1)
+        known = ~(used & ~seen).any(axis=1)
         points = np.nan_to_num(xy)
         out = self.weights @ points
-        # The parts' errors are taken as independent.
+        # The errors of the parts are assumed independent.
         out_covariance = self.weights**2 @ np.nan_to_num(covariance)
         length = np.maximum(np.linalg.norm(self.lines @ points, axis=1), 0.05 * box_size)
         extra = np.where(self.spread > 0, (self.spread * length) ** 2, 0.0)
         out_covariance = out_covariance + extra[:, None] * np.array([1.0, 0.0, 1.0])
         lowest = np.where(used, np.nan_to_num(confidence)[None], np.inf).min(axis=1)
         out_confidence = np.where(self.spread > 0, _EXTRAPOLATED_CONFIDENCE, 1.0) * lowest
-        out[~fine] = np.nan
-        out_covariance[~fine] = np.nan
-        return out, out_covariance, np.where(fine, out_confidence, 0.0)
+        out[~known] = np.nan
+        out_covariance[~known] = np.nan
+        return out, out_covariance, np.where(known, out_confidence, 0.0)
 
 
 @cache

@@ -1,10 +1,9 @@
-"""Left and right legs kept apart over a whole recording.
+"""Left and right legs of a whole recording, in place of the network's exchanges.
 
-From the side both legs look alike, and networks exchange them for some images at a time.  Two hypotheses are
-followed through all images, that the network named the legs rightly and that it exchanged them: a change of
-hypothesis is a jump of the legs in the picture, and the second contradicts the network, the more the surer that
-is.  The cheapest course is found by dynamic programming (Viterbi), so what comes later helps to understand what
-came before; live, where there is no later, the network's own sides are published.
+From the side both legs look alike, and networks exchange them for some images at a time.  Each image has two
+hypotheses: the network named the legs correctly, or it exchanged them.  A change of hypothesis costs the jump of the
+legs in the image; the second hypothesis costs more the more confident the network is.  Dynamic programming (Viterbi)
+finds the cheapest path, so later images correct earlier ones.
 """
 
 from __future__ import annotations
@@ -18,15 +17,15 @@ _LEFT = np.array([BODY_15.index("lknee"), BODY_15.index("lankle")])
 _RIGHT = np.array([BODY_15.index("rknee"), BODY_15.index("rankle")])
 _HIPS = np.array([BODY_15.index("lhip"), BODY_15.index("rhip")])
 
-#: Standard deviation of a leg joint's step against the hips between two images, share of the box.
+#: Standard deviation of a leg joint's step relative to the hips between two images, share of the box.
 _STEP_SIGMA = 0.04
-#: Most that one joint's step can cost: a gross error says nothing about sides.
+#: Bound on the cost of one joint's step: a gross error carries no information about sides.
 _MOST_COST = 8.0
-#: Price of contradicting the network, per pair of joints and unit of -log(1 - confidence).
+#: Cost of the second hypothesis, per pair of joints and unit of -log(1 - confidence).
 _CONTRADICTION = 0.12
-#: After such a gap nothing is known about where the legs were.
+#: Gap after which the positions of the legs carry no information.
 _LONGEST_GAP_S = 0.25
-#: An exchanged leg was named wrongly by the network: it is a little less sure.
+#: Factor on the confidence of an exchanged joint, which the network named wrongly.
 _EXCHANGED_CONFIDENCE = 0.85
 
 
@@ -46,10 +45,10 @@ def exchanged_legs(keypoints: Keypoints2D, stamp_ns: np.ndarray, box_size: np.nd
     """(F,) bool, images in which the network most likely exchanged the legs; arguments as :func:`with_own_legs`."""
     xy, weights = keypoints.xy, keypoints.weights
     step = _step_costs(xy, stamp_ns, box_size)
-    sure = np.minimum(weights[:, _LEFT], weights[:, _RIGHT])
-    prices = (-_CONTRADICTION * np.log1p(-np.clip(sure, 0.0, 0.999)).sum(axis=1)).tolist()
+    certain = np.minimum(weights[:, _LEFT], weights[:, _RIGHT])
+    prices = (-_CONTRADICTION * np.log1p(-np.clip(certain, 0.0, 0.999)).sum(axis=1)).tolist()
     right, wrong = 0.0, prices[0]
-    origin = [(False, False)]  # per hypothesis: whether the image before was of the other one
+    origin = [(False, False)]  # per hypothesis: whether the image before has the other one
     for keep, change, price in zip(step[1:, 0].tolist(), step[1:, 1].tolist(), prices[1:], strict=True):
         stay_right, to_right, stay_wrong, to_wrong = right + keep, wrong + change, wrong + keep, right + change
         origin.append((to_right < stay_right, to_wrong < stay_wrong))
@@ -63,7 +62,7 @@ def exchanged_legs(keypoints: Keypoints2D, stamp_ns: np.ndarray, box_size: np.nd
 
 
 def _step_costs(xy: np.ndarray, stamp_ns: np.ndarray, box_size: np.ndarray) -> np.ndarray:
-    """(F, 2) cost of the legs' step to each image, with both images of one hypothesis and of different ones."""
+    """(F, 2) cost of the legs' step to each image, for equal and for different hypotheses of both images."""
     relative = xy - xy[:, _HIPS].mean(axis=1, keepdims=True)
     left, right = relative[:, _LEFT], relative[:, _RIGHT]
     out = np.zeros((len(xy), 2))

@@ -12,7 +12,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.tracks import MAX_FRAMES, read_npz
 
-#: Joints further than this from the origin are no motion of a person, in whatever unit they are.
+#: Joints farther than this from the origin are refused: no unit makes them a person's motion.
 _FARTHEST_M = 1e6
 
 
@@ -50,9 +50,9 @@ class Motion:
 
 
 def upright_joints(motion: Motion) -> np.ndarray:
-    """(F, P, 3) m, z up: frame "world" as it is; frame "camera" as x right, y away from the camera, z up.
+    """(F, P, 3) m, z up: frame "world" unchanged; frame "camera" as x right, y away from the camera, z up.
 
-    The vertical of the latter is the camera's; gravity is not known.
+    The vertical of the latter is the camera's; gravity is unknown.
     """
     if motion.frame == "world":
         return motion.joints3d
@@ -60,7 +60,7 @@ def upright_joints(motion: Motion) -> np.ndarray:
 
 
 def save_motion(path: str | Path, motion: Motion, **further: np.ndarray) -> None:
-    """Write ``motion.npz``; ``further`` arrays stand beside the motion's, and :func:`load_motion` passes them over."""
+    """Write ``motion.npz``; ``further`` arrays are added, and :func:`load_motion` ignores them."""
     np.savez_compressed(
         path,
         joints3d=motion.joints3d.astype(np.float64),

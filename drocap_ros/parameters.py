@@ -1,7 +1,7 @@
-"""Typed component parameters: one frozen dataclass per component is the only source.
+"""Typed component parameters, one frozen dataclass per component.
 
-The YAML loader, the ROS parameter declarations and the table in ``docs/parameters.md`` all read the
-metadata that :func:`param` attaches to a field.
+The metadata of :func:`param` is the only source of the YAML loader, the ROS parameter declarations and the table in
+``docs/parameters.md``.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Parameters:
 
     @classmethod
     def from_mapping(cls: type[P], values: Mapping[str, Any], where: str = "") -> P:
-        """Build from a mapping, refusing names that do not exist."""
+        """Build from a mapping; an unknown name is refused."""
         known = {spec.name for spec in dataclasses.fields(cls)}
         unknown = sorted(set(values) - known)
         if unknown:

@@ -1,4 +1,4 @@
-"""From any input to a motion: the offline path, which calls the same core as the nodes."""
+"""Any input to a motion: the offline path, with the same core as the nodes."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class Telemetry:
     """A telemetry log beside a video.
 
     path : .tlog, .ulg, .bin or .srt
-    time_offset_s : from the log's first state to the video's first picture; None = known or estimated
-    mount_pitch_deg : of a camera fixed to the body of a vehicle without a gimbal, negative looks down
+    time_offset_s : from the log's first state to the video's first image; None = known or estimated
+    mount_pitch_deg : of a camera fixed to the body of a vehicle without a gimbal, negative down
     """
 
     path: Path
@@ -60,13 +60,12 @@ def reconstruct_input(
 
     Parameters
     ----------
-    path : video, folder of pictures, ``.mcap``, rosbag1 ``.bag``, rosbag2 folder, or tracks ``.npz``
-    method : one of :data:`drocap_ros.reconstruction.reconstruct.METHODS`, or "live": the sliding windows of the live
-        graph on a recording with ``pose2d``, with the parameters that it was recorded with unless ``config`` is other
-        than the defaults
+    path : video, folder of images, ``.mcap``, rosbag1 ``.bag``, rosbag2 folder, or tracks ``.npz``
+    method : one of :data:`drocap_ros.reconstruction.methods.METHODS`, or "live": the sliding windows of the live
+        graph on a recording with ``pose2d``, with the recorded parameters unless ``config`` differs from the defaults
     models : folder of ONNX files; None = ``DROCAP_MODELS`` or the user's own
-    progress : called with a stage's name and the share done
-    telemetry : log beside a video, which tells the camera's pose
+    progress : called with a stage and its fraction done
+    telemetry : log beside a video, with the camera's pose
 
     Raises
     ------
@@ -104,7 +103,7 @@ def _reconstruct_live(path: Path, config: DrocapConfig, progress: Progress | Non
 def _with_telemetry(
     path: Path, tracks: Tracks, telemetry: Telemetry, log: TelemetryLog, progress: Progress | None
 ) -> Tracks:
-    """Tracks of a video with the camera's poses of the log beside it; says what the log lacks."""
+    """Tracks of a video with the camera's poses of the log beside it; warns of missing data."""
     if path.is_dir() or path.suffix == ".npz" or is_recording(path):
         raise InputError(f"--telemetry: expected a video file as input, found {path}; recordings hold their telemetry")
     pitch = telemetry.mount_pitch_deg
@@ -120,7 +119,7 @@ def _with_telemetry(
 
 
 def read_input(path: Path, config: DrocapConfig, models: Path | None, progress: Progress | None = None) -> Tracks:
-    """2D tracks of the subject: read where the input holds them, else seen in its pictures."""
+    """2D tracks of the subject: from the input where it holds them, else estimated from its images."""
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
     if path.suffix == ".npz":
@@ -130,15 +129,15 @@ def read_input(path: Path, config: DrocapConfig, models: Path | None, progress: 
             if session.has_pose2d:
                 tracks = read_pose2d(session)
             else:
-                tracks = _watch(read_images(session), None, config, models, progress, str(path))
+                tracks = _track(read_images(session), None, config, models, progress, str(path))
             for warning in session.warnings:
                 logger.warning("%s: %s", path, warning)
             return tracks
     with open_source(str(path), config.image_ingest) as source:
-        return _watch(source, source.length, config, models, progress, str(path))
+        return _track(source, source.length, config, models, progress, str(path))
 
 
-def _watch(
+def _track(
     frames: Iterable[Frame],
     length: int | None,
     config: DrocapConfig,
@@ -148,14 +147,14 @@ def _watch(
 ) -> Tracks:
     done = itertools.count(1)
 
-    def count(*_: object) -> None:
+    def report(*_: object) -> None:
         if progress is not None:
             progress("2D pose", next(done) / length if length else -1.0)
 
-    # Nobody is there to choose again, and the whole recording is at hand: the subject seen longest is taken at the end.
+    # Offline the most frequent subject of the whole recording is chosen at the end.
     settings = dataclasses.replace(config.pose_estimator, on_loss="next")
     estimator = PoseEstimator(models_folder(models or settings.models_dir or None), settings)
     try:
-        return tracks_from_observations(observe(frames, estimator, count))
+        return tracks_from_observations(observe(frames, estimator, report))
     except InputError as error:
         raise InputError(f"{name}: {error}") from None

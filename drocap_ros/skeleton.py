@@ -1,6 +1,6 @@
-"""Named joint sets, their bones, and the maps between them.
+"""Named joint sets and their bones.
 
-``BODY_15`` is the set that every 3D result uses.  Its joints follow the MoCap convention of Human3.6M:
+``BODY_15`` is the set of every 3D result.  Its joints follow the MoCap convention of Human3.6M:
 ``pelvis`` is the middle of the hips, ``neck`` the top of the neck (not the line of the shoulders) and
 ``head`` the middle of the skull's upper half.
 """
@@ -27,7 +27,7 @@ class JointSet:
         return len(self.joints)
 
     def index(self, joint: str) -> int:
-        """Place of a joint by its name."""
+        """Index of a joint by its name."""
         return self.joints.index(joint)
 
     @cached_property
@@ -112,13 +112,13 @@ H36M_17 = JointSet(
 
 JOINT_SETS: dict[str, JointSet] = {s.name: s for s in (BODY_15, COCO_17, HALPE_26, WHOLEBODY_133, MPII_16, H36M_17)}
 
-#: The twelve joints over which the paper's tables average.
+#: The twelve joints of the averages in the paper's tables.
 LIMB_JOINTS = (
     "rhip", "rknee", "rankle", "lhip", "lknee", "lankle",
     "lshoulder", "lelbow", "lwrist", "rshoulder", "relbow", "rwrist",
 )  # fmt: skip
 
-#: Bones of ``BODY_15`` that keep their length on a real person (the spine and the shoulder girdle do not).
+#: Bones of ``BODY_15`` of constant length on a real person (not the spine and the shoulder girdle).
 RIGID_BONES = (
     ("rhip", "rknee"), ("rknee", "rankle"), ("lhip", "lknee"), ("lknee", "lankle"), ("rhip", "lhip"),
     ("lshoulder", "lelbow"), ("lelbow", "lwrist"), ("rshoulder", "relbow"), ("relbow", "rwrist"),
@@ -141,7 +141,7 @@ def joint_set(name: str) -> JointSet:
 
 
 def side_of(joint: str, joints: tuple[str, ...]) -> str:
-    """Body side of a joint of ``BODY_15``'s naming among others: "left", "right" or "middle"."""
+    """Body side of a joint by its name, "left", "right" or "middle"; both sides must be among ``joints``."""
     for letter, other, side in (("l", "r", "left"), ("r", "l", "right")):
         if joint.startswith(letter) and other + joint[1:] in joints:
             return side
@@ -149,7 +149,7 @@ def side_of(joint: str, joints: tuple[str, ...]) -> str:
 
 
 def indices(joints: tuple[str, ...] | list[str], wanted: tuple[str, ...]) -> np.ndarray:
-    """(len(wanted),) int, where the wanted joints stand in ``joints``.
+    """(len(wanted),) int, indices of the wanted joints in ``joints``.
 
     Raises
     ------

@@ -11,9 +11,9 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 
-#: Longest sequence that is accepted (10 h at 30 fps); refusing beats running out of memory.
+#: Longest accepted sequence (10 h at 30 fps); longer ones are refused before memory runs out.
 MAX_FRAMES = 1_080_000
-#: Arrays of such a sequence, every optional one with them, stay below this.
+#: Upper bound on the arrays of such a sequence, optional ones included.
 MAX_BYTES = 4 * 2**30
 
 

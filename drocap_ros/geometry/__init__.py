@@ -1,1 +1,1 @@
-"""Rotations, alignment of point sets and the body-fixed frame, batched over leading axes."""
+"""Rotations, alignment, the body-fixed frame, bone lengths and interpolation, batched over leading axes."""

@@ -47,7 +47,7 @@ def apply_similarity(
 
 
 def torso_frame(s: np.ndarray, joints: JointSet = BODY_15) -> np.ndarray:
-    """Body-fixed frame of each pose: x forward, y to the left, z up along the trunk.
+    """Body-fixed frame of each pose: x forward, y left, z up along the trunk.
 
     Parameters
     ----------
@@ -62,9 +62,9 @@ def torso_frame(s: np.ndarray, joints: JointSet = BODY_15) -> np.ndarray:
     z = _unit(at["neck"] - at["pelvis"], np.array([0.0, 0.0, 1.0]))
     left = _unit(at["lhip"] - at["rhip"], np.zeros(3)) + _unit(at["lshoulder"] - at["rshoulder"], np.zeros(3))
     left = left - np.sum(left * z, axis=-1, keepdims=True) * z
-    # A trunk seen edge-on has no left: any axis across z then does.
-    spare = np.cross(z, np.where(np.abs(z[..., :1]) < 0.9, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])))
-    y = _unit(left, _unit(spare, np.zeros(3)))
+    # Without a left-right direction any axis perpendicular to z serves.
+    across = np.cross(z, np.where(np.abs(z[..., :1]) < 0.9, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])))
+    y = _unit(left, _unit(across, np.zeros(3)))
     return np.stack([np.cross(y, z), y, z], axis=-1)
 
 

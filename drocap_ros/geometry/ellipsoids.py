@@ -6,7 +6,7 @@ import numpy as np
 
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 
-#: Below this a half axis could not be seen.
+#: Least squared half axis: smaller ones are invisible.
 _SMALLEST_M2 = 1e-8
 
 

@@ -27,7 +27,7 @@ def exp_so3(v: np.ndarray) -> np.ndarray:
 
 def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angle (...) in rad of the rotation from ``a`` to ``b``, both (..., 3, 3)."""
-    # Chordal distance |a - b|_F = 2 sqrt(2) sin(angle / 2) keeps its precision near zero; the trace does not.
+    # Chordal distance |a - b|_F = 2 sqrt(2) sin(angle / 2) is precise near zero; the trace is not.
     chord = np.linalg.norm(a - b, axis=(-2, -1)) / (2.0 * np.sqrt(2.0))
     return 2.0 * np.arcsin(np.clip(chord, 0.0, 1.0))
 
@@ -65,7 +65,7 @@ def matrix_from_quaternion(q: np.ndarray) -> np.ndarray:
 def quaternion_from_matrix(r: np.ndarray) -> np.ndarray:
     """Unit quaternions (..., 4), x y z w, of rotation matrices (..., 3, 3); the largest component is positive."""
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    # Row i of 4 q q^T, one row per component; the row of the largest component divides by no small number.
+    # Rows of 4 q q^T, one per component; the row of the largest component avoids a division by a small number.
     rows = np.stack(
         [
             np.stack([1 + xx - yy - zz, r[..., 0, 1] + r[..., 1, 0], r[..., 0, 2] + r[..., 2, 0],
@@ -97,7 +97,7 @@ def slerp(q0: np.ndarray, q1: np.ndarray, s: np.ndarray | float) -> np.ndarray:
     dot = np.sum(q0 * q1, axis=-1, keepdims=True)
     q1 = np.where(dot < 0, -q1, q1)
     s = np.asarray(s, dtype=float)[..., None]
-    # atan2 of the chord keeps its precision for nearly equal quaternions, where arccos does not.
+    # atan2 of the chord is precise for nearly equal quaternions; arccos is not.
     angle = 2.0 * np.arctan2(
         np.linalg.norm(q1 - q0, axis=-1, keepdims=True), np.linalg.norm(q1 + q0, axis=-1, keepdims=True)
     )

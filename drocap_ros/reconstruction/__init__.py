@@ -1,1 +1,1 @@
-"""From 2D tracks to 3D motion: the paper's single-view start, bundle adjustment, and what goes beyond."""
+"""2D tracks to 3D motion: the paper, the default method, the live windows and the placement in the world."""

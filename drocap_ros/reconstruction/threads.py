@@ -10,11 +10,11 @@ from typing import Any
 
 @contextmanager
 def blas_threads(count: int) -> Iterator[None]:
-    """Hold BLAS to ``count`` threads.
+    """Limit BLAS to ``count`` threads.
 
-    The solvers multiply thousands of small matrices: a second thread brings nothing, costs a factor of twenty where
-    another process has the core (measured), and makes the last bits depend on the machine.  Without threadpoolctl
-    the environment's setting (``OMP_NUM_THREADS``) stays.
+    The solvers multiply thousands of small matrices: a second thread gains nothing, costs a factor of twenty while
+    another process uses the core (measured), and makes the last bits depend on the machine.  Without threadpoolctl
+    the environment's setting (``OMP_NUM_THREADS``) applies.
     """
     controller = _controller()
     if controller is None:
@@ -30,7 +30,7 @@ def _controller() -> Any:
         from threadpoolctl import ThreadpoolController
     except ImportError:
         return None
-    # The controller knows the libraries that are loaded by now: scipy brings a BLAS of its own beside numpy's.
+    # The controller covers only loaded libraries: scipy has a BLAS beside numpy's.
     import scipy.linalg  # noqa: F401
 
     return ThreadpoolController()

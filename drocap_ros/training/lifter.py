@@ -1,8 +1,7 @@
 """Training of the temporal lifter (needs PyTorch, the optional extra ``train``).
 
-The network maps 2D joints of a window to 3D joints in each frame's own camera: pairs of frames become
-tokens, dilated convolutions look about 3 s to either side, and a mean over the window tells the body's
-proportions.
+The network maps 2D joints of a window to 3D joints in each frame's own camera: pairs of frames are tokens, dilated
+convolutions span about 3 s to either side, and means over the window carry the body's proportions.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ _BONES = BODY_15.bones
 
 @dataclass(frozen=True)
 class LifterTraining(Parameters):
-    """How the lifter is trained."""
+    """Parameters of the lifter's training."""
 
     minutes: float = param(80.0, "wall-clock time of the training", unit="min", minimum=0.01, maximum=10000.0)
     width: int = param(240, "channels of the network", minimum=8, maximum=2048)
@@ -48,7 +47,13 @@ class LifterTraining(Parameters):
 
 
 def pytorch() -> Any:
-    """PyTorch, or an error that says how to get it."""
+    """PyTorch.
+
+    Raises
+    ------
+    DrocapError
+        When PyTorch is not installed.
+    """
     try:
         import torch
     except ImportError:
@@ -64,7 +69,7 @@ def set_threads(count: int) -> None:
 def describe_training(
     files: list[Path], include: str, options: LifterTraining, facts: dict[str, Any]
 ) -> dict[str, str]:
-    """Metadata of the ONNX file: what was learned from, under which licence, by which command."""
+    """Metadata of the ONNX file: training data, licence and command."""
     arrays = [read_npz(path, ("X",)) for path in files]
     return {
         "origin": "; ".join(sorted({str(a["source"]) for a in arrays if "source" in a})),
@@ -133,8 +138,8 @@ def build_network(width: int) -> torch.nn.Module:
 def lifting_loss(joints: torch.Tensor, log_sigma: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, float]:
     """Loss of a batch and, for the log, the mean joint distance of the twelve limb joints.
 
-    Distance of the joints, of their displacements over one frame and of bone lengths, and the Laplace
-    likelihood of the residuals, which only the uncertainties are fitted to.
+    Distances of the joints, of their displacements over one frame and of bone lengths, and the Laplace likelihood of
+    the residuals, whose gradient reaches the uncertainties only.
     """
     torch = pytorch()
     error = joints - target
@@ -160,7 +165,7 @@ def _rate(progress: float) -> float:
 
 
 def _optimisers(network: torch.nn.Module, options: LifterTraining) -> list[Any]:
-    """AdamW for embedding, head, norms and biases; Muon, which halved the steps in a trial, for the rest."""
+    """AdamW for embedding, head, norms and biases; Muon for the rest (half the steps in a trial)."""
     torch = pytorch()
     matrices: list[Any] = []
     others: list[Any] = []
@@ -180,9 +185,9 @@ def train(
     checkpoint_minutes: float = 5.0,
     initial: dict[str, Any] | None = None,
 ) -> tuple[torch.nn.Module, dict[str, Any]]:
-    """Train on endless virtual views for a given time; returns averaged weights and what was seen.
+    """Train on virtual views for ``options.minutes``; returns averaged weights and the counts of steps and frames.
 
-    ``checkpoint(network, facts)`` is called now and then with the averaged weights.
+    ``checkpoint(network, facts)`` is called every ``checkpoint_minutes`` with the averaged weights.
     """
     torch = pytorch()
     torch.manual_seed(options.seed)
@@ -244,7 +249,7 @@ def write_onnx(
 ) -> None:
     """Write a network as ONNX with weights in half precision (computed in single) and ``facts`` as metadata.
 
-    ``axes`` names the dimensions that may vary, per input and output.
+    ``axes`` names the variable dimensions per input and output.
     """
     torch = pytorch()
     try:
@@ -257,7 +262,7 @@ def write_onnx(
     network = copy.deepcopy(network).eval().float()
     path.parent.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings():
-        # The exporter warns that it will be replaced and that it leaves some slices unfolded.
+        # The exporter warns of its deprecation and of unfolded slices.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             network,

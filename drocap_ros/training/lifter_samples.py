@@ -1,4 +1,4 @@
-"""Endless training samples for the lifter: MoCap, varied, seen by virtual orbiting cameras with imperfect 2D.
+"""Unlimited training samples for the lifter: varied MoCap in virtual orbiting cameras with imperfect 2D joints.
 
 Lengths in metres, angles in rad, times in frames of 24 fps.  Arrays are (B, T, ...): B windows of T frames.
 """
@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.reconstruction.lifted.lifter_input import BONES, LIFTER_FPS, normalise
-from drocap_ros.skeleton import BODY_15, indices
-from drocap_ros.tracks import read_npz
+from drocap_ros.geometry.bones import bone_lengths
+from drocap_ros.mocap import load_mocap
+from drocap_ros.reconstruction.lifted.lifter_input import LIFTER_FPS, normalise
+from drocap_ros.skeleton import BODY_15
 
 _J = {name: i for i, name in enumerate(BODY_15.joints)}
 _UPPER = np.array([_J[j] for j in ("rknee", "lknee", "lelbow", "relbow")])
@@ -26,7 +27,7 @@ _SIDES = ((_J["rhip"], _J["lhip"]), (_J["rknee"], _J["lknee"]), (_J["rankle"], _
 
 @dataclass(frozen=True)
 class MocapBank:
-    """Sequences laid end to end: joints (N, 15, 3) float32 m, z up; where each starts, its length and rate."""
+    """Concatenated sequences: joints (N, 15, 3) float32 m, z up; first frame, length and rate of each."""
 
     joints: np.ndarray
     start: np.ndarray
@@ -40,26 +41,24 @@ def load_bank(paths: list[Path]) -> MocapBank:
     Raises
     ------
     InputError
-        When a file cannot be used or none is given.
+        When a file cannot be used or there is none.
     """
     if not paths:
         raise InputError("MoCap: expected at least one .npz file, found none; check the folder and the pattern")
     parts, rates = [], []
     for path in paths:
-        arrays = read_npz(path, ("X", "joints", "fps"))
-        place = indices([str(j) for j in arrays["joints"]], BODY_15.joints)
-        x = arrays["X"][:, place].astype(np.float32) / 1000
-        if len(x) < 2 or not np.isfinite(x).all():
-            raise InputError(f"{path}: expected at least 2 frames of finite joints; leave the file out")
-        parts.append(x)
-        rates.append(float(arrays["fps"]))
+        x, fps = load_mocap(path)
+        if len(x) < 2:
+            raise InputError(f"{path}: expected at least 2 frames, got {len(x)}; leave the file out")
+        parts.append(x.astype(np.float32) / 1000)
+        rates.append(fps)
     length = np.array([len(p) for p in parts])
     return MocapBank(np.concatenate(parts), np.cumsum(length) - length, length, np.array(rates))
 
 
 @dataclass(frozen=True)
 class Batch:
-    """features (B, T, 73); target (B, T, 15, 3) in the features' units, x and y where the joint would be seen."""
+    """features (B, T, 73); target (B, T, 15, 3) in the features' units, x and y in the image."""
 
     features: np.ndarray
     target: np.ndarray
@@ -67,9 +66,9 @@ class Batch:
 
 def sample_batch(bank: MocapBank, rng: np.random.Generator, windows: int, frames: int) -> Batch:
     """Draw ``windows`` training windows of ``frames`` frames."""
-    # Two cameras look at each body: half the cost of making bodies.
+    # Two cameras per body halve the cost of the bodies.
     body = _vary_body(_draw_motion(bank, rng, (windows + 1) // 2, frames), rng)
-    return _see(np.concatenate([body, body])[:windows], rng)
+    return _project(np.concatenate([body, body])[:windows], rng)
 
 
 def _draw_motion(bank: MocapBank, rng: np.random.Generator, windows: int, frames: int) -> np.ndarray:
@@ -80,7 +79,7 @@ def _draw_motion(bank: MocapBank, rng: np.random.Generator, windows: int, frames
     spare = last - step * (frames - 1)
     begin = rng.uniform(0, np.where(spare > 0, spare, last))
     time = begin[:, None] + step[:, None] * np.arange(frames)
-    # A sequence that is too short is played forth and back; some windows run backwards as a whole.
+    # Short sequences run forth and back; some windows run backwards as a whole.
     time = np.abs((time + last[:, None]) % (2 * last[:, None]) - last[:, None])
     back = rng.random(windows) < 0.2
     time[back] = time[back, ::-1]
@@ -146,7 +145,7 @@ def _vary_body(motion: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         size[:, :, right] = size[:, :, left] * np.exp(0.01 * rng.standard_normal((windows, 1, 1)))
     bone *= size.astype(np.float32)
 
-    # Marker sets differ in where neck, head, shoulders and hips are said to be: shift them in the trunk's frame.
+    # Marker sets differ in the positions of neck, head, shoulders and hips: shift them in the trunk's frame.
     up = bone[:, :, _J["neck"]]
     up = up / np.linalg.norm(up, axis=-1, keepdims=True)
     right = bone[:, :, _J["rhip"]] - bone[:, :, _J["lhip"]]
@@ -173,7 +172,7 @@ def _vary_body(motion: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     pitch = body[:, :, _J["rhip"]] - body[:, :, _J["lhip"]]
     pitch = pitch.mean(axis=1, keepdims=True) + 1e-6
     pitch /= np.linalg.norm(pitch, axis=-1, keepdims=True)
-    # Some lie on a side: the axis that the body tips over about is not the hips'.
+    # Some lie on a side: the axis of the tilt is not that of the hips.
     aside = np.where(rng.random(windows) < 0.4, rng.uniform(-np.pi, np.pi, windows), 0.2 * rng.standard_normal(windows))
     pitch = _turn(pitch, (aside[:, None] * np.array([0.0, 0.0, 1.0])).astype(np.float32)[:, None])
     return _turn(body, (posture[:, :, 0, None] * pitch)[:, :, None])
@@ -182,8 +181,8 @@ def _vary_body(motion: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def _posture(rng: np.random.Generator, windows: int, frames: int) -> np.ndarray:
     """(B, T, 6) float32 rad: pitch of the body (back > 0), flexion of trunk, right and left hip and knees.
 
-    Zero in most windows; in the others the body sits, crouches, kneels, bends or lies down, and may get up
-    again.  Everyday MoCap holds little of that.
+    Zero in most windows; in the others the body sits, crouches, kneels, bends or lies down, and may get up again:
+    postures that everyday MoCap lacks.
     """
     kind = rng.random(windows)
     low = np.array([-0.4, -0.4, -0.2, -0.2, 0.0, 0.0])
@@ -207,9 +206,7 @@ def _posture(rng: np.random.Generator, windows: int, frames: int) -> np.ndarray:
 
 
 def camera_rotation(azimuth: np.ndarray, elevation: np.ndarray, roll: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) world (z up) -> camera (x right, y down, z forward) of a camera that looks at the origin from
-    direction (azimuth, elevation), rolled about its axis.
-    """
+    """(..., 3, 3) world (z up) -> camera (x right, y down, z forward), towards the origin from a direction, rolled."""
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
     zero = np.zeros_like(ca)
     right = np.stack([-sa, ca, zero], axis=-1)
@@ -232,7 +229,7 @@ def _orbit(rng: np.random.Generator, windows: int, frames: int) -> np.ndarray:
     return camera_rotation(azimuth, elevation, 0.04 * wobble[..., 2]).astype(np.float32)
 
 
-def _see(body: np.ndarray, rng: np.random.Generator) -> Batch:
+def _project(body: np.ndarray, rng: np.random.Generator) -> Batch:
     windows, frames = body.shape[:2]
     seen = np.einsum("btij,btpj->btpi", _orbit(rng, windows, frames), body, optimize=True)
 
@@ -243,16 +240,16 @@ def _see(body: np.ndarray, rng: np.random.Generator) -> Batch:
     exact = seen[..., :2] / (1 + inverse[..., None, None] * seen[..., 2:]) * zoom[..., None, None]
     truth = np.concatenate([exact, seen[..., 2:] * zoom[..., None, None]], axis=-1)
 
-    keypoints, confidence = _spoil(exact, rng)
-    features, centre, scale = normalise(keypoints, confidence, _told_lengths(truth, rng))
+    keypoints, confidence = _detect(exact, rng)
+    features, centre, scale = normalise(keypoints, confidence, _estimated_lengths(truth, rng))
     truth[..., :2] -= centre[:, :, None]
     truth /= scale[:, None, None, None]
     return Batch(features, truth.astype(np.float32))
 
 
-def _told_lengths(truth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _estimated_lengths(truth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """(B, 14) bone lengths with the errors of an estimate; unknown (NaN) in two windows of five."""
-    length = np.median(np.linalg.norm(truth[:, :, BONES[:, 1]] - truth[:, :, BONES[:, 0]], axis=-1), axis=1)
+    length = np.median(bone_lengths(truth), axis=1)
     error = np.abs(0.025 * rng.standard_normal((len(length), 1))) * rng.standard_normal(length.shape)
     return np.where(rng.random((len(length), 1)) < 0.4, np.nan, length * np.exp(error))
 
@@ -267,8 +264,8 @@ def _runs(rng: np.random.Generator, shape: tuple[int, ...], frames: int, share: 
     return chosen & (time >= begin) & (time < begin + length)
 
 
-def _spoil(exact: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """What a detector makes of exact 2D joints (B, T, 15, 2) m: keypoints with NaN, and confidences."""
+def _detect(exact: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A detector's output for exact 2D joints (B, T, 15, 2) m: keypoints with NaN, and confidences."""
     windows, frames, joints, _ = exact.shape
 
     def share(probability: float, most: float) -> np.ndarray:
@@ -295,8 +292,8 @@ def _spoil(exact: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.
     missing |= _runs(rng, (windows, 1), frames, share(0.2, 0.7), 16)
     keypoints[missing] = np.nan
 
-    # Confidences tell something in a third of the windows; otherwise every visible joint counts the same.
+    # Confidences are informative in a third of the windows; otherwise every seen joint has the same.
     error = np.sqrt(np.square(keypoints - exact).sum(axis=-1))
-    told = np.exp(-error / 0.1) * rng.uniform(0.6, 1, error.shape)
-    confidence = np.where(rng.random((windows, 1, 1)) < 0.33, told, 1.0)
+    informative = np.exp(-error / 0.1) * rng.uniform(0.6, 1, error.shape)
+    confidence = np.where(rng.random((windows, 1, 1)) < 0.33, informative, 1.0)
     return keypoints, confidence.astype(np.float32)

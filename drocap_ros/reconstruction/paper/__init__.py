@@ -1,1 +1,1 @@
-"""The paper, found by its equations: single-view initialization, equations (2) to (4), and the baseline MF+NNM."""
+"""The paper by its equations: single-view initializer, equations (2) to (4), and the baseline MF+NNM."""

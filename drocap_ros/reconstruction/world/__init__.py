@@ -1,1 +1,1 @@
-"""From the camera to the world: metric scale and placement by telemetry."""
+"""Camera to world: metric scale and placement by telemetry."""

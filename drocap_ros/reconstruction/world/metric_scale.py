@@ -1,8 +1,7 @@
-"""True scale from the camera's own motion: a foot on the ground stays where it is while the drone moves.
+"""Metric scale from the camera's own motion: a foot on the ground is still while the drone moves.
 
-Without a known length a monocular reconstruction is right up to a factor.  The camera's position is metric, so the
-factor is the one that keeps the feet still for as long as possible; only motion across the line of sight counts,
-which pixels measure well, not that along it.
+A monocular reconstruction lacks a factor.  The camera's position is metric; the factor that keeps the feet still
+longest is the scale.  Only motion across the line of sight counts: pixels measure it well, unlike that along it.
 """
 
 from __future__ import annotations
@@ -11,22 +10,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Times over which a foot is compared with itself.
+#: Time lags between two positions of a foot.
 LAGS_S = (0.15, 0.25, 0.4)
 
-#: Distance within which a foot counts as having stayed, m.
+#: Distance within which a foot counts as still, m.
 STILL_M = 0.03
 
-#: Factors that are tried; people are not outside of it if the assumed height is that of a person.
+#: Range of the factors; the assumed height of a person keeps people within it.
 LOWEST, HIGHEST = 0.6, 1.6
 
-#: Pairs of frames that are looked at, spread over the recording.
+#: Most pairs of frames, spread over the recording.
 MOST_PAIRS = 4000
 
 
 @dataclass(frozen=True)
 class ScaleEstimate:
-    """Factor on the assumed scale, its relative standard deviation, and the share of feet that it keeps still."""
+    """Factor on the assumed scale, its relative standard deviation, and the share of still feet."""
 
     factor: float
     std: float
@@ -34,12 +33,12 @@ class ScaleEstimate:
 
     @property
     def trusted(self) -> bool:
-        """Whether the motion of camera and feet fixes the scale: to 3 %, by a fifth of the pairs, off the limits."""
+        """Whether camera and feet determine the scale: to 3 %, by a fifth of the pairs, within the range."""
         return self.std < 0.03 and self.support > 0.2 and LOWEST * 1.02 < self.factor < HIGHEST / 1.02
 
 
 def estimate_scale(feet: np.ndarray, camera_position: np.ndarray, stamp_ns: np.ndarray) -> ScaleEstimate | None:
-    """Scale that keeps feet still.
+    """Scale at which the feet are still.
 
     Parameters
     ----------
@@ -49,10 +48,10 @@ def estimate_scale(feet: np.ndarray, camera_position: np.ndarray, stamp_ns: np.n
 
     Returns
     -------
-    ScaleEstimate, or None when the camera hardly moves or there are too few frames
+    ScaleEstimate, or None when the camera moves too little or there are too few frames
     """
     gap, base = _pairs(feet, camera_position, stamp_ns)
-    # The camera has to move by more than a foot's uncertainty for its motion to say anything.
+    # Camera motion below a foot's uncertainty carries no information.
     moved = np.linalg.norm(base, axis=1) > 5.0 * STILL_M
     gap, base = gap[moved], base[moved]
     if len(gap) < 50:
@@ -69,7 +68,7 @@ def estimate_scale(feet: np.ndarray, camera_position: np.ndarray, stamp_ns: np.n
             return None
         factor = float(np.clip(-np.sum(weight * b) / np.sum(weight * a), LOWEST, HIGHEST))
     support = float(weight.mean())
-    # Neighbouring pairs share their frames: as many independent ones as there are lags apart in time.
+    # Neighbouring pairs share their frames: a tenth of them is independent.
     independent = max(support * len(gap) / 10.0, 1.0)
     spread = np.sqrt(np.sum(weight * (a * factor**2 + 2.0 * b * factor + c)) / weight.sum() / 2.0)
     lever = np.sqrt(np.sum(weight * a) / weight.sum())
@@ -83,7 +82,7 @@ def _pairs(feet: np.ndarray, camera: np.ndarray, stamp_ns: np.ndarray) -> tuple[
     for lag_s in LAGS_S:
         later = np.searchsorted(stamp_ns, stamp_ns + round(lag_s * 1e9))
         first = np.flatnonzero(later < len(stamp_ns))
-        # A gap in the recording is no lag.
+        # Pairs across a gap of the recording are left out.
         first = first[(stamp_ns[later[first]] - stamp_ns[first]) < 1.5e9 * lag_s]
         stride = max(1, len(first) * feet.shape[1] * len(LAGS_S) // MOST_PAIRS)
         first = first[::stride]

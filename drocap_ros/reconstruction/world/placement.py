@@ -1,4 +1,4 @@
-"""Scale and place of the reconstructed body: from px to metres, from the camera to the world."""
+"""Scale and placement of the reconstructed body: px to metres, camera to world."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drocap_ros.reconstruction.world.metric_scale import ScaleEstimate, estimate
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
 
-#: Time over which the person's image size is averaged: a drone changes its range slowly.
+#: Standard deviation of the average of the person's image size: a drone changes its range slowly.
 SIZE_SMOOTHING_S = 1.0
 
 
@@ -22,19 +22,19 @@ def metres_per_px(joints_px: np.ndarray, stamp_ns: np.ndarray, height_m: float) 
 
 
 def smooth_over_time(values: np.ndarray, stamp_ns: np.ndarray, std_s: float) -> np.ndarray:
-    """Gaussian average (F, ...) over a standard deviation in time; shorter than a sample changes nothing."""
+    """Gaussian average (F, ...) with a standard deviation in time."""
     from scipy.ndimage import gaussian_filter1d
 
     if len(values) < 2:
         return values
     step_s = float(np.median(np.diff(stamp_ns))) * 1e-9
-    # Stamps of nonsense (a counter for nanoseconds) must not make a kernel of a thousand million taps.
+    # The bound keeps invalid stamps (a counter for nanoseconds) from a kernel of 10^9 taps.
     return gaussian_filter1d(values, min(std_s / step_s, len(values), 1000.0), axis=0, mode="nearest", truncate=3.0)
 
 
 @dataclass(frozen=True)
 class WorldPoses:
-    """Poses (F, 15, 3) m in the world, whether their scale was measured (how: ``scale_source``), and the estimate."""
+    """Poses (F, 15, 3) m in the world, whether and from what their scale was measured, and the estimate."""
 
     joints: np.ndarray
     metric: bool
@@ -43,12 +43,12 @@ class WorldPoses:
 
 
 def place_in_world(joints: np.ndarray, projected_px: np.ndarray, per_px: np.ndarray, tracks: Tracks) -> WorldPoses:
-    """Poses (F, 15, 3) m in camera axes, pelvis at the origin, turned and moved to the world (ENU, z up).
+    """Poses (F, 15, 3) m in camera axes, pelvis at the origin, rotated and translated to the world (ENU, z up).
 
-    The pelvis lies at the weak-perspective range, focal length times metres per px, and every joint on the ray of
-    its own pixel (F, 15, 2), before or behind the pelvis as in the pose: this undoes the perspective that the
-    scaled orthographic model leaves out.  Without the camera's position and matrix the pelvis stays at the origin.
-    A camera that moves enough measures the scale.
+    The pelvis lies at the weak-perspective range, focal length times metres per px; every joint lies on the ray of
+    its pixel (F, 15, 2) at the pose's depth.  This adds the perspective that the scaled orthographic model lacks.
+    Without the camera's position and matrix the pelvis stays at the origin.  Sufficient camera motion measures the
+    scale.
     """
     to_world = tracks.camera_rotation
     assert to_world is not None
@@ -59,7 +59,7 @@ def place_in_world(joints: np.ndarray, projected_px: np.ndarray, per_px: np.ndar
     ray = np.concatenate(
         [(projected_px - k[:2, 2]) / np.diagonal(k)[:2], np.ones((*projected_px.shape[:2], 1))], axis=-1
     )
-    # A joint nearer than a tenth of the range is an error of the pose, not of the place.
+    # A joint nearer than a tenth of the range is an error of the pose.
     depth = np.maximum(range_m[:, None] + joints[..., 2], 0.1 * range_m[:, None])
     from_camera = (ray * depth[..., None]) @ to_world
     feet = from_camera[:, [BODY_15.index("lankle"), BODY_15.index("rankle")]]
