@@ -144,7 +144,7 @@ def test_topic_of_an_unknown_type_is_listed_and_readable(tmp_path, messages, cap
         assert session.warnings == []
 
 
-def test_several_topics_the_named_one_counts(tmp_path, messages, capture):
+def test_topic_with_most_messages_is_read(tmp_path, messages, capture):
     tracks = capture.tracks
     entries = [("/a/pose2d", messages.pose2d(tracks, i, START_NS + i), START_NS + i) for i in range(3)]
     entries += [("/b/pose2d", messages.pose2d(tracks, i, START_NS + i), START_NS + i) for i in range(5)]

@@ -139,17 +139,16 @@ def _is_whole(stream: McapStream, count: int) -> bool:
 
 def _replace(stream: McapStream, beside: Path, count: int, damage: tuple[Damage, ...]) -> RecoveredFile:
     path = stream.path
+    has_header = path.stat().st_size >= len(MAGIC)
     try:
-        if count:
+        if has_header:
             _copy(stream, beside)
         else:
-            McapFile(beside, profile=stream.profile).finish(sync=True)
+            McapFile(beside).finish(sync=True)
         copy = McapStream(beside)
-        pairs = itertools.zip_longest(stream.messages() if count else (), copy.messages())
-        if not all(ours == theirs for ours, theirs in pairs) or copy.damage or not _is_whole(copy, count):
-            raise InputError(
-                f"{path}: expected the same {count} messages in the repaired copy; the session is unchanged"
-            )
+        pairs = itertools.zip_longest(stream.messages() if has_header else (), copy.messages())
+        if not all(old == new for old, new in pairs) or copy.damage or not _is_whole(copy, count):
+            raise InputError(f"{path}: expected {count} equal messages in the repaired copy; the session is unchanged")
         kept = None
         if any(d.keeps_data for d in damage):
             kept = path.with_name(path.name + ".damaged")

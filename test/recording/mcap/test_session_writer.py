@@ -1,14 +1,11 @@
 import os
-import signal
-import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from killed_recording import killed_session
 from recorded import NAMES, START_NS, write_poses
 
 from drocap_ros.errors import InputError
@@ -58,7 +55,7 @@ def test_read_by_mcap_rosbags_and_mcap_ros2(pose_session, capture, messages):
     )
 
 
-def test_metadata_file_is_there_from_the_start_and_complete_at_the_end(tmp_path, messages, capture):
+def test_metadata_file_exists_from_the_start_and_is_complete_at_the_end(tmp_path, messages, capture):
     folder = tmp_path / "deep" / "session"
     writer = SessionWriter(folder, metadata={"vehicle": "test"})
     early = yaml.safe_load((folder / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
@@ -93,7 +90,7 @@ def test_empty_session_is_whole(tmp_path):
             read_pose2d(session)
 
 
-def test_folder_with_something_in_it_is_refused(tmp_path):
+def test_non_empty_folder_is_refused(tmp_path):
     (tmp_path / "s").mkdir()
     (tmp_path / "s" / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="new or empty folder"):
@@ -105,7 +102,7 @@ def test_folder_with_something_in_it_is_refused(tmp_path):
     assert (tmp_path / "s" / "notes.txt").read_text() == "mine"
 
 
-def test_full_disk_is_refused_at_the_door(tmp_path):
+def test_full_disk_is_refused_before_recording(tmp_path):
     with pytest.raises(InputError, match="MiB free on the disk"):
         SessionWriter(tmp_path / "s", SessionRecorderConfig(free_mib=1_000_000))
 
@@ -154,50 +151,20 @@ def test_messages_reach_the_disk_within_the_chunk_time(tmp_path, messages, captu
     writer.close()
 
 
-_CHILD = """
-import sys, time
-sys.path[:0] = [{tests!r}]
-from recorded import *
-from drocap_ros.simulation.capture import simulate_capture
-from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
-messages, tracks = Messages(), simulate_capture(1, 30, seed=1).tracks
-writer = SessionWriter({folder!r}, SessionRecorderConfig(chunk_s=0.1))
-writer.register("/pose2d", NAMES["pose2d"], schema_text(NAMES["pose2d"]))
-writer.register("/image", NAMES["compressed"], schema_text(NAMES["compressed"]), image=True)
-noise = np.random.default_rng(0).integers(0, 255, 100_000, dtype=np.uint8)
-blob = messages.cdr(messages(NAMES["compressed"], data=noise))
-i = 0
-while True:
-    now = time.time_ns()
-    writer.write("/pose2d", messages.cdr(messages.pose2d(tracks, i % 30, now)), now)
-    writer.write("/image", blob, now)
-    i += 1
-    if i == 1:
-        print("going", flush=True)
-    time.sleep(0.005)
-"""
-
-
-def test_killed_in_mid_write_leaves_all_but_the_last_moment(tmp_path):
-    for attempt, delay in enumerate((0.35, 0.52, 0.78)):
+def test_killed_writer_loses_only_the_last_chunk(tmp_path):
+    for attempt, delay_s in enumerate((0.35, 0.52, 0.78)):
         folder = tmp_path / f"killed{attempt}"
-        code = _CHILD.format(tests=str(Path(__file__).parents[2] / "helpers"), folder=str(folder))
-        process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
-        process.stdout.readline()
-        time.sleep(delay)
-        process.send_signal(signal.SIGKILL)
-        killed_ns = time.time_ns()
-        process.wait()
-        process.stdout.close()
+        begun_ns, killed_ns = killed_session(folder, delay_s, chunk_s=0.1)
         with open_session(folder) as session:
-            tracks = read_pose2d(session)
-            assert any("whole" in w or "summary" in w for w in session.warnings)
-        assert (killed_ns - tracks.stamp_ns[-1]) * 1e-9 < 0.35
-        assert tracks.stamp_ns[-1] - tracks.stamp_ns[0] > 0
+            log_ns = [raw.log_time_ns for raw in session.raw_messages()]
+            assert session.info.warnings
+        assert killed_ns - log_ns[-1] < 0.35e9
+        assert log_ns[-1] > log_ns[0]
+        assert log_ns[0] <= begun_ns
         assert not list(folder.glob("*.tmp"))
 
 
-def test_disk_full_in_mid_flight(tmp_path, messages, capture, monkeypatch):
+def test_disk_full_while_recording_keeps_earlier_messages(tmp_path, messages, capture, monkeypatch):
     data = messages.cdr(messages.pose2d(capture.tracks, 0, START_NS))
     writer = SessionWriter(tmp_path / "s", SessionRecorderConfig(chunk_s=0.05))
     writer.register("/a", POSE2D, schema_text(POSE2D))
@@ -226,17 +193,17 @@ def test_disk_full_in_mid_flight(tmp_path, messages, capture, monkeypatch):
         assert [raw.log_time_ns for raw in session.raw_messages()] == [START_NS + i for i in range(20)]
 
 
-def test_a_real_disk_that_fills_up(small_disk, messages, capture):
+def test_real_full_disk_keeps_or_counts_every_message(small_disk, messages, capture):
     folder = small_disk / "s"
     writer = SessionWriter(folder, SessionRecorderConfig(chunk_s=0.05, free_mib=0, compression="none"))
     writer.register("/a", POSE2D, schema_text(POSE2D))
     writer.register("/image", NAMES["compressed"], schema_text(NAMES["compressed"]), image=True)
     pose = messages.cdr(messages.pose2d(capture.tracks, 0, START_NS))
-    picture = messages.cdr(messages(NAMES["compressed"], data=np.zeros(100_000, np.uint8)))
+    image_cdr = messages.cdr(messages(NAMES["compressed"], data=np.zeros(100_000, np.uint8)))
     sent = 0
     while writer.error is None and sent < 1000:
         writer.write("/a", pose, START_NS + sent)
-        writer.write("/image", picture, START_NS + sent)
+        writer.write("/image", image_cdr, START_NS + sent)
         sent += 1
         time.sleep(0.005)
     writer.close()
@@ -248,7 +215,7 @@ def test_a_real_disk_that_fills_up(small_disk, messages, capture):
     assert [raw.log_time_ns for raw in there if raw.topic == "/a"] == [START_NS + i for i in range(len(there) // 2)]
 
 
-def test_little_space_left_ends_the_session_while_it_can_be_finished(small_disk, messages, capture):
+def test_low_disk_space_finishes_the_session_early(small_disk, messages, capture):
     from mcap.reader import make_reader
 
     folder = small_disk / "s"
@@ -271,19 +238,19 @@ def test_little_space_left_ends_the_session_while_it_can_be_finished(small_disk,
 
 
 @pytest.mark.parametrize("by", [{"split_s": 1.0}, {"split_mib": 1}])
-def test_split_files_stand_by_themselves(tmp_path, messages, capture, by):
+def test_split_files_are_independent(tmp_path, messages, capture, by):
     from mcap.reader import make_reader
     from rosbags.highlevel import AnyReader
 
     folder = tmp_path / "s"
     config = SessionRecorderConfig(compression="none", chunk_kib=64, **by)
-    picture = messages.cdr(messages(NAMES["compressed"], data=np.zeros(30_000, np.uint8)))
+    image_cdr = messages.cdr(messages(NAMES["compressed"], data=np.zeros(30_000, np.uint8)))
     with SessionWriter(folder, config, {"git_revision": "abc"}) as writer:
         writer.register("/pose2d", POSE2D, schema_text(POSE2D))
         writer.register("/image", NAMES["compressed"], schema_text(NAMES["compressed"]), image=True)
         for i, stamp_ns in enumerate(capture.tracks.stamp_ns.tolist()):
             writer.write("/pose2d", messages.cdr(messages.pose2d(capture.tracks, i, stamp_ns)), stamp_ns)
-            writer.write("/image", picture, stamp_ns)
+            writer.write("/image", image_cdr, stamp_ns)
     files = sorted(folder.glob("*.mcap"))
     assert [p.name for p in files] == [f"s_{i}.mcap" for i in range(4)]
     for path in files:
@@ -301,7 +268,7 @@ def test_split_files_stand_by_themselves(tmp_path, messages, capture, by):
     assert sequences == capture.tracks.stamp_ns.tolist()
 
 
-def test_committed_file_never_ends_in_half_a_piece(tmp_path, monkeypatch):
+def test_committed_file_ends_at_a_commit_after_an_error(tmp_path, monkeypatch):
     file = CommittedFile(tmp_path / "f")
     file.write(b"whole")
     file.commit()
@@ -319,7 +286,7 @@ def test_committed_file_never_ends_in_half_a_piece(tmp_path, monkeypatch):
         CommittedFile(tmp_path / "f")
 
 
-def test_slow_disk_drops_pictures_not_poses(tmp_path, messages, capture, monkeypatch):
+def test_slow_disk_drops_images_not_poses(tmp_path, messages, capture, monkeypatch):
     real = os.write
 
     def slow(fd, view):
@@ -327,14 +294,14 @@ def test_slow_disk_drops_pictures_not_poses(tmp_path, messages, capture, monkeyp
         return real(fd, view)
 
     monkeypatch.setattr(os, "write", slow)
-    picture = messages.cdr(messages(NAMES["compressed"], data=np.zeros(200_000, np.uint8)))
+    image_cdr = messages.cdr(messages(NAMES["compressed"], data=np.zeros(200_000, np.uint8)))
     pose = messages.cdr(messages.pose2d(capture.tracks, 0, START_NS))
     config = SessionRecorderConfig(queue_mib=1, chunk_kib=16, compression="none", sync=False)
     with SessionWriter(tmp_path / "s", config) as writer:
         writer.register("/image", NAMES["compressed"], schema_text(NAMES["compressed"]), image=True)
         writer.register("/pose2d", POSE2D, schema_text(POSE2D))
         for i in range(60):
-            writer.write("/image", picture, START_NS + i)
+            writer.write("/image", image_cdr, START_NS + i)
             writer.write("/pose2d", pose, START_NS + i)
     assert writer.dropped_by_topic.keys() == {"/image"}
     with open_session(tmp_path / "s") as session:
