@@ -30,6 +30,7 @@ from drocap_ros.config import DrocapConfig  # noqa: E402
 from drocap_ros.errors import NodeError  # noqa: E402
 from drocap_ros.flight.frames import camera_rotation  # noqa: E402
 from drocap_ros.flight.mavlink.transport import open_transport  # noqa: E402
+from drocap_ros.flight.orbit.conditions import ConditionCode  # noqa: E402
 from drocap_ros.flight.orbit.states import Command, State  # noqa: E402
 from drocap_ros.observation import PoseObservation  # noqa: E402
 from drocap_ros.simulation.closed_loop.fault_causes import TIMEOUT  # noqa: E402
@@ -126,64 +127,65 @@ class Drone:
 
 
 class Scene:
-    """All that flies: processes by their ids, what the bridge says, the operator's hand."""
+    """The flight under test: processes by their ids, statuses of the bridge, commands of the operator."""
 
     def __init__(self, graph: Any, drone: Drone, perception: subprocess.Popen[bytes], config: DrocapConfig) -> None:
-        from drocap_ros.msg import OrbitCommand, OrbitStatus
+        from drocap_ros.msg import OrbitStatus
         from drocap_ros.ros.topics import TOPICS
+        from drocap_ros.srv import OrbitCommand
 
         self.graph, self.drone, self.perception, self.config = graph, drone, perception, config
         self.bridge = graph.pid("mavlink_bridge")
-        self.said: list[Any] = []
-        self.mark = 0  # how much it had said before the fault
+        self.statuses: list[Any] = []
+        self.mark = 0  # number of statuses before the fault
         node = graph.node
-        node.create_subscription(OrbitStatus, "orbit/status", self.said.append, TOPICS["orbit/status"].qos)
-        self._commands = node.create_publisher(OrbitCommand, "orbit/command", TOPICS["orbit/command"].qos)
+        node.create_subscription(OrbitStatus, "orbit/status", self.statuses.append, TOPICS["orbit/status"].qos)
+        self._commands = node.create_client(OrbitCommand, "orbit/command")
 
     def listen(self, seconds: float) -> None:
-        """Let time pass, whatever becomes of the nodes."""
+        """Let time pass, also after the end of nodes."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             self.graph._executor.spin_once(timeout_sec=0.02)
 
     def wait(self, state: State, timeout_s: float = 40.0) -> None:
-        """Listen until the bridge says this state."""
+        """Wait for this state of the bridge."""
         end = time.monotonic() + timeout_s
-        while not (self.said and self.said[-1].state == int(state)):
+        while not (self.statuses and self.statuses[-1].state == int(state)):
             if time.monotonic() > end:
-                raise AssertionError(f"no {state.name} in {timeout_s:g} s: {[m.reason for m in self.said[-9:]]}")
+                raise AssertionError(f"no {state.name} in {timeout_s:g} s: {[m.reason for m in self.statuses[-9:]]}")
             self.listen(0.05)
 
     def command(self, kind: Command) -> None:
         """The operator's command."""
-        from drocap_ros.msg import OrbitCommand
+        from drocap_ros.srv import OrbitCommand
 
         nan = float("nan")
-        message = OrbitCommand(command=int(kind), radius_m=nan, height_m=nan, angular_speed_deg_s=nan)
-        self._commands.publish(message)
+        request = OrbitCommand.Request(command=int(kind), radius_m=nan, height_m=nan, angular_speed_deg_s=nan)
+        self._commands.call_async(request)
 
     def orbit(self, seconds: float) -> None:
         """Start the orbit and fly it for a while."""
         self.wait(State.READY)
-        while not self._commands.get_subscription_count():  # discovery: what is said earlier is lost
+        while not self._commands.service_is_ready():  # discovery: an earlier request is lost
             self.listen(0.05)
         control = self.drone.copter.mode == CONTROL[self.drone.autopilot]
-        for _ in range(5):  # an operator who is refused asks again
+        for _ in range(5):  # a refused command is repeated
             self.command(Command.START if control else Command.ENGAGE)
             with contextlib.suppress(AssertionError):
                 self.wait(State.ORBITING, 4.0)
                 break
         self.wait(State.ORBITING, 1.0)
         self.listen(seconds)
-        if self.said[-1].state != int(State.ORBITING):
-            raise AssertionError(f"not orbiting before the fault: {self.said[-1].reason}")
+        if self.statuses[-1].state != int(State.ORBITING):
+            raise AssertionError(f"not orbiting before the fault: {self.statuses[-1].reason}")
 
     @contextlib.contextmanager
     def new_bridge(self) -> Iterator[None]:
         """Another bridge process in the place of the dead one."""
         from drocap_ros.bringup import bringup
 
-        self.said.clear()
+        self.statuses.clear()
         self.mark = 0
         with bringup(self.config, ["mavlink_bridge"], processes=True, domain_id=self.graph.domain_id):
             yield
@@ -221,14 +223,18 @@ def _ended_by_us() -> Iterator[None]:
 
 
 class Outcome(NamedTuple):
-    """What a fault of a process did; see ``simulation.flight_faults.FaultResult``."""
+    """Effect of a fault of a process; see ``simulation.closed_loop.fault_flight.FaultResult``.
+
+    ended : state and condition of the last status; None = no status after the fault
+    """
 
     motion_s: float
     excursion_m: float
     speed_m_s: float
     accepted_later: int  # setpoints taken from `quiet_s` after the fault on
     mode: str
-    said: str
+    ended: tuple[State, ConditionCode] | None
+    reason: str
 
 
 def watch(flying: Scene, observable_s: float, quiet_s: float, begin_s: float) -> Outcome:
@@ -238,12 +244,12 @@ def watch(flying: Scene, observable_s: float, quiet_s: float, begin_s: float) ->
     place = rows[0][1]
     ahead = next(row for row in rows if row[0] >= rows[0][0] + 0.05)
     late = [row[2] for row in rows if row[0] >= begin_s + quiet_s]
-    new = flying.said[flying.mark :]
-    said = f"{State(new[-1].state).name}: {new[-1].reason}" if new else "nothing"
+    new = flying.statuses[flying.mark :]
+    ended = (State(new[-1].state), ConditionCode(new[-1].condition)) if new else None
     return Outcome(
         drone.copter.motion_until_s - rows[0][0], max(float(np.linalg.norm((r[1] - place)[:2])) for r in rows),
         float(np.linalg.norm((ahead[1] - place)[:2])) / (ahead[0] - rows[0][0]), late[-1] - late[0] if late else 0,
-        drone.copter.mode, said,
+        drone.copter.mode, ended, f"{ended[0].name}: {new[-1].reason}" if ended else "no status",
     )  # fmt: skip
 
 
@@ -276,7 +282,7 @@ def _kill_perception(flying: Scene) -> None:
 
 
 def _stop_perception(flying: Scene) -> None:
-    """It comes back with three seconds of old pictures in its queue."""
+    """It resumes with three seconds of old images in its queue."""
     flying.perception.send_signal(signal.SIGSTOP)
     flying.listen(3.0)
     flying.perception.send_signal(signal.SIGCONT)
@@ -291,27 +297,29 @@ def _stop_camera(flying: Scene) -> None:
 class Case(NamedTuple):
     """A fault of a process.
 
-    says : words of which the bridge must say one at the end
-    quiet_s : from when on no setpoint may be taken at all; infinite = the hold streams
+    ends : the last status must show one of these states or conditions; empty = any
+    quiet_s : time after which no setpoint may be accepted at all; infinite = the hold streams
     """
 
     name: str
     make: Callable[[Scene], None]
     observable_s: float
     timeout: bool
-    says: tuple[str, ...]
+    ends: frozenset[State | ConditionCode]
     quiet_s: float = float("inf")
 
 
-_STOOD = ("stood still", "another hand")
+_ANY: frozenset[State | ConditionCode] = frozenset()
+_STOOD = frozenset({ConditionCode.CONTROL_LOOP_STALLED, ConditionCode.PILOT_TOOK_OVER})
+_LOST = frozenset({ConditionCode.SUBJECT_OUTDATED, ConditionCode.NO_SUBJECT})
 CASES = (
-    Case("bridge killed (SIGKILL)", _kill_bridge, LINK_S, True, (), 0.2),
+    Case("bridge killed (SIGKILL)", _kill_bridge, LINK_S, True, _ANY, 0.2),
     Case("bridge stopped for 3 s (SIGSTOP)", _stop_bridge, LINK_S, True, _STOOD),
-    Case("bridge ended (SIGINT)", _end_bridge, LINK_S, False, ()),
-    Case("bridge killed and started again", _restart_bridge, LINK_S, True, ("READY", "IDLE"), 0.2),
-    Case("perception killed (SIGKILL)", _kill_perception, FRAME_S, False, ("last located", "no subject")),
-    Case("perception stopped for 3 s (SIGSTOP)", _stop_perception, FRAME_S, False, ("last located", "no subject")),
-    Case("camera sends nothing", _stop_camera, FRAME_S, False, ("last located", "no subject")),
+    Case("bridge ended (SIGINT)", _end_bridge, LINK_S, False, _ANY),
+    Case("bridge killed and started again", _restart_bridge, LINK_S, True, frozenset({State.READY, State.IDLE}), 0.2),
+    Case("perception killed (SIGKILL)", _kill_perception, FRAME_S, False, _LOST),
+    Case("perception stopped for 3 s (SIGSTOP)", _stop_perception, FRAME_S, False, _LOST),
+    Case("camera sends nothing", _stop_camera, FRAME_S, False, _LOST),
 )
 
 
@@ -319,13 +327,13 @@ def fly(case: Case, autopilot: str, seed: int = 1) -> Outcome:
     """Orbit, make the fault, measure."""
     with scene(autopilot, seed) as flying:
         flying.orbit(ORBIT_S)
-        begin_s, flying.mark = flying.drone.t, len(flying.said)
+        begin_s, flying.mark = flying.drone.t, len(flying.statuses)
         case.make(flying)
         return watch(flying, case.observable_s, case.quiet_s, begin_s)
 
 
 def bounds(case: Case, autopilot: str, speed_m_s: float) -> Bounds:
-    """What must hold, stated before the flight."""
+    """Bounds of the case, stated before the flight."""
     if not case.timeout:
         return Bounds()
     motion_s, excursion_m = TIMEOUT.bounds(LoopSettings(autopilot=autopilot), speed_m_s)
@@ -333,7 +341,7 @@ def bounds(case: Case, autopilot: str, speed_m_s: float) -> Bounds:
 
 
 def failures(case: Case, autopilot: str, outcome: Outcome) -> list[str]:
-    """What does not hold, in words."""
+    """Violated bounds, as sentences."""
     limits, found = bounds(case, autopilot, outcome.speed_m_s), []
     if outcome.motion_s > limits.motion_s:
         found.append(f"motion for {outcome.motion_s:.2f} s, bound {limits.motion_s:.2f} s")
@@ -341,8 +349,9 @@ def failures(case: Case, autopilot: str, outcome: Outcome) -> list[str]:
         found.append(f"excursion of {outcome.excursion_m:.2f} m, bound {limits.excursion_m:.2f} m")
     if outcome.accepted_later:
         found.append(f"{outcome.accepted_later} setpoints after the end")
-    if case.says and not any(word in outcome.said for word in case.says):
-        found.append(f"said {outcome.said}")
+    # By type too: states and conditions are both numbers.
+    if case.ends and not any(type(a) is type(b) and a == b for a in case.ends for b in outcome.ended or ()):
+        found.append(f"ended with {outcome.reason}")
     return found
 
 
@@ -361,7 +370,7 @@ def main() -> int:
             print(
                 f"{'-' if found else '+' if kept else 'c'} {autopilot:9} {case.name:38} {outcome.motion_s:7.2f} "
                 f"{outcome.excursion_m:6.2f} {limits.motion_s:6.2f} {limits.excursion_m:6.2f} {outcome.speed_m_s:5.2f} "
-                f"{outcome.mode:8} {note}{outcome.said}",
+                f"{outcome.mode:8} {note}{outcome.reason}",
                 flush=True,
             )
     print(f"{2 * len(CASES)} cases with real processes, in real time: {bad} not kept")

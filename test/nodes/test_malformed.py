@@ -8,18 +8,21 @@ from array import array
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CompressedImage, RegionOfInterest
 
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
-from drocap_ros.msg import OrbitCommand, Pose2D, Pose3D, VehicleState
+from drocap_ros.flight.orbit.conditions import ConditionCode
+from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, VehicleState
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.ros.conversions import camera_info_to_ros, header_at, stamp_to_ros
 from drocap_ros.ros.diagnostics import Key, of
 from drocap_ros.ros.topics import RESULT_QOS, TOPICS
 from drocap_ros.simulation.vehicle.ports import free_udp_port
+from drocap_ros.srv import OrbitCommand
 
 NODES = [
     "image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "visualizer",
@@ -38,7 +41,7 @@ class Bench:
         self.now_ns = time.time_ns()
         self.values, self.heard = {}, {}
         graph.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_report, RESULT_QOS)
-        for topic in {entry[3] for entry in INPUTS.values()} - {None}:
+        for topic in {"orbit/status", *(entry[3] for entry in INPUTS.values())} - {None}:
             self.heard[topic] = []
             graph.node.create_subscription(TOPICS[topic].message, topic, self.heard[topic].append, TOPICS[topic].qos)
         self.publishers = {CAMERA: graph.node.create_publisher(CompressedImage, CAMERA, qos_profile_sensor_data)}
@@ -71,7 +74,7 @@ def bench(shared, tmp_path_factory):
     session = tmp_path_factory.mktemp("malformed") / "session"
     config = DrocapConfig().replace("image_ingest", source=f"topic:{CAMERA}", horizontal_fov_deg=60.0)
     config = config.replace("pose_estimator", models_dir=str(shared / "models"), confirm_frames=1)
-    config = config.replace("mavlink_bridge", url=f"udpin:127.0.0.1:{free_udp_port()}")
+    config = config.replace("mavlink_bridge", url=f"udpin:127.0.0.1:{free_udp_port()}", commands_enabled=True)
     config = config.replace("session_recorder", session_dir=str(session))
     picture = (shared / "media" / "skier.jpg").read_bytes()
     with bringup(config, NODES, processes=True) as graph:
@@ -124,10 +127,6 @@ def good_info(b):
 
 def good_roi(_):
     return RegionOfInterest(x_offset=100, y_offset=50, width=300, height=400)
-
-
-def good_command(_):
-    return OrbitCommand(command=OrbitCommand.START, radius_m=6.0, height_m=2.0, angular_speed_deg_s=20.0)
 
 
 # -- what is wrong with them -------------------------------------------------------------------------------
@@ -196,7 +195,6 @@ INPUTS = {
     "pose3d/latest": (["visualizer"], good_latest, BAD_POSE3D, "markers/latest"),
     "vehicle/state": (["visualizer"], good_state, {}, "markers/camera_path"),
     "camera_info": (["mavlink_bridge"], good_info, BAD_INFO, None),
-    "orbit/command": (["mavlink_bridge"], good_command, {}, "orbit/status"),
 }
 
 
@@ -265,15 +263,6 @@ STRANGE = {
         VehicleState(header=header_at(1, "map"), position_enu_m=[INF, 0.0, -INF]),
         VehicleState(header=header_at(1, "map"), mode="m" * 100_000, autopilot="", landed_state=255),
     ],
-    "orbit/command": [
-        OrbitCommand(command=200),
-        OrbitCommand(command=OrbitCommand.START, radius_m=INF, height_m=-INF, angular_speed_deg_s=INF),
-        OrbitCommand(command=OrbitCommand.START, radius_m=-5.0),
-        OrbitCommand(command=OrbitCommand.START, radius_m=1e30, height_m=1e30, angular_speed_deg_s=1e30),
-        OrbitCommand(command=OrbitCommand.ADJUST, radius_m=NAN, height_m=NAN, angular_speed_deg_s=NAN),
-        OrbitCommand(header=header_at(5 * 10**9, ""), command=OrbitCommand.START),
-        OrbitCommand(header=header_at(4_000_000_000 * 10**9 // 2, ""), command=OrbitCommand.START),
-    ],
 }
 
 
@@ -291,12 +280,42 @@ def test_what_is_strange_kills_nothing(bench, topic):
         check_it_works(bench, "image/compressed")
 
 
-def test_no_orbit_command_that_makes_no_sense_was_obeyed(bench):
-    heard = bench.heard["orbit/status"]
-    for message in STRANGE["orbit/command"]:
-        heard.clear()
-        bench.publishers["orbit/command"].publish(message)
-        bench.graph.wait_until(lambda: any("refused" in m.reason or "no motion" in m.reason for m in heard), 10)
+MALFORMED_COMMANDS = [
+    ({"command": 200}, ConditionCode.UNKNOWN_COMMAND),
+    ({"radius_m": INF}, ConditionCode.VALUE_NOT_FINITE),
+    ({"height_m": -INF}, ConditionCode.VALUE_NOT_FINITE),
+    ({"radius_m": 6.0, "height_m": 2.0, "angular_speed_deg_s": INF}, ConditionCode.VALUE_NOT_FINITE),
+    ({"radius_m": -5.0}, ConditionCode.RADIUS_TOO_SMALL),
+    ({"radius_m": 1e30, "height_m": 1e30, "angular_speed_deg_s": 1e30}, ConditionCode.RADIUS_TOO_LARGE),
+    ({"height_m": 1e30}, ConditionCode.HEIGHT_OUT_OF_RANGE),
+    ({"angular_speed_deg_s": -1e30}, ConditionCode.SPEED_ABOVE_LIMIT),
+    ({"stamp": Time(sec=5)}, ConditionCode.COMMAND_OUTDATED),
+    ({"stamp": Time(sec=-(2**31), nanosec=2**32 - 1)}, ConditionCode.COMMAND_OUTDATED),
+    ({"stamp": Time(sec=2**31 - 1, nanosec=2**32 - 1)}, ConditionCode.COMMAND_OUTDATED),
+    ({"command": OrbitCommand.Request.ADJUST}, ConditionCode.NO_ORBIT_TO_ADJUST),
+    # As it should be: validation passes, and the silent link is the reason of the refusal.
+    ({}, ConditionCode.LINK_SILENT),
+]
+
+
+@pytest.mark.parametrize(("values", "code"), MALFORMED_COMMANDS)
+def test_malformed_orbit_command_is_refused_with_its_code(bench, values, code):
+    statuses = bench.heard["orbit/status"]
+    client = bench.graph.node.create_client(OrbitCommand, "orbit/command")
+    bench.graph.wait_until(client.service_is_ready, 10, "the service of the bridge")
+    given = {"radius_m": NAN, "height_m": NAN, "angular_speed_deg_s": NAN, "command": OrbitCommand.Request.START}
+    statuses.clear()
+    answer = client.call_async(OrbitCommand.Request(**{**given, **values}))
+    bench.graph.wait_until(answer.done, 10, "an answer")
+    response = answer.result()
+    assert (response.accepted, ConditionCode(response.condition)) == (False, code)
+    assert response.words
+    bench.graph.wait_until(lambda: any(m.command_answer == response.words for m in statuses), 10, "a status")
+    status = next(m for m in statuses if m.command_answer == response.words)
+    assert (status.state, status.command) == (OrbitStatus.IDLE, values.get("command", given["command"]))
+    assert (status.command_accepted, status.command_condition) == (False, code)
+    assert status.command_stamp == values.get("stamp", Time())
+    bench.graph.node.destroy_client(client)
 
 
 def test_unknown_joints_are_no_fault(bench):

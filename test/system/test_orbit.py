@@ -87,9 +87,9 @@ def flying(**values):
 
 
 def operator(graph, *words):
-    """Run ``drocap orbit`` as the operator does, beside the graph; returns the exit status and what it printed.
+    """Run ``drocap orbit`` beside the graph; returns the exit status and the output.
 
-    In a process of its own: a ROS context that is made in this one would hold up the drone's thread for a second.
+    It runs in a process of its own: a second ROS context in this one would delay the drone's thread for a second.
     """
     command = [sys.executable, "-m", "drocap_ros.cli", "orbit", *words, "--domain-id", str(graph.domain_id)]
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -98,8 +98,8 @@ def operator(graph, *words):
         return process.returncode, process.stdout.read().strip()
 
 
-def test_the_operator_flies_an_orbit_from_the_command_line():
-    # How soon a fault is noticed is not the question here, and this machine may run other tests beside this one.
+def test_operator_flies_an_orbit_from_the_command_line():
+    # Loose bounds: this machine may run other tests at the same time.
     with flying(commands_enabled=True, max_state_age_s=0.5, watchdog_s=0.5) as (graph, drone, got):
         graph.wait_until(lambda: got and got[-1].state == OrbitStatus.READY, 40, "readiness")
         assert operator(graph, "start", "--radius", "2") == (
@@ -110,7 +110,7 @@ def test_the_operator_flies_an_orbit_from_the_command_line():
         assert status == 1
         assert answer.startswith("refused: angular_speed_deg_s: expected at most 33.1 deg/s at 6 m (max_acceleration")
         graph.wait_until(lambda: got[-1].state == OrbitStatus.READY, 20, "readiness")
-        assert operator(graph, "start", "--speed", "15") == (0, "orbiting")
+        assert operator(graph, "start", "--speed", "15") == (0, "orbiting the subject")
         begin = time.monotonic()
         graph.wait_until(lambda: time.monotonic() - begin > 6, 30)
         assert np.linalg.norm(drone.copter.body.velocity) > 0.8, [(m.state, m.reason) for m in got[-5:]]
@@ -119,16 +119,28 @@ def test_the_operator_flies_an_orbit_from_the_command_line():
         assert sentence.startswith("orbiting: orbiting the subject; ")
         drone.seeing = False
         graph.wait_until(lambda: got[-1].state == OrbitStatus.HOLDING, 10, "a hold when perception stops")
-        assert "last located" in got[-1].reason
+        assert got[-1].condition == OrbitStatus.CONDITION_SUBJECT_OUTDATED
         graph.wait_until(lambda: drone.copter.mode == "BRAKE", 15, "the hold mode")
         drone.copter.set_mode("LOITER", "pilot")
         graph.wait_until(lambda: got[-1].state == OrbitStatus.TAKEN_OVER, 10, "the take-over to be seen")
         status, answer = operator(graph, "start")
         assert (status, answer.split(";")[0]) == (1, "refused: the pilot has taken over")
-        assert operator(graph, "stop") == (0, "acknowledged")
+        assert got[-1].command_condition == OrbitStatus.CONDITION_PILOT_IN_COMMAND
+        assert operator(graph, "stop") == (0, "acknowledged by the operator")
+        graph.wait_until(lambda: got[-1].command_accepted, 10, "a status with the accepted command")
+        assert got[-1].command_condition == OrbitStatus.CONDITION_ACKNOWLEDGED
 
 
-def test_without_permission_nothing_moves():
+def test_commands_are_a_service_and_no_topic_that_a_replay_could_publish():
+    with flying(commands_enabled=True) as (graph, _, got):
+        graph.wait_until(lambda: got, 40, "a status")
+        names = dict(graph.node.get_topic_names_and_types())
+        assert not any("orbit/command" in name for name in names)
+        services = dict(graph.node.get_service_names_and_types())
+        assert services["/drocap/orbit/command"] == ["drocap_ros/srv/OrbitCommand"]
+
+
+def test_commands_that_are_not_enabled_move_nothing():
     with flying() as (graph, drone, got):
         graph.wait_until(lambda: got, 40, "a status")
         status, answer = operator(graph, "engage")
@@ -149,14 +161,14 @@ def test_without_permission_nothing_moves():
         ["status", "--timeout", "0"],
     ],
 )
-def test_options_that_cannot_be_used(words, capsys):
+def test_options_out_of_range_are_refused(words, capsys):
     assert main(["orbit", *words]) == 2
     error = capsys.readouterr().err
     assert "expected" in error or "takes no values" in error
     assert error.count("\n") == 1
 
 
-def test_an_option_that_is_no_number(capsys):
+def test_option_that_is_no_number_is_refused(capsys):
     with pytest.raises(SystemExit) as stopped:
         main(["orbit", "start", "--radius", "six"])
     assert stopped.value.code == 2
@@ -179,7 +191,7 @@ def test_an_option_that_is_no_number(capsys):
         ("orbit_radius: 5.0", "unknown parameter 'orbit_radius'"),
     ],
 )
-def test_a_configuration_that_cannot_be_flown_is_refused_at_the_door(line, words, tmp_path, capsys):
+def test_configuration_that_cannot_be_flown_is_refused(line, words, tmp_path, capsys):
     file = tmp_path / "config.yaml"
     file.write_text(f"mavlink_bridge:\n  {line}\n")
     assert main(["live", "--config", str(file), "--nodes", "mavlink_bridge", "--one-process", "--domain-id", "96"]) == 2
@@ -188,6 +200,6 @@ def test_a_configuration_that_cannot_be_flown_is_refused_at_the_door(line, words
     assert error.count("\n") == 1
 
 
-def test_no_graph_to_talk_to(capsys):
+def test_orbit_without_a_running_graph_is_refused(capsys):
     assert main(["orbit", "status", "--timeout", "1", "--domain-id", "97"]) == 2
     assert "drocap live" in capsys.readouterr().err
