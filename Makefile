@@ -2,11 +2,12 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# A parent process that already runs in a ROS environment must not leak its libraries into ours.
+# Libraries of a ROS environment around this process must not leak into ours.
 CLEAN := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE -u LD_LIBRARY_PATH -u PYTHONPATH -u AMENT_PREFIX_PATH -u CMAKE_PREFIX_PATH
+BENCHMARK = $(CLEAN) $(BIN)/python benchmarks
 SOURCES := $(shell find drocap_ros msg srv config resource -type f -not -path '*/__pycache__/*') setup.py CMakeLists.txt package.xml
 
-.PHONY: help setup demo test lint bench bench-flight clean
+.PHONY: help setup demo test lint bench bench-quick bench-flight clean
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
 
@@ -20,7 +21,7 @@ $(VENV)/.requirements: requirements.lock
 	@$(CLEAN) $(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
 	@touch $@
 
-# The wheels lack tf2_msgs, without which nobody can publish TF, and hri_msgs, of which REP 155 has need.
+# The ROS wheels on PyPI lack tf2_msgs (TF) and hri_msgs (REP 155).
 .SECONDEXPANSION:
 $(VENV)/.tf2_msgs $(VENV)/.hri_msgs: $(VENV)/.%: $(VENV)/.requirements resource/cmake/ros_wheels.cmake $$(wildcard resource/$$*/*) $$(wildcard resource/$$*/msg/*)
 	@PATH="$(CURDIR)/$(BIN):$$PATH" AMENT_PREFIX_PATH=$(CURDIR)/$(VENV) CMAKE_PREFIX_PATH=$(CURDIR)/$(VENV) $(BIN)/cmake -S resource/$* -B build/$* -G Ninja -DCMAKE_INSTALL_PREFIX=$(CURDIR)/$(VENV) -DPython3_EXECUTABLE=$(CURDIR)/$(BIN)/python -DBUILD_TESTING=OFF > build/$*.log
@@ -35,7 +36,7 @@ $(VENV)/.package: $(VENV)/.requirements $(VENV)/.tf2_msgs $(VENV)/.hri_msgs $(SO
 demo: setup  ## a whole simulated capture, reconstructed and compared with its truth
 	@$(CLEAN) $(BIN)/drocap demo --out demo_out
 
-test: setup  ## the whole test suite: two tests at a time, then those that watch a clock, alone
+test: setup  ## the whole test suite: two tests at a time, then tests with clocks or nodes, alone
 	$(CLEAN) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not clock" -n 2 --dist loadfile
 	$(CLEAN) $(BIN)/python -m pytest -m clock
 
@@ -44,11 +45,30 @@ lint: setup  ## ruff and mypy
 	$(CLEAN) $(BIN)/ruff format --check .
 	$(CLEAN) $(BIN)/mypy
 
-bench: setup  ## benchmarks (about an hour); results under benchmarks/results
-	for part in reconstruction perception recording live; do $(CLEAN) $(BIN)/python benchmarks/$$part.py || exit 1; done
+bench: setup  ## benchmarks (about an hour); each writes its page of docs/figures
+	$(BENCHMARK)/demo.py
+	$(BENCHMARK)/accuracy.py
+	$(BENCHMARK)/reconstruction.py
+	$(BENCHMARK)/perception.py
+	$(BENCHMARK)/recording.py --seconds 120 --flight 60
+	$(BENCHMARK)/live.py
 
-bench-flight: setup  ## simulated faults, orbits by keypoints and by pictures, fuzzing (hours)
-	for part in faults orbits pixels fuzz; do $(CLEAN) $(BIN)/python benchmarks/flight_$$part.py || exit 1; done
+bench-quick: export DROCAP_FIGURES := $(CURDIR)/build/figures
+bench-quick: setup  ## the same benchmarks, short (about ten minutes); pages in build/figures
+	$(BENCHMARK)/demo.py --runs 1
+	$(BENCHMARK)/accuracy.py --limit 1
+	$(BENCHMARK)/reconstruction.py --frames 30 300 --threads 1 --repeat 1
+	$(BENCHMARK)/perception.py --quick
+	$(BENCHMARK)/recording.py --seconds 10 --kills 2 --mutations 20 --minutes 2 --flight 10
+	$(BENCHMARK)/live.py load kills --seconds 15 --rounds 1
+
+bench-flight: setup  ## simulated faults, orbits by keypoints and by images, fuzzing (hours)
+	$(BENCHMARK)/flight_faults.py
+	$(BENCHMARK)/flight_faults.py processes
+	$(BENCHMARK)/flight_orbits.py
+	$(BENCHMARK)/flight_orbits.py quality
+	$(BENCHMARK)/flight_pixels.py
+	$(BENCHMARK)/flight_fuzz.py
 
 clean:  ## remove everything that was built
 	rm -rf $(VENV) build install log

@@ -5,6 +5,7 @@ elsewhere: `DROCAP_FIGURES=DIR` writes the pages to DIR instead of docs/figures.
 
 One page per part that can run alone:
 
+    demo.py             demo
     accuracy.py         accuracy, accuracy_live, accuracy_perspective, accuracy_world
     reconstruction.py   reconstruction
     perception.py       perception
