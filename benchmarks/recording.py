@@ -1,4 +1,4 @@
-"""Figures of the recording: `python benchmarks/recording.py`, or some of its parts by name.
+"""Figures of the recording: `python benchmarks/recording.py [PART ...]`.
 
 load       recorder node under 1280x720 JPEG 30 Hz + poses 30 Hz + telemetry 50 Hz (`--seconds 300` for the full time)
 kills      SIGKILL at random moments, recover, read by three libraries (`--kills 200`)
@@ -6,8 +6,8 @@ mutations  mutated copies of a session, tracks, tlog, ULog, DataFlash and SRT (`
 long       a session of `--minutes 30` against one of a minute: time per frame, memory
 live       a simulated flight of `--flight 60` s, repeated offline bit for bit
 
-Each part runs in processes of its own, so that memory and processor time are that part's.  Results go to
-benchmarks/results/recording.json.
+Each part runs in its own processes, so that memory and processor time are those of the part.  Each part writes the page
+recording_PART of docs/figures.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "test" / "recording")]
+from figures import ROOT, table, write_figures
+from recorder_load import make_sources, process_usage, publish_all, watch_process
+
+sys.path[:0] = [str(ROOT), str(ROOT / "test" / "helpers")]
 PARTS = ("load", "kills", "mutations", "long", "live")
-CLOCK_TICKS = os.sysconf("SC_CLK_TCK")
-PAGE_MIB = os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def main() -> int:
@@ -45,25 +45,19 @@ def main() -> int:
     parser.add_argument("--minutes", type=int, default=5)
     parser.add_argument("--flight", type=float, default=20.0)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results")
     parser.add_argument("--cell", nargs="+", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.cell:
         print(json.dumps(CELLS[args.cell[0]](*args.cell[1:])))
         return 0
-    args.out.mkdir(parents=True, exist_ok=True)
-    target = args.out / "recording.json"
-    results = json.loads(target.read_text()) if target.exists() else {}
     for part in args.parts or PARTS:
         with tempfile.TemporaryDirectory(prefix="drocap_bench_") as folder:
-            results[part] = globals()[f"part_{part}"](args, Path(folder))
-        print(f"{part}: {json.dumps(results[part])}", flush=True)
-        target.write_text(json.dumps(results, indent=1) + "\n")
+            globals()[f"part_{part}"](args, Path(folder))
     return 0
 
 
 def cell(*words: object) -> dict[str, Any]:
-    """Run a part of this file in a process of its own."""
+    """Run a function of CELLS in its own process."""
     done = subprocess.run(
         [sys.executable, __file__, "--cell", *map(str, words)], stdout=subprocess.PIPE, text=True, check=True
     )
@@ -78,7 +72,7 @@ def peak_mib() -> float:
 # -- load --------------------------------------------------------------------------------------------------
 
 
-def part_load(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+def part_load(args: argparse.Namespace, folder: Path) -> None:
     """Publishers in this process, the recorder in its own, DDS between them."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
@@ -104,136 +98,74 @@ def part_load(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         time.sleep(1.0)
         executor.shutdown()
     info = session_info(folder / "session")
-    counts = {topic.name.rsplit("/", 1)[-1]: topic.count for topic in info.topics}
-    third = max(1, len(usage) // 3)
-    memory = [mib for _, mib in usage]
-    return {
-        "seconds": args.seconds,
-        "sent": sent,
-        "recorded": {name: counts.get(name.rsplit("/", 1)[-1], 0) for name in sent},
-        "warnings": list(info.warnings),
-        "cores_used": round((usage[-1][0] - usage[0][0]) / (len(usage) - 1 or 1), 3),
-        "memory_mib_first_third": round(max(memory[:third]), 1),
-        "memory_mib_last_third": round(max(memory[-third:]), 1),
-        "lost_on_the_way": lost_on_the_way(folder / "session"),
-        "mib_written": round(sum(p.stat().st_size for p in (folder / "session").iterdir()) / 2**20, 1),
-        "load_average": os.getloadavg()[0],
-    }
-
-
-def lost_on_the_way(session_dir: Path) -> dict[str, str]:
-    """What the recorder itself said on /diagnostics, at the end."""
-    from drocap_ros.recording.open_session import open_session
-
-    told: dict[str, str] = {}
-    with open_session(session_dir) as session:
-        for _, message in session.messages(("/diagnostics",)):
-            for status in message.status:
-                told |= {v.key: v.value for v in status.values if v.key.startswith(("lost", "dropped"))}
-    return told
-
-
-def make_sources(node: Any) -> list[tuple[Any, Any, float, str]]:
-    """(publisher, function of a number -> message, Hz, topic)."""
-    import cv2
-    import numpy as np
-
-    from drocap_ros.msg import VehicleState
-    from drocap_ros.nodes.capture_simulator import observation_of
-    from drocap_ros.perception.jpeg import encode_jpeg
-    from drocap_ros.ros.conversions import header_at, pose2d_to_ros
-    from drocap_ros.ros.topics import TOPICS
-    from drocap_ros.simulation.capture import simulate_capture
-
-    tracks = simulate_capture(2.0, 30.0, 0).tracks
-    rng = np.random.default_rng(0)
-    scene = cv2.GaussianBlur(rng.integers(0, 255, (720, 1400, 3), dtype=np.uint8), (0, 0), 4)
-    scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
-    jpegs = [encode_jpeg(np.ascontiguousarray(scene[:, i : i + 1280]), 90) for i in range(0, 100, 10)]
-
-    def image(i: int) -> Any:
-        return TOPICS["image/compressed"].message(
-            header=header_at(time.time_ns(), "camera_optical"), format="jpeg", data=jpegs[i % len(jpegs)]
-        )
-
-    def pose(i: int) -> Any:
-        return pose2d_to_ros(observation_of(tracks, i % len(tracks), time.time_ns()), "camera_optical")
-
-    def state(_: int) -> Any:
-        return VehicleState(header=header_at(time.time_ns(), "map"), autopilot="px4", mode="OFFBOARD")
-
-    kinds = (("image/compressed", image, 30.0), ("pose2d", pose, 30.0), ("vehicle/state", state, 50.0))
-    return [
-        (
-            node.create_publisher(TOPICS[topic].message, topic, TOPICS[topic].offered or TOPICS[topic].qos),
-            make,
-            hz,
-            topic,
-        )
-        for topic, make, hz in kinds
+    counts = {topic.name.removeprefix("/drocap/"): topic.count for topic in info.topics}
+    lost = losses(folder / "session")
+    rows = [
+        (topic, number, counts.get(topic, 0), ", ".join(f"{key} {lost[key]}" for key in lost if key.endswith(topic)))
+        for topic, number in sent.items()
     ]
+    cores = (usage[-1][0] - usage[0][0]) / (len(usage) - 1 or 1)
+    third = max(1, len(usage) // 3)
+    first_mib, last_mib = (max(mib for _, mib in part) for part in (usage[:third], usage[-third:]))
+    size_mib = sum(p.stat().st_size for p in (folder / "session").iterdir()) / 2**20
+    write_figures(
+        "recording_load",
+        "Recorder under load",
+        f"1280x720 JPEG and poses at 30 Hz, telemetry at 50 Hz, {args.seconds:g} s; load {os.getloadavg()[0]:.1f};"
+        f" {cores:.2f} cores used; memory {first_mib:.0f} MiB in the first third, {last_mib:.0f} MiB in the last;"
+        f" {size_mib:.0f} MiB written{''.join('; ' + warning for warning in info.warnings)}.\n\n"
+        + table(("topic", "sent", "recorded", "losses counted by the recorder"), rows),
+    )
 
 
-def publish_all(sources: list[tuple[Any, Any, float, str]], begin: float, seconds: float) -> dict[str, int]:
-    sent = dict.fromkeys((topic for *_, topic in sources), 0)
-    while True:
-        due, publisher, make, topic = min(
-            ((begin + sent[topic] / hz, p, make, topic) for p, make, hz, topic in sources), key=lambda entry: entry[0]
-        )
-        if due - begin >= seconds:
-            return sent
-        time.sleep(max(0.0, due - time.monotonic()))
-        publisher.publish(make(sent[topic]))
-        sent[topic] += 1
+def losses(session_dir: Path) -> dict[str, str]:
+    """Last loss counters of the recorder on /diagnostics, by key."""
+    from drocap_ros.recording.open_session import open_session
+    from drocap_ros.ros.diagnostics import Key
 
-
-def watch_process(pid: int, begin: float, seconds: float, usage: list[tuple[float, float]]) -> None:
-    while time.monotonic() - begin < seconds:
-        time.sleep(1.0)
-        usage.append(process_usage(pid))
-
-
-def process_usage(pid: int) -> tuple[float, float]:
-    """Processor seconds and resident MiB so far."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return (int(fields[11]) + int(fields[12])) / CLOCK_TICKS, pages * PAGE_MIB
+    kinds = (Key.LOST, Key.MISSED, Key.NOT_WRITTEN)
+    with open_session(session_dir) as session:
+        values = (v for _, m in session.messages(("/diagnostics",)) for status in m.status for v in status.values)
+        return {v.key: v.value for v in values if v.key.split("/", 1)[0] in kinds}
 
 
 # -- kills -------------------------------------------------------------------------------------------------
 
 
-def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    from test_recover import check_recovered, killed_session
+def part_kills(args: argparse.Namespace, folder: Path) -> None:
+    from killed_recording import check_recovered, killed_session
 
     rng = random.Random(args.seed)
-    messages, gaps, delays = 0, [], []
+    messages, gaps = 0, []
     for i in range(args.kills):
-        delay_s = rng.uniform(0.02, 2.2)
-        begun_ns, killed_ns = killed_session(folder / f"s{i}", delay_s)
+        begun_ns, killed_ns = killed_session(folder / f"s{i}", rng.uniform(0.02, 2.2))
         count, gap_s = check_recovered(folder / f"s{i}", begun_ns, killed_ns)
-        messages, delays = messages + count, [*delays, delay_s]
+        messages += count
         gaps.append(gap_s)
         shutil.rmtree(folder / f"s{i}")
-    return {
-        "kills": args.kills,
-        "messages_recovered": messages,
-        "last_message_before_kill_s": {"median": sorted(gaps)[len(gaps) // 2], "worst": max(gaps)},
-    }
+    write_figures(
+        "recording_kills",
+        "Sessions of a killed recorder",
+        f"{args.kills} SIGKILLs: {messages} messages recovered, every one in sequence; the last one"
+        f" {sorted(gaps)[len(gaps) // 2]:.2f} s before the kill in the median, {max(gaps):.2f} s at worst; three"
+        " libraries read all files.",
+    )
 
 
 # -- mutations ---------------------------------------------------------------------------------------------
 
 
-def part_mutations(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    return {
-        kind: cell("mutations", kind, args.mutations, args.seed, folder)
-        for kind in ("mcap", "npz", "tlog", "srt", "bin", "ulg")
-    }
+def part_mutations(args: argparse.Namespace, folder: Path) -> None:
+    kinds = ("mcap", "npz", "tlog", "srt", "bin", "ulg")
+    results = {kind: cell("mutations", kind, args.mutations, args.seed, folder) for kind in kinds}
+    head = ("format", "copies", "used", "refused", "faults", "longest, s", "memory, MiB", "memory at the start, MiB")
+    rows = [(kind, *list(result.values())[:4], *list(result.values())[5:]) for kind, result in results.items()]
+    faults = [f"- {kind} {fault}" for kind, result in results.items() for fault in result["examples"]]
+    write_figures("recording_mutations", "Mutated files", table(head, rows) + "\n" + "\n".join(faults))
 
 
 def cell_mutations(kind: str, count: str, seed: str, folder: str) -> dict[str, Any]:
-    from test_telemetry import mutated
+    from telemetry_logs import mutated
 
     whole = whole_file(kind, Path(folder))
     rng = random.Random(f"{seed} {kind}")
@@ -258,7 +190,7 @@ def cell_mutations(kind: str, count: str, seed: str, folder: str) -> dict[str, A
             faults.append(f"{i}: {words.strip()[:200]}")
             shutil.copy(path, Path(tempfile.gettempdir()) / f"drocap_fault_{i}.{kind}")
     return {
-        "copies": int(count), "used": used, "refused": refused, "faults": faults[:5], "fault_count": len(faults),
+        "copies": int(count), "used": used, "refused": refused, "faults": len(faults), "examples": faults[:5],
         "worst_s": round(worst_s, 2), "peak_mib": round(peak_mib()), "base_mib": round(base_mib),
     }  # fmt: skip
 
@@ -268,7 +200,7 @@ def _too_long(*_: object) -> None:
 
 
 def use(kind: str, path: Path) -> tuple[int, str]:
-    """What a command does with the file: its exit status and what it says on stderr."""
+    """Exit status of a command for the file, and its text on stderr."""
     from drocap_ros.cli import main as drocap
     from drocap_ros.config import DrocapConfig
     from drocap_ros.errors import InputError
@@ -298,7 +230,7 @@ def whole_file(kind: str, folder: Path) -> bytes:
     import numpy as np
     from dataflash import write_dataflash
     from recorded import START_NS, Messages, write_poses
-    from test_telemetry import new_form, srt_text
+    from telemetry_logs import dji_subtitle, srt_text
 
     from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
     from drocap_ros.simulation.capture import simulate_capture
@@ -313,7 +245,9 @@ def whole_file(kind: str, folder: Path) -> bytes:
     if kind == "ulg":
         return (media / "px4_sample_small.ulg").read_bytes()[:300_000]
     if kind == "srt":
-        return srt_text(t, [new_form(i, g, a) for i, (g, a) in enumerate(zip(geodetic, angles, strict=True))]).encode()
+        return srt_text(
+            t, [dji_subtitle(i, g, a) for i, (g, a) in enumerate(zip(geodetic, angles, strict=True))]
+        ).encode()
     if kind == "bin":
         return write_dataflash(folder / "whole.bin", t, angles, geodetic, angles).read_bytes()
     tracks = simulate_capture(4, 30, seed=2, start_ns=START_NS).tracks
@@ -326,28 +260,25 @@ def whole_file(kind: str, folder: Path) -> bytes:
 # -- long sessions -----------------------------------------------------------------------------------------
 
 
-def part_long(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    result: dict[str, Any] = {}
+def part_long(args: argparse.Namespace, folder: Path) -> None:
+    rows = []
     for minutes in (1, args.minutes):
         session = folder / f"session{minutes}"
         cell("write_long", minutes, session)
-        for what in ("read", "ba"):
-            result[f"{what}_{minutes}_min"] = cell("long", what, session)
-    for what in ("read", "ba"):
-        one, many = (result[f"{what}_{minutes}_min"]["ms_per_frame"] for minutes in (1, args.minutes))
-        result[f"{what}_ratio"] = round(many / one, 3)
-    return result
+        rows += [(minutes, what, *cell("long", what, session).values()) for what in ("read", "ba")]
+    head = ("minutes", "stage", "frames", "ms/frame", "memory, MiB", "memory at the start, MiB")
+    write_figures("recording_long", "Long sessions", table(head, rows))
 
 
 def cell_write_long(minutes: str, folder: str) -> dict[str, Any]:
-    """The same simulated minute again and again, with telemetry at 50 Hz."""
+    """Repeats one simulated minute, with telemetry at 50 Hz."""
     import numpy as np
     from recorded import NAMES, START_NS, Messages
 
     from drocap_ros.recording.mcap.schemas import schema_text
     from drocap_ros.recording.mcap.writer import SessionWriter
     from drocap_ros.simulation.capture import simulate_capture
-    from drocap_ros.simulation.vehicle.path import SampledPath
+    from drocap_ros.simulation.vehicle.flight_path import SampledPath
 
     messages, capture = Messages(), simulate_capture(60.0, 30.0, seed=5, start_ns=START_NS)
     tracks = capture.tracks
@@ -398,7 +329,7 @@ def cell_long(what: str, folder: str) -> dict[str, Any]:
 # -- live against offline ----------------------------------------------------------------------------------
 
 
-def part_live(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+def part_live(args: argparse.Namespace, folder: Path) -> None:
     from drocap_ros.bringup import bringup
     from drocap_ros.config import DrocapConfig
     from drocap_ros.live_replay import reconstruct_live, recorded_config
@@ -411,12 +342,13 @@ def part_live(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         graph.wait_finished("capture_simulator", timeout_s=5 * args.flight + 60)
     with open_session(folder / "session") as session:
         motion, _, agreement = reconstruct_live(session, recorded_config(session) or config)
-    return {
-        "flight_s": args.flight,
-        "frames": len(motion.joints3d),
-        "initial_compared_and_equal": agreement.initial,
-        "windows_compared_and_equal": agreement.windows,
-    }
+    initial, windows = agreement.initial, agreement.windows
+    write_figures(
+        "recording_live",
+        "Live graph against its offline repetition",
+        f"{args.flight:g} s, {len(motion.joints3d)} frames: {initial[1]} of {initial[0]} published initial poses and"
+        f" {windows[1]} of {windows[0]} windows equal, bit for bit.",
+    )
 
 
 CELLS = {"mutations": cell_mutations, "write_long": cell_write_long, "long": cell_long}

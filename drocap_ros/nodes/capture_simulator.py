@@ -20,8 +20,8 @@ from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.spin import node_main
 from drocap_ros.simulation.capture import SimulatedCapture, simulate_capture
+from drocap_ros.simulation.vehicle.flight_path import SampledPath
 from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle
-from drocap_ros.simulation.vehicle.path import SampledPath
 from drocap_ros.tracks import Tracks
 
 #: The drone hovers this long before the first image, until links are up and clocks synchronized.

@@ -126,7 +126,7 @@ class FlightSimulatorNode(ManagedComponent):
         if copter.crashed:
             self.report(WARN, f"the vehicle has crashed: {copter.crashed}")
         elif self.active:
-            self.report(OK, f"pilot: {pilot.doing}")
+            self.report(OK, f"pilot: {pilot.phase.value}")
 
 
 def main() -> int:

@@ -6,7 +6,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.rotations import angle_between
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_pose2d
-from drocap_ros.simulation.vehicle.path import SampledPath
+from drocap_ros.simulation.vehicle.flight_path import SampledPath
 
 POSE2D, STATE, INFO = NAMES["pose2d"], NAMES["state"], NAMES["info"]
 

@@ -17,6 +17,7 @@ import numpy as np
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.mavlink.link import MavlinkLink
+from drocap_ros.flight.orbit.conditions import Condition
 from drocap_ros.flight.orbit.controller import ControlStatus, OrbitController
 from drocap_ros.flight.orbit.states import Action, Command, CommandAnswer, OperatorCommand, State
 from drocap_ros.flight.orbit.watchdog import Watchdog
@@ -116,7 +117,7 @@ class OrbitLoop:
         )  # fmt: skip
         self.rows: list[Row] = []
         self.answers: list[tuple[float, CommandAnswer]] = []
-        self.reasons: list[tuple[float, str, str]] = []
+        self.reasons: list[tuple[float, str, Condition]] = []
         self.framing: list[tuple[float, bool]] = []
         self.status: ControlStatus | None = None
         self.matrix = pinhole_matrix(*_SIZE, _FIELD_DEG)
@@ -204,9 +205,9 @@ class OrbitLoop:
         if runs:
             self.status = status = self.controller.step(self.clock_ns(), self.t)
             self.answers += [(self.t, answer) for _, answer in status.answers]
-            reason = (status.state.name, status.reason)
-            if not self.reasons or self.reasons[-1][1:] != reason:
-                self.reasons.append((self.t, *reason))
+            _, state, before = self.reasons[-1] if self.reasons else (0.0, "", None)
+            if before is None or (state, before.code) != (status.state.name, status.condition.code):
+                self.reasons.append((self.t, status.state.name, status.condition))
         body, pelvis = self.copter.body, self.pelvis()
         sight = pelvis[:2] - body.position[:2]
         error = math.remainder(body.yaw - math.atan2(sight[1], sight[0]), 2 * math.pi)

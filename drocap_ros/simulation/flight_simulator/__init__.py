@@ -1,1 +1,1 @@
-"""The world of the demo: pilot, camera, truth."""
+"""The simulated flight of the demo: pilot, person, camera, truth."""

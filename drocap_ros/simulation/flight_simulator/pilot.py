@@ -1,7 +1,8 @@
-"""A simulated pilot with sticks: takes off, hovers, and gives control as the autopilot's dialect wants it."""
+"""A simulated pilot with sticks: takes off, hovers, and hands over control in the way of the autopilot."""
 
 from __future__ import annotations
 
+import enum
 import math
 
 import numpy as np
@@ -13,8 +14,8 @@ from drocap_ros.simulation.vehicle.dynamics import Target
 
 #: The mode in which the sticks command velocities.
 STICK_MODE = {"ardupilot": "LOITER", "px4": "POSCTL"}
-#: ArduPilot: the pilot switches to GUIDED, where it waits for setpoints.  PX4 takes OFFBOARD only while setpoints
-#: stream, so the pilot leaves it holding and the operator's `engage` asks for OFFBOARD.
+#: ArduPilot waits for setpoints in GUIDED.  PX4 enters OFFBOARD only while setpoints stream, so the pilot leaves it
+#: holding and the operator's `engage` requests OFFBOARD.
 HANDED_OVER_MODE = {"ardupilot": "GUIDED", "px4": "LOITER"}
 _CLIMB_M_S, _BRAKING_M_S2, _LAG_S = 1.2, 1.45, 0.35
 _SKIDS_M = 0.1
@@ -24,9 +25,9 @@ _READY_S, _HOVER_S = 1.0, 1.5
 class PilotedCopter(SimulatedCopter):
     """A copter that stands on the ground until its pilot takes off.
 
-    ground : (2,) m ENU, where it stands
-    stick : (3,) m/s ENU, the velocity that the sticks ask for in ``STICK_MODE``
-    Further parameters are those of :class:`SimulatedCopter`.
+    ground : (2,) m ENU, initial position
+    stick : (3,) m/s ENU, the velocity commanded by the sticks in ``STICK_MODE``
+    The other parameters are those of :class:`SimulatedCopter`.
     """
 
     def __init__(
@@ -40,54 +41,62 @@ class PilotedCopter(SimulatedCopter):
         self._ground: np.ndarray = self.body.position.copy()
 
     def fly(self, t_s: float) -> None:
-        """Fly up to path time ``t_s``, then speak and listen; on the ground it stays where it is."""
+        """Fly up to path time ``t_s``, then send and receive; on the ground the position is fixed."""
         super().fly(t_s)
         if self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND:
             self.body.position, self.body.velocity = self._ground.copy(), np.zeros(3)
 
     def _present_target(self, dt: float) -> Target:
         if self.mode == STICK_MODE[self.autopilot] and self.stick.any():
-            self._stop_velocity = None  # once the sticks are let go it stops from the speed it then has
+            self._stop_velocity = None  # released sticks: it stops from its speed then
             return Target(velocity=self.stick.copy(), yaw=self._heading)
         return super()._present_target(dt)
 
 
-class SimulatedPilot:
-    """Arms, climbs to a height with the camera on the person, hovers, hands over; then keeps the hands off.
+class PilotPhase(enum.Enum):
+    """Phases of the take-off, in their order."""
 
-    height_m : where to hover
-    aim : (3,) m ENU, where the camera is to look until the hand-over
-    doing : in words
+    CHECKS = "checking the vehicle"
+    CLIMB = "climbing"
+    HOVER = "hovering"
+    HANDED_OVER = "hands off"
+
+
+class SimulatedPilot:
+    """Arms, climbs with the camera on the person, hovers, hands over; then takes the hands off.
+
+    height_m : of the hover
+    aim : (3,) m ENU, target of the camera until the hand-over
     """
 
     def __init__(self, copter: PilotedCopter, height_m: float, aim: np.ndarray) -> None:
         self._copter, self._height_m, self._aim = copter, height_m, aim
-        self.doing = "checking the vehicle"
+        self.phase = PilotPhase.CHECKS
         self._since_s = 0.0
 
     @property
     def handed_over(self) -> bool:
-        """Whether the pilot's hands are off."""
-        return self.doing == "hands off"
+        """Whether the pilot has taken the hands off."""
+        return self.phase == PilotPhase.HANDED_OVER
 
     def step(self, t_s: float) -> None:
-        """Look at the vehicle at path time ``t_s`` and act."""
+        """Act on the vehicle's state at path time ``t_s``."""
         copter = self._copter
         if not self.handed_over:
             sight = self._aim - copter.body.position
             copter.camera_pitch = math.atan2(float(sight[2]), float(np.hypot(sight[0], sight[1])))
-        if self.doing == "checking the vehicle" and t_s >= _READY_S:
+        if self.phase == PilotPhase.CHECKS and t_s >= _READY_S:
             copter.armed, copter.landed_state = True, mavlink.MAV_LANDED_STATE_TAKEOFF
             copter.stick = np.array([0.0, 0.0, _CLIMB_M_S])
-            self._next("climbing", t_s)
-        elif self.doing == "climbing":
+            self._enter(PilotPhase.CLIMB, t_s)
+        elif self.phase == PilotPhase.CLIMB:
             climb = float(copter.body.velocity[2])
             if copter.body.position[2] + climb * (_LAG_S + climb / (2 * _BRAKING_M_S2)) >= self._height_m:
                 copter.stick, copter.landed_state = np.zeros(3), mavlink.MAV_LANDED_STATE_IN_AIR
-                self._next("hovering", t_s)
-        elif self.doing == "hovering" and t_s - self._since_s >= _HOVER_S:
+                self._enter(PilotPhase.HOVER, t_s)
+        elif self.phase == PilotPhase.HOVER and t_s - self._since_s >= _HOVER_S:
             copter.set_mode(HANDED_OVER_MODE[copter.autopilot], "pilot")
-            self._next("hands off", t_s)
+            self._enter(PilotPhase.HANDED_OVER, t_s)
 
-    def _next(self, doing: str, t_s: float) -> None:
-        self.doing, self._since_s = doing, t_s
+    def _enter(self, phase: PilotPhase, t_s: float) -> None:
+        self.phase, self._since_s = phase, t_s

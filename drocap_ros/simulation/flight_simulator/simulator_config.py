@@ -1,4 +1,4 @@
-"""Parameters of a simulated flight with pictures."""
+"""Parameters of the flight simulator."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ _SIMULATED_AUTOPILOTS = ("ardupilot", "px4")
 class FlightSimulatorConfig(Parameters):
     """Vehicle, person and camera of the flight simulator."""
 
-    vehicle_url: str = param("udpout:127.0.0.1:14540", "MAVLink URL that the simulated vehicle speaks on")
-    autopilot: str = param("ardupilot", "whose dialect the vehicle speaks", choices=_SIMULATED_AUTOPILOTS)
+    vehicle_url: str = param("udpout:127.0.0.1:14540", "MAVLink URL of the simulated vehicle")
+    autopilot: str = param("ardupilot", "MAVLink dialect of the vehicle", choices=_SIMULATED_AUTOPILOTS)
     seed: int = param(0, "seed of person, take, wind, sensor errors and scenery", minimum=0)
-    action: str = param("mixed", "what the person does, while the vehicle is flown by setpoints", choices=ACTIONS)
+    action: str = param("mixed", "motion of the person while setpoints steer the vehicle", choices=ACTIONS)
     stature_m: float = param(1.75, "height of the person", unit="m", minimum=0.5, maximum=2.5)
-    wind_m_s: float = param(3.0, "mean wind, from the west; gusts come on top", unit="m/s", minimum=0, maximum=15)
+    wind_m_s: float = param(3.0, "mean wind from the west; gusts are added", unit="m/s", minimum=0, maximum=15)
     start_distance_m: float = param(
-        7.0, "horizontal distance from the person at which the vehicle takes off", unit="m", minimum=2, maximum=50
+        7.0, "horizontal distance between person and take-off", unit="m", minimum=2, maximum=50
     )
-    takeoff_height_m: float = param(3.0, "height at which the pilot hands over", unit="m", minimum=1.5, maximum=50)
-    image_width: int = param(1280, "width of the pictures", unit="px", minimum=64, maximum=8192)
-    image_height: int = param(720, "height of the pictures", unit="px", minimum=64, maximum=8192)
+    takeoff_height_m: float = param(3.0, "height of the hand-over by the pilot", unit="m", minimum=1.5, maximum=50)
+    image_width: int = param(1280, "width of the images", unit="px", minimum=64, maximum=8192)
+    image_height: int = param(720, "height of the images", unit="px", minimum=64, maximum=8192)
     horizontal_fov_deg: float = param(60.0, "horizontal field of view", unit="deg", minimum=5, maximum=150)
-    rate_hz: float = param(15.0, "pictures per second", unit="Hz", minimum=1, maximum=120)
+    rate_hz: float = param(15.0, "images per second", unit="Hz", minimum=1, maximum=120)
     jpeg_quality: int = param(85, "quality of the published JPEG", minimum=1, maximum=100)
-    truth_file: str = param("", "npz to write the truth to at the end, in the form of a motion file; empty: none")
+    truth_file: str = param("", "npz for the truth, written at the end as a motion file; empty = none")

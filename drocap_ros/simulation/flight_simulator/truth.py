@@ -1,6 +1,6 @@
-"""What was really there during a simulated flight, and how good an orbit it was.
+"""Truth of a simulated flight, and the quality of its orbit.
 
-The file is a motion (``drocap evaluate pair MOTION TRUTH`` takes it) with ``camera_position`` beside it.
+The file is a motion (``drocap evaluate compare MOTION TRUTH`` reads it) with ``camera_position`` added.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from drocap_ros.simulation.orbit_camera import project
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import read_npz
 
-#: Exposures that are kept, the first ones: two hours at 15 Hz.
+#: The world keeps this many exposures: two hours at 15 Hz.
 MAX_EXPOSURES = 108_000
 
 
 @dataclass(frozen=True)
 class FlightTruth:
-    """Truth at F exposures, whether or not a picture came of them.
+    """Truth at F exposures, rendered or not.
 
     stamp_ns : (F,) int64, increasing
     joints3d : (F, 15, 3) m ENU, order of ``BODY_15``
-    camera_rotation, camera_position : (F, 3, 3) world -> optical, (F, 3) m ENU, the vehicle's place
+    camera_rotation, camera_position : (F, 3, 3) world -> optical, (F, 3) m ENU, the vehicle's position
     camera_matrix, image_size : (3, 3) px; width, height px
     """
 
@@ -46,7 +46,7 @@ class FlightTruth:
 
 
 def save_flight_truth(path: Path, truth: FlightTruth) -> None:
-    """Write the file; it appears whole or not at all."""
+    """Write the file atomically."""
     frames, joints = truth.joints3d.shape[:2]
     motion = Motion(
         joints3d=truth.joints3d, joints=BODY_15.joints, parents=BODY_15.parents, stamp_ns=truth.stamp_ns,
@@ -66,12 +66,12 @@ def save_flight_truth(path: Path, truth: FlightTruth) -> None:
 
 
 def load_flight_truth(path: Path) -> FlightTruth:
-    """Read what :func:`save_flight_truth` wrote.
+    """Read a file of :func:`save_flight_truth`.
 
     Raises
     ------
     InputError
-        When the file cannot be used.
+        When the file is no such truth.
     """
     motion = load_motion(path)
     more = read_npz(path, ("camera_position", "camera_matrix", "image_size"))
@@ -87,10 +87,10 @@ def load_flight_truth(path: Path) -> FlightTruth:
 
 
 class FlownOrbit(NamedTuple):
-    """An orbit against the truth: means of absolute errors, shares of the exposures, extremes.
+    """Quality of a flown orbit: mean absolute errors, shares of the exposures, extremes.
 
-    in_middle_third : the middle of the person's extent lies in the middle third of the picture, both ways
-    turned_deg : angle that the vehicle covered round the person
+    in_middle_third : the middle of the person's extent lies in the middle third of the image, in both directions
+    turned_deg : angle of the vehicle's path about the person
     """
 
     exposures: int
@@ -103,12 +103,12 @@ class FlownOrbit(NamedTuple):
 
 
 def flown_orbit(truth: FlightTruth, within: np.ndarray, radius_m: float) -> FlownOrbit:
-    """Quality of the orbit over the exposures (F,) bool; angles and speeds come from pairs of neighbours within.
+    """Quality of the orbit over the exposures ``within`` (F,) bool; angles and speeds from pairs of neighbours.
 
     Raises
     ------
     InputError
-        When fewer than two exposures lie within.
+        When ``within`` has fewer than two exposures.
     """
     if int(within.sum()) < 2:
         raise InputError("orbit: expected at least two exposures within it, found fewer; fly longer")
@@ -133,7 +133,7 @@ def flown_orbit(truth: FlightTruth, within: np.ndarray, radius_m: float) -> Flow
 
 
 def middle_third(truth: FlightTruth) -> np.ndarray:
-    """(F,) bool, the middle of the person's extent is in the middle third of the picture; False where it is behind."""
+    """(F,) bool, the middle of the person's extent is in the middle third of the image; False behind the camera."""
     px = truth.keypoints
     size = np.array(truth.image_size, dtype=float)
     middle = 0.5 * (px.min(axis=1) + px.max(axis=1)) - size / 2

@@ -1,4 +1,4 @@
-"""One world for the flight simulator: copter with its pilot, person, camera.  No ROS, no clock of its own."""
+"""World of the flight simulator: copter with its pilot, person, camera.  No ROS, no clock of its own."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from drocap_ros.simulation.orbit_camera import pinhole_matrix
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.copter import CONTROL_MODE
 
-#: The person stands until the vehicle has been flown by setpoints for this long and has come near, and waits, within
-#: a moment, whenever it is not: whoever is filmed sees the drone stop.
+#: The person stands until setpoints have steered the vehicle for this long, and pauses whenever they stop: a filmed
+#: person sees the drone stop.
 BEGINS_AFTER_S = 3.0
 _GAP_S, _REACTION_S = 0.5, 0.3
 _TAKE_HZ, _TAKE_CHUNK_S = 100.0, 20.0
 
 
 class Exposure(NamedTuple):
-    """What the camera sees at one instant.
+    """State at the exposure of one image.
 
     joints3d (15, 3) m ENU; rotation (3, 3) world -> optical; position (3,) m ENU
     """
@@ -36,7 +36,7 @@ class Exposure(NamedTuple):
 
 
 class FlightWorld:
-    """Stepped in time; exposures are kept as the truth.
+    """Stepped in time; keeps its exposures as the truth.
 
     Parameters
     ----------
@@ -55,35 +55,32 @@ class FlightWorld:
         self._take = Take(config)
         aim = self._take.at(0.0)[0]
         self.pilot = SimulatedPilot(self.copter, config.takeoff_height_m, aim)
-        self.forgotten = 0  # exposures beyond the limit
         self._t = self._take_s = 0.0
         self._pace = 0.0  # of the person, 0 standing to 1 acting
         self._setpoints = 0
-        self._heard_s = self._steered_s = -math.inf  # last setpoint; since when they come without a gap
+        self._setpoint_s = self._steered_s = -math.inf  # last setpoint; first one after the last gap
         self._rows: list[Exposure] = []
 
     def step(self, t_s: float) -> None:
-        """Go on to world time ``t_s``, which is the vehicle's path time too."""
+        """Advance to world time ``t_s``, which is also the vehicle's path time."""
         passed_s, self._t = t_s - self._t, t_s
         self.copter.fly(t_s)
         self.pilot.step(t_s)
         if self.copter.mode == CONTROL_MODE[self.copter.autopilot] and self.copter.accepted_setpoints > self._setpoints:
-            if t_s - self._heard_s > _GAP_S:
+            if t_s - self._setpoint_s > _GAP_S:
                 self._steered_s = t_s
-            self._heard_s = t_s
+            self._setpoint_s = t_s
         self._setpoints = self.copter.accepted_setpoints
-        acts = t_s - self._heard_s <= _GAP_S and t_s - self._steered_s >= BEGINS_AFTER_S
+        acts = t_s - self._setpoint_s <= _GAP_S and t_s - self._steered_s >= BEGINS_AFTER_S
         self._pace += (float(acts) - self._pace) * (1 - math.exp(-passed_s / _REACTION_S))
         self._take_s += self._pace * passed_s
 
     def expose(self, stamp_ns: int) -> Exposure:
-        """What the camera sees now; ``stamp_ns`` is now by the clock of the stamps."""
+        """Expose an image now; ``stamp_ns`` is the present time of the stamps' clock."""
         rotation = camera_rotation(self.copter.camera_orientation())
-        exposure = Exposure(stamp_ns, self._person(), rotation, self.copter.body.position.copy())
+        exposure = Exposure(stamp_ns, self._take.at(self._take_s), rotation, self.copter.body.position.copy())
         if len(self._rows) < MAX_EXPOSURES:
             self._rows.append(exposure)
-        else:
-            self.forgotten += 1
         return exposure
 
     def truth(self) -> FlightTruth:
@@ -99,16 +96,12 @@ class FlightWorld:
         )
 
     def close(self) -> None:
-        """Let go of the link."""
+        """Close the link."""
         self.copter.close()
-
-    def _person(self) -> np.ndarray:
-        """(15, 3) m ENU, now."""
-        return self._take.at(self._take_s)
 
 
 class Take:
-    """The person's motion, worked out a piece at a time and linear within 10 ms."""
+    """The person's motion, computed in pieces of 20 s and linear within 10 ms."""
 
     def __init__(self, config: FlightSimulatorConfig) -> None:
         self._config = config

@@ -1,7 +1,7 @@
-"""A MAVLink vehicle that flies what it is told, as the two autopilots were seen (ArduPilot) or read (PX4) to do.
+"""A simulated copter under setpoints, modes, time-outs, refusals and failsafes of ArduPilot or PX4.
 
-Modes, setpoints, time-outs, acknowledgements, refusals and failsafes; the facts are in the project's field notes.
-What it reports is its own estimate: the truth with the errors of GPS and attitude.
+ArduPilot's behaviour was measured on its own simulation, PX4's is taken from its documentation and source.  The copter
+reports its estimate: the truth with the errors of GPS and attitude.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.flight.frames import ned_to_enu
 from drocap_ros.flight.mavlink.transport import Transport
 from drocap_ros.simulation.vehicle.dynamics import PointMass, Target
+from drocap_ros.simulation.vehicle.flight_path import VehiclePose
 from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle
-from drocap_ros.simulation.vehicle.path import VehiclePose
 
 _STEP_S = 0.01
 _MODES = {
@@ -38,27 +38,24 @@ _HEALTHY, _CONSTANT_POSITION = 831, 831 & ~(8 | 16) | 128
 
 
 class SimulatedCopter(SimulatedVehicle):
-    """See the module.
+    """A MAVLink vehicle with the dynamics of a copter.
 
     Parameters
     ----------
-    position, yaw : where it hovers at the beginning, ENU, truth
+    position, yaw : of the initial hover, ENU, truth
     wind : (3,) m/s
     guid_timeout_s : ArduPilot's GUID_TIMEOUT
     offboard_loss_s : PX4's COM_OF_LOSS_T; 1 s as PX4 ships
-    gps_noise_m : of the slow error of the position; fine errors come on top
+    gps_noise_m : of the slow error of the position; fine errors are added
     """
 
     def __init__(
         self, transport: Transport, position: np.ndarray, yaw: float, autopilot: str = "ardupilot", *,
         wind: np.ndarray | None = None, seed: int = 0, gps_noise_m: float = 0.4, attitude_error_deg: float = 0.4,
         guid_timeout_s: float = 0.5, mode: str = "LOITER", gimbal: bool = True, gimbal_pitch_deg: float = -14.0,
-        system_id: int = 1, offboard_loss_s: float = 0.5, signing_key: bytes | None = None,
+        offboard_loss_s: float = 0.5,
     ) -> None:  # fmt: skip
-        super().__init__(
-            "", _Nowhere(), autopilot, gimbal=gimbal, system_id=system_id, transport=transport, signing_key=signing_key
-        )
-        self.path = self
+        super().__init__("", None, autopilot, gimbal=gimbal, transport=transport)
         self.body = PointMass(position, yaw, np.zeros(3) if wind is None else wind, seed)
         self.mode, self.armed, self.battery, self.landed_state = mode, True, 87, mavlink.MAV_LANDED_STATE_IN_AIR
         self.guid_timeout_s, self.offboard_loss_s = guid_timeout_s, offboard_loss_s
@@ -70,8 +67,8 @@ class SimulatedCopter(SimulatedVehicle):
         self.frozen_clock = False
         self.crashed = ""
         self.accepted_setpoints = 0
-        self.deaf = False  # takes setpoints no more and says nothing
-        self.motion_until_s = -1.0  # when somebody's setpoints last made it move
+        self.deaf = False  # ignores setpoints silently
+        self.motion_until_s = -1.0  # last motion by setpoints
         self.fence_m = math.inf
         self.camera_pitch = math.radians(gimbal_pitch_deg)
         self.mode_log: list[tuple[float, str, str]] = [(0.0, mode, "start")]
@@ -81,19 +78,17 @@ class SimulatedCopter(SimulatedVehicle):
         self.gps_error = gps_noise_m * self._rng.standard_normal(3) * np.array([1, 1, 0.5])
         self._attitude_error = math.radians(attitude_error_deg) * self._rng.standard_normal(3)
         self.target = Target(position=position.astype(float).copy(), yaw=yaw)
-        self._heard_s = -1e9  # last accepted setpoint
-        self._stream_s = math.inf  # since when setpoints stream without a gap
-        self._seen_s = 0.0  # last setpoint, accepted or not
+        self._accepted_s = -1e9  # last accepted setpoint
+        self._stream_s = math.inf  # first setpoint after the last gap
+        self._setpoint_s = 0.0  # last setpoint, accepted or not
         self._stop_velocity: np.ndarray | None = None
-        self._heading = yaw  # kept in the modes that no setpoint steers
+        self._heading = yaw  # held in the modes without setpoints
         self._timed_out_at: Target | None = None
         self._report: VehiclePose | None = None
         self._report_s = -1.0
 
-    # -- flying ----------------------------------------------------------------------------------------
-
     def fly(self, t_s: float) -> None:
-        """Fly up to path time ``t_s``, then speak and listen."""
+        """Fly up to path time ``t_s``, then send and receive."""
         while self._t < t_s - 1e-9 and not self.crashed:
             dt = min(_STEP_S, t_s - self._t)
             self._t += dt
@@ -108,19 +103,19 @@ class SimulatedCopter(SimulatedVehicle):
             self.step(t_s)
 
     def set_mode(self, mode: str, by: str) -> None:
-        """Change the mode."""
+        """Change the mode; ``by`` ("pilot", "command", "failsafe: ...") enters the log."""
         if mode != self.mode:
             self.mode = mode
             self.mode_log.append((self._t, mode, by))
             self._stop_velocity = self.body.velocity.copy()
             self._heading = self.body.yaw
             if mode == CONTROL_MODE[self.autopilot] and self.autopilot == "ardupilot":
-                self._heard_s = -1e9  # GUIDED begins by holding
+                self._accepted_s = -1e9  # GUIDED starts with a hold
                 self.target = Target(yaw=self.body.yaw)
 
     @property
     def estimate(self) -> np.ndarray:
-        """(3,) where the autopilot believes it is."""
+        """(3,) m, the autopilot's position estimate."""
         return self.body.position + self.gps_error
 
     def camera_orientation(self) -> np.ndarray:
@@ -129,7 +124,7 @@ class SimulatedCopter(SimulatedVehicle):
 
     def _present_target(self, dt: float) -> Target:
         if self.mode == CONTROL_MODE[self.autopilot]:
-            silent_s = self._t - self._heard_s
+            silent_s = self._t - self._accepted_s
             expired = self.autopilot == "ardupilot" and silent_s > self.guid_timeout_s
             if float(np.linalg.norm(self.target.velocity)) > 0.05 and not expired:
                 self.motion_until_s = self._t
@@ -151,12 +146,12 @@ class SimulatedCopter(SimulatedVehicle):
         return self._stopping(_BRAKING.get(self.mode, 1.45), dt)
 
     def _in_truth(self, target: Target) -> Target:
-        """The loops close on the estimate: in terms of the truth its error shifts the target."""
+        """Target relative to the truth: the loops close on the estimate, whose error shifts the target."""
         position = None if target.position is None else target.position - self.gps_error
         return Target(position, target.velocity, target.acceleration, target.yaw, target.yaw_rate)
 
     def _stopping(self, braking: float, dt: float) -> Target:
-        """Come to rest at this deceleration, then stay."""
+        """Brake at this deceleration, then hold the position."""
         if self._stop_velocity is None:
             self._stop_velocity = self.body.velocity.copy()
         speed = float(np.linalg.norm(self._stop_velocity))
@@ -172,14 +167,12 @@ class SimulatedCopter(SimulatedVehicle):
         return self.target
 
     def _failsafes(self) -> None:
-        if self.autopilot == "px4" and self.mode == "OFFBOARD" and self._t - self._seen_s > self.offboard_loss_s:
+        if self.autopilot == "px4" and self.mode == "OFFBOARD" and self._t - self._setpoint_s > self.offboard_loss_s:
             self.set_mode("LOITER", "failsafe: offboard lost")
         if self._t > min(self.ekf_failed_s + 1.0, self.gps_lost_s + _EKF_NOTICED_S + 1.0) and self.mode != "LAND":
             self.set_mode("LAND", "failsafe: estimator")
         if np.hypot(*self.estimate[:2]) > self.fence_m and self.mode not in ("RTL", "LAND"):
             self.set_mode("RTL", "failsafe: fence")
-
-    # -- what it hears ---------------------------------------------------------------------------------
 
     def _answer(self, message: Any, t_s: float) -> None:
         name = message.get_type()
@@ -206,7 +199,7 @@ class SimulatedCopter(SimulatedVehicle):
         names = [name for name, value in _MODES[self.autopilot].items() if value == number]
         if not names:
             return int(mavlink.MAV_RESULT_FAILED)
-        streams = self._t - self._stream_s >= _PX4_STREAM_S and self._t - self._seen_s < _PX4_GAP_S
+        streams = self._t - self._stream_s >= _PX4_STREAM_S and self._t - self._setpoint_s < _PX4_GAP_S
         if names[0] in self.denied_modes or (names[0] == "OFFBOARD" and not streams):
             return int(mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
         self.set_mode(names[0], "command")
@@ -216,11 +209,11 @@ class SimulatedCopter(SimulatedVehicle):
         if m.target_system not in (0, self._mav.srcSystem):
             return
         values = (m.x, m.y, m.z, m.vx, m.vy, m.vz, m.afx, m.afy, m.afz, m.yaw, m.yaw_rate)
-        if self._t - self._seen_s > _PX4_GAP_S:
+        if self._t - self._setpoint_s > _PX4_GAP_S:
             self._stream_s = self._t
-        self._seen_s = self._t
+        self._setpoint_s = self._t
         if self.mode != CONTROL_MODE[self.autopilot] or self.deaf:
-            return  # silently ignored
+            return
         if not all(math.isfinite(v) for v in (*values[:3], m.yaw)):
             self.crashed = "a setpoint with NaN"
             return
@@ -235,13 +228,11 @@ class SimulatedCopter(SimulatedVehicle):
             vectors[0] if keep[0] else None, vectors[1] if keep[1] else np.zeros(3),
             vectors[2] if keep[2] else np.zeros(3), yaw, 0.0 if mask & 2048 else -m.yaw_rate,
         )  # fmt: skip
-        self._heard_s = self._t
+        self._accepted_s = self._t
         self.accepted_setpoints += 1
 
-    # -- what it tells ---------------------------------------------------------------------------------
-
     def at(self, t_s: float) -> VehiclePose:
-        """What it reports: its estimate, not the truth."""
+        """Reported pose: the estimate, not the truth."""
         if self._report is not None and (self.frozen or t_s == self._report_s):
             return self._report
         fine = self._rng.standard_normal(6)
@@ -263,12 +254,12 @@ class SimulatedCopter(SimulatedVehicle):
         return super()._known() | more
 
     def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> Any:
-        told_s = self._report_s if self.frozen and self.frozen_clock else t_s
-        boot_ms = int((told_s + self.boot_s) * 1e3) % 2**32
+        reported_s = self._report_s if self.frozen and self.frozen_clock else t_s
+        boot_ms = int((reported_s + self.boot_s) * 1e3) % 2**32
         mav = self._mav
         if number == mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED:
-            if self._t - self._heard_s > 0.5:
-                return None  # echoes what it accepted, nothing else
+            if self._t - self._accepted_s > 0.5:
+                return None  # only accepted setpoints are echoed
             return mav.position_target_local_ned_encode(boot_ms, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
         if number in (mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT, mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS):
             lost = self._t > min(self.ekf_failed_s, self.gps_lost_s + _EKF_NOTICED_S)
@@ -283,7 +274,7 @@ class SimulatedCopter(SimulatedVehicle):
         if number == mavlink.MAVLINK_MSG_ID_GPS_RAW_INT:
             fix = 1 if self._t > self.gps_lost_s + _GPS_NOTICED_S else 3
             return mav.gps_raw_int_encode(boot_ms * 1000, fix, 473977420, 85455940, 488000, 60, 90, 0, 0, 17)
-        return super()._telemetry(number, told_s, pose)
+        return super()._telemetry(number, reported_s, pose)
 
     def _heartbeat(self) -> Any:
         px4 = self.autopilot == "px4"
@@ -295,13 +286,6 @@ class SimulatedCopter(SimulatedVehicle):
             _MODES[self.autopilot][self.mode],
             mavlink.MAV_STATE_ACTIVE,
         )
-
-
-class _Nowhere:
-    """Takes the place of a path until the copter is its own."""
-
-    def at(self, t_s: float) -> VehiclePose:
-        raise AssertionError("the copter is its own path")
 
 
 def _level(yaw: float, pitch: float) -> np.ndarray:

@@ -1,7 +1,8 @@
-"""How the simulated vehicle moves: a point mass with lag under an autopilot's position and velocity loops, in wind.
+"""Dynamics of the simulated copter: a point mass with lag under an autopilot's position and velocity loops, in wind.
 
-The loops are tuned to what was measured on ArduPilot Copter: stops from 2 m/s, errors of an orbit of 6 m at 2 m/s by
-what the setpoint holds, in wind and round a moving centre.  ``test/simulation/test_copter_measured.py`` prints both.
+The loops are tuned to measurements on ArduPilot Copter: stops from 2 m/s, errors of an orbit of 6 m at 2 m/s for each
+content of the setpoint, in wind and about a moving centre.  ``test/simulation/vehicle/test_copter_measured.py`` prints
+both.
 """
 
 from __future__ import annotations
@@ -13,18 +14,18 @@ import numpy as np
 
 _POSITION_GAIN, _VELOCITY_GAIN, _INTEGRAL_GAIN = 0.9, 1.55, 0.06
 _LAG_S = 0.12
-_FEED_FORWARD = 0.77  # share of the acceleration asked for that comes through the autopilot's shaping
-_SHAPING_M_S2 = 4.1  # how fast the loops let the wanted velocity change, beyond what is fed forward
+_FEED_FORWARD = 0.77  # share of the commanded acceleration that passes the autopilot's shaping
+_SHAPING_M_S2 = 4.1  # largest change of the wanted velocity beyond the feed forward
 _MAX_ACCELERATION, _MAX_SPEED, _MAX_CLIMB = 4.5, 9.7, 2.5
 _YAW_GAIN, _YAW_LAG_S, _MAX_YAW_RATE = 6.85, 0.1, 1.6
 _DRAG = 0.016
 _GUST = 0.12  # share of the wind
-_GUST_TURN = 0.24  # rad/s of turn per m/s of gust from the side
+_GUST_TURN = 0.24  # rad/s of yaw per m/s of lateral gust
 
 
 @dataclass
 class Target:
-    """What the loops are asked for, ENU; None = not asked."""
+    """Input of the loops, ENU; None = not commanded."""
 
     position: np.ndarray | None = None
     velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -49,7 +50,7 @@ class PointMass:
         self._wind: np.ndarray = wind.astype(float)
         self._gust: np.ndarray = np.zeros(3)
         self._rng = np.random.default_rng([seed, 0xF1])
-        # Whoever hovers has already learned the wind.
+        # In hover the integral has already adapted to the wind.
         self._integral: np.ndarray = -self._drag()
 
     def step(self, target: Target, dt: float) -> None:

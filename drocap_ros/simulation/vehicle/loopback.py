@@ -1,4 +1,4 @@
-"""A link inside one process, in simulated time: with delay, loss, duplicates and packets out of order."""
+"""A link inside one process in simulated time, with delay, loss, duplicates and packets out of order."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from collections.abc import Callable
 class Channel:
     """One direction.  Deterministic: its randomness comes from a seed.
 
-    delay_s, jitter_s : of each packet; jitter above the packets' distance puts them out of order
+    delay_s, jitter_s : of each packet; jitter above the interval of the packets reorders them
     loss, duplicate : shares of the packets
-    cut : whether nothing passes
+    cut : no packet passes
     """
 
     def __init__(self, clock_s: Callable[[], float], seed: int = 0) -> None:
@@ -24,14 +24,14 @@ class Channel:
         self.delay_s, self.jitter_s, self.loss, self.duplicate, self.cut = 0.01, 0.0, 0.0, 0.0, False
 
     def write(self, data: bytes) -> None:
-        """Take a packet."""
+        """Send a packet."""
         for _ in range(1 + (self._random.random() < self.duplicate)):
             if not self.cut and self._random.random() >= self.loss:
                 due = self._clock_s() + self.delay_s + self._random.uniform(0, self.jitter_s)
                 heapq.heappush(self._waiting, (due, next(self._order), data))
 
     def read(self) -> bytes:
-        """All that has arrived."""
+        """Arrived packets, joined."""
         parts = []
         while self._waiting and self._waiting[0][0] <= self._clock_s():
             parts.append(heapq.heappop(self._waiting)[2])
@@ -45,7 +45,7 @@ class LoopbackTransport:
         self._incoming, self._outgoing = incoming, outgoing
 
     def read(self, timeout_s: float) -> bytes:
-        """Whatever has come."""
+        """Arrived packets, joined."""
         return self._incoming.read()
 
     def write(self, data: bytes) -> bool:
@@ -54,7 +54,7 @@ class LoopbackTransport:
         return True
 
     def accept_peer(self) -> None:
-        """Nothing to choose: there is one peer."""
+        """Do nothing: there is one peer."""
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Do nothing."""

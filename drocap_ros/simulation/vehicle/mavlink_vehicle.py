@@ -1,7 +1,7 @@
-"""A vehicle that speaks MAVLink and flies a given path.
+"""A simulated MAVLink vehicle on a given path.
 
-It stands in for an autopilot: heartbeat, telemetry at the rates asked for, acknowledgements, time synchronization.
-``python -m drocap_ros.simulation.vehicle.mavlink_vehicle`` runs it as a process of its own (``--url``).
+It replaces an autopilot: heartbeat, telemetry at the requested rates, acknowledgements, time synchronization.
+``python -m drocap_ros.simulation.vehicle.mavlink_vehicle --url URL`` runs it as a process of its own.
 """
 
 from __future__ import annotations
@@ -18,16 +18,11 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.frames import (
-    enu_to_geodetic,
-    enu_to_ned,
-    flu_to_frd,
-    orientation_to_aviation,
-)
+from drocap_ros.flight.frames import enu_to_geodetic, enu_to_ned, flu_to_frd, orientation_to_aviation
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.signing import sign_with
 from drocap_ros.flight.mavlink.transport import Transport, open_transport
-from drocap_ros.simulation.vehicle.path import FlightPath, VehiclePose, orbit_path
+from drocap_ros.simulation.vehicle.flight_path import FlightPath, VehiclePose, orbit_path
 
 AUTOPILOTS = ("ardupilot", "px4")
 #: Latitude deg, longitude deg, altitude m of the local frame's origin.
@@ -45,25 +40,24 @@ class SimulatedVehicle:
     Parameters
     ----------
     url : of :func:`drocap_ros.flight.mavlink.transport.open_transport`
-    path : where it flies
+    path : None = the subclass overrides :meth:`at`
     autopilot : "ardupilot" or "px4"
-    gimbal : whether it has one and tells its attitude
-    system_id : its MAVLink system
-    max_rate_hz : what it delivers at most, whatever is asked and acknowledged (a slow link)
-    boot_s : seconds since boot at path time 0
-    transport : instead of that of the URL
-    signing_key : 32 bytes; then it signs, and hears only what is signed
+    gimbal : whether it has a gimbal and reports its attitude
+    max_rate_hz : highest delivered rate, whatever was requested and acknowledged (a slow link)
+    boot_s : time since boot at path time 0
+    transport : replaces the URL
+    signing_key : 32 bytes; it then signs its packets and drops unsigned ones
 
     Raises
     ------
     InputError
-        When the autopilot is unknown or the URL cannot be used.
+        When the autopilot is unknown or the URL is invalid.
     """
 
     def __init__(
         self,
         url: str,
-        path: FlightPath,
+        path: FlightPath | None,
         autopilot: str = "ardupilot",
         *,
         gimbal: bool = True,
@@ -76,7 +70,7 @@ class SimulatedVehicle:
         if autopilot not in AUTOPILOTS:
             raise InputError(f"autopilot: expected one of {', '.join(AUTOPILOTS)}, got {autopilot!r}")
         self.path, self.autopilot, self.gimbal = path, autopilot, gimbal
-        self.received: list[str] = []  # names of what came in, for tests that nothing else was sent
+        self.received: list[str] = []  # names of the received messages, for tests of what is sent
         self._max_rate_hz, self.boot_s = max_rate_hz, boot_s
         self._transport = transport or open_transport(url)
         self._parser = MavlinkParser()
@@ -88,7 +82,7 @@ class SimulatedVehicle:
         if signing_key is not None:
             self.use_key(signing_key, time.time_ns())
         self._period_s: dict[int, float] = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}
-        if autopilot == "px4":  # PX4 streams a set by itself, ArduPilot almost nothing
+        if autopilot == "px4":  # PX4 streams some messages unrequested, ArduPilot almost none
             self._period_s[mavlink.MAVLINK_MSG_ID_ATTITUDE] = 0.05
             self._period_s[mavlink.MAVLINK_MSG_ID_SYS_STATUS] = 1.0
         self._due_s: dict[int, float] = {}
@@ -102,7 +96,7 @@ class SimulatedVehicle:
         self.close()
 
     def use_key(self, key: bytes, now_ns: int) -> None:
-        """Sign from now on, and hear only what is signed."""
+        """Sign from now on, and drop unsigned packets."""
         self._parser = MavlinkParser(key, now_ns)
         sign_with(self._mav, key, now_ns)
 
@@ -118,7 +112,7 @@ class SimulatedVehicle:
             self.step(clock_s() - start, wait_s=0.004)
 
     def step(self, t_s: float, wait_s: float = 0.0) -> None:
-        """Answer what has come (waiting at most ``wait_s``) and send what is due at path time ``t_s``."""
+        """Answer the received messages (waiting at most ``wait_s``) and send those due at path time ``t_s``."""
         data = self._transport.read(wait_s)
         if data:
             for message in self._parser.feed(data):
@@ -130,11 +124,16 @@ class SimulatedVehicle:
             if t_s >= self._due_s.get(number, -math.inf):
                 due = self._due_s.get(number, t_s)
                 self._due_s[number] = due + period_s if t_s - due < period_s else t_s + period_s
-                pose = pose or self.path.at(t_s)
+                pose = pose or self.at(t_s)
                 self._send(self._telemetry(number, t_s, pose))
 
+    def at(self, t_s: float) -> VehiclePose:
+        """Reported pose at path time ``t_s``."""
+        assert self.path is not None
+        return self.path.at(t_s)
+
     def close(self) -> None:
-        """Stop and give the port back."""
+        """Stop and close the port."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(2.0)
@@ -149,7 +148,7 @@ class SimulatedVehicle:
         if name == "TIMESYNC" and message.tc1 == 0:
             self._send(self._mav.timesync_encode(int((t_s + self.boot_s) * 1e9), message.ts1))
         elif name == "PARAM_REQUEST_READ":
-            self._tell_setting(message.param_id)
+            self._report_setting(message.param_id)
         elif name == "COMMAND_LONG":
             result = mavlink.MAV_RESULT_UNSUPPORTED
             if message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
@@ -160,11 +159,11 @@ class SimulatedVehicle:
                 )
             )
 
-    def _tell_setting(self, name: str) -> None:
+    def _report_setting(self, name: str) -> None:
         if name not in self.settings:
             return
         value, kind = self.settings[name], mavlink.MAV_PARAM_TYPE_REAL32
-        if isinstance(value, int):  # PX4's way: the integer's bytes in the place of the float
+        if isinstance(value, int):  # PX4 sends the bytes of the integer in the field of the float
             value, kind = struct.unpack("<f", struct.pack("<i", value))[0], mavlink.MAV_PARAM_TYPE_INT32
         self._send(self._mav.param_value_encode(name.encode("ascii"), value, kind, len(self.settings), 0))
 
@@ -255,9 +254,9 @@ class SimulatedVehicle:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Fly an orbit as a process of its own."""
+    """Run an orbit as a process."""
     parser = argparse.ArgumentParser(prog="mavlink_vehicle", description=__doc__)
-    parser.add_argument("--url", default="udpout:127.0.0.1:14540", help="where the companion listens")
+    parser.add_argument("--url", default="udpout:127.0.0.1:14540", help="address of the companion computer")
     parser.add_argument("--autopilot", choices=AUTOPILOTS, default="ardupilot")
     parser.add_argument("--seconds", type=float, default=3600.0, help="length of the flight, s")
     parser.add_argument("--radius", type=float, default=6.0, help="of the orbit, m")

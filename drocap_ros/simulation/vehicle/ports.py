@@ -1,4 +1,4 @@
-"""Ports for simulated links."""
+"""UDP ports for simulated links."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import socket
 
 
 def free_udp_port() -> int:
-    """A UDP port on loopback that nobody uses at the moment."""
+    """A free UDP port on loopback."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

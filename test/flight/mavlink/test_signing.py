@@ -11,8 +11,8 @@ from drocap_ros.flight.mavlink.dialects import halt_message
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.signing import read_signing_key, sign_with, signing_time
+from drocap_ros.simulation.vehicle.flight_path import orbit_path
 from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle
-from drocap_ros.simulation.vehicle.path import orbit_path
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 
 KEY, OTHER = bytes(range(32)), bytes(range(1, 33))

@@ -1,4 +1,4 @@
-"""The world of the flight simulator, stepped in simulated time."""
+"""The flight simulator without ROS, stepped in simulated time."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def fly(clock, flight, until_s, each=lambda: None):
 
 
 @pytest.mark.parametrize(("autopilot", "mode"), [("ardupilot", "GUIDED"), ("px4", "LOITER")])
-def test_the_pilot_takes_off_hovers_and_hands_over(autopilot, mode):
+def test_pilot_takes_off_hovers_and_hands_over(autopilot, mode):
     clock, flight = world(autopilot=autopilot, wind_m_s=6.0, seed=3)
     start = flight.copter.body.position.copy()
     fly(clock, flight, 0.9)
@@ -45,14 +45,14 @@ def test_the_pilot_takes_off_hovers_and_hands_over(autopilot, mode):
     assert not flight.pilot.handed_over
     fly(clock, flight, 10.0, lambda: flight.expose(round(clock.t * 1e9)))
     truth = flight.truth()
-    assert ((truth.keypoints > 0) & (truth.keypoints < truth.image_size)).all()  # the person is in view all the time
+    assert ((truth.keypoints > 0) & (truth.keypoints < truth.image_size)).all()  # the person stays in view
     assert (flight.pilot.handed_over, flight.copter.landed_state, flight.copter.mode) == (True, IN_AIR, mode)
     assert abs(flight.copter.body.position[2] - 3.0) < 0.6
     assert np.linalg.norm(flight.copter.body.position[:2] - start[:2]) < 1.0
     assert np.linalg.norm(flight.copter.body.velocity) < 0.3
 
 
-def test_the_person_acts_while_setpoints_steer_the_vehicle_and_the_truth_tells_it():
+def test_person_moves_while_setpoints_steer_the_vehicle_and_the_truth_records_it():
     clock, flight = world(seed=1, action="walk")
 
     def setpoint():
@@ -67,7 +67,7 @@ def test_the_person_acts_while_setpoints_steer_the_vehicle_and_the_truth_tells_i
     after = flight.expose(3_000)
     walked = np.linalg.norm((after.joints3d - still.joints3d)[0, :2])
     assert 2.0 < walked < 8.0
-    fly(clock, flight, clock.t + 3.0)  # nobody steers any more
+    fly(clock, flight, clock.t + 3.0)  # no more setpoints
     waiting = flight.expose(4_000)
     fly(clock, flight, clock.t + 1.0)
     assert np.abs(flight.expose(5_000).joints3d - waiting.joints3d).max() < 0.005
@@ -77,7 +77,7 @@ def test_the_person_acts_while_setpoints_steer_the_vehicle_and_the_truth_tells_i
     np.testing.assert_array_equal(truth.joints3d[2], after.joints3d)
 
 
-def test_the_take_is_the_person_s_motion_across_its_pieces():
+def test_take_equals_the_simulated_person_across_its_pieces():
     config = FlightSimulatorConfig(seed=1, action="mixed")
     take, times = Take(config), np.array([0.0, 0.123, 19.996, 20.0, 47.3])
     exact = simulate_person(times, "mixed", 1, config.stature_m)
@@ -97,7 +97,7 @@ def orbit_truth(seconds=10.0, radius=6.0, speed_deg_s=20.0, off_deg=0.0, rate=10
     return FlightTruth(stamps, joints, look_at(position, target), position, matrix, (1280, 720))
 
 
-def test_the_quality_of_an_orbit_is_what_was_flown():
+def test_orbit_quality_equals_the_constructed_errors():
     truth = orbit_truth(radius=6.4, off_deg=3.0)
     found = flown_orbit(truth, np.ones(100, bool), 6.0)
     assert found.radius_error_m == pytest.approx(0.4)
@@ -114,7 +114,7 @@ def test_the_quality_of_an_orbit_is_what_was_flown():
         flown_orbit(truth, np.zeros(100, bool), 6.0)
 
 
-def test_the_truth_file_is_a_motion_that_can_be_compared(tmp_path):
+def test_truth_file_is_a_motion_and_reads_back(tmp_path):
     truth = orbit_truth()
     save_flight_truth(tmp_path / "truth.npz", truth)
     assert [path.name for path in tmp_path.iterdir()] == ["truth.npz"]

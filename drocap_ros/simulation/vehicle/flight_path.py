@@ -1,4 +1,4 @@
-"""Where the simulated vehicle is: paths as functions of time."""
+"""Flight paths of the simulated vehicle as functions of time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from drocap_ros.flight.frames import OPTICAL_FROM_FLU
-from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, slerp
+from drocap_ros.geometry.rotations import quaternion_from_matrix, slerp
 from drocap_ros.simulation.orbit_camera import orbit_camera
 
 
@@ -22,14 +22,14 @@ class VehiclePose(NamedTuple):
 
 
 class FlightPath(Protocol):
-    """A path that the simulated vehicle follows exactly."""
+    """A path that the simulated vehicle follows without error."""
 
     def at(self, t_s: float) -> VehiclePose:
-        """Pose at an instant; before the start and after the end it stands still."""
+        """Pose at an instant; at rest before the start and after the end."""
 
 
 class SampledPath:
-    """Path through sampled camera poses: the vehicle carries the camera at its own place and turns its nose with it.
+    """Path through sampled camera poses: the camera is at the vehicle's position, the nose follows its bearing.
 
     Parameters
     ----------
@@ -68,13 +68,8 @@ class SampledPath:
 def orbit_path(
     seconds: float, radius_m: float = 6.0, height_m: float = 2.5, speed_deg_s: float = 25.0, rate_hz: float = 50.0
 ) -> SampledPath:
-    """Orbit of a point 0.9 m above the origin."""
+    """Orbit about a point 0.9 m above the origin."""
     t = np.arange(0.0, seconds + 1.0 / rate_hz, 1.0 / rate_hz)
     centre = np.broadcast_to(np.array([0.0, 0.0, 0.9]), (len(t), 3))
     rotation, position = orbit_camera(t, centre, radius_m, height_m, speed_deg_s)
     return SampledPath(t, rotation, position)
-
-
-def optical_rotation(pose: VehiclePose) -> np.ndarray:
-    """(3, 3) world ENU -> camera optical of a pose."""
-    return OPTICAL_FROM_FLU @ matrix_from_quaternion(pose.gimbal_orientation_xyzw).T
