@@ -22,8 +22,8 @@ from figures import ROOT, table, write_figures
 sys.path[:0] = [str(ROOT)]
 
 from drocap_ros.cli.progress import progress_bars  # noqa: E402
-from drocap_ros.evaluation.live import live_study  # noqa: E402
-from drocap_ros.evaluation.live_table import live_markdown  # noqa: E402
+from drocap_ros.evaluation.live_study import live_study  # noqa: E402
+from drocap_ros.evaluation.live_study_table import live_markdown  # noqa: E402
 from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error, w_mpjpe  # noqa: E402
 from drocap_ros.evaluation.protocol import (  # noqa: E402
     FPS,

@@ -129,8 +129,8 @@ def _live(args: argparse.Namespace) -> int:
     from drocap_ros.cli.atomic_output import check_output_folder, output_folder
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.config import DrocapConfig, load_config
-    from drocap_ros.evaluation.live import live_study
-    from drocap_ros.evaluation.live_table import live_markdown
+    from drocap_ros.evaluation.live_study import live_study
+    from drocap_ros.evaluation.live_study_table import live_markdown
     from drocap_ros.evaluation.tables import save_csv
 
     if args.out is not None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.cli import main
-from drocap_ros.evaluation.live import fly, live_study, standardized_error
+from drocap_ros.evaluation.live_study import live_study, simulate_live, standardized_error
 from drocap_ros.evaluation.protocol import orbit_view
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.simulation.simulated_person import simulate_person
@@ -41,10 +41,10 @@ def test_the_command_prints_its_tables_and_writes_them(mocap, tmp_path, capsys):
 
 def test_a_solution_counts_from_its_arrival():
     view = orbit_view(walk_mm(5.0), 25.0)
-    never = fly(view, 10.0, InitializerConfig(), BundleAdjusterConfig())
+    never = simulate_live(view, 10.0, InitializerConfig(), BundleAdjusterConfig())
     np.testing.assert_array_equal(never.latest, never.initial)
     assert np.isnan(never.refined).all()
-    soon = fly(view, 0.5, InitializerConfig(), BundleAdjusterConfig())
+    soon = simulate_live(view, 0.5, InitializerConfig(), BundleAdjusterConfig())
     # The first window ends after a third of a second, at the ninth image; its solution arrives half a second later.
     np.testing.assert_array_equal(soon.latest[:20], soon.initial[:20])
     assert not np.array_equal(soon.latest[20:24], soon.initial[20:24])

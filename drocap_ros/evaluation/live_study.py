@@ -1,8 +1,9 @@
-"""The live method on simulated orbits: what is published when, beside the offline result on the same tracks."""
+"""The live method on simulated orbits: published poses beside the offline result on the same tracks."""
 
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +22,7 @@ from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 
-#: Age at which a refined pose is judged.
+#: Age at which the error of a refined pose counts.
 REFINED_AFTER_S = 2.0
 
 
@@ -31,11 +32,11 @@ class LiveRow:
 
     initial_mm, latest_mm : reconstruction error (12 limb joints) of ``pose3d/initial`` and ``pose3d/latest`` when they
         are published, over all frames
-    refined_mm : of the newest refined pose 2 s after the image, over the frames that are so old at the end
+    refined_mm : of the newest refined pose 2 s after the image, over the frames of at least that age at the end
     offline_mm, offline_all_mm : of ``drocap reconstruct --method ba`` on the same tracks, over the same frames as
         refined_mm, and over all
-    refined_std, initial_std : RMS of the standardized error, about the pelvis, at the true scale: 1 = honest
-    step_mm : the most that taking over solutions moves a joint of ``pose3d/latest`` from one image to the next
+    refined_std, initial_std : RMS of the standardized error, about the pelvis, at the true scale; 1 = consistent
+    step_mm : the largest step of a joint of ``pose3d/latest`` between two images that new solutions cause
     initial_ms, initial_p95_ms, solve_p95_s : wall-clock of one image's initial pose, of one adjustment
     """
 
@@ -72,7 +73,7 @@ def live_study(
 
     Parameters
     ----------
-    delay_s : after its newest image a window's solution is there
+    delay_s : from a window's newest image to the arrival of its solution
 
     Raises
     ------
@@ -89,15 +90,15 @@ def live_study(
     rows = []
     for sequence in sequences:
         view = orbit_view(sequence.x, speed_deg_s, noisy=noisy, seed=seed)
-        flown = fly(view, delay_s, initializer or InitializerConfig(), adjuster or BundleAdjusterConfig())
-        rows.append(_row(sequence, speed_deg_s, noisy, view, flown))
+        result = simulate_live(view, delay_s, initializer or InitializerConfig(), adjuster or BundleAdjusterConfig())
+        rows.append(_row(sequence, speed_deg_s, noisy, view, result))
         if progress is not None:
             progress("live study", len(rows) / len(sequences))
     return rows
 
 
 def observations(view: OrbitView) -> Iterator[PoseObservation]:
-    """The view's keypoints as the pose estimator would publish them; their covariance is not known."""
+    """The view's keypoints as the pose estimator publishes them, without a covariance."""
     t = view.tracks
     keypoints = t.keypoints.astype(np.float32)
     for i, stamp_ns in enumerate(t.stamp_ns.tolist()):
@@ -113,12 +114,12 @@ def observations(view: OrbitView) -> Iterator[PoseObservation]:
 
 
 @dataclass(frozen=True)
-class Flown:
-    """What the live method published: F frames, m, camera axes.
+class LiveResult:
+    """Published poses: F frames, m, camera axes.
 
-    refined : (F, 15, 3) as :data:`REFINED_AFTER_S` later; NaN where the sequence ended before
-    initial_std_m, refined_std_m : (F, 15, 3) by its covariances
-    step_m : (F,) how far the change of the correction since the image before moves a joint at most
+    refined : (F, 15, 3) as of :data:`REFINED_AFTER_S` later; NaN where the sequence ended before
+    initial_std_m, refined_std_m : (F, 15, 3) by the published covariances
+    step_m : (F,) largest step of a joint by the change of the correction since the previous image
     """
 
     initial: np.ndarray
@@ -131,8 +132,10 @@ class Flown:
     solve_s: np.ndarray
 
 
-def fly(view: OrbitView, delay_s: float, initializer: InitializerConfig, adjuster: BundleAdjusterConfig) -> Flown:
-    """Run the live method over a view; a window's solution is there ``delay_s`` after its newest image."""
+def simulate_live(
+    view: OrbitView, delay_s: float, initializer: InitializerConfig, adjuster: BundleAdjusterConfig
+) -> LiveResult:
+    """Run the live method over a view; a window's solution arrives ``delay_s`` after its newest image."""
     stamps = view.tracks.stamp_ns
     place = {int(stamp): i for i, stamp in enumerate(stamps)}
     shape = (len(stamps), 15, 3)
@@ -140,18 +143,17 @@ def fly(view: OrbitView, delay_s: float, initializer: InitializerConfig, adjuste
     initial_std, refined_std = np.full(shape, np.nan), np.full(shape, np.nan)
     seconds: dict[type, list[float]] = {LivePose: [], LiveWindow: []}
     steps = list[float]()
-    newest, pending = LatestPose(adjuster.blend_s), list[AdjustedWindow]()
+    newest, pending = LatestPose(adjuster.blend_s), deque[AdjustedWindow]()
     clock = time.perf_counter()
     for result in live_poses(observations(view), initializer, adjuster):
         seconds[type(result)].append(time.perf_counter() - clock)
         if isinstance(result, LivePose):
             now = result.observation.stamp_ns
             i, joints = place[now], result.joints3d.astype(float)
-            # The same image with the correction as it was at the one before: what solutions move in between.
+            # The same image with the previous image's correction: the step that new solutions cause.
             before = newest.pose(int(stamps[max(i - 1, 0)]), joints)
-            for window in [w for w in pending if w.stamp_ns[-1] + delay_s * 1e9 <= now]:
-                pending.remove(window)
-                newest.set_solution(median_bone_lengths(window.joints3d), now)
+            while pending and pending[0].stamp_ns[-1] + delay_s * 1e9 <= now:
+                newest.set_solution(median_bone_lengths(pending.popleft().joints3d), now)
             initial[i], initial_std[i] = joints, _std(result.pose.covariance)
             latest[i] = newest.pose(now, joints)
             steps.append(float(np.linalg.norm(latest[i] - before, axis=-1).max()))
@@ -160,12 +162,12 @@ def fly(view: OrbitView, delay_s: float, initializer: InitializerConfig, adjuste
             pending.append(window)
             age_s = (window.stamp_ns[-1] - window.stamp_ns) * 1e-9
             rows = np.array([place[int(stamp)] for stamp in window.stamp_ns])
-            # Later windows overwrite, as long as they come in time.
+            # Later windows overwrite earlier ones until the pose has that age.
             chosen = (age_s + delay_s <= REFINED_AFTER_S) & (stamps[-1] - window.stamp_ns >= REFINED_AFTER_S * 1e9)
             refined[rows[chosen]] = result.joints3d[chosen]
             refined_std[rows[chosen]] = _std(window.covariance[chosen])
         clock = time.perf_counter()
-    return Flown(
+    return LiveResult(
         initial,
         latest,
         refined,
@@ -177,8 +179,8 @@ def fly(view: OrbitView, delay_s: float, initializer: InitializerConfig, adjuste
     )
 
 
-def _row(sequence: Sequence, speed_deg_s: float, noisy: bool, view: OrbitView, flown: Flown) -> LiveRow:
-    old = np.isfinite(flown.refined).all(axis=(1, 2))
+def _row(sequence: Sequence, speed_deg_s: float, noisy: bool, view: OrbitView, result: LiveResult) -> LiveRow:
+    old = np.isfinite(result.refined).all(axis=(1, 2))
     if not old.any():
         raise InputError(f"{sequence.name}: expected a refined pose within {REFINED_AFTER_S:g} s, got none")
     offline = pa_mpjpe(reconstruct(view.tracks, method="ba").joints3d * 1000.0, view.truth)
@@ -187,17 +189,17 @@ def _row(sequence: Sequence, speed_deg_s: float, noisy: bool, view: OrbitView, f
         speed_deg_s=float(speed_deg_s),
         noisy=noisy,
         frames=len(view.truth),
-        initial_mm=float(pa_mpjpe(flown.initial * 1000.0, view.truth).mean()),
-        latest_mm=float(pa_mpjpe(flown.latest * 1000.0, view.truth).mean()),
-        refined_mm=float(pa_mpjpe(flown.refined[old] * 1000.0, view.truth[old]).mean()),
+        initial_mm=float(pa_mpjpe(result.initial * 1000.0, view.truth).mean()),
+        latest_mm=float(pa_mpjpe(result.latest * 1000.0, view.truth).mean()),
+        refined_mm=float(pa_mpjpe(result.refined[old] * 1000.0, view.truth[old]).mean()),
         offline_mm=float(offline[old].mean()),
         offline_all_mm=float(offline.mean()),
-        refined_std=standardized_error(flown.refined[old], flown.refined_std_m[old], view.truth[old]),
-        initial_std=standardized_error(flown.initial, flown.initial_std_m, view.truth),
-        step_mm=float(np.nanmax(flown.step_m, initial=0.0) * 1000.0),
-        initial_ms=float(np.median(flown.initial_s) * 1000.0),
-        initial_p95_ms=float(np.quantile(flown.initial_s, 0.95) * 1000.0),
-        solve_p95_s=float(np.quantile(flown.solve_s, 0.95)),
+        refined_std=standardized_error(result.refined[old], result.refined_std_m[old], view.truth[old]),
+        initial_std=standardized_error(result.initial, result.initial_std_m, view.truth),
+        step_mm=float(np.nanmax(result.step_m, initial=0.0) * 1000.0),
+        initial_ms=float(np.median(result.initial_s) * 1000.0),
+        initial_p95_ms=float(np.quantile(result.initial_s, 0.95) * 1000.0),
+        solve_p95_s=float(np.quantile(result.solve_s, 0.95)),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.evaluation.live import REFINED_AFTER_S, LiveRow
+from drocap_ros.evaluation.live_study import REFINED_AFTER_S, LiveRow
 from drocap_ros.evaluation.tables import markdown_table
 
 
