@@ -130,12 +130,12 @@ def outcome(seed: int) -> dict[str, Any]:
     rows = [row for row in loop.rows if row.t_s > SETTLE_S]
     orbiting = [row.state == State.ORBITING for row in rows]
     settled = [row.distance_m - settings.config.radius_m for row in rows if row.t_s > 14.0]
-    told = [(state, reason) for t, state, reason in loop.reasons if t > SETTLE_S]
+    reasons = [(state, reason) for t, state, reason in loop.reasons if t > SETTLE_S]
     stops = [
-        reason for (before, _), (state, reason) in itertools.pairwise(told)
+        reason.code.name for (before, _), (state, reason) in itertools.pairwise(reasons)
         if before == "ORBITING" and state != "ORBITING"
     ]  # fmt: skip
-    refusals = [str(answer) for _, answer in loop.answers if not answer.accepted]
+    refusals = [answer.condition.code.name for _, answer in loop.answers if not answer.accepted]
     whole = all(row.state == State.ORBITING for row in rows if row.t_s > 14.0)
     return {
         "seed": seed, "code": _CODE, "autopilot": settings.autopilot, "action": settings.action,
@@ -182,18 +182,12 @@ def table(first: int, count: int) -> int:
         print(f"radius error of those, m: mean {np.mean(errors):.2f}, worst {max(errors):.2f}")
     if near:
         print(f"least true distance, m: {near[0]:.2f}, {near[1]:.2f}, {near[2]:.2f} ..." if len(near) > 2 else near)
-    kinds = Counter(_kind(reason) for row in rows for reason in row["held"])
+    kinds = Counter(reason for row in rows for reason in row["held"])
     for reason, number in kinds.most_common():
         print(f"  held {number} times: {reason}")
-    for reason, number in Counter(_kind(reason) for row in rows for reason in row["refused"]).most_common():
+    for reason, number in Counter(reason for row in rows for reason in row["refused"]).most_common():
         print(f"  never flown, {number}: {reason}")
     return 1 if bad else 0
-
-
-def _kind(reason: str) -> str:
-    """The reason without its figures."""
-    words = ["#" if any(c.isdigit() for c in word) else word for word in reason.split()]
-    return " ".join(words)[:90]
 
 
 def _read() -> list[dict[str, Any]]:
