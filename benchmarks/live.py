@@ -1,15 +1,15 @@
 """Figures of the live graph: `python benchmarks/live.py`, or some of its parts by name.
 
-load    a 1280x720 video at 30 fps round and round through all nodes, adjustment and recording on: rate, drops,
-        latency from the image's stamp to pose3d/initial, the adjustment's duration, processor time, in one process
-        and in a process each, with the adjuster and without (`--seconds 300`, `--one-process`, `--processes`,
-        `--no-adjuster` for one case; `--seamless`: no cuts, so that somebody is followed all the time)
-memory  resident memory of every process against its value at minute 2 (`--minutes 30`)
-kills   SIGKILL of each node in turn, a person in view all the time: how long until it works again, what the recording
-        lost (`--rounds 5`)
+load    a 1280x720 video at 30 fps in a loop through all nodes, with adjustment and recording: rate, drops, latency
+        from the image's stamp to pose3d/initial, the adjustment's duration, processor time, with the adjuster and
+        without (`--seconds 300`; `--processes` or `--one-process`, `--no-adjuster` for one case; `--seamless`: no
+        cuts, so that a subject is tracked all the time)
+memory  resident memory of every process compared with its value at minute 2 (`--minutes 30`)
+kills   SIGKILL of each node in turn, a person in view all the time: time until it works again, gaps in the recording
+        (`--rounds 5`)
 
-Needs ../shared (video, weights).  Results go to benchmarks/results/live.json.  Run it on a machine that does nothing
-else; the load average before each part stands beside its figures.
+Needs ../shared (video, weights).  Writes docs/figures/live_load.md, live_memory.md and live_kills.md.  Run it on an
+idle machine; the load average before each part is among its figures.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import itertools
-import json
 import os
 import signal
 import subprocess
@@ -29,7 +28,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
+from figures import ROOT, table, write_figures
+
 sys.path[:0] = [str(ROOT)]
 SHARED = ROOT.parent / "shared"
 PARTS = ("load", "memory", "kills")
@@ -50,20 +50,33 @@ def main() -> int:
     parser.add_argument("--processes", action="store_true")
     parser.add_argument("--no-adjuster", action="store_true")
     parser.add_argument("--seamless", action="store_true", help="the video there and back again, without cuts")
-    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results")
     args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
-    target = args.out / "live.json"
-    results = json.loads(target.read_text()) if target.exists() else {}
     for part in args.parts or PARTS:
         with tempfile.TemporaryDirectory(prefix="drocap_bench_") as folder:
-            results.setdefault(part, {}).update(globals()[f"part_{part}"](args, Path(folder)))
-        target.write_text(json.dumps(results, indent=1) + "\n")
+            results = globals()[f"part_{part}"](args, Path(folder))
+        write_figures(f"live_{part}", f"Live graph: {part}", markdown(results))
     return 0
 
 
-def say(what: str, figures: dict[str, Any]) -> None:
-    print(f"{what}:", *(f"  {key}: {value}" for key, value in figures.items()), sep="\n", flush=True)
+def show(title: str, figures: dict[str, Any]) -> None:
+    print(f"{title}:", *(f"  {key}: {value}" for key, value in figures.items()), sep="\n", flush=True)
+
+
+def markdown(results: dict[str, Any]) -> str:
+    """A table for the plain figures, and one for each case of several."""
+    plain = {key: value for key, value in results.items() if not isinstance(value, dict)}
+    text = table(("figure", "value"), plain.items()) if plain else ""
+    for name, figures in results.items():
+        if isinstance(figures, dict):
+            rows = ((key, text_of(value)) for key, value in figures.items())
+            text += f"\n## {name}\n\n{table(('figure', 'value'), rows)}"
+    return text
+
+
+def text_of(value: Any) -> str:
+    if isinstance(value, dict):
+        return "; ".join(f"{key} {text_of(inner)}" for key, inner in value.items())
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 # -- the stream and the graph ------------------------------------------------------------------------------
@@ -124,7 +137,7 @@ def usage(pid: int) -> tuple[float, float]:
 
 
 def taken_by_host() -> tuple[int, int]:
-    """Ticks of all processors that the host of this virtual machine gave to others, and ticks altogether."""
+    """Processor ticks that the host took from this virtual machine, and all ticks."""
     ticks = [int(v) for v in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
     return ticks[7], sum(ticks)
 
@@ -133,7 +146,7 @@ def taken_by_host() -> tuple[int, int]:
 
 
 def part_load(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Every asked case of the graph, one after the other."""
+    """The requested cases of the graph, one after the other."""
     video = stream(folder, args.seamless)
     results = {}
     for processes in (False, True):
@@ -146,7 +159,7 @@ def part_load(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
             load = os.getloadavg()[0]
             results[name] = measure_load(video, folder / name.replace(" ", "_"), processes, adjuster, args)
             results[name]["load average before"] = round(load, 2)
-            say(f"load, {name}, {args.seconds:g} s", results[name])
+            show(f"load, {name}, {args.seconds:g} s", results[name])
     return results
 
 
@@ -187,15 +200,24 @@ def percentiles(late_ms: dict[str, list[float]]) -> dict[str, list[float]]:
     }
 
 
-def session_figures(session: Path, begin_ns: int, end_ns: int) -> dict[str, Any]:
-    """What the recorded messages and the nodes' own counts say of a span of time.
+#: Counters of what a node did not pass on.
+NOT_PASSED_ON = (
+    "missed", "lost", "not_written", "messages_refused", "images_late", "images_skipped", "adjustments_skipped",
+    "keypoints_unpaired", "initial_unpaired",
+)  # fmt: skip
 
-    Late is a message by the time from the image's stamp to its publication, as the publisher's middleware noted it.
-    The recorder, which comes last by intention, receives it later: that stands beside it.
+
+def session_figures(session: Path, begin_ns: int, end_ns: int) -> dict[str, Any]:
+    """Figures of a span of time from the recorded messages and the nodes' counters.
+
+    Latency is the time from the image's stamp to the publication of a message, by the publisher's middleware.  The
+    recorder, whose priority is low, receives it later: a figure of its own.
     """
     import numpy as np
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
+
+    from drocap_ros.ros.diagnostics import Key
 
     stamps: dict[str, list[int]] = {}
     late_ms: dict[str, list[float]] = {}
@@ -225,16 +247,16 @@ def session_figures(session: Path, begin_ns: int, end_ns: int) -> dict[str, Any]
                         frames.append(len(message.poses))
                         strides.append(message.stride)
     seconds = (end_ns - begin_ns) * 1e-9
-    # Exactly, by stamps: which pictures were never looked at.
+    # Exactly, by stamps: images without a result.
     sent = {stamp for stamp in stamps["camera_info"] if stamp < end_ns - 10**9}
     unseen = len(sent - set(stamps["pose2d"])) / len(sent)
     figures: dict[str, Any] = {
         "per second": {topic: round(len(found) / seconds, 2) for topic, found in stamps.items()},
-        "late ms p50 / p95 / p99": percentiles(late_ms),
+        "latency ms p50 / p95 / p99": percentiles(late_ms),
         "received by the recorder, ms p50 / p95 / p99": percentiles(received_ms),
     }
-    initial = figures["late ms p50 / p95 / p99"]["pose3d/initial"]
-    figures["pictures without keypoints %"] = round(100 * unseen, 2)
+    initial = figures["latency ms p50 / p95 / p99"]["pose3d/initial"]
+    figures["images without keypoints %"] = round(100 * unseen, 2)
     figures["within the bounds (60 / 120 / 200 ms, 1 %)"] = bool(
         all(late <= bound for late, bound in zip(initial, (60, 120, 200), strict=True)) and unseen <= 0.01
     )
@@ -246,12 +268,12 @@ def session_figures(session: Path, begin_ns: int, end_ns: int) -> dict[str, Any]
         f"{name}: {key}": int(value) - int(first.get(name, {}).get(key, 0))
         for name, values in counts.items()
         for key, value in values.items()
-        if value.isdigit() and any(word in key for word in ("drop", "lost", "skipped", "refused", ": late"))
+        if value.isdigit() and key.partition("/")[0] in NOT_PASSED_ON
     }
-    figures["not passed on, by the nodes' own counts"] = {key: value for key, value in lost.items() if value}
-    seen = {name: int(values.get("images", 0)) for name, values in counts.items()}
+    figures["not passed on, by the nodes' counters"] = {key: value for key, value in lost.items() if value}
+    seen = {name: int(values.get(Key.IMAGES, 0)) for name, values in counts.items()}
     figures["images counted"] = {
-        name: number - int(first.get(name, {}).get("images", 0)) for name, number in seen.items() if number
+        name: number - int(first.get(name, {}).get(Key.IMAGES, 0)) for name, number in seen.items() if number
     }
     return figures
 
@@ -260,7 +282,7 @@ def session_figures(session: Path, begin_ns: int, end_ns: int) -> dict[str, Any]
 
 
 def part_memory(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Resident memory of each process of the whole graph, looked at every 5 s."""
+    """Resident memory of each process of the whole graph, every 5 s."""
     from drocap_ros.bringup import bringup
     from drocap_ros.simulation.vehicle.ports import free_udp_port
 
@@ -294,13 +316,13 @@ def part_memory(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
             "every minute": [round(mib) for now, mib in values if now % 60 < 5.0],
         }
     results["verdict"] = "within 5 % of minute 2" if good else "NOT within 5 % of minute 2"
-    say(f"memory, {args.minutes:g} minutes", results)
+    show(f"memory, {args.minutes:g} minutes", results)
     return results
 
 
 # -- kills -------------------------------------------------------------------------------------------------
 
-#: What shows that a node works again.
+#: Topic whose messages prove that a node works again.
 SIGNS = {
     "image_ingest": "camera_info",
     "pose_estimator": "pose2d",
@@ -311,7 +333,7 @@ SIGNS = {
 
 
 def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Every node killed while all others run, once in every round; bringup starts it again."""
+    """Every node killed while all others run, once in every round; the bringup restarts it."""
     from drocap_ros.bringup import bringup
     from drocap_ros.recording.open_session import open_session
     from drocap_ros.ros.topics import TOPICS
@@ -341,7 +363,9 @@ def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
             for name, topic in SIGNS.items():
                 begin, begin_ns = time.monotonic(), time.time_ns()
                 os.kill(graph.pid(name), signal.SIGKILL)
-                graph.wait_until(lambda name=name, done=done: graph.restarts[name] > done, 30, f"{name} to be started")
+                graph.wait_until(
+                    lambda name=name, done=done: graph.restarts[name] > done, 30, f"{name} to be restarted"
+                )
                 graph.wait_until(lambda topic=topic, t=begin_ns: heard[topic][0] > t, 60, f"{topic} again")
                 took[name].append(round(heard[topic][1] - begin, 2))
                 killed[name].append((begin_ns, time.time_ns()))
@@ -370,7 +394,7 @@ def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
                 gaps[topic] = round(max(longest, default=float("nan")), 3)
             results[f"{folder_.name}: messages"] = info
             results[f"{folder_.name}: longest gap s, own death aside"] = gaps
-    say("kills", results)
+    show("kills", results)
     return results
 
 

@@ -24,6 +24,7 @@ from drocap_ros.pipeline import reconstruct_input
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_pose2d
 from drocap_ros.ros.conversions import stamp_from_ros
+from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, TOPICS
 
 FLIGHT = ("capture_simulator", "initializer", "bundle_adjuster", "session_recorder")
@@ -31,7 +32,6 @@ FLIGHT = ("capture_simulator", "initializer", "bundle_adjuster", "session_record
 
 def flight_config(session_dir, seconds=4.0):
     config = DrocapConfig().replace("capture_simulator", seconds=seconds, rate_hz=15.0, seed=3)
-    config = config.replace("initializer", azimuth_starts=2, start_iterations=4, sparse_rounds=1)
     config = config.replace("bundle_adjuster", limb_iterations=3, period_s=0.5)
     return config.replace("session_recorder", session_dir=str(session_dir))
 
@@ -44,7 +44,7 @@ def flown(tmp_path_factory):
     return folder
 
 
-def test_offline_gives_bit_for_bit_what_the_live_graph_published(flown):
+def test_the_offline_replay_equals_the_live_graph_bit_for_bit(flown):
     with open_session(flown) as session:
         config = recorded_config(session)
         assert config.bundle_adjuster == flight_config(flown).bundle_adjuster
@@ -54,7 +54,7 @@ def test_offline_gives_bit_for_bit_what_the_live_graph_published(flown):
     assert agreement.windows[0] >= 5
     assert agreement.windows[0] == agreement.windows[1]
     assert len(tracks) == len(motion.joints3d) == 60
-    # A comparison that cannot fail would say the same of other parameters.
+    # The comparison notices other parameters.
     with open_session(flown) as session:
         other = config.replace("bundle_adjuster", limb_iterations=2)
         _, _, agreement = reconstruct_live(session, other)
@@ -72,7 +72,7 @@ for method in ("live", "ba"):
 """
 
 
-def test_one_thread_or_two_give_the_same_arrays(flown, tmp_path):
+def test_one_thread_and_two_give_the_same_arrays(flown, tmp_path):
     import os
 
     for threads in ("1", "2"):
@@ -92,14 +92,14 @@ def test_the_command_takes_the_recorded_parameters(flown):
         reconstruct_input(flown.parent / "none.mp4", method="live", config=DrocapConfig())
 
 
-def test_a_session_knows_how_it_was_made(flown):
+def test_a_session_holds_its_provenance(flown):
     with open_session(flown) as session:
-        told = session.info.metadata
-    assert told["namespace"] == "/drocap"
-    assert json.loads(told["versions"])["numpy"] == np.__version__
-    assert "k: [" in told["calibration"]
+        metadata = session.info.metadata
+    assert metadata["namespace"] == "/drocap"
+    assert json.loads(metadata["versions"])["numpy"] == np.__version__
+    assert "k: [" in metadata["calibration"]
     for name in ("capture_simulator", "initializer", "bundle_adjuster", "session_recorder"):
-        assert f"/**/{name}:" in told["configuration"]
+        assert f"/**/{name}:" in metadata["configuration"]
 
 
 def test_a_session_without_a_name_is_named_by_its_date(tmp_path, monkeypatch):
@@ -112,7 +112,7 @@ def test_a_session_without_a_name_is_named_by_its_date(tmp_path, monkeypatch):
 
 
 def play(session, expected, seconds=30.0, **options):
-    """Stamps of pose2d, initial poses by stamp, times of /clock, and how long it took."""
+    """Messages of pose2d, pose3d/initial and /clock, and the duration in seconds."""
     config = flight_config("").replace("session_player", session=str(session), **options)
     got = {"pose2d": [], "pose3d/initial": [], "clock": []}
     with bringup(config, ["session_player", "initializer"]) as graph:
@@ -197,11 +197,11 @@ def test_pictures_wait_for_a_recorder_that_was_not_let_run_and_too_many_are_coun
 
         publish_while_it_stands(120)
         graph.wait_until(lambda: told("messages") and told("messages")[0] >= 120, 20, "120 pictures")
-        assert not told("not recorded")
+        assert not told(Key.MISSED)
         publish_while_it_stands(1000)
-        graph.wait_until(lambda: told("not recorded"), 20, "the count of what was too much")
+        graph.wait_until(lambda: told(Key.MISSED), 20, "the count of what was too much")
         graph.spin_for(2.1)
-        missed = told("not recorded")[0]
+        missed = told(Key.MISSED)[0]
     with open_session(tmp_path / "s") as session:
         recorded = next(t.count for t in session.info.topics if t.name.endswith("image/compressed"))
     assert recorded + missed == 1120
@@ -228,6 +228,6 @@ def test_a_disk_that_fills_up_is_told_and_the_others_live_on(small_disk):
         assert "make room" in status.message
         before = len(poses)
         graph.wait_until(lambda: len(poses) > before + 15, 20, "more poses")
-        graph.wait_until(lambda: any("dropped" in v.key for v in told()[-1].values), 20, "the drops")
+        graph.wait_until(lambda: any(Key.NOT_WRITTEN in v.key for v in told()[-1].values), 20, "the drops")
     with open_session(small_disk / "s") as session:
         assert session.info.message_count > 10

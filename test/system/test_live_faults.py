@@ -1,4 +1,4 @@
-"""Nodes that are killed in a running graph, and started again."""
+"""Nodes that are killed in a running graph and restarted."""
 
 import os
 import time
@@ -15,7 +15,7 @@ from drocap_ros.ros.topics import RESULT_QOS, TOPICS
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 
 NODES = ["capture_simulator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
-#: What shows that a node works again.  (The source simulates its whole flight first, which takes long.)
+#: Topic that proves that a node works; not of the source, which simulates its whole flight first.
 SIGN = {
     "initializer": ("pose3d/initial", Pose3D),
     "bundle_adjuster": ("pose3d/refined", Pose3DWindow),
@@ -25,13 +25,12 @@ SIGN = {
 
 def flight(session, seconds=40.0):
     config = DrocapConfig().replace("capture_simulator", seconds=seconds, rate_hz=15.0)
-    config = config.replace("initializer", azimuth_starts=2, start_iterations=4, sparse_rounds=1)
     config = config.replace("bundle_adjuster", iterations=5, period_s=0.5)
     config = config.replace("mavlink_bridge", url=f"udpin:127.0.0.1:{free_udp_port()}")
     return config.replace("session_recorder", session_dir=str(session))
 
 
-def test_each_node_killed_and_respawned_works_again_and_only_its_silence_is_lost(tmp_path):
+def test_each_killed_node_restarts_and_costs_the_others_no_message(tmp_path):
     session = tmp_path / "session"
     with bringup(flight(session), NODES, processes=True, respawn=True) as graph:
         heard = {name: [] for name in SIGN}
@@ -44,21 +43,21 @@ def test_each_node_killed_and_respawned_works_again_and_only_its_silence_is_lost
         graph.wait_until(lambda: all(heard.values()), 30, "every node to work")
         for name, messages in heard.items():
             os.kill(graph.pid(name), 9)
-            graph.wait_until(lambda name=name: graph.restarts[name], 10, f"{name} to be started again")
+            graph.wait_until(lambda name=name: graph.restarts[name], 10, f"{name} to be restarted")
             messages.clear()
             begin = time.monotonic()
             graph.wait_until(lambda messages=messages: messages, 20, f"{name} to work again")
-            assert time.monotonic() - begin < 5.0, name
+            assert time.monotonic() - begin < 6.0, name
         os.kill(graph.pid("session_recorder"), 9)
         second = tmp_path / "session_2"
         graph.wait_until(lambda: any(second.glob("*.mcap")), 10, "the recorder's next folder")
         before = len(heard["initializer"])
         graph.wait_until(lambda: len(heard["initializer"]) > before + 20, 20, "messages for it")
-        told = [s.message for m in reports for s in m.status if s.name == "drocap/bringup"]
-    assert any("initializer started again" in text for text in told)
+        reported = [s.message for m in reports for s in m.status if s.name == "drocap/bringup"]
+    assert any("initializer restarted" in text for text in reported)
     assert dict(graph.restarts) == dict.fromkeys(NODES[1:], 1)
 
-    # From its first message to its last each recording holds what was heard here: other nodes' deaths cost it nothing.
+    # Between its first and last message each recording holds every message received here.
     heard_ns = {stamp_from_ros(message.header.stamp) for message in statuses}
     for folder in (session, second):
         with open_session(folder) as opened:
@@ -67,7 +66,7 @@ def test_each_node_killed_and_respawned_works_again_and_only_its_silence_is_lost
         assert {stamp for stamp in heard_ns if recorded[0] <= stamp <= recorded[-1]} <= set(recorded)
 
 
-def test_a_node_restarted_by_hand_in_one_process_works_again(tmp_path):
+def test_node_restarted_by_the_script_in_one_process_works_again(tmp_path):
     nodes = NODES[:2]
     with bringup(flight(tmp_path / "session"), nodes) as graph:
         poses = []
@@ -81,14 +80,14 @@ def test_a_node_restarted_by_hand_in_one_process_works_again(tmp_path):
             graph.restart("visualizer")
 
 
-def kill_again_and_again(session):
+def kill_repeatedly(session):
     with bringup(flight(session), NODES[:2], processes=True, respawn=True) as graph:
         for number in range(20):
             os.kill(graph.pid("initializer"), 9)
             graph.wait_until(lambda number=number: graph.restarts["initializer"] > number, 30)
 
 
-def test_a_node_that_dies_again_and_again_is_given_up(tmp_path, monkeypatch):
-    monkeypatch.setattr("drocap_ros.bringup.FIRST_PAUSE_S", 0.05)
+def test_node_that_keeps_dying_ends_the_graph(tmp_path, monkeypatch):
+    monkeypatch.setattr("drocap_ros.ros.graph.FIRST_PAUSE_S", 0.05)
     with pytest.raises(NodeError, match="initializer ended with status -9"):
-        kill_again_and_again(tmp_path / "session")
+        kill_repeatedly(tmp_path / "session")

@@ -20,7 +20,6 @@ def test_two_graphs_in_two_namespaces_do_not_mix(tmp_path, monkeypatch, processe
         graphs = []
         for seed, drone in enumerate(DRONES):
             config = DrocapConfig().replace("capture_simulator", seconds=2.0, seed=seed, rate_hz=10.0)
-            config = config.replace("initializer", azimuth_starts=2, start_iterations=4, sparse_rounds=1)
             config = config.replace("session_recorder", session_dir=str(tmp_path / drone))
             graphs.append(
                 stack.enter_context(

@@ -11,6 +11,7 @@ from drocap_ros.cli import main
 from drocap_ros.config import DrocapConfig
 from drocap_ros.motion import load_motion
 from drocap_ros.ros.conversions import stamp_from_ros
+from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import TOPICS
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 
@@ -20,7 +21,7 @@ NODES = ["image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "ma
 def test_what_was_published_is_recorded_and_reconstructed(shared, tmp_path):
     video = tmp_path / "walk.mp4"
     shutil.copyfile(shared / "media" / "outdoor_walk.mp4", video)
-    # Round and round: a busy machine sees fewer of its pictures, and the test wants a number of them.
+    # In a loop: a busy machine processes fewer of its images, and the test needs a number of them.
     config = DrocapConfig().replace("image_ingest", source=str(video), horizontal_fov_deg=60.0, loop=True)
     config = config.replace("pose_estimator", models_dir=str(shared / "models"))
     config = config.replace("mavlink_bridge", url=f"udpin:127.0.0.1:{free_udp_port()}")
@@ -42,7 +43,7 @@ def test_what_was_published_is_recorded_and_reconstructed(shared, tmp_path):
             if connection.topic == "/drocap/pose2d":
                 recorded[stamp_from_ros(message.header.stamp)] = message
             elif connection.topic == "/diagnostics" and message.status[0].name.endswith("pose_estimator"):
-                published = max(published, *(int(v.value) for v in message.status[0].values if v.key == "images"), 0)
+                published = max(published, *(int(v.value) for v in message.status[0].values if v.key == Key.IMAGES), 0)
     assert len(recorded) >= published > 20  # what the estimator itself counted in its last report
     assert counts["/drocap/pose2d"] == len(recorded) >= len(heard)
     for message in heard:
