@@ -51,7 +51,7 @@ def capture() -> tuple[np.ndarray, Motion, np.ndarray]:
     estimator = PoseEstimator(models_folder("simulation"), PoseEstimatorConfig())
     observations, shown = [], None
     for i, seconds in enumerate(t):
-        image = renderer.picture(joints[i], rotation[i], position[i])
+        image = renderer.render(joints[i], rotation[i], position[i])
         observations.append(estimator.process(image, round(seconds * 1e9)))
         shown = image if i == SHOWN else shown
     tracks = replace(

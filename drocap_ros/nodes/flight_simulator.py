@@ -112,7 +112,7 @@ class FlightSimulatorNode(ManagedComponent):
                 return
             if not self.active:
                 continue
-            image = self._renderer.picture(exposure.joints3d, exposure.rotation, exposure.position)
+            image = self._renderer.render(exposure.joints3d, exposure.rotation, exposure.position)
             header = header_at(exposure.stamp_ns, FRAME_ID)
             self._images.publish(compressed_image_to_ros(header, encode_jpeg(image, self.config.jpeg_quality)))
             self._infos.publish(camera_info_to_ros(header, self._camera))

@@ -1,4 +1,4 @@
-"""An articulated person who walks, boxes, kicks and squats.
+"""An articulated person that walks, boxes, kicks and squats.
 
 Every action is written as smooth controls (path of the root, trunk angles, goals of wrists and ankles); two-bone
 inverse kinematics turns the goals into joints, so that all bone lengths of ``BODY_15`` are constant.
@@ -15,7 +15,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.skeleton import BODY_15
 
 _SINGLE = ("walk", "boxing", "kicking", "squats")
-#: What a simulated person can do; "mixed" goes through the others in turn.
+#: Motions of the person; "mixed" repeats the last four in turn.
 ACTIONS = ("mixed", "stand", *_SINGLE)
 
 #: Bone lengths as shares of the stature (means of adults; hips and shoulders from the midline).
@@ -31,7 +31,7 @@ _STANCE = 0.6  # share of a stride during which a foot stands
 
 @dataclass(frozen=True)
 class _Style:
-    """What distinguishes one person and take from another."""
+    """Parameters of one person and take."""
 
     size: dict[str, float]
     speed_m_s: float
@@ -73,7 +73,7 @@ def simulate_person(t: np.ndarray, action: str = "mixed", seed: int = 0, stature
     ----------
     t : (F,) s, at least 0, in any order; the pose at an instant does not depend on the other instants
     action : one of ``ACTIONS``
-    seed : chooses the person's proportions and the take
+    seed : of the person's proportions and of the take
     stature_m : height of the person
 
     Returns
@@ -99,7 +99,7 @@ def simulate_person(t: np.ndarray, action: str = "mixed", seed: int = 0, stature
 
 
 def action_weights(t: np.ndarray, action: str) -> np.ndarray:
-    """(F, 4) in [0, 1], how much of walk, boxing, kicking and squats there is at each instant."""
+    """(F, 4) in [0, 1], weights of walk, boxing, kicking and squats at each instant."""
     weight = np.zeros((t.size, len(_SINGLE)))
     if action in _SINGLE:
         weight[:, _SINGLE.index(action)] = 1.0
@@ -136,7 +136,7 @@ def _walk_speed(t: np.ndarray, action: str, style: _Style) -> np.ndarray:
 
 
 def _grid_path(seconds: float, action: str, style: _Style) -> tuple[np.ndarray, np.ndarray]:
-    """Path of the root on a fixed time grid, so that it does not depend on which instants are asked for."""
+    """Path of the root on a fixed time grid, independent of the requested instants."""
     grid = np.arange(0.0, seconds + 4.0, _PATH_STEP_S)
     yaw, speed = _heading(grid, style), _walk_speed(grid, action, style)
     velocity = speed[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
@@ -188,7 +188,7 @@ def two_bone(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Middle and end joint (F, 3) of a two-bone limb that reaches for ``goal`` and bends towards ``pole``.
 
-    A goal out of reach is pulled in along the line from the start, so both bones keep their lengths exactly.
+    A goal out of reach is moved along the line from the start, so both bones keep their lengths exactly.
     """
     away = goal - start
     distance = np.linalg.norm(away, axis=1, keepdims=True)
@@ -262,7 +262,7 @@ def _pulse(phase: np.ndarray, start: float, end: float) -> np.ndarray:
 
 
 def _kick_phase(phase: np.ndarray, side: int, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far the leg is lifted, and how far stretched; the legs take turns."""
+    """Shares to which the leg is lifted and stretched; the legs alternate."""
     turn = (phase * 0.5 + (0.5 if side > 0 else 0.0)) % 1.0 * 2.0
     lifted = weight * _plateau(turn, 0.05, 0.75, 0.25)
     stretched = weight * _plateau(turn, 0.25, 0.58, 0.165)

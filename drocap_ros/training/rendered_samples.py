@@ -1,4 +1,4 @@
-"""Rendered and spoilt pictures from which the networks of the simulation learn.
+"""Rendered and spoilt images from which the networks of the simulation learn.
 
 A sample is a person of any build and clothes in any pose of the simulation, seen from any side, -5 to 60 degrees
 above and 2.5 to 25 m away, in any place; then noise, blur, JPEG, other light, things in the way.
@@ -34,7 +34,7 @@ _TAKE_S = 22.0
 
 
 class View(NamedTuple):
-    """A camera: matrix (3, 3) px, rotation (3, 3) world -> camera, position (3,) m, picture size (width, height)."""
+    """A camera: matrix (3, 3) px, rotation (3, 3) world -> camera, position (3,) m, image size (width, height)."""
 
     matrix: np.ndarray
     rotation: np.ndarray
@@ -57,16 +57,16 @@ class World:
 
 
 class DetectorSample(NamedTuple):
-    """picture (192, 320, 3) uint8 BGR; box (4,) input px x_min y_min x_max y_max, NaN without a person."""
+    """image (192, 320, 3) uint8 BGR; box (4,) input px x_min y_min x_max y_max, NaN without a person."""
 
-    picture: np.ndarray
+    image: np.ndarray
     box: np.ndarray
 
 
 class PoseSample(NamedTuple):
-    """picture (128, 96, 3) uint8 BGR; joints (15, 2) px; seen (15,) bool inside picture and crop; box_px its side."""
+    """image (128, 96, 3) uint8 BGR; joints (15, 2) px; seen (15,) bool inside image and crop; box_px its side."""
 
-    picture: np.ndarray
+    image: np.ndarray
     joints: np.ndarray
     seen: np.ndarray
     box_px: float
@@ -88,7 +88,7 @@ def make_world(rng: np.random.Generator, scenes: int = 12, takes: int = _TAKES_P
 def _view(
     rng: np.random.Generator, joints: np.ndarray, size: tuple[int, int], fraction: float, shift: np.ndarray
 ) -> View:
-    """Camera that sees the person over a fraction of the picture's height, off the middle by a share of the picture."""
+    """Camera that sees the person over a fraction of the image's height, off the middle by a share of the image."""
     distance = 2.5 * 10 ** rng.uniform(0, 1)
     tilt = np.deg2rad(rng.uniform(-5, 60))
     bearing = rng.uniform(-np.pi, np.pi)
@@ -128,7 +128,7 @@ def _person(world: World, rng: np.random.Generator) -> np.ndarray:
 
 
 def detector_sample(world: World, rng: np.random.Generator) -> DetectorSample:
-    """One picture, whole or a window around the person, in the detector's input."""
+    """One image, whole or a window around the person, in the detector's input."""
     joints = _person(world, rng)
     whole = rng.random() < 0.5
     if whole:
@@ -142,14 +142,14 @@ def detector_sample(world: World, rng: np.random.Generator) -> DetectorSample:
     arguments = (view.matrix, *view.size, view.rotation, view.position)
     box = None
     if rng.random() < 0.1:
-        picture = draw_background(scene, *arguments)
+        image = draw_background(scene, *arguments)
     else:
         look = dress(FIRST_SEED + int(rng.integers(1_000_000_000)))
-        picture, box = draw(scene, look, view.matrix, *view.size, joints, view.rotation, view.position)
+        image, box = draw(scene, look, view.matrix, *view.size, joints, view.rotation, view.position)
     for _ in range(int(rng.integers(0, 4)) if rng.random() < 0.4 else 0):
-        _put_thing(rng, picture, box)
-    picture = spoil(rng, picture)
-    canvas, place = letterbox(picture, (0, 0, *view.size), DETECTOR_SIZE)
+        _put_thing(rng, image, box)
+    image = spoil(rng, image)
+    canvas, place = letterbox(image, (0, 0, *view.size), DETECTOR_SIZE)
     if box is None:
         return DetectorSample(canvas, np.full(4, np.nan, np.float32))
     in_canvas = (box.reshape(2, 2) * place.scale + np.array(place.offset)).reshape(4)
@@ -165,28 +165,28 @@ def pose_sample(world: World, rng: np.random.Generator) -> PoseSample:
     size = (int(1.7 * POSE_SIZE[0] * scale), int(1.5 * POSE_SIZE[1] * scale))
     view = _view(rng, joints, size, 0.55, rng.uniform(-0.05, 0.05, 2))
     look = dress(FIRST_SEED + int(rng.integers(1_000_000_000)))
-    picture, box = draw(_scene(world, rng), look, view.matrix, *size, joints, view.rotation, view.position)
+    image, box = draw(_scene(world, rng), look, view.matrix, *size, joints, view.rotation, view.position)
     if box is None:
         return pose_sample(world, rng)
     px = project(joints[None], view.rotation[None], view.position[None], view.matrix)[0]
     if rng.random() < 0.15:
-        _put_thing(rng, picture, box)
-    picture = spoil(rng, picture)
-    box = _edge_of_picture(rng, picture, box)
+        _put_thing(rng, image, box)
+    image = spoil(rng, image)
+    box = _cut_by_the_border(rng, image, box)
     extent = box[2:] - box[:2]
     px_inside = (px > -0.5).all(axis=1) & (px < np.array(size) - 0.5).all(axis=1)
-    px_inside &= _shown(picture, px)
+    px_inside &= _shown(image, px)
     middle = 0.5 * (box[:2] + box[2:]) + rng.normal(0, 0.04, 2) * extent
     half = 0.5 * extent * np.exp(rng.normal(0, 0.09, 2))
     guess = np.concatenate([middle - half, middle + half])
     crop = crop_around(guess, POSE_SIZE, POSE_PADDING)
     at = (px + 0.5 - np.array(crop.centre)) * crop.scale + np.array(POSE_SIZE) / 2 - 0.5
     seen = px_inside & (at > -0.5).all(axis=1) & (at < np.array(POSE_SIZE) - 0.5).all(axis=1)
-    return PoseSample(cut(picture, crop), at.astype(np.float32), seen, float(extent.max() * crop.scale))
+    return PoseSample(cut(image, crop), at.astype(np.float32), seen, float(extent.max() * crop.scale))
 
 
-def _edge_of_picture(rng: np.random.Generator, picture: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Now and then the camera's picture ends within the person: black beyond, and the box ends there."""
+def _cut_by_the_border(rng: np.random.Generator, image: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """Now and then the camera's image ends within the person: black beyond, and the box ends there."""
     box = box.copy()
     if rng.random() < 0.25:
         side = int(rng.integers(4))
@@ -194,31 +194,31 @@ def _edge_of_picture(rng: np.random.Generator, picture: np.ndarray, box: np.ndar
         x0, y0, x1, y1 = box
         if side == 0:
             box[0] = x0 + share * (x1 - x0)
-            picture[:, : int(box[0])] = 0
+            image[:, : int(box[0])] = 0
         elif side == 1:
             box[1] = y0 + share * (y1 - y0)
-            picture[: int(box[1])] = 0
+            image[: int(box[1])] = 0
         elif side == 2:
             box[2] = x1 - share * (x1 - x0)
-            picture[:, int(box[2]) :] = 0
+            image[:, int(box[2]) :] = 0
         else:
             box[3] = y1 - share * (y1 - y0)
-            picture[int(box[3]) :] = 0
+            image[int(box[3]) :] = 0
     return box
 
 
-def _shown(picture: np.ndarray, px: np.ndarray) -> np.ndarray:
-    """(15,) bool, whether the picture is not black (beyond its edge) at points (15, 2) px."""
-    height, width = picture.shape[:2]
+def _shown(image: np.ndarray, px: np.ndarray) -> np.ndarray:
+    """(15,) bool, whether the image is not black (beyond its edge) at points (15, 2) px."""
+    height, width = image.shape[:2]
     at = np.clip(np.round(np.nan_to_num(px)), 0, [width - 1, height - 1]).astype(int)
-    return picture[at[:, 1], at[:, 0]].any(axis=1)
+    return image[at[:, 1], at[:, 0]].any(axis=1)
 
 
-def _put_thing(rng: np.random.Generator, picture: np.ndarray, box: np.ndarray | None) -> None:
-    """A post, a board or a ball in the picture; over at most a part of the person."""
+def _put_thing(rng: np.random.Generator, image: np.ndarray, box: np.ndarray | None) -> None:
+    """A post, a board or a ball in the image; over at most a part of the person."""
     import cv2
 
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     colour = tuple(float(v) for v in rng.uniform(0, 255, 3))
     centre = rng.uniform([0, 0], [width, height])
     half = np.exp(rng.uniform(np.log(0.01), np.log(0.12), 2)) * height
@@ -229,14 +229,14 @@ def _put_thing(rng: np.random.Generator, picture: np.ndarray, box: np.ndarray | 
             half = np.minimum(half, 0.18 * extent.max())
     at = (int(centre[0]), int(centre[1]))
     if rng.random() < 0.4:
-        cv2.ellipse(picture, at, (int(half[0]) + 1, int(half[1]) + 1), 0, 0, 360, colour, -1)
+        cv2.ellipse(image, at, (int(half[0]) + 1, int(half[1]) + 1), 0, 0, 360, colour, -1)
     else:
         low, high = (centre - half).astype(int), (centre + half).astype(int) + 1
-        cv2.rectangle(picture, tuple(low.tolist()), tuple(high.tolist()), colour, -1)
+        cv2.rectangle(image, tuple(low.tolist()), tuple(high.tolist()), colour, -1)
 
 
-def spoil(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
-    """Picture (H, W, 3) uint8 with other light and colours, blur, noise and JPEG, each now and then."""
+def spoil(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
+    """Image (H, W, 3) uint8 with other light and colours, blur, noise and JPEG, each now and then."""
     import cv2
 
     if rng.random() < 0.7:
@@ -244,21 +244,21 @@ def spoil(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
         lift = rng.normal(0, 12)
         level = np.arange(256)[:, None] / 255.0
         table = 255 * level ** np.exp(rng.normal(0, 0.2)) * gain + lift
-        picture = np.asarray(cv2.LUT(picture, np.clip(table, 0, 255).astype(np.uint8)[None]))
+        image = np.asarray(cv2.LUT(image, np.clip(table, 0, 255).astype(np.uint8)[None]))
     if rng.random() < 0.2:
-        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.4, 1.6)))
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 1.6)))
     elif rng.random() < 0.15:
         length = int(rng.integers(2, 7))
         kernel = np.zeros((length, length), np.float32)
         kernel[length // 2] = 1 / length
-        picture = np.asarray(cv2.filter2D(picture, -1, kernel if rng.random() < 0.7 else kernel.T))
+        image = np.asarray(cv2.filter2D(image, -1, kernel if rng.random() < 0.7 else kernel.T))
     if rng.random() < 0.35:
-        noise = rng.standard_normal(picture.shape, np.float32) * np.float32(rng.uniform(1, 12))
-        picture = np.clip(picture + noise, 1, 255).astype(np.uint8)
+        noise = rng.standard_normal(image.shape, np.float32) * np.float32(rng.uniform(1, 12))
+        image = np.clip(image + noise, 1, 255).astype(np.uint8)
     if rng.random() < 0.4:
-        _, code = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 96))])
-        picture = np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR))
-    return np.maximum(picture, 1)  # black is left to what lies beyond the picture
+        _, code = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 96))])
+        image = np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR))
+    return np.maximum(image, 1)  # black is left to what lies beyond the image
 
 
 MIRROR = BODY_15.mirror

@@ -29,7 +29,7 @@ from drocap_ros.training.simulation_networks import build_detector, build_pose_n
 if TYPE_CHECKING:
     import torch
 
-#: Normalisation of RGB pictures, that of the public pose networks.
+#: Normalisation of RGB images, that of the public pose networks.
 _MEAN = np.array([123.675, 116.28, 103.53], np.float32)
 _STD = np.array([58.395, 57.12, 57.375], np.float32)
 _FRESH_SHARE = 0.34  # of each batch is rendered anew, the rest seen before
@@ -43,9 +43,9 @@ class SimulationTraining(Parameters):
     minutes: float = param(40.0, "wall-clock time of the training", unit="min", minimum=0.01, maximum=10000.0)
     steps: int = param(0, "end after this many rounds instead; the result then depends on the seed only", minimum=0)
     only: str = param("both", "which networks to train", choices=("both", "detector", "pose"))
-    batch: int = param(32, "pictures of a batch", minimum=2, maximum=1024)
+    batch: int = param(32, "images of a batch", minimum=2, maximum=1024)
     pose_batches: int = param(2, "batches of the pose network to one of the detector", minimum=1, maximum=16)
-    pool: int = param(4096, "rendered pictures that are kept for further batches", minimum=8, maximum=100_000)
+    pool: int = param(4096, "rendered images that are kept for further batches", minimum=8, maximum=100_000)
     learning_rate: float = param(2.5e-3, "peak of the schedule, AdamW", minimum=1e-6, maximum=1.0)
     weight_decay: float = param(0.02, "decoupled weight decay", minimum=0.0, maximum=1.0)
     seed: int = param(0, "of the samples and of the first weights", minimum=0)
@@ -72,32 +72,32 @@ class _Pool:
         return new + chosen
 
 
-def _varied(pictures: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Pictures (B, H, W, 3) uint8 as float32, each in a slightly other light, so that old samples are new."""
-    gain = np.exp(rng.normal(0, 0.1, (len(pictures), 1, 1, 3))).astype(np.float32)
-    return np.asarray(np.clip(pictures * gain, 0, 255), np.float32)
+def _varied(images: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Images (B, H, W, 3) uint8 as float32, each in a slightly other light, so that old samples are new."""
+    gain = np.exp(rng.normal(0, 0.1, (len(images), 1, 1, 3))).astype(np.float32)
+    return np.asarray(np.clip(images * gain, 0, 255), np.float32)
 
 
 def detector_batch(samples: list[Any], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Pictures (B, 3, 192, 320) BGR 0-255 and boxes (B, 4) px, NaN = nobody; half of the batch mirrored."""
-    pictures = _varied(np.stack([s.picture for s in samples]), rng)
+    """Images (B, 3, 192, 320) BGR 0-255 and boxes (B, 4) px, NaN = nobody; half of the batch mirrored."""
+    images = _varied(np.stack([s.image for s in samples]), rng)
     boxes = np.stack([s.box for s in samples])
     for i in np.flatnonzero(rng.random(len(samples)) < 0.5):
-        pictures[i] = pictures[i, :, ::-1]
+        images[i] = images[i, :, ::-1]
         boxes[i, [0, 2]] = DETECTOR_SIZE[0] - boxes[i, [2, 0]]
-    return np.ascontiguousarray(pictures.transpose(0, 3, 1, 2)), boxes
+    return np.ascontiguousarray(images.transpose(0, 3, 1, 2)), boxes
 
 
 def pose_batch(samples: list[Any], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Pictures (B, 3, 128, 96) normalised RGB, joints (B, 15, 2) px, seen (B, 15), box sides (B,); half mirrored."""
-    pictures = _varied(np.stack([s.picture for s in samples]), rng)
+    """Images (B, 3, 128, 96) normalised RGB, joints (B, 15, 2) px, seen (B, 15), box sides (B,); half mirrored."""
+    images = _varied(np.stack([s.image for s in samples]), rng)
     joints, seen = np.stack([s.joints for s in samples]), np.stack([s.seen for s in samples])
     for i in np.flatnonzero(rng.random(len(samples)) < 0.5):
-        pictures[i] = pictures[i, :, ::-1]
+        images[i] = images[i, :, ::-1]
         joints[i] = joints[i, MIRROR]
         joints[i, :, 0] = POSE_SIZE[0] - 1 - joints[i, :, 0]
         seen[i] = seen[i, MIRROR]
-    rgb = (pictures[..., ::-1] - _MEAN) / _STD
+    rgb = (images[..., ::-1] - _MEAN) / _STD
     sides = np.array([s.box_px for s in samples], np.float32)
     return np.ascontiguousarray(rgb.transpose(0, 3, 1, 2)), joints, seen, sides
 
@@ -168,8 +168,8 @@ def train(
         if progress >= 1:
             break
         if options.only != "pose":
-            pictures, boxes = detector_batch(pools[0].batch(world, rng, options.batch), rng)
-            detector.step(*detector_loss(detector.network, _tensor(pictures), boxes), progress)
+            images, boxes = detector_batch(pools[0].batch(world, rng, options.batch), rng)
+            detector.step(*detector_loss(detector.network, _tensor(images), boxes), progress)
         for _ in range(options.pose_batches if options.only != "detector" else 0):
             crops, *truth = pose_batch(pools[1].batch(world, rng, options.batch), rng)
             pose.step(*pose_loss(pose.network, _tensor(crops), *truth), progress)
@@ -190,9 +190,9 @@ def train(
     return detector.average, pose.average, facts()
 
 
-def _tensor(pictures: np.ndarray) -> torch.Tensor:
+def _tensor(images: np.ndarray) -> torch.Tensor:
     library = pytorch()
-    tensor: torch.Tensor = library.from_numpy(pictures).contiguous(memory_format=library.channels_last)
+    tensor: torch.Tensor = library.from_numpy(images).contiguous(memory_format=library.channels_last)
     return tensor
 
 
@@ -212,11 +212,11 @@ def export(detector: torch.nn.Module, pose: torch.nn.Module, folder: Path, facts
     if int(facts["detector_steps"]):
         write_onnx(
             detector, torch.zeros(1, 3, DETECTOR_SIZE[1], DETECTOR_SIZE[0]), folder / "person_detector.onnx",
-            ["picture"], ["grid"], {}, facts,
+            ["image"], ["grid"], {}, facts,
         )  # fmt: skip
     if int(facts["pose_steps"]):
         write_onnx(
             pose, torch.zeros(1, 3, POSE_SIZE[1], POSE_SIZE[0]), folder / "person_pose.onnx",
-            ["picture"], ["columns", "rows"], {}, facts,
+            ["image"], ["columns", "rows"], {}, facts,
         )  # fmt: skip
         (folder / "person_pose.yaml").write_text("skeleton: body15\n", encoding="utf-8")

@@ -49,7 +49,7 @@ def _residual(channels: int) -> Any:
 
 
 def build_detector() -> torch.nn.Module:
-    """Pictures (B, 3, 192, 320) BGR 0-255 -> YOLOX's grid (B, 1260, 6): cx cy w h, objectness, class (always 1).
+    """Images (B, 3, 192, 320) BGR 0-255 -> YOLOX's grid (B, 1260, 6): cx cy w h, objectness, class (always 1).
 
     Centres in cells from the cell's corner, sizes as logarithms in cells, objectness in [0, 1].
     """
@@ -120,11 +120,11 @@ def detector_targets(boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return positive, free
 
 
-def detector_loss(network: Any, pictures: torch.Tensor, boxes: np.ndarray) -> tuple[torch.Tensor, float]:
+def detector_loss(network: Any, images: torch.Tensor, boxes: np.ndarray) -> tuple[torch.Tensor, float]:
     """Loss of a batch and, for the log, the mean overlap (IoU) of the answering cells."""
     torch = pytorch()
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        raw = network.raw(pictures)
+        raw = network.raw(images)
     raw = raw.float()
     positive, free = (torch.from_numpy(v) for v in detector_targets(boxes))
     corner, stride = (torch.from_numpy(v) for v in grid())
@@ -207,7 +207,7 @@ def build_pose_network() -> torch.nn.Module:
 
 
 def pose_loss(
-    network: Any, pictures: torch.Tensor, joints: np.ndarray, seen: np.ndarray, box_px: np.ndarray
+    network: Any, images: torch.Tensor, joints: np.ndarray, seen: np.ndarray, box_px: np.ndarray
 ) -> tuple[torch.Tensor, float]:
     """Loss of a batch and, for the log, the mean distance of the seen joints in shares of the box's longer side.
 
@@ -215,7 +215,7 @@ def pose_loss(
     """
     torch = pytorch()
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        columns, rows, certain = network.raw(pictures)
+        columns, rows, certain = network.raw(images)
     at, there = torch.from_numpy(joints), torch.from_numpy(seen)
     loss = torch.zeros(())
     found = []

@@ -11,7 +11,7 @@ from drocap_ros.errors import InputError, ParameterError
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import limited_use, models_folder
 from drocap_ros.perception.models.runtime import OnnxModel
-from drocap_ros.perception.perception_config import PoseEstimatorConfig
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
 from drocap_ros.simulation.render.body import dress
 from drocap_ros.simulation.render.renderer import draw
@@ -37,35 +37,35 @@ def overlap(a, b):
     return both / ((a[2:] - a[:2]).prod() + (b[2:] - b[:2]).prod() - both)
 
 
-def as_received(picture):
-    """The picture after the JPEG of the camera's topic."""
+def as_received(image):
+    """The image after the JPEG of the camera's topic."""
     import cv2
 
-    return cv2.imdecode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1], cv2.IMREAD_COLOR)
+    return cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1], cv2.IMREAD_COLOR)
 
 
 class Flown:
     """What the estimator made of orbits round persons in places that no training saw."""
 
-    def __init__(self, orbits=3, pictures=20):
+    def __init__(self, orbits=3, images=20):
         matrix = pinhole_matrix(1280, 720, 60)
         self.found, self.followed, self.off, self.exchanged, self.standard, self.confidence = [], [], [], [], [], []
         for seed in range(orbits):
             assert seed < FIRST_SEED
-            t = 0.7 + 14.4 / pictures * np.arange(pictures)  # once round at 25 deg/s
+            t = 0.7 + 14.4 / images * np.arange(images)  # once round at 25 deg/s
             joints = simulate_person(t, "mixed", seed, 1.65 + 0.1 * seed)
             centre = joints[:, 0] * [1, 1, 0] + [0, 0, 0.9]
             rotation, position = orbit_camera(t, centre, 6.0, 2.5, 25.0, 70.0 * seed)
             truth = project(joints, rotation, position, matrix)
             estimator = PoseEstimator(FOLDER, PoseEstimatorConfig(detect_every_s=0.0))
             scene, look = make_scenery(seed), dress(seed)
-            for i in range(pictures):
-                picture, box = draw(scene, look, matrix, 1280, 720, joints[i], rotation[i], position[i])
-                picture = as_received(picture)
-                whole = estimator.detector.detect(picture, None, estimator.config.detection_threshold)
+            for i in range(images):
+                image, box = draw(scene, look, matrix, 1280, 720, joints[i], rotation[i], position[i])
+                image = as_received(image)
+                whole = estimator.detector.detect(image, None, estimator.config.detection_threshold)
                 self.found.append(len(whole) > 0 and overlap(whole.boxes[0], box) > 0.5)
-                # Pictures 0.2 s apart for the tracker: the person moves as far in one as at 15 fps in three.
-                self._compare(estimator.process(picture, i * 200_000_000), truth[i], box)
+                # Images 0.2 s apart for the tracker: the person moves as far in one as at 15 fps in three.
+                self._compare(estimator.process(image, i * 200_000_000), truth[i], box)
 
     def _compare(self, observation, truth, box):
         self.followed.append(observation.has_subject)
@@ -113,9 +113,9 @@ def test_an_empty_place_holds_nobody():
     for seed in range(8):
         position = np.array([[1.0, 2.0 + seed, 2.5]])
         rotation = orbit_camera(np.zeros(1), np.zeros((1, 3)), 6.0, 2.5, 0.0, 90.0)[0][0]
-        picture, box = draw(make_scenery(seed), dress(0), matrix, 1280, 720, away, rotation, position[0])
+        image, box = draw(make_scenery(seed), dress(0), matrix, 1280, 720, away, rotation, position[0])
         assert box is None
-        assert not estimator.process(picture, seed * 100_000_000).has_subject
+        assert not estimator.process(image, seed * 100_000_000).has_subject
 
 
 def test_both_files_together_are_small_and_say_what_they_are_for():
@@ -164,12 +164,12 @@ def test_samples_agree_with_their_pictures():
     world = make_world(rng, scenes=2, takes=1)
     for _ in range(12):
         sample = detector_sample(world, rng)
-        assert sample.picture.shape == (DETECTOR_SIZE[1], DETECTOR_SIZE[0], 3)
+        assert sample.image.shape == (DETECTOR_SIZE[1], DETECTOR_SIZE[0], 3)
         if np.isfinite(sample.box).all():
             assert (sample.box >= 0).all()
             assert (sample.box <= [*DETECTOR_SIZE, *DETECTOR_SIZE]).all()
         crop = pose_sample(world, rng)
-        assert crop.picture.shape == (POSE_SIZE[1], POSE_SIZE[0], 3)
+        assert crop.image.shape == (POSE_SIZE[1], POSE_SIZE[0], 3)
         inside = ((crop.joints > -0.5) & (crop.joints < np.array(POSE_SIZE) - 0.5)).all(axis=1)
         assert not (crop.seen & ~inside).any()
     assert world.poses[..., 2].min() > 0
@@ -197,8 +197,8 @@ def test_a_short_training_gives_networks_that_run(tmp_path, capsys):
     estimator = PoseEstimator(tmp_path / "m")
     assert estimator.limited_use
     assert estimator.pose_model.joints is BODY_15
-    picture = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
-    assert estimator.pose_model.estimate(picture, np.array([50.0, 20, 150, 200])).xy.shape == (15, 2)
+    image = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
+    assert estimator.pose_model.estimate(image, np.array([50.0, 20, 150, 200])).xy.shape == (15, 2)
 
 
 def test_one_network_is_trained_alone(tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""The closed loop in simulated time with pictures: rendered, and looked at by the real pose estimator."""
+"""The closed loop in simulated time with rendered images and the real pose estimator."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from drocap_ros.simulation.render.renderer import Renderer
 
 
 class PixelOrbitLoop(OrbitLoop):
-    """An orbit by what is seen in rendered pictures; as deterministic as the networks are.
+    """An orbit by keypoints of the pose estimator in rendered images; as deterministic as the networks.
 
-    errors : (15,) px per picture, distance of the keypoints from the truth; NaN where not seen
-    heights_px : of the person in each picture
+    errors : (15,) px per image, distance of the keypoints from the truth; NaN = missed
+    heights_px : of the person in each image
     """
 
     def __init__(self, settings: LoopSettings, estimator: PoseEstimator) -> None:
@@ -27,9 +27,9 @@ class PixelOrbitLoop(OrbitLoop):
         self._renderer = Renderer(self.matrix, width, height, settings.seed)
 
     def observe(self, joints: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> PoseObservation:
-        """Render and look."""
-        picture = self._renderer.picture(joints, rotation, position)
-        observation = self._estimator.process(picture, self.clock_ns())
+        """Render an image and estimate its keypoints."""
+        image = self._renderer.render(joints, rotation, position)
+        observation = self._estimator.process(image, self.clock_ns())
         exact = project(joints[None], rotation[None], position[None], self.matrix)[0]
         seen = observation.keypoints if len(observation.keypoints) else np.full(exact.shape, np.nan)
         self.errors.append(np.linalg.norm(seen - exact, axis=1))

@@ -1,4 +1,4 @@
-"""The visible body of a simulated person: surfaces around the joints of ``BODY_15``, and what it wears."""
+"""Surfaces of a simulated person around the joints of ``BODY_15``, and their colours."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _Add = Callable[[str, np.ndarray, np.ndarray, tuple[float, float, float], float]
 
 _J = {name: i for i, name in enumerate(BODY_15.joints)}
 
-#: From joint, to joint, radius at both (m at 1.75 m stature), what covers it.
+#: From joint, to joint, radius at both (m at 1.75 m stature), part of the look.
 _LIMBS = (
     ("hip", "knee", 0.083, 0.056, "thigh"),
     ("knee", "ankle", 0.056, 0.040, "shank"),
@@ -27,7 +27,7 @@ _LEG_M = 0.491 * 1.75
 
 @dataclass(frozen=True)
 class Look:
-    """Colours (3,) BGR 0-255 of the parts of a person, and how stout it is (1 = slim average)."""
+    """Colours (3,) BGR 0-255 of the parts of a person, and the factor of its girth (1 = slim average)."""
 
     colours: dict[str, np.ndarray]
     girth: float
@@ -67,7 +67,7 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Product of two vectors; ``np.cross`` takes ten times as long for one pair."""
+    """Cross product; ``np.cross`` takes ten times as long for one pair."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
@@ -79,7 +79,7 @@ def _axes(left: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def body(joints: np.ndarray, look: Look) -> tuple[Quadrics, list[str]]:
-    """Surfaces of one person in the frame of its joints, and the part of the look that colours each.
+    """Surfaces of one person in the frame of its joints, and the part of the look of each.
 
     joints : (15, 3) m, ``BODY_15``, in a frame with z up
     """
@@ -136,7 +136,7 @@ def body(joints: np.ndarray, look: Look) -> tuple[Quadrics, list[str]]:
 
 
 def _add_head(add: _Add, at: dict[str, np.ndarray], facing: np.ndarray, unit: float) -> None:
-    """Head that faces where the body does; hair behind and above leaves the face free."""
+    """Head with the body's direction; the hair is behind and above the face."""
     frame = _axes(facing[1], at["head"] - at["neck"])
     forward, left, up = frame
     head = at["head"]
@@ -161,7 +161,7 @@ def _add_hand_and_foot(add: _Add, at: dict[str, np.ndarray], side: str, hips: np
     ankle = at[side + "ankle"]
     shank = _unit(ankle - at[side + "knee"])
     toes = _unit(hips[0] - (hips[0] @ shank) * shank)
-    # The toes do not go through the ground.
+    # The toes stay above the ground.
     drop = max((0.035 * unit - ankle[2]) / (0.19 * unit), -0.95)
     if toes[2] < drop:
         flat = _unit(np.array([toes[0], toes[1], 0.0]))

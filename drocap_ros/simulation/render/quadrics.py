@@ -1,4 +1,4 @@
-"""Clipped quadric surfaces (ellipsoids, cones) of a camera's view: exact outline and depth per pixel."""
+"""Clipped quadric surfaces (ellipsoids, cones) in a camera's view: exact outline and depth per pixel."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-#: Surfaces nearer than this to the camera are left out, m.
+#: Surfaces nearer to the camera are omitted, m.
 _NEAR_M = 0.15
 
 
@@ -28,7 +28,7 @@ class Quadrics(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """What is seen of some surfaces: origin x, y px of the layer; surface (h, w) int16, -1 = none; light (h, w)."""
+    """Visible surfaces: origin x, y px of the layer; surface index (h, w) int16, -1 = none; light (h, w)."""
 
     x: int
     y: int
@@ -55,7 +55,7 @@ def cones(start: np.ndarray, end: np.ndarray, start_m: np.ndarray, end_m: np.nda
 
 def ellipsoids(centre: np.ndarray, axes: np.ndarray, half_m: np.ndarray) -> Quadrics:
     """Ellipsoids about centre (N, 3) m with unit axes (N, 3 axes, 3) and half lengths (N, 3) m."""
-    # Scaled by the square of the least half length, so that all surfaces have numbers of one size.
+    # Scaled by the square of the least half length: all surfaces then have coefficients of one magnitude.
     share = half_m.min(axis=1, keepdims=True) / half_m
     a = np.einsum("nki,nk,nkj->nij", axes, share**2, axes)
     b = -np.einsum("nij,nj->ni", a, centre)
@@ -67,36 +67,36 @@ def ellipsoids(centre: np.ndarray, axes: np.ndarray, half_m: np.ndarray) -> Quad
 
 
 def joined(parts: list[Quadrics]) -> Quadrics:
-    """All surfaces of several sets in one."""
+    """One set of the surfaces of several."""
     return Quadrics(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
-def see(quadrics: Quadrics, matrix: np.ndarray, width: int, height: int, light: np.ndarray) -> Layer | None:
-    """The nearest surface at each pixel.
+def rasterize(quadrics: Quadrics, matrix: np.ndarray, width: int, height: int, light: np.ndarray) -> Layer | None:
+    """Rasterize the nearest surface at each pixel.
 
     Parameters
     ----------
     quadrics : in the camera's frame (x right, y down, z forward)
     matrix : (3, 3) px without skew, pixel centres at whole numbers
-    width, height : px of the picture
+    width, height : px of the image
     light : (3,) unit, towards the light, in the camera's frame
 
     Returns
     -------
-    The part of the picture that holds the surfaces, its light the cosine between surface and light (-1 to 1);
-    None when nothing is in view.
+    The part of the image with the surfaces; its light is the cosine between normal and light (-1 to 1).
+    None without a surface in view.
     """
     focal, middle = np.diag(matrix)[:2], matrix[:2, 2]
-    boxes, seen = _boxes(quadrics, focal, middle, width, height)
-    if not seen.any():
+    boxes, visible = _boxes(quadrics, focal, middle, width, height)
+    if not visible.any():
         return None
-    x0, y0 = boxes[seen, :2].min(axis=0)
-    x1, y1 = boxes[seen, 2:].max(axis=0)
+    x0, y0 = boxes[visible, :2].min(axis=0)
+    x1, y1 = boxes[visible, 2:].max(axis=0)
     shape = (y1 - y0, x1 - x0)
     depth = np.full(shape, np.inf, np.float32)
     layer = Layer(int(x0), int(y0), np.full(shape, -1, np.int16), np.zeros(shape, np.float32))
     flat = (depth.ravel(), layer.surface.ravel(), layer.light.ravel())
-    for i in np.flatnonzero(seen):
+    for i in np.flatnonzero(visible):
         _draw(quadrics, int(i), boxes[i], (focal, middle), light, (int(x0), int(y0), int(shape[1])), flat)
     return layer
 
@@ -104,19 +104,19 @@ def see(quadrics: Quadrics, matrix: np.ndarray, width: int, height: int, light: 
 def _boxes(
     q: Quadrics, focal: np.ndarray, middle: np.ndarray, width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 4) px x0 y0 x1 y1 (ends excluded) within the picture, and (N,) bool whether anything is left."""
+    """(N, 4) px x0 y0 x1 y1 (ends excluded) within the image, and (N,) bool whether it is in view."""
     depth = q.ends[..., 2]
     safe = np.maximum(depth - q.reach[:, None], _NEAR_M)
     centre = q.ends[..., :2] / np.maximum(depth, _NEAR_M)[..., None] * focal + middle
-    # Towards the edge of the picture a sphere's outline grows by the secant of its angle.
+    # Towards the edge of the image a sphere's outline grows by the secant of its angle.
     secant = np.sqrt(1 + np.sum(((centre - middle) / focal) ** 2, axis=-1))
     half = (q.reach[:, None] / safe * secant)[..., None] * focal + 1
     low = np.floor((centre - half).min(axis=1))
     high = np.ceil((centre + half).max(axis=1)) + 1
     size = np.array([width, height])
     low, high = np.clip(low, 0, size).astype(int), np.clip(high, 0, size).astype(int)
-    seen = (high > low).all(axis=1) & (depth.min(axis=1) - q.reach > _NEAR_M)
-    return np.concatenate([low, high], axis=1), seen
+    visible = (high > low).all(axis=1) & (depth.min(axis=1) - q.reach > _NEAR_M)
+    return np.concatenate([low, high], axis=1), visible
 
 
 def _draw(
@@ -128,11 +128,11 @@ def _draw(
     place: tuple[int, int, int],
     flat: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
-    """Draw one surface into the flattened depth, surface and light."""
+    """Draw one surface into the flattened arrays of depth, surface and light."""
     a, b, c, axis = q.a[i], q.b[i], q.c[i], q.axis[i]
     (focal, middle), (left, top, stride) = view, place
-    # Rays are base + x ex + y ey with x, y from the middle of the box: double precision goes into the few
-    # coefficients, so that single precision does for the pixels.
+    # Rays are base + x ex + y ey with x, y from the middle of the box: with coefficients in double precision,
+    # single precision is enough for the pixels.
     base = np.append((0.5 * (box[:2] + box[2:]) - middle) / focal, 1.0)
     x = ((np.arange(box[0], box[2]) - 0.5 * (box[0] + box[2])) / focal[0]).astype(np.float32)
     y = ((np.arange(box[1], box[3]) - 0.5 * (box[1] + box[3])) / focal[1]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Pictures of a simulated person from any camera: a body of surfaces on a ground under a sky."""
+"""Images of a simulated person from any camera: a body of quadric surfaces in a scenery."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.simulation.render.background import draw_background, draw_shadow
 from drocap_ros.simulation.render.body import Look, body, dress
-from drocap_ros.simulation.render.quadrics import Layer, Quadrics, see
+from drocap_ros.simulation.render.quadrics import Layer, Quadrics, rasterize
 from drocap_ros.simulation.render.scenery import Scenery, make_scenery
 from drocap_ros.skeleton import BODY_15
 
-#: Pictures of more pixels than this get a background of half the resolution.
+#: Larger images have a background of half the resolution.
 _FULL_BACKGROUND_PX = 300_000
-#: A person whose box has more pixels than this is drawn at half the resolution.
+#: A person with a larger box is drawn at half the resolution.
 _FULL_PERSON_PX = 150_000
 _MOST_PX = 8192
 
 
 class Renderer:
-    """A camera in a simulated place; the same seed gives the same place and clothes, hence the same pictures.
+    """A camera in a scenery; the same seed gives the same scenery and clothes, hence the same images.
 
     Parameters
     ----------
     camera_matrix : (3, 3) px without skew, pixel centres at whole numbers
-    width, height : px of the pictures
-    seed : chooses the place and the look of the person
+    width, height : px of the images
+    seed : of the scenery and of the look of the person
 
     Raises
     ------
     InputError
-        When matrix or size cannot be used.
+        When matrix or size is invalid.
     """
 
     def __init__(self, camera_matrix: np.ndarray, width: int, height: int, seed: int = 0) -> None:
@@ -43,7 +43,7 @@ class Renderer:
         self.scene = make_scenery(seed)
         self.look = dress(seed)
 
-    def picture(self, joints3d: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    def render(self, joints3d: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
         """(H, W, 3) uint8 BGR.
 
         Parameters
@@ -67,11 +67,11 @@ class Renderer:
                 raise InputError(
                     f"{name}: expected {shape} of finite numbers, got {np.shape(array)}; correct its source"
                 )
-        picture, _ = draw(
+        image, _ = draw(
             self.scene, self.look, self.camera_matrix, self.width, self.height,
             np.asarray(joints3d, float), np.asarray(rotation, float), np.asarray(position, float),
         )  # fmt: skip
-        return picture
+        return image
 
 
 def draw(
@@ -84,9 +84,9 @@ def draw(
     rotation: np.ndarray,
     position: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Picture (H, W, 3) uint8 BGR, and the box (4,) px x_min y_min x_max y_max of what is seen of the person or None.
+    """Image (H, W, 3) uint8 BGR, and the box (4,) px x_min y_min x_max y_max of the visible person, or None.
 
-    The arguments are those of :class:`Renderer`, not checked.
+    The arguments are those of :class:`Renderer`, unvalidated.
     """
     import cv2
 
@@ -94,28 +94,28 @@ def draw(
     coarse = 2 if width * height > _FULL_BACKGROUND_PX else 1
     small = _scaled(matrix, 1 / coarse)
     size = (-(-width // coarse), -(-height // coarse))
-    picture = draw_background(scene, small, *size, rotation, position)
-    draw_shadow(scene, picture, surfaces.ends, surfaces.reach, small, rotation, position)
+    image = draw_background(scene, small, *size, rotation, position)
+    draw_shadow(scene, image, surfaces.ends, surfaces.reach, small, rotation, position)
     if coarse > 1:
-        picture = cv2.resize(picture, (size[0] * coarse, size[1] * coarse), interpolation=cv2.INTER_LINEAR)
-        picture = np.ascontiguousarray(picture[:height, :width])
-    seen = _in_camera(surfaces, rotation, position)
+        image = cv2.resize(image, (size[0] * coarse, size[1] * coarse), interpolation=cv2.INTER_LINEAR)
+        image = np.ascontiguousarray(image[:height, :width])
+    visible = _in_camera(surfaces, rotation, position)
     colours = np.array([look.colours[part] for part in parts], np.float32)
     light = rotation @ scene.sun
-    factor = 2 if _person_px(seen, matrix, width, height) > _FULL_PERSON_PX else 1
-    layer = see(seen, _scaled(matrix, 1 / factor), -(-width // factor), -(-height // factor), light)
+    factor = 2 if _person_px(visible, matrix, width, height) > _FULL_PERSON_PX else 1
+    layer = rasterize(visible, _scaled(matrix, 1 / factor), -(-width // factor), -(-height // factor), light)
     if layer is None:
-        return picture, None
-    mask, painted = _painted(layer, colours, scene.sunlight, rotation)
+        return image, None
+    mask, painted = _shaded(layer, colours, scene.sunlight, rotation)
     if factor > 1:
         double = (mask.shape[1] * factor, mask.shape[0] * factor)
         mask = np.where(cv2.resize(mask, double, interpolation=cv2.INTER_LINEAR) > 127, np.uint8(255), np.uint8(0))
         painted = cv2.resize(painted, double, interpolation=cv2.INTER_LINEAR)
-    return picture, _laid_over(picture, mask, painted, layer.x * factor, layer.y * factor)
+    return image, _overlay_person(image, mask, painted, layer.x * factor, layer.y * factor)
 
 
 def _scaled(matrix: np.ndarray, scale: float) -> np.ndarray:
-    """Camera matrix of the picture shrunk by a factor; pixel centres stay at whole numbers."""
+    """Camera matrix of the scaled image; pixel centres stay at whole numbers."""
     shrunk = matrix * scale
     shrunk[:2, 2] = (matrix[:2, 2] + 0.5) * scale - 0.5
     shrunk[2] = matrix[2]
@@ -135,39 +135,39 @@ def _in_camera(q: Quadrics, rotation: np.ndarray, position: np.ndarray) -> Quadr
     )  # fmt: skip
 
 
-def _person_px(seen: Quadrics, matrix: np.ndarray, width: int, height: int) -> float:
-    """About the number of pixels of the person's box."""
-    depth = np.maximum(seen.ends[..., 2], 0.2)
-    px = seen.ends[..., :2] / depth[..., None] * np.diag(matrix)[:2] + matrix[:2, 2]
+def _person_px(visible: Quadrics, matrix: np.ndarray, width: int, height: int) -> float:
+    """Approximate number of pixels of the person's box."""
+    depth = np.maximum(visible.ends[..., 2], 0.2)
+    px = visible.ends[..., :2] / depth[..., None] * np.diag(matrix)[:2] + matrix[:2, 2]
     px = np.clip(px.reshape(-1, 2), 0, [width, height])
     return float(np.prod(np.ptp(px, axis=0)))
 
 
-def _painted(layer: Layer, colours: np.ndarray, sunlight: float, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _shaded(layer: Layer, colours: np.ndarray, sunlight: float, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mask (h, w) uint8 0 or 255 and colours (h, w, 3) uint8 of a layer."""
     import cv2
 
     direct = np.maximum(layer.light, 0)
     bright = np.float32(0.62 - 0.25 * sunlight) + np.float32(0.12) * layer.light + np.float32(1.15 * sunlight) * direct
     mask = (layer.surface >= 0).view(np.uint8) * np.uint8(255)
-    table = np.concatenate([colours, np.zeros((1, 3), np.float32)])  # -1 = none takes the last
+    table = np.concatenate([colours, np.zeros((1, 3), np.float32)])  # -1 = no surface indexes the last
     painted = np.take(table, layer.surface, axis=0, mode="wrap")
     painted *= bright[..., None]
     return mask, cv2.convertScaleAbs(painted)
 
 
-def _laid_over(picture: np.ndarray, mask: np.ndarray, painted: np.ndarray, x: int, y: int) -> np.ndarray | None:
-    """Lay the person over the picture with the softness of a lens; returns its box (4,) px or None."""
+def _overlay_person(image: np.ndarray, mask: np.ndarray, painted: np.ndarray, x: int, y: int) -> np.ndarray | None:
+    """Draw the person over the image with slightly blurred edges; returns its box (4,) px or None."""
     import cv2
 
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     mask, painted = mask[: height - y, : width - x], painted[: height - y, : width - x]
     columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
     if not columns.size:
         return None
-    part = picture[y : y + mask.shape[0], x : x + mask.shape[1]]
+    part = image[y : y + mask.shape[0], x : x + mask.shape[1]]
     cv2.copyTo(painted, mask, part)
     y0, x0 = max(y - 1, 0), max(x - 1, 0)
-    edge = picture[y0 : y + mask.shape[0] + 1, x0 : x + mask.shape[1] + 1]
+    edge = image[y0 : y + mask.shape[0] + 1, x0 : x + mask.shape[1] + 1]
     edge[:] = cv2.GaussianBlur(edge, (3, 3), 0.7)
     return np.array([x + columns[0], y + rows[0], x + columns[-1] + 1, y + rows[-1] + 1], float)

@@ -1,4 +1,4 @@
-"""The place around a simulated person: ground, sky, sun, trees and houses far away."""
+"""The scenery around a simulated person: ground, sky, sun, distant trees and houses."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Side of the ground's repeating pattern: what is near, and what the far ground is averaged to.
+#: Side of the ground's repeating pattern, near and far.
 NEAR_M, FAR_M = 24.0, 480.0
 _NEAR_PX, _FAR_PX = 1024, 512
-#: Things around stand at least this far from the origin, beyond where the person walks.
+#: Distances of trees and houses from the origin, beyond the person's path.
 _LEAST_M, _MOST_M = 32.0, 95.0
 
-_GROUNDS = (  # base colour BGR, how much it varies, size of its patches in px of the pattern
+_GROUNDS = (  # base colour BGR, its variation, size of its patches in px of the pattern
     ((60, 115, 85), 22.0, 40),  # grass
     ((85, 140, 125), 26.0, 90),  # dry grass
     ((110, 112, 115), 10.0, 60),  # asphalt
@@ -32,12 +32,12 @@ _SKIES = (  # at the horizon, overhead, share of direct sunlight
 
 @dataclass(frozen=True)
 class Scenery:
-    """A place; z = 0 is the ground, m, ENU.
+    """Scenery, m, ENU, with the ground at z = 0.
 
     near, far : (S, S) uint32, packed BGRX patterns of the ground that repeat every NEAR_M and FAR_M
     horizon, zenith : (3,) BGR colours of the sky
-    sun : (3,) unit vector towards the sun; sunlight : share of the light that comes from it
-    haze_m : distance over which the haze takes 63 % of the colour
+    sun : (3,) unit vector towards the sun; sunlight : its share of the light
+    haze_m : distance at which the haze replaces 63 % of the colour
     houses : (H, 8, 3) m corners, the first four on the ground; house_colours (H, 3)
     trees : (T, 4) x, y, height, radius of the crown, m; tree_colours (T, 3)
     """
@@ -56,7 +56,7 @@ class Scenery:
 
 
 def make_scenery(seed: int) -> Scenery:
-    """A place; the same seed gives the same."""
+    """Scenery of a seed."""
     rng = np.random.default_rng([seed, 0x5CE])
     base, contrast, patch = _GROUNDS[rng.integers(len(_GROUNDS))]
     colour = np.array(base, float) * rng.uniform(0.8, 1.15)
@@ -76,14 +76,14 @@ def make_scenery(seed: int) -> Scenery:
 
 
 def _packed(pattern: np.ndarray) -> np.ndarray:
-    """(S, S, 3) uint8 -> (S, S) uint32, so that a pixel is looked up at once."""
+    """(S, S, 3) uint8 -> (S, S) uint32: one look-up per pixel."""
     full = np.zeros((*pattern.shape[:2], 4), np.uint8)
     full[..., :3] = pattern
     return full.view(np.uint32)[..., 0]
 
 
 def _pattern(rng: np.random.Generator, side: int, colour: np.ndarray, contrast: float, patch: int) -> np.ndarray:
-    """Noise of several sizes around a colour, which repeats without a seam."""
+    """Noise of several sizes around a colour; it repeats without a seam."""
     import cv2
 
     total = np.zeros((side, side), np.float32)
@@ -99,7 +99,7 @@ def _pattern(rng: np.random.Generator, side: int, colour: np.ndarray, contrast: 
 
 
 def _paint_lines(rng: np.random.Generator, near: np.ndarray) -> None:
-    """Markings, slabs or stains: something of size for the eye to hold on to."""
+    """Add markings, slabs or stains of visible size."""
     import cv2
 
     side = len(near)

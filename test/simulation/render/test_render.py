@@ -1,4 +1,4 @@
-"""The renderer: geometry of the pictures, what hides what, and what it refuses."""
+"""The renderer: geometry, occlusion, light, and refused arguments."""
 
 import time
 
@@ -8,7 +8,7 @@ import pytest
 from drocap_ros.errors import InputError
 from drocap_ros.simulation.orbit_camera import look_at, orbit_camera, pinhole_matrix, project, to_camera
 from drocap_ros.simulation.render.body import body, dress
-from drocap_ros.simulation.render.quadrics import cones, ellipsoids, joined, see
+from drocap_ros.simulation.render.quadrics import cones, ellipsoids, joined, rasterize
 from drocap_ros.simulation.render.renderer import Renderer, draw
 from drocap_ros.simulation.render.scenery import make_scenery
 from drocap_ros.simulation.simulated_person import ACTIONS, simulate_person
@@ -26,11 +26,11 @@ def orbit(action="mixed", seed=0, count=1, radius_m=6.0, height_m=2.5, start_deg
 
 
 def person_mask(joints, rotation, position, matrix=MATRIX, size=(1280, 720), seed=0):
-    """Pixels that differ between the picture and the same one with the person far behind the camera."""
-    with_person = Renderer(matrix, *size, seed).picture(joints, rotation, position).astype(int)
+    """Pixels that differ between the image and the same one with the person far behind the camera."""
+    with_person = Renderer(matrix, *size, seed).render(joints, rotation, position).astype(int)
     moved = joints.copy()
     moved[:, :2] += 1e4 * (position - joints[0])[:2]  # no body, no shadow
-    without = Renderer(matrix, *size, seed).picture(moved, rotation, position).astype(int)
+    without = Renderer(matrix, *size, seed).render(moved, rotation, position).astype(int)
     return np.abs(with_person - without).sum(axis=2) > 0
 
 
@@ -38,19 +38,19 @@ def sphere(centre, radius):
     return ellipsoids(np.array([centre]), np.eye(3)[None], np.full((1, 3), radius))
 
 
-def test_small_spheres_at_the_joints_are_drawn_where_the_camera_projects_them():
+def test_spheres_at_the_joints_are_drawn_at_their_projections():
     joints, rotation, position = orbit(count=6)
     px = project(joints, rotation, position, MATRIX)
     local = to_camera(joints, rotation, position)
     for frame in range(len(joints)):
         for point, at in zip(local[frame], px[frame], strict=True):
-            layer = see(sphere(point, 0.03), MATRIX, 1280, 720, LIGHT)
+            layer = rasterize(sphere(point, 0.03), MATRIX, 1280, 720, LIGHT)
             rows, columns = np.nonzero(layer.surface >= 0)
             centre = np.array([columns.mean() + layer.x, rows.mean() + layer.y])
             assert np.abs(centre - at).max() < 0.3
 
 
-def test_limbs_are_drawn_round_the_line_between_their_joints():
+def test_limbs_are_drawn_about_the_line_between_their_joints():
     joints, rotation, position = orbit("walk", count=4)
     px = project(joints, rotation, position, MATRIX)
     local = to_camera(joints, rotation, position)
@@ -58,12 +58,12 @@ def test_limbs_are_drawn_round_the_line_between_their_joints():
     for frame in range(len(joints)):
         for a, b in zip(parent, child, strict=True):
             limb = cones(local[frame, [a]], local[frame, [b]], np.array([0.04]), np.array([0.04]))
-            layer = see(limb, MATRIX, 1280, 720, LIGHT)
+            layer = rasterize(limb, MATRIX, 1280, 720, LIGHT)
             rows, columns = np.nonzero(layer.surface >= 0)
             seen = np.stack([columns + layer.x, rows + layer.y], axis=1) - px[frame, a]
             axis = px[frame, b] - px[frame, a]
             length = np.linalg.norm(axis)
-            if length < 15:  # seen along its axis: there is no line to speak of
+            if length < 15:  # seen along its axis: no line
                 continue
             along, across = seen @ axis / length, seen @ np.array([-axis[1], axis[0]]) / length
             middle = (along > 0.3 * length) & (along < 0.7 * length)
@@ -71,7 +71,7 @@ def test_limbs_are_drawn_round_the_line_between_their_joints():
 
 
 @pytest.mark.parametrize("size", [(1280, 720), (640, 480), (321, 241)])
-def test_the_body_covers_its_joints_in_every_size_of_picture(size):
+def test_body_covers_its_joints_at_every_image_size(size):
     matrix = pinhole_matrix(*size, 60)
     for radius in (3.0, 6.0):  # near persons are drawn at half the resolution
         joints, rotation, position = orbit(count=3, radius_m=radius)
@@ -84,7 +84,7 @@ def test_the_body_covers_its_joints_in_every_size_of_picture(size):
             assert mask[y, x].all()
 
 
-def test_a_near_person_drawn_at_half_the_resolution_has_the_same_outline():
+def test_near_person_at_half_resolution_has_the_same_outline():
     joints, rotation, position = (v[0] for v in orbit(radius_m=2.6))
     surfaces, _ = body(joints, dress(0))
     ends = to_camera(surfaces.ends, rotation[None].repeat(len(surfaces.ends), 0), position[None])
@@ -99,14 +99,14 @@ def test_a_near_person_drawn_at_half_the_resolution_has_the_same_outline():
         high=surfaces.high - surfaces.axis @ position,
         ends=ends,
     )
-    rows, columns = np.nonzero((layer := see(turned, MATRIX, 1280, 720, LIGHT)).surface >= 0)
+    rows, columns = np.nonzero((layer := rasterize(turned, MATRIX, 1280, 720, LIGHT)).surface >= 0)
     full = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]) + [layer.x, layer.y] * 2
     assert np.abs(full - box).max() <= 2
 
 
-def test_the_outline_of_a_sphere_is_exact_to_a_pixel():
+def test_outline_of_a_sphere_is_exact_to_a_pixel():
     centre, radius = np.array([0.4, -0.3, 5.0]), 0.5
-    layer = see(sphere(centre, radius), MATRIX, 1280, 720, LIGHT)
+    layer = rasterize(sphere(centre, radius), MATRIX, 1280, 720, LIGHT)
     v, u = np.mgrid[:720, :1280]
     rays = np.stack([(u - MATRIX[0, 2]) / MATRIX[0, 0], (v - MATRIX[1, 2]) / MATRIX[1, 1], np.ones_like(u)], -1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -117,37 +117,37 @@ def test_the_outline_of_a_sphere_is_exact_to_a_pixel():
     assert (found != truth).sum() < 0.002 * truth.sum()
 
 
-def test_the_nearer_surface_hides_the_farther_whatever_the_order():
+def test_nearer_surface_hides_the_farther_one_in_any_order():
     near, far = sphere([0.0, 0.0, 4.0], 0.2), sphere([0.05, 0.0, 5.0], 0.4)
     for pair, front in ((joined([near, far]), 0), (joined([far, near]), 1)):
-        layer = see(pair, MATRIX, 1280, 720, LIGHT)
+        layer = rasterize(pair, MATRIX, 1280, 720, LIGHT)
         middle = layer.surface[round(MATRIX[1, 2]) - layer.y, round(MATRIX[0, 2]) - layer.x]
         assert middle == front
         assert set(np.unique(layer.surface)) == {-1, 0, 1}
 
 
-def test_a_limb_hides_part_of_another_and_is_cut_off_at_its_ends():
+def test_limb_hides_part_of_another_and_ends_at_its_joints():
     cross = cones(
         np.array([[-1.0, 0, 5], [0, -1.0, 4.5]]),
         np.array([[1.0, 0, 5], [0, 1.0, 4.5]]),
         np.full(2, 0.1),
         np.full(2, 0.1),
     )
-    layer = see(cross, MATRIX, 1280, 720, LIGHT)
+    layer = rasterize(cross, MATRIX, 1280, 720, LIGHT)
     row, column = round(MATRIX[1, 2]) - layer.y, round(MATRIX[0, 2]) - layer.x
     assert layer.surface[row, column] == 1
     wide = np.flatnonzero((layer.surface == 0).any(axis=0))
     assert wide[-1] - wide[0] + 1 == pytest.approx(2 * MATRIX[0, 0] / 4.9, abs=3)  # its front is 4.9 m away
 
 
-def test_light_falls_on_the_side_of_the_sun():
-    layer = see(sphere([0.0, 0.0, 5.0], 0.5), MATRIX, 1280, 720, np.array([0.0, -1.0, 0.0]))
+def test_side_towards_the_sun_is_lit():
+    layer = rasterize(sphere([0.0, 0.0, 5.0], 0.5), MATRIX, 1280, 720, np.array([0.0, -1.0, 0.0]))
     half = layer.light.shape[0] // 2
     assert layer.light[:half].sum() > 0 > layer.light[half:].sum()
     assert layer.light.max() <= 1.001
 
 
-def test_front_and_back_differ():
+def test_front_and_back_of_the_head_differ():
     """The face and the chest have other colours than hair and back."""
     joints = simulate_person(np.array([0.0]), "stand", 3)
     ahead = np.cross(joints[0, BODY_15.index("lhip")] - joints[0, BODY_15.index("rhip")], [0, 0, 1.0])
@@ -157,13 +157,13 @@ def test_front_and_back_differ():
     for name, sign in (("front", 1), ("back", -1)):
         position = joints[0, 0] + sign * 4 * ahead + np.array([0, 0, 0.6])
         rotation = look_at(position[None], joints[:, 0])[0]
-        picture, _ = draw(scene, look, MATRIX, 1280, 720, joints[0], rotation, position)
+        image, _ = draw(scene, look, MATRIX, 1280, 720, joints[0], rotation, position)
         x, y = np.round(project(joints, rotation[None], position[None], MATRIX)[0, BODY_15.index("head")]).astype(int)
-        seen[name] = picture[y - 6 : y + 18, x - 8 : x + 9].reshape(-1, 3).mean(axis=0)
+        seen[name] = image[y - 6 : y + 18, x - 8 : x + 9].reshape(-1, 3).mean(axis=0)
     assert np.abs(seen["front"] - seen["back"]).max() > 30
 
 
-def test_toes_point_forward_and_nothing_reaches_below_the_ground():
+def test_toes_point_forward_and_the_body_stays_above_the_ground():
     for action in ACTIONS:
         for frame in simulate_person(np.arange(0, 12, 0.7), action, 2):
             surfaces, parts = body(frame, dress(1))
@@ -176,18 +176,18 @@ def test_toes_point_forward_and_nothing_reaches_below_the_ground():
                 assert sole @ ahead > 0
 
 
-def test_the_same_seed_gives_the_same_picture_and_another_one_another():
+def test_image_depends_on_the_seed_alone():
     joints, rotation, position = (v[0] for v in orbit())
-    first = Renderer(MATRIX, 1280, 720, 5).picture(joints, rotation, position)
-    again = Renderer(MATRIX, 1280, 720, 5).picture(joints, rotation, position)
-    other = Renderer(MATRIX, 1280, 720, 6).picture(joints, rotation, position)
+    first = Renderer(MATRIX, 1280, 720, 5).render(joints, rotation, position)
+    again = Renderer(MATRIX, 1280, 720, 5).render(joints, rotation, position)
+    other = Renderer(MATRIX, 1280, 720, 6).render(joints, rotation, position)
     assert first.shape == (720, 1280, 3)
     assert first.dtype == np.uint8
     assert (first == again).all()
     assert (first != other).mean() > 0.5
 
 
-def test_the_horizon_lies_where_the_camera_is_level():
+def test_horizon_lies_at_zero_elevation():
     """Sky above, ground below, for a level camera and one that rolls."""
     scene, look = make_scenery(2), dress(2)
     position = np.array([0.0, 0.0, 3.0])
@@ -196,18 +196,18 @@ def test_the_horizon_lies_where_the_camera_is_level():
     for roll in (0.0, 0.3, -0.4):
         turn = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
         rotation = turn @ level
-        picture, box = draw(scene, look, MATRIX, 1280, 720, far, rotation, position)
+        image, box = draw(scene, look, MATRIX, 1280, 720, far, rotation, position)
         assert box is None
         v, u = np.mgrid[:720:8, :1280:8]
         rise = np.stack([(u - MATRIX[0, 2]) / MATRIX[0, 0], (v - MATRIX[1, 2]) / MATRIX[1, 1], np.ones(u.shape)], -1)
         rise = rise @ rotation[:, 2]
-        sky = np.abs(picture[::8, ::8].astype(float) - scene.horizon).max(axis=2)
+        sky = np.abs(image[::8, ::8].astype(float) - scene.horizon).max(axis=2)
         ground = scene.near.view(np.uint8).reshape(-1, 4)[:, :3].mean(axis=0)
-        assert np.linalg.norm(picture[::8, ::8][rise < -0.25].mean(axis=0) - ground) < 30
+        assert np.linalg.norm(image[::8, ::8][rise < -0.25].mean(axis=0) - ground) < 30
         assert np.median(sky[np.abs(rise) < 0.01]) < 40
 
 
-def test_the_ground_keeps_its_place_while_the_camera_moves():
+def test_ground_mark_is_found_at_its_projection_from_two_positions():
     """A mark of the ground is found at its own projection from two places."""
     scene = make_scenery(4)
     side, size = len(scene.near), 24.0
@@ -220,8 +220,8 @@ def test_the_ground_keeps_its_place_while_the_camera_moves():
     for offset in ([2.0, -5.0, 3.0], [-4.0, -3.0, 2.0]):
         position = spot + np.array(offset)
         rotation = look_at(position[None], (spot + np.array([0.4, 0.3, 0.0]))[None])[0]
-        picture, _ = draw(plain, dress(0), MATRIX, 1280, 720, far, rotation, position)
-        blue = picture[..., 0].astype(int) - picture[..., 2] > 60
+        image, _ = draw(plain, dress(0), MATRIX, 1280, 720, far, rotation, position)
+        blue = image[..., 0].astype(int) - image[..., 2] > 60
         at = project(spot[None, None], rotation[None], position[None], MATRIX)[0, 0]
         rows, columns = np.nonzero(blue)
         assert rows.size > 100
@@ -230,25 +230,25 @@ def test_the_ground_keeps_its_place_while_the_camera_moves():
         assert np.abs(centre - at).max() < 6  # a patch's middle in perspective is not quite the middle of its image
 
 
-def test_a_person_partly_outside_outside_behind_or_at_the_lens_is_drawn_as_far_as_it_is_seen():
+def test_person_at_the_border_outside_behind_or_at_the_lens_is_drawn_as_far_as_visible():
     joints, rotation, position = (v[0] for v in orbit("stand"))
     matrix = MATRIX.copy()
     matrix[0, 2] -= 640  # the person at the left edge
     renderer = Renderer(matrix, 1280, 720, 0)
-    renderer.picture(joints, rotation, position)
+    renderer.render(joints, rotation, position)
     mask = person_mask(joints, rotation, position, matrix)
     assert mask[:, :100].any()
     sideways = joints + 40 * rotation[0]
     behind = joints + 2 * (position - joints[0])
     for away in (sideways, behind, joints + (position - joints[BODY_15.index("head")])):
-        picture = renderer.picture(away, rotation, position)
-        assert picture.shape == (720, 1280, 3)
+        image = renderer.render(away, rotation, position)
+        assert image.shape == (720, 1280, 3)
     scene, look = make_scenery(0), dress(0)
     for away in (sideways, behind):
         assert draw(scene, look, MATRIX, 1280, 720, away, rotation, position)[1] is None
 
 
-def test_what_cannot_be_drawn_is_refused_in_one_line():
+def test_invalid_arguments_are_refused_in_one_line():
     joints, rotation, position = (v[0] for v in orbit())
     renderer = Renderer(MATRIX, 64, 48, 0)
     bad = joints.copy()
@@ -260,21 +260,21 @@ def test_what_cannot_be_drawn_is_refused_in_one_line():
         (joints, rotation, np.array([0.0, np.inf, 1.0])),
     ):
         with pytest.raises(InputError, match=r"expected .* got") as error:
-            renderer.picture(*arguments)
+            renderer.render(*arguments)
         assert "\n" not in str(error.value)
     for matrix, width, height in ((-MATRIX, 64, 48), (MATRIX, 0, 48), (MATRIX, 64, 100_000), (MATRIX[:2], 64, 48)):
         with pytest.raises(InputError, match="expected"):
             Renderer(matrix, width, height, 0)
 
 
-def test_a_picture_is_fast_enough_for_the_demo():
-    """The bound of the demo is 12 ms; a shared machine gets three times that before this says so."""
+def test_image_is_rendered_within_three_times_the_demo_bound():
+    """The bound of the demo is 12 ms; the factor of three allows for a shared machine."""
     joints, rotation, position = orbit(count=12)
     renderer = Renderer(MATRIX, 1280, 720, 0)
-    renderer.picture(joints[0], rotation[0], position[0])
+    renderer.render(joints[0], rotation[0], position[0])
     spent = []
     for frame in range(12):
         begin = time.process_time()
-        renderer.picture(joints[frame], rotation[frame], position[frame])
+        renderer.render(joints[frame], rotation[frame], position[frame])
         spent.append(time.process_time() - begin)
     assert np.median(spent) < 0.036
