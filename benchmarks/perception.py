@@ -25,10 +25,10 @@ from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import load_detector, load_pose_model
 from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.perception.models.spec import read_spec
-from drocap_ros.perception.perception_config import PoseEstimatorConfig
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.pose import Keypoints, PoseModel
 from drocap_ros.perception.sources import open_source
-from drocap_ros.perception.sources.pictures import read_picture
+from drocap_ros.perception.sources.image_files import read_image
 from drocap_ros.perception.track_video import observe, subjects
 from drocap_ros.perception.uncertainty import CALIBRATIONS, Calibration, calibrate
 from drocap_ros.skeleton import COCO_17
@@ -78,7 +78,7 @@ def speed(repetitions: int) -> None:
         cpu, wall = timed(work, count)
         print(f"{name:<58} {cpu:7.1f} {wall:7.1f}")
 
-    image = read_picture(MEDIA / "skier.jpg")
+    image = read_image(MEDIA / "skier.jpg")
     box = np.array([280.0, 44, 500, 392])
     for path in sorted(MODELS.glob("*.onnx")):
         model = OnnxModel(path)

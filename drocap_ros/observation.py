@@ -1,4 +1,4 @@
-"""What perception says about one image: the subject's box and keypoints with their uncertainty."""
+"""Result of perception for one image: the subject's box and keypoints with their uncertainty."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.skeleton import BODY_15, JointSet
 
 
@@ -16,19 +15,19 @@ def _empty(*shape: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PoseObservation:
-    """The subject in one image; P joints, or empty arrays when there is no subject.
+    """The subject in one image; P joints, or empty arrays without a subject.
 
     stamp_ns : exposure time of the image
     track_id : 1, 2, ... for the subject; 0 = no subject
     joints : names and order of the keypoints
     image_size : (width, height) px
     roi : (4,) float32, the subject's box x_min y_min x_max y_max px; NaN without a subject
-    detection_score : the detector's score of the box in [0, 1], the last one while the pose network carries the
-        box on; 0 while the box is only predicted
+    detection_score : the detector's score of the box in [0, 1], the last one while the box is propagated by the pose
+        network; 0 for a predicted box
     keypoints : (P, 2) float32 px, NaN = not seen
     covariance : (P, 3) float32 px^2, xx xy yy, NaN where the keypoint is
-    confidence : (P,) float32 in [0, 1], calibrated: the share of such keypoints that lie within 10 % of the
-        box height of where a person would mark them
+    confidence : (P,) float32 in [0, 1], calibrated: the share of such keypoints within 10 % of the box height of a
+        human label
     """
 
     stamp_ns: int
@@ -42,12 +41,6 @@ class PoseObservation:
     confidence: np.ndarray = field(default_factory=lambda: _empty(0))
 
     @property
-    def keypoints_2d(self) -> Keypoints2D:
-        """Keypoints, confidence and covariance as float64."""
-        arrays = (self.keypoints, self.confidence, self.covariance)
-        return Keypoints2D(*(array.astype(np.float64) for array in arrays))
-
-    @property
     def has_subject(self) -> bool:
-        """Whether a subject was followed in this image."""
+        """Whether the image has a subject."""
         return self.track_id > 0

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from drocap_ros.observation import PoseObservation
-    from drocap_ros.perception.perception_config import PoseEstimatorConfig
+    from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
     from drocap_ros.perception.sources import Frame
 
 SUBJECTS = ("largest", "centre")
@@ -92,7 +92,7 @@ def _configs(args: argparse.Namespace) -> tuple[PoseEstimatorConfig, Any]:
     if args.subject in SUBJECTS:
         changes["subject"] = args.subject
     else:
-        from drocap_ros.perception.tracking.subject import parse_box
+        from drocap_ros.perception.pose_estimator_config import parse_box
 
         parse_box(args.subject)
         changes |= {"subject": "box", "subject_box": args.subject}

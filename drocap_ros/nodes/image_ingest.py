@@ -199,7 +199,7 @@ class ImageIngestNode(ManagedComponent):
     def _watch(self) -> None:
         """Report a camera, stream or topic without images within 2 s."""
         for event in self._source.events() if self._source is not None else ():
-            self.count(of(Key.SOURCE_EVENT, event.kind))
+            self.count(of(Key.SOURCE_EVENT, event.kind.value))
         is_live = self._source is None or self._source.live
         silence_s = time.monotonic() - self._arrived_s
         if self.active and is_live and silence_s > self.config.stall_timeout_s:

@@ -75,7 +75,7 @@ class PoseEstimatorNode(ManagedComponent):
         observation = self._estimator.process(sample.image, stamp_from_ros(header.stamp), roi, level)
         if level:
             self.count(Key.IMAGES_SHED)
-        if self._estimator.carried:
+        if self._estimator.propagated:
             self.count(Key.IMAGES_PROPAGATED)
         self._pose2d.publish(pose2d_to_ros(observation, header.frame_id))
         self.count(Key.IMAGES)

@@ -1,4 +1,4 @@
-"""What is known of the camera: a calibration file, or a stated field of view."""
+"""Camera model from a calibration file or a configured field of view."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.perception_config import ImageIngestConfig
+from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 
 
 @dataclass(frozen=True)
 class CameraModel:
-    """Pinhole camera as ``sensor_msgs/CameraInfo`` tells it.
+    """Pinhole camera with lens distortion, as in ``sensor_msgs/CameraInfo``.
 
     width, height : px
     matrix : (3, 3) px
@@ -28,13 +28,13 @@ class CameraModel:
     distortion_model: str = "plumb_bob"
 
     def resized(self, width: int, height: int) -> CameraModel:
-        """The same lens at another picture size."""
+        """The same lens at another image size."""
         scale = np.array([width / self.width, height / self.height, 1.0])
         return CameraModel(width, height, self.matrix * scale[:, None], self.distortion, self.distortion_model)
 
 
 def camera_model(config: ImageIngestConfig, size: tuple[int, int]) -> CameraModel | None:
-    """Camera of a source whose pictures have ``size`` (width, height); None when nothing is known of it.
+    """Camera of a source with images of ``size`` (width, height); None when it is unknown.
 
     Raises
     ------
@@ -45,8 +45,8 @@ def camera_model(config: ImageIngestConfig, size: tuple[int, int]) -> CameraMode
         model = load_calibration(Path(config.calibration_file))
         if abs(model.width * size[1] - model.height * size[0]) > 0.02 * model.width * size[1]:
             raise InputError(
-                f"{config.calibration_file}: expected the picture's shape {size[0]}x{size[1]}, found"
-                f" {model.width}x{model.height}; calibrate with pictures of this camera mode"
+                f"{config.calibration_file}: expected the aspect ratio of {size[0]}x{size[1]}, found"
+                f" {model.width}x{model.height}; calibrate with images of this camera mode"
             )
         return model.resized(*size)
     if config.horizontal_fov_deg > 0:
@@ -57,7 +57,7 @@ def camera_model(config: ImageIngestConfig, size: tuple[int, int]) -> CameraMode
 
 
 def load_calibration(path: Path) -> CameraModel:
-    """Read the YAML that ROS's ``camera_calibration`` writes.
+    """Read the YAML of ROS's ``camera_calibration``.
 
     Raises
     ------
@@ -82,5 +82,5 @@ def load_calibration(path: Path) -> CameraModel:
             f" found a problem with {str(error).splitlines()[0] or type(error).__name__}"
         ) from None
     if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0 and min(model.width, model.height) > 0):
-        raise InputError(f"{path}: expected positive focal lengths and picture size, found others")
+        raise InputError(f"{path}: expected positive focal lengths and image size, found others")
     return model

@@ -1,8 +1,8 @@
-"""Keypoints carried from one picture to the next by optical flow: what is done where there is no time for the network.
+"""Optical flow of keypoints: propagation from one image to the next without a network, for load shedding.
 
-Pyramidal Lucas-Kanade (Bouguet 2001) around each joint, there and back again (forward-backward error, Kalal et al.
-2010).  From one picture to the next of a video at 30 Hz, joints that come back to within 0.2 % of the box are
-carried as well as the network repeats itself: median 0.3 to 0.6 % of the box, 1 to 2 % at the 90th percentile.
+Pyramidal Lucas-Kanade (Bouguet 2001) around each joint, forward and backward (forward-backward error, Kalal et al.
+2010).  At 30 Hz, joints whose backward flow returns to within 0.2 % of the box are as accurate as the network's
+repeatability: median 0.3 to 0.6 % of the box, 1 to 2 % at the 90th percentile.
 """
 
 from __future__ import annotations
@@ -15,23 +15,25 @@ import numpy as np
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.detection.letterbox import shrink
 
-#: The box's longer side is brought to this many px, no smaller picture is enlarged.
+#: Longer side of the box in the flow's image, px; smaller boxes are not enlarged.
 _SIDE_PX = 192
-#: Seen around the box, shares of its longer side.
+#: Margin around the box, share of its longer side.
 _MARGIN = 0.25
 _WINDOW_PX, _LEVELS = (15, 15), 2
-#: Share of the box's longer side by which a joint may miss its start on the way back.
-_MISSED = 0.01
-#: Standard deviation that a carried joint has more, same unit, beside what it missed its start by.
+#: Largest forward-backward error of a joint, share of the box's longer side.
+_MAX_ERROR = 0.01
+#: Standard deviation that each step adds beside the forward-backward error, same unit.
 _SIGMA = 0.005
-#: Share of the joints seen before that have to arrive; else the picture is another one, or too blurred.
-_ARRIVED = 0.5
-#: Longest time between the two pictures.
+#: Least share of valid joints; below it the scene changed or the image is blurred.
+_MIN_VALID = 0.5
+#: Longest time between the two images.
 _LONGEST_S = 0.1
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Reference:
+    """An image's grey region around the subject, and the keypoints in it."""
+
     observation: PoseObservation
     region: tuple[int, int, int, int]
     view: np.ndarray
@@ -39,53 +41,53 @@ class _Seen:
 
 
 class KeypointFlow:
-    """Finds one picture's keypoints in the next.
+    """Propagates keypoints from image to image.
 
     Attributes
     ----------
-    steps : pictures through which the keypoints have come since the network saw them
+    steps : number of propagations since the network's last keypoints
     """
 
     def __init__(self) -> None:
         self.steps = 0
-        self._seen: _Seen | None = None
+        self._reference: _Reference | None = None
 
-    def begin(self, image: np.ndarray | None, observation: PoseObservation | None) -> None:
-        """Keep what is needed of a picture (H, W, 3) uint8 BGR and of what the network saw in it; None = nothing."""
+    def start(self, image: np.ndarray | None, observation: PoseObservation | None) -> None:
+        """Set the reference: an image (H, W, 3) uint8 BGR and the network's keypoints in it; None = no reference."""
         self.steps = 0
-        self._seen = None if image is None or observation is None else _seen(image, observation)
+        self._reference = None if image is None or observation is None else _reference(image, observation)
 
-    def carry(self, image: np.ndarray, stamp_ns: int) -> PoseObservation | None:
-        """The same subject in the next picture; None when that cannot be.
+    def propagate(self, image: np.ndarray, stamp_ns: int) -> PoseObservation | None:
+        """The same subject in the next image; None without a reference or with too few valid joints.
 
-        Joints that were lost are NaN, the box goes with the others; covariances grow by the flow's own error, scores
-        and confidences stay.
+        Invalid joints are NaN, and the box moves with the others.  Covariances grow by the flow's error; scores and
+        confidences stay.
         """
-        seen = self._seen
+        reference = self._reference
         size = (image.shape[1], image.shape[0])
-        if seen is None or size != seen.observation.image_size:
+        if reference is None or size != reference.observation.image_size:
             return None
-        before = seen.observation
+        before = reference.observation
         if not 0 < (stamp_ns - before.stamp_ns) * 1e-9 <= _LONGEST_S:
             return None
         known = np.isfinite(before.keypoints).all(axis=1)
-        view = _view(image, seen.region, seen.length)
-        origin = np.array(seen.region[:2], float)
-        scale = np.array([view.shape[1], view.shape[0]]) / (np.array(seen.region[2:]) - origin)
+        view = _view(image, reference.region, reference.length)
+        origin = np.array(reference.region[:2], float)
+        scale = np.array([view.shape[1], view.shape[0]]) / (np.array(reference.region[2:]) - origin)
         start = ((before.keypoints[known] - origin) * scale).astype(np.float32)
-        there, found = _follow(seen.view, view, start)
-        back, found_back = _follow(view, seen.view, there)
-        missed = np.linalg.norm((back - start) / scale, axis=1) / seen.length
-        moved = there / scale + origin
-        arrived = found & found_back & (missed <= _MISSED) & ((moved >= 0) & (moved < size)).all(axis=1)
-        if arrived.sum() < _ARRIVED * known.sum():
+        forward, found = _flow(reference.view, view, start)
+        backward, found_backward = _flow(view, reference.view, forward)
+        error = np.linalg.norm((backward - start) / scale, axis=1) / reference.length
+        moved = forward / scale + origin
+        valid = found & found_backward & (error <= _MAX_ERROR) & ((moved >= 0) & (moved < size)).all(axis=1)
+        if valid.sum() < _MIN_VALID * known.sum():
             return None
-        joints = np.nonzero(known)[0][arrived]
+        joints = np.nonzero(known)[0][valid]
         keypoints = np.full_like(before.keypoints, np.nan)
         covariance = np.full_like(before.covariance, np.nan)
         confidence = np.zeros_like(before.confidence)
-        keypoints[joints] = moved[arrived]
-        variance = ((_SIGMA**2 + missed[arrived] ** 2) * seen.length**2)[:, None]
+        keypoints[joints] = moved[valid]
+        variance = ((_SIGMA**2 + error[valid] ** 2) * reference.length**2)[:, None]
         covariance[joints] = before.covariance[joints] + variance * np.array([1.0, 0.0, 1.0])
         confidence[joints] = before.confidence[joints]
         shift = np.median(keypoints[joints] - before.keypoints[joints], axis=0)
@@ -94,12 +96,12 @@ class KeypointFlow:
             before, stamp_ns=stamp_ns, roi=roi, keypoints=keypoints, covariance=covariance, confidence=confidence
         )
         self.steps += 1
-        self._seen = _seen(image, observation)
+        self._reference = _reference(image, observation)
         return observation
 
 
-def _seen(image: np.ndarray, observation: PoseObservation) -> _Seen | None:
-    """What is needed to follow the observed joints from this picture on; None when there are none."""
+def _reference(image: np.ndarray, observation: PoseObservation) -> _Reference | None:
+    """Reference for the next image; None without keypoints or with a box too small for the flow's window."""
     if not observation.has_subject or not np.isfinite(observation.keypoints).any():
         return None
     box = observation.roi.astype(float)
@@ -109,19 +111,19 @@ def _seen(image: np.ndarray, observation: PoseObservation) -> _Seen | None:
     if (high - low).min() <= 2 * max(_WINDOW_PX):
         return None
     region = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-    return _Seen(observation, region, _view(image, region, length), length)
+    return _Reference(observation, region, _view(image, region, length), length)
 
 
-def _follow(view: np.ndarray, later: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _flow(view: np.ndarray, later: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 2) float32 px in the later view, and whether they were found (N,)."""
     import cv2
 
-    there, found, _ = cv2.calcOpticalFlowPyrLK(view, later, points, points.copy(), winSize=_WINDOW_PX, maxLevel=_LEVELS)
-    return np.asarray(there), np.asarray(found)[:, 0] == 1
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(view, later, points, points.copy(), winSize=_WINDOW_PX, maxLevel=_LEVELS)
+    return np.asarray(moved), np.asarray(found)[:, 0] == 1
 
 
 def _view(image: np.ndarray, region: tuple[int, int, int, int], length: float) -> np.ndarray:
-    """The region in grey, the person ``_SIDE_PX`` long at most."""
+    """The region in grey, scaled so that the person is at most ``_SIDE_PX`` long."""
     import cv2
 
     x0, y0, x1, y1 = region

@@ -1,4 +1,4 @@
-"""Pictures as bytes."""
+"""JPEG encoding of images."""
 
 from __future__ import annotations
 

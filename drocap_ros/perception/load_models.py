@@ -1,4 +1,4 @@
-"""From a folder of ONNX files to a detector and a 2D pose model."""
+"""Loading of a detector and a 2D pose model from a folder of ONNX files."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from drocap_ros.errors import InputError
 from drocap_ros.perception.detection import Detector
 from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.perception.models.spec import ModelSpec, read_spec
-from drocap_ros.perception.perception_config import PoseEstimatorConfig
 from drocap_ros.perception.pose import PoseModel
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 
 T = TypeVar("T", Detector, PoseModel)
 
-#: Name parts, best first: with ``auto`` a folder's models are tried in this order, others after them.
-DETECTOR_ORDER = ("rtmdet", "yolox", "yolo", "rtmo")
-POSE_ORDER = ("rtmpose", "tinypose", "vitpose", "hrnet", "hourglass", "movenet", "yolo", "rtmo")
+#: Name parts in the order of preference of ``auto``; other names come last.
+_DETECTOR_ORDER = ("rtmdet", "yolox", "yolo", "rtmo")
+_POSE_ORDER = ("rtmpose", "tinypose", "vitpose", "hrnet", "hourglass", "movenet", "yolo", "rtmo")
 
-#: Named in place of a folder: the networks that ship with this package.  They were trained on its own renders and
-#: know no real person, so nothing falls back to them: they have to be asked for.
+#: Name of the shipped networks, in place of a folder.  They are trained on rendered images only, so nothing falls back
+#: to them.
 SIMULATION = "simulation"
 _SHIPPED = Path(__file__).parents[1] / "data" / "simulation_models"
 
@@ -29,9 +29,9 @@ _FETCH = "run `drocap models fetch` or name a folder with --models or DROCAP_MOD
 
 
 def models_folder(given: str | Path | None = None) -> Path:
-    """The folder of models: the one given, else ``DROCAP_MODELS``, else the user's own, where ``fetch`` puts them.
+    """Folder of models: the given one, else ``DROCAP_MODELS``, else the user's own, the target of ``fetch``.
 
-    ``simulation`` in place of a folder names the networks for rendered pictures that ship with the package.
+    ``simulation`` in place of a folder names the shipped networks for rendered images.
     """
     if named := given or os.environ.get("DROCAP_MODELS"):
         return _SHIPPED if str(named) == SIMULATION else Path(named)
@@ -40,40 +40,32 @@ def models_folder(given: str | Path | None = None) -> Path:
 
 
 def limited_use(model: OnnxModel) -> str:
-    """What a model says of itself where it is not for any picture, else nothing."""
+    """Notice in the metadata of a model with limited use, else an empty string."""
     if purpose := model.metadata.get("only_for", ""):
         return model.metadata.get("notice") or f"for {purpose} only"
     return ""
 
 
 def load_detector(models_dir: str | Path, config: PoseEstimatorConfig) -> Detector:
-    """The configured person detector of a folder, or the best with ``auto``.
+    """The configured person detector of a folder, or the preferred one with ``auto``.
 
     Raises
     ------
     InputError
-        When the folder has none, or the named one cannot be used.
+        When the folder has none, or the configured one cannot be used.
     """
-
-    def build(model: OnnxModel, spec: ModelSpec) -> Detector:
-        return Detector(model, spec, config.nms_iou)
-
-    return _load(Path(models_dir), config.detector, "detector", DETECTOR_ORDER, config, build)
+    return _load(Path(models_dir), config.detector, "detector", _DETECTOR_ORDER, config, Detector)
 
 
 def load_pose_model(models_dir: str | Path, config: PoseEstimatorConfig) -> PoseModel:
-    """The configured 2D pose model of a folder, or the best with ``auto``.
+    """The configured 2D pose model of a folder, or the preferred one with ``auto``.
 
     Raises
     ------
     InputError
-        When the folder has none, or the named one cannot be used.
+        When the folder has none, or the configured one cannot be used.
     """
-
-    def build(model: OnnxModel, spec: ModelSpec) -> PoseModel:
-        return PoseModel(model, spec, config.box_padding)
-
-    return _load(Path(models_dir), config.pose_model, "pose", POSE_ORDER, config, build)
+    return _load(Path(models_dir), config.pose_model, "pose", _POSE_ORDER, config, PoseModel)
 
 
 def _load(

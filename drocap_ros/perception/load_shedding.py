@@ -1,37 +1,37 @@
-"""How much of a hurry the pose estimator is in."""
+"""Load shedding of the pose estimator: a level that rises while images queue."""
 
 from __future__ import annotations
 
 import math
 
-#: Time without a picture that waited after which the hurry is one less: else the backlog that has just gone comes back.
+#: Time without a queued image before the level falls: a shorter one lets the backlog return at once.
 _CALM_S = 1.0
-#: A step up has to show what it does before the next one.
-_STEP_S = 0.2
+#: Shortest time between two rises: each level needs time to take effect.
+_RISE_S = 0.2
 
 
-class Hurry:
-    """A level from 0, there is time, to ``most``: one up when pictures wait, one down after a second without."""
+class LoadShedding:
+    """Level from 0 (full work) to ``max_level``: rises while images queue, falls by one per second without."""
 
-    def __init__(self, most: int) -> None:
-        self._most = most
+    def __init__(self, max_level: int) -> None:
+        self._max_level = max_level
         self._level = 0
-        self._waited_s = -math.inf
+        self._queued_s = -math.inf
         self._raised_s = -math.inf
 
-    def level(self, now_s: float, waited: bool, behind: int) -> int:
-        """For the picture that has just been taken.
+    def level(self, now_s: float, queued: bool, backlog: int) -> int:
+        """Level for the current image.
 
         Parameters
         ----------
         now_s : monotonic time
-        waited : it lay there while the one before was worked on
-        behind : how many lie there still
+        queued : whether the image arrived while the previous one was processed
+        backlog : number of images still queued
         """
-        if waited:
-            self._waited_s = now_s
-            if now_s - self._raised_s >= _STEP_S and self._level < self._most:
+        if queued:
+            self._queued_s = now_s
+            if now_s - self._raised_s >= _RISE_S and self._level < self._max_level:
                 self._level, self._raised_s = self._level + 1, now_s
-        elif self._level and now_s - self._waited_s >= _CALM_S:
-            self._level, self._waited_s = self._level - 1, now_s
-        return min(self._level + behind, self._most) if self._level else 0
+        elif self._level and now_s - self._queued_s >= _CALM_S:
+            self._level, self._queued_s = self._level - 1, now_s
+        return min(self._level + backlog, self._max_level) if self._level else 0

@@ -1,4 +1,4 @@
-"""A whole recording: every image's observation, and the tracks of one subject from them."""
+"""Pose estimation over a whole recording, and the tracks of its subjects."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def observe(
     estimator: PoseEstimator,
     on_frame: Callable[[Frame, PoseObservation], None] | None = None,
 ) -> list[PoseObservation]:
-    """Observations of all frames, decoding ahead in a second thread.
+    """Observations of all frames; a second thread decodes ahead.
 
     Parameters
     ----------
-    frames : a source, or any frames in the order of time
-    estimator : its models and subject
+    frames : a source, or frames in the order of time
+    estimator : a fresh one; it keeps its subject between calls
     on_frame : called with each frame and its observation, for progress and overlays
     """
     observations = []
@@ -41,25 +41,25 @@ def observe(
 
 
 def subjects(observations: Sequence[PoseObservation]) -> list[tuple[int, int]]:
-    """(track_id, number of images with keypoints) of every subject, the longest seen first."""
+    """(track_id, number of images with keypoints) of each subject, by falling number."""
     count = Counter(o.track_id for o in observations if o.track_id and np.isfinite(o.keypoints).any())
     return sorted(count.items(), key=lambda item: (-item[1], item[0]))
 
 
 def tracks_from_observations(observations: Sequence[PoseObservation], track_id: int | None = None) -> Tracks:
-    """Tracks of one subject over all images; NaN where another or none was followed.
+    """Tracks of one subject over all images; NaN in images without it.
 
     Legs that the network exchanged for some images are put right (:mod:`drocap_ros.leg_sides`).
 
     Parameters
     ----------
     observations : in the order of time, of images of one size
-    track_id : the subject; None = the one seen in most images
+    track_id : the subject; None = the one with keypoints in most images
 
     Raises
     ------
     InputError
-        When there are no images, or the subject is in none of them.
+        When there are no images, or none shows the subject.
     """
     if not observations:
         raise InputError("images: expected at least one, got none")

@@ -1,12 +1,12 @@
-"""Covariance and confidence of keypoints, calibrated on labelled pictures.
+"""Covariance and confidence of keypoints, calibrated on labelled images.
 
-What a network says of itself (the height of its peak, how much a second peak rivals it, how far its
-distribution spreads) is turned into two statements.  The covariance is that of a keypoint found on the right
-limb, against a person's mark: standardized errors then have unit spread.  The confidence is the share of such
-keypoints that lie within 10 % of the box of the mark; the rest are gross errors, which no Gaussian describes.
+Inputs are the height of the network's peak, the height of its second peak and the spread of its distribution.  The
+covariance describes keypoints on the correct limb against human labels: standardized errors have unit spread.  The
+confidence is the share of keypoints within 10 % of the box of the label; the others are gross errors, which no Gaussian
+describes.
 
-The numbers come from ``benchmarks/perception.py --fit``: the 12 limb joints on the labelled pictures, as they
-are and made worse (small, blurred, dark, hazy, partly covered, badly boxed).
+``benchmarks/perception.py --fit`` computes the constants from the 12 limb joints on the labelled images, unchanged and
+degraded (small, blurred, dark, hazy, partly covered, shifted box).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drocap_ros.perception.pose.keypoints import Keypoints
+from drocap_ros.perception.pose.network_keypoints import NetworkKeypoints
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Calibration:
 
     scores, sigmas : knots of the standard deviation over the peak's height, in shares of the box's longer side
     spread_share : share of the measured spread (px^2) that adds to the variance
-    intercept, per_score, per_rival, per_spread : logistic regression of the confidence on the peak's height,
+    intercept, per_score, per_second_peak, per_spread : logistic regression of the confidence on the peak's height,
         the second peak's height and ten times the spread's standard deviation over the box
     """
 
@@ -33,14 +33,14 @@ class Calibration:
     spread_share: float
     intercept: float
     per_score: float
-    per_rival: float = 0.0
+    per_second_peak: float = 0.0
     per_spread: float = 0.0
 
 
 _KNOTS = (0.0, 0.3, 0.5, 0.65, 0.75, 0.85, 0.95)
 
-#: Fitted with PP-TinyPose and MoveNet Lightning.  SimCC and one-stage models take the nearest kind's numbers:
-#: no weights of theirs were at hand.
+#: Fitted with PP-TinyPose and MoveNet Lightning.  SimCC and one-stage models use the most similar kind's constants: the
+#: fit had no weights of theirs.
 CALIBRATIONS: dict[str, Calibration] = {
     "heatmap": Calibration(
         _KNOTS, (0.0444, 0.0316, 0.0282, 0.0282, 0.0282, 0.0134, 0.0099), 0.25, -1.543, 6.847, -4.887, -0.997
@@ -50,16 +50,16 @@ CALIBRATIONS: dict[str, Calibration] = {
 }
 _ONE_STAGE = CALIBRATIONS["movenet"]
 
-#: No keypoint is better than this, px: the grid of the picture itself.
+#: Least standard deviation, px: the pixel grid.
 _FLOOR_PX = 0.3
 
 
-def calibrate(keypoints: Keypoints, layout: str) -> tuple[np.ndarray, np.ndarray]:
+def calibrate(keypoints: NetworkKeypoints, layout: str) -> tuple[np.ndarray, np.ndarray]:
     """Covariance and confidence of one person's keypoints.
 
     Parameters
     ----------
-    keypoints : P joints as the network gives them
+    keypoints : P joints
     layout : of the pose model's outputs
 
     Returns
@@ -71,7 +71,7 @@ def calibrate(keypoints: Keypoints, layout: str) -> tuple[np.ndarray, np.ndarray
     spread = np.nan_to_num(keypoints.spread.astype(float))
     variance = (np.interp(score, c.scores, c.sigmas) * keypoints.box_size) ** 2 + _FLOOR_PX**2
     covariance = c.spread_share * spread + variance[:, None] * np.array([1.0, 0.0, 1.0])
-    rival = np.clip(np.nan_to_num(keypoints.candidates[:, 1, 2].astype(float)), 0.0, None)
+    second_peak = np.clip(np.nan_to_num(keypoints.candidates[:, 1, 2].astype(float)), 0.0, None)
     width = np.sqrt((spread[:, 0] + spread[:, 2]) / 2) / max(keypoints.box_size, 1.0)
-    logit = c.intercept + c.per_score * score + c.per_rival * rival + c.per_spread * 10.0 * width
+    logit = c.intercept + c.per_score * score + c.per_second_peak * second_peak + c.per_spread * 10.0 * width
     return covariance, 1.0 / (1.0 + np.exp(-np.clip(logit, -30, 30)))

@@ -5,7 +5,7 @@ from rclpy.context import Context
 
 from drocap_ros.bringup import free_domain
 from drocap_ros.nodes.pose_estimator import PoseEstimatorNode
-from drocap_ros.perception.perception_config import PoseEstimatorConfig
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 
 
 def test_networks_for_simulation_are_named_on_diagnostics():

@@ -1,4 +1,4 @@
-"""Keypoints carried on by optical flow."""
+"""Keypoints propagated by optical flow."""
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ STEP_NS = 33_333_333
 
 @pytest.fixture
 def scene():
-    """A textured picture (480, 640, 3) and a person in it."""
+    """A textured image (480, 640, 3) and a person in it."""
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 255, (480, 640, 3), dtype=np.uint8)
     image = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 4), None, 0, 255, cv2.NORM_MINMAX)
@@ -32,12 +32,12 @@ def moved(image, dx, dy):
     return cv2.warpAffine(image, np.float32([[1, 0, dx], [0, 1, dy]]), (640, 480), borderMode=cv2.BORDER_REFLECT)
 
 
-def test_joints_and_box_go_with_the_picture_and_become_less_sure(scene):
+def test_joints_and_box_move_with_the_image_and_covariance_grows(scene):
     image, before = scene
     flow = KeypointFlow()
-    flow.begin(image, before)
+    flow.start(image, before)
     for k in (1, 2, 3):
-        after = flow.carry(moved(image, 6.5 * k, -3.25 * k), before.stamp_ns + k * STEP_NS)
+        after = flow.propagate(moved(image, 6.5 * k, -3.25 * k), before.stamp_ns + k * STEP_NS)
         assert flow.steps == k
         np.testing.assert_allclose(after.keypoints - before.keypoints, np.tile([6.5 * k, -3.25 * k], (15, 1)), atol=0.5)
         np.testing.assert_allclose(after.roi - before.roi, np.tile([6.5 * k, -3.25 * k], 2), atol=0.5)
@@ -48,15 +48,15 @@ def test_joints_and_box_go_with_the_picture_and_become_less_sure(scene):
         np.testing.assert_allclose(gain[:, 1], 0)
 
 
-def test_a_joint_that_is_covered_is_not_seen_and_the_others_are(scene):
+def test_covered_joint_is_nan_and_the_others_are_not(scene):
     image, before = scene
     flow = KeypointFlow()
-    flow.begin(image, before)
+    flow.start(image, before)
     later = moved(image, 4, 0)
     covered = int(before.keypoints[:, 1].argmin())
     x, y = before.keypoints[covered].astype(int)
     later[y - 40 : y + 40, x - 40 : x + 40] = np.random.default_rng(1).integers(0, 255, (80, 80, 3))
-    after = flow.carry(later, before.stamp_ns + STEP_NS)
+    after = flow.propagate(later, before.stamp_ns + STEP_NS)
     assert np.isnan(after.keypoints[covered]).all()
     assert np.isnan(after.covariance[covered]).all()
     assert after.confidence[covered] == 0
@@ -64,12 +64,12 @@ def test_a_joint_that_is_covered_is_not_seen_and_the_others_are(scene):
     np.testing.assert_allclose((after.keypoints - before.keypoints)[far], np.tile([4, 0], (far.sum(), 1)), atol=0.5)
 
 
-def test_a_joint_that_was_not_seen_stays_so(scene):
+def test_unseen_joint_stays_nan(scene):
     image, before = scene
     before.keypoints[4], before.covariance[4], before.confidence[4] = np.nan, np.nan, 0
     flow = KeypointFlow()
-    flow.begin(image, before)
-    after = flow.carry(image, before.stamp_ns + STEP_NS)
+    flow.start(image, before)
+    after = flow.propagate(image, before.stamp_ns + STEP_NS)
     assert np.flatnonzero(np.isnan(after.keypoints).any(axis=1)).tolist() == [4]
 
 
@@ -83,41 +83,41 @@ def test_a_joint_that_was_not_seen_stays_so(scene):
         (lambda image: image[::-1].copy(), STEP_NS),
         (np.zeros_like, STEP_NS),
     ],
-    ids=["same time", "earlier", "much later", "another size", "a cut", "the lamp goes out"],
+    ids=["same time", "earlier", "much later", "another size", "a cut", "dark"],
 )
-def test_nothing_is_carried_where_the_pictures_do_not_follow_each_other(scene, change, dt_ns):
+def test_unrelated_images_give_no_keypoints(scene, change, dt_ns):
     image, before = scene
     flow = KeypointFlow()
-    flow.begin(image, before)
-    assert flow.carry(change(image), before.stamp_ns + dt_ns) is None
+    flow.start(image, before)
+    assert flow.propagate(change(image), before.stamp_ns + dt_ns) is None
     assert flow.steps == 0
 
 
-def test_nothing_is_carried_from_nothing(scene):
+def test_reference_without_keypoints_gives_none(scene):
     image, before = scene
     flow = KeypointFlow()
-    assert flow.carry(image, STEP_NS) is None
+    assert flow.propagate(image, STEP_NS) is None
     for kept in (None, image):
-        flow.begin(kept, PoseObservation(before.stamp_ns, 0, (640, 480)))
-        assert flow.carry(image, before.stamp_ns + STEP_NS) is None
+        flow.start(kept, PoseObservation(before.stamp_ns, 0, (640, 480)))
+        assert flow.propagate(image, before.stamp_ns + STEP_NS) is None
     before.keypoints[:] = np.nan
-    flow.begin(image, before)
-    assert flow.carry(image, before.stamp_ns + STEP_NS) is None
+    flow.start(image, before)
+    assert flow.propagate(image, before.stamp_ns + STEP_NS) is None
 
 
-def test_on_a_real_person_it_agrees_with_the_network(shared):
+def test_flow_agrees_with_the_network_on_a_real_person(shared):
     video = cv2.VideoCapture(str(shared / "media" / "pose_1.mp4"))
     estimator, flow, gaps = PoseEstimator(shared / "models"), KeypointFlow(), []
     for i in range(60):
         image = video.read()[1]
         network = estimator.process(image, i * STEP_NS)
-        carried = flow.carry(image, i * STEP_NS)
-        if carried is not None:
-            sure = (carried.confidence > 0.5) & (network.confidence > 0.5)
-            gap = np.linalg.norm(carried.keypoints - network.keypoints, axis=1)
+        propagated = flow.propagate(image, i * STEP_NS)
+        if propagated is not None:
+            sure = (propagated.confidence > 0.5) & (network.confidence > 0.5)
+            gap = np.linalg.norm(propagated.keypoints - network.keypoints, axis=1)
             gaps.append((flow.steps, gap[sure] / (network.roi[2:] - network.roi[:2]).max()))
-        if carried is None or flow.steps == 3:
-            flow.begin(image, network)
+        if propagated is None or flow.steps == 3:
+            flow.start(image, network)
     assert len(gaps) >= 40
     assert np.median(np.concatenate([g for steps, g in gaps if steps == 1])) < 0.005
     assert np.median(np.concatenate([g for steps, g in gaps if steps == 3])) < 0.01

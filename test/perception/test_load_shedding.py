@@ -1,42 +1,162 @@
-"""How much of a hurry the estimator is in."""
+"""Load shedding in the estimator, with the shipped simulation networks on rendered images."""
 
+import cv2
+import numpy as np
 import pytest
+from rendered_person import rendered_images
 
-from drocap_ros.perception.load_shedding import Hurry
+from drocap_ros.perception.detection.detector import Detections
+from drocap_ros.perception.estimator import PoseEstimator
+from drocap_ros.perception.load_models import SIMULATION, models_folder
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 
+pytest.importorskip("onnxruntime")
 
-def levels(hurry, waits, step_s=1 / 30, behind=0):
-    return [hurry.level(i * step_s, waited, behind) for i, waited in enumerate(waits)]
-
-
-def test_nobody_hurries_while_no_picture_waits():
-    assert levels(Hurry(3), [False] * 100) == [0] * 100
-
-
-def test_it_rises_step_by_step_while_pictures_wait_and_no_further():
-    seen = levels(Hurry(3), [True] * 60)
-    assert seen[0] == 1
-    assert sorted(seen) == seen
-    assert seen[-1] == 3
-    assert seen.count(1) >= 5  # each step is given time to show what it does
+STEP_NS = 33_333_333
 
 
-def test_it_falls_by_one_a_second_when_none_waits_any_more():
-    hurry = Hurry(3)
-    levels(hurry, [True] * 60)
-    seen = [hurry.level(2.0 + i / 30, False, 0) for i in range(120)]
-    assert [seen[i] for i in (0, 40, 70, 110)] == [3, 2, 1, 0]
+@pytest.fixture(scope="module")
+def images():
+    """Three seconds of a moving person."""
+    return rendered_images(90)
 
 
-def test_one_late_picture_in_a_while_costs_no_more_than_one_step():
-    assert set(levels(Hurry(3), ([True] + [False] * 59) * 5)) == {0, 1}
+@pytest.fixture
+def estimator():
+    return PoseEstimator(models_folder(SIMULATION), PoseEstimatorConfig(detect_every_s=0.1))
 
 
-def test_pictures_that_lie_there_still_are_worked_off_at_once():
-    hurry = Hurry(3)
-    assert [hurry.level(0.0, True, 1), hurry.level(0.01, True, 4), hurry.level(0.02, True, 0)] == [2, 3, 1]
+def counted(monkeypatch, owner, name):
+    calls, original = [], getattr(owner, name)
+    monkeypatch.setattr(owner, name, lambda *a: calls.append(a) or original(*a))
+    return calls
 
 
-@pytest.mark.parametrize("behind", [0, 3])
-def test_who_may_not_hurry_never_does(behind):
-    assert set(levels(Hurry(0), [True] * 60, behind=behind)) == {0}
+def iou_per_image(boxes, others):
+    low, high = np.maximum(boxes[:, :2], others[:, :2]), np.minimum(boxes[:, 2:], others[:, 2:])
+    both = np.prod(np.clip(high - low, 0, None), axis=1)
+    return both / (sum(np.prod(b[:, 2:] - b[:, :2], axis=1) for b in (boxes, others)) - both)
+
+
+@pytest.mark.parametrize("load_level", [0, 1])
+def test_second_pass_runs_only_without_load_shedding(estimator, images, monkeypatch, load_level):
+    for i in range(3):
+        assert estimator.process(images[0], i * STEP_NS).track_id == 1
+    detections = counted(monkeypatch, estimator.detector, "detect")
+    dim = cv2.GaussianBlur(images[0] // 12, (0, 0), 9)
+    assert estimator.process(dim, 3 * STEP_NS, load_level=load_level).track_id == 1
+    assert len(detections) == (1 if load_level else 2)
+    assert None not in [window for _, window, *_ in detections]  # near the subject, not the whole image
+
+
+@pytest.mark.parametrize(
+    ("load_level", "expected"),
+    [  # D: detection and pose network, P: pose network, f: optical flow
+        (0, "DDDDDDDD"),
+        (1, "PfDfPfDfPf"),
+        (3, "PfffPfffDfffPfffPfffD"),
+    ],
+)
+def test_clear_subject_is_detected_when_due_and_propagated_in_between(
+    estimator, images, monkeypatch, load_level, expected
+):
+    first = estimator.process(images[0], 0)
+    assert first.track_id == 1
+    detections = counted(monkeypatch, estimator.detector, "detect")
+    poses = counted(monkeypatch, estimator.pose_model, "estimate")
+    work = ""
+    for i in range(1, len(expected) + 1):
+        monkeypatch.setattr(estimator.tracker, "isolated", lambda *_: False)
+        before = len(detections), len(poses)
+        observation = estimator.process(images[0], i * STEP_NS, load_level=load_level)
+        assert observation.track_id == 1
+        assert observation.stamp_ns == i * STEP_NS
+        assert observation.confidence.mean() > 0.8
+        size = (first.roi[2:] - first.roi[:2]).max()
+        assert np.nanmax(np.abs(observation.keypoints - first.keypoints)) < 0.03 * size
+        work += {(1, 1): "D", (0, 1): "P", (0, 0): "f"}[len(detections) - before[0], len(poses) - before[1]]
+        assert estimator.propagated == (work[-1] == "f")
+    assert work == expected
+
+
+def test_isolated_subject_is_propagated_by_the_pose_network_without_load_shedding(estimator, images, monkeypatch):
+    detections = counted(monkeypatch, estimator.detector, "detect")
+    observations = [estimator.process(image, i * STEP_NS) for i, image in enumerate(images[:30])]
+    assert {o.track_id for o in observations} == {1}
+    assert len(detections) < 20
+
+
+@pytest.mark.parametrize(
+    ("load_level", "expected"),
+    [(1, [0, 1, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), (3, [0] * 3 + [1] + [0] * 6 + [1] + [0] * 12 + [1])],
+)
+def test_pose_network_pauses_double_while_it_finds_no_person(estimator, images, monkeypatch, load_level, expected):
+    for i in range(3):
+        assert estimator.process(images[0], i * STEP_NS).track_id == 1
+    dark = np.zeros_like(images[0])
+    estimator.process(dark, 3 * STEP_NS)
+    poses = counted(monkeypatch, estimator.pose_model, "estimate")
+    runs = []
+    for i in range(4, 4 + len(expected)):
+        before = len(poses)
+        observation = estimator.process(dark, i * STEP_NS, load_level=load_level)
+        assert observation.track_id == 1
+        runs.append(len(poses) - before)
+        assert runs[-1] or np.isnan(observation.keypoints).all()
+    assert runs == expected
+
+
+def test_search_takes_one_window_per_image_in_turn(estimator, monkeypatch):
+    detections = counted(monkeypatch, estimator.detector, "detect")
+    empty = np.full((720, 1280, 3), 90, np.uint8)
+    for i in range(8):
+        assert estimator.process(empty, i * STEP_NS, load_level=1).track_id == 0
+        assert len(detections) == i + 1
+    windows = [window for _, window, *_ in detections]
+    assert windows.count(None) == 4
+    assert len(set(windows)) > 2  # tiles, one after the other
+
+
+def test_shedding_halves_the_network_runs_and_keeps_the_subject(images, monkeypatch):
+    boxes, runs = {}, {}
+    for load_level in (0, 1, 3):
+        estimator = PoseEstimator(models_folder(SIMULATION))
+        networks = ((estimator.detector, "detect"), (estimator.pose_model, "estimate"))
+        calls = [counted(monkeypatch, *network) for network in networks]
+        observations = [estimator.process(im, i * STEP_NS, load_level=load_level) for i, im in enumerate(images)]
+        assert {o.track_id for o in observations} == {1}
+        boxes[load_level] = np.array([o.roi for o in observations])
+        runs[load_level] = sum(map(len, calls))
+    assert runs[1] < 0.6 * runs[0]
+    assert runs[3] < 0.45 * runs[0]
+    for load_level in (1, 3):
+        assert (iou_per_image(boxes[0], boxes[load_level]) > 0.3).mean() > 0.8
+
+
+def test_doubtful_keypoints_without_a_detection_are_not_propagated(estimator, images, monkeypatch):
+    for i in range(4):
+        assert estimator.process(images[0], i * STEP_NS, load_level=3).track_id == 1
+    assert estimator.propagated
+    nobody = Detections(np.empty((0, 4), np.float32), np.empty(0, np.float32))
+    monkeypatch.setattr(estimator.detector, "detect", lambda *_: nobody)
+    calibrated = estimator._calibrated
+    monkeypatch.setattr(
+        estimator, "_calibrated", lambda k: (pose := calibrated(k))._replace(confidence=0.4 * pose.confidence)
+    )
+    propagated = []
+    for i in range(4, 19):
+        estimator.process(images[0], i * STEP_NS, load_level=3)
+        propagated.append(estimator.propagated)
+    assert not any(propagated[3:])  # the first three may still follow the last certain keypoints
+
+
+def test_subject_survives_a_somersault_under_constant_shedding(shared):
+    video = cv2.VideoCapture(str(shared / "media" / "outdoor_walk.mp4"))
+    images = [cv2.resize(video.read()[1], (1280, 720), interpolation=cv2.INTER_AREA) for _ in range(212)][100:]
+    boxes = {}
+    for load_level in (0, 3):
+        estimator = PoseEstimator(shared / "models")
+        observations = [estimator.process(im, i * STEP_NS, load_level=load_level) for i, im in enumerate(images)]
+        assert {o.track_id for o in observations} == {1}
+        boxes[load_level] = np.array([o.roi for o in observations])
+    assert (iou_per_image(boxes[0], boxes[3]) > 0.3).mean() > 0.9

@@ -136,7 +136,7 @@ def run_fetch(args: argparse.Namespace) -> int:
 def run_check(args: argparse.Namespace) -> int:
     """Load the models, and on a picture run and draw them."""
     from drocap_ros.perception.load_models import load_detector, load_pose_model, models_folder
-    from drocap_ros.perception.perception_config import PoseEstimatorConfig
+    from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 
     folder = models_folder(args.models)
     config = PoseEstimatorConfig(detector=args.detector, pose_model=args.pose)
@@ -149,9 +149,9 @@ def run_check(args: argparse.Namespace) -> int:
 
     from drocap_ros.perception.estimator import PoseEstimator
     from drocap_ros.perception.overlay import draw
-    from drocap_ros.perception.sources.pictures import read_picture
+    from drocap_ros.perception.sources.image_files import read_image
 
-    image = read_picture(args.picture)
+    image = read_image(args.picture)
     estimator = PoseEstimator(folder, config)
     observation = estimator.process(image, 0)
     print(f"detector {estimator.detector.model.path.name}, pose {estimator.pose_model.model.path.name}")

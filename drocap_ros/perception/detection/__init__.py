@@ -1,4 +1,4 @@
-"""Person detection: letterbox, decoding of every layout, non-maximum suppression."""
+"""Person detection: letterbox, decoding of each layout, non-maximum suppression."""
 
 from drocap_ros.perception.detection.detector import Detections, Detector
 

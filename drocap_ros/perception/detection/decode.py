@@ -1,4 +1,4 @@
-"""Outputs of each detector layout -> boxes, scores (and keypoints) in input px, before suppression."""
+"""Decoding of each detector layout: outputs -> boxes, scores and keypoints in input px, before suppression."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _flat(output: np.ndarray) -> np.ndarray:
 def rtmdet_maps(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
     """RTMDet's raw maps: class logits and distances l t r b (px) from each cell's corner.
 
-    Either one map a stride with both, classes first, or a class map and a distance map a stride; NHWC or NCHW.
+    Per stride either one map, classes first, or a class map and a distance map; NHWC or NCHW.
     """
     by_stride: dict[int, list[np.ndarray]] = {}
     for output in outputs:
@@ -51,7 +51,7 @@ def rtmdet_maps(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) ->
         if len(maps) == 1:
             logits, distances = maps[0][..., spec.person_class], maps[0][..., -4:]
         else:
-            # The distance map comes second, as in the exports, unless only the first has four channels.
+            # Exports put the distance map second; a first map of four channels is the distance map.
             first, second = maps
             swapped = first.shape[-1] == 4 and second.shape[-1] != 4
             logits, distances = (second if swapped else first)[..., spec.person_class], first if swapped else second
@@ -65,7 +65,7 @@ def rtmdet_maps(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) ->
 
 
 def yolox_grid(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
-    """YOLOX's grid: cx cy w h, objectness, classes; centres in cells and log sizes unless already decoded."""
+    """YOLOX's grid: cx cy w h, objectness, classes; centres in cells and log sizes unless ``spec.decoded``."""
     rows = _flat(outputs[0])
     score = rows[:, 4] * rows[:, 5 + spec.person_class]
     keep = np.nonzero(score >= threshold)[0]
@@ -79,7 +79,7 @@ def yolox_grid(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> 
 
 
 def boxes_nms(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
-    """Suppression inside: x_min y_min x_max y_max score, and class labels where there is a second output."""
+    """Model with suppression: x_min y_min x_max y_max score; a second output holds class labels."""
     rows = _flat(outputs[0])
     keep = rows[:, 4] >= threshold
     if len(outputs) > 1:
@@ -88,7 +88,7 @@ def boxes_nms(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> R
 
 
 def yolo_nms(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
-    """Suppression inside, one output: x_min y_min x_max y_max score class (and keypoints x y score)."""
+    """Model with suppression, one output: x_min y_min x_max y_max score class (and keypoints x y score)."""
     rows = _flat(outputs[0])
     rows = rows[(rows[:, 4] >= threshold) & (np.round(rows[:, 5]) == spec.person_class)]
     keypoints = rows[:, 6:].reshape(len(rows), -1, 3) if rows.shape[1] > 6 else None
@@ -116,7 +116,7 @@ def yolo_pose(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> R
 
 
 def rtmo(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
-    """RTMO with suppression inside: boxes with score, keypoints x y score."""
+    """RTMO with suppression: boxes with score, keypoints x y score."""
     rows, keypoints = _flat(outputs[0]), outputs[1].reshape(-1, *outputs[1].shape[-2:])
     keep = rows[:, 4] >= threshold
     return RawDetections(rows[keep, :4], rows[keep, 4], keypoints[keep])

@@ -1,4 +1,4 @@
-"""A person detector: any supported model, over the whole image or a window of it."""
+"""Person detector: any supported model on a whole image or a window of it."""
 
 from __future__ import annotations
 
@@ -25,12 +25,10 @@ class Detections:
 
     boxes : (N, 4) float32 px, x_min y_min x_max y_max, clipped to the image
     scores : (N,) float32 in [0, 1]
-    keypoints : (N, P, 3) float32 x y px and score, from a one-stage model, else None
     """
 
     boxes: np.ndarray
     scores: np.ndarray
-    keypoints: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.scores)
@@ -39,54 +37,48 @@ class Detections:
 class Detector:
     """A detector model with its spec."""
 
-    def __init__(self, model: OnnxModel, spec: ModelSpec, nms_iou: float = 0.6) -> None:
+    def __init__(self, model: OnnxModel, spec: ModelSpec) -> None:
         self.model = model
         self.spec = spec
-        self._nms_iou = nms_iou
         self._normalize = Normalizer(spec)
         self._decode = DECODERS[spec.layout]
-        self._any_size = spec.layout == "rtmdet-maps" and self._follows_its_input()
+        self._dynamic = spec.layout == "rtmdet-maps" and self._accepts_other_sizes()
 
     def detect(
         self,
         image: np.ndarray,
         window: tuple[int, int, int, int] | None = None,
         threshold: float = 0.3,
-        quick: float | None = None,
+        reduced: float | None = None,
     ) -> Detections:
         """Persons in an image.
 
         Parameters
         ----------
         image : (H, W, 3) uint8 BGR
-        window : x_min, y_min, x_max, y_max px inside the image; None = all of it
+        window : x_min, y_min, x_max, y_max px inside the image; None = the whole image
         threshold : least score
-        quick : share of the network's input that the window's longer side is given, with no grey beside the picture:
-            less time, where the size of the input is free
+        reduced : share of the network's input for the window's longer side, without padding: a faster run of a model
+            with a dynamic input size; None = the full input
         """
         height, width = image.shape[:2]
         window = window or (0, 0, width, height)
         spec = self.spec
-        if quick is not None and self._any_size:
-            spec = dataclasses.replace(spec, input_size=_quick_size(window, quick * min(spec.input_size)))
+        if reduced is not None and self._dynamic:
+            spec = dataclasses.replace(spec, input_size=_reduced_size(window, reduced * min(spec.input_size)))
         canvas, place = letterbox(image, window, spec.input_size, spec.letterbox == "centre")
         raw = self._decode(self.model(self._normalize(canvas)), spec, threshold)
         boxes = place.boxes_to_image(raw.boxes.astype(np.float32))
         boxes = np.clip(boxes, 0, np.array([width, height, width, height], np.float32))
-        solid = (boxes[:, 2:] - boxes[:, :2]).min(axis=1, initial=np.inf) >= 1.0
-        kept = np.nonzero(solid)[0]
-        kept = kept[suppress(boxes[kept], raw.scores[kept], self._nms_iou)]
-        keypoints = None
-        if raw.keypoints is not None:
-            points = raw.keypoints[kept].astype(np.float32)
-            keypoints = np.concatenate([place.to_image(points[..., :2]), points[..., 2:]], axis=-1)
-        return Detections(boxes[kept], raw.scores[kept].astype(np.float32), keypoints)
+        not_empty = (boxes[:, 2:] - boxes[:, :2]).min(axis=1, initial=np.inf) >= 1.0
+        kept = np.nonzero(not_empty)[0]
+        kept = kept[suppress(boxes[kept], raw.scores[kept])]
+        return Detections(boxes[kept], raw.scores[kept].astype(np.float32))
 
-    def _follows_its_input(self) -> bool:
-        """Whether the network takes inputs of other sizes, with outputs to match."""
+    def _accepts_other_sizes(self) -> bool:
+        """Whether the network accepts inputs of other sizes, with outputs to match."""
         width, height = 6 * _STRIDE, 4 * _STRIDE
-        channels_last = self.spec.channels_last
-        if channels_last or not self.model.free_size():
+        if self.spec.channels_last or not self.model.make_dynamic():
             return False
         try:
             outputs = self.model(np.zeros((1, 3, height, width), np.float32))
@@ -94,11 +86,11 @@ class Detector:
             outputs = []
         if outputs and all(map_grid(output.shape, (width, height)) for output in outputs):
             return True
-        self.model.fix_size()
+        self.model.make_fixed()
         return False
 
 
-def _quick_size(window: tuple[int, int, int, int], longest: float) -> tuple[int, int]:
+def _reduced_size(window: tuple[int, int, int, int], longest: float) -> tuple[int, int]:
     """(width, height) of the smallest input that holds a window whose longer side takes ``longest`` px."""
     sides = np.array([window[2] - window[0], window[3] - window[1]])
     sides = np.ceil(np.round(sides * longest / sides.max()) / _STRIDE).astype(int) * _STRIDE

@@ -1,4 +1,4 @@
-"""A window of an image scaled into a detector's input, and boxes scaled back."""
+"""Letterbox: an image window scaled into a detector's input, and boxes scaled back."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class Letterbox:
 def letterbox(
     image: np.ndarray, window: tuple[int, int, int, int], size: tuple[int, int], centred: bool = False
 ) -> tuple[np.ndarray, Letterbox]:
-    """Scale a window of the image into a canvas of ``size``, its shape kept, the rest grey.
+    """Scale a window of the image into a canvas of ``size`` at its aspect ratio; the rest is grey.
 
     Parameters
     ----------
     image : (H, W, 3) uint8
     window : x_min, y_min, x_max, y_max px, inside the image
     size : (width, height) of the canvas
-    centred : the picture in the middle instead of the upper left corner
+    centred : window in the middle of the canvas instead of the upper left corner
     """
     x0, y0, x1, y1 = window
     view = image[y0:y1, x0:x1]
@@ -49,16 +49,16 @@ def letterbox(
 
 
 def shrink(view: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Picture at another ``size`` (width, height): averaged over whole pixels first, then interpolated.
+    """Image at another ``size`` (width, height): averaged over whole pixels first, then interpolated.
 
-    Averaging keeps small persons from breaking up; over whole pixels it costs a tenth of an exact area mean.
+    Averaging avoids aliasing of small persons; over whole pixels it costs a tenth of an exact area mean.
     """
     import cv2
 
     factor = min(view.shape[1] // size[0], view.shape[0] // size[1])
     if factor >= 2:
         rows, columns = view.shape[0] // factor, view.shape[1] // factor
-        # What the division leaves at the right and bottom edge is less than ``factor`` pixels: stretch over it.
+        # The remainder at the right and bottom edge, less than ``factor`` pixels, is left out.
         exact = view[: rows * factor, : columns * factor]
         view = cv2.resize(exact, (columns, rows), interpolation=cv2.INTER_AREA)
     if (view.shape[1], view.shape[0]) == size:

@@ -1,8 +1,13 @@
-"""Boxes that mean the same person."""
+"""Overlap of boxes, and suppression of boxes of the same person."""
 
 from __future__ import annotations
 
 import numpy as np
+
+#: Most boxes that :func:`suppress` keeps.
+_MAX_BOXES = 100
+#: A box is a part of a better-scored one when this share of it lies inside and its area is below that share.
+_PART_INSIDE, _PART_AREA = 0.8, 0.65
 
 
 def iou(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -12,7 +17,7 @@ def iou(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.divide(common, union, out=np.zeros_like(common), where=union > 0)
 
 
-def shared(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+def overlap_coefficient(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     """(N, M) intersection over the smaller of two boxes; 0 for empty boxes."""
     common, areas, other_areas = _areas(boxes, others)
     smaller = np.minimum(areas[:, None], other_areas[None])
@@ -28,32 +33,30 @@ def _areas(boxes: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return common, areas, np.prod(np.clip(others[:, 2:] - others[:, :2], 0, None), axis=1)
 
 
-def suppress(boxes: np.ndarray, scores: np.ndarray, threshold: float, limit: int = 100) -> np.ndarray:
-    """Indices of the boxes kept, by falling score: greedy non-maximum suppression.
+def suppress(boxes: np.ndarray, scores: np.ndarray, max_iou: float = 0.6) -> np.ndarray:
+    """Greedy non-maximum suppression: indices of the boxes kept, by falling score.
 
-    boxes : (N, 4); scores : (N,); threshold : overlap above which the weaker box goes; limit : most boxes kept
+    boxes : (N, 4); scores : (N,); max_iou : overlap above which the weaker box is dropped
     """
-    order = np.argsort(-scores, kind="stable")[: 10 * limit]
+    order = np.argsort(-scores, kind="stable")[: 10 * _MAX_BOXES]
     overlap = iou(boxes[order], boxes[order])
     kept: list[int] = []
     alive = np.ones(len(order), bool)
     for i in range(len(order)):
         if alive[i]:
             kept.append(i)
-            if len(kept) == limit:
+            if len(kept) == _MAX_BOXES:
                 break
-            alive &= overlap[i] <= threshold
+            alive &= overlap[i] <= max_iou
     return order[kept]
 
 
-def whole(boxes: np.ndarray, scores: np.ndarray, inside: float = 0.8, smaller: float = 0.65) -> np.ndarray:
-    """Indices of the boxes that are no part of a better one: legs or a trunk detected beside the whole person.
+def without_parts(boxes: np.ndarray, scores: np.ndarray) -> np.ndarray:
+    """Indices of the boxes that are not parts of a better-scored one, such as legs beside the whole person.
 
     boxes : (N, 4); scores : (N,)
-    inside : share of a box within a better-scored one from which it may be a part of it
-    smaller : share of the better one's area below which it is
     """
     areas = np.prod(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None), axis=1)
     better = scores[None] > scores[:, None]
-    part = better & (shared(boxes, boxes) > inside) & (areas[:, None] < smaller * areas[None])
+    part = better & (overlap_coefficient(boxes, boxes) > _PART_INSIDE) & (areas[:, None] < _PART_AREA * areas[None])
     return np.nonzero(~part.any(axis=1))[0]

@@ -1,4 +1,4 @@
-"""Download of a known model: resumed where it was cut off, verified before it is put in place."""
+"""Download of a known model: resumable, verified before installation."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from drocap_ros.perception.models.registry import KnownModel
 
 _CHUNK = 1 << 18
 _TIMEOUT_S = 30.0
-#: No model of the registry is larger; a server that sends more is not the right one.
-_MOST_BYTES = 2_000_000_000
+#: Larger than any model of the registry; a longer download is refused.
+_MAX_BYTES = 2_000_000_000
 
-#: Called with the bytes received and the total, 0 where the server does not tell.
+#: Called with the bytes received and the total; 0 = unknown total.
 Progress = Callable[[int, int], None]
 
 
 class FetchError(DrocapError):
-    """The download failed for a reason outside the command line: no network, server, disk."""
+    """The download failed: no network, server or disk error, wrong checksum."""
 
 
 def sha256_of(path: Path) -> str:
@@ -37,11 +37,11 @@ def sha256_of(path: Path) -> str:
 
 
 def fetch(model: KnownModel, folder: Path, *, unverified: bool = False, progress: Progress | None = None) -> Path:
-    """The model's file in ``folder``, downloaded unless it is there already.
+    """The model's file in ``folder``, downloaded unless it is present.
 
-    The download goes to a ``.part`` file that the next attempt continues; the model appears under its name
-    only when its checksum is right.  A model without a known checksum is fetched only with ``unverified``,
-    and the checksum found is kept beside it, so that a later fetch of other bytes is noticed.
+    A ``.part`` file holds the download, and the next attempt resumes it; the model gets its name after its checksum
+    matched.  A model without a known checksum needs ``unverified``; the checksum found is stored beside it and
+    expected by later fetches.
 
     Raises
     ------
@@ -71,12 +71,12 @@ def fetch(model: KnownModel, folder: Path, *, unverified: bool = False, progress
 
 
 def download(url: str, part: Path, progress: Progress | None = None) -> None:
-    """Bring ``url`` into ``part``, continuing what is there.
+    """Download ``url`` into ``part``, resuming its content.
 
     Raises
     ------
     FetchError
-        With the reason in words; what has come stays in ``part``.
+        When the download fails; ``part`` keeps the received bytes.
     """
     have = part.stat().st_size if part.exists() else 0
     request = urllib.request.Request(url, headers={"User-Agent": "drocap_ros", "Accept-Encoding": "identity"})
@@ -84,20 +84,20 @@ def download(url: str, part: Path, progress: Progress | None = None) -> None:
         request.add_header("Range", f"bytes={have}-")
     try:
         with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
-            if have and answer.status != 206:  # the server cannot continue: from the beginning
+            if have and answer.status != 206:  # the server cannot resume: restart
                 have = 0
             length = int(answer.headers.get("Content-Length") or 0)
             total = have + length if length else 0
             with part.open("ab" if have else "wb") as file:
                 while block := answer.read(_CHUNK):
                     have += len(block)
-                    if have > _MOST_BYTES:
-                        raise FetchError(f"{url}: expected at most {_MOST_BYTES} bytes, got more; the address is wrong")
+                    if have > _MAX_BYTES:
+                        raise FetchError(f"{url}: expected at most {_MAX_BYTES} bytes, got more; the address is wrong")
                     file.write(block)
                     if progress is not None:
                         progress(have, total)
     except urllib.error.HTTPError as error:
-        if error.code == 416 and have:  # nothing left to send: complete, or not ours; the checksum decides
+        if error.code == 416 and have:  # nothing left to send: the checksum decides whether it is complete
             return
         raise FetchError(
             f"{url}: expected the model, the server answered {error.code} {error.reason}; try later"
@@ -139,9 +139,9 @@ def _extract(archive: Path, member: str, target: Path) -> None:
             names = [n for n in files.namelist() if n == member or n.endswith("/" + member)]
             if len(names) != 1:
                 raise FetchError(f"{archive.name}: expected one {member} in it, found {len(names)}; try again later")
-            if files.getinfo(names[0]).file_size > _MOST_BYTES:
+            if files.getinfo(names[0]).file_size > _MAX_BYTES:
                 raise FetchError(
-                    f"{archive.name}: expected a model of at most {_MOST_BYTES} bytes; the address is wrong"
+                    f"{archive.name}: expected a model of at most {_MAX_BYTES} bytes; the address is wrong"
                 )
             with files.open(names[0]) as source, target.open("wb") as sink:
                 shutil.copyfileobj(source, sink, _CHUNK)
@@ -154,6 +154,6 @@ def _record_path(target: Path) -> Path:
 
 
 def _recorded(target: Path) -> str:
-    """Checksum kept at the first unverified fetch, or an empty text."""
+    """Checksum stored by the first unverified fetch, or an empty string."""
     path = _record_path(target)
     return path.read_text(encoding="ascii").split()[0] if path.is_file() and path.stat().st_size else ""

@@ -1,4 +1,4 @@
-"""From a BGR image to a model's input tensor."""
+"""Conversion of a BGR image into a model's input tensor."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from drocap_ros.perception.models.spec import ModelSpec
 
 
 class Normalizer:
-    """(x - mean) / std through a table of 256 entries per channel: one pass, no float picture in between."""
+    """(x - mean) / std by a table of 256 entries per channel: one pass, no intermediate float image."""
 
     def __init__(self, spec: ModelSpec) -> None:
         mean, std = np.array(spec.mean, np.float32), np.array(spec.std, np.float32)
@@ -19,7 +19,7 @@ class Normalizer:
         self._channels_last = spec.channels_last
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """(H, W, 3) uint8 BGR -> (1, 3, H, W) or (1, H, W, 3) float32 (uint8 where nothing is to be scaled)."""
+        """(H, W, 3) uint8 BGR -> (1, 3, H, W) or (1, H, W, 3) float32 (uint8 without scaling)."""
         if self._channels_last:
             ordered = np.ascontiguousarray(image[..., self._order])[None]
             if self._plain:

@@ -1,4 +1,4 @@
-"""The models that drocap knows by name: what they are, whose, and where they come from."""
+"""Registry of known models: publisher, licence, download and checksum."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ _SDK = f"{_MMPOSE}/rtmposev1/onnx_sdk"
 class KnownModel:
     """One model of the registry.
 
-    name : as on the command line
+    name : on the command line
     task : "detector" or "pose"
     file : name in the models folder
     size_mb : of the ONNX file
-    licence : of the weights as their publisher states it
-    training_data : what they were trained on; its own terms may bind commercial use
-    home : who publishes it
-    url : the file or a ZIP archive with it; empty = not offered as ONNX by its publisher
-    member : the end of the file's path in the archive; empty = the download is the file itself
-    sha256 : of the ONNX file; empty = none is published or known to us
+    licence : of the weights, as their publisher states it
+    training_data : data sets of the training; their terms may restrict commercial use
+    home : publisher
     layout : ModelSpec layout
+    url : the file or a ZIP archive with it; empty = no ONNX download
+    member : end of the file's path in the archive; empty = the download is the file itself
+    sha256 : of the ONNX file; empty = unknown
     """
 
     name: str
@@ -38,9 +38,8 @@ class KnownModel:
     sha256: str = ""
 
 
-#: Publishers give no checksums for these files.  Those here are the SHA-256 sums that independent projects pin
-#: for the same official download (many projects; one for rtmdet-nano); a model without one is fetched only
-#: with ``--unverified``.
+#: Publishers state no checksums for these files.  These SHA-256 sums are pinned by independent projects for the same
+#: official downloads (one project for rtmdet-nano, several for the others); a model without one needs ``--unverified``.
 KNOWN_MODELS: tuple[KnownModel, ...] = (
     KnownModel(
         "rtmdet-nano", "detector", "rtmdet-nano-person.onnx", 4.0, "Apache-2.0", "COCO, Objects365 (persons)",
@@ -86,7 +85,7 @@ KNOWN_MODELS: tuple[KnownModel, ...] = (
     ),
 )  # fmt: skip
 
-#: What ``fetch`` without names brings.
+#: Models of ``fetch`` without names.
 DEFAULT_FETCH = ("rtmdet-nano", "rtmpose-s")
 
 

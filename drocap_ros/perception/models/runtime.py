@@ -1,4 +1,4 @@
-"""One ONNX model in onnxruntime: provider and threads chosen on purpose, every refusal in one line."""
+"""One ONNX model in onnxruntime, with its execution provider and threads."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.models.free_size import with_free_size
+from drocap_ros.perception.models.dynamic_size import with_dynamic_size
 
 _PROVIDERS = {
     "cpu": "CPUExecutionProvider",
@@ -18,7 +18,7 @@ _PROVIDERS = {
     "openvino": "OpenVINOExecutionProvider",
     "coreml": "CoreMLExecutionProvider",
 }
-#: TensorRT builds an engine for minutes at the first start, so ``auto`` leaves it to those who ask.
+#: Without TensorRT, which builds an engine for minutes at the first start.
 _AUTO_ORDER = ("cuda", "cpu")
 
 _ELEMENT_TYPES = {
@@ -45,12 +45,12 @@ class OnnxModel:
     ----------
     path : the ``.onnx`` file
     threads : intra-op threads on the CPU
-    provider : "auto" or a key of the execution providers; asking for one that is not offered is an error
+    provider : "auto" or a key of the execution providers
 
     Raises
     ------
     InputError
-        When the file is no model that onnxruntime can run.
+        When onnxruntime cannot run the file or does not offer the provider.
     """
 
     def __init__(self, path: Path, threads: int = 1, provider: str = "auto") -> None:
@@ -63,7 +63,7 @@ class OnnxModel:
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
         options.log_severity_level = 4
-        # A spinning thread pool starves the decoder and the other nodes of a small companion computer.
+        # A spinning thread pool starves the decoder and the other nodes of a companion computer.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         providers = choose_providers(provider, ort.get_available_providers())
         self._open = lambda source: ort.InferenceSession(source, options, providers=providers)
@@ -84,13 +84,13 @@ class OnnxModel:
         self._dtype = _ELEMENT_TYPES[self.inputs[0].element_type]
         self._names = [t.name for t in self.outputs]
 
-    def free_size(self) -> bool:
-        """Let the input's height and width vary, where that can be done; whether they do now.
+    def make_dynamic(self) -> bool:
+        """Make the input's height and width dynamic; False where that is impossible.
 
-        On the CPU only: other providers prepare themselves for each size anew.  The caller tries whether the outputs
-        follow, and calls :meth:`fix_size` where they do not.
+        On the CPU only: other providers compile for each size.  The caller tests the outputs and calls
+        :meth:`make_fixed` where they do not follow the input.
         """
-        source = with_free_size(self.path) if self.provider == _PROVIDERS["cpu"] else None
+        source = with_dynamic_size(self.path) if self.provider == _PROVIDERS["cpu"] else None
         if source is None:
             return False
         try:
@@ -99,8 +99,8 @@ class OnnxModel:
             return False
         return True
 
-    def fix_size(self) -> None:
-        """Take back :meth:`free_size`."""
+    def make_fixed(self) -> None:
+        """Undo :meth:`make_dynamic`."""
         self._session = self._open(str(self.path))
 
     def __call__(self, tensor: np.ndarray) -> list[np.ndarray]:
@@ -109,14 +109,14 @@ class OnnxModel:
         Raises
         ------
         InputError
-            When the model refuses the input or answers with something else than finite numbers.
+            When the model refuses the input or returns a value that is not finite.
         """
         try:
             outputs = self._session.run(self._names, {self.inputs[0].name: tensor.astype(self._dtype, copy=False)})
         except Exception as error:
             raise InputError(f"{self.path}: the model stopped: {_first_line(error)}; check its input size") from None
         for info, value in zip(self.outputs, outputs, strict=True):
-            # The sum is NaN or infinite whenever an element is: one pass, no temporary.
+            # The sum is NaN or infinite whenever an element is; one pass, no temporary array.
             if value.dtype.kind == "f" and not np.isfinite(value.sum(dtype=np.float64)):
                 raise InputError(
                     f"{self.path}: output {info.name}: expected finite numbers, got NaN or infinity; replace the model"

@@ -1,4 +1,4 @@
-"""What has to be known about a model: read from its inputs and outputs, or from a small YAML beside it."""
+"""Specification of a model: inferred from its inputs and outputs, or read from a YAML beside it."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ _UNIT_RGB: dict[str, Any] = {**_PLAIN, "std": (255.0, 255.0, 255.0), "colour": "
 _IMAGENET: dict[str, Any] = {"mean": (123.675, 116.28, 103.53), "std": (58.395, 57.12, 57.375), "colour": "rgb"}
 _MMDET: dict[str, Any] = {"mean": (103.53, 116.28, 123.675), "std": (57.375, 57.12, 58.395), "colour": "bgr"}
 
-#: Joint sets that are known by the number of their joints.
+#: Joint sets by their number of joints.
 JOINTS_BY_COUNT = {17: "coco17", 133: "wholebody133", 26: "halpe26", 16: "mpii16"}
 
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """Everything an adapter needs; each field may stand in ``MODEL.yaml`` beside ``MODEL.onnx``.
+    """Everything an adapter needs; ``MODEL.yaml`` beside ``MODEL.onnx`` may set each field.
 
     layout : meaning of the outputs, one of DETECTOR_LAYOUTS or POSE_LAYOUTS
     task : "detector", "pose" or "both"
     input_size : (width, height) px
     channels_last : NHWC input
     colour : "rgb" or "bgr"; mean, std : per channel of that order, in 0-255 units
-    letterbox : where the picture lies in a detector's input: "corner" or "centre"
+    letterbox : place of the image in a detector's input: "corner" or "centre"
     skeleton : joint set of the keypoints ("" for a detector)
     person_class : class index of a person
-    decoded : for "yolox-grid": whether the grid is already added inside
+    decoded : for "yolox-grid": whether the outputs are px
     udp : for "heatmap": trained with unit-length coordinates (MMPose's UDPHeatmap; its ViTPose and later HRNets)
-    box_padding : side of the pose crop over that of the box; 0 = the estimator's setting
+    box_padding : side of the pose crop over that of the box
     """
 
     layout: str
@@ -56,7 +56,7 @@ class ModelSpec:
     person_class: int = 0
     decoded: bool = False
     udp: bool = False
-    box_padding: float = 0.0
+    box_padding: float = 1.25
 
 
 def read_spec(model: OnnxModel) -> ModelSpec:
@@ -65,7 +65,7 @@ def read_spec(model: OnnxModel) -> ModelSpec:
     Raises
     ------
     InputError
-        When the outputs fit no known layout, or the YAML is wrong; the line says what to write into it.
+        When the outputs fit no known layout, or the YAML is invalid.
     """
     overrides = _read_yaml(model.path.with_suffix(".yaml"))
     size, channels_last = _input_size(model, overrides)
@@ -128,14 +128,14 @@ def guess_layout(shapes: list[tuple[int, ...]], input_size: tuple[int, int]) -> 
 
 
 def _holds_keypoints(channels: int, first: int) -> bool:
-    """Whether a row of an anchor is ``first`` numbers and x, y, score of a known number of joints."""
-    if channels in (84, 85):  # the boxes and 80 classes of COCO, which 26 joints would also fit
+    """Whether an anchor's row holds ``first`` numbers, then x, y, score of a known number of joints."""
+    if channels in (84, 85):  # box and 80 classes of COCO; 26 joints would also fit
         return False
     return (channels - first) % 3 == 0 and (channels - first) // 3 in JOINTS_BY_COUNT
 
 
 def map_grid(shape: tuple[int, ...], input_size: tuple[int, int]) -> tuple[int, int, bool] | None:
-    """(stride, channels, channels last) of a detection map (1, ., ., .), or None when it fits no stride."""
+    """(stride, channels, channels last) of a detection map (1, ., ., .); None when it fits no stride."""
     width, height = input_size
     for stride in (8, 16, 32, 64):
         cells = (height // stride, width // stride)
@@ -147,7 +147,7 @@ def map_grid(shape: tuple[int, ...], input_size: tuple[int, int]) -> tuple[int, 
 
 
 def _anchors(input_size: tuple[int, int]) -> set[int]:
-    """Numbers of anchor points: strides 8, 16, 32 and optionally 64, one or three anchors a cell."""
+    """Possible numbers of anchors: strides 8, 16, 32 and optionally 64, one or three anchors per cell."""
     cells = [(input_size[0] // s) * (input_size[1] // s) for s in (8, 16, 32, 64)]
     return {sum(cells[:3]), sum(cells), 3 * sum(cells[:3]), 3 * sum(cells)}
 
@@ -177,7 +177,7 @@ def _defaults(
     elif layout == "yolox-grid":
         fields |= _RAW_BGR | {"decoded": is_decoded_grid(outputs[0], size)}
     elif layout == "boxes-nms":
-        # RTMDet and YOLOX with NMS inside look alike but are fed differently; only the name tells.
+        # RTMDet and YOLOX with NMS have equal outputs but different inputs; only the name distinguishes them.
         if "yolox" in stem:
             fields |= _RAW_BGR
         elif "rtmdet" in stem:
@@ -224,7 +224,7 @@ def _skeleton(layout: str, outputs: list[np.ndarray], stem: str, overrides: Mapp
 
 
 def is_decoded_grid(output: np.ndarray, input_size: tuple[int, int]) -> bool:
-    """Whether a YOLOX output holds pixels already: its centres then lie near their own cells.
+    """Whether a YOLOX output is in px: its centres then lie near their own cells.
 
     output : (1, A, 5 + classes)
     """
@@ -236,7 +236,7 @@ def is_decoded_grid(output: np.ndarray, input_size: tuple[int, int]) -> bool:
 
 
 def grid_centres(input_size: tuple[int, int], strides: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (A, 2) px of all cells, row by row and stride by stride, and their strides (A,)."""
+    """Corners (A, 2) px of all cells, by stride and row, and their strides (A,)."""
     corners, all_strides = [], []
     for stride in strides:
         columns, rows = input_size[0] // stride, input_size[1] // stride
@@ -284,7 +284,7 @@ def _checked(spec: ModelSpec, path: Path) -> ModelSpec:
         (len(spec.mean) == 3 and np.isfinite(spec.mean).all(), "mean", "three numbers", spec.mean),
         (len(spec.std) == 3 and all(v > 0 for v in spec.std), "std", "three positive numbers", spec.std),
         (spec.task == "detector" or spec.skeleton in JOINT_SETS, "skeleton", ", ".join(JOINT_SETS), spec.skeleton),
-        (spec.box_padding == 0 or 1 <= spec.box_padding <= 3, "box_padding", "0 or 1 to 3", spec.box_padding),
+        (1 <= spec.box_padding <= 3, "box_padding", "1 to 3", spec.box_padding),
     ]
     for fine, name, expected, found in problems:
         if not fine:

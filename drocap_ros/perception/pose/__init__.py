@@ -1,6 +1,6 @@
-"""2D pose: the crop around a person, decoding of every layout, uncertainty."""
+"""2D pose: crop of a person, decoding of each layout."""
 
-from drocap_ros.perception.pose.keypoints import Keypoints
-from drocap_ros.perception.pose.model import PoseModel
+from drocap_ros.perception.pose.network_keypoints import NetworkKeypoints
+from drocap_ros.perception.pose.pose_model import PoseModel
 
-__all__ = ["Keypoints", "PoseModel"]
+__all__ = ["NetworkKeypoints", "PoseModel"]

@@ -1,4 +1,4 @@
-"""The crop of a person that a pose model sees."""
+"""Crop of a person, the input of a pose model."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ class Crop:
 
 
 def crop_around(box: np.ndarray, size: tuple[int, int], padding: float) -> Crop:
-    """Crop of the model's shape that holds a box (4,) x_min y_min x_max y_max with room around it."""
+    """Crop of ``size`` (width, height) around a box (4,) x_min y_min x_max y_max, enlarged by ``padding``."""
     x0, y0, x1, y1 = (float(v) for v in box)
     width, height = max(x1 - x0, 1.0) * padding, max(y1 - y0, 1.0) * padding
     scale = min(size[0] / width, size[1] / height)
     return Crop(((x0 + x1) / 2, (y0 + y1) / 2), scale, size)
 
 
-def cut(image: np.ndarray, crop: Crop, pad: int = 0) -> np.ndarray:
-    """(H, W, 3) uint8 -> crop (size[1], size[0], 3), the outside of the image filled with ``pad``."""
+def cut(image: np.ndarray, crop: Crop) -> np.ndarray:
+    """(H, W, 3) uint8 -> crop (size[1], size[0], 3), black outside the image."""
     import cv2
 
     cx, cy = crop.centre
     scale = crop.scale
     if scale < 0.5:
-        # Bilinear sampling would skip pixels: shrink by averaging first, only the part that is seen.
+        # Bilinear sampling would skip pixels: average first, over the visible part.
         half_w, half_h = crop.size[0] / scale / 2, crop.size[1] / scale / 2
         x0, y0 = max(0, int(cx - half_w)), max(0, int(cy - half_h))
         x1, y1 = min(image.shape[1], int(cx + half_w) + 2), min(image.shape[0], int(cy + half_h) + 2)
@@ -52,11 +52,11 @@ def cut(image: np.ndarray, crop: Crop, pad: int = 0) -> np.ndarray:
                     [0, scale * exact[1], (y0 + 0.5 * exact[1] - cy) * scale + crop.size[1] / 2 - 0.5],
                 ]
             )
-            return cv2.warpAffine(image, matrix, crop.size, flags=cv2.INTER_LINEAR, borderValue=(pad, pad, pad))
+            return cv2.warpAffine(image, matrix, crop.size, flags=cv2.INTER_LINEAR)
     matrix = np.array(
         [
             [scale, 0, (0.5 - cx) * scale + crop.size[0] / 2 - 0.5],
             [0, scale, (0.5 - cy) * scale + crop.size[1] / 2 - 0.5],
         ]
     )
-    return cv2.warpAffine(image, matrix, crop.size, flags=cv2.INTER_LINEAR, borderValue=(pad, pad, pad))
+    return cv2.warpAffine(image, matrix, crop.size, flags=cv2.INTER_LINEAR)

@@ -1,18 +1,18 @@
-"""Heatmaps (P, h, w) -> joints with sub-pixel positions, their spread and further peaks."""
+"""Heatmap decoding: (P, h, w) -> joints with sub-pixel positions, spread and further peaks."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.perception.pose.keypoints import Peaks
+from drocap_ros.perception.pose.network_keypoints import Peaks
 
-#: Cells within which the distribution around a peak is measured.
+#: Radius in cells of the window for the second moments around a peak.
 _RADIUS = 6
-#: Highest peaks reported per joint.
+#: Peaks reported per joint, the highest first.
 CANDIDATES = 3
 #: Least height of a further candidate, as a share of the highest peak.
 _LEAST_CANDIDATE = 0.1
-#: Standard deviation in cells of the Gaussian that networks of this kind are trained to draw.
+#: Standard deviation in cells of the Gaussian in the training targets.
 _TRAINED_SIGMA = 2.0
 
 
@@ -20,14 +20,14 @@ def decode_heatmaps(maps: np.ndarray, input_size: tuple[int, int], udp: bool = F
     """Joints of a stack of heatmaps.
 
     The position is the maximum of the logarithm's Taylor expansion after smoothing (Zhang et al.,
-    "Distribution-aware coordinate representation", 2020); a Gaussian peak is found exactly.
+    "Distribution-aware coordinate representation", 2020), exact for a Gaussian peak.
 
     Parameters
     ----------
     maps : (P, h, w) float32, larger = more likely
-    input_size : (width, height) px of the picture that the network saw
-    udp : whether the network was trained with unit-length coordinates (Huang et al., "The Devil is in the
-        details", 2020): the first and last cells then lie on the first and last pixels
+    input_size : (width, height) px of the network's input
+    udp : network trained with unit-length coordinates (Huang et al., "The Devil is in the details", 2020): its first
+        and last cells lie on the first and last pixels
     """
     _, rows, columns = maps.shape
     less = 1 if udp else 0
@@ -38,7 +38,7 @@ def decode_heatmaps(maps: np.ndarray, input_size: tuple[int, int], udp: bool = F
     spread = _spread(maps, tops[:, 0], xy)
     candidates = np.concatenate([tops.astype(np.float32), scores[..., None]], axis=2)
     candidates[:, 0, :2] = xy
-    # Networks are trained with the peak of a joint at pixel x drawn at cell x / stride, not at the cell's middle.
+    # Training draws the peak of a joint at pixel x at cell x / stride, not at the cell's middle.
     candidates[..., :2] *= stride
     candidates[~np.isfinite(scores)] = np.nan
     scale = np.array([stride[0] ** 2, stride[0] * stride[1], stride[1] ** 2], np.float32)
@@ -56,7 +56,7 @@ def _local_maxima(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     padded = np.pad(maps, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
     across = np.maximum(np.maximum(padded[:, :, :-2], padded[:, :, 1:-1]), padded[:, :, 2:])
     highest = np.maximum(np.maximum(across[:, :-2], across[:, 1:-1]), across[:, 2:])
-    # Ripples far below the best peak are no candidates; leaving them out keeps the sort short.
+    # The bound keeps the sort short.
     peak = (maps >= highest) & (maps > _LEAST_CANDIDATE * heights[:, 0, None, None])
     joint, place = np.nonzero(peak.reshape(joints, -1))
     other = place != top[joint]

@@ -1,13 +1,13 @@
-"""SimCC's two 1-D distributions per joint -> joints with their spread and further peaks."""
+"""SimCC decoding: two 1-D distributions per joint -> joints with spread and further peaks."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from drocap_ros.perception.pose.heatmap import CANDIDATES
-from drocap_ros.perception.pose.keypoints import Peaks
+from drocap_ros.perception.pose.network_keypoints import Peaks
 
-#: Share of the trained width of the 1-D Gaussian (RTMPose: 5.66 px for 256, 4.9 for 192, that is sqrt(side / 8)).
+#: Window of the spread in trained widths of the 1-D Gaussian, sqrt(side / 8) (RTMPose: 5.66 px for 256, 4.9 for 192).
 _WINDOW_SIGMAS = 3.0
 
 
@@ -17,7 +17,7 @@ def decode_simcc(x: np.ndarray, y: np.ndarray, input_size: tuple[int, int]) -> P
     Parameters
     ----------
     x : (P, width * k) float32; y : (P, height * k) float32, both with peak height about the confidence
-    input_size : (width, height) px of the picture that the network saw
+    input_size : (width, height) px of the network's input
     """
     tops_x, height_x = _local_maxima(x)
     tops_y, height_y = _local_maxima(y)
@@ -25,7 +25,7 @@ def decode_simcc(x: np.ndarray, y: np.ndarray, input_size: tuple[int, int]) -> P
     at_y, spread_y = _refine(y, tops_y[:, 0], input_size[1])
     xy = np.stack([at_x, at_y], -1)
     spread = np.stack([spread_x, np.zeros_like(spread_x), spread_y], -1).astype(np.float32)
-    # Candidates: the second-best bin of one axis with the best of the other.
+    # Further candidates: the second-best bin of one axis with the best of the other.
     ratio = np.array([x.shape[1] / input_size[0], y.shape[1] / input_size[1]], np.float32)
     candidates = np.full((len(x), CANDIDATES, 3), np.nan, np.float32)
     candidates[:, 0, :2] = xy
@@ -37,7 +37,7 @@ def decode_simcc(x: np.ndarray, y: np.ndarray, input_size: tuple[int, int]) -> P
 
 
 def _local_maxima(response: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(P, 2) bins and heights of the two highest local maxima; -inf where there is one only."""
+    """(P, 2) bins and heights of the two highest local maxima; -inf for a missing one."""
     padded = np.pad(response, ((0, 0), (1, 1)), constant_values=-np.inf)
     highest = np.maximum(padded[:, :-2], padded[:, 2:])
     peaks = np.where(response >= highest, response, -np.inf)

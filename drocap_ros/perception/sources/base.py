@@ -1,10 +1,11 @@
-"""What every image source offers."""
+"""Interface of all image sources."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import Enum
 from types import TracebackType
 
 import numpy as np
@@ -22,12 +23,26 @@ class Frame:
     image: np.ndarray
 
 
+class SourceEventKind(Enum):
+    """Kinds of source events; the values are keys of the diagnostics and, with spaces, the words of the log."""
+
+    STALLED = "stalled"
+    RECONNECTING = "reconnecting"
+    RECOVERED = "recovered"
+    ENDED_EARLY = "ended_early"
+    NO_TIMES = "no_presentation_times"
+
+
 @dataclass(frozen=True)
 class SourceEvent:
-    """Something that a user should know about a source: ``kind`` and the words."""
+    """Event of a source that a user should see."""
 
-    kind: str  # "stalled", "reconnecting", "recovered", "ended_early", "corrupt"
-    text: str
+    kind: SourceEventKind
+    source: str
+    detail: str
+
+    def __str__(self) -> str:
+        return f"{self.source}: {self.kind.value.replace('_', ' ')}: {self.detail}"
 
 
 class ImageSource(ABC):
@@ -35,7 +50,7 @@ class ImageSource(ABC):
 
     size : (width, height) px of every frame
     length : number of frames where the source states it (for progress only), else None
-    live : whether frames come at their own pace and are lost when nobody takes them
+    live : whether frames arrive at their own pace and unread ones are lost
     """
 
     size: tuple[int, int]

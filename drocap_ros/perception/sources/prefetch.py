@@ -1,4 +1,4 @@
-"""Decoding ahead: a second thread reads while the first computes."""
+"""Prefetch: a second thread decodes while the first computes."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _END = object()
 
 
 def prefetch(frames: Iterable[Frame], ahead: int = 4) -> Generator[Frame, None, None]:
-    """The same frames in the same order, up to ``ahead`` of them decoded beforehand.
+    """The same frames in the same order, up to ``ahead`` of them decoded in advance.
 
-    An error of the source is raised where its frame would have come.  Leaving the loop early stops the thread.
+    An error of the source is raised in place of its frame.  Closing the generator stops the thread.
     """
     ready: queue.Queue[Any] = queue.Queue(maxsize=ahead)
     stop = threading.Event()
@@ -35,7 +35,7 @@ def prefetch(frames: Iterable[Frame], ahead: int = 4) -> Generator[Frame, None, 
                 if not put(frame):
                     return
             put(_END)
-        except BaseException as error:  # handed over to the reader's thread
+        except BaseException as error:  # raised in the reader's thread
             put(error)
 
     thread = threading.Thread(target=run, name="prefetch", daemon=True)

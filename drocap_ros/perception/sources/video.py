@@ -1,4 +1,4 @@
-"""A video file through FFmpeg, with the container's own times."""
+"""Video file, decoded by FFmpeg, with the container's presentation times."""
 
 from __future__ import annotations
 
@@ -10,33 +10,32 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from drocap_ros.errors import InputError
-from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent
+from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
+from drocap_ros.perception.sources.image_files import to_bgr
 
 log = logging.getLogger(__name__)
 
-#: Frames that a container may promise beyond those that decode before it counts as cut off.
+#: Missing frames at the end, against the container's count, from which the file counts as cut off.
 _TAIL_FRAMES = 2
 
 
 def quiet_ffmpeg() -> None:
-    """Keep FFmpeg's and OpenCV's own lines out of the terminal: every failure is reported once, by us."""
+    """Silence FFmpeg's and OpenCV's messages; drocap reports each failure once."""
     import cv2
 
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
-#: OpenCV hands options to FFmpeg through one variable of the whole process.
+#: OpenCV passes options to FFmpeg through one environment variable of the process.
 _OPTIONS_LOCK = threading.Lock()
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 
 
 @contextlib.contextmanager
 def ffmpeg_options(options: str | None) -> Iterator[None]:
-    """Options for the captures opened inside; a user's own in the environment come first."""
+    """Options for captures opened inside the context; options in the user's environment take precedence."""
     with _OPTIONS_LOCK:
         if options is None or _OPTIONS in os.environ:
             yield
@@ -51,15 +50,14 @@ def ffmpeg_options(options: str | None) -> Iterator[None]:
 class VideoSource(ImageSource):
     """Frames of a video file.
 
-    A stamp is the frame's presentation time in its container, from 0 at the first, plus ``start_ns``:
-    variable frame rates keep their times and the nominal rate is used for nothing.  Rotation metadata is
-    applied.  A file that is cut off gives its frames up to the cut and an ``ended_early`` event; one
-    without a readable index or first frame is an error.
+    A stamp is the frame's presentation time in its container, from 0 at the first, plus ``start_ns``; variable frame
+    rates keep their times.  Rotation metadata is applied.  A file that is cut off gives its frames up to the cut and an
+    ``ENDED_EARLY`` event.
 
     Raises
     ------
     InputError
-        When the file is missing, empty, or no video of which a frame can be decoded.
+        When the file is missing or empty, or its index or first frame cannot be decoded.
     """
 
     def __init__(self, path: Path, start_ns: int = 0) -> None:
@@ -73,20 +71,20 @@ class VideoSource(ImageSource):
         size = path.stat().st_size
         if size == 0:
             raise InputError(f"{path}: expected a video file, found 0 bytes; copy or record it again")
-        with ffmpeg_options(None):  # not while a stream is being opened with other options
+        with ffmpeg_options(None):  # not while another thread opens a stream with its options
             self._capture: Any = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         if not self._capture.isOpened():
             raise InputError(
                 f"{path}: expected a video that FFmpeg can open, found {size} bytes without a readable header or index"
-                " (no video, or cut off); copy or record it again"
+                " (not a video, or cut off); copy or record it again"
             )
         self._start_ns = start_ns
         self._origin_ns: int | None = None
         self._last_ns: int | None = None
         self._count = 0
-        promised = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        # A container without an index promises nonsense (negative or huge); then nothing is promised.
-        self.length = int(promised) if 0 < promised < 1e9 else None
+        stated = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        # A container without an index states a negative or huge number.
+        self.length = int(stated) if 0 < stated < 1e9 else None
         self._pending = self._decode()
         if self._pending is None:
             self.close()
@@ -111,7 +109,7 @@ class VideoSource(ImageSource):
         ok, image = self._capture.read()
         if not ok:
             return None
-        return Frame(self._stamp(self._capture.get(cv2.CAP_PROP_POS_MSEC)), _three_channels(image))
+        return Frame(self._stamp(self._capture.get(cv2.CAP_PROP_POS_MSEC)), to_bgr(image))
 
     def _stamp(self, position_ms: float) -> int:
         now = round(position_ms * 1e6)
@@ -119,12 +117,11 @@ class VideoSource(ImageSource):
             self._origin_ns = now
         now += self._start_ns - self._origin_ns
         if self._last_ns is not None and now <= self._last_ns:
-            # A stream without times (raw H.264): FFmpeg repeats 0.  Its rate is all there is.
+            # FFmpeg gives 0 for each frame of a stream without times (raw H.264).
             step = round(1e9 / self._nominal_rate())
-            if not any(e.kind == "no_times" for e in self._events) and now == self._start_ns:
-                self._events.append(
-                    SourceEvent("no_times", f"{self.path}: no presentation times; using its nominal rate")
-                )
+            kind = SourceEventKind.NO_TIMES
+            if not any(e.kind is kind for e in self._events) and now == self._start_ns:
+                self._events.append(SourceEvent(kind, str(self.path), "the nominal rate is used"))
             now = self._last_ns + step
         self._last_ns = now
         return now
@@ -137,9 +134,10 @@ class VideoSource(ImageSource):
 
     def _report_end(self) -> None:
         if self._capture is not None and self.length is not None and self._count < self.length - _TAIL_FRAMES:
-            text = f"{self.path}: cut off or damaged: {self._count} of {self.length} frames decoded"
-            log.warning(text)
-            self._events.append(SourceEvent("ended_early", text))
+            detail = f"cut off or damaged, {self._count} of {self.length} frames decoded"
+            event = SourceEvent(SourceEventKind.ENDED_EARLY, str(self.path), detail)
+            log.warning(str(event))
+            self._events.append(event)
         self.close()
 
     def close(self) -> None:
@@ -147,11 +145,3 @@ class VideoSource(ImageSource):
         if self._capture is not None:
             self._capture.release()
             self._capture = None
-
-
-def _three_channels(image: np.ndarray) -> np.ndarray:
-    from drocap_ros.perception.sources.pictures import to_bgr
-
-    if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
-        return image
-    return to_bgr(image)

@@ -1,4 +1,4 @@
-"""Following one person among others: motion, look, search, choice."""
+"""Single-subject tracking: box filter, appearance, association, re-identification."""
 
 from drocap_ros.perception.tracking.subject import Subject, SubjectTracker
 

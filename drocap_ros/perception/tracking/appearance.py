@@ -1,10 +1,10 @@
-"""What a person looks like: colours of head, trunk and legs, comparable across images."""
+"""Appearance of a person: colour histograms of head, trunk and legs."""
 
 from __future__ import annotations
 
 import numpy as np
 
-#: Parts of a box as shares of its height, and the middle share of its width that is surely the person.
+#: Parts as shares of the box's height, and the middle share of its width, which holds little background.
 _PARTS = ((0.03, 0.17), (0.2, 0.5), (0.55, 0.9))
 _WIDTH = 0.5
 _BINS = 8
@@ -12,7 +12,7 @@ _PATCH = (12, 12)
 
 
 def describe(image: np.ndarray, box: np.ndarray) -> np.ndarray | None:
-    """Colour description of the person in a box.
+    """Colour descriptor of the person in a box.
 
     Parameters
     ----------
@@ -21,8 +21,8 @@ def describe(image: np.ndarray, box: np.ndarray) -> np.ndarray | None:
 
     Returns
     -------
-    (72,) float32, square roots of the Lab histograms of the three parts, each channel summing to one third of
-    the part's weight; None when the box holds too few pixels.
+    (72,) float32, square roots of the normalized Lab histograms of the three parts; None when the box holds too few
+    pixels.
     """
     import cv2
 
@@ -47,7 +47,7 @@ def describe(image: np.ndarray, box: np.ndarray) -> np.ndarray | None:
 
 
 def _soft_histogram(values: np.ndarray, low: float, high: float) -> np.ndarray:
-    """(_BINS,) shares; a value is split between its two nearest bins: a small change of light changes little."""
+    """(_BINS,) shares; linear split between the two nearest bins, against jumps under small changes of light."""
     at = np.clip((values.astype(np.float64) - low) / (high - low), 0, 1) * (_BINS - 1)
     lower = np.minimum(at.astype(int), _BINS - 2)
     upper_share = at - lower
@@ -56,5 +56,5 @@ def _soft_histogram(values: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def similarity(a: np.ndarray | None, b: np.ndarray | None) -> float:
-    """Bhattacharyya coefficient of two descriptions in [0, 1]; 0.5 when one is unknown."""
+    """Bhattacharyya coefficient of two descriptors in [0, 1]; 0.5 when one is unknown."""
     return 0.5 if a is None or b is None else float(a @ b)

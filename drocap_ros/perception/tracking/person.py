@@ -1,79 +1,78 @@
-"""One person seen in the image, the subject or a bystander."""
+"""Track of one person, the subject or a bystander."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from drocap_ros.perception.tracking.appearance import similarity
-from drocap_ros.perception.tracking.motion import BoxMotion
+from drocap_ros.perception.tracking.box_filter import BoxFilter
 
-#: Share of a new look taken into the remembered one.
-_LOOK_RATE = 0.08
-#: Images after which the remembered look is settled.
-_LOOK_SETTLED = 10
-
-
-#: Share of a new score in the quality.
-_QUALITY_RATE = 0.3
+#: Weight of a new descriptor in the mean appearance.
+_APPEARANCE_RATE = 0.08
+#: Number of descriptors in a settled mean appearance.
+_SETTLED = 10
+#: Weight of a new detection score in the mean score.
+_SCORE_RATE = 0.3
 
 
 class Person:
-    """Motion, look and history of one person.
+    """Box filter, appearance and history of one person.
 
-    seen_ns : last detection; sure_ns : last one that was certain
-    quality : recent mean of the detection score: low for parts of somebody and for clutter
+    first_ns : first detection; detected_ns : last detection; confirmed_ns : last confirmed detection
+    score : of the last detection; mean_score : recent mean, low for body parts and clutter
+    hits : number of detections
     """
 
-    def __init__(self, box: np.ndarray, score: float, stamp_ns: int, look: np.ndarray | None) -> None:
-        self.motion = BoxMotion(box, stamp_ns)
+    def __init__(self, box: np.ndarray, score: float, stamp_ns: int, appearance: np.ndarray | None) -> None:
+        self.filter = BoxFilter(box, stamp_ns)
         self.box = np.asarray(box, float)
         self.first_ns = stamp_ns
-        self.seen_ns = stamp_ns
-        self.sure_ns = stamp_ns
+        self.detected_ns = stamp_ns
+        self.confirmed_ns = stamp_ns
         self.score = score
-        self.quality = score
+        self.mean_score = score
         self.hits = 1
-        self.look = look
-        self._looks = 1 if look is not None else 0
+        self.appearance = appearance
+        self._descriptors = 1 if appearance is not None else 0
 
-    def gap_s(self, stamp_ns: int) -> float:
-        """Seconds since the person was last seen."""
-        return (stamp_ns - self.seen_ns) * 1e-9
+    def undetected_s(self, stamp_ns: int) -> float:
+        """Seconds since the last detection."""
+        return (stamp_ns - self.detected_ns) * 1e-9
 
-    def unsure_s(self, stamp_ns: int) -> float:
-        """Seconds since the person was surely seen."""
-        return (stamp_ns - self.sure_ns) * 1e-9
+    def unconfirmed_s(self, stamp_ns: int) -> float:
+        """Seconds since the last confirmed detection."""
+        return (stamp_ns - self.confirmed_ns) * 1e-9
 
-    def see(self, box: np.ndarray, score: float, stamp_ns: int) -> None:
-        """Take in a doubtful detection; :meth:`assure` makes it a sure one."""
-        self.motion.update(box)
+    def update(self, box: np.ndarray, score: float, stamp_ns: int) -> None:
+        """Update with a detection, not yet confirmed."""
+        self.filter.update(box)
         self.box = np.asarray(box, float)
-        self.seen_ns = stamp_ns
+        self.detected_ns = stamp_ns
         self.score = score
-        self.quality += _QUALITY_RATE * (score - self.quality)
+        self.mean_score += _SCORE_RATE * (score - self.mean_score)
         self.hits += 1
 
-    def assure(self, stamp_ns: int) -> None:
-        """Note that it was surely the person, not clutter."""
-        self.seen_ns = self.sure_ns = stamp_ns
+    def confirm(self, stamp_ns: int) -> None:
+        """Confirm the detection at this time."""
+        self.detected_ns = self.confirmed_ns = stamp_ns
 
-    def learn_look(self, look: np.ndarray | None) -> None:
-        """Blend a look into the remembered one, faster at first."""
-        if look is None:
+    def update_appearance(self, appearance: np.ndarray | None) -> None:
+        """Blend a descriptor into the mean appearance, with larger weights at first."""
+        if appearance is None:
             return
-        self._looks += 1
-        if self.look is None:
-            self.look = look
+        self._descriptors += 1
+        if self.appearance is None:
+            self.appearance = appearance
             return
-        rate = max(_LOOK_RATE, 1 / self._looks) if self._looks < _LOOK_SETTLED else _LOOK_RATE
-        # The squares are the histograms; blending these keeps their sum.
-        self.look = np.sqrt((1 - rate) * self.look**2 + rate * look**2)
+        rate = max(_APPEARANCE_RATE, 1 / self._descriptors) if self._descriptors < _SETTLED else _APPEARANCE_RATE
+        # The squares are the histograms; a blend of these keeps their sum.
+        self.appearance = np.sqrt((1 - rate) * self.appearance**2 + rate * appearance**2)
 
     @property
-    def look_settled(self) -> bool:
-        """Whether the remembered look is a mean over enough images."""
-        return self._looks >= _LOOK_SETTLED
+    def appearance_settled(self) -> bool:
+        """Whether the appearance is a mean over enough images."""
+        return self._descriptors >= _SETTLED
 
-    def likeness(self, look: np.ndarray | None) -> float:
-        """Similarity to a look in [0, 1]."""
-        return similarity(self.look, look)
+    def similarity(self, appearance: np.ndarray | None) -> float:
+        """Similarity to a descriptor in [0, 1]."""
+        return similarity(self.appearance, appearance)

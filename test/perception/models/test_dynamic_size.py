@@ -1,4 +1,4 @@
-"""Detectors that take inputs of other sizes than their export fixes."""
+"""Detectors with a dynamic input size."""
 
 import sys
 
@@ -8,8 +8,8 @@ import pytest
 from tiny_models import write_model
 
 from drocap_ros.perception.load_models import load_detector
-from drocap_ros.perception.models.free_size import with_free_size
-from drocap_ros.perception.perception_config import PoseEstimatorConfig
+from drocap_ros.perception.models.dynamic_size import with_dynamic_size
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 
 CONFIG = PoseEstimatorConfig(detector="rtmdet-nano")
 
@@ -27,27 +27,27 @@ def sizes_seen(monkeypatch, detector):
 
 
 @pytest.mark.parametrize(
-    ("window", "quick", "size"),
+    ("window", "reduced", "size"),
     [
         (None, 1.0, (320, 192)),
         ((300, 0, 700, 400), 0.8, (256, 256)),
         ((300, 0, 500, 400), 0.8, (128, 256)),
     ],
 )
-def test_a_smaller_input_shows_the_same_person(shared, walk, monkeypatch, window, quick, size):
+def test_reduced_input_shows_the_same_person(shared, walk, monkeypatch, window, reduced, size):
     detector = load_detector(shared / "models", CONFIG)
     whole = detector.detect(walk, window)
     seen = sizes_seen(monkeypatch, detector)
-    found = detector.detect(walk, window, quick=quick)
+    found = detector.detect(walk, window, reduced=reduced)
     assert seen == [size]
     length = (whole.boxes[0, 2:] - whole.boxes[0, :2]).max()
     assert np.abs(found.boxes[0] - whole.boxes[0]).max() < 0.08 * length
     assert found.scores[0] > 0.6
 
 
-def test_without_haste_the_network_sees_what_its_export_says(shared, walk, monkeypatch):
+def test_full_input_equals_the_fixed_export(shared, walk, monkeypatch):
     free, fixed = load_detector(shared / "models", CONFIG), load_detector(shared / "models", CONFIG)
-    fixed.model.fix_size()
+    fixed.model.make_fixed()
     seen = sizes_seen(monkeypatch, free)
     a, b = free.detect(walk), fixed.detect(walk)
     assert seen == [(320, 320)] * 2
@@ -59,25 +59,25 @@ def tiny_maps():
     return {f"map{s}": np.full((1, 96 // s, 128 // s, 5), -5, np.float32) for s in (8, 16, 32)}
 
 
-def test_a_network_whose_outputs_do_not_follow_keeps_its_size(tmp_path, monkeypatch):
+def test_network_with_fixed_outputs_keeps_its_size(tmp_path, monkeypatch):
     write_model(tmp_path / "rtmdet-tiny.onnx", (1, 3, 96, 128), tiny_maps())
     detector = load_detector(tmp_path, PoseEstimatorConfig())
     seen = sizes_seen(monkeypatch, detector)
-    assert len(detector.detect(np.zeros((200, 300, 3), np.uint8), quick=0.5)) == 0
+    assert len(detector.detect(np.zeros((200, 300, 3), np.uint8), reduced=0.5)) == 0
     assert seen == [(128, 96)]
 
 
-def test_without_the_package_onnx_the_size_is_fixed(shared, walk, monkeypatch):
+def test_size_is_fixed_without_the_package_onnx(shared, walk, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
     detector = load_detector(shared / "models", CONFIG)
     seen = sizes_seen(monkeypatch, detector)
-    assert detector.detect(walk, quick=0.8).scores[0] > 0.6
+    assert detector.detect(walk, reduced=0.8).scores[0] > 0.6
     assert seen == [(320, 320)]
 
 
-def test_what_is_no_model_has_no_free_size(tmp_path):
+def test_invalid_model_has_no_dynamic_size(tmp_path):
     path = tmp_path / "broken.onnx"
     for content in (b"", b"not a model", bytes(range(256)) * 9):
         path.write_bytes(content)
-        assert with_free_size(path) is None
-    assert with_free_size(tmp_path / "missing.onnx") is None
+        assert with_dynamic_size(path) is None
+    assert with_dynamic_size(tmp_path / "missing.onnx") is None

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.perception_config import ImageIngestConfig
-from drocap_ros.perception.sources import Frame, open_source
-from drocap_ros.perception.sources.pictures import read_picture
+from drocap_ros.perception.sources import Frame, SourceEventKind, open_source
+from drocap_ros.perception.sources.image_files import read_image
+from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.perception.sources.prefetch import prefetch
 
 cv2 = pytest.importorskip("cv2")
@@ -37,7 +37,7 @@ def patch_box(path: Path, name: bytes, edit) -> None:
     path.write_bytes(data)
 
 
-def test_stamps_are_the_containers_times(tmp_path):
+def test_stamps_are_the_presentation_times(tmp_path):
     with open_source(write_video(tmp_path / "a.mp4"), start_ns=5_000_000_000) as source:
         frames = list(source)
     assert source.size == (64, 48)
@@ -46,20 +46,10 @@ def test_stamps_are_the_containers_times(tmp_path):
     assert frames[3].image.shape == (48, 64, 3)
 
 
-def test_a_variable_frame_rate_keeps_its_times(tmp_path):
+def test_nominal_rate_does_not_replace_the_times(tmp_path):
+    """Half the media's time scale doubles the times and leaves the nominal rate."""
     path = write_video(tmp_path / "a.mp4")
-    steps = []
 
-    def edit(content: bytes) -> bytes:
-        count, delta = struct.unpack(">II", content[8:16])  # one run: all frames of one duration
-        assert (struct.unpack(">I", content[4:8])[0], count) == (1, 12)
-        steps.append(delta)
-        return content[:12] + struct.pack(">I", delta)
-
-    patch_box(path, b"stts", edit)
-
-    # Two runs need a longer box: write the frames of a second half at three times the distance as an edit of
-    # the media's time scale for the whole file, which no nominal rate knows of.
     def slower(content: bytes) -> bytes:
         scale = struct.unpack(">I", content[12:16])[0]
         return content[:12] + struct.pack(">I", scale // 2) + content[16:]
@@ -87,7 +77,7 @@ def test_rotation_metadata_is_applied(tmp_path):
     assert first.image[4, 4].mean() < 60
 
 
-def test_a_file_cut_off_gives_its_frames_and_says_so(tmp_path, caplog):
+def test_cut_off_file_gives_its_frames_and_an_event(tmp_path, caplog):
     path = write_video(tmp_path / "a.mp4", frames=60)
     data = bytearray(path.read_bytes())
     # FFmpeg's writer puts the index last; a recorder that puts it first and is cut off leaves this:
@@ -106,12 +96,12 @@ def test_a_file_cut_off_gives_its_frames_and_says_so(tmp_path, caplog):
         frames = list(source)
         events = source.events()
     assert 10 < len(frames) < 58
-    assert [e.kind for e in events] == ["ended_early"]
+    assert [e.kind for e in events] == [SourceEventKind.ENDED_EARLY]
     assert f"{len(frames)} of 60" in caplog.text
 
 
 @pytest.mark.parametrize("content", [b"", b"this is no video\n" * 20, None], ids=["empty", "text", "without index"])
-def test_files_that_are_no_video_are_refused_in_one_line(tmp_path, content):
+def test_invalid_video_is_refused_in_one_line(tmp_path, content):
     path = tmp_path / "bad.mp4"
     if content is None:
         whole = write_video(tmp_path / "a.mp4", frames=60).read_bytes()
@@ -122,24 +112,24 @@ def test_files_that_are_no_video_are_refused_in_one_line(tmp_path, content):
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_source_is_refused(tmp_path):
+def test_missing_source_is_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         open_source(tmp_path / "nothing.mp4")
     with pytest.raises(InputError, match="/dev/video97"):
         open_source("/dev/video97")
 
 
-def test_pictures_come_in_the_order_of_their_numbers(tmp_path):
+def test_images_come_in_the_order_of_their_numbers(tmp_path):
     for i in (10, 9, 1):
         cv2.imwrite(str(tmp_path / f"frame_{i}.png"), np.full((10, 12, 3), i, np.uint8))
-    (tmp_path / "notes.txt").write_text("not a picture")
+    (tmp_path / "notes.txt").write_text("not an image")
     with open_source(tmp_path, ImageIngestConfig(folder_rate_hz=4.0)) as source:
         frames = list(source)
     assert [int(f.image[0, 0, 0]) for f in frames] == [1, 9, 10]
     assert [f.stamp_ns for f in frames] == [0, 250_000_000, 500_000_000]
 
 
-def test_picture_names_that_are_times_are_the_stamps(tmp_path):
+def test_file_names_that_are_times_are_the_stamps(tmp_path):
     names = ["1700000000000000000", "1700000000040000000"]
     for name in names:
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((4, 4, 3), np.uint8))
@@ -147,7 +137,7 @@ def test_picture_names_that_are_times_are_the_stamps(tmp_path):
         assert [f.stamp_ns for f in source] == [int(n) for n in names]
 
 
-def test_pictures_of_different_sizes_are_refused(tmp_path):
+def test_images_of_different_sizes_are_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "1.png"), np.zeros((4, 4, 3), np.uint8))
     cv2.imwrite(str(tmp_path / "2.png"), np.zeros((5, 4, 3), np.uint8))
     with open_source(tmp_path) as source, pytest.raises(InputError, match="expected 4x4 px"):
@@ -155,7 +145,7 @@ def test_pictures_of_different_sizes_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "picture",
+    "pixels",
     [
         np.full((6, 8), 77, np.uint8),
         np.dstack([np.full((6, 8, 3), 77, np.uint8), np.zeros((6, 8, 1), np.uint8)]),
@@ -164,21 +154,21 @@ def test_pictures_of_different_sizes_are_refused(tmp_path):
     ],
     ids=["grey", "alpha", "16 bit", "1x1"],
 )
-def test_every_kind_of_picture_becomes_bgr(tmp_path, picture):
-    cv2.imwrite(str(tmp_path / "a.png"), picture)
-    image = read_picture(tmp_path / "a.png")
-    assert image.shape == (*picture.shape[:2], 3)
+def test_each_pixel_format_becomes_bgr(tmp_path, pixels):
+    cv2.imwrite(str(tmp_path / "a.png"), pixels)
+    image = read_image(tmp_path / "a.png")
+    assert image.shape == (*pixels.shape[:2], 3)
     assert image.dtype == np.uint8
     assert (image == 77).all()
 
 
-def test_a_damaged_picture_is_refused(tmp_path):
+def test_damaged_image_is_refused(tmp_path):
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\nand then nothing")
-    with pytest.raises(InputError, match="expected a picture"):
+    with pytest.raises(InputError, match="expected an image"):
         open_source(tmp_path / "a.png")
 
 
-def test_decoding_ahead_keeps_order_and_passes_errors_on():
+def test_prefetch_keeps_order_and_raises_errors():
     def frames():
         for i in range(20):
             yield Frame(i, np.full((2, 2, 3), i, np.uint8))
@@ -194,7 +184,7 @@ def test_decoding_ahead_keeps_order_and_passes_errors_on():
     assert seen == list(range(20))
 
 
-def test_decoding_ahead_stops_when_the_reader_leaves():
+def test_prefetch_stops_when_the_reader_leaves():
     made = []
 
     def frames():

@@ -1,4 +1,4 @@
-"""A camera that stalls and comes back, played over loopback UDP as MPEG-TS and through a named pipe."""
+"""Live sources that stall and recover, over loopback UDP as MPEG-TS and through a named pipe."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.perception_config import ImageIngestConfig
-from drocap_ros.perception.sources import open_source
-from drocap_ros.perception.sources.stamps import StreamClock
+from drocap_ros.perception.sources import SourceEventKind, open_source
+from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+from drocap_ros.perception.sources.stream_clock import StreamClock
 
 cv2 = pytest.importorskip("cv2")
 
@@ -35,7 +35,7 @@ def stream(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 class Sender:
-    """Plays a stream in a loop to a UDP port, until told to pause."""
+    """Plays a stream in a loop to a UDP port; ``paused`` interrupts it."""
 
     def __init__(self, port: int, data: bytes) -> None:
         self.port, self.data = port, data
@@ -72,7 +72,7 @@ def wait_for(condition, seconds: float) -> bool:
     return False
 
 
-def test_a_stalled_stream_is_reported_within_two_seconds_and_recovers(stream):
+def test_stalled_stream_is_reported_within_two_seconds_and_recovers(stream):
     port = free_port()
     sender = Sender(port, stream)
     try:
@@ -82,26 +82,26 @@ def test_a_stalled_stream_is_reported_within_two_seconds_and_recovers(stream):
             assert source.size == (160, 120)
             stamps = [source.read().stamp_ns for _ in range(5)]
             assert (np.diff(stamps) > 0).all()
-            assert abs(stamps[-1] - time.time_ns()) < 3e9  # the clock's time, not the stream's
-            kinds: list[str] = []
+            assert abs(stamps[-1] - time.time_ns()) < 3e9  # system clock, not stream time
+            kinds: list[SourceEventKind] = []
 
-            def heard(kind: str) -> bool:
+            def received(kind: SourceEventKind) -> bool:
                 kinds.extend(e.kind for e in source.events())
                 return kind in kinds
 
             sender.paused.set()
             begin = time.monotonic()
-            assert wait_for(lambda: heard("stalled"), 5.0)
+            assert wait_for(lambda: received(SourceEventKind.STALLED), 5.0)
             assert time.monotonic() - begin < 2.0
             sender.paused.clear()
-            assert wait_for(lambda: heard("recovered"), 20.0), kinds
+            assert wait_for(lambda: received(SourceEventKind.RECOVERED), 20.0), kinds
             assert source.read() is not None
     finally:
         sender.stopped.set()
         sender.thread.join()
 
 
-def test_a_pipe_that_ends_is_reported_and_opened_again(stream, tmp_path):
+def test_ended_pipe_is_reported_and_reopened(stream, tmp_path):
     pipe = tmp_path / "camera.ts"
     os.mkfifo(pipe)
     stopped = threading.Event()
@@ -119,13 +119,13 @@ def test_a_pipe_that_ends_is_reported_and_opened_again(stream, tmp_path):
     thread.start()
     source = open_source(pipe, ImageIngestConfig(stall_timeout_s=1.0, reconnect_max_s=0.5))
     try:
-        kinds: list[str] = []
+        kinds: list[SourceEventKind] = []
 
-        def heard() -> bool:
+        def received() -> bool:
             kinds.extend(e.kind for e in source.events())
-            return kinds.count("reconnecting") >= 2  # so it was opened again in between
+            return kinds.count(SourceEventKind.RECONNECTING) >= 2  # so it was opened again in between
 
-        assert wait_for(heard, 20.0), kinds
+        assert wait_for(received, 20.0), kinds
     finally:
         stopped.set()
         source.close()
@@ -134,13 +134,13 @@ def test_a_pipe_that_ends_is_reported_and_opened_again(stream, tmp_path):
         thread.join(timeout=2.0)
 
 
-def test_nothing_behind_an_address_is_refused_in_one_line():
+def test_address_without_a_stream_is_refused_in_one_line():
     with pytest.raises(InputError, match="expected a camera or stream") as caught:
         open_source("tcp://127.0.0.1:9", ImageIngestConfig(stall_timeout_s=0.5))
     assert "\n" not in str(caught.value)
 
 
-def test_stream_times_become_the_clocks_without_the_networks_jitter():
+def test_stream_clock_removes_the_network_jitter():
     rng = np.random.default_rng(0)
     clock = StreamClock()
     exposure = 40_000_000 * np.arange(400)

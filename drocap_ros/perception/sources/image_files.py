@@ -1,4 +1,4 @@
-"""Pictures: one file, or a folder of them in the order of their names."""
+"""Image files: one file, or a folder in the order of the names."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent
+from drocap_ros.perception.sources.base import Frame, ImageSource
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
 
-#: A file name of so many digits is a time in nanoseconds (the EuRoC and TUM convention).
+#: Least number of digits of a file name that is a time in nanoseconds (the EuRoC and TUM convention).
 _STAMP_DIGITS = 16
 
 
 def to_bgr(image: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 BGR from a grey, alpha, 16-bit or float picture."""
+    """(H, W, 3) uint8 BGR from a grey, alpha, 16-bit or float image."""
     if image.dtype == np.uint16:
         image = (image >> 8).astype(np.uint8)
     elif image.dtype.kind == "f":
@@ -32,46 +32,45 @@ def to_bgr(image: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(image[..., :3])
 
 
-def read_picture(path: Path) -> np.ndarray:
-    """(H, W, 3) uint8 BGR, turned upright as its EXIF says.
+def read_image(path: Path) -> np.ndarray:
+    """(H, W, 3) uint8 BGR, with its EXIF orientation applied.
 
     Raises
     ------
     InputError
-        When the file is missing or is no picture.
+        When the file is missing or not an image.
     """
     import cv2
 
     if not path.is_file():
-        raise InputError(f"{path}: expected a picture, found no such file; check the path")
+        raise InputError(f"{path}: expected an image, found no such file; check the path")
     data = np.fromfile(path, np.uint8)
     try:
-        # IMREAD_UNCHANGED would keep 16 bits and alpha, but it ignores the EXIF orientation.
+        # IMREAD_UNCHANGED would ignore the EXIF orientation.
         image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH) if data.size else None
     except cv2.error:
         image = None
     if image is None:
         raise InputError(
-            f"{path}: expected a picture (JPEG, PNG, TIFF, ...), found {data.size} bytes that are none; replace it"
+            f"{path}: expected an image (JPEG, PNG, TIFF, ...), found {data.size} bytes that do not decode; replace it"
         )
     return to_bgr(image)
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Sort key under which frame_2 comes before frame_10."""
+    """Sort key that puts frame_2 before frame_10."""
     return [(1, int(t), "") if t.isdigit() else (0, 0, t) for t in re.split(r"(\d+)", name) if t]
 
 
-class PictureSource(ImageSource):
-    """Pictures of one size.
+class ImageFileSource(ImageSource):
+    """Image files of one size.
 
-    Stamps are the file names where these are times in nanoseconds, else a steady ``rate_hz`` from 0: a
-    folder of pictures has no other time.
+    Stamps are the file names where these are times in nanoseconds, else ``rate_hz`` counts from 0.
 
     Raises
     ------
     InputError
-        When there is no picture, or one is unreadable or of another size.
+        When there is no image, or one is unreadable or of another size.
     """
 
     def __init__(self, path: Path, rate_hz: float = 30.0) -> None:
@@ -82,26 +81,25 @@ class PictureSource(ImageSource):
                 key=lambda p: _natural(p.name),
             )
             if not self._paths:
-                raise InputError(f"{path}: expected a folder with pictures ({', '.join(sorted(SUFFIXES))}), found none")
+                raise InputError(f"{path}: expected a folder with images ({', '.join(sorted(SUFFIXES))}), found none")
         else:
             self._paths = [path]
         self._stamps = _stamps(self._paths, rate_hz)
-        self._first: np.ndarray | None = read_picture(self._paths[0])
+        self._first: np.ndarray | None = read_image(self._paths[0])
         self.size = (self._first.shape[1], self._first.shape[0])
         self.length = len(self._paths)
         self._next = 0
 
     def read(self) -> Frame | None:
-        """Next picture, or None at the end."""
+        """Next image, or None at the end."""
         if self._next >= len(self._paths):
             return None
         path = self._paths[self._next]
-        image = self._first if self._first is not None else read_picture(path)
+        image = self._first if self._first is not None else read_image(path)
         self._first = None
         if (image.shape[1], image.shape[0]) != self.size:
-            self._events.append(SourceEvent("corrupt", f"{path}: other size than the first picture"))
             raise InputError(
-                f"{path}: expected {self.size[0]}x{self.size[1]} px like the first picture, got {image.shape[1]}x"
+                f"{path}: expected {self.size[0]}x{self.size[1]} px like the first image, got {image.shape[1]}x"
                 f"{image.shape[0]}; keep one recording per folder"
             )
         stamp = self._stamps[self._next]
@@ -109,7 +107,7 @@ class PictureSource(ImageSource):
         return Frame(stamp, image)
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """End the iteration."""
         self._next = len(self._paths)
 
 

@@ -8,13 +8,13 @@ from tiny_models import TensorProto, heatmaps, write_model
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.load_models import load_pose_model
-from drocap_ros.perception.perception_config import PoseEstimatorConfig
 from drocap_ros.perception.pose.crop import crop_around, cut
 from drocap_ros.perception.pose.heatmap import decode_heatmaps
 from drocap_ros.perception.pose.simcc import decode_simcc
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 
-PICTURE = np.zeros((400, 300, 3), np.uint8)
-#: 3:4 like the networks' input, so that the crop is 1.25 times the box without further room.
+IMAGE = np.zeros((400, 300, 3), np.uint8)
+#: Aspect ratio of the networks' input, so that the crop is 1.25 times the box.
 BOX = np.array([60.0, 80.0, 210.0, 280.0])
 
 
@@ -22,19 +22,19 @@ def load(folder, **config):
     return load_pose_model(folder, PoseEstimatorConfig(**config))
 
 
-def in_picture(crop_px: np.ndarray, size: tuple[int, int] = (192, 256)) -> np.ndarray:
+def in_image(crop_px: np.ndarray, size: tuple[int, int] = (192, 256)) -> np.ndarray:
     return crop_around(BOX, size, 1.25).to_image(crop_px)
 
 
 @settings(max_examples=80, deadline=None)
 @given(st.floats(2, 45), st.floats(2, 61), st.floats(0.05, 1.0), st.floats(1.2, 3.0))
-def test_a_gaussian_peak_is_found_between_the_cells(x, y, height, sigma):
+def test_heatmap_peak_has_subcell_precision(x, y, height, sigma):
     peaks = decode_heatmaps(heatmaps(1, 64, 48, np.array([[x, y]]), height, sigma)[0], (192, 256))
     np.testing.assert_allclose(peaks.xy[0], [4 * x, 4 * y], atol=0.12)
     assert peaks.score[0] == pytest.approx(height, rel=0.25)
 
 
-def test_the_spread_grows_with_the_width_and_names_its_direction():
+def test_spread_follows_width_and_direction():
     y, x = np.mgrid[:64, :48]
     sharp = heatmaps(1, 64, 48, np.array([[20.0, 30.0]]))[0]
     wide = np.exp(-((x - 20) ** 2 / (2 * 4.0**2) + (y - 30) ** 2 / (2 * 2.0**2)))[None].astype(np.float32)
@@ -54,14 +54,14 @@ def test_further_peaks_are_candidates():
     assert np.isnan(candidates[2]).all()
 
 
-def test_udp_networks_place_their_cells_on_the_outer_pixels():
+def test_udp_cells_span_the_outer_pixels():
     peaks = decode_heatmaps(heatmaps(1, 64, 48, np.array([[47.0, 63.0]]))[0], (192, 256), udp=True)
     np.testing.assert_allclose(peaks.xy[0], [191, 255], atol=4.5)
     middle = decode_heatmaps(heatmaps(1, 64, 48, np.array([[23.5, 31.5]]))[0], (192, 256), udp=True)
     np.testing.assert_allclose(middle.xy[0], [95.5, 127.5], atol=0.1)
 
 
-def test_an_empty_heatmap_gives_no_score():
+def test_empty_heatmap_has_score_zero():
     peaks = decode_heatmaps(np.zeros((3, 64, 48), np.float32), (192, 256))
     assert (peaks.score == 0).all()
     assert np.isfinite(peaks.xy).all()
@@ -70,7 +70,7 @@ def test_an_empty_heatmap_gives_no_score():
 
 @settings(max_examples=40, deadline=None)
 @given(st.floats(10, 180), st.floats(10, 245))
-def test_simcc_finds_its_peaks_between_the_bins(x, y):
+def test_simcc_peak_has_subbin_precision(x, y):
     bins_x, bins_y = np.arange(384) / 2, np.arange(512) / 2
     rx = 0.9 * np.exp(-((bins_x - x) ** 2) / (2 * 4.9**2))
     ry = 0.8 * np.exp(-((bins_y - y) ** 2) / (2 * 5.66**2))
@@ -88,24 +88,24 @@ def heatmap_outputs(joints: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
 @pytest.mark.parametrize(
     ("joints", "skeleton"), [(17, "coco17"), (16, "mpii16"), (26, "halpe26"), (133, "wholebody133")]
 )
-def test_heatmap_models_of_every_joint_set(tmp_path, joints, skeleton):
+def test_heatmap_model_of_each_joint_set(tmp_path, joints, skeleton):
     outputs, expected = heatmap_outputs(joints)
     write_model(tmp_path / "a.onnx", (1, 3, 256, 192), outputs)
     model = load(tmp_path)
     assert (model.spec.layout, model.joints.name) == ("heatmap", skeleton)
-    np.testing.assert_allclose(model.estimate(PICTURE, BOX).xy, in_picture(expected), atol=0.1)
+    np.testing.assert_allclose(model.estimate(IMAGE, BOX).xy, in_image(expected), atol=0.1)
 
 
-def test_of_stacked_heatmaps_the_last_counts(tmp_path):
+def test_last_of_stacked_heatmaps_is_used(tmp_path):
     cells = np.full((16, 2), 30.0)
     outputs = {"first": heatmaps(16, 64, 64, cells - 10), "second": heatmaps(16, 64, 64, cells)}
     write_model(tmp_path / "hourglass.onnx", (1, 3, 256, 256), outputs)
     model = load(tmp_path)
-    expected = in_picture(np.full((16, 2), 120.0), (256, 256))
-    np.testing.assert_allclose(model.estimate(PICTURE, BOX).xy, expected, atol=0.1)
+    expected = in_image(np.full((16, 2), 120.0), (256, 256))
+    np.testing.assert_allclose(model.estimate(IMAGE, BOX).xy, expected, atol=0.1)
 
 
-def test_h36m_models_say_so_in_their_name_or_yaml(tmp_path):
+def test_h36m_joint_set_comes_from_name_or_yaml(tmp_path):
     outputs, _ = heatmap_outputs(17)
     write_model(tmp_path / "hrnet_h36m.onnx", (1, 3, 256, 192), outputs)
     assert load(tmp_path).joints.name == "h36m17"
@@ -115,7 +115,7 @@ def test_h36m_models_say_so_in_their_name_or_yaml(tmp_path):
     assert (model.joints.name, model.spec.udp) == ("h36m17", True)
 
 
-def test_simcc_models(tmp_path):
+def test_simcc_model(tmp_path):
     x = np.zeros((1, 17, 384), np.float32)
     y = np.zeros((1, 17, 512), np.float32)
     for j in range(17):
@@ -125,33 +125,33 @@ def test_simcc_models(tmp_path):
     model = load(tmp_path)
     assert (model.spec.layout, model.spec.colour) == ("simcc", "rgb")
     expected = np.column_stack([20 + 8 * np.arange(17), 30 + 10 * np.arange(17)])
-    np.testing.assert_allclose(model.estimate(PICTURE, BOX).xy, in_picture(expected), atol=0.1)
+    np.testing.assert_allclose(model.estimate(IMAGE, BOX).xy, in_image(expected), atol=0.1)
 
 
-def test_movenet_models_take_bytes_in_rows_of_pixels(tmp_path):
+def test_movenet_model_takes_uint8_channels_last(tmp_path):
     rows = np.full((1, 1, 17, 3), 0.5, np.float32)
     rows[..., 0] = 0.25  # y comes first
     write_model(tmp_path / "a.onnx", (1, 192, 192, 3), {"out": rows}, TensorProto.UINT8)
     model = load(tmp_path)
     assert (model.spec.layout, model.spec.channels_last) == ("movenet", True)
-    expected = in_picture(np.tile([96.0, 48.0], (17, 1)), (192, 192))
-    np.testing.assert_allclose(model.estimate(PICTURE, BOX).xy, expected, atol=0.01)
+    expected = in_image(np.tile([96.0, 48.0], (17, 1)), (192, 192))
+    np.testing.assert_allclose(model.estimate(IMAGE, BOX).xy, expected, atol=0.01)
 
 
-def test_one_stage_models_serve_as_pose_models(tmp_path):
+def test_one_stage_model_gives_the_person_in_the_box(tmp_path):
     inside = np.array([30.0, 30.0, 160.0, 220.0])
     rows = np.zeros((1, 20, 57), np.float32)
-    rows[0, 0] = [0, 0, 20, 20, 0.99, 0, *np.tile([5, 5, 0.9], 17)]  # somebody else
+    rows[0, 0] = [0, 0, 20, 20, 0.99, 0, *np.tile([5, 5, 0.9], 17)]  # another person
     rows[0, 1] = [*inside, 0.6, 0, *np.tile([100, 120, 0.8], 17)]
     write_model(tmp_path / "yolo11-pose.onnx", (1, 3, 256, 192), {"out": rows})
-    keypoints = load(tmp_path).estimate(PICTURE, BOX)
-    np.testing.assert_allclose(keypoints.xy, in_picture(np.tile([100.0, 120.0], (17, 1))), atol=0.01)
+    keypoints = load(tmp_path).estimate(IMAGE, BOX)
+    np.testing.assert_allclose(keypoints.xy, in_image(np.tile([100.0, 120.0], (17, 1))), atol=0.01)
     np.testing.assert_allclose(keypoints.score, 0.8, atol=1e-6)
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.floats(-50, 350), st.floats(-50, 450), st.floats(3, 400), st.floats(3, 500))
-def test_the_crop_holds_the_box_and_goes_there_and_back(x, y, width, height):
+def test_crop_holds_the_box_and_is_invertible(x, y, width, height):
     box = np.array([x, y, x + width, y + height])
     crop = crop_around(box, (192, 256), 1.25)
     edges = (box.reshape(2, 2) - crop.centre) * crop.scale + np.array(crop.size) / 2
@@ -162,8 +162,8 @@ def test_the_crop_holds_the_box_and_goes_there_and_back(x, y, width, height):
 
 
 @pytest.mark.parametrize("scale", [0.15, 0.3, 0.7, 2.0])
-def test_the_crop_shows_what_lies_there(scale):
-    """A bright disc of the picture appears where the crop's own arithmetic puts it."""
+def test_crop_samples_the_image_at_its_mapping(scale):
+    """A bright disc of the image appears at the mapped position."""
     height, width = int(200 / scale) + 40, int(150 / scale) + 40
     y, x = np.mgrid[:height, :width]
     centre, radius = np.array([0.6 * width, 0.4 * height]), 12 / scale
@@ -175,7 +175,7 @@ def test_the_crop_shows_what_lies_there(scale):
     np.testing.assert_allclose(crop.to_image(middle), centre, atol=0.35 / crop.scale)
 
 
-def test_an_unknown_output_names_the_layouts(tmp_path):
+def test_unknown_outputs_are_refused_with_the_layouts(tmp_path):
     write_model(tmp_path / "odd.onnx", (1, 3, 256, 192), {"embedding": np.zeros((1, 512), np.float32)})
     with pytest.raises(InputError, match=r"found no layout|embedding \[1, 512\].*odd\.yaml"):
         load(tmp_path, pose_model="odd")
@@ -189,7 +189,7 @@ def test_nan_outputs_are_refused(tmp_path):
         load(tmp_path, pose_model="a")
 
 
-def test_a_file_that_is_no_model_is_refused(tmp_path):
+def test_invalid_model_file_is_refused(tmp_path):
     (tmp_path / "a.onnx").write_bytes(b"not a model at all")
     with pytest.raises(InputError, match=r"a\.onnx: expected an ONNX model") as caught:
         load(tmp_path, pose_model="a")
@@ -210,7 +210,7 @@ def test_a_file_that_is_no_model_is_refused(tmp_path):
         ("{", "expected YAML"),
     ],
 )
-def test_a_wrong_yaml_is_refused_with_what_it_should_hold(tmp_path, text, complaint):
+def test_invalid_yaml_is_refused(tmp_path, text, complaint):
     outputs, _ = heatmap_outputs(17)
     write_model(tmp_path / "a.onnx", (1, 3, 256, 192), outputs)
     (tmp_path / "a.yaml").write_text(text)
@@ -218,7 +218,7 @@ def test_a_wrong_yaml_is_refused_with_what_it_should_hold(tmp_path, text, compla
         load(tmp_path, pose_model="a")
 
 
-def test_a_folder_without_a_pose_model_says_how_to_get_one(tmp_path):
+def test_folder_without_a_pose_model_is_refused_with_advice(tmp_path):
     with pytest.raises(
         InputError, match=r"expected a 2D pose model \(\.onnx\), found no \.onnx file.*drocap models fetch"
     ):

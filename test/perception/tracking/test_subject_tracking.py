@@ -1,4 +1,4 @@
-"""The subject among others: painted persons with boxes as a detector would give them."""
+"""Subject tracker on drawn persons with simulated detections."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import ParameterError
-from drocap_ros.perception.perception_config import PoseEstimatorConfig
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking import SubjectTracker
-from drocap_ros.perception.tracking.search import inside, tiles, window_around
+from drocap_ros.perception.tracking.detection_windows import tiles, uncut, wide_window
 
 SIZE = (640, 360)
 RED, BLUE, GREEN = ((40, 40, 200), (30, 30, 90)), ((200, 60, 30), (20, 20, 20)), ((60, 180, 60), (200, 200, 200))
@@ -50,7 +50,7 @@ def offset(subject, x: float, y: float = 180) -> float:
 
 @pytest.mark.parametrize("front", [True, False], ids=["subject in front", "subject behind"])
 @pytest.mark.parametrize("speed", [4.0, 9.0])
-def test_a_crossing_keeps_the_subject(front, speed):
+def test_subject_is_kept_through_a_crossing(front, speed):
     scene = Scene()
     ids = set()
     for t in range(int(440 / speed)):
@@ -69,7 +69,7 @@ def test_a_crossing_keeps_the_subject(front, speed):
     assert subject.score > 0
 
 
-def test_while_hidden_the_keypoints_would_be_somebody_elses():
+def test_subject_behind_another_person_is_hidden():
     scene = Scene()
     for t in range(44):
         scene.show([(300, 180, 185, RED), (80 + 4 * t, 180, 180, BLUE)])
@@ -78,7 +78,7 @@ def test_while_hidden_the_keypoints_would_be_somebody_elses():
     assert all(s.hidden for s in states[6:])  # from an overlap of a quarter on
 
 
-def test_missing_detections_are_bridged():
+def test_missing_detections_are_predicted():
     scene = Scene()
     for t in range(60):
         subject = scene.show([(100 + 5 * t, 180, 160, RED)], unseen=(0,) if t % 10 in (6, 7, 8) and t > 10 else ())
@@ -87,7 +87,7 @@ def test_missing_detections_are_bridged():
         assert offset(subject, 100 + 5 * t) < 25
 
 
-def test_a_lost_subject_is_not_replaced_by_another_person():
+def test_lost_subject_is_not_replaced_by_another_person():
     scene = Scene()
     for _ in range(20):
         scene.show([(150, 180, 160, RED), (500, 180, 150, BLUE)])
@@ -96,7 +96,7 @@ def test_a_lost_subject_is_not_replaced_by_another_person():
     assert all(s is None or s.score == 0.0 for s in after)
 
 
-def test_a_lost_subject_is_taken_up_again_when_it_looks_the_same():
+def test_lost_subject_of_the_same_appearance_is_reidentified():
     scene = Scene()
     for _ in range(20):
         scene.show([(300, 180, 160, RED)])
@@ -111,7 +111,7 @@ def test_a_lost_subject_is_taken_up_again_when_it_looks_the_same():
     assert back[-1].track_id == 1
 
 
-def test_who_left_the_picture_is_gone_and_the_next_has_another_number():
+def test_next_person_after_the_subject_left_has_a_new_track_id():
     scene = Scene(on_loss="next")
     for t in range(60):
         scene.show([(300 + 8 * t, 180, 160, RED)])
@@ -120,19 +120,18 @@ def test_who_left_the_picture_is_gone_and_the_next_has_another_number():
     assert newcomers[-1].track_id == 2
 
 
-def test_waiting_means_waiting_until_somebody_chooses():
+def test_on_loss_wait_follows_nobody_until_a_roi_chooses():
     scene = Scene(on_loss="wait")
     for t in range(60):
         scene.show([(300 + 8 * t, 180, 160, RED)])
     for t in range(60):
         assert scene.show([(40 + 3 * t, 180, 160, BLUE)]) is None
-    scene.tracker.choose(np.array([200, 100, 270, 260]))
-    subject = scene.show([(223, 180, 160, BLUE)])
+    subject = scene.show([(223, 180, 160, BLUE)], roi=np.array([200.0, 100, 270, 260]))
     assert subject.track_id == 2
     assert offset(subject, 223) < 10
 
 
-def test_the_largest_or_the_most_central_is_chosen():
+def test_configured_rule_chooses_the_subject():
     persons = [(150, 180, 200, RED), (330, 180, 120, BLUE)]
     assert offset(Scene(subject="largest").show(persons), 150) < 10
     assert offset(Scene(subject="centre").show(persons), 330) < 10
@@ -140,7 +139,7 @@ def test_the_largest_or_the_most_central_is_chosen():
     assert offset(boxed.show(persons), 330) < 10
 
 
-def test_the_drones_own_box_leads_and_carries_on():
+def test_roi_chooses_the_subject_and_replaces_missing_detections():
     scene = Scene(subject="roi")
     persons = [(150, 180, 200, RED), (330, 180, 120, BLUE)]
     assert scene.show(persons) is None  # nobody chosen yet
@@ -154,7 +153,7 @@ def test_the_drones_own_box_leads_and_carries_on():
     assert (moved.track_id, offset(moved, 150) < 10) == (2, True)
 
 
-def test_clutter_does_not_become_the_subject():
+def test_low_score_clutter_does_not_become_the_subject():
     scene = Scene()
     for _ in range(20):
         scene.show([(300, 180, 160, RED)])
@@ -162,14 +161,14 @@ def test_clutter_does_not_become_the_subject():
     assert after[-1] is None
 
 
-def test_somebody_comes_into_the_picture_bit_by_bit():
+def test_person_entering_the_image_gets_one_track_id():
     scene = Scene(on_loss="next")
     shown = [scene.show([(320, 360 + 80 - 12 * t, 200, RED)]) for t in range(20)]
     assert {s.track_id for s in shown if s is not None} == {1}
     assert sum(s is not None for s in shown) >= 15
 
 
-def test_two_runs_are_equal_to_the_bit():
+def test_two_runs_are_equal_bit_for_bit():
     runs = []
     for _ in range(2):
         scene = Scene()
@@ -179,7 +178,7 @@ def test_two_runs_are_equal_to_the_bit():
 
 
 @pytest.mark.parametrize("text", ["", "1,2,3", "10,10,5,20", "a,b,c,d", "0,0,nan,5"])
-def test_a_wrong_subject_box_is_refused(text):
+def test_invalid_subject_box_is_refused(text):
     with pytest.raises(ParameterError, match="subject_box: expected x_min"):
         SubjectTracker(PoseEstimatorConfig(subject="box", subject_box=text))
 
@@ -187,7 +186,7 @@ def test_a_wrong_subject_box_is_refused(text):
 def test_windows_lie_in_the_image_and_tiles_cover_it():
     size = (1920, 1080)
     for box in ([0, 0, 50, 120], [1880, 1000, 1920, 1080], [900, 500, 950, 620]):
-        x0, y0, x1, y1 = window_around(np.array(box, float), size)
+        x0, y0, x1, y1 = wide_window(np.array(box, float), size)
         assert 0 <= x0 < x1 <= 1920
         assert 0 <= y0 < y1 <= 1080
         assert x0 <= box[0]
@@ -197,5 +196,5 @@ def test_windows_lie_in_the_image_and_tiles_cover_it():
         covered[y0:y1, x0:x1] = True
     assert covered.all()
     assert tiles((960, 540)) == []
-    cut = inside(np.array([[100.0, 100, 200, 200], [300, 110, 400, 220]]), (100, 0, 500, 400), size)
+    cut = uncut(np.array([[100.0, 100, 200, 200], [300, 110, 400, 220]]), (100, 0, 500, 400), size)
     assert cut.tolist() == [False, True]

@@ -1,17 +1,16 @@
-"""From a driver's or stream's own time to the clock's."""
+"""Conversion of a driver's or stream's time to the system clock."""
 
 from __future__ import annotations
 
-#: A stream's clock may run slower than ours by so much (crystals are good to 50 ppm).
+#: Largest relative drift of a slower stream clock; crystals are accurate to 50 ppm.
 _DRIFT = 2e-4
 
 
 class StreamClock:
-    """Maps presentation times to the time of ``now``.
+    """Maps presentation times to the system clock.
 
-    The offset between the two is the smallest difference between arrival and presentation time seen so far:
-    the network and the decoder only ever add delay.  It may creep up by 0.2 per mille, so that a slower
-    foreign clock is followed.
+    The offset is the smallest difference between arrival and presentation time so far, because network and decoder
+    only add delay.  It grows by 0.2 per mille of the elapsed time, to follow a slower stream clock.
     """
 
     def __init__(self) -> None:
@@ -22,7 +21,7 @@ class StreamClock:
     def stamp(self, position_ns: int, now_ns: int) -> int:
         """Stamp of an image with presentation time ``position_ns`` that arrived at ``now_ns``; strictly increasing."""
         difference = now_ns - position_ns
-        if self._offset is None or position_ns < self._position:  # the first, or the stream's time began anew
+        if self._offset is None or position_ns < self._position:  # first image, or the stream restarted
             self._offset = difference
         else:
             self._offset = min(self._offset + _DRIFT * (position_ns - self._position), difference)

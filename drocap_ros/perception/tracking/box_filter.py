@@ -1,19 +1,19 @@
-"""Motion of a box in the image: a constant-velocity Kalman filter in units of the person's length."""
+"""Constant-velocity Kalman filter of a box in the image, in units of the person's length."""
 
 from __future__ import annotations
 
 import numpy as np
 
-#: Standard deviations: of a measured centre (lengths) and log size; of the acceleration (lengths/s^2) and of
-#: the log size's (1/s^2).  A runner turns at about 1 g, 5 lengths/s^2; a drone's yaw adds its own.
+#: Standard deviations of the measurement (centre in lengths, log size) and of the acceleration (lengths/s^2, 1/s^2):
+#: a runner turns at about 1 g, 5 lengths/s^2, and the camera's yaw adds to it.
 _MEASURED = np.array([0.03, 0.03, 0.08, 0.08])
 _ACCELERATION = np.array([4.0, 4.0, 2.0, 2.0])
-#: Longest time over which a velocity carries on: after that a person has turned, stooped or stopped.
+#: Longest extrapolation of a velocity; persons turn, stoop or stop within it.
 _LONGEST_PREDICTION_S = 0.4
 
 
-class BoxMotion:
-    """Centre (px) and logarithm of width and height of a box with their rates.
+class BoxFilter:
+    """Kalman filter of centre (px) and logarithm of width and height.
 
     State ``x`` (4, 2): value, rate per second; covariance ``p`` (4, 2, 2).
     """
@@ -37,7 +37,7 @@ class BoxMotion:
         return np.array([cx - w / 2, cy - h / 2, cx + w / 2, cy + h / 2])
 
     def box_at(self, stamp_ns: int) -> np.ndarray:
-        """(4,) px predicted for a time, without moving on to it."""
+        """(4,) px predicted for a time; the state stays."""
         dt = float(np.clip((stamp_ns - self.stamp_ns) * 1e-9, 0.0, _LONGEST_PREDICTION_S))
         cx, cy, w, h = self.x[:, 0] + dt * self.x[:, 1]
         half = np.exp(np.clip([w, h], 0.0, 10.0)) / 2
@@ -45,11 +45,11 @@ class BoxMotion:
 
     @property
     def length(self) -> float:
-        """Longer side of the box, px: the measure of a person who stands, lies or turns a somersault."""
+        """Longer side of the box, px: the size of a person in any posture."""
         return float(np.exp(self.x[2:, 0].max()))
 
     def predict(self, stamp_ns: int) -> None:
-        """Move on to a later time; the velocity fades while nothing is measured."""
+        """Advance to a later time; velocities decay without measurements."""
         dt = min((stamp_ns - self.stamp_ns) * 1e-9, _LONGEST_PREDICTION_S)
         self.stamp_ns = stamp_ns
         if dt <= 0:
@@ -63,7 +63,7 @@ class BoxMotion:
         self.p = f @ self.p @ f.T + q[:, None, None] * noise
 
     def update(self, box: np.ndarray, noise: float = 1.0) -> None:
-        """Take a measured box in; ``noise`` scales its standard deviation."""
+        """Update with a measured box; ``noise`` scales its standard deviation."""
         r = (noise * self._scaled(_MEASURED)) ** 2
         innovation = _to_state(box) - self.x[:, 0]
         gain = self.p[:, :, 0] / (self.p[:, 0, 0] + r)[:, None]

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from drocap_ros.perception.estimator import PoseEstimator
-from drocap_ros.perception.perception_config import PoseEstimatorConfig
-from drocap_ros.perception.pose.keypoints import Keypoints
+from drocap_ros.perception.pose.network_keypoints import NetworkKeypoints
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.sources import open_source
 from drocap_ros.perception.uncertainty import calibrate
 from drocap_ros.skeleton import BODY_15, COCO_17
 
-#: COCO's spread of human marks per joint, share of the square root of the person's area.
+#: COCO's spread of human labels per joint, share of the square root of the person's area.
 COCO_SIGMAS = np.array([26, 25, 25, 35, 35, 79, 79, 72, 72, 62, 62, 107, 107, 87, 87, 89, 89]) / 1000
 BLAZEPOSE_AS_COCO = [0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28]
 LIMBS = slice(5, 17)
@@ -28,7 +28,7 @@ def models(shared: Path) -> Path:
 
 
 def labelled(shared: Path) -> dict[str, tuple[np.ndarray, int]]:
-    """Recording -> keypoints (F, 17, 2) px, and which images to look at: every n-th."""
+    """Recording -> keypoints (F, 17, 2) px, and the stride of the images."""
     media = shared / "media"
     skier = json.loads((media / "skier_keypoints.json").read_text())["persons"][0]
     named = json.loads((media / "pose_1_keypoints2d.json").read_text())
@@ -41,9 +41,9 @@ def labelled(shared: Path) -> dict[str, tuple[np.ndarray, int]]:
 
 
 @pytest.fixture(scope="module")
-def seen(models: Path, shared: Path) -> dict[str, list[tuple[Keypoints, np.ndarray, np.ndarray]]]:
+def seen(models: Path, shared: Path) -> dict[str, list[tuple[NetworkKeypoints, np.ndarray, np.ndarray]]]:
     """Recording -> (keypoints, box, truth) of each labelled image."""
-    out: dict[str, list[tuple[Keypoints, np.ndarray, np.ndarray]]] = {}
+    out: dict[str, list[tuple[NetworkKeypoints, np.ndarray, np.ndarray]]] = {}
     for name, (truth, step) in labelled(shared).items():
         estimator = PoseEstimator(models)
         out[name] = []
@@ -56,7 +56,7 @@ def seen(models: Path, shared: Path) -> dict[str, list[tuple[Keypoints, np.ndarr
     return out
 
 
-def test_the_skier(seen, shared):
+def test_object_keypoint_similarity_of_the_skier(seen, shared):
     keypoints, _, truth = seen["skier.jpg"][0]
     area = json.loads((shared / "media" / "skier_keypoints.json").read_text())["persons"][0]["area"]
     squared = ((keypoints.xy - truth) ** 2).sum(axis=1)
@@ -65,7 +65,7 @@ def test_the_skier(seen, shared):
 
 
 @pytest.mark.parametrize(("name", "percent"), [("pose_1.mp4", 3.0), ("pose_squats.mp4", 2.0)])
-def test_distance_to_the_given_keypoints(seen, name, percent):
+def test_mean_distance_to_the_labels_is_small(seen, name, percent):
     distance = [np.linalg.norm(k.xy - truth, axis=1)[LIMBS].mean() / (box[3] - box[1]) for k, box, truth in seen[name]]
     assert 100 * np.mean(distance) <= percent
 
@@ -80,7 +80,7 @@ def test_standardized_errors_have_unit_spread(seen):
     assert 0.8 <= np.concatenate(errors).std() <= 1.25
 
 
-def test_the_same_picture_gives_the_same_bits_and_the_whole_body(models, shared):
+def test_equal_images_give_equal_bits_and_the_whole_body(models, shared):
     with open_source(shared / "media" / "skier.jpg") as source:
         image = source.read().image
     first, second = (PoseEstimator(models).process(image, 0) for _ in range(2))
@@ -94,13 +94,13 @@ def test_the_same_picture_gives_the_same_bits_and_the_whole_body(models, shared)
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (9000, 12000, 3), (8, 4000, 3)])
-def test_pictures_of_any_shape(models, shape):
+def test_images_of_any_shape_are_accepted(models, shape):
     observation = PoseEstimator(models).process(np.zeros(shape, np.uint8), 0)
     assert observation.track_id == 0
     assert observation.keypoints.shape == (0, 2)
 
 
-def test_a_person_in_a_huge_picture_is_found(models, shared):
+def test_person_in_a_huge_image_is_found(models, shared):
     import cv2
 
     with open_source(shared / "media" / "skier.jpg") as source:
@@ -115,7 +115,7 @@ def test_a_person_in_a_huge_picture_is_found(models, shared):
     assert distance.max() < 12
 
 
-def test_time_that_goes_back_begins_anew(models, shared, caplog):
+def test_stamps_that_go_back_restart_the_tracker(models, shared, caplog):
     with open_source(shared / "media" / "skier.jpg") as source:
         image = source.read().image
     estimator = PoseEstimator(models)
@@ -124,7 +124,7 @@ def test_time_that_goes_back_begins_anew(models, shared, caplog):
     assert "stamps went back" in caplog.text
 
 
-def test_somebody_who_moves_before_the_camera_keeps_one_track(models, shared):
+def test_person_close_to_the_camera_keeps_one_track(models, shared):
     estimator = PoseEstimator(models, PoseEstimatorConfig(on_loss="next"))
     ids = []
     with open_source(shared / "media" / "one_by_one_person_detection.mp4") as source:
@@ -138,16 +138,16 @@ def test_somebody_who_moves_before_the_camera_keeps_one_track(models, shared):
 
 
 @pytest.mark.parametrize(("size", "images"), [((1280, 720), 8), ((3840, 2160), 28)])
-def test_a_small_person_in_a_large_picture_is_searched_for_and_kept(models, shared, size, images):
+def test_small_person_in_a_large_image_is_found_and_kept(models, shared, size, images):
     import cv2
 
     estimator = PoseEstimator(models)
     with open_source(shared / "media" / "pose_squats.mp4") as source:
         person = cv2.resize(source.read().image[100:760, 150:520], None, fx=0.15, fy=0.15, interpolation=cv2.INTER_AREA)
     ground = np.random.default_rng(0).normal(110, 12, (size[1] // 8, size[0] // 8, 3)).clip(0, 255).astype(np.uint8)
-    picture = cv2.resize(ground, size, interpolation=cv2.INTER_LINEAR)
+    image = cv2.resize(ground, size, interpolation=cv2.INTER_LINEAR)
     x, y = int(0.6 * size[0]), int(0.55 * size[1])
-    picture[y : y + person.shape[0], x : x + person.shape[1]] = person
-    ids = [estimator.process(picture, i * 33_000_000).track_id for i in range(images + 4)]
+    image[y : y + person.shape[0], x : x + person.shape[1]] = person
+    ids = [estimator.process(image, i * 33_000_000).track_id for i in range(images + 4)]
     assert set(ids[images:]) == {1}
     assert set(ids) <= {0, 1}

@@ -8,15 +8,15 @@ from tiny_models import write_model
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.detection.letterbox import letterbox
-from drocap_ros.perception.detection.nms import iou, shared, suppress, whole
+from drocap_ros.perception.detection.nms import iou, overlap_coefficient, suppress, without_parts
 from drocap_ros.perception.load_models import load_detector
 from drocap_ros.perception.models.spec import grid_centres
-from drocap_ros.perception.perception_config import PoseEstimatorConfig
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 
-#: The person that every tiny model sees, in its 128x96 input; the picture is twice as large.
+#: Output of every tiny model, in px of its 128x96 input; the image is twice as large.
 BOX = np.array([40.0, 20.0, 72.0, 84.0])
 SIZE = (128, 96)
-PICTURE = np.zeros((192, 256, 3), np.uint8)
+IMAGE = np.zeros((192, 256, 3), np.uint8)
 
 
 def logit(p: float) -> float:
@@ -99,38 +99,36 @@ LAYOUTS = {
 
 
 @pytest.mark.parametrize(("file", "outputs", "layout"), LAYOUTS.values(), ids=LAYOUTS)
-def test_every_layout_is_recognized_and_gives_the_person(tmp_path, file, outputs, layout):
+def test_layout_is_inferred_and_decoded(tmp_path, file, outputs, layout):
     write_model(tmp_path / file, (1, 3, SIZE[1], SIZE[0]), outputs)
     detector = load_detector(tmp_path, PoseEstimatorConfig())
     assert detector.spec.layout == layout
-    found = detector.detect(PICTURE, None, 0.3)
+    found = detector.detect(IMAGE, None, 0.3)
     assert len(found) == 1
     np.testing.assert_allclose(found.boxes[0], 2 * BOX, atol=0.05)
     assert 0.8 < found.scores[0] <= 0.95
-    if found.keypoints is not None:
-        assert found.keypoints.shape == (1, 17, 3)
 
 
-def test_a_window_moves_the_boxes(tmp_path):
+def test_boxes_of_a_window_are_in_image_px(tmp_path):
     write_model(tmp_path / "rtmdet.onnx", (1, 3, SIZE[1], SIZE[0]), end_to_end())
     detector = load_detector(tmp_path, PoseEstimatorConfig())
     found = detector.detect(np.zeros((400, 600, 3), np.uint8), (100, 50, 100 + 128, 50 + 96), 0.3)
     np.testing.assert_allclose(found.boxes[0], BOX + np.array([100, 50, 100, 50]), atol=0.01)
 
 
-def test_boxes_and_labels_alone_do_not_tell_how_a_model_is_fed(tmp_path):
+def test_ambiguous_outputs_need_a_name_or_a_yaml(tmp_path):
     write_model(tmp_path / "best.onnx", (1, 3, SIZE[1], SIZE[0]), end_to_end())
     with pytest.raises(InputError, match=r"rtmdet or yolox in the name.*best\.yaml"):
         load_detector(tmp_path, PoseEstimatorConfig())
     (tmp_path / "best.yaml").write_text("colour: rgb\nmean: [0, 0, 0]\nstd: [255, 255, 255]\n")
     detector = load_detector(tmp_path, PoseEstimatorConfig())
     assert detector.spec.std == (255.0, 255.0, 255.0)
-    assert len(detector.detect(PICTURE, None, 0.3)) == 1
+    assert len(detector.detect(IMAGE, None, 0.3)) == 1
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 400), st.integers(1, 400), st.booleans(), st.integers(0, 2**32 - 1))
-def test_letterbox_takes_points_there_and_back(width, height, centred, seed):
+def test_letterbox_is_invertible(width, height, centred, seed):
     rng = np.random.default_rng(seed)
     image = np.zeros((height, width, 3), np.uint8)
     canvas, place = letterbox(image, (0, 0, width, height), (64, 48), centred)
@@ -144,7 +142,7 @@ def test_letterbox_takes_points_there_and_back(width, height, centred, seed):
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 30), st.floats(0.1, 0.9), st.integers(0, 2**32 - 1))
-def test_suppression_keeps_the_best_and_no_pair_that_overlaps(count, threshold, seed):
+def test_suppression_keeps_the_best_of_each_overlap(count, threshold, seed):
     rng = np.random.default_rng(seed)
     low = rng.uniform(0, 50, (count, 2))
     boxes = np.concatenate([low, low + rng.uniform(1, 40, (count, 2))], axis=1)
@@ -158,8 +156,8 @@ def test_suppression_keeps_the_best_and_no_pair_that_overlaps(count, threshold, 
         assert (iou(boxes[i][None], boxes[kept])[0][scores[kept] >= scores[i]] > threshold).any()
 
 
-def test_a_part_of_a_person_is_nobody():
+def test_parts_of_a_better_box_are_dropped():
     boxes = np.array([[0, 0, 40, 100], [2, 55, 38, 99], [30, 0, 70, 100]], float)
-    assert whole(boxes, np.array([0.9, 0.5, 0.4])).tolist() == [0, 2]
-    assert whole(boxes, np.array([0.4, 0.5, 0.4])).tolist() == [0, 1, 2]
-    assert shared(boxes[:1], boxes[1:2])[0, 0] == pytest.approx(1.0)
+    assert without_parts(boxes, np.array([0.9, 0.5, 0.4])).tolist() == [0, 2]
+    assert without_parts(boxes, np.array([0.4, 0.5, 0.4])).tolist() == [0, 1, 2]
+    assert overlap_coefficient(boxes[:1], boxes[1:2])[0, 0] == pytest.approx(1.0)

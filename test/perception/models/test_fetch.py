@@ -68,7 +68,7 @@ def model(url: str, **changes) -> KnownModel:
     return replace(plain, **changes)
 
 
-def test_a_model_is_fetched_verified_and_not_fetched_twice(server, tmp_path):
+def test_model_is_verified_and_not_fetched_twice(server, tmp_path):
     Handler.files["/tiny.onnx"] = WEIGHTS
     seen = []
     path = fetch(model(f"{server}/tiny.onnx"), tmp_path / "new", progress=lambda *a: seen.append(a))
@@ -79,7 +79,7 @@ def test_a_model_is_fetched_verified_and_not_fetched_twice(server, tmp_path):
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["tiny.onnx"]
 
 
-def test_a_download_cut_off_goes_on_where_it_stopped(server, tmp_path):
+def test_interrupted_download_resumes(server, tmp_path):
     Handler.files["/tiny.onnx"], Handler.cut = WEIGHTS, 300_000
     with pytest.raises(FetchError, match=r"300000 (of 1024000 )?bytes"):
         fetch(model(f"{server}/tiny.onnx"), tmp_path)
@@ -88,14 +88,14 @@ def test_a_download_cut_off_goes_on_where_it_stopped(server, tmp_path):
     assert Handler.ranges == [None, "bytes=300000-"]
 
 
-def test_a_wrong_checksum_keeps_nothing(server, tmp_path):
+def test_wrong_checksum_leaves_no_file(server, tmp_path):
     Handler.files["/tiny.onnx"] = WEIGHTS[:-1] + b"x"
     with pytest.raises(FetchError, match=f"expected SHA-256 {SHA}"):
         fetch(model(f"{server}/tiny.onnx"), tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_model_in_an_archive(server, tmp_path):
+def test_model_is_extracted_from_an_archive(server, tmp_path):
     memory = io.BytesIO()
     with zipfile.ZipFile(memory, "w") as archive:
         archive.writestr("2023/model/end2end.onnx", WEIGHTS)
@@ -108,7 +108,7 @@ def test_a_model_in_an_archive(server, tmp_path):
         fetch(model(f"{server}/tiny.zip", member="end2end.onnx", file="b.onnx"), tmp_path)
 
 
-def test_a_model_without_a_known_checksum_needs_a_word(server, tmp_path):
+def test_model_without_a_checksum_needs_unverified(server, tmp_path):
     Handler.files["/tiny.onnx"] = WEIGHTS
     unknown = model(f"{server}/tiny.onnx", sha256="")
     with pytest.raises(InputError, match="--unverified"):
@@ -116,12 +116,12 @@ def test_a_model_without_a_known_checksum_needs_a_word(server, tmp_path):
     fetch(unknown, tmp_path, unverified=True)
     assert (tmp_path / "tiny.onnx.sha256").read_text().startswith(SHA)
     (tmp_path / "tiny.onnx").unlink()
-    Handler.files["/tiny.onnx"] = b"changed"  # what was recorded at first is expected from then on
+    Handler.files["/tiny.onnx"] = b"changed"  # the recorded checksum is expected
     with pytest.raises(FetchError, match="expected SHA-256"):
         fetch(unknown, tmp_path, unverified=True)
 
 
-def test_no_server_no_page_no_download(server, tmp_path):
+def test_failed_downloads_are_reported_in_one_line(server, tmp_path):
     with pytest.raises(FetchError, match="answered 404"):
         fetch(model(f"{server}/nothing.onnx"), tmp_path)
     with pytest.raises(FetchError, match="check the network") as caught:
@@ -131,7 +131,7 @@ def test_no_server_no_page_no_download(server, tmp_path):
         fetch(model("", name="tinypose"), tmp_path)
 
 
-def test_the_registry_is_complete():
+def test_registry_is_complete():
     assert len({m.name for m in KNOWN_MODELS}) == len({m.file for m in KNOWN_MODELS}) == len(KNOWN_MODELS)
     for name in DEFAULT_FETCH:
         found = known_model(name)

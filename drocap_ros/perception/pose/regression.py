@@ -1,4 +1,4 @@
-"""Models that name coordinates instead of distributions: MoveNet, YOLO-pose, RTMO."""
+"""Regression-based models, which output coordinates instead of distributions: MoveNet, YOLO-pose, RTMO."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from drocap_ros.perception.detection.decode import DECODERS
 from drocap_ros.perception.detection.nms import iou
 from drocap_ros.perception.models.spec import ModelSpec
 from drocap_ros.perception.pose.heatmap import CANDIDATES
-from drocap_ros.perception.pose.keypoints import Peaks
+from drocap_ros.perception.pose.network_keypoints import Peaks
 
 
 def as_peaks(points: np.ndarray) -> Peaks:
-    """(P, 3) x y px and score -> peaks whose distribution is unknown (spread 0)."""
+    """(P, 3) x y px and score -> peaks of unknown distribution (spread 0)."""
     candidates = np.full((len(points), CANDIDATES, 3), np.nan, np.float32)
     candidates[:, 0] = points
     spread = np.zeros((len(points), 3), np.float32)
@@ -20,14 +20,14 @@ def as_peaks(points: np.ndarray) -> Peaks:
 
 
 def decode_movenet(output: np.ndarray, input_size: tuple[int, int]) -> Peaks:
-    """MoveNet (1, 1, P, 3): y, x as shares of the picture, score."""
+    """MoveNet (1, 1, P, 3): y, x as shares of the input, score."""
     rows = output.reshape(output.shape[-2:])
     points = np.stack([rows[:, 1] * input_size[0], rows[:, 0] * input_size[1], rows[:, 2]], -1)
     return as_peaks(points.astype(np.float32))
 
 
 def decode_one_stage(outputs: list[np.ndarray], spec: ModelSpec, box: np.ndarray, joints: int) -> Peaks:
-    """The person of a one-stage model's output who overlaps ``box`` (4,) input px most; scores 0 when there is none."""
+    """The person in a one-stage model's output that overlaps ``box`` (4,) input px most; scores 0 without one."""
     raw = DECODERS[spec.layout](outputs, spec, 0.05)
     if raw.keypoints is None or not len(raw.scores):
         return as_peaks(np.zeros((joints, 3), np.float32))

@@ -1,0 +1,123 @@
+"""Windows of the image in which the detector runs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+Window = tuple[int, int, int, int]
+
+#: Side of a window over the subject's longer side, and its least side in px.  Detectors of 320-416 px input score a
+#: person in bad light two to three times higher who fills most of the window than one who fills a third; a wider
+#: window also covers the persons nearby.
+_WIDE, _CLOSE, _TIGHT = (1.8, 416), (1.45, 208), (1.3, 160)
+#: Images longer than this are also searched in tiles of this side, one per image.
+_TILE = 800
+#: Interval of detection over the whole image while the subject is in view.
+_FULL_EVERY_NS = 1_000_000_000
+
+
+class WindowSchedule:
+    """Order of the windows: near the subject, at intervals the whole image, without a subject also tiles."""
+
+    def __init__(self) -> None:
+        self._full_ns: int | None = None
+        self._tile = 0
+        self._alternate = False
+
+    def reset(self) -> None:
+        """Forget the time of the last detection over the whole image."""
+        self._full_ns = None
+
+    def full_image_due(self, stamp_ns: int) -> bool:
+        """Whether the interval since the last detection over the whole image has passed."""
+        return self._full_ns is None or stamp_ns - self._full_ns >= _FULL_EVERY_NS
+
+    def near_subject(
+        self, box: np.ndarray, image_size: tuple[int, int], stamp_ns: int, single: bool, close: bool
+    ) -> list[Window | None]:
+        """Windows while the subject is in view at a predicted ``box`` (4,) px; None = the whole image.
+
+        ``single`` allows one window; ``close`` takes a smaller one around the subject.
+        """
+        near = close_window(box, image_size) if close else wide_window(box, image_size)
+        if near is None or self.full_image_due(stamp_ns) or stamp_ns < (self._full_ns or 0):
+            self._full_ns = stamp_ns
+            return [None] if single else list({near: None, None: None})
+        return [near]
+
+    def search(
+        self, candidate: np.ndarray | None, image_size: tuple[int, int], stamp_ns: int, single: bool
+    ) -> list[Window | None]:
+        """Windows without a subject: the whole image, and a window around a candidate's box (4,) px or the next tile.
+
+        With ``single`` the two alternate.
+        """
+        self._full_ns = stamp_ns
+        self._alternate = not self._alternate
+        if single and not self._alternate:
+            return [None]
+        near, tiled = None if candidate is None else wide_window(candidate, image_size), tiles(image_size)
+        if near is None and tiled:
+            self._tile = (self._tile + 1) % len(tiled)
+            near = tiled[self._tile]
+        if near is None:
+            return [None]
+        return [near] if single else [None, near]
+
+
+def wide_window(box: np.ndarray, image_size: tuple[int, int]) -> Window | None:
+    """Window around a box (4,) px that also covers the persons nearby; None when it would be the whole image."""
+    return _window(box, image_size, *_WIDE)
+
+
+def close_window(box: np.ndarray, image_size: tuple[int, int]) -> Window | None:
+    """Smaller window, in which a person is as large at 256 px of input as in the wide one at 320 px."""
+    return _window(box, image_size, *_CLOSE)
+
+
+def tight_window(box: np.ndarray, image_size: tuple[int, int]) -> Window | None:
+    """Window of the second pass, for a subject with a low score."""
+    return _window(box, image_size, *_TIGHT)
+
+
+def _window(box: np.ndarray, image_size: tuple[int, int], factor: float, least: int) -> Window | None:
+    width, height = image_size
+    side = max(factor * float(max(box[2] - box[0], box[3] - box[1])), least)
+    if side >= max(width, height):
+        return None
+    cx, cy = float(box[0] + box[2]) / 2, float(box[1] + box[3]) / 2
+    w, h = int(min(side, width)), int(min(side, height))
+    x0 = int(np.clip(cx - w / 2, 0, width - w))
+    y0 = int(np.clip(cy - h / 2, 0, height - h))
+    return x0, y0, x0 + w, y0 + h
+
+
+def tiles(image_size: tuple[int, int]) -> list[Window]:
+    """Overlapping tiles that cover a large image; none for an image that fits the detector."""
+    width, height = image_size
+    if max(width, height) <= 1.25 * _TILE:
+        return []
+    side = max(_TILE, max(width, height) // 6)
+
+    def origins(length: int) -> list[int]:
+        if length <= side:
+            return [0]
+        count = int(np.ceil((length - side) / (0.75 * side))) + 1
+        return [round(i * (length - side) / (count - 1)) for i in range(count)]
+
+    return [(x, y, min(x + side, width), min(y + side, height)) for y in origins(height) for x in origins(width)]
+
+
+def uncut(boxes: np.ndarray, window: Window | None, image_size: tuple[int, int]) -> np.ndarray:
+    """(N,) bool: boxes that no edge of the window cuts; edges of the image do not count."""
+    if window is None:
+        return np.ones(len(boxes), bool)
+    x0, y0, x1, y1 = window
+    width, height = image_size
+    margin = 2.0
+    return (
+        ((boxes[:, 0] > x0 + margin) | (x0 == 0))
+        & ((boxes[:, 1] > y0 + margin) | (y0 == 0))
+        & ((boxes[:, 2] < x1 - margin) | (x1 == width))
+        & ((boxes[:, 3] < y1 - margin) | (y1 == height))
+    )
