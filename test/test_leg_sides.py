@@ -25,27 +25,27 @@ def walk_from_the_side(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return xy, np.full((FRAMES, 15), 0.95), (t * 1e9).astype(np.int64), np.full(FRAMES, 300.0)
 
 
-def test_exchanged_legs_are_found_and_put_right():
+def test_exchanged_legs_are_exchanged_back():
     xy, confidence, stamps, size = walk_from_the_side()
     wrong = np.zeros(FRAMES, bool)
     wrong[20:26] = wrong[55] = wrong[70:80] = True
     confidence[wrong] = 0.7
     spoiled = exchange_legs(Keypoints2D(xy, confidence), wrong)
-    mended = with_own_legs(spoiled, stamps, size).xy
+    corrected = with_own_legs(spoiled, stamps, size).xy
     ankles = [LEGS["l"][1], LEGS["r"][1]]
     apart = np.abs(xy[:, ankles[0], 0] - xy[:, ankles[1], 0]) > 30  # where the legs stand together sides mean nothing
-    off = np.abs(mended[:, ankles] - xy[:, ankles]).max(axis=(1, 2)) > 20
+    off = np.abs(corrected[:, ankles] - xy[:, ankles]).max(axis=(1, 2)) > 20
     assert not (off & apart).any()
     before = np.abs(spoiled.xy[:, ankles] - xy[:, ankles]).max(axis=(1, 2)) > 20
     assert (before & apart).sum() >= 10
 
 
-def test_a_sure_network_is_believed():
+def test_correct_legs_of_a_confident_network_stay():
     xy, confidence, stamps, size = walk_from_the_side(1)
     assert not exchanged_legs(Keypoints2D(xy, confidence), stamps, size).any()
 
 
-def test_unseen_legs_are_left_alone():
+def test_unseen_legs_stay():
     xy, confidence, stamps, size = walk_from_the_side(2)
     xy[30:60] = np.nan
     confidence[30:60] = 0.0

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.skeleton import BODY_15, COCO_17, JOINT_SETS
+from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks, load_tracks, save_tracks
 
 
@@ -16,7 +16,7 @@ def arrays(frames=4, joints=BODY_15.joints):
     }
 
 
-def test_tracks_survive_a_trip_through_their_file(tmp_path):
+def test_file_round_trip(tmp_path):
     tracks = Tracks(
         keypoints=arrays()["keypoints"],
         joints=BODY_15.joints,
@@ -55,7 +55,7 @@ def test_tracks_survive_a_trip_through_their_file(tmp_path):
         ({"camera_matrix": np.zeros((3, 3))}, "focal"),
     ],
 )
-def test_arrays_that_do_not_fit_are_refused_in_one_line(tmp_path, change, words):
+def test_inconsistent_arrays_are_refused_in_one_line(tmp_path, change, words):
     path = tmp_path / "bad.npz"
     np.savez(path, **{**arrays(), **change})
     with pytest.raises(InputError, match=words) as caught:
@@ -64,7 +64,7 @@ def test_arrays_that_do_not_fit_are_refused_in_one_line(tmp_path, change, words)
     assert "bad.npz" in str(caught.value)
 
 
-def test_files_that_are_no_tracks_are_refused(tmp_path):
+def test_invalid_files_are_refused(tmp_path):
     text, whole, cut, single = (tmp_path / f"{n}.npz" for n in ("text", "whole", "cut", "single"))
     text.write_text("hello")
     np.savez(whole, **arrays())
@@ -77,11 +77,3 @@ def test_files_that_are_no_tracks_are_refused(tmp_path):
     for name in ("text", "cut", "single", "other", "object", "none"):
         with pytest.raises(InputError, match=name):
             load_tracks(tmp_path / f"{name}.npz")
-
-
-def test_mirror_is_an_involution_that_swaps_the_sides():
-    for joints in JOINT_SETS.values():
-        np.testing.assert_array_equal(joints.mirror[joints.mirror], np.arange(len(joints)))
-    assert BODY_15.joints[BODY_15.mirror[BODY_15.index("rwrist")]] == "lwrist"
-    assert COCO_17.joints[COCO_17.mirror[COCO_17.index("left_ear")]] == "right_ear"
-    assert BODY_15.mirror[BODY_15.index("neck")] == BODY_15.index("neck")

@@ -28,7 +28,7 @@ def bank(frames: int = 90) -> MocapBank:
     return MocapBank(x.astype(np.float32), np.array([0, frames]), np.array([frames, frames]), np.array([30.0, 30.0]))
 
 
-def test_virtual_camera_looks_at_the_person_with_its_head_up():
+def test_virtual_camera_sees_the_head_above_the_feet():
     azimuth, elevation, roll = np.array([0.3, 2.0]), np.array([0.2, 0.9]), np.zeros(2)
     rotation = camera_rotation(azimuth, elevation, roll)
     np.testing.assert_allclose(rotation @ np.swapaxes(rotation, 1, 2), np.tile(np.eye(3), (2, 1, 1)), atol=1e-12)
@@ -58,7 +58,7 @@ def test_samples_are_finite_repeatable_and_mostly_show_the_target(frames):
     assert np.median(gap[seen]) < 0.1
 
 
-def test_told_lengths_and_reach_agree_with_the_truth():
+def test_length_and_reach_features_agree_with_the_truth():
     batch = sample_batch(bank(), np.random.default_rng(5), 60, 64)
     length, reach = batch.features[..., 45:59], batch.features[..., 59:73]
     told = (length > 0).all(axis=(1, 2))
@@ -71,7 +71,7 @@ def test_told_lengths_and_reach_agree_with_the_truth():
     assert np.median(np.abs(reach[told] - np.abs(span[told][..., 2]))[shown]) < 0.15
 
 
-def test_files_that_cannot_be_used_are_refused(tmp_path):
+def test_unusable_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="at least one"):
         load_bank([])
     np.savez(tmp_path / "a.npz", X=np.full((5, 15, 3), np.nan), fps=30.0, joints=np.array(BODY_15.joints))

@@ -44,7 +44,7 @@ def adjusted() -> tuple[Walk, np.ndarray, AdjustmentResult]:
     return walk, start, adjust(w, start, BundleAdjusterConfig(iterations=500))
 
 
-def test_it_improves_a_bad_start(adjusted: tuple[Walk, np.ndarray, AdjustmentResult]) -> None:
+def test_wrong_initial_depths_are_corrected(adjusted: tuple[Walk, np.ndarray, AdjustmentResult]) -> None:
     walk, start, result = adjusted
     before = pa_mpjpe(start, 1000.0 * walk.in_camera).mean()
     after = pa_mpjpe(result.camera_shape, 1000.0 * walk.in_camera).mean()
@@ -52,14 +52,14 @@ def test_it_improves_a_bad_start(adjusted: tuple[Walk, np.ndarray, AdjustmentRes
     assert after < 6.0
 
 
-def test_the_cost_never_rises(adjusted: tuple[Walk, np.ndarray, AdjustmentResult]) -> None:
+def test_cost_never_rises(adjusted: tuple[Walk, np.ndarray, AdjustmentResult]) -> None:
     result = adjusted[2]
     assert np.all(np.diff(result.history) <= 1e-9 * result.history[0])
     assert result.cost == pytest.approx(sum(result.cost_terms.values()))
     assert result.cost == pytest.approx(result.history[-1], rel=1e-6)
 
 
-def test_the_cost_never_rises_through_restarts() -> None:
+def test_cost_never_rises_with_strong_nuclear_norm() -> None:
     walk = make_walk(60)
     w, scale = units(walk)
     config = BundleAdjusterConfig(iterations=600, gamma=0.0, alpha=3.0, tolerance=0.0)
@@ -77,7 +77,7 @@ def test_limb_ratios_become_constant(adjusted: tuple[Walk, np.ndarray, Adjustmen
     assert wobble(result.shape) < 0.2 * wobble(start)
 
 
-def test_scale_of_the_image_does_not_matter() -> None:
+def test_result_scales_with_the_unit() -> None:
     """Units are the caller's: the same data in units twice as large, with the weights that go with them."""
     walk = make_walk(40)
     w, scale = units(walk)
@@ -88,7 +88,7 @@ def test_scale_of_the_image_does_not_matter() -> None:
     np.testing.assert_allclose(b.camera_shape, 2.0 * a.camera_shape, atol=1e-6)
 
 
-def test_order_of_frames_in_time_and_a_roll_of_the_image_do_not_matter() -> None:
+def test_result_follows_time_reversal_and_image_roll() -> None:
     walk = make_walk(40)
     w, scale = units(walk)
     start = disturbed(walk, scale)
@@ -101,7 +101,7 @@ def test_order_of_frames_in_time_and_a_roll_of_the_image_do_not_matter() -> None
     np.testing.assert_allclose(rolled.camera_shape, result.camera_shape @ roll.T, atol=1e-7)
 
 
-def test_what_stands_at_missing_joints_does_not_matter() -> None:
+def test_values_of_missing_joints_are_ignored() -> None:
     walk = make_walk(40)
     w, scale = units(walk)
     start = disturbed(walk, scale)
@@ -116,7 +116,7 @@ def test_what_stands_at_missing_joints_does_not_matter() -> None:
     np.testing.assert_array_equal(a.camera_shape, c.camera_shape)
 
 
-def test_equal_covariances_are_no_covariances() -> None:
+def test_equal_covariances_equal_none() -> None:
     walk = make_walk(30)
     w, scale = units(walk)
     start = disturbed(walk, scale)
@@ -125,7 +125,7 @@ def test_equal_covariances_are_no_covariances() -> None:
     np.testing.assert_allclose(b.camera_shape, a.camera_shape, atol=1e-9)
 
 
-def test_a_joint_of_large_covariance_is_hardly_believed() -> None:
+def test_a_joint_of_large_covariance_has_little_weight() -> None:
     walk = make_walk(60)
     w, scale = units(walk)
     w = w.copy()
@@ -139,7 +139,7 @@ def test_a_joint_of_large_covariance_is_hardly_believed() -> None:
     assert aware < 0.5 * blind
 
 
-def test_it_says_why_it_stopped() -> None:
+def test_stop_reason_is_reported() -> None:
     walk = make_walk(30)
     w, scale = units(walk)
     start = walk.in_camera * scale
@@ -150,7 +150,7 @@ def test_it_says_why_it_stopped() -> None:
     assert long.iterations < 5000
 
 
-def test_the_same_call_gives_the_same_bits() -> None:
+def test_equal_input_gives_equal_bits() -> None:
     walk = make_walk(30)
     w, scale = units(walk)
     start = disturbed(walk, scale)
@@ -170,7 +170,7 @@ def test_wrong_shapes_are_refused(w: np.ndarray, s0: np.ndarray, match: str) -> 
         bundle_adjust(w, np.ones((5, 15, 3)), s0)
 
 
-def test_a_window_of_nothing_but_noise_still_has_a_body() -> None:
+def test_a_window_of_pure_noise_keeps_a_body() -> None:
     rng = np.random.default_rng(0)
     w, walk = rng.normal(size=(30, 15, 2)), make_walk(30)
     result = adjust(w, walk.in_camera / 0.35)
@@ -178,7 +178,7 @@ def test_a_window_of_nothing_but_noise_still_has_a_body() -> None:
     assert limb_lengths(result.shape).mean() > 0.1
 
 
-def test_noise_raises_the_weight_of_the_low_rank() -> None:
+def test_noise_raises_the_weight_of_the_nuclear_norm() -> None:
     walk = make_walk(240)
     w, scale = units(walk)
     noisy = w + np.random.default_rng(0).normal(0.0, 0.04, w.shape)

@@ -1,16 +1,14 @@
-"""Dictionary learning: the shipped one, a learned one, its file and its command."""
+"""Dictionary learning: the shipped one, a learned one and its file."""
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from walking import make_walk, write_mocap
+from walking import make_walk
 
-from drocap_ros.cli.models import learn_dictionary
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.mocap import load_mocap
@@ -28,7 +26,7 @@ from drocap_ros.reconstruction.paper.dictionary import (
 from drocap_ros.skeleton import BODY_15
 
 
-def test_the_shipped_dictionary_says_where_it_is_from(dictionary: Dictionary) -> None:
+def test_shipped_dictionary_names_its_origin(dictionary: Dictionary) -> None:
     m = dictionary.metadata
     assert m["include"] == "cmu_*"
     assert "CMU" in m["licence"][0]
@@ -39,12 +37,12 @@ def test_the_shipped_dictionary_says_where_it_is_from(dictionary: Dictionary) ->
     np.testing.assert_allclose(np.linalg.norm(dictionary.atoms, axis=(1, 2)), 1.0, atol=1e-5)
 
 
-def test_the_shipped_dictionary_is_symmetric_on_average(dictionary: Dictionary) -> None:
+def test_shipped_mean_pose_is_symmetric(dictionary: Dictionary) -> None:
     np.testing.assert_allclose(mirror_poses(dictionary.mean), dictionary.mean, atol=1e-6)
     assert np.all(np.diff(dictionary.component_std) <= 1e-9)
 
 
-def test_it_fits_people_it_was_not_learned_from(dictionary: Dictionary, shared: Path) -> None:
+def test_held_out_people_are_fitted(dictionary: Dictionary, shared: Path) -> None:
     poses = normalize_poses(load_mocap(shared / "mocap" / "dev" / "cmu_03_03.npz")[0][::20])
     assert quality(dictionary, poses)["reconstruction_error_mm"] < 35.0
 
@@ -78,7 +76,7 @@ def learned(seed: int = 0) -> Dictionary:
     return learn(poses, atoms=24, sparsity=0.01, rounds=12, batch=256, seed=seed, components=8)
 
 
-def test_learning_reduces_the_error_and_repeats_itself() -> None:
+def test_learning_reduces_the_error_and_is_repeatable() -> None:
     a, b = learned(), learned()
     np.testing.assert_array_equal(a.atoms, b.atoms)
     poses = normalize_poses(make_walk(50).shape)
@@ -94,7 +92,7 @@ def test_more_sparsity_means_fewer_active_atoms(dictionary: Dictionary) -> None:
     assert sparse["reconstruction_error_mm"] > dense["reconstruction_error_mm"]
 
 
-def test_a_dictionary_survives_its_file(tmp_path: Path) -> None:
+def test_file_round_trip(tmp_path: Path) -> None:
     a = learned()
     save_dictionary(tmp_path / "d.npz", a)
     b = load_dictionary(tmp_path / "d.npz")
@@ -102,7 +100,7 @@ def test_a_dictionary_survives_its_file(tmp_path: Path) -> None:
     assert b.metadata == a.metadata
 
 
-def test_files_that_are_no_dictionary_are_refused(tmp_path: Path, dictionary: Dictionary) -> None:
+def test_invalid_files_are_refused(tmp_path: Path, dictionary: Dictionary) -> None:
     path = tmp_path / "d.npz"
     with pytest.raises(InputError, match="no such file"):
         load_dictionary(path)
@@ -115,46 +113,3 @@ def test_files_that_are_no_dictionary_are_refused(tmp_path: Path, dictionary: Di
     save_dictionary(path, replace(dictionary, joints=("a", "b")))
     with pytest.raises(InputError, match="joints: expected those of body15"):
         load_dictionary(path)
-
-
-def command(*words: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    learn_dictionary.add_parser(parser.add_subparsers())
-    return parser.parse_args(["learn-dictionary", *words])
-
-
-def test_the_command_learns_and_reports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_mocap(tmp_path, "one_1")
-    write_mocap(tmp_path, "two_1", X=np.full((5, 15, 3), np.nan, np.float32))
-    out = tmp_path / "d.npz"
-    args = command(str(tmp_path), "--out", str(out), "--include", "one_*", "--atoms", "16", "--every", "1")
-    assert args.run(args) == 0
-    printed = capsys.readouterr().out
-    assert "reconstruction error" in printed
-    assert "active atoms" in printed
-    metadata = load_dictionary(out).metadata
-    assert (metadata["files"], metadata["licence"], metadata["origin"]) == (1, ["made here"], ["synthetic"])
-
-
-@pytest.mark.parametrize(
-    ("words", "match"),
-    [
-        (("nowhere", "--out", "d.npz"), "expected a folder of MoCap"),
-        ((".", "--out", "d.npz", "--include", "none_*"), "found none"),
-        ((".", "--out", "d.npz"), "expected finite millimetres"),
-        ((".", "--out", "nowhere/d.npz"), "--out: expected a .npz"),
-        ((".", "--out", "d.npz", "--atoms", "1"), "--atoms: expected 8 to 4096"),
-        ((".", "--out", "d.npz", "--sparsity", "nan"), "--sparsity: expected more than 0"),
-        ((".", "--out", "d.npz", "--include", "one_*", "--atoms", "4000"), "at least as many as atoms"),
-    ],
-)
-def test_the_command_refuses_what_it_cannot_use(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], match: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_mocap(tmp_path, "one_1", frames=10)
-    write_mocap(tmp_path, "two_1", X=np.full((5, 15, 3), np.nan, np.float32))
-    args = command(*words)
-    with pytest.raises(InputError, match=match):
-        args.run(args)
-    assert not list(tmp_path.glob("d.npz"))

@@ -50,7 +50,7 @@ def state() -> tuple[np.ndarray, np.ndarray]:
     return rng.normal(size=(3, 15, F)), np.moveaxis(exp_so3(rng.normal(size=(F, 3))), 0, -1)
 
 
-def test_reprojection_by_shape(projection: Projection, state: tuple[np.ndarray, np.ndarray]) -> None:
+def test_reprojection_gradient(projection: Projection, state: tuple[np.ndarray, np.ndarray]) -> None:
     s, r = state
     value, gradient = projection.value_and_gradient(s, r)
     assert value == pytest.approx(projection.value(s, r))
@@ -64,7 +64,7 @@ def test_the_translation_is_at_its_optimum(projection: Projection, state: tuple[
     np.testing.assert_allclose(pull, 0.0, atol=1e-10)
 
 
-def test_articulation(state: tuple[np.ndarray, np.ndarray]) -> None:
+def test_articulation_gradient(state: tuple[np.ndarray, np.ndarray]) -> None:
     s, _ = state
     value, gradient = articulation_term(s)
     assert value == pytest.approx(articulation_value(s))
@@ -76,7 +76,7 @@ def test_articulation_vanishes_for_a_rigid_scale(state: tuple[np.ndarray, np.nda
     assert articulation_term(s)[0] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_sum_of_all_terms(projection: Projection, state: tuple[np.ndarray, np.ndarray]) -> None:
+def test_gradient_of_the_sum_of_all_terms(projection: Projection, state: tuple[np.ndarray, np.ndarray]) -> None:
     s, r = state
     s = s - s.mean(1, keepdims=True)
     objective = Objective(projection, r, BundleAdjusterConfig(gamma=0.7))
@@ -88,7 +88,7 @@ def test_sum_of_all_terms(projection: Projection, state: tuple[np.ndarray, np.nd
     np.testing.assert_allclose(gradient, centred, atol=1e-5, rtol=1e-5)
 
 
-def test_sparse_coefficients(projection: Projection, dictionary: Dictionary) -> None:
+def test_sparse_coefficient_gradient(projection: Projection, dictionary: Dictionary) -> None:
     rng = np.random.default_rng(3)
     basis = dictionary.basis
     c = 0.3 * rng.normal(size=(len(basis), F))
@@ -102,7 +102,7 @@ def test_sparse_coefficients(projection: Projection, dictionary: Dictionary) -> 
 
 
 @pytest.mark.parametrize("smoothness", [0.0, 2.0])
-def test_rotation_updates_only_go_down(
+def test_rotation_updates_never_raise_the_cost(
     projection: Projection, state: tuple[np.ndarray, np.ndarray], smoothness: float
 ) -> None:
     s, r = state

@@ -49,11 +49,11 @@ def motion() -> LowRank:
 def test_rotations_are_exact_up_to_the_common_frame_and_mirroring(motion: LowRank) -> None:
     found = rotations_by_factorization(motion.w, 3)
     flip = np.diag([1.0, 1.0, -1.0])
-    wander = []
+    angles = []
     for candidate in (found, flip @ found @ flip):
         relative = np.swapaxes(candidate, 1, 2) @ motion.rotation
-        wander.append(float(angle_between(relative[:1], relative).max()))
-    assert min(wander) < np.deg2rad(0.01)
+        angles.append(float(angle_between(relative[:1], relative).max()))
+    assert min(angles) < np.deg2rad(0.01)
 
 
 def test_shapes_are_exact_for_known_rotations(motion: LowRank) -> None:
@@ -66,7 +66,7 @@ def test_shapes_are_exact_for_known_rotations(motion: LowRank) -> None:
     assert pa_mpjpe(poses, motion.camera).mean() < 1e-3
 
 
-def test_a_walk_comes_out_unmirrored(dictionary: Dictionary) -> None:
+def test_the_walk_is_not_mirrored(dictionary: Dictionary) -> None:
     walk = make_walk(240, speed_deg_s=90.0)
     w = walk.in_camera[..., :2] / 0.35
     poses, terms, iterations, stop = factorize(w, information_from(w, None, None), dictionary, BundleAdjusterConfig())

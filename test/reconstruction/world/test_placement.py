@@ -34,7 +34,7 @@ def capture(stature_m: float) -> SimulatedCapture:
 
 
 @pytest.mark.parametrize("true_factor", [0.8, 1.0, 1.25])
-def test_still_feet_give_the_scale_away(true_factor: float) -> None:
+def test_still_feet_determine_the_scale(true_factor: float) -> None:
     t = np.arange(240) / 24.0
     person = simulate_person(t, action="walk", seed=0)
     _, position = orbit_camera(t, person[:, 0], radius_m=6.0, height_m=2.0, speed_deg_s=25.0)
@@ -45,13 +45,13 @@ def test_still_feet_give_the_scale_away(true_factor: float) -> None:
     assert found.factor == pytest.approx(true_factor, rel=0.02)
 
 
-def test_a_camera_that_stands_still_says_nothing() -> None:
+def test_a_still_camera_gives_no_scale() -> None:
     t = np.arange(240) / 24.0
     person = simulate_person(t, action="walk", seed=0)
     assert estimate_scale(person[:, ANKLES] + 6.0, np.zeros((240, 3)), stamps(240)) is None
 
 
-def test_feet_that_never_stand_are_not_trusted() -> None:
+def test_feet_that_never_stand_give_no_trusted_scale() -> None:
     """Somebody on a swing or a bicycle: no factor keeps the feet still."""
     rng = np.random.default_rng(0)
     t = np.arange(240) / 24.0
@@ -62,7 +62,7 @@ def test_feet_that_never_stand_are_not_trusted() -> None:
 
 
 @pytest.mark.parametrize("stature_m", [1.50, 1.95])
-def test_a_moving_camera_measures_the_person(stature_m: float) -> None:
+def test_a_moving_camera_measures_the_stature(stature_m: float) -> None:
     """Assumed are 1.70 m; what is found is nearer the truth than that, and is marked as measured."""
     truth = capture(stature_m)
     motion = reconstruct(truth.tracks, method="paper")
