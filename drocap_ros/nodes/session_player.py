@@ -128,19 +128,19 @@ class SessionPlayerNode(ManagedComponent):
 
 
 def _chosen(session: Session, wanted: str) -> list[TopicInfo]:
-    """Topics to publish: those named, else all that can be; types that are not installed here are told."""
+    """Topics to publish: the named ones, else all; a type that is not installed is left out with a warning."""
     names = wanted.split()
-    there = [topic for topic in session.info.topics if topic.count]
+    present = [topic for topic in session.info.topics if topic.count]
     for name in names:
-        if not any(_fits(topic.name, name) for topic in there):
+        if not any(_fits(topic.name, name) for topic in present):
             raise InputError(
-                f"{session.path}: expected topic {name!r} with messages, found {', '.join(t.name for t in there)}; "
+                f"{session.path}: expected topic {name!r} with messages, found {', '.join(t.name for t in present)}; "
                 "name some of these"
             )
     if names:
-        chosen = [topic for topic in there if any(_fits(topic.name, name) for name in names)]
+        chosen = [topic for topic in present if any(_fits(topic.name, name) for name in names)]
     else:
-        chosen = [topic for topic in there if topic.name not in _OWN]
+        chosen = [topic for topic in present if topic.name not in _OWN]
     known = [topic for topic in chosen if _is_installed(topic.type_name)]
     for topic in chosen:
         if topic not in known:

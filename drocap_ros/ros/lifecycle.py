@@ -3,8 +3,8 @@
 ``configure`` acquires the resource, ``activate`` starts the work, ``deactivate`` stops the output and keeps the
 resource, ``cleanup`` releases it, ``shutdown`` ends the node's work for good.  With parameter ``autostart`` (default)
 a node configures and activates itself.  A source then waits until it is ready, and in a graph until the bringup
-activates it; parameter ``graph_running`` of a restarted one says that the graph needs no activation any more.  A source
-that has ended shuts down: its state is then ``finalized``.
+activates it; with parameter ``graph_running``, of a restarted node, it activates itself too.  A source that has ended
+shuts down: its state is then ``finalized``.
 """
 
 from __future__ import annotations

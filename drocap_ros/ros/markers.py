@@ -21,7 +21,7 @@ _SIGMAS = 2.0
 
 
 def pose_markers(message: Pose3D, lifetime_s: float) -> MarkerArray:
-    """Skeleton, joints and their uncertainty ellipsoids of one pose, in the pose's own frame, for a while.
+    """Skeleton, joints and their uncertainty ellipsoids of one pose, in the pose's frame, for ``lifetime_s``.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def path_marker(header: Header, positions: np.ndarray) -> Marker:
 
 
 def keypoint_marker(message: Pose2D) -> ImageMarker:
-    """Bones and a cross on each keypoint, to be drawn over the picture; without a subject it removes the last.
+    """Bones and a cross on each keypoint, drawn over the image; without a subject the previous marker is removed.
 
     One marker of lines, not one per joint: viewers keep only the last message of a topic of image markers.
 
@@ -114,7 +114,7 @@ def _line(marker: ImageMarker, start: np.ndarray, end: np.ndarray, colour: Color
 
 
 def body_transforms(message: Pose3D, frame_prefix: str = "") -> list[TransformStamped]:
-    """One frame per joint, ``<prefix>body_<id>/<joint>``, so that viewers without markers see the body too."""
+    """One frame per joint, ``<prefix>body_<id>/<joint>``, for viewers that draw no markers."""
     joints, _ = pose3d_from_ros(message)
     transforms = []
     for name, p in zip(joint_set(message.skeleton).joints, joints, strict=False):

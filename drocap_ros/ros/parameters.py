@@ -17,7 +17,7 @@ P = TypeVar("P", bound=Parameters)
 
 
 def declare_parameters(node: Node, defaults: P) -> P:
-    """Declare every field of ``defaults`` on the node and return the values that ROS settled on.
+    """Declare every field of ``defaults`` on the node and return the values after ROS's overrides.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The subject as REP 155 tells of bodies: ``/humans/bodies`` topics and TF frames.
+"""The subject by REP 155: ``/humans/bodies`` topics and TF frames.
 
 The messages are those of ``hri_msgs`` 2; ``make setup`` builds the four of them, a ROS installation has the package
 ``ros-DISTRO-hri-msgs``.  Without them only the frames are published.
@@ -26,7 +26,7 @@ try:
 except ImportError:  # optional: see above
     hri = None
 
-MISSING = "no hri_msgs here: only the frames of REP 155; install ros-$ROS_DISTRO-hri-msgs, or run `make setup`"
+MISSING = "hri_msgs is missing: only the frames of REP 155; install ros-$ROS_DISTRO-hri-msgs, or run `make setup`"
 _BODIES = "/humans/bodies"
 _QOS = QoSProfile(depth=10)
 
@@ -43,14 +43,14 @@ _CODES = {
 
 
 def body_id(track_id: int, frame_prefix: str = "") -> str:
-    """Identifier of a track; the prefix tells the bodies of two drones apart."""
-    return "_".join([*filter(None, frame_prefix.split("/")), str(track_id)])
+    """Identifier of a track; the prefix distinguishes the bodies of two drones.  No name in ROS begins with a digit."""
+    return "_".join([*filter(None, frame_prefix.split("/")), f"b{track_id}"])
 
 
 def human_transforms(message: Pose3D, frame_prefix: str = "") -> list[TransformStamped]:
     """Frame ``body_<id>`` between the hips, x forward, z up along the trunk, and one per link of :data:`LINKS` in it.
 
-    The links have the axes of the body: joints alone do not show how a limb is turned about itself.
+    The links have the axes of the body: joints alone do not determine the rotation of a limb about itself.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def human_transforms(message: Pose3D, frame_prefix: str = "") -> list[TransformS
 
 
 def skeleton2d(observation: PoseObservation, header: Header) -> Any:
-    """Keypoints as ``hri_msgs/Skeleton2D``; what is unknown or outside the image has confidence 0."""
+    """Keypoints as ``hri_msgs/Skeleton2D``; an unknown one, or one outside the image, has confidence 0."""
     message = hri.Skeleton2D(header=header)
     unit = observation.keypoints / np.array(observation.image_size)
     known = np.isfinite(unit).all(1) & (unit >= 0).all(1) & (unit <= 1).all(1)
@@ -105,7 +105,7 @@ def region(observation: PoseObservation, header: Header) -> Any:
 
 
 class HumanTopics:
-    """Publishers of the tracked bodies; those of a body go when it is tracked no more."""
+    """Publishers of the tracked body; destroyed when the track ends."""
 
     def __init__(self, node: Node, frame_prefix: str = "") -> None:
         self._node, self._prefix = node, frame_prefix
@@ -114,7 +114,7 @@ class HumanTopics:
         self._publishers: list[Any] = []
 
     def publish(self, message: Pose2D) -> None:
-        """Tell who is tracked, and box and keypoints.
+        """Publish the tracked body's identifier, box and keypoints.
 
         Raises
         ------

@@ -1,3 +1,5 @@
+"""Conversions between messages and arrays."""
+
 from array import array
 
 import numpy as np
@@ -7,6 +9,9 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.msg import Pose3D
 from drocap_ros.observation import PoseObservation
+from drocap_ros.reconstruction.live.effort import Effort
+from drocap_ros.reconstruction.live.window import AdjustedWindow
+from drocap_ros.reconstruction.stop_reason import DEADLINE
 from drocap_ros.ros import conversions as c
 from drocap_ros.skeleton import BODY_15
 
@@ -27,7 +32,7 @@ def observation(seed=0):
     )
 
 
-def test_keypoints_survive_the_trip_through_a_message_bit_for_bit():
+def test_keypoints_keep_every_bit_in_a_message():
     before = observation()
     after = c.pose2d_from_ros(c.pose2d_to_ros(before, "camera"))
     assert (after.stamp_ns, after.track_id, after.joints) == (before.stamp_ns, 7, BODY_15)
@@ -36,7 +41,7 @@ def test_keypoints_survive_the_trip_through_a_message_bit_for_bit():
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
 
 
-def test_no_subject_is_a_message_with_empty_arrays():
+def test_an_image_without_a_subject_is_a_message_with_empty_arrays():
     message = c.pose2d_to_ros(PoseObservation(5, 0, (640, 480)), "camera")
     assert len(message.keypoints) == len(message.confidence) == 0
     assert not c.pose2d_from_ros(message).has_subject
@@ -69,7 +74,7 @@ def test_a_stamp_before_1970_is_refused():
         c.pose2d_from_ros(message)
 
 
-def test_pose_survives_the_trip():
+def test_a_pose_keeps_every_bit_in_a_message():
     rng = np.random.default_rng(1)
     joints, confidence = rng.normal(size=(15, 3)).astype(np.float32), rng.uniform(size=15).astype(np.float32)
     message = c.pose3d_to_ros(
@@ -91,7 +96,35 @@ def test_pose_survives_the_trip():
         c.pose3d_from_ros(message)
 
 
-def test_unknown_vehicle_values_stay_nan():
+def adjusted(effort):
+    frames = 3
+    return AdjustedWindow(
+        stamp_ns=np.arange(frames) * 10**8,
+        joints3d=np.random.default_rng(2).normal(size=(frames, 15, 3)),
+        covariance=np.ones((frames, 15, 6)),
+        confidence=np.ones((frames, 15)),
+        reprojection_rms_px=np.full(frames, 2.0),
+        iterations=9,
+        cost=4.0,
+        stop_reason=DEADLINE,
+        cost_terms={},
+        effort=effort,
+    )
+
+
+@pytest.mark.parametrize(("steps", "sent"), [(None, []), ((4, 2), [4, 2]), ((0, 3), [0, 3])])
+def test_a_window_message_states_its_effort(steps, sent):
+    window = adjusted(Effort(2, steps))
+    message = c.window_to_ros(window, "camera", 7, 5, 0.25)
+    assert (message.window_seq, message.stride, list(message.steps)) == (5, 2, sent)
+    assert message.header.frame_id == "camera"
+    assert c.stamp_from_ros(message.header.stamp) == window.stamp_ns[-1]
+    assert {pose.stage for pose in message.poses} == {Pose3D.REFINED}
+    for pose, joints in zip(message.poses, window.joints3d, strict=True):
+        np.testing.assert_array_equal(c.pose3d_from_ros(pose)[0], joints.astype(np.float32))
+
+
+def test_unknown_values_of_the_vehicle_stay_nan():
     message = c.vehicle_state_to_ros(VehicleState(stamp_ns=3))
     assert np.isnan(message.position_enu_m).all()
     assert np.isnan(message.battery_fraction)

@@ -123,12 +123,12 @@ def test_keypoints_lie_over_the_picture_in_one_marker():
     assert len(marker.outline_colors) == len(marker.points)
 
 
-def test_without_a_subject_the_keypoints_go():
+def test_without_a_subject_the_keypoints_are_removed():
     marker = keypoint_marker(keypoints(track_id=0)[0])
     assert marker.action == ImageMarker.REMOVE
     assert not marker.points
 
 
-def test_a_prefix_tells_the_frames_of_two_drones_apart():
+def test_prefix_distinguishes_the_frames_of_two_drones():
     message, _, _ = pose()
     assert {t.child_frame_id.split("/")[0] for t in body_transforms(message, "drone2/")} == {"drone2"}

@@ -1,4 +1,4 @@
-"""The subject as REP 155 tells of bodies, from the visualizer on a running graph."""
+"""The subject by REP 155, from the visualizer on a running graph."""
 
 import contextlib
 import time
@@ -18,7 +18,7 @@ from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.nodes import visualizer
 from drocap_ros.observation import PoseObservation
-from drocap_ros.ros import rep155 as humans
+from drocap_ros.ros import rep155
 from drocap_ros.ros.conversions import header_at, pose2d_to_ros, pose3d_to_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import RESULT_QOS, TFMessage
@@ -69,19 +69,19 @@ def turn(q):
     return matrix_from_quaternion(np.array([q.x, q.y, q.z, q.w]))
 
 
-def test_the_frames_put_every_joint_where_it_is(capture):
+def test_frames_place_every_joint_at_its_position(capture):
     joints = capture.joints3d_world[0]
-    body, *links = humans.human_transforms(pose3d(joints))
-    assert (body.header.frame_id, body.child_frame_id) == ("map", "body_7")
+    body, *links = rep155.human_transforms(pose3d(joints))
+    assert (body.header.frame_id, body.child_frame_id) == ("map", "body_b7")
     place, axes = vector(body.transform.translation), turn(body.transform.rotation)
     np.testing.assert_allclose(place, joints[[BODY_15.index("lhip"), BODY_15.index("rhip")]].mean(0), atol=1e-5)
     found = {}
     for link in links:
-        assert link.header.frame_id == "body_7"
+        assert link.header.frame_id == "body_b7"
         found[link.child_frame_id] = place + axes @ vector(link.transform.translation)
-    assert set(found) == {f"{link}_7" for link in humans.LINKS.values()}
-    np.testing.assert_allclose(found["l_knee_7"], joints[BODY_15.index("lknee")], atol=1e-5)
-    np.testing.assert_allclose(found["head_7"], joints[BODY_15.index("head")], atol=1e-5)
+    assert set(found) == {f"{link}_b7" for link in rep155.LINKS.values()}
+    np.testing.assert_allclose(found["l_knee_b7"], joints[BODY_15.index("lknee")], atol=1e-5)
+    np.testing.assert_allclose(found["head_b7"], joints[BODY_15.index("head")], atol=1e-5)
     # x forward, z towards the head: the left hip lies to the left.
     assert (axes.T @ (joints[BODY_15.index("head")] - place))[2] > 0.5
     assert (axes.T @ (joints[BODY_15.index("lhip")] - place))[1] > 0.05
@@ -90,20 +90,20 @@ def test_the_frames_put_every_joint_where_it_is(capture):
 def test_without_a_trunk_there_is_no_body_frame(capture):
     joints = capture.joints3d_world[0].copy()
     joints[BODY_15.index("neck")] = np.nan
-    assert humans.human_transforms(pose3d(joints)) == []
-    assert humans.human_transforms(Pose3D(skeleton="body15")) == []
+    assert rep155.human_transforms(pose3d(joints)) == []
+    assert rep155.human_transforms(Pose3D(skeleton="body15")) == []
 
 
-def test_keypoints_are_shares_of_the_image_and_none_lies_outside(capture):
+def test_keypoints_are_relative_to_the_image_and_none_lies_outside(capture):
     points = np.tile([320.0, 120.0], (15, 1))
     points[BODY_15.index("rwrist")] = (700.0, 100.0)
     points[BODY_15.index("lknee")] = np.nan
-    skeleton = humans.skeleton2d(observation(points), Header()).skeleton
+    skeleton = rep155.skeleton2d(observation(points), Header()).skeleton
     elbow = skeleton[hri.Skeleton2D.RIGHT_ELBOW]
     assert (elbow.x, elbow.y, elbow.c) == pytest.approx((0.5, 0.25, 0.8))
     for code in (hri.Skeleton2D.RIGHT_WRIST, hri.Skeleton2D.LEFT_KNEE, hri.Skeleton2D.NOSE):
         assert skeleton[code].c == 0.0
-    box = humans.region(observation(points), Header())
+    box = rep155.region(observation(points), Header())
     assert (box.xmin, box.ymin, box.xmax, box.ymax) == pytest.approx((0.1, 0.1, 0.5, 1.0))
 
 
@@ -134,14 +134,15 @@ def graph(**parameters):
             context.try_shutdown()
 
 
-def test_a_running_graph_tells_of_the_body_while_it_is_tracked(capture):
+@pytest.mark.parametrize(("prefix", "name"), [("", "b7"), ("drone2/", "drone2_b7")])
+def test_tracked_body_is_published_while_it_is_tracked(capture, prefix, name):
     points = np.tile([320.0, 120.0], (15, 1))
-    with graph(human_topics=True, frame_prefix="drone2/") as (node, other, until):
+    with graph(human_topics=True, frame_prefix=prefix) as (node, other, until):
         ids, skeletons, boxes, frames = [], [], [], []
         qos = QoSProfile(depth=10)
         other.create_subscription(hri.IdsList, "/humans/bodies/tracked", lambda m: ids.append(list(m.ids)), qos)
-        other.create_subscription(hri.Skeleton2D, "/humans/bodies/drone2_7/skeleton2d", skeletons.append, qos)
-        other.create_subscription(hri.NormalizedRegionOfInterest2D, "/humans/bodies/drone2_7/roi", boxes.append, qos)
+        other.create_subscription(hri.Skeleton2D, f"/humans/bodies/{name}/skeleton2d", skeletons.append, qos)
+        other.create_subscription(hri.NormalizedRegionOfInterest2D, f"/humans/bodies/{name}/roi", boxes.append, qos)
         other.create_subscription(
             TFMessage, "/tf", lambda m: frames.extend(t.child_frame_id for t in m.transforms), RESULT_QOS
         )
@@ -161,16 +162,16 @@ def test_a_running_graph_tells_of_the_body_while_it_is_tracked(capture):
             return ids and skeletons and boxes and frames
 
         until(arrived)
-        assert ids[-1] == ["drone2_7"]
+        assert ids[-1] == [name]
         assert skeletons[-1].header == seen.header
-        assert {"body_drone2_7", "l_wrist_drone2_7", "drone2/body_7/lwrist"} <= set(frames)
+        assert {f"body_{name}", f"l_wrist_{name}", f"{prefix}body_7/lwrist"} <= set(frames)
 
         keypoints.publish(pose2d_to_ros(observation(points, track_id=0), "camera_optical"))
         until(lambda: ids[-1] == [])
-        until(lambda: not node.get_publishers_info_by_topic("/humans/bodies/drone2_7/skeleton2d"))
+        until(lambda: not node.get_publishers_info_by_topic(f"/humans/bodies/{name}/skeleton2d"))
 
 
-def test_without_hri_msgs_the_frames_remain_and_diagnostics_say_why(capture, monkeypatch):
+def test_without_hri_msgs_the_frames_remain_and_the_status_names_the_reason(capture, monkeypatch):
     monkeypatch.setattr(visualizer, "hri", None)
     with graph(human_topics=True) as (node, other, until):
         frames = []
@@ -179,12 +180,12 @@ def test_without_hri_msgs_the_frames_remain_and_diagnostics_say_why(capture, mon
         until(lambda: poses.get_subscription_count() and node.count_subscribers("/tf"))
         poses.publish(pose3d(capture.joints3d_world[0]))
         until(lambda: frames)
-        assert "body_7" in {t.child_frame_id for t in frames}
-        assert node._text.endswith(humans.MISSING)
+        assert "body_b7" in {t.child_frame_id for t in frames}
+        assert node._text.endswith(rep155.MISSING)
         assert not node.get_publishers_info_by_topic("/humans/bodies/tracked")
 
 
-def test_markers_come_at_their_rate_and_frames_with_every_pose(capture):
+def test_markers_have_their_rate_and_every_pose_its_frames(capture):
     with graph(marker_rate_hz=10.0) as (node, other, until):
         arrays, frames = [], []
         other.create_subscription(MarkerArray, "markers/initial", arrays.append, RESULT_QOS)
