@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from pathlib import Path
+from typing import Any
 
-from drocap_ros.config import DrocapConfig, section_types
+# The sources of this checkout, not an installed package.
+sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
+
+from drocap_ros.config import DrocapConfig, section_types  # noqa: E402
 
 HEADER = """# Parameters
 
-Made from the components' dataclasses by `python docs/make_parameters.py`; the same table feeds the ROS
-parameter declarations and the YAML loader. A configuration file has the form of a ROS 2 parameter file:
+`python docs/make_parameters.py` writes this page from the components' dataclasses, which are also the source of the ROS
+parameter declarations and of the YAML loader. A configuration file has the form of a ROS 2 parameter file:
 
 ```yaml
 /**/pose_estimator:
@@ -37,7 +42,7 @@ def render() -> str:
     return "".join(parts)
 
 
-def _range(meta: dict) -> str:
+def _range(meta: Any) -> str:
     if meta["choices"]:
         return ", ".join(meta["choices"])
     low, high = meta["minimum"], meta["maximum"]

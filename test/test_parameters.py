@@ -30,23 +30,23 @@ class Example(Parameters):
         ({"radius": 3.0}, "unknown parameter 'radius'"),
     ],
 )
-def test_a_value_that_cannot_be_used_is_refused_with_the_reason(values, words):
+def test_unusable_value_is_refused_with_its_range(values, words):
     with pytest.raises(ParameterError, match=words) as caught:
         Example.from_mapping(values)
     assert "\n" not in str(caught.value)
 
 
-def test_a_whole_number_is_a_float_too():
+def test_integer_is_accepted_for_a_float():
     assert Example(radius_m=7).radius_m == 7.0
 
 
 @pytest.mark.parametrize("component", section_types())
-def test_every_parameter_says_what_it_is(component):
+def test_every_parameter_has_a_description(component):
     for spec in dataclasses.fields(section_types()[component]):
         assert spec.metadata["description"], f"{component}.{spec.name}"
 
 
-def test_the_configuration_survives_a_trip_through_a_parameter_file(tmp_path):
+def test_configuration_read_back_from_its_parameter_file_is_equal(tmp_path):
     import yaml
 
     config = DrocapConfig().replace("image_ingest", source="flight.mp4", jpeg_quality=77)
@@ -72,7 +72,7 @@ def test_every_shipped_configuration_loads(root):
         ("/**/pose_estimator: {ros__parameters: {threads: 0}}", "pose_estimator|PoseEstimatorConfig"),
     ],
 )
-def test_a_bad_configuration_file_is_refused_in_one_line(tmp_path, text, words):
+def test_bad_configuration_file_is_refused_in_one_line(tmp_path, text, words):
     path = tmp_path / "config.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=words) as caught:
@@ -80,11 +80,11 @@ def test_a_bad_configuration_file_is_refused_in_one_line(tmp_path, text, words):
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_configuration_file_is_refused(tmp_path):
+def test_missing_configuration_file_is_refused(tmp_path):
     with pytest.raises(InputError, match="No such file"):
         load_config(tmp_path / "none.yaml")
 
 
-def test_ros_own_parameters_may_stand_in_the_file():
+def test_parameters_of_ros_itself_are_ignored():
     config = parse_config({"/drocap/initializer": {"ros__parameters": {"use_sim_time": True}}}, "x")
     assert config == DrocapConfig()

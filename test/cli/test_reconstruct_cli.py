@@ -1,4 +1,4 @@
-"""``drocap reconstruct`` as a user runs it: real videos, and whatever else people feed it."""
+"""``drocap reconstruct`` as a process: real videos, tracks files, unusable input."""
 
 import json
 import os
@@ -23,7 +23,7 @@ BLAZEPOSE = [24, 26, 28, 23, 25, 27, 11, 13, 15, 12, 14, 16]
 
 
 def drocap(*arguments, cwd, **env):
-    # A terminal's colours and a models folder of the person who runs the tests must not matter.
+    # The environment of the test run must not reach the command.
     clean = {k: v for k, v in os.environ.items() if k not in ("DROCAP_MODELS", "DROCAP_DEBUG")}
     clean["PYTHONPATH"] = str(ROOT)
     command = [sys.executable, "-m", "drocap_ros.cli", *map(str, arguments)]
@@ -59,7 +59,7 @@ def changed(path, **arrays):
     return path.parent / "changed.npz"
 
 
-def test_a_walk_outdoors(shared, tmp_path):
+def test_outdoor_walk_gives_an_upright_motion_of_every_frame(shared, tmp_path):
     motion = reconstructed(shared / "media" / "outdoor_walk.mp4", tmp_path, "--models", shared / "models")
     assert motion.joints3d.shape == (230, 15, 3)
     assert motion.joints3d.dtype == np.float64
@@ -74,19 +74,19 @@ def test_a_walk_outdoors(shared, tmp_path):
     assert motion.meta["stop_reason"]
 
 
-def test_squats_against_another_system(shared, tmp_path):
+def test_squats_agree_with_another_system(shared, tmp_path):
     motion = reconstructed(shared / "media" / "pose_squats.mp4", tmp_path, "--models", shared / "models")
     assert np.isfinite(motion.keypoints).all(axis=2).any(axis=1).mean() >= 0.95
     landmarks = json.loads((shared / "media" / "pose_squats_landmarks3d.json").read_text())
     other = np.array(landmarks, float)[: len(motion.joints3d), BLAZEPOSE, :3]
     ours = motion.joints3d[:, indices(motion.joints, LIMB_JOINTS)]
-    # Not a truth, another estimate: agreement to a hand's breadth shows that nothing is flipped or mixed up.
+    # Another estimate, not a truth: agreement within 130 mm excludes mirrored and exchanged joints.
     error = 1000 * pa_mpjpe(ours, other, LIMB_JOINTS).mean()
     print(f"pose_squats.mp4 against the other system's landmarks, 12 limb joints: {error:.1f} mm")
     assert error < 130
 
 
-def test_the_same_input_gives_the_same_arrays(tracks_file, tmp_path):
+def test_same_input_gives_the_same_arrays(tracks_file, tmp_path):
     first = reconstructed(tracks_file, tmp_path)
     (tmp_path / "again").mkdir()
     second = reconstructed(tracks_file, tmp_path / "again")
@@ -103,7 +103,7 @@ def test_every_method_runs_on_tracks(tracks_file, tmp_path, method):
     assert (tmp_path / "out" / "preview.png").stat().st_size > 10_000
 
 
-def test_one_frame_is_enough_for_a_pose(tracks_file, tmp_path):
+def test_one_frame_gives_a_pose(tracks_file, tmp_path):
     capture = simulate_capture(0.05, 20.0, seed=1)
     save_tracks(tmp_path / "one.npz", capture.tracks)
     motion = reconstructed(tmp_path / "one.npz", tmp_path)
@@ -121,12 +121,12 @@ def test_one_frame_is_enough_for_a_pose(tracks_file, tmp_path):
         ({"covariance": np.full((72, 15, 3), -1.0)}, "covariance"),
     ],
 )
-def test_tracks_that_cannot_be_used_are_refused(tracks_file, tmp_path, change, words):
+def test_unusable_tracks_are_refused(tracks_file, tmp_path, change, words):
     path = changed(tracks_file, **change)
     assert_refused(drocap("reconstruct", path, "--out", "out", cwd=tmp_path), tmp_path, words)
 
 
-def test_files_that_are_no_video_are_refused(tmp_path):
+def test_files_without_a_video_are_refused(tmp_path):
     (tmp_path / "text.mp4").write_text("This is not a video.\n" * 50)
     (tmp_path / "empty.mp4").touch()
     (tmp_path / "folder").mkdir()
@@ -139,14 +139,14 @@ def test_files_that_are_no_video_are_refused(tmp_path):
         assert_refused(drocap("reconstruct", name, "--out", "out", cwd=tmp_path), tmp_path, words)
 
 
-def test_a_truncated_video_is_refused(shared, tmp_path):
+def test_truncated_video_is_refused(shared, tmp_path):
     data = (shared / "media" / "pose_squats.mp4").read_bytes()
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) // 2])
     done = drocap("reconstruct", "cut.mp4", "--models", shared / "models", "--out", "out", cwd=tmp_path)
     assert_refused(done, tmp_path, "cut.mp4")
 
 
-def test_a_models_folder_without_a_pose_model_is_refused(shared, tmp_path):
+def test_models_folder_without_a_pose_model_is_refused(shared, tmp_path):
     models = tmp_path / "models"
     models.mkdir()
     for names in ((), ("rtmdet-nano.onnx",)):
@@ -157,14 +157,14 @@ def test_a_models_folder_without_a_pose_model_is_refused(shared, tmp_path):
         assert_refused(done, tmp_path, "drocap models fetch")
 
 
-def test_an_output_that_cannot_be_written_is_refused_before_the_work(tracks_file, tmp_path):
+def test_unwritable_output_is_refused_before_the_work(tracks_file, tmp_path):
     (tmp_path / "file").touch()
     done = drocap("reconstruct", tracks_file, "--out", "file", cwd=tmp_path)
     assert done.returncode == 2
     assert "expected a folder" in done.stderr
 
 
-def test_help_lists_only_what_works(tmp_path):
+def test_every_listed_command_has_a_help_text(tmp_path):
     done = drocap("--help", cwd=tmp_path)
     assert done.returncode == 0
     commands = set(re.findall(r"^    ([a-z][a-z-]+)", done.stdout, re.MULTILINE))
