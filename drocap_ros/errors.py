@@ -12,7 +12,7 @@ class DrocapError(Exception):
 class InputError(DrocapError):
     """An input, option, message or parameter cannot be used; a command ends with status 2.
 
-    The text is one line: what was expected, what was found, what to do.
+    The text is one line: the expectation, the finding, the remedy.
     """
 
     exit_status = 2

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import logging
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.sources import Frame, open_source
 from drocap_ros.perception.track_video import observe, tracks_from_observations
+from drocap_ros.reconstruction.methods.method_input import Progress
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording.image_messages import read_images
 from drocap_ros.recording.open_session import is_recording, open_session
@@ -29,8 +30,6 @@ from drocap_ros.recording.telemetry.time_offset import find_offset
 from drocap_ros.tracks import Tracks, load_tracks
 
 logger = logging.getLogger(__name__)
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)

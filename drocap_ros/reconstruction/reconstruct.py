@@ -139,7 +139,7 @@ def _to_motion(
     meta: dict[str, Any] = {"assumed_height_m": config.assumed_height_m, "reference_stature_m": REFERENCE_STATURE_M}
     rotation, frame = np.broadcast_to(np.eye(3), (len(tracks), 3, 3)).copy(), "camera"
     if tracks.camera_rotation is None and tracks.camera_matrix is not None:
-        # Joints behind the pelvis are farther from the axis than they look: undo the perspective, as place_in_world.
+        # Undo the perspective, as place_in_world: it moves joints behind the pelvis towards the axis.
         range_m = 0.5 * (tracks.camera_matrix[0, 0] + tracks.camera_matrix[1, 1]) * per_px
         joints[..., :2] *= np.maximum(1.0 + joints[..., 2] / range_m[:, None], 0.1)[..., None]
     if tracks.camera_rotation is not None:

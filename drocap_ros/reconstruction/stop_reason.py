@@ -12,6 +12,6 @@ DEADLINE = "deadline"
 #: The window has too few frames for an adjustment.
 TOO_SHORT = "too short"
 #: The method has no adjustment.
-START_ONLY = "start only"
+NO_ADJUSTMENT = "no adjustment"
 #: The recording is shorter than the live method's first window.
 NO_WINDOW = "no window was due"

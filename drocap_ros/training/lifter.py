@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import math
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,12 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drocap_ros.errors import DrocapError, InputError
+from drocap_ros.errors import DrocapError
 from drocap_ros.parameters import Parameters, param
 from drocap_ros.reconstruction.lifted.lifter_input import FEATURES
 from drocap_ros.skeleton import BODY_15, LIMB_JOINTS, indices
 from drocap_ros.tracks import read_npz
 from drocap_ros.training.lifter_samples import MocapBank, sample_batch
+from drocap_ros.training.torch_extra import pytorch, write_onnx
 
 if TYPE_CHECKING:
     import torch
@@ -44,26 +44,6 @@ class LifterTraining(Parameters):
     )
     weight_decay: float = param(0.02, "decoupled weight decay", minimum=0.0, maximum=1.0)
     seed: int = param(0, "of the samples and of the first weights", minimum=0)
-
-
-def pytorch() -> Any:
-    """PyTorch.
-
-    Raises
-    ------
-    DrocapError
-        When PyTorch is not installed.
-    """
-    try:
-        import torch
-    except ImportError:
-        raise DrocapError("training needs PyTorch, which is not installed; pip install 'drocap_ros[train]'") from None
-    return torch
-
-
-def set_threads(count: int) -> None:
-    """Threads of PyTorch."""
-    pytorch().set_num_threads(count)
 
 
 def describe_training(
@@ -199,7 +179,7 @@ def train(
     optimisers = _optimisers(network, options)
     peaks = [options.learning_rate, options.matrix_learning_rate]
     begin = time.monotonic()
-    step, frames_seen, shown, saved, smooth = 0, 0, 0.0, 0.0, math.nan
+    step, frames_seen, reported, saved, smooth = 0, 0, 0.0, 0.0, math.nan
     while (elapsed := (time.monotonic() - begin) / 60) < options.minutes:
         frames = int(rng.choice([16, 64, 160, 240], p=[0.05, 0.1, 0.45, 0.4]))
         batch = sample_batch(bank, rng, max(options.frames_per_batch // frames, 1), frames)
@@ -219,8 +199,8 @@ def train(
         with torch.no_grad():
             torch._foreach_lerp_(list(average.parameters()), list(network.parameters()), 1 - keep)
         smooth = distance if math.isnan(smooth) else 0.99 * smooth + 0.01 * distance
-        if elapsed - shown > 0.5:
-            shown = elapsed
+        if elapsed - reported > 0.5:
+            reported = elapsed
             report(f"{elapsed:6.1f} min  step {step}  frames {frames_seen / 1e6:.2f} M  error {smooth:.4f} of the size")
         if elapsed - saved > checkpoint_minutes:
             saved = elapsed
@@ -231,63 +211,8 @@ def train(
 
 
 def export_onnx(network: torch.nn.Module, path: Path, facts: dict[str, str]) -> None:
-    """Write the lifter as ONNX, see :func:`write_onnx`."""
+    """Write the lifter as ONNX, with :func:`drocap_ros.training.torch_extra.write_onnx`."""
     torch = pytorch()
     names = (["features"], ["joints", "log_sigma"])
     axes = {name: {0: "windows", 1: "frames"} for name in (*names[0], *names[1])}
     write_onnx(network, torch.zeros(2, 16, FEATURES), path, *names, axes, facts)
-
-
-def write_onnx(
-    network: torch.nn.Module,
-    example: torch.Tensor,
-    path: Path,
-    inputs: list[str],
-    outputs: list[str],
-    axes: dict[str, dict[int, str]],
-    facts: dict[str, str],
-) -> None:
-    """Write a network as ONNX with weights in half precision (computed in single) and ``facts`` as metadata.
-
-    ``axes`` names the variable dimensions per input and output.
-    """
-    torch = pytorch()
-    try:
-        import onnx
-        from onnx import TensorProto, helper, numpy_helper
-    except ImportError:
-        raise DrocapError("export needs the package onnx, which is not installed; pip install onnx") from None
-    if path.suffix != ".onnx":
-        raise InputError(f"--out: expected a file name ending in .onnx, got {path.name!r}")
-    network = copy.deepcopy(network).eval().float()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with warnings.catch_warnings():
-        # The exporter warns of its deprecation and of unfolded slices.
-        warnings.simplefilter("ignore")
-        torch.onnx.export(
-            network,
-            (example,),
-            str(path),
-            input_names=inputs,
-            output_names=outputs,
-            dynamic_axes=axes,
-            opset_version=17,
-            dynamo=False,
-        )
-    model = onnx.load(str(path))
-    kept, casts = [], []
-    for tensor in model.graph.initializer:
-        array = numpy_helper.to_array(tensor)
-        if array.dtype == np.float32 and array.size > 1024:
-            half = numpy_helper.from_array(array.astype(np.float16), tensor.name + "_half")
-            kept.append(half)
-            casts.append(helper.make_node("Cast", [half.name], [tensor.name], to=TensorProto.FLOAT))
-        else:
-            kept.append(tensor)
-    nodes = casts + list(model.graph.node)
-    del model.graph.initializer[:], model.graph.node[:]
-    model.graph.initializer.extend(kept)
-    model.graph.node.extend(nodes)
-    helper.set_model_props(model, facts)
-    onnx.checker.check_model(model)
-    onnx.save(model, str(path))

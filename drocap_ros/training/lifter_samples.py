@@ -233,7 +233,7 @@ def _project(body: np.ndarray, rng: np.random.Generator) -> Batch:
     windows, frames = body.shape[:2]
     seen = np.einsum("btij,btpj->btpi", _orbit(rng, windows, frames), body, optimize=True)
 
-    # Half of the cameras are orthographic; the others stand 3-15 m away, and the distance drifts.
+    # Half of the cameras are orthographic; the others are 3-15 m away, and the distance drifts.
     away = np.exp(rng.uniform(np.log(3), np.log(15), (windows, 1))) * (1 + 0.05 * _slow(rng, windows, frames, ()))
     inverse = np.where(rng.random((windows, 1)) < 0.6, 0, 1 / away).astype(np.float32)
     zoom = np.where(inverse > 0, inverse / np.maximum(inverse.mean(axis=1, keepdims=True), 1e-6), 1).astype(np.float32)

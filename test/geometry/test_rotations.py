@@ -66,9 +66,3 @@ def test_completion_is_the_projection_on_the_stiefel_manifold() -> None:
     others = Rotation.random(500, random_state=1).as_matrix()[:, :2]
     best = np.linalg.norm(rows[:, None] - others[None], axis=(2, 3)).min(1)
     assert np.all(np.linalg.norm(rows - r[:, :2], axis=(1, 2)) <= best)
-
-
-def test_angle_between_small_and_large() -> None:
-    for angle in (0.0, 1e-9, 1e-3, 1.0, np.pi):
-        r = so3.exp_so3(np.array([0.0, angle, 0.0]))
-        assert so3.angle_between(np.eye(3), r) == pytest.approx(angle, rel=1e-6, abs=1e-12)

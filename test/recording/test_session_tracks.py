@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
+from angles import angle_between
 from recorded import NAMES, START_NS, record, write_poses
 
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.rotations import angle_between
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_pose2d
 from drocap_ros.simulation.vehicle.flight_path import SampledPath

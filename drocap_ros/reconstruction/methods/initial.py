@@ -10,7 +10,7 @@ from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodIn
 from drocap_ros.reconstruction.methods.windows import normalized_windows, placed, split
 from drocap_ros.reconstruction.paper.reprojection import information_from
 from drocap_ros.reconstruction.paper.single_view import initialize
-from drocap_ros.reconstruction.stop_reason import START_ONLY
+from drocap_ros.reconstruction.stop_reason import NO_ADJUSTMENT
 
 
 def run(data: MethodInput) -> CameraPoses:
@@ -21,7 +21,7 @@ def run(data: MethodInput) -> CameraPoses:
     keypoints = data.keypoints
     weights = inlier if keypoints.confidence is None else inlier * np.nan_to_num(keypoints.confidence)
     information = information_from(keypoints.xy, weights, keypoints.covariance)
-    return CameraPoses(*split(placed(joints, keypoints.xy, information)), seconds, 0, START_ONLY, {})
+    return CameraPoses(*split(placed(joints, keypoints.xy, information)), seconds, 0, NO_ADJUSTMENT, {})
 
 
 def initial_poses(data: MethodInput) -> tuple[np.ndarray, np.ndarray]:

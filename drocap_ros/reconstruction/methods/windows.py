@@ -61,7 +61,7 @@ def windows(frames: int, length: int, overlap: int) -> list[slice]:
         return [slice(0, frames)]
     overlap = min(overlap, length // 2)
     count = int(np.ceil((frames - overlap) / (length - overlap)))
-    # No longer than the overlap needs: 1000 frames take three windows of 374, not of 480.
+    # The shortest windows with this overlap: 1000 frames take three windows of 374, not of 480.
     length = int(np.ceil((frames + (count - 1) * overlap) / count))
     begins = np.round(np.linspace(0, frames - length, count)).astype(int)
     return [slice(int(begin), int(begin) + length) for begin in begins]

@@ -83,16 +83,14 @@ def soft_threshold(x: np.ndarray, tau: float | np.floating | np.ndarray) -> np.n
     return np.sign(x) * np.maximum(np.abs(x) - tau, 0.0)
 
 
-def sparse_code(
-    poses: np.ndarray, atoms: np.ndarray, sparsity: float, *, start: np.ndarray | None = None, iterations: int = 60
-) -> np.ndarray:
+def sparse_code(poses: np.ndarray, atoms: np.ndarray, sparsity: float, *, iterations: int = 60) -> np.ndarray:
     """Coefficients (N, K) of flattened, mean-free poses (N, 3P): lasso by accelerated proximal gradient.
 
     Minimizes ``0.5 |poses - C atoms|^2 + sparsity |C|_1`` for atoms (K, 3P).
     """
     gram, target = atoms @ atoms.T, poses @ atoms.T
     step = 1.0 / np.linalg.norm(atoms, 2) ** 2
-    c = np.zeros_like(target) if start is None else start
+    c = np.zeros_like(target)
     ahead, t = c, 1.0
     for _ in range(iterations):
         new = soft_threshold(ahead - step * (ahead @ gram - target), np.float32(step * sparsity))

@@ -71,14 +71,14 @@ def minimize_nuclear_norm(
     rotation: np.ndarray,
     config: BundleAdjusterConfig,
     *,
-    start: np.ndarray | None = None,
+    initial: np.ndarray | None = None,
 ) -> tuple[np.ndarray, dict[str, float], dict[str, Any]]:
     """Shapes (F, P, 3) in the common frame for known rotations (F, 3, 3); cost per term; the solver's outcome.
 
-    Without ``start`` the initial shapes are the joints back-projected into the common frame without depth.
+    Without ``initial`` the first shapes are the joints back-projected into the common frame without depth.
     """
     centred = w - w.mean(axis=1, keepdims=True)
-    s = frames_last(centred @ rotation[:, :2] if start is None else start)
+    s = frames_last(centred @ rotation[:, :2] if initial is None else initial)
     fixed = _FixedCameras(Projection(w, information), np.ascontiguousarray(np.moveaxis(rotation, 0, -1)), config)
     s, outcome = minimize(fixed, s)
     return frames_first(s), fixed.terms(s), outcome

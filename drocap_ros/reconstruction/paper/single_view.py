@@ -46,7 +46,7 @@ def initialize(
     information : (F, P, 3) of :func:`~drocap_ros.reconstruction.paper.reprojection.information_from`
     """
     config = config or InitializerConfig()
-    given = information
+    measured = information
     dense = search_viewpoints(w, information, dictionary, config)
     path = choose_path(dense.cost, dense.camera_shape, config.switch_cost)
     frames = np.arange(len(w))
@@ -58,7 +58,7 @@ def initialize(
         if k < config.em_rounds:
             rotation, coefficients = fit.rotation, fit.coefficients
             information = expected_information(
-                w, given, projected_joints(projection, fit), config.keypoint_std, outlier_share=config.outlier_share
+                w, measured, projected_joints(projection, fit), config.keypoint_std, outlier_share=config.outlier_share
             )
     return SingleViewFit(fit.shape, fit.rotation, information)
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from angles import angle_between
 from walking import make_walk
 
 from drocap_ros.evaluation.metrics import is_mirrored, pa_mpjpe
 from drocap_ros.evaluation.protocol import orbit_rotations
-from drocap_ros.geometry.rotations import angle_between
 from drocap_ros.reconstruction.paper.dictionary import Dictionary
 from drocap_ros.reconstruction.paper.mf_nnm import (
     factorize,
@@ -61,7 +61,7 @@ def test_shapes_are_exact_for_known_rotations(motion: LowRank) -> None:
     s, config = None, BundleAdjusterConfig(iterations=300, tolerance=0.0)
     for alpha in (3.0, 1.0, 0.3, 0.1, 0.03, 0.01):
         config = BundleAdjusterConfig(alpha=alpha, gamma=0.0, iterations=300, tolerance=0.0)
-        s, _, _ = minimize_nuclear_norm(motion.w, information, motion.rotation, config, start=s)
+        s, _, _ = minimize_nuclear_norm(motion.w, information, motion.rotation, config, initial=s)
     poses = s @ np.swapaxes(motion.rotation, 1, 2)
     assert pa_mpjpe(poses, motion.camera).mean() < 1e-3
 

@@ -4,11 +4,11 @@ import socket
 import time
 
 import numpy as np
+from angles import angle_between
 from recorded import NAMES
 
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.geometry.rotations import angle_between
 from drocap_ros.recording.mcap.schemas import schema_text
 from drocap_ros.recording.mcap.writer import SessionWriter
 from drocap_ros.recording.open_session import open_session
