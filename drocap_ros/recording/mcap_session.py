@@ -9,7 +9,7 @@ from typing import Any
 from drocap_ros.errors import InputError
 from drocap_ros.recording.mcap.metadata import METADATA_RECORD, FileRecord
 from drocap_ros.recording.mcap.schemas import standard_types
-from drocap_ros.recording.mcap.stream import MAGIC, McapChannel, McapStream, ros2_name
+from drocap_ros.recording.mcap.stream import MAGIC, McapChannel, McapStream, counted_channels
 from drocap_ros.recording.session import RawMessage, Session, SessionInfo, TopicInfo
 
 
@@ -57,10 +57,9 @@ class McapSession(Session):
         times: list[int] = []
         metadata = dict(self._metadata)
         for stream in self._streams:
-            for key, value in stream.metadata().get(METADATA_RECORD, {}).items():
-                metadata.setdefault(key, value)
             if not _count_by_summary(stream, counts, times):
                 self._count_by_messages(stream, counts, times)
+            metadata = stream.metadata().get(METADATA_RECORD, {}) | metadata
         return SessionInfo(
             path=self.path,
             kind="rosbag2 folder, MCAP" if self.path.is_dir() else "MCAP",
@@ -98,10 +97,9 @@ def _count_by_summary(stream: McapStream, counts: dict[tuple[str, str], int], ti
     statistics = summary.statistics
     if len(summary.channels) != statistics.channel_count:
         return False
-    for number, record in summary.channels.items():
-        schema = summary.schemas.get(record.schema_id)
-        key = (record.topic, ros2_name(schema.name) if schema is not None else "")
-        counts[key] = counts.get(key, 0) + statistics.channel_message_counts.get(number, 0)
+    for channel, count in counted_channels(summary):
+        key = (channel.topic, channel.type_name)
+        counts[key] = counts.get(key, 0) + count
     if statistics.message_count:
         times += [statistics.message_start_time, statistics.message_end_time]
     return True

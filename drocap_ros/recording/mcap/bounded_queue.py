@@ -20,16 +20,20 @@ class BoundedQueue:
     """Messages in order of arrival, at most ``limit_bytes`` of them.
 
     An image that does not fit is dropped; any other message that does not fit replaces the oldest images, and is
-    dropped only when none are left.  Images use at most seven eighths of the space.  Drops are counted by topic.
+    dropped only when none are left.  Images use at most seven eighths of the space.
+
+    size : queued bytes
+    closed : whether further messages are refused
+    dropped : messages by topic
     """
 
     def __init__(self, limit_bytes: int) -> None:
         self._limit = limit_bytes
         self._images: deque[tuple[int, QueuedMessage]] = deque()
         self._others: deque[tuple[int, QueuedMessage]] = deque()
-        self._size = 0
+        self.size = 0
         self._arrivals = 0
-        self._closed = False
+        self.closed = False
         self._changed = threading.Condition()
         self.dropped: Counter[str] = Counter()
 
@@ -39,46 +43,36 @@ class BoundedQueue:
         with self._changed:
             limit = self._limit - self._limit // 8 if image else self._limit
             if not image:
-                while self._size + size > limit and self._images:
+                while self.size + size > limit and self._images:
                     _, victim = self._images.popleft()
-                    self._size -= len(victim.data)
+                    self.size -= len(victim.data)
                     self.dropped[victim.topic] += 1
-            if self._closed or self._size + size > limit:
+            if self.closed or self.size + size > limit:
                 self.dropped[message.topic] += 1
                 return False
             (self._images if image else self._others).append((self._arrivals, message))
             self._arrivals += 1
-            self._size += size
+            self.size += size
             self._changed.notify()
             return True
 
     def take(self, timeout_s: float) -> QueuedMessage | None:
         """Oldest message, None when none comes within the time-out."""
         with self._changed:
-            if not self._images and not self._others and not self._closed:
+            if not self._images and not self._others and not self.closed:
                 self._changed.wait(timeout_s)
             if not self._images and not self._others:
                 return None
             first_is_image = bool(self._images) and (not self._others or self._images[0][0] < self._others[0][0])
             _, message = (self._images if first_is_image else self._others).popleft()
-            self._size -= len(message.data)
+            self.size -= len(message.data)
             return message
 
     def close(self) -> None:
         """Refuse further messages; queued ones can still be taken."""
         with self._changed:
-            self._closed = True
+            self.closed = True
             self._changed.notify_all()
-
-    @property
-    def closed(self) -> bool:
-        """Whether it refuses further messages."""
-        return self._closed
-
-    @property
-    def size(self) -> int:
-        """Queued bytes."""
-        return self._size
 
     def drop_all(self) -> None:
         """Drop and count all queued messages."""
@@ -87,7 +81,7 @@ class BoundedQueue:
                 self.dropped[message.topic] += 1
             self._images.clear()
             self._others.clear()
-            self._size = 0
+            self.size = 0
 
     def drop_count(self) -> int:
         """Drops so far."""

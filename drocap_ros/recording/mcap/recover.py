@@ -32,7 +32,7 @@ from drocap_ros.recording.mcap.metadata import (
     write_atomically,
 )
 from drocap_ros.recording.mcap.schemas import type_hash
-from drocap_ros.recording.mcap.stream import MAGIC, McapChannel, McapStream
+from drocap_ros.recording.mcap.stream import MAGIC, McapChannel, McapStream, counted_channels
 
 _BESIDE = ".recovering"
 
@@ -76,6 +76,7 @@ def recover_session(path: str | Path, progress: Progress | None = None) -> list[
                 progress("files", number / len(files))
             done.append(_recover_file(file, len(files) > 1))
             records.append(_describe(file, topics))
+            custom = McapStream(file).metadata().get(METADATA_RECORD, {}) | custom
         if path.is_dir():
             ordered = [topics[name] for name in sorted(topics)]
             write_atomically(path / METADATA_FILE, dump_yaml(bag_metadata(records, ordered, custom)))
@@ -102,11 +103,7 @@ def _files(path: Path) -> tuple[list[Path], dict[str, str]]:
     files = storage_files(path, description)
     if not files or any(file.suffix != ".mcap" for file in files):
         raise InputError(f"{path}: expected a session of MCAP files, found none or others; check the path")
-    custom = custom_metadata(description)
-    for file in files:
-        for key, value in McapStream(file).metadata().get(METADATA_RECORD, {}).items():
-            custom.setdefault(key, value)
-    return files, custom
+    return files, custom_metadata(description)
 
 
 def _recover_file(path: Path, one_of_several: bool) -> RecoveredFile:
@@ -197,13 +194,12 @@ def _describe(path: Path, topics: dict[str, TopicRecord]) -> FileRecord:
     if statistics.message_count:
         record.start_ns, record.end_ns = statistics.message_start_time, statistics.message_end_time
         record.messages = statistics.message_count
-    for number, channel in summary.channels.items():
-        schema = summary.schemas.get(channel.schema_id)
-        kind = schema.name if schema is not None else ""
-        text = schema.data.decode("utf-8", "replace") if schema is not None else ""
+    for channel, count in counted_channels(summary):
+        kind = channel.raw_type_name
         if channel.topic not in topics:
-            topics[channel.topic] = TopicRecord(channel.topic, kind, type_hash(kind, text), _qos(channel.metadata))
-        topics[channel.topic].count += statistics.channel_message_counts.get(number, 0)
+            qos = _qos(dict(channel.metadata))
+            topics[channel.topic] = TopicRecord(channel.topic, kind, type_hash(kind, channel.schema), qos)
+        topics[channel.topic].count += count
     return record
 
 

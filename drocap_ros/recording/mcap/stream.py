@@ -80,6 +80,7 @@ class McapStream:
     damage: list[Damage] = field(default_factory=list)
     profile: str = "ros2"
     _whole_until: int = 0
+    _metadata: dict[str, dict[str, str]] = field(default_factory=dict)
 
     def messages(self) -> Iterator[McapMessage]:
         """All messages in the order of the file.
@@ -89,7 +90,7 @@ class McapStream:
         InputError
             When the file is no MCAP or cannot be opened.
         """
-        from mcap.records import Channel, Header, Message, Schema
+        from mcap.records import Channel, Header, Message, Metadata, Schema
 
         schemas: dict[int, Any] = {}
         channels: dict[int, McapChannel] = {}
@@ -107,6 +108,8 @@ class McapStream:
                 yield McapMessage(channel, record.log_time, record.data, record.publish_time, record.sequence)
             elif isinstance(record, Header):
                 self.profile = record.profile
+            elif isinstance(record, Metadata):
+                self._metadata.setdefault(record.name, {}).update(record.metadata)
         if lost:
             self.damage.append(Damage(DamageKind.UNKNOWN_CHANNELS, amount=lost))
 
@@ -126,30 +129,20 @@ class McapStream:
             return None
 
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Metadata records by name, those of one name merged; without a summary the whole file is read for them."""
+        """Metadata records by name, those of one name merged; without a summary those passed by :meth:`messages`."""
         from mcap.reader import SeekingReader
 
+        if self.summary() is None:
+            return self._metadata
         found: dict[str, dict[str, str]] = {}
         try:
             with self.path.open("rb") as file:
                 bounded: Any = _BoundedFile(file)
-                whole = self.summary() is not None
-                reader = SeekingReader(bounded, record_size_limit=bounded.size)
-                for record in reader.iter_metadata() if whole else self._loose_metadata(file):
+                for record in SeekingReader(bounded, record_size_limit=bounded.size).iter_metadata():
                     found.setdefault(record.name, {}).update(record.metadata)
         except Exception:  # messages can be read without metadata
             logger.debug("%s: metadata cannot be read", self.path)
         return found
-
-    def _loose_metadata(self, file: IO[bytes]) -> Iterator[Any]:
-        from mcap.records import Metadata
-        from mcap.stream_reader import StreamReader
-
-        bounded: Any = _BoundedFile(file)
-        damage, self.damage = self.damage, []
-        records = StreamReader(bounded, emit_chunks=True, record_size_limit=bounded.size).records
-        yield from (r for r in self._until_damaged(iter(records), file, bounded.size) if isinstance(r, Metadata))
-        self.damage = damage
 
     def _records(self) -> Iterator[Any]:
         from mcap.records import Chunk
@@ -235,11 +228,18 @@ def _next_chunk(file: IO[bytes], start: int) -> int | None:
     return None
 
 
+def counted_channels(summary: Any) -> Iterator[tuple[McapChannel, int]]:
+    """Channels of a summary with their numbers of messages."""
+    for number, record in summary.channels.items():
+        channel = _channel(record, summary.schemas.get(record.schema_id))
+        yield channel, summary.statistics.channel_message_counts.get(number, 0)
+
+
 def _channel(record: Any, schema: Any | None) -> McapChannel:
     text = schema.data.decode("utf-8", "replace") if schema is not None else ""
     return McapChannel(
         topic=record.topic,
-        type_name=ros2_name(schema.name) if schema is not None else "",
+        type_name=_ros2_name(schema.name) if schema is not None else "",
         message_encoding=record.message_encoding,
         schema_encoding=schema.encoding if schema is not None else "",
         schema=text,
@@ -248,7 +248,7 @@ def _channel(record: Any, schema: Any | None) -> McapChannel:
     )
 
 
-def ros2_name(name: str) -> str:
+def _ros2_name(name: str) -> str:
     """``package/Name`` (ROS 1, some writers) -> ``package/msg/Name``."""
     parts = name.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name

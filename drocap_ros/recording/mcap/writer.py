@@ -39,8 +39,9 @@ class SessionWriter:
     Chunks are compressed and written at least every ``config.chunk_s``: a crash or power cut leaves whole chunks up to
     then.  A new, independent file starts after ``config.split_mib`` or ``config.split_s``.  ``write`` never waits:
     messages above the disk's rate are dropped, images first, and counted.  ``metadata.yaml`` exists from the start;
-    :meth:`close` completes it.  With less than ``config.free_mib`` left on the disk the session is finished early, and
-    ``error`` gives the reason.
+    :meth:`close` completes it.  With less than ``config.free_mib`` left on the disk the session is finished early.
+
+    error : reason of an early end of the recording, one line; None without one
 
     Parameters
     ----------
@@ -73,7 +74,7 @@ class SessionWriter:
         self._space_checked_s = -1e9
         self._description_changed = False
         self._lock = threading.Lock()  # guards the current file and the description
-        self._error: str | None = None
+        self.error: str | None = None
         self._closed = False
         self._queue = BoundedQueue(self.config.queue_mib * _MIB)
         try:
@@ -115,11 +116,6 @@ class SessionWriter:
         """Bytes in the queue to the disk."""
         return self._queue.size
 
-    @property
-    def error(self) -> str | None:
-        """Reason of an early end of the recording, one line; None without one."""
-        return self._error
-
     def register(
         self,
         topic: str,
@@ -151,7 +147,7 @@ class SessionWriter:
                 return
             profile = qos or qos_profile(reliable=not image)
             record = TopicRecord(topic, type_name, type_hash(type_name, schema), profile)
-            if self._error is None:
+            if self.error is None:
                 self._file.register(record, schema)
             self._schemas[topic] = schema
             self._topics[topic] = record
@@ -187,7 +183,7 @@ class SessionWriter:
         self._queue.close()
         self._thread.join()
         with self._lock:
-            if self._error is None:
+            if self.error is None:
                 try:
                     self._finish_file()
                     self._write_description(current=False)
@@ -212,7 +208,7 @@ class SessionWriter:
                     self._save_if_due(ended=message is None and self._queue.closed)
             except Exception as error:  # the graph continues; diagnostics report the reason
                 self._fail(error)
-            if self._error is not None:
+            if self.error is not None:
                 self._queue.drop_all()
             if message is None and self._queue.closed:
                 return
@@ -224,7 +220,7 @@ class SessionWriter:
         return max(0.0, self._unsaved_s + self.config.chunk_s - time.monotonic())
 
     def _add(self, message: QueuedMessage) -> None:
-        if self._error is not None:
+        if self.error is not None:
             self._queue.dropped[message.topic] += 1
             return
         if self._file_is_full(message.log_time_ns):
@@ -237,7 +233,7 @@ class SessionWriter:
             self._unsaved_s = time.monotonic()
 
     def _save_if_due(self, ended: bool) -> None:
-        if self._error is not None:
+        if self.error is not None:
             return
         now = time.monotonic()
         due = self._unsaved_s is not None and now - self._unsaved_s >= self.config.chunk_s
@@ -301,7 +297,7 @@ class SessionWriter:
         self._set_error(f"less than {self.config.free_mib} MiB left on the disk; the session is complete until then")
 
     def _fail(self, error: Exception) -> None:
-        if self._error is not None:
+        if self.error is not None:
             return
         reason = getattr(error, "strerror", None) or (str(error).splitlines() or [type(error).__name__])[0]
         for topic, count in self._file.abandon().items():
@@ -315,8 +311,8 @@ class SessionWriter:
             logger.debug("metadata.yaml of %s is not up to date", self.folder)
 
     def _set_error(self, reason: str) -> None:
-        self._error = f"{self.folder}: the recording ended early: {reason}; make room and start a new session"
-        logger.error("%s", self._error)
+        self.error = f"{self.folder}: the recording ended early: {reason}; make room and start a new session"
+        logger.error("%s", self.error)
 
     def _description(self, current: bool) -> dict[str, Any]:
         topics = []
