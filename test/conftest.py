@@ -16,7 +16,7 @@ CLOCKED = (
     "nodes", "ros", "system", "view", "cli/test_live_cli.py", "flight/mavlink/test_link.py",
     "flight/mavlink/test_signing.py", "flight/mavlink/test_gimbal.py", "perception/sources/test_live_sources.py",
     "perception/models/test_fetch.py", "recording/mcap/test_bounded_queue.py",
-    "recording/test_live_graph.py", "recording/mcap/test_recover.py", "recording/mcap/test_session_writer.py",
+    "recording/mcap/test_recover.py", "recording/mcap/test_session_writer.py",
 )  # fmt: skip
 COMPUTING = ("system/test_packaging.py",)
 

@@ -96,11 +96,8 @@ def pose3d_to_ros(
     covariance: np.ndarray,
     confidence: np.ndarray,
     reprojection_rms_px: float,
-    metric: bool = False,
-    camera_orientation_xyzw: np.ndarray | None = None,
 ) -> Pose3D:
-    """Pose (P, 3) m with covariance (P, 6) m^2 -> message; the camera's orientation is NaN when not given."""
-    xyzw = np.full(4, np.nan) if camera_orientation_xyzw is None else camera_orientation_xyzw
+    """Pose (P, 3) m in the camera's frame, with covariance (P, 6) m^2 -> message; scale and orientation unknown."""
     return Pose3D(
         header=header,
         track_id=track_id,
@@ -109,8 +106,8 @@ def pose3d_to_ros(
         joints=floats(joints),
         covariance=floats(covariance),
         confidence=floats(confidence),
-        camera_orientation=quaternion_to_ros(xyzw),
-        metric=metric,
+        camera_orientation=quaternion_to_ros(np.full(4, np.nan)),
+        metric=False,
         reprojection_rms=float(reprojection_rms_px),
     )
 

@@ -1,0 +1,89 @@
+"""Node ``session_recorder`` in a running graph."""
+
+import json
+import os
+import signal
+
+import numpy as np
+from captured_flight import flight_config
+from sensor_msgs.msg import CompressedImage
+
+from drocap_ros.bringup import bringup
+from drocap_ros.config import DrocapConfig
+from drocap_ros.recording.open_session import open_session
+from drocap_ros.ros.diagnostics import Key
+from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, TOPICS
+
+
+def test_a_session_holds_its_provenance(captured):
+    with open_session(captured) as session:
+        metadata = session.info.metadata
+    assert metadata["namespace"] == "/drocap"
+    assert json.loads(metadata["versions"])["numpy"] == np.__version__
+    assert "k: [" in metadata["calibration"]
+    for name in ("capture_simulator", "initializer", "bundle_adjuster", "session_recorder"):
+        assert f"/**/{name}:" in metadata["configuration"]
+
+
+def test_a_session_without_a_name_is_named_by_its_date(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with bringup(flight_config(""), ["session_recorder"]):
+        pass
+    (folder,) = tmp_path.iterdir()
+    assert folder.name.startswith("session_20")
+    assert (folder / "metadata.yaml").exists()
+
+
+def test_images_wait_for_a_stopped_recorder_and_excess_images_are_counted(tmp_path):
+    config = DrocapConfig().replace("session_recorder", session_dir=str(tmp_path / "s"))
+    with bringup(config, ["session_recorder"], processes=True) as graph:
+        states, recorder = [], graph.pid("session_recorder")
+        graph.node.create_subscription(TOPICS["/diagnostics"].message, "/diagnostics", states.append, 100)
+        images = graph.node.create_publisher(CompressedImage, "image/compressed", IMAGE_RECORDING_QOS)
+        graph.wait_until(lambda: images.get_subscription_count() == 1, 20, "the recorder")
+
+        def publish_while_stopped(count):
+            os.kill(recorder, signal.SIGSTOP)
+            for _ in range(count):
+                images.publish(CompressedImage(format="jpeg", data=b"x"))
+            os.kill(recorder, signal.SIGCONT)
+
+        def counted(key):
+            return [int(v.value) for m in states for s in m.status for v in s.values if key in v.key][-1:]
+
+        publish_while_stopped(120)
+        graph.wait_until(lambda: counted("messages") and counted("messages")[0] >= 120, 20, "120 images")
+        assert not counted(Key.MISSED)
+        publish_while_stopped(1000)
+        graph.wait_until(lambda: counted(Key.MISSED), 20, "the count of missed images")
+        graph.spin_for(2.1)
+        missed = counted(Key.MISSED)[0]
+    with open_session(tmp_path / "s") as session:
+        recorded = next(t.count for t in session.info.topics if t.name.endswith("image/compressed"))
+    assert recorded + missed == 1120
+
+
+def test_a_full_disk_is_an_error_of_the_recorder_alone(small_disk):
+    config = flight_config(small_disk / "s", seconds=60.0).replace("session_recorder", free_mib=0, compression="none")
+    with bringup(config, ["capture_simulator", "session_recorder"]) as graph:
+        states, poses = [], []
+        graph.node.create_subscription(TOPICS["/diagnostics"].message, "/diagnostics", states.append, 100)
+        graph.node.create_subscription(TOPICS["pose2d"].message, "pose2d", poses.append, TOPICS["pose2d"].qos)
+        images = graph.node.create_publisher(CompressedImage, "image/compressed", IMAGE_RECORDING_QOS)
+        image = CompressedImage(format="jpeg", data=np.zeros(400_000, np.uint8).tobytes())
+
+        def errors():
+            images.publish(image)
+            return [
+                s for m in states for s in m.status if "session_recorder" in s.name and "No space left" in s.message
+            ]
+
+        graph.wait_until(errors, 40, "an error on /diagnostics")
+        status = errors()[-1]
+        assert status.level == b"\x02"
+        assert "make room" in status.message
+        before = len(poses)
+        graph.wait_until(lambda: len(poses) > before + 15, 20, "more poses")
+        graph.wait_until(lambda: any(Key.NOT_WRITTEN in v.key for v in errors()[-1].values), 20, "the drops")
+    with open_session(small_disk / "s") as session:
+        assert session.info.message_count > 10
