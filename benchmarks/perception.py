@@ -1,11 +1,11 @@
-"""Perception: speed of every part, accuracy and uncertainty on the labelled recordings.
+"""Perception: speed of each part, accuracy and uncertainty on the labelled recordings.
 
     python benchmarks/perception.py            tables, and the plot benchmarks/results/keypoint_uncertainty.png
-    python benchmarks/perception.py --fit      also fit the calibration anew and print its numbers
+    python benchmarks/perception.py --fit      also fit the calibration and print its constants
     python benchmarks/perception.py --quick    fewer repetitions
 
-Recordings and weights are those of ../shared; without them there is nothing to measure and it says so.
-Times are of this process on one thread (CPU time, which other processes disturb less, and wall time).
+Recordings and weights are those of ../shared; without them the benchmark reports that and ends.
+Times are CPU and wall time of this process on one thread; other processes disturb CPU time less.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import load_detector, load_pose_model
 from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.perception.models.spec import read_spec
+from drocap_ros.perception.pose import NetworkKeypoints, PoseModel
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
-from drocap_ros.perception.pose import Keypoints, PoseModel
 from drocap_ros.perception.sources import open_source
 from drocap_ros.perception.sources.image_files import read_image
 from drocap_ros.perception.track_video import observe, subjects
@@ -45,11 +45,11 @@ GROSS = 0.1
 
 
 class Case(NamedTuple):
-    """One labelled person: where from, how the picture was made worse, what was found, the marks (17, 2) px."""
+    """One labelled person: recording, kind of degradation, keypoints, labels (17, 2) px."""
 
     source: str
     kind: str
-    keypoints: Keypoints
+    keypoints: NetworkKeypoints
     truth: np.ndarray
 
     @property
@@ -128,7 +128,7 @@ def steady(name: str, config: PoseEstimatorConfig, video: Path, count: int) -> N
 
 
 def labelled() -> Iterator[tuple[str, int, np.ndarray, np.ndarray]]:
-    """(recording, index, image, marks (17, 2) px) of every labelled picture."""
+    """(recording, index, image, labels (17, 2) px) of each labelled image."""
     skier = json.loads((MEDIA / "skier_keypoints.json").read_text())["persons"][0]
     named = json.loads((MEDIA / "pose_1_keypoints2d.json").read_text())
     squats = np.array(json.loads((MEDIA / "pose_squats_landmarks2d.json").read_text()))
@@ -151,12 +151,12 @@ def clean_cases(pose: str) -> list[Case]:
         assert estimator is not None
         estimator.process(image, i * 33_000_000)
         if estimator.keypoints is not None:
-            cases.append(Case(name, "as it is", estimator.keypoints, truth))
+            cases.append(Case(name, "unchanged", estimator.keypoints, truth))
     return cases
 
 
-def worse_cases(pose: str) -> list[Case]:
-    """The labelled pictures made worse, the marks as they were; always the same."""
+def degraded_cases(pose: str) -> list[Case]:
+    """Degraded labelled images with their labels; deterministic."""
     config = PoseEstimatorConfig(pose_model=pose)
     model, detector = load_pose_model(MODELS, config), load_detector(MODELS, config)
     rng = np.random.default_rng(0)
@@ -168,8 +168,8 @@ def worse_cases(pose: str) -> list[Case]:
         size = box[2:] - box[:2]
         for _ in range(12 if name == "skier.jpg" else 1):
 
-            def add(kind: str, picture: np.ndarray, b: np.ndarray, t: np.ndarray, name: str = name) -> None:
-                cases.append(Case(name, kind, model.estimate(picture, b), t))
+            def add(kind: str, image: np.ndarray, b: np.ndarray, t: np.ndarray, name: str = name) -> None:
+                cases.append(Case(name, kind, model.estimate(image, b), t))
 
             for height in (40, 60, 90, 150):
                 s = height / size[1]
@@ -195,7 +195,7 @@ def _noisy(image: np.ndarray, sigma: float, rng: np.random.Generator) -> np.ndar
 
 
 def _covered(image: np.ndarray, box: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A piece of the picture's own background laid over a quarter to a half of the person."""
+    """A piece of the image's background over a quarter to a half of the person."""
     out = image.copy()
     w = int((box[2] - box[0]) * rng.uniform(0.5, 1))
     h = int((box[3] - box[1]) * rng.uniform(0.25, 0.5))
@@ -231,7 +231,7 @@ def area_under_roc(gross: np.ndarray, confidence: np.ndarray) -> float:
     return float((rank[~gross].sum() - fine * (fine - 1) / 2) / (fine * bad)) if fine and bad else float("nan")
 
 
-def accuracy(pose: str, cases: list[Case], worse: list[Case], layout: str) -> None:
+def accuracy(pose: str, cases: list[Case], degraded: list[Case], layout: str) -> None:
     print(f"\n## {pose}: accuracy and uncertainty of the 12 limb joints\n")
     area = json.loads((MEDIA / "skier_keypoints.json").read_text())["persons"][0]["area"]
     skier = next(c for c in cases if c.source == "skier.jpg")
@@ -241,25 +241,23 @@ def accuracy(pose: str, cases: list[Case], worse: list[Case], layout: str) -> No
         mine = [c for c in cases if c.source == name]
         distance = 100 * np.mean([np.linalg.norm(c.errors, axis=1) for c in mine])
         spread = standardized(mine, layout).std()
-        print(
-            f"{name:<16} {len(mine):4d} pictures  mean distance {distance:.2f} % of the box  standardized {spread:.2f}"
-        )
-    print(f"all labelled pictures: standardized error {standardized(cases, layout).std():.2f}")
+        print(f"{name:<16} {len(mine):4d} images  mean distance {distance:.2f} % of the box  standardized {spread:.2f}")
+    print(f"all labelled images: standardized error {standardized(cases, layout).std():.2f}")
     gross, confidence = gross_and_confidence(cases, layout)
     print(f"gross errors (> 10 % of the box) on them: {gross.sum()} of {gross.size}")
-    gross, confidence = gross_and_confidence(worse, layout)
+    gross, confidence = gross_and_confidence(degraded, layout)
     print(
-        f"made worse ({len(worse)} pictures): gross errors {gross.mean():.1%}, area under the ROC curve of the"
+        f"degraded ({len(degraded)} images): gross errors {gross.mean():.1%}, area under the ROC curve of the"
         f" confidence {area_under_roc(gross, confidence):.3f}; standardized error of the others"
-        f" {standardized(worse, layout, GROSS).std():.2f}"
+        f" {standardized(degraded, layout, GROSS).std():.2f}"
     )
-    for kind in dict.fromkeys(c.kind for c in worse):
-        mine = [c for c in worse if c.kind == kind]
+    for kind in dict.fromkeys(c.kind for c in degraded):
+        mine = [c for c in degraded if c.kind == kind]
         distance = np.concatenate([np.linalg.norm(c.errors, axis=1) for c in mine])
         print(f"  {kind:<16} median {100 * np.median(distance):.2f} %  gross {np.mean(distance > GROSS):6.1%}")
 
 
-def plot(pose: str, cases: list[Case], worse: list[Case], layout: str) -> None:
+def plot(pose: str, cases: list[Case], degraded: list[Case], layout: str) -> None:
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -267,14 +265,14 @@ def plot(pose: str, cases: list[Case], worse: list[Case], layout: str) -> None:
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4))
     bins = np.linspace(-4, 4, 49)
-    left.hist(standardized(cases, layout), bins, density=True, alpha=0.6, label="as they are")
+    left.hist(standardized(cases, layout), bins, density=True, alpha=0.6, label="unchanged")
     left.hist(
-        standardized(worse, layout, GROSS), bins, density=True, histtype="step", label="made worse, no gross errors"
+        standardized(degraded, layout, GROSS), bins, density=True, histtype="step", label="degraded, no gross errors"
     )
     left.plot(bins, np.exp(-(bins**2) / 2) / np.sqrt(2 * np.pi), "k--", label="unit normal")
     left.set(xlabel="error / stated standard deviation", ylabel="density", title=f"{pose}: covariance")
     left.legend()
-    gross, confidence = gross_and_confidence(worse + cases, layout)
+    gross, confidence = gross_and_confidence(degraded + cases, layout)
     place = np.clip((confidence * 10).astype(int), 0, 9)
     filled = [place == i for i in range(10) if (place == i).sum() >= 20]
     stated = [confidence[at].mean() for at in filled]
@@ -289,23 +287,23 @@ def plot(pose: str, cases: list[Case], worse: list[Case], layout: str) -> None:
     print(f"plot: {path.relative_to(ROOT)}")
 
 
-def fit(cases: list[Case], worse: list[Case], spread_share: float) -> Calibration:
+def fit(cases: list[Case], degraded: list[Case], spread_share: float) -> Calibration:
     """Calibration by maximum likelihood: sigmas from errors below 10 %, the logistic regression from all."""
     from scipy.optimize import minimize
 
     knots = np.array(CALIBRATIONS["heatmap"].scores)
-    # The three recordings count alike though one is a single picture; the worse pictures count less.
+    # Equal weights of the three recordings, one of which is a single image; degraded images count less.
     weights = {"pose_1.mp4": 0.5, "pose_squats.mp4": 0.7, "skier.jpg": 20.0}
 
     def columns(these: list[Case], weight: Callable[[Case], float]) -> tuple[np.ndarray, ...]:
         error = np.concatenate([c.errors for c in these])
         score = np.concatenate([c.keypoints.score[LIMBS] for c in these])
         spread = np.concatenate([c.keypoints.spread[LIMBS] / c.keypoints.box_size**2 for c in these])
-        rival = np.nan_to_num(np.concatenate([c.keypoints.candidates[LIMBS, 1, 2] for c in these]))
-        return error, score, spread, rival, np.repeat([weight(c) for c in these], 12)
+        second_peak = np.nan_to_num(np.concatenate([c.keypoints.candidates[LIMBS, 1, 2] for c in these]))
+        return error, score, spread, second_peak, np.repeat([weight(c) for c in these], 12)
 
-    parts = [columns(cases, lambda c: weights[c.source]), columns(worse, lambda c: 0.15)]
-    error, score, spread, rival, weight = (np.concatenate(p) for p in zip(*parts, strict=True))
+    parts = [columns(cases, lambda c: weights[c.source]), columns(degraded, lambda c: 0.15)]
+    error, score, spread, second_peak, weight = (np.concatenate(p) for p in zip(*parts, strict=True))
     inlier = np.linalg.norm(error, axis=1) < GROSS
 
     def loss(log_sigma: np.ndarray) -> float:
@@ -315,10 +313,10 @@ def fit(cases: list[Case], worse: list[Case], spread_share: float) -> Calibratio
         return float((weight * terms)[inlier].sum() + 5e3 * (rising**2).sum())
 
     sigmas = np.exp(minimize(loss, np.log(np.linspace(0.045, 0.01, len(knots))), method="L-BFGS-B").x)
-    error, score, spread, rival, _ = parts[1]
+    error, score, spread, second_peak, _ = parts[1]
     fine = np.linalg.norm(error, axis=1) < GROSS
     width = np.sqrt(spread[:, [0, 2]].mean(axis=1))
-    features = np.stack([np.ones_like(score), score, rival, 10 * width], axis=1)
+    features = np.stack([np.ones_like(score), score, second_peak, 10 * width], axis=1)
     if spread_share == 0:
         features = features[:, :2]
 
@@ -345,7 +343,7 @@ def tracking() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--fit", action="store_true", help="fit the calibration anew")
+    parser.add_argument("--fit", action="store_true", help="fit the calibration")
     parser.add_argument("--quick", action="store_true", help="fewer repetitions, no long video")
     options = parser.parse_args()
     if not MODELS.is_dir() or not MEDIA.is_dir():
@@ -354,11 +352,11 @@ def main() -> None:
     cv2.setNumThreads(1)
     for pose in ("tinypose_256x192", "movenet_lightning_int8"):
         layout = load_pose_model(MODELS, PoseEstimatorConfig(pose_model=pose)).spec.layout
-        cases, worse = clean_cases(pose), worse_cases(pose)
-        accuracy(pose, cases, worse, layout)
-        plot(pose, cases, worse, layout)
+        cases, degraded = clean_cases(pose), degraded_cases(pose)
+        accuracy(pose, cases, degraded, layout)
+        plot(pose, cases, degraded, layout)
         if options.fit:
-            print(fit(cases, worse, CALIBRATIONS[layout].spread_share))
+            print(fit(cases, degraded, CALIBRATIONS[layout].spread_share))
     speed(20 if options.quick else 100)
     if not options.quick:
         tracking()

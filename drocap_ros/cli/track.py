@@ -1,15 +1,14 @@
-"""``drocap track``: 2D tracks of the person in a video."""
+"""``drocap track``: 2D tracks of the subject of a video."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from drocap_ros.observation import PoseObservation
     from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
     from drocap_ros.perception.sources import Frame
@@ -21,26 +20,24 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the command's options; ``run`` is its action."""
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "track",
-        help="2D tracks of the person in a video",
-        description="Follow the person in VIDEO and write tracks.npz: keypoints, covariance and confidence of every"
-        " image. Each further person followed, one after another, is written as tracks_person_N.npz.",
+        help="2D tracks of the subject of a video",
+        description="Track the subject of VIDEO and write tracks.npz: keypoints, covariance and confidence of each"
+        " image. Each later subject is written to tracks_person_N.npz.",
     )
-    parser.add_argument("video", metavar="VIDEO", help="video file, picture, or folder of pictures")
+    parser.add_argument("video", metavar="VIDEO", help="video file, image, or folder of images")
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="output folder")
     parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
-    parser.add_argument("--detector", metavar="NAME", help="detector in that folder (default: the best there)")
-    parser.add_argument("--pose", metavar="NAME", help="2D pose model in that folder (default: the best there)")
+    parser.add_argument("--detector", metavar="NAME", help="detector in that folder (default: the preferred one)")
+    parser.add_argument("--pose", metavar="NAME", help="2D pose model in that folder (default: the preferred one)")
     parser.add_argument(
         "--subject",
-        metavar="WHO",
+        metavar="RULE",
         default="largest",
-        help="largest (default), centre, or the box x_min,y_min,x_max,y_max px in the first image",
+        help="largest (default), centre, or a box x_min,y_min,x_max,y_max px in the first image",
     )
-    parser.add_argument(
-        "--wait", action="store_true", help="after the subject is lost follow nobody else (as in flight)"
-    )
+    parser.add_argument("--wait", action="store_true", help="track no other person after the subject is lost")
     parser.add_argument("--threads", metavar="N", type=int, help="threads of one model run (default: 1)")
-    parser.add_argument("--overlay", action="store_true", help="also write overlay.mp4 with the subject drawn in")
+    parser.add_argument("--overlay", action="store_true", help="also write overlay.mp4 with the subject drawn")
     parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
     parser.add_argument("--quiet", action="store_true", help="no progress, only errors")
     parser.set_defaults(run=run)
@@ -62,22 +59,21 @@ def run(args: argparse.Namespace) -> int:
     with open_source(args.video, ingest) as source:
         estimator = PoseEstimator(models_folder(args.models or config.models_dir or None), config)
         with output_folder(args.out) as folder, progress_bars(args.quiet) as progress:
-            done: list[int] = [0]
+            overlay = _OverlayWriter(folder / "overlay.mp4", source.size) if args.overlay else None
+            done = itertools.count(1)
 
             def on_frame(frame: Frame, observation: PoseObservation) -> None:
-                done[0] += 1
-                progress("2D pose", done[0] / source.length if source.length else -1.0)
-                if writer is not None:
-                    writer(frame, observation)
+                progress("2D pose", next(done) / source.length if source.length else -1.0)
+                if overlay is not None:
+                    overlay.add(frame, observation)
 
-            writer, finish = _overlay_writer(folder / "overlay.mp4", source.size) if args.overlay else (None, None)
             observations = observe(source, estimator, on_frame)
-            if finish is not None:
-                finish([o.stamp_ns for o in observations])
-            tracks_from_observations(observations)  # refuses a recording without a person
+            if overlay is not None:
+                overlay.close()
+            tracks_from_observations(observations)  # raises for a recording without a person
             found = subjects(observations)
-            for place, (track_id, _) in enumerate(found):
-                name = "tracks.npz" if place == 0 else f"tracks_person_{track_id}.npz"
+            for rank, (track_id, _) in enumerate(found):
+                name = "tracks.npz" if rank == 0 else f"tracks_person_{track_id}.npz"
                 save_tracks(folder / name, tracks_from_observations(observations, track_id))
     if not args.quiet:
         print(_summary(found, len(observations), args.out))
@@ -101,42 +97,46 @@ def _configs(args: argparse.Namespace) -> tuple[PoseEstimatorConfig, Any]:
     return dataclasses.replace(whole.pose_estimator, **changes), whole.image_ingest
 
 
-def _overlay_writer(
-    path: Path, size: tuple[int, int]
-) -> tuple[Callable[[Frame, PoseObservation], None], Callable[[list[int]], None]]:
-    """A function that adds a drawn frame, and one that ends the video."""
-    import cv2
+class _OverlayWriter:
+    """Writes the video with the subject drawn, at the rate of its first two frames."""
 
-    from drocap_ros.errors import DrocapError
-    from drocap_ros.perception.overlay import draw
+    def __init__(self, path: Path, size: tuple[int, int]) -> None:
+        scale = min(1.0, 1280 / max(size))
+        self._size = (max(2, round(size[0] * scale) // 2 * 2), max(2, round(size[1] * scale) // 2 * 2))
+        self._path = path
+        self._first: tuple[int, Any] | None = None
+        self._video: Any = None
 
-    scale = min(1.0, 1280 / max(size))
-    even = (max(2, round(size[0] * scale) // 2 * 2), max(2, round(size[1] * scale) // 2 * 2))
-    stamps: list[int] = []
-    pending: list[Any] = []
-    video: list[Any] = []
+    def add(self, frame: Frame, observation: PoseObservation) -> None:
+        import cv2
 
-    def begin(rate: float) -> None:
-        video.append(cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate, even))
-        if not video[0].isOpened():
-            raise DrocapError(f"{path}: the video could not be written; is there space on the disk?")
+        from drocap_ros.perception.overlay import draw
 
-    def add(frame: Frame, observation: PoseObservation) -> None:
-        stamps.append(frame.stamp_ns)
-        pending.append(cv2.resize(draw(frame.image, observation), even, interpolation=cv2.INTER_AREA))
-        if not video and len(stamps) == 2:
-            begin(min(max(1e9 / (stamps[1] - stamps[0]), 1.0), 120.0))
-        while video and pending:
-            video[0].write(pending.pop(0))
+        image = cv2.resize(draw(frame.image, observation), self._size, interpolation=cv2.INTER_AREA)
+        if self._first is None:
+            self._first = frame.stamp_ns, image
+            return
+        if self._video is None:
+            self._open(1e9 / (frame.stamp_ns - self._first[0]))
+        self._video.write(image)
 
-    def finish(_: list[int]) -> None:
-        if not video:
-            begin(1.0)
-            for image in pending:
-                video[0].write(image)
-        video[0].release()
+    def close(self) -> None:
+        if self._video is None and self._first is not None:  # a single image
+            self._open(1.0)
+        if self._video is not None:
+            self._video.release()
 
-    return add, finish
+    def _open(self, rate_hz: float) -> None:
+        import cv2
+
+        from drocap_ros.errors import DrocapError
+
+        rate_hz = min(max(rate_hz, 1.0), 120.0)
+        self._video = cv2.VideoWriter(str(self._path), cv2.VideoWriter.fourcc(*"mp4v"), rate_hz, self._size)
+        if not self._video.isOpened():
+            raise DrocapError(f"{self._path}: the video could not be written; check the space on the disk")
+        assert self._first is not None
+        self._video.write(self._first[1])
 
 
 def _summary(found: list[tuple[int, int]], frames: int, out: Path) -> str:

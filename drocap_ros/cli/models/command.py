@@ -1,4 +1,4 @@
-"""``drocap models``: which networks there are, getting them, trying them."""
+"""``drocap models``: list, fetch and check networks."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "models",
         help="list, fetch or check the networks",
-        description="The networks for person detection and 2D pose: list what is known and what is there, fetch from"
-        " the official homes, check one on a picture.",
+        description="Networks for person detection and 2D pose: list the known and the installed ones, fetch them from"
+        " their publishers, check them on an image.",
     )
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    listing = actions.add_parser("list", help="known models and those in the folder")
+    listing = actions.add_parser("list", help="known and installed models")
     fetching = actions.add_parser("fetch", help="download known models and verify them")
-    checking = actions.add_parser("check", help="run the folder's models on a picture and draw the result")
+    checking = actions.add_parser("check", help="run the folder's models on an image and draw the result")
     for sub in (listing, fetching, checking):
         sub.add_argument(
             "--models",
             metavar="DIR",
             type=Path,
-            help="folder of ONNX models, or 'simulation' for those that ship for rendered pictures (default:"
+            help="folder of ONNX models, or 'simulation' for the shipped ones for rendered images (default:"
             " $DROCAP_MODELS)",
         )
     fetching.add_argument("names", nargs="*", metavar="NAME", help="models by name (default: rtmdet-nano rtmpose-s)")
     fetching.add_argument("--unverified", action="store_true", help="allow models without a known checksum")
     fetching.add_argument("--quiet", action="store_true", help="no progress, only errors")
-    checking.add_argument("picture", nargs="?", type=Path, metavar="PICTURE", help="picture with a person")
-    checking.add_argument("--detector", metavar="NAME", default="auto", help="detector (default: the best there)")
-    checking.add_argument("--pose", metavar="NAME", default="auto", help="2D pose model (default: the best there)")
-    checking.add_argument("--out", metavar="PNG", type=Path, help="where the drawing goes (default: PICTURE_check.png)")
+    checking.add_argument("image", nargs="?", type=Path, metavar="IMAGE", help="image of a person")
+    checking.add_argument("--detector", metavar="NAME", default="auto", help="detector (default: the preferred one)")
+    checking.add_argument("--pose", metavar="NAME", default="auto", help="2D pose model (default: the preferred one)")
+    checking.add_argument("--out", metavar="PNG", type=Path, help="output image (default: IMAGE_check.png)")
     parser.set_defaults(run=run)
     return parser
 
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def run_list(args: argparse.Namespace) -> int:
-    """Print the registry and the folder's files."""
+    """Print the registry and the files of the folder."""
     from drocap_ros.perception.load_models import SIMULATION, models_folder
     from drocap_ros.perception.models.registry import KNOWN_MODELS
 
@@ -56,28 +56,28 @@ def run_list(args: argparse.Namespace) -> int:
     if args.models and not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of models, found no such folder; check the path")
     present = sorted(folder.glob("*.onnx")) if folder.is_dir() else []
-    rows = [("NAME", "TASK", "MB", "LICENCE", "TRAINED ON", "FROM", "FILE", "THERE")]
+    names = {path.name for path in present}
+    rows = [("NAME", "TASK", "MB", "LICENCE", "TRAINED ON", "FROM", "FILE", "INSTALLED")]
     for model in KNOWN_MODELS:
-        here = any(p.name == model.file for p in present)
         origin = model.home if model.url else f"{model.home} (no ONNX download)"
-        size, there = f"{model.size_mb:.1f}", "yes" if here else "-"
-        rows.append((model.name, model.task, size, model.licence, model.training_data, origin, model.file, there))
+        size, installed = f"{model.size_mb:.1f}", "yes" if model.file in names else "-"
+        rows.append((model.name, model.task, size, model.licence, model.training_data, origin, model.file, installed))
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     for row in rows:
         print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-    print(f"\nfolder {folder}: " + ("" if present else "no models; `drocap models fetch` brings the default pair"))
+    print(f"\nfolder {folder}: " + ("" if present else "no models; `drocap models fetch` downloads the default pair"))
     for path in present:
         print(f"  {describe(path)}")
     shipped = models_folder(SIMULATION)
     if folder != shipped:
-        print(f"\nshipped, used only when asked for with `--models {SIMULATION}`:")
+        print(f"\nshipped, used only with `--models {SIMULATION}`:")
         for path in sorted(shipped.glob("*.onnx")):
             print(f"  {describe(path)}")
     return 0
 
 
 def describe(path: Path) -> str:
-    """One line on a model file: what it is, or why it cannot be used."""
+    """One line on a model file: its layout and input, or the reason why it cannot be used."""
     from drocap_ros.perception.load_models import limited_use
     from drocap_ros.perception.models.runtime import OnnxModel
     from drocap_ros.perception.models.spec import read_spec
@@ -134,13 +134,13 @@ def run_fetch(args: argparse.Namespace) -> int:
 
 
 def run_check(args: argparse.Namespace) -> int:
-    """Load the models, and on a picture run and draw them."""
+    """Load the models; with an image, run them and draw the result."""
     from drocap_ros.perception.load_models import load_detector, load_pose_model, models_folder
     from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 
     folder = models_folder(args.models)
     config = PoseEstimatorConfig(detector=args.detector, pose_model=args.pose)
-    if args.picture is None:
+    if args.image is None:
         for loaded in (load_detector(folder, config), load_pose_model(folder, config)):
             print(describe(loaded.model.path))
         return 0
@@ -151,12 +151,12 @@ def run_check(args: argparse.Namespace) -> int:
     from drocap_ros.perception.overlay import draw
     from drocap_ros.perception.sources.image_files import read_image
 
-    image = read_image(args.picture)
+    image = read_image(args.image)
     estimator = PoseEstimator(folder, config)
     observation = estimator.process(image, 0)
     print(f"detector {estimator.detector.model.path.name}, pose {estimator.pose_model.model.path.name}")
     if not observation.has_subject:
-        print(f"{args.picture}: no person found")
+        print(f"{args.image}: no person found")
         return 0
     for name, point, variance, confidence in zip(
         observation.joints.joints, observation.keypoints, observation.covariance, observation.confidence, strict=True
@@ -165,10 +165,8 @@ def run_check(args: argparse.Namespace) -> int:
             float(np.sqrt(max((variance[0] + variance[2]) / 2, 0.0))) if np.isfinite(variance).all() else float("nan")
         )
         print(f"{name:<10} {point[0]:8.1f} {point[1]:8.1f} px  sigma {sigma:6.1f} px  confidence {confidence:.2f}")
-    out = args.out or args.picture.with_name(f"{args.picture.stem}_check.png")
+    out = args.out or args.image.with_name(f"{args.image.stem}_check.png")
     if not out.parent.is_dir() or not cv2.imwrite(str(out), draw(image, observation)):
-        raise InputError(
-            f"--out {out}: expected a picture name (.png, .jpg) in a folder that can be written; choose another"
-        )
+        raise InputError(f"--out {out}: expected an image name (.png, .jpg) in a writable folder; choose another")
     print(f"written: {out}")
     return 0

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import Enum
-from types import TracebackType
 
 import numpy as np
 
@@ -45,7 +45,7 @@ class SourceEvent:
         return f"{self.source}: {self.kind.value.replace('_', ' ')}: {self.detail}"
 
 
-class ImageSource(ABC):
+class ImageSource(AbstractContextManager["ImageSource"]):
     """Iterator of :class:`Frame` and context manager.
 
     size : (width, height) px of every frame
@@ -78,12 +78,6 @@ class ImageSource(ABC):
         while (frame := self.read()) is not None:
             yield frame
 
-    def __enter__(self) -> ImageSource:
-        """Enter the context."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close on leaving."""
+    def __exit__(self, *_: object) -> None:
+        """Close on leaving the context."""
         self.close()

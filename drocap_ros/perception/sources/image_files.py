@@ -23,8 +23,6 @@ def to_bgr(image: np.ndarray) -> np.ndarray:
         image = (image >> 8).astype(np.uint8)
     elif image.dtype.kind == "f":
         image = np.clip(np.nan_to_num(image) * 255.0, 0, 255).astype(np.uint8)
-    elif image.dtype != np.uint8:
-        image = np.clip(image, 0, 255).astype(np.uint8)
     if image.ndim == 2:
         image = image[..., None]
     if image.shape[2] in (1, 2):  # grey, grey + alpha

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import queue
-import threading
+from collections import deque
 from collections.abc import Generator, Iterable
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
 
 from drocap_ros.perception.sources.base import Frame
-
-_END = object()
 
 
 def prefetch(frames: Iterable[Frame], ahead: int = 4) -> Generator[Frame, None, None]:
@@ -17,34 +14,13 @@ def prefetch(frames: Iterable[Frame], ahead: int = 4) -> Generator[Frame, None, 
 
     An error of the source is raised in place of its frame.  Closing the generator stops the thread.
     """
-    ready: queue.Queue[Any] = queue.Queue(maxsize=ahead)
-    stop = threading.Event()
-
-    def put(item: Any) -> bool:
-        while not stop.is_set():
-            try:
-                ready.put(item, timeout=0.1)
-            except queue.Full:
-                continue
-            return True
-        return False
-
-    def run() -> None:
-        try:
-            for frame in frames:
-                if not put(frame):
-                    return
-            put(_END)
-        except BaseException as error:  # raised in the reader's thread
-            put(error)
-
-    thread = threading.Thread(target=run, name="prefetch", daemon=True)
-    thread.start()
+    iterator = iter(frames)
+    pool = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
     try:
-        while (item := ready.get()) is not _END:
-            if isinstance(item, BaseException):
-                raise item
-            yield item
+        pending = deque(pool.submit(next, iterator, None) for _ in range(ahead))
+        while (frame := pending.popleft().result()) is not None:
+            pending.append(pool.submit(next, iterator, None))
+            yield frame
     finally:
-        stop.set()
-        thread.join(timeout=5.0)
+        # A file must not be closed during a read; the read of a live source ends only by its closing.
+        pool.shutdown(wait=not getattr(frames, "live", False), cancel_futures=True)
