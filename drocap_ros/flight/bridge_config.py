@@ -13,7 +13,7 @@ from drocap_ros.parameters import param
 
 @dataclass(frozen=True)
 class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
-    """The link to the autopilot, the telemetry asked of it, the orbit, and when motion may be commanded."""
+    """The link to the autopilot, its telemetry, the orbit, and the conditions for motion."""
 
     url: str = param(
         "udpin:127.0.0.1:14540",
@@ -21,13 +21,13 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
     )
     system_id: int = param(
         1,
-        "own MAVLink system; that of the vehicle we ride on.  Never 255: it is the ground station's, and an "
-        "autopilot that hears it does not notice the loss of the real one",
+        "own MAVLink system, that of the carrying vehicle.  Never 255: it is the ground station's, and an "
+        "autopilot that receives it does not notice the loss of the real one",
         minimum=1,
         maximum=254,
     )
     component_id: int = param(191, "own MAVLink component; 191 = onboard computer", minimum=2, maximum=250)
-    target_system_id: int = param(0, "vehicle to read; 0 = the first autopilot heard", minimum=0, maximum=254)
+    target_system_id: int = param(0, "vehicle to read; 0 = the first autopilot", minimum=0, maximum=254)
     signing_key_file: str = param(
         "", "file with the 64 hexadecimal digits of the key by which packets are signed, both ways; empty = unsigned"
     )
@@ -35,18 +35,18 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
     attitude_hz: float = param(50.0, "wanted rate of attitude", unit="Hz", minimum=1, maximum=200)
     position_hz: float = param(30.0, "wanted rate of local position", unit="Hz", minimum=1, maximum=100)
     gimbal_hz: float = param(
-        20.0, "wanted rate of the gimbal's attitude; 0 = do not ask", unit="Hz", minimum=0, maximum=100
+        20.0, "wanted rate of the gimbal's attitude; 0 = not requested", unit="Hz", minimum=0, maximum=100
     )
     status_hz: float = param(
         5.0, "wanted rate of GPS, battery, estimator and landed state", unit="Hz", minimum=0.2, maximum=20
     )
     time_sync_hz: float = param(
-        10.0, "rate of time synchronization; its answers show that the link carries both ways", unit="Hz", minimum=0.1,
-        maximum=20,
+        10.0, "rate of time synchronization; its answers show that the link works in both directions", unit="Hz",
+        minimum=0.1, maximum=20,
     )  # fmt: skip
     rate_window_s: float = param(3.0, "time over which the real rates are measured", unit="s", minimum=1, maximum=30)
     rate_shortfall: float = param(
-        0.5, "share of the wanted rate below which a message is asked for again", minimum=0, maximum=1
+        0.5, "share of the wanted rate below which a message is requested again", minimum=0, maximum=1
     )
     request_retry_s: float = param(2.0, "time between requests for the same message", unit="s", minimum=0.2, maximum=60)
     link_timeout_s: float = param(3.0, "silence after which the link counts as lost", unit="s", minimum=0.5, maximum=60)
@@ -57,10 +57,10 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
     )  # fmt: skip
     max_control_timeout_s: float = param(
         0.5, "longest time-out after which the autopilot may stop by itself when our setpoints stay away "
-        "(GUID_TIMEOUT, COM_OF_LOSS_T, read from it): with a longer or unknown one nothing is flown; 0 = no matter",
+        "(GUID_TIMEOUT, COM_OF_LOSS_T, read from it): a longer or unknown one forbids motion; 0 = not checked",
         unit="s", minimum=0, maximum=10,
     )  # fmt: skip
-    gimbal_control: bool = param(False, "whether the mount's pitch is turned to the subject")
+    gimbal_control: bool = param(False, "whether the mount's pitch follows the subject")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,4 +1,4 @@
-"""The one place where aviation frames (NED, FRD) become those of ROS (ENU, FLU), and back.
+"""Conversion of aviation frames (NED, FRD) to those of ROS (ENU, FLU) and back; no other module does it.
 
 Both changes of axes are their own inverses:
 

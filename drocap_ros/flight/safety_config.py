@@ -19,8 +19,8 @@ class SafetyConfig(Parameters):
     )
     max_subject_age_s: float = param(0.4, "greatest age of the subject's position", unit="s", minimum=0.05, maximum=2)
     max_blind_m: float = param(
-        0.85, "greatest distance flown on one sight of the subject: at speed its age is limited further, to this over "
-        "the speed, not below 0.25 s", unit="m", minimum=0.1, maximum=10,
+        0.85, "greatest distance flown since the subject was located: at speed its age is limited further, to this "
+        "over the speed, not below 0.25 s", unit="m", minimum=0.1, maximum=10,
     )  # fmt: skip
     max_subject_sd_m: float = param(
         1.5, "greatest standard deviation of the subject's position", unit="m", minimum=0.05, maximum=10
@@ -33,11 +33,11 @@ class SafetyConfig(Parameters):
     )
     max_heartbeat_age_s: float = param(2.5, "greatest age of the flight mode", unit="s", minimum=0.3, maximum=10)
     max_round_trip_s: float = param(
-        0.5, "greatest time since the sending of what the autopilot has answered last", unit="s", minimum=0.02,
-        maximum=5,
+        0.5, "greatest time since the sending of the message that the autopilot has answered last", unit="s",
+        minimum=0.02, maximum=5,
     )  # fmt: skip
     max_echo_age_s: float = param(
-        0.5, "time without the autopilot's echo of our setpoints after which it is taken not to follow them",
+        0.5, "time without the autopilot's echo of our setpoints after which it counts as not following them",
         unit="s", minimum=0.3, maximum=10,
     )  # fmt: skip
     min_battery_fraction: float = param(0.25, "least charge of the battery", minimum=0, maximum=1)
@@ -47,18 +47,18 @@ class SafetyConfig(Parameters):
     min_height_m: float = param(1.2, "least height above the subject's ground", unit="m", minimum=0.3, maximum=100)
     max_height_m: float = param(20.0, "greatest height above the subject's ground", unit="m", minimum=1, maximum=120)
     braking_m_s2: float = param(
-        1.3, "deceleration that is counted on: the margin to every limit is v^2 / (2 of this)", unit="m/s^2",
+        1.3, "assumed deceleration: the margin to every limit is v^2 / (2 of this)", unit="m/s^2",
         minimum=0.2, maximum=10,
     )  # fmt: skip
     speed_margin: float = param(
         1.3, "share of max_speed_m_s above which the vehicle is stopped", minimum=1.0, maximum=3.0
     )
     hold_s: float = param(
-        3.0, "time for which a place is held by setpoints before the autopilot's hold mode is asked for, if the "
+        3.0, "time for which setpoints hold the position before the autopilot's hold mode is requested, if the "
         "vehicle has not come to rest before", unit="s", minimum=0.5, maximum=30,
     )  # fmt: skip
     engage_timeout_s: float = param(
-        5.0, "time for GUIDED or OFFBOARD to come after `engage`", unit="s", minimum=1, maximum=30
+        5.0, "time for the autopilot to enter GUIDED or OFFBOARD after `engage`", unit="s", minimum=1, maximum=30
     )
 
     def __post_init__(self) -> None:

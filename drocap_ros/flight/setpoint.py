@@ -1,4 +1,4 @@
-"""What the vehicle is asked to do at one instant."""
+"""The setpoint: commanded motion of the vehicle at one instant."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class Setpoint(NamedTuple):
     yaw_rate: float
 
     def is_finite(self) -> bool:
-        """Whether it may be sent: an autopilot that gets NaN as a position or yaw has been seen to crash."""
+        """Whether it may be sent: NaN as position or yaw has crashed an autopilot."""
         vectors = np.isfinite(self.position).all() and np.isfinite(self.velocity).all()
         return bool(vectors and np.isfinite(self.acceleration).all() and np.isfinite([self.yaw, self.yaw_rate]).all())
 
 
 def hold_setpoint(position: np.ndarray, yaw: float) -> Setpoint:
-    """Stay at a place."""
+    """Setpoint that stays at a position."""
     return Setpoint(position.copy(), np.zeros(3), np.zeros(3), yaw, 0.0)

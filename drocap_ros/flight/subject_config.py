@@ -9,14 +9,14 @@ from drocap_ros.parameters import Parameters, param
 
 @dataclass(frozen=True)
 class SubjectConfig(Parameters):
-    """Where the subject is: what is assumed of body, ground and sensors."""
+    """Assumptions about body, ground and sensors that locate the subject."""
 
     body_height_m: float = param(1.7, "assumed height of the subject", unit="m", minimum=0.5, maximum=2.5)
     ground_height_m: float = param(
         0.0, "height of the subject's ground in the map frame (0 = where the autopilot's local frame begins)",
         unit="m", minimum=-500, maximum=500,
     )  # fmt: skip
-    use_ground_plane: bool = param(True, "take the range from the feet on level ground too; switch off on slopes")
+    use_ground_plane: bool = param(True, "use the range of the feet on level ground too; switch off on slopes")
     size_error: float = param(
         0.08,
         "standard deviation of the range from body size, as a share of it: 0.04 where body_height_m is measured",
@@ -30,13 +30,13 @@ class SubjectConfig(Parameters):
         0.6, "standard deviation of the camera's attitude", unit="deg", minimum=0, maximum=20
     )
     subject_acceleration_m_s2: float = param(
-        1.2, "how fast a subject changes its velocity (standard deviation over a second)",
+        1.2, "standard deviation of the change of a subject's velocity in a second",
         unit="m/s^2", minimum=0.05, maximum=20,
     )  # fmt: skip
     subject_gate: float = param(
         16.3, "squared Mahalanobis distance beyond which a measurement is not the subject", minimum=3, maximum=1000
     )
     camera_mount_pitch_deg: float = param(
-        0.0, "without a mount that tells its attitude: tilt of the camera against the body, down positive",
+        0.0, "without a mount that reports its attitude: tilt of the camera against the body, down positive",
         unit="deg", minimum=-90, maximum=90,
     )  # fmt: skip

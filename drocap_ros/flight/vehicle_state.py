@@ -1,4 +1,4 @@
-"""What is known of the vehicle at one instant: SI units, ENU world, FLU body, unknown = NaN."""
+"""State of the vehicle at one instant: SI units, ENU world, FLU body, unknown = NaN."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def test_the_demo_flies_by_what_it_sees_and_ends_with_a_motion_near_the_truth(tm
         ]
         vehicle = read_vehicle_track(session)
     told = re.search(
-        r"pictures: (\d+) exposed .*, (\d+) rendered and recorded, (\d+) looked at, (\d+) with the subject; "
+        r"pictures: (\d+) exposed .*, (\d+) rendered and recorded, (\d+) estimated, (\d+) with the subject; "
         r"live: (\d+) poses, error ([\d.]+) mm", printed,
     )  # fmt: skip
     assert [int(told[i]) for i in range(1, 4)] == [

@@ -1,4 +1,4 @@
-"""``drocap demo``: a whole capture flight in simulation, with pictures, through the real nodes, judged by the truth."""
+"""``drocap demo``: a simulated capture flight with images through the real nodes, compared with the truth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from drocap_ros.motion import Motion
     from drocap_ros.simulation.flight_simulator.truth import FlightTruth
 
-#: The networks that this package brings along, for simulated pictures only.
+#: The networks of this package, for simulated images only.
 MODELS = "simulation"
 _LEAST_S, _MOST_S = 2.0, 3600.0
 
@@ -26,8 +26,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "demo",
         help="fly a capture in simulation, reconstruct it, compare with the truth",
         description="A simulated drone takes off and films a simulated person; the real nodes see the person in the"
-        " pictures and fly the orbit by what they see. Record it, reconstruct it, and print the errors against the"
-        " simulated truth. Exit status 1 when no orbit came of it.",
+        " images and fly the orbit by their keypoints. Record it, reconstruct it, and print the errors against the"
+        " simulated truth. Exit status 1 when less than half of the orbit was flown.",
     )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("demo_out"), help="folder (default demo_out)")
     parser.add_argument("--seconds", metavar="S", type=float, default=30.0, help="length of the orbit (default 30)")
@@ -81,8 +81,8 @@ def run(args: argparse.Namespace) -> int:
         if not args.quiet:
             print(summary(motion, "ba"))
             print("processor: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in load.items()))
-    print(_flight_words(operator, verdict, config))
-    print(_picture_words(verdict, truth))
+    print(_flight_sentence(operator, verdict, config))
+    print(_image_sentence(verdict, truth))
     world = "" if math.isnan(errors.w_error_mm) else f", W-MPJPE {errors.w_error_mm:.1f} mm"
     print(
         f"reconstruction error against the simulated truth: {errors.error_mm:.1f} mm (PA-MPJPE, 12 limb joints,"
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def demo_config(folder: Path, seed: int, autopilot: str, models: str) -> DrocapConfig:
-    """The demo's graph: motion is allowed, of the simulated vehicle on a port of this machine."""
+    """The demo's graph, with motion enabled for the simulated vehicle on a port of this machine."""
     from drocap_ros.config import DrocapConfig
     from drocap_ros.simulation.vehicle.ports import free_udp_port
 
@@ -108,14 +108,14 @@ def demo_config(folder: Path, seed: int, autopilot: str, models: str) -> DrocapC
         "mavlink_bridge", url=f"udpin:{address}", commands_enabled=True, mode_change_allowed=True,
         gimbal_control=True, body_height_m=config.flight_simulator.stature_m, attitude_hz=25.0,
     )  # fmt: skip
-    # The operator has asked how tall the person is, as one does before a flight.
+    # The stature is known, as an operator would ask for it before a flight.
     config = config.replace("initializer", assumed_height_m=config.flight_simulator.stature_m)
     config = config.replace("pose_estimator", models_dir=models, on_loss="next")
     return config.replace("session_recorder", session_dir=str(folder / "session"))
 
 
 def _reconstruct(folder: Path, config: DrocapConfig, args: argparse.Namespace) -> Motion:
-    """Motion of the recorded session, with the pictures of it."""
+    """Motion of the recorded session, saved with its images and report."""
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.motion import save_motion
     from drocap_ros.pipeline import reconstruct_input
@@ -134,7 +134,7 @@ def _reconstruct(folder: Path, config: DrocapConfig, args: argparse.Namespace) -
     return motion
 
 
-def _flight_words(operator: Operator, verdict: FlightVerdict, config: DrocapConfig) -> str:
+def _flight_sentence(operator: Operator, verdict: FlightVerdict, config: DrocapConfig) -> str:
     holds = f"held {len(operator.holds)} times ({'; '.join(operator.holds)})" if operator.holds else "never held"
     words = f"orbit: {operator.orbited_s:.1f} s flown, {holds}"
     if operator.failure:
@@ -150,11 +150,11 @@ def _flight_words(operator: Operator, verdict: FlightVerdict, config: DrocapConf
     )
 
 
-def _picture_words(verdict: FlightVerdict, truth: FlightTruth) -> str:
+def _image_sentence(verdict: FlightVerdict, truth: FlightTruth) -> str:
     seconds = (truth.stamp_ns[-1] - truth.stamp_ns[0]) * 1e-9
     words = (
         f"pictures: {verdict.exposures} exposed in {seconds:.0f} s, {verdict.pictures} rendered and recorded,"
-        f" {verdict.poses} looked at, {verdict.seen} with the subject"
+        f" {verdict.poses} estimated, {verdict.seen} with the subject"
     )
     if verdict.live is None:
         return f"{words}; no live 3D pose"

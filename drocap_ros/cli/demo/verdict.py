@@ -28,7 +28,7 @@ class LivePoses:
 
 @dataclass(frozen=True)
 class FlightVerdict:
-    """What the recording tells of the flight, against the truth.
+    """Comparison of the recorded flight with the truth.
 
     exposures, pictures, poses, seen : exposed in the simulation; recorded; with a Pose2D; with the subject in it
     orbit : quality after the ramp; None where nothing is left after it
@@ -60,7 +60,7 @@ def judge_flight(session: Session, truth: FlightTruth, radius_m: float) -> Fligh
 def settled_orbit(stamp_ns: np.ndarray, statuses: list[tuple[int, State]]) -> np.ndarray:
     """(F,) bool, instants at which the bridge had been orbiting for longer than the ramp.
 
-    ``statuses`` : stamps, increasing, and the state told at each
+    ``statuses`` : increasing stamps with the state at each
     """
     settled = np.zeros(len(stamp_ns), bool)
     since: int | None = None

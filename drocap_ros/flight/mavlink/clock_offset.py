@@ -1,4 +1,4 @@
-"""The autopilot's clock in terms of ours, so that attitude and position carry the stamps of our clock."""
+"""Offset of the autopilot's clock: attitude and position get stamps of our clock."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ _NS = 1_000_000_000
 class ClockOffset:
     """Offset between our clock and the autopilot's time since boot.
 
-    Answers to TIMESYNC give it from both directions: of the exchanges of the last minute, that with the shortest
-    round trip counts.  Until one comes, the fastest message of the last ten seconds gives it from one direction,
-    late by the shortest transmission time.  A restart of the autopilot or a jump of either clock starts afresh.
+    Answers to TIMESYNC give it from both directions; the exchange with the shortest round trip of the last minute is
+    used.  Before the first answer, the fastest message of the last ten seconds gives it from one direction, late by the
+    shortest transmission time.  A restart of the autopilot or a jump of either clock resets it.
     """
 
     def __init__(self, window_s: float = 60.0, one_way_window_s: float = 10.0, jump_s: float = 1.0) -> None:
@@ -33,7 +33,7 @@ class ClockOffset:
 
     @property
     def round_trip_ns(self) -> int | None:
-        """Of the exchange that counts, or None when there was none."""
+        """Round trip of the exchange in use, or None without one."""
         return None if self._best is None else self._best[1]
 
     def exchange(self, sent_ns: int, remote_ns: int, received_ns: int) -> None:
@@ -50,11 +50,11 @@ class ClockOffset:
         self._best = min(self._exchanges, key=lambda e: e[1])
 
     def observe(self, remote_ns: int, received_ns: int) -> None:
-        """Take any message that tells the autopilot's time since boot."""
+        """Take a message that contains the autopilot's time since boot."""
         offset = received_ns - remote_ns
         known = self.offset_ns
         if known is not None and not -self._jump_ns < offset - known < 5 * self._jump_ns:
-            # One odd message is a late or damaged one; several in a row mean that a clock has jumped.
+            # A single outlier is a late or damaged message; several in a row mean that a clock has jumped.
             self._suspects += 1
             if self._suspects < 3:
                 return
@@ -67,9 +67,9 @@ class ClockOffset:
             self._fastest.popleft()
 
     def to_local_ns(self, remote_ns: int, received_ns: int) -> int:
-        """Our clock's stamp of an instant told in the autopilot's time; never later than its reception.
+        """Our clock's stamp of an instant of the autopilot's clock; never later than its reception.
 
-        An instant that would lie more than 5 s before its reception is not believed: then the reception counts.
+        The reception replaces an instant that would lie more than 5 s before it.
         """
         offset = self.offset_ns
         if offset is None:

@@ -1,4 +1,4 @@
-"""Bytes to MAVLink messages: whatever comes, it does not raise."""
+"""Bytes to MAVLink messages; no input raises."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ class MavlinkParser:
 
     Parameters
     ----------
-    key : 32 bytes; then whatever is not signed with it counts as bad
-    now_ns : our clock at the beginning: a stream that is a minute behind it is a recording played again
+    key : 32 bytes; then messages without its signature count as bad
+    now_ns : our clock at the beginning; a stream that is a minute behind it is a replayed recording
     """
 
     def __init__(self, key: bytes | None = None, now_ns: int = 0) -> None:
@@ -30,7 +30,7 @@ class MavlinkParser:
         return self._mav.signing
 
     def feed(self, data: bytes) -> list[Any]:
-        """Messages that are complete with these bytes; damaged ones are counted and left out."""
+        """Messages that these bytes complete; damaged ones are counted and left out."""
         try:
             found = self._mav.parse_buffer(data) or []
         except Exception:  # the parser raises many kinds on damaged packets; none may reach the flight loop

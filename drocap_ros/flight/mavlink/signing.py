@@ -1,4 +1,4 @@
-"""Signatures of MAVLink v2 packets: the key's file, and what pymavlink signs and checks with."""
+"""Signatures of MAVLink v2 packets: the file of the key, signing and checking by pymavlink."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LONGEST_FILE = 1024
 
 
 def read_signing_key(path: str) -> bytes:
-    """32 bytes from a file of 64 hexadecimal digits.  What the file holds is never part of a message.
+    """32 bytes from a file of 64 hexadecimal digits.  Error messages never contain the content of the file.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def signing_time(now_ns: int) -> int:
 
 
 def sign_with(mav: Any, key: bytes, now_ns: int, link_id: int = 0) -> None:
-    """Make an encoder or parser sign what it packs, and refuse what is not signed with this key."""
+    """Make an encoder or parser sign its packets, and refuse packets that are not signed with this key."""
     mav.signing.secret_key = key
     mav.signing.sign_outgoing = True
     mav.signing.link_id = link_id
@@ -54,13 +54,13 @@ def sign_with(mav: Any, key: bytes, now_ns: int, link_id: int = 0) -> None:
 
 
 class SigningMavlink(mavlink.MAVLink):
-    """pymavlink's protocol object, with one repair: a forged signature does not move the time of its stream.
+    """pymavlink's protocol object, except that a forged signature does not advance the time of its stream.
 
-    Otherwise one packet with a wrong signature and a time far ahead would make every later good one look old.
+    Otherwise one forged packet with a time far ahead would make every later genuine packet outdated.
     """
 
     def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:
-        """Whether the packet was signed with our key, later than the one before it."""
+        """Whether the packet was signed with our key, later than the previous one."""
         stream = (msgbuf[-13], srcSystem, srcComponent)
         before = self.signing.stream_timestamps.get(stream)
         good = bool(super().check_signature(msgbuf, srcSystem, srcComponent))

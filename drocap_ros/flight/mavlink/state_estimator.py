@@ -1,4 +1,4 @@
-"""From the autopilot's messages to :class:`VehicleState`: pure, so that live link and log replay share it."""
+"""From the autopilot's messages to :class:`VehicleState`; the live link and the readers of logs share it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from drocap_ros.flight.frames import (
 )
 from drocap_ros.flight.mavlink.clock_offset import ClockOffset
 from drocap_ros.flight.vehicle_state import VehicleState
-from drocap_ros.geometry.rotations import slerp
+from drocap_ros.geometry.rotations import slerp, unit_quaternions
 
 _NS = 1_000_000_000
 _MS = 1_000_000
@@ -28,7 +28,7 @@ _MAV_AUTOPILOT_INVALID = 8
 _AUTOPILOTS = {3: "ardupilot", 12: "px4"}
 _MAV_TYPE_GCS = 6
 _MAV_MODE_FLAG_SAFETY_ARMED = 128
-#: attitude, horizontal and vertical velocity, vertical position: all needed; horizontal position, relative or absolute.
+#: All of attitude, horizontal and vertical velocity and vertical position; either horizontal position.
 _ESTIMATOR_NEEDED = 1 | 2 | 4 | 32
 _ESTIMATOR_POSITION = 8 | 16
 _ESTIMATOR_CONSTANT_POSITION = 128
@@ -48,19 +48,18 @@ _EXTRAPOLATE_S = 0.5
 class VehicleStateEstimator:
     """Reduces messages of one autopilot to its state.
 
-    The first autopilot heard (or the one asked for) is the vehicle; other systems are not listened to.  Nothing
-    here reads a clock: the caller says when each message came.
+    The first autopilot (or the configured one) is the vehicle; messages of other systems are ignored.  It reads no
+    clock: each message comes with its time of reception.
 
     Parameters
     ----------
-    target_system_id : MAVLink system of the vehicle; 0 = the first autopilot heard
+    target_system_id : MAVLink system of the vehicle; 0 = the first autopilot
     """
 
     def __init__(self, target_system_id: int = 0) -> None:
         self.clock = ClockOffset()
         self.system_id = target_system_id
         self.component_id = 0
-        self.utc_minus_boot_ns: int | None = None
         self._heard_ns: int | None = None
         self._stamp_ns = -(10**18)
         self._heartbeat: tuple[str, str, bool] | None = None
@@ -74,15 +73,15 @@ class VehicleStateEstimator:
         self._gimbal: tuple[int, np.ndarray] | None = None  # reception, camera FRD -> NED x y z w
         self._gimbal_before: tuple[int, np.ndarray] | None = None
         self._values: dict[str, Any] = {}
-        #: When the latest message of each kind came from the vehicle, and when its position last changed: our clock.
+        #: Reception of the latest message of each kind, and of the last change of the position: our clock.
         self.received_ns: dict[str, int] = {}
         self.position_changed_ns = -(10**18)
 
     def update(self, message: Any, receive_time_ns: int) -> VehicleState | None:
-        """Take one decoded pymavlink message; a new state when it tells the attitude, else None.
+        """Take one decoded pymavlink message; returns a state for each attitude, else None.
 
-        Stamps increase, but after a jump of a clock by more than five seconds.
-        Values that cannot be (not finite, quaternion of no unit length) are dropped.
+        Stamps increase, except after a jump of a clock by more than five seconds.  Values that are not finite and
+        quaternions that are not normalized are dropped.
         """
         name = message.get_type()
         if name == "HEARTBEAT":
@@ -100,19 +99,19 @@ class VehicleStateEstimator:
         if not handler(self, message, receive_time_ns):
             return None
         state = self.snapshot(receive_time_ns)
-        # The clock's offset becomes better with time: what would go back by a little is left out.
+        # The estimate of the clock offset improves with time: states slightly back in time are left out.
         if state is None or 0 <= self._stamp_ns - state.stamp_ns < 5 * _NS:
             return None
         self._stamp_ns = state.stamp_ns
         return state
 
     def age_s(self, names: tuple[str, ...], now_ns: int) -> float:
-        """Time since the latest of these kinds of message came from the vehicle; infinity before the first."""
+        """Time in s since the latest message of these kinds; infinity before the first."""
         latest = max((self.received_ns[name] for name in names if name in self.received_ns), default=None)
         return math.inf if latest is None else (now_ns - latest) / _NS
 
     def snapshot(self, now_ns: int) -> VehicleState | None:
-        """The state as known at ``now_ns``; None before the first heartbeat and attitude."""
+        """The state at ``now_ns``; None before the first heartbeat and attitude."""
         if self._heartbeat is None or self._attitude is None or self._heard_ns is None:
             return None
         autopilot, mode, armed = self._heartbeat
@@ -160,7 +159,7 @@ class VehicleStateEstimator:
         return boot_ns
 
     def _take_attitude(self, message: Any, now_ns: int) -> bool:
-        # Where both forms come, the quaternion counts, so that each instant gives one state.
+        # With both forms of the attitude only the quaternion is used: one state for each instant.
         if (now_ns - self._quaternion_ns) / _NS < _QUATERNION_PREFERRED_S:
             return False
         angles = (message.roll, message.pitch, message.yaw)
@@ -169,7 +168,7 @@ class VehicleStateEstimator:
         return self._set_attitude(message, quaternion_from_euler(*angles), now_ns)
 
     def _take_attitude_quaternion(self, message: Any, now_ns: int) -> bool:
-        quaternion = _unit_quaternion((message.q2, message.q3, message.q4, message.q1))
+        quaternion = _quaternion(message.q2, message.q3, message.q4, message.q1)
         if quaternion is None:
             return False
         self._quaternion_ns = now_ns
@@ -187,7 +186,7 @@ class VehicleStateEstimator:
         if np.isfinite(ned).all() and np.isfinite(velocity).all():
             self._local_position_ns = now_ns
             position = ned_to_enu(ned)
-            # A real estimate never repeats bit for bit: one that does is frozen, however fresh its stamp.
+            # A real estimate never repeats bit for bit: a repeated one is frozen, even with a fresh stamp.
             if self._position is None or not np.array_equal(self._position[1], position):
                 self.position_changed_ns = now_ns
             self._position = (self._boot_ns(message, now_ns), position, ned_to_enu(velocity))
@@ -195,7 +194,7 @@ class VehicleStateEstimator:
 
     def _take_global_position(self, message: Any, now_ns: int) -> bool:
         boot_ns = self._boot_ns(message, now_ns)
-        if message.lat == 0 and message.lon == 0:  # autopilots send zeros until they know better
+        if message.lat == 0 and message.lon == 0:  # autopilots send zeros before the first fix
             return False
         geodetic = np.array([message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3])
         if abs(geodetic[0]) > 90 or abs(geodetic[1]) > 180:
@@ -205,7 +204,7 @@ class VehicleStateEstimator:
         )
         if (now_ns - self._local_position_ns) / _NS < _POSITION_STALE_S:
             return False
-        # No local position: a frame of our own, with its origin at the ground below the first position.
+        # No local position: our own frame, with its origin on the ground below the first position.
         if self._origin is None:
             self._origin = np.array([geodetic[0], geodetic[1], geodetic[2] - message.relative_alt * 1e-3])
         velocity = np.array([message.vx, message.vy, message.vz]) * 1e-2
@@ -238,7 +237,7 @@ class VehicleStateEstimator:
 
     def _take_gimbal(self, message: Any, now_ns: int) -> bool:
         w, x, y, z = message.q
-        quaternion = _unit_quaternion((x, y, z, w))
+        quaternion = _quaternion(x, y, z, w)
         if quaternion is None:
             return False
         flags = message.flags
@@ -250,7 +249,7 @@ class VehicleStateEstimator:
 
     def _take_mount_orientation(self, message: Any, now_ns: int) -> bool:
         absolute = message.yaw_absolute
-        # A v1 message has no absolute yaw and decodes it as 0: then the one relative to the vehicle counts.
+        # A v1 message has no absolute yaw and decodes it as 0: the yaw relative to the vehicle is used instead.
         earth = math.isfinite(absolute) and absolute != 0.0
         angles = np.deg2rad([message.roll, message.pitch, absolute if earth else message.yaw])
         if np.isfinite(angles).all():
@@ -265,7 +264,7 @@ class VehicleStateEstimator:
         return False
 
     def _set_gimbal(self, quaternion: np.ndarray, yaw_from_north: bool, now_ns: int) -> None:
-        """Keep the rotation camera FRD -> NED; a gimbal's roll and pitch are against the horizon in either case."""
+        """Keep the rotation camera FRD -> NED; its roll and pitch are relative to the horizon in either case."""
         if not yaw_from_north:
             if self._attitude is None:
                 return
@@ -274,16 +273,14 @@ class VehicleStateEstimator:
         self._gimbal_before, self._gimbal = self._gimbal, (now_ns, quaternion)
 
     def _take_system_time(self, message: Any, now_ns: int) -> bool:
-        boot_ns = self._boot_ns(message, now_ns)
-        if message.time_unix_usec > 1_000_000_000_000_000:  # before 2001 it has no GPS time yet
-            self.utc_minus_boot_ns = int(message.time_unix_usec) * 1000 - boot_ns
+        self._boot_ns(message, now_ns)
         return False
 
     def _gimbal_at(self, received_ns: int) -> np.ndarray:
-        """(4,) x y z w camera FLU -> ENU at the attitude's reception, NaN when it is not known.
+        """(4,) x y z w camera FLU -> ENU at the attitude's reception, NaN = unknown.
 
-        The gimbal's own messages come at other times, by a clock of its own: its last turn is carried on for as
-        long as it took, so that at 25 deg/s and 20 Hz the camera is not told a degree late.
+        Messages of the gimbal come at other times than the attitude.  Its last rotation is extrapolated over at most
+        one period: at 25 deg/s and 20 Hz the error would be a degree.
         """
         if self._gimbal is None or (received_ns - self._gimbal[0]) / _NS > _GIMBAL_STALE_S:
             return np.full(4, np.nan)
@@ -297,7 +294,7 @@ class VehicleStateEstimator:
         return orientation_to_ros(orientation)
 
     def _position_at(self, boot_ns: int) -> tuple[np.ndarray, np.ndarray]:
-        """Position and velocity (3,) ENU at an instant: carried on by the velocity for up to half a second."""
+        """Position and velocity (3,) ENU at an instant, extrapolated for up to half a second."""
         if self._position is None:
             return np.full(3, np.nan), np.full(3, np.nan)
         since, position, velocity = self._position
@@ -314,14 +311,17 @@ def mode_name(heartbeat: Any) -> str:
     return str(mavutil.mode_string_v10(heartbeat))
 
 
+def _quaternion(x: float, y: float, z: float, w: float) -> np.ndarray | None:
+    """Normalized (4,) x y z w; None where a value is not finite or the length is too far from 1."""
+    raw = np.array([[x, y, z, w]], dtype=float)
+    if not np.isfinite(raw).all():
+        return None
+    quaternion: np.ndarray = unit_quaternions(raw)[0]
+    return quaternion if np.isfinite(quaternion).all() else None
+
+
 def _estimator_ok(flags: int, bad: int) -> bool:
     return flags & _ESTIMATOR_NEEDED == _ESTIMATOR_NEEDED and bool(flags & _ESTIMATOR_POSITION) and not flags & bad
-
-
-def _unit_quaternion(xyzw: tuple[float, float, float, float]) -> np.ndarray | None:
-    quaternion = np.array(xyzw, dtype=float)
-    length = float(np.linalg.norm(quaternion))
-    return quaternion / length if math.isfinite(length) and 0.9 < length < 1.1 else None
 
 
 _FROM_ANY_COMPONENT = frozenset({"GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS"})

@@ -1,4 +1,4 @@
-"""Which telemetry is asked of the autopilot, whether it really comes, and when to ask again."""
+"""Requests for telemetry: which messages, at which rates, and when to repeat a request."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _ECHO_HZ = 10.0
 class _Wanted:
     rate_hz: float
     arrivals: deque[int] = field(default_factory=lambda: deque(maxlen=2048))
-    asked_ns: int = -(10**18)
-    asked_count: int = 0
+    requested_ns: int = -(10**18)
+    request_count: int = 0
     result: int | None = None
 
 
 class TelemetryRequests:
-    """The wanted messages with their rates: asked for, measured, asked for again when they fall short.
+    """The wanted messages: requested, measured, requested again when their rate is too low.
 
-    An acknowledgement says little (behind a proxy 20 Hz was acknowledged and 1.2 Hz came): the arrivals count.
-    What the autopilot refuses is asked for ever more rarely, for a mount may appear later.
+    The measured rate decides, because acknowledgements are not reliable: behind a proxy 20 Hz was acknowledged and
+    1.2 Hz arrived.  Refused messages are requested ten times more rarely, because a mount may appear later.
     """
 
     def __init__(self, config: MavlinkBridgeConfig) -> None:
@@ -42,29 +42,29 @@ class TelemetryRequests:
             mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: config.gimbal_hz,
         }
         if config.commands_enabled:
-            # A pilot's change of mode and the echo of our setpoints must not be seen a second late.
+            # At their usual 1 Hz a pilot's change of mode and the echo of our setpoints would be noticed a second late.
             rates[mavlink.MAVLINK_MSG_ID_HEARTBEAT] = _FAST_HEARTBEAT_HZ
             rates[mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED] = _ECHO_HZ
         self._wanted = {number: _Wanted(rate) for number, rate in rates.items() if rate > 0}
         self._since_ns: int | None = None
 
     def set_autopilot(self, autopilot: str) -> None:
-        """Add the estimator's health by the message that this autopilot has for it."""
+        """Add the message by which this autopilot reports its estimator's health."""
         px4 = autopilot == "px4"
         number = mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS if px4 else mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT
         self._wanted.setdefault(number, _Wanted(self._config.status_hz))
 
     def count(self, message_id: int, now_ns: int) -> None:
-        """A message has come."""
+        """Count a message."""
         wanted = self._wanted.get(message_id)
         if wanted is not None:
             wanted.arrivals.append(now_ns)
 
     def acknowledge(self, result: int, now_ns: int) -> None:
-        """An answer to a request.  It does not name the message: it is that of the oldest one unanswered."""
-        waiting = [w for w in self._wanted.values() if w.asked_count and w.result is None]
-        if waiting and now_ns >= waiting[0].asked_ns:
-            min(waiting, key=lambda w: w.asked_ns).result = result
+        """Take the answer to a request.  It names no message: it belongs to the oldest unanswered request."""
+        waiting = [w for w in self._wanted.values() if w.request_count and w.result is None]
+        if waiting and now_ns >= waiting[0].requested_ns:
+            min(waiting, key=lambda w: w.requested_ns).result = result
 
     def rate_hz(self, message_id: int, now_ns: int) -> float:
         """Real rate of a wanted message over the configured window."""
@@ -72,7 +72,7 @@ class TelemetryRequests:
         if self._since_ns is not None:
             window_ns = min(window_ns, max(now_ns - self._since_ns, 1))
         arrivals = self._wanted[message_id].arrivals
-        # This is asked for at every turn of the link: what is too old is looked at once.
+        # Called at every turn of the link: each outdated arrival is visited once.
         while arrivals and now_ns - arrivals[0] > window_ns:
             arrivals.popleft()
         return len(arrivals) * _NS / window_ns
@@ -93,23 +93,27 @@ class TelemetryRequests:
         }
 
     def due(self, now_ns: int) -> list[tuple[int, int]]:
-        """(message id, interval us) to ask for now: one at most at a time, so that answers can be told apart."""
+        """(message id, interval us) to request now: at most one, so that its answer is unambiguous."""
         if self._since_ns is None:
             self._since_ns = now_ns
         settle_ns = int(self._config.rate_window_s * _NS)
         for number, wanted in self._wanted.items():
             wait_s = self._config.request_retry_s * (1 if wanted.result in (None, 0) else 10)
-            if (now_ns - wanted.asked_ns) / _NS < wait_s:
+            if (now_ns - wanted.requested_ns) / _NS < wait_s:
                 continue
-            measured = now_ns - self._since_ns >= settle_ns and now_ns - wanted.asked_ns >= settle_ns
+            measured = now_ns - self._since_ns >= settle_ns and now_ns - wanted.requested_ns >= settle_ns
             short = measured and self.rate_hz(number, now_ns) < self._config.rate_shortfall * wanted.rate_hz
-            if wanted.asked_count == 0 or short:
-                wanted.asked_ns, wanted.result = now_ns, None
-                wanted.asked_count += 1
+            if wanted.request_count == 0 or short:
+                wanted.requested_ns, wanted.result = now_ns, None
+                wanted.request_count += 1
                 return [(number, round(1e6 / wanted.rate_hz))]
         return []
 
     def unanswered(self) -> bool:
-        """Whether the autopilot seems not to know the request at all: asked thrice, never answered."""
-        asked = [w for w in self._wanted.values() if w.asked_count]
-        return bool(asked) and all(w.result is None for w in asked) and max(w.asked_count for w in asked) >= 3
+        """Whether the autopilot ignores the request: three requests for a message, no answer to any."""
+        requested = [w for w in self._wanted.values() if w.request_count]
+        return (
+            bool(requested)
+            and all(w.result is None for w in requested)
+            and max(w.request_count for w in requested) >= 3
+        )

@@ -20,19 +20,19 @@ class LinkError(DrocapError):
 
 
 class Transport(Protocol):
-    """Something that carries bytes to and from an autopilot."""
+    """Carries bytes to and from an autopilot."""
 
     def read(self, timeout_s: float) -> bytes:
-        """Whatever has come within the time; empty when nothing has.  Raises LinkError when the link broke."""
+        """Bytes that arrive within the time, maybe none.  Raises LinkError when the link broke."""
 
     def write(self, data: bytes) -> bool:
-        """Send; False when there is nobody to send to, or no room."""
+        """Send; False without a peer or without room."""
 
     def accept_peer(self) -> None:
-        """Answer from now on to whom the latest bytes came from (UDP that listens)."""
+        """Send to the sender of the latest bytes from now on (listening UDP)."""
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
 
 
 def open_transport(url: str) -> Transport:
@@ -107,7 +107,7 @@ class _UdpTransport:
             return b""
         try:
             data, self._sender = self._socket.recvfrom(_MAX_DATAGRAM)
-        except (BlockingIOError, ConnectionRefusedError):  # refused: nobody listens there yet
+        except (BlockingIOError, ConnectionRefusedError):  # refused: no peer listens yet
             return b""
         return data
 
@@ -157,7 +157,7 @@ class _TcpTransport:
             raise LinkError(f"the TCP link to the autopilot broke: {error.strerror or error}") from None
 
     def accept_peer(self) -> None:
-        """Nothing to choose: there is one peer."""
+        """Do nothing: there is one peer."""
 
     def close(self) -> None:
         self._socket.close()
@@ -187,7 +187,7 @@ class _SerialTransport:
             return False
 
     def accept_peer(self) -> None:
-        """Nothing to choose: there is one peer."""
+        """Do nothing: there is one peer."""
 
     def close(self) -> None:
         self._port.close()

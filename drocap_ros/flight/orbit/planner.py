@@ -2,7 +2,7 @@
 
 A reference point circles a smoothed centre; the setpoint is that point with its velocity and acceleration
 (centripetal ``-omega^2 R r_hat`` included) and a yaw from the vehicle's *actual* place to the subject.  The
-reference waits for a vehicle that lags.  Angular speed, radius and height change along ramps limited in
+reference waits for a vehicle that lags behind.  Angular speed, radius and height change along ramps limited in
 acceleration and jerk.
 """
 
@@ -17,16 +17,16 @@ from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.setpoint import Setpoint
 
 _TRIM_RATE, _MAX_TRIM_M = 0.15, 0.5  # 1/s, m
-_FREE_LEAD = 0.6  # share of the greatest lead below which the reference does not wait
-_CENTRE_RATE = 4.0  # 1/s; fast, for the subject's estimate is steady: a slow centre is itself an error of the radius
-_CENTRE_ACCELERATION = 8.0  # m/s^2; above what a subject does, so that only jumps are limited
-_MAX_FORWARD = 1.5  # m/s^2 of the centre that are asked of the vehicle too: a walker's sharp turn
-_DAMPING, _MAX_DAMPING = 2.0, 2.0  # 1/s, m/s^2: how the vehicle's lack of velocity is made up for
+_FREE_LEAD = 0.6  # share of the greatest lead, below which the reference does not wait
+_CENTRE_RATE = 4.0  # 1/s; fast, because the subject's estimate is steady and a slow centre is an error of the radius
+_CENTRE_ACCELERATION = 8.0  # m/s^2; above any acceleration of a subject, so it limits only jumps
+_MAX_FORWARD = 1.5  # m/s^2 of the centre that the setpoint passes on: a walker's sharp turn
+_DAMPING, _MAX_DAMPING = 2.0, 2.0  # 1/s, m/s^2: feedback of the velocity error
 _STANDING_M_S, _SURPRISE_S, _FLIGHT_ERROR_M = 0.3, 0.5, 0.5  # of the least radius
 
 
 class OrbitGoal(NamedTuple):
-    """What the operator asked for."""
+    """Radius, height and angular speed that the operator wants."""
 
     radius_m: float
     height_m: float
@@ -42,13 +42,13 @@ class Ramp(NamedTuple):
 
 
 class OrbitState(NamedTuple):
-    """Where the reference is.
+    """State of the reference.
 
     phase : rad, bearing of the reference from the centre, from east
     omega : rad/s with its rate
     radius, height : m; height in the map frame
     centre, centre_velocity, centre_acceleration : (2,) m, m/s, m/s^2
-    trim : m, added to the radius: what the vehicle stays out or in on the mean (wind, lag), learned slowly
+    trim : m, added to the radius: integrated mean radius error (wind, lag)
     """
 
     phase: float
@@ -79,8 +79,8 @@ def goal_of(
 def least_radius(config: OrbitConfig, subject_sd_m: float, subject_speed_m_s: float, braking_m_s2: float) -> float:
     """Radius (m) at which an orbit stays clear of the minimum distance.
 
-    The subject may be nearer than it seems (two standard deviations), and one that walks may turn towards the vehicle
-    or stop dead before it.
+    It includes two standard deviations of the subject's position, and a walking subject that turns towards the vehicle
+    or stops at once.
     """
     speed = min(max(subject_speed_m_s - _STANDING_M_S, 0.0), config.max_subject_speed_m_s)
     surprise = max(_SURPRISE_S * speed, speed**2 / (2 * braking_m_s2))
@@ -88,7 +88,7 @@ def least_radius(config: OrbitConfig, subject_sd_m: float, subject_speed_m_s: fl
 
 
 def begin_orbit(vehicle: np.ndarray, velocity: np.ndarray, subject: np.ndarray, config: OrbitConfig) -> OrbitState:
-    """Reference at the vehicle's own place: nothing jumps at the start.
+    """Reference at the vehicle's own position, so that no setpoint jumps at the start.
 
     vehicle, velocity, subject : (3,) ENU
     """
@@ -117,9 +117,9 @@ def advance(
 ) -> OrbitState:
     """The reference ``dt`` seconds later (at most 0.2 s of them).
 
-    vehicle, subject, subject_velocity : (3,) ENU, as they are
+    vehicle, subject, subject_velocity : (3,) ENU, actual
     ground_m : height of the subject's ground in the map frame
-    least_radius_m : a smaller radius is not flown, whatever the goal
+    least_radius_m : lower bound of the radius
     """
     dt = min(max(dt, 0.0), 0.2)
     if dt == 0.0:
@@ -138,7 +138,7 @@ def advance(
     # A ramp of the wanted length with rounded ends: its greatest rate is 1.5 times its mean.
     rate = 1.5 * max(abs(goal.angular_speed_rad_s), math.radians(5.0)) / config.ramp_s
     omega = _speed_toward(state.omega, target, rate, 6.0 * rate / config.ramp_s, dt)
-    # The ramp is too slow for a vehicle that suddenly stays behind: then the phase itself waits.
+    # The ramp is too slow for a vehicle that suddenly falls behind: the phase itself waits.
     creep = min(max((1.3 * config.max_lead_m - lead) / (0.3 * config.max_lead_m), 0.0), 1.0)
     phase = state.phase + 0.5 * (state.omega.value + omega.value) * dt * creep
     trim = state.trim
@@ -152,7 +152,7 @@ def advance(
 
 
 def reference_position(state: OrbitState) -> np.ndarray:
-    """(3,) m ENU, where the reference is."""
+    """(3,) m ENU, position of the reference."""
     c, s = math.cos(state.phase), math.sin(state.phase)
     r = state.radius.value + state.trim
     return np.array([state.centre[0] + r * c, state.centre[1] + r * s, state.height.value])
@@ -166,36 +166,36 @@ def setpoint_of(
     config: OrbitConfig,
     vehicle_velocity: np.ndarray | None = None,
 ) -> Setpoint:
-    """What to send: the reference, never farther from the vehicle than the greatest lead.
+    """Setpoint of the reference, at most the greatest lead away from the vehicle.
 
-    vehicle_velocity : (3,) m/s; what it lacks of the reference's is asked for as acceleration too
+    vehicle_velocity : (3,) m/s; its error becomes an acceleration of the setpoint
     """
     c, s = math.cos(state.phase), math.sin(state.phase)
     outward, along = np.array([c, s]), np.array([-s, c])
     r, omega = state.radius, state.omega
     flat_velocity = state.centre_velocity + r.rate * outward + r.value * omega.value * along
     flat_acceleration = (
-        _shortened(state.centre_acceleration, _MAX_FORWARD)
+        _limited(state.centre_acceleration, _MAX_FORWARD)
         + (r.acceleration - omega.value**2 * r.value) * outward
         + (r.value * omega.rate + 2 * r.rate * omega.value) * along
     )
-    velocity = _shortened(np.array([*flat_velocity, state.height.rate]), config.max_speed_m_s)
+    velocity = _limited(np.array([*flat_velocity, state.height.rate]), config.max_speed_m_s)
     if vehicle_velocity is not None:
-        flat_acceleration = flat_acceleration + _shortened(
+        flat_acceleration = flat_acceleration + _limited(
             _DAMPING * (flat_velocity - vehicle_velocity[:2]), _MAX_DAMPING
         )
-    acceleration = _shortened(np.array([*flat_acceleration, state.height.acceleration]), config.max_acceleration_m_s2)
-    position = vehicle + _shortened(reference_position(state) - vehicle, config.max_lead_m)
+    acceleration = _limited(np.array([*flat_acceleration, state.height.acceleration]), config.max_acceleration_m_s2)
+    position = vehicle + _limited(reference_position(state) - vehicle, config.max_lead_m)
     sight = subject[:2] - vehicle[:2]
     distance2 = max(float(sight @ sight), 0.25)
-    # The subject moves as estimated, the vehicle as it is asked to.
+    # The subject moves as estimated, the vehicle as commanded.
     drift = subject_velocity[:2] - velocity[:2]
     yaw_rate = float(sight[0] * drift[1] - sight[1] * drift[0]) / distance2
     return Setpoint(position, velocity, acceleration, math.atan2(sight[1], sight[0]), yaw_rate)
 
 
 def _approach_speed(state: OrbitState, config: OrbitConfig) -> float:
-    """Speed of radius changes: slower after a subject that walks away, who may stop while the vehicle cannot."""
+    """Speed of radius changes: slower behind a subject that walks away, because it may stop at once."""
     outward = np.array([math.cos(state.phase), math.sin(state.phase)])
     chase = max(-float(state.centre_velocity @ outward), 0.0)
     room = max(state.radius.value - config.min_distance_m, 0.0)
@@ -203,7 +203,7 @@ def _approach_speed(state: OrbitState, config: OrbitConfig) -> float:
 
 
 def _allowed_speed(wanted: float, radius: float, centre_speed: float, config: OrbitConfig) -> float:
-    """Angular speed (rad/s) that radius, speed and acceleration limits leave of the wanted one."""
+    """Wanted angular speed in rad/s, limited by speed and acceleration at this radius."""
     by_acceleration = math.sqrt(config.max_acceleration_m_s2 / radius)
     by_speed = max(config.max_speed_m_s - centre_speed, 0.0) / radius
     return math.copysign(min(abs(wanted), by_acceleration, by_speed), wanted)
@@ -212,10 +212,10 @@ def _allowed_speed(wanted: float, radius: float, centre_speed: float, config: Or
 def _follow(
     state: OrbitState, subject: np.ndarray, velocity: np.ndarray, dt: float, config: OrbitConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centre after the subject: critically damped, limited in speed and acceleration, so that no jump comes through."""
+    """Centre that follows the subject: critically damped, limited in speed and acceleration against jumps."""
     pull = _CENTRE_RATE**2 * (subject - state.centre) + 2 * _CENTRE_RATE * (velocity - state.centre_velocity)
-    acceleration = _shortened(pull, _CENTRE_ACCELERATION)
-    moved = _shortened(state.centre_velocity + acceleration * dt, config.max_subject_speed_m_s)
+    acceleration = _limited(pull, _CENTRE_ACCELERATION)
+    moved = _limited(state.centre_velocity + acceleration * dt, config.max_subject_speed_m_s)
     return state.centre + 0.5 * (state.centre_velocity + moved) * dt, moved, acceleration
 
 
@@ -235,6 +235,6 @@ def _speed_toward(speed: Ramp, target: float, max_acceleration: float, jerk: flo
     return Ramp(speed.value + rate * dt, rate)
 
 
-def _shortened(vector: np.ndarray, length: float) -> np.ndarray:
+def _limited(vector: np.ndarray, length: float) -> np.ndarray:
     norm = float(np.linalg.norm(vector))
     return vector if norm <= length else vector * (length / norm)

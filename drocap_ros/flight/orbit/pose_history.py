@@ -1,8 +1,8 @@
 """The camera's pose at the instant of an image, from the vehicle's states around it.
 
-The reported position wanders by decimetres within seconds, the reported velocity hardly: places here are the
-integrated velocity, led back to the position slowly.  So what the subject seems to move is not the satellites' noise,
-and its range from the ground not that of the height.
+The reported position wanders by decimetres within seconds, the reported velocity hardly.  So positions here are the
+integrated velocity with a slow correction towards the reported position: noise of the satellites does not appear as
+motion of the subject, nor noise of the height as its range from the ground.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import slerp
 
 _NS = 1_000_000_000
-_LED_BACK_S = 6.0
-_JUMP_M = 3.0  # beyond which the position is believed at once
+_CORRECTION_S = 6.0
+_JUMP_M = 3.0  # beyond which the reported position replaces the integrated one
 
 
 class CameraPose(NamedTuple):
@@ -33,9 +33,9 @@ class PoseHistory:
 
     Parameters
     ----------
-    mount_pitch_deg : tilt of the camera against the body, down positive, where no mount tells its attitude
+    mount_pitch_deg : tilt of the camera against the body, down positive, without a mount that reports its attitude
     keep_s : how far back
-    extrapolate_s : how far beyond the newest state a pose is still told
+    extrapolate_s : longest extrapolation beyond the newest state
     """
 
     def __init__(self, mount_pitch_deg: float = 0.0, keep_s: float = 3.0, extrapolate_s: float = 0.15) -> None:
@@ -43,11 +43,11 @@ class PoseHistory:
         self._mount = np.array([0.0, np.sin(half), 0.0, np.cos(half)])  # about FLU y: positive turns the nose down
         self._keep_ns, self._extrapolate_ns = int(keep_s * _NS), int(extrapolate_s * _NS)
         self._poses: deque[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = deque()
-        #: (3,) m, what the reported position is away from the steady one, now: of any place told here, add it.
+        #: (3,) m, reported minus integrated position now: add it to a position from here.
         self.offset: np.ndarray = np.zeros(3)
 
     def add(self, state: VehicleState) -> None:
-        """Take a state; one without position or attitude is left out.  A stamp that goes back starts afresh."""
+        """Take a state; one without position or attitude is left out.  A stamp that goes back clears the history."""
         camera = state.gimbal_orientation_xyzw
         if not np.isfinite(camera).all():
             camera = quaternion_multiply(state.orientation_xyzw, self._mount)
@@ -63,7 +63,7 @@ class PoseHistory:
             self._poses.popleft()
 
     def _steady(self, stamp_ns: int, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """(3,) m, where the velocity leads to from the last pose, a little towards the position."""
+        """(3,) m, last position plus integrated velocity, with the correction towards the reported position."""
         if not self._poses:
             return position
         before = self._poses[-1]
@@ -72,10 +72,10 @@ class PoseHistory:
         gap = position - moved
         if float(np.linalg.norm(gap)) > _JUMP_M:
             return position
-        return moved + (1 - np.exp(-dt / _LED_BACK_S)) * gap
+        return moved + (1 - np.exp(-dt / _CORRECTION_S)) * gap
 
     def at(self, stamp_ns: int) -> CameraPose | None:
-        """Pose at an instant; None when the states do not reach there."""
+        """Pose at an instant; None outside the states."""
         if not self._poses or stamp_ns < self._poses[0][0] - self._extrapolate_ns:
             return None
         newest = self._poses[-1]

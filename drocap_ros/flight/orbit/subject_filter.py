@@ -58,7 +58,7 @@ def _range_noise(
 class SubjectFilter:
     """Kalman filter of position and velocity, white acceleration; measurements must come in the order of stamps.
 
-    It reads no clock.  A frozen picture (the same keypoints bit for bit) and a measurement outside the gate do not
+    It reads no clock.  A frozen image (the same keypoints bit for bit) and a measurement outside the gate do not
     refresh the estimate.
     """
 

@@ -266,11 +266,3 @@ def test_link_age_grows_in_silence(ready):
     estimator, sender = ready
     assert estimator.update(attitude(sender), 10 * S).link_age_s == 0
     assert np.isclose(estimator.snapshot(12 * S).link_age_s, 2.0)
-
-
-def test_system_time_gives_utc(ready):
-    estimator, sender = ready
-    estimator.update(sender("system_time", 1_700_000_000_000_000, 5000), 10 * S)
-    assert estimator.utc_minus_boot_ns == 1_700_000_000 * S - 5 * S
-    estimator.update(sender("system_time", 0, 6000), 11 * S)
-    assert estimator.utc_minus_boot_ns == 1_700_000_000 * S - 5 * S
