@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.motion import Motion
+from drocap_ros.report.statistics import mean_known
+from drocap_ros.skeleton import side_of
 
-_SIDE_COLOURS = {"r": "#c0392b", "l": "#2471a3", "": "#444444"}
+_COLOURS = {"right": "#c0392b", "left": "#2471a3", "middle": "#444444"}
 _POSES = 7
 
 
@@ -58,9 +60,8 @@ def _upright_body(motion: Motion) -> tuple[np.ndarray, float]:
 def _draw(axes: Any, points: np.ndarray, motion: Motion, limit: float | None, title: str) -> None:
     for child, parent in enumerate(motion.parents):
         if parent >= 0:
-            name = motion.joints[child]
-            side = name[0] if name[1:] in ("hip", "knee", "ankle", "shoulder", "elbow", "wrist") else ""
-            axes.plot(*points[[parent, child]].T, color=_SIDE_COLOURS[side], linewidth=1.8, solid_capstyle="round")
+            colour = _COLOURS[side_of(motion.joints[child], motion.joints)]
+            axes.plot(*points[[parent, child]].T, color=colour, linewidth=1.8, solid_capstyle="round")
     axes.set_aspect("equal")
     axes.set_title(title)
     axes.set_xticks([])
@@ -72,10 +73,7 @@ def _draw(axes: Any, points: np.ndarray, motion: Motion, limit: float | None, ti
 
 def _plot_error(axes: Any, motion: Motion) -> None:
     seconds = (motion.stamp_ns - motion.stamp_ns[0]) * 1e-9
-    squared = np.where(np.isfinite(motion.reprojection_px), motion.reprojection_px, 0.0) ** 2
-    seen = np.isfinite(motion.reprojection_px).sum(axis=1)
-    rms = np.sqrt(squared.sum(axis=1) / np.maximum(seen, 1))
-    axes.plot(seconds, np.where(seen > 0, rms, np.nan), color="#444444", linewidth=1)
+    axes.plot(seconds, np.sqrt(mean_known(np.square(motion.reprojection_px), 1)), color="#444444", linewidth=1)
     axes.set_xlabel("s")
     axes.set_ylabel("reprojection RMS, px")
     axes.set_ylim(bottom=0)
