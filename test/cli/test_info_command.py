@@ -17,7 +17,7 @@ def run(path):
     return args.run(args)
 
 
-def test_session(pose_session, capture, capsys):
+def test_info_of_a_session_lists_topics_counts_and_rates(pose_session, capture, capsys):
     assert run(pose_session) == 0
     out, err = capsys.readouterr()
     assert "messages: 120" in out
@@ -37,7 +37,7 @@ def test_truncated_session_warns_on_stderr(pose_session, capsys):
     assert err.startswith("drocap: warning: session_0.mcap: cut off")
 
 
-def test_table_on_a_terminal(pose_session, capsys, monkeypatch):
+def test_info_prints_a_table_on_a_terminal(pose_session, capsys, monkeypatch):
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     info._print_table(info.summarize(pose_session))
     out = capsys.readouterr().out
@@ -45,7 +45,7 @@ def test_table_on_a_terminal(pose_session, capsys, monkeypatch):
     assert "┃" in out
 
 
-def test_tracks_and_motion(tmp_path, capture, capsys):
+def test_info_of_tracks_and_motion_lists_arrays_and_rates(tmp_path, capture, capsys):
     save_tracks(tmp_path / "tracks.npz", capture.tracks)
     assert run(tmp_path / "tracks.npz") == 0
     out = capsys.readouterr().out
@@ -70,7 +70,7 @@ def test_tracks_and_motion(tmp_path, capture, capsys):
     assert "method: ba" in out
 
 
-def test_files_of_no_known_kind(tmp_path):
+def test_files_of_unknown_kinds_are_refused_in_one_line(tmp_path):
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     (tmp_path / "text.npz").write_text("no archive")
     (tmp_path / "x.mp4").write_bytes(b"0000")

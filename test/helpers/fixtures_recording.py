@@ -35,7 +35,7 @@ def pose_session(tmp_path, messages, capture):
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """A disk of 8 MB, where this machine lets us make one."""
+    """A disk of 8 MB, where this machine permits one."""
     place = tmp_path / "disk"
     place.mkdir()
     made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "none", str(place)], capture_output=True)

@@ -10,7 +10,7 @@ from drocap_ros.recording.open_session import open_session
 @pytest.mark.parametrize(
     ("encoding", "pad"), [("bgr8", 0), ("rgb8", 0), ("rgb8", 5), ("bgra8", 3), ("rgba8", 0), ("mono8", 0), ("mono8", 1)]
 )
-def test_raw_pictures(tmp_path, messages, encoding, pad):
+def test_raw_images_equal_the_recorded_ones(tmp_path, messages, encoding, pad):
     import cv2
 
     images = [random_image(i) for i in range(3)]
@@ -31,7 +31,7 @@ def test_raw_pictures(tmp_path, messages, encoding, pad):
     ("encoding", "red"),
     [("bayer_rggb8", (0, 0)), ("bayer_grbg8", (0, 1)), ("bayer_gbrg8", (1, 0)), ("bayer_bggr8", (1, 1))],
 )
-def test_bayer_pictures_have_their_colours(messages, encoding, red):
+def test_bayer_images_have_their_colours(messages, encoding, red):
     mosaic = np.zeros((32, 32), np.uint8)
     mosaic[red[0] :: 2, red[1] :: 2] = 200  # only the red pixels have light
     message = messages(NAMES["image"], height=32, width=32, encoding=encoding, step=32, data=mosaic.ravel())
@@ -40,7 +40,7 @@ def test_bayer_pictures_have_their_colours(messages, encoding, red):
     assert max(blue, green) < 5
 
 
-def test_yuv_pictures(messages):
+def test_yuv_images_are_grey_without_chroma(messages):
     for encoding, order in (("yuv422", (1, 0)), ("yuv422_yuy2", (0, 1))):  # UYVY, YUYV
         pair = np.zeros((4, 8, 2), np.uint8)
         pair[..., order[0]], pair[..., order[1]] = 120, 128
@@ -50,7 +50,7 @@ def test_yuv_pictures(messages):
         assert abs(int(image.mean()) - 121) < 5
 
 
-def test_compressed_pictures_and_damaged_ones(tmp_path, messages):
+def test_damaged_compressed_images_are_left_out_with_a_warning(tmp_path, messages):
     import cv2
 
     images = [random_image(i) for i in range(4)]
@@ -79,7 +79,7 @@ def test_compressed_pictures_and_damaged_ones(tmp_path, messages):
         {"data": np.zeros(5, np.uint8)},
     ],
 )
-def test_pictures_that_do_not_fit_are_refused(tmp_path, messages, change):
+def test_images_with_wrong_sizes_are_refused(tmp_path, messages, change):
     message = image_message(messages, random_image(0), START_NS)
     for name, value in change.items():
         setattr(message, name, value)

@@ -12,13 +12,13 @@ from drocap_ros.recording.session_tracks import read_pose2d
 POSE2D = NAMES["pose2d"]
 
 
-def test_lone_mcap_reads_like_its_folder(pose_session):
+def test_single_mcap_gives_the_tracks_of_its_folder(pose_session):
     with open_session(pose_session) as a, open_session(pose_session / "session_0.mcap") as b:
         assert np.array_equal(read_pose2d(a).keypoints, read_pose2d(b).keypoints, equal_nan=True)
 
 
 def write_with_rosbags(path, kind, messages, capture):
-    """The same pictures and poses, recorded by rosbags and not by us."""
+    """Images and poses, recorded by rosbags."""
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2
@@ -60,7 +60,7 @@ def ros1_copy(store, message, i):
 
 
 @pytest.mark.parametrize("kind", ["bag", "sqlite3", "mcap"])
-def test_recordings_of_others(tmp_path, messages, capture, kind):
+def test_recordings_of_other_writers_are_read(tmp_path, messages, capture, kind):
     path = write_with_rosbags(tmp_path / ("other.bag" if kind == "bag" else "other"), kind, messages, capture)
     assert is_recording(path)
     with open_session(path) as session:
@@ -75,7 +75,7 @@ def test_recordings_of_others(tmp_path, messages, capture, kind):
     assert info.duration_s == pytest.approx(0.09)
 
 
-def test_sqlite3_of_an_older_ros_without_embedded_definitions(tmp_path, messages, capture):
+def test_sqlite3_without_embedded_definitions_is_read(tmp_path, messages, capture):
     import sqlite3
 
     path = write_with_rosbags(tmp_path / "old", "sqlite3", messages, capture)
@@ -87,7 +87,7 @@ def test_sqlite3_of_an_older_ros_without_embedded_definitions(tmp_path, messages
         assert len(read_pose2d(session)) == 10
 
 
-def test_session_without_its_metadata_file(pose_session, capture):
+def test_session_without_its_metadata_file_is_read(pose_session, capture):
     (pose_session / "metadata.yaml").unlink()
     with open_session(pose_session) as session:
         assert len(read_pose2d(session)) == len(capture.tracks)
@@ -97,7 +97,7 @@ def test_session_without_its_metadata_file(pose_session, capture):
         assert len(read_pose2d(session)) == len(capture.tracks)
 
 
-def test_info(pose_session, capture):
+def test_info_gives_topics_types_counts_and_duration(pose_session, capture):
     info = session_info(pose_session)
     assert info.message_count == len(capture.tracks)
     assert info.topics[0].type_name == POSE2D
@@ -105,9 +105,9 @@ def test_info(pose_session, capture):
     assert info.warnings == ()
 
 
-def test_missing_and_foreign_paths(tmp_path):
+def test_missing_and_other_files_are_refused_in_one_line(tmp_path):
     (tmp_path / "empty").mkdir()
-    (tmp_path / "text.mcap").write_text("not a recording, but long enough to look at")
+    (tmp_path / "text.mcap").write_text("not a recording, but long enough")
     (tmp_path / "zero.mcap").write_bytes(b"")
     (tmp_path / "text.bag").write_text("neither is this")
     (tmp_path / "text.db3").write_text("nor this")
@@ -119,7 +119,7 @@ def test_missing_and_foreign_paths(tmp_path):
         assert name in str(error.value)
 
 
-def test_newer_version_of_the_folder_is_still_read_by_its_file(pose_session, capture):
+def test_folder_of_a_newer_version_is_read(pose_session, capture):
     text = (pose_session / "metadata.yaml").read_text()
     (pose_session / "metadata.yaml").write_text(text.replace("version: 9", "version: 42"))
     with open_session(pose_session) as session:

@@ -67,18 +67,18 @@ def flight_entries(messages, capture, *, gimbal=True, rate_hz=50.0, skip_s=(9.0,
     return [(topic, message, log, messages.cdr(message)) for topic, message, log in entries]
 
 
-def test_telemetry_at_each_picture(tmp_path, messages, capture):
+def test_camera_pose_at_each_image(tmp_path, messages, capture):
     record(tmp_path / "s", flight_entries(messages, capture))
     with open_session(tmp_path / "s") as session:
         tracks = read_pose2d(session)
         assert session.warnings == []
-    # The last picture lies between the last state of the moving path and the first of the standing one.
+    # The last image is between the last state of the moving path and the first of the resting one.
     assert np.rad2deg(angle_between(tracks.camera_rotation, capture.camera_rotation))[:-1].max() < 0.01
     assert np.linalg.norm(tracks.camera_position - capture.camera_position, axis=1)[:-1].max() < 0.001
     assert np.array_equal(tracks.camera_matrix, capture.tracks.camera_matrix)
 
 
-def test_without_a_gimbal_the_rotation_is_not_invented(tmp_path, messages, capture):
+def test_rotation_is_unknown_without_a_gimbal(tmp_path, messages, capture):
     record(tmp_path / "s", flight_entries(messages, capture, gimbal=False))
     with open_session(tmp_path / "s") as session:
         tracks = read_pose2d(session)
@@ -87,7 +87,7 @@ def test_without_a_gimbal_the_rotation_is_not_invented(tmp_path, messages, captu
         assert any("hold no gimbal" in warning for warning in session.warnings)
 
 
-def test_short_gap_in_the_telemetry_is_bridged_and_told(tmp_path, messages, capture):
+def test_short_gap_in_the_telemetry_is_interpolated_with_a_warning(tmp_path, messages, capture):
     record(tmp_path / "s", flight_entries(messages, capture, skip_s=(1.0, 2.5)))
     with open_session(tmp_path / "s") as session:
         tracks = read_pose2d(session)
@@ -96,7 +96,7 @@ def test_short_gap_in_the_telemetry_is_bridged_and_told(tmp_path, messages, capt
         assert any("the attitude was interpolated over gaps of up to 1.5 s" in w for w in session.warnings)
 
 
-def test_long_gap_in_the_telemetry_leaves_it_unknown(tmp_path, messages, capture):
+def test_camera_pose_is_unknown_after_a_long_gap(tmp_path, messages, capture):
     record(tmp_path / "s", flight_entries(messages, capture, skip_s=(0.8, 3.2)))
     with open_session(tmp_path / "s") as session:
         tracks = read_pose2d(session)
@@ -106,7 +106,7 @@ def test_long_gap_in_the_telemetry_leaves_it_unknown(tmp_path, messages, capture
         assert any("2.4 s from an attitude" in warning for warning in session.warnings)
 
 
-def test_telemetry_that_starts_late(tmp_path, messages, capture):
+def test_images_before_the_telemetry_are_left_out_if_most_remain(tmp_path, messages, capture):
     record(tmp_path / "a", flight_entries(messages, capture, start_s=1.0))
     record(tmp_path / "b", flight_entries(messages, capture, start_s=3.0))
     with open_session(tmp_path / "a") as session:
@@ -115,7 +115,7 @@ def test_telemetry_that_starts_late(tmp_path, messages, capture):
     assert np.array_equal(tracks.stamp_ns, capture.tracks.stamp_ns[27:])
     assert np.array_equal(tracks.keypoints, capture.tracks.keypoints[27:].astype(np.float32), equal_nan=True)
     error = np.rad2deg(angle_between(tracks.camera_rotation, capture.camera_rotation[27:]))
-    assert error.max() < 3.0  # the first state holds for the three pictures right before it
+    assert error.max() < 3.0  # the first state holds for the three images right before it
     assert np.median(error) < 0.01
     with open_session(tmp_path / "b") as session:
         tracks = read_pose2d(session)
@@ -123,7 +123,7 @@ def test_telemetry_that_starts_late(tmp_path, messages, capture):
     assert len(tracks) == len(capture.tracks)
 
 
-def test_out_of_order_and_repeated_poses(tmp_path, messages, capture):
+def test_poses_are_sorted_and_repeated_ones_left_out(tmp_path, messages, capture):
     tracks = capture.tracks
     order = [3, 1, 2, 0, 2]
     entries = [("/pose2d", messages.pose2d(tracks, i, START_NS + i), START_NS + k) for k, i in enumerate(order)]
@@ -145,7 +145,7 @@ def test_out_of_order_and_repeated_poses(tmp_path, messages, capture):
         ({"image_width": 640}, "image size: expected"),
     ],
 )
-def test_poses_that_cannot_be_used(tmp_path, messages, capture, change, text):
+def test_unusable_poses_are_refused_in_one_line(tmp_path, messages, capture, change, text):
     entries = []
     for i in range(3):
         message = messages.pose2d(capture.tracks, i, START_NS + i)

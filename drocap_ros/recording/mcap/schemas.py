@@ -8,7 +8,6 @@ those of ROS come from ``rosbags``.
 from __future__ import annotations
 
 import os
-import re
 import sys
 from functools import lru_cache
 from pathlib import Path
@@ -61,15 +60,21 @@ def schema_text(type_name: str) -> str:
     InputError
         When the type is unknown.
     """
-    done = {type_name: _definition(type_name)}
-    waiting = _dependencies(type_name)
-    while waiting:
-        name = waiting.pop(0)
-        if name not in done:
-            done[name] = _definition(name)
-            waiting += _dependencies(name)
-    first, *rest = done.items()
-    return first[1] + "".join(f"{_SEPARATOR}MSG: {name.replace('/msg/', '/')}\n{text}" for name, text in rest)
+    try:
+        text, _ = standard_types().generate_msgdef(type_name, ros_version=2)
+    except Exception as error:
+        raise InputError(
+            f"message type: expected one of drocap_ros or of ROS 2 Jazzy, got {type_name!r} ({error}); "
+            "register it with its schema text"
+        ) from None
+    # The generated text has no comments, which give the units; the package's own files replace it.
+    own = own_definitions()
+    first, *rest = str(text).split(_SEPARATOR)
+    parts = [own.get(type_name, first)]
+    for part in rest:
+        head, body = part.split("\n", 1)
+        parts.append(f"{head}\n{own.get(head.removeprefix('MSG: ').replace('/', '/msg/'), body)}")
+    return _SEPARATOR.join(part.rstrip("\n") + "\n" for part in parts)
 
 
 def type_hash(type_name: str, schema: str) -> str:
@@ -82,22 +87,3 @@ def type_hash(type_name: str, schema: str) -> str:
         return store.hash_rihs01(type_name)
     except Exception:  # readers do without a hash
         return ""
-
-
-def _definition(type_name: str) -> str:
-    own = own_definitions().get(type_name)
-    if own is not None:
-        return own if own.endswith("\n") else own + "\n"
-    try:
-        text, _ = standard_types().generate_msgdef(type_name, ros_version=2)
-    except Exception as error:
-        raise InputError(
-            f"message type: expected one of drocap_ros or of ROS 2 Jazzy, got {type_name!r} ({error}); "
-            "register it with its schema text"
-        ) from None
-    return str(text).split(_SEPARATOR)[0]
-
-
-def _dependencies(type_name: str) -> list[str]:
-    fields = standard_types().fielddefs[type_name][1]
-    return sorted(set(re.findall(r"[A-Za-z]\w*/msg/\w+", repr([kind for _, kind in fields]))), key=repr)

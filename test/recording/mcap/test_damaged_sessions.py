@@ -37,7 +37,7 @@ def test_truncated_file_is_read_as_far_as_it_goes(tmp_path, whole, capture, shar
     assert any("cut off or damaged at byte" in w and f"read the {len(tracks)} messages" in w for w in warnings)
 
 
-def test_truncated_before_the_first_chunk(tmp_path, whole):
+def test_file_truncated_before_its_first_chunk_has_no_topics(tmp_path, whole):
     path = tmp_path / "cut.mcap"
     path.write_bytes(whole[:120])
     with pytest.raises(InputError, match="expected a topic of type"):
@@ -88,14 +88,14 @@ def test_mutated_files_give_a_result_or_one_clear_line(tmp_path, whole, seed):
     _attempt(path)
 
 
-def test_lengths_that_lie_take_no_memory(tmp_path, whole):
+def test_wrong_lengths_take_no_memory(tmp_path, whole):
     tracemalloc.start()
     rng = random.Random(3)
     for i in range(60):
         data = bytearray(whole)
         place = rng.randrange(8, 600) if i % 2 else rng.randrange(8, len(data) - 8)
         data[place : place + 8] = (2 ** rng.choice([30, 33, 40, 62])).to_bytes(8, "little")
-        path = tmp_path / "lie.mcap"
+        path = tmp_path / "wrong_length.mcap"
         path.write_bytes(data)
         _attempt(path)
     _, peak = tracemalloc.get_traced_memory()
@@ -105,7 +105,7 @@ def test_lengths_that_lie_take_no_memory(tmp_path, whole):
 
 @settings(max_examples=60, deadline=5000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(text=st.text(max_size=300) | st.binary(max_size=300).map(lambda b: b.decode("latin-1")))
-def test_any_metadata_file(tmp_path, whole, text):
+def test_any_metadata_file_gives_a_result_or_one_clear_line(tmp_path, whole, text):
     folder = tmp_path / "folder"
     folder.mkdir(exist_ok=True)
     (folder / "folder_0.mcap").write_bytes(whole)

@@ -132,7 +132,7 @@ def test_full_disk_leaves_the_session_unchanged(small_disk, messages, capture):
 
 def test_files_that_are_no_session_are_refused_and_unchanged(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
-    (tmp_path / "text.mcap").write_text("not a recording, but long enough to look at")
+    (tmp_path / "text.mcap").write_text("not a recording, but long enough")
     (tmp_path / "zero.mcap").touch()
     (tmp_path / "old.bag").touch()
     for name in ("empty", "text.mcap", "zero.mcap", "old.bag", "missing"):

@@ -8,7 +8,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.recording.mcap.schemas import own_definitions, schema_text, standard_types, type_hash
 
 
-def test_schema_is_the_file_with_all_that_it_depends_on(root):
+def test_schema_is_the_file_followed_by_its_dependencies(root):
     text = schema_text("drocap_ros/msg/Pose3DWindow")
     first, *rest = text.split("=" * 80 + "\n")
     assert first == (root / "msg" / "Pose3DWindow.msg").read_text()
@@ -20,10 +20,12 @@ def test_schema_is_the_file_with_all_that_it_depends_on(root):
         "MSG: geometry_msgs/Quaternion",
     }
     assert len(names) == len(set(names))
+    pose3d = next(part for part in rest if part.startswith("MSG: drocap_ros/Pose3D\n"))
+    assert pose3d.split("\n", 1)[1] == (root / "msg" / "Pose3D.msg").read_text()
 
 
 @pytest.mark.parametrize("name", [*sorted(own_definitions()), "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"])
-def test_schema_stands_alone(name):
+def test_schema_defines_the_whole_type(name):
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.EMPTY)
@@ -32,7 +34,7 @@ def test_schema_stands_alone(name):
     assert type_hash(name, schema_text(name)).startswith("RIHS01_")
 
 
-def test_hash_equals_that_of_ros():
+def test_hash_equals_the_one_of_ros():
     share = Path(sys.prefix) / "share" / "std_msgs" / "msg" / "Header.json"
     if not share.exists():
         pytest.skip("no ROS message packages in this environment to compare with")

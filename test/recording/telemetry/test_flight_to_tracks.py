@@ -1,4 +1,4 @@
-"""The whole way of the telemetry without ROS: vehicle, MAVLink, estimator, session, tracks."""
+"""Telemetry from the vehicle through MAVLink, estimator and session to tracks, without ROS."""
 
 import socket
 import time
@@ -32,7 +32,7 @@ def state_message(messages, state):
     )
 
 
-def test_camera_of_the_tracks_is_that_of_the_flight(tmp_path, messages):
+def test_camera_of_the_tracks_equals_the_one_of_the_flight(tmp_path, messages):
     capture = simulate_capture(3.0, 30, seed=4)
     t = HOVER_S + capture.tracks.stamp_ns * 1e-9
     path = SampledPath(t, capture.camera_rotation, capture.camera_position)
@@ -58,7 +58,7 @@ def test_camera_of_the_tracks_is_that_of_the_flight(tmp_path, messages):
     with open_session(tmp_path / "s") as session:
         tracks = read_pose2d(session)
         assert all("left out" in w or "interpolated" in w for w in session.warnings)
-    # A machine that is busy may get the last states late: pictures after them are left out.
+    # On a busy machine the last states may arrive late: images after them are left out.
     kept = np.isin(takeoff_ns + np.round(t * 1e9).astype(np.int64), tracks.stamp_ns)
     assert kept.sum() == len(tracks) > 0.8 * len(t)
     error = np.rad2deg(angle_between(tracks.camera_rotation, capture.camera_rotation[kept]))

@@ -16,7 +16,7 @@ TLOG = SHARED / "media" / "arduplane_vtol_sitl.tlog"
 @pytest.fixture(scope="module")
 def messages():
     if not TLOG.exists():
-        pytest.skip(f"{TLOG.name} is not there (../shared)")
+        pytest.skip(f"{TLOG.name} is missing (../shared)")
     return list(tlog_messages(TLOG))
 
 

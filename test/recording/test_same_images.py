@@ -1,4 +1,4 @@
-"""The same pictures in three kinds of recording, made by rosbags and not by us, give identical keypoints."""
+"""The same images in three formats of recordings, written by rosbags, give identical keypoints."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ SHARED = Path(__file__).parents[2].parent / "shared"
 COUNT = 4
 
 
-def pictures():
+def video_images():
     import cv2
 
     source = VideoSource(SHARED / "media" / "pose_squats.mp4")
@@ -49,10 +49,10 @@ def write(path, kind, frames, messages):
     return path
 
 
-def test_three_kinds_of_recording(tmp_path):
+def test_keypoints_do_not_depend_on_the_format_of_the_recording(tmp_path):
     if not (SHARED / "models").is_dir() or not (SHARED / "media").is_dir():
-        pytest.skip("models and media are not there (../shared)")
-    frames, messages = pictures(), Messages()
+        pytest.skip("no models and media (../shared)")
+    frames, messages = video_images(), Messages()
     tracks = [
         read_input(write(tmp_path / name, kind, frames, messages), DrocapConfig(), SHARED / "models")
         for kind, name in (("bag", "x.bag"), ("sqlite3", "x"), ("mcap", "y"))
