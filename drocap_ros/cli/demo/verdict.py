@@ -8,7 +8,7 @@ import numpy as np
 
 from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error
 from drocap_ros.flight.orbit.states import State
-from drocap_ros.recording.session import COMPRESSED_IMAGE, POSE2D, POSE3D, Session
+from drocap_ros.recording.session import COMPRESSED_IMAGE, POSE2D, POSE3D, Session, header_stamp_ns
 from drocap_ros.simulation.flight_simulator.truth import FlightTruth, FlownOrbit, flown_orbit
 
 ORBIT_STATUS = "drocap_ros/msg/OrbitStatus"
@@ -47,7 +47,7 @@ def judge_flight(session: Session, truth: FlightTruth, radius_m: float) -> Fligh
     pictures = [t.count for t in session.info.topics if t.type_name == COMPRESSED_IMAGE]
     poses = [bool(m.track_id) for _, m in session.messages(_names(session, POSE2D, "pose2d"))]
     statuses = [
-        (_stamp_ns(m), State(m.state)) for _, m in session.messages(_names(session, ORBIT_STATUS, "orbit/status"))
+        (header_stamp_ns(m), State(m.state)) for _, m in session.messages(_names(session, ORBIT_STATUS, "orbit/status"))
     ]
     settled = settled_orbit(truth.stamp_ns, statuses)
     return FlightVerdict(
@@ -79,7 +79,7 @@ def _live(session: Session, truth: FlightTruth) -> LivePoses | None:
     at = {int(stamp): i for i, stamp in enumerate(truth.stamp_ns)}
     for _, message in session.messages(_names(session, POSE3D, "pose3d/latest")):
         joints = np.asarray(message.joints, dtype=np.float64).reshape(-1, 3)
-        place = at.get(_stamp_ns(message))
+        place = at.get(header_stamp_ns(message))
         if place is not None and np.isfinite(joints).all() and len(joints) == truth.joints3d.shape[1]:
             estimates.append(joints)
             places.append(place)
@@ -92,8 +92,3 @@ def _live(session: Session, truth: FlightTruth) -> LivePoses | None:
 
 def _names(session: Session, type_name: str, end: str) -> list[str]:
     return [t.name for t in session.topics_of(type_name) if t.name.endswith("/" + end)] or ["/none"]
-
-
-def _stamp_ns(message: object) -> int:
-    stamp = message.header.stamp  # type: ignore[attr-defined]
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
