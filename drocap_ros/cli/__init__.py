@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("drocap: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        # The reader of our output has gone (`drocap ... | head`): that is no failure, and nothing more to say.
+        # The reader closed the pipe (`drocap ... | head`): no failure.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:

@@ -1,4 +1,4 @@
-"""Output folders that appear whole or not at all."""
+"""Output files and folders that are written atomically."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from drocap_ros.errors import InputError
 
 
 def check_output_folder(target: Path) -> None:
-    """Refuse an output folder before any work is done for it.
+    """Validate an output folder before the work starts.
 
     Raises
     ------
     InputError
-        When it is a file, or its parent does not exist or cannot be written to.
+        When it is a file, or its nearest existing parent is not writable.
     """
     if target.exists() and not target.is_dir():
         raise InputError(f"--out {target}: expected a folder, found a file; choose another name")
@@ -26,12 +26,12 @@ def check_output_folder(target: Path) -> None:
     while not parent.exists():
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise InputError(f"--out {target}: expected a place that can be written to; choose another")
+        raise InputError(f"--out {target}: expected a writable folder; choose another")
 
 
 @contextlib.contextmanager
 def output_folder(target: Path) -> Iterator[Path]:
-    """A folder to write into, whose files are moved to ``target`` together when the block succeeds."""
+    """A temporary folder; its files are moved to ``target`` together when the block succeeds."""
     check_output_folder(target)
     parent = target.absolute().parent
     parent.mkdir(parents=True, exist_ok=True)
@@ -50,12 +50,12 @@ def output_folder(target: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def output_file(target: Path) -> Iterator[Path]:
-    """A file to write, moved to ``target`` when the block succeeds; one that stood there before is replaced.
+    """A temporary file, moved to ``target`` when the block succeeds; an existing file is replaced.
 
     Raises
     ------
     InputError
-        When the target is a folder, or its folder cannot be written to.
+        When the target is a folder, or its folder is not writable.
     """
     if target.is_dir():
         raise InputError(f"--out {target}: expected a file, found a folder; name a file in it")

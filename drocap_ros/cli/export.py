@@ -1,4 +1,4 @@
-"""``drocap export``: a motion for Blender, OpenSim and the like."""
+"""``drocap export``: write a motion for Blender, OpenSim and other tools."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     units = "; ".join(f"{form}: {facts}" for form, facts in FORMATS.items())
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "export",
-        help="a motion as BVH, C3D, TRC, CSV or glTF",
-        description=f"Write a motion in the format of another tool. {units}. docs/export.md says more.",
+        help="write a motion as BVH, C3D, TRC, CSV or glTF",
+        description=f"Write a motion in the format of another tool. {units}. Conventions: docs/export.md.",
     )
     parser.add_argument("motion", metavar="MOTION", type=Path, help=HELP)
     parser.add_argument("--to", metavar="FORMAT", choices=tuple(FORMATS), required=True, help=", ".join(FORMATS))
     parser.add_argument("--out", metavar="FILE", type=Path, help="file to write (default: beside MOTION)")
-    parser.add_argument("--quiet", action="store_true", help="say nothing")
+    parser.add_argument("--quiet", action="store_true", help="no output, only errors")
     parser.set_defaults(run=run)
     return parser
 
 
 def run(args: argparse.Namespace) -> int:
-    """Export and say what the file holds."""
+    """Export, and print the changes of the motion."""
     from drocap_ros.cli.atomic_output import output_file
     from drocap_ros.export import export_motion
 

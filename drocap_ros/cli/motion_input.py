@@ -1,4 +1,4 @@
-"""The MOTION argument: a motion file, or the folder that holds one."""
+"""The MOTION argument: a motion file, or its folder."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from drocap_ros.motion import Motion
 
-HELP = "motion.npz, or the folder that holds it"
+HELP = "motion.npz, or its folder"
 
 
 def read_motion(argument: Path) -> tuple[Path, Motion]:
-    """The file that an argument names, and the motion in it.
+    """Path and content of the motion file of an argument.
 
     Raises
     ------
     InputError
-        When it is no motion.
+        When it is not a motion.
     """
     from drocap_ros.motion import load_motion
 

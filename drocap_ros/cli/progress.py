@@ -1,4 +1,4 @@
-"""Progress bars on a terminal, silence in a pipe."""
+"""Progress bars on a terminal, no output in a pipe."""
 
 from __future__ import annotations
 
@@ -6,19 +6,15 @@ import contextlib
 import sys
 from collections.abc import Callable, Iterator
 
-#: Called with a stage's name and the share of it that is done, 0 to 1; a negative share = unknown length.
+#: Called with the name of a stage and its completed share, 0 to 1; a negative share = unknown length.
 Progress = Callable[[str, float], None]
-
-
-def _silent(stage: str, done: float) -> None:
-    """Report nothing."""
 
 
 @contextlib.contextmanager
 def progress_bars(quiet: bool = False) -> Iterator[Progress]:
     """A callback that draws one bar per stage on stderr while the context lasts."""
     if quiet or not sys.stderr.isatty():
-        yield _silent
+        yield lambda stage, done: None
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn

@@ -29,12 +29,12 @@ def export_motion(motion: Motion, form: str, path: str | Path) -> tuple[str, ...
 
     Returns
     -------
-    Sentences on what was changed: resampled, interpolated, bones made constant, vertical not known.
+    Notes on changes, as sentences: resampling, interpolation, constant bones, unknown vertical.
 
     Raises
     ------
     InputError
-        When the format is unknown, or the motion has fewer than two frames or lacks what the format needs.
+        When the format is unknown, or the motion has fewer than two frames or lacks data that the format needs.
     """
     from drocap_ros.export.bvh import write_bvh
     from drocap_ros.export.c3d_file import write_c3d

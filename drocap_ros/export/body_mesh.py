@@ -1,4 +1,4 @@
-"""A body of spindles and knobs, so that an exported skeleton is seen."""
+"""A visible body of spindles and knobs for an exported skeleton."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from drocap_ros.skeleton import side_of
 COLOURS = {"right": (0.53, 0.04, 0.03), "left": (0.02, 0.16, 0.37), "middle": (0.18, 0.18, 0.2)}
 
 _KNOB_M = 0.025
-#: Half width of a bone as a share of its length, at most so many metres.
+#: Half width of a bone as a share of its length, and at most, m.
 _GIRTH, _MAX_GIRTH_M = 0.12, 0.045
-#: Where along a bone it is widest.
+#: Share of the bone's length at which it is widest.
 _WAIST = 0.15
-#: The eight faces of an octahedron with corners foot, four around the waist, tip; seen from outside counter-clockwise.
+#: Eight faces of an octahedron with corners foot, four about the waist, tip; counter-clockwise from outside.
 _FACES = np.array([(0, 1 + (i + 1) % 4, 1 + i) for i in range(4)] + [(5, 1 + i, 1 + (i + 1) % 4) for i in range(4)])
 
 
@@ -34,7 +34,7 @@ class MeshPart:
 def body_mesh(rest: np.ndarray, clip: Clip) -> list[MeshPart]:
     """One part per colour of the body in its rest pose ``rest`` (P, 3).
 
-    A bone's foot and waist hang on the joint that it starts from, its tip on the joint that it leads to.
+    Foot and waist of a bone follow its first joint, its tip follows the second one.
     """
     corners: dict[str, list[np.ndarray]] = {side: [] for side in COLOURS}
     owners: dict[str, list[np.ndarray]] = {side: [] for side in COLOURS}

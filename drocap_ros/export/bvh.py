@@ -1,7 +1,7 @@
 """BVH: a hierarchy with constant bones, rotations per frame; y up, centimetres, degrees.
 
-A joint with several children has a joint without length before each of them (``pelvis_to_rhip``), as the CMU
-files do: hips, spine and shoulders then turn one by one, and no bone's direction is lost.
+A joint with several children has a zero-length joint before each of them (``pelvis_to_rhip``), as in the CMU files:
+hips, spine and shoulders then rotate independently, and every bone keeps its direction.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from drocap_ros.export.clip import Clip, at_constant_rate, without_gaps, y_up
 from drocap_ros.export.rig import Rig, fit_rig
 
 _CM = 100.0
-#: A joint at the end of a limb ends in a stub of this length along its bone, so that importers draw it.
+#: Length of the end site along the bone, so that importers draw the last joint.
 _END_CM = 5.0
 _FORMAT = "%.5f"
 
 
 def write_bvh(path: Path, clip: Clip) -> tuple[str, ...]:
-    """Write a BVH file; returns notes on what was changed.
+    """Write a BVH file; returns notes on changes.
 
     Parameters
     ----------
-    clip : z-up; resampled to a constant rate and its gaps interpolated where need be
+    clip : z-up; it is resampled to a constant rate, and its gaps are interpolated
 
     Raises
     ------
@@ -49,7 +49,7 @@ def write_bvh(path: Path, clip: Clip) -> tuple[str, ...]:
 
 
 def _joint(lines: list[str], columns: list[np.ndarray], rig: Rig, clip: Clip, joint: int, depth: int) -> None:
-    """Append a joint and all below it: text of the hierarchy, and its columns of the motion."""
+    """Append the lines and motion columns of a joint and all its descendants."""
     name, parent = clip.joints[joint], clip.parents[joint]
     children = [c for c in rig.order if clip.parents[c] == joint]
     above = rig.aimed[joint]

@@ -11,17 +11,17 @@ from drocap_ros.errors import InputError
 from drocap_ros.export.clip import Clip, at_constant_rate
 
 _MM = 1000.0
-#: The format counts frames in 16 bits; what lies beyond is read differently by different programs.
+#: The format counts frames in 16 bits; readers differ in longer files.
 _MAX_FRAMES = 65_535
 
 
 def write_c3d(path: Path, clip: Clip) -> tuple[str, ...]:
-    """Write a C3D file of a z-up clip; returns notes on what was changed.
+    """Write a C3D file of a z-up clip; returns notes on changes.
 
     Raises
     ------
     InputError
-        When there are more frames than the format can count.
+        When there are more than 65,535 frames.
     """
     import c3d
 

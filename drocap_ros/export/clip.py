@@ -1,4 +1,4 @@
-"""A motion made ready for the formats of other tools: upright axes, a time line, its gaps known."""
+"""A motion prepared for other formats: upright axes, a time line, marked gaps."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from drocap_ros.errors import InputError
 from drocap_ros.motion import Motion, upright_joints
 from drocap_ros.tracks import MAX_FRAMES
 
-#: Stamps that stray from an even time line by less than this share of a frame count as even.
+#: Stamps within this share of a frame of an even time line count as even.
 EVEN_TOLERANCE = 0.05
 #: Times that differ by less than this share of a frame are the same.
 _SAME_FRAME = 1e-3
-#: What every format can hold as a name.
+#: Names that every format accepts.
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,60}")
-#: glTF skins in one byte per joint, and what C3D readers accept.
+#: glTF skins store a joint in one byte; C3D readers accept no more either.
 _MAX_JOINTS = 255
-#: Between two frames further apart than this nothing is known, and resampling leaves a gap.
+#: Resampling leaves a gap between two frames further apart than this.
 LONGEST_BRIDGE_S = 0.5
 
 
@@ -31,8 +31,7 @@ class Clip:
     joints, parents : P names; P parent indices, -1 at the root
     times_s : (F,) s, 0 at the first frame
     rate_hz : frames per second; of an uneven time line the inverse of its median step
-    up : "z" or "y"
-    notes : sentences on what was changed on the way
+    notes : sentences on changes
     """
 
     positions: np.ndarray
@@ -40,7 +39,6 @@ class Clip:
     parents: tuple[int, ...]
     times_s: np.ndarray
     rate_hz: float
-    up: str = "z"
     notes: tuple[str, ...] = ()
 
 
@@ -48,13 +46,12 @@ def clip_of(motion: Motion) -> Clip:
     """Z-up clip of a motion.
 
     Frame "world" keeps its axes (x east, y north, z up).  Frame "camera" (x right, y down, z forward) becomes
-    x right, y away from the camera, z up: its vertical is the camera's, and gravity is not known.
+    x right, y away from the camera, z up: its vertical is the camera's, not gravity's.
 
     Raises
     ------
     InputError
-        When there are fewer than two frames, no joint is known in any of them, or joints are too many or
-        bear names that suit no format.
+        When there are fewer than two frames, no known joint, too many joints, or names that some format refuses.
     """
     frames = len(motion.joints3d)
     if frames < 2:
@@ -79,13 +76,13 @@ def clip_of(motion: Motion) -> Clip:
 def y_up(clip: Clip) -> Clip:
     """The same clip with y up: (x, y, z) becomes (x, z, -y)."""
     turned = clip.positions[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
-    return replace(clip, positions=turned, up="y")
+    return replace(clip, positions=turned)
 
 
 def at_constant_rate(clip: Clip) -> Clip:
-    """Clip on an even time line, for formats that know only a frame rate.
+    """Clip on an even time line, for formats with a frame rate instead of stamps.
 
-    An uneven one is resampled, linearly, at the inverse of its median step; within gaps longer than
+    An uneven time line is resampled, linearly, at the inverse of its median step; within gaps longer than
     ``LONGEST_BRIDGE_S`` the result is NaN.
 
     Raises
@@ -107,7 +104,7 @@ def at_constant_rate(clip: Clip) -> Clip:
     right = np.clip(np.searchsorted(times, even, side="left"), 1, len(times) - 1)
     left, span = right - 1, times[right] - times[right - 1]
     share = np.clip((even - times[left]) / span, 0.0, 1.0)
-    # A sample that falls on a frame is that frame, even where its neighbour is unknown or far.
+    # A sample on a frame equals that frame, even where its neighbour is unknown or far.
     on_left, on_right = (np.abs(even - times[i]) * clip.rate_hz < _SAME_FRAME for i in (left, right))
     share = np.where(on_left, 0.0, np.where(on_right, 1.0, share))[:, None, None]
     a, b = clip.positions[left], clip.positions[right]
@@ -118,7 +115,7 @@ def at_constant_rate(clip: Clip) -> Clip:
 
 
 def without_gaps(clip: Clip) -> Clip:
-    """Clip whose unknown joints are interpolated over time, held before the first and after the last known one.
+    """Clip with unknown joints interpolated over time, constant before the first and after the last known one.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""CSV: one row per frame at its own stamp, metres, z up, empty where a joint is unknown."""
+"""CSV: one row per frame with its own stamp, metres, z up, empty where a joint is unknown."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Binary glTF 2.0: an animated skeleton with a simple body to look at; metres, y up, the frames' own times.
+"""Binary glTF 2.0: an animated skeleton with a simple visible body; metres, y up, the frames' own times.
 
 Each joint is a node of the skin's hierarchy with animated rotation (as in :mod:`drocap_ros.export.rig`) and
-translation, so that the positions are those of the motion although its bones change their lengths a little.
+translation: the positions equal those of the motion although its bone lengths vary a little.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from drocap_ros.export.rig import Rig, fit_rig
 _ARRAY_BUFFER = 34962
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _COMPONENTS = {"float32": 5126, "uint8": 5121}
-#: A GLB counts its bytes in 32 bits.
+#: A GLB stores its length in 32 bits.
 _MAX_BYTES = 2**32 - 2**20
 
 
 def write_glb(path: Path, clip: Clip) -> tuple[str, ...]:
-    """Write a GLB file of a z-up clip; returns notes on what was changed.
+    """Write a GLB file of a z-up clip; returns notes on changes.
 
     Raises
     ------
     InputError
-        When a joint is never known, or the file would pass 4 GiB.
+        When a joint is never known, or the file would exceed 4 GiB.
     """
     clip = without_gaps(y_up(clip))
     if clip.positions.size * 14 > _MAX_BYTES:
@@ -156,7 +156,7 @@ def _animation(buffer: _Buffer, clip: Clip, rig: Rig) -> dict[str, Any]:
 
 
 def _continuous(quaternions: np.ndarray) -> np.ndarray:
-    """The same rotations (F, 4), of each pair of signs the one nearer to the frame before."""
+    """The same rotations (F, 4), each with the sign nearer to the previous frame."""
     flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
     signs = np.cumprod(np.concatenate([[1.0], np.where(flips, -1.0, 1.0)]))
     return quaternions * signs[:, None]

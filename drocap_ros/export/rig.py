@@ -1,8 +1,8 @@
-"""A skeleton with constant bones and the rotations that pose it.
+"""A skeleton with constant bones, and its rotations in each frame.
 
-Rest pose: a standing T, y up, facing +z, left at +x.  A joint with one child is turned so that the child lies in
-its measured direction by the smallest rotation relative to its parent (no twist about the bone, which positions
-do not show).  A joint with several children takes the rotation that fits their directions best.
+Rest pose: a standing T, y up, facing +z, left at +x.  A joint with one child has the smallest rotation relative to its
+parent that brings the child into its measured direction, without twist about the bone, which positions do not show.  A
+joint with several children has the rotation that fits their directions best.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from drocap_ros.geometry.rotations import project_to_so3
 
-#: Twist that keeps a bone's rotation continuous where it points against its rest direction fades out in this time.
+#: Fading time of the twist that keeps a rotation continuous where a bone points against its rest direction.
 TWIST_FADE_S = 0.5
 
 #: Direction of each joint from its parent in the rest pose.
@@ -34,8 +34,8 @@ class Rig:
 
     order : joints from the root outwards, each after its parent
     offsets : (P, 3) of each joint from its parent in the rest pose (0 at the root)
-    turned : (F, P) rotations, from the rest pose to the world, of what hangs on each joint
-    aimed : per joint, (F,) rotations from the rest pose to the world that bring its bone into its measured direction
+    turned : per joint, (F,) rotations of its children from the rest pose to the world
+    aimed : per joint, (F,) rotations of its own bone from the rest pose to the world
     """
 
     order: tuple[int, ...]
@@ -91,7 +91,7 @@ def _outwards(parents: tuple[int, ...]) -> tuple[int, ...]:
 
 def _rest_directions(directions: np.ndarray, joints: tuple[str, ...], below_root: list[int]) -> np.ndarray:
     rest = np.array([_REST.get(name, (0, 0, 0)) for name in joints], float)
-    # A joint that the table does not name rests as it usually lies in the body, seen from the root.
+    # A joint without an entry rests in its median direction relative to the root.
     known = [j for j in below_root if joints[j] in _REST]
     body = project_to_so3(np.einsum("fci,cj->fij", directions[:, known], rest[known]))
     usual = np.median(np.einsum("fji,fpj->fpi", body, directions), axis=0)
@@ -104,7 +104,7 @@ def _swing(rest: np.ndarray, direction: np.ndarray, rate_hz: float) -> Rotation:
     """Smallest rotations (F,) from ``rest`` (3,) to ``direction`` (F, 3), made continuous over time.
 
     Where a bone points against its rest direction, the smallest rotation is ambiguous and jumps; there the rotation
-    is carried on from the frame before, and the twist that this adds fades out.
+    continues from the previous frame, and the added twist fades out.
     """
     swing = _shortest_arc(np.broadcast_to(rest, direction.shape), direction)
     if len(direction) < 2:
@@ -120,7 +120,7 @@ def _swing(rest: np.ndarray, direction: np.ndarray, rate_hz: float) -> Rotation:
 
 def _shortest_arc(a: np.ndarray, b: np.ndarray) -> Rotation:
     axis, cosine = np.cross(a, b), np.sum(a * b, axis=1)
-    # Opposite directions: half a turn about any axis across them.
+    # Opposite directions: half a turn about any perpendicular axis.
     across = np.cross(a, np.where(np.abs(a[:, :1]) < 0.7, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     opposite = cosine < -1.0 + 1e-12
     quaternion = np.concatenate([np.where(opposite[:, None], across, axis), 1.0 + cosine[:, None]], axis=1)

@@ -12,7 +12,7 @@ _MM = 1000.0
 
 
 def write_trc(path: Path, clip: Clip) -> tuple[str, ...]:
-    """Write a TRC file of a z-up clip; returns notes on what was changed."""
+    """Write a TRC file of a z-up clip; returns notes on changes."""
     clip = y_up(at_constant_rate(clip))
     frames, joints = clip.positions.shape[:2]
     rate = f"{clip.rate_hz:.9g}"

@@ -1,7 +1,7 @@
-"""Rendered and spoilt images from which the networks of the simulation learn.
+"""Rendered and degraded images for the training of the simulation's networks.
 
-A sample is a person of any build and clothes in any pose of the simulation, seen from any side, -5 to 60 degrees
-above and 2.5 to 25 m away, in any place; then noise, blur, JPEG, other light, things in the way.
+A sample is a person of any build and clothes in any pose of the simulation, in any scenery, from any side, from -5 to
+60 degrees above and from 2.5 to 25 m away; then occluders, light, blur, noise and JPEG.
 """
 
 from __future__ import annotations
@@ -19,13 +19,12 @@ from drocap_ros.simulation.render.body import dress
 from drocap_ros.simulation.render.renderer import draw
 from drocap_ros.simulation.render.scenery import Scenery, make_scenery
 from drocap_ros.simulation.simulated_person import ACTIONS, simulate_person
-from drocap_ros.skeleton import BODY_15
 
 #: Input sizes of the networks (width, height) px, and the pose crop's side over that of the box.
 DETECTOR_SIZE = (320, 192)
 POSE_SIZE = (96, 128)
 POSE_PADDING = 1.25
-#: Seeds of places, persons and clothes seen in training begin here: all below are unseen.
+#: Smallest seed of sceneries, persons and clothes of the training: all below are unseen.
 FIRST_SEED = 1_000_000
 
 _TAKES_PER_ACTION = 16
@@ -44,14 +43,14 @@ class View(NamedTuple):
 
 @dataclass
 class World:
-    """Poses (N, 15, 3) m, ground under the origin, and some places that are exchanged for new ones in turn."""
+    """Poses (N, 15, 3) m with the pelvis above the origin, and sceneries that are replaced in turn."""
 
     poses: np.ndarray
     scenes: list[Scenery]
     next_seed: int
 
     def renew(self) -> None:
-        """Put a new place for the oldest."""
+        """Replace the oldest scenery."""
         self.scenes = [*self.scenes[1:], make_scenery(self.next_seed)]
         self.next_seed += 1
 
@@ -73,7 +72,7 @@ class PoseSample(NamedTuple):
 
 
 def make_world(rng: np.random.Generator, scenes: int = 12, takes: int = _TAKES_PER_ACTION) -> World:
-    """Poses of all actions by persons of 1.35 to 2 m, and places."""
+    """Poses of all actions by persons of 1.35 to 2 m, and sceneries."""
     first = FIRST_SEED + int(rng.integers(1_000_000_000))
     poses = []
     for take in range(takes):
@@ -88,7 +87,7 @@ def make_world(rng: np.random.Generator, scenes: int = 12, takes: int = _TAKES_P
 def _view(
     rng: np.random.Generator, joints: np.ndarray, size: tuple[int, int], fraction: float, shift: np.ndarray
 ) -> View:
-    """Camera that sees the person over a fraction of the image's height, off the middle by a share of the image."""
+    """Camera in which the person has a fraction of the image's height, off the centre by a share of the image."""
     distance = 2.5 * 10 ** rng.uniform(0, 1)
     tilt = np.deg2rad(rng.uniform(-5, 60))
     bearing = rng.uniform(-np.pi, np.pi)
@@ -105,7 +104,7 @@ def _view(
     low, high = flat.min(axis=0), flat.max(axis=0)
     side = max(high[1] - low[1], 0.6 * (high[0] - low[0]), 1e-3) * 1.15
     focal = min(fraction * size[1] / side, 12.0 * max(size))
-    # The person is put off the middle by turning the camera, as a drone would.
+    # A rotation of the camera moves the person off the centre, as on a drone.
     middle = 0.5 * (low + high) - shift * np.array(size) / focal
     turn = look_at(np.zeros((1, 3)), np.array([[middle[0], 1.0, -middle[1]]]))[0]
     turn = turn @ np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
@@ -118,7 +117,7 @@ def _scene(world: World, rng: np.random.Generator) -> Scenery:
 
 
 def _person(world: World, rng: np.random.Generator) -> np.ndarray:
-    """(15, 3) m, a pose somewhere in the middle of the place."""
+    """(15, 3) m, a random pose within 12 m of the origin."""
     joints = world.poses[int(rng.integers(len(world.poses)))].copy()
     turn = rng.uniform(-np.pi, np.pi)
     cos, sin = np.cos(turn), np.sin(turn)
@@ -128,7 +127,7 @@ def _person(world: World, rng: np.random.Generator) -> np.ndarray:
 
 
 def detector_sample(world: World, rng: np.random.Generator) -> DetectorSample:
-    """One image, whole or a window around the person, in the detector's input."""
+    """One image, or a window around the person, in the detector's input."""
     joints = _person(world, rng)
     whole = rng.random() < 0.5
     if whole:
@@ -147,19 +146,19 @@ def detector_sample(world: World, rng: np.random.Generator) -> DetectorSample:
         look = dress(FIRST_SEED + int(rng.integers(1_000_000_000)))
         image, box = draw(scene, look, view.matrix, *view.size, joints, view.rotation, view.position)
     for _ in range(int(rng.integers(0, 4)) if rng.random() < 0.4 else 0):
-        _put_thing(rng, image, box)
-    image = spoil(rng, image)
+        _occlude(rng, image, box)
+    image = degrade(rng, image)
     canvas, place = letterbox(image, (0, 0, *view.size), DETECTOR_SIZE)
     if box is None:
         return DetectorSample(canvas, np.full(4, np.nan, np.float32))
     in_canvas = (box.reshape(2, 2) * place.scale + np.array(place.offset)).reshape(4)
-    if min(in_canvas[2] - in_canvas[0], in_canvas[3] - in_canvas[1]) < 3:  # a sliver at the edge teaches nothing
+    if min(in_canvas[2] - in_canvas[0], in_canvas[3] - in_canvas[1]) < 3:  # too thin to learn from
         return detector_sample(world, rng)
     return DetectorSample(canvas, in_canvas.astype(np.float32))
 
 
 def pose_sample(world: World, rng: np.random.Generator) -> PoseSample:
-    """One crop around a person, by a box that is not exact."""
+    """One crop around a person, by an inexact box."""
     joints = _person(world, rng)
     scale = 1.1 * (2.6 / 1.1) ** rng.random()
     size = (int(1.7 * POSE_SIZE[0] * scale), int(1.5 * POSE_SIZE[1] * scale))
@@ -170,8 +169,8 @@ def pose_sample(world: World, rng: np.random.Generator) -> PoseSample:
         return pose_sample(world, rng)
     px = project(joints[None], view.rotation[None], view.position[None], view.matrix)[0]
     if rng.random() < 0.15:
-        _put_thing(rng, image, box)
-    image = spoil(rng, image)
+        _occlude(rng, image, box)
+    image = degrade(rng, image)
     box = _cut_by_the_border(rng, image, box)
     extent = box[2:] - box[:2]
     px_inside = (px > -0.5).all(axis=1) & (px < np.array(size) - 0.5).all(axis=1)
@@ -186,7 +185,7 @@ def pose_sample(world: World, rng: np.random.Generator) -> PoseSample:
 
 
 def _cut_by_the_border(rng: np.random.Generator, image: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Now and then the camera's image ends within the person: black beyond, and the box ends there."""
+    """Box, in a quarter of the cases cut by the image's border within the person; black beyond the border."""
     box = box.copy()
     if rng.random() < 0.25:
         side = int(rng.integers(4))
@@ -208,14 +207,14 @@ def _cut_by_the_border(rng: np.random.Generator, image: np.ndarray, box: np.ndar
 
 
 def _shown(image: np.ndarray, px: np.ndarray) -> np.ndarray:
-    """(15,) bool, whether the image is not black (beyond its edge) at points (15, 2) px."""
+    """(15,) bool, whether points (15, 2) px lie inside the border, where the image is not black."""
     height, width = image.shape[:2]
     at = np.clip(np.round(np.nan_to_num(px)), 0, [width - 1, height - 1]).astype(int)
     return image[at[:, 1], at[:, 0]].any(axis=1)
 
 
-def _put_thing(rng: np.random.Generator, image: np.ndarray, box: np.ndarray | None) -> None:
-    """A post, a board or a ball in the image; over at most a part of the person."""
+def _occlude(rng: np.random.Generator, image: np.ndarray, box: np.ndarray | None) -> None:
+    """Draw a post, a board or a ball; it covers at most a part of the person."""
     import cv2
 
     height, width = image.shape[:2]
@@ -235,8 +234,8 @@ def _put_thing(rng: np.random.Generator, image: np.ndarray, box: np.ndarray | No
         cv2.rectangle(image, tuple(low.tolist()), tuple(high.tolist()), colour, -1)
 
 
-def spoil(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
-    """Image (H, W, 3) uint8 with other light and colours, blur, noise and JPEG, each now and then."""
+def degrade(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
+    """Image (H, W, 3) uint8 with random changes of light, colour, blur, noise and JPEG."""
     import cv2
 
     if rng.random() < 0.7:
@@ -258,7 +257,4 @@ def spoil(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
     if rng.random() < 0.4:
         _, code = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 96))])
         image = np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR))
-    return np.maximum(image, 1)  # black is left to what lies beyond the image
-
-
-MIRROR = BODY_15.mirror
+    return np.maximum(image, 1)  # black marks the outside of the image

@@ -1,4 +1,4 @@
-"""Training of the person detector and the 2D pose network on the project's own renders (extra ``train``)."""
+"""Training of the simulation's person detector and 2D pose network on rendered images (extra ``train``)."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ import numpy as np
 
 from drocap_ros.errors import DrocapError
 from drocap_ros.parameters import Parameters, param
-from drocap_ros.training.lifter import pytorch
+from drocap_ros.skeleton import BODY_15
 from drocap_ros.training.rendered_samples import (
     DETECTOR_SIZE,
-    MIRROR,
     POSE_SIZE,
     World,
     detector_sample,
@@ -25,6 +24,7 @@ from drocap_ros.training.rendered_samples import (
     pose_sample,
 )
 from drocap_ros.training.simulation_networks import build_detector, build_pose_network, detector_loss, pose_loss
+from drocap_ros.training.torch_extra import pytorch, write_onnx
 
 if TYPE_CHECKING:
     import torch
@@ -32,34 +32,34 @@ if TYPE_CHECKING:
 #: Normalisation of RGB images, that of the public pose networks.
 _MEAN = np.array([123.675, 116.28, 103.53], np.float32)
 _STD = np.array([58.395, 57.12, 57.375], np.float32)
-_FRESH_SHARE = 0.34  # of each batch is rendered anew, the rest seen before
-_RENEW_EVERY = 25  # batches after which a place is exchanged
+_FRESH_SHARE = 0.34  # of each batch is newly rendered
+_RENEW_EVERY = 25  # rounds between two new sceneries
 
 
 @dataclass(frozen=True)
 class SimulationTraining(Parameters):
-    """How the networks of the simulation are trained."""
+    """Parameters of the training of the simulation's networks."""
 
     minutes: float = param(40.0, "wall-clock time of the training", unit="min", minimum=0.01, maximum=10000.0)
-    steps: int = param(0, "end after this many rounds instead; the result then depends on the seed only", minimum=0)
+    steps: int = param(0, "end after this many rounds instead; the result then depends on the seed alone", minimum=0)
     only: str = param("both", "which networks to train", choices=("both", "detector", "pose"))
     batch: int = param(32, "images of a batch", minimum=2, maximum=1024)
     pose_batches: int = param(2, "batches of the pose network to one of the detector", minimum=1, maximum=16)
-    pool: int = param(4096, "rendered images that are kept for further batches", minimum=8, maximum=100_000)
+    pool: int = param(4096, "rendered images kept for further batches", minimum=8, maximum=100_000)
     learning_rate: float = param(2.5e-3, "peak of the schedule, AdamW", minimum=1e-6, maximum=1.0)
     weight_decay: float = param(0.02, "decoupled weight decay", minimum=0.0, maximum=1.0)
-    seed: int = param(0, "of the samples and of the first weights", minimum=0)
+    seed: int = param(0, "of the samples and of the initial weights", minimum=0)
 
 
 class _Pool:
-    """Samples of one kind; each batch takes some new ones and some that were seen before."""
+    """Samples of one kind; each batch mixes new and earlier ones."""
 
     def __init__(self, sample: Callable[[World, np.random.Generator], Any], size: int) -> None:
         self._sample, self._size, self._next = sample, size, 0
         self._kept: list[Any] = []
 
     def batch(self, world: World, rng: np.random.Generator, count: int) -> list[Any]:
-        """``count`` samples, a third of them new, all of them while there are few."""
+        """``count`` samples, a third of them new; all of them while the pool is small."""
         fresh = math.ceil(count * (_FRESH_SHARE if len(self._kept) >= 8 * count else 1.0))
         new = [self._sample(world, rng) for _ in range(fresh)]
         chosen = [self._kept[i] for i in rng.integers(0, len(self._kept), count - fresh)] if fresh < count else []
@@ -73,13 +73,13 @@ class _Pool:
 
 
 def _varied(images: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Images (B, H, W, 3) uint8 as float32, each in a slightly other light, so that old samples are new."""
+    """Images (B, H, W, 3) uint8 as float32, each with a random gain per colour, which varies repeated samples."""
     gain = np.exp(rng.normal(0, 0.1, (len(images), 1, 1, 3))).astype(np.float32)
     return np.asarray(np.clip(images * gain, 0, 255), np.float32)
 
 
 def detector_batch(samples: list[Any], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Images (B, 3, 192, 320) BGR 0-255 and boxes (B, 4) px, NaN = nobody; half of the batch mirrored."""
+    """Images (B, 3, 192, 320) BGR 0-255 and boxes (B, 4) px, NaN without a person; half of the batch mirrored."""
     images = _varied(np.stack([s.image for s in samples]), rng)
     boxes = np.stack([s.box for s in samples])
     for i in np.flatnonzero(rng.random(len(samples)) < 0.5):
@@ -94,9 +94,9 @@ def pose_batch(samples: list[Any], rng: np.random.Generator) -> tuple[np.ndarray
     joints, seen = np.stack([s.joints for s in samples]), np.stack([s.seen for s in samples])
     for i in np.flatnonzero(rng.random(len(samples)) < 0.5):
         images[i] = images[i, :, ::-1]
-        joints[i] = joints[i, MIRROR]
+        joints[i] = joints[i, BODY_15.mirror]
         joints[i, :, 0] = POSE_SIZE[0] - 1 - joints[i, :, 0]
-        seen[i] = seen[i, MIRROR]
+        seen[i] = seen[i, BODY_15.mirror]
     rgb = (images[..., ::-1] - _MEAN) / _STD
     sides = np.array([s.box_px for s in samples], np.float32)
     return np.ascontiguousarray(rgb.transpose(0, 3, 1, 2)), joints, seen, sides
@@ -111,10 +111,10 @@ class _Learner:
         self.average = copy.deepcopy(network)
         self._peak = options.learning_rate
         self._optimiser = torch.optim.AdamW(network.parameters(), lr=self._peak, weight_decay=options.weight_decay)
-        self.steps, self.measure = 0, math.nan
+        self.steps, self.mean_measure = 0, math.nan
 
     def step(self, loss: torch.Tensor, measure: float, progress: float) -> None:
-        """Go one step; ``measure`` is averaged for the log."""
+        """Take one step; ``measure`` is averaged for the log."""
         torch = pytorch()
         warm = min(self.steps / 60, 1.0)
         self._optimiser.param_groups[0]["lr"] = self._peak * warm * (0.5 + 0.5 * math.cos(math.pi * progress)) + 1e-6
@@ -129,7 +129,8 @@ class _Learner:
             for mean, now in zip(self.average.buffers(), self.network.buffers(), strict=True):
                 mean.copy_(now) if not mean.is_floating_point() else mean.lerp_(now, 1 - keep)
         if math.isfinite(measure):
-            self.measure = measure if math.isnan(self.measure) else 0.98 * self.measure + 0.02 * measure
+            last = self.mean_measure
+            self.mean_measure = measure if math.isnan(last) else 0.98 * last + 0.02 * measure
 
 
 def train(
@@ -138,11 +139,14 @@ def train(
     checkpoint: Callable[[torch.nn.Module, torch.nn.Module, dict[str, Any]], None],
     checkpoint_minutes: float = 4.0,
 ) -> tuple[torch.nn.Module, torch.nn.Module, dict[str, Any]]:
-    """Train both on endless renders; returns detector and pose network with averaged weights, and what was seen.
+    """Train both networks on rendered samples.
 
-    ``checkpoint(detector, pose, facts)`` is called now and then.
+    ``checkpoint(detector, pose, facts)`` is called every ``checkpoint_minutes``.
 
-    Those that ``options.only`` leaves out come back as they were born, with no steps among the facts.
+    Returns
+    -------
+    Detector and pose network with averaged weights, and the facts: steps of each, batch size.  A network excluded by
+    ``options.only`` keeps its initial weights and has no steps.
 
     Raises
     ------
@@ -179,8 +183,8 @@ def train(
         if elapsed - shown > 0.5:
             shown = elapsed
             report(
-                f"{elapsed:6.1f} min  detector step {detector.steps} overlap {detector.measure:.3f}"
-                f"  pose step {pose.steps} error {pose.measure:.4f} of the box"
+                f"{elapsed:6.1f} min  detector step {detector.steps} overlap {detector.mean_measure:.3f}"
+                f"  pose step {pose.steps} error {pose.mean_measure:.4f} of the box"
             )
         if elapsed - saved > checkpoint_minutes:
             saved = elapsed
@@ -196,18 +200,8 @@ def _tensor(images: np.ndarray) -> torch.Tensor:
     return tensor
 
 
-def set_threads(count: int) -> None:
-    """Threads of PyTorch and OpenCV."""
-    import cv2
-
-    pytorch().set_num_threads(count)
-    cv2.setNumThreads(count)
-
-
 def export(detector: torch.nn.Module, pose: torch.nn.Module, folder: Path, facts: dict[str, str]) -> None:
-    """Write those with steps as ONNX into a folder, with weights in half precision and ``facts`` as metadata."""
-    from drocap_ros.training.lifter import write_onnx
-
+    """Write the networks that have steps as ONNX files, with weights in half precision and ``facts`` as metadata."""
     torch = pytorch()
     if int(facts["detector_steps"]):
         write_onnx(

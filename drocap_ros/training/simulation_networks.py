@@ -1,4 +1,4 @@
-"""The two small networks of the simulation, as PyTorch modules with their losses (extra ``train``)."""
+"""The simulation's two networks as PyTorch modules, with their losses (extra ``train``)."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drocap_ros.skeleton import BODY_15
-from drocap_ros.training.lifter import pytorch
 from drocap_ros.training.rendered_samples import DETECTOR_SIZE, POSE_SIZE
+from drocap_ros.training.torch_extra import pytorch
 
 if TYPE_CHECKING:
     import torch
 
 STRIDES = (8, 16, 32)
-#: Longer side of the boxes (px of the input) that each stride answers for; they overlap.
+#: Range of the longer box side (px of the input) assigned to each stride; the ranges overlap.
 _SIZES = ((0.0, 56.0), (40.0, 112.0), (88.0, math.inf))
 _JOINTS = len(BODY_15)
-#: Width of the 1-D Gaussians that the pose network is trained for, px: what the SimCC decoder expects.
+#: Width of the target 1-D Gaussians of the pose network, px, as the SimCC decoder expects it.
 _SIGMA = tuple(math.sqrt(side / 8) for side in POSE_SIZE)
 
 
@@ -99,7 +99,7 @@ def grid() -> tuple[np.ndarray, np.ndarray]:
 
 
 def detector_targets(boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which cells answer for a box: (B, 1260) bool, and cells that need not (B, 1260) bool.
+    """Cells that must detect a box (B, 1260) bool, and cells without a target (B, 1260) bool.
 
     boxes (B, 4) px, NaN without a person
     """
@@ -115,13 +115,13 @@ def detector_targets(boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     inside = ((middle > box[:, None, :2]) & (middle < box[:, None, 2:])).all(axis=2)
     central = (off < 1.25).all(axis=2) & (inside | (off < 0.51).all(axis=2))
     positive = of_size & central
-    # Cells of another stride have no box of this size to offer: a score of theirs would make a second person.
+    # Cells of another stride predict no box of this size: their score would be a second person.
     free = of_size & inside & ~positive & (off < 2.5).all(axis=2)
     return positive, free
 
 
 def detector_loss(network: Any, images: torch.Tensor, boxes: np.ndarray) -> tuple[torch.Tensor, float]:
-    """Loss of a batch and, for the log, the mean overlap (IoU) of the answering cells."""
+    """Loss of a batch and, for the log, the mean overlap (IoU) of the positive cells."""
     torch = pytorch()
     with torch.autocast("cpu", dtype=torch.bfloat16):
         raw = network.raw(images)
@@ -158,7 +158,7 @@ def _overlap(a: Any, b: Any) -> Any:
 def build_pose_network() -> torch.nn.Module:
     """Crops (B, 3, 128, 96) normalised RGB -> SimCC responses x (B, 15, 96), y (B, 15, 128).
 
-    A response is a distribution over the crop's columns or rows, its peak 1 where the joint is certain.
+    A response is a distribution over the crop's columns or rows; its peak is 1 for a certain joint.
     """
     torch = pytorch()
     nn = torch.nn
@@ -175,13 +175,13 @@ def build_pose_network() -> torch.nn.Module:
             self.merge = nn.ModuleList([_conv(80, 80), _conv(40, 48)])
             self.heat = nn.Conv2d(48, _JOINTS, 1)
             self.finer = nn.ConvTranspose1d(1, 1, 16, 4, 6, bias=False)
-            with torch.no_grad():  # a smooth interpolation to begin with: a triangle twice as wide as a step, rounded
+            with torch.no_grad():  # initially a smooth interpolation, about a triangle twice as wide as a step
                 t = (torch.arange(16) - 7.5) / 4
                 self.finer.weight[0, 0] = torch.exp(-0.5 * (t / 0.5) ** 2) / (0.5 * math.sqrt(2 * math.pi))
             self.certain = nn.Linear(104, _JOINTS)
 
         def raw(self, x: Any) -> tuple[Any, Any, Any]:
-            """Logits over columns (B, 15, 96), rows (B, 15, 128), and of the joint being there (B, 15)."""
+            """Logits over columns (B, 15, 96), rows (B, 15, 128), and of the certainty of each joint (B, 15)."""
             fine = self.stem(x)
             middle = self.middle(fine)
             coarse = self.coarse(middle)
@@ -209,7 +209,7 @@ def build_pose_network() -> torch.nn.Module:
 def pose_loss(
     network: Any, images: torch.Tensor, joints: np.ndarray, seen: np.ndarray, box_px: np.ndarray
 ) -> tuple[torch.Tensor, float]:
-    """Loss of a batch and, for the log, the mean distance of the seen joints in shares of the box's longer side.
+    """Loss of a batch and, for the log, the mean error of the visible joints as a share of the box's longer side.
 
     joints (B, 15, 2) px of the crop, seen (B, 15) bool, box_px (B,)
     """

@@ -1,4 +1,4 @@
-"""The networks for simulation: what they see of rendered orbits, what they say of themselves, how they are made."""
+"""The simulation's networks: accuracy on rendered orbits, metadata, selection, training."""
 
 import argparse
 import logging
@@ -21,7 +21,6 @@ from drocap_ros.skeleton import BODY_15
 from drocap_ros.training.rendered_samples import (
     DETECTOR_SIZE,
     FIRST_SEED,
-    MIRROR,
     POSE_SIZE,
     detector_sample,
     make_world,
@@ -29,7 +28,7 @@ from drocap_ros.training.rendered_samples import (
 )
 
 FOLDER = models_folder("simulation")
-SIDES = [i for i in range(len(BODY_15)) if MIRROR[i] != i]
+SIDES = [i for i in range(len(BODY_15)) if BODY_15.mirror[i] != i]
 
 
 def overlap(a, b):
@@ -38,14 +37,14 @@ def overlap(a, b):
 
 
 def as_received(image):
-    """The image after the JPEG of the camera's topic."""
+    """The image after the JPEG of the image topic."""
     import cv2
 
     return cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1], cv2.IMREAD_COLOR)
 
 
 class Flown:
-    """What the estimator made of orbits round persons in places that no training saw."""
+    """Results of the estimator on orbits about persons in sceneries that no training used."""
 
     def __init__(self, orbits=3, images=20):
         matrix = pinhole_matrix(1280, 720, 60)
@@ -74,7 +73,7 @@ class Flown:
         difference = observation.keypoints - truth
         height = box[3] - box[1]
         self.off.append(np.linalg.norm(difference, axis=1) / height)
-        mirrored = np.linalg.norm(observation.keypoints - truth[MIRROR], axis=1) / height
+        mirrored = np.linalg.norm(observation.keypoints - truth[BODY_15.mirror], axis=1) / height
         self.exchanged.append(np.nanmean(mirrored[SIDES]) < np.nanmean(self.off[-1][SIDES]))
         self.standard.append(difference / np.sqrt(observation.covariance[:, [0, 2]]))
         self.confidence.append(observation.confidence)
@@ -85,28 +84,28 @@ def flown():
     return Flown()
 
 
-def test_the_person_is_found_in_whole_pictures_and_followed(flown):
+def test_person_is_detected_and_tracked_in_whole_images(flown):
     assert np.mean(flown.found) >= 0.99
     assert np.mean(flown.followed) >= 0.99
 
 
-def test_keypoints_are_within_three_percent_of_the_box_on_average(flown):
+def test_mean_keypoint_error_is_within_three_percent_of_the_box(flown):
     off = np.array(flown.off)
     assert np.isfinite(off).mean() > 0.95
     assert np.nanmean(off) <= 0.03
 
 
-def test_left_and_right_are_told_apart(flown):
+def test_left_and_right_are_not_exchanged(flown):
     assert np.mean(flown.exchanged) < 0.01
 
 
-def test_the_covariance_says_how_far_off_they_are(flown):
+def test_covariance_matches_the_errors(flown):
     standard = np.array(flown.standard)
     sure = np.array(flown.confidence) > 0.5
     assert 0.7 <= np.sqrt(np.nanmean(standard[sure] ** 2)) <= 1.5
 
 
-def test_an_empty_place_holds_nobody():
+def test_empty_scenery_has_no_subject():
     matrix = pinhole_matrix(1280, 720, 60)
     estimator = PoseEstimator(FOLDER)
     away = simulate_person(np.array([0.0]), "stand")[0] + np.array([0, -500.0, 0])
@@ -118,7 +117,7 @@ def test_an_empty_place_holds_nobody():
         assert not estimator.process(image, seed * 100_000_000).has_subject
 
 
-def test_both_files_together_are_small_and_say_what_they_are_for():
+def test_both_files_are_small_and_state_their_purpose():
     files = sorted(FOLDER.glob("*.onnx"))
     assert [f.name for f in files] == ["person_detector.onnx", "person_pose.onnx"]
     assert sum(f.stat().st_size for f in files) <= 3_000_000
@@ -129,7 +128,7 @@ def test_both_files_together_are_small_and_say_what_they_are_for():
         assert model.metadata["command"].startswith("drocap train-simulation-models")
 
 
-def test_who_uses_them_is_told(caplog, capsys):
+def test_use_of_the_simulation_networks_is_reported(caplog, capsys):
     with caplog.at_level(logging.WARNING):
         estimator = PoseEstimator(FOLDER)
     assert "for simulation only" in caplog.text
@@ -140,14 +139,14 @@ def test_who_uses_them_is_told(caplog, capsys):
     assert "body15" in capsys.readouterr().out
 
 
-def test_the_list_shows_them_apart_from_the_models_of_the_user(tmp_path, capsys):
+def test_model_list_separates_them_from_the_models_of_the_user(tmp_path, capsys):
     assert main(["models", "list", "--models", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert "no models" in out
-    assert out.index("used only when asked for") < out.index("person_detector.onnx")
+    assert out.index("used only with") < out.index("person_detector.onnx")
 
 
-def test_nothing_falls_back_to_them(tmp_path, monkeypatch):
+def test_missing_models_do_not_fall_back_to_them(tmp_path, monkeypatch):
     monkeypatch.delenv("DROCAP_MODELS", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     assert models_folder(None) != FOLDER
@@ -158,8 +157,8 @@ def test_nothing_falls_back_to_them(tmp_path, monkeypatch):
     assert models_folder(tmp_path) == tmp_path
 
 
-def test_samples_agree_with_their_pictures():
-    """The box holds the joints, and joints said to be seen lie inside the crop."""
+def test_labels_of_samples_lie_inside_their_images():
+    """Boxes lie inside the input, visible joints inside the crop."""
     rng = np.random.default_rng(4)
     world = make_world(rng, scenes=2, takes=1)
     for _ in range(12):
@@ -183,13 +182,13 @@ def run_command(folder, *words):
 
 
 @pytest.mark.parametrize("words", [["--threads", "0"], ["--minutes", "-1"], ["--steps", "-1"], ["--seed", "-2"]])
-def test_options_of_the_training_that_cannot_be_used_are_refused(tmp_path, words):
+def test_invalid_training_options_are_refused(tmp_path, words):
     with pytest.raises((InputError, ParameterError), match="expected"):
         run_command(tmp_path / "m", *words)
     assert not (tmp_path / "m").exists()
 
 
-def test_a_short_training_gives_networks_that_run(tmp_path, capsys):
+def test_short_training_writes_networks_that_run(tmp_path, capsys):
     pytest.importorskip("torch", reason="the extra 'train' is not installed")
     pytest.importorskip("onnx", reason="the extra 'train' is not installed")
     assert run_command(tmp_path / "m", "--steps", "1", "--quiet") == 0
@@ -201,7 +200,7 @@ def test_a_short_training_gives_networks_that_run(tmp_path, capsys):
     assert estimator.pose_model.estimate(image, np.array([50.0, 20, 150, 200])).xy.shape == (15, 2)
 
 
-def test_one_network_is_trained_alone(tmp_path, capsys):
+def test_one_network_can_be_trained_alone(tmp_path, capsys):
     pytest.importorskip("torch", reason="the extra 'train' is not installed")
     pytest.importorskip("onnx", reason="the extra 'train' is not installed")
     assert run_command(tmp_path / "m", "--steps", "1", "--only", "detector", "--quiet") == 0
@@ -209,7 +208,7 @@ def test_one_network_is_trained_alone(tmp_path, capsys):
     assert [f.name for f in (tmp_path / "m").iterdir()] == ["person_detector.onnx"]
 
 
-def test_cells_of_one_size_answer_for_a_box_and_those_of_others_stay_silent():
+def test_a_box_has_positive_cells_of_one_stride_alone():
     from drocap_ros.training.simulation_networks import detector_targets, grid
 
     boxes = np.array([[100.0, 40, 140, 120], [10, 10, 22, 40], [0, 0, 190, 180], [np.nan] * 4], np.float32)
@@ -221,7 +220,7 @@ def test_cells_of_one_size_answer_for_a_box_and_those_of_others_stay_silent():
     assert not (positive & free).any()
 
 
-def test_a_training_of_given_steps_depends_on_the_seed_only():
+def test_training_of_given_steps_depends_on_the_seed_alone():
     torch = pytest.importorskip("torch", reason="the extra 'train' is not installed")
     from drocap_ros.training.simulation_models import SimulationTraining, train
 

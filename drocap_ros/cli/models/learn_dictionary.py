@@ -1,9 +1,8 @@
-"""``drocap learn-dictionary``: a pose dictionary from a folder of MoCap files."""
+"""``drocap learn-dictionary``: learn a pose dictionary from a folder of MoCap files."""
 
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,12 +35,12 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Learn, write, and print the quality.
+    """Learn and write the dictionary, print its quality.
 
     Raises
     ------
     InputError
-        When an option or the folder cannot be used.
+        When an option or the folder is invalid.
     """
     from drocap_ros.reconstruction.paper.dictionary import save_dictionary
 
@@ -61,7 +60,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def learn_from_folder(folder: Path, include: str, every: int, atoms: int, sparsity: float, seed: int) -> Dictionary:
-    """Dictionary from the files ``include`` of a MoCap folder, every n-th frame."""
+    """Dictionary from every n-th frame of the files of a MoCap folder whose names match ``include``."""
+    from drocap_ros.cli.progress import progress_bars
     from drocap_ros.mocap import load_mocap, mocap_files
     from drocap_ros.reconstruction.paper.dictionary import learn, normalize_poses
     from drocap_ros.tracks import read_npz
@@ -78,15 +78,8 @@ def learn_from_folder(folder: Path, include: str, every: int, atoms: int, sparsi
         "command": f"drocap learn-dictionary MOCAP_DIR --out NPZ --include '{include}' --every {every}"
         f" --atoms {atoms} --sparsity {sparsity:g} --seed {seed}",
     }
-    show = sys.stderr.isatty()
-    dictionary = learn(
-        poses,
-        atoms=atoms,
-        sparsity=sparsity,
-        seed=seed,
-        metadata=metadata,
-        progress=(lambda done: print(f"\rlearning {done:4.0%}", end="", file=sys.stderr)) if show else None,
-    )
-    if show:
-        print("\r", end="", file=sys.stderr)
-    return dictionary
+    with progress_bars() as show:
+        return learn(
+            poses, atoms=atoms, sparsity=sparsity, seed=seed, metadata=metadata,
+            progress=lambda done: show("learning", done),
+        )  # fmt: skip
