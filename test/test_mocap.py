@@ -1,0 +1,34 @@
+"""MoCap files: reading and resampling."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from walking import write_mocap
+
+from drocap_ros.errors import InputError
+from drocap_ros.mocap import load_mocap, resample
+
+
+def test_resampling_keeps_the_motion() -> None:
+    t = np.arange(91) / 30.0
+    x = np.sin(t)[:, None, None] * np.ones((1, 15, 3))
+    out = resample(x, 30.0, 24.0)
+    assert len(out) == 73
+    np.testing.assert_allclose(out[:, 0, 0], np.sin(np.arange(73) / 24.0), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"X": np.zeros((4, 3, 3))}, r"X: expected \(T, 15, 3\)"),
+        ({"fps": np.array(0.0)}, "fps: expected 1 to 1000"),
+        ({"joints": np.array(["a"] * 15)}, "missing pelvis"),
+    ],
+)
+def test_bad_files_are_refused(tmp_path: Path, changes: dict[str, np.ndarray], match: str) -> None:
+    write_mocap(tmp_path, "bad", frames=200, **changes)
+    with pytest.raises(InputError, match=match):
+        load_mocap(tmp_path / "bad.npz")
