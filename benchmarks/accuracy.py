@@ -11,7 +11,6 @@ Needs ../shared/mocap/dev, `world` excepted.  `--limit 2` takes the first two se
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,13 +18,11 @@ from pathlib import Path
 import numpy as np
 from figures import ROOT, table, write_figures
 
-sys.path[:0] = [str(ROOT)]
-
-from drocap_ros.cli.progress import progress_bars  # noqa: E402
-from drocap_ros.evaluation.live_study import live_study  # noqa: E402
-from drocap_ros.evaluation.live_study_table import live_markdown  # noqa: E402
-from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error, w_mpjpe  # noqa: E402
-from drocap_ros.evaluation.protocol import (  # noqa: E402
+from drocap_ros.cli.progress import progress_bars
+from drocap_ros.evaluation.live_study import live_study
+from drocap_ros.evaluation.live_study_table import live_markdown
+from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error, w_mpjpe
+from drocap_ros.evaluation.protocol import (
     FPS,
     IMAGE_SIZE,
     NOISE_MM,
@@ -33,14 +30,14 @@ from drocap_ros.evaluation.protocol import (  # noqa: E402
     orbit_rotations,
     protocol_sequences,
 )  # fmt: skip
-from drocap_ros.evaluation.rotation import rotation_study  # noqa: E402
-from drocap_ros.evaluation.tables import study_markdown  # noqa: E402
-from drocap_ros.reconstruction.reconstruct import reconstruct  # noqa: E402
-from drocap_ros.simulation.capture import simulate_capture  # noqa: E402
-from drocap_ros.simulation.capture_config import SimulationConfig  # noqa: E402
-from drocap_ros.simulation.orbit_camera import project, to_camera  # noqa: E402
-from drocap_ros.skeleton import BODY_15, indices  # noqa: E402
-from drocap_ros.tracks import Tracks  # noqa: E402
+from drocap_ros.evaluation.rotation import rotation_study
+from drocap_ros.evaluation.tables import study_markdown
+from drocap_ros.reconstruction.reconstruct import reconstruct
+from drocap_ros.simulation.capture import simulate_capture
+from drocap_ros.simulation.capture_config import SimulationConfig
+from drocap_ros.simulation.orbit_camera import project, to_camera
+from drocap_ros.skeleton import BODY_15, indices
+from drocap_ros.tracks import Tracks
 
 SPEED_DEG_S = 25.0
 SOLUTION_DELAY_S = 0.5

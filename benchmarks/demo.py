@@ -14,14 +14,12 @@ from pathlib import Path
 
 from figures import ROOT, table, write_figures
 
-sys.path[:0] = [str(ROOT)]
-
-from drocap_ros.cli.demo.verdict import judge_flight  # noqa: E402
-from drocap_ros.config import DrocapConfig  # noqa: E402
-from drocap_ros.evaluation.compare import compare  # noqa: E402
-from drocap_ros.motion import load_motion  # noqa: E402
-from drocap_ros.recording.open_session import open_session  # noqa: E402
-from drocap_ros.simulation.flight_simulator.truth import load_flight_truth  # noqa: E402
+from drocap_ros.cli.demo.verdict import judge_flight
+from drocap_ros.config import DrocapConfig
+from drocap_ros.evaluation.compare import compare
+from drocap_ros.motion import load_motion
+from drocap_ros.recording.open_session import open_session
+from drocap_ros.simulation.flight_simulator.truth import load_flight_truth
 
 
 def flown(out: Path, seed: int, seconds: float, autopilot: str) -> list[str]:

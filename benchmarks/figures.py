@@ -26,6 +26,9 @@ from datetime import date
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+# Benchmarks measure the sources of this checkout, not an installed package.
+sys.path[:0] = [str(ROOT)]
+
 #: What a figure depends on: changes there that are not committed are mentioned beside the revision.
 SOURCES = ("drocap_ros", "benchmarks", "msg", "srv", "setup.py", "requirements.lock")
 

@@ -7,12 +7,10 @@ and stops it and its perception.
 from __future__ import annotations
 
 import argparse
-import sys
-from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
+from figures import table, write_figures
 
-from drocap_ros.simulation.closed_loop.fault_flight import (  # noqa: E402
+from drocap_ros.simulation.closed_loop.fault_flight import (
     EXCURSION_M,
     MOTION_S,
     Fault,
@@ -21,19 +19,23 @@ from drocap_ros.simulation.closed_loop.fault_flight import (  # noqa: E402
     fly_fault,
     within_protocol,
 )
-from drocap_ros.simulation.closed_loop.fault_table import FAULTS  # noqa: E402
+from drocap_ros.simulation.closed_loop.fault_table import FAULTS
+
+HEAD = [
+    "", "dialect", "fault", "motion, s", "bound, s", "away, m", "bound, m", "speed, m/s", "state", "cause or condition",
+]  # fmt: skip
 
 
-def row(fault: Fault, autopilot: str, result: FaultResult) -> tuple[str, str]:
-    """Mark and line of a case: + bounds of the protocol kept, c those of the stated cause, h harmless, - not kept."""
+def row(fault: Fault, autopilot: str, result: FaultResult) -> list[str]:
+    """Cells of a case; first: + within the protocol's bounds, c within those of the cause, h harmless, - not kept."""
     bad = failures(fault, autopilot, result)
     mark = "-" if bad else "h" if fault.harmless else "+" if within_protocol(result) else "c"
     going = fault.harmless and result.state.name == "ORBITING"
-    bounds = "     -      -"
+    motion_bound, away_bound = "-", "-"
     if not fault.harmless:
         limits = fault.bounds(autopilot, result.speed_m_s)
-        bounds = f"{limits.motion_s:6.2f} {limits.excursion_m:6.2f}"
-    motion = "goes on" if going else f"{result.motion_s:7.2f}"
+        motion_bound, away_bound = f"{limits.motion_s:.2f}", f"{limits.excursion_m:.2f}"
+    motion = "continues" if going else f"{result.motion_s:.2f}"
     note = (
         f"NOT KEPT: {'; '.join(bad)}. "
         if bad
@@ -41,10 +43,10 @@ def row(fault: Fault, autopilot: str, result: FaultResult) -> tuple[str, str]:
         if mark == "c" and fault.cause
         else ""
     )
-    return mark, (
-        f"{mark} {autopilot:9} {fault.name:40} {motion} {result.excursion_m:6.2f} {bounds} {result.speed_m_s:5.2f} "
-        f"{result.state.name:10} {note}{result.condition}"
-    )
+    return [
+        mark, autopilot, fault.name, motion, motion_bound, f"{result.excursion_m:.2f}", away_bound,
+        f"{result.speed_m_s:.2f}", result.state.name, f"{note}{result.condition}",
+    ]  # fmt: skip
 
 
 def main() -> int:
@@ -58,9 +60,7 @@ def main() -> int:
         from flight_processes import main as fly_processes
 
         return fly_processes()
-    print(f"  {'dialect':9} {'fault':40} {'motion':>7} {'away':>6} {'bound':>6} {'bound':>6} {'speed':>5}")
-    print(f"  {'':9} {'':40} {'s':>7} {'m':>6} {'s':>6} {'m':>6} {'m/s':>5} state      reason, or cause", flush=True)
-    marks: list[str] = []
+    worst: list[list[str]] = []
     part, parts = (int(number) for number in args.part.split("/"))
     for autopilot in (args.autopilot,) if args.autopilot else ("ardupilot", "px4"):
         for fault in FAULTS[part - 1 :: parts]:
@@ -68,15 +68,17 @@ def main() -> int:
                 continue
             results = [fly_fault(fault, autopilot, 4 + i) for i in range(args.seeds)]
             rows = [row(fault, autopilot, result) for result in results]
-            worst = max(range(args.seeds), key=lambda i: ("+hc-".index(rows[i][0]), results[i].excursion_m))
-            marks.append(rows[worst][0])
-            print(rows[worst][1], flush=True)
-    counts = {mark: marks.count(mark) for mark in "+ch-"}
-    print(
-        f"{len(marks)} cases, {args.seeds} flight(s) each, the worst shown: {counts['+']} within "
-        f"{MOTION_S:g} s and {EXCURSION_M:g} m; {counts['c']} within the bounds of a cause stated beforehand; "
-        f"{counts['h']} harmless; {counts['-']} not kept"
+            worst.append(rows[max(range(args.seeds), key=lambda i: ("+hc-".index(rows[i][0]), results[i].excursion_m))])
+            print("  ".join(worst[-1]), flush=True)
+    counts = {mark: sum(cells[0] == mark for cells in worst) for mark in "+ch-"}
+    summary = (
+        f"{len(worst)} cases, {args.seeds} flight(s) each, the worst of each: {counts['+']} within {MOTION_S:g} s and"
+        f" {EXCURSION_M:g} m (+), {counts['c']} within the bounds of a cause stated beforehand (c), {counts['h']}"
+        f" harmless (h), {counts['-']} not kept (-)."
     )
+    print(summary)
+    if len(worst) == 2 * len(FAULTS):  # a selection of cases must not replace the page
+        write_figures("flight_faults", "Faults in flight", f"{summary}\n\n{table(HEAD, worst)}")
     return 1 if counts["-"] else 0
 
 

@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import argparse
 import random
-import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import NamedTuple
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
+from figures import write_figures
 
-from drocap_ros.flight.orbit.conditions import ConditionCode  # noqa: E402
-from drocap_ros.flight.orbit.states import Action, OperatorCommand, State  # noqa: E402
-from drocap_ros.simulation.closed_loop.orbit_loop import EPOCH_NS, LoopSettings, OrbitLoop, with_config  # noqa: E402
+from drocap_ros.flight.orbit.conditions import ConditionCode
+from drocap_ros.flight.orbit.states import Action, OperatorCommand, State
+from drocap_ros.simulation.closed_loop.orbit_loop import EPOCH_NS, LoopSettings, OrbitLoop, with_config
 
 _ODD = [float("nan"), float("inf"), -float("inf"), 0.0, -0.0, -1e30, 1e30, 5.0, 1e-300, 3.4e38]
 _BAD_RADIUS = [0.0, -5.0, 1e30, float("inf"), -float("inf"), 3.49, 100.1]
@@ -100,7 +99,7 @@ def fuzz(seed: int, key_file: Path, block_s: float = _BLOCK_S) -> Block:
 
 
 def main() -> int:
-    """Fuzz for so many seconds of real time and print what came of it."""
+    """Fuzz for the given seconds of real time and print the counts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("seconds", nargs="?", type=float, default=600.0)
     parser.add_argument("first_seed", nargs="?", type=int, default=0)
@@ -113,13 +112,15 @@ def main() -> int:
             blocks.append(fuzz(args.first_seed + len(blocks), key_file))
     total = Block(*(sum(values) for values in zip(*blocks, strict=True)))
     last = args.first_seed + len(blocks) - 1
-    print(
+    summary = (
         f"{time.monotonic() - begin:.0f} s, seeds {args.first_seed} to {last}: "
         f"{total.mutated} mutated and {total.random} "
         f"random packets, {total.commands} commands ({total.answers} answered, each refused), {total.bad} pieces "
         f"of bad data counted, in {len(blocks)} flights of {_BLOCK_S:.0f} s: no crash, no motion; {total.flew} of "
         f"{len(blocks)} flew an orbit afterwards"
     )
+    print(summary)
+    write_figures("flight_fuzz", "Fuzzing of link and commands", f"Both dialects, every fourth pair signed. {summary}.")
     return 0 if total.flew == len(blocks) else 1
 
 

@@ -1,12 +1,11 @@
-"""Orbits in closed loop: randomized ones, where no limit may be broken, and how well the orbit of the protocol is kept.
+"""Orbits in closed loop: randomized ones, which must keep every limit, and the quality of the protocol's orbit.
 
     python benchmarks/flight_orbits.py                      the 300 randomized orbits, those not flown yet
     python benchmarks/flight_orbits.py --first 100 --count 50
-    python benchmarks/flight_orbits.py table                what has been flown, summed up
+    python benchmarks/flight_orbits.py table                summary of the orbits flown
     python benchmarks/flight_orbits.py quality              errors of radius, yaw and framing
 
-Each randomized orbit is a line of `benchmarks/results/flight_orbits.jsonl`; one that is there is not flown again
-(`--again` does).
+Each randomized orbit is a line of `benchmarks/results/flight_orbits.jsonl`; `--again` repeats the recorded ones.
 """
 
 from __future__ import annotations
@@ -23,6 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from figures import table as markdown_table
+from figures import write_figures
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
@@ -37,9 +38,9 @@ _SOURCES = Path(__file__).parents[1] / "drocap_ros"
 
 
 def _code_version() -> str:
-    """Of everything that flies here, as it was loaded."""
+    """Hash of the flight and simulation sources."""
     digest = hashlib.sha256()
-    for path in sorted([*(_SOURCES / "flight").glob("*.py"), *(_SOURCES / "simulation").glob("*.py")]):
+    for path in sorted([*(_SOURCES / "flight").rglob("*.py"), *(_SOURCES / "simulation").rglob("*.py")]):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
 
@@ -174,19 +175,23 @@ def table(first: int, count: int) -> int:
     flown = [row for row in rows if row["flown"]]
     errors = [row["radius_error_m"] for row in rows if row["radius_error_m"] is not None]
     near = sorted(row["least_distance_m"] for row in flown)
-    print(f"{len(rows)} of {count} orbits, {len({row['code'] for row in rows})} version(s) of the code")
-    print(f"with a breach: {len(bad)}" + "".join(f"\n  seed {r['seed']}: {'; '.join(r['breaches'])}" for r in bad))
-    print(f"flown: {len(flown)}, of which {len(errors)} orbited without a stop from 14 s to the end")
-    print(f"time in ORBITING after the first start: {100 * np.mean([row['orbiting'] for row in rows]):.0f} %")
+    lines = [
+        ["orbits", f"{len(rows)} of {count}, {len({row['code'] for row in rows})} version(s) of the code"],
+        ["with a breach", f"{len(bad)} " + "; ".join(f"seed {r['seed']}: {', '.join(r['breaches'])}" for r in bad)],
+        ["flown", len(flown)],
+        ["orbited without a stop from 14 s to the end", len(errors)],
+        ["time in ORBITING after the first start, %", f"{100 * np.mean([row['orbiting'] for row in rows]):.0f}"],
+    ]
     if errors:
-        print(f"radius error of those, m: mean {np.mean(errors):.2f}, worst {max(errors):.2f}")
+        lines.append(["radius error of those, m: mean, worst", f"{np.mean(errors):.2f}, {max(errors):.2f}"])
     if near:
-        print(f"least true distance, m: {near[0]:.2f}, {near[1]:.2f}, {near[2]:.2f} ..." if len(near) > 2 else near)
-    kinds = Counter(reason for row in rows for reason in row["held"])
-    for reason, number in kinds.most_common():
-        print(f"  held {number} times: {reason}")
-    for reason, number in Counter(reason for row in rows for reason in row["refused"]).most_common():
-        print(f"  never flown, {number}: {reason}")
+        lines.append(["least true distances, m", ", ".join(f"{value:.2f}" for value in near[:3])])
+    for title, key in (("held", "held"), ("never flown", "refused")):
+        counts = Counter(reason for row in rows for reason in row[key])
+        lines += [[f"{title}: {reason}", number] for reason, number in counts.most_common()]
+    for line in lines:
+        print(*line, sep=": ")
+    write_figures("flight_orbits", "Randomized orbits", markdown_table(["what", "count"], lines))
     return 1 if bad else 0
 
 
@@ -196,18 +201,24 @@ def _read() -> list[dict[str, Any]]:
 
 def quality(first: int, count: int) -> int:
     """Orbit of 6 m at 2 m/s, 8 m/s wind, body height known, from 13 to 31 s: means over seeds, and the worst."""
-    print("mean (worst) of", count, "seeds    radius error, m   yaw error, deg   in the middle third, %   orbiting, %")
-    missed = 0
+    missed, lines = 0, []
     for autopilot in ("ardupilot", "px4"):
         for action in ("stand", "walk"):
             rows = np.array([quality_of(autopilot, action, seed) for seed in range(first, first + count)])
             (radius, yaw, middle, orbiting), worst = rows.mean(axis=0), rows.max(axis=0)
             least = rows.min(axis=0)
-            print(
-                f"{autopilot:10s} {action:6s}        {radius:12.2f} ({worst[0]:.2f}) {yaw:10.2f} ({worst[1]:.2f}) "
-                f"{100 * middle:14.1f} ({100 * least[2]:.1f}) {100 * orbiting:14.1f} ({100 * least[3]:.0f})"
-            )
+            lines.append([
+                autopilot, action, f"{radius:.2f} ({worst[0]:.2f})", f"{yaw:.2f} ({worst[1]:.2f})",
+                f"{100 * middle:.1f} ({100 * least[2]:.1f})", f"{100 * orbiting:.1f} ({100 * least[3]:.0f})",
+            ])  # fmt: skip
+            print("  ".join(lines[-1]), flush=True)
             missed += radius > 0.3 or yaw > 3.0 or middle < 0.95
+    head = ["autopilot", "person", "radius error, m", "yaw error, deg", "in the middle third, %", "orbiting, %"]
+    text = (
+        f"Orbit of 6 m at 2 m/s in 8 m/s wind, body height known, from 13 to 31 s: mean over {count} seeds (worst"
+        " seed). Required: 0.3 m, 3 deg, 95 %.\n\n"
+    )
+    write_figures("flight_quality", "Quality of the orbit", text + markdown_table(head, lines))
     return 1 if missed else 0
 
 
@@ -226,8 +237,8 @@ def main() -> int:
     parser.add_argument("what", nargs="?", default="randomized", choices=["randomized", "table", "quality"])
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--count", type=int, help="number of seeds: 300, quality 10")
-    parser.add_argument("--again", action="store_true", help="fly those too that are in the results")
-    parser.add_argument("--seconds", type=float, default=math.inf, help="begin no orbit after this time")
+    parser.add_argument("--again", action="store_true", help="fly recorded seeds again")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="no new orbit after this time")
     args = parser.parse_args()
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     if args.what == "quality":

@@ -10,6 +10,7 @@ import argparse
 import time
 
 import numpy as np
+from figures import table, write_figures
 
 from drocap_ros.cli.demo.operator import Operator
 from drocap_ros.flight.orbit.states import State
@@ -31,18 +32,22 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=31.0, help="of each flight")
     parser.add_argument("--models", default="simulation")
     args = parser.parse_args()
-    print(
-        "| autopilot | person | seed | radius error m | yaw error deg | middle third | orbiting | holds | nearest m |"
-        " with subject | keypoint error / height | machine s |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
+    rows = []
     for autopilot in args.autopilots:
         for action in args.actions:
             for seed in args.seeds:
-                print(flown(autopilot, action, seed, args.seconds, args.models), flush=True)
+                rows.append(flown(autopilot, action, seed, args.seconds, args.models))
+                print("  ".join(rows[-1]), flush=True)
+    head = [
+        "autopilot", "person", "seed", "radius error, m", "yaw error, deg", "middle third", "orbiting", "holds",
+        "nearest, m", "with subject", "keypoint error / height", "machine s",
+    ]  # fmt: skip
+    write_figures(
+        "flight_pixels", "Orbits by rendered images", "Radius 6 m, 2 m/s, wind 8 m/s.\n\n" + table(head, rows)
+    )
 
 
-def flown(autopilot: str, action: str, seed: int, seconds: float, models: str) -> str:
+def flown(autopilot: str, action: str, seed: int, seconds: float, models: str) -> list[str]:
     """A row of the table."""
     begin = time.process_time()
     settings = with_config(
@@ -66,17 +71,17 @@ def flown(autopilot: str, action: str, seed: int, seconds: float, models: str) -
 
     loop.run(seconds, operate)
     share = np.array(loop.errors) / np.array(loop.heights_px)[:, None]
-    words = f"| {autopilot} | {action} | {seed} |"
+    first = [autopilot, action, str(seed)]
     rows = [row for row in loop.rows if row.t_s >= _SETTLED_S]
     if not any(row.state == State.ORBITING for row in rows):
-        return f"{words} no orbit: {'; '.join(operator.holds) or loop.reasons[-1]} |"
+        return [*first, f"no orbit: {'; '.join(operator.holds) or loop.reasons[-1]}", *["-"] * 8]
     q = orbit_quality(loop, _RADIUS_M, _SETTLED_S)
     seen = np.isfinite(share).any(axis=1).mean()
-    return (
-        f"{words} {q.radius_error_m:.2f} | {q.yaw_error_deg:.1f} | {100 * q.in_middle_third:.0f} % |"
-        f" {100 * q.orbiting:.0f} % | {len(operator.holds)} | {q.least_distance_m:.1f} | {100 * seen:.0f} % |"
-        f" {np.nanmean(share):.3f} | {time.process_time() - begin:.0f} |"
-    )
+    return [
+        *first, f"{q.radius_error_m:.2f}", f"{q.yaw_error_deg:.1f}", f"{100 * q.in_middle_third:.0f} %",
+        f"{100 * q.orbiting:.0f} %", str(len(operator.holds)), f"{q.least_distance_m:.1f}", f"{100 * seen:.0f} %",
+        f"{np.nanmean(share):.3f}", f"{time.process_time() - begin:.0f}",
+    ]  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -22,25 +22,23 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from figures import ROOT, table, write_figures
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT)]
-
-from drocap_ros.config import DrocapConfig  # noqa: E402
-from drocap_ros.errors import NodeError  # noqa: E402
-from drocap_ros.flight.frames import camera_rotation  # noqa: E402
-from drocap_ros.flight.mavlink.transport import open_transport  # noqa: E402
-from drocap_ros.flight.orbit.conditions import ConditionCode  # noqa: E402
-from drocap_ros.flight.orbit.states import Command, State  # noqa: E402
-from drocap_ros.observation import PoseObservation  # noqa: E402
-from drocap_ros.simulation.closed_loop.fault_causes import TIMEOUT  # noqa: E402
-from drocap_ros.simulation.closed_loop.fault_flight import EXCURSION_M, MOTION_S, Bounds  # noqa: E402
-from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings  # noqa: E402
-from drocap_ros.simulation.keypoint_errors import noisy_keypoints  # noqa: E402
-from drocap_ros.simulation.orbit_camera import pinhole_matrix, project  # noqa: E402
-from drocap_ros.simulation.simulated_person import simulate_person  # noqa: E402
-from drocap_ros.simulation.vehicle.copter import SimulatedCopter  # noqa: E402
-from drocap_ros.simulation.vehicle.ports import free_udp_port  # noqa: E402
+from drocap_ros.config import DrocapConfig
+from drocap_ros.errors import NodeError
+from drocap_ros.flight.frames import camera_rotation
+from drocap_ros.flight.mavlink.transport import open_transport
+from drocap_ros.flight.orbit.conditions import ConditionCode
+from drocap_ros.flight.orbit.states import Command, State
+from drocap_ros.observation import PoseObservation
+from drocap_ros.simulation.closed_loop.fault_causes import TIMEOUT
+from drocap_ros.simulation.closed_loop.fault_flight import EXCURSION_M, MOTION_S, Bounds
+from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings
+from drocap_ros.simulation.keypoint_errors import noisy_keypoints
+from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
+from drocap_ros.simulation.simulated_person import simulate_person
+from drocap_ros.simulation.vehicle.copter import SimulatedCopter
+from drocap_ros.simulation.vehicle.ports import free_udp_port
 
 RATE_HZ, WIDTH, HEIGHT, FIELD_DEG = 15.0, 1280, 720, 60.0
 CONTROL = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}
@@ -356,9 +354,8 @@ def failures(case: Case, autopilot: str, outcome: Outcome) -> list[str]:
 
 
 def main() -> int:
-    """Print the table."""
-    print(f"  {'dialect':9} {'fault of a process':38} {'motion':>7} {'away':>6} {'bound':>6} {'bound':>6} {'speed':>5}")
-    bad = 0
+    """Fly every case and write the table."""
+    rows, bad = [], 0
     for autopilot in ("ardupilot", "px4"):
         for case in CASES:
             outcome = fly(case, autopilot)
@@ -367,13 +364,18 @@ def main() -> int:
             limits = bounds(case, autopilot, outcome.speed_m_s)
             kept = outcome.motion_s <= MOTION_S and outcome.excursion_m < EXCURSION_M
             note = f"NOT KEPT: {'; '.join(found)}. " if found else "" if kept else f"[{TIMEOUT.description}] "
-            print(
-                f"{'-' if found else '+' if kept else 'c'} {autopilot:9} {case.name:38} {outcome.motion_s:7.2f} "
-                f"{outcome.excursion_m:6.2f} {limits.motion_s:6.2f} {limits.excursion_m:6.2f} {outcome.speed_m_s:5.2f} "
-                f"{outcome.mode:8} {note}{outcome.reason}",
-                flush=True,
-            )
-    print(f"{2 * len(CASES)} cases with real processes, in real time: {bad} not kept")
+            rows.append([
+                "-" if found else "+" if kept else "c", autopilot, case.name, f"{outcome.motion_s:.2f}",
+                f"{limits.motion_s:.2f}", f"{outcome.excursion_m:.2f}", f"{limits.excursion_m:.2f}",
+                f"{outcome.speed_m_s:.2f}", outcome.mode, f"{note}{outcome.reason}",
+            ])  # fmt: skip
+            print("  ".join(rows[-1]), flush=True)
+    summary = f"{len(rows)} cases with real processes, in real time, one flight each: {bad} not kept."
+    print(summary)
+    head = [
+        "", "dialect", "fault", "motion, s", "bound, s", "away, m", "bound, m", "speed, m/s", "mode", "cause or reason",
+    ]  # fmt: skip
+    write_figures("flight_processes", "Faults of real processes", f"{summary}\n\n{table(head, rows)}")
     return 1 if bad else 0
 
 
