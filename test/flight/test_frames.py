@@ -9,7 +9,7 @@ V = RNG.normal(size=(50, 3))
 Q = Rotation.random(50, random_state=3).as_quat()
 
 
-def test_axes():
+def test_axes_are_swapped_and_negated():
     north, east, down = np.eye(3)
     assert np.array_equal(frames.ned_to_enu(north), [0, 1, 0])
     assert np.array_equal(frames.ned_to_enu(east), [1, 0, 0])
@@ -17,14 +17,14 @@ def test_axes():
     assert np.array_equal(frames.frd_to_flu(np.array([1.0, 2.0, 3.0])), [1, -2, -3])
 
 
-def test_there_and_back():
+def test_conversion_is_its_own_inverse():
     assert np.array_equal(frames.enu_to_ned(frames.ned_to_enu(V)), V)
     assert np.array_equal(frames.flu_to_frd(frames.frd_to_flu(V)), V)
     back = frames.orientation_to_aviation(frames.orientation_to_ros(Q))
     assert np.allclose(np.abs(np.sum(back * Q, axis=1)), 1.0)
 
 
-def test_orientation_turns_vectors_as_the_axes_say():
+def test_orientation_agrees_with_converted_vectors():
     # body FLU -> ENU must equal: FLU to FRD, then FRD -> NED, then NED to ENU.
     ros = Rotation.from_quat(frames.orientation_to_ros(Q)).apply(V)
     chain = frames.ned_to_enu(Rotation.from_quat(Q).apply(frames.flu_to_frd(V)))
@@ -42,7 +42,7 @@ def test_vehicle_that_points_north_has_enu_yaw_of_90_degrees():
     assert Rotation.from_quat(q).apply([0, 1, 0])[2] > 0.49
 
 
-def test_euler_and_product_against_scipy():
+def test_euler_angles_and_product_equal_scipy():
     angles = RNG.uniform(-1.5, 1.5, (30, 3))
     for roll, pitch, yaw in angles:
         ours = frames.quaternion_from_euler(roll, pitch, yaw)
@@ -54,7 +54,7 @@ def test_euler_and_product_against_scipy():
     assert np.allclose(np.abs(np.sum(ours * theirs, axis=1)), 1.0)
 
 
-def test_camera_rotation_of_a_level_camera_that_looks_north():
+def test_camera_rotation_of_a_level_camera_facing_north():
     q = frames.orientation_to_ros(frames.quaternion_from_euler(0, 0, 0))
     rotation = frames.camera_rotation(q)
     assert np.allclose(rotation @ [0, 1, 0], [0, 0, 1])  # north is ahead
@@ -65,14 +65,14 @@ def test_camera_rotation_of_a_level_camera_that_looks_north():
 
 
 @pytest.mark.parametrize("origin", [(47.4, 8.5, 488.0), (0.0, 0.0, 0.0), (-33.9, 151.2, 20.0), (89.99, 10.0, 5.0)])
-def test_geodetic_there_and_back(origin):
+def test_geodetic_conversion_is_inverted(origin):
     origin = np.array(origin)
     enu = RNG.uniform(-2000, 2000, (40, 3))
     geodetic = frames.enu_to_geodetic(enu, origin)
     assert np.allclose(frames.geodetic_to_enu(geodetic, origin), enu, atol=1e-5)
 
 
-def test_geodetic_scale():
+def test_geodetic_offsets_have_the_known_scale():
     # A minute of latitude is one nautical mile, to within its variation with latitude.
     enu = frames.geodetic_to_enu(np.array([45.0 + 1 / 60, 7.0, 0.0]), np.array([45.0, 7.0, 0.0]))
     assert np.isclose(enu[1], 1852, atol=2)

@@ -21,7 +21,7 @@ from drocap_ros.recording.telemetry.vehicle_track import interpolate
 from drocap_ros.simulation.flight_simulator.truth import flown_orbit, load_flight_truth
 
 
-def test_the_demo_flies_by_what_it_sees_and_ends_with_a_motion_near_the_truth(tmp_path, capsys):
+def test_demo_flies_by_its_images_and_reconstructs_a_motion_near_the_truth(tmp_path, capsys):
     out = tmp_path / "demo"
     assert main(["demo", "--seconds", "8", "--seed", "1", "--out", str(out), "--quiet"]) == 0
     printed = capsys.readouterr().out
@@ -72,7 +72,7 @@ def test_the_demo_flies_by_what_it_sees_and_ends_with_a_motion_near_the_truth(tm
     assert np.nanmedian(np.linalg.norm(off, axis=1)) < 1.0
 
 
-def test_an_interrupted_demo_leaves_no_process_and_no_file(tmp_path):
+def test_interrupted_demo_leaves_no_process_and_no_file(tmp_path):
     command = [sys.executable, "-u", "-m", "drocap_ros.cli", "demo", "--out", str(tmp_path / "demo")]
     mark = f"demo_{os.getpid()}"
     environment = {**os.environ, "DROCAP_TEST_MARK": mark}
@@ -91,7 +91,7 @@ def test_an_interrupted_demo_leaves_no_process_and_no_file(tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interruption_is_known_also_where_python_cannot_raise_it(number, monkeypatch):
+def test_interruption_is_noticed_where_python_cannot_raise_it(number, monkeypatch):
     class Interrupted:
         def __del__(self):
             os.kill(os.getpid(), number)
@@ -121,20 +121,20 @@ def _environment(path):
         return b""
 
 
-def test_a_flight_without_length_is_refused(tmp_path, capsys):
+def test_flight_without_length_is_refused(tmp_path, capsys):
     assert main(["demo", "--seconds", "-1", "--out", str(tmp_path / "demo")]) == 2
     assert "seconds: expected" in capsys.readouterr().err
     assert not (tmp_path / "demo").exists()
 
 
-def test_a_demo_without_networks_is_refused_and_leaves_nothing(tmp_path, capsys):
+def test_demo_without_networks_is_refused_and_leaves_nothing(tmp_path, capsys):
     words = ["demo", "--models", str(tmp_path / "none"), "--out", str(tmp_path / "demo"), "--quiet"]
     assert main(words) == 2
     assert "none: expected a folder with a" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_orbit_is_settled_after_its_ramp_and_each_start_has_one():
+def test_orbit_is_settled_after_the_ramp_of_each_start():
     stamps = np.arange(60) * 10**9
     orbit, hold = State.ORBITING, State.HOLDING
     told = [(0, State.READY), (10, orbit), (11, orbit), (25, hold), (30, orbit), (33, hold), (40, orbit), (49, orbit)]

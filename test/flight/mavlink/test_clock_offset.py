@@ -16,7 +16,7 @@ def test_exchange_gives_the_offset_within_half_the_asymmetry():
     assert clock.round_trip_ns < 12_000_000
 
 
-def test_one_way_is_late_by_the_shortest_delay():
+def test_one_way_offset_is_late_by_the_shortest_delay():
     rng = np.random.default_rng(1)
     clock, true = ClockOffset(), 5 * S
     for i in range(400):
@@ -25,7 +25,7 @@ def test_one_way_is_late_by_the_shortest_delay():
     assert 2_000_000 <= clock.offset_ns - true < 4_000_000
 
 
-def test_restart_of_the_autopilot_starts_afresh():
+def test_restart_of_the_autopilot_resets_the_offset():
     clock = ClockOffset()
     for i in range(50):
         clock.observe(1000 * S + i * S // 10, 5000 * S + i * S // 10)
@@ -34,7 +34,7 @@ def test_restart_of_the_autopilot_starts_afresh():
     assert clock.offset_ns == 5010 * S
 
 
-def test_one_damaged_stamp_changes_nothing():
+def test_single_damaged_stamp_changes_nothing():
     clock = ClockOffset()
     for i in range(50):
         clock.observe(i * S, 100 * S + i * S)
@@ -58,7 +58,7 @@ def test_stamp_is_never_later_than_its_reception():
     assert clock.to_local_ns(11 * S, 100 * S + S // 2) == 100 * S + S // 2
 
 
-def test_answers_from_nowhere_are_ignored():
+def test_unmatched_answers_are_ignored():
     clock = ClockOffset()
     clock.exchange(100 * S, 0, 99 * S)
     clock.exchange(100 * S, 0, 110 * S)

@@ -37,7 +37,7 @@ def test_setpoint_survives_the_wire(values, yaw, rate):
 
 
 @pytest.mark.parametrize("field", range(5))
-def test_a_setpoint_that_is_not_finite_is_never_sent(field):
+def test_setpoint_that_is_not_finite_is_never_sent(field):
     good = hold_setpoint(np.zeros(3), 0.0)
     values = list(good)
     values[field] = np.array([0, math.nan, 0]) if field < 3 else math.inf
@@ -45,7 +45,7 @@ def test_a_setpoint_that_is_not_finite_is_never_sent(field):
         setpoint_message(MAV, (1, 1), Setpoint(*values))
 
 
-def test_halt_is_velocity_zero_and_nothing_else():
+def test_halt_is_velocity_zero_alone():
     message = halt_message(MAV, (1, 1))
     assert message.type_mask & (8 | 16 | 32 | 2048) == 0  # velocity and yaw rate count
     assert message.type_mask & (1 | 2 | 4 | 64 | 128 | 256 | 1024) == 1479
@@ -69,7 +69,7 @@ def test_command_is_sent_until_answered_and_a_failure_is_reported():
     assert queue.failure(SET_MODE) == ""
 
 
-def test_command_without_an_answer_gives_up():
+def test_command_without_an_answer_is_given_up():
     queue = CommandQueue()
     queue.request(SET_MODE, PX4.mode_parameters(True), "mode LOITER", 0.0)
     sent = sum(len(queue.due(0.5 * i)) for i in range(40))
@@ -77,7 +77,7 @@ def test_command_without_an_answer_gives_up():
     assert "not answered after 5 tries" in queue.failure(SET_MODE)
 
 
-def test_temporary_rejection_is_tried_again_and_progress_waited_for():
+def test_temporary_rejection_is_retried_and_progress_awaited():
     queue = CommandQueue()
     queue.request(SET_MODE, PX4.mode_parameters(False), "mode OFFBOARD", 0.0)
     queue.due(0.0)
@@ -96,7 +96,7 @@ def link(**values):
     return MavlinkLink(config, lambda: 10**10, monotonic_s=lambda: 0.0, transport=LoopbackTransport(up, up))
 
 
-def test_the_link_sends_setpoints_and_the_modes_of_the_dialects_and_no_other_command():
+def test_link_sends_only_setpoints_and_the_modes_of_the_dialects():
     sender = link()
     sender.send_motion(halt_message(sender.mav, (1, 1)))
     for dialect in DIALECTS.values():
@@ -120,7 +120,7 @@ def test_the_link_sends_setpoints_and_the_modes_of_the_dialects_and_no_other_com
             sender.send_motion(getattr(sender.mav, name)(*values))
 
 
-def test_without_permission_the_link_sends_no_motion_at_all():
+def test_link_sends_no_motion_without_permission():
     up = Channel(lambda: 0.0)
     sender = MavlinkLink(MavlinkBridgeConfig(), transport=LoopbackTransport(up, up))
     with pytest.raises(AssertionError, match="sends no"):

@@ -35,7 +35,7 @@ def flown(autopilot, mount, **values):
 
 
 @pytest.mark.parametrize("autopilot", ["ardupilot"])
-def test_the_mount_turns_to_the_subject_as_height_and_radius_change(autopilot):
+def test_mount_pitch_follows_height_and_radius(autopilot):
     loop = flown(autopilot, True, gimbal_control=True)
     loop.copter.camera_pitch = math.radians(-9.0)
     loop.run(12.0)
@@ -58,7 +58,7 @@ def test_the_mount_turns_to_the_subject_as_height_and_radius_change(autopilot):
 
 
 @pytest.mark.parametrize("autopilot", ["px4"])
-def test_without_a_mount_it_is_asked_once(autopilot):
+def test_refused_mount_is_requested_once(autopilot):
     loop = flown(autopilot, False, gimbal_control=True)
     loop.run(16.0)
     assert len(loop.asked) == 1  # refused with MAV_RESULT_FAILED, as measured
@@ -72,7 +72,7 @@ def test_without_a_mount_it_is_asked_once(autopilot):
     assert len(loop.asked) == 1
 
 
-def test_it_is_asked_nothing_without_permission():
+def test_mount_is_not_commanded_without_permission():
     loop = flown("ardupilot", True)
     loop.run(9.0)
     assert loop.controller.safety.state == State.ORBITING

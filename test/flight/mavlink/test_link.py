@@ -82,7 +82,7 @@ def test_wanted_rates_arrive(port):
     assert math.isclose(rates["LOCAL_POSITION_NED"][0], 10, rel_tol=0.3)
 
 
-def test_rate_that_was_acknowledged_but_does_not_come_is_asked_for_again(port):
+def test_acknowledged_rate_that_does_not_arrive_is_requested_again(port):
     config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}", rate_window_s=1.0, request_retry_s=0.2)
     with (
         MavlinkLink(config) as link,
@@ -96,7 +96,7 @@ def test_rate_that_was_acknowledged_but_does_not_come_is_asked_for_again(port):
         assert slow.received.count("COMMAND_LONG") > 8
 
 
-def test_vehicle_without_a_gimbal_refuses_and_the_state_says_unknown(port):
+def test_state_without_a_gimbal_has_unknown_orientation(port):
     config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}")
     with MavlinkLink(config) as link, SimulatedVehicle(f"udpout:127.0.0.1:{port}", orbit_path(60), gimbal=False) as v:
         v.start()
@@ -105,7 +105,7 @@ def test_vehicle_without_a_gimbal_refuses_and_the_state_says_unknown(port):
         assert np.isnan(states[-1].gimbal_orientation_xyzw).all()
 
 
-def test_link_lost_and_found_again(port):
+def test_link_recovers_after_a_loss(port):
     config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}", link_timeout_s=0.5)
     with MavlinkLink(config) as link:
         assert not link.status().connected
@@ -120,7 +120,7 @@ def test_link_lost_and_found_again(port):
         assert abs(states[-1].stamp_ns - time.time_ns()) < S
 
 
-def test_run_in_a_thread_hands_states_over_and_stops(port):
+def test_link_thread_delivers_states_and_stops(port):
     states, stop = [], threading.Event()
     with MavlinkLink(MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}")) as link:
         thread = threading.Thread(target=link.run, args=(states.append, stop))
@@ -136,7 +136,7 @@ def test_run_in_a_thread_hands_states_over_and_stops(port):
     assert len(states) >= 5
 
 
-def test_vehicle_as_a_process(port):
+def test_link_to_a_vehicle_process(port):
     command = [
         sys.executable,
         "-m",
@@ -157,7 +157,7 @@ def test_vehicle_as_a_process(port):
             process.wait(5)
 
 
-def test_tcp(port):
+def test_link_over_tcp(port):
     server = socket.create_server(("127.0.0.1", 0))
     url = f"tcp:127.0.0.1:{server.getsockname()[1]}"
     with MavlinkLink(MavlinkBridgeConfig(url=url)) as link:
@@ -206,13 +206,13 @@ def _accepts(server, link):
         "tcp:localhost:-5",
     ],
 )
-def test_url_that_cannot_be_understood(url):
+def test_malformed_url_is_refused(url):
     with pytest.raises(InputError, match=r"^url: expected") as error:
         open_transport(url)
     assert "\n" not in str(error.value)
 
 
-def test_address_that_cannot_be_opened(port):
+def test_address_that_cannot_be_opened_is_refused(port):
     with open_transport_guard(f"udpin:127.0.0.1:{port}"), pytest.raises(InputError, match="can be opened"):
         open_transport(f"udpin:127.0.0.1:{port}")
     with pytest.raises(InputError, match="can be opened"):
@@ -233,7 +233,7 @@ class open_transport_guard:  # noqa: N801
 
 
 @pytest.mark.parametrize("change", [{"system_id": 255}, {"system_id": 0}, {"component_id": 0}, {"attitude_hz": -1.0}])
-def test_config_refuses(change):
+def test_bridge_parameters_out_of_range_are_refused(change):
     with pytest.raises(ParameterError):
         MavlinkBridgeConfig(**change)
 
@@ -259,7 +259,7 @@ def packets(rng):
         yield getattr(mav, name + "_encode")(**values).pack(mav)
 
 
-def test_mutated_and_random_bytes_do_no_harm(port):
+def test_mutated_and_random_bytes_raise_nothing(port):
     rng = random.Random(5)
     out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     with MavlinkLink(MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}")) as link:
@@ -303,7 +303,7 @@ def test_link_refuses_to_send_motion(port):
             link._send(mav.command_long_encode(1, 1, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1, 0, 0, 0, 0, 0, 0))
 
 
-def test_requests_one_at_a_time_until_the_rate_is_real():
+def test_requests_are_sent_one_at_a_time_until_the_rate_is_measured():
     config = MavlinkBridgeConfig(rate_window_s=1.0, request_retry_s=0.5)
     requests = TelemetryRequests(config)
     requests.set_autopilot("px4")

@@ -34,7 +34,7 @@ def states_within(link, vehicle, seconds):
     return states
 
 
-def test_both_sides_with_the_same_key(key_file):
+def test_signed_link_works_with_the_same_key(key_file):
     port = free_udp_port()
     config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}", signing_key_file=key_file, commands_enabled=True)
     with (
@@ -54,7 +54,7 @@ def test_both_sides_with_the_same_key(key_file):
 
 
 @pytest.mark.parametrize("key", [OTHER, None], ids=["another key", "no key"])
-def test_a_vehicle_without_our_key_is_not_heard_nor_does_it_hear_us(key_file, key):
+def test_packets_without_our_key_are_refused_in_both_directions(key_file, key):
     port = free_udp_port()
     config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}", signing_key_file=key_file)
     with (
@@ -67,7 +67,7 @@ def test_a_vehicle_without_our_key_is_not_heard_nor_does_it_hear_us(key_file, ke
         assert vehicle.received == []  # we answer only whom we believe
 
 
-def test_an_unsigned_link_is_not_heard_by_a_vehicle_that_signs():
+def test_signing_vehicle_refuses_an_unsigned_link():
     port = free_udp_port()
     config = MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}")
     with (
@@ -96,7 +96,7 @@ def test_replayed_and_old_packets_are_refused():
     assert parser.refused_count == parser.bad_count == 3
 
 
-def test_a_forger_cannot_lock_the_real_vehicle_out():
+def test_forged_packet_does_not_lock_the_vehicle_out():
     parser = MavlinkParser(KEY, NOW_NS)
     good = signed(KEY, NOW_NS, count=3)
     assert parser.feed(good[0])
@@ -108,7 +108,7 @@ def test_a_forger_cannot_lock_the_real_vehicle_out():
     assert parser.feed(good[2])
 
 
-def test_a_clock_that_was_never_set_or_goes_back_does_not_stop_the_signatures(key_file):
+def test_signatures_survive_a_clock_that_is_unset_or_goes_back(key_file):
     times = iter([0, 0, 0, NOW_NS, NOW_NS - 10**12, *[NOW_NS] * 50])
     sent = []
 
@@ -128,7 +128,7 @@ def test_a_clock_that_was_never_set_or_goes_back_does_not_stop_the_signatures(ke
 @pytest.mark.parametrize(
     "text", ["", "abc", "00" * 31, "00" * 33, "zz" * 32, "00" * 32 + "\n" + "11" * 32], ids=range(6)
 )
-def test_a_file_without_a_key(tmp_path, text):
+def test_file_without_a_key_is_refused(tmp_path, text):
     file = tmp_path / "key"
     file.write_text(text)
     with pytest.raises(InputError, match="64 hexadecimal digits") as error:
@@ -137,7 +137,7 @@ def test_a_file_without_a_key(tmp_path, text):
     assert not text or text.strip() not in str(error.value)  # what may be a secret is never told
 
 
-def test_a_file_that_cannot_be_read(tmp_path):
+def test_unreadable_key_file_is_refused(tmp_path):
     for path in (tmp_path / "missing", tmp_path):
         with pytest.raises(InputError, match="signing_key_file: expected a file"):
             MavlinkLink(MavlinkBridgeConfig(signing_key_file=str(path)))

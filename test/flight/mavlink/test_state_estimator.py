@@ -44,13 +44,13 @@ def ready():
     return estimator, sender
 
 
-def test_nothing_before_the_first_heartbeat():
+def test_no_state_before_the_first_heartbeat():
     estimator, sender = VehicleStateEstimator(), Sender()
     assert estimator.update(attitude(sender), S) is None
     assert estimator.snapshot(S) is None
 
 
-def test_attitude_gives_a_state_with_the_rest_unknown(ready):
+def test_attitude_alone_gives_a_state_with_unknown_fields(ready):
     estimator, sender = ready
     state = estimator.update(attitude(sender, q=(1, 0, 0, 0), rates=(0.1, 0.2, 0.3)), 10 * S)
     assert (state.autopilot, state.mode, state.armed) == ("ardupilot", "GUIDED", True)
@@ -64,7 +64,7 @@ def test_attitude_gives_a_state_with_the_rest_unknown(ready):
     assert not state.position_ok
 
 
-def test_modes_of_both_autopilots():
+def test_mode_names_of_both_autopilots():
     for autopilot, mode, name, kind in (
         (3, 5, "LOITER", "ardupilot"),
         (12, 6 << 16, "OFFBOARD", "px4"),
@@ -77,7 +77,7 @@ def test_modes_of_both_autopilots():
         assert name is None or state.mode == name
 
 
-def test_position_is_enu_and_carried_to_the_time_of_the_attitude(ready):
+def test_position_is_enu_and_extrapolated_to_the_attitude(ready):
     estimator, sender = ready
     estimator.update(sender("local_position_ned", 1000, 1, 2, -3, 10, 0, 0), 10 * S)
     state = estimator.update(attitude(sender, 1200), 10 * S + S // 5)
@@ -92,7 +92,7 @@ def test_old_position_is_unknown(ready):
     assert np.isnan(state.position_enu_m).all()
 
 
-def test_without_local_position_the_global_one_counts(ready):
+def test_global_position_replaces_a_missing_local_one(ready):
     estimator, sender = ready
     estimator.update(sender("global_position_int", 1000, 474000000, 85000000, 500000, 20000, 0, 0, 0, 0), 10 * S)
     estimator.update(
@@ -123,7 +123,7 @@ def test_estimator_health(ready, flags, ok):
     assert estimator.update(attitude(sender), 10 * S).position_ok is ok
 
 
-def test_old_estimator_health_does_not_count(ready):
+def test_outdated_estimator_health_is_unhealthy(ready):
     estimator, sender = ready
     estimator.update(sender("ekf_status_report", 831, 0, 0, 0, 0, 0), 10 * S)
     estimator.update(sender("local_position_ned", 7000, 0, 0, -3, 0, 0, 0), 16 * S)
@@ -159,7 +159,7 @@ def test_gimbal_yaw_from_north_and_from_the_nose(ready):
         assert np.isclose(axis[2], -math.sin(0.5))
 
 
-def test_turning_gimbal_is_told_at_the_time_of_the_attitude(ready):
+def test_turning_gimbal_is_extrapolated_to_the_attitude(ready):
     estimator, sender = ready
     gimbal = Sender(component=154)
     for i, yaw in enumerate((0.0, 0.02)):  # 50 ms apart
@@ -175,7 +175,7 @@ def test_turning_gimbal_is_told_at_the_time_of_the_attitude(ready):
     assert np.isnan(state.gimbal_orientation_xyzw).all()
 
 
-def test_old_mount_messages_agree_with_the_new(ready):
+def test_old_and_new_mount_messages_agree(ready):
     estimator, sender = ready
     estimator.update(attitude(sender), 10 * S)
     axes = []
@@ -192,7 +192,7 @@ def test_old_mount_messages_agree_with_the_new(ready):
     assert np.allclose(axes, expected, atol=1e-6)
 
 
-def test_quaternion_wins_over_angles_so_that_each_instant_gives_one_state(ready):
+def test_quaternion_replaces_angles_so_each_instant_gives_one_state(ready):
     estimator, sender = ready
     assert estimator.update(sender("attitude", 900, 0, 0, 0, 0, 0, 0), 9 * S) is not None
     assert estimator.update(attitude(sender), 10 * S) is not None
@@ -208,7 +208,7 @@ def test_angles_and_quaternion_agree(ready):
     assert np.isclose(abs(a.orientation_xyzw @ b.orientation_xyzw), 1, atol=1e-6)
 
 
-def test_other_systems_and_components_are_not_the_vehicle(ready):
+def test_other_systems_and_components_are_ignored(ready):
     estimator, _ = ready
     stranger, companion, station = Sender(system=9), Sender(component=191), Sender(system=255, component=190)
     for other in (stranger, companion, station):
@@ -219,7 +219,7 @@ def test_other_systems_and_components_are_not_the_vehicle(ready):
     assert state.armed
 
 
-def test_ground_station_and_companion_are_never_taken_for_an_autopilot():
+def test_ground_station_and_companion_are_no_autopilot():
     estimator = VehicleStateEstimator()
     estimator.update(heartbeat(Sender(255, 190), autopilot=8, kind=6), S)
     estimator.update(heartbeat(Sender(1, 191), autopilot=8, kind=18), S)
@@ -228,7 +228,7 @@ def test_ground_station_and_companion_are_never_taken_for_an_autopilot():
     assert estimator.system_id == 7
 
 
-def test_asked_for_vehicle_is_the_only_one():
+def test_configured_vehicle_is_the_only_one():
     estimator = VehicleStateEstimator(target_system_id=2)
     estimator.update(heartbeat(Sender(1)), S)
     assert estimator.update(attitude(Sender(1)), S) is None
@@ -237,12 +237,12 @@ def test_asked_for_vehicle_is_the_only_one():
 
 
 @pytest.mark.parametrize("q", [(0, 0, 0, 0), (math.nan, 0, 0, 0), (5, 0, 0, 0), (math.inf, 0, 0, 0)])
-def test_impossible_attitude_is_dropped(ready, q):
+def test_attitude_without_unit_quaternion_is_dropped(ready, q):
     estimator, sender = ready
     assert estimator.update(attitude(sender, q=q), 10 * S) is None
 
 
-def test_impossible_position_is_dropped(ready):
+def test_position_that_is_not_finite_is_dropped(ready):
     estimator, sender = ready
     for bad in itertools.islice((math.nan, math.inf, -math.inf), 3):
         estimator.update(sender("local_position_ned", 1000, bad, 0, 0, 0, 0, 0), 10 * S)

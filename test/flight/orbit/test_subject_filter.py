@@ -67,7 +67,7 @@ def test_range_of_a_person_seen_from_steeply_above(action, bound):
         assert np.nanmedian(sizes) == pytest.approx(1.0, abs=0.12)
 
 
-def test_one_wrong_joint_does_not_turn_the_bearing():
+def test_one_wrong_joint_does_not_change_the_bearing():
     capture = flight("stand", noise_scale=0.0, outlier_fraction=0.0, missed_fraction=0.0, attitude_error_deg=0.0)
     _, pose, seen = next(observations(capture))
     keypoints = seen.keypoints.copy()
@@ -79,7 +79,7 @@ def test_one_wrong_joint_does_not_turn_the_bearing():
     assert np.linalg.norm(places[1].position - places[0].position) < 0.2
 
 
-def test_a_foot_kicked_to_the_horizon_leaves_the_range_to_the_other():
+def test_range_ignores_a_foot_at_the_horizon():
     capture = flight("stand", noise_scale=0.0, outlier_fraction=0.0, missed_fraction=0.0, attitude_error_deg=0.0)
     _, pose, seen = next(observations(capture))
     ankle = seen.joints.index("rankle")
@@ -131,7 +131,7 @@ def test_velocity_of_a_walking_person():
     assert np.mean(np.linalg.norm(truth, axis=1)) > 0.8
 
 
-def test_each_source_alone_and_a_slope_that_contradicts():
+def test_each_range_source_works_alone_and_size_wins_on_a_slope():
     capture = flight("stand", noise_scale=0.0, outlier_fraction=0.0, missed_fraction=0.0, attitude_error_deg=0.0)
     _, pose, seen = next(observations(capture))
     truth = np.linalg.norm(capture.joints3d_world[0, 0, :2] - pose.position[:2])
@@ -145,7 +145,7 @@ def test_each_source_alone_and_a_slope_that_contradicts():
     assert wrong.systematic[0, 0] + wrong.systematic[1, 1] > size_only.systematic[0, 0] + size_only.systematic[1, 1]
 
 
-def test_what_gives_no_measurement():
+def test_too_few_joints_or_a_steep_view_give_no_measurement():
     capture = flight("stand")
     _, pose, seen = next(observations(capture))
     matrix, config = capture.tracks.camera_matrix, SubjectConfig()
@@ -175,7 +175,7 @@ def accepted(subject, capture, count, **kwargs):
     ],
     ids=["frozen", "jumped", "another", "nan"],
 )
-def test_age_grows_without_good_news(spoil):
+def test_age_grows_without_accepted_keypoints(spoil):
     capture = flight("stand")
     subject = SubjectFilter(SubjectConfig())
     assert sum(accepted(subject, capture, 30)) > 25
@@ -189,7 +189,7 @@ def test_age_grows_without_good_news(spoil):
     assert estimate.age_s == pytest.approx(1.0, abs=0.1)
 
 
-def test_unlocked_filter_follows_to_another_person():
+def test_unlocked_filter_switches_to_another_person():
     capture, other = flight("stand"), flight("stand", seed=9)
     subject = SubjectFilter(SubjectConfig())
     accepted(subject, capture, 5)
@@ -198,39 +198,6 @@ def test_unlocked_filter_follows_to_another_person():
     assert subject.estimate(seen.stamp_ns).track_id == 2
 
 
-def state(t_s, yaw_deg=0.0, **kwargs):
-    half = np.deg2rad(yaw_deg) / 2
-    return VehicleState(
-        int(t_s * S), position_enu_m=np.array([t_s, 0.0, 2.0]), velocity_enu_m_s=np.array([1.0, 0.0, 0.0]),
-        orientation_xyzw=np.array([0.0, 0.0, np.sin(half), np.cos(half)]), **kwargs,
-    )  # fmt: skip
-
-
-def test_pose_between_and_after_states():
-    history = PoseHistory()
-    assert history.at(S) is None
-    for i in range(20):
-        history.add(state(1 + 0.1 * i, 3.0 * i))
-    middle = history.at(int(1.55 * S))
-    assert np.allclose(middle.position, [1.55, 0, 2])
-    yaw = np.deg2rad(16.5)
-    assert np.allclose(middle.rotation[2], [np.cos(yaw), np.sin(yaw), 0])
-    after = history.at(int(3.0 * S))
-    yaw = np.deg2rad(60.0)
-    assert np.allclose(after.position, [3.0, 0, 2])
-    assert np.allclose(after.rotation[2], [np.cos(yaw), np.sin(yaw), 0])
-    assert history.at(int(3.3 * S)) is None
-    assert history.at(int(0.5 * S)) is None
-    history.add(state(0.2))  # the clock went back
-    assert history.at(int(1.5 * S)) is None
-
-
-def test_fixed_mount_looks_down():
-    history = PoseHistory(mount_pitch_deg=30.0)
-    history.add(state(1.0))
-    assert np.allclose(history.at(S).rotation[2], [np.cos(np.pi / 6), 0, -0.5])
-
-
-def test_bad_parameters_are_refused():
+def test_parameters_out_of_range_are_refused():
     with pytest.raises(ParameterError, match="body_height_m"):
         SubjectConfig(body_height_m=-1.0)

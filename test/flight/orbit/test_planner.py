@@ -41,7 +41,7 @@ def test_reaches_radius_height_and_angular_speed():
     assert setpoint.yaw_rate == pytest.approx(math.radians(19), rel=0.02)
 
 
-def test_begins_where_the_vehicle_is():
+def test_orbit_begins_at_the_vehicle():
     _, _, first = fly(1, start=(0.0, 8.0, 5.0))[0]
     assert np.allclose(first.position, [0, 8, 5], atol=0.02)
     assert np.linalg.norm(first.velocity) < 0.2
@@ -55,7 +55,7 @@ def test_angular_speed_ramps_in_about_three_seconds_without_overshoot():
     assert 2.0 < np.argmax(omega > 0.95 * top) * DT < 4.0
 
 
-def test_velocity_and_acceleration_belong_to_the_path():
+def test_velocity_and_acceleration_are_derivatives_of_the_path():
     rows = fly(15, lambda t: np.array([1.4 * t, 0.3 * math.sin(t), 0.0]))
     position = np.array([reference_position(state) for _, state, _ in rows])
     velocity = np.array([setpoint.velocity for _, _, setpoint in rows])
@@ -70,7 +70,7 @@ def test_follows_a_walking_subject():
     assert np.linalg.norm(setpoint.position[:2] - subject) == pytest.approx(6.0, abs=0.15)
 
 
-def test_an_uncertain_or_walking_subject_is_given_more_room():
+def test_least_radius_grows_for_an_uncertain_or_walking_subject():
     config = OrbitConfig(radius_m=3.8)
     sure = least_radius(config, 0.1, 0.0, 1.3)
     assert config.min_distance_m + 0.4 < sure < 3.8
@@ -84,7 +84,7 @@ def test_an_uncertain_or_walking_subject_is_given_more_room():
     assert state.radius.value == pytest.approx(4.5, abs=0.02)
 
 
-def test_a_vehicle_that_is_too_slow_is_asked_for_more():
+def test_lack_of_velocity_becomes_acceleration():
     config = OrbitConfig()
     vehicle, zero = np.array([6.0, 0.0, 2.5]), np.zeros(3)
     state = begin_orbit(vehicle, zero, zero, config)
@@ -97,7 +97,7 @@ def test_a_vehicle_that_is_too_slow_is_asked_for_more():
     assert (lags.acceleration - told.acceleration) @ told.velocity > 0
 
 
-def test_a_jump_of_the_subject_does_not_come_through():
+def test_jump_of_the_subject_is_smoothed():
     rows = fly(12, lambda t: np.array([0.0 if t < 8 else 500.0, 0.0, 0.0]))
     speeds = [np.linalg.norm(setpoint.velocity) for _, _, setpoint in rows]
     steps = np.diff([setpoint.position for _, _, setpoint in rows], axis=0)
@@ -105,7 +105,7 @@ def test_a_jump_of_the_subject_does_not_come_through():
     assert np.linalg.norm(steps, axis=1).max() / DT < OrbitConfig().max_speed_m_s * 1.05
 
 
-def test_the_reference_waits_for_a_vehicle_that_stands_still():
+def test_reference_waits_for_a_vehicle_that_stands_still():
     config = OrbitConfig()
     vehicle = np.array([6.0, 0.0, 2.5])
     state = begin_orbit(vehicle, np.zeros(3), np.zeros(3), config)
@@ -116,7 +116,7 @@ def test_the_reference_waits_for_a_vehicle_that_stands_still():
     assert np.linalg.norm(sent.position - vehicle) <= config.max_lead_m + 1e-9
 
 
-def test_angular_speed_yields_to_the_acceleration_at_a_larger_radius():
+def test_larger_radius_reduces_angular_speed_to_the_acceleration_limit():
     config = OrbitConfig(radius_m=4.0, angular_speed_deg_s=40.0)
     _, state, _ = fly(30, config=config, start=(15.0, 0, 2.5))[20]
     assert abs(state.omega.value) ** 2 * state.radius.value <= config.max_acceleration_m_s2 * 1.02
@@ -124,7 +124,7 @@ def test_angular_speed_yields_to_the_acceleration_at_a_larger_radius():
     assert math.degrees(state.omega.value) == pytest.approx(40, abs=0.5)
 
 
-def test_clockwise_is_the_mirror_image():
+def test_clockwise_orbit_mirrors_the_counter_clockwise_one():
     left = fly(10, start=(7.0, 0, 2.5))[-1][2]
     right = fly(10, config=OrbitConfig(angular_speed_deg_s=-19.0), start=(7.0, 0, 2.5))[-1][2]
     assert np.allclose(left.position * [1, -1, 1], right.position)
@@ -136,7 +136,7 @@ def test_clockwise_is_the_mirror_image():
     st.floats(-30, 30), st.floats(-30, 30), st.floats(0, 12), st.floats(3.5, 20), st.floats(-60, 60),
     st.integers(0, 2**31),
 )  # fmt: skip
-def test_limits_hold_for_any_start_and_any_subject(x, y, z, radius, speed, seed):
+def test_limits_hold_for_any_start_and_subject(x, y, z, radius, speed, seed):
     config = OrbitConfig()
     try:
         goal = goal_of(config, radius, 3.0, speed)
@@ -168,7 +168,7 @@ def test_limits_hold_for_any_start_and_any_subject(x, y, z, radius, speed, seed)
         ({"ramp_s": 0.0}, "ramp_s"),
     ],
 )
-def test_contradictions_are_refused_at_construction(values, word):
+def test_contradicting_orbit_parameters_are_refused(values, word):
     with pytest.raises(InputError, match=word) as error:
         OrbitConfig(**values)
     assert "\n" not in str(error.value)
