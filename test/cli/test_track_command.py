@@ -32,7 +32,7 @@ def test_track_writes_tracks_and_an_overlay(models, shared, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("content", [b"", b"no video"], ids=["empty", "text"])
-def test_bad_videos_end_with_status_2_and_one_line(models, tmp_path, capsys, content):
+def test_invalid_video_ends_with_status_2_and_one_line(models, tmp_path, capsys, content):
     (tmp_path / "a.mp4").write_bytes(content)
     assert main(["track", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "out"), "--models", models]) == 2
     captured = capsys.readouterr()
@@ -41,7 +41,7 @@ def test_bad_videos_end_with_status_2_and_one_line(models, tmp_path, capsys, con
     assert not (tmp_path / "out").exists()
 
 
-def test_a_recording_without_a_person_ends_with_status_2(models, tmp_path, capsys):
+def test_recording_without_a_person_ends_with_status_2(models, tmp_path, capsys):
     cv2 = pytest.importorskip("cv2")
     cv2.imwrite(str(tmp_path / "a.png"), np.full((200, 300, 3), 90, np.uint8))
     assert main(["track", str(tmp_path / "a.png"), "--out", str(tmp_path / "out"), "--models", models]) == 2
@@ -52,9 +52,9 @@ def test_a_recording_without_a_person_ends_with_status_2(models, tmp_path, capsy
 @pytest.mark.parametrize(
     "option", [["--subject", "tallest"], ["--pose", "nothing"], ["--detector", "tinypose_256x192"]]
 )
-def test_options_that_cannot_be_used_end_with_status_2(models, shared, tmp_path, capsys, option):
-    picture = str(shared / "media" / "skier.jpg")
-    assert main(["track", picture, "--out", str(tmp_path / "out"), "--models", models, *option]) == 2
+def test_unusable_option_ends_with_status_2(models, shared, tmp_path, capsys, option):
+    image = str(shared / "media" / "skier.jpg")
+    assert main(["track", image, "--out", str(tmp_path / "out"), "--models", models, *option]) == 2
     assert "expected" in capsys.readouterr().err
 
 
@@ -64,14 +64,14 @@ def test_models_list_and_check(models, shared, tmp_path, capsys):
     for part in ("rtmdet-nano", "Apache-2.0", "tinypose_256x192.onnx", "heatmap, 192x256, coco17", "rtmdet-maps"):
         assert part in listed
     drawing = tmp_path / "drawn.png"
-    picture = str(shared / "media" / "skier.jpg")
-    assert main(["models", "check", picture, "--models", models, "--out", str(drawing)]) == 0
+    image = str(shared / "media" / "skier.jpg")
+    assert main(["models", "check", image, "--models", models, "--out", str(drawing)]) == 0
     assert "lwrist" in capsys.readouterr().out
     assert drawing.stat().st_size > 10_000
     assert main(["models", "check", "--models", models]) == 0
 
 
-def test_models_commands_refuse_what_is_not_there(tmp_path, capsys):
+def test_models_commands_refuse_unknown_folders_and_names(tmp_path, capsys):
     assert main(["models", "list", "--models", str(tmp_path / "nowhere")]) == 2
     assert main(["models", "check", "--models", str(tmp_path)]) == 2
     assert main(["models", "fetch", "resnet", "--models", str(tmp_path)]) == 2
@@ -80,7 +80,7 @@ def test_models_commands_refuse_what_is_not_there(tmp_path, capsys):
     assert err.count("\n") == 3
 
 
-def test_fetch_without_a_network_says_so_and_ends_with_status_1(tmp_path):
+def test_fetch_without_a_network_ends_with_status_1(tmp_path):
     env = {**os.environ, "https_proxy": "http://127.0.0.1:9", "no_proxy": ""}
     command = [sys.executable, "-m", "drocap_ros.cli", "models", "fetch", "yolox-nano", "--models", str(tmp_path)]
     done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=60, check=False)

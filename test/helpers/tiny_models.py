@@ -1,4 +1,4 @@
-"""ONNX models of every supported layout that answer with fixed numbers whatever they see."""
+"""ONNX models of each supported layout with constant outputs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from onnx import TensorProto, helper, numpy_helper
 def write_model(
     path: Path, input_shape: tuple[int, ...], outputs: dict[str, np.ndarray], element_type: int = TensorProto.FLOAT
 ) -> Path:
-    """A model with one image input whose outputs are ``outputs`` plus zero times the picture's mean."""
+    """A model with one image input whose outputs are ``outputs`` plus zero times the image's mean."""
     nodes, initializers, infos = [], [], []
     nodes.append(helper.make_node("Cast", ["image"], ["as_float"], to=TensorProto.FLOAT))
     nodes.append(helper.make_node("ReduceMean", ["as_float"], ["mean"], keepdims=0))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,17 +28,8 @@ _ELEMENT_TYPES = {
 }
 
 
-@dataclass(frozen=True)
-class TensorInfo:
-    """Name, shape (None = dynamic) and element type of a model's input or output."""
-
-    name: str
-    shape: tuple[int | None, ...]
-    element_type: str
-
-
 class OnnxModel:
-    """A loaded model.
+    """A loaded model; ``inputs`` and ``outputs`` are onnxruntime's name, shape and type of each tensor.
 
     Parameters
     ----------
@@ -75,13 +65,13 @@ class OnnxModel:
                 " export or fetch it again"
             ) from None
         self.provider: str = self._session.get_providers()[0]
-        self.inputs = tuple(_info(t) for t in self._session.get_inputs())
-        self.outputs = tuple(_info(t) for t in self._session.get_outputs())
+        self.inputs = self._session.get_inputs()
+        self.outputs = self._session.get_outputs()
         self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
-        if len(self.inputs) != 1 or self.inputs[0].element_type not in _ELEMENT_TYPES:
-            found = ", ".join(f"{t.name} {t.element_type}" for t in self.inputs)
+        if len(self.inputs) != 1 or self.inputs[0].type not in _ELEMENT_TYPES:
+            found = ", ".join(f"{t.name} {t.type}" for t in self.inputs)
             raise InputError(f"{self.path}: expected one image input (float, uint8 or int32), found {found}")
-        self._dtype = _ELEMENT_TYPES[self.inputs[0].element_type]
+        self._dtype = _ELEMENT_TYPES[self.inputs[0].type]
         self._names = [t.name for t in self.outputs]
 
     def make_dynamic(self) -> bool:
@@ -140,11 +130,6 @@ def choose_providers(wanted: str, offered: list[str]) -> list[str]:
         raise InputError(f"provider: expected one of {have} (offered by this onnxruntime), got {wanted!r}")
     cpu = _PROVIDERS["cpu"]
     return [name] if name == cpu else [name, cpu]
-
-
-def _info(tensor: Any) -> TensorInfo:
-    shape = tuple(d if isinstance(d, int) and d > 0 else None for d in tensor.shape)
-    return TensorInfo(tensor.name, shape, tensor.type)
 
 
 def _first_line(error: Exception) -> str:

@@ -160,7 +160,7 @@ def _input_size(model: OnnxModel, overrides: Mapping[str, Any]) -> tuple[tuple[i
     height, width = info.shape[1:3] if channels_last else info.shape[2:]
     if "input_size" in overrides:
         width, height = overrides["input_size"]
-    if width is None or height is None:
+    if not all(isinstance(side, int) and side > 0 for side in (width, height)):  # dynamic
         many = len(model.outputs) == 2 or (len(model.outputs[0].shape) == 4)
         width, height = (192, 256) if many and "det" not in model.path.stem.lower() else (640, 640)
     return (int(width), int(height)), channels_last

@@ -6,9 +6,9 @@ import numpy as np
 
 Window = tuple[int, int, int, int]
 
-#: Side of a window over the subject's longer side, and its least side in px.  Detectors of 320-416 px input score a
-#: person in bad light two to three times higher who fills most of the window than one who fills a third; a wider
-#: window also covers the persons nearby.
+#: Side of a window over the subject's longer side, and its least side in px.  In bad light, detectors of 320-416 px
+#: input give a person over most of the window two to three times the score of one over a third of it; a wider window
+#: also covers the persons nearby.
 _WIDE, _CLOSE, _TIGHT = (1.8, 416), (1.45, 208), (1.3, 160)
 #: Images longer than this are also searched in tiles of this side, one per image.
 _TILE = 800

@@ -60,8 +60,8 @@ class SubjectTracker:
     """Tracks all persons in view, so that each detection in a crossing has its owner; one of them is the subject.
 
     A subject without detection is predicted for ``coast_s``.  After that there is no subject until a new track is
-    re-identified: a person who was not in view together with the subject, has its appearance, and is within reach for
-    the elapsed time.
+    re-identified: a person without simultaneous detections of the subject, of its appearance, and within reach for the
+    elapsed time.
     """
 
     def __init__(self, config: PoseEstimatorConfig) -> None:
@@ -97,7 +97,7 @@ class SubjectTracker:
         return self._schedule.search(self._candidate_box(stamp_ns), image_size, stamp_ns, single)
 
     def _candidate_box(self, stamp_ns: int) -> np.ndarray | None:
-        """(4,) px, a new person who may become the subject: a small one needs a window to be confirmed."""
+        """(4,) px, a possible new subject: a small person needs a window to be confirmed."""
         lost = self._subject
         recent = [p for p in self._persons if p is not lost and p.undetected_s(stamp_ns) <= _CANDIDATE_S]
         if lost is not None:  # persons in view together with the subject cannot be the subject
