@@ -1,4 +1,4 @@
-"""``drocap export`` as a user runs it, and what it refuses."""
+"""``drocap export``: outputs and refused inputs."""
 
 import dataclasses
 
@@ -28,7 +28,7 @@ def refused(arguments, folder, capsys, words):
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_the_folder_of_a_motion_is_enough(folder, form, capsys):
+def test_folder_of_a_motion_is_accepted(folder, form, capsys):
     assert main(["export", str(folder), "--to", form]) == 0
     assert "15 joints" in capsys.readouterr().out
     assert len(READERS[form](folder / f"motion.{form}").joints) == 15
@@ -43,7 +43,7 @@ def test_out_names_the_file_and_replaces_it(folder, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_what_is_no_motion_is_refused(folder, capsys):
+def test_other_files_are_refused(folder, capsys):
     (folder / "text.npz").write_text("no archive")
     np.savez(folder / "other.npz", a=np.zeros(3))
     (folder / "empty").mkdir()
@@ -93,14 +93,14 @@ def test_damaged_motions_are_refused(folder, capsys, change, words):
     refused(["export", folder / "damaged.npz", "--to", "glb"], folder, capsys, words)
 
 
-def test_a_time_line_that_no_rate_can_fill_is_refused(walker, folder, capsys):
+def test_time_line_with_too_many_resampled_frames_is_refused(walker, folder, capsys):
     stamps = walker.stamp_ns.copy()
     stamps[-1] += 10**15
     save_motion(folder / "far.npz", dataclasses.replace(walker, stamp_ns=stamps))
     refused(["export", folder / "far.npz", "--to", "bvh"], folder, capsys, "csv or glb")
 
 
-def test_a_skeleton_of_too_many_joints_is_refused(walker, folder, capsys):
+def test_skeleton_with_too_many_joints_is_refused(walker, folder, capsys):
     count = 300
     chain = {
         name: np.resize(getattr(walker, name), (48, count, *getattr(walker, name).shape[2:]))
@@ -113,7 +113,7 @@ def test_a_skeleton_of_too_many_joints_is_refused(walker, folder, capsys):
     refused(["export", folder / "chain.npz", "--to", "bvh"], folder, capsys, "at most 255 joints")
 
 
-def test_a_joint_that_is_never_known_is_named(walker, folder, capsys):
+def test_refusal_names_a_joint_that_is_never_known(walker, folder, capsys):
     joints = walker.joints3d.copy()
     joints[:, 3] = np.nan
     save_motion(folder / "lame.npz", dataclasses.replace(walker, joints3d=joints))
@@ -122,7 +122,7 @@ def test_a_joint_that_is_never_known_is_named(walker, folder, capsys):
     assert main(["export", str(folder / "lame.npz"), "--to", "c3d"]) == 0
 
 
-def test_more_frames_than_a_c3d_counts_are_refused(walker, folder, capsys):
+def test_too_many_frames_for_c3d_are_refused(walker, folder, capsys):
     many = 70_000
     parts = {
         name: np.resize(getattr(walker, name), (many, *getattr(walker, name).shape[1:]))
@@ -133,7 +133,7 @@ def test_more_frames_than_a_c3d_counts_are_refused(walker, folder, capsys):
     refused(["export", folder / "long.npz", "--to", "c3d"], folder, capsys, "65535 frames")
 
 
-def test_outputs_that_cannot_be_written_are_refused(folder, capsys):
+def test_unwritable_outputs_are_refused(folder, capsys):
     (folder / "here").mkdir()
     (folder / "file").touch()
     motion = folder / "motion.npz"
@@ -142,7 +142,7 @@ def test_outputs_that_cannot_be_written_are_refused(folder, capsys):
 
 
 def test_mutated_motions_are_exported_or_refused_in_one_line(walker, tmp_path):
-    """Bytes flipped, cut and replaced: a motion comes out, or one line; nothing else is raised."""
+    """Flipped, cut and replaced bytes: an export or an InputError of one line, no other exception."""
     short = {f.name: getattr(walker, f.name) for f in dataclasses.fields(walker)}
     short = {k: v[:8] if isinstance(v, np.ndarray) else v for k, v in short.items()}
     save_motion(tmp_path / "motion.npz", type(walker)(**short))

@@ -1,4 +1,4 @@
-"""Every format read back by an independent library: positions, names and rate are those of the motion."""
+"""Round trip of every format through an independent reader: positions, names and rate."""
 
 import dataclasses
 
@@ -38,7 +38,7 @@ def test_positions_names_and_rate_are_kept(walker, tmp_path, form):
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_a_motion_in_the_cameras_frame_stands_upright(in_camera, tmp_path, form):
+def test_motion_in_the_camera_frame_is_upright(in_camera, tmp_path, form):
     back, notes = written(in_camera, form, tmp_path)
     x, y, z = np.moveaxis(in_camera.joints3d, -1, 0)
     assert worst(back, np.stack([x, z, -y], axis=-1)) < TOLERANCE_M[form]
@@ -48,7 +48,7 @@ def test_a_motion_in_the_cameras_frame_stands_upright(in_camera, tmp_path, form)
 
 
 @pytest.mark.parametrize("form", ["c3d", "trc", "csv"])
-def test_gaps_stay_gaps_where_the_format_knows_them(with_gaps, tmp_path, form):
+def test_gaps_are_kept_by_formats_with_missing_values(with_gaps, tmp_path, form):
     back, _ = written(with_gaps, form, tmp_path)
     missing = np.isnan(with_gaps.joints3d).any(axis=2)
     np.testing.assert_array_equal(np.isnan(in_order(back)).any(axis=2), missing)
@@ -56,7 +56,7 @@ def test_gaps_stay_gaps_where_the_format_knows_them(with_gaps, tmp_path, form):
 
 
 @pytest.mark.parametrize("form", ["bvh", "glb"])
-def test_gaps_are_bridged_where_the_format_has_no_word_for_them(walker, with_gaps, tmp_path, form):
+def test_gaps_are_interpolated_in_formats_without_missing_values(walker, with_gaps, tmp_path, form):
     back, notes = written(with_gaps, form, tmp_path)
     error = np.linalg.norm(in_order(back) - walker.joints3d, axis=2)
     known = np.isfinite(with_gaps.joints3d).all(axis=2)
@@ -67,8 +67,8 @@ def test_gaps_are_bridged_where_the_format_has_no_word_for_them(walker, with_gap
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_uneven_stamps(walker, tmp_path, form):
-    """A motion linear in time is resampled exactly; formats with their own stamps keep them."""
+def test_uneven_stamps_are_kept_or_resampled(walker, tmp_path, form):
+    """A motion linear in time is resampled exactly; formats with stamps keep them."""
     stamps = np.array([0, 40, 80, 125, 160, 200, 240, 300, 320, 360]) * 1_000_000
     drift = np.arange(3)[None] * stamps[:, None] * 1e-9
     joints = walker.joints3d[0] + drift[:, None]
@@ -93,7 +93,7 @@ def test_uneven_stamps(walker, tmp_path, form):
         assert any("resampled" in note for note in notes)
 
 
-def test_nothing_is_invented_in_a_long_hole_between_frames(walker, tmp_path):
+def test_long_gap_between_frames_stays_unknown(walker, tmp_path):
     stamps = walker.stamp_ns.copy()
     stamps[24:] += 2_000_000_000
     motion = dataclasses.replace(walker, stamp_ns=stamps)
@@ -104,7 +104,7 @@ def test_nothing_is_invented_in_a_long_hole_between_frames(walker, tmp_path):
     assert hole.sum() > 40
 
 
-def test_the_glb_holds_a_body_that_follows_the_joints(walker, tmp_path):
+def test_glb_has_a_body_bound_to_the_joints(walker, tmp_path):
     import pygltflib
 
     export_motion(walker, "glb", tmp_path / "motion.glb")
@@ -130,15 +130,15 @@ def test_the_glb_holds_a_body_that_follows_the_joints(walker, tmp_path):
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_the_same_motion_gives_the_same_bytes(walker, tmp_path, form):
+def test_export_is_deterministic(walker, tmp_path, form):
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
         export_motion(walker, form, tmp_path / folder / f"motion.{form}")
     assert (tmp_path / "a" / f"motion.{form}").read_bytes() == (tmp_path / "b" / f"motion.{form}").read_bytes()
 
 
-def test_ten_minutes_in_seconds(walker, tmp_path):
-    """14,400 frames: no loop over frames hides in the formats."""
+def test_ten_minutes_are_exported_within_seconds(walker, tmp_path):
+    """14,400 frames: the bound excludes loops over frames."""
     import time
 
     repeats = 300

@@ -1,4 +1,4 @@
-"""Bones of constant length and rotations that lead them where the joints were."""
+"""Constant bones and the rotations that reproduce the joints."""
 
 import numpy as np
 import pytest
@@ -12,13 +12,13 @@ def y_up(walker):
     return np.stack([x, z, -y], axis=-1)
 
 
-def test_forward_kinematics_returns_the_joints(walker):
+def test_forward_kinematics_reproduces_the_joints(walker):
     joints = y_up(walker)
     rig = fit_rig(joints, BODY_15.joints, BODY_15.parents, 24.0)
     np.testing.assert_allclose(rig.positions(joints[:, 0], BODY_15.parents), joints, atol=1e-6)
 
 
-def test_the_rest_pose_needs_no_rotation():
+def test_rest_pose_has_identity_rotations():
     """A body that stands in a T facing +z has the identity everywhere."""
     joints = np.zeros((3, 15, 3))
     offsets = {
@@ -35,7 +35,7 @@ def test_the_rest_pose_needs_no_rotation():
         np.testing.assert_allclose(rotation.magnitude(), 0.0, atol=1e-7)
 
 
-def test_rotations_are_continuous_although_a_bone_passes_its_opposite_direction(walker):
+def test_rotations_are_continuous_where_a_bone_passes_its_opposite_direction(walker):
     """A forearm that swings past the direction opposite to its rest: the smallest rotation alone would jump by pi."""
     joints = np.repeat(y_up(walker)[:1], 240, axis=0)
     elbow, wrist = BODY_15.index("lelbow"), BODY_15.index("lwrist")
@@ -55,7 +55,7 @@ def test_rotations_are_continuous_although_a_bone_passes_its_opposite_direction(
     np.testing.assert_allclose((still[:-1].inv() * still[1:]).magnitude(), 0.0, atol=1e-9)
 
 
-def test_other_trees_and_unnamed_joints(walker):
+def test_other_trees_and_joints_without_an_entry_are_posed(walker):
     """Human3.6M's tree with spine and thorax, and a joint of which the table knows nothing."""
     body = y_up(walker)
     at = {name: body[:, BODY_15.index(name)] for name in BODY_15.joints}

@@ -1,4 +1,4 @@
-"""Exported files read by libraries that are not ours: positions (F, P, 3) in metres, z up, with names and rate."""
+"""Readers of exported files by independent libraries: positions (F, P, 3) m, z up, names and rate."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def z_up(y_up: np.ndarray) -> np.ndarray:
 
 
 def read_bvh(path: Path) -> ReadBack:
-    """Forward kinematics by bvhio; the joints without length that split a joint's children are left out."""
+    """Forward kinematics by bvhio, without the zero-length joints."""
     import bvhio
 
     root = bvhio.readAsHierarchy(str(path))
@@ -39,7 +39,7 @@ def read_bvh(path: Path) -> ReadBack:
 
 
 def read_c3d(path: Path) -> ReadBack:
-    """By ezc3d (the file is written by another library); missing points are NaN."""
+    """By ezc3d, which is not the writing library; missing points are NaN."""
     import ezc3d
 
     content = ezc3d.c3d(str(path))
@@ -102,7 +102,7 @@ def read_glb(path: Path) -> ReadBack:
 
 
 def gltf_array(document, number: int) -> np.ndarray:
-    """An accessor's rows, as the specification lays them out."""
+    """Rows of an accessor."""
     accessor = document.accessors[number]
     view = document.bufferViews[accessor.bufferView]
     width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor.type]

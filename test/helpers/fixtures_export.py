@@ -1,4 +1,4 @@
-"""A motion with constant bones, as a real person has, and ways to spoil it."""
+"""A motion with constant bones, in the camera frame, and with gaps."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def in_camera(walker: Motion) -> Motion:
 
 @pytest.fixture(scope="session")
 def with_gaps(walker: Motion) -> Motion:
-    """The person with joints unknown: a wrist for five frames, everything in two frames, the head at the start."""
+    """Unknown joints: a wrist in five frames, all joints in two, the head at the start."""
     joints = walker.joints3d.copy()
     joints[10:15, BODY_15.index("rwrist")] = np.nan
     joints[30:32] = np.nan

@@ -6,8 +6,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
@@ -61,6 +59,8 @@ def run(args: argparse.Namespace) -> int:
 
 def learn_from_folder(folder: Path, include: str, every: int, atoms: int, sparsity: float, seed: int) -> Dictionary:
     """Dictionary from every n-th frame of the files of a MoCap folder whose names match ``include``."""
+    import numpy as np
+
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.mocap import load_mocap, mocap_files
     from drocap_ros.reconstruction.paper.dictionary import learn, normalize_poses

@@ -5,7 +5,7 @@ import random
 import numpy as np
 import pytest
 
-from drocap_ros.flight.orbit.conditions import ConditionCode
+from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.states import Action, Command, OperatorCommand, State
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
 

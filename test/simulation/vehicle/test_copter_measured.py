@@ -1,4 +1,4 @@
-"""The simulated copter beside what was measured on ArduPilot Copter (orbit of 6 m at 2 m/s, 20 setpoints a second)."""
+"""The simulated copter against measurements on ArduPilot Copter (orbit of 6 m at 2 m/s, 20 setpoints per second)."""
 
 import math
 
@@ -15,7 +15,7 @@ ALL, NO_YAW_RATE, NO_ACCELERATION, POSITION_YAW, VELOCITY = 0, 2048, 2496, 2552,
 
 
 class Flight:
-    """A copter without errors of its own, and who sends it setpoints."""
+    """A copter without estimation errors, and its setpoints."""
 
     def __init__(self, wind=0.0, centre_speed=0.0, guid_timeout_s=3.0):
         self.t, self.centre_speed = 0.0, centre_speed
@@ -42,7 +42,7 @@ class Flight:
         )  # fmt: skip
 
     def orbit(self, mask, yaw_from):
-        """The setpoint of the circle; ``yaw_from`` the reference, or the vehicle's actual place."""
+        """Send the setpoint of the circle; ``yaw_from`` the reference, or the vehicle's position."""
         omega = SPEED / RADIUS * min(self.t / RAMP_S, 1.0)
         phase = SPEED / RADIUS * (self.t**2 / (2 * RAMP_S) if self.t < RAMP_S else self.t - RAMP_S / 2)
         outward, along = (
@@ -79,7 +79,7 @@ def settled(mask=ALL, yaw_from="reference", **world):
 
 
 def stop(how, guid_timeout_s=3.0):
-    """Greatest distance from where the orbit was when it was stopped, m."""
+    """Greatest distance from the position at the stop, m."""
     flight = Flight(guid_timeout_s=guid_timeout_s)
     flight.fly(15.0, lambda: flight.orbit(ALL, "vehicle"))
     first, place, yaw = len(flight.rows), flight.copter.body.position.copy(), flight.copter.body.yaw
@@ -117,22 +117,22 @@ STOPS = (
 
 
 def compare(name, simulated, least, most, rounding):
-    """Say both; 10 % of what was measured, and the half of its last digit, are allowed."""
+    """Print both; allow 10 % of the measurement and half of its last digit."""
     print(f"{name:45s} simulated {simulated:5.2f}  measured {least:g}" + (f" to {most:g}" if most > least else ""))
     assert 0.9 * least - rounding <= simulated <= 1.1 * most + rounding, name
 
 
 @pytest.mark.parametrize(("name", "mask", "yaw_from", "world", "radius", "yaw"), ORBITS, ids=[o[0] for o in ORBITS])
-def test_orbit_errors_are_the_measured_ones(name, mask, yaw_from, world, radius, yaw):
+def test_orbit_errors_equal_the_measured_ones(name, mask, yaw_from, world, radius, yaw):
     signed, size, turned = settled(mask, yaw_from, **world)
     compare(f"{name}: radius error, m", size if world else signed, radius, radius, 0.005)
     compare(f"{name}: yaw error, deg", turned, yaw, yaw, 0.05)
 
 
 @pytest.mark.parametrize(("how", "timeout_s", "least", "most"), STOPS)
-def test_stops_are_as_long_as_measured(how, timeout_s, least, most):
+def test_stops_are_as_long_as_the_measured_ones(how, timeout_s, least, most):
     compare(f"stop by {how}, GUID_TIMEOUT {timeout_s:g} s, m", stop(how, timeout_s), least, most, 0.005)
 
 
-def test_a_setpoint_500_m_away_is_flown_to_at_full_speed():
+def test_distant_setpoint_is_approached_at_full_speed():
     compare("setpoint 500 m away: speed, m/s", jump(), 9.3, 9.3, 0.05)
