@@ -32,7 +32,12 @@ from figures import ROOT, table, write_figures
 
 sys.path[:0] = [str(ROOT)]
 SHARED = ROOT.parent / "shared"
-PARTS = ("load", "memory", "kills")
+TITLES = {
+    "load": "Live graph under load",
+    "memory": "Memory of the live graph",
+    "kills": "Restart of killed nodes",
+}
+PARTS = tuple(TITLES)
 NODES = ["image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
 #: Networks, discovery and the first window take their time: not part of the figures.
 WARM_S = 15.0
@@ -54,7 +59,7 @@ def main() -> int:
     for part in args.parts or PARTS:
         with tempfile.TemporaryDirectory(prefix="drocap_bench_") as folder:
             results = globals()[f"part_{part}"](args, Path(folder))
-        write_figures(f"live_{part}", f"Live graph: {part}", markdown(results))
+        write_figures(f"live_{part}", TITLES[part], page(part, results))
     return 0
 
 
@@ -62,14 +67,32 @@ def show(title: str, figures: dict[str, Any]) -> None:
     print(f"{title}:", *(f"  {key}: {value}" for key, value in figures.items()), sep="\n", flush=True)
 
 
-def markdown(results: dict[str, Any]) -> str:
-    """A table for the plain figures, and one for each case of several."""
-    plain = {key: value for key, value in results.items() if not isinstance(value, dict)}
-    text = table(("figure", "value"), plain.items()) if plain else ""
-    for name, figures in results.items():
-        if isinstance(figures, dict):
-            rows = ((key, text_of(value)) for key, value in figures.items())
-            text += f"\n## {name}\n\n{table(('figure', 'value'), rows)}"
+def page(part: str, results: dict[str, Any]) -> str:
+    """Table of a part's main figures, one row per case or node; then all other figures."""
+    if part == "load":
+        head = ("graph", "images with a result, per s (without one)", "`pose3d/initial` p50 / p95 / p99, ms",
+                "processors, % of one core")  # fmt: skip
+        rows = [
+            (
+                name,
+                f"{f['per second']['pose2d']} ({f['images without keypoints %']} %)",
+                " / ".join(map(str, f["latency ms p50 / p95 / p99"]["pose3d/initial"])),
+                f["CPU %, of one core"]["sum"],
+            )
+            for name, f in results.items()
+        ]
+        rest = results
+    elif part == "memory":
+        head = ("node", "MiB at minute 2", "largest difference")
+        rows = [(k, v["MiB at minute 2"], v["farthest"]) for k, v in results.items() if isinstance(v, dict)]
+        rest = {"run": {k: v for k, v in results.items() if not isinstance(v, dict)}}
+    else:
+        head = ("node", "topic", "s from SIGKILL to its first message")
+        rows = [(name, SIGNS.get(name, "the next file"), text_of(v)) for name, v in results["seconds"].items()]
+        rest = {"recording": {k: v for k, v in results.items() if k != "seconds"}}
+    text = table(head, rows)
+    for name, figures in rest.items():
+        text += f"\n## {name}\n\n{table(('figure', 'value'), ((k, text_of(v)) for k, v in figures.items()))}"
     return text
 
 
@@ -376,8 +399,7 @@ def part_kills(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         graph.wait_until(lambda: any(second.glob("*.mcap")), 60, "the recorder's next folder")
         took["session_recorder"].append(round(time.monotonic() - begin, 2))
         graph.spin_for(5.0)
-    for name, seconds in took.items():
-        results[f"{name} killed, s until {SIGNS.get(name, 'the next file')}"] = seconds
+    results["seconds"] = took
     for folder_ in (session, second):
         with open_session(folder_) as opened:
             info = {t.name.removeprefix("/drocap/"): t.count for t in opened.info.topics if t.count}
