@@ -108,13 +108,7 @@ class McapFile:
         self._mcap.add_metadata(name, dict(values))
 
     def save(self, sync: bool) -> None:
-        """Close the open chunk and commit all chunks.
-
-        Raises
-        ------
-        OSError
-            When it cannot be written; the file then ends at the last commit.
-        """
+        """Close the open chunk and commit all chunks; an OSError leaves the file at the last commit."""
         self._mcap.flush()
         self._chunk_closed()
         self.commit(sync)
@@ -125,13 +119,7 @@ class McapFile:
         self._in_closed_chunks.clear()
 
     def finish(self, sync: bool) -> None:
-        """Write the summary and close.
-
-        Raises
-        ------
-        OSError
-            When it cannot be written; committed chunks stay.
-        """
+        """Write the summary and close; errors as :meth:`save`."""
         self._mcap.finish()
         self._chunk_closed()
         self.commit(sync)
