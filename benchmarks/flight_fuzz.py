@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from figures import write_figures
 
-from drocap_ros.flight.orbit.conditions import ConditionCode
+from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.states import Action, OperatorCommand, State
 from drocap_ros.simulation.closed_loop.orbit_loop import EPOCH_NS, LoopSettings, OrbitLoop, with_config
 

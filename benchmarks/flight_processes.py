@@ -26,9 +26,9 @@ from figures import ROOT, table, write_figures
 
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import NodeError
+from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.mavlink.transport import open_transport
-from drocap_ros.flight.orbit.conditions import ConditionCode
 from drocap_ros.flight.orbit.states import Command, State
 from drocap_ros.observation import PoseObservation
 from drocap_ros.simulation.closed_loop.fault_causes import TIMEOUT

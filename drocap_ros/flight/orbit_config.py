@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from drocap_ros.errors import ParameterError
-from drocap_ros.flight.orbit.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.parameters import Parameters, param
 
 _ROOM_M = 0.5

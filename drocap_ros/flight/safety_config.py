@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from drocap_ros.errors import ParameterError
-from drocap_ros.flight.orbit.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.parameters import Parameters, param
 
 

@@ -1,4 +1,4 @@
-"""Messages that cannot be, on every input topic of every node: dropped, counted, explained, and nothing dies."""
+"""Malformed messages on every input topic of every node: dropped, counted, explained, and no node ends."""
 
 import math
 import struct
@@ -15,7 +15,7 @@ from sensor_msgs.msg import CompressedImage, RegionOfInterest
 
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
-from drocap_ros.flight.orbit.conditions import ConditionCode
+from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, VehicleState
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.ros.conversions import camera_info_to_ros, header_at, stamp_to_ros
@@ -34,7 +34,7 @@ FAR_STAMPS = {"1970": 5 * 10**9, "2100": 4_102_444_800 * 10**9, "before 1970": -
 
 
 class Bench:
-    """The running graph, a publisher on each of its inputs, and what it says."""
+    """The running graph, a publisher on each of its inputs, and its messages."""
 
     def __init__(self, graph, picture):
         self.graph, self.picture = graph, picture
@@ -81,7 +81,7 @@ def bench(shared, tmp_path_factory):
         yield Bench(graph, picture)
 
 
-# -- messages as they should be ----------------------------------------------------------------------------
+# -- correct messages ----------------------------------------------------------------------------
 
 
 def good_image(b):
@@ -129,7 +129,7 @@ def good_roi(_):
     return RegionOfInterest(x_offset=100, y_offset=50, width=300, height=400)
 
 
-# -- what is wrong with them -------------------------------------------------------------------------------
+# -- faults of messages -------------------------------------------------------------------------------
 
 
 def wrong_png(width, height):
@@ -206,7 +206,7 @@ def spoilt(bench, good, changes):
 
 
 def check_it_works(bench, topic):
-    """Good messages still do what they should, and no node has died."""
+    """Correct messages still have their effect, and no node has ended."""
     _, good, _, sign = INPUTS[topic]
     if sign is None:
         bench.graph.spin_for(0.3)
@@ -221,7 +221,7 @@ def check_it_works(bench, topic):
 
 
 @pytest.mark.parametrize("topic", [topic for topic, entry in INPUTS.items() if entry[2]])
-def test_what_cannot_be_is_refused_counted_and_explained(bench, topic):
+def test_malformed_message_is_refused_counted_and_explained(bench, topic):
     nodes, good, wrong, _ = INPUTS[topic]
     check_it_works(bench, topic)
     bench.graph.spin_for(1.1)  # each node has reported its counts once more
@@ -267,7 +267,7 @@ STRANGE = {
 
 
 @pytest.mark.parametrize("topic", STRANGE)
-def test_what_is_strange_kills_nothing(bench, topic):
+def test_strange_message_ends_no_node(bench, topic):
     check_it_works(bench, topic)
     for message in STRANGE[topic]:
         bench.publishers[topic].publish(message)
@@ -318,8 +318,8 @@ def test_malformed_orbit_command_is_refused_with_its_code(bench, values, code):
     bench.graph.node.destroy_client(client)
 
 
-def test_unknown_joints_are_no_fault(bench):
-    bench.graph.spin_for(2.0)  # until what the tests before sent is told
+def test_unknown_joints_are_not_refused(bench):
+    bench.graph.spin_for(2.0)  # until the refusals of the tests before are published
     before = [bench.refused(node) for node in INPUTS["pose2d"][0]]
     for _ in range(5):
         message = good_pose2d(bench)
@@ -333,7 +333,7 @@ def test_unknown_joints_are_no_fault(bench):
     check_it_works(bench, "pose2d")
 
 
-def test_the_recorder_took_down_what_was_sent(bench):
+def test_recorder_has_written_the_messages(bench):
     values = bench.values["session_recorder"]
     assert int(values[Key.WRITTEN]) > 100
     assert not any(key.startswith(of(Key.NOT_WRITTEN, "/drocap/pose")) for key in values)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drocap_ros.flight.orbit.conditions import ConditionCode
+from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.states import State
 from drocap_ros.simulation.closed_loop.fault_causes import TIMEOUT
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
-from drocap_ros.flight.orbit.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.planner import OrbitGoal, goal_of
 from drocap_ros.flight.orbit.states import Command, OperatorCommand
 from drocap_ros.flight.orbit_config import orbit_condition

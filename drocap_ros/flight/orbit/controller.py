@@ -16,11 +16,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.commands import CommandQueue, command_message
 from drocap_ros.flight.mavlink.dialects import ARDUPILOT, DIALECTS, Dialect, halt_message, setpoint_message
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.orbit.command_checks import command_condition, commanded_goal
-from drocap_ros.flight.orbit.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.observer import observe, position_jump_m
 from drocap_ros.flight.orbit.planner import (
     OrbitGoal,

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from drocap_ros.flight.orbit.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.motion_checks import braking_distance, subject_located
 from drocap_ros.flight.orbit.states import Limits, Observed, SafetyState, State
 from drocap_ros.flight.safety_config import SafetyConfig

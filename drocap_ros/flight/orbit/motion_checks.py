@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
-from drocap_ros.flight.orbit.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.states import Limits, Observed
 from drocap_ros.flight.safety_config import SafetyConfig
 

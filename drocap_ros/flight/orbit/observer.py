@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.dialects import ARDUPILOT, DIALECTS
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.orbit.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.states import Observed
 from drocap_ros.flight.orbit.subject_filter import SubjectEstimate
 from drocap_ros.flight.vehicle_state import VehicleState

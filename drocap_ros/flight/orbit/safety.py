@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from drocap_ros.flight.orbit.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.hold import begin_hold, request_hold_mode, retreat, update_hold
 from drocap_ros.flight.orbit.motion_checks import limit_condition, subject_condition, vehicle_condition
 from drocap_ros.flight.orbit.states import (

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.orbit.conditions import Condition, ConditionCode
+from drocap_ros.flight.conditions import Condition, ConditionCode
 from drocap_ros.flight.orbit.states import Action, State
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop
 

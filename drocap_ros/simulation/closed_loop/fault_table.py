@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drocap_ros.flight.orbit.conditions import ConditionCode
+from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.states import Action, Command, OperatorCommand, State
 from drocap_ros.observation import PoseObservation
 from drocap_ros.simulation.closed_loop.fault_causes import (

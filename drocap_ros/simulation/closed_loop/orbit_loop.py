@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.conditions import Condition
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.orbit.conditions import Condition
 from drocap_ros.flight.orbit.controller import ControlStatus, OrbitController
 from drocap_ros.flight.orbit.states import Action, Command, CommandAnswer, OperatorCommand, State
 from drocap_ros.flight.orbit.watchdog import Watchdog

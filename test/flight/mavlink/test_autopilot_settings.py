@@ -3,8 +3,8 @@ import math
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.mavlink.autopilot_settings import AutopilotSettings
-from drocap_ros.flight.orbit.conditions import ConditionCode
 from drocap_ros.flight.orbit.motion_checks import loss_condition
 from drocap_ros.flight.orbit.states import Action, State
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, with_config

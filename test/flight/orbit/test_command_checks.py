@@ -3,8 +3,8 @@ import math
 import pytest
 
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.conditions import Condition, ConditionCode
 from drocap_ros.flight.orbit.command_checks import command_condition, commanded_goal
-from drocap_ros.flight.orbit.conditions import Condition, ConditionCode
 from drocap_ros.flight.orbit.planner import OrbitGoal
 from drocap_ros.flight.orbit.states import Command, OperatorCommand
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop

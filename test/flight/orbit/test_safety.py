@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drocap_ros.errors import ParameterError
+from drocap_ros.flight.conditions import ConditionCode, condition
 from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
-from drocap_ros.flight.orbit.conditions import ConditionCode, condition
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
 from drocap_ros.flight.orbit.states import Action, Command, Limits, ModeRequest, Observed, SafetyState, State
 from drocap_ros.flight.orbit_config import OrbitConfig

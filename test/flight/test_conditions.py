@@ -5,8 +5,8 @@ import string
 
 import pytest
 
-from drocap_ros.flight.orbit import conditions
-from drocap_ros.flight.orbit.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight import conditions
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.states import Command, CommandAnswer, State
 
 

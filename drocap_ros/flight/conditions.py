@@ -1,7 +1,8 @@
 """Conditions for motion as codes with measured values, and the only place that makes sentences of them.
 
 To find why a command is refused: look the code of ``orbit/status`` or of the service's answer up in
-:class:`ConditionCode`; the checks that produce it are in ``motion_checks.py`` and ``command_checks.py``.
+:class:`ConditionCode`; the checks that produce it are in ``orbit/motion_checks.py`` and
+``orbit/command_checks.py``.
 """
 
 from __future__ import annotations
