@@ -12,7 +12,7 @@ from drocap_ros.ros.topics import NODES, TOPICS
 
 COMPANIONS = ("px4_companion", "ardupilot_companion")
 ALL = (*COMPANIONS, "ground_station")
-#: What a file for real hardware must say, whatever the defaults are.
+#: Parameters that a file for real hardware must set, whatever the defaults are.
 EXPECTED = {
     "image_ingest": {"source", "horizontal_fov_deg", "stall_timeout_s"},
     "pose_estimator": {"models_dir", "threads", "subject", "on_loss"},
@@ -30,12 +30,12 @@ EXPECTED = {
 
 
 def topic_of(name):
-    """Name in the table of a topic as a viewer knows it."""
+    """Name in the table of a viewer's topic."""
     return name if name in TOPICS else name.removeprefix("/drocap/")
 
 
 @pytest.mark.parametrize("name", [*ALL, "video_file"])
-def test_a_configuration_holds_only_parameters_that_exist(root, name):
+def test_configuration_holds_existing_parameters_only(root, name):
     path = root / "config" / f"{name}.yaml"
     config = load_config(path)
     types = section_types()
@@ -47,7 +47,7 @@ def test_a_configuration_holds_only_parameters_that_exist(root, name):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_a_configuration_for_hardware_is_complete_and_moves_nothing(root, name):
+def test_configuration_for_hardware_is_complete_and_permits_no_motion(root, name):
     text = (root / "config" / f"{name}.yaml").read_text()
     sections = {key.rsplit("/", 1)[-1]: body["ros__parameters"] for key, body in yaml.safe_load(text).items()}
     for component, parameters in EXPECTED.items():
@@ -56,7 +56,7 @@ def test_a_configuration_for_hardware_is_complete_and_moves_nothing(root, name):
     assert bridge["commands_enabled"] is False
     assert bridge["mode_change_allowed"] is False
     assert bridge["system_id"] != 255
-    # The vehicle's own system id belongs to who rides on it.
+    # Only a companion has the system id of its vehicle.
     assert (bridge["system_id"] == 1) == (name in COMPANIONS)
     for line in text.splitlines():
         if line.startswith("    ") and "ros__parameters" not in line:
@@ -77,7 +77,7 @@ def topics_in(value):
             yield from topics_in(inner)
 
 
-def test_the_foxglove_layout_names_topics_and_fields_that_exist(root):
+def test_foxglove_layout_names_existing_topics_and_fields(root):
     layout = json.loads((root / "config" / "foxglove_layout.json").read_text())
     paths = set(topics_in(layout["configById"]))
     assert {topic_of(path.split(".")[0]) for path in paths} <= set(TOPICS)
@@ -104,7 +104,7 @@ def panels_of(place):
     return panels_of(place["first"]) + panels_of(place["second"])
 
 
-def test_the_foxglove_layout_places_each_of_its_panels_once(root):
+def test_foxglove_layout_places_each_panel_once(root):
     layout = json.loads((root / "config" / "foxglove_layout.json").read_text())
     assert set(layout) == {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"}
     placed = panels_of(layout["layout"])
@@ -115,7 +115,7 @@ def test_the_foxglove_layout_places_each_of_its_panels_once(root):
     assert {panel.split("!")[0] for panel in placed} == known
 
 
-def test_the_rviz_file_shows_topics_of_the_graph(root):
+def test_rviz_file_shows_topics_of_the_graph(root):
     displays = yaml.safe_load((root / "config" / "drocap.rviz").read_text())["Visualization Manager"]["Displays"]
     shown = {}
     for display in displays:

@@ -1,4 +1,4 @@
-"""Every way into ``image_ingest``."""
+"""Every kind of source of ``image_ingest``."""
 
 from array import array
 
@@ -29,7 +29,7 @@ def folder(tmp_path):
 
 
 def run(config, until, publish=None, kind=None, topic=None):
-    """Bring the node up, publish messages to it if asked, and collect what it sends until a condition holds."""
+    """Bring the node up, publish messages to it if asked, and collect its messages until a condition holds."""
     images, infos, reports = [], [], []
     with bringup(DrocapConfig().replace("image_ingest", **config), ["image_ingest"]) as graph:
         for name, into in (("image/compressed", images), ("camera_info", infos), ("/diagnostics", reports)):
@@ -49,7 +49,7 @@ def values(reports):
     return {v.key: v.value for m in reports for v in m.status[0].values}
 
 
-def test_a_looped_folder_keeps_its_stamps_increasing_and_tells_the_camera(folder):
+def test_stamps_of_a_looped_folder_increase_and_the_camera_is_published(folder):
     config = {"source": str(folder), "loop": True, "folder_rate_hz": 60.0, "horizontal_fov_deg": 90.0}
     images, infos, _ = run(config, lambda i, _n, _r: len(i) >= 30)
     stamps = [stamp_from_ros(m.header.stamp) for m in images]
@@ -60,7 +60,7 @@ def test_a_looped_folder_keeps_its_stamps_increasing_and_tells_the_camera(folder
     assert cv2.imdecode(np.frombuffer(images[0].data, np.uint8), 1).shape == (120, 160, 3)
 
 
-def test_max_rate_skips_and_counts(folder):
+def test_max_rate_skips_images_and_counts_them(folder):
     config = {"source": str(folder), "loop": True, "folder_rate_hz": 60.0, "max_rate_hz": 20.0}
     images, _, reports = run(config, lambda i, _n, r: len(i) >= 20 and Key.IMAGES_SKIPPED in values(r))
     stamps = np.array([stamp_from_ros(m.header.stamp) for m in images])
@@ -69,7 +69,7 @@ def test_max_rate_skips_and_counts(folder):
 
 
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8"])
-def test_an_image_topic_keeps_its_stamps_and_colours(encoding):
+def test_image_topic_keeps_its_stamps_and_colours(encoding):
     image = picture()
     data = {"rgb8": image[..., ::-1], "bgr8": image, "mono8": image[..., 1]}[encoding]
     messages = [
@@ -92,7 +92,7 @@ def test_an_image_topic_keeps_its_stamps_and_colours(encoding):
     assert np.abs(decoded[50:70, 60:80] - expected[50:70, 60:80]).max() < 12
 
 
-def test_a_compressed_topic_goes_on_as_it_came_and_rubbish_is_refused():
+def test_jpeg_topic_is_passed_on_unchanged_and_a_broken_image_is_refused():
     jpeg = cv2.imencode(".jpg", picture())[1].tobytes()
     good = CompressedImage(header=header_at(7, "c"), format="jpeg", data=array("B", jpeg))
     bad = CompressedImage(header=header_at(8, "c"), format="jpeg", data=array("B", b"not a picture"))
@@ -107,7 +107,7 @@ def test_a_compressed_topic_goes_on_as_it_came_and_rubbish_is_refused():
     assert bytes(images[0].data) == jpeg
 
 
-def test_a_silent_topic_is_reported_within_two_seconds():
+def test_silent_topic_is_reported_within_two_seconds():
     config = {"source": "topic:/nobody/image_raw", "stall_timeout_s": 1.0}
     _, _, reports = run(config, lambda _i, _n, r: any("no image" in m.status[0].message for m in r))
     assert "check the camera" in reports[-1].status[0].message

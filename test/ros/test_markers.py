@@ -35,7 +35,7 @@ def by_namespace(array, namespace):
     return [marker for marker in array.markers if marker.ns == namespace]
 
 
-def test_every_bone_and_joint_is_drawn_where_it_is():
+def test_every_bone_and_joint_is_drawn_at_its_position():
     message, joints, _ = pose()
     markers = pose_markers(message, 0.5)
     (lines,), (balls,) = by_namespace(markers, "skeleton"), by_namespace(markers, "joints")
@@ -48,7 +48,7 @@ def test_every_bone_and_joint_is_drawn_where_it_is():
     assert (lines.lifetime.sec, lines.lifetime.nanosec) == (0, 500_000_000)
 
 
-def test_ellipsoids_have_the_covariance_that_the_pose_has():
+def test_ellipsoids_have_the_covariance_of_the_pose():
     message, _, full = pose()
     balls = by_namespace(pose_markers(message, 0.5), "uncertainty")
     assert [ball.id for ball in balls] == list(range(15))
@@ -71,19 +71,19 @@ def test_unknown_joints_and_their_bones_are_left_out():
     assert len(names) == 14
 
 
-def test_no_subject_is_nothing_to_draw():
+def test_without_a_subject_there_is_no_marker():
     assert pose_markers(Pose3D(skeleton="body15"), 0.5).markers == []
     assert body_transforms(Pose3D(skeleton="body15")) == []
 
 
-def test_a_malformed_pose_is_refused():
+def test_malformed_pose_is_refused():
     message, _, _ = pose()
     message.joints = message.joints[:40]
     with pytest.raises(InputError, match="joints: expected 45"):
         pose_markers(message, 0.5)
 
 
-def test_path_keeps_its_points_and_stays():
+def test_path_keeps_its_points_and_has_no_lifetime():
     line = path_marker(header_at(1, "map"), np.arange(12.0).reshape(4, 3))
     assert line.type == Marker.LINE_STRIP
     assert [p.z for p in line.points] == [2.0, 5.0, 8.0, 11.0]
@@ -107,7 +107,7 @@ def keypoints(track_id=4, unknown=()):
     return pose2d_to_ros(observation, "camera_optical"), points
 
 
-def test_keypoints_lie_over_the_picture_in_one_marker():
+def test_keypoints_of_an_image_are_one_marker():
     knee = BODY_15.index("rknee")
     message, points = keypoints(unknown=[knee])
     marker = keypoint_marker(message)

@@ -14,7 +14,7 @@ DRONES = ("drone1", "drone10")  # one name begins with the other
 
 
 @pytest.mark.parametrize("processes", [False, True], ids=["one process", "a process each"])
-def test_two_graphs_in_two_namespaces_do_not_mix(tmp_path, monkeypatch, processes):
+def test_graphs_in_two_namespaces_receive_their_own_messages_only(tmp_path, monkeypatch, processes):
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     with free_domain() as domain, ExitStack() as stack:
         graphs = []
@@ -28,7 +28,7 @@ def test_two_graphs_in_two_namespaces_do_not_mix(tmp_path, monkeypatch, processe
             )
         for graph in graphs:
             graph.wait_finished("capture_simulator", timeout_s=60)
-            graph.spin_for(1.5)  # another report of each node
+            graph.spin_for(1.5)  # one more status of each node
     keypoints = []
     for drone in DRONES:
         with open_session(tmp_path / drone) as session:

@@ -18,7 +18,7 @@ from drocap_ros.simulation.vehicle.ports import free_udp_port
 NODES = ["image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
 
 
-def test_what_was_published_is_recorded_and_reconstructed(shared, tmp_path):
+def test_published_messages_are_recorded_and_reconstructed(shared, tmp_path):
     video = tmp_path / "walk.mp4"
     shutil.copyfile(shared / "media" / "outdoor_walk.mp4", video)
     # In a loop: a busy machine processes fewer of its images, and the test needs a number of them.
@@ -31,7 +31,7 @@ def test_what_was_published_is_recorded_and_reconstructed(shared, tmp_path):
         graph.node.create_subscription(TOPICS["pose2d"].message, "pose2d", heard.append, TOPICS["pose2d"].qos)
         graph.wait_until(lambda: len(heard) > 80, 200, "keypoints")
 
-    # The standard readers open it, every message decodes, and nothing that was heard is missing.
+    # The standard readers decode every message, and every message received here is recorded.
     (path,) = (tmp_path / "session").glob("*.mcap")
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
@@ -44,7 +44,7 @@ def test_what_was_published_is_recorded_and_reconstructed(shared, tmp_path):
                 recorded[stamp_from_ros(message.header.stamp)] = message
             elif connection.topic == "/diagnostics" and message.status[0].name.endswith("pose_estimator"):
                 published = max(published, *(int(v.value) for v in message.status[0].values if v.key == Key.IMAGES), 0)
-    assert len(recorded) >= published > 20  # what the estimator itself counted in its last report
+    assert len(recorded) >= published > 20  # the count of the estimator in its last status
     assert counts["/drocap/pose2d"] == len(recorded) >= len(heard)
     for message in heard:
         np.testing.assert_array_equal(recorded[stamp_from_ros(message.header.stamp)].keypoints, message.keypoints)
