@@ -1,4 +1,4 @@
-"""The package builds and installs the ways that people do it: colcon, colcon --symlink-install, pip."""
+"""Builds and installations: colcon, colcon --symlink-install, pip with and without ROS."""
 
 import os
 import shutil
@@ -13,10 +13,9 @@ ROOT = Path(__file__).resolve().parents[2]
 PREFIX = Path(sys.prefix)
 PARTS = (
     "CMakeLists.txt", "package.xml", "setup.py", "pyproject.toml", "README.md",
-    "drocap_ros", "msg", "srv", "config", "resource",
+    "drocap_ros", "msg", "srv", "config", "launch", "resource",
 )  # fmt: skip
-NODES = ["image_ingest", "pose_estimator", "initializer", "bundle_adjuster", "mavlink_bridge", "session_recorder"]
-EXECUTABLES = {"drocap", "flight_simulator", "visualizer", "session_player", *NODES}
+NODES = sorted(path.stem for path in (ROOT / "drocap_ros" / "nodes").glob("[a-z]*.py"))
 
 pytestmark = pytest.mark.skipif(
     not (PREFIX / "bin" / "colcon").exists(), reason="not in the environment that `make setup` makes"
@@ -25,9 +24,8 @@ pytestmark = pytest.mark.skipif(
 
 def environment(**values):
     clean = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH")}
-    # What the compiler makes of it matters here, not how fast it runs.
-    plain = {"CFLAGS": "-O0", "CXXFLAGS": "-O0"}
-    return {**clean, **plain, "PATH": f"{PREFIX / 'bin'}{os.pathsep}{os.environ['PATH']}", **values}
+    fast_build = {"CFLAGS": "-O0", "CXXFLAGS": "-O0"}
+    return {**clean, **fast_build, "PATH": f"{PREFIX / 'bin'}{os.pathsep}{os.environ['PATH']}", **values}
 
 
 def run(*command, cwd, env):
@@ -38,7 +36,7 @@ def run(*command, cwd, env):
 
 @pytest.fixture
 def source(tmp_path):
-    """A copy of what the package is built from, so that a build leaves nothing in the checkout."""
+    """A copy of the sources: the build leaves no file in the checkout."""
     return copied_to(tmp_path)
 
 
@@ -62,8 +60,8 @@ def copied_to(workspace):
 
 
 @pytest.mark.parametrize("option", ["", "--symlink-install"])
-def test_colcon_builds_a_workspace_in_which_messages_and_nodes_import(workspace, option):
-    # The second way installs anew what the first has compiled; where that copies Python modules, this one links them.
+def test_colcon_installs_messages_nodes_and_launch_file(workspace, option):
+    # The second build reuses the compiled messages and links the Python modules instead of copying them.
     for left in ("install", "build/drocap_ros/ament_cmake_python/drocap_ros/drocap_ros"):
         shutil.rmtree(workspace / left, ignore_errors=True)
     ros = environment(AMENT_PREFIX_PATH=str(PREFIX), CMAKE_PREFIX_PATH=str(PREFIX))
@@ -73,17 +71,18 @@ def test_colcon_builds_a_workspace_in_which_messages_and_nodes_import(workspace,
     check = f"import drocap_ros.msg as m; m.Pose2D(); print(m.__file__); {imports}; print(drocap_ros.nodes.__file__)"
     shell = f". install/setup.sh && python3 -c '{check}' && ls install/drocap_ros/lib/drocap_ros"
     lines = run("bash", "-c", shell, cwd=workspace, env=ros).split()
-    # The workspace's own copy, not the one of the environment beside it.
+    # The workspace's own copy, not the one of the environment.
     install = str(workspace / "install")
     assert lines[0].startswith(install)
     assert lines[1].startswith(install)
-    assert set(lines[2:]) == EXECUTABLES
+    assert set(lines[2:]) == {"drocap", *NODES}
+    assert (workspace / "install" / "drocap_ros" / "share" / "drocap_ros" / "launch" / "drocap.launch.py").exists()
     run(
         "bash", "-c", ". install/setup.sh && install/drocap_ros/lib/drocap_ros/drocap --version", cwd=workspace, env=ros
     )
 
 
-def test_pip_makes_a_wheel_with_the_messages_and_their_libraries(source, tmp_path):
+def test_wheel_contains_interfaces_libraries_and_data(source, tmp_path):
     run(
         sys.executable, "-m", "pip", "wheel", source, "--no-deps", "--no-build-isolation", "-w", tmp_path / "wheels",
         cwd=tmp_path, env=environment(),
@@ -93,6 +92,7 @@ def test_pip_makes_a_wheel_with_the_messages_and_their_libraries(source, tmp_pat
     names = zipfile.ZipFile(wheel).namelist()
     for wanted in (
         "drocap_ros/msg/_pose2_d.py",
+        "drocap_ros/srv/_orbit_command.py",
         "drocap_ros/nodes/initializer.py",
         "drocap_ros/data/dictionary_cmu.npz",
         "drocap_ros/data/simulation_models/person_pose.onnx",
@@ -103,7 +103,7 @@ def test_pip_makes_a_wheel_with_the_messages_and_their_libraries(source, tmp_pat
     assert any(name.endswith("/share/drocap_ros/msg/Pose2D.msg") for name in names)
 
 
-def test_without_ros_the_package_installs_and_all_but_the_messages_imports(source, tmp_path):
+def test_package_without_ros_imports_all_but_nodes_and_messages(source, tmp_path):
     base = Path(sys.base_prefix) / "bin" / "python3"
     run(base, "-m", "venv", "--without-pip", "bare", cwd=tmp_path, env=environment())
     site = str(PREFIX / "lib" / f"python{sys.version_info[0]}.{sys.version_info[1]}" / "site-packages")
@@ -124,8 +124,7 @@ drocap_ros.__path__ = drocap_ros.__path__[:1]
 for module in pkgutil.walk_packages(drocap_ros.__path__, "drocap_ros."):
     needs_ros = module.name.startswith(("drocap_ros.nodes", "drocap_ros.ros", "drocap_ros.bringup"))
     if not needs_ros and "__main__" not in module.name:
-        if "train_lifter" not in module.name:
-            importlib.import_module(module.name)
+        importlib.import_module(module.name)
 print(drocap_ros.__file__)
 from drocap_ros.cli import main
 assert main(["live", "--config", "target/none.yaml"]) == 2
