@@ -10,6 +10,7 @@ from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
 from drocap_ros.flight.orbit.states import Limits, Observed
 from drocap_ros.flight.safety_config import SafetyConfig
+from drocap_ros.flight.vehicle_state import LANDED_LANDING, LANDED_ON_GROUND, LANDED_TAKEOFF
 
 _C = ConditionCode
 _REACTION_S = 0.5
@@ -17,7 +18,7 @@ _LEAST_SUBJECT_AGE_S = 0.25
 _TIMEOUT_ROUNDING_S = 1e-3
 #: The clocks of image and step differ by a transmission at most.
 _FUTURE_S = 0.2
-_LANDED_STATES = {1: "on the ground", 3: "taking off", 4: "landing"}
+_LANDED_STATES = {LANDED_ON_GROUND: "on the ground", LANDED_TAKEOFF: "taking off", LANDED_LANDING: "landing"}
 _FATAL_ACTIONS = {6: "flight is terminated", 7: "the motors are stopped"}
 
 
