@@ -1,18 +1,24 @@
-"""The documentation says what the code does."""
+"""The documents agree with the code and with each other."""
 
 import re
 import runpy
 
+import pytest
+
 from drocap_ros.cli import build_parser
 
 
-def test_the_table_of_parameters_is_up_to_date(root):
+def pages(root):
+    return [*root.glob("*.md"), *(root / "docs").rglob("*.md")]
+
+
+def test_table_of_parameters_is_up_to_date(root):
     render = runpy.run_path(str(root / "docs" / "make_parameters.py"))["render"]
     page = (root / "docs" / "parameters.md").read_text()
     assert page == render(), "run `python docs/make_parameters.py`"
 
 
-def test_the_readme_names_every_command_and_no_other(root):
+def test_readme_names_every_command_and_no_other(root):
     (choices,) = (a.choices for a in build_parser()._subparsers._group_actions)
     # The first column of the table of commands; one cell may hold several.
     table = re.findall(r"^\| (`drocap .*?) \|", (root / "README.md").read_text(), re.MULTILINE)
@@ -20,16 +26,28 @@ def test_the_readme_names_every_command_and_no_other(root):
     assert named == set(choices)
 
 
-def test_links_between_pages_lead_somewhere(root):
-    for page in [*root.glob("*.md"), *(root / "docs").glob("*.md")]:
+def test_readme_has_at_most_150_lines(root):
+    assert len((root / "README.md").read_text().splitlines()) <= 150
+
+
+def test_links_between_pages_lead_to_files(root):
+    for page in pages(root):
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
             if "://" not in target:
                 assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
-def test_every_topic_of_the_graph_is_in_the_readme(root):
-    import pytest
+def test_files_that_the_pages_name_exist(root):
+    folders = ("drocap_ros", "test", "benchmarks", "docs", "launch")
+    known = [path for folder in folders for path in (root / folder).rglob("*.py")] + list(root.glob("*.py"))
+    ends = {"/".join(path.parts[-n:]) for path in known for n in range(1, len(path.parts))}
+    for page in pages(root):
+        for name in re.findall(r"`(?:\.\./)*((?:[\w.]+/)*\w+\.py)`", page.read_text()):
+            placeholder = re.search(r"\b[A-Z]{3,}\b", name.replace("_", " "))  # NAME.py
+            assert placeholder or name in ends, f"{page.name}: {name}"
 
+
+def test_every_topic_of_the_graph_is_in_the_readme(root):
     pytest.importorskip("drocap_ros.msg", reason="the messages are not built: `make setup` builds them")
     pytest.importorskip("rclpy", reason="no ROS here")
     from drocap_ros.ros.topics import TOPICS
@@ -37,3 +55,29 @@ def test_every_topic_of_the_graph_is_in_the_readme(root):
     text = (root / "README.md").read_text()
     for topic in TOPICS:
         assert f"`{topic}`" in text
+
+
+def measured_rows(text):
+    """Rows of tables with at least three cells that hold a measured number, one with a decimal point."""
+    rows = (re.sub(r"[ *`]", "", line) for line in text.splitlines() if line.startswith("|"))
+    return {row for row in rows if len(re.findall(r"\|[-+]?\d+\.\d", row)) >= 3}
+
+
+def test_a_measured_row_stands_in_one_page_only(root):
+    first = {}
+    for page in pages(root):
+        for row in measured_rows(page.read_text()):
+            assert row not in first, f"{page.name} and {first[row]}: {row}"
+            first[row] = page.name
+
+
+def test_every_page_of_figures_names_its_command_date_revision_and_machine(root):
+    found = [page for page in (root / "docs" / "figures").glob("*.md") if page.name != "README.md"]
+    assert found
+    index = (root / "docs" / "figures" / "README.md").read_text()
+    for page in found:
+        head = page.read_text().splitlines()[2]
+        script = re.match(r"`python (benchmarks/\w+\.py)[^`]*`, \d{4}-\d\d-\d\d, revision \w+.*, \d+ ", head)
+        assert script, f"{page.name}: {head}"
+        assert (root / script[1]).exists()
+        assert f"({page.name})" in index, f"{page.name} is missing in docs/figures/README.md"

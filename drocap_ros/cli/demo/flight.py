@@ -55,13 +55,13 @@ class _Desk:
     """Connects the operator with the graph: status and diagnostics in, commands out."""
 
     def __init__(self, graph: Graph, operator: Operator, say: Callable[[str], None]) -> None:
-        from drocap_ros.ros.topics import RESULT_QOS, TOPICS
-        from drocap_ros.srv import OrbitCommand
+        from drocap_ros.ros.orbit_client import OrbitClient
+        from drocap_ros.ros.topics import TOPICS
 
         self._graph, self._operator, self._say = graph, operator, say
         self._pilot = ""
         operator.cleared = False
-        self._commands = graph.node.create_client(OrbitCommand, "orbit/command", qos_profile=RESULT_QOS)
+        self._client = OrbitClient(graph.node)
         for topic, take in (("orbit/status", self._on_status), ("/diagnostics", self._on_diagnostics)):
             graph.node.create_subscription(TOPICS[topic].message, topic, take, TOPICS[topic].qos)
 
@@ -70,16 +70,8 @@ class _Desk:
 
         command = self._operator.on_status(State(message.state), message.condition, message.reason, time.monotonic())
         if command is not None:
-            self._send(int(command))
+            self._client.send(int(command)).add_done_callback(self._on_answer)
         self._print_remarks()
-
-    def _send(self, command: int) -> None:
-        from drocap_ros.srv import OrbitCommand
-
-        nan = float("nan")
-        now = self._graph.node.get_clock().now().to_msg()
-        request = OrbitCommand.Request(stamp=now, command=command, radius_m=nan, height_m=nan, angular_speed_deg_s=nan)
-        self._commands.call_async(request).add_done_callback(self._on_answer)
 
     def _on_answer(self, future: Any) -> None:
         answer = future.result()

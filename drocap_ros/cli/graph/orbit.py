@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
-import time
 from typing import Any
 
 from drocap_ros.errors import InputError
@@ -40,48 +39,25 @@ def run(args: argparse.Namespace) -> int:
     """Send the command and print the answer."""
     _check_options(args)
     try:
-        import rclpy
-        from rclpy.context import Context
-        from rclpy.executors import SingleThreadedExecutor
-
-        from drocap_ros.flight.orbit.states import Command
-        from drocap_ros.msg import OrbitStatus
-        from drocap_ros.ros.topics import RESULT_QOS
-        from drocap_ros.srv import OrbitCommand
+        from drocap_ros.ros.orbit_client import orbit_client
     except ImportError as error:
         raise InputError(f"expected ROS 2 with drocap_ros's messages, found none ({error}); run `make setup`") from None
-    context = Context()
-    rclpy.init(args=[], context=context, domain_id=args.domain_id)
-    node = rclpy.create_node("orbit_operator", context=context, namespace=args.namespace)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    end = time.monotonic() + args.timeout
-
-    def wait(done: Any) -> bool:
-        while not done() and time.monotonic() < end:
-            executor.spin_once(timeout_sec=0.05)
-        return bool(done())
+    from drocap_ros.flight.orbit.states import Command
 
     no_graph = InputError(
         f"orbit: expected a running graph with mavlink_bridge in {args.namespace}, domain {args.domain_id}, "
         f"found none within {args.timeout:g} s; start `drocap live` first"
     )
-    try:
+    with orbit_client(args.namespace, args.domain_id, args.timeout) as (client, wait):
         if args.action == "status":
-            statuses: list[Any] = []
-            node.create_subscription(OrbitStatus, "orbit/status", statuses.append, RESULT_QOS)
-            if not wait(lambda: statuses):
+            client.subscribe()
+            if not wait(lambda: bool(client.statuses)):
                 raise no_graph
-            print(_sentence(statuses[-1]))
+            print(_sentence(client.statuses[-1]))
             return 0
-        client = node.create_client(OrbitCommand, "orbit/command", qos_profile=RESULT_QOS)
-        if not wait(client.service_is_ready):
+        if not wait(lambda: client.is_ready):
             raise no_graph
-        request = OrbitCommand.Request(
-            stamp=node.get_clock().now().to_msg(), command=int(Command[args.action.upper()]), radius_m=args.radius,
-            height_m=args.height, angular_speed_deg_s=args.speed,
-        )  # fmt: skip
-        answer = client.call_async(request)
+        answer = client.send(int(Command[args.action.upper()]), args.radius, args.height, args.speed)
         if not wait(answer.done):
             raise InputError(
                 f"orbit: expected an answer to {args.action} within {args.timeout:g} s, found none; "
@@ -90,10 +66,6 @@ def run(args: argparse.Namespace) -> int:
         response = answer.result()
         print(response.words if response.accepted else f"refused: {response.words}")
         return 0 if response.accepted else 1
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        context.try_shutdown()
 
 
 def _check_options(args: argparse.Namespace) -> None:
