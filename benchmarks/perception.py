@@ -1,6 +1,6 @@
 """Perception: speed of each part, accuracy and uncertainty on the labelled recordings.
 
-    python benchmarks/perception.py            tables, and the plot benchmarks/results/keypoint_uncertainty.png
+    python benchmarks/perception.py            page perception of docs/figures, plots in benchmarks/results
     python benchmarks/perception.py --fit      also fit the calibration and print its constants
     python benchmarks/perception.py --quick    fewer repetitions
 
@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from figures import ROOT, table, write_figures
 
 from drocap_ros.perception.detection import Detector
 from drocap_ros.perception.estimator import PoseEstimator
@@ -33,7 +34,6 @@ from drocap_ros.perception.track_video import observe, subjects
 from drocap_ros.perception.uncertainty import CALIBRATIONS, Calibration, calibrate
 from drocap_ros.skeleton import COCO_17
 
-ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
 MODELS, MEDIA = SHARED / "models", SHARED / "media"
 RESULTS = ROOT / "benchmarks" / "results"
@@ -69,14 +69,14 @@ def timed(work: Callable[[], object], repetitions: int) -> tuple[float, float]:
     return 1e3 * float(np.median(cpu)), 1e3 * float(np.median(wall))
 
 
-def speed(repetitions: int) -> None:
-    print("\n## Speed, ms (median), one thread\n")
-    print(f"{'what':<58} {'CPU':>7} {'wall':>7}")
+def speed(repetitions: int) -> str:
+    """Median times of each part, as Markdown."""
+    rows = []
 
     def row(name: str, work: Callable[[], object], count: int = repetitions) -> None:
         work()
-        cpu, wall = timed(work, count)
-        print(f"{name:<58} {cpu:7.1f} {wall:7.1f}")
+        rows.append([name, *(f"{value:.1f}" for value in timed(work, count))])
+        print("  ".join(rows[-1]), flush=True)
 
     image = read_image(MEDIA / "skier.jpg")
     box = np.array([280.0, 44, 500, 392])
@@ -96,22 +96,21 @@ def speed(repetitions: int) -> None:
     video = MEDIA / "outdoor_walk.mp4"
     with open_source(video) as source:
         row("decoding one image of outdoor_walk.mp4 (1768x994)", source.read, min(repetitions, 60))
-        row("the same again", source.read, min(repetitions, 60))
     for name, changes in (("detection in every image", {"detect_every_s": 0.0}), ("as configured", {})):
-        steady(name, PoseEstimatorConfig(**changes), video, 95)
-        steady(name, PoseEstimatorConfig(**changes), MEDIA / "pose_1.mp4", 95)
+        rows += [steady(name, PoseEstimatorConfig(**changes), path, 95) for path in (video, MEDIA / "pose_1.mp4")]
     begin, cpu = time.perf_counter(), time.process_time()
     with open_source(video) as source:
         frames = len(observe(source, PoseEstimator(MODELS, PoseEstimatorConfig(on_loss="next"))))
     wall = time.perf_counter() - begin
-    print(
-        f"drocap track outdoor_walk.mp4, loading of the models included: {frames / wall:.1f} images/s"
-        f" ({wall:.1f} s, CPU {time.process_time() - cpu:.1f} s, {frames} images)"
+    track = (
+        f"`drocap track outdoor_walk.mp4`, loading of the models included: {frames / wall:.1f} images/s"
+        f" ({wall:.1f} s, CPU {time.process_time() - cpu:.1f} s, {frames} images).\n"
     )
+    return "## Speed, one thread\n\n" + table(["what (median)", "CPU, ms", "wall, ms"], rows) + "\n" + track
 
 
-def steady(name: str, config: PoseEstimatorConfig, video: Path, count: int) -> None:
-    """Mean time of detection and pose in steady tracking, decoding left out."""
+def steady(name: str, config: PoseEstimatorConfig, video: Path, count: int) -> list[str]:
+    """Mean CPU and wall time of detection and pose in steady tracking, decoding left out; a row of the table."""
     estimator = PoseEstimator(MODELS, config)
     cpu, wall = [], []
     with open_source(video) as source:
@@ -123,8 +122,7 @@ def steady(name: str, config: PoseEstimatorConfig, video: Path, count: int) -> N
             if i >= 10:
                 cpu.append(time.process_time() - c)
                 wall.append(time.perf_counter() - w)
-    text = f"detection + pose, {video.name}, {name} (mean)"
-    print(f"{text:<58} {1e3 * np.mean(cpu):7.1f} {1e3 * np.mean(wall):7.1f}")
+    return [f"detection + pose, {video.name}, {name} (mean)", *(f"{1e3 * np.mean(t):.1f}" for t in (cpu, wall))]
 
 
 def labelled() -> Iterator[tuple[str, int, np.ndarray, np.ndarray]]:
@@ -231,30 +229,34 @@ def area_under_roc(gross: np.ndarray, confidence: np.ndarray) -> float:
     return float((rank[~gross].sum() - fine * (fine - 1) / 2) / (fine * bad)) if fine and bad else float("nan")
 
 
-def accuracy(pose: str, cases: list[Case], degraded: list[Case], layout: str) -> None:
-    print(f"\n## {pose}: accuracy and uncertainty of the 12 limb joints\n")
+def accuracy(pose: str, cases: list[Case], degraded: list[Case], layout: str) -> str:
+    """Errors of the 12 limb joints and their covariance and confidence, as Markdown."""
     area = json.loads((MEDIA / "skier_keypoints.json").read_text())["persons"][0]["area"]
     skier = next(c for c in cases if c.source == "skier.jpg")
     squared = ((skier.keypoints.xy - skier.truth) ** 2).sum(axis=1)
-    print(f"skier.jpg: object keypoint similarity {np.exp(-squared / (2 * area * (2 * COCO_SIGMAS) ** 2)).mean():.3f}")
+    similarity = np.exp(-squared / (2 * area * (2 * COCO_SIGMAS) ** 2)).mean()
+    rows = []
     for name in ("skier.jpg", "pose_1.mp4", "pose_squats.mp4"):
         mine = [c for c in cases if c.source == name]
         distance = 100 * np.mean([np.linalg.norm(c.errors, axis=1) for c in mine])
-        spread = standardized(mine, layout).std()
-        print(f"{name:<16} {len(mine):4d} images  mean distance {distance:.2f} % of the box  standardized {spread:.2f}")
-    print(f"all labelled images: standardized error {standardized(cases, layout).std():.2f}")
-    gross, confidence = gross_and_confidence(cases, layout)
-    print(f"gross errors (> 10 % of the box) on them: {gross.sum()} of {gross.size}")
-    gross, confidence = gross_and_confidence(degraded, layout)
-    print(
-        f"degraded ({len(degraded)} images): gross errors {gross.mean():.1%}, area under the ROC curve of the"
-        f" confidence {area_under_roc(gross, confidence):.3f}; standardized error of the others"
-        f" {standardized(degraded, layout, GROSS).std():.2f}"
-    )
+        rows.append([name, len(mine), f"{distance:.2f}", f"{standardized(mine, layout).std():.2f}"])
+    kinds = []
     for kind in dict.fromkeys(c.kind for c in degraded):
         mine = [c for c in degraded if c.kind == kind]
-        distance = np.concatenate([np.linalg.norm(c.errors, axis=1) for c in mine])
-        print(f"  {kind:<16} median {100 * np.median(distance):.2f} %  gross {np.mean(distance > GROSS):6.1%}")
+        distances = np.concatenate([np.linalg.norm(c.errors, axis=1) for c in mine])
+        kinds.append([kind, f"{100 * np.median(distances):.2f}", f"{100 * np.mean(distances > GROSS):.1f}"])
+    few, _ = gross_and_confidence(cases, layout)
+    gross, confidence = gross_and_confidence(degraded, layout)
+    return "\n".join([
+        f"## {pose}: accuracy and uncertainty of the 12 limb joints\n",
+        table(["recording", "images", "mean distance, % of the box", "standardized error"], rows),
+        f"Object keypoint similarity of skier.jpg: {similarity:.3f}. All images: standardized error"
+        f" {standardized(cases, layout).std():.2f}, gross errors (> 10 % of the box) {few.sum()} of {few.size}.\n",
+        table(["degradation", "median distance, % of the box", "gross errors, %"], kinds),
+        f"Degraded ({len(degraded)} images): gross errors {gross.mean():.1%}, area under the ROC curve of the"
+        f" confidence {area_under_roc(gross, confidence):.3f}; standardized error of the others"
+        f" {standardized(degraded, layout, GROSS).std():.2f}.\n",
+    ])  # fmt: skip
 
 
 def plot(pose: str, cases: list[Case], degraded: list[Case], layout: str) -> None:
@@ -329,16 +331,19 @@ def fit(cases: list[Case], degraded: list[Case], spread_share: float) -> Calibra
     return Calibration(tuple(map(float, knots)), rounded, spread_share, *(round(float(v), 3) for v in b))
 
 
-def tracking() -> None:
-    print("\n## Subject tracking\n")
+def tracking() -> str:
+    """Subjects of two recordings over their images, as Markdown."""
+    rows = []
     for name in ("outdoor_walk.mp4", "one_by_one_person_detection.mp4"):
         with open_source(MEDIA / name) as source:
             seen = observe(source, PoseEstimator(MODELS, PoseEstimatorConfig(on_loss="next")))
         ids = np.array([o.track_id for o in seen])
-        print(f"{name}: {len(seen)} images; with keypoints: " + ", ".join(f"person {i} {n}" for i, n in subjects(seen)))
         changes = np.nonzero(np.diff(ids))[0] + 1
         runs = [(int(r[0]), int(r[-1]), int(ids[r[0]])) for r in np.split(np.arange(len(ids)), changes)]
-        print("   " + ", ".join(f"{a}-{b}: {i or 'nobody'}" for a, b, i in runs))
+        found = ", ".join(f"person {i}: {n}" for i, n in subjects(seen))
+        rows.append([name, len(seen), found, ", ".join(f"{a}-{b}: {i or 'nobody'}" for a, b, i in runs)])
+    head = ["recording", "images", "with keypoints", "subject by image"]
+    return "## Subject tracking\n\n" + table(head, rows)
 
 
 def main() -> None:
@@ -350,16 +355,18 @@ def main() -> None:
         print("perception: no ../shared beside the checkout, nothing to measure")
         return
     cv2.setNumThreads(1)
+    parts = []
     for pose in ("tinypose_256x192", "movenet_lightning_int8"):
         layout = load_pose_model(MODELS, PoseEstimatorConfig(pose_model=pose)).spec.layout
         cases, degraded = clean_cases(pose), degraded_cases(pose)
-        accuracy(pose, cases, degraded, layout)
+        parts.append(accuracy(pose, cases, degraded, layout))
         plot(pose, cases, degraded, layout)
         if options.fit:
             print(fit(cases, degraded, CALIBRATIONS[layout].spread_share))
-    speed(20 if options.quick else 100)
+    parts.append(speed(20 if options.quick else 100))
     if not options.quick:
-        tracking()
+        parts.append(tracking())
+    write_figures("perception", "Perception: accuracy, uncertainty, speed", "\n".join(parts))
 
 
 if __name__ == "__main__":
