@@ -7,9 +7,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from drocap_ros.cli import reconstruct
 from drocap_ros.cli.motion_input import HELP, read_motion
 
-METHODS = ("ba", "paper", "paper-no-articulation", "initial", "mf-nnm")
+#: ``live`` needs a recording of the live graph.
+METHODS = tuple(method for method in reconstruct.METHODS if method != "live")
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
