@@ -32,11 +32,11 @@ from drocap_ros.recording.provenance import (
     session_provenance,
 )
 from drocap_ros.ros.component import ERROR, HARDWARE_ID, OK, WARN, Gaps
-from drocap_ros.ros.diagnostics import Key, node_of, of
-from drocap_ros.ros.lifecycle import ManagedComponent
+from drocap_ros.ros.diagnostics import Key, node_of, of, values_of
+from drocap_ros.ros.lifecycle import ACTIVE, ManagedComponent
 from drocap_ros.ros.parameter_survey import ParameterSurvey
 from drocap_ros.ros.spin import node_main
-from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, TOPICS
+from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, NODES, TOPICS
 
 _IMAGES = "image/compressed"
 
@@ -52,6 +52,8 @@ class SessionRecorderNode(ManagedComponent):
         self._survey: ParameterSurvey | None = None
         self._calibrated = False
         self._received = False  # any message but diagnostics
+        self._sources = {name for name in self.peers if NODES[name].source}
+        self._source_active = False
         self._sessions = 0
         self._image_gaps = Gaps()
         special = {
@@ -82,7 +84,7 @@ class SessionRecorderNode(ManagedComponent):
     def release(self) -> None:
         """Write the queue and finish the files; discard the session of a graph that never started."""
         if self._writer is not None:
-            if self.ready or self._received:
+            if self._received or self._source_active or (self.ready and not self._sources):
                 self._writer.close()
             else:
                 self._writer.discard()
@@ -128,6 +130,9 @@ class SessionRecorderNode(ManagedComponent):
         """Record diagnostics, except those of another drone's graph."""
         ours = self.get_namespace().strip("/")
         statuses = deserialize_message(data, DiagnosticArray).status
+        for status in statuses:
+            if node_of(status)[1] in self._sources and values_of(status).get(Key.LIFECYCLE) == ACTIVE:
+                self._source_active = True
         if not all(s.hardware_id == HARDWARE_ID and node_of(s)[0] != ours for s in statuses):
             self._on_message(name, data, info)
 

@@ -91,13 +91,14 @@ class NodeProcess:
         Raises
         ------
         InputError, NodeError
-            With the last line of its log.
+            With the last message of its log.
         """
         status = self._process.exitcode
         if status is None or (self._stopping and status in (0, -signal.SIGINT)):
             return
-        lines = self._log.read_text(errors="replace").strip().splitlines() if self._log.exists() else []
-        last = lines[-1].removeprefix("drocap: ") if lines else "its log is empty"
+        lines = self._log.read_text(errors="replace").splitlines() if self._log.exists() else []
+        messages = [line for line in lines if line[:1].strip()]  # without the indented lines of a traceback
+        last = messages[-1].removeprefix("drocap: ") if messages else "its log is empty"
         if status == InputError.exit_status:
             raise InputError(last)
         raise NodeError(f"node {self.name} ended with status {status}: {last}")
