@@ -6,11 +6,11 @@ The command starts, watches and restarts its nodes itself, so launch runs the co
 import os
 import sys
 
+from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 
 from drocap_ros.ros.topics import NODES
-from launch import LaunchDescription
 
 NO = ("false", "False", "0", "no")
 
