@@ -60,7 +60,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument(
         "--memory", default="1GB", help="of a viewer; beyond it the oldest data go (default 1GB; 25%% works too)"
     )
-    parser.add_argument("--quiet", action="store_true", help="say nothing")
+    parser.add_argument("--quiet", action="store_true", help="print nothing")
     parser.set_defaults(run=run)
     return parser
 
