@@ -24,8 +24,9 @@ from drocap_ros.ros.topics import NODES
 
 #: After the order to stop, messages that have arrived are still processed, for this long at most.
 DRAIN_S = 5.0
-#: A node has processed all messages when none was left for this long.
-_QUIET_S = 0.05
+#: A node has processed all messages when none came for this long and for so many turns of the executor: on a busy
+#: machine a single timer's callback may take longer.
+_QUIET_S, _QUIET_TURNS = 0.05, 5
 #: At or above this niceness nodes use SCHED_BATCH: a message for them does not preempt other nodes.
 _BATCH = 10
 
@@ -67,11 +68,15 @@ def spin(
 
 def _drain(executor: Executor, node: ComponentNode) -> None:
     begin_s = quiet_s = time.monotonic()
-    while node.context.ok() and (now_s := time.monotonic()) - quiet_s < _QUIET_S and now_s - begin_s < DRAIN_S:
+    turns = 0
+    while node.context.ok() and (now_s := time.monotonic()) - begin_s < DRAIN_S:
+        if turns >= _QUIET_TURNS and now_s - quiet_s >= _QUIET_S:
+            return
         before = node.callbacks_done
-        executor.spin_once(timeout_sec=_QUIET_S)
+        executor.spin_once(timeout_sec=_QUIET_S / _QUIET_TURNS)
+        turns += 1
         if node.callbacks_done != before:
-            quiet_s = time.monotonic()
+            turns, quiet_s = 0, time.monotonic()
 
 
 def lower_priority(niceness: int) -> None:
