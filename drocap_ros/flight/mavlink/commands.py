@@ -30,6 +30,7 @@ class _Pending:
     label: str
     tries: int = 0
     sent_s: float = -1e9
+    paused: bool = False
     result: int | None = None  # MAV_RESULT, or _NOT_ANSWERED
     answered_s: float = -1e9
 
@@ -50,6 +51,12 @@ class CommandQueue:
         same = present is not None and present.parameters == parameters
         if present is None or not same or (present.result is not None and now_s - present.answered_s > _REPEAT_S):
             self._pending[command] = _Pending(parameters, label)
+        self._pending[command].paused = False
+
+    def pause(self, command: int) -> None:
+        """Do not send the command until it is requested again; its answer is still taken."""
+        if command in self._pending:
+            self._pending[command].paused = True
 
     def cancel(self, command: int) -> None:
         """Stop sending the command."""
@@ -75,7 +82,7 @@ class CommandQueue:
         """(command, confirmation, parameters) to send now."""
         ready = []
         for command, pending in self._pending.items():
-            if pending.result is not None or now_s - pending.sent_s < _RETRY_S:
+            if pending.paused or pending.result is not None or now_s - pending.sent_s < _RETRY_S:
                 continue
             if pending.tries >= _TRIES:
                 pending.result, pending.answered_s = _NOT_ANSWERED, now_s

@@ -173,6 +173,10 @@ class MavlinkLink:
         except LinkError as error:
             logger.warning("the watchdog could not send: %s", error)
 
+    def fresh_mode(self, max_age_s: float) -> str:
+        """The mode by a heartbeat of at most this age; "" = it cannot be seen.  Takes no lock."""
+        return self.estimator.fresh_mode(self._clock_ns(), max_age_s, self.config.max_state_age_s)
+
     def take_answers(self) -> list[tuple[int, int]]:
         """(command, MAV_RESULT) of the acknowledgements since the last call, without those of telemetry."""
         with self._lock:

@@ -110,6 +110,12 @@ class VehicleStateEstimator:
         latest = max((self.received_ns[name] for name in names if name in self.received_ns), default=None)
         return math.inf if latest is None else (now_ns - latest) / _NS
 
+    def fresh_mode(self, now_ns: int, heartbeat_s: float, attitude_s: float) -> str:
+        """The mode, if heartbeat and attitude are not older than this; "" = it cannot be seen.  Needs no lock."""
+        late = abs(now_ns - self._stamp_ns) / _NS > attitude_s
+        heartbeat = self._heartbeat
+        return "" if heartbeat is None or late or self.age_s(("HEARTBEAT",), now_ns) > heartbeat_s else heartbeat[1]
+
     def snapshot(self, now_ns: int) -> VehicleState | None:
         """The state at ``now_ns``; None before the first heartbeat and attitude."""
         if self._heartbeat is None or self._attitude is None or self._heard_ns is None:

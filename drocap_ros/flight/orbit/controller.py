@@ -53,6 +53,7 @@ from drocap_ros.observation import PoseObservation
 _NS = 1_000_000_000
 _CLOCK_JUMP_S = 0.25
 _GIMBAL_PERIOD_S = 0.5
+_MODE_AGE_S, _MODE_AGE_STEPS = 0.1, 1.5  # a heartbeat is seen in the step that follows it
 _SET_MODE = mavlink.MAV_CMD_DO_SET_MODE
 _GIMBAL = mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW
 _MAX_WAITING_COMMANDS = 16
@@ -93,7 +94,10 @@ class OrbitController:
 
     def __init__(self, link: MavlinkLink, config: MavlinkBridgeConfig, watchdog: Watchdog | None = None) -> None:
         self._link, self._config, self._watchdog = link, config, watchdog
-        self._limits = Limits(config, config, max_control_timeout_s=config.max_control_timeout_s)
+        self._limits = Limits(
+            config, config, max_control_timeout_s=config.max_control_timeout_s,
+            max_mode_age_s=max(_MODE_AGE_S, _MODE_AGE_STEPS / config.control_hz),
+        )  # fmt: skip
         self._history = PoseHistory(config.camera_mount_pitch_deg)
         self._subject = SubjectFilter(config)
         self._camera_matrix: np.ndarray | None = None
@@ -186,7 +190,7 @@ class OrbitController:
             )
         if self.safety.state != before.state:
             self._on_change(seen, estimate)
-        self._request_mode(decision.mode_request, dialect, now_s)
+        self._request_mode(decision.mode_request, seen, dialect, now_s)
         sent = self._send(decision.action, seen, estimate, dt)
         self._send_commands(seen, estimate, now_s)
         self._leave_fallback(seen, dialect, now_s)
@@ -250,9 +254,12 @@ class OrbitController:
         if self.safety.state in (State.TAKEN_OVER, State.IDLE):
             self._queue.cancel_all()
 
-    def _request_mode(self, request: ModeRequest, dialect: Dialect, now_s: float) -> None:
+    def _request_mode(self, request: ModeRequest, seen: Observed, dialect: Dialect, now_s: float) -> None:
         if request == ModeRequest.NONE:
-            self._queue.cancel(_SET_MODE)
+            # A request that waits for a visible mode is not sent, but it is not forgotten either: a mode that was
+            # granted must not be requested again.
+            waiting = self.safety.requesting or self.safety.state in (State.HOLDING, State.FAULT)
+            (self._queue.pause if waiting and not seen.in_hold else self._queue.cancel)(_SET_MODE)
             return
         hold = request == ModeRequest.HOLD
         mode = dialect.hold_mode if hold else dialect.control_mode
@@ -307,7 +314,10 @@ class OrbitController:
             self._fallback = hold_setpoint(seen.position, seen.yaw)
             hold = setpoint_message(mav, target, self._fallback)
             mode = command_message(mav, target, _SET_MODE, 0, dialect.mode_parameters(True))
-            commands = FallbackCommands(self._link.check_motion(hold), self._link.check_motion(mode))
+            commands = FallbackCommands(
+                self._link.check_motion(hold), self._link.check_motion(mode),
+                lambda: self._link.fresh_mode(self._limits.max_mode_age_s) == dialect.control_mode,
+            )  # fmt: skip
         self._watchdog.kick(now_s, commands)
 
     def _status(self, seen: Observed, estimate: SubjectEstimate | None, sent: Action) -> ControlStatus:

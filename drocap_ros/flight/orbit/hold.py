@@ -12,7 +12,7 @@ from drocap_ros.flight.orbit.motion_checks import braking_distance, subject_loca
 from drocap_ros.flight.orbit.states import Limits, Observed, SafetyState, State
 from drocap_ros.flight.safety_config import SafetyConfig
 
-_AT_REST_M_S, _AT_REST_S = 0.35, 0.5
+_AT_REST_M_S, _AT_REST_S, _SETTLED_S = 0.35, 0.5, 0.3
 _DEAD_RECKONING_S = 0.6
 _FRESH_S = 0.25
 _NEAR_M, _STOPPING_S, _MAX_WAY_OUT_M = 5.0, 1.2, 1.5
@@ -46,7 +46,7 @@ def begin_hold(
     return dataclasses.replace(
         state, state=State.HOLDING, since_s=now_s, condition=reason, blind=blind and not fresh,
         hold_mode_s=math.nan if seen.followed else now_s, hold_position=place, hold_yaw=seen.yaw,
-        retreats=retreats, retreated_s=-math.inf,
+        retreats=retreats, retreated_s=-math.inf, slow_s=math.nan,
     )  # fmt: skip
 
 
@@ -57,7 +57,7 @@ def update_hold(state: SafetyState, seen: Observed, now_s: float, blind: bool) -
         if state.hold_position is None:
             state = dataclasses.replace(state, hold_position=seen.position.copy(), hold_yaw=seen.yaw)
     late = not math.isnan(state.hold_mode_s) and now_s - state.hold_mode_s > _HOLD_MODE_PATIENCE_S
-    if state.state == State.HOLDING and late and not seen.in_hold:
+    if state.state == State.HOLDING and late and not seen.in_hold and math.isnan(state.lost_s):
         reason = condition(ConditionCode.HOLD_MODE_MISSING, cause=state.condition)
         return dataclasses.replace(state, state=State.FAULT, since_s=now_s, condition=reason)
     return state
@@ -89,8 +89,13 @@ def retreat(state: SafetyState, seen: Observed, now_s: float, limits: Limits) ->
 
 def request_hold_mode(state: SafetyState, seen: Observed, now_s: float, config: SafetyConfig) -> SafetyState:
     """Allow the request of the hold mode once the vehicle is at rest, or after ``hold_s``."""
-    if state.state != State.HOLDING or not math.isnan(state.hold_mode_s) or state.blind:
+    if state.state != State.HOLDING or not math.isnan(state.hold_mode_s) or state.blind or not math.isnan(state.lost_s):
         return state
     held_s = now_s - max(state.since_s, state.retreated_s)
-    still = bool(np.linalg.norm(seen.velocity) < _AT_REST_M_S) and held_s > _AT_REST_S
+    if not np.linalg.norm(seen.velocity) < _AT_REST_M_S:
+        state = dataclasses.replace(state, slow_s=math.nan)
+    elif math.isnan(state.slow_s):
+        state = dataclasses.replace(state, slow_s=now_s)
+    # Slow for a while: a vehicle that springs back is slow for a moment where it turns.
+    still = now_s - state.slow_s >= _SETTLED_S and held_s > _AT_REST_S
     return dataclasses.replace(state, hold_mode_s=now_s) if still or held_s > config.hold_s else state

@@ -8,6 +8,7 @@ import math
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.hold import begin_hold, request_hold_mode, retreat, update_hold
 from drocap_ros.flight.orbit.motion_checks import limit_condition, subject_condition, vehicle_condition
+from drocap_ros.flight.orbit.sight import is_lost, is_silent, mode_visible, watch
 from drocap_ros.flight.orbit.states import (
     Action,
     Command,
@@ -43,12 +44,14 @@ def reduce(
     vehicle = vehicle_condition(seen, limits)
     place = None if vehicle else limit_condition(seen, state.fence_centre, limits)
     problem = vehicle or place or subject_condition(seen, limits)
-    known_mode = seen.link_age_s <= limits.safety.max_state_age_s
-    if state.modes and seen.mode not in state.modes and seen.mode and known_mode:
+    state = watch(state, seen, now_s, limits)
+    lost_s, seen_s = state.lost_s, state.seen_s
+    # However late it is heard: a mode of somebody else is a take-over.
+    if state.modes and seen.mode not in state.modes and seen.mode:
         state = _enter(State.TAKEN_OVER, condition(_C.PILOT_TOOK_OVER, mode=seen.mode), now_s)
-    elif state.state in _ACTIVE and known_mode and not seen.armed and seen.mode:
+    elif state.state in _ACTIVE and not is_lost(state) and not seen.armed and seen.mode:
         state = _enter(State.IDLE, condition(_C.DISARMED), now_s)
-    elif state.modes and seen.in_hold:
+    elif state.state in _ACTIVE and seen.in_hold:
         # Once the autopilot holds, any other mode is somebody's choice.
         state = dataclasses.replace(state, modes=frozenset({seen.mode}))
     answer = None
@@ -64,6 +67,7 @@ def reduce(
         state = update_hold(state, seen, now_s, vehicle is not None)
         moved = state if vehicle or place else retreat(state, seen, now_s, limits)
         state = moved if moved is not state else request_hold_mode(state, seen, now_s, limits.safety)
+    state = dataclasses.replace(state, lost_s=lost_s, seen_s=seen_s)
     return state, Decision(*_permitted(state, seen, now_s, limits), answer)
 
 
@@ -139,19 +143,18 @@ def _permitted(state: SafetyState, seen: Observed, now_s: float, limits: Limits)
     if state.state == State.ORBITING:
         return Action.ORBIT, ModeRequest.NONE
     if state.state == State.READY and state.requesting:
-        warm = now_s - state.requesting_s >= limits.warm_up_s
+        warm = now_s - state.requesting_s >= limits.warm_up_s and mode_visible(state, seen, now_s, limits)
         return Action.HOLD, ModeRequest.CONTROL if warm else ModeRequest.NONE
-    if state.state not in (State.HOLDING, State.FAULT) or seen.in_hold:
+    if state.state not in (State.HOLDING, State.FAULT) or seen.in_hold or is_silent(state, now_s, limits):
         return Action.NOTHING, ModeRequest.NONE
-    if state.blind:
-        since = now_s - state.since_s
-        # Not at once: the autopilot's brake takes longer than velocity zero.  And not without a visible mode: the
-        # pilot may have taken over unseen; setpoints are ignored then, a request for a mode would not be.
-        seen_mode = seen.link_age_s <= limits.safety.max_state_age_s and seen.in_control
-        request = ModeRequest.HOLD if since > _BLIND_MODE_REQUEST_S and seen_mode else ModeRequest.NONE
-        action = Action.HALT if state.hold_position is None else Action.HOLD
-        return (action if since < _BLIND_STOP_S else Action.NOTHING), request
-    return Action.HOLD, ModeRequest.NONE if math.isnan(state.hold_mode_s) else ModeRequest.HOLD
+    action, since = Action.HALT if state.hold_position is None else Action.HOLD, now_s - state.since_s
+    if state.blind and since >= _BLIND_STOP_S:
+        action = Action.NOTHING
+    # Not at once: the autopilot's brake takes longer than velocity zero.  And not without a visible mode: the pilot
+    # may have taken over unseen; setpoints are ignored then, a request for a mode would not be.
+    wanted = since > _BLIND_MODE_REQUEST_S if state.blind else not math.isnan(state.hold_mode_s)
+    request = wanted and seen.in_control and mode_visible(state, seen, now_s, limits)
+    return action, ModeRequest.HOLD if request else ModeRequest.NONE
 
 
 def _begin_orbit(seen: Observed, now_s: float) -> SafetyState:

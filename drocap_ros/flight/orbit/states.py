@@ -103,12 +103,14 @@ class Limits(NamedTuple):
 
     warm_up_s : how long the autopilot must receive setpoints before it grants control
     max_control_timeout_s : longest time-out of the autopilot without setpoints; 0 = not checked
+    max_mode_age_s : greatest age of the heartbeat at which a mode is requested
     """
 
     safety: SafetyConfig
     orbit: OrbitConfig
     warm_up_s: float = 0.0
     max_control_timeout_s: float = 0.0
+    max_mode_age_s: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -121,11 +123,14 @@ class SafetyState:
     retreats : whether the hold position moves away from an approaching subject: only where nothing but nearness
         ended the orbit
     retreated_s : when it last did
+    slow_s : since when the vehicle has been slow during the hold; NaN = it is not
     fence_centre : (2,) where the orbit began
     modes : modes that are no take-over at present; empty = any
     requesting_s : since when control is requested; NaN = it is not
     hold_mode_s : when the hold mode was first requested; NaN = not yet
     blind : whether the hold began without a trustworthy vehicle state
+    lost_s : since when the vehicle is out of sight (no fresh telemetry); NaN = it is in sight
+    seen_s : since when it is in sight without interruption; -infinity = it was never lost
     """
 
     state: State = State.IDLE
@@ -135,11 +140,14 @@ class SafetyState:
     hold_yaw: float = math.nan
     retreats: bool = False
     retreated_s: float = -math.inf
+    slow_s: float = math.nan
     fence_centre: np.ndarray | None = None
     modes: frozenset[str] = frozenset()
     requesting_s: float = math.nan
     hold_mode_s: float = math.nan
     blind: bool = False
+    lost_s: float = math.nan
+    seen_s: float = -math.inf
 
     @property
     def reason(self) -> str:

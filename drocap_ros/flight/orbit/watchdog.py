@@ -15,10 +15,15 @@ _STOPPED_S = 0.5
 
 
 class FallbackCommands(NamedTuple):
-    """Messages to send if the loop hangs: the position to hold, and the hold mode."""
+    """Messages to send if the loop hangs: the position to hold, and the hold mode.
+
+    in_control : whether the autopilot has just reported the mode in which it follows us; without it no mode is
+        requested, because the pilot may have chosen another one
+    """
 
     hold: Any
     hold_mode: Any
+    in_control: Callable[[], bool]
 
 
 class Watchdog:
@@ -57,7 +62,7 @@ class Watchdog:
             return
         self.fired, self._sent_s = True, now_s
         self._send(commands.hold)
-        if silent_s > _REQUEST_MODE_S and not self.mode_requested:
+        if silent_s > _REQUEST_MODE_S and not self.mode_requested and commands.in_control():
             self.mode_requested = True
             self._send(commands.hold_mode)
 

@@ -144,15 +144,17 @@ def test_contradicting_parameters_of_the_bridge_are_refused(values, word):
 
 
 def test_watchdog_sends_the_fallback_commands_only_when_the_loop_hangs():
-    sent = []
+    sent, visible = [], False
     dog = Watchdog(sent.append, 0.2)
-    commands = FallbackCommands("hold", "mode")
+    commands = FallbackCommands("hold", "mode", lambda: visible)
     for i in range(20):
         dog.kick(0.05 * i, commands)
         dog.step(0.05 * i + 0.02)
     assert sent == []
     for i in range(200):
+        visible = i > 100
         dog.step(0.95 + 0.05 * i)
+        assert visible or "mode" not in sent
     assert sent[0] == "hold"
     assert sent.count("mode") == 1
     assert 50 < sent.count("hold") < 110  # ten times a second, for ten seconds
@@ -167,7 +169,7 @@ def test_watchdog_sends_the_fallback_commands_only_when_the_loop_hangs():
 def test_watchdog_that_stood_still_with_its_loop_sends_no_outdated_position():
     sent = []
     dog = Watchdog(sent.append, 0.2)
-    commands = FallbackCommands("hold", "mode")
+    commands = FallbackCommands("hold", "mode", lambda: True)
     dog.kick(1.0, commands)
     dog.step(1.02)
     for i in range(100):  # stopped for three seconds, and the loop is not back yet

@@ -5,24 +5,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from orbit_observations import BRAKE, GOOD, LIMITS, LOITER, orbiting
 
 from drocap_ros.errors import ParameterError
 from drocap_ros.flight.conditions import ConditionCode, condition
 from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
-from drocap_ros.flight.orbit.states import Action, Command, Limits, ModeRequest, Observed, SafetyState, State
-from drocap_ros.flight.orbit_config import OrbitConfig
+from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, SafetyState, State
 from drocap_ros.flight.safety_config import SafetyConfig
-
-LIMITS = Limits(SafetyConfig(commands_enabled=True, mode_change_allowed=True), OrbitConfig())
-GOOD = Observed(
-    autopilot="ardupilot", mode="GUIDED", in_control=True, armed=True, landed_state=2, link_age_s=0.02,
-    heartbeat_age_s=0.3, state_age_s=0.05, position_age_s=0.05, status_age_s=0.2, round_trip_s=0.02,
-    gps_fix_type=3, position_ok=True, battery_fraction=0.8, position=np.array([6.0, 0, 2.5]), velocity=np.zeros(3),
-    yaw=math.pi, height_m=2.5, subject=np.zeros(3), subject_age_s=0.1, subject_sd_m=0.5, subject_distance_m=6.0,
-)  # fmt: skip
-LOITER = dataclasses.replace(GOOD, mode="LOITER", in_control=False)
-BRAKE = dataclasses.replace(GOOD, mode="BRAKE", in_control=False, in_hold=True)
 
 BAD = {
     "disturbance": {"disturbance": condition(ConditionCode.CLOCK_JUMPED, jump_s=3.0)},
@@ -93,15 +83,6 @@ def refusal(decision):
     return decision.answer.condition.code
 
 
-def orbiting(seen=GOOD):
-    state, _ = reduce(SafetyState(), seen, 0.0, None, LIMITS)
-    assert state.state == State.READY
-    state, decision = reduce(state, seen, 0.1, Command.START, LIMITS)
-    assert (state.state, decision.action) == (State.ORBITING, Action.ORBIT)
-    assert (decision.answer.accepted, decision.answer.condition.code) == (True, ConditionCode.ORBITING)
-    return state
-
-
 def bad(name, base=GOOD):
     return dataclasses.replace(base, **BAD[name])
 
@@ -137,7 +118,10 @@ def test_hold_latches_the_position_requests_the_hold_mode_and_then_sends_nothing
     state, decision = reduce(state, drifted, 2.0, None, LIMITS)
     assert np.array_equal(state.hold_position, GOOD.position)
     assert decision.mode_request == ModeRequest.NONE
-    state, decision = reduce(state, dataclasses.replace(drifted, velocity=np.zeros(3)), 2.1, None, LIMITS)
+    at_rest = dataclasses.replace(drifted, velocity=np.zeros(3))
+    state, decision = reduce(state, at_rest, 2.1, None, LIMITS)
+    assert decision.mode_request == ModeRequest.NONE  # it may only turn, to spring back
+    state, decision = reduce(state, at_rest, 2.45, None, LIMITS)
     assert decision == (Action.HOLD, ModeRequest.HOLD, None)
     state = permit_mode(state, "BRAKE")
     state, decision = reduce(state, BRAKE, 2.5, None, LIMITS)

@@ -1,0 +1,65 @@
+"""Whether the vehicle, and the mode that the pilot may have changed, can be seen."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from drocap_ros.flight.orbit.states import Limits, Observed, SafetyState, State
+
+#: Telemetry must arrive for so long after a loss before a mode is requested: longer than the 1 s between two
+#: heartbeats of PX4, and than packets that were late and arrive after newer ones.
+_STEADY_S = 1.3
+
+
+def watch(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> SafetyState:
+    """Note when the vehicle is lost from sight, and when it is in sight again.
+
+    In sight again means that a heartbeat has arrived since the loss: fresh attitude with the mode of before the loss
+    shows nothing of what the pilot has chosen meanwhile.
+    """
+    lost = not math.isnan(state.lost_s)
+    if not _telemetry_fresh(seen, limits):
+        return state if lost else dataclasses.replace(state, lost_s=now_s)
+    if not lost or seen.heartbeat_age_s >= now_s - state.lost_s:
+        return state
+    silent = is_silent(state, now_s, limits)
+    state = dataclasses.replace(state, lost_s=math.nan, seen_s=now_s)
+    if state.state not in (State.HOLDING, State.FAULT):
+        return state
+    state = dataclasses.replace(state, since_s=now_s, hold_mode_s=math.nan)
+    if not silent:
+        return state
+    # Setpoints had ended: the vehicle is held where it is now, and not led back.
+    known = bool(np.isfinite(seen.position).all()) and seen.position_ok and seen.gps_fix_type >= 3
+    place = seen.position.copy() if known else None
+    return dataclasses.replace(state, hold_position=place, hold_yaw=seen.yaw)
+
+
+def is_lost(state: SafetyState) -> bool:
+    """Whether the vehicle is out of sight."""
+    return not math.isnan(state.lost_s)
+
+
+def is_silent(state: SafetyState, now_s: float, limits: Limits) -> bool:
+    """Whether the vehicle has been out of sight for so long that nothing is sent any more."""
+    return now_s - state.lost_s > limits.safety.blind_hold_s  # NaN: in sight
+
+
+def mode_visible(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> bool:
+    """Whether a mode may be requested now: the present one has just been reported, by a link that works both ways.
+
+    The pilot's choice within the age of this report is the only one that a request can override.
+    """
+    steady = now_s - state.seen_s >= _STEADY_S and not is_lost(state)
+    late = seen.round_trip_s > limits.safety.max_round_trip_s  # the request would arrive late too
+    return steady and not late and seen.heartbeat_age_s <= limits.max_mode_age_s
+
+
+def _telemetry_fresh(seen: Observed, limits: Limits) -> bool:
+    # The attitude's stamp shows packets that arrive late; a heartbeat has no stamp.
+    safety = limits.safety
+    newest = max(seen.link_age_s, seen.state_age_s)
+    return newest <= safety.max_state_age_s and seen.heartbeat_age_s <= safety.max_heartbeat_age_s

@@ -1,0 +1,66 @@
+"""What is sent while the vehicle, or the mode that the pilot may have changed, cannot be seen."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from orbit_observations import GOOD, LIMITS, LOITER, orbiting
+
+from drocap_ros.flight.orbit.safety import reduce
+from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, SafetyState, State
+
+
+def lost(link_age_s, **values):
+    return dataclasses.replace(GOOD, link_age_s=link_age_s, state_age_s=link_age_s, **values)
+
+
+def test_no_mode_is_requested_while_the_mode_cannot_be_seen_and_the_hold_ends_after_its_time():
+    # The hold begins on telemetry that is 0.21 s old, and the vehicle is at rest: a position is known.
+    state, decision = reduce(orbiting(), lost(0.21, heartbeat_age_s=0.3), 1.0, None, LIMITS)
+    assert decision == (Action.HOLD, ModeRequest.NONE, None)
+    for i in range(1, 400):
+        after_s = 0.05 * i
+        unseen = lost(0.21 + after_s, heartbeat_age_s=0.3 + after_s)
+        state, decision = reduce(state, unseen, 1.0 + after_s, None, LIMITS)
+        assert decision.mode_request == ModeRequest.NONE
+        assert decision.action == (Action.HOLD if after_s <= 3.5 else Action.NOTHING) or abs(after_s - 3.5) < 0.06
+
+
+@pytest.mark.parametrize("silent_s", [2.0, 6.0])
+def test_the_mode_after_a_loss_is_known_by_a_heartbeat_since_the_loss(silent_s):
+    state, _ = reduce(orbiting(), lost(0.21, heartbeat_age_s=0.3), 1.0, None, LIMITS)
+    state, before = reduce(state, lost(silent_s, heartbeat_age_s=silent_s), 1.0 + silent_s, None, LIMITS)
+    # Attitude is heard first; the mode is still that of before the loss.
+    early = dataclasses.replace(GOOD, heartbeat_age_s=silent_s + 0.1, position=GOOD.position + 1.0)
+    state, decision = reduce(state, early, 1.1 + silent_s, None, LIMITS)
+    assert decision[:2] == (before.action, ModeRequest.NONE)
+    pilot, decision = reduce(state, dataclasses.replace(LOITER, mode="RTL"), 1.2 + silent_s, None, LIMITS)
+    assert (pilot.state, decision.action) == (State.TAKEN_OVER, Action.NOTHING)
+    # Our own mode: the hold goes on, after silence where the vehicle is now, and the hold mode waits for steadiness.
+    place = early.position if silent_s > 3.5 else GOOD.position
+    for i in range(80):
+        t = 1.2 + silent_s + 0.05 * i
+        state, decision = reduce(
+            state, early if i == 0 else dataclasses.replace(early, heartbeat_age_s=0.05), t, None, LIMITS
+        )
+        assert decision.mode_request == ModeRequest.NONE or i * 0.05 >= 1.3
+    assert decision == (Action.HOLD, ModeRequest.HOLD, None)
+    assert np.array_equal(state.hold_position, place)
+
+
+def test_a_mode_of_somebody_else_is_a_take_over_however_late_it_is_heard():
+    late = lost(0.9, mode="RTL", in_control=False)
+    assert reduce(orbiting(), late, 1.0, None, LIMITS)[0].state == State.TAKEN_OVER
+
+
+def test_a_mode_is_requested_only_right_after_a_heartbeat_and_with_a_short_round_trip():
+    state, _ = reduce(orbiting(), GOOD, 10.0, Command.STOP, LIMITS)
+    state, decision = reduce(state, GOOD, 11.0, None, LIMITS)
+    assert decision.mode_request == ModeRequest.HOLD
+    old = dataclasses.replace(GOOD, heartbeat_age_s=0.15)
+    assert reduce(state, old, 11.1, None, LIMITS)[1] == (Action.HOLD, ModeRequest.NONE, None)
+    slow = dataclasses.replace(GOOD, round_trip_s=0.6)
+    assert reduce(state, slow, 11.1, None, LIMITS)[1] == (Action.HOLD, ModeRequest.NONE, None)
+    engaging, _ = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, LIMITS)
+    unseen = dataclasses.replace(LOITER, heartbeat_age_s=0.15)
+    assert reduce(engaging, unseen, 0.2, None, LIMITS)[1].mode_request == ModeRequest.NONE
