@@ -66,11 +66,11 @@ def perceive(port: int) -> None:
     camera.bind(("127.0.0.1", port))
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         for frame in range(10**9):
-            told = json.loads(camera.recv(4096))
-            rotation = camera_rotation(np.array(told["orientation"]))[None]
-            seen = noisy_keypoints(project(joints, rotation, np.array([told["position"]]), MATRIX), None, frame)
+            pose = json.loads(camera.recv(4096))
+            rotation = camera_rotation(np.array(pose["orientation"]))[None]
+            seen = noisy_keypoints(project(joints, rotation, np.array([pose["position"]]), MATRIX), None, frame)
             observation = PoseObservation(
-                told["stamp_ns"], 1, (WIDTH, HEIGHT), keypoints=seen.keypoints[0].astype(np.float32),
+                pose["stamp_ns"], 1, (WIDTH, HEIGHT), keypoints=seen.keypoints[0].astype(np.float32),
                 covariance=seen.covariance[0].astype(np.float32), confidence=seen.confidence[0].astype(np.float32),
             )  # fmt: skip
             poses.publish(pose2d_to_ros(observation, "camera_optical"))
@@ -107,11 +107,11 @@ class Drone:
             if self.t * RATE_HZ >= frame:
                 frame = int(self.t * RATE_HZ) + 1
                 if self.seeing:
-                    told = {
+                    pose = {
                         "stamp_ns": time.time_ns(), "position": self.copter.body.position.tolist(),
                         "orientation": self.copter.camera_orientation().tolist(),
                     }  # fmt: skip
-                    self._camera.sendto(json.dumps(told).encode(), ("127.0.0.1", self._camera_port))
+                    self._camera.sendto(json.dumps(pose).encode(), ("127.0.0.1", self._camera_port))
 
     def __enter__(self) -> Drone:
         self._thread.start()

@@ -34,7 +34,7 @@ from drocap_ros.recording.provenance import (
 from drocap_ros.ros.component import ERROR, HARDWARE_ID, OK, WARN, Gaps
 from drocap_ros.ros.diagnostics import Key, node_of, of, values_of
 from drocap_ros.ros.lifecycle import ACTIVE, ManagedComponent
-from drocap_ros.ros.parameter_survey import ParameterSurvey
+from drocap_ros.ros.parameters import ParameterSurvey
 from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, NODES, TOPICS
 
