@@ -55,7 +55,7 @@ bench: setup  ## benchmarks (about an hour); each writes its page of docs/figure
 
 bench-quick: export DROCAP_FIGURES := $(CURDIR)/build/figures
 bench-quick: setup  ## the same benchmarks, short (about ten minutes); pages in build/figures
-	$(BENCHMARK)/demo.py --runs 1
+	$(BENCHMARK)/demo.py --seeds 0 --seconds 8
 	$(BENCHMARK)/accuracy.py --limit 1
 	$(BENCHMARK)/reconstruction.py --frames 30 300 --threads 1 --repeat 1
 	$(BENCHMARK)/perception.py --quick
@@ -67,6 +67,9 @@ bench-flight: setup  ## simulated faults, orbits by keypoints and by images, fuz
 	$(BENCHMARK)/flight_faults.py processes
 	$(BENCHMARK)/flight_orbits.py
 	$(BENCHMARK)/flight_orbits.py quality
+	$(BENCHMARK)/flight_field.py
+	$(BENCHMARK)/flight_kills.py
+	$(BENCHMARK)/flight_kills.py pilot
 	$(BENCHMARK)/flight_pixels.py
 	$(BENCHMARK)/flight_fuzz.py
 

@@ -16,8 +16,9 @@ import os
 import socket
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import rclpy
 from rclpy.context import Context
@@ -27,9 +28,12 @@ from rclpy.parameter import Parameter
 
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import DrocapError, InputError, NodeError
+from drocap_ros.flight.mavlink.transport import Transport
+from drocap_ros.reconstruction.threads import blas_threads
 from drocap_ros.ros import fastdds
 from drocap_ros.ros.component import ComponentNode
 from drocap_ros.ros.graph import Graph, Runner
+from drocap_ros.ros.lockstep import Lockstep
 from drocap_ros.ros.processes import (
     DEFAULT_NAMESPACE,
     STOP_TIMEOUT_S,
@@ -121,6 +125,65 @@ def watch(namespace: str, domain_id: int, names: Sequence[str] = ()) -> Iterator
         context.try_shutdown()
 
 
+@contextlib.contextmanager
+def lockstep(
+    config: DrocapConfig,
+    nodes: Sequence[str],
+    *,
+    transports: Mapping[str, Transport] | None = None,
+    namespace: str = DEFAULT_NAMESPACE,
+) -> Iterator[Lockstep]:
+    """Run the named nodes in this thread and in simulated time, while the context lasts.
+
+    The caller adds its own endpoints to ``Lockstep.node`` and then calls ``Lockstep.start``.
+
+    Parameters
+    ----------
+    config, nodes, namespace : as of :func:`bringup`; the DDS domain is a free one
+    transports : simulated ends of MAVLink links, by the nodes that own them
+
+    Raises
+    ------
+    InputError, NodeError
+        When a node refuses its parameters or fails.
+    """
+    names = [name for name in NODES if name in nodes]
+    overrides = [Parameter("use_sim_time", value=True), Parameter("graph_nodes", value=",".join(names))]
+    with contextlib.ExitStack() as stack:
+        domain_id = stack.enter_context(free_domain())
+        stack.enter_context(environment({fastdds.RANGE_VARIABLE: "LOCALHOST"}))
+        stack.enter_context(environment(fastdds.environment()))
+        # More threads would make the last bits depend on the machine.
+        stack.enter_context(blas_threads(1))
+        context = Context()
+        rclpy.init(args=["--ros-args", "--disable-stdout-logs"], context=context, domain_id=domain_id)
+        stack.callback(context.try_shutdown)
+        place: dict[str, Any] = {"context": context, "namespace": namespace, "use_global_arguments": False}
+        components: list[ComponentNode] = []
+        stack.callback(_close, components)
+        for name in names:
+            link = {"transport": transports[name]} if transports and name in transports else {}
+            arguments = ["--ros-args", *remaps(namespace)]
+            components.append(
+                node_class(name)(
+                    config.section(name), **link, **place, cli_args=arguments, parameter_overrides=overrides
+                )
+            )  # fmt: skip
+        observer = Node("bringup", **place, parameter_overrides=overrides[:1])
+        stack.callback(observer.destroy_node)
+        graph = Lockstep(components, observer)
+        yield graph
+        graph.stop()
+
+
+def _close(components: list[ComponentNode]) -> None:
+    """Close nodes, from the sources downwards."""
+    with contextlib.ExitStack() as stack:
+        for component in reversed(components):
+            stack.callback(component.destroy_node)
+            stack.callback(component.close)
+
+
 class _NodeThread:
     """A node in a thread of this process."""
 
@@ -188,4 +251,4 @@ def free_domain() -> Iterator[int]:
     raise NodeError("expected a free DDS domain id between 1 and 100, found none; stop other graphs")
 
 
-__all__ = ["DrocapError", "Graph", "bringup", "free_domain", "node_class", "watch"]
+__all__ = ["DrocapError", "Graph", "bringup", "free_domain", "lockstep", "node_class", "watch"]

@@ -33,6 +33,7 @@ class Motion:
     keypoints : (F, P, 2) px, those used, NaN where not seen
     reprojection_px : (F, P) px, distance of the projected joint from its keypoint, NaN where not seen
     meta : JSON-compatible: versions, revision, parameters, seconds per stage, solver's outcome
+    camera_position : (F, 3) m in that frame, None where unknown
     """
 
     joints3d: np.ndarray
@@ -47,6 +48,7 @@ class Motion:
     keypoints: np.ndarray
     reprojection_px: np.ndarray
     meta: dict[str, Any] = field(default_factory=dict)
+    camera_position: np.ndarray | None = None
 
 
 def upright_joints(motion: Motion) -> np.ndarray:
@@ -61,6 +63,8 @@ def upright_joints(motion: Motion) -> np.ndarray:
 
 def save_motion(path: str | Path, motion: Motion, **further: np.ndarray) -> None:
     """Write ``motion.npz``; ``further`` arrays are added, and :func:`load_motion` ignores them."""
+    if motion.camera_position is not None:
+        further = {"camera_position": motion.camera_position, **further}
     np.savez_compressed(
         path,
         joints3d=motion.joints3d.astype(np.float64),
@@ -117,6 +121,7 @@ def load_motion(path: str | Path) -> Motion:
         keypoints=a["keypoints"],
         reprojection_px=a["reprojection_px"],
         meta=meta if isinstance(meta, dict) else {},
+        camera_position=a.get("camera_position"),
     )
     try:
         _check(motion)
@@ -137,6 +142,8 @@ def _check(m: Motion) -> None:
         "keypoints": (frames, joints, 2),
         "reprojection_px": (frames, joints),
     }
+    if m.camera_position is not None:
+        shapes["camera_position"] = (frames, 3)
     for name, shape in shapes.items():
         value = getattr(m, name)
         if value.shape != shape or value.dtype.kind not in "fiu":

@@ -54,6 +54,7 @@ def reconstruct_input(
     models: Path | None = None,
     progress: Progress | None = None,
     telemetry: Telemetry | None = None,
+    mount_pitch_deg: float | None = None,
 ) -> tuple[Motion, Tracks]:
     """Motion of the subject in a video file, image folder, recording or tracks file.
 
@@ -65,6 +66,7 @@ def reconstruct_input(
     models : folder of ONNX files; None = ``DROCAP_MODELS`` or the user's own
     progress : called with a stage and its fraction done
     telemetry : log beside a video, with the camera's pose
+    mount_pitch_deg : of a camera fixed to the body, negative down, for a recording without the camera's attitude
 
     Raises
     ------
@@ -75,7 +77,7 @@ def reconstruct_input(
         return _reconstruct_live(Path(path), config, progress)
     begin = time.perf_counter()
     log = read_telemetry(telemetry.path) if telemetry is not None else None
-    tracks = read_input(Path(path), config, models, progress)
+    tracks = read_input(Path(path), config, models, progress, mount_pitch_deg)
     if telemetry is not None and log is not None:
         tracks = _with_telemetry(Path(path), tracks, telemetry, log, progress)
     seconds = time.perf_counter() - begin
@@ -117,7 +119,13 @@ def _with_telemetry(
     return tracks
 
 
-def read_input(path: Path, config: DrocapConfig, models: Path | None, progress: Progress | None = None) -> Tracks:
+def read_input(
+    path: Path,
+    config: DrocapConfig,
+    models: Path | None,
+    progress: Progress | None = None,
+    mount_pitch_deg: float | None = None,
+) -> Tracks:
     """2D tracks of the subject: from the input where it holds them, else estimated from its images."""
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
@@ -126,7 +134,7 @@ def read_input(path: Path, config: DrocapConfig, models: Path | None, progress: 
     if is_recording(path):
         with open_session(path) as session:
             if session.has_pose2d:
-                tracks = read_pose2d(session)
+                tracks = read_pose2d(session, mount_pitch_deg)
             else:
                 tracks = _track(read_images(session), None, config, models, progress, str(path))
             for warning in session.warnings:

@@ -3,7 +3,6 @@
 The command starts, watches and restarts its nodes itself, so launch runs the command instead of single nodes.
 """
 
-import os
 import sys
 
 from launch import LaunchDescription
@@ -35,7 +34,6 @@ def live(context):
         LaunchConfiguration(name).perform(context) for name in ("config", "namespace", "record")
     )
     command = [sys.executable, "-m", "drocap_ros.cli", "live", "--config", config, "--namespace", namespace]
-    command += ["--domain-id", os.environ.get("ROS_DOMAIN_ID", "0")]
     if record in NO:
         command += ["--nodes", *(name for name, node in NODES.items() if node.live and name != "session_recorder")]
     elif record not in ("true", "True", "1", "yes"):

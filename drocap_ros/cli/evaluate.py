@@ -48,6 +48,20 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     rotation.add_argument("--methods", choices=METHODS, nargs="+", default=list(METHODS), help="default: all")
     rotation.add_argument("--processes", metavar="N", type=int, default=1, help="number of processes (default 1)")
     rotation.set_defaults(run=_rotation)
+    world = _study_parser(
+        kinds,
+        "world",
+        help="errors in the world, by a camera whose telemetry errs",
+        description="The sequences of at least 8 s in MOCAP_DIR with their root motion, their first 20 s at 24 fps,"
+        " seen by a perspective camera that orbits the person, with telemetry of stated errors.",
+        files="world.csv and world.md",
+        noisy=False,
+    )
+    world.add_argument("--telemetry", choices=("exact", "rtk", "gps"), default="exact", help="default: exact")
+    world.add_argument("--still", action="store_true", help="the camera keeps its bearing from the person")
+    world.add_argument("--method", choices=METHODS, default="ba", help="default: ba")
+    world.add_argument("--every", metavar="N", type=int, default=1, help="only every N-th sequence")
+    world.set_defaults(run=_world)
     live = _study_parser(
         kinds,
         "live",
@@ -63,11 +77,14 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     return parser
 
 
-def _study_parser(kinds: Any, name: str, help: str, description: str, files: str) -> argparse.ArgumentParser:
+def _study_parser(
+    kinds: Any, name: str, help: str, description: str, files: str, noisy: bool = True
+) -> argparse.ArgumentParser:
     """Parser of a study, with the options that all studies have."""
     parser: argparse.ArgumentParser = kinds.add_parser(name, help=help, description=description)
     parser.add_argument("folder", metavar="MOCAP_DIR", type=Path, help="folder of MoCap .npz files")
-    parser.add_argument("--noisy", action="store_true", help="10 mm noise and 5 %% gross outliers in the 2D joints")
+    if noisy:
+        parser.add_argument("--noisy", action="store_true", help="10 mm noise and 5 %% gross outliers in the 2D joints")
     parser.add_argument("--limit", metavar="N", type=int, help="only the first N sequences")
     parser.add_argument("--seed", type=int, default=0, help="seed of the noise (default 0)")
     parser.add_argument("--out", metavar="DIR", type=Path, help=f"also write {files} to DIR")
@@ -123,6 +140,29 @@ def _rotation(args: argparse.Namespace) -> int:
             tables.save_csv(out / "rotation.csv", [asdict(row) for row in rows])
             (out / "rotation.md").write_text(text, encoding="utf-8")
             tables.save_curves(out / "rotation.png", rows)
+    return 0
+
+
+def _world(args: argparse.Namespace) -> int:
+    """Run the study of the motion in the world, print the table and write the files."""
+    from drocap_ros.cli.atomic_output import check_output_folder, output_folder
+    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.evaluation.tables import save_csv
+    from drocap_ros.evaluation.world import world_markdown, world_study
+
+    if args.out is not None:
+        check_output_folder(args.out)
+    with progress_bars(args.quiet) as progress:
+        rows = world_study(
+            args.folder, args.telemetry, still=args.still, seed=args.seed, method=args.method, every=args.every,
+            limit=args.limit, progress=progress,
+        )  # fmt: skip
+    text = world_markdown(rows, args.telemetry, args.still)
+    print(text, end="")
+    if args.out is not None:
+        with output_folder(args.out) as out:
+            save_csv(out / "world.csv", [{"sequence": row.sequence, **asdict(row.errors)} for row in rows])
+            (out / "world.md").write_text(text, encoding="utf-8")
     return 0
 
 

@@ -95,6 +95,7 @@ def _print_metadata(path: Path) -> int:
 
 def _of_arrays(path: Path) -> Summary:
     from drocap_ros.motion import load_motion
+    from drocap_ros.reconstruction.world.calibration_words import telemetry_words
     from drocap_ros.tracks import load_tracks, read_npz
 
     arrays = read_npz(path, ())
@@ -108,6 +109,7 @@ def _of_arrays(path: Path) -> Summary:
             ("joints", ", ".join(motion.joints)),
             ("frame", motion.frame),
             ("scale", f"{scale} ({motion.scale_source})"),
+            *((("telemetry", words),) if (words := telemetry_words(motion.meta)) else ()),
             *((key, str(motion.meta[key])) for key in ("method", "input", "version") if key in motion.meta),
         ]
     elif "keypoints" in arrays:

@@ -52,7 +52,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "--mount-pitch",
         metavar="DEG",
         type=float,
-        help="pitch of a camera fixed to a vehicle without a gimbal, negative looks down",
+        help="pitch of a camera fixed to a vehicle without a gimbal, negative looks down; for a log, or a session"
+        " without the camera's attitude",
     )
     parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
     parser.add_argument("--dictionary", metavar="NPZ", type=Path, help="pose dictionary instead of the shipped one")
@@ -88,6 +89,7 @@ def run(args: argparse.Namespace) -> int:
             models=args.models,
             progress=progress,
             telemetry=_telemetry(args),
+            mount_pitch_deg=args.mount_pitch,
         )
     motion = dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line})
     with output_folder(out) as folder:
@@ -107,11 +109,13 @@ def _telemetry(args: argparse.Namespace) -> Any:
 
     from drocap_ros.errors import InputError
     from drocap_ros.pipeline import Telemetry
+    from drocap_ros.recording.open_session import is_recording
 
     for name, value in (("--time-offset", args.time_offset), ("--mount-pitch", args.mount_pitch)):
         if value is None:
             continue
-        if args.telemetry is None:
+        session = name == "--mount-pitch" and args.input.exists() and is_recording(args.input)
+        if args.telemetry is None and not session:
             raise InputError(f"{name}: expected --telemetry LOG with it, found none; add the log")
         if not math.isfinite(value):
             raise InputError(f"{name}: expected a finite number, got {value}; correct the value")

@@ -17,6 +17,7 @@ from drocap_ros.evaluation.metrics import (
     scale_error,
     w_mpjpe,
 )
+from drocap_ros.evaluation.world_errors import WorldErrors, world_errors
 from drocap_ros.mocap import load_mocap
 from drocap_ros.motion import Motion, load_motion
 from drocap_ros.skeleton import BODY_15, indices
@@ -32,6 +33,7 @@ class MotionErrors:
     mirrored, mirrored_share : handedness of the whole sequence, share of mirrored frames
     scale_error : estimated over true mean limb length, less 1
     metric : the motion's scale is measured, not assumed
+    world : errors in the world where both motions are in world frames, else None
     """
 
     frames: int
@@ -43,6 +45,7 @@ class MotionErrors:
     mirrored_share: float
     scale_error: float
     metric: bool
+    world: WorldErrors | None = None
 
 
 def load_truth(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
@@ -101,7 +104,13 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
         mirrored_share=float(mirrored_frames(estimate, true).mean()),
         scale_error=scale_error(estimate, true),
         metric=motion.metric,
+        world=world_errors(estimate, true, _rate(at[usable])) if world else None,
     )
+
+
+def _rate(time_s: np.ndarray) -> float:
+    """Frames per second of increasing times; 1 for a single frame."""
+    return 1.0 / float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
 
 
 def _at_times(values: np.ndarray, time_s: np.ndarray, wanted: np.ndarray) -> np.ndarray:

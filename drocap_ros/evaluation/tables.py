@@ -13,6 +13,7 @@ import numpy as np
 from drocap_ros.evaluation.compare import MotionErrors
 from drocap_ros.evaluation.metrics import JOINT_GROUPS
 from drocap_ros.evaluation.rotation import StudyRow
+from drocap_ros.evaluation.world_errors import WORLD_HEAD, world_cells
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -93,13 +94,18 @@ def comparison_markdown(name: str, e: MotionErrors) -> str:
         f"{e.mirrored_share:.1%}",
         *("-" if np.isnan(v) else f"{v:.1f}" for v in (e.w_error_mm, e.horizon_deg)),
     ]
-    return "\n".join([*markdown_table(head, [line]), "", *markdown_table(more, [rest])]) + "\n"
+    tables = [*markdown_table(head, [line]), "", *markdown_table(more, [rest])]
+    if e.world is not None:
+        tables += ["", *markdown_table(WORLD_HEAD, [world_cells(e.world)])]
+    return "\n".join(tables) + "\n"
 
 
 def comparison_record(name: str, e: MotionErrors) -> dict[str, object]:
     """Errors of one motion as a record for :func:`save_csv`."""
     record: dict[str, object] = {"motion": name, **asdict(e)}
-    del record["per_group_mm"]
+    del record["per_group_mm"], record["world"]
+    if e.world is not None:
+        record |= {f"world_{key}": value for key, value in asdict(e.world).items()}
     return record | {f"{group}_mm": value for group, value in e.per_group_mm.items()}
 
 

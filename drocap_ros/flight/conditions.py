@@ -32,6 +32,8 @@ class ConditionCode(enum.IntEnum):
     PILOT_TOOK_OVER = 13
     CONTROL_NOT_GRANTED = 14
     HOLD_MODE_MISSING = 15
+    DEGRADED = 16
+    SLOWED = 17
     # Commands that are refused for what they ask, or for the state in which they come
     UNKNOWN_COMMAND = 40
     COMMAND_OUTDATED = 41
@@ -48,6 +50,7 @@ class ConditionCode(enum.IntEnum):
     FAULT_NOT_ACKNOWLEDGED = 52
     NOT_IN_CONTROL_MODE = 53
     MODE_CHANGE_FORBIDDEN = 54
+    PERSON_LEAVES_PICTURE = 55
     # Link, autopilot and vehicle
     COMMANDS_DISABLED = 100
     CLOCK_JUMPED = 101
@@ -71,17 +74,25 @@ class ConditionCode(enum.IntEnum):
     STATUS_OUTDATED = 119
     BATTERY_UNKNOWN = 120
     BATTERY_LOW = 121
+    CAMERA_UNKNOWN = 122
+    MOUNT_TYPE_UNKNOWN = 123
+    MOUNT_OUTDATED = 124
+    # Others in the graph
+    OTHER_POSE_PUBLISHER = 130
+    SECOND_BRIDGE = 131
     # Limits of place and speed
     TOO_FAST = 150
     TOO_HIGH = 151
     TOO_LOW = 152
     AT_FENCE = 153
+    COAST_UNSAFE = 154
     # Subject
     NO_SUBJECT = 200
     SUBJECT_OUTDATED = 201
     SUBJECT_UNCERTAIN = 202
     SUBJECT_NEAR = 203
     SUBJECT_FAR = 204
+    SUBJECT_AT_BORDER = 205
 
 
 _C = ConditionCode
@@ -104,6 +115,9 @@ _SENTENCES = {
     "the operator acknowledges it by stop",
     _C.CONTROL_NOT_GRANTED: "the autopilot did not grant control",
     _C.HOLD_MODE_MISSING: "{cause}; the autopilot does not enter its hold mode: take over by hand",
+    _C.DEGRADED: "the orbit is slowed down: {cause}",
+    _C.SLOWED: "{cause}, at {speed_deg_s:.1f} deg/s instead of {wanted_deg_s:.1f}: without setpoints the autopilot "
+    "flies on for {timeout_s:g} s, and the vehicle must stop within max_coast_m, {limit_m:g} m",
     _C.UNKNOWN_COMMAND: "no command has the number {number}",
     _C.COMMAND_OUTDATED: "the command is {age_s:.1f} s old, and {limit_s:g} s is the limit",
     _C.TOO_MANY_COMMANDS: "more than {limit} commands are waiting",
@@ -122,22 +136,26 @@ _SENTENCES = {
     _C.NO_ORBIT_TO_ADJUST: "adjust needs a running orbit, the state is {state}",
     _C.PILOT_IN_COMMAND: "the pilot has taken over; send stop to acknowledge it, then start",
     _C.FAULT_NOT_ACKNOWLEDGED: "{cause}; send stop to acknowledge it, then start",
-    _C.NOT_IN_CONTROL_MODE: "the mode is {mode}; switch to GUIDED or OFFBOARD, or send engage",
-    _C.MODE_CHANGE_FORBIDDEN: "the mode is {mode} and mode_change_allowed is false; switch it by hand",
+    _C.NOT_IN_CONTROL_MODE: "the mode is {mode}; send engage, or switch to GUIDED by hand (ArduPilot)",
+    _C.MODE_CHANGE_FORBIDDEN: "the mode is {mode} and mode_change_allowed is false; set it to true (PX4 enters "
+    "OFFBOARD only while setpoints arrive), or switch to GUIDED by hand (ArduPilot)",
+    _C.PERSON_LEAVES_PICTURE: "at {radius_m:g} m, {height_m:g} m high and {speed_deg_s:.0f} deg/s the person "
+    "leaves the picture of the fixed camera by {missing_percent:.0f} % of its height, as the body leans; {remedy}",
     _C.COMMANDS_DISABLED: "no motion: commands are disabled; set commands_enabled to true to allow it",
     _C.CLOCK_JUMPED: "our clock jumped by {jump_s:.1f} s",
     _C.POSITION_JUMPED: "the reported position jumped by {jump_m:.1f} m",
     _C.CONTROL_LOOP_STALLED: "the control loop stood still for {gap_s:.1f} s",
-    _C.SETPOINTS_NOT_FOLLOWED: "the autopilot has not echoed a setpoint for {age_s:.1f} s: it does not follow them",
+    _C.SETPOINTS_NOT_FOLLOWED: "the vehicle does not follow the setpoints: {evidence}",
     _C.LINK_SILENT: "nothing heard from the autopilot; last message: {ago}",
     _C.AUTOPILOT_UNSUPPORTED: "the autopilot is {autopilot!r}: expected ArduPilot or PX4",
     _C.TIMEOUT_UNKNOWN: "the autopilot has not reported {name}, how long it flies on without setpoints; set {name} to "
     "{limit_s:g} on the autopilot, or change max_control_timeout_s",
     _C.TIMEOUT_TOO_LONG: "the autopilot flies on for {value_s:g} s without setpoints; set {name} to {limit_s:g} on the "
     "autopilot, or change max_control_timeout_s",
-    _C.LOSS_ACTION_FATAL: "without setpoints {consequence} ({name} {value:g}); set it to 5, hold, on the autopilot",
+    _C.LOSS_ACTION_FATAL: "without setpoints {consequence} ({name} is {value:g}); set {name} to 5, hold, on the "
+    "autopilot",
     _C.MODE_OUTDATED: "the flight mode is outdated; last report: {ago}",
-    _C.ATTITUDE_OUTDATED: "the vehicle's attitude is {age_s:.1f} s old",
+    _C.ATTITUDE_OUTDATED: "the vehicle's attitude is outdated; last one: {ago}",
     _C.POSITION_FROZEN: "the vehicle's position is not changing, telemetry lost or frozen; last change: {ago}",
     _C.ROUND_TRIP_TOO_LONG: "the autopilot has answered nothing that was sent within the last {age_s:.1f} s",
     _C.VEHICLE_STATE_UNKNOWN: "the vehicle's position, velocity or heading is unknown",
@@ -146,16 +164,28 @@ _SENTENCES = {
     _C.NO_SATELLITE_FIX: "no 3D satellite fix (type {fix_type})",
     _C.ESTIMATOR_UNHEALTHY: "the autopilot's estimator reports no usable position",
     _C.STATUS_OUTDATED: "GPS, estimator or battery data is outdated; last report: {ago}",
-    _C.BATTERY_UNKNOWN: "the battery's charge is unknown",
-    _C.BATTERY_LOW: "the battery is at {percent:.0f} %",
+    _C.BATTERY_UNKNOWN: "the battery's charge is unknown: set up its monitor on the autopilot, or set "
+    "min_battery_voltage_v to fly by the voltage alone",
+    _C.BATTERY_LOW: "the battery is at {level}",
+    _C.CAMERA_UNKNOWN: "nothing reports where the camera points; set the mount up on the autopilot, or set mount to "
+    "fixed and camera_pitch_deg to the camera's pitch",
+    _C.MOUNT_TYPE_UNKNOWN: "the autopilot has not reported {name}, the kind of its mount; set mount to gimbal or servo",
+    _C.MOUNT_OUTDATED: "the camera's attitude is outdated; last report of its mount: {ago}",
+    _C.OTHER_POSE_PUBLISHER: "pose2d has more than one publisher ({names}): stop the others, or give them another "
+    "namespace",
+    _C.SECOND_BRIDGE: "another bridge, or a replay of one, publishes in {namespace}: stop it, or give it another "
+    "namespace",
     _C.TOO_FAST: "speed of {speed_m_s:.1f} m/s above the limit",
     _C.TOO_HIGH: "height of {height_m:.1f} m at the limit of {limit_m:g} m",
     _C.TOO_LOW: "height of {height_m:.1f} m at the lower limit of {limit_m:g} m",
     _C.AT_FENCE: "{distance_m:.1f} m from where the orbit began: at the fence of {limit_m:g} m",
+    _C.COAST_UNSAFE: "if the bridge failed now, the vehicle would {reach} before it stands",
     _C.NO_SUBJECT: "no subject is tracked",
     _C.SUBJECT_OUTDATED: "the subject was last located {ago}",
     _C.SUBJECT_UNCERTAIN: "the subject's position is uncertain by {sd_m:.1f} m",
     _C.SUBJECT_NEAR: "the subject is {distance_m:.1f} m away, give or take {sd_m:.1f} m: at the limit of {limit_m:g} m",
+    _C.SUBJECT_AT_BORDER: "the body leans, and the person is {margin_percent:.0f} % of the picture's height from the "
+    "border of the fixed camera's picture",
     _C.SUBJECT_FAR: "the subject is {distance_m:.1f} m away: farther than {limit_m:g} m",
 }
 

@@ -41,6 +41,10 @@ class OrbitConfig(Parameters):
     max_jerk_m_s3: float = param(2.0, "greatest change of acceleration", unit="m/s^3", minimum=0.1, maximum=20)
     ramp_s: float = param(3.0, "time to reach the angular speed", unit="s", minimum=0.5, maximum=30)
     approach_speed_m_s: float = param(1.0, "speed of changes of radius and height", unit="m/s", minimum=0.05, maximum=5)
+    max_closing_m_s: float = param(
+        1.0, "greatest speed towards the subject, whatever his estimate says; behind one who walks away, the speed at "
+        "which his image surely shrinks is added", unit="m/s", minimum=0.2, maximum=5,
+    )  # fmt: skip
     max_subject_speed_m_s: float = param(
         2.5, "greatest speed at which the orbit's centre follows the subject", unit="m/s", minimum=0, maximum=10
     )

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
+from drocap_ros.flight.mavlink.mount import KINDS
 from drocap_ros.parameters import Parameters, param
 
 
 @dataclass(frozen=True)
 class SubjectConfig(Parameters):
     """Assumptions about body, ground and sensors that locate the subject."""
+
+    RETIRED: ClassVar[Mapping[str, str]] = {
+        "camera_mount_pitch_deg": "write mount: fixed and camera_pitch_deg, which is negative where the camera looks "
+        "down: the sign has changed"
+    }
 
     body_height_m: float = param(1.7, "assumed height of the subject", unit="m", minimum=0.5, maximum=2.5)
     ground_height_m: float = param(
@@ -24,11 +32,16 @@ class SubjectConfig(Parameters):
         maximum=1,
     )
     height_error_m: float = param(
-        0.3, "standard deviation of the camera's height above the subject's ground", unit="m", minimum=0, maximum=20
-    )
+        0.5, "standard deviation of the camera's height above the subject's ground: PX4's height wanders by as much",
+        unit="m", minimum=0, maximum=20,
+    )  # fmt: skip
     attitude_error_deg: float = param(
         0.6, "standard deviation of the camera's attitude", unit="deg", minimum=0, maximum=20
     )
+    camera_latency_s: float = param(
+        0.0, "time from the exposure to the stamp of an image, subtracted from the stamps: 0.07 s were seen of USB "
+        "cameras", unit="s", minimum=0, maximum=0.5,
+    )  # fmt: skip
     subject_acceleration_m_s2: float = param(
         1.2, "standard deviation of the change of a subject's velocity in a second",
         unit="m/s^2", minimum=0.05, maximum=20,
@@ -36,7 +49,12 @@ class SubjectConfig(Parameters):
     subject_gate: float = param(
         16.3, "squared Mahalanobis distance beyond which a measurement is not the subject", minimum=3, maximum=1000
     )
-    camera_mount_pitch_deg: float = param(
-        0.0, "without a mount that reports its attitude: tilt of the camera against the body, down positive",
-        unit="deg", minimum=-90, maximum=90,
+    mount: str = param(
+        "auto", "what holds the camera: gimbal = its angles are reported against the horizon; servo = reported against "
+        "the body; fixed = camera_pitch_deg against the body; auto = gimbal, or servo where ArduPilot's MNT1_TYPE is 1",
+        choices=KINDS,
+    )  # fmt: skip
+    camera_pitch_deg: float = param(
+        0.0, "pitch of a fixed camera against the body, as in MAVLink: negative = it looks down", unit="deg",
+        minimum=-90, maximum=90,
     )  # fmt: skip

@@ -30,7 +30,7 @@ class VehicleState:
     satellites : in use, 255 = unknown
     position_ok : the estimator reports a usable attitude, velocity and position
     battery_fraction : [0, 1]
-    gimbal_orientation_xyzw : (4,) rotation camera FLU -> ENU
+    gimbal_orientation_xyzw : (4,) rotation camera FLU -> ENU, on a gimbal, on servos or fixed to the body
     link_age_s : since the last message of the autopilot
     """
 

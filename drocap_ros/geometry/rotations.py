@@ -25,6 +25,27 @@ def exp_so3(v: np.ndarray) -> np.ndarray:
     return np.eye(3, dtype=v.dtype) + a * k + b * (k @ k)
 
 
+def log_so3(r: np.ndarray) -> np.ndarray:
+    """Rotation vectors (..., 3) in rad of rotation matrices (..., 3, 3); the inverse of :func:`exp_so3` below pi."""
+    q = quaternion_from_matrix(r)
+    sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    half = np.arctan2(sine, q[..., 3:])
+    angle = 2.0 * np.where(half > 0.5 * np.pi, half - np.pi, half)
+    return np.where(sine < 1e-12, 2.0, angle / np.maximum(sine, 1e-12)) * q[..., :3]
+
+
+def left_jacobian(v: np.ndarray) -> np.ndarray:
+    """(..., 3, 3) with ``exp_so3(v + d) = exp_so3(left_jacobian(v) @ d) @ exp_so3(v)`` for small ``d``."""
+    angle2 = np.sum(v * v, axis=-1)[..., None, None]
+    angle = np.sqrt(angle2)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    b = np.where(small, 1.0 / 6.0 - angle2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    k = hat(v)
+    return np.eye(3, dtype=v.dtype) + a * k + b * (k @ k)
+
+
 def project_to_so3(m: np.ndarray) -> np.ndarray:
     """Closest rotation (..., 3, 3), in Frobenius norm, to each matrix (..., 3, 3)."""
     u, _, vt = np.linalg.svd(m)

@@ -7,9 +7,11 @@ until there is one.
 
 from __future__ import annotations
 
+import math
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,15 +36,26 @@ from drocap_ros.ros.diagnostics import Key, of
 from drocap_ros.ros.spin import node_main
 
 
+class _Solved(NamedTuple):
+    """The adjusted window, or why there is none; ``seconds`` on the wall clock."""
+
+    result: AdjustedWindow | str
+    frame_id: str
+    track_id: int
+    seconds: float
+
+
 class BundleAdjusterNode(ComponentNode):
     """Collects keypoints and initial poses and adjusts them in a worker thread every ``period_s``.
 
     The period is counted in image stamps, so that a replay at another speed adjusts the same windows.  An adjustment
     ends after the step in which ``max_solve_s`` is over; after a slow one the next takes fewer images.  The message's
-    ``stride`` and ``steps`` state both.
+    ``stride`` and ``steps`` state both.  In simulated time an adjustment is never cut, and its result comes with the
+    first image ``max_solve_s`` after the newest one of its window.
     """
 
     component = "bundle_adjuster"
+    needs = ("pose2d", "pose3d/initial")
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
@@ -52,20 +65,37 @@ class BundleAdjusterNode(ComponentNode):
         self._latest_pose = LatestPose(self.config.blend_s)
         self._join: StampJoin[PoseObservation, Pose3D] = StampJoin(self.config.max_pending)
         self._worker = ThreadPoolExecutor(1, "bundle_adjuster")
-        self._job: Future[np.ndarray | None] | None = None
+        self._job: Future[Any] | None = None  # in simulated time of a result that is still to be published
         self._job_subject = 0
+        self._job_due_ns = 0  # in simulated time
         self._sequence = 0
+        self._subject_in_view = True
         self._refined = self.output("pose3d/refined")
         self._latest = self.output("pose3d/latest")
         self.input("pose2d", self._on_pose2d)
         self.input("pose3d/initial", self._on_initial)
 
+    def on_stop(self) -> None:
+        """In simulated time publish the running adjustment."""
+        if self.simulated:
+            self._take_solution(self._job_due_ns)
+
     def close(self) -> None:
         """Wait for the running adjustment."""
         self._worker.shutdown(wait=True, cancel_futures=True)
 
+    def idle_reason(self) -> str:
+        """Also: nobody to adjust, or too few images for a first adjustment."""
+        if self.ready and not self._subject_in_view:
+            return "no subject in view"
+        reason = super().idle_reason()
+        if not reason and not self.counters[Key.ADJUSTMENTS] and not self.counters[Key.ADJUSTMENTS_FAILED]:
+            return f"too few poses for a first adjustment, {self.counters[Key.LATEST_POSES]} so far"
+        return reason
+
     def _on_pose2d(self, message: Pose2D) -> None:
         observation = pose2d_from_ros(message)
+        self._subject_in_view = observation.has_subject
         if observation.has_subject:
             self._on_pair(self._join.add_first(observation.stamp_ns, observation))
 
@@ -94,48 +124,64 @@ class BundleAdjusterNode(ComponentNode):
         self.count(Key.LATEST_POSES)
         if not due:
             return
-        if self._job is not None and not self._job.done():
+        if self._is_running(observation.stamp_ns):
             self.count(Key.ADJUSTMENTS_SKIPPED)
             return
         self._take_solution(observation.stamp_ns)
         self._job_subject = self._buffer.subject
+        self._job_due_ns = observation.stamp_ns + round(self.config.max_solve_s * 1e9)
+        work: Callable[..., Any] = self._solve if self.simulated else self._adjust
         arguments = self._buffer.window(), initial.header.frame_id, observation.track_id, self._control.stride
-        self._job = self._worker.submit(self._adjust, *arguments)
+        self._job = self._worker.submit(work, *arguments)
+
+    def _is_running(self, stamp_ns: int) -> bool:
+        if self._job is None:
+            return False
+        return stamp_ns < self._job_due_ns if self.simulated else not self._job.done()
 
     def _take_solution(self, stamp_ns: int) -> None:
         """Blend a finished solution into the latest pose."""
-        if self._job is None or not self._job.done():
+        if self._job is None or self._is_running(stamp_ns):
             return
         job, self._job = self._job, None
-        lengths = job.result()
+        lengths = self._publish(job.result()) if self.simulated else job.result()
         if lengths is not None and self._job_subject == self._buffer.subject:
             self._latest_pose.set_solution(lengths, stamp_ns)
 
     def _adjust(self, window: Window, frame_id: str, track_id: int, stride: int) -> np.ndarray | None:
         """Adjust, publish and return the bone lengths, in the worker; None after a failure."""
-        begin = time.perf_counter()
-        deadline = begin + self.config.max_solve_s
-        try:
-            adjusted = self._adjuster.adjust(window, Effort(stride), lambda: time.perf_counter() > deadline)
-        except SOLVER_ERRORS as error:
-            self.count(Key.ADJUSTMENTS_FAILED)
-            self.report(ERROR, f"adjustment failed, the last solution stays: {error}")
-            return None
-        seconds = time.perf_counter() - begin
-        self._control.record(seconds)
-        if adjusted.effort.steps is not None:
-            self.count(Key.ADJUSTMENTS_CUT)
-        if stride > 1:
-            self.count(Key.ADJUSTMENTS_STRIDED)
-        self._publish(adjusted, frame_id, track_id, seconds)
-        return median_bone_lengths(adjusted.joints3d)
+        return self._publish(self._solve(window, frame_id, track_id, stride))
 
-    def _publish(self, window: AdjustedWindow, frame_id: str, track_id: int, seconds: float) -> None:
-        self._refined.publish(window_to_ros(window, frame_id, track_id, self._sequence, seconds))
+    def _solve(self, window: Window, frame_id: str, track_id: int, stride: int) -> _Solved:
+        begin = time.perf_counter()
+        deadline = math.inf if self.simulated else begin + self.config.max_solve_s
+        try:
+            result: AdjustedWindow | str = self._adjuster.adjust(
+                window, Effort(stride), lambda: time.perf_counter() > deadline
+            )
+        except SOLVER_ERRORS as error:
+            result = str(error)
+        return _Solved(result, frame_id, track_id, time.perf_counter() - begin)
+
+    def _publish(self, solved: _Solved) -> np.ndarray | None:
+        window, seconds = solved.result, solved.seconds
+        if isinstance(window, str):
+            self.count(Key.ADJUSTMENTS_FAILED)
+            self.report(ERROR, f"adjustment failed, the last solution stays: {window}")
+            return None
+        if not self.simulated:
+            self._control.record(seconds)
+        if window.effort.steps is not None:
+            self.count(Key.ADJUSTMENTS_CUT)
+        if window.effort.stride > 1:
+            self.count(Key.ADJUSTMENTS_STRIDED)
+        self._refined.publish(window_to_ros(window, solved.frame_id, solved.track_id, self._sequence, seconds))
         self._sequence += 1
         self.count(Key.ADJUSTMENTS)
         self.produced(int(window.stamp_ns[-1]))
-        self.report(OK, f"{len(window.stamp_ns)} poses in {seconds:.2f} s: {window.stop_reason}")
+        took = "" if self.simulated else f" in {seconds:.2f} s"
+        self.report(OK, f"{len(window.stamp_ns)} poses{took}: {window.stop_reason}")
+        return median_bone_lengths(window.joints3d)
 
 
 def main() -> int:

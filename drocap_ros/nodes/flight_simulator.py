@@ -1,8 +1,11 @@
-"""Node ``flight_simulator``: a simulated drone with a camera, and a person, in real time.
+"""Node ``flight_simulator``: a simulated drone with a camera, and a person.
 
 Replaces vehicle, autopilot, pilot and ``image_ingest``: sends and receives MAVLink on ``vehicle_url``, publishes
 ``image/compressed`` and ``camera_info`` of images rendered from the vehicle's true pose.  Stamps are the instants of
 exposure.  At its end it writes the truth to ``truth_file``.
+
+In real time, images come as fast as this machine renders them.  In simulated time (``use_sim_time``) each image is
+published ``latency_s`` after its exposure, and the vehicle moves with the clock alone.
 """
 
 from __future__ import annotations
@@ -10,10 +13,12 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from drocap_ros.flight.mavlink.transport import open_transport
+from drocap_ros.flight.mavlink.transport import Transport, open_transport
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.perception.jpeg import encode_jpeg
 from drocap_ros.ros.component import OK, WARN
@@ -27,18 +32,27 @@ from drocap_ros.simulation.render.renderer import Renderer
 
 FRAME_ID = "camera_optical"
 _STEP_S = 0.005
+#: Step of the simulated time.
+SIMULATED_STEP_S = 0.01
 
 
 class FlightSimulatorNode(ManagedComponent):
-    """One thread flies and exposes, another renders: a slow image never delays the vehicle."""
+    """One thread flies and exposes, another renders: a slow image never delays the vehicle.
+
+    In simulated time a timer flies and exposes, and waits for the rendering.
+
+    Parameters
+    ----------
+    transport : the vehicle's end of a simulated link in this process, instead of that of ``config.vehicle_url``
+    """
 
     component = "flight_simulator"
 
-    def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
+    def __init__(self, config: Any = None, *, transport: Transport | None = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
         self._images = self.output("image/compressed")
         self._infos = self.output("camera_info")
-        self._world = FlightWorld(self.config, open_transport(self.config.vehicle_url))
+        self._world = FlightWorld(self.config, transport or open_transport(self.config.vehicle_url))
         width, height = self.config.image_width, self.config.image_height
         self._camera = CameraModel(width, height, self._world.camera_matrix)
         self._renderer = Renderer(self._world.camera_matrix, width, height, self.config.seed)
@@ -49,11 +63,19 @@ class FlightSimulatorNode(ManagedComponent):
             threading.Thread(target=self._guarded, args=(body,), name=name, daemon=True)
             for name, body in (("flight", self._fly), ("camera", self._render))
         ]
+        self._camera_thread = ThreadPoolExecutor(1, "camera")  # in simulated time
+        self._pending: deque[tuple[int, Future[bytes]]] = deque()  # stamps of exposures with their pictures
+        self._begin_ns = 0
         self.create_timer(0.5, self._on_timer)
         self.set_up()
 
     def begin(self) -> None:
         """Let the pilot take off; a flight under way has continued meanwhile."""
+        if self.simulated:
+            if not self._begin_ns:
+                self._begin_ns = self.now_ns()
+                self.create_timer(SIMULATED_STEP_S, self._step)
+            return
         for thread in self._threads:
             if thread.ident is None:
                 thread.start()
@@ -64,6 +86,7 @@ class FlightSimulatorNode(ManagedComponent):
         for thread in self._threads:
             if thread.is_alive():
                 thread.join(timeout=5.0)
+        self._camera_thread.shutdown(cancel_futures=True)
         self._world.close()
         if self.config.truth_file and self.counters[Key.EXPOSURES]:
             save_flight_truth(Path(self.config.truth_file), self._world.truth())
@@ -92,6 +115,18 @@ class FlightSimulatorNode(ManagedComponent):
             passed_ns = int((time.monotonic() - now) * 1e9)
             self._expose(self.get_clock().now().nanoseconds - passed_ns)
 
+    def _step(self) -> None:
+        """Fly to the simulated time, expose on the way, publish what is due."""
+        now_ns, latency_ns = self.now_ns(), round(self.config.latency_s * 1e9)
+        while (stamp_ns := self._begin_ns + round(self.counters[Key.EXPOSURES] / self.config.rate_hz * 1e9)) < now_ns:
+            self._world.step((stamp_ns - self._begin_ns) * 1e-9)
+            self._pending.append((stamp_ns, self._camera_thread.submit(self._picture, self._world.expose(stamp_ns))))
+            self.count(Key.EXPOSURES)
+        self._world.step((now_ns - self._begin_ns) * 1e-9)
+        while self._pending and self._pending[0][0] + latency_ns <= now_ns:
+            stamp_ns, picture = self._pending.popleft()
+            self._publish(stamp_ns, picture.result())
+
     def _expose(self, stamp_ns: int) -> None:
         exposure = self._world.expose(stamp_ns)
         self.count(Key.EXPOSURES)
@@ -112,12 +147,19 @@ class FlightSimulatorNode(ManagedComponent):
                 return
             if not self.active:
                 continue
-            image = self._renderer.render(exposure.joints3d, exposure.rotation, exposure.position)
-            header = header_at(exposure.stamp_ns, FRAME_ID)
-            self._images.publish(compressed_image_to_ros(header, encode_jpeg(image, self.config.jpeg_quality)))
+            self._publish(exposure.stamp_ns, self._picture(exposure))
+
+    def _picture(self, exposure: Exposure) -> bytes:
+        image = self._renderer.render(exposure.joints3d, exposure.rotation, exposure.position)
+        return encode_jpeg(image, self.config.jpeg_quality)
+
+    def _publish(self, stamp_ns: int, jpeg: bytes) -> None:
+        if self.active:
+            header = header_at(stamp_ns, FRAME_ID)
+            self._images.publish(compressed_image_to_ros(header, jpeg))
             self._infos.publish(camera_info_to_ros(header, self._camera))
             self.count(Key.IMAGES)
-            self.produced(exposure.stamp_ns)
+            self.produced(stamp_ns)
 
     def _on_timer(self) -> None:
         copter, pilot = self._world.copter, self._world.pilot

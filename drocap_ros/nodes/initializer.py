@@ -24,6 +24,7 @@ class InitializerNode(ComponentNode):
     """Passes every observation to the live initializer."""
 
     component = "initializer"
+    needs = ("pose2d",)
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)

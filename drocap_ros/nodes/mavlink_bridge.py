@@ -1,8 +1,8 @@
 """Node ``mavlink_bridge``: the autopilot's telemetry on topics and TF, and the orbit of the subject.
 
-Subscribes ``pose2d`` and ``camera_info``; publishes ``vehicle/state`` (drocap_ros/VehicleState), TF ``map`` ->
-``base_link`` and ``map`` -> ``camera_optical``, and ``orbit/status`` (drocap_ros/OrbitStatus); serves
-``orbit/command`` (drocap_ros/OrbitCommand).
+Subscribes ``pose2d``, ``camera_info``, and ``orbit/status``, where a second bridge would appear; publishes
+``vehicle/state`` (drocap_ros/VehicleState), TF ``map`` -> ``base_link`` and ``map`` -> ``camera_optical``, and
+``orbit/status`` (drocap_ros/OrbitStatus); serves ``orbit/command`` (drocap_ros/OrbitCommand).
 
 With ``commands_enabled`` false (the default) it reads only: it sends heartbeats, time synchronization and requests
 for telemetry, and refuses every start of an orbit.
@@ -19,11 +19,15 @@ import numpy as np
 from geometry_msgs.msg import Point, TransformStamped, Vector3
 from sensor_msgs.msg import CameraInfo
 
+from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import optical_orientation
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.orbit.controller import ControlStatus, OrbitController
+from drocap_ros.flight.mavlink.transport import Transport
+from drocap_ros.flight.orbit.control_status import ControlStatus
+from drocap_ros.flight.orbit.controller import OrbitController
 from drocap_ros.flight.orbit.states import Command, OperatorCommand, State
 from drocap_ros.flight.orbit.watchdog import Watchdog
+from drocap_ros.flight.rivals import Rivals
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.msg import OrbitStatus, Pose2D
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
@@ -41,25 +45,46 @@ from drocap_ros.ros.topics import RESULT_QOS, TFMessage
 from drocap_ros.srv import OrbitCommand
 
 _STATUS_PERIOD_S = 0.2
+_LINK_PERIOD_S = 0.01  # of a simulated link
 _MAX_REQUESTS = 100
 
 
 class MavlinkBridgeNode(ComponentNode):
-    """One thread owns the link, one steps the control loop, one watches it; the executor takes keypoints."""
+    """One thread owns the link, one steps the control loop, one watches it; the executor takes keypoints.
+
+    With a simulated link there are no threads: timers of the node's clock take their place, in a fixed order.
+
+    Parameters
+    ----------
+    transport : a simulated link in this process, instead of that of ``config.url``
+
+    Raises
+    ------
+    InputError
+        In simulated time with ``commands_enabled`` and without a simulated link: a real autopilot flies in real time.
+    """
 
     component = "mavlink_bridge"
 
-    def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
+    def __init__(self, config: Any = None, *, transport: Transport | None = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
-        self._link = MavlinkLink(self.config, lambda: self.get_clock().now().nanoseconds)
+        if self.simulated and self.config.commands_enabled and transport is None:
+            raise InputError(
+                "mavlink_bridge.use_sim_time: expected false with commands_enabled, because the autopilot on "
+                f"{self.config.url} flies in real time; set one of the two to false"
+            )
+        self._stepped = transport is not None
+        self._link = MavlinkLink(self.config, self.now_ns, monotonic_s=self.now_s, transport=transport)
         self._watchdog = Watchdog(self._link.send_unlocked, self.config.watchdog_s)
         self._controller = OrbitController(self._link, self.config, self._watchdog)
         self._states = self.output("vehicle/state")
         self._statuses = self.output("orbit/status")
         self._tf = self.output("/tf") if TFMessage is not None else None
         self.input("camera_info", self._on_camera_info)
-        self.input("pose2d", self._on_pose2d)
-        self._requests = PolledService(self, OrbitCommand, "orbit/command", RESULT_QOS)
+        self.input("pose2d", self._on_pose2d, with_info=True)
+        self.input("orbit/status", self._on_status)
+        self._rivals = Rivals(self.get_namespace())
+        self.requests = PolledService(self, OrbitCommand, "orbit/command", RESULT_QOS)
         self._unanswered: list[tuple[OperatorCommand, Any, Any]] = []  # with request and header
         self._last_command: dict[str, Any] = {"command": OrbitStatus.NO_COMMAND}
         self.create_timer(1.0, self._on_second)
@@ -73,14 +98,22 @@ class MavlinkBridgeNode(ComponentNode):
 
     def on_ready(self) -> None:
         """Start reading telemetry and answering commands."""
+        if self._stepped:
+            self.create_timer(_LINK_PERIOD_S, self._read_link)
+            self.create_timer(1.0 / self.config.control_hz, self._control_step)
+            return
         for thread in self._threads:
             thread.start()
         self._watchdog.start()
 
     def on_stop(self) -> None:
         """End a running orbit by a hold at once, before the shutdown waits for other nodes."""
-        if self._threads[1].is_alive() and self._controller.safety.state == State.ORBITING:
-            self._controller.command(OperatorCommand(int(Command.STOP)))
+        if self._controller.safety.state != State.ORBITING:
+            return
+        self._controller.command(OperatorCommand(int(Command.STOP)))
+        if self._stepped:
+            self._control_step()
+        elif self._threads[1].is_alive():
             time.sleep(3.0 / self.config.control_hz)
 
     def close(self) -> None:
@@ -91,7 +124,7 @@ class MavlinkBridgeNode(ComponentNode):
             if thread.is_alive():
                 thread.join(timeout=5.0)
         self._watchdog.close()
-        self._requests.close()
+        self.requests.close()
         self._link.close()
 
     def _control(self) -> None:
@@ -100,20 +133,29 @@ class MavlinkBridgeNode(ComponentNode):
         due_s = time.monotonic()
         while not self._stop.is_set():
             try:
-                self._take_commands()
-                status = self._controller.step(self.get_clock().now().nanoseconds, time.monotonic())
-                self._answer_commands(status)
-                self._report_status(status)
+                self._control_step()
             except Exception as error:
                 self.failure = error
                 return
             due_s = max(due_s + period_s, time.monotonic())
             self._stop.wait(due_s - time.monotonic())
 
+    def _control_step(self) -> None:
+        self._take_commands()
+        self._controller.intruder = self._rivals.condition(self.now_s())
+        status = self._controller.step(self.now_ns(), self.now_s())
+        self._answer_commands(status)
+        self._report_status(status)
+
+    def _read_link(self) -> None:
+        for state in self._link.spin_once():
+            self._on_state(state)
+        self._watchdog.step(self.now_s())
+
     def _take_commands(self) -> None:
         # All that wait, so that a stop precedes the others; a flood must not delay the step.
         for _ in range(_MAX_REQUESTS):
-            taken = self._requests.take()
+            taken = self.requests.take()
             if taken is None:
                 return
             request, header = taken
@@ -136,13 +178,13 @@ class MavlinkBridgeNode(ComponentNode):
             for entry in self._unanswered:
                 if entry[0] is command:
                     self._last_command["command_stamp"] = entry[1].stamp
-                    self._requests.answer(entry[2], response)
+                    self.requests.answer(entry[2], response)
             self._unanswered = [entry for entry in self._unanswered if entry[0] is not command]
             self._publish_status(status)
 
     def _report_status(self, status: ControlStatus) -> None:
         """Publish every change at once, except while idle, and else five times a second."""
-        now_s, reported = time.monotonic(), (status.state, status.reason)
+        now_s, reported = self.now_s(), (status.state, status.reason)
         changed = reported != self._reported and status.state != State.IDLE
         if not status.answers and (changed or now_s - self._reported_s >= _STATUS_PERIOD_S):
             self._reported, self._reported_s = reported, now_s
@@ -157,16 +199,22 @@ class MavlinkBridgeNode(ComponentNode):
             if transforms:
                 self._tf.publish(TFMessage(transforms=transforms))
 
-    def _on_pose2d(self, message: Pose2D) -> None:
+    def _on_pose2d(self, message: Pose2D, info: dict[str, Any]) -> None:
+        self._rivals.take_pose2d(info["publication_sequence_number"] or 0, self.now_s())
         observation = pose2d_from_ros(message)
         self._controller.on_pose2d(observation)
         if observation.has_subject:
             self.count(Key.SUBJECT_SEEN)
 
+    def _on_status(self, message: OrbitStatus) -> None:
+        self._rivals.take_status(stamp_from_ros(message.header.stamp), self.now_s())
+
     def _on_camera_info(self, message: CameraInfo) -> None:
         self._controller.on_camera(np.array(message.k, dtype=float).reshape(3, 3))
 
     def _on_second(self) -> None:
+        publishers = self.get_publishers_info_by_topic(self.resolve_topic_name("pose2d"))
+        self._rivals.set_names(f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers)
         status = self._link.status()
         safety = self._controller.safety
         if not status.connected:
@@ -182,7 +230,9 @@ class MavlinkBridgeNode(ComponentNode):
         elif self._link.settings.warning():
             self.report(WARN, self._link.settings.warning())
         else:
-            doing = "reading telemetry" if not self.config.commands_enabled else safety.state.name.lower()
+            doing = f"{safety.state.name.lower()}: {safety.reason}"
+            if not self.config.commands_enabled:
+                doing = "reading telemetry; commands_enabled is false, so it moves nothing"
             self.report(OK, doing + ("" if self._tf else "; tf2_msgs is not installed, so no TF"))
         for name, (real, _) in status.rates_hz.items():
             self.details[of(Key.STREAM_RATE, name)] = f"{real:.1f}"
@@ -194,9 +244,11 @@ class MavlinkBridgeNode(ComponentNode):
 
     def _publish_status(self, status: ControlStatus) -> None:
         x, y, z = (float(v) for v in status.subject_position)
+        now_ns = self.now_ns()
+        self._rivals.published_status(now_ns)
         self._statuses.publish(
             OrbitStatus(
-                header=header_at(self.get_clock().now().nanoseconds, "map"),
+                header=header_at(now_ns, "map"),
                 state=int(status.state),
                 condition=int(status.condition.code),
                 reason=status.reason,

@@ -6,7 +6,6 @@ drone's own tracker); publishes ``pose2d`` (drocap_ros/Pose2D) with the image's 
 
 from __future__ import annotations
 
-import time
 from functools import partial
 from typing import Any
 
@@ -30,6 +29,7 @@ class PoseEstimatorNode(ManagedComponent):
     """Runs detection, subject tracking and 2D pose on images, with less work for each while they queue."""
 
     component = "pose_estimator"
+    needs = ("image/compressed",)
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)
@@ -69,7 +69,7 @@ class PoseEstimatorNode(ManagedComponent):
 
     def _on_image(self, sample: ImageSample) -> None:
         assert self._estimator is not None, "no message is taken before the node is active"
-        level = self._load_shedding.level(time.monotonic(), sample.waited, sample.behind)
+        level = self._load_shedding.level(self.now_s(), sample.waited, sample.behind)
         roi, self._roi = self._roi, None
         header = sample.header
         observation = self._estimator.process(sample.image, stamp_from_ros(header.stamp), roi, level)

@@ -9,12 +9,12 @@ from __future__ import annotations
 import itertools
 import shutil
 import threading
+import time
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.clock import ROSClock
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
@@ -39,6 +39,7 @@ from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, NODES, TOPICS
 
 _IMAGES = "image/compressed"
+_MOST_WAITING = 1 << 19  # bytes, below the least length of the writer's queue
 
 
 class SessionRecorderNode(ManagedComponent):
@@ -99,10 +100,13 @@ class SessionRecorderNode(ManagedComponent):
         log_ns = info["received_timestamp"]
         sent_ns = info["source_timestamp"]
         # The middleware's times are not simulated ones.
-        if cast(ROSClock, self.get_clock()).ros_time_is_active or not log_ns:
-            log_ns = sent_ns = self.get_clock().now().nanoseconds
+        if self.simulated or not log_ns:
+            log_ns = sent_ns = self.now_ns()
         self._received = self._received or name != "/diagnostics"
         if self._writer is not None:
+            # Simulated time waits for the disk; real time does not, and messages are dropped.
+            while self.simulated and self._writer.error is None and self._writer.queued_bytes > _MOST_WAITING:
+                time.sleep(0.01)
             self._writer.write(name, data, log_ns, sent_ns or log_ns)
             self.count(Key.MESSAGES)
 
@@ -170,7 +174,8 @@ class SessionRecorderNode(ManagedComponent):
         elif writer.dropped:
             self.report(WARN, f"{writer.dropped} messages dropped: the disk is too slow; lower jpeg_quality")
         else:
-            self.report(OK, f"recording to {writer.folder}")
+            waiting = "" if self._received else "; no message has arrived yet"
+            self.report(OK, f"recording to {writer.folder}{waiting}")
 
 
 def _free_name(folder: Path) -> Path:

@@ -33,6 +33,7 @@ class VisualizerNode(ComponentNode):
     """Publishes markers and TF of the poses; no other node depends on it."""
 
     component = "visualizer"
+    needs = ("pose2d", "pose3d/initial")
 
     def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
         super().__init__(config, **node_kwargs)

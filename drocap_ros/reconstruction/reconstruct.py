@@ -23,6 +23,7 @@ from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M, Dict
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.threads import blas_threads
 from drocap_ros.reconstruction.world.placement import metres_per_px, place_in_world
+from drocap_ros.reconstruction.world.refine import PlacedPoses, refine_in_world
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
 
@@ -137,6 +138,7 @@ def _to_motion(
     joints = (result.joints_px - result.joints_px[:, pelvis][:, None]) * per_px[:, None, None]
     metric, scale_source = False, "assumed_height"
     meta: dict[str, Any] = {"assumed_height_m": config.assumed_height_m, "reference_stature_m": REFERENCE_STATURE_M}
+    position = None
     rotation, frame = np.broadcast_to(np.eye(3), (len(tracks), 3, 3)).copy(), "camera"
     if tracks.camera_rotation is None and tracks.camera_matrix is not None:
         # Undo the perspective, as place_in_world: it moves joints behind the pelvis towards the axis.
@@ -148,6 +150,22 @@ def _to_motion(
         joints, metric, scale_source = world.joints, world.metric, world.scale_source
         if world.scale is not None:
             meta["scale"] = dataclasses.asdict(world.scale)
+        position = tracks.camera_position
+        if result.depth_sigma_px is not None:
+            factor = world.scale.factor if world.metric and world.scale is not None else 1.0
+            size = per_px[:, None]
+            depth = (result.joints_px[..., 2] - result.joints_px[:, [pelvis], 2]) * size
+            found = refine_in_world(tracks, keypoints, PlacedPoses(joints, factor, depth, result.depth_sigma_px * size))
+            if found is not None and found.rejected:
+                without = dataclasses.replace(tracks, camera_rotation=None, camera_position=None)
+                motion = _to_motion(without, keypoints, result, config)
+                motion.meta["telemetry_rejected"] = found.rejected
+                return motion
+            if found is not None:
+                joints, rotation, position, metric = found.joints, found.rotation, found.position, found.metric
+                scale_source = "telemetry" if metric else "assumed_height"
+                reprojection = _reprojection(joints, rotation, position, tracks.camera_matrix, keypoints.xy)
+                meta["calibration"] = found.calibration
     return Motion(
         joints3d=np.ascontiguousarray(joints),
         joints=BODY_15.joints,
@@ -161,7 +179,19 @@ def _to_motion(
         keypoints=keypoints.xy,
         reprojection_px=reprojection,
         meta=meta,
+        camera_position=position,
     )
+
+
+def _reprojection(
+    joints: np.ndarray, rotation: np.ndarray, position: np.ndarray, matrix: np.ndarray | None, keypoints: np.ndarray
+) -> np.ndarray:
+    """(F, P) px, distance of the projected joints from their keypoints; NaN where not seen."""
+    assert matrix is not None
+    seen = (joints - position[:, None]) @ np.swapaxes(rotation, 1, 2)
+    projected = seen[..., :2] / np.maximum(seen[..., 2:], 1e-3) * np.diagonal(matrix)[:2] + matrix[:2, 2]
+    distance: np.ndarray = np.linalg.norm(projected - keypoints, axis=-1)
+    return distance
 
 
 def _versions() -> dict[str, str]:

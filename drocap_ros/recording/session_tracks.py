@@ -15,16 +15,20 @@ from drocap_ros.skeleton import joint_set
 from drocap_ros.tracks import MAX_FRAMES, Tracks
 
 
-def read_pose2d(session: Session) -> Tracks:
+def read_pose2d(session: Session, mount_pitch_deg: float | None = None) -> Tracks:
     """Tracks of the subject, keypoints exactly as in the recorded messages.
 
     Images without a subject are frames of NaN.  The tracks contain the camera's poses where the recording does, see
     :func:`drocap_ros.recording.telemetry.camera_poses.camera_poses`.  Missing parts are in ``session.warnings``.
 
+    Parameters
+    ----------
+    mount_pitch_deg : of a camera fixed to the body, negative down, for recordings without the camera's attitude
+
     Raises
     ------
     InputError
-        When there are no usable keypoints.
+        When there are no usable keypoints, or ``mount_pitch_deg`` contradicts the recording.
     """
     chosen = session.choose_topic(POSE2D)
     poses: dict[int, Any] = {}
@@ -49,7 +53,9 @@ def read_pose2d(session: Session) -> Tracks:
         vehicle = read_vehicle_track(session, chosen.name)
         if vehicle is None:
             return tracks
-        tracks, reason = with_camera(tracks, vehicle, tracks.stamp_ns)
+        if mount_pitch_deg is not None and np.isfinite(vehicle.gimbal).all(axis=1).any():
+            raise InputError("--mount-pitch: expected no recorded camera attitude, found one; leave the option out")
+        tracks, reason = with_camera(tracks, vehicle, tracks.stamp_ns, mount_pitch_deg)
         if reason:
             session.warn(f"camera telemetry incomplete: {reason}")
         return tracks

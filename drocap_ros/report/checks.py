@@ -8,6 +8,7 @@ from enum import Enum, auto
 import numpy as np
 
 from drocap_ros.motion import Motion
+from drocap_ros.reconstruction.world.calibration_words import telemetry_words
 from drocap_ros.report.statistics import Statistics, mean_known
 
 #: The paper's study of camera speed: little is gained below, and it flew at about 25 degrees per second.
@@ -44,6 +45,8 @@ class Check(Enum):
     BONE_LENGTHS = auto()
     NO_VERTICAL = auto()
     ASSUMED_SCALE = auto()
+    TELEMETRY_REJECTED = auto()
+    CALIBRATION = auto()
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,8 @@ _WORDS: dict[Check, tuple[str, str]] = {
         "Without camera telemetry each pose is in the axes of its own image: up is the camera's up, and the body's"
         " path is not known. The player stands it on its lowest joint.",
     ),
+    Check.TELEMETRY_REJECTED: ("Telemetry not used", "{words} The motion stays in the axes of the camera."),
+    Check.CALIBRATION: ("Telemetry corrected", "{words}"),
     Check.ASSUMED_SCALE: ("Scale assumed", "Metres come from {source}{height}, not from a measurement."),
 }
 
@@ -126,6 +131,7 @@ def run_checks(motion: Motion, s: Statistics) -> list[CheckResult]:
         _bone_lengths,
         _no_vertical,
         _assumed_scale,
+        _telemetry,
     )
     results = [result for check in checks if (result := check(motion, s)) is not None]
     return sorted(results, key=lambda result: result.level is not Level.WARNING)
@@ -207,3 +213,14 @@ def _assumed_scale(motion: Motion, s: Statistics) -> CheckResult | None:
     height = motion.meta.get("assumed_height_m")
     assumed = f" of {height:.2f} m" if isinstance(height, int | float) else ""
     return _note(Check.ASSUMED_SCALE, source=motion.scale_source.replace("_", " "), height=assumed)
+
+
+def _telemetry(motion: Motion, s: Statistics) -> CheckResult | None:
+    words = telemetry_words(motion.meta)
+    if not words:
+        return None
+    return (
+        _warn(Check.TELEMETRY_REJECTED, words=words)
+        if "telemetry_rejected" in motion.meta
+        else _note(Check.CALIBRATION, words=words)
+    )

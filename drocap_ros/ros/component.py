@@ -10,6 +10,8 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
@@ -20,11 +22,13 @@ from rclpy.subscription import Subscription
 from drocap_ros.config import section_types
 from drocap_ros.errors import InputError
 from drocap_ros.parameters import Parameters
-from drocap_ros.ros.diagnostics import ERROR, HARDWARE_ID, OK, WARN, Key, of
-from drocap_ros.ros.latency import Latency
+from drocap_ros.ros.diagnostics import ERROR, HARDWARE_ID, OK, WARN, Key, Latency, of
 from drocap_ros.ros.parameters import declare_parameters
 from drocap_ros.ros.stamps import StampValidator
 from drocap_ros.ros.topics import FROM_OUTSIDE, TOPICS, publishers_of, subscribers_of
+
+#: A node whose input has been silent for this long is idle.
+IDLE_S = 3.0
 
 
 class Gaps:
@@ -54,10 +58,16 @@ class ComponentNode(Node):
     """
 
     component: ClassVar[str]
+    #: Topics without which the node has nothing to do.
+    needs: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: Parameters | None = None, **node_kwargs: Any) -> None:
         node_kwargs.setdefault("namespace", "/drocap")
         super().__init__(self.component, **node_kwargs)
+        #: Whether ROS' parameter ``use_sim_time`` is set: every time is then that of ``/clock``, and no result depends
+        #: on how fast this machine is.
+        self.simulated = bool(self.get_parameter("use_sim_time").value)
+        self.add_on_set_parameters_callback(self._refuse_another_clock)
         peers = self.declare_parameter("graph_nodes", "").value
         #: All nodes of the graph; empty without a bringup.
         self.peers: list[str] = [name for name in peers.split(",") if name]
@@ -72,13 +82,32 @@ class ComponentNode(Node):
         #: Error of a thread of this node, raised where the node spins.
         self.failure: BaseException | None = None
         self.callbacks_done = 0
+        self._heard_s: dict[str, float] = {}
+        self._begin_s = time.monotonic()
         self._level = OK
         self._text = "running"
-        self._outputs: list[tuple[str, Publisher]] = []
+        #: Publishers by the names of their topics.
+        self.outputs: list[tuple[str, Publisher]] = []
         self._inputs: list[tuple[str, Subscription]] = []
         self._diagnostics = self.output("/diagnostics")
         self.create_timer(1.0, self.publish_diagnostics)
-        self._matching = self.create_timer(0.05, self._match)
+        # Before the simulated time begins the endpoints are matched already.
+        self._matching = self.create_timer(0.05, self.match, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    # -- time ------------------------------------------------------------------------------------------
+
+    def now_ns(self) -> int:
+        """Clock of the stamps, ns."""
+        return int(self.get_clock().now().nanoseconds)
+
+    def now_s(self) -> float:
+        """Clock of periods and ages, s: monotonic, or the simulated time."""
+        return self.now_ns() * 1e-9 if self.simulated else time.monotonic()
+
+    def _refuse_another_clock(self, parameters: list[Any]) -> SetParametersResult:
+        changed = any(p.name == "use_sim_time" and p.value != self.simulated for p in parameters)
+        reason = "use_sim_time: expected at the start of the node; start it again" if changed else ""
+        return SetParametersResult(successful=not changed, reason=reason)
 
     # -- endpoints -------------------------------------------------------------------------------------
 
@@ -88,7 +117,7 @@ class ComponentNode(Node):
         # The subscriber reports an incompatible quality of service itself.
         silent = PublisherEventCallbacks(use_default_callbacks=False)
         publisher = self.create_publisher(entry.message, topic, entry.offered or entry.qos, event_callbacks=silent)
-        self._outputs.append((topic, publisher))
+        self.outputs.append((topic, publisher))
         return publisher
 
     def input(
@@ -127,6 +156,7 @@ class ComponentNode(Node):
 
         def run(*arguments: Any) -> None:
             self.callbacks_done += 1
+            self._heard_s[topic] = time.monotonic()
             if not self.active:
                 return
             try:
@@ -159,13 +189,14 @@ class ComponentNode(Node):
 
     def flush(self) -> None:
         """Wait until published messages have arrived, at most a second each."""
-        for _, publisher in self._outputs:
+        for _, publisher in self.outputs:
             publisher.wait_for_all_acked(Duration(seconds=1))
 
     def close(self) -> None:
         """Finish work in progress and release files, links and threads; called before destruction."""
 
-    def _match(self) -> None:
+    def match(self) -> None:
+        """Become ready if every peer is matched."""
         if self.peers and not self._matched():
             return
         self._matching.cancel()
@@ -176,7 +207,7 @@ class ComponentNode(Node):
 
     def _matched(self) -> bool:
         return all(
-            publisher.get_subscription_count() >= _subscribers(topic, self.peers) for topic, publisher in self._outputs
+            publisher.get_subscription_count() >= _subscribers(topic, self.peers) for topic, publisher in self.outputs
         ) and all(
             subscription.get_publisher_count() >= _publishers(topic, self.peers) for topic, subscription in self._inputs
         )
@@ -190,8 +221,7 @@ class ComponentNode(Node):
 
     def produced(self, stamp_ns: int) -> None:
         """Note that the result of the image of this stamp has just been published."""
-        late_s = (self.get_clock().now().nanoseconds - stamp_ns) * 1e-9
-        self._latency.add(late_s, time.monotonic())
+        self._latency.add((self.now_ns() - stamp_ns) * 1e-9, self.now_s())
 
     def report(self, level: bytes, text: str) -> None:
         """Set level and text of the node's status; warnings and errors are logged too, at most every 5 s."""
@@ -201,21 +231,40 @@ class ComponentNode(Node):
         elif level == WARN:
             self.get_logger().warning(text, throttle_duration_sec=5.0)
 
+    def idle_reason(self) -> str:
+        """Why the node has nothing to do, as words; "" = it works, or its status says why not."""
+        if not self.active:
+            return ""
+        if not self.ready:
+            return "waiting for the other nodes of the graph"
+        now_s = time.monotonic()
+        for topic in self.needs:
+            heard_s = self._heard_s.get(topic)
+            silent_s = now_s - (self._begin_s if heard_s is None else heard_s)
+            if silent_s > IDLE_S:
+                since = "since the start" if heard_s is None else f"for {silent_s:.0f} s"
+                nobody = "" if self.count_publishers(topic) else ": nobody publishes it"
+                return f"no message on {topic} {since}{nobody}"
+        return ""
+
     def publish_diagnostics(self) -> None:
         """Publish the status now; a timer does so once a second."""
+        level, text = self._level, self._text
+        if level != ERROR and (reason := self.idle_reason()):
+            level, text = WARN, f"idle: {reason}"
         if late_ms := self._latency.percentiles_ms():
             for key, value in zip((Key.LATENCY_P50, Key.LATENCY_P95, Key.LATENCY_P99), late_ms, strict=True):
                 self.details[key] = f"{value:.1f}"
-            self.details[Key.RATE] = f"{self._latency.rate_hz(time.monotonic()):.1f}"
+            self.details[Key.RATE] = f"{self._latency.rate_hz(self.now_s()):.1f}"
         with self._counting:
             values = {**self.details, **dict(sorted(self.counters.items()))}
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
         message.status = [
             DiagnosticStatus(
-                level=self._level,
+                level=level,
                 name=f"{self.get_namespace().strip('/')}/{self.component}",
-                message=self._text,
+                message=text,
                 hardware_id=HARDWARE_ID,
                 values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
             )

@@ -76,6 +76,8 @@ class ImageQueue:
 class ImageInput:
     """Subscription to ``image/compressed`` that decodes in the node's thread and processes in one of its own.
 
+    In simulated time it processes each image on arrival: however long that takes, no image waits or is dropped.
+
     Parameters
     ----------
     node : the node that subscribes
@@ -99,7 +101,8 @@ class ImageInput:
         qos = IMAGE_IN_GRAPH_QOS if publishers_of(_TOPIC, node.peers) else None
         node.input(_TOPIC, self._on_message, qos=qos, with_info=True)
         self._thread = threading.Thread(target=self._run, name="images", daemon=True)
-        self._thread.start()
+        if not node.simulated:
+            self._thread.start()
 
     def wait_idle(self) -> None:
         """Wait until the images that have arrived are processed, at most 5 s."""
@@ -108,16 +111,24 @@ class ImageInput:
     def close(self) -> None:
         """Process no more images."""
         self._queue.close()
-        self._thread.join(timeout=5.0)
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0)
 
     def _on_message(self, message: Any, info: dict[str, Any]) -> None:
-        self._queue.put(message.header, self._decode(message), self._gaps.before(info))
+        image, missed = self._decode(message), self._gaps.before(info)
+        if self._node.simulated:
+            self._process_now(ImageSample(message.header, image, missed, waited=False, behind=0))
+        else:
+            self._queue.put(message.header, image, missed)
+
+    def _process_now(self, sample: ImageSample) -> None:
+        if sample.missed:
+            self._node.missed(_TOPIC, sample.missed)
+        self._process(sample)
 
     def _run(self) -> None:
         try:
             while (sample := self._queue.take()) is not None:
-                if sample.missed:
-                    self._node.missed(_TOPIC, sample.missed)
-                self._process(sample)
+                self._process_now(sample)
         except Exception as error:
             self._node.failure = error

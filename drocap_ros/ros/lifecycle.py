@@ -23,6 +23,13 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 #: Values of ``Key.LIFECYCLE`` on ``/diagnostics``, as ROS names its states.
 UNCONFIGURED, INACTIVE, ACTIVE, FINALIZED = "unconfigured", "inactive", "active", "finalized"
 
+_WORDS = {
+    UNCONFIGURED: "unconfigured: it holds nothing until it is configured",
+    INACTIVE: "inactive: it publishes nothing until it is activated",
+    ACTIVE: "running",
+    FINALIZED: "finalized: its work has ended",
+}
+
 
 class ManagedComponent(LifecycleNodeMixin, ComponentNode):
     """A component with a life cycle.
@@ -162,5 +169,5 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
         self.details[Key.LIFECYCLE] = state
         # The error that ended a source stays readable.
         if state != FINALIZED or self._level != ERROR:
-            self.report(OK, "running" if state == ACTIVE else state)
+            self.report(OK, _WORDS[state])
         self.publish_diagnostics()

@@ -29,6 +29,8 @@ def declare_parameters(node: Node, defaults: P) -> P:
     ParameterError
         When an override has the wrong type or lies outside its range.
     """
+    for name in sorted(defaults.RETIRED.keys() & node._parameter_overrides.keys()):  # ROS ignores unknown ones
+        type(defaults).from_mapping({name: None}, node.get_name())
     values = {}
     for spec in dataclasses.fields(defaults):
         default = getattr(defaults, spec.name)

@@ -93,7 +93,9 @@ NODES: dict[str, NodeEntry] = {
     "bundle_adjuster": NodeEntry(
         ("pose3d/refined", "pose3d/latest"), ("pose2d", "pose3d/initial"), live=True, niceness=15
     ),
-    "mavlink_bridge": NodeEntry(("vehicle/state", "orbit/status", *_TF), ("pose2d", "camera_info"), live=True),
+    "mavlink_bridge": NodeEntry(
+        ("vehicle/state", "orbit/status", *_TF), ("pose2d", "camera_info", "orbit/status"), live=True
+    ),
     "visualizer": NodeEntry(
         ("markers/keypoints", "markers/initial", "markers/latest", "markers/camera_path", *_TF),
         ("pose2d", "pose3d/initial", "pose3d/latest", "vehicle/state"),

@@ -1,5 +1,6 @@
 """``drocap live`` and ``drocap record`` as commands, with a video that the test draws itself."""
 
+import importlib.util
 import os
 import signal
 import subprocess
@@ -12,7 +13,9 @@ import numpy as np
 import pytest
 
 from drocap_ros.bringup import free_domain
+from drocap_ros.cli import main
 from drocap_ros.recording.open_session import session_info
+from drocap_ros.simulation.vehicle.ports import free_udp_port
 
 ROOT = Path(__file__).resolve().parents[2]
 IMAGES = "/drocap/image/compressed"
@@ -30,9 +33,9 @@ def video(tmp_path_factory):
     return path
 
 
-def start(*arguments, log):
+def start(*arguments, log, **variables):
     command = [sys.executable, "-m", "drocap_ros.cli", *map(str, arguments)]
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", **variables}
     return subprocess.Popen(command, env=env, stdout=log.open("w"), stderr=subprocess.STDOUT)
 
 
@@ -127,3 +130,46 @@ def test_top_shows_the_nodes_of_a_running_graph(video, tmp_path):
         assert "drocap/session_recorder" in (tmp_path / "top.log").read_text()
         # Nobody is left to be heard.
         assert start("top", "--once", "--domain-id", domain, log=tmp_path / "top.log").wait(60) == 1
+
+
+def test_every_command_joins_the_domain_of_the_environment(tmp_path):
+    config = tmp_path / "quiet.yaml"
+    config.write_text(f"mavlink_bridge:\n  url: udpin:127.0.0.1:{free_udp_port()}\n")
+    with free_domain() as domain:
+        here = {"ROS_DOMAIN_ID": str(domain)}
+
+        def run(*arguments):
+            name = arguments[0]
+            status = start(*arguments, log=tmp_path / name, **here).wait(120)
+            return status, (tmp_path / name).read_text()
+
+        common = ("--config", config, "--nodes", "mavlink_bridge")
+        live = start("live", *common, log=tmp_path / "live.log", **here)
+        record = start("record", "--out", tmp_path / "rec", log=tmp_path / "record.log", **here)
+        try:
+            for name in ("live", "record"):
+                wait_for_running(tmp_path / f"{name}.log")
+                assert f"domain {domain}; Ctrl-C stops" in (tmp_path / f"{name}.log").read_text()
+            status, text = run("top", "--once")
+            assert (status, "drocap/mavlink_bridge" in text) == (0, True), text
+            status, text = run("orbit", "status")
+            assert (status, text.split(":")[0]) == (0, "idle"), text
+            if importlib.util.find_spec("rerun"):
+                status, text = run("view", "--live", "--seconds", "6", "--save", tmp_path / "live.rrd")
+                assert status == 0, text
+            # The option comes first, and another domain is empty.
+            assert start("top", "--once", "--domain-id", "101", log=tmp_path / "top", **here).wait(60) == 1
+        finally:
+            for process in (record, live):
+                process.send_signal(signal.SIGINT)
+        assert (record.wait(60), live.wait(60)) == (0, 0)
+        assert counts(tmp_path / "rec")["/drocap/orbit/status"] > 0
+        status, text = run("replay", tmp_path / "rec", "--rate", "100")
+        assert (status, f"in domain {domain};" in text) == (0, True), text
+
+
+@pytest.mark.parametrize("command", [("orbit", "status"), ("top", "--once"), ("record",), ("view", "--live")])
+def test_a_domain_of_the_environment_that_does_not_exist_is_refused(command, monkeypatch, capsys):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "400")
+    assert main(list(command)) == 2
+    assert capsys.readouterr().err == "drocap: ROS_DOMAIN_ID: expected 0 to 101, got 400; choose another domain\n"

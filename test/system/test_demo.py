@@ -1,5 +1,6 @@
 """``drocap demo``: the whole capture flight with pictures, at small scale, as `make demo` runs it."""
 
+import contextlib
 import os
 import re
 import signal
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from session_contents import session_contents
 
 from drocap_ros.cli import main
 from drocap_ros.cli.demo.verdict import settled_orbit
@@ -42,16 +44,16 @@ def test_demo_flies_by_its_images_and_reconstructs_a_motion_near_the_truth(tmp_p
             for _, m in session.messages(("/drocap/orbit/status",))
         ]
         vehicle = read_vehicle_track(session)
-    told = re.search(
+    figures = re.search(
         r"pictures: (\d+) exposed .*, (\d+) rendered and recorded, (\d+) estimated, (\d+) with the subject; "
         r"live: (\d+) poses, error ([\d.]+) mm", printed,
     )  # fmt: skip
-    assert [int(told[i]) for i in range(1, 4)] == [
+    assert [int(figures[i]) for i in range(1, 4)] == [
         len(truth.stamp_ns), counts["/drocap/image/compressed"], counts["/drocap/pose2d"],
     ]  # fmt: skip
-    assert int(told[4]) > 100
-    assert int(told[5]) > 50
-    assert float(told[6]) < 120
+    assert int(figures[4]) > 100
+    assert int(figures[5]) > 50
+    assert float(figures[6]) < 120
     assert counts["/drocap/image/compressed"] >= counts["/drocap/pose2d"]
     # The first pictures are older than the first telemetry.
     assert len(motion.stamp_ns) > counts["/drocap/pose2d"] - 30
@@ -72,16 +74,61 @@ def test_demo_flies_by_its_images_and_reconstructs_a_motion_near_the_truth(tmp_p
     assert np.nanmedian(np.linalg.norm(off, axis=1)) < 1.0
 
 
-def test_interrupted_demo_leaves_no_process_and_no_file(tmp_path):
-    command = [sys.executable, "-u", "-m", "drocap_ros.cli", "demo", "--out", str(tmp_path / "demo")]
+def test_same_seed_gives_the_same_flight_beside_busy_processes(tmp_path, capsys):
+    printed, contents, arrays = [], [], []
+    for name, busy in (("quiet", 0), ("busy", 4)):
+        out = tmp_path / name / "demo"
+        with busy_processes(busy):
+            assert main(["demo", "--seconds", "3", "--seed", "2", "--out", str(out), "--quiet"]) == 0
+        printed.append(capsys.readouterr().out.replace(str(out), "OUT"))
+        contents.append(session_contents(out / "session"))
+        truth, motion = load_flight_truth(out / "truth.npz"), load_motion(out / "motion.npz")
+        arrays.append([truth.stamp_ns, truth.joints3d, truth.camera_position, motion.joints3d, motion.camera_rotation])
+    assert printed[0] == printed[1]
+    assert contents[0].keys() == contents[1].keys()
+    for topic, messages in contents[0].items():
+        assert messages == contents[1][topic], topic
+    assert len(contents[0]) == 14
+    assert len(contents[0]["/drocap/pose2d"]) > 100
+    for quiet, busy in zip(*arrays, strict=True):
+        np.testing.assert_array_equal(quiet, busy)
+
+
+@contextlib.contextmanager
+def busy_processes(count):
+    """Processes that use all of the processor's time that they get."""
+    processes = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def test_demo_in_real_time_flies_and_shows_the_shares_of_the_processor(tmp_path, capsys):
+    status = main(["demo", "--seconds", "4", "--seed", "1", "--out", str(tmp_path / "demo"), "--real-time"])
+    printed = capsys.readouterr()
+    if status:  # a busy machine may hold the vehicle
+        assert "demo: expected 4 s of orbit" in printed.err
+    else:
+        assert re.search(
+            r"processor: flight_simulator \d+ %, pose_estimator \d+ %, .*session_recorder \d+ %", printed.out
+        )
+        assert "simulated time:" not in printed.out
+
+
+# In real time: the command, seven nodes, the server that forks them, and multiprocessing's resource tracker.
+@pytest.mark.parametrize(("options", "processes"), [((), 1), (("--real-time",), 10)])
+def test_interrupted_demo_leaves_no_process_and_no_file(tmp_path, options, processes):
+    command = [sys.executable, "-u", "-m", "drocap_ros.cli", "demo", "--out", str(tmp_path / "demo"), *options]
     mark = f"demo_{os.getpid()}"
     environment = {**os.environ, "DROCAP_TEST_MARK": mark}
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as demo:
         for line in demo.stdout:
             if "pilot" in line:
                 break
-        # The command, seven nodes, the server that forks them, and multiprocessing's resource tracker.
-        assert len(_marked(mark)) == 10
+        assert len(_marked(mark)) == processes
         demo.send_signal(signal.SIGINT)
         demo.stdout.read()
         error = demo.stderr.read()
@@ -138,7 +185,16 @@ def test_demo_without_networks_is_refused_and_leaves_nothing(tmp_path, capsys):
 def test_orbit_is_settled_after_the_ramp_of_each_start():
     stamps = np.arange(60) * 10**9
     orbit, hold = State.ORBITING, State.HOLDING
-    told = [(0, State.READY), (10, orbit), (11, orbit), (25, hold), (30, orbit), (33, hold), (40, orbit), (49, orbit)]
-    settled = settled_orbit(stamps, [(t * 10**9, state) for t, state in told])
+    printed = [
+        (0, State.READY),
+        (10, orbit),
+        (11, orbit),
+        (25, hold),
+        (30, orbit),
+        (33, hold),
+        (40, orbit),
+        (49, orbit),
+    ]
+    settled = settled_orbit(stamps, [(t * 10**9, state) for t, state in printed])
     assert np.flatnonzero(settled).tolist() == [*range(16, 25), *range(46, 49)]
     assert not settled_orbit(stamps, []).any()

@@ -28,6 +28,7 @@ from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 
 ROOT = Path(__file__).resolve().parents[2]
+OTHER_POSE_PUBLISHER, SECOND_BRIDGE = 130, 131  # CONDITION_* of OrbitStatus
 MATRIX = pinhole_matrix(1280, 720, 60.0)
 
 
@@ -129,6 +130,47 @@ def test_operator_flies_an_orbit_from_the_command_line():
         assert operator(graph, "stop") == (0, "acknowledged by the operator")
         graph.wait_until(lambda: got[-1].command_accepted, 10, "a status with the accepted command")
         assert got[-1].command_condition == OrbitStatus.CONDITION_ACKNOWLEDGED
+
+
+def test_a_second_publisher_of_the_keypoints_ends_the_orbit_and_forbids_another():
+    with flying(commands_enabled=True, max_state_age_s=0.5, watchdog_s=0.5) as (graph, drone, got):
+        graph.wait_until(lambda: got and got[-1].state == OrbitStatus.READY, 40, "readiness")
+        assert operator(graph, "start") == (0, "orbiting the subject")
+        graph.wait_until(lambda: got[-1].state == OrbitStatus.ORBITING, 20, "an orbit")
+        other = graph.node.create_publisher(TOPICS["pose2d"].message, "pose2d", TOPICS["pose2d"].qos)
+        copies = graph.node.create_subscription(
+            TOPICS["pose2d"].message, "pose2d", lambda m: m.track_id < 9 and other.publish(relabelled(m)), 10
+        )
+        begin = time.monotonic()
+        graph.wait_until(lambda: got[-1].state == OrbitStatus.HOLDING, 10, "a hold")
+        assert time.monotonic() - begin < 2.0
+        assert got[-1].condition == OTHER_POSE_PUBLISHER, got[-1].reason
+        graph.wait_until(lambda: drone.copter.mode == "BRAKE", 15, "the hold mode")
+        status, answer = operator(graph, "start")
+        assert (status, answer.split(" (")[0]) == (1, "refused: pose2d has more than one publisher")
+        graph.node.destroy_subscription(copies)
+        graph.spin_for(4.0)
+        assert "pose2d" not in operator(graph, "start")[1]  # the other one has gone
+
+
+def test_a_second_bridge_ends_the_orbit_of_the_first_and_flies_none():
+    with flying(commands_enabled=True, max_state_age_s=0.5, watchdog_s=0.5) as (graph, drone, got):
+        graph.wait_until(lambda: got and got[-1].state == OrbitStatus.READY, 40, "readiness")
+        assert operator(graph, "start") == (0, "orbiting the subject")
+        url = f"udpin:127.0.0.1:{free_udp_port()}"
+        config = DrocapConfig().replace("mavlink_bridge", url=url, commands_enabled=True)
+        begin = time.monotonic()
+        with bringup(config, ["mavlink_bridge"], domain_id=graph.domain_id):
+            ready_s = time.monotonic() - begin
+            graph.wait_until(lambda: SECOND_BRIDGE in {m.condition for m in got}, 10, "the second bridge to be seen")
+            assert time.monotonic() - begin - ready_s < 2.0
+            graph.wait_until(lambda: drone.copter.mode == "BRAKE", 15, "the hold mode")
+
+
+def relabelled(message):
+    """The same person by another tracker."""
+    message.track_id = 9
+    return message
 
 
 def test_commands_are_a_service_and_no_topic_that_a_replay_could_publish():

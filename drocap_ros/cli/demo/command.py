@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,6 +40,10 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument(
         "--models", metavar="DIR", default=MODELS, help="folder of ONNX models instead of those for simulation"
     )
+    parser.add_argument(
+        "--real-time", action="store_true", help="fly as fast as the clock, each node in a process of its own: a busy"
+        " machine is late",
+    )  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="print only the result")
     parser.set_defaults(run=run)
     return parser
@@ -47,7 +52,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 def run(args: argparse.Namespace) -> int:
     """Fly, record, reconstruct, compare."""
     from drocap_ros.cli.atomic_output import check_output_folder, output_folder
-    from drocap_ros.cli.demo.flight import NODES, check_flown, fly
+    from drocap_ros.cli.demo.desk import check_flown
     from drocap_ros.cli.demo.operator import Operator
     from drocap_ros.cli.demo.verdict import judge_flight
     from drocap_ros.cli.graph.live import interruptible
@@ -60,27 +65,21 @@ def run(args: argparse.Namespace) -> int:
     if not (math.isfinite(args.seconds) and _LEAST_S <= args.seconds <= _MOST_S):
         raise InputError(f"--seconds: expected {_LEAST_S:g} to {_MOST_S:g}, got {args.seconds:g}; choose another")
     check_output_folder(args.out)
-    begin = time.monotonic()
     operator = Operator(args.seconds, requests_control=args.autopilot == "px4")
-
-    def say(text: str) -> None:
-        if not args.quiet:
-            print(f"{time.monotonic() - begin:6.1f} s  {text}", flush=True)
-
     with interruptible() as interrupted, output_folder(args.out) as folder:
         config = demo_config(folder, args.seed, args.autopilot, args.models)
-        say(f"starting {', '.join(NODES)}, a process each")
-        load = fly(config, operator, say, interrupted)
+        if args.real_time:
+            config = with_link(config)
+        how = _fly(config, operator, args, interrupted)
         check_flown(operator)
         truth = load_flight_truth(folder / "truth.npz")
         with open_session(folder / "session") as session:
             verdict = judge_flight(session, truth, config.mavlink_bridge.radius_m)
-        say("landed; reconstructing from the recorded session")
         motion = _reconstruct(folder, config, args)
         errors = compare(motion, truth.joints3d, truth.stamp_ns * 1e-9, "world")
         if not args.quiet:
             print(summary(motion, "ba"))
-            print("processor: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in load.items()))
+            print(how)
     print(_flight_sentence(operator, verdict, config))
     print(_image_sentence(verdict, truth))
     world = "" if math.isnan(errors.w_error_mm) else f", W-MPJPE {errors.w_error_mm:.1f} mm"
@@ -90,28 +89,53 @@ def run(args: argparse.Namespace) -> int:
         f" frame {motion.frame}"
     )
     print(f"files in {args.out}: motion.npz, truth.npz, pictures.jpg, preview.png, report.html, session/")
-    say("done")
     return 0
 
 
-def demo_config(folder: Path, seed: int, autopilot: str, models: str) -> DrocapConfig:
-    """The demo's graph, with motion enabled for the simulated vehicle on a port of this machine."""
-    from drocap_ros.config import DrocapConfig
-    from drocap_ros.simulation.vehicle.ports import free_udp_port
+def _fly(config: DrocapConfig, operator: Operator, args: argparse.Namespace, interrupted: threading.Event) -> str:
+    """Fly; returns a sentence about the machine."""
+    begin = time.monotonic()
 
-    address = f"127.0.0.1:{free_udp_port()}"
+    def say(seconds: float, text: str) -> None:
+        if not args.quiet:
+            print(f"{seconds:6.1f} s  {text}", flush=True)
+
+    if args.real_time:
+        from drocap_ros.cli.demo.real_time import fly_in_real_time
+
+        load = fly_in_real_time(config, operator, lambda text: say(time.monotonic() - begin, text), interrupted)
+        return "processor: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in load.items())
+    from drocap_ros.cli.demo.simulated_time import fly_in_simulated_time
+
+    flown_s = fly_in_simulated_time(config, operator, say, interrupted)
+    return f"simulated time: {flown_s:.1f} s in {time.monotonic() - begin:.1f} s on this machine"
+
+
+def demo_config(folder: Path, seed: int, autopilot: str, models: str) -> DrocapConfig:
+    """The demo's graph, with motion enabled for the simulated vehicle."""
+    from drocap_ros.config import DrocapConfig
+
     config = DrocapConfig().replace(
-        "flight_simulator", vehicle_url=f"udpout:{address}", autopilot=autopilot, seed=seed,
-        truth_file=str(folder / "truth.npz"),
+        "flight_simulator", autopilot=autopilot, seed=seed, truth_file=str(folder / "truth.npz"),
     )  # fmt: skip
     config = config.replace(
-        "mavlink_bridge", url=f"udpin:{address}", commands_enabled=True, mode_change_allowed=True,
+        "mavlink_bridge", commands_enabled=True, mode_change_allowed=True,
         gimbal_control=True, body_height_m=config.flight_simulator.stature_m, attitude_hz=25.0,
     )  # fmt: skip
     # The stature is known, as an operator would ask for it before a flight.
     config = config.replace("initializer", assumed_height_m=config.flight_simulator.stature_m)
-    config = config.replace("pose_estimator", models_dir=models, on_loss="next")
+    # Another processor than the CPU would give other last bits.
+    config = config.replace("pose_estimator", models_dir=models, on_loss="next", provider="cpu")
     return config.replace("session_recorder", session_dir=str(folder / "session"))
+
+
+def with_link(config: DrocapConfig) -> DrocapConfig:
+    """The configuration with a MAVLink link over a free port of this machine."""
+    from drocap_ros.simulation.vehicle.ports import free_udp_port
+
+    address = f"127.0.0.1:{free_udp_port()}"
+    config = config.replace("flight_simulator", vehicle_url=f"udpout:{address}")
+    return config.replace("mavlink_bridge", url=f"udpin:{address}")
 
 
 def _reconstruct(folder: Path, config: DrocapConfig, args: argparse.Namespace) -> Motion:

@@ -14,6 +14,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from drocap_ros.cli.graph.dashboard import Dashboard, dashboard_on_terminal
+from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 def add_graph_options(parser: argparse.ArgumentParser) -> None:
     """Options of every command that starts nodes."""
     parser.add_argument("--namespace", default="/drocap", help="of all topics (default /drocap)")
-    parser.add_argument("--domain-id", type=int, default=0, metavar="N", help="DDS domain, 0 to 101 (default 0)")
+    add_domain_option(parser)
     parser.add_argument(
         "--one-process", action="store_true", help="all nodes in this process, a thread each: for tests"
     )
@@ -78,18 +79,18 @@ def live_nodes() -> list[str]:
 
 def run_graph(config: DrocapConfig, nodes: list[str], args: argparse.Namespace) -> int:
     """Start nodes, show their diagnostics, stop on Ctrl-C or when the source has ended."""
-    check_domain(args.domain_id)
+    domain_id = chosen_domain(args)
     bringup = import_bringup().bringup
     with bringup(
         config,
         nodes,
         processes=not args.one_process,
         namespace=args.namespace,
-        domain_id=args.domain_id,
+        domain_id=domain_id,
         respawn=not args.no_respawn,
     ) as graph:
         if not args.quiet:
-            print(f"running {', '.join(graph.names)} in {args.namespace}, domain {args.domain_id}; Ctrl-C stops")
+            print(f"running {', '.join(graph.names)} in {args.namespace}, domain {domain_id}; Ctrl-C stops")
             sys.stdout.flush()
         with dashboard_of(graph, show=not args.quiet) as (_, draw), stop_signals() as stop:
             while not stop.is_set() and "image_ingest" not in graph.finished:
@@ -130,12 +131,6 @@ def interruptible() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def check_domain(domain_id: int) -> None:
-    """Refuse a DDS domain that does not exist."""
-    if not 0 <= domain_id <= 101:
-        raise InputError(f"--domain-id: expected 0 to 101, got {domain_id}")
 
 
 def import_bringup() -> ModuleType:

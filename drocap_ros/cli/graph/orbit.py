@@ -7,6 +7,7 @@ import dataclasses
 import math
 from typing import Any
 
+from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
 from drocap_ros.errors import InputError
 
 #: Parameter of the orbit behind each option: its range is checked here, its limits by the bridge.
@@ -30,13 +31,14 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     )
     parser.add_argument("--timeout", metavar="S", type=float, default=10.0, help="to wait for an answer (default 10)")
     parser.add_argument("--namespace", default="/drocap", help="of all topics (default /drocap)")
-    parser.add_argument("--domain-id", type=int, default=0, metavar="N", help="DDS domain, 0 to 101 (default 0)")
+    add_domain_option(parser)
     parser.set_defaults(run=run)
     return parser
 
 
 def run(args: argparse.Namespace) -> int:
     """Send the command and print the answer."""
+    domain_id = chosen_domain(args)
     _check_options(args)
     try:
         from drocap_ros.ros.orbit_client import orbit_client
@@ -45,10 +47,10 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.flight.orbit.states import Command
 
     no_graph = InputError(
-        f"orbit: expected a running graph with mavlink_bridge in {args.namespace}, domain {args.domain_id}, "
+        f"orbit: expected a running graph with mavlink_bridge in {args.namespace}, domain {domain_id}, "
         f"found none within {args.timeout:g} s; start `drocap live` first"
     )
-    with orbit_client(args.namespace, args.domain_id, args.timeout) as (client, wait):
+    with orbit_client(args.namespace, domain_id, args.timeout) as (client, wait):
         if args.action == "status":
             client.subscribe()
             if not wait(lambda: bool(client.statuses)):
@@ -69,8 +71,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_options(args: argparse.Namespace) -> None:
-    if not 0 <= args.domain_id <= 101:
-        raise InputError(f"--domain-id: expected 0 to 101, got {args.domain_id}")
     if not 0 < args.timeout <= 600:
         raise InputError(f"--timeout: expected above 0 and at most 600 s, got {args.timeout:g}")
     for name, value in (("--radius", args.radius), ("--height", args.height), ("--speed", args.speed)):

@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from drocap_ros.cli.graph.live import add_graph_options, check_domain, import_bringup, stop_signals
+from drocap_ros.cli.graph.domain import chosen_domain
+from drocap_ros.cli.graph.live import add_graph_options, import_bringup, stop_signals
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -37,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     """Publish until the session ends or the user interrupts."""
     from drocap_ros.config import DrocapConfig
 
-    check_domain(args.domain_id)
+    domain_id = chosen_domain(args)
     config = DrocapConfig().replace(
         "session_player",
         session=str(args.session.absolute()),
@@ -52,10 +53,10 @@ def run(args: argparse.Namespace) -> int:
         ["session_player"],
         processes=not args.one_process,
         namespace=args.namespace,
-        domain_id=args.domain_id,
+        domain_id=domain_id,
     ) as graph:
         if not args.quiet:
-            print(f"publishing {args.session} in domain {args.domain_id}; Ctrl-C stops", flush=True)
+            print(f"publishing {args.session} in domain {domain_id}; Ctrl-C stops", flush=True)
         with stop_signals() as stop:
             while not stop.is_set() and "session_player" not in graph.finished:
                 graph.spin_for(0.2)

@@ -6,7 +6,8 @@ import argparse
 import sys
 from typing import Any
 
-from drocap_ros.cli.graph.live import check_domain, dashboard_of, import_bringup, stop_signals
+from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
+from drocap_ros.cli.graph.live import dashboard_of, import_bringup, stop_signals
 
 #: How long ``--once`` waits for a first status.
 ONCE_TIMEOUT_S = 8.0
@@ -20,7 +21,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         description="Show state, rate, latency and counts of every node of a running graph until Ctrl-C.",
     )
     parser.add_argument("--namespace", default="/drocap", help="of the graph (default /drocap)")
-    parser.add_argument("--domain-id", type=int, default=0, metavar="N", help="DDS domain, 0 to 101 (default 0)")
+    add_domain_option(parser)
     parser.add_argument("--once", action="store_true", help="print the table once and end")
     parser.set_defaults(run=run)
     return parser
@@ -30,9 +31,9 @@ def run(args: argparse.Namespace) -> int:
     """Subscribe and draw; status 1 with ``--once`` when no status arrived."""
     from rich.console import Console
 
-    check_domain(args.domain_id)
+    domain_id = chosen_domain(args)
     with (
-        import_bringup().watch(args.namespace, args.domain_id) as graph,
+        import_bringup().watch(args.namespace, domain_id) as graph,
         dashboard_of(graph, show=not args.once) as (dashboard, draw),
         stop_signals() as stop,
     ):

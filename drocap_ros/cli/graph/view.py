@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drocap_ros.cli.atomic_output import output_file
-from drocap_ros.cli.graph.live import check_domain, import_bringup, interruptible, stop_signals
+from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
+from drocap_ros.cli.graph.live import import_bringup, interruptible, stop_signals
 from drocap_ros.cli.motion_input import read_motion
 from drocap_ros.cli.progress import progress_bars
 from drocap_ros.errors import InputError
@@ -55,7 +56,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     )
     parser.add_argument("--video", metavar="VIDEO", type=Path, help="video or pictures that a motion was made from")
     parser.add_argument("--namespace", help="of the topics (default: /drocap live, that of the keypoints otherwise)")
-    parser.add_argument("--domain-id", type=int, default=0, metavar="N", help="DDS domain, 0 to 101 (default 0)")
+    add_domain_option(parser)
     parser.add_argument("--seconds", type=float, metavar="S", help="end a --live view after so long")
     parser.add_argument(
         "--memory", default="1GB", help="of a viewer; beyond it the oldest data go (default 1GB; 25%% works too)"
@@ -88,7 +89,8 @@ def is_session(path: Path) -> bool:
 
 
 def _check(args: argparse.Namespace) -> None:
-    check_domain(args.domain_id)
+    if args.live or args.domain_id is not None:
+        chosen_domain(args)
     if args.live == (args.input is not None):
         raise InputError(f"expected INPUT or --live, found {'both' if args.live else 'neither'}; name what to show")
     if args.live and args.video is not None:
@@ -136,8 +138,8 @@ def _view_live(recording: rerun.RecordingStream, args: argparse.Namespace) -> in
     from drocap_ros.view.message_view import PLOTS, MessageView
     from drocap_ros.view.rerun_scene import Scene
 
-    namespace = args.namespace or "/drocap"
-    with import_bringup().watch(namespace, args.domain_id) as graph, _shown(recording, (*PLOTS, "log"), args):
+    namespace, domain_id = args.namespace or "/drocap", chosen_domain(args)
+    with import_bringup().watch(namespace, domain_id) as graph, _shown(recording, (*PLOTS, "log"), args):
         view = MessageView(Scene(recording), image_hz=0.0 if args.save else LIVE_PICTURE_HZ)
         view.namespace = namespace
         _subscribe(graph, view)
@@ -148,7 +150,7 @@ def _view_live(recording: rerun.RecordingStream, args: argparse.Namespace) -> in
         view.finish()
     _warn_refused(view)
     if not view.taken:
-        print(f"drocap: heard nothing of {namespace} in domain {args.domain_id}; is it running there?", file=sys.stderr)
+        print(f"drocap: heard nothing of {namespace} in domain {domain_id}; is it running there?", file=sys.stderr)
     return 0 if view.taken else 1
 
 

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.flight.mavlink.dialects import DIALECTS
 
 TELEMETRY = frozenset({"HEARTBEAT", "TIMESYNC", "COMMAND_LONG", "REQUEST_DATA_STREAM", "PARAM_REQUEST_READ"})
-TELEMETRY_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL})
+TELEMETRY_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
 _MODES = frozenset(
     (float(main), float(sub)) for d in DIALECTS.values() for main, sub in (d.control_numbers, d.hold_numbers)
 )

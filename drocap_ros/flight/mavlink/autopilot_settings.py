@@ -7,22 +7,25 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from drocap_ros.flight.mavlink.mount import TYPE_PARAMETER
+
 _TIMEOUT = {"ardupilot": "GUID_TIMEOUT", "px4": "COM_OF_LOSS_T"}
 _ACTION = "COM_OBL_RC_ACT"
 _READ = {"ardupilot": ("GUID_TIMEOUT",), "px4": ("COM_OF_LOSS_T", _ACTION)}
-_DRIFTING = {1: "altitude mode", 2: "manual flight"}
+_LEAVING = {3: "flies home", 4: "lands where it is"}
 _RETRY_S, _TRIES, _AGAIN_S = 0.7, 10, 10.0
 
 
 class LossSettings(NamedTuple):
     """Reaction to the loss of setpoints: time-out in s and number of the action, with their parameters' names.
 
-    NaN = not reported.
+    NaN = not reported; action_name "" = the autopilot has no such setting.
     """
 
     timeout_name: str
@@ -39,16 +42,28 @@ class _Setting:
 
 
 class AutopilotSettings:
-    """The parameters of one autopilot that decide its flight without setpoints.  Time is an argument."""
+    """The parameters of one autopilot that decide its flight without setpoints.  Time is an argument.
 
-    def __init__(self) -> None:
+    mount_type : whether the kind of the camera's mount is read too, where the autopilot has a parameter for it
+    """
+
+    def __init__(self, mount_type: bool = False) -> None:
         self._autopilot = ""
+        self._mount_type = mount_type
         self._settings: dict[str, _Setting] = {}
 
     def set_autopilot(self, autopilot: str) -> None:
         """Set the autopilot: "ardupilot" or "px4"."""
         self._autopilot = autopilot
-        self._settings = {name: _Setting() for name in _READ.get(autopilot, ())}
+        names = _READ.get(autopilot, ())
+        if self._mount_type and autopilot == "ardupilot":
+            names = (*names, TYPE_PARAMETER)
+        self._settings = {name: _Setting() for name in names}
+
+    def add(self, names: Iterable[str]) -> None:
+        """Read these parameters of the autopilot too."""
+        for name in names:
+            self._settings.setdefault(name, _Setting())
 
     def due(self, now_s: float) -> list[str]:
         """Parameters to request now: often until they are reported or the tries are used up, then every 10 s."""
@@ -72,18 +87,14 @@ class AutopilotSettings:
 
     def loss_settings(self) -> LossSettings | None:
         """Reaction to the loss of setpoints; None for an autopilot without such settings."""
-        name = _TIMEOUT.get(self._autopilot)
-        if name is None:
-            return None
-        values = self.reported()
-        return LossSettings(name, values[name], _ACTION, values.get(_ACTION, math.nan))
+        return loss_settings_of(self._autopilot, self.reported())
 
     def warning(self) -> str:
         """A setting that should change and does not forbid motion, as a sentence; "" = none."""
         settings = self.loss_settings()
-        if settings is not None and settings.action in _DRIFTING:
+        if settings is not None and settings.action in _LEAVING:
             return (
-                f"without setpoints the vehicle drifts in {_DRIFTING[int(settings.action)]} "
+                f"without setpoints the vehicle {_LEAVING[int(settings.action)]} "
                 f"({settings.action_name} {settings.action:g}); set it to 5, hold, on the autopilot"
             )
         return ""
@@ -91,3 +102,12 @@ class AutopilotSettings:
     def reported(self) -> dict[str, float]:
         """Values by their names, NaN = not reported."""
         return {name: setting.value for name, setting in self._settings.items()}
+
+
+def loss_settings_of(autopilot: str, values: Mapping[str, float]) -> LossSettings | None:
+    """Reaction to the loss of setpoints by an autopilot's parameters; None for one without such settings."""
+    name = _TIMEOUT.get(autopilot)
+    if name is None:
+        return None
+    action = _ACTION if _ACTION in _READ[autopilot] else ""
+    return LossSettings(name, values.get(name, math.nan), action, values.get(action, math.nan))

@@ -11,6 +11,7 @@ _RETRY_S = 0.4
 _TRIES = 5
 _PROGRESS_S = 3.0
 _REPEAT_S = 1.5
+_SECOND_ANSWER_S = 1.0
 _NOT_ANSWERED = -1
 _RESULTS = {
     mavlink.MAV_RESULT_ACCEPTED: "accepted",
@@ -67,10 +68,18 @@ class CommandQueue:
         self._pending.clear()
 
     def acknowledge(self, command: int, result: int, now_s: float) -> None:
-        """Take an acknowledgement."""
+        """Take an acknowledgement.
+
+        PX4 answers DO_SET_MODE twice: accepted at once, and then in earnest.  A refusal that follows counts.
+        """
         pending = self._pending.get(command)
-        if pending is None or pending.result is not None or pending.tries == 0:
+        if pending is None or pending.tries == 0:
             return
+        if pending.result is not None:
+            accepted = pending.result == mavlink.MAV_RESULT_ACCEPTED
+            if not accepted or result == pending.result or now_s - pending.answered_s > _SECOND_ANSWER_S:
+                return
+            pending.result = None
         if result == mavlink.MAV_RESULT_IN_PROGRESS:
             pending.sent_s = now_s + _PROGRESS_S - _RETRY_S
         elif result == mavlink.MAV_RESULT_TEMPORARILY_REJECTED and pending.tries < _TRIES:

@@ -10,8 +10,9 @@ import logging
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -19,6 +20,8 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.allowed_messages import TELEMETRY_COMMANDS, is_motion, is_telemetry
 from drocap_ros.flight.mavlink.autopilot_settings import AutopilotSettings
+from drocap_ros.flight.mavlink.link_status import LinkStatus
+from drocap_ros.flight.mavlink.mount import Mount
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.signing import read_signing_key, sign_with, signing_time
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
@@ -29,29 +32,9 @@ from drocap_ros.flight.vehicle_state import VehicleState
 _NS = 1_000_000_000
 _STREAM_FALLBACK_S = 5.0
 _RECONNECT_S = 1.0
+_SENT_SETPOINTS = 80
 
 logger = logging.getLogger(__name__)
-
-
-class LinkStatus(NamedTuple):
-    """State of the link.
-
-    connected : a message of the vehicle arrived within the time-out
-    silence_s : since that message; infinity before the first
-    round_trip_s : of the best time synchronization, NaN without one
-    rates_hz : (real, wanted) of each requested message, by its name
-    refused : MAV_RESULT of the messages that the autopilot does not grant
-    bad_count : pieces of data that were no message, or not signed correctly
-    refused_count : of these, whole messages that were not signed with our key
-    """
-
-    connected: bool
-    silence_s: float
-    round_trip_s: float
-    rates_hz: dict[str, tuple[float, float]]
-    refused: dict[str, int]
-    bad_count: int
-    refused_count: int = 0
 
 
 class MavlinkLink:
@@ -79,14 +62,15 @@ class MavlinkLink:
         transport: Transport | None = None,
     ) -> None:
         self.config = config
-        self.estimator = VehicleStateEstimator(config.target_system_id)
+        mount = Mount(config.mount, config.camera_pitch_deg)
+        self.estimator = VehicleStateEstimator(config.target_system_id, mount)
         self._clock_ns = clock_ns
         self._monotonic_s = monotonic_s
         key = read_signing_key(config.signing_key_file) if config.signing_key_file else None
         self._transport = transport or open_transport(config.url)
         self._parser = MavlinkParser(key, clock_ns())
         self._requests = TelemetryRequests(config)
-        self.settings = AutopilotSettings()
+        self.settings = AutopilotSettings(mount_type=config.mount == "auto")
         self._mav = mavlink.MAVLink(None, srcSystem=config.system_id, srcComponent=config.component_id)
         # The watchdog packs with an encoder of its own and so shares nothing with a loop that hangs.  It signs as
         # another stream, because signed packets of one stream must not go back in time.
@@ -99,6 +83,9 @@ class MavlinkLink:
         self._due: dict[str, float] = {}
         self._sync_sent: dict[int, float] = {}  # monotonic s by our stamp, ns
         self._answered_s = math.nan  # when the message was sent that was answered last, monotonic
+        self._sent: deque[tuple[float, Any]] = deque(maxlen=_SENT_SETPOINTS)  # monotonic s
+        #: Monotonic time of the control step that decides what is sent: what is older than ``watchdog_s`` is dropped.
+        self.decided_s = math.inf
         self._broken_s: float | None = None
         self._lock = threading.Lock()
         self._answers: list[tuple[int, int]] = []
@@ -142,7 +129,9 @@ class MavlinkLink:
         return self.estimator.system_id, self.estimator.component_id
 
     def send_motion(self, message: Any) -> None:
-        """Send a setpoint or a command of the allow-list.
+        """Send a setpoint or a command of the allow-list; one that was decided too long ago is dropped.
+
+        A process that was stopped within a control step continues with its setpoint of that time.
 
         Raises
         ------
@@ -151,6 +140,11 @@ class MavlinkLink:
         """
         self.check_motion(message)
         with self._lock:
+            late_s = self._monotonic_s() - self.decided_s
+            if late_s > self.config.watchdog_s:
+                logger.warning("dropped a %s that was decided %.1f s ago", message.get_type(), late_s)
+                return
+            self._note_stream(message)
             self._transmit(message)
 
     def check_motion(self, message: Any) -> Any:
@@ -168,13 +162,28 @@ class MavlinkLink:
     def send_unlocked(self, message: Any) -> None:
         """Send a motion message without any lock: for the watchdog of a loop that hangs."""
         self.check_motion(message)
+        self._note_stream(message)
         try:
             self._transport.write(self._pack(message, self._watchdog_mav))
         except LinkError as error:
             logger.warning("the watchdog could not send: %s", error)
 
+    def stream_gap_s(self) -> float:
+        """Time in s since the last setpoint was sent; infinity before the first."""
+        sent = self.sent_setpoints()
+        return self._monotonic_s() - sent[-1][0] if sent else math.inf
+
+    def sent_setpoints(self) -> list[tuple[float, Any]]:
+        """(monotonic s, message) of the last ones, in order of time."""
+        return list(self._sent)
+
+    def echo(self) -> tuple[float, Any] | None:
+        """(age in s, POSITION_TARGET_LOCAL_NED): the target that the autopilot follows; None before the first."""
+        latest = self.estimator.echo
+        return None if latest is None else ((self._clock_ns() - latest[0]) / _NS, latest[1])
+
     def fresh_mode(self, max_age_s: float) -> str:
-        """The mode by a heartbeat of at most this age; "" = it cannot be seen.  Takes no lock."""
+        """The mode by a report of at most this age; "" = it cannot be seen.  Takes no lock."""
         return self.estimator.fresh_mode(self._clock_ns(), max_age_s, self.config.max_state_age_s)
 
     def take_answers(self) -> list[tuple[int, int]]:
@@ -204,6 +213,7 @@ class MavlinkLink:
             refused=self._requests.refused(),
             bad_count=self._parser.bad_count,
             refused_count=self._parser.refused_count,
+            unknown_count=self._parser.unknown_count,
         )
 
     def _read(self, timeout_s: float) -> bytes:
@@ -292,9 +302,8 @@ class MavlinkLink:
                         system, component, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, interval_us, 0, 0, 0, 0, 0
                     )
                 )
-        if config.commands_enabled:
-            for setting in self.settings.due(self._monotonic_s()):
-                self._send(self._mav.param_request_read_encode(system, component, setting.encode("ascii"), -1))
+        for setting in self.settings.due(self._monotonic_s()):
+            self._send(self._mav.param_request_read_encode(system, component, setting.encode("ascii"), -1))
         if self._requests.unanswered() and self._is_due("streams", _STREAM_FALLBACK_S):
             # Autopilots and proxies too old for SET_MESSAGE_INTERVAL support this one.
             rate = round(min(config.position_hz, 50))
@@ -311,6 +320,10 @@ class MavlinkLink:
         if not is_telemetry(message):
             raise AssertionError(f"this link sends no {message.get_type()}")
         self._transmit(message)
+
+    def _note_stream(self, message: Any) -> None:
+        if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
+            self._sent.append((self._monotonic_s(), message))
 
     def _transmit(self, message: Any) -> None:
         if self._broken_s is not None:

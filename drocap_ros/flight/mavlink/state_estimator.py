@@ -13,21 +13,18 @@ from drocap_ros.flight.frames import (
     ned_to_enu,
     orientation_to_ros,
     quaternion_from_euler,
-    quaternion_multiply,
-    yaw_of,
 )
+from drocap_ros.flight.mavlink import mount
 from drocap_ros.flight.mavlink.clock_offset import ClockOffset
+from drocap_ros.flight.mavlink.mode_reports import ModeReports, PacketOrder
 from drocap_ros.flight.vehicle_state import VehicleState
-from drocap_ros.geometry.rotations import slerp, unit_quaternions
 
 _NS = 1_000_000_000
 _MS = 1_000_000
 
 # MAVLink's enumerations, by the names of its definition.
 _MAV_AUTOPILOT_INVALID = 8
-_AUTOPILOTS = {3: "ardupilot", 12: "px4"}
 _MAV_TYPE_GCS = 6
-_MAV_MODE_FLAG_SAFETY_ARMED = 128
 #: All of attitude, horizontal and vertical velocity and vertical position; either horizontal position.
 _ESTIMATOR_NEEDED = 1 | 2 | 4 | 32
 _ESTIMATOR_POSITION = 8 | 16
@@ -35,13 +32,10 @@ _ESTIMATOR_CONSTANT_POSITION = 128
 _EKF_UNINITIALIZED = 1024  # EKF_STATUS_REPORT only; in ESTIMATOR_STATUS the bit is the GPS glitch
 _EKF_GPS_GLITCH = 32768
 _ESTIMATOR_GLITCH = 1024 | 2048  # GPS, accelerometer
-_GIMBAL_YAW_IN_VEHICLE_FRAME, _GIMBAL_YAW_IN_EARTH_FRAME, _GIMBAL_YAW_LOCK = 32, 64, 16
 
 _POSITION_STALE_S = 3.0
 _ESTIMATOR_STALE_S = 5.0
 _QUATERNION_PREFERRED_S = 1.0
-_GIMBAL_STALE_S = 3.0
-_GIMBAL_STEP_S = 0.25
 _EXTRAPOLATE_S = 0.5
 
 
@@ -54,15 +48,18 @@ class VehicleStateEstimator:
     Parameters
     ----------
     target_system_id : MAVLink system of the vehicle; 0 = the first autopilot
+    camera_mount : kind of the camera's mount; None = as the autopilot describes it
     """
 
-    def __init__(self, target_system_id: int = 0) -> None:
+    def __init__(self, target_system_id: int = 0, camera_mount: mount.Mount | None = None) -> None:
         self.clock = ClockOffset()
+        self.mount = camera_mount or mount.Mount()
         self.system_id = target_system_id
         self.component_id = 0
         self._heard_ns: int | None = None
         self._stamp_ns = -(10**18)
-        self._heartbeat: tuple[str, str, bool] | None = None
+        self.modes = ModeReports()
+        self._order = PacketOrder()
         self._attitude: tuple[int, np.ndarray, np.ndarray] | None = None  # boot ns, FRD -> NED x y z w, rates FRD
         self._quaternion_ns = -(10**18)
         self._position: tuple[int, np.ndarray, np.ndarray] | None = None  # boot ns, ENU m, ENU m/s
@@ -70,9 +67,9 @@ class VehicleStateEstimator:
         self._origin: np.ndarray | None = None
         self._estimator: tuple[int, bool] | None = None
         self._attitude_received_ns = 0
-        self._gimbal: tuple[int, np.ndarray] | None = None  # reception, camera FRD -> NED x y z w
-        self._gimbal_before: tuple[int, np.ndarray] | None = None
         self._values: dict[str, Any] = {}
+        #: The target that the autopilot follows, and its reception.
+        self.echo: tuple[int, Any] | None = None
         #: Reception of the latest message of each kind, and of the last change of the position: our clock.
         self.received_ns: dict[str, int] = {}
         self.position_changed_ns = -(10**18)
@@ -87,13 +84,17 @@ class VehicleStateEstimator:
         if name == "HEARTBEAT":
             self._take_heartbeat(message, receive_time_ns)
             return None
-        if self._heartbeat is None or message.get_srcSystem() != self.system_id:
+        if not self.modes.autopilot or message.get_srcSystem() != self.system_id:
             return None
         from_autopilot = message.get_srcComponent() == self.component_id
         if from_autopilot:
             self._heard_ns = receive_time_ns
             self.received_ns[name] = receive_time_ns
-        handler = _HANDLERS.get(name) if from_autopilot or name in _FROM_ANY_COMPONENT else None
+            late = self._order.is_late(message.get_seq())
+            if name == "CURRENT_MODE":
+                self.modes.take_current_mode(message, late, receive_time_ns)
+                return None
+        handler = _HANDLERS.get(name) if from_autopilot or name in mount.MESSAGES else None
         if handler is None:
             return None
         if not handler(self, message, receive_time_ns):
@@ -110,17 +111,15 @@ class VehicleStateEstimator:
         latest = max((self.received_ns[name] for name in names if name in self.received_ns), default=None)
         return math.inf if latest is None else (now_ns - latest) / _NS
 
-    def fresh_mode(self, now_ns: int, heartbeat_s: float, attitude_s: float) -> str:
-        """The mode, if heartbeat and attitude are not older than this; "" = it cannot be seen.  Needs no lock."""
+    def fresh_mode(self, now_ns: int, mode_s: float, attitude_s: float) -> str:
+        """The mode, if its report and the attitude are not older than this; "" = it cannot be seen.  Needs no lock."""
         late = abs(now_ns - self._stamp_ns) / _NS > attitude_s
-        heartbeat = self._heartbeat
-        return "" if heartbeat is None or late or self.age_s(("HEARTBEAT",), now_ns) > heartbeat_s else heartbeat[1]
+        return "" if late or self.modes.age_s(now_ns) > mode_s else self.modes.mode
 
     def snapshot(self, now_ns: int) -> VehicleState | None:
         """The state at ``now_ns``; None before the first heartbeat and attitude."""
-        if self._heartbeat is None or self._attitude is None or self._heard_ns is None:
+        if not self.modes.autopilot or self._attitude is None or self._heard_ns is None:
             return None
-        autopilot, mode, armed = self._heartbeat
         boot_ns, orientation, rates = self._attitude
         position, velocity = self._position_at(boot_ns)
         estimator_ok = False
@@ -129,15 +128,15 @@ class VehicleStateEstimator:
             estimator_ok = self._estimator[1] and age_s < _ESTIMATOR_STALE_S
         return VehicleState(
             stamp_ns=self.clock.to_local_ns(boot_ns, self._heard_ns),
-            autopilot=autopilot,
-            mode=mode,
-            armed=armed,
+            autopilot=self.modes.autopilot,
+            mode=self.modes.mode,
+            armed=self.modes.armed,
             position_enu_m=position,
             velocity_enu_m_s=velocity,
             orientation_xyzw=orientation_to_ros(orientation),
             angular_velocity_flu_rad_s=frd_to_flu(rates),
             position_ok=estimator_ok and bool(np.isfinite(position).all()),
-            gimbal_orientation_xyzw=self._gimbal_at(self._attitude_received_ns),
+            gimbal_orientation_xyzw=self.mount.camera_at(orientation, self._attitude_received_ns),
             link_age_s=max(0.0, (now_ns - self._heard_ns) / _NS),
             **self._values,
         )
@@ -148,16 +147,12 @@ class VehicleStateEstimator:
         system = message.get_srcSystem()
         if self.system_id not in (0, system):
             return
-        if self._heartbeat is not None and message.get_srcComponent() != self.component_id:
+        if self.modes.autopilot and message.get_srcComponent() != self.component_id:
             return
         self.system_id, self.component_id = system, message.get_srcComponent()
         self._heard_ns = now_ns
         self.received_ns["HEARTBEAT"] = now_ns
-        self._heartbeat = (
-            _AUTOPILOTS.get(message.autopilot, "other"),
-            mode_name(message),
-            bool(message.base_mode & _MAV_MODE_FLAG_SAFETY_ARMED),
-        )
+        self.modes.take_heartbeat(message, self._order.is_late(message.get_seq()), now_ns)
 
     def _boot_ns(self, message: Any, now_ns: int) -> int:
         boot_ns = int(message.time_boot_ms) * _MS
@@ -174,7 +169,7 @@ class VehicleStateEstimator:
         return self._set_attitude(message, quaternion_from_euler(*angles), now_ns)
 
     def _take_attitude_quaternion(self, message: Any, now_ns: int) -> bool:
-        quaternion = _quaternion(message.q2, message.q3, message.q4, message.q1)
+        quaternion = mount.finite_quaternion(message.q2, message.q3, message.q4, message.q1)
         if quaternion is None:
             return False
         self._quaternion_ns = now_ns
@@ -237,67 +232,26 @@ class VehicleStateEstimator:
         self._estimator = (now_ns, _estimator_ok(message.flags, bad))
         return False
 
+    def _take_echo(self, message: Any, now_ns: int) -> bool:
+        self.echo = (now_ns, message)
+        return False
+
     def _take_extended_state(self, message: Any, _now_ns: int) -> bool:
         self._values["landed_state"] = int(message.landed_state) if 0 <= message.landed_state <= 4 else 0
         return False
 
-    def _take_gimbal(self, message: Any, now_ns: int) -> bool:
-        w, x, y, z = message.q
-        quaternion = _quaternion(x, y, z, w)
-        if quaternion is None:
-            return False
-        flags = message.flags
-        earth = bool(flags & _GIMBAL_YAW_IN_EARTH_FRAME)
-        if not flags & (_GIMBAL_YAW_IN_EARTH_FRAME | _GIMBAL_YAW_IN_VEHICLE_FRAME):
-            earth = bool(flags & _GIMBAL_YAW_LOCK)
-        self._set_gimbal(quaternion, earth, now_ns)
+    def _take_mount(self, message: Any, now_ns: int) -> bool:
+        self.mount.take(message, now_ns)
         return False
 
-    def _take_mount_orientation(self, message: Any, now_ns: int) -> bool:
-        absolute = message.yaw_absolute
-        # A v1 message has no absolute yaw and decodes it as 0: the yaw relative to the vehicle is used instead.
-        earth = math.isfinite(absolute) and absolute != 0.0
-        angles = np.deg2rad([message.roll, message.pitch, absolute if earth else message.yaw])
-        if np.isfinite(angles).all():
-            self._set_gimbal(quaternion_from_euler(*angles), earth, now_ns)
+    def _take_parameter(self, message: Any, _now_ns: int) -> bool:
+        if str(message.param_id).rstrip("\0") == mount.TYPE_PARAMETER:
+            self.mount.take_type(float(message.param_value))
         return False
-
-    def _take_mount_status(self, message: Any, now_ns: int) -> bool:
-        pitch, roll, yaw = np.deg2rad(
-            np.array([message.pointing_a, message.pointing_b, message.pointing_c], dtype=float) * 1e-2
-        )
-        self._set_gimbal(quaternion_from_euler(roll, pitch, yaw), False, now_ns)
-        return False
-
-    def _set_gimbal(self, quaternion: np.ndarray, yaw_from_north: bool, now_ns: int) -> None:
-        """Keep the rotation camera FRD -> NED; its roll and pitch are relative to the horizon in either case."""
-        if not yaw_from_north:
-            if self._attitude is None:
-                return
-            turn = quaternion_from_euler(0.0, 0.0, float(yaw_of(self._attitude[1])))
-            quaternion = quaternion_multiply(turn, quaternion)
-        self._gimbal_before, self._gimbal = self._gimbal, (now_ns, quaternion)
 
     def _take_system_time(self, message: Any, now_ns: int) -> bool:
         self._boot_ns(message, now_ns)
         return False
-
-    def _gimbal_at(self, received_ns: int) -> np.ndarray:
-        """(4,) x y z w camera FLU -> ENU at the attitude's reception, NaN = unknown.
-
-        Messages of the gimbal come at other times than the attitude.  Its last rotation is extrapolated over at most
-        one period: at 25 deg/s and 20 Hz the error would be a degree.
-        """
-        if self._gimbal is None or (received_ns - self._gimbal[0]) / _NS > _GIMBAL_STALE_S:
-            return np.full(4, np.nan)
-        latest_ns, orientation = self._gimbal
-        if self._gimbal_before is not None:
-            before_ns, before = self._gimbal_before
-            step_ns = latest_ns - before_ns
-            if 0 < step_ns <= _GIMBAL_STEP_S * _NS:
-                part = min(max(received_ns - latest_ns, 0), step_ns) / step_ns
-                orientation = slerp(before, orientation, 1.0 + part)
-        return orientation_to_ros(orientation)
 
     def _position_at(self, boot_ns: int) -> tuple[np.ndarray, np.ndarray]:
         """Position and velocity (3,) ENU at an instant, extrapolated for up to half a second."""
@@ -310,27 +264,10 @@ class VehicleStateEstimator:
         return position + velocity * min(max(gap_s, -_EXTRAPOLATE_S), _EXTRAPOLATE_S), velocity
 
 
-def mode_name(heartbeat: Any) -> str:
-    """Flight mode by the autopilot's own name, or its number where pymavlink knows none."""
-    from pymavlink import mavutil
-
-    return str(mavutil.mode_string_v10(heartbeat))
-
-
-def _quaternion(x: float, y: float, z: float, w: float) -> np.ndarray | None:
-    """Normalized (4,) x y z w; None where a value is not finite or the length is too far from 1."""
-    raw = np.array([[x, y, z, w]], dtype=float)
-    if not np.isfinite(raw).all():
-        return None
-    quaternion: np.ndarray = unit_quaternions(raw)[0]
-    return quaternion if np.isfinite(quaternion).all() else None
-
-
 def _estimator_ok(flags: int, bad: int) -> bool:
     return flags & _ESTIMATOR_NEEDED == _ESTIMATOR_NEEDED and bool(flags & _ESTIMATOR_POSITION) and not flags & bad
 
 
-_FROM_ANY_COMPONENT = frozenset({"GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS"})
 _HANDLERS = {
     "ATTITUDE": VehicleStateEstimator._take_attitude,
     "ATTITUDE_QUATERNION": VehicleStateEstimator._take_attitude_quaternion,
@@ -341,8 +278,8 @@ _HANDLERS = {
     "EKF_STATUS_REPORT": VehicleStateEstimator._take_ekf,
     "ESTIMATOR_STATUS": VehicleStateEstimator._take_estimator,
     "EXTENDED_SYS_STATE": VehicleStateEstimator._take_extended_state,
-    "GIMBAL_DEVICE_ATTITUDE_STATUS": VehicleStateEstimator._take_gimbal,
-    "MOUNT_ORIENTATION": VehicleStateEstimator._take_mount_orientation,
-    "MOUNT_STATUS": VehicleStateEstimator._take_mount_status,
+    "POSITION_TARGET_LOCAL_NED": VehicleStateEstimator._take_echo,
+    "PARAM_VALUE": VehicleStateEstimator._take_parameter,
     "SYSTEM_TIME": VehicleStateEstimator._take_system_time,
+    **dict.fromkeys(mount.MESSAGES, VehicleStateEstimator._take_mount),
 }

@@ -2,32 +2,43 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from dataclasses import dataclass, field
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.mavlink.current_mode import CURRENT_MODE_ID
 
 _NS = 1_000_000_000
 _FAST_HEARTBEAT_HZ = 5.0
+#: PX4 sends CURRENT_MODE twice a second while nothing changes, and a change after one interval.
+_CURRENT_MODE_HZ, _CURRENT_MODE_INTERVAL_HZ = 2.0, 20.0
 _ECHO_HZ = 10.0
+_GIMBAL = mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS
+#: Requests for the attitude of a mount that has never sent it, after which there is none: without an answer, refused.
+_MOUNT_REQUESTS, _MOUNT_REFUSALS = 10, 2
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass
 class _Wanted:
     rate_hz: float
+    interval_hz: float = 0.0  # 0 = at the rate
     arrivals: deque[int] = field(default_factory=lambda: deque(maxlen=2048))
     requested_ns: int = -(10**18)
     request_count: int = 0
     result: int | None = None
+    ever: bool = False  # whether it has arrived at all
 
 
 class TelemetryRequests:
     """The wanted messages: requested, measured, requested again when their rate is too low.
 
     The measured rate decides, because acknowledgements are not reliable: behind a proxy 20 Hz was acknowledged and
-    1.2 Hz arrived.  Refused messages are requested ten times more rarely, because a mount may appear later.
+    1.2 Hz arrived.  Refused messages are requested ten times more rarely.
     """
 
     def __init__(self, config: MavlinkBridgeConfig) -> None:
@@ -39,7 +50,7 @@ class TelemetryRequests:
             mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: config.status_hz,
             mavlink.MAVLINK_MSG_ID_SYS_STATUS: config.status_hz,
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: config.status_hz,
-            mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: config.gimbal_hz,
+            _GIMBAL: config.gimbal_hz,
         }
         if config.commands_enabled:
             # At their usual 1 Hz a pilot's change of mode and the echo of our setpoints would be noticed a second late.
@@ -49,22 +60,33 @@ class TelemetryRequests:
         self._since_ns: int | None = None
 
     def set_autopilot(self, autopilot: str) -> None:
-        """Add the message by which this autopilot reports its estimator's health."""
+        """Add the messages by which this autopilot reports its estimator's health and, soon, a change of its mode."""
         px4 = autopilot == "px4"
         number = mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS if px4 else mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT
         self._wanted.setdefault(number, _Wanted(self._config.status_hz))
+        if px4 and self._wanted.pop(mavlink.MAVLINK_MSG_ID_HEARTBEAT, None) is not None:
+            # It grants no interval for its heartbeat: 1 Hz.
+            self._wanted[CURRENT_MODE_ID] = _Wanted(_CURRENT_MODE_HZ, _CURRENT_MODE_INTERVAL_HZ)
 
     def count(self, message_id: int, now_ns: int) -> None:
         """Count a message."""
         wanted = self._wanted.get(message_id)
         if wanted is not None:
             wanted.arrivals.append(now_ns)
+            wanted.ever = True
 
     def acknowledge(self, result: int, now_ns: int) -> None:
         """Take the answer to a request.  It names no message: it belongs to the oldest unanswered request."""
         waiting = [w for w in self._wanted.values() if w.request_count and w.result is None]
-        if waiting and now_ns >= waiting[0].requested_ns:
-            min(waiting, key=lambda w: w.requested_ns).result = result
+        if not waiting or now_ns < waiting[0].requested_ns:
+            return
+        asked = min(waiting, key=lambda w: w.requested_ns)
+        asked.result = result
+        if asked is self._wanted.get(CURRENT_MODE_ID) and result != mavlink.MAV_RESULT_ACCEPTED:
+            del self._wanted[CURRENT_MODE_ID]
+            logger.warning(
+                "the autopilot does not send CURRENT_MODE: a mode that the pilot chooses is noticed up to 1 s late"
+            )
 
     def rate_hz(self, message_id: int, now_ns: int) -> float:
         """Real rate of a wanted message over the configured window."""
@@ -85,11 +107,11 @@ class TelemetryRequests:
         }
 
     def refused(self) -> dict[str, int]:
-        """MAV_RESULT of the messages that the autopilot does not grant, by their names."""
+        """MAV_RESULT of the messages that the autopilot does not grant, by their names; no mount is no refusal."""
         return {
             mavlink.mavlink_map[number].msgname: wanted.result
             for number, wanted in self._wanted.items()
-            if wanted.result not in (None, mavlink.MAV_RESULT_ACCEPTED)
+            if wanted.result not in (None, mavlink.MAV_RESULT_ACCEPTED) and not self._no_mount(number)
         }
 
     def due(self, now_ns: int) -> list[tuple[int, int]]:
@@ -99,15 +121,20 @@ class TelemetryRequests:
         settle_ns = int(self._config.rate_window_s * _NS)
         for number, wanted in self._wanted.items():
             wait_s = self._config.request_retry_s * (1 if wanted.result in (None, 0) else 10)
-            if (now_ns - wanted.requested_ns) / _NS < wait_s:
+            if (now_ns - wanted.requested_ns) / _NS < wait_s or self._no_mount(number):
                 continue
             measured = now_ns - self._since_ns >= settle_ns and now_ns - wanted.requested_ns >= settle_ns
             short = measured and self.rate_hz(number, now_ns) < self._config.rate_shortfall * wanted.rate_hz
             if wanted.request_count == 0 or short:
                 wanted.requested_ns, wanted.result = now_ns, None
                 wanted.request_count += 1
-                return [(number, round(1e6 / wanted.rate_hz))]
+                return [(number, round(1e6 / (wanted.interval_hz or wanted.rate_hz)))]
         return []
+
+    def _no_mount(self, number: int) -> bool:
+        wanted = self._wanted[number]
+        enough = _MOUNT_REQUESTS if wanted.result in (None, mavlink.MAV_RESULT_ACCEPTED) else _MOUNT_REFUSALS
+        return number == _GIMBAL and wanted.request_count >= enough and not wanted.ever
 
     def unanswered(self) -> bool:
         """Whether the autopilot ignores the request: three requests for a message, no answer to any."""

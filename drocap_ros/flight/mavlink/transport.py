@@ -81,7 +81,7 @@ def _open_serial(rest: str, url: str) -> Transport:
             "url: expected the package pyserial for serial URLs, found none; pip install pyserial"
         ) from None
     try:
-        return _SerialTransport(serial.Serial(device, int(baud), timeout=0, write_timeout=0.2))
+        return _SerialTransport(serial.Serial(device, int(baud), timeout=0, write_timeout=0.2, exclusive=True))
     except (serial.SerialException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"url: expected a serial device that can be opened, got {url!r}: {reason}") from None

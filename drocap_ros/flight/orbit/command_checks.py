@@ -10,6 +10,7 @@ from drocap_ros.flight.orbit.planner import OrbitGoal, goal_of
 from drocap_ros.flight.orbit.states import Command, OperatorCommand
 from drocap_ros.flight.orbit_config import orbit_condition
 from drocap_ros.flight.safety_config import height_condition
+from drocap_ros.flight.subject.framing import Framing
 
 _NS = 1_000_000_000
 _COMMAND_AGE_S = 2.0
@@ -26,15 +27,17 @@ def command_condition(command: OperatorCommand, now_ns: int) -> Condition | None
 
 
 def commanded_goal(
-    config: MavlinkBridgeConfig, command: OperatorCommand, present: OrbitGoal | None
+    config: MavlinkBridgeConfig, command: OperatorCommand, present: OrbitGoal | None, framing: Framing | None = None
 ) -> OrbitGoal | Condition:
     """The goal that a command asks for, or why the limits forbid it.
 
     present : values that a NaN keeps; None = the configured ones
+    framing : of a fixed camera, which must keep the person in the picture
     """
     for name in ("radius_m", "height_m", "angular_speed_deg_s"):
         if math.isinf(value := getattr(command, name)):
             return condition(ConditionCode.VALUE_NOT_FINITE, name=name, value=value)
     goal = goal_of(config, command.radius_m, command.height_m, command.angular_speed_deg_s, present)
     speed = math.degrees(goal.angular_speed_rad_s)
-    return orbit_condition(config, goal.radius_m, speed) or height_condition(config, goal.height_m) or goal
+    beyond = orbit_condition(config, goal.radius_m, speed) or height_condition(config, goal.height_m)
+    return beyond or (framing.refusal(goal) if framing else None) or goal

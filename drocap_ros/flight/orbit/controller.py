@@ -9,7 +9,6 @@ import dataclasses
 import math
 import threading
 from collections import deque
-from typing import NamedTuple
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -21,6 +20,10 @@ from drocap_ros.flight.mavlink.commands import CommandQueue, command_message
 from drocap_ros.flight.mavlink.dialects import ARDUPILOT, DIALECTS, Dialect, halt_message, setpoint_message
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.orbit.command_checks import command_condition, commanded_goal
+from drocap_ros.flight.orbit.control_status import ControlStatus
+from drocap_ros.flight.orbit.degradation import slowed
+from drocap_ros.flight.orbit.following import Following
+from drocap_ros.flight.orbit.last_setpoint import coast_speed, harmless, slowed_condition
 from drocap_ros.flight.orbit.observer import observe, position_jump_m
 from drocap_ros.flight.orbit.planner import (
     OrbitGoal,
@@ -44,43 +47,21 @@ from drocap_ros.flight.orbit.states import (
     SafetyState,
     State,
 )
-from drocap_ros.flight.orbit.subject_filter import SubjectEstimate, SubjectFilter
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
 from drocap_ros.flight.setpoint import Setpoint, hold_setpoint
+from drocap_ros.flight.subject.framing import Framing
+from drocap_ros.flight.subject.guard import Guard
+from drocap_ros.flight.subject.subject_filter import SubjectEstimate, SubjectFilter
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.observation import PoseObservation
 
 _NS = 1_000_000_000
 _CLOCK_JUMP_S = 0.25
 _GIMBAL_PERIOD_S = 0.5
-_MODE_AGE_S, _MODE_AGE_STEPS = 0.1, 1.5  # a heartbeat is seen in the step that follows it
+_MODE_AGE_STEPS = 1.5  # a report of the mode is seen in the step that follows it
 _SET_MODE = mavlink.MAV_CMD_DO_SET_MODE
 _GIMBAL = mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW
 _MAX_WAITING_COMMANDS = 16
-
-
-class ControlStatus(NamedTuple):
-    """Outcome of one step: the fields of ``msg/OrbitStatus.msg``, the commands it answered, and what was sent.
-
-    mode_failure : why the autopilot did not enter the requested mode, as a sentence; "" = it did, or none was requested
-    """
-
-    state: State
-    condition: Condition
-    mode_failure: str
-    answers: list[tuple[OperatorCommand, CommandAnswer]]
-    radius_m: float
-    height_m: float
-    angular_speed_deg_s: float
-    radius_error_m: float
-    yaw_error_deg: float
-    subject_position: np.ndarray
-    action: Action
-
-    @property
-    def reason(self) -> str:
-        """Why the controller is in its state, as a sentence."""
-        return f"{self.condition} ({self.mode_failure})" if self.mode_failure else str(self.condition)
 
 
 class OrbitController:
@@ -96,15 +77,17 @@ class OrbitController:
         self._link, self._config, self._watchdog = link, config, watchdog
         self._limits = Limits(
             config, config, max_control_timeout_s=config.max_control_timeout_s,
-            max_mode_age_s=max(_MODE_AGE_S, _MODE_AGE_STEPS / config.control_hz),
+            max_mode_age_s=_MODE_AGE_STEPS / config.control_hz,
         )  # fmt: skip
-        self._history = PoseHistory(config.camera_mount_pitch_deg)
+        self._history = PoseHistory()
         self._subject = SubjectFilter(config)
-        self._camera_matrix: np.ndarray | None = None
+        self._framing = Framing(config)
+        self._guard = Guard(config, config, config.braking_m_s2)
         self._vehicle: VehicleState | None = None
         self._commands: deque[OperatorCommand] = deque()
         self._answers: list[tuple[OperatorCommand, CommandAnswer]] = []
         self._queue = CommandQueue()
+        self._following = Following(config.max_echo_age_s)
         self._lock = threading.Lock()
         self.safety = SafetyState()
         self._goal: OrbitGoal = goal_of(config)
@@ -113,6 +96,9 @@ class OrbitController:
         self._fallback: Setpoint | None = None  # what the watchdog holds if this loop hangs
         self._jump_m = 0.0  # of the reported position, since the last step
         self._gimbal_s = -1e18
+        #: Another one that commands or is followed, found in the graph; any thread may set it.
+        self.intruder: Condition | None = None
+        self._unsafe: Condition | None = None  # why the last setpoint was not sent
 
     # -- inputs ----------------------------------------------------------------------------------------
 
@@ -135,15 +121,18 @@ class OrbitController:
         if not np.isfinite(camera_matrix).all() or np.any(focal <= 0):
             raise InputError("camera_info: expected a camera matrix with positive focal lengths; calibrate the camera")
         with self._lock:
-            self._camera_matrix = np.asarray(camera_matrix, dtype=float)
+            self._framing.matrix = np.asarray(camera_matrix, dtype=float)
 
     def on_pose2d(self, observation: PoseObservation) -> None:
         """Take the keypoints of one image."""
+        late_ns = round(self._config.camera_latency_s * _NS)
+        observation = dataclasses.replace(observation, stamp_ns=observation.stamp_ns - late_ns)
         with self._lock:
-            if self._camera_matrix is not None:
+            self._framing.size = observation.image_size
+            if (matrix := self._framing.matrix) is not None:
                 camera = self._history.at(observation.stamp_ns)
-                locked = self.safety.state == State.ORBITING or self.safety.requesting
-                self._subject.update(observation, self._camera_matrix, camera, locked=locked)
+                for estimator in (self._subject.update, self._guard.see):
+                    estimator(observation, matrix, camera, locked=self.safety.bound)
 
     def command(self, command: OperatorCommand) -> None:
         """Take a command; a step answers it.  Each step answers one, and a stop before all others."""
@@ -170,12 +159,17 @@ class OrbitController:
             return self._step(now_ns, now_s)
 
     def _step(self, now_ns: int, now_s: float) -> ControlStatus:
+        self._link.decided_s = now_s
         disturbance, dt, hung = self._disturbance(now_ns, now_s)
         estimate = self._subject.estimate(now_ns)
         if estimate is not None:  # into the frame of the reported position, by which the setpoints are flown
             estimate = dataclasses.replace(estimate, position=estimate.position + self._history.offset)
         orbiting_s = now_s - self.safety.since_s if self.safety.state == State.ORBITING else 0.0
-        seen = observe(self._link, self._config, self._vehicle, estimate, disturbance, orbiting_s, now_ns)
+        setpoints, echo = self._link.sent_setpoints(), self._link.echo()
+        not_followed = self._following.step(now_s, orbiting_s, setpoints, echo, self._vehicle)
+        seen = observe(self._link, self._config, self._vehicle, estimate, disturbance, not_followed, now_ns)
+        seen = self._framing.watch(self._vehicle, seen, dt)
+        seen = dataclasses.replace(self._guard.doubt(seen, self._history.offset, now_ns), intruder=self.intruder)
         command, kind = self._next_command(now_ns)
         dialect = DIALECTS.get(seen.autopilot, ARDUPILOT)
         before = self.safety
@@ -214,7 +208,7 @@ class OrbitController:
             return condition(ConditionCode.POSITION_JUMPED, jump_m=jump_m), dt, hung
         if hung or dt > self._config.watchdog_s:
             return condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=dt), dt, hung
-        return None, dt, hung
+        return self._unsafe, dt, hung
 
     def _next_command(self, now_ns: int) -> tuple[OperatorCommand | None, Command | None]:
         """The command to execute in this step; an invalid one is refused here."""
@@ -236,7 +230,7 @@ class OrbitController:
         running = self.safety.state == State.ORBITING
         if (kind == Command.ADJUST and not running) or (kind != Command.ADJUST and (running or self.safety.requesting)):
             return command, kind  # the state decides, and the goal stays
-        goal = commanded_goal(self._config, command, self._goal if kind == Command.ADJUST else None)
+        goal = commanded_goal(self._config, command, self._goal if kind == Command.ADJUST else None, self._framing)
         if isinstance(goal, Condition):
             self._refuse(command, goal)
             return None, None
@@ -250,7 +244,7 @@ class OrbitController:
         if self.safety.state == State.ORBITING and estimate is not None:
             self._orbit = begin_orbit(seen.position, seen.velocity, estimate.position, self._config)
         else:
-            self._orbit = None
+            self._orbit = self._unsafe = None
         if self.safety.state in (State.TAKEN_OVER, State.IDLE):
             self._queue.cancel_all()
 
@@ -270,15 +264,16 @@ class OrbitController:
         mav, target = self._link.mav, self._link.target
         setpoint: Setpoint | None = None
         if action == Action.ORBIT and self._orbit is not None and estimate is not None:
-            config = self._config
+            config, pace = self._config, self.safety.pace
             speed = float(np.hypot(*estimate.velocity[:2]))
+            least = least_radius(config, estimate.position_sd_m, speed, config.braking_m_s2)
             self._orbit = advance(
                 self._orbit, self._goal, seen.position, estimate.position, estimate.velocity, config.ground_height_m,
-                dt, config, least_radius(config, estimate.position_sd_m, speed, config.braking_m_s2),
+                dt * pace.value, config, least, coast_speed(seen, self._limits),
             )  # fmt: skip
-            setpoint = setpoint_of(
-                self._orbit, seen.position, estimate.position, estimate.velocity, config, seen.velocity
-            )
+            setpoint = setpoint_of(self._orbit, seen.position, estimate.position, estimate.velocity, config)
+            setpoint = self._guard.limit(slowed(setpoint, pace, config.max_acceleration_m_s2), seen)
+            setpoint, self._unsafe = harmless(setpoint, seen, estimate.velocity, self.safety.fence_centre, self._limits)
         elif action == Action.HOLD and self.safety.hold_position is not None:
             setpoint = hold_setpoint(self.safety.hold_position, self.safety.hold_yaw)
         if setpoint is not None and setpoint.is_finite():
@@ -329,10 +324,12 @@ class OrbitController:
             omega = math.degrees((sight[0] * drift[1] - sight[1] * drift[0]) / max(float(sight @ sight), 0.01))
             bearing = math.atan2(-sight[1], -sight[0])
             yaw_error = math.degrees(math.remainder(seen.yaw - bearing, 2 * math.pi)) if sight.any() else math.nan
-        orbiting = self.safety.state == State.ORBITING
+        orbiting, present = self.safety.state == State.ORBITING, self.safety.condition
+        if orbiting:
+            present = slowed_condition(present, self._goal, seen, self._limits)
         answers, self._answers = self._answers, []
         return ControlStatus(
-            state=self.safety.state, condition=self.safety.condition, mode_failure=self._queue.failure(_SET_MODE),
+            state=self.safety.state, condition=present, mode_failure=self._queue.failure(_SET_MODE),
             answers=answers, radius_m=seen.subject_distance_m, height_m=seen.height_m, angular_speed_deg_s=omega,
             radius_error_m=seen.subject_distance_m - self._goal.radius_m if orbiting else math.nan,
             yaw_error_deg=yaw_error, subject_position=subject, action=sent,

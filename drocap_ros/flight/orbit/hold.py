@@ -18,6 +18,8 @@ _FRESH_S = 0.25
 _NEAR_M, _STOPPING_S, _MAX_WAY_OUT_M = 5.0, 1.2, 1.5
 _LEAD_S, _CLEAR_M, _MAX_LEAD_M = 1.5, 0.3, 3.0
 _HOLD_MODE_PATIENCE_S = 5.0
+#: Causes that pass by themselves.  A silent link is none of them: motion does not resume because a link returns.
+_HARMLESS = frozenset({ConditionCode.SUBJECT_OUTDATED, ConditionCode.ATTITUDE_OUTDATED, ConditionCode.POSITION_FROZEN})
 
 
 def begin_hold(
@@ -46,7 +48,8 @@ def begin_hold(
     return dataclasses.replace(
         state, state=State.HOLDING, since_s=now_s, condition=reason, blind=blind and not fresh,
         hold_mode_s=math.nan if seen.followed else now_s, hold_position=place, hold_yaw=seen.yaw,
-        retreats=retreats, retreated_s=-math.inf, slow_s=math.nan,
+        retreats=retreats, retreated_s=-math.inf, slow_s=math.nan, resumable=reason.code in _HARMLESS,
+        clear_s=math.nan,
     )  # fmt: skip
 
 
@@ -61,6 +64,20 @@ def update_hold(state: SafetyState, seen: Observed, now_s: float, blind: bool) -
         reason = condition(ConditionCode.HOLD_MODE_MISSING, cause=state.condition)
         return dataclasses.replace(state, state=State.FAULT, since_s=now_s, condition=reason)
     return state
+
+
+def resumption(
+    state: SafetyState, seen: Observed, now_s: float, problem: Condition | None, config: SafetyConfig
+) -> SafetyState:
+    """Note since when all is clear in a hold that may end by itself; any other cause takes this permission away."""
+    if not state.resumable:
+        return state
+    over = now_s - state.since_s > config.resume_after_hold_s or seen.in_hold or not seen.in_control
+    if over or (problem is not None and problem.code not in _HARMLESS):
+        return dataclasses.replace(state, resumable=False, clear_s=math.nan)
+    if problem is not None:
+        return dataclasses.replace(state, clear_s=math.nan)
+    return state if not math.isnan(state.clear_s) else dataclasses.replace(state, clear_s=now_s)
 
 
 def retreat(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> SafetyState:
@@ -90,6 +107,8 @@ def retreat(state: SafetyState, seen: Observed, now_s: float, limits: Limits) ->
 def request_hold_mode(state: SafetyState, seen: Observed, now_s: float, config: SafetyConfig) -> SafetyState:
     """Allow the request of the hold mode once the vehicle is at rest, or after ``hold_s``."""
     if state.state != State.HOLDING or not math.isnan(state.hold_mode_s) or state.blind or not math.isnan(state.lost_s):
+        return state
+    if state.resumable and now_s - state.since_s <= config.resume_after_hold_s:
         return state
     held_s = now_s - max(state.since_s, state.retreated_s)
     if not np.linalg.norm(seen.velocity) < _AT_REST_M_S:

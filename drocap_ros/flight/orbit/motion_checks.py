@@ -14,22 +14,34 @@ from drocap_ros.flight.vehicle_state import LANDED_LANDING, LANDED_ON_GROUND, LA
 
 _C = ConditionCode
 _REACTION_S = 0.5
+_OWN_SPEED_SD_M_S = 0.1
 _LEAST_SUBJECT_AGE_S = 0.25
 _TIMEOUT_ROUNDING_S = 1e-3
 #: The clocks of image and step differ by a transmission at most.
 _FUTURE_S = 0.2
 _LANDED_STATES = {LANDED_ON_GROUND: "on the ground", LANDED_TAKEOFF: "taking off", LANDED_LANDING: "landing"}
-_FATAL_ACTIONS = {6: "flight is terminated", 7: "the motors are stopped"}
+#: PX4's COM_OBL_RC_ACT but for hold (5), land (4) and return (3).
+_LOSS_ACTIONS = {
+    0: "the vehicle waits for sticks in position mode, and lands without a remote control",
+    1: "the vehicle drifts in altitude mode",
+    2: "the vehicle flies by its sticks alone",
+    6: "flight is terminated",
+    7: "the motors are stopped",
+}
 
 
-def vehicle_condition(seen: Observed, limits: Limits) -> Condition | None:
-    """Why the vehicle must not be commanded; None = it may."""
+def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) -> Condition | None:
+    """Why the vehicle must not be commanded; None = it may.
+
+    patient : of an orbit that is flown: gaps of telemetry slow it down before they end it
+    """
     safety = limits.safety
+    oldest_s = oldest_state_s(safety, patient=patient)
     if not safety.commands_enabled:
         return condition(_C.COMMANDS_DISABLED)
     if seen.disturbance is not None:
         return seen.disturbance
-    if seen.link_age_s > safety.max_state_age_s:
+    if seen.link_age_s > oldest_s:
         return condition(_C.LINK_SILENT, age_s=seen.link_age_s)
     if seen.autopilot not in ("ardupilot", "px4"):
         return condition(_C.AUTOPILOT_UNSUPPORTED, autopilot=seen.autopilot)
@@ -37,9 +49,9 @@ def vehicle_condition(seen: Observed, limits: Limits) -> Condition | None:
         return settings
     if seen.heartbeat_age_s > safety.max_heartbeat_age_s:
         return condition(_C.MODE_OUTDATED, age_s=seen.heartbeat_age_s)
-    if seen.state_age_s > safety.max_state_age_s:
+    if seen.state_age_s > oldest_s:
         return condition(_C.ATTITUDE_OUTDATED, age_s=seen.state_age_s)
-    if seen.position_age_s > safety.max_state_age_s:
+    if seen.position_age_s > oldest_s:
         return condition(_C.POSITION_FROZEN, age_s=seen.position_age_s)
     if seen.round_trip_s > safety.max_round_trip_s:
         return condition(_C.ROUND_TRIP_TOO_LONG, age_s=seen.round_trip_s)
@@ -55,10 +67,19 @@ def vehicle_condition(seen: Observed, limits: Limits) -> Condition | None:
         return condition(_C.ESTIMATOR_UNHEALTHY)
     if seen.status_age_s > safety.max_status_age_s:
         return condition(_C.STATUS_OUTDATED, age_s=seen.status_age_s)
-    if math.isnan(seen.battery_fraction):
+    battery = battery_condition(seen.battery_fraction, seen.battery_voltage_v, safety)
+    return battery or seen.camera_problem or seen.intruder
+
+
+def battery_condition(charge: float, volts: float, safety: SafetyConfig) -> Condition | None:
+    """Why the battery forbids motion: its charge (0 to 1), and its voltage where a least one is configured."""
+    least_v = safety.min_battery_voltage_v
+    if least_v > 0 and volts < least_v:
+        return condition(_C.BATTERY_LOW, level=f"{volts:.1f} V")
+    if charge < safety.min_battery_fraction:
+        return condition(_C.BATTERY_LOW, level=f"{100 * charge:.0f} %")
+    if math.isnan(charge) and (least_v == 0 or math.isnan(volts)):
         return condition(_C.BATTERY_UNKNOWN)
-    if seen.battery_fraction < safety.min_battery_fraction:
-        return condition(_C.BATTERY_LOW, percent=100 * seen.battery_fraction)
     return None
 
 
@@ -70,11 +91,13 @@ def loss_condition(settings: LossSettings | None, longest_s: float) -> Condition
         return condition(_C.TIMEOUT_UNKNOWN, name=settings.timeout_name, limit_s=longest_s)
     if settings.timeout_s > longest_s + _TIMEOUT_ROUNDING_S:
         return condition(_C.TIMEOUT_TOO_LONG, name=settings.timeout_name, value_s=settings.timeout_s, limit_s=longest_s)
-    if settings.action in _FATAL_ACTIONS:
+    if not settings.action_name:
+        return None
+    unknown = "the vehicle reacts in an unknown way" if math.isnan(settings.action) else ""
+    if consequence := unknown or _LOSS_ACTIONS.get(int(settings.action), ""):
         return condition(
-            _C.LOSS_ACTION_FATAL, name=settings.action_name, value=settings.action,
-            consequence=_FATAL_ACTIONS[int(settings.action)],
-        )  # fmt: skip
+            _C.LOSS_ACTION_FATAL, name=settings.action_name, value=settings.action, consequence=consequence
+        )
     return None
 
 
@@ -99,13 +122,18 @@ def limit_condition(seen: Observed, fence_centre: np.ndarray | None, limits: Lim
     return None
 
 
-def subject_condition(seen: Observed, limits: Limits) -> Condition | None:
-    """Why the subject's position does not allow motion; None = it does."""
+def subject_condition(seen: Observed, limits: Limits, *, patient: bool = False) -> Condition | None:
+    """Why the subject's position does not allow motion; None = it does.
+
+    patient : of an orbit that is flown: late pictures slow it down, and stop it, before they end it; pictures of
+        something else end it as before
+    """
     safety = limits.safety
     if seen.subject is None:
         return condition(_C.NO_SUBJECT)
-    speed = float(np.linalg.norm(np.nan_to_num(seen.velocity)))
-    oldest_s = min(safety.max_subject_age_s, max(safety.max_blind_m / max(speed, 1e-3), _LEAST_SUBJECT_AGE_S))
+    oldest_s = oldest_subject_s(seen, safety)
+    if patient and not seen.subject_contradicted:
+        oldest_s = max(oldest_s, safety.max_subject_gap_s)
     if not -_FUTURE_S < seen.subject_age_s <= oldest_s:
         return condition(_C.SUBJECT_OUTDATED, age_s=seen.subject_age_s)
     if not seen.subject_sd_m <= safety.max_subject_sd_m:
@@ -121,12 +149,30 @@ def subject_condition(seen: Observed, limits: Limits) -> Condition | None:
 
 
 def _too_near(seen: Observed, limits: Limits) -> bool:
-    # Braking takes the speed at which the distance shrinks.  A subject that walks towards the vehicle cannot be
-    # stopped: its steps until a hold has begun count.  One that is followed may stop dead: its speed counts too.
-    chase, approach = max(-seen.approach_m_s, 0.0), max(seen.approach_m_s, 0.0)
-    own = max(seen.closing_m_s - chase, 0.0)
-    room = braking_distance(own, limits.safety) + braking_distance(chase, limits.safety) + _REACTION_S * approach
-    return not seen.subject_distance_m - room - seen.subject_sd_m >= limits.orbit.min_distance_m
+    return not seen.subject_distance_m - stopping_room(seen, limits.safety) >= limits.orbit.min_distance_m
+
+
+def stopping_room(seen: Observed, safety: SafetyConfig) -> float:
+    """Distance (m) that may be lost between vehicle and subject until the vehicle stands, uncertainty included.
+
+    A subject that recedes may stand in truth: what the vehicle flies towards him counts whole, and at least the speed
+    at which it follows him.  One that comes nearer cannot be stopped: his steps count until the vehicle stands.  A
+    standard deviation of his position, and of his speed until the vehicle reacts, is added.
+    """
+    toward = max(seen.closing_m_s, -seen.approach_m_s, 0.0) + _OWN_SPEED_SD_M_S  # own speed and chase together
+    steps = max(seen.approach_m_s, 0.0) * (_REACTION_S + toward / safety.braking_m_s2)
+    return braking_distance(toward, safety) + steps + math.hypot(seen.subject_sd_m, _REACTION_S * seen.approach_sd_m_s)
+
+
+def oldest_state_s(safety: SafetyConfig, *, patient: bool = False) -> float:
+    """Greatest age in s of attitude, position and link; ``patient`` as in :func:`vehicle_condition`."""
+    return max(safety.max_state_age_s, safety.max_state_gap_s if patient else 0.0)
+
+
+def oldest_subject_s(seen: Observed, safety: SafetyConfig) -> float:
+    """Greatest age in s of the subject at which the vehicle is moved: less at speed."""
+    speed = float(np.linalg.norm(np.nan_to_num(seen.velocity)))
+    return min(safety.max_subject_age_s, max(safety.max_blind_m / max(speed, 1e-3), _LEAST_SUBJECT_AGE_S))
 
 
 def subject_located(seen: Observed, safety: SafetyConfig) -> bool:

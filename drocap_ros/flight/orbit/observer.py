@@ -11,7 +11,7 @@ from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.dialects import ARDUPILOT, DIALECTS
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.orbit.states import Observed
-from drocap_ros.flight.orbit.subject_filter import SubjectEstimate
+from drocap_ros.flight.subject.subject_filter import SubjectEstimate
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 
@@ -27,7 +27,7 @@ def observe(
     vehicle: VehicleState | None,
     estimate: SubjectEstimate | None,
     disturbance: Condition | None,
-    orbiting_s: float,
+    not_followed: str,
     now_ns: int,
 ) -> Observed:
     """The observation of one step.
@@ -37,11 +37,12 @@ def observe(
     vehicle : latest state
     estimate : of the subject, in the frame of the reported position
     disturbance : of our own time or of the reported position
-    orbiting_s : how long the orbit has been flown; 0 = it is not
+    not_followed : why the setpoints count as not followed, in words; "" = they are
     """
     if vehicle is None:
         return Observed(disturbance=disturbance)
     estimator = link.estimator
+    heard = estimator.modes.take_heard()
     age_s = (now_ns - vehicle.stamp_ns) / _NS
     # The state is at the attitude's stamp; a moment later the vehicle is a little farther.
     position = vehicle.position_enu_m + np.nan_to_num(vehicle.velocity_enu_m_s) * min(
@@ -50,34 +51,36 @@ def observe(
     latest = estimator.snapshot(now_ns) or vehicle  # mode and health are newer than the attitude
     dialect = DIALECTS.get(latest.autopilot, ARDUPILOT)
     status_age = max(estimator.age_s(names, now_ns) for names in _STATUS_MESSAGES)
-    distance, closing, approach = math.nan, 0.0, 0.0
+    distance, closing, approach, approach_sd = math.nan, 0.0, 0.0, 0.0
     if estimate is not None:
         offset = position[:2] - estimate.position[:2]
         distance = float(np.hypot(*offset))
         closing = -float(offset @ vehicle.velocity_enu_m_s[:2]) / max(distance, 1e-3)
         approach = float(offset @ estimate.velocity[:2]) / max(distance, 1e-3)
-    followed = True
-    if disturbance is None:
-        echo_age = estimator.age_s(("POSITION_TARGET_LOCAL_NED",), now_ns)
-        if math.isfinite(echo_age) and min(echo_age, orbiting_s) > config.max_echo_age_s:
-            # PX4 needs another mode; ArduPilot's GUID_TIMEOUT has ended the motion by now, and BRAKE from there would
-            # take longer.
-            followed = latest.autopilot != "px4"
-            disturbance = condition(ConditionCode.SETPOINTS_NOT_FOLLOWED, age_s=echo_age)
+        approach_sd = math.sqrt(max(float(offset @ estimate.covariance[3:5, 3:5] @ offset), 0.0)) / max(distance, 1e-3)
+    if not_followed and disturbance is None:
+        disturbance = condition(ConditionCode.SETPOINTS_NOT_FOLLOWED, evidence=not_followed)
+    # PX4 needs another mode; ArduPilot's GUID_TIMEOUT has ended the motion by now, and BRAKE would take longer.
+    followed = not not_followed or latest.autopilot != "px4"
     return Observed(
         autopilot=latest.autopilot, mode=latest.mode, in_control=latest.mode == dialect.control_mode,
-        in_hold=latest.mode == dialect.hold_mode, armed=latest.armed, landed_state=latest.landed_state,
-        link_age_s=latest.link_age_s, heartbeat_age_s=estimator.age_s(("HEARTBEAT",), now_ns),
+        in_hold=latest.mode == dialect.hold_mode, heard=heard | {latest.mode},
+        left_by_itself=estimator.modes.intended == dialect.control_mode != latest.mode,
+        armed=latest.armed, landed_state=latest.landed_state, link_age_s=latest.link_age_s,
+        heartbeat_age_s=estimator.modes.age_s(now_ns),
         state_age_s=abs(age_s), position_age_s=(now_ns - estimator.position_changed_ns) / _NS,
-        status_age_s=status_age, round_trip_s=link.answer_age_s(),
+        status_age_s=status_age, round_trip_s=link.answer_age_s(), stream_gap_s=link.stream_gap_s(),
         gps_fix_type=latest.gps_fix_type, position_ok=latest.position_ok, battery_fraction=latest.battery_fraction,
+        battery_voltage_v=latest.battery_voltage_v,
         position=position, velocity=np.asarray(vehicle.velocity_enu_m_s, float), yaw=_yaw(vehicle),
         height_m=float(position[2]) - config.ground_height_m,
         subject=None if estimate is None else estimate.position,
         subject_age_s=math.inf if estimate is None else estimate.age_s,
+        subject_contradicted=estimate is not None and estimate.contradicted,
         subject_sd_m=math.inf if estimate is None else estimate.position_sd_m,
-        subject_distance_m=distance, closing_m_s=closing, approach_m_s=approach, disturbance=disturbance,
-        followed=followed, loss_settings=link.settings.loss_settings(),
+        subject_distance_m=distance, closing_m_s=closing, approach_m_s=approach, approach_sd_m_s=approach_sd,
+        disturbance=disturbance, followed=followed, loss_settings=link.settings.loss_settings(),
+        camera_problem=estimator.mount.problem(latest.autopilot, now_ns),
     )  # fmt: skip
 
 

@@ -18,10 +18,14 @@ from drocap_ros.flight.setpoint import Setpoint
 
 _TRIM_RATE, _MAX_TRIM_M = 0.15, 0.5  # 1/s, m
 _FREE_LEAD = 0.6  # share of the greatest lead, below which the reference does not wait
-_CENTRE_RATE = 4.0  # 1/s; fast, because the subject's estimate is steady and a slow centre is an error of the radius
+_CENTRE_RATE = 3.0  # 1/s; a slower centre is an error of the radius, a faster one passes on the estimate's noise
 _CENTRE_ACCELERATION = 8.0  # m/s^2; above any acceleration of a subject, so it limits only jumps
-_MAX_FORWARD = 1.5  # m/s^2 of the centre that the setpoint passes on: a walker's sharp turn
-_DAMPING, _MAX_DAMPING = 2.0, 2.0  # 1/s, m/s^2: feedback of the velocity error
+_FORWARD_S = 0.5  # s; filter of the centre's acceleration
+_FORWARD_RATE, _MAX_FORWARD = (
+    0.4,
+    0.5,
+)  # 1/s, m/s^2: so much of it is passed on, by the centre's speed: noise if it stands
+_MAX_HASTE = 0.3  # m/s^2 along the path that the setpoint passes on: the reference waits for a vehicle that lags
 _STANDING_M_S, _SURPRISE_S, _FLIGHT_ERROR_M = 0.3, 0.5, 0.5  # of the least radius
 
 
@@ -47,7 +51,7 @@ class OrbitState(NamedTuple):
     phase : rad, bearing of the reference from the centre, from east
     omega : rad/s with its rate
     radius, height : m; height in the map frame
-    centre, centre_velocity, centre_acceleration : (2,) m, m/s, m/s^2
+    centre, centre_velocity, centre_acceleration : (2,) m, m/s, m/s^2; the acceleration filtered
     trim : m, added to the radius: integrated mean radius error (wind, lag)
     """
 
@@ -114,12 +118,14 @@ def advance(
     dt: float,
     config: OrbitConfig,
     least_radius_m: float = 0.0,
+    greatest_speed_m_s: float = math.inf,
 ) -> OrbitState:
     """The reference ``dt`` seconds later (at most 0.2 s of them).
 
     vehicle, subject, subject_velocity : (3,) ENU, actual
     ground_m : height of the subject's ground in the map frame
     least_radius_m : lower bound of the radius
+    greatest_speed_m_s : of the vehicle, beside ``max_speed_m_s``
     """
     dt = min(max(dt, 0.0), 0.2)
     if dt == 0.0:
@@ -131,12 +137,17 @@ def advance(
     wanted = max(goal.radius_m, config.min_distance_m, min(least_radius_m, config.max_distance_m))
     radius = _toward(state.radius, wanted, approach, slow, jerk, dt)
     height = _toward(state.height, ground_m + goal.height_m, config.approach_speed_m_s, slow, jerk, dt)
-    target = _allowed_speed(goal.angular_speed_rad_s, radius.value, float(np.hypot(*centre_velocity)), config)
+    outward = np.array([math.cos(state.phase), math.sin(state.phase)])
+    moving = centre_velocity + radius.rate * outward
+    along = math.copysign(1.0, goal.angular_speed_rad_s) * np.array([-outward[1], outward[0]])
+    greatest = min(greatest_speed_m_s, config.max_speed_m_s)
+    target = _allowed_speed(goal.angular_speed_rad_s, radius.value, moving, along, greatest, config)
+    fastest = min(abs(goal.angular_speed_rad_s), greatest / radius.value)
     lead = float(np.linalg.norm(reference_position(state)[:2] - vehicle[:2]))
     wait = (config.max_lead_m - lead) / ((1 - _FREE_LEAD) * config.max_lead_m)
     target *= min(max(wait, 0.0), 1.0)
     # A ramp of the wanted length with rounded ends: its greatest rate is 1.5 times its mean.
-    rate = 1.5 * max(abs(goal.angular_speed_rad_s), math.radians(5.0)) / config.ramp_s
+    rate = 1.5 * max(fastest, math.radians(5.0)) / config.ramp_s
     omega = _speed_toward(state.omega, target, rate, 6.0 * rate / config.ramp_s, dt)
     # The ramp is too slow for a vehicle that suddenly falls behind: the phase itself waits.
     creep = min(max((1.3 * config.max_lead_m - lead) / (0.3 * config.max_lead_m), 0.0), 1.0)
@@ -164,26 +175,18 @@ def setpoint_of(
     subject: np.ndarray,
     subject_velocity: np.ndarray,
     config: OrbitConfig,
-    vehicle_velocity: np.ndarray | None = None,
 ) -> Setpoint:
-    """Setpoint of the reference, at most the greatest lead away from the vehicle.
-
-    vehicle_velocity : (3,) m/s; its error becomes an acceleration of the setpoint
-    """
+    """Setpoint of the reference, at most the greatest lead away from the vehicle."""
     c, s = math.cos(state.phase), math.sin(state.phase)
     outward, along = np.array([c, s]), np.array([-s, c])
     r, omega = state.radius, state.omega
     flat_velocity = state.centre_velocity + r.rate * outward + r.value * omega.value * along
     flat_acceleration = (
-        _limited(state.centre_acceleration, _MAX_FORWARD)
+        _limited(state.centre_acceleration, min(_FORWARD_RATE * float(np.hypot(*state.centre_velocity)), _MAX_FORWARD))
         + (r.acceleration - omega.value**2 * r.value) * outward
-        + (r.value * omega.rate + 2 * r.rate * omega.value) * along
+        + (min(max(r.value * omega.rate, -_MAX_HASTE), _MAX_HASTE) + 2 * r.rate * omega.value) * along
     )
     velocity = _limited(np.array([*flat_velocity, state.height.rate]), config.max_speed_m_s)
-    if vehicle_velocity is not None:
-        flat_acceleration = flat_acceleration + _limited(
-            _DAMPING * (flat_velocity - vehicle_velocity[:2]), _MAX_DAMPING
-        )
     acceleration = _limited(np.array([*flat_acceleration, state.height.acceleration]), config.max_acceleration_m_s2)
     position = vehicle + _limited(reference_position(state) - vehicle, config.max_lead_m)
     sight = subject[:2] - vehicle[:2]
@@ -202,10 +205,18 @@ def _approach_speed(state: OrbitState, config: OrbitConfig) -> float:
     return min(max(math.sqrt(room) - chase, 0.2), config.approach_speed_m_s)
 
 
-def _allowed_speed(wanted: float, radius: float, centre_speed: float, config: OrbitConfig) -> float:
-    """Wanted angular speed in rad/s, limited by speed and acceleration at this radius."""
+def _allowed_speed(
+    wanted: float, radius: float, moving: np.ndarray, along: np.ndarray, greatest: float, config: OrbitConfig
+) -> float:
+    """Wanted angular speed in rad/s, limited by speed and acceleration at this radius.
+
+    moving : (2,) m/s, what the orbit adds to: of the centre and of the radius
+    along : (2,) direction in which it adds
+    """
     by_acceleration = math.sqrt(config.max_acceleration_m_s2 / radius)
-    by_speed = max(config.max_speed_m_s - centre_speed, 0.0) / radius
+    ahead = float(moving @ along)
+    room = greatest**2 - float(moving @ moving) + ahead**2
+    by_speed = max(math.sqrt(max(room, 0.0)) - ahead, 0.0) / radius
     return math.copysign(min(abs(wanted), by_acceleration, by_speed), wanted)
 
 
@@ -216,7 +227,9 @@ def _follow(
     pull = _CENTRE_RATE**2 * (subject - state.centre) + 2 * _CENTRE_RATE * (velocity - state.centre_velocity)
     acceleration = _limited(pull, _CENTRE_ACCELERATION)
     moved = _limited(state.centre_velocity + acceleration * dt, config.max_subject_speed_m_s)
-    return state.centre + 0.5 * (state.centre_velocity + moved) * dt, moved, acceleration
+    change = (moved - state.centre_velocity) / dt
+    filtered = state.centre_acceleration + (change - state.centre_acceleration) * min(dt / _FORWARD_S, 1.0)
+    return state.centre + 0.5 * (state.centre_velocity + moved) * dt, moved, filtered
 
 
 def _toward(ramp: Ramp, target: float, max_rate: float, max_acceleration: float, jerk: float, dt: float) -> Ramp:

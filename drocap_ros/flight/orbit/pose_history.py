@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.frames import camera_rotation, quaternion_multiply
+from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import slerp
 
@@ -33,24 +33,19 @@ class PoseHistory:
 
     Parameters
     ----------
-    mount_pitch_deg : tilt of the camera against the body, down positive, without a mount that reports its attitude
     keep_s : how far back
     extrapolate_s : longest extrapolation beyond the newest state
     """
 
-    def __init__(self, mount_pitch_deg: float = 0.0, keep_s: float = 3.0, extrapolate_s: float = 0.15) -> None:
-        half = 0.5 * np.deg2rad(mount_pitch_deg)
-        self._mount = np.array([0.0, np.sin(half), 0.0, np.cos(half)])  # about FLU y: positive turns the nose down
+    def __init__(self, keep_s: float = 3.0, extrapolate_s: float = 0.15) -> None:
         self._keep_ns, self._extrapolate_ns = int(keep_s * _NS), int(extrapolate_s * _NS)
         self._poses: deque[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = deque()
         #: (3,) m, reported minus integrated position now: add it to a position from here.
         self.offset: np.ndarray = np.zeros(3)
 
     def add(self, state: VehicleState) -> None:
-        """Take a state; one without position or attitude is left out.  A stamp that goes back clears the history."""
+        """Take a state; without position or camera's attitude it is left out.  A stamp that goes back clears all."""
         camera = state.gimbal_orientation_xyzw
-        if not np.isfinite(camera).all():
-            camera = quaternion_multiply(state.orientation_xyzw, self._mount)
         if not (np.isfinite(camera).all() and np.isfinite(state.position_enu_m).all()):
             return
         if self._poses and state.stamp_ns <= self._poses[-1][0]:

@@ -6,9 +6,10 @@ import dataclasses
 import math
 
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.orbit.hold import begin_hold, request_hold_mode, retreat, update_hold
+from drocap_ros.flight.orbit.degradation import allowed_pace, next_pace
+from drocap_ros.flight.orbit.hold import begin_hold, request_hold_mode, resumption, retreat, update_hold
 from drocap_ros.flight.orbit.motion_checks import limit_condition, subject_condition, vehicle_condition
-from drocap_ros.flight.orbit.sight import is_lost, is_silent, mode_visible, watch
+from drocap_ros.flight.orbit.sight import foreign_mode, is_lost, is_silent, mode_visible, stream_ended, watch
 from drocap_ros.flight.orbit.states import (
     Action,
     Command,
@@ -17,6 +18,7 @@ from drocap_ros.flight.orbit.states import (
     Limits,
     ModeRequest,
     Observed,
+    Pace,
     SafetyState,
     State,
 )
@@ -24,6 +26,8 @@ from drocap_ros.flight.orbit.states import (
 _C = ConditionCode
 _BLIND_MODE_REQUEST_S = 2.0
 _BLIND_STOP_S = 10.0
+_CLEAR_S = 1.0  # for which all conditions hold before an orbit resumes by itself
+_INTENTION_S = 1.0
 _ACTIVE = frozenset({State.ORBITING, State.HOLDING, State.FAULT})
 
 
@@ -47,8 +51,10 @@ def reduce(
     state = watch(state, seen, now_s, limits)
     lost_s, seen_s = state.lost_s, state.seen_s
     # However late it is heard: a mode of somebody else is a take-over.
-    if state.modes and seen.mode not in state.modes and seen.mode:
-        state = _enter(State.TAKEN_OVER, condition(_C.PILOT_TOOK_OVER, mode=seen.mode), now_s)
+    if _returned(state, seen):
+        state = _enter(State.IDLE, condition(_C.ALL_CLEAR), now_s)
+    elif foreign := foreign_mode(state, seen) or _misjudged(state, seen, now_s):
+        state = _yield(state, seen, foreign, now_s)
     elif state.state in _ACTIVE and not is_lost(state) and not seen.armed and seen.mode:
         state = _enter(State.IDLE, condition(_C.DISARMED), now_s)
     elif state.state in _ACTIVE and seen.in_hold:
@@ -58,17 +64,62 @@ def reduce(
     if command is not None:
         state, answer = _execute(state, seen, now_s, command, problem, limits)
     if state.state == State.ORBITING:
-        if problem:
-            near = problem.code == _C.SUBJECT_NEAR
-            state = begin_hold(state, problem, seen, now_s, vehicle is not None, retreats=near)
+        state = _orbit(state, seen, now_s, vehicle is not None, limits)
     elif state.state in (State.IDLE, State.READY):
         state = _wait(state, seen, now_s, problem, limits)
-    elif state.state in (State.HOLDING, State.FAULT):
+    elif state.state in (State.HOLDING, State.FAULT) and not stream_ended(seen):
         state = update_hold(state, seen, now_s, vehicle is not None)
         moved = state if vehicle or place else retreat(state, seen, now_s, limits)
         state = moved if moved is not state else request_hold_mode(state, seen, now_s, limits.safety)
+        state = resumption(state, seen, now_s, problem, limits.safety)
+        if state.clear_s <= now_s - _CLEAR_S and seen.in_control and not is_lost(state):
+            state = dataclasses.replace(_begin_orbit(seen, now_s), fence_centre=state.fence_centre)
     state = dataclasses.replace(state, lost_s=lost_s, seen_s=seen_s)
     return state, Decision(*_permitted(state, seen, now_s, limits), answer)
+
+
+def _returned(state: SafetyState, seen: Observed) -> bool:
+    """Whether the pilot gives control back after our own hold mode: nothing is sent, but a start is enough then."""
+    return state.state == State.HOLDING and bool(state.modes) and seen.in_control and seen.mode not in state.modes
+
+
+def _orbit(state: SafetyState, seen: Observed, now_s: float, blind: bool, limits: Limits) -> SafetyState:
+    """Slow the orbit down by the age of the data, or end it."""
+    vehicle = vehicle_condition(seen, limits, patient=True)
+    place = None if vehicle else limit_condition(seen, state.fence_centre, limits)
+    problem = vehicle or place or subject_condition(seen, limits, patient=True)
+    if problem:
+        return begin_hold(state, problem, seen, now_s, blind, retreats=problem.code == _C.SUBJECT_NEAR)
+    allowed, cause = allowed_pace(seen, limits)
+    pace = next_pace(state.pace, allowed, now_s)
+    reason = state.condition
+    if cause is not None:
+        reason = condition(_C.DEGRADED, cause=cause)
+    elif pace.value == 1.0:
+        reason = condition(_C.ORBITING)
+    return dataclasses.replace(state, pace=pace, condition=reason)
+
+
+def _yield(state: SafetyState, seen: Observed, mode: str, now_s: float) -> SafetyState:
+    """End all commands: the mode is not ours."""
+    if not (seen.left_by_itself and mode == seen.mode):
+        return _enter(State.TAKEN_OVER, condition(_C.PILOT_TOOK_OVER, mode=mode), now_s)
+    evidence = f"the autopilot has left its control mode for {mode} by itself, as where setpoints do not arrive"
+    reason = seen.disturbance or condition(_C.SETPOINTS_NOT_FOLLOWED, evidence=evidence)
+    if not seen.in_hold:
+        return _enter(State.TAKEN_OVER, reason, now_s)
+    # Its hold is the one in which a stop ends; nothing is sent in it.
+    if state.state in (State.HOLDING, State.FAULT):
+        reason = state.condition
+    return _enter(State.HOLDING, reason, now_s, modes=frozenset({mode}))
+
+
+def _misjudged(state: SafetyState, seen: Observed, now_s: float) -> str:
+    """The mode that was taken for the pilot's because a heartbeat came before the report of what is intended."""
+    taken = state.state == State.TAKEN_OVER and state.condition.code == _C.PILOT_TOOK_OVER
+    if taken and seen.left_by_itself and now_s - state.since_s < _INTENTION_S:
+        return seen.mode if state.condition.values.get("mode") == seen.mode else ""
+    return ""
 
 
 def permit_mode(state: SafetyState, mode: str) -> SafetyState:
@@ -120,7 +171,9 @@ def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> t
     if state.requesting:
         answer = _accepted(_C.STOPPED)
         return _enter(State.IDLE, answer.condition, now_s), answer
-    return state, _accepted(_C.ALREADY_HOLDING if state.state == State.HOLDING else _C.NOT_ORBITING)
+    if state.state == State.HOLDING:
+        return dataclasses.replace(state, resumable=False), _accepted(_C.ALREADY_HOLDING)
+    return state, _accepted(_C.NOT_ORBITING)
 
 
 def _wait(state: SafetyState, seen: Observed, now_s: float, problem: Condition | None, limits: Limits) -> SafetyState:
@@ -145,7 +198,8 @@ def _permitted(state: SafetyState, seen: Observed, now_s: float, limits: Limits)
     if state.state == State.READY and state.requesting:
         warm = now_s - state.requesting_s >= limits.warm_up_s and mode_visible(state, seen, now_s, limits)
         return Action.HOLD, ModeRequest.CONTROL if warm else ModeRequest.NONE
-    if state.state not in (State.HOLDING, State.FAULT) or seen.in_hold or is_silent(state, now_s, limits):
+    silent = not seen.in_control or is_silent(state, now_s, limits) or stream_ended(seen)
+    if state.state not in (State.HOLDING, State.FAULT) or silent:
         return Action.NOTHING, ModeRequest.NONE
     action, since = Action.HALT if state.hold_position is None else Action.HOLD, now_s - state.since_s
     if state.blind and since >= _BLIND_STOP_S:
@@ -162,6 +216,7 @@ def _begin_orbit(seen: Observed, now_s: float) -> SafetyState:
     return _enter(
         State.ORBITING, condition(_C.ORBITING), now_s, modes=frozenset({seen.mode}),
         fence_centre=seen.subject[:2].copy(), hold_position=seen.position.copy(), hold_yaw=seen.yaw,
+        pace=Pace(at_s=now_s),
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Whether the vehicle, and the mode that the pilot may have changed, can be seen."""
+"""Whether the vehicle, and the mode that the pilot may have changed, can be seen, and whose mode it is."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from drocap_ros.flight.orbit.states import Limits, Observed, SafetyState, State
 #: Telemetry must arrive for so long after a loss before a mode is requested: longer than the 1 s between two
 #: heartbeats of PX4, and than packets that were late and arrive after newer ones.
 _STEADY_S = 1.3
+_DEFAULT_TIMEOUT_S = 0.5
 
 
 def watch(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> SafetyState:
@@ -56,6 +57,30 @@ def mode_visible(state: SafetyState, seen: Observed, now_s: float, limits: Limit
     steady = now_s - state.seen_s >= _STEADY_S and not is_lost(state)
     late = seen.round_trip_s > limits.safety.max_round_trip_s  # the request would arrive late too
     return steady and not late and seen.heartbeat_age_s <= limits.max_mode_age_s
+
+
+def foreign_mode(state: SafetyState, seen: Observed) -> str:
+    """A mode that was reported and is not ours; "" = none.
+
+    While the operator's request is pending the control mode is ours, whoever restores it: PX4 keeps OFFBOARD as its
+    intention after a loss, and the first setpoint is enough.
+    """
+    if not state.modes:
+        return ""
+    own = state.modes | ({seen.mode} if state.requesting and seen.in_control else frozenset())
+    foreign = (seen.heard | {seen.mode}) - own - {""}
+    return seen.mode if seen.mode in foreign else min(foreign, default="")
+
+
+def stream_ended(seen: Observed) -> bool:
+    """Whether no setpoint was sent for longer than the autopilot's time-out: none may follow by itself.
+
+    A process that was stopped and continues, or a link that returns, would take control back: PX4 restores OFFBOARD
+    with the first setpoint.
+    """
+    settings = seen.loss_settings
+    timeout_s = math.nan if settings is None else settings.timeout_s
+    return seen.stream_gap_s > (_DEFAULT_TIMEOUT_S if math.isnan(timeout_s) else timeout_s)
 
 
 def _telemetry_fresh(seen: Observed, limits: Limits) -> bool:

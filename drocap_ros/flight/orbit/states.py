@@ -57,21 +57,32 @@ class Observed:
     """Vehicle, link and subject at one instant; ages in s, infinite = never.
 
     in_control, in_hold : the mode is GUIDED or OFFBOARD; it is the autopilot's hold mode
+    heard : all modes that were reported since the last step, late ones too; empty = the mode alone
+    left_by_itself : whether the autopilot left the control mode while nobody chose another one: a failsafe
+    heartbeat_age_s : since the newest report of the mode
     position_age_s : since the reported position last changed, so frozen telemetry ages too
     round_trip_s : since the sending of the message that was answered last; NaN = no answer yet
+    stream_gap_s : since the last setpoint left
     position, velocity : (3,) ENU; the position is extrapolated over the age of the state
     height_m : above the subject's ground
+    subject_contradicted : whether images since the subject was located showed something else in his place
     subject_distance_m : horizontal
     closing_m_s, approach_m_s : speed of the vehicle towards the subject, and of the subject towards the vehicle
+    approach_sd_m_s : standard deviation of ``approach_m_s``
+    intruder : another one that commands, or whose keypoints would be followed
     disturbance : a condition that ends motion and that no other field shows
     followed : whether the autopilot follows our setpoints; if not, only a mode can stop it
     loss_settings : the autopilot's settings for the loss of setpoints
+    camera_problem : why the camera's attitude is unknown
+    framing_margin : between the person and the border of a fixed camera's picture, as a share of its height
     """
 
     autopilot: str = "other"
     mode: str = ""
     in_control: bool = False
     in_hold: bool = False
+    heard: frozenset[str] = frozenset()
+    left_by_itself: bool = False
     armed: bool = False
     landed_state: int = 0
     link_age_s: float = math.inf
@@ -80,22 +91,29 @@ class Observed:
     position_age_s: float = math.inf
     status_age_s: float = math.inf
     round_trip_s: float = math.nan
+    stream_gap_s: float = 0.0
     gps_fix_type: int = 0
     position_ok: bool = False
     battery_fraction: float = math.nan
+    battery_voltage_v: float = math.nan
     position: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
     velocity: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
     yaw: float = math.nan
     height_m: float = math.nan
     subject: np.ndarray | None = None
     subject_age_s: float = math.inf
+    subject_contradicted: bool = False
     subject_sd_m: float = math.inf
     subject_distance_m: float = math.nan
     closing_m_s: float = 0.0
     approach_m_s: float = 0.0
+    approach_sd_m_s: float = 0.0
+    intruder: Condition | None = None
     disturbance: Condition | None = None
     followed: bool = True
     loss_settings: LossSettings | None = None
+    camera_problem: Condition | None = None
+    framing_margin: float = math.inf
 
 
 class Limits(NamedTuple):
@@ -103,7 +121,7 @@ class Limits(NamedTuple):
 
     warm_up_s : how long the autopilot must receive setpoints before it grants control
     max_control_timeout_s : longest time-out of the autopilot without setpoints; 0 = not checked
-    max_mode_age_s : greatest age of the heartbeat at which a mode is requested
+    max_mode_age_s : greatest age of the report of the mode at which another one is requested
     """
 
     safety: SafetyConfig
@@ -113,12 +131,26 @@ class Limits(NamedTuple):
     max_mode_age_s: float = 0.1
 
 
+class Pace(NamedTuple):
+    """Share of its speed at which the orbit is flown, 0 to 1, with its rate in 1/s.
+
+    kept : the share that a vehicle still has that brakes and accelerates as usual
+    at_s : monotonic
+    """
+
+    value: float = 1.0
+    rate: float = 0.0
+    kept: float = 1.0
+    at_s: float = 0.0
+
+
 @dataclass(frozen=True)
 class SafetyState:
     """State of the machine.
 
     since_s : of the state
     condition : why it is in the state
+    pace : of the orbit; below 1 while it is degraded
     hold_position, hold_yaw : latched
     retreats : whether the hold position moves away from an approaching subject: only where nothing but nearness
         ended the orbit
@@ -129,6 +161,8 @@ class SafetyState:
     requesting_s : since when control is requested; NaN = it is not
     hold_mode_s : when the hold mode was first requested; NaN = not yet
     blind : whether the hold began without a trustworthy vehicle state
+    resumable : whether the orbit may resume by itself: a harmless cause alone began the hold
+    clear_s : since when all conditions hold again in such a hold; NaN = they do not
     lost_s : since when the vehicle is out of sight (no fresh telemetry); NaN = it is in sight
     seen_s : since when it is in sight without interruption; -infinity = it was never lost
     """
@@ -136,6 +170,7 @@ class SafetyState:
     state: State = State.IDLE
     since_s: float = 0.0
     condition: Condition = field(default_factory=lambda: condition(ConditionCode.NO_DATA))
+    pace: Pace = field(default_factory=Pace)
     hold_position: np.ndarray | None = None
     hold_yaw: float = math.nan
     retreats: bool = False
@@ -146,6 +181,8 @@ class SafetyState:
     requesting_s: float = math.nan
     hold_mode_s: float = math.nan
     blind: bool = False
+    resumable: bool = False
+    clear_s: float = math.nan
     lost_s: float = math.nan
     seen_s: float = -math.inf
 
@@ -158,6 +195,11 @@ class SafetyState:
     def requesting(self) -> bool:
         """Whether control is being requested from the autopilot."""
         return not math.isnan(self.requesting_s)
+
+    @property
+    def bound(self) -> bool:
+        """Whether the vehicle flies, or may soon fly by itself, by the present subject: no other may replace it."""
+        return self.state == State.ORBITING or self.requesting or self.resumable
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ class Person:
     first_ns : first detection; detected_ns : last detection; confirmed_ns : last confirmed detection
     score : of the last detection; mean_score : recent mean, low for body parts and clutter
     hits : number of detections
+    double : whether it began as a second box around the subject, see :func:`.reidentification.is_double`
     """
 
     def __init__(self, box: np.ndarray, score: float, stamp_ns: int, appearance: np.ndarray | None) -> None:
@@ -32,6 +33,7 @@ class Person:
         self.score = score
         self.mean_score = score
         self.hits = 1
+        self.double = False
         self.appearance = appearance
         self._descriptors = 1 if appearance is not None else 0
 

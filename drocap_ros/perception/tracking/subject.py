@@ -16,6 +16,7 @@ from drocap_ros.perception.tracking.reidentification import (
     FORGET_S,
     MIXED_IOU,
     RELIABLE_SCORE,
+    is_double,
     known_other,
     leaving,
     replaced,
@@ -193,7 +194,7 @@ class SubjectTracker:
         """Indices of the assigned detections: first to reliable persons, then to the others, then low scores."""
         subject = self._subject
         persons = [p for p in self._persons if p is not subject or p.unconfirmed_s(stamp_ns) <= self._coast_s]
-        reliable = [p for p in persons if p is subject or p.mean_score >= RELIABLE_SCORE]
+        reliable = [p for p in persons if p is subject or (p.mean_score >= RELIABLE_SCORE and not p.double)]
         unreliable = [p for p in persons if not any(p is q for q in reliable)]
         high = scores >= self._config.detection_threshold
         assigned: set[int] = set()
@@ -239,7 +240,9 @@ class SubjectTracker:
                 continue
             if len(known) and overlap_coefficient(boxes[j][None].astype(float), known).max() > _PART:
                 continue
-            self._persons.append(Person(boxes[j], float(scores[j]), stamp_ns, appearances[j]))
+            person = Person(boxes[j], float(scores[j]), stamp_ns, appearances[j])
+            person.double = subject is not None and is_double(subject, boxes[j], appearances[j], stamp_ns)
+            self._persons.append(person)
 
     def _reidentify(self, stamp_ns: int) -> None:
         """Re-identify a lost subject in a new track."""
@@ -331,7 +334,7 @@ class SubjectTracker:
         if subject.detected_ns == stamp_ns:
             return Subject(self._track_id, subject.box, subject.score, False)
         box = subject.filter.box()
-        others = [p.box for p in self._persons if p is not subject and p.confirmed_ns == stamp_ns]
+        others = [p.box for p in self._persons if p is not subject and not p.double and p.confirmed_ns == stamp_ns]
         hidden = bool(len(others)) and bool((iou(box[None], np.array(others)) > _HIDDEN_IOU).any())
         return Subject(self._track_id, box, 0.0, hidden)
 

@@ -54,8 +54,7 @@ def window_model(keypoints: Keypoints2D, mm: float, fps: float, config: LiftedCo
     seen = np.isfinite(points_mm[..., 0])
     noise = config.noise_mm
     if len(keypoints) > 3:
-        third = nanmedian_small(np.abs(np.diff(points_mm, n=3, axis=0)).reshape(-1), axis=0)
-        noise = max(noise, 1.48 / np.sqrt(20) * float(np.nan_to_num(third)))
+        noise = max(noise, difference_noise(points_mm))
     square = np.full(seen.shape, noise**2)
     if variance is not None:
         square = np.where(np.isfinite(variance), np.maximum(variance * mm**2, config.noise_mm**2), square)
@@ -64,6 +63,15 @@ def window_model(keypoints: Keypoints2D, mm: float, fps: float, config: LiftedCo
     if confidence is not None:
         weight = weight * np.clip(np.nan_to_num(confidence), 0.0, 1.0)
     return WindowModel(weight, noise, fps, config, *zoom_model(len(keypoints), fps, config.zoom_std_per_s))
+
+
+def difference_noise(points: np.ndarray) -> float:
+    """Standard deviation per coordinate of points (F, P, 2), F > 3, from their third difference; 0 = none is seen.
+
+    Motion contributes little to it, errors that last for some frames are underestimated.
+    """
+    third = nanmedian_small(np.abs(np.diff(points, n=3, axis=0)).reshape(-1), axis=0)
+    return float(1.48 / np.sqrt(20) * float(np.nan_to_num(third)))
 
 
 def solve_signs_and_adjust(

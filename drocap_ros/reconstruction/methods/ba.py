@@ -27,6 +27,6 @@ def run(data: MethodInput) -> CameraPoses:
         found = solve_window(data.stamp_ns[rows], Keypoints2D(points, n.weights, covariance), focal, config)
         for stage, value in found.seconds.items():
             seconds[stage] += value
-        return WindowResult(found.joints, found.cost_terms, found.steps[1], found.stop_reason)
+        return WindowResult(found.joints, found.cost_terms, found.steps[1], found.stop_reason, found.sigma[..., 1])
 
     return replace(over_windows(data, solve), seconds=seconds)

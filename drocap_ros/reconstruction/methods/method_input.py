@@ -44,6 +44,7 @@ class CameraPoses:
     joints_px : (F, 15, 3), centred; ``keypoints ~ joints_px[..., :2] + translation_px``
     translation_px : (F, 2)
     seconds : wall-clock per stage
+    depth_sigma_px : (F, 15) expected error of the depths, None = the method has none
     """
 
     joints_px: np.ndarray
@@ -52,3 +53,4 @@ class CameraPoses:
     iterations: int
     stop_reason: str
     cost_terms: dict[str, float]
+    depth_sigma_px: np.ndarray | None = None

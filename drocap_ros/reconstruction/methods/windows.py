@@ -14,32 +14,41 @@ from drocap_ros.reconstruction.paper.reprojection import Projection, frames_last
 
 
 class WindowResult(NamedTuple):
-    """Poses (F, 15, 3) in camera axes, x and y in the window's normalized image; the solver's report."""
+    """Poses (F, 15, 3) in camera axes, x and y in the window's normalized image; the solver's report.
+
+    sigma : (F, 15) expected error of the depths, in the same unit; None = the method has none
+    """
 
     poses: np.ndarray
     cost_terms: dict[str, float]
     iterations: int
     stop_reason: str
+    sigma: np.ndarray | None = None
 
 
 def over_windows(data: MethodInput, solve: Callable[[slice, NormalizedTracks], WindowResult]) -> CameraPoses:
     """Solve window by window and cross-fade the poses where windows overlap."""
     keypoints, overlap = data.keypoints, data.adjuster.overlap_frames
+    sigma: np.ndarray | None = None
     out, weight = np.zeros((*keypoints.xy.shape[:2], 3)), np.zeros(len(keypoints))
     iterations, terms, stops = 0, dict[str, float](), set[str]()
     for rows, n in normalized_windows(keypoints, data.adjuster.window_frames, overlap):
         found = solve(rows, n)
-        fade = _fade(len(found.poses), overlap, rows.start > 0, rows.stop < len(keypoints))
+        fade = fade_weights(rows, len(keypoints), overlap)
         in_image = found.poses * n.scale_px
         in_image[..., :2] += n.centre_px[:, None]
         out[rows] += fade[:, None, None] * in_image
         weight[rows] += fade
+        if found.sigma is not None:
+            sigma = np.zeros(keypoints.xy.shape[:2]) if sigma is None else sigma
+            sigma[rows] += fade[:, None] * found.sigma * n.scale_px
         iterations += found.iterations
         stops.add(found.stop_reason)
         for name, value in found.cost_terms.items():
             terms[name] = terms.get(name, 0.0) + value
         data.progress("ba", rows.stop / len(keypoints))
-    return CameraPoses(*split(out / weight[:, None, None]), {}, iterations, ", ".join(sorted(stops)), terms)
+    sigma = None if sigma is None else sigma / weight[:, None]
+    return CameraPoses(*split(out / weight[:, None, None]), {}, iterations, ", ".join(sorted(stops)), terms, sigma)
 
 
 def placed(poses: np.ndarray, w: np.ndarray, information: np.ndarray) -> np.ndarray:
@@ -73,7 +82,8 @@ def normalized_windows(keypoints: Keypoints2D, length: int, overlap: int) -> Ite
         yield rows, normalize_tracks(keypoints[rows])
 
 
-def _fade(count: int, overlap: int, at_start: bool, at_end: bool) -> np.ndarray:
-    """Weights (count,) that rise over the overlap with the window before and fall over that with the next."""
+def fade_weights(rows: slice, frames: int, overlap: int) -> np.ndarray:
+    """Weights of a window's frames that rise over the overlap with the one before and fall over that with the next."""
+    count = rows.stop - rows.start
     ramp = np.minimum(np.arange(1, count + 1) / (overlap + 1.0), 1.0)
-    return (ramp if at_start else np.ones(count)) * (ramp[::-1] if at_end else np.ones(count))
+    return (ramp if rows.start > 0 else np.ones(count)) * (ramp[::-1] if rows.stop < frames else np.ones(count))

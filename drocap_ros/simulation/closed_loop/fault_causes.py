@@ -16,6 +16,7 @@ ECHO_S = 0.65  # the simulated autopilot repeats its echo for 0.5 s at 10 Hz
 DELAY_S = 1.0  # of a delayed link
 TAKEN_S = 0.8  # from the fault to the pilot's mode during a hold
 _DRIFT_M = 0.3  # of the position estimate during the stop: 0.4 m with a time constant of 20 s
+_LOSS_CHECK_S = 0.14  # after COM_OF_LOSS_T; measured on PX4: 0.06 to 0.13 s
 _MAX_ACCELERATION = 4.5  # of the simulated vehicle, m/s^2
 #: Measured stops from 2 m/s, m: a position setpoint, LOITER (assumed for PX4's hold mode too), BRAKE.
 _POSITION_STOP_M, _LOITER_STOP_M, _BRAKE_STOP_M = 1.5, 2.0, 3.4
@@ -29,7 +30,7 @@ def _scaled(stop_m: float, speed: float) -> float:
 def _timeout_bounds(settings: LoopSettings, speed: float) -> Bounds:
     """The last setpoint acts for the time-out; then ArduPilot holds its position, PX4 changes to its hold mode."""
     ardupilot = settings.autopilot == "ardupilot"
-    flown_s = (settings.guid_timeout_s if ardupilot else settings.offboard_loss_s) + 0.02
+    flown_s = settings.guid_timeout_s + 0.02 if ardupilot else settings.offboard_loss_s + _LOSS_CHECK_S
     stop_m = _POSITION_STOP_M if ardupilot else _LOITER_STOP_M
     return Bounds(max(flown_s, MOTION_S), speed * flown_s + _scaled(stop_m, speed) + _DRIFT_M)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -18,20 +19,24 @@ from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.orbit.controller import ControlStatus, OrbitController
+from drocap_ros.flight.orbit.control_status import ControlStatus
+from drocap_ros.flight.orbit.controller import OrbitController
 from drocap_ros.flight.orbit.states import Action, Command, CommandAnswer, OperatorCommand, State
 from drocap_ros.flight.orbit.watchdog import Watchdog
 from drocap_ros.observation import PoseObservation
 from drocap_ros.simulation.keypoint_errors import detect_person
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
-from drocap_ros.simulation.vehicle.copter import CONTROL_MODE, SimulatedCopter
+from drocap_ros.simulation.vehicle.autopilot_modes import CONTROL_MODE
+from drocap_ros.simulation.vehicle.copter import SimulatedCopter
+from drocap_ros.simulation.vehicle.copter_reports import Readiness
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
+from drocap_ros.simulation.vehicle.mount import SimulatedMount
 
 EPOCH_NS = 1_700_000_000_000_000_000
 _STEP_S = 0.01
 _LINK_S = 0.02
-_SIZE, _FIELD_DEG = (1280, 720), 60.0
+_SIZE = (1280, 720)
 
 
 @dataclass(frozen=True)
@@ -44,8 +49,17 @@ class LoopSettings:
     bearing_deg, distance_m, height_m : initial position of the vehicle, from the person
     wind_m_s : (3,) mean
     latency_s : from exposure to keypoints
+    late_share, late_s : share of the images whose keypoints are late, by up to this time more (a busy machine); images
+        that come meanwhile are dropped
+    stamp_late_s : of the pictures' stamps after the exposure, as a USB camera's
+    gaps_hz : pauses of the telemetry, as on a busy machine; see :class:`Channel`
+    readiness : of the vehicle; the default is ready
     seconds : longest flight
     start_mode : "" = the mode in which the pilot hands over: GUIDED, or LOITER for PX4
+    mount : of the camera: "gimbal", "servo" or "fixed"; the bridge is configured for it where the autopilot cannot
+        describe it
+    camera_pitch_deg : of the camera, negative = down; NaN = aimed at the middle of the person
+    field_deg : width of the camera's field of view
     """
 
     autopilot: str = "ardupilot"
@@ -60,8 +74,16 @@ class LoopSettings:
     wind_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
     perception_hz: float = 15.0
     latency_s: float = 0.1
+    late_share: float = 0.0
+    late_s: float = 0.3
+    stamp_late_s: float = 0.0
+    gaps_hz: float = 0.0
+    readiness: Readiness = field(default_factory=Readiness)
     seconds: float = 40.0
     start_mode: str = ""
+    mount: str = "gimbal"
+    camera_pitch_deg: float = math.nan
+    field_deg: float = 60.0
     guid_timeout_s: float = 0.5
     offboard_loss_s: float = 0.5
     config: MavlinkBridgeConfig = field(
@@ -69,6 +91,28 @@ class LoopSettings:
             commands_enabled=True, mode_change_allowed=True, attitude_hz=25.0, position_hz=20.0
         )
     )
+
+
+def configured_mount(settings: LoopSettings) -> LoopSettings:
+    """Settings with the camera's pitch, and with the bridge configured for a mount that the autopilot cannot describe.
+
+    A mount that follows the person already points at them; another camera is tilted for the orbit, a fixed one also
+    for the lean that the orbit needs.
+    """
+    config, pitch = settings.config, settings.camera_pitch_deg
+    if math.isnan(pitch):
+        aim = 0.53 * settings.stature_m
+        drop, away = config.height_m - aim, config.radius_m
+        if config.gimbal_control:
+            drop, away = settings.height_m - aim, settings.distance_m
+        pitch = -math.degrees(math.atan2(drop, away))
+        if settings.mount == "fixed":
+            centripetal = math.radians(config.angular_speed_deg_s) ** 2 * config.radius_m
+            pitch += math.degrees(math.atan2(centripetal, 9.81))
+    if config.mount == "auto" and (settings.mount == "fixed" or settings.autopilot == "px4"):
+        fixed_pitch = pitch if settings.mount == "fixed" else config.camera_pitch_deg
+        config = dataclasses.replace(config, mount=settings.mount, camera_pitch_deg=fixed_pitch)
+    return dataclasses.replace(settings, camera_pitch_deg=pitch, config=config)
 
 
 class Row(NamedTuple):
@@ -94,36 +138,34 @@ class OrbitLoop:
     """
 
     def __init__(self, settings: LoopSettings) -> None:
+        settings = configured_mount(settings)
         self.settings, self.t = settings, 0.0
         self.hung = self.stopped = False
         self.clock_jump_s = 0.0
         self.perceive: Callable[[PoseObservation], PoseObservation | None] = lambda seen: seen
         self.down, self.up = (Channel(lambda: self.t, settings.seed + i) for i in (1, 2))
+        self.down.gaps_hz = settings.gaps_hz
         joints = self._person()
         bearing = math.radians(settings.bearing_deg)
         start = np.array([math.cos(bearing), math.sin(bearing), 0.0]) * settings.distance_m
         start += np.array([*joints[0, 0, :2], settings.height_m])
-        aim = 0.53 * settings.stature_m
-        # A gimbal already points at the person; a fixed camera is tilted for the orbit.
-        drop, away = settings.config.height_m - aim, settings.config.radius_m
-        if settings.config.gimbal_control:
-            drop, away = settings.height_m - aim, settings.distance_m
-        pitch = -math.degrees(math.atan2(drop, away))
         handed_over = "LOITER" if settings.autopilot == "px4" else CONTROL_MODE[settings.autopilot]
         self.copter = SimulatedCopter(
             LoopbackTransport(self.up, self.down), start, bearing + math.pi, settings.autopilot,
             wind=np.array(settings.wind_m_s), seed=settings.seed, guid_timeout_s=settings.guid_timeout_s,
-            offboard_loss_s=settings.offboard_loss_s, mode=settings.start_mode or handed_over, gimbal_pitch_deg=pitch,
+            offboard_loss_s=settings.offboard_loss_s, mode=settings.start_mode or handed_over,
+            mount=SimulatedMount(settings.mount, settings.camera_pitch_deg), readiness=settings.readiness,
         )  # fmt: skip
         self.rows: list[Row] = []
         self.answers: list[tuple[float, CommandAnswer]] = []
         self.reasons: list[tuple[float, str, Condition]] = []
         self.framing: list[tuple[float, bool]] = []
         self.status: ControlStatus | None = None
-        self.matrix = pinhole_matrix(*_SIZE, _FIELD_DEG)
+        self.matrix = pinhole_matrix(*_SIZE, settings.field_deg)
         self._joints = joints
         self._frame = 0
         self._waiting: list[tuple[float, PoseObservation]] = []
+        self._chance = random.Random(settings.seed)
         self._next_link = self._next_control = 0.0
         self.restart()
 
@@ -139,6 +181,10 @@ class OrbitLoop:
     def clock_ns(self) -> int:
         """The bridge's clock of the stamps."""
         return EPOCH_NS + round((self.t + self.clock_jump_s) * 1e9)
+
+    def stamp_ns(self) -> int:
+        """Stamp of a picture that is exposed now."""
+        return self.clock_ns() + round(self.settings.stamp_late_s * 1e9)
 
     def command(self, kind: Command, **values: float) -> None:
         """Send a command of the operator now."""
@@ -178,7 +224,7 @@ class OrbitLoop:
         seed = self.settings.seed * 1_000_003 + self._frame
         found = detect_person(joints[None], rotation[None], position[None], self.matrix, _SIZE, seed)
         return PoseObservation(
-            self.clock_ns(), 1 if found.visible.any() else 0, _SIZE, keypoints=found.keypoints[0].astype(np.float32),
+            self.stamp_ns(), 1 if found.visible.any() else 0, _SIZE, keypoints=found.keypoints[0].astype(np.float32),
             covariance=found.covariance[0].astype(np.float32), confidence=found.confidence[0].astype(np.float32),
         )  # fmt: skip
 
@@ -242,7 +288,12 @@ class OrbitLoop:
         self.framing.append((self.t, bool(np.all(np.abs(middle) < np.array(_SIZE) / 6))))
         observation = self.observe(joints, rotation, position)
         self._frame += 1
-        self._waiting.append((self.t + self.settings.latency_s, observation))
+        arrival_s = self.t + self.settings.latency_s
+        if self._waiting and self._waiting[-1][0] > arrival_s:
+            return  # perception is busy with a late one
+        if self._chance.random() < self.settings.late_share:
+            arrival_s += self._chance.uniform(0.0, self.settings.late_s)
+        self._waiting.append((arrival_s, observation))
 
     def _deliver(self) -> None:
         while self._waiting and self._waiting[0][0] <= self.t + 1e-9:

@@ -29,7 +29,7 @@ class PixelOrbitLoop(OrbitLoop):
     def observe(self, joints: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> PoseObservation:
         """Render an image and estimate its keypoints."""
         image = self._renderer.render(joints, rotation, position)
-        observation = self._estimator.process(image, self.clock_ns())
+        observation = self._estimator.process(image, self.stamp_ns())
         exact = project(joints[None], rotation[None], position[None], self.matrix)[0]
         seen = observation.keypoints if len(observation.keypoints) else np.full(exact.shape, np.nan)
         self.errors.append(np.linalg.norm(seen - exact, axis=1))

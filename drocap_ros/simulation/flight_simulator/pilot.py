@@ -10,7 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.mavlink.transport import Transport
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
-from drocap_ros.simulation.vehicle.dynamics import Target
+from drocap_ros.simulation.vehicle.flight_control import Manner, Target
+from drocap_ros.simulation.vehicle.mount import SimulatedMount
 
 #: The mode in which the sticks command velocities.
 STICK_MODE = {"ardupilot": "LOITER", "px4": "POSCTL"}
@@ -31,10 +32,12 @@ class PilotedCopter(SimulatedCopter):
     """
 
     def __init__(
-        self, transport: Transport, ground: np.ndarray, yaw: float, autopilot: str, *, wind: np.ndarray, seed: int
-    ) -> None:
+        self, transport: Transport, ground: np.ndarray, yaw: float, autopilot: str, *, wind: np.ndarray, seed: int,
+        mount: SimulatedMount | None = None,
+    ) -> None:  # fmt: skip
         super().__init__(
             transport, np.array([*ground, _SKIDS_M]), yaw, autopilot, wind=wind, seed=seed, mode=STICK_MODE[autopilot],
+            mount=mount,
         )  # fmt: skip
         self.armed, self.landed_state = False, mavlink.MAV_LANDED_STATE_ON_GROUND
         self.stick: np.ndarray = np.zeros(3)
@@ -46,11 +49,15 @@ class PilotedCopter(SimulatedCopter):
         if self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND:
             self.body.position, self.body.velocity = self._ground.copy(), np.zeros(3)
 
-    def _present_target(self, dt: float) -> Target:
-        if self.mode == STICK_MODE[self.autopilot] and self.stick.any():
-            self._stop_velocity = None  # released sticks: it stops from its speed then
-            return Target(velocity=self.stick.copy(), yaw=self._heading)
-        return super()._present_target(dt)
+    def _move(self, dt: float) -> None:
+        control = self.control
+        if self.mode == STICK_MODE[self.autopilot]:
+            manner = Manner.STICK if self.stick.any() else Manner.HOLD
+            if control.manner != manner:
+                control.begin(manner, self.estimate, self.body.velocity, self.body.yaw)
+            if manner == Manner.STICK:
+                control.target = Target(velocity=self.stick.copy(), yaw=control.target.yaw)
+        super()._move(dt)
 
 
 class PilotPhase(enum.Enum):
@@ -84,7 +91,7 @@ class SimulatedPilot:
         copter = self._copter
         if not self.handed_over:
             sight = self._aim - copter.body.position
-            copter.camera_pitch = math.atan2(float(sight[2]), float(np.hypot(sight[0], sight[1])))
+            copter.mount.command(math.degrees(math.atan2(float(sight[2]), float(np.hypot(sight[0], sight[1])))))
         if self.phase == PilotPhase.CHECKS and t_s >= _READY_S:
             copter.armed, copter.landed_state = True, mavlink.MAV_LANDED_STATE_TAKEOFF
             copter.stick = np.array([0.0, 0.0, _CLIMB_M_S])

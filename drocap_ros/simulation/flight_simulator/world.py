@@ -14,7 +14,8 @@ from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimula
 from drocap_ros.simulation.flight_simulator.truth import MAX_EXPOSURES, FlightTruth
 from drocap_ros.simulation.orbit_camera import pinhole_matrix
 from drocap_ros.simulation.simulated_person import simulate_person
-from drocap_ros.simulation.vehicle.copter import CONTROL_MODE
+from drocap_ros.simulation.vehicle.autopilot_modes import CONTROL_MODE
+from drocap_ros.simulation.vehicle.mount import SimulatedMount
 
 #: The person stands until setpoints have steered the vehicle for this long, and pauses whenever they stop: a filmed
 #: person sees the drone stop.
@@ -51,6 +52,7 @@ class FlightWorld:
         self.copter = PilotedCopter(
             transport, ground, math.remainder(bearing + math.pi, 2 * math.pi), config.autopilot,
             wind=np.array([config.wind_m_s, 0.0, 0.0]), seed=config.seed,
+            mount=SimulatedMount(config.mount, config.camera_pitch_deg),
         )  # fmt: skip
         self._take = Take(config)
         aim = self._take.at(0.0)[0]

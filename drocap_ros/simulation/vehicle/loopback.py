@@ -14,6 +14,8 @@ class Channel:
     delay_s, jitter_s : of each packet; jitter above the interval of the packets reorders them
     loss, duplicate : shares of the packets
     cut : no packet passes
+    gaps_hz : of a busy machine: pauses of up to ``longest_gap_s``, whose packets come in one burst afterwards
+    drops : packets that are lost
     """
 
     def __init__(self, clock_s: Callable[[], float], seed: int = 0) -> None:
@@ -22,13 +24,23 @@ class Channel:
         self._order = itertools.count()
         self._waiting: list[tuple[float, int, bytes]] = []
         self.delay_s, self.jitter_s, self.loss, self.duplicate, self.cut = 0.01, 0.0, 0.0, 0.0, False
+        self.gaps_hz, self.longest_gap_s = 0.0, 0.3
+        self.drops: Callable[[bytes], bool] = lambda packet: False
+        self._gap_from_s = self._gap_until_s = 0.0
 
     def write(self, data: bytes) -> None:
         """Send a packet."""
         for _ in range(1 + (self._random.random() < self.duplicate)):
-            if not self.cut and self._random.random() >= self.loss:
-                due = self._clock_s() + self.delay_s + self._random.uniform(0, self.jitter_s)
+            if not self.cut and self._random.random() >= self.loss and not self.drops(data):
+                due = self._after_gap(self._clock_s() + self.delay_s + self._random.uniform(0, self.jitter_s))
                 heapq.heappush(self._waiting, (due, next(self._order), data))
+
+    def _after_gap(self, due_s: float) -> float:
+        """When a packet arrives that would be due then."""
+        if self.gaps_hz > 0 and due_s > self._gap_until_s:
+            self._gap_from_s = max(self._gap_until_s, due_s - 1e-9) + self._random.expovariate(self.gaps_hz)
+            self._gap_until_s = self._gap_from_s + self._random.uniform(0.05, self.longest_gap_s)
+        return self._gap_until_s if self._gap_from_s <= due_s <= self._gap_until_s else due_s
 
     def read(self) -> bytes:
         """Arrived packets, joined."""
@@ -36,6 +48,11 @@ class Channel:
         while self._waiting and self._waiting[0][0] <= self._clock_s():
             parts.append(heapq.heappop(self._waiting)[2])
         return b"" if self.cut else b"".join(parts)
+
+
+def is_setpoint(packet: bytes) -> bool:
+    """Whether a MAVLink 2 packet is SET_POSITION_TARGET_LOCAL_NED."""
+    return packet[:1] == b"\xfd" and packet[7:10] == b"\x54\x00\x00"
 
 
 class LoopbackTransport:

@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import enu_to_geodetic, enu_to_ned, flu_to_frd, orientation_to_aviation
+from drocap_ros.flight.mavlink.current_mode import CURRENT_MODE_ID, CurrentMode
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.signing import sign_with
 from drocap_ros.flight.mavlink.transport import Transport, open_transport
@@ -29,6 +30,7 @@ AUTOPILOTS = ("ardupilot", "px4")
 HOME = np.array([47.397742, 8.545594, 488.0])
 _COPTER_GUIDED = 4
 _PX4_OFFBOARD = 6 << 16
+_CURRENT_MODE_S = 0.5  # PX4 publishes its state so often, and every change at once
 _ESTIMATOR_HEALTHY = 831
 _GIMBAL_FLAGS = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
 _GIMBAL_EARTH = _GIMBAL_FLAGS | mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
@@ -86,6 +88,7 @@ class SimulatedVehicle:
             self._period_s[mavlink.MAVLINK_MSG_ID_ATTITUDE] = 0.05
             self._period_s[mavlink.MAVLINK_MSG_ID_SYS_STATUS] = 1.0
         self._due_s: dict[int, float] = {}
+        self._mode_sent: tuple[float, tuple[int, int]] = (-math.inf, (0, 0))
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -140,6 +143,8 @@ class SimulatedVehicle:
         self._transport.close()
 
     def _send(self, message: Any) -> None:
+        if message is None:
+            return
         self._transport.write(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
 
@@ -193,12 +198,16 @@ class SimulatedVehicle:
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
             mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
         }
+        if self.autopilot == "px4":
+            numbers.add(CURRENT_MODE_ID)
         return frozenset(numbers | ({mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS} if self.gimbal else set()))
 
     def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> Any:
         mav, boot_ms = self._mav, int((t_s + self.boot_s) * 1e3) % 2**32
         if number == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
             return self._heartbeat()
+        if number == CURRENT_MODE_ID:
+            return self._current_mode(t_s)
         if number in (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION):
             return self._attitude(number, boot_ms, pose)
         if number == mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
@@ -230,6 +239,18 @@ class SimulatedVehicle:
             mavlink.MAV_STATE_ACTIVE,
         )
 
+    def _present_modes(self) -> tuple[int, int]:
+        """Numbers of the present and of the intended mode."""
+        return _PX4_OFFBOARD, _PX4_OFFBOARD
+
+    def _current_mode(self, t_s: float) -> Any:
+        sent_s, before = self._mode_sent
+        present = self._present_modes()
+        if present == before and t_s - sent_s < _CURRENT_MODE_S:
+            return None
+        self._mode_sent = t_s, present
+        return CurrentMode(0, *present)
+
     def _attitude(self, number: int, boot_ms: int, pose: VehiclePose) -> Any:
         x, y, z, w = orientation_to_aviation(pose.orientation_xyzw)
         rates = flu_to_frd(pose.angular_velocity_flu_rad_s)
@@ -253,6 +274,15 @@ class SimulatedVehicle:
         )
 
 
+def _setting(text: str) -> tuple[str, float]:
+    """Name and value of NAME=VALUE; a value without a decimal point is an int."""
+    name, _, value = text.partition("=")
+    try:
+        return name, int(value) if value.lstrip("-").isdigit() else float(value)
+    except ValueError:
+        raise InputError(f"--set: expected NAME=VALUE, got {text!r}") from None
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run an orbit as a process."""
     parser = argparse.ArgumentParser(prog="mavlink_vehicle", description=__doc__)
@@ -262,10 +292,16 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--radius", type=float, default=6.0, help="of the orbit, m")
     parser.add_argument("--height", type=float, default=2.5, help="above the ground, m")
     parser.add_argument("--speed", type=float, default=25.0, help="deg/s, counter-clockwise from above")
+    parser.add_argument("--max-rate", type=float, default=400.0, help="highest delivered rate of a message, Hz")
+    parser.add_argument(
+        "--set", nargs="*", default=[], metavar="NAME=VALUE", help="parameters of the autopilot, e.g. GUID_TIMEOUT=3"
+    )
     args = parser.parse_args(arguments)
     path = orbit_path(args.seconds, args.radius, args.height, args.speed)
     try:
-        with SimulatedVehicle(args.url, path, args.autopilot) as vehicle:
+        settings = dict(map(_setting, args.set))
+        with SimulatedVehicle(args.url, path, args.autopilot, max_rate_hz=args.max_rate) as vehicle:
+            vehicle.settings.update(settings)
             vehicle.run(seconds=args.seconds)
     except InputError as error:
         parser.exit(2, f"{error}\n")

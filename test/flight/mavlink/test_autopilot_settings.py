@@ -37,6 +37,12 @@ def settings(autopilot, **values):
         ("px4", {"COM_OF_LOSS_T": 1.0}, ConditionCode.TIMEOUT_TOO_LONG),
         ("px4", {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 7}, ConditionCode.LOSS_ACTION_FATAL),
         ("px4", {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 6}, ConditionCode.LOSS_ACTION_FATAL),
+        ("px4", {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 0}, ConditionCode.LOSS_ACTION_FATAL),  # as it ships
+        ("px4", {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 1}, ConditionCode.LOSS_ACTION_FATAL),
+        ("px4", {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 2}, ConditionCode.LOSS_ACTION_FATAL),
+        ("px4", {"COM_OF_LOSS_T": 0.5}, ConditionCode.LOSS_ACTION_FATAL),
+        ("px4", {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 3}, None),
+        ("px4", {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 4}, None),
         ("px4", {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5}, None),
         ("other", {}, None),
     ],
@@ -46,12 +52,15 @@ def test_settings_that_forbid_motion(autopilot, values, code):
     found = loss_condition(known, 0.5)
     assert (found and found.code) == code
     assert loss_condition(known, 0.0) is None
+    if code == ConditionCode.LOSS_ACTION_FATAL:
+        assert "set COM_OBL_RC_ACT to 5, hold" in str(found)
     if code == ConditionCode.TIMEOUT_TOO_LONG:
         assert f"set {known.timeout_name} to 0.5" in str(found)
 
 
-def test_drift_without_setpoints_is_a_warning():
-    assert "altitude" in settings("px4", COM_OF_LOSS_T=0.5, COM_OBL_RC_ACT=1).warning()
+def test_leaving_without_setpoints_is_a_warning():
+    assert "lands" in settings("px4", COM_OF_LOSS_T=0.5, COM_OBL_RC_ACT=4).warning()
+    assert "home" in settings("px4", COM_OF_LOSS_T=0.5, COM_OBL_RC_ACT=3).warning()
     assert settings("px4", COM_OF_LOSS_T=0.5, COM_OBL_RC_ACT=5).warning() == ""
     assert settings("ardupilot", GUID_TIMEOUT=0.5).warning() == ""
 

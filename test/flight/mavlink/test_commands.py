@@ -180,3 +180,25 @@ def test_watchdog_that_stood_still_with_its_loop_sends_no_outdated_position():
     for i in range(20):
         dog.step(6.14 + 0.02 * i)
     assert sent[0] == "hold"  # and watches again afterwards
+
+
+def test_both_acknowledgements_of_a_mode_count():
+    queue = CommandQueue()
+    queue.request(SET_MODE, PX4.mode_parameters(False), "mode OFFBOARD", 0.0)
+    queue.due(0.0)
+    queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_ACCEPTED, 0.05)
+    queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_DENIED, 0.07)
+    assert queue.failure(SET_MODE) == "mode OFFBOARD: denied"
+    queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_ACCEPTED, 0.1)  # a refusal stays
+    assert queue.failure(SET_MODE) == "mode OFFBOARD: denied"
+    queue.cancel_all()
+    queue.request(SET_MODE, PX4.mode_parameters(False), "mode OFFBOARD", 3.0)
+    queue.due(3.0)
+    queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_ACCEPTED, 3.05)
+    queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, 3.07)
+    assert len(queue.due(3.6)) == 1  # asked again
+    queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_ACCEPTED, 3.65)
+    queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_ACCEPTED, 3.67)
+    assert (queue.failure(SET_MODE), queue.due(4.5)) == ("", [])
+    queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_FAILED, 9.0)  # too late for this request
+    assert queue.failure(SET_MODE) == ""

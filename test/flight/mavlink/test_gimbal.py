@@ -28,8 +28,8 @@ class Watched(OrbitLoop):
 
 
 def flown(autopilot, mount, **values):
-    loop = Watched(with_config(LoopSettings(autopilot=autopilot, seconds=40, seed=2), **values))
-    loop.copter.gimbal = mount
+    settings = LoopSettings(autopilot=autopilot, seconds=40, seed=2, mount="gimbal" if mount else "fixed")
+    loop = Watched(with_config(settings, **values))
     loop.start()
     return loop
 
@@ -37,7 +37,7 @@ def flown(autopilot, mount, **values):
 @pytest.mark.parametrize("autopilot", ["ardupilot"])
 def test_mount_pitch_follows_height_and_radius(autopilot):
     loop = flown(autopilot, True, gimbal_control=True)
-    loop.copter.camera_pitch = math.radians(-9.0)
+    loop.copter.mount.command(-9.0)
     loop.run(12.0)
     assert loop.controller.safety.state == State.ORBITING
     assert len(loop.asked) > 3
@@ -52,7 +52,7 @@ def test_mount_pitch_follows_height_and_radius(autopilot):
     drop = loop.copter.body.position[2] - loop.pelvis()[2]
     wanted = -math.degrees(math.atan2(drop, loop.rows[-1].distance_m))
     assert wanted < -25
-    assert abs(math.degrees(loop.copter.camera_pitch) - wanted) < 3.0
+    assert abs(math.degrees(loop.copter.mount.pitch) - wanted) < 3.0
     assert loop.asked[-1][0] - loop.asked[0][0] > 10  # it goes on being asked
     assert np.diff([t for t, _ in loop.asked]).min() > 0.35
 

@@ -10,7 +10,7 @@ def state(t_s, yaw_deg=0.0, **kwargs):
     half = np.deg2rad(yaw_deg) / 2
     return VehicleState(
         int(t_s * S), position_enu_m=np.array([t_s, 0.0, 2.0]), velocity_enu_m_s=np.array([1.0, 0.0, 0.0]),
-        orientation_xyzw=np.array([0.0, 0.0, np.sin(half), np.cos(half)]), **kwargs,
+        gimbal_orientation_xyzw=np.array([0.0, 0.0, np.sin(half), np.cos(half)]), **kwargs,
     )  # fmt: skip
 
 
@@ -31,9 +31,3 @@ def test_pose_is_interpolated_and_briefly_extrapolated():
     assert history.at(int(0.5 * S)) is None
     history.add(state(0.2))  # the clock went back
     assert history.at(int(1.5 * S)) is None
-
-
-def test_fixed_mount_tilts_the_camera_down():
-    history = PoseHistory(mount_pitch_deg=30.0)
-    history.add(state(1.0))
-    assert np.allclose(history.at(S).rotation[2], [np.cos(np.pi / 6), 0, -0.5])

@@ -15,12 +15,12 @@ def lost(link_age_s, **values):
 
 
 def test_no_mode_is_requested_while_the_mode_cannot_be_seen_and_the_hold_ends_after_its_time():
-    # The hold begins on telemetry that is 0.21 s old, and the vehicle is at rest: a position is known.
-    state, decision = reduce(orbiting(), lost(0.21, heartbeat_age_s=0.3), 1.0, None, LIMITS)
+    # The hold begins on telemetry that is 0.5 s old, and the vehicle is at rest: a position is known.
+    state, decision = reduce(orbiting(), lost(0.5, heartbeat_age_s=0.6), 1.0, None, LIMITS)
     assert decision == (Action.HOLD, ModeRequest.NONE, None)
     for i in range(1, 400):
         after_s = 0.05 * i
-        unseen = lost(0.21 + after_s, heartbeat_age_s=0.3 + after_s)
+        unseen = lost(0.5 + after_s, heartbeat_age_s=0.6 + after_s)
         state, decision = reduce(state, unseen, 1.0 + after_s, None, LIMITS)
         assert decision.mode_request == ModeRequest.NONE
         assert decision.action == (Action.HOLD if after_s <= 3.5 else Action.NOTHING) or abs(after_s - 3.5) < 0.06
@@ -28,7 +28,7 @@ def test_no_mode_is_requested_while_the_mode_cannot_be_seen_and_the_hold_ends_af
 
 @pytest.mark.parametrize("silent_s", [2.0, 6.0])
 def test_the_mode_after_a_loss_is_known_by_a_heartbeat_since_the_loss(silent_s):
-    state, _ = reduce(orbiting(), lost(0.21, heartbeat_age_s=0.3), 1.0, None, LIMITS)
+    state, _ = reduce(orbiting(), lost(0.5, heartbeat_age_s=0.6), 1.0, None, LIMITS)
     state, before = reduce(state, lost(silent_s, heartbeat_age_s=silent_s), 1.0 + silent_s, None, LIMITS)
     # Attitude is heard first; the mode is still that of before the loss.
     early = dataclasses.replace(GOOD, heartbeat_age_s=silent_s + 0.1, position=GOOD.position + 1.0)

@@ -8,7 +8,7 @@ from drocap_ros.flight.orbit.states import Action, State
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop
 
 MODES = {"ardupilot": ("LOITER", "RTL", "LAND"), "px4": ("RTL", "LOITER", "POSCTL")}
-FAULTS = ("lost", "late", "lossy")
+FAULTS = ("lost", "late", "lossy", "shuffled")
 MOMENTS, FLOWN = 18, 17  # of each fault and autopilot: at least 51 orbits for each autopilot
 WATCHED_S, RETURNED_S = 5.0, 2.5
 
@@ -18,13 +18,16 @@ def damage(loop, fault, chance):
         loop.down.cut = True
     elif fault == "late":
         loop.down.delay_s = chance.uniform(0.3, 1.0)
-    else:
+    elif fault == "lossy":
         loop.down.loss = chance.uniform(0.5, 0.95)
+    else:
+        loop.down.jitter_s, loop.down.duplicate = chance.uniform(0.1, 0.8), 0.1
 
 
 def repair(loop):
     """New packets may arrive before old ones that were late."""
     loop.down.cut, loop.down.delay_s, loop.down.loss = False, 0.01, 0.0
+    loop.down.jitter_s = loop.down.duplicate = 0.0
 
 
 @pytest.mark.parametrize("autopilot", MODES)

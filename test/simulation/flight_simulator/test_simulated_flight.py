@@ -52,6 +52,18 @@ def test_pilot_takes_off_hovers_and_hands_over(autopilot, mode):
     assert np.linalg.norm(flight.copter.body.velocity) < 0.3
 
 
+@pytest.mark.parametrize(("mount", "number"), [("servo", 1), ("fixed", 0)])
+def test_the_camera_leans_with_the_body_without_a_gimbal(mount, number):
+    clock, flight = world(mount=mount, wind_m_s=6.0, seed=3)
+    fly(clock, flight, 9.0)
+    assert flight.copter.settings["MNT1_TYPE"] == number
+    truth = flight.expose(round(clock.t * 1e9)).rotation
+    right = np.degrees(np.arcsin(truth[0, 2]))  # the camera's right above the horizon
+    assert 1.0 < abs(right) < 25.0  # it leans against the wind
+    down = np.degrees(np.arcsin(truth[2, 2]))
+    assert -35.0 < down < 0.0
+
+
 def test_person_moves_while_setpoints_steer_the_vehicle_and_the_truth_records_it():
     clock, flight = world(seed=1, action="walk")
 

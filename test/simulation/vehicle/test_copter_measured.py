@@ -11,7 +11,7 @@ from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 
 RADIUS, SPEED, RAMP_S, HEIGHT = 6.0, 2.0, 3.0, 2.5
-ALL, NO_YAW_RATE, NO_ACCELERATION, POSITION_YAW, VELOCITY = 0, 2048, 2496, 2552, 1 | 2 | 4 | 64 | 128 | 256 | 1024
+ALL, NO_YAW_RATE, POSITION_YAW, VELOCITY = 0, 2048, 2552, 1 | 2 | 4 | 64 | 128 | 256 | 1024
 
 
 class Flight:
@@ -81,7 +81,7 @@ def settled(mask=ALL, yaw_from="reference", **world):
 def stop(how, guid_timeout_s=3.0):
     """Greatest distance from the position at the stop, m."""
     flight = Flight(guid_timeout_s=guid_timeout_s)
-    flight.fly(15.0, lambda: flight.orbit(ALL, "vehicle"))
+    flight.fly(15.04, lambda: flight.orbit(ALL, "vehicle"))  # the stop begins with the next setpoint, or without it
     first, place, yaw = len(flight.rows), flight.copter.body.position.copy(), flight.copter.body.yaw
     if how in ("BRAKE", "LOITER"):
         flight.copter.set_mode(how, "test")
@@ -100,10 +100,9 @@ def jump():
 
 
 #: What the setpoint holds, where its yaw points from, and the world; measured radius error m and yaw error deg.
-#: Only with the reference's yaw in the first three rows do 19, 1.8 and 2.9 deg belong to one vehicle.
+#: Rows without velocity or acceleration, which the bridge never sends, are left out: an older ArduPilot flew them, with
+#: another shaping than the recorded flights of test_replay.py.
 ORBITS = (
-    ("position, yaw", POSITION_YAW, "reference", {}, 0.06, 19.0),
-    ("position, velocity, yaw", NO_ACCELERATION, "reference", {}, 0.47, 1.8),
     ("and acceleration", NO_YAW_RATE, "reference", {}, 0.12, 2.9),
     ("and yaw rate", ALL, "vehicle", {}, 0.12, 0.9),
     ("all, wind 8 m/s", ALL, "vehicle", {"wind": 8.0}, 0.16, 1.4),

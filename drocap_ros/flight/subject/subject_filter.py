@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
 from drocap_ros.flight.orbit.pose_history import CameraPose
-from drocap_ros.flight.orbit.subject_measurement import SubjectMeasurement, locate_subject
+from drocap_ros.flight.subject.subject_measurement import SubjectMeasurement, locate_subject
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.observation import PoseObservation
 
 _NS = 1_000_000_000
 _DRIFT = 0.05  # m/sqrt(s), of the vehicle's position and of the feet that are set down; no motion of the subject
-_RATIO_NOISE, _RATIO_WANDER = 0.035, 0.02  # of the logarithm of size over ground: of one image; 1/sqrt(s)
-_BENDING_BY_NOISE = 0.1
+_RATIO_MEMORY_NS, _LEAST_RATIOS, _RATIO_QUANTILE = 4 * _NS, 15, 0.4  # of size over ground
+_MAX_BENDING = 0.3  # of a body whose size counts; 0.1 by noise alone
 _MAX_SURPRISE = 0.3  # share of the range, beyond which the gate decides
 
 
@@ -26,6 +27,7 @@ class SubjectEstimate:
     covariance : (6, 6) of the filter; ``position_sd_m`` holds the systematic error too
     stamp_ns : exposure of the last image that was accepted
     age_s : since then
+    contradicted : whether an image since then showed another track, or a subject where this one cannot be
     """
 
     position: np.ndarray
@@ -35,6 +37,7 @@ class SubjectEstimate:
     stamp_ns: int
     age_s: float
     track_id: int
+    contradicted: bool = False
 
 
 def _range_noise(
@@ -69,9 +72,9 @@ class SubjectFilter:
         self._systematic = np.eye(3)
         self._stamp_ns = 0
         self._track_id = 0
+        self._contradicted = False
         self._last_keypoints: np.ndarray | None = None
-        self._ratio = float("nan")
-        self._ratio_variance = 0.0
+        self._ratio, self._ratios = float("nan"), deque[tuple[int, float]]()
 
     def update(
         self,
@@ -97,6 +100,7 @@ class SubjectFilter:
         gap_s = (observation.stamp_ns - self._stamp_ns) / _NS
         other = observation.track_id != self._track_id
         if locked and (self._state is None or other):
+            self._contradicted = True
             return False
         if self._state is None or (not locked and (other or abs(gap_s) > 2.0)):
             self._start(observation, measurement)
@@ -112,14 +116,15 @@ class SubjectFilter:
             if not locked and gap_s > 1.0:
                 self._start(observation, measurement)
                 return True
+            self._contradicted = True
             return False
         gain = covariance[:, :3] @ inverse
         self._state = state + gain @ innovation
         covariance = covariance - gain @ covariance[:3]
         self._covariance = 0.5 * (covariance + covariance.T)
         self._systematic = measurement.systematic
-        self._stamp_ns = observation.stamp_ns
-        self._learn_ratio(measurement, gap_s)
+        self._stamp_ns, self._contradicted = observation.stamp_ns, False
+        self._learn_ratio(measurement, observation.stamp_ns)
         return True
 
     def estimate(self, now_ns: int) -> SubjectEstimate | None:
@@ -132,34 +137,34 @@ class SubjectFilter:
         return SubjectEstimate(
             position=state[:3], velocity=state[3:], covariance=covariance,
             position_sd_m=float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[-1])),
-            stamp_ns=self._stamp_ns, age_s=age_s, track_id=self._track_id,
+            stamp_ns=self._stamp_ns, age_s=age_s, track_id=self._track_id, contradicted=self._contradicted,
         )  # fmt: skip
 
-    def _learn_ratio(self, measurement: SubjectMeasurement, gap_s: float) -> None:
-        """Track the ratio of the two ranges: a Kalman filter of its logarithm, a random walk.
+    def _learn_ratio(self, measurement: SubjectMeasurement, stamp_ns: int) -> None:
+        """Ratio of the two ranges over the last seconds.
 
-        Bending makes the body look smaller, never larger, so larger ratios and unequal bones get less weight.
+        Bending makes the body look smaller, never larger, so unequal bones do not count, and a little less than the
+        median does.  A quantile does not follow a few wrong images, the first ones least of all.
         """
         ratio = measurement.range_size_m / measurement.range_ground_m
-        if not 0.5 < ratio < 2.0:  # NaN too
-            return
-        bent = max(measurement.bending - _BENDING_BY_NOISE, 0.0)
-        if np.isnan(self._ratio):
-            self._ratio, self._ratio_variance = ratio, _RATIO_NOISE**2 + bent**2
-            return
-        innovation = float(np.log(ratio / self._ratio))
-        variance = _RATIO_NOISE**2 + bent**2 + max(innovation, 0.0) ** 2
-        self._ratio_variance += _RATIO_WANDER**2 * gap_s
-        gain = self._ratio_variance / (self._ratio_variance + variance)
-        self._ratio *= float(np.exp(gain * innovation))
-        self._ratio_variance *= 1 - gain
+        if 0.5 < ratio < 2.0 and measurement.bending < _MAX_BENDING:  # NaN is not
+            self._ratios.append((stamp_ns, ratio))
+        while self._ratios and stamp_ns - self._ratios[0][0] > _RATIO_MEMORY_NS:
+            self._ratios.popleft()
+        if len(self._ratios) >= _LEAST_RATIOS:
+            self._ratio = float(np.quantile([ratio for _, ratio in self._ratios], _RATIO_QUANTILE))
 
     def _start(self, observation: PoseObservation, measurement: SubjectMeasurement) -> None:
         self._state = np.concatenate([measurement.position, np.zeros(3)])
         self._covariance = np.diag([0.0] * 3 + [1.0, 1.0, 0.1])
         self._covariance[:3, :3] = measurement.noise
         self._systematic = measurement.systematic
+        if observation.track_id != self._track_id:  # another person
+            self._ratios.clear()
+            self._ratio = float("nan")
         self._stamp_ns, self._track_id = observation.stamp_ns, observation.track_id
+        self._contradicted = False
+        self._learn_ratio(measurement, observation.stamp_ns)
 
     def _predicted(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
         assert self._state is not None

@@ -142,7 +142,8 @@ def _range_from_size(
     """Horizontal range from the third longest bone relative to its own length, and the bending.
 
     The bones are measured in the upright plane across the line of sight, at distance 1, so a camera that looks down
-    does not shorten them.  A wrong joint lengthens two bones at most; the shortest bones are foreshortened.
+    does not shorten them.  A wrong joint lengthens two bones at most; the shortest bones are foreshortened.  Where the
+    picture cuts the shanks off, the third of three bones is the shortest: then the second longest counts.
     """
     depth = rays[:, :2] @ ahead
     usable = seen & (depth > 0.05)
@@ -153,9 +154,10 @@ def _range_from_size(
     across = across / np.where(usable, depth, 1.0)[:, None]
     lengths = np.linalg.norm(across[_ENDS_A] - across[_ENDS_B], axis=1)[bones] / (_SHARES[bones] * config.body_height_m)
     order = np.sort(lengths)[::-1]
-    if order[2] < 1e-6:
+    length = float(order[2 if len(order) > 4 else 1])
+    if length < 1e-6:
         return float("nan"), float("nan")
-    return _THIRD_LONGEST / float(order[2]), float(np.log(order[1] / max(order[min(3, len(order) - 1)], 1e-6)))
+    return _THIRD_LONGEST / length, float(np.log(order[1] / max(order[min(3, len(order) - 1)], 1e-6)))
 
 
 def _range_from_ground(

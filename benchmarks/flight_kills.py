@@ -1,0 +1,212 @@
+"""Random moments of orbits: the bridge is killed, or the downlink fails and the pilot chooses a mode.
+
+    python benchmarks/flight_kills.py [--moments 200] [--jobs 2]         SIGKILL, time-outs of 0.5 s
+    python benchmarks/flight_kills.py pilot [--moments 200] [--jobs 2]   the pilot's mode is kept
+
+Orbits of 4, 6 and 10 m, calm and in 8 m/s, standing and walking person.  Required after a kill: horizontal motion of
+2.5 m at most in 95 %, 3.0 m always, and never more than 1 m nearer to the subject than at the kill.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import random
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from branches import branch, over_processes
+from figures import table, write_figures
+
+from drocap_ros.flight.orbit.states import Action, State
+from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, with_config
+
+AUTOPILOTS = ("ardupilot", "px4")
+RADII_M, WINDS_M_S, ACTIONS = (4.0, 6.0, 10.0), (0.0, 8.0), ("stand", "walk")
+SPEED_M_S, SPEED_DEG_S = 2.0, 19.0
+FIRST_S, LAST_S, TAIL_S = 6.0, 20.0, 5.0  # an orbit is long enough to be settled, and ends before most holds
+_ORBITS = 6  # at most, for the moments of one kind
+OFTEN_M, ALWAYS_M, NEARER_M = 2.5, 3.0, 1.0
+MODES = {"ardupilot": ("LOITER", "RTL", "LAND"), "px4": ("RTL", "LOITER", "POSCTL")}
+DOWNLINKS = ("lost", "late", "lossy")
+WATCHED_S, RETURNED_S = 5.0, 2.5
+Result = TypeVar("Result")
+
+
+class World(NamedTuple):
+    """One kind of orbit."""
+
+    autopilot: str
+    radius_m: float
+    wind_m_s: float
+    action: str
+    moments: int
+
+    def loop(self, seed: int) -> OrbitLoop:
+        settings = LoopSettings(
+            autopilot=self.autopilot, seed=seed + 10 * int(self.radius_m + self.wind_m_s), action=self.action,
+            wind_m_s=(self.wind_m_s, 0.0, 0.0), distance_m=self.radius_m + 1.0, seconds=LAST_S + 20.0,
+        )  # fmt: skip
+        omega = min(SPEED_DEG_S, math.degrees(SPEED_M_S / self.radius_m))
+        return OrbitLoop(with_config(settings, radius_m=self.radius_m, angular_speed_deg_s=omega, fence_radius_m=60.0))
+
+    def branches(self, end: Callable[[OrbitLoop, int, float], Result]) -> list[Result]:
+        """Ends of orbits at random moments, from their number and a random number."""
+        found: list[Result] = []
+        chance = random.Random(f"{self.autopilot} {self.radius_m} {self.wind_m_s} {self.action}")
+        for seed in range(_ORBITS):
+            loop = self.loop(seed)
+            loop.start()
+            least = max(1, self.moments // 2)
+            for at_s in sorted(chance.uniform(FIRST_S, LAST_S) for _ in range(least)):
+                loop.run(at_s)
+                if len(found) == self.moments:
+                    return found
+                if loop.controller.safety.state != State.ORBITING:
+                    break
+                number = chance.random()
+                found.append(branch(lambda loop=loop, number=number: end(loop, len(found), number)))
+        print(f"{self}: {len(found)} moments only: {loop.controller.safety.reason}")
+        return found
+
+
+class Kill(NamedTuple):
+    """One kill: greatest horizontal distance from there, m; how much nearer to the subject, m; speeds, m/s."""
+
+    world: World
+    at_s: float
+    moved_m: float
+    nearer_m: float
+    speed_m_s: float
+    top_m_s: float
+
+
+def killed(world: World, loop: OrbitLoop) -> Kill:
+    """The bridge sends nothing from now on."""
+    first, place = len(loop.rows), loop.copter.body.position.copy()
+    at_s, speed = loop.t, float(np.linalg.norm(loop.copter.body.velocity))
+    distance = float(np.hypot(*(loop.pelvis()[:2] - place[:2])))
+    loop.stopped = True
+    loop.run(loop.t + TAIL_S)
+    rows = loop.rows[first:]
+    return Kill(
+        world, at_s, max(float(np.hypot(*(row.position - place)[:2])) for row in rows),
+        distance - min(nearness(row, loop) for row in rows), speed,
+        max(float(np.linalg.norm(row.velocity)) for row in rows),
+    )  # fmt: skip
+
+
+def nearness(row: Any, loop: OrbitLoop) -> float:
+    """Distance from the person, m; a person who walks up to a vehicle that stands does not count."""
+    return float(row.distance_m) if np.linalg.norm(row.velocity) > 0.3 else math.inf
+
+
+def kills_of(world: World) -> list[Kill]:
+    return world.branches(lambda loop, count, number: killed(world, loop))
+
+
+class Choice(NamedTuple):
+    """One mode of the pilot: whether it was kept, and whether the bridge sent nothing at the end."""
+
+    world: World
+    downlink: str
+    mode: str
+    kept: bool
+    silent: bool
+    later: list[tuple[float, str, str]]
+
+
+def chosen(world: World, loop: OrbitLoop, downlink: str, seed: float) -> Choice:
+    """The downlink fails, the pilot chooses a mode, the downlink returns."""
+    chance = random.Random(seed)
+    if downlink == "lost":
+        loop.down.cut = True
+    elif downlink == "late":
+        loop.down.delay_s = chance.uniform(0.3, 1.0)
+    else:
+        loop.down.loss = chance.uniform(0.5, 0.95)
+    loop.run(loop.t + chance.uniform(0.2, 5.0))
+    mode, chosen_s = chance.choice(MODES[world.autopilot]), loop.t
+    loop.copter.set_mode(mode, "pilot")
+    loop.run(loop.t + WATCHED_S)
+    loop.down.cut, loop.down.delay_s, loop.down.loss = False, 0.01, 0.0
+    loop.run(loop.t + RETURNED_S)
+    silent = all(row.action == Action.NOTHING for row in loop.rows if row.t_s > loop.t - RETURNED_S + 0.3)
+    later = [entry for entry in loop.copter.mode_log if entry[0] > chosen_s]
+    return Choice(world, downlink, mode, loop.copter.mode == mode and not later, silent, later)
+
+
+def choices_of(world: World) -> list[Choice]:
+    return world.branches(lambda loop, count, number: chosen(world, loop, DOWNLINKS[count % 3], number))
+
+
+def worlds(moments: int) -> list[World]:
+    """All of them, so that each autopilot has at least so many moments."""
+    kinds = list(itertools.product(RADII_M, WINDS_M_S, ACTIONS))
+    each = math.ceil(moments / len(kinds))
+    return [World(autopilot, *kind, each) for autopilot in AUTOPILOTS for kind in kinds]
+
+
+def kills(moments: int, jobs: int) -> int:
+    """Distribution of the motion after kills."""
+    rows, lines, bad = [], [], 0
+    for part in over_processes(kills_of, worlds(moments), jobs):
+        rows += part
+        if part:
+            lines.append([*part[0].world[:4], *figures_of(part)])
+            print("  ".join(str(cell) for cell in lines[-1]), flush=True)
+    for autopilot in AUTOPILOTS:
+        part = [kill for kill in rows if kill.world.autopilot == autopilot]
+        moved = np.array([kill.moved_m for kill in part])
+        bad += bool(np.mean(moved <= OFTEN_M) < 0.95 or moved.max() > ALWAYS_M)
+        bad += max(kill.nearer_m for kill in part) > NEARER_M
+        lines.append([autopilot, "all", "", "", *figures_of(part)])
+        print("  ".join(str(cell) for cell in lines[-1]), flush=True)
+    head = [
+        "autopilot", "radius, m", "wind, m/s", "person", "kills", "moved: median, m", "95 %", "most",
+        "share <= 2.5 m, %", "nearer by, most, m", "top speed / at the kill, m/s",
+    ]  # fmt: skip
+    write_figures("flight_kills", "The bridge's death at random moments", table(head, lines))
+    return bad
+
+
+def figures_of(part: list[Kill]) -> list[str]:
+    """Cells of a row."""
+    moved = np.array([kill.moved_m for kill in part])
+    worst = max(part, key=lambda kill: kill.top_m_s - kill.speed_m_s)
+    return [
+        str(len(part)), f"{np.median(moved):.2f}", f"{np.quantile(moved, 0.95):.2f}", f"{moved.max():.2f}",
+        f"{100 * np.mean(moved <= OFTEN_M):.0f}", f"{max(kill.nearer_m for kill in part):.2f}",
+        f"{worst.top_m_s:.2f} / {worst.speed_m_s:.2f}",
+    ]  # fmt: skip
+
+
+def pilot(moments: int, jobs: int) -> int:
+    """Modes that the pilot chose while the downlink failed."""
+    found = [choice for part in over_processes(choices_of, worlds(moments), jobs) for choice in part]
+    lines = []
+    for autopilot, downlink in itertools.product(AUTOPILOTS, DOWNLINKS):
+        part = [c for c in found if (c.world.autopilot, c.downlink) == (autopilot, downlink)]
+        kept, silent = sum(c.kept for c in part), sum(c.silent for c in part)
+        lines.append([autopilot, downlink, len(part), kept, silent])
+        print("  ".join(str(cell) for cell in lines[-1]), flush=True)
+        for c in [c for c in part if not c.kept][:3]:
+            print(f"    {c.mode} became {c.later}")
+    head = ["autopilot", "downlink", "moments", "mode kept", "nothing sent after its return"]
+    write_figures("flight_pilot", "The pilot's mode while the downlink fails", table(head, lines))
+    return sum(not (c.kept and c.silent) for c in found)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="?", default="kills", choices=["kills", "pilot"])
+    parser.add_argument("--moments", type=int, default=200, help="of each autopilot")
+    parser.add_argument("--jobs", type=int, default=1, help="processes at a time")
+    args = parser.parse_args()
+    return 1 if (kills if args.what == "kills" else pilot)(args.moments, args.jobs) else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,106 @@
+"""What the ``mavlink_bridge`` of a running graph hears of the autopilot, read from its topics."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drocap_ros.cli.progress import Progress
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
+from drocap_ros.flight.orbit.states import State
+from drocap_ros.flight.preflight.findings import Measured, Stream
+from drocap_ros.flight.preflight.measure import MORE_SETTINGS
+from drocap_ros.flight.vehicle_state import VehicleState
+
+if TYPE_CHECKING:
+    from drocap_ros.bringup import Graph
+
+#: A running bridge publishes its status five times a second; discovery may take longer.
+_FIND_S = 2.0
+_STATE_FIELDS = (
+    "autopilot", "mode", "armed", "landed_state", "gps_fix_type", "satellites", "position_ok", "battery_fraction",
+    "battery_voltage_v",
+)  # fmt: skip
+
+
+class BridgeListener:
+    """Collects the messages of one bridge."""
+
+    def __init__(self, graph: Graph) -> None:
+        from drocap_ros.ros.topics import TOPICS
+
+        self.statuses: list[Any] = []
+        self.states: list[tuple[float, Any]] = []  # age at the arrival, message
+        self.values: dict[str, str] = {}
+        self._graph = graph
+        takers = {
+            "orbit/status": self.statuses.append,
+            "vehicle/state": self._take_state,
+            "/diagnostics": self._take_diagnostics,
+        }
+        for topic, take in takers.items():
+            graph.node.create_subscription(TOPICS[topic].message, topic, take, TOPICS[topic].qos)
+
+    def _take_state(self, message: Any) -> None:
+        stamp = message.header.stamp
+        now_ns = self._graph.node.get_clock().now().nanoseconds
+        self.states.append((now_ns * 1e-9 - stamp.sec - stamp.nanosec * 1e-9, message))
+
+    def _take_diagnostics(self, message: Any) -> None:
+        for status in message.status:
+            if status.name == f"{self._graph.namespace.strip('/')}/mavlink_bridge":
+                self.values.update({value.key: value.value for value in status.values})
+
+    def measured(self, config: MavlinkBridgeConfig, namespace: str) -> Measured:
+        """What the bridge has reported; it reads fewer of the autopilot's parameters than a link of our own."""
+        from drocap_ros.ros.diagnostics import Key, of
+
+        status = self.statuses[-1]
+        state = State(status.state).name.lower().replace("_", " ")
+        requests = TelemetryRequests(dataclasses.replace(config, commands_enabled=True))
+        vehicle = None
+        if self.states:
+            message = self.states[-1][1]
+            vehicle = VehicleState(0, **{name: getattr(message, name) for name in _STATE_FIELDS})
+            requests.set_autopilot(vehicle.autopilot)
+        known = {name for names in MORE_SETTINGS.values() for name in names} | {"GUID_TIMEOUT", "COM_OF_LOSS_T"}
+        streams = {
+            name: Stream(float(self.values.get(of(Key.STREAM_RATE, name), math.nan)), wanted)
+            for name, (_, wanted) in requests.rates_hz(0).items()
+            if of(Key.STREAM_RATE, name) in self.values
+        }
+        return Measured(
+            vehicle=vehicle, heard=vehicle is not None, streams=streams,
+            settings={name: float(text) for name, text in self.values.items() if name in known},
+            delays_s=np.array([age for age, _ in self.states]),
+            bridge=f"by the running bridge in {namespace}, {state}: {status.reason}",
+        )  # fmt: skip
+
+
+def listen_to_bridge(
+    config: MavlinkBridgeConfig, namespace: str, domain_id: int, seconds: float, progress: Progress
+) -> Measured | None:
+    """What a running bridge reports within some seconds; None = no bridge runs there, or ROS is missing."""
+    with contextlib.ExitStack() as stack:
+        try:
+            from drocap_ros.bringup import watch
+        except ImportError:
+            return None
+        graph = stack.enter_context(watch(namespace, domain_id))
+        listener = BridgeListener(graph)
+        begin_s = time.monotonic()
+        while not listener.statuses:
+            if time.monotonic() - begin_s > _FIND_S:
+                return None
+            graph.spin_for(0.1)
+        begin_s = time.monotonic()
+        while (share := (time.monotonic() - begin_s) / seconds) < 1.0:
+            graph.spin_for(0.1)
+            progress("listening", share)
+        return listener.measured(config, namespace)

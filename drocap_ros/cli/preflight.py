@@ -1,0 +1,162 @@
+"""``drocap preflight``: what is missing before a flight, and how to mend it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from drocap_ros.cli.atomic_output import output_file
+from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
+from drocap_ros.cli.progress import progress_bars
+from drocap_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from drocap_ros.config import DrocapConfig
+    from drocap_ros.flight.preflight.findings import Finding, Measured
+    from drocap_ros.flight.preflight.setup_checks import Setup
+
+_COLOURS = {"ok": "green", "warning": "yellow", "missing": "red"}
+_PIPE_WIDTH = 160
+#: Images of a camera whose size is not configured.
+_USUAL_SIZE = (1280, 720)
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Add the command's options; ``run`` is its action."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "preflight",
+        help="what is missing before a flight, and how to mend it",
+        description="Listen to the autopilot of a configuration for some seconds and print every check: found, wanted, "
+        "how to mend it. Sends requests for telemetry and parameters only; it never arms, moves or changes the "
+        "vehicle. With a running graph it listens to that graph's bridge.",
+        epilog="Exit status: 0 nothing is missing (warnings may remain), 1 something is missing, 2 the configuration "
+        "or the link cannot be used, or no autopilot is heard.",
+    )
+    parser.add_argument(
+        "--config", metavar="FILE", type=Path, required=True, help="parameters of the components (YAML)"
+    )
+    parser.add_argument(
+        "--seconds", metavar="S", type=float, default=8.0, help="to listen, 2 to 300 (default 8); more finds rarer gaps"
+    )
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write the checks with their values, for programs")
+    parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
+    parser.add_argument("--namespace", default="/drocap", help="of a running graph (default /drocap)")
+    add_domain_option(parser)
+    parser.add_argument("--quiet", action="store_true", help="print what is missing only")
+    parser.set_defaults(run=run)
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Listen, check, print; the status says whether anything is missing."""
+    from drocap_ros.config import load_config
+    from drocap_ros.flight.preflight.checks import all_findings, is_ready
+
+    if not 2 <= args.seconds <= 300:
+        raise InputError(f"--seconds: expected 2 to 300, got {args.seconds:g}; choose another")
+    config = load_config(args.config)
+    setup = setup_of(config, args.models)
+    measured = _measure(config, args)
+    found = all_findings(config.mavlink_bridge, setup, measured)
+    ready = is_ready(found)
+    status = 2 if not measured.heard else 0 if ready else 1
+    if args.json:
+        _write(args.json, "silent" if status == 2 else "ready" if ready else "missing", status, found)
+    _print(found, args.quiet)
+    if status == 2:
+        silence = found[-1]
+        raise InputError(
+            f"preflight: expected {silence.wanted} within {args.seconds:g} s, found {silence.found}; {silence.remedy}"
+        )
+    return status
+
+
+def setup_of(config: DrocapConfig, models: Path | None = None) -> Setup:
+    """Camera, source and networks that a configuration names."""
+    from drocap_ros.flight.preflight.setup_checks import Setup
+    from drocap_ros.perception.calibration import camera_model, load_calibration
+    from drocap_ros.perception.load_models import models_folder
+
+    ingest = config.image_ingest
+    size = (ingest.width_px or _USUAL_SIZE[0], ingest.height_px or _USUAL_SIZE[1])
+    matrix, words = None, "neither calibration_file nor horizontal_fov_deg is set"
+    try:
+        if ingest.calibration_file and not (ingest.width_px and ingest.height_px):
+            calibration = load_calibration(Path(ingest.calibration_file))
+            size = (calibration.width, calibration.height)
+        camera = camera_model(ingest, size)
+    except InputError as error:
+        camera, words = None, str(error)
+    if camera is not None:
+        matrix = camera.matrix
+        words = f"{size[0]}x{size[1]}, " + (
+            f"calibrated by {ingest.calibration_file}"
+            if ingest.calibration_file
+            else f"{ingest.horizontal_fov_deg:g} deg wide as stated"
+        )
+    folder = models_folder(models or config.pose_estimator.models_dir or None)
+    present = folder.is_dir() and any(folder.glob("*.onnx"))
+    return Setup(
+        camera_matrix=matrix, image_size=size, camera_words=words, calibrated=bool(ingest.calibration_file),
+        source=ingest.source, assumed_height_m=config.initializer.assumed_height_m,
+        models=str(folder) if present else "",
+        models_remedy="run `drocap models fetch` or name a folder with --models or DROCAP_MODELS",
+    )  # fmt: skip
+
+
+def _measure(config: DrocapConfig, args: argparse.Namespace) -> Measured:
+    from drocap_ros.cli.graph.running_bridge import listen_to_bridge
+    from drocap_ros.flight.preflight.measure import Listening
+
+    bridge = config.mavlink_bridge
+    with progress_bars(args.quiet) as progress:
+        # A link belongs to one program: two on a serial line or a TCP link would take each other's packets.
+        measured = listen_to_bridge(bridge, args.namespace, chosen_domain(args), args.seconds, progress)
+        if measured is not None:
+            return measured
+        listening = Listening(bridge, args.seconds)
+        try:
+            while not listening.done:
+                listening.turn()
+                progress("listening", listening.progress)
+            return listening.measured()
+        finally:
+            listening.close()
+
+
+def _print(found: Sequence[Finding], quiet: bool) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from drocap_ros.flight.preflight.findings import Level
+
+    counts = {level: [f for f in found if f.level == level] for level in Level}
+    shown = counts[Level.MISSING] if quiet else found
+    if shown:
+        table = Table("", "check", box=None, pad_edge=False)
+        for title, share in (("found", 3), ("wanted", 3), ("how to mend it", 5)):
+            table.add_column(title, ratio=share)
+        before = ""
+        for finding in shown:
+            word = finding.level.name.lower()
+            same = finding.remedy and finding.remedy == before
+            before = finding.remedy or before
+            texts = (finding.name, finding.found, finding.wanted, "as above" if same else finding.remedy)
+            table.add_row(Text(word, _COLOURS[word]), *map(Text, texts))
+        # A pipe has no width.
+        Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH, highlight=False).print(table)
+    missing = ", ".join(f.name for f in counts[Level.MISSING])
+    verdict = f"not ready, missing: {missing}" if missing else "ready"
+    if not quiet:
+        print(f"{verdict} ({len(counts[Level.OK])} checks are ok, {len(counts[Level.WARNING])} warnings)")
+
+
+def _write(path: Path, status: str, exit_status: int, found: Sequence[Finding]) -> None:
+    content = {"status": status, "exit_status": exit_status, "checks": [finding.as_dict() for finding in found]}
+    with output_file(path) as file:
+        file.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

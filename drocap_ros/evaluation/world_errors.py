@@ -1,0 +1,83 @@
+"""All errors of one motion in the world, and their cells of a table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drocap_ros.evaluation import world_metrics
+from drocap_ros.evaluation.metrics import horizon_error, pa_mpjpe, scale_error, w_mpjpe
+
+WORLD_HEAD = [
+    "PA-MPJPE mm", "MPJPE mm", "W-MPJPE mm", "WA-MPJPE mm", "not aligned mm", "RTE %", "scale %", "horizon deg",
+    "still feet m/s (mm per frame)", "penetration mm", "acceleration ratio", "acceleration error m/s^2",
+    "in 90 % ellipsoid",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class WorldErrors:
+    """Errors of one motion in the world; :mod:`world_metrics` defines them.
+
+    absolute_mm : mean distance of the joints without any alignment
+    root_percent : RTE, percent of the true path
+    scale : estimated over true mean limb length, less 1
+    foot_m_s, foot_mm : speed of the ankles where the true ones are still, and their step between two frames
+    acceleration_ratio : mean acceleration over the truth's
+    coverage : share of the joints within their own 90 % ellipsoids; NaN = the motion has no covariance
+    """
+
+    pa_mm: float
+    mpjpe_mm: float
+    w_mm: float
+    wa_mm: float
+    absolute_mm: float
+    root_percent: float
+    scale: float
+    horizon_deg: float
+    foot_m_s: float
+    foot_mm: float
+    penetration_mm: float
+    acceleration_ratio: float
+    acceleration_error_m_s2: float
+    coverage: float = float("nan")
+
+
+def world_errors(
+    estimate: np.ndarray, truth: np.ndarray, fps: float, covariance: np.ndarray | None = None
+) -> WorldErrors:
+    """Errors of joints (F, 15, 3) m in the world against the truth, both z up at ``fps``.
+
+    covariance : (F, 15, 6) m^2 of the estimate, or None
+    """
+    nan = float("nan")
+    moving = len(truth) > 2
+    foot = world_metrics.still_foot_speed(estimate, truth, fps) if moving else nan
+    return WorldErrors(
+        pa_mm=1000 * float(pa_mpjpe(estimate, truth).mean()),
+        mpjpe_mm=1000 * float(world_metrics.mpjpe(estimate, truth).mean()),
+        w_mm=1000 * float(w_mpjpe(estimate, truth).mean()),
+        wa_mm=1000 * float(world_metrics.wa_mpjpe(estimate, truth).mean()),
+        absolute_mm=1000 * float(np.linalg.norm(estimate - truth, axis=-1).mean()),
+        root_percent=100 * world_metrics.root_error(estimate, truth) if moving else nan,
+        scale=scale_error(estimate, truth),
+        horizon_deg=float(np.degrees(horizon_error(estimate, truth)).mean()),
+        foot_m_s=foot,
+        foot_mm=1000 * foot / fps,
+        penetration_mm=1000 * world_metrics.penetration(estimate, truth),
+        acceleration_ratio=world_metrics.acceleration_ratio(estimate, truth, fps) if moving else nan,
+        acceleration_error_m_s2=world_metrics.acceleration_error(estimate, truth, fps) if moving else nan,
+        coverage=nan if covariance is None else world_metrics.ellipsoid_coverage(estimate, truth, covariance),
+    )
+
+
+def world_cells(e: WorldErrors) -> list[str]:
+    """Cells under :data:`WORLD_HEAD`; "-" where an error is not known."""
+    return [
+        f"{e.pa_mm:.1f}", f"{e.mpjpe_mm:.1f}", f"{e.w_mm:.0f}", f"{e.wa_mm:.0f}", f"{e.absolute_mm:.0f}",
+        f"{e.root_percent:.1f}", f"{100 * e.scale:+.1f}", f"{e.horizon_deg:.1f}",
+        "-" if np.isnan(e.foot_m_s) else f"{e.foot_m_s:.2f} ({e.foot_mm:.1f})", f"{e.penetration_mm:.0f}",
+        f"{e.acceleration_ratio:.2f}", f"{e.acceleration_error_m_s2:.1f}",
+        "-" if np.isnan(e.coverage) else f"{e.coverage:.0%}",
+    ]  # fmt: skip

@@ -1,0 +1,90 @@
+"""Error measures of a motion in the world, against the truth; poses are (F, 15, 3) m in the order of BODY_15, z up.
+
+The names and definitions are those of the world-grounded literature (EMDB, WHAM); every mean is over all 15 joints
+unless said otherwise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drocap_ros.geometry.alignment import apply_similarity, similarity
+from drocap_ros.skeleton import BODY_15, indices
+
+FEET = indices(BODY_15.joints, ("rankle", "lankle"))
+#: Speed (m/s) below which a true foot counts as still.
+STILL_M_S = 0.1
+#: Squared radius of the ellipsoid that holds 90 % of a normal distribution in three dimensions (chi-squared).
+ELLIPSOID_90 = 6.2514
+_PELVIS = BODY_15.index("pelvis")
+
+
+def mpjpe(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """(F,) mean distance of the joints, both poses with the pelvis at the origin."""
+    relative = (estimate - estimate[:, [_PELVIS]]) - (truth - truth[:, [_PELVIS]])
+    return np.linalg.norm(relative, axis=-1).mean(-1)
+
+
+def wa_mpjpe(estimate: np.ndarray, truth: np.ndarray, segment: int = 100) -> np.ndarray:
+    """(F,) mean distance after one rigid alignment per segment of frames, on all its frames, without scale."""
+    out = np.empty(len(truth))
+    for first in range(0, len(truth), segment):
+        part = slice(first, first + segment)
+        est, tru = estimate[part], truth[part]
+        fit = similarity(est.reshape(-1, 3), tru.reshape(-1, 3), with_scale=False)
+        moved = apply_similarity(est.reshape(-1, 3), *fit).reshape(est.shape)
+        out[part] = np.linalg.norm(moved - tru, axis=-1).mean(-1)
+    return out
+
+
+def root_error(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """RTE: mean distance of the pelvis after one rigid alignment of its path, as a share of the true path's length."""
+    est, tru = estimate[:, _PELVIS], truth[:, _PELVIS]
+    moved = apply_similarity(est, *similarity(est, tru, with_scale=False))
+    path = float(np.linalg.norm(np.diff(tru, axis=0), axis=1).sum())
+    return float(np.linalg.norm(moved - tru, axis=1).mean()) / max(path, 1e-9)
+
+
+def still_foot_speed(estimate: np.ndarray, truth: np.ndarray, fps: float) -> float:
+    """Mean speed (m/s) of the estimated ankles where the true ones move slower than ``STILL_M_S``; NaN = never."""
+    still = _speed(truth[:, FEET], fps) < STILL_M_S
+    return float(_speed(estimate[:, FEET], fps)[still].mean()) if still.any() else float("nan")
+
+
+def penetration(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """Mean depth (m) of the ankles below the lowest place of the true ones."""
+    return float(np.maximum(truth[:, FEET, 2].min() - estimate[:, FEET, 2], 0.0).mean())
+
+
+def accelerations(joints: np.ndarray, fps: float) -> np.ndarray:
+    """(F - 2, 15, 3) m/s^2, second differences."""
+    return (joints[2:] - 2 * joints[1:-1] + joints[:-2]) * fps**2
+
+
+def acceleration_ratio(estimate: np.ndarray, truth: np.ndarray, fps: float) -> float:
+    """Mean acceleration of the estimated joints over that of the true ones."""
+    est, tru = (np.linalg.norm(accelerations(x, fps), axis=-1).mean() for x in (estimate, truth))
+    return float(est / max(float(tru), 1e-9))
+
+
+def acceleration_error(estimate: np.ndarray, truth: np.ndarray, fps: float) -> float:
+    """Mean length (m/s^2) of the difference of the accelerations."""
+    return float(np.linalg.norm(accelerations(estimate, fps) - accelerations(truth, fps), axis=-1).mean())
+
+
+def ellipsoid_coverage(estimate: np.ndarray, truth: np.ndarray, covariance: np.ndarray) -> float:
+    """Share of the true joints within the ellipsoid that should hold 90 % of them.
+
+    covariance : (F, 15, 6) m^2: xx, xy, xz, yy, yz, zz; joints without a finite one are left out
+    """
+    rows = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+    known = np.isfinite(covariance).all(-1)
+    if not known.any():
+        return float("nan")
+    matrix, gap = covariance[known][:, rows], (estimate - truth)[known]
+    square = np.einsum("ni,ni->n", gap, np.linalg.solve(matrix + 1e-12 * np.eye(3), gap[..., None])[..., 0])
+    return float((square < ELLIPSOID_90).mean())
+
+
+def _speed(points: np.ndarray, fps: float) -> np.ndarray:
+    return np.linalg.norm(np.diff(points, axis=0), axis=-1) * fps

@@ -1,0 +1,137 @@
+"""The world protocol: MoCap with its root motion, seen by a simulated drone whose telemetry errs.
+
+Sequences of at least 8 s, their first 20 s at 24 fps.  A perspective camera (1280x720, 70 degrees wide) orbits at 6 m,
+2.5 m high, 19 deg/s, aimed at the person's smoothed place.  2D noise is 3 px per coordinate, correlated over 0.1 s;
+2 % of the joints are thrown by up to 80 px.  There are no confidences.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.evaluation.protocol import FPS
+from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.mocap import Sequence
+from drocap_ros.skeleton import BODY_15, indices
+from drocap_ros.tracks import Tracks
+
+SHORTEST_S, LONGEST_S = 8.0, 20.0
+IMAGE_SIZE = (1280, 720)
+FOCAL_PX = 0.5 * IMAGE_SIZE[0] / np.tan(np.deg2rad(35.0))
+RADIUS_M, HEIGHT_M, SPEED_DEG_S = 6.0, 2.5, 19.0
+_AIM_M = 0.95
+_ANKLE_M = 0.07
+_AIM_SMOOTHING_S = 1.0
+_NOISE_PX, _NOISE_S = 3.0, 0.1
+_OUTLIERS, _OUTLIER_PX = 0.02, 80.0
+_POSITION_WANDER_S, _ATTITUDE_WANDER_S = 60.0, 10.0
+
+
+class TelemetryErrors(NamedTuple):
+    """Wander of the position, misalignment about each axis, wander of the attitude (standard deviations), and delay."""
+
+    position_m: float = 0.0
+    misalignment_deg: float = 0.0
+    attitude_deg: float = 0.0
+    late_s: float = 0.0
+
+
+TELEMETRY = {
+    "exact": TelemetryErrors(),
+    "rtk": TelemetryErrors(0.05, 0.3, 0.1),
+    "gps": TelemetryErrors(0.5, 1.0, 0.3, 0.08),
+}
+
+
+@dataclass(frozen=True)
+class WorldView:
+    """A sequence as the simulated drone records it.
+
+    tracks : keypoints in px and the telemetry
+    truth : (F, 15, 3) m, ENU; the lowest ankles stand 7 cm above z = 0
+    camera_rotation : (F, 3, 3) true, world -> camera
+    """
+
+    tracks: Tracks
+    truth: np.ndarray
+    camera_rotation: np.ndarray
+
+
+def world_view(sequence: Sequence, telemetry: str = "exact", *, still: bool = False, seed: int = 0) -> WorldView:
+    """View of one sequence.
+
+    Parameters
+    ----------
+    telemetry : a key of ``TELEMETRY``
+    still : the camera keeps its bearing from the person instead of orbiting
+    seed : of the orbit's phase, the 2D noise and the errors of the telemetry
+    """
+    errors = TELEMETRY[telemetry]
+    rng = np.random.default_rng(seed)
+    truth = _on_ground(sequence.x / 1000.0)
+    frames = len(truth)
+    phase, rate = rng.uniform(0, 2 * np.pi), 0.0 if still else np.deg2rad(SPEED_DEG_S)
+    position, rotation = _camera(truth, phase, rate, 0.0)
+    keypoints = _project(truth, position, rotation)
+    keypoints = keypoints + _NOISE_PX * _wander(rng, frames, _NOISE_S, keypoints[0].size).reshape(keypoints.shape)
+    thrown = rng.random(keypoints.shape[:2]) < _OUTLIERS
+    keypoints = keypoints + thrown[..., None] * rng.uniform(-_OUTLIER_PX, _OUTLIER_PX, keypoints.shape)
+    reported_position, reported_rotation = _camera(truth, phase, rate, errors.late_s)
+    drift = _wander(rng, frames, _POSITION_WANDER_S, 3) * [1.0, 1.0, 0.7]
+    misalignment = np.deg2rad(errors.misalignment_deg) * rng.choice([-1.0, 1.0], 3)
+    wander = np.deg2rad(errors.attitude_deg) * _wander(rng, frames, _ATTITUDE_WANDER_S, 3)
+    tracks = Tracks(
+        keypoints=keypoints,
+        joints=BODY_15.joints,
+        stamp_ns=np.round(np.arange(frames) * (1e9 / FPS)).astype(np.int64),
+        image_size=IMAGE_SIZE,
+        camera_rotation=exp_so3(misalignment) @ exp_so3(wander) @ reported_rotation,
+        camera_position=reported_position + errors.position_m * drift,
+        camera_matrix=np.array(
+            [[FOCAL_PX, 0.0, IMAGE_SIZE[0] / 2], [0.0, FOCAL_PX, IMAGE_SIZE[1] / 2], [0.0, 0.0, 1.0]]
+        ),
+    )
+    return WorldView(tracks, truth, rotation)
+
+
+def _on_ground(joints: np.ndarray) -> np.ndarray:
+    """Joints moved so that the mean pelvis is at the origin and the lowest ankles stand at their height above z = 0."""
+    feet = joints[:, indices(BODY_15.joints, ("rankle", "lankle")), 2]
+    moved: np.ndarray = joints - [*joints[:, 0, :2].mean(axis=0), np.percentile(feet, 2) - _ANKLE_M]
+    return moved
+
+
+def _camera(truth: np.ndarray, phase: float, rate: float, ahead_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Position (F, 3) and rotation (F, 3, 3) world -> camera, each ``ahead_s`` after its frame."""
+    from scipy.ndimage import gaussian_filter1d
+
+    time = np.arange(len(truth)) / FPS
+    aim = gaussian_filter1d(truth[:, 0], _AIM_SMOOTHING_S * FPS, axis=0, mode="nearest", truncate=3.0)
+    aim = np.stack([np.interp(time + ahead_s, time, aim[:, axis]) for axis in range(3)], axis=1)
+    bearing = phase + rate * (time + ahead_s)
+    flat = aim[:, :2] + RADIUS_M * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+    position = np.column_stack([flat, np.full(len(time), HEIGHT_M)])
+    forward = np.column_stack([aim[:, :2], np.full(len(time), _AIM_M)]) - position
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return position, np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
+def _project(joints: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    seen = (joints - position[:, None]) @ np.swapaxes(rotation, 1, 2)
+    return FOCAL_PX * seen[..., :2] / seen[..., 2:] + np.array(IMAGE_SIZE) / 2
+
+
+def _wander(rng: np.random.Generator, frames: int, correlated_s: float, dims: int) -> np.ndarray:
+    """(F, dims) Gauss-Markov process of unit variance."""
+    from scipy.signal import lfilter
+
+    decay = np.exp(-1.0 / (correlated_s * FPS))
+    draws = rng.standard_normal((frames, dims))
+    draws[1:] *= np.sqrt(1.0 - decay**2)
+    process: np.ndarray = lfilter([1.0], [1.0, -decay], draws, axis=0)
+    return process

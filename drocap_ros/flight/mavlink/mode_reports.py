@@ -1,0 +1,114 @@
+"""The flight mode: the newer of HEARTBEAT and CURRENT_MODE counts, and no mode that was reported is overlooked."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Any
+
+_NS = 1_000_000_000
+_AUTOPILOTS = {3: "ardupilot", 12: "px4"}
+_MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, _MAV_MODE_FLAG_SAFETY_ARMED = 1, 128
+#: Packets; farther back a sequence number counts as the beginning of a new sequence.
+_MAX_LATE = 32
+_HISTORY_S = 1.0
+
+
+class PacketOrder:
+    """Which packets of one sender arrive after newer ones, by the sequence number that MAVLink counts modulo 256."""
+
+    def __init__(self) -> None:
+        self._newest: int | None = None
+
+    def is_late(self, sequence: int) -> bool:
+        """Take the next packet."""
+        if self._newest is not None and 0 < (self._newest - sequence) % 256 <= _MAX_LATE:
+            return True
+        self._newest = sequence
+        return False
+
+
+class ModeReports:
+    """The mode of one vehicle.
+
+    autopilot : "ardupilot", "px4" or "other"; "" before the first heartbeat
+    mode : by the newest report, the autopilot's own name; "" before the first
+    intended : the mode that the pilot or a command has chosen last, as CURRENT_MODE reported it together with the
+        present mode; "" = unknown.  PX4 keeps it where a failsafe enters another mode.
+    armed : by the last heartbeat
+    received_ns : reception of the newest report that did not arrive late
+    """
+
+    def __init__(self) -> None:
+        self.autopilot = self.mode = self.intended = ""
+        self.armed = False
+        self.received_ns: int | None = None
+        self._heartbeat: Any = None
+        self._before = ""
+        self._changed = (0, 0)  # sequence and reception of the first report of the present mode
+        self._heard: deque[str] = deque(maxlen=32)  # appended by one thread and drained by another
+
+    def take_heartbeat(self, message: Any, late: bool, now_ns: int) -> None:
+        """Take a HEARTBEAT; ``late``: it was sent before a packet that has already arrived."""
+        self._heartbeat = message
+        self.autopilot = _AUTOPILOTS.get(message.autopilot, "other")
+        if not late:
+            self.armed = bool(message.base_mode & _MAV_MODE_FLAG_SAFETY_ARMED)
+        # The mode that is intended belongs to the mode with which it was reported.
+        mode = _mode_name(message)
+        self._take(mode, self.intended if mode == self.mode else "", message.get_seq(), late, now_ns)
+
+    def take_current_mode(self, message: Any, late: bool, now_ns: int) -> None:
+        """Take a CURRENT_MODE; before the first heartbeat its numbers have no names."""
+        if self._heartbeat is None:
+            return
+        intended = message.intended_custom_mode
+        self._take(
+            self._name(message.custom_mode), self._name(intended) if intended else "", message.get_seq(), late, now_ns
+        )
+
+    def take_heard(self) -> frozenset[str]:
+        """All modes that were reported since the last call, late ones too."""
+        heard = set()
+        while self._heard:
+            heard.add(self._heard.popleft())
+        return frozenset(heard)
+
+    def age_s(self, now_ns: int) -> float:
+        """Time in s since the newest report; infinity before the first."""
+        return math.inf if self.received_ns is None else (now_ns - self.received_ns) / _NS
+
+    def _take(self, mode: str, intended: str, sequence: int, late: bool, now_ns: int) -> None:
+        if late:
+            # What was sent before the present mode began, with the mode of that time, is no news.  Any other mode is
+            # one in between: the vehicle was in it.
+            first, since_ns = self._changed
+            history = 0 < (first - sequence) % 256 <= _MAX_LATE and now_ns - since_ns < _HISTORY_S * _NS
+            if not (history and mode == self._before):
+                self._heard.append(mode)
+            return
+        if mode != self.mode:
+            self._before, self._changed = self.mode, (sequence, now_ns)
+        self.mode, self.intended, self.received_ns = mode, intended, now_ns
+        self._heard.append(mode)
+
+    def _name(self, custom_mode: int) -> str:
+        return _mode_name(_Numbered(self._heartbeat, custom_mode))
+
+
+class _Numbered:
+    """A heartbeat with another mode, for pymavlink's table of names."""
+
+    def __init__(self, heartbeat: Any, custom_mode: int) -> None:
+        self.autopilot, self.type, self.custom_mode = heartbeat.autopilot, heartbeat.type, custom_mode
+        self.base_mode = _MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+
+    def get_type(self) -> str:
+        return "HEARTBEAT"
+
+
+def _mode_name(heartbeat: Any) -> str:
+    """Flight mode by the autopilot's own name, or its number where pymavlink knows none."""
+    from pymavlink import mavutil
+
+    return str(mavutil.mode_string_v10(heartbeat))

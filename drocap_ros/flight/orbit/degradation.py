@@ -1,0 +1,85 @@
+"""The first of three levels (degrade, hold, hand over): an orbit by old data slows down, and goes on with fresh data.
+
+The pace is the share of its speed at which the orbit is flown: the time of the reference runs slower by this factor.
+Old data reduce it at once; fresh data restore the speed that is left, and the rest along a ramp.  At pace 0 the vehicle
+stops at the reference, and the orbit has not ended: only the ages of ``motion_checks.py`` end it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.orbit.motion_checks import oldest_state_s, oldest_subject_s
+from drocap_ros.flight.orbit.states import Limits, Observed, Pace
+from drocap_ros.flight.setpoint import Setpoint
+from drocap_ros.flight.subject.framing import framed_pace
+
+_C = ConditionCode
+_USUAL_SUBJECT_AGE_S = 0.2  # a camera at 15 Hz and its network
+_CONTRADICTED_PACE = 0.3
+_CHANGE = 0.6  # 1/s; how fast a vehicle of 2 m/s brakes and accelerates, 1.2 m/s^2
+
+
+class Allowed(NamedTuple):
+    """The pace that the data allow, 0 to 1, and the condition that reduces it."""
+
+    pace: float
+    cause: Condition | None
+
+
+def allowed_pace(seen: Observed, limits: Limits) -> Allowed:
+    """The pace by the greatest age, relative to its limits, of subject, attitude, position and link, and by framing."""
+    safety = limits.safety
+    usual_s = safety.max_state_age_s
+    halt_s = 0.5 * (usual_s + oldest_state_s(safety, patient=True))
+    subject_s = oldest_subject_s(seen, safety)
+    ages = (
+        (seen.subject_age_s, min(_USUAL_SUBJECT_AGE_S, 0.8 * subject_s), subject_s, _C.SUBJECT_OUTDATED),
+        (seen.link_age_s, usual_s, halt_s, _C.LINK_SILENT),
+        (seen.state_age_s, usual_s, halt_s, _C.ATTITUDE_OUTDATED),
+        (seen.position_age_s, usual_s, halt_s, _C.POSITION_FROZEN),
+    )
+    allowed = Allowed(1.0, None)
+    if seen.subject_contradicted:  # at once: most of what is flown after a jump is flown before the hold
+        allowed = Allowed(_CONTRADICTED_PACE, condition(_C.SUBJECT_OUTDATED, age_s=seen.subject_age_s))
+    for age_s, full_s, none_s, code in ages:
+        if age_s > full_s:
+            pace = max(none_s - age_s, 0.0) / (none_s - full_s) if none_s > full_s else 0.0
+            if pace < allowed.pace:
+                allowed = Allowed(pace, condition(code, age_s=age_s))
+    framed = framed_pace(seen.framing_margin)
+    if framed < allowed.pace:
+        allowed = Allowed(framed, condition(_C.SUBJECT_AT_BORDER, margin_percent=100 * seen.framing_margin))
+    return allowed
+
+
+def next_pace(pace: Pace, allowed: float, now_s: float) -> Pace:
+    """The pace now: at most the allowed one, and at most the one that the vehicle has kept meanwhile.
+
+    A vehicle does not lose its speed at once: after a short gap the orbit goes on from the speed that is left.
+    """
+    dt = now_s - pace.at_s
+    kept = min(max(allowed, pace.kept - _CHANGE * dt), pace.kept + _CHANGE * dt)
+    value = min(allowed, kept)
+    return Pace(value, (kept - pace.kept) / dt if dt > 0.0 else 0.0, kept, now_s)
+
+
+def slowed(setpoint: Setpoint, pace: Pace, max_acceleration_m_s2: float) -> Setpoint:
+    """The setpoint of a reference whose time runs at this pace; a change of the pace is an acceleration.
+
+    None at pace 0: an autopilot integrates the acceleration, and the setpoint stands.
+    """
+    if pace.value == 1.0 and pace.rate == 0.0:
+        return setpoint
+    acceleration = pace.value**2 * setpoint.acceleration
+    if pace.value > 0.0:
+        acceleration = acceleration + pace.rate * setpoint.velocity
+    size = float(np.linalg.norm(acceleration))
+    return setpoint._replace(
+        velocity=pace.value * setpoint.velocity,
+        acceleration=acceleration * min(1.0, max_acceleration_m_s2 / max(size, 1e-9)),
+        yaw_rate=pace.value * setpoint.yaw_rate,
+    )

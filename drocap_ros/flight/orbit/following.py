@@ -1,0 +1,102 @@
+"""Whether the vehicle follows the setpoints: by the content of the autopilot's echo and by the vehicle's motion.
+
+ArduPilot streams POSITION_TARGET_LOCAL_NED throughout GUIDED and PX4 in every mode, whether or not setpoints arrive:
+its age shows nothing but the loss of the stream.  It contains the target that is followed.  ArduPilot integrates the
+last setpoint until GUID_TIMEOUT, and then sets its velocity to zero; PX4 adds the correction of the position to it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from drocap_ros.flight.vehicle_state import VehicleState
+
+_SENT_S = 0.7  # a setpoint may be echoed for so long: two transmissions and the period of the echo
+_AHEAD_S = 0.5  # along its velocity: ArduPilot's integration
+_PLACE_M, _VELOCITY_M_S = 0.5, 0.75
+_MISMATCH_S = 0.25  # longer than two echoes
+_WINDOW_S, _COMMANDED_M_S = 1.0, 0.6
+#: Of the commanded speed; the vehicle is slower for all of the window.  In every recorded flight it reached 0.46.
+_STANDING = 0.25
+
+
+class Following:
+    """Judges an orbit step by step.
+
+    Parameters
+    ----------
+    max_echo_age_s : time without any echo after which the setpoints count as not followed
+    """
+
+    def __init__(self, max_echo_age_s: float) -> None:
+        self._max_echo_age_s = max_echo_age_s
+        self._matched_s = math.nan  # when an echo last agreed in this orbit
+        self._speeds: deque[tuple[float, float, float]] = deque()  # time, commanded m/s, flown m/s
+
+    def step(
+        self,
+        now_s: float,
+        orbiting_s: float,
+        sent: Sequence[tuple[float, Any]],
+        echo: tuple[float, Any] | None,
+        vehicle: VehicleState | None,
+    ) -> str:
+        """Why the setpoints count as not followed, in words; "" = they are followed, or it is not known.
+
+        Parameters
+        ----------
+        now_s : monotonic
+        orbiting_s : how long the orbit has been flown; 0 = it is not
+        sent : (monotonic s, SET_POSITION_TARGET_LOCAL_NED) in order of time
+        echo : (age in s, POSITION_TARGET_LOCAL_NED), or None before the first
+        """
+        if orbiting_s == 0.0 or not sent or vehicle is None:
+            self._matched_s = math.nan
+            self._speeds.clear()
+            return ""
+        if echo is not None:
+            age_s, target = echo
+            if min(age_s, orbiting_s) > self._max_echo_age_s:
+                return f"no echo of a target for {age_s:.1f} s"
+            recent = [message for at_s, message in sent if now_s - at_s <= _SENT_S]
+            if _agrees(target, recent, with_velocity=vehicle.autopilot != "px4"):
+                self._matched_s = now_s
+            elif now_s - self._matched_s > _MISMATCH_S:  # NaN: its content has not agreed yet, and is not judged
+                return "the autopilot's target is none that was sent"
+        return self._stands(now_s, sent[-1][1], float(np.hypot(*vehicle.velocity_enu_m_s[:2])))
+
+    def _stands(self, now_s: float, setpoint: Any, speed_m_s: float) -> str:
+        commanded = math.hypot(setpoint.vx, setpoint.vy)
+        if not commanded >= _COMMANDED_M_S:
+            self._speeds.clear()
+            return ""
+        self._speeds.append((now_s, commanded, speed_m_s))
+        whole = now_s - self._speeds[0][0] >= _WINDOW_S
+        while now_s - self._speeds[0][0] > _WINDOW_S:
+            self._speeds.popleft()
+        mean = sum(wanted for _, wanted, _ in self._speeds) / len(self._speeds)
+        fastest = max(flown for _, _, flown in self._speeds)
+        if whole and fastest < _STANDING * mean:
+            return f"it flies at {fastest:.1f} m/s where {mean:.1f} m/s are commanded"
+        return ""
+
+
+def _agrees(echo: Any, sent: list[Any], *, with_velocity: bool) -> bool:
+    """Whether the echoed target lies on the way of a setpoint, and has its velocity."""
+    place = np.array([echo.x, echo.y], dtype=float)
+    if not sent or not np.isfinite(place).all():
+        return False
+    begin = np.array([[m.x, m.y] for m in sent], dtype=float)
+    velocity = np.array([[m.vx, m.vy] for m in sent], dtype=float)
+    way = _AHEAD_S * velocity
+    part = ((place - begin) * way).sum(axis=1) / np.maximum((way * way).sum(axis=1), 1e-9)
+    nearest = begin + np.clip(part, 0.0, 1.0)[:, None] * way
+    near = np.hypot(*(place - nearest).T) <= _PLACE_M
+    if with_velocity:
+        near &= np.hypot(*(np.array([echo.vx, echo.vy], dtype=float) - velocity).T) <= _VELOCITY_M_S
+    return bool(near.any())

@@ -1,0 +1,101 @@
+"""The last check before the link: whether a setpoint is harmless if it stays the last one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.orbit.coast import Coast, coast_of, greatest_speed
+from drocap_ros.flight.orbit.planner import OrbitGoal
+from drocap_ros.flight.orbit.states import Limits, Observed
+from drocap_ros.flight.setpoint import Setpoint, hold_setpoint
+
+#: Shares that are tried, one after the other: of the way to the reference, of velocity and of acceleration.  The way
+#: comes first: with less velocity the vehicle would fall behind the reference, and the way to it would grow.
+_SHARES = (
+    (1.0, 1.0, 1.0), (0.5, 1.0, 1.0), (0.0, 1.0, 1.0), (0.0, 0.8, 0.5), (0.0, 0.6, 0.0), (0.0, 0.4, 0.0),
+    (0.0, 0.2, 0.0),
+)  # fmt: skip
+_MEAN = 0.75  # share of max_coast_m that a steady flight uses: gusts, turns and the way to the reference add to it
+_NEARER_M = 1.0
+_SLACK_M, _SLACK_M_S = 0.2, 0.1  # what the vehicle has already is no effect of the setpoint
+_SHIPPED_S = {"ardupilot": 3.0, "px4": 1.0}  # time-outs, where they are not reported
+_SLOWED = 0.95
+
+
+def coast_speed(seen: Observed, limits: Limits) -> float:
+    """Speed in m/s of a steady flight whose coast leaves room to ``max_coast_m``."""
+    return greatest_speed(seen.autopilot, _timeout_s(seen), _MEAN * limits.safety.max_coast_m)
+
+
+def slowed_condition(present: Condition, goal: OrbitGoal, seen: Observed, limits: Limits) -> Condition:
+    """The condition of a flown orbit, with the angular speed that is flown if the coast limits it."""
+    wanted = abs(goal.angular_speed_rad_s)
+    allowed = coast_speed(seen, limits) / goal.radius_m
+    if present.code != ConditionCode.ORBITING or allowed >= _SLOWED * wanted:
+        return present
+    return condition(
+        ConditionCode.SLOWED, cause=present, speed_deg_s=math.degrees(allowed), wanted_deg_s=math.degrees(wanted),
+        limit_m=limits.safety.max_coast_m, timeout_s=_timeout_s(seen),
+    )  # fmt: skip
+
+
+def harmless(
+    setpoint: Setpoint, seen: Observed, subject_velocity: np.ndarray, fence_centre: np.ndarray | None, limits: Limits
+) -> tuple[Setpoint, Condition | None]:
+    """The setpoint as it is sent, slowed down where its coast would break a limit.
+
+    Where no motion is harmless, the setpoint holds the present position, and the condition is why.
+
+    The coast must stay inside the fence and the greatest speed.  It must stay clear of the minimum distance from a
+    subject that stands and from one that moves as estimated, and come at most 1 m nearer to that one.
+
+    Parameters
+    ----------
+    subject_velocity : (3,) m/s, estimated
+    fence_centre : (2,) m; None = there is no fence
+    """
+    problem: Condition | None = None
+    for way, speed, push in _SHARES:
+        part = setpoint._replace(
+            position=seen.position + way * (setpoint.position - seen.position),
+            velocity=speed * setpoint.velocity, acceleration=push * setpoint.acceleration,
+        )  # fmt: skip
+        coast = coast_of(part, seen.position, seen.velocity, seen.autopilot, _timeout_s(seen))
+        problem = _danger(coast, seen, complex(*subject_velocity[:2]), fence_centre, limits)
+        # A coast that is only long is not shorter after a hold: the slowest setpoint is sent.
+        if problem is None and (coast.length_m <= limits.safety.max_coast_m or speed == _SHARES[-1][1]):
+            return part, None
+    return hold_setpoint(seen.position, seen.yaw), problem
+
+
+def _danger(
+    coast: Coast, seen: Observed, subject_velocity: complex, fence_centre: np.ndarray | None, limits: Limits
+) -> Condition | None:
+    speed = float(coast.speed_m_s.max())
+    if speed > max(limits.orbit.max_speed_m_s, float(coast.speed_m_s[0]) + _SLACK_M_S):
+        return condition(ConditionCode.COAST_UNSAFE, reach=f"reach {speed:.1f} m/s")
+    if fence_centre is not None:
+        away = np.abs(coast.place - complex(*fence_centre))
+        if away.max() > max(limits.safety.fence_radius_m, float(away[0]) + _SLACK_M):
+            return condition(ConditionCode.COAST_UNSAFE, reach=f"reach {away.max():.1f} m from where the orbit began")
+    if seen.subject is None:
+        return None
+    subject, least = complex(*seen.subject[:2]), limits.orbit.min_distance_m
+    stands = np.abs(coast.place - subject)
+    walks = np.abs(coast.place - subject - subject_velocity * coast.time_s)
+    alone = np.abs(coast.place[0] - subject - subject_velocity * coast.time_s)  # distances of a vehicle that stands
+    near = min(
+        (float(distance.min()) for distance, limit in (
+            (stands, min(least, float(stands[0]) - _SLACK_M)),
+            (walks, max(min(least, float(alone.min()) - _SLACK_M), float(alone.min()) - _NEARER_M)),
+        ) if distance.min() < limit), default=math.nan,
+    )  # fmt: skip
+    return None if math.isnan(near) else condition(ConditionCode.COAST_UNSAFE, reach=f"come to {near:.1f} m")
+
+
+def _timeout_s(seen: Observed) -> float:
+    reported = math.nan if seen.loss_settings is None else seen.loss_settings.timeout_s
+    return _SHIPPED_S.get(seen.autopilot, 3.0) if math.isnan(reported) else reported

@@ -1,0 +1,103 @@
+"""Types of the check before a flight: what was measured, and what a check finds in it."""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.flight.conditions import Condition, ConditionCode
+from drocap_ros.flight.vehicle_state import VehicleState
+
+#: Share of the time above which a failing condition is no mere gap.
+LASTING = 0.5
+
+
+class Level(enum.IntEnum):
+    """How much a finding matters."""
+
+    OK = 0
+    WARNING = 1  # it flies; the setting or the link should change
+    MISSING = 2  # the bridge refuses motion, or soon ends it
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One check.
+
+    code : of programs
+    name : of people
+    found, wanted, remedy : sentences; "" where there is nothing to write
+    values : measured values by names with their units; NaN = unknown
+    conditions : that this finding explains
+    """
+
+    code: str
+    name: str
+    level: Level
+    found: str
+    wanted: str = ""
+    remedy: str = ""
+    values: Mapping[str, float | str | bool] = field(default_factory=dict)
+    conditions: tuple[ConditionCode, ...] = ()
+
+    def as_dict(self) -> dict[str, object]:
+        """The finding for JSON, which has no NaN."""
+        values = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in self.values.items()}
+        return {
+            "code": self.code, "level": self.level.name.lower(), "name": self.name, "found": self.found,
+            "wanted": self.wanted, "remedy": self.remedy, "values": values,
+        }  # fmt: skip
+
+
+class Stream(NamedTuple):
+    """A wanted message: rates in Hz, and the longest time between two in s; NaN = not measured."""
+
+    real_hz: float
+    wanted_hz: float
+    longest_gap_s: float = math.nan
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What was heard of an autopilot within some seconds.
+
+    vehicle : its last state; None = no heartbeat or no attitude
+    heard : whether an autopilot was heard at all
+    version : of its firmware; "" = not reported
+    streams : the wanted messages by their names
+    refused : MAV_RESULT of the messages that it refuses to send
+    settings : its parameters; NaN = asked for and not reported, absent = not asked for
+    round_trips_s : of time synchronization
+    offsets_s : (N,) our clock minus its clock, one by each exchange; their spread counts
+    delays_s : (N,) age of each state at its arrival
+    good_count, bad_count, unsigned_count : messages; data that is none; messages without our signature
+    systems : MAVLink systems of all autopilots on the link
+    conditions : conditions for motion that failed, with the share of the time, in the order of the checks; as if the
+        vehicle were armed and in the air
+    bridge : state and reason of the running bridge that was listened to; "" = the link itself
+    """
+
+    vehicle: VehicleState | None = None
+    heard: bool = False
+    version: str = ""
+    streams: Mapping[str, Stream] = field(default_factory=dict)
+    refused: Mapping[str, int] = field(default_factory=dict)
+    settings: Mapping[str, float] = field(default_factory=dict)
+    round_trips_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    offsets_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    delays_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    good_count: int = 0
+    bad_count: int = 0
+    unsigned_count: int = 0
+    systems: frozenset[int] = frozenset()
+    conditions: tuple[tuple[Condition, float], ...] = ()
+    bridge: str = ""
+
+    def setting(self, name: str) -> float:
+        """A parameter of the autopilot; NaN = not reported, or not asked for."""
+        return self.settings.get(name, math.nan)

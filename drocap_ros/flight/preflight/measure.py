@@ -1,0 +1,203 @@
+"""Listens to an autopilot for some seconds, by a link that cannot send motion."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.conditions import Condition, ConditionCode
+from drocap_ros.flight.mavlink.autopilot_settings import AutopilotSettings
+from drocap_ros.flight.mavlink.link import MavlinkLink
+from drocap_ros.flight.mavlink.mount import TYPE_PARAMETER
+from drocap_ros.flight.mavlink.transport import Transport
+from drocap_ros.flight.orbit.motion_checks import vehicle_condition
+from drocap_ros.flight.orbit.observer import observe
+from drocap_ros.flight.orbit.states import Limits
+from drocap_ros.flight.preflight.findings import Measured, Stream
+from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, VehicleState
+
+_NS = 1_000_000_000
+_CONDITIONS_PERIOD_S, _VERSION_PERIOD_S, _VERSION_TRIES = 0.1, 1.0, 4
+#: Read beside the parameters that decide about motion.
+MORE_SETTINGS = {
+    "ardupilot": (
+        "FENCE_ENABLE", "FENCE_TYPE", "FENCE_RADIUS", "FENCE_ALT_MAX", "FENCE_ACTION", TYPE_PARAMETER, "BATT_MONITOR",
+    ),
+    "px4": ("GF_ACTION", "GF_MAX_HOR_DIST", "GF_MAX_VER_DIST", "COM_RC_OVERRIDE", "COM_OBL_RC_ACT"),
+}  # fmt: skip
+
+
+class _Settings(AutopilotSettings):
+    def set_autopilot(self, autopilot: str) -> None:
+        super().set_autopilot(autopilot)
+        self.add(MORE_SETTINGS.get(autopilot, ()))
+
+
+class ListeningLink(MavlinkLink):
+    """A link that asks for all telemetry of a flight, and that no caller can make send motion.
+
+    It never arms, changes a mode or writes a parameter.
+    """
+
+    def __init__(self, config: MavlinkBridgeConfig, **keywords: Any) -> None:
+        # With motion enabled the link asks for the rates and parameters of a flight.
+        super().__init__(dataclasses.replace(config, commands_enabled=True), **keywords)
+        self.settings = _Settings()
+        self.version = ""
+        self.arrivals: defaultdict[str, list[int]] = defaultdict(list)
+        self.exchanges: list[tuple[int, int]] = []  # round trip, offset, ns
+        self.systems: set[int] = set()
+        self._version_tries = 0
+
+    def check_motion(self, message: Any) -> NoReturn:
+        """Refuse every motion.
+
+        Raises
+        ------
+        AssertionError
+            Always.
+        """
+        raise AssertionError(f"this link sends no {message.get_type()}")
+
+    def _take(self, message: Any, now_ns: int) -> VehicleState | None:
+        name = message.get_type()
+        if name == "TIMESYNC" and message.tc1 and message.ts1 in self._sync_sent:
+            trip = now_ns - message.ts1
+            self.exchanges.append((trip, message.ts1 + trip // 2 - message.tc1))
+        elif name == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID:
+            self.systems.add(message.get_srcSystem())
+        elif name == "AUTOPILOT_VERSION":
+            self.version = version_text(message.flight_sw_version)
+        elif name == "COMMAND_ACK" and message.command == mavlink.MAV_CMD_REQUEST_MESSAGE:
+            return None  # the message itself is the answer
+        state = super()._take(message, now_ns)
+        if message.get_srcSystem() == self.estimator.system_id and self.estimator.component_id:
+            self.arrivals[name].append(now_ns)
+        return state
+
+    def _send_due(self) -> None:
+        super()._send_due()
+        wanted = self._autopilot is not None and not self.version and self._version_tries < _VERSION_TRIES
+        if wanted and self._is_due("version", _VERSION_PERIOD_S):
+            self._version_tries += 1
+            number = mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+            request = mavlink.MAV_CMD_REQUEST_MESSAGE
+            self._send(self._mav.command_long_encode(*self.target, request, 0, number, 0, 0, 0, 0, 0, 0))
+
+
+class Listening:
+    """One session of listening: :meth:`turn` again and again until :attr:`done`, then :meth:`measured`.
+
+    Parameters
+    ----------
+    seconds : since the first message of the autopilot; without one, since the beginning
+    keywords : of :class:`MavlinkLink`
+
+    Raises
+    ------
+    InputError
+        At construction, when the link cannot be opened.
+    """
+
+    def __init__(
+        self, config: MavlinkBridgeConfig, seconds: float, *, clock_ns: Callable[[], int] = time.time_ns,
+        monotonic_s: Callable[[], float] = time.monotonic, transport: Transport | None = None,
+    ) -> None:  # fmt: skip
+        self.link = ListeningLink(config, clock_ns=clock_ns, monotonic_s=monotonic_s, transport=transport)
+        self._config, self._seconds = self.link.config, seconds
+        self._clock_ns, self._monotonic_s = clock_ns, monotonic_s
+        self._begin_s, self._heard_s = monotonic_s(), math.inf
+        self._vehicle: VehicleState | None = None
+        self._delays: list[tuple[int, float]] = []
+        self._from_ns: int | None = None
+        self._samples, self._next_sample_s = 0, 0.0
+        self._failed: Counter[ConditionCode] = Counter()
+        self._examples: dict[ConditionCode, Condition] = {}
+
+    @property
+    def progress(self) -> float:
+        """Share of the time that is over."""
+        begin_s = self._begin_s if math.isinf(self._heard_s) else self._heard_s
+        return min((self._monotonic_s() - begin_s) / self._seconds, 1.0)
+
+    @property
+    def done(self) -> bool:
+        """Whether the time is over."""
+        return self.progress >= 1.0
+
+    def turn(self, wait_s: float = 0.02) -> None:
+        """Read for a moment and send the requests that are due."""
+        states = self.link.spin_once(wait_s)
+        now_ns, now_s = self._clock_ns(), self._monotonic_s()
+        for state in states:
+            self._vehicle = state
+            self._delays.append((now_ns, (now_ns - state.stamp_ns) / _NS))
+        if math.isinf(self._heard_s) and self.link.estimator.component_id:
+            self._heard_s = now_s
+        # The autopilot needs the first half to grant the requests and to answer.
+        if self._from_ns is None and not math.isinf(self._heard_s) and self.progress >= 0.5:
+            self._from_ns = now_ns
+        if self._from_ns is not None and now_s >= self._next_sample_s:
+            self._next_sample_s = now_s + _CONDITIONS_PERIOD_S
+            self._sample(now_ns)
+
+    def _sample(self, now_ns: int) -> None:
+        # As in flight, so that not everything hides behind "not armed".
+        seen = observe(self.link, self._config, self._vehicle, None, None, "", now_ns)
+        seen = dataclasses.replace(seen, armed=True, landed_state=LANDED_IN_AIR)
+        limits = Limits(self._config, self._config, max_control_timeout_s=self._config.max_control_timeout_s)
+        failed = vehicle_condition(seen, limits)
+        self._samples += 1
+        if failed is not None:
+            self._failed[failed.code] += 1
+            self._examples[failed.code] = failed
+
+    def measured(self) -> Measured:
+        """What was heard; rates and delays are those of the second half of the time."""
+        link, now_ns = self.link, self._clock_ns()
+        from_ns = now_ns if self._from_ns is None else self._from_ns
+        status = link.status()
+        trips = np.array(link.exchanges, dtype=np.int64).reshape(-1, 2)
+        return Measured(
+            vehicle=link.estimator.snapshot(now_ns), heard=not math.isinf(self._heard_s), version=link.version,
+            streams={
+                name: _stream(link.arrivals.get(name, []), from_ns, now_ns, wanted)
+                for name, (_, wanted) in status.rates_hz.items()
+            },
+            refused=status.refused, settings=link.settings.reported(),
+            round_trips_s=trips[:, 0] / _NS, offsets_s=(trips[:, 1] - trips[:1, 1].sum()) / _NS,
+            delays_s=np.array([delay for at, delay in self._delays if at >= from_ns]),
+            good_count=sum(map(len, link.arrivals.values())), bad_count=status.bad_count,
+            unsigned_count=status.refused_count, systems=frozenset(link.systems),
+            conditions=tuple(
+                (self._examples[code], self._failed[code] / self._samples) for code in sorted(self._failed)
+            ),
+        )  # fmt: skip
+
+    def close(self) -> None:
+        """Close the port."""
+        self.link.close()
+
+
+def version_text(number: int) -> str:
+    """``flight_sw_version`` of AUTOPILOT_VERSION as in "4.6.2"; a release has no suffix."""
+    kinds = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc", 255: ""}
+    major, minor, patch, kind = number.to_bytes(4, "big")
+    return f"{major}.{minor}.{patch}{kinds.get(kind, '')}"
+
+
+def _stream(arrivals: list[int], from_ns: int, now_ns: int, wanted_hz: float) -> Stream:
+    recent = [at for at in arrivals if at >= from_ns]
+    seconds = (now_ns - from_ns) / _NS
+    if seconds <= 0:
+        return Stream(math.nan, wanted_hz)
+    gap_s = max(np.diff([from_ns, *recent, now_ns])) / _NS
+    return Stream(len(recent) / seconds, wanted_hz, float(gap_s))

@@ -1,0 +1,180 @@
+"""Whether the person stays in the picture of a camera that is fixed to the body.
+
+A copter leans to accelerate: towards the centre of its orbit, and against the wind.  A gimbal takes that away; a fixed
+camera leans with the body, and the person moves in the picture by the same angle.  The lean needed against wind is
+learned while the vehicle hovers.  On an orbit the nose turns through all directions, so it counts in each.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.orbit.planner import OrbitGoal
+from drocap_ros.flight.orbit.states import Observed
+from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.geometry.rotations import matrix_from_quaternion
+
+_GRAVITY = 9.81
+_HALF_WIDTH_M = 0.3  # of a person with the arms
+_HEADROOM_M = 0.1  # above the head
+_DIRECTIONS = 12
+_GUSTS, _RESERVE = 1.2, 0.4  # times the wind's lean; m/s^2 of corrections
+_LEAST_UP = 0.3  # of the body's axis; beyond it the vehicle tumbles
+_STILL_M_S, _SETTLED_S = 0.5, 1.0
+_LEARNING_S = 4.0  # of the lean against wind: a gust passes, the wind stays
+_STEADY_S = 0.7  # over which the margin now is averaged: a slower orbit cannot follow a gust
+_COMFORT, _LEAST_PACE = 0.08, 0.3  # share of the picture's height below which the orbit slows down, and how far
+
+
+class View(NamedTuple):
+    """A fixed camera: matrix (3, 3) px, width and height px, pitch against the body in rad, negative = down."""
+
+    matrix: np.ndarray
+    size: tuple[int, int]
+    pitch: float
+
+
+def framing_margin(
+    view: View, distance_m: float, height_m: float, body_height_m: float, ahead: np.ndarray, left: np.ndarray
+) -> np.ndarray:
+    """(N,) distance of the person from the nearest border, as a share of the picture's height; negative = outside.
+
+    Parameters
+    ----------
+    distance_m : horizontal, along the nose
+    height_m : of the camera above the person's ground
+    ahead, left : (N,) rad, lean of the body: nose down, left side down
+    """
+    up = np.array([-height_m, body_height_m + _HEADROOM_M - height_m])
+    corners = np.array([[distance_m, y, z] for y in (-_HALF_WIDTH_M, _HALF_WIDTH_M) for z in up])
+    mount = _nose_down(np.array([-view.pitch]))
+    forward, leftward, upward = np.moveaxis(_nose_down(ahead) @ _left_down(left) @ mount, -1, 0)
+    depth = np.maximum(forward @ corners.T, 1e-6)
+    u = view.matrix[0, 2] - view.matrix[0, 0] * (leftward @ corners.T) / depth
+    v = view.matrix[1, 2] - view.matrix[1, 1] * (upward @ corners.T) / depth
+    width, height = view.size
+    inside = np.minimum(np.minimum(u, width - u), np.minimum(v, height - v))
+    margin: np.ndarray = np.where(depth > 0.1, inside, -height).min(axis=-1) / height
+    return margin
+
+
+def _nose_down(angle: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) rotation about left, of angles (N,)."""
+    c, s, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
+    return np.stack([np.stack([c, zero, s], -1), np.stack([zero, zero + 1, zero], -1), np.stack([-s, zero, c], -1)], -2)
+
+
+def _left_down(angle: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) rotation against forward, of angles (N,)."""
+    c, s, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
+    return np.stack([np.stack([zero + 1, zero, zero], -1), np.stack([zero, c, s], -1), np.stack([zero, -s, c], -1)], -2)
+
+
+def framed_pace(margin: float) -> float:
+    """Share of its speed at which an orbit is flown with this margin; it leans less then."""
+    return min(max(margin / _COMFORT, _LEAST_PACE), 1.0)
+
+
+def orbit_margin(view: View, goal: OrbitGoal, body_height_m: float, wind: float) -> float:
+    """Least margin on an orbit, from its start on, whose lean against the wind is an acceleration of ``wind`` m/s^2.
+
+    Gusts, and what it takes to keep to the orbit, lean the body further.
+    """
+    lean = _GUSTS * wind + _RESERVE
+    around = np.linspace(0.0, 2 * math.pi, _DIRECTIONS, endpoint=False)
+    inward = np.array([[0.0], [goal.angular_speed_rad_s**2 * goal.radius_m]])
+    ahead = np.arctan2(inward + lean * np.cos(around), _GRAVITY).ravel()
+    left = np.arctan2(np.tile(lean * np.sin(around), 2), _GRAVITY)
+    return float(framing_margin(view, goal.radius_m, goal.height_m, body_height_m, ahead, left).min())
+
+
+class Framing:
+    """Watches the picture of a fixed camera; without one it changes and refuses nothing.
+
+    matrix : (3, 3) px; None before the first calibration
+    size : width and height of the pictures, px; None before the first
+    """
+
+    def __init__(self, config: MavlinkBridgeConfig) -> None:
+        self._config = config
+        self.matrix: np.ndarray | None = None
+        self.size: tuple[int, int] | None = None
+        self._wind = np.zeros(2)  # m/s^2 ENU, by which the vehicle leans without accelerating
+        self._still_s = 0.0
+        self._learned_s = 0.0
+        self._margin = math.nan
+
+    def watch(self, vehicle: VehicleState | None, seen: Observed, dt: float) -> Observed:
+        """The observation with the margin now; learns the lean against wind, ``dt`` s after the last one."""
+        view = self._view()
+        if view is None or vehicle is None or not np.isfinite(vehicle.orientation_xyzw).all():
+            return seen
+        forward, left, up = matrix_from_quaternion(vehicle.orientation_xyzw).T
+        if up[2] < _LEAST_UP:
+            return seen
+        step_s = min(max(dt, 0.0), 0.2)
+        # Only a hover leans by the wind alone.
+        self._still_s = self._still_s + step_s if float(np.hypot(*seen.velocity[:2])) < _STILL_M_S else 0.0
+        if self._still_s > _SETTLED_S:
+            self._learned_s = min(self._learned_s + step_s, _LEARNING_S)
+            share = step_s / max(self._learned_s, 1e-3)
+            self._wind = self._wind + share * (_GRAVITY * up[:2] / up[2] - self._wind)
+        if not math.isfinite(seen.subject_distance_m + seen.height_m):
+            return seen
+        ahead, aside = np.arcsin(np.clip([-forward[2:], -left[2:]], -1.0, 1.0))
+        margin = framing_margin(
+            view, max(seen.subject_distance_m, 0.5), seen.height_m, self._config.body_height_m, ahead, aside
+        )
+        share = min(step_s / _STEADY_S, 1.0) if math.isfinite(self._margin) else 1.0
+        self._margin = (1 - share) * np.nan_to_num(self._margin) + share * float(margin[0])
+        return dataclasses.replace(seen, framing_margin=self._margin)
+
+    def refusal(self, goal: OrbitGoal) -> Condition | None:
+        """Why an orbit loses the person, with what would keep them; None = it does not, or nothing is known."""
+        view, config = self._view(), self._config
+        if view is None:
+            return None
+        wind = float(np.hypot(*self._wind))
+        body = config.body_height_m
+        margin = orbit_margin(view, goal, body, wind)
+        if margin >= 0.0:
+            return None
+        return condition(
+            ConditionCode.PERSON_LEAVES_PICTURE, missing_percent=-100 * margin, radius_m=goal.radius_m,
+            height_m=goal.height_m, speed_deg_s=math.degrees(abs(goal.angular_speed_rad_s)),
+            remedy=_remedy(view, goal, body, wind, config.max_distance_m),
+        )  # fmt: skip
+
+    def _view(self) -> View | None:
+        if self._config.mount != "fixed" or self.matrix is None or self.size is None:
+            return None
+        return View(self.matrix, self.size, math.radians(self._config.camera_pitch_deg))
+
+
+def _remedy(view: View, goal: OrbitGoal, body_height_m: float, wind: float, max_radius_m: float) -> str:
+    """What keeps the person in the picture, as words: another pitch, a slower or a wider orbit; else another lens."""
+
+    def keeps(view: View, goal: OrbitGoal) -> bool:
+        return orbit_margin(view, goal, body_height_m, wind) >= 0.0
+
+    words = []
+    pitches = [math.radians(d) for d in range(-80, 31, 1)]
+    best = max(pitches, key=lambda p: orbit_margin(view._replace(pitch=p), goal, body_height_m, wind))
+    if keeps(view._replace(pitch=best), goal):
+        words.append(f"tilt the camera to {math.degrees(best):.0f} deg (camera_pitch_deg)")
+    speed = math.degrees(abs(goal.angular_speed_rad_s))
+    slower = range(math.ceil(speed) - 1, 1, -1)
+    kept = next((d for d in slower if keeps(view, goal._replace(angular_speed_rad_s=math.radians(d)))), None)
+    if kept:
+        words.append(f"fly at most {kept} deg/s")
+    radii = np.arange(math.ceil(2 * goal.radius_m + 0.01) / 2, max_radius_m + 0.01, 0.5)
+    wider = [r for r in radii if keeps(view, goal._replace(radius_m=float(r)))]
+    if wider:
+        words.append(f"fly at {wider[0]:g} m or more")
+    return ", or ".join(words) or "use a wider lens or a gimbal"

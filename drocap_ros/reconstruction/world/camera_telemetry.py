@@ -1,0 +1,81 @@
+"""The camera's path as telemetry reports it, shifted in time by a latency."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.geometry.rotations import exp_so3, log_so3
+
+_SMOOTHING_S = 0.25
+_MARGIN = 12
+
+
+class CameraPath(NamedTuple):
+    """The camera at every frame.
+
+    rotation : (F, 3, 3) world -> camera
+    turn_rate : (F, 3) rad/s in camera axes
+    position, velocity : (F, 3) m, m/s
+    """
+
+    rotation: np.ndarray
+    turn_rate: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+
+
+class CameraTelemetry:
+    """Reported rotations (F, 3, 3) world -> camera and positions (F, 3) m of evenly spaced frames.
+
+    A latency shifts the path by its smoothed motion only: interpolation between frames would average the noise of the
+    reports, and an adjustment would take the latency that averages most.
+    """
+
+    def __init__(self, rotation: np.ndarray, position: np.ndarray, fps: float) -> None:
+        from scipy.ndimage import gaussian_filter1d
+
+        self.fps, self.frames = fps, len(rotation)
+        self.rotation, self.position = rotation, position
+        #: (F, 3) the reported direction of view in the world.
+        self.view = rotation[:, 2]
+        turn: np.ndarray = np.zeros((self.frames, 3))
+        if self.frames > 1:
+            step = log_so3(rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2)) * fps
+            turn = np.concatenate([step[:1], 0.5 * (step[1:] + step[:-1]), step[-1:]])
+        smoothing = _SMOOTHING_S * fps
+        self._turn_rate = gaussian_filter1d(turn, smoothing, axis=0, mode="nearest")
+        self._smooth = gaussian_filter1d(_extended(position), smoothing, axis=0, mode="nearest")[_MARGIN:-_MARGIN]
+        self._velocity = np.gradient(self._smooth, axis=0) * fps if self.frames > 1 else np.zeros((self.frames, 3))
+
+    def shifted(self, attitude_s: float, position_s: float) -> CameraPath:
+        """The path with the attitude and the position of so many seconds later."""
+        moved = self._smooth_at(position_s) - self._smooth
+        rotation = exp_so3(self._turn_rate * attitude_s) @ self.rotation
+        return CameraPath(rotation, self._turn_rate, self.position + moved, self._velocity)
+
+    def roughness(self) -> float:
+        """Standard deviation (m) of the position's change from frame to frame that no camera could fly."""
+        if self.frames < 5:
+            return 0.0
+        # The third difference: even a hard manoeuvre contributes less than a millimetre.
+        third = np.diff(self.position, n=3, axis=0)
+        return float(1.48 * np.median(np.abs(third)) / np.sqrt(6.0))
+
+    def _smooth_at(self, later_s: float) -> np.ndarray:
+        frame = np.arange(self.frames) + later_s * self.fps
+        inside = np.clip(frame, 0, self.frames - 1)
+        at = np.arange(self.frames)
+        path = np.stack([np.interp(inside, at, self._smooth[:, axis]) for axis in range(3)], axis=1)
+        ends = np.where((frame < inside)[:, None], self._velocity[0], self._velocity[-1])
+        return path + ends * ((frame - inside) / self.fps)[:, None]
+
+
+def _extended(values: np.ndarray) -> np.ndarray:
+    """Values (F, 3) continued in straight lines, so that a smoothing keeps their slope at both ends."""
+    reach = min(_MARGIN, len(values) - 1)
+    steps = np.arange(1, _MARGIN + 1)[:, None]
+    before = values[0] - (values[reach] - values[0]) / max(reach, 1) * steps[::-1]
+    after = values[-1] + (values[-1] - values[-1 - reach]) / max(reach, 1) * steps
+    return np.concatenate([before, values, after])

@@ -1,0 +1,172 @@
+"""From poses that telemetry has placed in the world to poses that are adjusted together with the camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drocap_ros.geometry.rotations import exp_so3, project_to_so3
+from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.lifted.adjustment import span_lengths
+from drocap_ros.reconstruction.lifted.even_frames import even_slots
+from drocap_ros.reconstruction.lifted.window_solver import difference_noise
+from drocap_ros.reconstruction.methods.windows import fade_weights, windows
+from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
+from drocap_ros.reconstruction.world.world_adjustment import WorldSolution, adjust_in_world
+from drocap_ros.reconstruction.world.world_model import (
+    ATTITUDE_LATENCY,
+    CAMERA,
+    MISALIGNMENT,
+    POSITION_LATENCY,
+    SCALE,
+    WorldConfig,
+    WorldInput,
+)
+from drocap_ros.tracks import Tracks
+
+_LEAST_FRAMES = 12
+#: Frames that are adjusted together, and that neighbouring windows of a long recording share.
+_WINDOW, _OVERLAP = 960, 48
+_LEAST_NOISE_PX = 0.5
+#: Relative standard deviation of the scale below which it counts as measured.
+_MEASURED = 0.03
+#: Cost of the telemetry per frame that no camera's flight explains, and share of contacts that walking exceeds.
+_LARGEST_COST, _LEAST_CONTACT = 100.0, 0.1
+
+
+@dataclass(frozen=True)
+class RefinedWorld:
+    """Poses and camera after the adjustment.
+
+    joints : (F, 15, 3) m; rotation : (F, 3, 3) world -> camera; position : (F, 3) m
+    metric : whether the scale was measured
+    rejected : why the telemetry cannot be true, in words; "" = it can
+    calibration : JSON-compatible, of every window: errors of the telemetry and their standard deviations
+    """
+
+    joints: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+    metric: bool
+    rejected: str
+    calibration: list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class PlacedPoses:
+    """Input of the refinement: F frames.
+
+    joints : (F, 15, 3) m in the world; factor : their scale over that of the assumed stature
+    depth, depth_sigma : (F, 15) m at the assumed stature: depth behind the pelvis and its expected error
+    """
+
+    joints: np.ndarray
+    factor: float
+    depth: np.ndarray
+    depth_sigma: np.ndarray
+
+
+def refine_in_world(
+    tracks: Tracks, keypoints: Keypoints2D, poses: PlacedPoses, config: WorldConfig | None = None
+) -> RefinedWorld | None:
+    """Adjust poses and camera; None where the tracks lack a finite camera or are shorter than twelve frames."""
+    rotation, position, matrix = tracks.camera_rotation, tracks.camera_position, tracks.camera_matrix
+    if rotation is None or position is None or matrix is None or len(tracks) < _LEAST_FRAMES:
+        return None
+    if not (np.isfinite(rotation).all() and np.isfinite(position).all() and np.isfinite(poses.joints).all()):
+        return None
+    slot, fps = even_slots(tracks.stamp_ns)
+    frames = int(slot[-1]) + 1
+    # A common origin near the path: the scale turns about it.
+    origin = position.mean(axis=0)
+    weight = np.zeros((frames, keypoints.xy.shape[1]))
+    points = np.zeros((*weight.shape, 2))
+    weight[slot], points[slot] = _weights(keypoints), np.nan_to_num(keypoints.xy)
+    body = (poses.joints - origin) / poses.factor
+    body, depth, sigma, path = (
+        _at_all_slots(values, slot) for values in (body, poses.depth, poses.depth_sigma, position - origin)
+    )
+    turn = project_to_so3(_at_all_slots(rotation, slot))
+    joints: np.ndarray = np.zeros(body.shape)
+    camera: np.ndarray = np.zeros((frames, CAMERA))
+    total, calibration = np.zeros(frames), []
+    measured, cost, contact = True, 0.0, 0.0
+    lengths = np.median(span_lengths(body), axis=0)
+    for rows in windows(frames, _WINDOW, _OVERLAP):
+        telemetry = CameraTelemetry(turn[rows], path[rows], fps)
+        data = WorldInput(
+            points[rows], weight[rows], depth[rows], sigma[rows], lengths, telemetry, matrix, config or WorldConfig()
+        )
+        found = adjust_in_world(data, body[rows], 1.0 / poses.factor)
+        fade = fade_weights(rows, frames, _OVERLAP)
+        joints[rows] += fade[:, None, None] * found.joints
+        camera[rows] += fade[:, None] * _correction(found, telemetry)
+        total[rows] += fade
+        calibration.append(_calibration(found, poses.factor))
+        cost = max(cost, found.cost_terms["telemetry"] / len(found.joints))
+        contact = max(contact, float(found.contact.mean()))
+        measured &= bool(found.std[SCALE] < _MEASURED * found.state.globals[SCALE])
+    joints, camera = joints / total[:, None, None] + origin, camera / total[:, None]
+    corrected, moved = exp_so3(camera[slot, 3:]) @ rotation, position + camera[slot, :3]
+    return RefinedWorld(joints[slot], corrected, moved, measured, _rejection(cost, contact), calibration)
+
+
+def _rejection(cost: float, contact: float) -> str:
+    if not cost <= _LARGEST_COST:
+        return "the camera's position jumps as no camera flies; check the log's time and its frame"
+    if contact < _LEAST_CONTACT:
+        return (
+            "no foot of the body ever rests on its path in the world; check that the log belongs to the video, its "
+            "time offset and the gimbal's yaw"
+        )
+    return ""
+
+
+def _correction(found: WorldSolution, telemetry: CameraTelemetry) -> np.ndarray:
+    """(F, 6) corrections of the reported position (m) and rotation (rad, camera axes)."""
+    shared, state = found.state.globals, found.state
+    path = state.path(telemetry)
+    position = path.position - telemetry.position + state.camera[:, :3]
+    turned = shared[MISALIGNMENT] + state.camera[:, 3:] + path.turn_rate * shared[ATTITUDE_LATENCY]
+    return np.concatenate([position, turned], axis=1)
+
+
+def _calibration(found: WorldSolution, factor: float) -> dict[str, Any]:
+    shared, std = found.state.globals, found.std
+    return {
+        "scale": 1.0 / float(shared[SCALE]),
+        "scale_std": float(std[SCALE] / shared[SCALE]),
+        "misalignment_deg": np.degrees(shared[MISALIGNMENT]).tolist(),
+        "misalignment_std_deg": np.degrees(std[MISALIGNMENT]).tolist(),
+        "attitude_latency_s": -float(shared[ATTITUDE_LATENCY]),
+        "attitude_latency_std_s": float(std[ATTITUDE_LATENCY]),
+        "position_latency_s": -float(shared[POSITION_LATENCY]),
+        "position_latency_std_s": float(std[POSITION_LATENCY]),
+        "contact_share": float(found.contact.mean()),
+        "iterations": found.iterations,
+        "stop_reason": found.stop_reason,
+    }
+
+
+def _weights(keypoints: Keypoints2D) -> np.ndarray:
+    """(F, 15) 1/px^2; without a covariance the noise comes from the third difference in time.
+
+    Errors of 2D joints last for some frames, which halves their differences.
+    """
+    xy, variance = keypoints.xy, keypoints.variance
+    square = np.full(xy.shape[:2], max(2 * difference_noise(xy), _LEAST_NOISE_PX) ** 2)
+    if variance is not None:
+        square = np.where(np.isfinite(variance), np.maximum(variance, _LEAST_NOISE_PX**2), square)
+    weights: np.ndarray = np.clip(keypoints.weights, 0.0, 1.0) / square
+    return weights
+
+
+def _at_all_slots(values: np.ndarray, slot: np.ndarray) -> np.ndarray:
+    """Values (F, ...) at their slots, interpolated at the empty ones."""
+    if slot[-1] + 1 == len(slot):
+        return values
+    flat, at = values.reshape(len(values), -1), np.arange(slot[-1] + 1)
+    out = np.stack([np.interp(at, slot, column) for column in flat.T], axis=1)
+    return out.reshape(-1, *values.shape[1:])

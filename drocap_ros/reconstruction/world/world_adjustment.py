@@ -1,0 +1,128 @@
+"""Adjustment of body and camera together in the world, by damped Gauss-Newton.
+
+Every step has three parts: the probability that a foot is in contact at the present point, the normal equations, and
+their solution with the frames eliminated.  After the last step, feet in contact are locked in their places while the
+unknowns of the whole recording stay as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drocap_ros.reconstruction.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
+from drocap_ros.reconstruction.world.contacts import contact_probability
+from drocap_ros.reconstruction.world.world_equations import normal_matrix
+from drocap_ros.reconstruction.world.world_model import (
+    CAMERA,
+    FEET,
+    FLOOR,
+    FRAME,
+    GLOBALS,
+    LENGTHS,
+    SCALE,
+    WorldInput,
+    WorldState,
+)
+from drocap_ros.reconstruction.world.world_residuals import Residuals, gradient, weights_of
+
+_CONVERGED = 1e-4
+#: Standard deviation (m/s) of the speed of feet in contact in the first steps, when the body still slides.
+_CONTACT_SPEEDS = (0.6, 0.4, 0.3, 0.2)
+_LAST_CONTACT_SPEED = 0.15
+_LEAST_SCALE = 0.2
+
+
+@dataclass(frozen=True)
+class WorldSolution:
+    """Result of the adjustment.
+
+    joints : (F, 15, 3) m in the world
+    contact : (F - 1, 2) of the right and the left ankle
+    std : (GLOBALS,) posterior standard deviations of the shared unknowns
+    """
+
+    joints: np.ndarray
+    state: WorldState
+    contact: np.ndarray
+    std: np.ndarray
+    cost_terms: dict[str, float]
+    iterations: int
+    stop_reason: str
+
+
+def initial_state(data: WorldInput, joints: np.ndarray, scale: float = 1.0) -> WorldState:
+    """The point from joints (F, 15, 3) m of the body."""
+    shared = np.zeros(GLOBALS)
+    shared[LENGTHS], shared[SCALE] = data.lengths, scale
+    shared[FLOOR] = np.percentile(joints[:, FEET, 2], 10)
+    return WorldState(joints, np.zeros((len(joints), CAMERA)), shared)
+
+
+def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) -> WorldSolution:
+    """Adjust from initial joints (F, 15, 3) m of the body, ``scale`` of which are a metre of the world."""
+    config, weights = data.config, weights_of(data)
+    state = initial_state(data, joints, scale)
+    damping, stop, done = 1e-4, ITERATIONS, 0
+    contact = np.zeros((len(joints) - 1, len(FEET)))
+    std = np.full(GLOBALS, np.nan)
+    for done in range(1, config.iterations + config.locking_iterations + 1):
+        locking = done > config.iterations
+        speed = _CONTACT_SPEEDS[done - 1] if done <= len(_CONTACT_SPEEDS) else _LAST_CONTACT_SPEED
+        contact = contact_probability(state, data.fps, speed)
+        weight = config.locked_weight if locking else config.contact_weight
+        here = Residuals(data, weights, state, contact, weight)
+        frames, shared = gradient(here)
+        matrix = normal_matrix(here)
+        there = None
+        for _ in range(6):
+            step = _solve(matrix, frames, shared, damping, locking)
+            if step is not None:
+                moved = state.moved(step[0], step[1])
+                if moved.globals[SCALE] > _LEAST_SCALE:
+                    there = Residuals(data, weights, moved, contact, weight)
+                    if there.cost <= here.cost:
+                        break
+            there, damping = None, max(damping, 1e-6) * 10
+        if there is None or step is None:
+            stop = NO_DESCENT
+            break
+        state, damping = there.state, 0.2 * damping
+        if not locking:
+            std = step[2] * np.sqrt(config.frames_per_fact)
+        if locking and here.cost - there.cost <= _CONVERGED * here.cost:
+            stop = CONVERGED
+            break
+    final = Residuals(data, weights, state, contact, config.contact_weight)
+    return WorldSolution(state.joints / state.globals[SCALE], state, contact, std, final.terms, done, stop)
+
+
+def _solve(
+    matrix: tuple[np.ndarray, np.ndarray, np.ndarray],
+    frames: np.ndarray,
+    shared: np.ndarray,
+    damping: float,
+    fixed: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Step of the frames' and the shared unknowns, and the latter's standard deviations; None = not positive definite.
+
+    fixed : the shared unknowns stay as they are
+    """
+    from scipy.linalg.lapack import dpbtrf, dtbtrs
+
+    band, border, corner = matrix
+    damped = band.copy()
+    damped[:, 0] *= 1 + damping
+    factor, info = dpbtrf(damped.T, lower=1, overwrite_ab=1)
+    if info != 0:
+        return None
+    right = -frames.reshape(1, -1) if fixed else np.concatenate([-frames.reshape(1, -1), border])
+    y = dtbtrs(factor, right.T, uplo="L")[0]
+    step, std = np.zeros(GLOBALS), np.full(GLOBALS, np.nan)
+    if not fixed:
+        schur = corner + np.diag(damping * np.diag(corner)) - y[:, 1:].T @ y[:, 1:]
+        step = np.linalg.solve(schur, -shared - y[:, 1:].T @ y[:, 0])
+        std = np.sqrt(np.maximum(np.diag(np.linalg.inv(schur)), 0.0))
+    x = dtbtrs(factor, y[:, 0] - y[:, 1:] @ (step if not fixed else np.zeros(0)), uplo="L", trans="T")[0]
+    return x.reshape(-1, FRAME), step, std

@@ -1,0 +1,131 @@
+"""Unknowns and inputs of the adjustment of body and camera in the world.
+
+Lengths are metres of a body whose bones keep their total length; ``scale`` of them make a metre of the world.  So the
+scale enters through the camera's position alone, and no term that prefers little motion can shrink the body.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from drocap_ros.parameters import Parameters, param
+from drocap_ros.reconstruction.lifted.adjustment import SPAN_STD_MM, SPANS
+from drocap_ros.reconstruction.world.camera_telemetry import CameraPath, CameraTelemetry
+from drocap_ros.skeleton import BODY_15, indices
+
+JOINTS = len(BODY_15)
+FEET = np.array(indices(BODY_15.joints, ("rankle", "lankle")))
+BONES = len(BODY_15.bones)
+SPAN_STD_M = SPAN_STD_MM / 1000.0
+#: Unknowns of one frame: position error (3), rotation error (3) of the camera, joints.
+CAMERA = 6
+FRAME = CAMERA + 3 * JOINTS
+#: The unknowns of the whole recording, in this order.
+LENGTHS = slice(0, len(SPANS))
+FLOOR = LENGTHS.stop
+SCALE = FLOOR + 1
+MISALIGNMENT = slice(SCALE + 1, SCALE + 4)
+ATTITUDE_LATENCY = MISALIGNMENT.stop
+POSITION_LATENCY = ATTITUDE_LATENCY + 1
+GLOBALS = POSITION_LATENCY + 1
+
+
+@dataclass(frozen=True)
+class WorldConfig(Parameters):
+    """Weights of the adjustment in the world, and the accuracy of the telemetry."""
+
+    iterations: int = param(12, "steps", minimum=0, maximum=1000)
+    locking_iterations: int = param(
+        3, "further steps that keep feet in contact in their places", minimum=0, maximum=100
+    )
+    stature_std: float = param(0.08, "relative standard deviation of the assumed stature", minimum=0.001, maximum=1)
+    tilt_error_deg: float = param(
+        0.3,
+        "standard deviation of the camera's constant error of pitch and roll",
+        unit="deg",
+        minimum=0.001,
+        maximum=45,
+    )
+    yaw_error_deg: float = param(
+        6.0, "standard deviation of its constant error of yaw: gimbals know the horizon, not north", unit="deg",
+        minimum=0.001, maximum=45,
+    )  # fmt: skip
+    latency_std_s: float = param(
+        0.1, "standard deviation of the latency of attitude and of position", unit="s", minimum=1e-4, maximum=2
+    )
+    position_wander_m: float = param(
+        0.05, "least standard deviation of the slow error of the position; rough telemetry has more", unit="m",
+        minimum=1e-4, maximum=100,
+    )  # fmt: skip
+    attitude_wander_deg: float = param(
+        0.1, "standard deviation of the slow error of the attitude", unit="deg", minimum=1e-3, maximum=45
+    )
+    camera_acceleration_m_s2: float = param(
+        3.0, "ordinary acceleration of the camera", unit="m/s^2", minimum=0.01, maximum=100
+    )
+    acceleration_m_s2: float = param(10.0, "ordinary acceleration of a joint", unit="m/s^2", minimum=0.01, maximum=1000)
+    image_weight: float = param(
+        0.25, "weight of the 2D joints: their errors last for some frames", minimum=0, maximum=10
+    )
+    depth_weight: float = param(0.2, "weight of the lifter's depths", minimum=0, maximum=100)
+    contact_weight: float = param(
+        0.2, "weight of feet in contact: contacts last for some frames", minimum=0, maximum=100
+    )
+    locked_weight: float = param(2.0, "their weight in the locking steps", minimum=0, maximum=100)
+    contact_speed_m_s: float = param(
+        0.1, "standard deviation of the speed of a foot in contact", unit="m/s", minimum=0.001, maximum=10
+    )
+    frames_per_fact: float = param(
+        7.0, "frames that carry one independent piece of information: the priors count as much more", minimum=1,
+        maximum=1000,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class WorldInput:
+    """What is measured and assumed, of evenly spaced frames.
+
+    keypoints : (F, 15, 2) px; weight : (F, 15) 1/px^2, 0 where not seen
+    depth, depth_sigma : (F, 15) m of the body, the lifter's depth behind the pelvis and its expected error
+    lengths : (16,) m of the body, of the adjustment's spans; the first 14 set the unit
+    camera_matrix : (3, 3) px
+    """
+
+    keypoints: np.ndarray
+    weight: np.ndarray
+    depth: np.ndarray
+    depth_sigma: np.ndarray
+    lengths: np.ndarray
+    telemetry: CameraTelemetry
+    camera_matrix: np.ndarray
+    config: WorldConfig = field(default_factory=WorldConfig)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return self.telemetry.fps
+
+
+@dataclass(frozen=True)
+class WorldState:
+    """One point in the space of the unknowns.
+
+    joints : (F, 15, 3) m of the body, world axes
+    camera : (F, 6) error of the reported position (m) and rotation (rad, camera axes) that wanders
+    globals : (GLOBALS,) lengths, floor (m of the body), scale, misalignment (rad), latencies (s)
+    """
+
+    joints: np.ndarray
+    camera: np.ndarray
+    globals: np.ndarray
+
+    def path(self, telemetry: CameraTelemetry) -> CameraPath:
+        """The telemetry shifted by the latencies, without the other errors."""
+        return telemetry.shifted(float(self.globals[ATTITUDE_LATENCY]), float(self.globals[POSITION_LATENCY]))
+
+    def moved(self, frames: np.ndarray, shared: np.ndarray) -> WorldState:
+        """The point after a step of the frames' unknowns (F, FRAME) and of the shared ones (GLOBALS,)."""
+        joints = self.joints + frames[:, CAMERA:].reshape(self.joints.shape)
+        return WorldState(joints, self.camera + frames[:, :CAMERA], self.globals + shared)

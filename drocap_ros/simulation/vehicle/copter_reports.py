@@ -1,0 +1,174 @@
+"""What the simulated copter reports of itself: estimates, readiness, the target that it follows, its mode."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from drocap_ros.flight.frames import enu_to_ned, quaternion_multiply
+from drocap_ros.flight.mavlink.transport import Transport
+from drocap_ros.simulation.vehicle.arducopter_control import ArduCopterControl
+from drocap_ros.simulation.vehicle.autopilot_modes import CONTROL_MODE, MODES
+from drocap_ros.simulation.vehicle.dynamics import AIRFRAMES, Body
+from drocap_ros.simulation.vehicle.estimate_error import EstimateError
+from drocap_ros.simulation.vehicle.flight_control import FlightControl
+from drocap_ros.simulation.vehicle.flight_path import VehiclePose
+from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle
+from drocap_ros.simulation.vehicle.mount import MOUNT_TYPES, SimulatedMount
+from drocap_ros.simulation.vehicle.px4_control import Px4Control
+
+_GPS_NOTICED_S, EKF_NOTICED_S = 0.4, 7.4
+_HEALTHY, _CONSTANT_POSITION = 831, 831 & ~(8 | 16) | 128
+_ECHO = mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED
+_NO_POSITION, _NO_ACCELERATION, _NO_YAW = 1 | 2 | 4, 64 | 128 | 256, 1024 | 2048
+_PLACES = {
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+}  # fmt: skip
+
+
+class Readiness(NamedTuple):
+    """Path times, s, from which there is a satellite fix, a healthy estimator, and an origin of the local frame."""
+
+    fix_s: float = -1.0
+    estimator_s: float = -1.0
+    origin_s: float = -1.0
+
+
+class ReportingCopter(SimulatedVehicle):
+    """State of a copter and its telemetry; see :class:`drocap_ros.simulation.vehicle.copter.SimulatedCopter`."""
+
+    def __init__(
+        self, transport: Transport, position: np.ndarray, yaw: float, autopilot: str, wind: np.ndarray, seed: int,
+        gps_noise_m: float, attitude_error_deg: float, mode: str, mount: SimulatedMount, readiness: Readiness,
+    ) -> None:  # fmt: skip
+        self.mount = mount
+        super().__init__("", None, autopilot, gimbal=mount.kind != "fixed", transport=transport)
+        if autopilot == "ardupilot":
+            self.settings["MNT1_TYPE"] = float(MOUNT_TYPES[mount.kind])
+        self.body = Body(position, yaw, wind, AIRFRAMES[autopilot], seed)
+        control = ArduCopterControl if autopilot == "ardupilot" else Px4Control
+        self.control: FlightControl = control(position, yaw, self.body.drag())
+        self.error = EstimateError(gps_noise_m, autopilot == "px4", seed)
+        self.readiness = readiness
+        self.mode, self.intended = mode, mode  # intended: chosen last; PX4 keeps it where a failsafe enters another
+        self.armed, self.battery, self.landed_state = True, 87, mavlink.MAV_LANDED_STATE_IN_AIR
+        self.gps_lost_s = self.ekf_failed_s = math.inf
+        self.frozen = False  # telemetry repeats its last values, with fresh or old stamps
+        self.frozen_clock = False
+        self._t = 0.0
+        self._rng = np.random.default_rng([seed, 0xC1])
+        self._attitude_error = math.radians(attitude_error_deg) * self._rng.standard_normal(3)
+        self._report: VehiclePose | None = None
+        self._report_s = -1.0
+
+    @property
+    def gps_error(self) -> np.ndarray:
+        """(3,) m, estimate less truth; setting it moves the estimate."""
+        return self.error.position
+
+    @gps_error.setter
+    def gps_error(self, value: np.ndarray) -> None:
+        self.error.offset = self.error.offset + value - self.error.position
+
+    @property
+    def estimate(self) -> np.ndarray:
+        """(3,) m, the autopilot's position estimate."""
+        return self.body.position + self.error.position
+
+    def at(self, t_s: float) -> VehiclePose:
+        """Reported pose: the estimate, not the truth."""
+        if self._report is not None and (self.frozen or t_s == self._report_s):
+            return self._report
+        fine = self._rng.standard_normal(6)
+        self._report_s = t_s
+        # The estimate of the body leans wrongly by as much as that of a gimbal.
+        lean = np.array([*(0.5 * self._attitude_error[:2]), 0.0, 1.0])
+        body = quaternion_multiply(self.body.orientation_xyzw(), lean / np.linalg.norm(lean))
+        self._report = VehiclePose(
+            self.estimate + 0.01 * fine[:3], self.body.velocity + self.error.velocity + 0.04 * fine[3:],
+            body, np.array([0.0, 0.0, self.body.yaw_rate]), self.camera_orientation(),
+        )  # fmt: skip
+        return self._report
+
+    def camera_orientation(self) -> np.ndarray:
+        """(4,) camera FLU -> ENU, truth."""
+        return self.mount.camera(self.body.orientation_xyzw())
+
+    def _known(self) -> frozenset[int]:
+        # PX4 sends its heartbeat once a second, whatever is requested.
+        own = {mavlink.MAVLINK_MSG_ID_HEARTBEAT} if self.autopilot == "ardupilot" else set()
+        return super()._known() | {_ECHO} | own
+
+    def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> Any:
+        reported_s = self._report_s if self.frozen and self.frozen_clock else t_s
+        boot_ms = int((reported_s + self.boot_s) * 1e3) % 2**32
+        mav = self._mav
+        if number == _ECHO:
+            return self._echo(boot_ms)
+        if number == mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS:
+            _, pitch, yaw = self._attitude_error
+            mounted = self.mount.report(pose.orientation_xyzw, (pitch, yaw))
+            if mounted is None:
+                return None
+            return mav.gimbal_device_attitude_status_encode(
+                0, 0, boot_ms, mounted.flags, mounted.quaternion_wxyz, 0, 0, 0, 0
+            )
+        if number in _PLACES and self._t < self.readiness.origin_s:
+            return None
+        if number in (mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT, mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS):
+            lost = self._t > min(self.ekf_failed_s, self.gps_lost_s + EKF_NOTICED_S)
+            flags = _CONSTANT_POSITION if lost or self._t < self.readiness.estimator_s else _HEALTHY
+            if number == mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT:
+                return mav.ekf_status_report_encode(flags, 0.1, 0.1, 0.1, 0.1, 0)
+            return mav.estimator_status_encode(boot_ms * 1000, flags, 0.1, 0.1, 0.1, 0.1, 0, 0, 0.3, 0.3)
+        if number == mavlink.MAVLINK_MSG_ID_SYS_STATUS:
+            return mav.sys_status_encode(0, 0, 0, 200, 15800, 1200, self.battery, 0, 0, 0, 0, 0, 0)
+        if number == mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE:
+            return mav.extended_sys_state_encode(0, self.landed_state)
+        if number == mavlink.MAVLINK_MSG_ID_GPS_RAW_INT:
+            there = self.readiness.fix_s <= self._t <= self.gps_lost_s + _GPS_NOTICED_S
+            return mav.gps_raw_int_encode(
+                boot_ms * 1000, 3 if there else 1, 473977420, 85455940, 488000, 60, 90, 0, 0, 17
+            )
+        return super()._telemetry(number, reported_s, pose)
+
+    def _echo(self, boot_ms: int) -> Any:
+        """The target that is followed.  ArduPilot sends it throughout GUIDED, PX4 in every mode: heard or not.
+
+        PX4 sends what its controller commands, the velocity with the correction of the position.
+        """
+        target, control = self.control.target, self.control
+        mask, velocity, acceleration, yaw = 0, target.velocity, target.acceleration, 0.0
+        if self.autopilot == "ardupilot":
+            if self.mode != CONTROL_MODE[self.autopilot]:
+                return None
+            mask = _NO_YAW
+            position = np.zeros(3) if target.position is None else target.position
+            mask |= _NO_POSITION if target.position is None else 0
+        else:
+            position = np.full(3, math.nan)
+            if control.place is not None and target.position is not None:
+                position = np.array([*control.place, target.position[2]])
+            velocity, acceleration = control.commanded_velocity, np.array([*control.push, 0.0])
+            yaw = math.nan if target.yaw is None else math.remainder(math.pi / 2 - target.yaw, 2 * math.pi)
+        values = [float(v) for vector in (position, velocity, acceleration) for v in enu_to_ned(vector)]
+        return self._mav.position_target_local_ned_encode(
+            boot_ms, mavlink.MAV_FRAME_LOCAL_NED, mask, *values, yaw, -target.yaw_rate
+        )
+
+    def _present_modes(self) -> tuple[int, int]:
+        return MODES["px4"][self.mode], MODES["px4"][self.intended]
+
+    def _heartbeat(self) -> Any:
+        px4 = self.autopilot == "px4"
+        armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0
+        return self._mav.heartbeat_encode(
+            mavlink.MAV_TYPE_QUADROTOR,
+            mavlink.MAV_AUTOPILOT_PX4 if px4 else mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+            mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | armed,
+            MODES[self.autopilot][self.mode],
+            mavlink.MAV_STATE_ACTIVE,
+        )

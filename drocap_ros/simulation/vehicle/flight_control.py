@@ -1,0 +1,152 @@
+"""Position and velocity loops of an autopilot: what is common to ArduPilot and PX4."""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+_MAX_LEAN_M_S2 = 5.66  # 30 degrees
+_YAW_GAIN = 6.85
+_CLIMB_GAIN, _CLIMB_RATE_GAIN, _MAX_CLIMB_M_S, _MAX_CLIMB_M_S2 = 1.0, 4.0, 2.5, 3.0
+_FILTER_HZ = 5.0
+
+
+@dataclass
+class Target:
+    """What the autopilot follows, ENU; None = not commanded."""
+
+    position: np.ndarray | None = None
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    acceleration: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    yaw: float | None = None
+    yaw_rate: float = 0.0
+
+
+class Manner(enum.Enum):
+    """How a mode flies."""
+
+    SETPOINTS = "follows setpoints"
+    HOLD = "stops and stays"
+    BRAKE = "stops, and drifts with the wind"
+    STICK = "velocity of the pilot's stick"
+
+
+class Gains(NamedTuple):
+    """Of position and velocity; feed : share of the target's acceleration that is passed on."""
+
+    position: float
+    velocity: float
+    integral: float
+    derivative: float
+    feed: float
+
+
+class FlightControl:
+    """Loops that command the body's acceleration.
+
+    A subclass shapes what they follow: ``place``, ``pace`` and ``push`` are the wanted horizontal position, velocity
+    and acceleration; ``place`` None leaves the position free.
+    """
+
+    def __init__(self, gains: Gains, position: np.ndarray, yaw: float, drag: np.ndarray) -> None:
+        self.gains = gains
+        self.target = Target(position=position.astype(float).copy(), yaw=yaw)
+        self.manner = Manner.HOLD
+        self.place: list[float] | None = [float(v) for v in position[:2]]
+        self.pace, self.push = [0.0, 0.0], [0.0, 0.0]
+        self.commanded_velocity: np.ndarray = np.zeros(3)
+        self.lean = (0.0, 0.0)  # last horizontal command
+        # In hover the integrals have already adapted to the wind.
+        self._integral = [-float(v) for v in drag]
+        self._derivative, self._before = [0.0, 0.0], [0.0, 0.0]
+
+    def begin(self, manner: Manner, position: np.ndarray, velocity: np.ndarray, yaw: float) -> None:
+        """Enter a mode at the estimated place and velocity."""
+        self.manner = manner
+        free = manner in (Manner.BRAKE, Manner.STICK)
+        height = position[2] + velocity[2] * 0.4  # where it stops
+        self.place = None if free else [float(v) for v in position[:2]]
+        self.pace = [float(v) for v in velocity[:2]]
+        self.target = Target(position=np.array([*position[:2], height]), yaw=yaw)
+
+    def take(self, target: Target) -> None:
+        """Take a setpoint."""
+        self.target = target
+
+    def command(self, position: np.ndarray, velocity: np.ndarray, expired: bool, dt: float) -> np.ndarray:
+        """(3,) m/s^2 of thrust, from the estimated place and velocity; ``expired`` the last setpoint is too old."""
+        here, speed = (float(position[0]), float(position[1])), (float(velocity[0]), float(velocity[1]))
+        self._shape(here, speed, expired, dt)
+        gains, command = self.gains, [0.0, 0.0]
+        toward = self._toward(here)
+        blend = min(1.0, dt * 2 * math.pi * _FILTER_HZ)
+        for i in (0, 1):
+            error = toward[i] + self.pace[i] - speed[i]
+            self._derivative[i] += ((self._before[i] - speed[i]) / dt - self._derivative[i]) * blend
+            self._before[i] = speed[i]
+            command[i] = gains.velocity * error + self._integral[i] + gains.derivative * self._derivative[i]
+            command[i] += gains.feed * self.push[i]
+            self._integral[i] += gains.integral * error * dt
+        self.lean = limited(command[0], command[1], _MAX_LEAN_M_S2)
+        self.commanded_velocity = np.array([toward[0] + self.pace[0], toward[1] + self.pace[1], 0.0])
+        return np.array([*self.lean, self._climb(float(position[2]), float(velocity[2]), dt)])
+
+    def yaw_rate(self, yaw: float) -> float:
+        """rad/s."""
+        rate = self.target.yaw_rate
+        if self.target.yaw is not None:
+            rate += _YAW_GAIN * math.remainder(self.target.yaw - yaw, 2 * math.pi)
+        return rate
+
+    def _shape(self, here: tuple[float, float], speed: tuple[float, float], expired: bool, dt: float) -> None:
+        raise NotImplementedError
+
+    def _toward(self, here: tuple[float, float]) -> tuple[float, float]:
+        """(2,) m/s towards ``place``."""
+        if self.place is None:
+            return 0.0, 0.0
+        return self.gains.position * (self.place[0] - here[0]), self.gains.position * (self.place[1] - here[1])
+
+    def _climb(self, height: float, climb: float, dt: float) -> float:
+        wanted = float(self.target.velocity[2])
+        if self.target.position is not None:
+            wanted += _CLIMB_GAIN * (float(self.target.position[2]) - height)
+        wanted = min(max(wanted, -_MAX_CLIMB_M_S), _MAX_CLIMB_M_S)
+        self.commanded_velocity[2] = wanted
+        error = wanted - climb
+        self._integral[2] += 0.5 * error * dt
+        command = _CLIMB_RATE_GAIN * error
+        return min(max(command, -_MAX_CLIMB_M_S2), _MAX_CLIMB_M_S2) + self._integral[2]
+
+    def _stop_pace(self, gain: float, most: float, jerk: float, dt: float) -> None:
+        """Slow the wanted velocity down: rate ``gain`` per s, at most ``most`` m/s^2."""
+        wanted = limited(-gain * self.pace[0], -gain * self.pace[1], most)
+        self._advance(wanted, jerk, dt)
+
+    def _advance(self, wanted: tuple[float, float], jerk: float, dt: float) -> None:
+        """Move the wanted place and velocity; its acceleration follows ``wanted`` within the jerk."""
+        change = limited(wanted[0] - self.push[0], wanted[1] - self.push[1], jerk * dt)
+        for i in (0, 1):
+            if self.place is not None:
+                self.place[i] += self.pace[i] * dt + 0.5 * self.push[i] * dt * dt
+            self.pace[i] += self.push[i] * dt
+            self.push[i] += change[i]
+
+
+def limited(x: float, y: float, most: float) -> tuple[float, float]:
+    """The vector, no longer than ``most``."""
+    size = math.hypot(x, y)
+    return (x, y) if size <= most else (x * most / size, y * most / size)
+
+
+def rooted(x: float, y: float, gain: float, most: float) -> tuple[float, float]:
+    """Rate that takes an error away: linear near zero, then its root, so that it falls by at most ``most`` per s."""
+    error, near = math.hypot(x, y), most / gain**2
+    if error <= near:
+        return gain * x, gain * y
+    rate = math.sqrt(2 * most * (error - near / 2))
+    return x * rate / error, y * rate / error

@@ -1,0 +1,206 @@
+"""``drocap preflight`` as a process, against simulated vehicles as processes; all cases run side by side."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from drocap_ros.errors import InputError
+from drocap_ros.flight.mavlink.transport import open_transport
+from drocap_ros.simulation.vehicle.ports import free_udp_port
+
+ROOT = Path(__file__).resolve().parents[2]
+ENV = {**os.environ, "PYTHONPATH": str(ROOT), "ROS_DOMAIN_ID": "99"}
+ARDUPILOT = ("FENCE_ENABLE=1.0", "FENCE_TYPE=3.0", "FENCE_RADIUS=60.0", "FENCE_ALT_MAX=50.0", "MNT1_TYPE=6.0")
+PX4 = ("GF_ACTION=2", "GF_MAX_HOR_DIST=60.0", "GF_MAX_VER_DIST=50.0", "COM_RC_OVERRIDE=3")
+#: Name: autopilot ("" = nobody), more words of the vehicle, expected status, expected missing checks.
+CASES = {
+    "ready": ("ardupilot", (), 0, set()),
+    "ready_px4": ("px4", (), 0, set()),
+    "timeout": ("ardupilot", ("GUID_TIMEOUT=3.0",), 1, {"guid_timeout"}),
+    "timeout_px4": ("px4", ("COM_OF_LOSS_T=3.0",), 1, {"com_of_loss_t"}),
+    "rates": ("ardupilot", ("--max-rate", "4"), 1, {"rate_attitude_quaternion", "rate_local_position_ned"}),
+    "silent": ("", (), 2, {"link"}),
+    "garbage": ("", (), 2, {"link"}),
+}
+
+
+def start(*arguments, log):
+    command = [sys.executable, "-m", *map(str, arguments)]
+    with log.open("w") as out, log.with_suffix(".err").open("w") as err:
+        return subprocess.Popen(command, env=ENV, stdout=out, stderr=err)
+
+
+def write_config(path, url, models, **values):
+    bridge = {"url": url, "commands_enabled": True, "mode_change_allowed": True, "size_error": 0.04, **values}
+    bridge.update(max_state_age_s=1.0, max_round_trip_s=2.0)  # this machine may run other tests at the same time
+    ingest = {"source": "/dev/video0", "horizontal_fov_deg": 60.0, "width_px": 1280, "height_px": 720}
+    sections = {"mavlink_bridge": bridge, "image_ingest": ingest, "pose_estimator": {"models_dir": str(models)}}
+    path.write_text(yaml.safe_dump(sections))
+    return path
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Status, table, error and JSON of each case."""
+    folder = tmp_path_factory.mktemp("preflight")
+    running, vehicles = {}, []
+    for name, (autopilot, words, _, _) in CASES.items():
+        port = free_udp_port()
+        config = write_config(folder / f"{name}.yaml", f"udpin:127.0.0.1:{port}", "simulation")
+        if autopilot:
+            more = words if words[:1] == ("--max-rate",) else ()
+            settings = (*(ARDUPILOT if autopilot == "ardupilot" else PX4), *(words if not more else ()))
+            module = "drocap_ros.simulation.vehicle.mavlink_vehicle"
+            place = ("--url", f"udpout:127.0.0.1:{port}", "--autopilot", autopilot)
+            vehicles.append(start(module, *place, *more, "--set", *settings, log=folder / f"{name}.vehicle"))
+        options = ("--config", config, "--seconds", "6", "--json", folder / f"{name}.json")
+        running[name] = start("drocap_ros.cli", "preflight", *options, log=folder / f"{name}.txt"), port
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as noise:
+        end = time.monotonic() + 90
+        while any(process.poll() is None for process, _ in running.values()) and time.monotonic() < end:
+            noise.sendto(os.urandom(200), ("127.0.0.1", running["garbage"][1]))
+            time.sleep(0.02)
+    for vehicle in vehicles:
+        vehicle.send_signal(signal.SIGINT)
+        assert vehicle.wait(20) == 0
+    return {
+        name: (
+            process.returncode, (folder / f"{name}.txt").read_text(), (folder / f"{name}.err").read_text(),
+            json.loads((folder / f"{name}.json").read_text()),
+        )
+        for name, (process, _) in running.items()
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_status_and_checks_of_each_case(runs, name):
+    _, _, expected, missing = CASES[name]
+    status, table, error, content = runs[name]
+    assert (status, content["exit_status"]) == (expected, expected), table + error
+    assert {check["code"] for check in content["checks"] if check["level"] == "missing"} == missing
+    assert content["status"] == {0: "ready", 1: "missing", 2: "silent"}[expected]
+    assert error.count("\n") == (expected == 2)
+    assert "Traceback" not in error
+    for check in content["checks"]:
+        assert check["name"] in table
+        assert (check["level"] == "ok") <= (not check["remedy"])
+        assert check["remedy"] or check["level"] == "ok", check
+
+
+def test_the_table_names_value_limit_and_remedy(runs):
+    _, table, _, content = runs["timeout"]
+    (check,) = (check for check in content["checks"] if check["code"] == "guid_timeout")
+    assert (check["found"], check["wanted"]) == ("3 s", "at most 0.5 s")
+    assert check["remedy"].startswith("set GUID_TIMEOUT to 0.5 on the autopilot")
+    assert check["values"] == {"value": 3.0, "limit": 0.5}
+    assert table.splitlines()[-1].startswith("not ready, missing: GUID_TIMEOUT (")
+
+
+def test_silence_and_noise_have_different_remedies(runs):
+    assert "found nothing on udpin" in runs["silent"][2]
+    assert "check the cable" in runs["silent"][2]
+    assert "that are no MAVLink" in runs["garbage"][2]
+    assert "check the baud rate" in runs["garbage"][2]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("mavlink_bridge: {orbit_radius: 5.0}", "unknown parameter 'orbit_radius'"),
+        ("mavlink_bridge: {url: 'http://localhost:1'}", "url: expected udpin:HOST:PORT"),
+        ("mavlink_bridge: {url: 'serial:/dev/none:57600'}", "url: expected a serial device that can be opened"),
+        ("mavlink_bridge: {radius_m: 2.0}", "radius_m: expected at least 3.5 m"),
+        ("mavlink_bridge: {status_hz: 1.0}", "status_hz: expected at least 2 Hz"),
+        ("[1, 2]", "expected a mapping of components"),
+        (":\n:", "expected YAML"),
+        (None, "expected a configuration file"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_line(tmp_path, text, words):
+    config = tmp_path / "config.yaml"
+    if text is not None:
+        config.write_text(text)
+    process = start("drocap_ros.cli", "preflight", "--config", config, log=tmp_path / "out")
+    assert process.wait(60) == 2
+    error = (tmp_path / "out.err").read_text()
+    assert words in error
+    assert error.count("\n") == 1
+    assert (tmp_path / "out").read_text() == ""
+
+
+@pytest.mark.parametrize("option", [("--seconds", "0.5"), ("--seconds", "nan"), ("--domain-id", "200")])
+def test_an_option_out_of_range_is_refused(tmp_path, option):
+    config = write_config(tmp_path / "c.yaml", f"udpin:127.0.0.1:{free_udp_port()}", "simulation")
+    process = start("drocap_ros.cli", "preflight", "--config", config, *option, log=tmp_path / "out")
+    assert process.wait(60) == 2
+    assert f"{option[0]}: expected" in (tmp_path / "out.err").read_text()
+
+
+def test_ctrl_c_ends_it_at_once_and_leaves_no_file(tmp_path):
+    config = write_config(tmp_path / "c.yaml", f"udpin:127.0.0.1:{free_udp_port()}", "simulation")
+    options = ("--config", config, "--seconds", "200", "--json", tmp_path / "out.json")
+    process = start("drocap_ros.cli", "preflight", *options, log=tmp_path / "out")
+    time.sleep(5.0)
+    assert process.poll() is None
+    begin = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    assert process.wait(20) == 130
+    assert time.monotonic() - begin < 2.0
+    assert (tmp_path / "out.err").read_text() == "drocap: interrupted\n"
+    assert not (tmp_path / "out.json").exists()
+
+
+def test_with_a_running_graph_it_reads_what_the_bridge_hears(tmp_path):
+    port = free_udp_port()
+    config = write_config(tmp_path / "c.yaml", f"udpin:127.0.0.1:{port}", "simulation")
+    module = "drocap_ros.simulation.vehicle.mavlink_vehicle"
+    vehicle = start(module, "--url", f"udpout:127.0.0.1:{port}", "--set", "GUID_TIMEOUT=3.0", log=tmp_path / "vehicle")
+    live = start("drocap_ros.cli", "live", "--config", config, "--nodes", "mavlink_bridge", log=tmp_path / "live")
+    try:
+        end = time.monotonic() + 60
+        while "running" not in (tmp_path / "live").read_text() and time.monotonic() < end:
+            time.sleep(0.2)
+        time.sleep(5.0)  # for the autopilot's parameters
+        options = ("--config", config, "--seconds", "4", "--json", tmp_path / "out.json")
+        process = start("drocap_ros.cli", "preflight", *options, log=tmp_path / "out")
+        assert process.wait(60) == 1, (tmp_path / "out.err").read_text()
+    finally:
+        for running in (live, vehicle):
+            running.send_signal(signal.SIGINT)
+        assert live.wait(60) == 0
+    checks = {check["code"]: check for check in json.loads((tmp_path / "out.json").read_text())["checks"]}
+    assert checks["link"]["found"].startswith("by the running bridge in /drocap, idle: ")
+    assert checks["guid_timeout"]["level"] == "missing"
+    assert checks["guid_timeout"]["found"] == "3 s"
+    assert checks["rate_attitude_quaternion"]["values"]["real_hz"] > 25
+    assert checks["battery"]["found"] == "87 %, 15.8 V"
+
+
+def test_a_link_that_another_program_holds_is_refused_in_one_line(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        config = write_config(tmp_path / "c.yaml", f"udpin:127.0.0.1:{other.getsockname()[1]}", "simulation")
+        process = start("drocap_ros.cli", "preflight", "--config", config, log=tmp_path / "out")
+        assert process.wait(60) == 2
+    error = (tmp_path / "out.err").read_text()
+    assert "that no other program holds them" in error
+    assert error.count("\n") == 1
+
+
+def test_a_serial_line_belongs_to_one_program():
+    pytest.importorskip("serial")
+    master, slave = os.openpty()
+    first = open_transport(f"serial:{os.ttyname(slave)}:57600")
+    with pytest.raises(InputError, match="expected a serial device that can be opened"):
+        open_transport(f"serial:{os.ttyname(slave)}:57600")
+    first.close()
+    os.close(master)
+    os.close(slave)

@@ -1,0 +1,134 @@
+"""The study of the motion in the world, and its error measures on motions whose errors are known."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import astuple
+from pathlib import Path
+
+import numpy as np
+import pytest
+from walking import Walk, make_walk, write_mocap
+
+from drocap_ros.cli import main
+from drocap_ros.evaluation import world_metrics
+from drocap_ros.evaluation.world import world_study
+from drocap_ros.evaluation.world_errors import world_errors
+from drocap_ros.evaluation.world_protocol import FOCAL_PX, FPS, IMAGE_SIZE, TELEMETRY, world_view
+from drocap_ros.mocap import Sequence
+
+
+def in_world(walk: Walk) -> np.ndarray:
+    return walk.in_camera @ walk.camera
+
+
+def test_no_error_is_zero_by_every_measure(walk: Walk) -> None:
+    truth = in_world(walk)
+    errors = world_errors(truth, truth, FPS, np.tile([1e-4, 0, 0, 1e-4, 0, 1e-4], (*truth.shape[:2], 1)))
+    for name in ("pa_mm", "mpjpe_mm", "w_mm", "wa_mm", "absolute_mm", "root_percent", "scale", "penetration_mm"):
+        assert getattr(errors, name) == pytest.approx(0.0, abs=1e-6), name
+    assert errors.acceleration_ratio == pytest.approx(1.0)
+    assert errors.acceleration_error_m_s2 == 0.0
+    assert errors.coverage == 1.0
+
+
+def test_a_shift_counts_only_without_alignment(walk: Walk) -> None:
+    truth = in_world(walk)
+    errors = world_errors(truth + np.array([0.3, 0.0, 0.4]), truth, FPS)
+    assert errors.absolute_mm == pytest.approx(500.0)
+    assert errors.w_mm == pytest.approx(0.0, abs=1e-6)
+    assert errors.wa_mm == pytest.approx(0.0, abs=1e-6)
+    assert errors.root_percent == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_body_that_sinks_penetrates_the_ground(walk: Walk) -> None:
+    truth = in_world(walk)
+    truth[:, world_metrics.FEET, 2] = 0.0
+    assert world_errors(truth - np.array([0.0, 0.0, 0.02]), truth, FPS).penetration_mm == pytest.approx(20.0)
+    assert world_errors(truth + np.array([0.0, 0.0, 0.02]), truth, FPS).penetration_mm == 0.0
+
+
+def test_feet_count_only_where_the_true_ones_are_still() -> None:
+    truth = np.zeros((49, 15, 3))
+    truth[24:, world_metrics.FEET[0], 0] = 0.2 * np.arange(25)  # 4.8 m/s
+    estimate = truth + np.arange(49.0)[:, None, None] * [0.01, 0.0, 0.0]  # slides by 0.24 m/s everywhere
+    assert world_metrics.still_foot_speed(estimate, truth, 24.0) == pytest.approx(0.24)
+    moving = np.arange(49.0)[:, None, None] * np.full((1, 15, 3), 0.1)
+    assert np.isnan(world_metrics.still_foot_speed(moving, moving, 24.0))
+
+
+def test_root_error_is_a_share_of_the_path() -> None:
+    truth = np.zeros((101, 15, 3))
+    truth[..., 0] = 0.1 * np.arange(101)[:, None]  # 10 m straight
+    estimate = truth.copy()
+    estimate[..., 0] *= 1.04  # aligned at its middle, the ends are 0.2 m off and the mean 0.1 m
+    assert world_metrics.root_error(estimate, truth) == pytest.approx(0.01, rel=0.02)
+
+
+def test_coverage_of_ellipsoids_that_are_true_is_90_percent() -> None:
+    rng = np.random.default_rng(0)
+    spread = rng.normal(size=(3, 3))
+    matrix = spread @ spread.T
+    truth = np.zeros((400, 15, 3))
+    estimate = rng.multivariate_normal(np.zeros(3), matrix, truth.shape[:2])
+    packed = np.broadcast_to(matrix[np.triu_indices(3)], (400, 15, 6))
+    assert world_metrics.ellipsoid_coverage(estimate, truth, packed) == pytest.approx(0.9, abs=0.015)
+    assert world_metrics.ellipsoid_coverage(estimate, truth, 0.25 * packed) < 0.5
+    assert np.isnan(world_metrics.ellipsoid_coverage(estimate, truth, np.full((400, 15, 6), np.nan)))
+
+
+@pytest.mark.parametrize("still", [False, True])
+def test_exact_telemetry_is_the_camera_that_took_the_images(still: bool) -> None:
+    view = world_view(_sequence(), "exact", still=still, seed=3)
+    np.testing.assert_array_equal(view.tracks.camera_rotation, view.camera_rotation)
+    seen = np.einsum(
+        "fij,fpj->fpi", view.camera_rotation, view.truth - view.tracks.camera_position[:, None]
+    )  # the pinhole camera, written once more
+    px = FOCAL_PX * seen[..., :2] / seen[..., 2:] + np.array(IMAGE_SIZE) / 2
+    gap = np.abs(px - view.tracks.keypoints).max(-1)
+    assert np.median(gap) < 6.0
+    assert (gap > 15.0).mean() == pytest.approx(0.02 * (1 - (15 / 80) ** 2), abs=0.01)
+    bearing = view.tracks.camera_position[:, :2] - view.truth[:, 0, :2]
+    turned = np.degrees(np.ptp(np.unwrap(np.arctan2(*bearing.T[::-1]))))
+    assert turned < 15.0 if still else turned > 150.0
+
+
+@pytest.mark.parametrize("level", ["rtk", "gps"])
+def test_telemetry_errs_as_stated(level: str) -> None:
+    errors = TELEMETRY[level]
+    true, reported = (world_view(_sequence(), name, seed=5).tracks for name in ("exact", level))
+    turn = np.einsum("fij,fkj->fik", reported.camera_rotation, true.camera_rotation)
+    angle = np.degrees(np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    late = 19.0 * errors.late_s
+    assert np.median(angle) == pytest.approx(np.sqrt(3) * errors.misalignment_deg, abs=late + 3 * errors.attitude_deg)
+    shift = np.linalg.norm(reported.camera_position - true.camera_position, axis=1)
+    assert 0.2 * errors.position_m < shift.mean() < 4 * errors.position_m + 2.5 * errors.late_s
+
+
+def test_command_prints_and_writes_every_measure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_mocap(tmp_path, "long", frames=300)
+    write_mocap(tmp_path, "short", frames=150)
+    out = tmp_path / "out"
+    words = ["evaluate", "world", str(tmp_path), "--telemetry", "rtk", "--quiet"]
+    assert main([*words, "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert text == (out / "world.md").read_text(encoding="utf-8")
+    assert "1 sequences, rtk telemetry, orbit" in text
+    with (out / "world.csv").open(encoding="utf-8") as file:
+        (line,) = csv.DictReader(file)
+    assert 0 < float(line["w_mm"]) < 1500
+    assert main([*words, "--every", "0"]) == 2
+    assert main(["evaluate", "world", str(tmp_path / "absent")]) == 2
+    with pytest.raises(SystemExit):
+        main([*words, "--telemetry", "perfect"])
+
+
+def test_study_is_the_same_every_time(tmp_path: Path) -> None:
+    write_mocap(tmp_path, "a", frames=260)
+    one, two = (astuple(world_study(tmp_path, "gps", seed=4)[0].errors) for _ in range(2))
+    np.testing.assert_array_equal(one, two)
+
+
+def _sequence() -> Sequence:
+    walk = make_walk(240)
+    return Sequence("walk", 1000.0 * walk.in_camera @ walk.camera)

@@ -1,0 +1,82 @@
+"""Which messages are requested from which autopilot, and which requests end."""
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.mavlink.current_mode import CURRENT_MODE_ID
+from drocap_ros.flight.mavlink.parser import MavlinkParser
+from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
+
+S = 1_000_000_000
+GIMBAL, BEAT = mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS, mavlink.MAVLINK_MSG_ID_HEARTBEAT
+
+
+def asked(requests, seconds, results=None, arriving=frozenset(), start_s=0):
+    """(time in s, number, interval us) of the requests; all are answered, with 0 unless another result is given."""
+    found = []
+    for i in range(start_s * 50, (start_s + seconds) * 50):
+        now = i * S // 50
+        for number in arriving:
+            requests.count(number, now)
+        for number, interval in requests.due(now):
+            found.append((i / 50, number, interval))
+            requests.acknowledge((results or {}).get(number, 0), now)
+    return found
+
+
+def test_px4_is_asked_for_current_mode_and_not_for_a_faster_heartbeat(caplog):
+    requests = TelemetryRequests(MavlinkBridgeConfig(commands_enabled=True))
+    requests.set_autopilot("px4")
+    first = {number: interval for _, number, interval in asked(requests, 1)}
+    assert BEAT not in first
+    assert first[CURRENT_MODE_ID] == 50_000
+    twice_a_second = [number for _, number, _ in asked(requests, 10, start_s=1)]
+    assert CURRENT_MODE_ID in twice_a_second  # nothing arrived
+    for i in range(40):
+        requests.count(CURRENT_MODE_ID, (20 * 50 + i * 25) * S // 50)
+    assert requests.rate_hz(CURRENT_MODE_ID, 40 * S) == pytest.approx(2.0, rel=0.2)
+    assert CURRENT_MODE_ID not in [number for number, _ in requests.due(40 * S)]
+    assert caplog.records == []
+
+
+def test_an_autopilot_that_refuses_current_mode_is_named_once(caplog):
+    requests = TelemetryRequests(MavlinkBridgeConfig(commands_enabled=True))
+    requests.set_autopilot("px4")
+    times = asked(requests, 60, {CURRENT_MODE_ID: mavlink.MAV_RESULT_DENIED})
+    assert [number for _, number, _ in times].count(CURRENT_MODE_ID) == 1
+    assert requests.refused() == {}
+    assert ["CURRENT_MODE" in record.message for record in caplog.records] == [True]
+
+
+def test_ardupilot_is_asked_for_a_fast_heartbeat():
+    requests = TelemetryRequests(MavlinkBridgeConfig(commands_enabled=True))
+    requests.set_autopilot("ardupilot")
+    assert {n: i for _, n, i in asked(requests, 1)}[BEAT] == 200_000
+    assert CURRENT_MODE_ID not in {n for _, n, _ in asked(requests, 5, start_s=1)}
+
+
+@pytest.mark.parametrize(("result", "count"), [(0, 10), (mavlink.MAV_RESULT_DENIED, 2)])
+def test_a_vehicle_without_a_mount_is_not_asked_for_ever(result, count):
+    requests = TelemetryRequests(MavlinkBridgeConfig())
+    times = [t for t, number, _ in asked(requests, 120, {GIMBAL: result}) if number == GIMBAL]
+    assert len(times) == count
+    assert requests.refused() == {}
+
+
+def test_a_mount_that_has_sent_its_attitude_is_asked_again():
+    requests = TelemetryRequests(MavlinkBridgeConfig())
+    asked(requests, 10, arriving={GIMBAL})
+    assert [n for _, n, _ in asked(requests, 60, start_s=20)].count(GIMBAL) > 10
+
+
+def test_a_message_that_we_do_not_know_is_no_bad_data():
+    parser = MavlinkParser()
+    unknown = bytes([0xFD, 2, 0, 0, 0, 1, 1, 0x9A, 0x01, 0, 7, 8, 1, 2])  # EVENT, 410
+    assert parser.feed(unknown) == []
+    assert (parser.bad_count, parser.unknown_count) == (0, 1)
+    mav = mavlink.MAVLink(None)
+    damaged = bytearray(mav.heartbeat_encode(2, 3, 0, 0, 4).pack(mav))
+    damaged[-1] ^= 1
+    assert parser.feed(bytes(damaged) + bytes(300)) == []
+    assert parser.bad_count > 0

@@ -1,0 +1,70 @@
+"""The predicted coast against recorded flights of the real autopilots whose bridge was killed."""
+
+import math
+import time
+
+import numpy as np
+import pytest
+
+from drocap_ros.flight.orbit.coast import coast_of, greatest_speed
+from drocap_ros.flight.setpoint import Setpoint
+
+ARDUPILOT = [f"bridge_killed_timeout_{timeout}s_{i}" for timeout, n in (("0.3", 3), ("0.5", 5)) for i in range(n)]
+PX4 = [f"px4_bridge_sigkill_{i}" for i in range(3)]
+
+
+def recorded(shared_files, name):
+    """Prediction, real places (N, 2) from the last setpoint on, until slower than 0.5 m/s, and times from there."""
+    flight = np.load(shared_files / "flight" / f"{name}.npz")
+    start = flight["setpoint_time_s"][-1]
+    after = flight["time_s"] >= start
+    times, places = flight["time_s"][after] - start, flight["position_m"][after][:, :2]
+    speeds = np.linalg.norm(flight["velocity_m_s"][after], axis=1)
+    stands = int(np.argmax((speeds < 0.5) & (times > 0.5)))
+    parts = ("position_m", "velocity_m_s", "acceleration_m_s2")
+    last = Setpoint(*(flight[f"setpoint_{part}"][-1] for part in parts), 0.0, 0.0)
+    px4, timeout_s = name.startswith("px4"), 0.3 if "timeout_0.3" in name else 0.5
+    coast = coast_of(
+        last, flight["position_m"][after][0], flight["velocity_m_s"][after][0], "px4" if px4 else "ardupilot", timeout_s
+    )
+    return coast, places[:stands], times[:stands]
+
+
+@pytest.mark.parametrize("name", ARDUPILOT + PX4)
+def test_prediction_agrees_with_the_recorded_flight(shared, name):
+    coast, places, times = recorded(shared, name)
+    real = float(np.linalg.norm(places - places[0], axis=1).max())
+    print(f"{name:32s} predicted {coast.length_m:.2f} m, flown {real:.2f} m")
+    assert 0.82 * real < coast.length_m < 1.3 * real
+    predicted = np.interp(times, coast.time_s, coast.place.real), np.interp(times, coast.time_s, coast.place.imag)
+    assert np.hypot(predicted[0] - places[:, 0], predicted[1] - places[:, 1]).max() < 1.0
+
+
+def steady(speed, autopilot="ardupilot", acceleration=0.0):
+    velocity, zero = np.array([speed, 0.0, 0.0]), np.zeros(3)
+    last = Setpoint(zero, velocity, np.array([0.0, acceleration, 0.0]), 0.0, 0.0)
+    return coast_of(last, zero, velocity, autopilot, 0.5)
+
+
+def test_noise_of_the_acceleration_lengthens_the_coast():
+    assert steady(2.0, acceleration=2.0).length_m > steady(2.0, acceleration=0.66).length_m + 0.3
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_greatest_speed_stops_within_the_distance(autopilot):
+    speed = greatest_speed(autopilot, 0.5, 2.5)
+    assert 1.7 < speed < 2.5
+    assert steady(speed, autopilot).length_m == pytest.approx(2.5, abs=0.05)
+    assert greatest_speed(autopilot, 0.3, 2.5) > speed > greatest_speed(autopilot, 1.0, 2.5)
+
+
+def test_prediction_is_fast_enough_for_every_setpoint():
+    start = time.process_time()
+    for _ in range(20):
+        steady(2.0)
+    assert (time.process_time() - start) / 20 < 0.005
+
+
+def test_a_vehicle_at_rest_stays():
+    assert steady(0.0).length_m == 0.0
+    assert math.isfinite(steady(0.0).time_s[-1])

@@ -1,0 +1,196 @@
+"""Degrade, hold, hand over: what old data do to an orbit, and how it goes on."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from orbit_observations import BRAKE, GOOD, LIMITS, LOITER, orbiting
+
+from drocap_ros.flight.conditions import ConditionCode
+from drocap_ros.flight.orbit.degradation import allowed_pace, next_pace, slowed
+from drocap_ros.flight.orbit.safety import permit_mode, reduce
+from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, Pace, State
+from drocap_ros.flight.setpoint import Setpoint
+
+RESUMING = LIMITS._replace(safety=dataclasses.replace(LIMITS.safety, resume_after_hold_s=6.0))
+OLD = {
+    "late picture": {"subject_age_s": 1.1},
+    "attitude": {"state_age_s": 0.5},
+    "position": {"position_age_s": 0.5},
+}
+NOT_HARMLESS = {
+    "silent link": {"link_age_s": 0.5, "state_age_s": 0.5},
+    "near": {"subject_distance_m": 2.9},
+    "uncertain": {"subject_sd_m": 2.0},
+    "battery": {"battery_fraction": 0.1},
+    "satellites": {"gps_fix_type": 1},
+}
+
+
+def seen(**values):
+    return dataclasses.replace(GOOD, **values)
+
+
+def fly(state, observed, seconds, start_s, limits=LIMITS, command=None):
+    """The state after these seconds of one observation; the command comes with the first step."""
+    actions = []
+    for i in range(round(seconds / 0.05)):
+        state, decision = reduce(state, observed, start_s + 0.05 * i, command if i == 0 else None, limits)
+        actions.append(decision.action)
+    return state, actions
+
+
+@pytest.mark.parametrize("name", ["subject_age_s", "link_age_s", "state_age_s", "position_age_s"])
+def test_pace_falls_with_every_age_from_one_to_zero(name):
+    paces = [allowed_pace(seen(**{name: age_s}), LIMITS).pace for age_s in np.arange(0.0, 0.5, 0.01)]
+    assert paces[:20] == [1.0] * 20
+    assert paces == sorted(paces, reverse=True)
+    assert paces[-9] == 0.0  # 0.41 s
+    assert len(set(paces)) > 8
+    assert allowed_pace(seen(**{name: 0.28}), LIMITS).cause is not None
+
+
+def test_pace_ends_sooner_at_speed():
+    fast = seen(subject_age_s=0.3, velocity=np.array([0.0, 3.4, 0.0]))
+    assert allowed_pace(fast, LIMITS).pace == 0.0
+    assert allowed_pace(dataclasses.replace(fast, velocity=np.zeros(3)), LIMITS).pace == pytest.approx(0.5)
+
+
+def test_orbit_slows_down_for_a_late_picture_and_goes_on_from_the_speed_that_is_left():
+    state, _ = fly(orbiting(), GOOD, 1.0, 1.0)
+    assert state.pace.value == 1.0
+    for i, age_s in enumerate((0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55)):
+        state, decision = reduce(state, seen(subject_age_s=age_s), 2.0 + 0.05 * i, None, LIMITS)
+        assert (state.state, decision.action) == (State.ORBITING, Action.ORBIT)
+        assert state.condition.code == ConditionCode.DEGRADED
+        assert state.condition.values["cause"].code == ConditionCode.SUBJECT_OUTDATED
+    assert state.pace.value == 0.0
+    state, _ = reduce(state, GOOD, 2.35, None, LIMITS)
+    assert 0.7 < state.pace.value < 0.9
+    assert state.condition.code == ConditionCode.DEGRADED
+    state, _ = fly(state, GOOD, 1.0, 2.4)
+    assert state.pace.value == 1.0
+    assert state.condition.code == ConditionCode.ORBITING
+
+
+def test_orbit_that_stood_goes_on_along_a_ramp():
+    pace = Pace(0.0, 0.0, 0.0, 5.0)
+    values = [pace.value]
+    for i in range(1, 60):
+        pace = next_pace(pace, 1.0, 5.0 + 0.05 * i)
+        values.append(pace.value)
+    assert values[-1] == 1.0
+    assert max(np.diff(values)) < 0.05
+    assert 1.0 < np.argmax(np.array(values) == 1.0) * 0.05 < 2.0
+
+
+@pytest.mark.parametrize("name", OLD)
+def test_orbit_ends_beyond_the_longest_gap_and_never_resumes_by_itself(name):
+    state, _ = reduce(orbiting(), seen(**OLD[name]), 1.0, None, LIMITS)
+    assert state.state == State.HOLDING
+    state, actions = fly(state, GOOD, 2.0, 1.05)
+    assert set(actions) == {Action.HOLD}
+
+
+def test_pictures_of_something_else_are_no_late_picture():
+    other = seen(subject_age_s=0.45, subject_contradicted=True)
+    assert reduce(orbiting(), other, 1.0, None, LIMITS)[0].state == State.HOLDING
+    assert reduce(orbiting(), seen(subject_age_s=0.45), 1.0, None, LIMITS)[0].state == State.ORBITING
+
+
+@pytest.mark.parametrize("name", [*OLD, *NOT_HARMLESS])
+def test_start_needs_what_an_orbit_at_full_speed_needs(name):
+    values = {**OLD, "attitude": {"state_age_s": 0.25}, "position": {"position_age_s": 0.25},
+              "late picture": {"subject_age_s": 0.45}, **NOT_HARMLESS}[name]  # fmt: skip
+    state, _ = reduce(orbiting(), GOOD, 1.0, Command.STOP, LIMITS)
+    state, decision = reduce(state, seen(**values), 1.3, Command.START, LIMITS)
+    assert state.state == State.HOLDING
+    assert not decision.answer.accepted
+
+
+@pytest.mark.parametrize("name", OLD)
+def test_orbit_resumes_after_a_short_hold_where_the_operator_allows_it(name):
+    state, _ = reduce(orbiting(), seen(**OLD[name]), 1.0, None, RESUMING)
+    centre = state.fence_centre
+    state, actions = fly(state, seen(**OLD[name]), 2.0, 1.05, RESUMING)
+    assert set(actions) == {Action.HOLD}
+    state, actions = fly(state, seen(subject=np.array([1.0, 0.0, 0.0])), 1.2, 3.05, RESUMING)
+    assert state.state == State.ORBITING
+    assert 19 <= actions.index(Action.ORBIT) <= 22  # all conditions have held for a second
+    assert np.array_equal(state.fence_centre, centre)  # the fence stays where it was
+
+
+@pytest.mark.parametrize("name", NOT_HARMLESS)
+def test_orbit_resumes_after_no_other_cause(name):
+    for first in (NOT_HARMLESS[name], OLD["attitude"]):  # at once, or during the hold
+        state, _ = reduce(orbiting(), seen(**first), 1.0, None, RESUMING)
+        assert state.state == State.HOLDING
+        state, _ = reduce(state, seen(**NOT_HARMLESS[name]), 1.05, None, RESUMING)
+        state, actions = fly(state, GOOD, 4.0, 1.1, RESUMING)
+        assert Action.ORBIT not in actions
+
+
+def test_orbit_does_not_resume_after_a_stop_nor_late_nor_in_another_mode():
+    held, _ = reduce(orbiting(), seen(**OLD["late picture"]), 1.0, None, RESUMING)
+    _, decision = reduce(held, GOOD, 1.05, Command.STOP, RESUMING)
+    assert decision.answer.accepted
+    _, actions = fly(held, GOOD, 4.0, 1.05, RESUMING, Command.STOP)
+    assert Action.ORBIT not in actions
+    late, _ = fly(held, seen(**OLD["late picture"]), 6.2, 1.05, RESUMING)
+    assert Action.ORBIT not in fly(late, GOOD, 4.0, 7.3, RESUMING)[1]
+    for other in (LOITER, BRAKE):
+        assert Action.ORBIT not in fly(held, other, 4.0, 1.05, RESUMING)[1]
+
+
+def test_hold_mode_is_requested_after_the_time_for_resuming():
+    old = seen(**OLD["late picture"])
+    state, _ = reduce(orbiting(), old, 1.0, None, RESUMING)
+    requests = []
+    for i in range(160):
+        state, decision = reduce(state, old, 1.05 + 0.05 * i, None, RESUMING)
+        requests.append(decision.mode_request)
+    first_s = 0.05 * requests.index(ModeRequest.HOLD)
+    assert 5.9 < first_s < 7.5
+
+
+def in_hold_mode():
+    state, _ = reduce(orbiting(), GOOD, 1.0, Command.STOP, LIMITS)
+    state = permit_mode(state, "BRAKE")
+    state, decision = reduce(state, BRAKE, 3.0, None, LIMITS)
+    assert (state.state, decision.action) == (State.HOLDING, Action.NOTHING)
+    return state
+
+
+def test_starting_again_after_a_hold_is_one_command():
+    # Still in GUIDED: start.
+    state, _ = reduce(orbiting(), GOOD, 1.0, Command.STOP, LIMITS)
+    state, decision = reduce(state, GOOD, 1.2, Command.START, LIMITS)
+    assert (state.state, decision.action) == (State.ORBITING, Action.ORBIT)
+    # In the hold mode: engage.
+    state, decision = reduce(in_hold_mode(), BRAKE, 5.0, Command.ENGAGE, LIMITS)
+    assert decision.mode_request == ModeRequest.CONTROL
+    state, decision = reduce(permit_mode(state, "GUIDED"), GOOD, 5.3, None, LIMITS)
+    assert (state.state, decision.action) == (State.ORBITING, Action.ORBIT)
+    # The pilot gives control back: nothing is sent until start.
+    state, actions = fly(in_hold_mode(), GOOD, 2.0, 5.0)
+    assert set(actions) == {Action.NOTHING}
+    assert state.state == State.READY
+    state, decision = reduce(state, GOOD, 8.0, Command.START, LIMITS)
+    assert (state.state, decision.action) == (State.ORBITING, Action.ORBIT)
+    # Another mode of the pilot stays a take-over.
+    state, _ = reduce(in_hold_mode(), LOITER, 5.0, None, LIMITS)
+    assert state.state == State.TAKEN_OVER
+
+
+def test_slowed_setpoint_scales_velocity_and_stands_without_acceleration():
+    full = Setpoint(np.ones(3), np.array([2.0, 0.0, 0.0]), np.array([0.0, 0.6, 0.0]), 1.0, 0.3)
+    assert slowed(full, Pace(), 2.0) is full
+    half = slowed(full, Pace(0.5, -0.6, 0.9, 0.0), 2.0)
+    assert np.allclose(half.velocity, [1.0, 0.0, 0.0])
+    assert np.allclose(half.acceleration, [-1.2, 0.15, 0.0])
+    assert half.yaw_rate == pytest.approx(0.15)
+    still = slowed(full, Pace(0.0, -0.6, 0.5, 0.0), 2.0)
+    assert not still.velocity.any()
+    assert not still.acceleration.any()
+    assert np.array_equal(still.position, full.position)
+    assert np.linalg.norm(slowed(full, Pace(0.9, -0.6, 0.9, 0.0), 0.5).acceleration) == pytest.approx(0.5)

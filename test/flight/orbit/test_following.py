@@ -1,0 +1,114 @@
+"""Whether the setpoints are followed, by the echo's content and by the motion."""
+
+import dataclasses
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from drocap_ros.flight.orbit.following import Following
+from drocap_ros.flight.vehicle_state import VehicleState
+
+MAX_ECHO_AGE_S = 0.5
+
+
+def vehicle(autopilot, speed):
+    return VehicleState(
+        stamp_ns=0, autopilot=autopilot, mode="GUIDED", armed=True, position_enu_m=np.zeros(3),
+        velocity_enu_m_s=np.array([0.0, speed, 0.1]), orientation_xyzw=np.array([0, 0, 0, 1.0]),
+        angular_velocity_flu_rad_s=np.zeros(3), position_ok=True, gimbal_orientation_xyzw=np.full(4, np.nan),
+        link_age_s=0.0,
+    )  # fmt: skip
+
+
+def setpoint(x, vx):
+    return SimpleNamespace(x=x, y=0.0, vx=vx, vy=0.0)
+
+
+def fly(echo_of, seconds=6.0, autopilot="ardupilot", commanded=2.0, flown=lambda t: 2.0):
+    """(time, evidence) of the first step that does not follow; ``echo_of(t, x)`` is the echo, where the path is x."""
+    following, sent, echoed = Following(MAX_ECHO_AGE_S), [], None
+    for i in range(1, round(seconds * 20)):
+        t = i / 20
+        x = commanded * t
+        if i % 2 == 0 and (echo := echo_of(t - 0.1, x - 0.1 * commanded)) is not None:
+            echoed = (t, echo)
+        judged = None if echoed is None else (t - echoed[0], echoed[1])
+        if evidence := following.step(t, t, sent, judged, vehicle(autopilot, flown(t))):
+            return t, evidence
+        sent = [*sent[-79:], (t, setpoint(x, commanded))]
+    return math.inf, ""
+
+
+def followed(t, x):
+    return setpoint(x, 2.0)
+
+
+def dropped(t, x):
+    """ArduPilot from 3 s on: integrated for half a second, then velocity zero at the place that was reached."""
+    return followed(t, x) if t < 3.5 else setpoint(7.0, 0.0)
+
+
+def test_an_echo_of_what_was_sent_is_followed():
+    assert fly(followed) == (math.inf, "")
+    assert fly(lambda t, x: setpoint(x - 0.8, 2.0)) == (math.inf, "")  # 0.4 s late
+
+
+def test_a_target_that_was_not_sent_shows_dropped_setpoints_within_half_a_second_of_the_time_out():
+    t, evidence = fly(dropped)
+    assert 3.5 < t <= 4.0
+    assert "target is none that was sent" in evidence
+
+
+def test_px4_echoes_the_velocity_of_its_controller():
+    assert fly(lambda t, x: setpoint(x, 3.1), autopilot="px4") == (math.inf, "")
+    t, _ = fly(lambda t, x: setpoint(min(x, 6.0), 0.4), autopilot="px4")  # the target stays
+    assert t <= 4.7
+
+
+def test_no_echo_at_all_counts_after_its_time_and_a_link_without_one_is_judged_by_the_motion():
+    t, evidence = fly(lambda t, x: followed(t, x) if t < 3 else None)
+    assert (t, evidence[:7]) == (pytest.approx(3.6, abs=0.1), "no echo")
+    assert fly(lambda t, x: None) == (math.inf, "")
+    t, evidence = fly(lambda t, x: None, flown=lambda t: max(0.2, min(2.0, 2.0 - 1.5 * (t - 3))))
+    assert t <= 3 + 2.0 / 1.5 + 1.1
+    assert "commanded" in evidence
+
+
+def test_an_echo_whose_content_never_agreed_is_not_judged_but_the_motion_is():
+    assert fly(lambda t, x: setpoint(math.nan, math.nan)) == (math.inf, "")
+    t, evidence = fly(lambda t, x: setpoint(0.0, 0.0), flown=lambda t: 0.05)
+    assert 1.0 <= t <= 1.2
+    assert evidence == "it flies at 0.1 m/s where 2.0 m/s are commanded"
+
+
+def test_a_slow_command_and_a_vehicle_in_wind_are_no_evidence():
+    assert fly(lambda t, x: None, commanded=0.4, flown=lambda t: 0.0) == (math.inf, "")
+    assert fly(lambda t, x: None, flown=lambda t: 0.9) == (math.inf, "")
+
+
+def test_each_orbit_is_judged_anew():
+    following = Following(MAX_ECHO_AGE_S)
+    sent = [(0.05 * i, setpoint(0.1 * i, 2.0)) for i in range(60)]
+    slow = vehicle("ardupilot", 0.0)
+    assert following.step(3.0, 3.0, sent, (0.1, setpoint(6.0, 2.0)), slow) == ""
+    assert following.step(3.5, 0.0, sent, (0.1, setpoint(0.0, 0.0)), slow) == ""
+    assert following.step(9.0, 0.2, sent, (0.1, setpoint(0.0, 0.0)), slow) == ""
+    assert following.step(9.1, 0.3, sent, None, dataclasses.replace(slow, velocity_enu_m_s=np.full(3, np.nan))) == ""
+
+
+def test_no_recorded_flight_of_a_real_autopilot_counts_as_standing(shared):
+    judged = 0
+    for path in sorted((shared / "flight").glob("*.npz")):
+        flight = np.load(path)
+        if "setpoint_time_s" not in flight or not path.name.startswith(("orbit", "px4_stand", "px4_walk")):
+            continue
+        following, time = Following(MAX_ECHO_AGE_S), flight["time_s"]
+        for at, (vn, ve) in zip(flight["setpoint_time_s"], flight["setpoint_velocity_m_s"][:, :2], strict=True):
+            flown = [np.interp(at - 0.1, time, flight["velocity_m_s"][:, i]) for i in range(3)]
+            state = dataclasses.replace(vehicle("px4", 0.0), velocity_enu_m_s=np.array(flown))
+            command = SimpleNamespace(x=0.0, y=0.0, vx=float(vn), vy=float(ve))
+            assert following.step(at, at + 1.0, [(at, command)], None, state) == "", path.name
+            judged += 1
+    assert judged > 3000

@@ -1,0 +1,121 @@
+"""The guard: what the images alone allow, whatever filter and planner want."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from orbit_observations import GOOD, LIMITS
+
+from drocap_ros.flight.orbit.degradation import allowed_pace
+from drocap_ros.flight.orbit.pose_history import CameraPose
+from drocap_ros.flight.orbit_config import OrbitConfig
+from drocap_ros.flight.setpoint import Setpoint
+from drocap_ros.flight.subject.guard import Guard
+from drocap_ros.flight.subject_config import SubjectConfig
+from drocap_ros.observation import PoseObservation
+from drocap_ros.simulation.keypoint_errors import detect_person
+from drocap_ros.simulation.orbit_camera import pinhole_matrix
+from drocap_ros.simulation.simulated_person import simulate_person
+
+S = 1_000_000_000
+MATRIX, SIZE = pinhole_matrix(1280, 720, 60.0), (1280, 720)
+STANDING = simulate_person(np.zeros(1), "stand", 0, 1.7)[0]
+LEVEL = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])  # looks west
+AT = np.array([6.0, 0.0, 1.2])
+STILL = Setpoint(AT, np.zeros(3), np.zeros(3), np.pi, 0.0)
+
+
+def image(t_s, person=(0.0, 0.0), camera=AT, track_id=1, shift_px=0.0):
+    joints = STANDING - np.append(STANDING[0, :2], 0.0) + np.append(person, 0.0)
+    found = detect_person(joints[None], LEVEL[None], camera[None], MATRIX, SIZE, round(t_s * 1000))
+    keypoints = found.keypoints[0].astype(np.float32) + np.float32([shift_px, 0.0])
+    return PoseObservation(
+        round(t_s * S) + S, track_id, SIZE, keypoints=keypoints,
+        covariance=found.covariance[0].astype(np.float32), confidence=found.confidence[0].astype(np.float32),
+    )  # fmt: skip
+
+
+def flown(person, camera, seconds=3.0):
+    """A guard that has seen both move: functions of time, m."""
+    guard = Guard(SubjectConfig(), OrbitConfig(), 1.3)
+    for i in range(int(seconds * 15)):
+        t = i / 15
+        place = np.array([6.0 + camera(t), 0.0, 1.2])
+        guard.see(image(t, (person(t), 0.0), place), MATRIX, CameraPose(LEVEL, place), locked=i > 15)
+    limit = int((1.0 + seconds) * S)
+    return guard, place, limit
+
+
+def limited(guard, setpoint, place, velocity, now_ns):
+    seen = dataclasses.replace(GOOD, position=place, velocity=velocity)
+    guard.doubt(seen, np.zeros(3), now_ns)
+    return guard.limit(setpoint, seen)
+
+
+def asked(guard, place, now_ns, inward, own=0.0):
+    """Speed towards the subject that is left of the one asked for."""
+    setpoint = STILL._replace(position=place, velocity=np.array([-inward, 0.0, 0.0]))
+    sent = limited(guard, setpoint, place, np.array([-own, 0.0, 0.0]), now_ns)
+    return -float(sent.velocity[0]), sent
+
+
+def test_towards_a_standing_person_the_speed_is_bounded():
+    guard, place, now = flown(lambda t: 0.0, lambda t: 0.0)
+    assert asked(guard, place, now, 2.5)[0] == pytest.approx(1.0, abs=0.5)
+    # A position ahead is a pull towards it: velocity and pull together.
+    ahead = STILL._replace(position=place - np.array([1.5, 0.0, 0.0]), velocity=np.array([-0.8, 0.5, 0.1]))
+    sent = limited(guard, ahead, place, np.zeros(3), now)
+    assert -sent.velocity[0] + place[0] - sent.position[0] < 1.5
+    assert np.allclose(sent.velocity[1:], [0.5, 0.1])
+    # What moves away or aside passes as it is.
+    away = STILL._replace(velocity=np.array([1.0, 2.0, 0.0]))
+    assert np.allclose(limited(guard, away, place, np.zeros(3), now).velocity, away.velocity)
+
+
+def test_a_vehicle_that_closes_too_fast_is_slowed():
+    guard, place, now = flown(lambda t: 0.0, lambda t: 0.0)
+    _, sent = asked(guard, place, now, 1.0, own=3.0)
+    assert sent.acceleration[0] == pytest.approx(2.0)
+
+
+def test_following_is_no_closing_while_the_image_keeps_its_size():
+    guard, place, now = flown(lambda t: -1.4 * t, lambda t: -1.4 * t)
+    assert asked(guard, place, now, 2.2, own=1.4)[0] == pytest.approx(2.2, abs=0.4)
+    # The vehicle follows, but the person stands: his image grows.
+    guard, place, now = flown(lambda t: 0.0, lambda t: -0.8 * t)
+    assert asked(guard, place, now, 2.2, own=0.8)[0] < 1.5
+
+
+def test_no_speed_towards_a_person_whose_image_is_large():
+    guard, place, now = flown(lambda t: 2.9, lambda t: 0.0)  # 3.1 m; 2.6 m if he is 1.43 m tall
+    assert asked(guard, place, now, 1.0)[0] < 0.35
+    seen = dataclasses.replace(GOOD, position=place, subject_distance_m=8.0, subject_age_s=0.0)
+    doubted = guard.doubt(seen, np.zeros(3), now)
+    assert 3.1 < doubted.subject_distance_m < 5.0
+
+
+@pytest.mark.parametrize(
+    ("spoil", "contradicts"),
+    [
+        (lambda last, t: dataclasses.replace(last, stamp_ns=round(t * S) + S), False),
+        (lambda last, t: PoseObservation(round(t * S) + S, 0, SIZE), False),
+        (lambda last, t: image(t, track_id=2), True),
+        (lambda last, t: image(t, shift_px=400.0), True),
+    ],
+    ids=["frozen", "nobody", "another", "jumped"],
+)
+def test_without_a_sure_image_the_last_sure_one_grows_old(spoil, contradicts):
+    guard, place, _ = flown(lambda t: 0.0, lambda t: 0.0)
+    last = image(3.0)
+    guard.see(last, MATRIX, CameraPose(LEVEL, place), locked=True)
+    for step in range(1, 9):
+        t = 3.0 + step / 15
+        assert not guard.see(spoil(last, t), MATRIX, CameraPose(LEVEL, place), locked=True)
+    seen = dataclasses.replace(GOOD, position=place, subject_age_s=0.0)
+    doubted = guard.doubt(seen, np.zeros(3), round(3.55 * S) + S)
+    assert doubted.subject_age_s == pytest.approx(0.55)
+    assert doubted.subject_contradicted == contradicts
+    if contradicts:
+        assert allowed_pace(doubted, LIMITS).pace < 0.5
+    assert guard.see(image(3.6), MATRIX, CameraPose(LEVEL, place), locked=True)
+    assert not guard.doubt(seen, np.zeros(3), round(3.65 * S) + S).subject_contradicted

@@ -1,0 +1,111 @@
+"""No setpoint is sent that would break a limit if it stayed the last one."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
+from drocap_ros.flight.orbit.last_setpoint import coast_speed, harmless, slowed_condition
+from drocap_ros.flight.orbit.planner import OrbitGoal
+from drocap_ros.flight.orbit.states import Limits, Observed
+from drocap_ros.flight.orbit_config import OrbitConfig
+from drocap_ros.flight.safety_config import SafetyConfig
+from drocap_ros.flight.setpoint import Setpoint
+
+LIMITS = Limits(SafetyConfig(), OrbitConfig())
+ZERO, CENTRE = np.zeros(3), np.zeros(2)
+
+
+def seen(position=(6.0, 0.0, 2.5), velocity=(0.0, 2.0, 0.0), subject=(0.0, 0.0, 1.0), timeout_s=0.5):
+    return Observed(
+        autopilot="ardupilot", position=np.array(position), velocity=np.array(velocity), yaw=math.pi,
+        subject=np.array(subject), loss_settings=LossSettings("GUID_TIMEOUT", timeout_s, "", math.nan),
+    )  # fmt: skip
+
+
+def sent_of(*values):
+    """What is sent, or why nothing may be."""
+    setpoint, problem = harmless(*values)
+    return setpoint if problem is None else problem
+
+
+def flight(now, velocity=None, acceleration=(-0.66, 0.0, 0.0)):
+    wanted = now.velocity if velocity is None else np.array(velocity)
+    return Setpoint(now.position.copy(), wanted, np.array(acceleration), math.pi, 0.3)
+
+
+def test_setpoint_of_a_calm_orbit_is_sent_whole():
+    now = seen()
+    sent = sent_of(flight(now), now, ZERO, CENTRE, LIMITS)
+    assert isinstance(sent, Setpoint)
+    assert np.allclose(sent.velocity, now.velocity)
+    assert np.allclose(sent.acceleration, [-0.66, 0.0, 0.0])
+
+
+def test_setpoint_of_a_long_coast_is_slowed_down():
+    now = seen(velocity=(0.0, 2.6, 0.0))
+    sent = sent_of(flight(now), now, ZERO, CENTRE, LIMITS)
+    assert isinstance(sent, Setpoint)
+    assert np.linalg.norm(sent.velocity) < 2.4
+
+
+@pytest.mark.parametrize("speed", [1.0, 2.0])
+def test_no_setpoint_leads_past_the_minimum_distance(speed):
+    now = seen(position=(3.4, 0.0, 2.5), velocity=(-speed, 0.0, 0.0))
+    sent = sent_of(flight(now, acceleration=(0.0, 0.0, 0.0)), now, ZERO, CENTRE, LIMITS)
+    assert isinstance(sent, Condition)
+    assert sent.code == ConditionCode.COAST_UNSAFE
+    assert "come to" in str(sent)
+
+
+def test_a_subject_that_comes_counts_as_it_moves():
+    now = seen(position=(4.6, 0.0, 2.5), velocity=(-0.6, 0.0, 0.0))
+    wanted = flight(now, acceleration=(0.0, 0.0, 0.0))
+    stands = sent_of(wanted, now, ZERO, CENTRE, LIMITS)
+    comes = sent_of(wanted, now, np.array([1.2, 0.0, 0.0]), CENTRE, LIMITS)
+    assert isinstance(stands, Setpoint)
+    assert isinstance(comes, Setpoint)
+    assert abs(comes.velocity[0]) < 0.95 * abs(stands.velocity[0])
+
+
+def test_a_vehicle_that_leaves_a_near_subject_may_go_on():
+    now = seen(position=(3.1, 0.0, 2.5), velocity=(1.0, 0.0, 0.0))
+    assert isinstance(sent_of(flight(now), now, np.array([1.0, 0.0, 0.0]), CENTRE, LIMITS), Setpoint)
+
+
+def test_the_coast_stays_inside_the_fence():
+    safety = dataclasses.replace(LIMITS.safety, fence_radius_m=10.0)
+    now = seen(position=(8.5, 0.0, 2.5), velocity=(2.0, 0.0, 0.0), subject=(3.0, 0.0, 1.0))
+    limits = LIMITS._replace(safety=safety)
+    assert isinstance(sent_of(flight(now), now, ZERO, None, limits), Setpoint)
+    slowed = sent_of(flight(now), now, ZERO, CENTRE, limits)
+    assert isinstance(slowed, Setpoint)
+    assert slowed.velocity[0] < 0.9
+    late = dataclasses.replace(now, position=np.array([9.3, 0.0, 2.5]))
+    sent = sent_of(flight(late), late, ZERO, CENTRE, limits)
+    assert isinstance(sent, Condition)
+    assert "from where the orbit began" in str(sent)
+    slow = dataclasses.replace(now, velocity=np.array([0.8, 0.0, 0.0]))
+    sent = sent_of(flight(slow), slow, ZERO, CENTRE, limits)
+    assert isinstance(sent, Setpoint)
+
+
+def test_speed_that_the_coast_allows_follows_the_autopilots_timeout():
+    assert coast_speed(seen(timeout_s=0.3), LIMITS) > coast_speed(seen(), LIMITS) > 1.7
+    unknown = seen(timeout_s=math.nan)
+    assert coast_speed(unknown, LIMITS) == coast_speed(seen(timeout_s=3.0), LIMITS)
+
+
+def test_status_names_the_angular_speed_that_the_coast_allows():
+    flown = condition(ConditionCode.ORBITING)
+    usual, wide = (OrbitGoal(radius, 2.5, math.radians(19)) for radius in (6.0, 10.0))
+    assert slowed_condition(flown, usual, seen(timeout_s=0.3), LIMITS) == flown
+    slowed = slowed_condition(flown, wide, seen(), LIMITS)
+    assert slowed.code == ConditionCode.SLOWED
+    assert "orbiting the subject, at 1" in str(slowed)
+    assert "instead of 19.0" in str(slowed)
+    degraded = condition(ConditionCode.DEGRADED, cause=condition(ConditionCode.NO_SUBJECT))
+    assert slowed_condition(degraded, wide, seen(), LIMITS) == degraded

@@ -1,0 +1,108 @@
+"""Whose mode it is: the pilot's, the autopilot's own, or one that was requested."""
+
+import dataclasses
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from orbit_observations import GOOD, LIMITS, orbiting
+
+from drocap_ros.flight.conditions import ConditionCode
+from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
+from drocap_ros.flight.orbit.safety import permit_mode, reduce
+from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, SafetyState, State
+
+PX4 = dataclasses.replace(GOOD, autopilot="px4", mode="OFFBOARD", heard=frozenset({"OFFBOARD"}))
+HOLD = dataclasses.replace(PX4, mode="LOITER", heard=frozenset({"LOITER"}), in_control=False, in_hold=True)
+FAILSAFE = dataclasses.replace(HOLD, left_by_itself=True)
+WARM = LIMITS._replace(warm_up_s=1.2)
+
+
+def engaged(seen):
+    state, _ = reduce(SafetyState(), seen, 0.0, None, WARM)
+    state, decision = reduce(state, seen, 0.1, Command.ENGAGE, WARM)
+    assert decision.answer.accepted
+    return state
+
+
+def test_a_mode_that_was_heard_between_two_steps_is_a_take_over():
+    state, decision = reduce(
+        orbiting(), dataclasses.replace(GOOD, heard=frozenset({"GUIDED", "RTL"})), 1.0, None, LIMITS
+    )
+    assert (state.state, decision.action) == (State.TAKEN_OVER, Action.NOTHING)
+    assert state.condition.values["mode"] == "RTL"
+
+
+def test_control_that_the_stream_restores_while_it_is_requested_is_no_take_over():
+    state = engaged(FAILSAFE)
+    state, decision = reduce(state, PX4, 0.2, None, WARM)
+    assert (state.state, decision.action) == (State.ORBITING, Action.ORBIT)
+    pilot = dataclasses.replace(PX4, mode="POSCTL", heard=frozenset({"POSCTL"}), in_control=False)
+    state, decision = reduce(engaged(FAILSAFE), pilot, 0.2, None, WARM)
+    assert (state.state, decision.action) == (State.TAKEN_OVER, Action.NOTHING)
+
+
+def test_the_autopilots_own_hold_is_not_called_the_pilots_and_engage_follows_it():
+    state, decision = reduce(orbiting(PX4), FAILSAFE, 1.0, None, WARM)
+    assert (state.state, decision[:2]) == (State.HOLDING, (Action.NOTHING, ModeRequest.NONE))
+    assert state.condition.code == ConditionCode.SETPOINTS_NOT_FOLLOWED
+    assert "by itself" in state.reason
+    state, decision = reduce(state, FAILSAFE, 2.0, Command.ENGAGE, WARM)
+    assert (decision.answer.accepted, decision.action) == (True, Action.HOLD)
+
+
+def test_another_failsafe_ends_the_commands_too():
+    landing = dataclasses.replace(FAILSAFE, mode="LAND", heard=frozenset({"LAND"}), in_hold=False)
+    state, decision = reduce(orbiting(PX4), landing, 1.0, None, WARM)
+    assert (state.state, decision.action) == (State.TAKEN_OVER, Action.NOTHING)
+    assert state.condition.code == ConditionCode.SETPOINTS_NOT_FOLLOWED
+
+
+def test_the_words_follow_when_the_intention_is_reported_after_the_mode():
+    state, _ = reduce(orbiting(PX4), HOLD, 1.0, None, WARM)
+    assert (state.state, state.condition.code) == (State.TAKEN_OVER, ConditionCode.PILOT_TOOK_OVER)
+    state, decision = reduce(state, FAILSAFE, 1.1, None, WARM)
+    assert (state.state, decision.action) == (State.HOLDING, Action.NOTHING)
+    state, _ = reduce(orbiting(PX4), HOLD, 1.0, None, WARM)
+    assert reduce(state, HOLD, 1.1, None, WARM)[0].state == State.TAKEN_OVER
+
+
+@pytest.mark.parametrize("timeout_s", [0.5, 3.0])
+@pytest.mark.parametrize("seen", [GOOD, PX4])
+def test_a_stream_that_was_interrupted_does_not_resume_by_itself(seen, timeout_s):
+    seen = dataclasses.replace(seen, loss_settings=LossSettings("", timeout_s, "", 5))
+    limits = LIMITS._replace(max_control_timeout_s=3.0)
+    state, decision = reduce(orbiting(), GOOD, 1.0, Command.STOP, limits)
+    assert decision.action == Action.HOLD
+    state = permit_mode(state, seen.mode)
+    for i in range(1, 400):
+        t = 1.0 + timeout_s + 0.05 * i
+        state, decision = reduce(state, dataclasses.replace(seen, stream_gap_s=timeout_s + 0.05 * i), t, None, limits)
+        assert decision[:2] == (Action.NOTHING, ModeRequest.NONE)
+        assert state.state == State.HOLDING
+    state, decision = reduce(state, dataclasses.replace(seen, stream_gap_s=30.0), t + 0.1, Command.START, limits)
+    assert decision.action == Action.ORBIT  # the operator commands
+    short = dataclasses.replace(seen, stream_gap_s=timeout_s - 0.1)
+    state, _ = reduce(orbiting(), GOOD, 1.0, Command.STOP, limits)
+    assert reduce(permit_mode(state, seen.mode), short, 1.1, None, limits)[1].action == Action.HOLD
+
+
+MODES = ("OFFBOARD", "LOITER", "RTL", "POSCTL", "")
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_after_a_foreign_mode_nothing_is_sent_until_the_operator_commands(seed):
+    chance = random.Random(seed)
+    state, foreign, t = orbiting(PX4), False, 1.0
+    for _ in range(chance.randint(1, 30)):
+        mode, heard = chance.choice(MODES), frozenset(chance.sample(MODES, chance.choice((0, 0, 1, 2))))
+        seen = dataclasses.replace(
+            PX4, mode=mode, heard=heard | {mode}, in_control=mode == "OFFBOARD", in_hold=mode == "LOITER",
+            left_by_itself=chance.random() < 0.5 and mode not in ("OFFBOARD", ""),
+        )  # fmt: skip
+        state, decision = reduce(state, seen, t, None, WARM)
+        foreign |= bool((heard | {mode}) - {"OFFBOARD", ""})
+        t += 0.05
+        if foreign:
+            assert decision[:2] == (Action.NOTHING, ModeRequest.NONE)

@@ -1,0 +1,116 @@
+"""A camera fixed to the body: what keeps the person in the picture is flown, the rest is refused with a remedy."""
+
+import dataclasses
+import math
+import re
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.conditions import ConditionCode
+from drocap_ros.flight.frames import camera_rotation
+from drocap_ros.flight.orbit.degradation import allowed_pace
+from drocap_ros.flight.orbit.planner import goal_of
+from drocap_ros.flight.orbit.states import Limits, Observed, State
+from drocap_ros.flight.subject.framing import Framing, View, framing_margin, orbit_margin
+from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop
+from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
+from drocap_ros.simulation.vehicle.mount import tilted_camera
+
+SIZE = (1280, 720)
+MATRIX = pinhole_matrix(*SIZE, 60.0)
+FRESH = Observed(subject_age_s=0.1, link_age_s=0.0, state_age_s=0.0, position_age_s=0.0, subject=np.zeros(3))
+CONFIG = MavlinkBridgeConfig(mount="fixed", camera_pitch_deg=-11.0)
+
+
+def framing(config=CONFIG, wind_m_s2=0.0):
+    """Framing that has watched a hover in this wind."""
+    watched = Framing(config)
+    watched.matrix, watched.size = MATRIX, SIZE
+    lean = Rotation.from_euler("y", math.atan2(wind_m_s2, 9.81)).as_quat()  # nose east, wind from the east
+    hover = VehicleState(1, orientation_xyzw=lean)
+    for _ in range(400):
+        watched.watch(hover, Observed(velocity=np.zeros(3)), 0.05)
+    return watched
+
+
+@pytest.mark.parametrize(("ahead", "left", "pitch"), [(0.1, 0.05, -0.25), (-0.2, 0.15, -0.8), (0.0, -0.1, 0.0)])
+def test_margin_equals_the_projection_of_the_person(ahead, left, pitch):
+    body = Rotation.from_euler("ZYX", [0, ahead, -left]).as_quat()
+    rotation = camera_rotation(tilted_camera(body, pitch))
+    corners = np.array([[6.0, y, z] for y in (-0.3, 0.3) for z in (0.0, 1.8)])
+    px = project(corners[None], rotation[None], np.array([[0.0, 0.0, 2.5]]), MATRIX)[0]
+    expected = min(px.min(), (np.array(SIZE) - px).min()) / SIZE[1]
+    margin = framing_margin(View(MATRIX, SIZE, pitch), 6.0, 2.5, 1.7, np.array([ahead]), np.array([left]))
+    assert margin[0] == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_person_behind_the_camera_is_outside():
+    behind = framing_margin(View(MATRIX, SIZE, 1.5), 1.0, 2.5, 1.7, np.array([0.0]), np.array([0.0]))
+    assert behind[0] == -1.0
+
+
+def test_the_orbit_is_refused_that_loses_the_person_and_the_remedies_keep_them():
+    flat = dataclasses.replace(CONFIG, camera_pitch_deg=4.0)
+    refusal = framing(flat).refusal(goal_of(flat))
+    assert refusal.code == ConditionCode.PERSON_LEAVES_PICTURE
+    pitch = float(re.search(r"tilt the camera to (-?\d+) deg", str(refusal)).group(1))
+    assert -20 < pitch < -5
+    assert framing(dataclasses.replace(CONFIG, camera_pitch_deg=pitch)).refusal(goal_of(flat)) is None
+    radius = float(re.search(r"fly at ([\d.]+) m or more", str(refusal)).group(1))
+    assert framing(flat).refusal(goal_of(flat, radius_m=radius)) is None
+    assert framing(flat).refusal(goal_of(flat, radius_m=radius - 1.0)) is not None
+
+
+def test_wind_makes_the_orbit_slower():
+    config = dataclasses.replace(CONFIG, camera_pitch_deg=-15.0)  # aimed for an orbit that leans little
+    goal = goal_of(config)
+    assert framing(config).refusal(goal) is None
+    refusal = framing(config, wind_m_s2=0.7).refusal(goal)
+    assert refusal.code == ConditionCode.PERSON_LEAVES_PICTURE
+    slow = float(re.search(r"fly at most (\d+) deg/s", str(refusal)).group(1))
+    assert 2 <= slow < 19
+    assert framing(config, wind_m_s2=0.7).refusal(goal_of(config, angular_speed_deg_s=slow)) is None
+    assert framing(config, wind_m_s2=0.7).refusal(goal_of(config, angular_speed_deg_s=slow + 1)) is not None
+
+
+def test_a_storm_asks_for_another_lens():
+    assert str(framing(wind_m_s2=6.0).refusal(goal_of(CONFIG))).endswith("use a wider lens or a gimbal")
+
+
+def test_only_a_fixed_camera_is_checked():
+    for mount in ("auto", "gimbal", "servo"):
+        config = dataclasses.replace(CONFIG, mount=mount, camera_pitch_deg=30.0)
+        assert framing(config).refusal(goal_of(config)) is None
+    blank = Framing(dataclasses.replace(CONFIG, camera_pitch_deg=30.0))
+    assert blank.refusal(goal_of(CONFIG)) is None  # no calibration yet: another condition says so
+
+
+def test_the_margin_now_follows_the_lean():
+    watched = framing()
+    seen = Observed(subject_distance_m=6.0, height_m=2.5, velocity=np.zeros(3))
+    level = VehicleState(1, orientation_xyzw=np.array([0.0, 0.0, 0.0, 1.0]))
+    down = VehicleState(1, orientation_xyzw=Rotation.from_euler("y", 0.6).as_quat())
+    assert watched.watch(level, seen, 0.05).framing_margin > 0.1
+    for _ in range(60):
+        last = watched.watch(down, seen, 0.05)
+    assert last.framing_margin < 0.0
+    limits = Limits(CONFIG, CONFIG)
+    slowed = allowed_pace(dataclasses.replace(FRESH, framing_margin=last.framing_margin), limits)
+    assert 0.0 < slowed.pace < 0.5
+    assert slowed.cause.code == ConditionCode.SUBJECT_AT_BORDER
+    assert allowed_pace(dataclasses.replace(FRESH, framing_margin=0.2), limits).pace == 1.0
+    assert orbit_margin(View(MATRIX, SIZE, math.radians(-11)), goal_of(CONFIG), 1.7, 0.0) > 0.1
+
+
+def test_a_commanded_orbit_is_refused_in_flight():
+    loop = OrbitLoop(LoopSettings(mount="fixed", camera_pitch_deg=6.0, seconds=8, seed=1))
+    loop.start()
+    loop.run(4.3)
+    _, answer = loop.answers[-1]
+    assert not answer.accepted
+    assert answer.condition.code == ConditionCode.PERSON_LEAVES_PICTURE
+    assert loop.controller.safety.state != State.ORBITING

@@ -1,0 +1,100 @@
+"""Gaps of pictures and telemetry in flight: the orbit slows down and goes on, or holds and starts again."""
+
+import numpy as np
+import pytest
+
+from drocap_ros.flight.conditions import ConditionCode
+from drocap_ros.flight.orbit.states import Action, Command, State
+from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, with_config
+
+FAULT_S = 12.0
+
+
+def orbit(autopilot, **config):
+    settings = LoopSettings(autopilot=autopilot, seed=4, seconds=40)
+    loop = OrbitLoop(with_config(settings, body_height_m=1.75, size_error=0.04, attitude_hz=50.0, **config))
+    loop.start()
+    loop.run(FAULT_S)
+    assert loop.controller.safety.state == State.ORBITING
+    return loop
+
+
+def blind(loop, seconds):
+    """No picture arrives for a while."""
+    loop.perceive = lambda seen: None
+    loop.run(loop.t + seconds)
+    loop.perceive = lambda seen: seen
+
+
+def silence(loop, seconds):
+    """Telemetry of a while arrives in one burst afterwards."""
+    read, loop.down.read = loop.down.read, lambda: b""
+    loop.run(loop.t + seconds)
+    loop.down.read = read
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+@pytest.mark.parametrize(("gap", "seconds"), [(blind, 0.5), (silence, 0.3)])
+def test_orbit_goes_on_after_a_gap(autopilot, gap, seconds):
+    loop = orbit(autopilot)
+    paces = []
+    for _ in range(3):
+        gap(loop, seconds)
+        loop.run(loop.t + 1.5, lambda loop: paces.append(loop.controller.safety.pace.value))
+    assert all(row.action == Action.ORBIT for row in loop.rows if row.t_s > FAULT_S), loop.reasons
+    assert ConditionCode.DEGRADED in [reason.code for t, _, reason in loop.reasons if t > FAULT_S]
+    assert min(paces) < 0.5
+    assert paces[-1] == 1.0
+    assert np.linalg.norm(loop.copter.body.velocity) > 1.0
+
+
+def test_dead_perception_ends_the_commanded_motion_in_time_and_holds():
+    loop = orbit("ardupilot")
+    position = loop.copter.body.position.copy()
+    blind(loop, 4.0)
+    assert loop.copter.motion_until_s - FAULT_S <= 0.35
+    assert max(np.linalg.norm(row.position[:2] - position[:2]) for row in loop.rows if row.t_s > FAULT_S) <= 2.5
+    assert loop.controller.safety.state == State.HOLDING
+    loop.run(loop.t + 4.0)
+    ended = next(i for i, row in enumerate(loop.rows) if row.t_s > FAULT_S and row.action != Action.ORBIT)
+    assert all(row.action != Action.ORBIT for row in loop.rows[ended:])  # off by default
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_orbit_resumes_after_a_short_hold_where_the_operator_allows_it(autopilot):
+    loop = orbit(autopilot, resume_after_hold_s=6.0)
+    blind(loop, 2.5)
+    assert loop.controller.safety.state == State.HOLDING
+    loop.run(loop.t + 1.5)
+    assert loop.controller.safety.state == State.ORBITING, loop.reasons[-3:]
+    assert {mode for _, mode, _ in loop.copter.mode_log if mode in ("BRAKE", "LOITER")} <= {"LOITER"}  # handed over
+    blind(loop, 9.0)
+    assert loop.copter.mode == ("BRAKE" if autopilot == "ardupilot" else "LOITER")
+    loop.run(loop.t + 4.0)
+    assert loop.controller.safety.state == State.HOLDING
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_starting_again_after_a_hold_is_one_command(autopilot):
+    loop = orbit(autopilot)
+    blind(loop, 6.0)
+    loop.run(loop.t + 2.0)
+    assert loop.controller.safety.state == State.HOLDING
+    assert loop.copter.mode == ("BRAKE" if autopilot == "ardupilot" else "LOITER")
+    loop.command(Command.ENGAGE)
+    loop.run(loop.t + 3.0)
+    assert loop.controller.safety.state == State.ORBITING, loop.reasons[-3:]
+
+
+def test_start_is_enough_when_the_pilot_gives_control_back_after_a_hold():
+    loop = orbit("ardupilot")
+    blind(loop, 6.0)
+    assert loop.copter.mode == "BRAKE"
+    loop.copter.set_mode("GUIDED", "pilot")
+    back_s = loop.t
+    loop.run(back_s + 2.0)
+    assert loop.controller.safety.state == State.READY
+    assert all(row.action == Action.NOTHING for row in loop.rows if row.t_s > back_s)
+    loop.command(Command.START)
+    loop.run(loop.t + 3.0)
+    assert loop.controller.safety.state == State.ORBITING, loop.reasons[-3:]

@@ -1,0 +1,44 @@
+"""The simulated vehicle against recorded flights of the real autopilots: the same setpoints, from the same state."""
+
+import numpy as np
+import pytest
+
+from drocap_ros.simulation.vehicle.replay import Case, RecordedFlight, load_recorded, recorded_cases, replay
+
+#: Flights whose every input is recorded: nothing but ArduPilot's control moves the vehicle.
+KILLS = [f"bridge_killed_timeout_{timeout}s_{i}" for timeout, count in ((0.3, 3), (0.5, 5)) for i in range(count)]
+#: PX4's estimate wanders by 0.2 m/s meanwhile, which is not recorded: the vehicle follows it.
+PX4_STOPS = ("bridge_sigkill_0", "bridge_sigkill_1", "bridge_sigkill_2", "setpoints_dropped", "uplink_cut")
+
+
+@pytest.mark.parametrize("name", [*KILLS, "pilot_takes_brake"])
+def test_ardupilot_goes_where_the_recorded_one_went(shared, name):
+    flight = load_recorded(shared / "flight" / f"{name}.npz")
+    (case,) = recorded_cases(flight, name)
+    got = replay(flight, case, "ardupilot")
+    assert got.time_s[-1] > 3.9
+    assert got.error_m.max() < 0.3
+    assert got.farthest_m(True) == pytest.approx(got.farthest_m(False), abs=0.3)
+
+
+@pytest.mark.parametrize("name", PX4_STOPS)
+def test_px4_stops_where_the_recorded_one_stopped(shared, name):
+    flight = load_recorded(shared / "flight" / f"px4_{name}.npz")
+    (case,) = recorded_cases(flight, f"px4_{name}")
+    got = replay(flight, case, "px4")
+    assert got.error_m[:150].max() < 0.3
+    assert got.error_m.max() < 0.5
+
+
+def test_stale_setpoint_is_continued_until_the_timeout_and_sprung_back_from():
+    t = np.arange(0.0, 3.0, 0.05)
+    ahead, up = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 2.5])
+    place, pace = 2.0 * t[:, None] * ahead + up, np.tile(2.0 * ahead, (len(t), 1))
+    push = np.where(t[:, None] > 2.9, 1.5 * ahead, 0.0 * ahead)  # of the last two setpoints
+    times = np.arange(0.0, 12.0, 0.01)
+    path = 2.0 * times[:, None] * ahead + up
+    flight = RecordedFlight(times, path, np.tile(2.0 * ahead, (len(times), 1)), 0 * times, t, place, pace, push)
+    short, long = (replay(flight, Case("kill", timeout_s=s), "ardupilot", 8.0).simulated[:, 0] for s in (0.3, 0.5))
+    assert np.diff(long[:70]).max() / 0.01 > 2.3  # faster than at the bridge's death
+    assert long.max() > short.max() + 0.3
+    assert long.max() - long[-1] > 0.5
