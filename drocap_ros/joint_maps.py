@@ -9,13 +9,15 @@ neck-to-crown distance, and less confidence.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_15, JOINT_SETS, JointSet
 
 #: Shares of the way from the middle of the shoulders to the middle of the ears.
 _NECK_ON_EARS, _HEAD_ON_EARS = 135 / 190, 232 / 190
@@ -94,28 +96,39 @@ class JointMap:
     spread: np.ndarray
 
     def apply(
-        self, xy: np.ndarray, covariance: np.ndarray, confidence: np.ndarray, box_size: float
+        self, xy: np.ndarray, covariance: np.ndarray, confidence: np.ndarray, box_size: float | np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Keypoints (P, 2) px, covariance (P, 3) px^2 and confidence (P,) -> the same for ``BODY_15``.
+        """Keypoints (..., P, 2) px, covariance (..., P, 3) px^2 and confidence (..., P) -> the same for ``BODY_15``.
 
         A joint is NaN, its confidence 0, where one of its parts is NaN.  The line's length is at least 5 % of
-        ``box_size``: a view from above shortens the line, not the uncertainty of the head.
+        ``box_size`` (...) px: a view from above shortens the line, not the uncertainty of the head.
         """
-        seen = np.isfinite(xy).all(axis=1)
+        seen = np.isfinite(xy).all(axis=-1)
         used = self.weights != 0
-        known = ~(used & ~seen).any(axis=1)
+        known = ~(used & ~seen[..., None, :]).any(axis=-1)
         points = np.nan_to_num(xy)
         out = self.weights @ points
         # The errors of the parts are assumed independent.
         out_covariance = self.weights**2 @ np.nan_to_num(covariance)
-        length = np.maximum(np.linalg.norm(self.lines @ points, axis=1), 0.05 * box_size)
+        length = np.maximum(np.linalg.norm(self.lines @ points, axis=-1), 0.05 * np.asarray(box_size)[..., None])
         extra = np.where(self.spread > 0, (self.spread * length) ** 2, 0.0)
-        out_covariance = out_covariance + extra[:, None] * np.array([1.0, 0.0, 1.0])
-        lowest = np.where(used, np.nan_to_num(confidence)[None], np.inf).min(axis=1)
+        out_covariance = out_covariance + extra[..., None] * np.array([1.0, 0.0, 1.0])
+        lowest = np.where(used, np.nan_to_num(confidence)[..., None, :], np.inf).min(axis=-1)
         out_confidence = np.where(self.spread > 0, _EXTRAPOLATED_CONFIDENCE, 1.0) * lowest
         out[~known] = np.nan
         out_covariance[~known] = np.nan
         return out, out_covariance, np.where(known, out_confidence, 0.0)
+
+
+def joint_set_of(names: Sequence[str]) -> tuple[JointSet, np.ndarray]:
+    """The joint set whose map gives most joints of ``BODY_15`` from these names, and its names' places (P,), -1 = none.
+
+    The spelling is free: ``left_shoulder``, ``leftShoulder`` and ``Left shoulder`` are one name.
+    """
+    place = {re.sub(r"(?<=[a-z])(?=[A-Z])|[\s-]+", "_", name).lower(): i for i, name in enumerate(names)}
+    given = {name: sum(set(parts) <= place.keys() for parts in table.values()) for name, table in TABLES.items()}
+    best = JOINT_SETS[max(given, key=lambda name: given[name])]
+    return best, np.array([place.get(joint, -1) for joint in best.joints])
 
 
 @cache

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.skeleton import BODY_15, indices
+from drocap_ros.skeleton import BODY_15, in_body_order
 from drocap_ros.tracks import read_npz
 
 
@@ -20,8 +20,10 @@ class Sequence:
     x: np.ndarray
 
 
-def load_mocap(path: Path) -> tuple[np.ndarray, float]:
+def load_mocap(path: Path, required: tuple[str, ...] = BODY_15.joints) -> tuple[np.ndarray, float]:
     """Joints (T, 15, 3) mm, world z up, and frames per second of one MoCap ``.npz``.
+
+    Joints that are neither in the file nor ``required`` are NaN.
 
     Raises
     ------
@@ -37,7 +39,7 @@ def load_mocap(path: Path) -> tuple[np.ndarray, float]:
     fps = float(a["fps"])
     if not 1.0 <= fps <= 1000.0:
         raise InputError(f"{path}: fps: expected 1 to 1000, got {fps:g}")
-    return x[:, indices([str(j) for j in a["joints"]], BODY_15.joints)], fps
+    return in_body_order(x, [str(j) for j in a["joints"]], required), fps
 
 
 def mocap_files(folder: str | Path, include: str = "*") -> list[Path]:

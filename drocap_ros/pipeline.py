@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import logging
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+from drocap_ros.clip import Clip
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.live_replay import reconstruct_live, recorded_config
 from drocap_ros.motion import Motion
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
-from drocap_ros.perception.sources import Frame, open_source
-from drocap_ros.perception.track_video import observe, tracks_from_observations
+from drocap_ros.perception.persons import find_persons, following
+from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
 from drocap_ros.reconstruction.methods.method_input import Progress
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.recording.image_messages import read_images
+from drocap_ros.recording.open_images import open_images, refuse_other_inputs
 from drocap_ros.recording.open_session import is_recording, open_session
-from drocap_ros.recording.session_tracks import read_pose2d
+from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Session
+from drocap_ros.recording.session_tracks import read_pose2d, with_recorded_camera
 from drocap_ros.recording.telemetry.camera_poses import with_camera
 from drocap_ros.recording.telemetry.log import TelemetryLog
 from drocap_ros.recording.telemetry.read import read_telemetry
@@ -46,6 +47,19 @@ class Telemetry:
     mount_pitch_deg: float | None = None
 
 
+@dataclass(frozen=True)
+class Selection:
+    """Part of an input that is reconstructed.
+
+    person : number of a person of :func:`~drocap_ros.perception.persons.find_persons`; None = as configured
+    redetect : estimate the 2D poses of a recording from its images, although it holds recorded ones
+    """
+
+    clip: Clip = field(default_factory=Clip)
+    person: int | None = None
+    redetect: bool = False
+
+
 def reconstruct_input(
     path: str | Path,
     *,
@@ -55,6 +69,7 @@ def reconstruct_input(
     progress: Progress | None = None,
     telemetry: Telemetry | None = None,
     mount_pitch_deg: float | None = None,
+    selection: Selection | None = None,
 ) -> tuple[Motion, Tracks]:
     """Motion of the subject in a video file, image folder, recording or tracks file.
 
@@ -67,25 +82,31 @@ def reconstruct_input(
     progress : called with a stage and its fraction done
     telemetry : log beside a video, with the camera's pose
     mount_pitch_deg : of a camera fixed to the body, negative down, for a recording without the camera's attitude
+    selection : part of the input; default: all images, the person in most of them
 
     Raises
     ------
     InputError
         When the input cannot be used.
     """
+    selection = selection or Selection()
     if method == "live":
+        if selection != Selection():
+            raise InputError("--method live: expected a whole recording with its recorded poses; choose another method")
         return _reconstruct_live(Path(path), config, progress)
     begin = time.perf_counter()
     log = read_telemetry(telemetry.path) if telemetry is not None else None
-    tracks = read_input(Path(path), config, models, progress, mount_pitch_deg)
+    tracks, origin = _read(Path(path), config, models, progress, mount_pitch_deg, selection)
     if telemetry is not None and log is not None:
         tracks = _with_telemetry(Path(path), tracks, telemetry, log, progress)
     seconds = time.perf_counter() - begin
     motion = reconstruct(
         tracks, method=method, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress
     )
-    meta = {**motion.meta, "input": Path(path).name}
-    meta["seconds"] = {"pose2d": round(seconds, 4), **meta.get("seconds", {})}
+    images = {"images": {"size": list(tracks.image_size)}}
+    meta = {**motion.meta, "input": Path(path).name, **images, **origin}
+    stages = {"pose2d": seconds, **meta.get("seconds", {})}
+    meta["seconds"] = {**stages, "total": seconds + stages.get("total", 0.0)}
     return dataclasses.replace(motion, meta=meta), tracks
 
 
@@ -96,8 +117,7 @@ def _reconstruct_live(path: Path, config: DrocapConfig, progress: Progress | Non
         if config == DrocapConfig():
             config = recorded_config(session) or config
         motion, tracks, _ = reconstruct_live(session, config, progress)
-        for warning in session.warnings:
-            logger.warning("%s: %s", path, warning)
+        _log_warnings(session)
     return dataclasses.replace(motion, meta={**motion.meta, "input": path.name}), tracks
 
 
@@ -112,7 +132,7 @@ def _with_telemetry(
     logger.warning("%s: %s; %s", telemetry.path, log.kind, offset)
     for lack in log.lacks:
         logger.warning("%s: %s", telemetry.path, lack)
-    at_ns = tracks.stamp_ns - tracks.stamp_ns[0] + int(log.track.stamp_ns[0]) + round(offset.seconds * 1e9)
+    at_ns = tracks.stamp_ns + int(log.track.stamp_ns[0]) + round(offset.seconds * 1e9)
     tracks, reason = with_camera(tracks, log.track, at_ns, pitch)
     if reason:
         logger.warning("%s: camera telemetry incomplete: %s", telemetry.path, reason)
@@ -125,43 +145,92 @@ def read_input(
     models: Path | None,
     progress: Progress | None = None,
     mount_pitch_deg: float | None = None,
+    selection: Selection | None = None,
 ) -> Tracks:
     """2D tracks of the subject: from the input where it holds them, else estimated from its images."""
+    return _read(path, config, models, progress, mount_pitch_deg, selection or Selection())[0]
+
+
+def needs_networks(path: Path, redetect: bool = False) -> bool:
+    """Whether the 2D poses of an input have to be estimated from its images.
+
+    Raises
+    ------
+    InputError
+        When the input does not exist or is of another kind.
+    """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
+    refuse_other_inputs(path)
     if path.suffix == ".npz":
-        return load_tracks(path)
-    if is_recording(path):
-        with open_session(path) as session:
-            if session.has_pose2d:
-                tracks = read_pose2d(session, mount_pitch_deg)
-            else:
-                tracks = _track(read_images(session), None, config, models, progress, str(path))
-            for warning in session.warnings:
-                logger.warning("%s: %s", path, warning)
-            return tracks
-    with open_source(str(path), config.image_ingest) as source:
-        return _track(source, source.length, config, models, progress, str(path))
+        return False
+    if redetect or not is_recording(path):
+        return True
+    with open_session(path) as session:
+        return not session.has_pose2d
 
 
-def _track(
-    frames: Iterable[Frame],
-    length: int | None,
+def _read(
+    path: Path,
     config: DrocapConfig,
     models: Path | None,
     progress: Progress | None,
-    name: str,
-) -> Tracks:
-    done = itertools.count(1)
+    mount_pitch_deg: float | None,
+    selection: Selection,
+) -> tuple[Tracks, dict[str, Any]]:
+    """Tracks, and what ``meta`` says of their origin."""
+    origin: dict[str, Any] = {} if selection.clip.whole else {"clip": selection.clip.meta}
+    if needs_networks(path, selection.redetect):
+        tracks, more = _track(path, config, models, progress, selection)
+        if is_recording(path):
+            with open_session(path) as session:
+                near = session.choose_topic(IMAGE, COMPRESSED_IMAGE).name
+                session.warnings.clear()  # reported with the images
+                tracks = with_recorded_camera(session, tracks, near, mount_pitch_deg)
+                _log_warnings(session)
+        return tracks, origin | more
+    if selection.person is not None:
+        raise InputError(f"--subject {selection.person}: expected images, found 2D poses of one person; add --redetect")
+    if path.suffix == ".npz":
+        return selection.clip.cut(load_tracks(path)), origin
+    with open_session(path) as session:
+        tracks = read_pose2d(session, mount_pitch_deg)
+        _log_warnings(session)
+    return selection.clip.cut(tracks), {**origin, "pose2d": "recorded"}
 
-    def report(*_: object) -> None:
-        if progress is not None:
-            progress("2D pose", next(done) / length if length else -1.0)
 
+def _track(
+    path: Path, config: DrocapConfig, models: Path | None, progress: Progress | None, selection: Selection
+) -> tuple[Tracks, dict[str, Any]]:
     # Offline the most frequent subject of the whole recording is chosen at the end.
-    settings = dataclasses.replace(config.pose_estimator, on_loss="next")
-    estimator = PoseEstimator(models_folder(models or settings.models_dir or None), settings)
+    settings, begin_ns = dataclasses.replace(config.pose_estimator, on_loss="next"), None
+    folder, clip = models_folder(models or settings.models_dir or None), selection.clip
     try:
-        return tracks_from_observations(observe(frames, estimator, report))
+        if selection.person is not None:
+            with open_images(path, config.image_ingest) as images:
+                count = clip.meter(progress, "persons", images.duration_s)
+                persons = find_persons(clip.select(images.frames), folder, settings, count)
+            settings = following(settings, persons, selection.person)
+            begin_ns = persons[selection.person - 1].first_ns
+        estimator = PoseEstimator(folder, settings)
+        with open_images(path, config.image_ingest) as images:
+            count = clip.meter(progress, "2D pose", images.duration_s)
+            observations = observe(clip.select(images.frames), estimator, count, begin_ns)
+        tracks = tracks_from_observations(observations)
     except InputError as error:
-        raise InputError(f"{name}: {error}") from None
+        raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
+    found = subjects(observations)
+    if len(found) > 1:
+        share = found[0][1] / len(observations)
+        logger.warning(
+            "%s: %d persons one after another; the one in most images (%.0f %%) is reconstructed;"
+            " `drocap track %s --list` numbers them for --subject N", path, len(found), 100 * share, path,
+        )  # fmt: skip
+    more: dict[str, Any] = {"pose2d": "estimated"}
+    more["images"] = {"size": list(tracks.image_size), "length": images.length, "rate_hz": images.rate_hz}
+    return tracks, more if selection.person is None else {**more, "person": selection.person}
+
+
+def _log_warnings(session: Session) -> None:
+    for warning in session.warnings:
+        logger.warning("%s: %s", session.path, warning)

@@ -161,3 +161,23 @@ def indices(joints: tuple[str, ...] | list[str], wanted: tuple[str, ...]) -> np.
     if missing:
         raise InputError(f"joints: expected {', '.join(wanted)}; missing {', '.join(missing)}; rename or add them")
     return np.array([place[name] for name in wanted])
+
+
+def in_body_order(values: np.ndarray, joints: tuple[str, ...] | list[str], required: tuple[str, ...]) -> np.ndarray:
+    """Values (F, P, D) of named joints as (F, 15, D) of ``BODY_15``; NaN for a missing joint that is not required.
+
+    A missing pelvis is the middle of the hips.
+
+    Raises
+    ------
+    InputError
+        When a required joint is missing.
+    """
+    indices(joints, required)
+    out = np.full((len(values), len(BODY_15), values.shape[2]), np.nan)
+    for row, name in enumerate(BODY_15.joints):
+        if name in joints:
+            out[:, row] = values[:, list(joints).index(name)]
+    if "pelvis" not in joints:
+        out[:, BODY_15.index("pelvis")] = out[:, indices(BODY_15.joints, ("rhip", "lhip"))].mean(axis=1)
+    return out

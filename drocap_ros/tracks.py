@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -103,6 +104,26 @@ _REQUIRED = ("keypoints", "joints", "stamp_ns", "image_size")
 _OPTIONAL = ("confidence", "covariance", "camera_rotation", "camera_position", "camera_matrix")
 
 
+def kind_of(arrays: Collection[str]) -> str:
+    """Kind by the names of a file's arrays: "motion", "tracks", "MoCap", else empty."""
+    kinds = {"motion": {"joints3d"}, "tracks": {"keypoints", "image_size"}, "MoCap": {"X", "fps"}}
+    return next((kind for kind, names in kinds.items() if names <= set(arrays)), "")
+
+
+#: Kind of a file -> its name in a sentence, and the use of a file of that kind.
+_USES = {
+    "motion": ("a motion", "`drocap report`, `export` and `evaluate compare` take it"),
+    "tracks": ("2D tracks", "`drocap reconstruct {path}` makes a motion of them"),
+    "MoCap": ("MoCap", "`drocap evaluate compare MOTION {path}` takes it as the truth"),
+}
+
+
+def wrong_kind(path: Path, arrays: Collection[str], expected: str) -> InputError:
+    """The refusal of a file of another kind; it names the use of that file."""
+    found, use = _USES.get(kind_of(arrays), ("another archive", "check the path"))
+    return InputError(f"{path}: expected {expected}, found {found}; {use.format(path=path)}")
+
+
 def read_npz(path: Path, required: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Arrays of an ``.npz`` file (never pickles).
 
@@ -111,6 +132,8 @@ def read_npz(path: Path, required: tuple[str, ...]) -> dict[str, np.ndarray]:
     InputError
         When the file is missing, is no ``.npz``, or lacks a required array.
     """
+    if path.is_file() and not zipfile.is_zipfile(path):
+        raise InputError(f"{path}: expected a readable .npz archive, found another or a damaged file; check the path")
     try:
         archive = np.load(path, allow_pickle=False)
         if not isinstance(archive, np.lib.npyio.NpzFile):
@@ -126,6 +149,9 @@ def read_npz(path: Path, required: tuple[str, ...]) -> dict[str, np.ndarray]:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: expected a readable .npz archive; {reason}") from None
     missing = [name for name in required if name not in arrays]
+    kind, wanted = kind_of(arrays), kind_of(required)
+    if missing and kind and wanted and kind != wanted:
+        raise wrong_kind(path, arrays, _USES[wanted][0])
     if missing:
         raise InputError(f"{path}: expected the arrays {', '.join(required)}; missing {', '.join(missing)}")
     return arrays

@@ -11,7 +11,7 @@ import pytest
 #: Bottom to top; a room imports rooms of its own layer or below.
 LAYERS = (
     ("errors", "parameters", "skeleton", "joint_maps", "leg_sides", "geometry", "keypoints", "observation", "tracks",
-     "motion", "mocap"),
+     "motion", "mocap", "clip"),
     ("perception", "flight", "reconstruction", "recording", "simulation"),
     ("config", "pipeline", "live_replay", "training", "evaluation", "export", "report", "view"),
     ("ros",),

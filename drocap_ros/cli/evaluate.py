@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from drocap_ros.cli import reconstruct
-from drocap_ros.cli.motion_input import HELP, read_motion
+from drocap_ros.cli.motion_input import HELP, TRUTH, motion_path, read_motion
 
 #: ``live`` needs a recording of the live graph.
 METHODS = tuple(method for method in reconstruct.METHODS if method != "live")
@@ -29,7 +29,12 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         description="Errors of MOTION: per joint group, world frame, handedness, scale.",
     )
     comparison.add_argument("motion", metavar="MOTION", type=Path, help=HELP)
-    comparison.add_argument("truth", metavar="TRUTH", type=Path, help="MoCap .npz or another motion.npz")
+    comparison.add_argument(
+        "truth",
+        metavar="TRUTH",
+        type=Path,
+        help="MoCap .npz, another motion.npz, or a folder with truth.npz or motion.npz",
+    )
     comparison.add_argument(
         "--out", metavar="DIR", type=Path, help="also write compare.csv, compare.md and compare.png to DIR"
     )
@@ -101,7 +106,7 @@ def _compare(args: argparse.Namespace) -> int:
     if args.out is not None:
         check_output_folder(args.out)
     path, motion = read_motion(args.motion)
-    errors = compare(motion, *load_truth(args.truth))
+    errors = compare(motion, *load_truth(motion_path(args.truth, TRUTH)))
     name = path.parent.name if path.name == "motion.npz" else path.stem
     text = tables.comparison_markdown(name, errors)
     print(text, end="")

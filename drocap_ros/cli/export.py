@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from drocap_ros.cli.motion_input import HELP, read_motion
+from drocap_ros.errors import InputError
 from drocap_ros.export import FORMATS
 
 
@@ -33,6 +34,8 @@ def run(args: argparse.Namespace) -> int:
 
     path, motion = read_motion(args.motion)
     out = args.out or path.with_suffix(f".{args.to}")
+    if out.suffix[1:] in set(FORMATS) - {args.to}:
+        raise InputError(f"--out {out}: expected a name that ends in .{args.to}, found {out.suffix}; change it or --to")
     with output_file(out) as file:
         notes = export_motion(motion, args.to, file)
     if not args.quiet:

@@ -9,6 +9,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from drocap_ros.cli.motion_input import FILE
 from drocap_ros.errors import InputError
 
 
@@ -29,7 +30,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         description="Print topics, types, counts and duration of a recording (session folder, .mcap, .bag, rosbag2 "
         "folder), or arrays and shapes of a motion.npz or tracks .npz.",
     )
-    parser.add_argument("session", metavar="SESSION", type=Path, help="recording, motion.npz or tracks .npz")
+    parser.add_argument(
+        "session", metavar="SESSION", type=Path, help="recording, motion.npz or its folder, or tracks .npz"
+    )
     parser.add_argument(
         "--metadata", action="store_true", help="print the session's configuration and other metadata in full"
     )
@@ -61,6 +64,8 @@ def summarize(path: Path) -> Summary:
     """
     if not path.exists():
         raise InputError(f"{path}: expected a recording, motion or tracks file, found no such file; check the path")
+    if path.is_dir() and (path / FILE).is_file():
+        path = path / FILE
     return _of_arrays(path) if path.suffix == ".npz" else _of_session(path)
 
 
@@ -96,7 +101,7 @@ def _print_metadata(path: Path) -> int:
 def _of_arrays(path: Path) -> Summary:
     from drocap_ros.motion import load_motion
     from drocap_ros.reconstruction.world.calibration_words import telemetry_words
-    from drocap_ros.tracks import load_tracks, read_npz
+    from drocap_ros.tracks import load_tracks, read_npz, wrong_kind
 
     arrays = read_npz(path, ())
     facts = [("path", str(path))]
@@ -123,10 +128,7 @@ def _of_arrays(path: Path) -> Summary:
             ("seen", f"{seen.any(axis=1).sum()} of {len(tracks)} frames, {100 * seen.mean():.1f} % of the keypoints"),
         ]
     else:
-        raise InputError(
-            f"{path}: expected a motion (joints3d) or tracks (keypoints) file, found the arrays "
-            f"{', '.join(sorted(arrays)[:8]) or 'none'}; check the path"
-        )
+        raise wrong_kind(path, arrays, "a motion or 2D tracks")
     rows = [(name, str(a.dtype), " x ".join(map(str, a.shape)) or "scalar") for name, a in sorted(arrays.items())]
     return Summary(facts, ("array", "type", "shape"), rows, ())
 

@@ -15,6 +15,9 @@ METHODS = ("ba", "paper", "paper-no-articulation", "initial", "mf-nnm", "live")
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the command's options; ``run`` is its action."""
+    from drocap_ros.cli.clip_options import add_clip_options
+    from drocap_ros.cli.models.on_demand import add_fetch_option
+
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "reconstruct",
         help="3D motion from a video, recording or tracks file",
@@ -36,6 +39,10 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         " term; initial: the paper's single-view initialization alone; mf-nnm: factorization and nuclear norm (Dai"
         " 2012); live: the live graph's sliding windows, from a recording's pose2d",
     )
+    add_clip_options(parser)
+    parser.add_argument(
+        "--redetect", action="store_true", help="estimate 2D poses from a recording's images, not its recorded ones"
+    )
     parser.add_argument(
         "--telemetry",
         metavar="LOG",
@@ -56,6 +63,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         " without the camera's attitude",
     )
     parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
+    add_fetch_option(parser)
     parser.add_argument("--dictionary", metavar="NPZ", type=Path, help="pose dictionary instead of the shipped one")
     parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
     parser.add_argument("--no-report", action="store_true", help="do not write report.html")
@@ -67,10 +75,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 def run(args: argparse.Namespace) -> int:
     """Reconstruct and write the output folder."""
     from drocap_ros.cli.atomic_output import check_output_folder, output_folder
+    from drocap_ros.cli.clip_options import clip_of, subject_of
+    from drocap_ros.cli.models.on_demand import ensure_networks
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.config import DrocapConfig, load_config
     from drocap_ros.motion import save_motion
-    from drocap_ros.pipeline import reconstruct_input
+    from drocap_ros.perception.load_models import models_folder
+    from drocap_ros.pipeline import Selection, needs_networks, reconstruct_input
     from drocap_ros.report.motion_images import has_images
     from drocap_ros.report.page import save_report
     from drocap_ros.report.preview import save_preview
@@ -81,6 +92,11 @@ def run(args: argparse.Namespace) -> int:
     config = load_config(args.config) if args.config else DrocapConfig()
     if args.dictionary:
         config = config.replace("initializer", dictionary=str(args.dictionary))
+    person, rule = subject_of(args.subject)
+    config = config.replace("pose_estimator", **rule)
+    telemetry, selection = _telemetry(args), Selection(clip_of(args), person, args.redetect)
+    if needs_networks(args.input, args.redetect):
+        ensure_networks(models_folder(args.models or config.pose_estimator.models_dir or None), args.fetch, args.quiet)
     with progress_bars(args.quiet) as progress:
         motion, tracks = reconstruct_input(
             args.input,
@@ -88,8 +104,9 @@ def run(args: argparse.Namespace) -> int:
             config=config,
             models=args.models,
             progress=progress,
-            telemetry=_telemetry(args),
+            telemetry=telemetry,
             mount_pitch_deg=args.mount_pitch,
+            selection=selection,
         )
     motion = dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line})
     with output_folder(out) as folder:
@@ -123,16 +140,18 @@ def _telemetry(args: argparse.Namespace) -> Any:
 
 
 def summary(motion: Motion, method: str) -> str:
-    """Two lines: frames, method, frame and scale; reprojection error and seconds per stage."""
-    import numpy as np
+    """Four lines: frames, method, frame and scale; reprojection error as in the report; seconds; quality."""
+    from drocap_ros.report.checks import quality_sentence, run_checks
+    from drocap_ros.report.statistics import motion_statistics, stage_seconds
 
-    seen = np.isfinite(motion.keypoints).all(axis=2)
-    with_subject = seen.any(axis=1).mean()
-    error = motion.reprojection_px[np.isfinite(motion.reprojection_px)]
-    rms = float(np.sqrt(np.mean(error**2))) if error.size else float("nan")
-    seconds = ", ".join(f"{name} {value:.2f} s" for name, value in motion.meta.get("seconds", {}).items())
+    s = motion_statistics(motion)
+    stages = stage_seconds(motion.meta)
+    total = stages.pop("total", sum(stages.values()))
+    poses = "; 2D poses as recorded (--redetect estimates them from the images)"
     return (
-        f"{len(motion.joints3d)} frames, a subject in {with_subject:.1%}; method {method}, frame {motion.frame},"
-        f" scale from {motion.scale_source}\n"
-        f"reprojection RMS {rms:.2f} px; {seconds}"
+        f"{len(motion.joints3d)} frames, a subject in {s.seen.mean():.1%}; method {method}, frame {motion.frame},"
+        f" scale from {motion.scale_source}{poses if motion.meta.get('pose2d') == 'recorded' else ''}\n"
+        f"median reprojection error {s.median_px:.1f} px, {s.median_px / s.body_px:.1%} of the body\n"
+        f"{total:.2f} s: {', '.join(f'{name} {value:.2f} s' for name, value in stages.items())}\n"
+        f"{quality_sentence(run_checks(motion, s))}"
     )

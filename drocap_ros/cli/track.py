@@ -4,37 +4,41 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from drocap_ros.cli.progress import Progress
+    from drocap_ros.clip import Clip
     from drocap_ros.observation import PoseObservation
+    from drocap_ros.perception.estimator import PoseEstimator
+    from drocap_ros.perception.persons import FoundPerson
     from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
     from drocap_ros.perception.sources import Frame
-
-SUBJECTS = ("largest", "centre")
+    from drocap_ros.recording.open_images import Images
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the command's options; ``run`` is its action."""
+    from drocap_ros.cli.clip_options import add_clip_options
+    from drocap_ros.cli.models.on_demand import add_fetch_option
+
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "track",
         help="2D tracks of the subject of a video",
         description="Track the subject of VIDEO and write tracks.npz: keypoints, covariance and confidence of each"
         " image. Each later subject is written to tracks_person_N.npz.",
     )
-    parser.add_argument("video", metavar="VIDEO", help="video file, image, or folder of images")
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="output folder")
+    parser.add_argument("video", metavar="VIDEO", help="video file, image, folder of images, or recording with images")
+    parser.add_argument("--out", metavar="DIR", type=Path, help="output folder (default: VIDEO's name + _tracks)")
+    parser.add_argument(
+        "--list", action="store_true", help="only find the persons, and write persons.jpg with their numbers"
+    )
+    add_clip_options(parser)
     parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
+    add_fetch_option(parser)
     parser.add_argument("--detector", metavar="NAME", help="detector in that folder (default: the preferred one)")
     parser.add_argument("--pose", metavar="NAME", help="2D pose model in that folder (default: the preferred one)")
-    parser.add_argument(
-        "--subject",
-        metavar="RULE",
-        default="largest",
-        help="largest (default), centre, or a box x_min,y_min,x_max,y_max px in the first image",
-    )
     parser.add_argument("--wait", action="store_true", help="track no other person after the subject is lost")
     parser.add_argument("--threads", metavar="N", type=int, help="threads of one model run (default: 1)")
     parser.add_argument("--overlay", action="store_true", help="also write overlay.mp4 with the subject drawn")
@@ -45,53 +49,95 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Track and write the output folder."""
+    """Track, or find all persons, and write the output folder."""
     from drocap_ros.cli.atomic_output import check_output_folder, output_folder
+    from drocap_ros.cli.clip_options import clip_of, subject_of
+    from drocap_ros.cli.models.on_demand import ensure_networks
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.perception.estimator import PoseEstimator
     from drocap_ros.perception.load_models import models_folder
-    from drocap_ros.perception.sources import open_source
-    from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
-    from drocap_ros.tracks import save_tracks
+    from drocap_ros.perception.persons import find_persons, following
+    from drocap_ros.recording.open_images import open_images, refuse_other_inputs
 
-    check_output_folder(args.out)
-    config, ingest = _configs(args)
-    with open_source(args.video, ingest) as source:
-        estimator = PoseEstimator(models_folder(args.models or config.models_dir or None), config)
-        with output_folder(args.out) as folder, progress_bars(args.quiet) as progress:
-            overlay = _OverlayWriter(folder / "overlay.mp4", source.size) if args.overlay else None
-            done = itertools.count(1)
-
-            def on_frame(frame: Frame, observation: PoseObservation) -> None:
-                progress("2D pose", next(done) / source.length if source.length else -1.0)
-                if overlay is not None:
-                    overlay.add(frame, observation)
-
-            observations = observe(source, estimator, on_frame)
-            if overlay is not None:
-                overlay.close()
-            tracks_from_observations(observations)  # raises for a recording without a person
-            found = subjects(observations)
-            for rank, (track_id, _) in enumerate(found):
-                name = "tracks.npz" if rank == 0 else f"tracks_person_{track_id}.npz"
-                save_tracks(folder / name, tracks_from_observations(observations, track_id))
+    out = args.out or Path(f"{Path(args.video).name.split('.')[0] or 'drocap'}_tracks")
+    check_output_folder(out)
+    clip, (person, rule) = clip_of(args), subject_of(args.subject)
+    config, ingest = _configs(args, rule)
+    folder = models_folder(args.models or config.models_dir or None)
+    if Path(args.video).exists():
+        refuse_other_inputs(Path(args.video))
+        ensure_networks(folder, args.fetch, args.quiet)
+    with output_folder(out) as target, progress_bars(args.quiet) as progress:
+        begin_ns, persons = None, []
+        if args.list or person is not None:
+            with open_images(args.video, ingest) as images:
+                meter = clip.meter(progress, "persons", images.duration_s)
+                persons = find_persons(clip.select(images.frames), folder, config, meter)
+        if person is not None:
+            config = following(config, persons, person)
+            begin_ns = persons[person - 1].first_ns
+        with open_images(args.video, ingest) as images:
+            if args.list:
+                text = _list(images, persons, target)
+            else:
+                text = _track(images, clip, PoseEstimator(folder, config), begin_ns, target, args.overlay, progress)
     if not args.quiet:
-        print(_summary(found, len(observations), args.out))
+        print(f"{text}\nwritten: {out}/{'persons.jpg' if args.list else 'tracks.npz'}")
     return 0
 
 
-def _configs(args: argparse.Namespace) -> tuple[PoseEstimatorConfig, Any]:
+def _list(images: Images, persons: list[FoundPerson], target: Path) -> str:
+    """Write the picture of the persons; returns a line for each."""
+    import cv2
+
+    from drocap_ros.perception.persons import persons_picture
+
+    picture, begin_ns = persons_picture(images.frames, persons)
+    cv2.imwrite(str(target / "persons.jpg"), picture)
+    lines = [
+        f"person {p.number}: {(p.first_ns - begin_ns) * 1e-9:.1f} to {(p.last_ns - begin_ns) * 1e-9:.1f} s"
+        for p in persons
+    ]
+    return "\n".join([*lines, "`drocap reconstruct` and `drocap track` take the number: --subject N"])
+
+
+def _track(
+    images: Images,
+    clip: Clip,
+    estimator: PoseEstimator,
+    begin_ns: int | None,
+    target: Path,
+    with_overlay: bool,
+    progress: Progress,
+) -> str:
+    """Write the tracks of every subject, and the overlay; returns a line about them."""
+    from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
+    from drocap_ros.tracks import save_tracks
+
+    overlay = _OverlayWriter(target / "overlay.mp4") if with_overlay else None
+    meter = clip.meter(progress, "2D pose", images.duration_s)
+
+    def on_frame(frame: Frame, observation: PoseObservation) -> None:
+        meter(frame, observation)
+        if overlay is not None:
+            overlay.add(frame, observation)
+
+    observations = observe(clip.select(images.frames), estimator, on_frame, begin_ns)
+    if overlay is not None:
+        overlay.close()
+    tracks_from_observations(observations)  # raises for a recording without a person
+    found = subjects(observations)
+    for rank, (track_id, _) in enumerate(found):
+        name = "tracks.npz" if rank == 0 else f"tracks_person_{track_id}.npz"
+        save_tracks(target / name, tracks_from_observations(observations, track_id))
+    return _summary(found, len(observations))
+
+
+def _configs(args: argparse.Namespace, rule: dict[str, Any]) -> tuple[PoseEstimatorConfig, Any]:
     from drocap_ros.config import DrocapConfig, load_config
 
     whole = load_config(args.config) if args.config else DrocapConfig()
-    changes: dict[str, Any] = {"on_loss": "wait" if args.wait else "next"}
-    if args.subject in SUBJECTS:
-        changes["subject"] = args.subject
-    else:
-        from drocap_ros.perception.pose_estimator_config import parse_box
-
-        parse_box(args.subject)
-        changes |= {"subject": "box", "subject_box": args.subject}
+    changes: dict[str, Any] = {"on_loss": "wait" if args.wait else "next", **rule}
     named = {"detector": args.detector, "pose_model": args.pose, "threads": args.threads}
     changes |= {key: value for key, value in named.items() if value is not None}
     return dataclasses.replace(whole.pose_estimator, **changes), whole.image_ingest
@@ -100,9 +146,7 @@ def _configs(args: argparse.Namespace) -> tuple[PoseEstimatorConfig, Any]:
 class _OverlayWriter:
     """Writes the video with the subject drawn, at the rate of its first two frames."""
 
-    def __init__(self, path: Path, size: tuple[int, int]) -> None:
-        scale = min(1.0, 1280 / max(size))
-        self._size = (max(2, round(size[0] * scale) // 2 * 2), max(2, round(size[1] * scale) // 2 * 2))
+    def __init__(self, path: Path) -> None:
         self._path = path
         self._first: tuple[int, Any] | None = None
         self._video: Any = None
@@ -112,7 +156,10 @@ class _OverlayWriter:
 
         from drocap_ros.perception.overlay import draw
 
-        image = cv2.resize(draw(frame.image, observation), self._size, interpolation=cv2.INTER_AREA)
+        height, width = frame.image.shape[:2]
+        scale = min(1.0, 1280 / max(width, height))
+        size = (max(2, round(width * scale) // 2 * 2), max(2, round(height * scale) // 2 * 2))
+        image = cv2.resize(draw(frame.image, observation), size, interpolation=cv2.INTER_AREA)
         if self._first is None:
             self._first = frame.stamp_ns, image
             return
@@ -131,17 +178,18 @@ class _OverlayWriter:
 
         from drocap_ros.errors import DrocapError
 
-        rate_hz = min(max(rate_hz, 1.0), 120.0)
-        self._video = cv2.VideoWriter(str(self._path), cv2.VideoWriter.fourcc(*"mp4v"), rate_hz, self._size)
+        assert self._first is not None
+        rate_hz, image = min(max(rate_hz, 1.0), 120.0), self._first[1]
+        size = (image.shape[1], image.shape[0])
+        self._video = cv2.VideoWriter(str(self._path), cv2.VideoWriter.fourcc(*"mp4v"), rate_hz, size)
         if not self._video.isOpened():
             raise DrocapError(f"{self._path}: the video could not be written; check the space on the disk")
-        assert self._first is not None
         self._video.write(self._first[1])
 
 
-def _summary(found: list[tuple[int, int]], frames: int, out: Path) -> str:
+def _summary(found: list[tuple[int, int]], frames: int) -> str:
     first = found[0]
     text = f"{frames} images, the subject in {first[1]} ({first[1] / frames:.1%})"
     if len(found) > 1:
         text += f"; {len(found) - 1} further: " + ", ".join(f"person {i} in {n}" for i, n in found[1:])
-    return f"{text}\nwritten: {out}/tracks.npz"
+    return text

@@ -20,8 +20,10 @@ from drocap_ros.evaluation.metrics import (
 from drocap_ros.evaluation.world_errors import WorldErrors, world_errors
 from drocap_ros.mocap import load_mocap
 from drocap_ros.motion import Motion, load_motion
-from drocap_ros.skeleton import BODY_15, indices
-from drocap_ros.tracks import read_npz
+from drocap_ros.skeleton import BODY_15, LIMB_JOINTS, in_body_order, indices
+from drocap_ros.tracks import kind_of, read_npz, wrong_kind
+
+_LIMBS = indices(BODY_15.joints, LIMB_JOINTS)
 
 
 @dataclass(frozen=True)
@@ -51,47 +53,50 @@ class MotionErrors:
 def load_truth(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
     """True joints (T, 15, 3) in m, their times (T,) in s and their frame, of a MoCap or motion ``.npz``.
 
+    The file has to hold the twelve limb joints; others that it lacks are NaN.
+
     Raises
     ------
     InputError
         When the file is neither.
     """
-    names = set(read_npz(path, ()))
-    if {"X", "fps", "joints"} <= names:
-        x, fps = load_mocap(path)
+    names = read_npz(path, ())
+    kind = kind_of(names)
+    if kind == "MoCap":
+        x, fps = load_mocap(path, LIMB_JOINTS)
         return x / 1000.0, np.arange(len(x)) / fps, "world"
-    if "joints3d" in names:
+    if kind == "motion":
         motion = load_motion(path)
-        joints = motion.joints3d[:, indices(motion.joints, BODY_15.joints)]
-        return joints, motion.stamp_ns * 1e-9, motion.frame
-    raise InputError(
-        f"{path}: expected MoCap (X, fps, joints) or a motion (joints3d, ...), got {', '.join(sorted(names))}"
-    )
+        return in_body_order(motion.joints3d, motion.joints, LIMB_JOINTS), motion.stamp_ns * 1e-9, motion.frame
+    raise wrong_kind(path, names, "MoCap or a motion as the truth")
 
 
 def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -> MotionErrors:
     """Errors of a motion against joints (T, 15, 3) m at increasing times (T,) s.
 
-    Times are absolute where both ranges overlap; otherwise both start at zero.  The truth is interpolated at the
-    motion's times; frames outside its range are ignored.
+    Only joints that both have are compared; the twelve limb joints are required.  Times are absolute where both ranges
+    overlap; otherwise both start at zero.  The truth is interpolated at the motion's times; frames outside its range
+    are ignored.
 
     Raises
     ------
     InputError
         When no finite frame lies within the truth's range, or the truth is not finite.
     """
-    estimate = motion.joints3d[:, indices(motion.joints, BODY_15.joints)]
+    estimate = in_body_order(motion.joints3d, motion.joints, LIMB_JOINTS)
+    known = np.isfinite(estimate).any(axis=(0, 2)) & np.isfinite(truth).any(axis=(0, 2))
+    known[_LIMBS] = True
     at = motion.stamp_ns * 1e-9
     if at[-1] < time_s[0] or at[0] > time_s[-1]:
         at, time_s = at - at[0], time_s - time_s[0]
-    usable = (at >= time_s[0] - 1e-6) & (at <= time_s[-1] + 1e-6) & np.isfinite(estimate).all(axis=(1, 2))
+    usable = (at >= time_s[0] - 1e-6) & (at <= time_s[-1] + 1e-6) & np.isfinite(estimate[:, known]).all(axis=(1, 2))
     if not usable.any():
         raise InputError(
             "evaluate compare: expected poses within the truth's time, found none; check that the files belong together"
         )
-    estimate = estimate[usable]
-    true = _at_times(truth, time_s, at[usable])
-    if not np.isfinite(true).all():
+    estimate = np.where(known[:, None], estimate[usable], np.nan)
+    true = np.where(known[:, None], _at_times(truth, time_s, at[usable]), np.nan)
+    if not np.isfinite(true[:, known]).all():
         raise InputError("evaluate compare: expected a truth of finite joints, got NaN or infinity; fill the gaps in")
     world = motion.frame == "world" and frame == "world"
     return MotionErrors(

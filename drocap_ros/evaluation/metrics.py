@@ -53,8 +53,10 @@ def w_mpjpe(estimate: np.ndarray, truth: np.ndarray, segment: int = 100) -> np.n
 
 
 def scale_error(estimate: np.ndarray, truth: np.ndarray) -> float:
-    """Mean estimated over mean true limb length, less 1."""
-    return float(limb_lengths(estimate).mean() / limb_lengths(truth).mean() - 1.0)
+    """Mean estimated over mean true limb length, less 1; limbs with a joint that is NaN are left out."""
+    ours, true = limb_lengths(estimate), limb_lengths(truth)
+    known = np.isfinite(ours).all(axis=0) & np.isfinite(true).all(axis=0)
+    return float(ours[:, known].mean() / true[:, known].mean() - 1.0)
 
 
 def mirrored_frames(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:

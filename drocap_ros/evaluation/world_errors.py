@@ -49,26 +49,30 @@ def world_errors(
 ) -> WorldErrors:
     """Errors of joints (F, 15, 3) m in the world against the truth, both z up at ``fps``.
 
+    Neck and head may be NaN: the means are then over the other joints.
+
     covariance : (F, 15, 6) m^2 of the estimate, or None
     """
     nan = float("nan")
     moving = len(truth) > 2
     foot = world_metrics.still_foot_speed(estimate, truth, fps) if moving else nan
+    known = (np.isfinite(estimate) & np.isfinite(truth)).all(axis=(0, 2))
+    est, tru = estimate[:, known], truth[:, known]
     return WorldErrors(
         pa_mm=1000 * float(pa_mpjpe(estimate, truth).mean()),
-        mpjpe_mm=1000 * float(world_metrics.mpjpe(estimate, truth).mean()),
+        mpjpe_mm=1000 * float(world_metrics.mpjpe(est, tru).mean()),
         w_mm=1000 * float(w_mpjpe(estimate, truth).mean()),
-        wa_mm=1000 * float(world_metrics.wa_mpjpe(estimate, truth).mean()),
-        absolute_mm=1000 * float(np.linalg.norm(estimate - truth, axis=-1).mean()),
+        wa_mm=1000 * float(world_metrics.wa_mpjpe(est, tru).mean()),
+        absolute_mm=1000 * float(np.linalg.norm(est - tru, axis=-1).mean()),
         root_percent=100 * world_metrics.root_error(estimate, truth) if moving else nan,
         scale=scale_error(estimate, truth),
         horizon_deg=float(np.degrees(horizon_error(estimate, truth)).mean()),
         foot_m_s=foot,
         foot_mm=1000 * foot / fps,
         penetration_mm=1000 * world_metrics.penetration(estimate, truth),
-        acceleration_ratio=world_metrics.acceleration_ratio(estimate, truth, fps) if moving else nan,
-        acceleration_error_m_s2=world_metrics.acceleration_error(estimate, truth, fps) if moving else nan,
-        coverage=nan if covariance is None else world_metrics.ellipsoid_coverage(estimate, truth, covariance),
+        acceleration_ratio=world_metrics.acceleration_ratio(est, tru, fps) if moving else nan,
+        acceleration_error_m_s2=world_metrics.acceleration_error(est, tru, fps) if moving else nan,
+        coverage=nan if covariance is None else world_metrics.ellipsoid_coverage(est, tru, covariance[:, known]),
     )
 
 

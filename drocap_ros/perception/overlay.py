@@ -42,6 +42,20 @@ def draw(image: np.ndarray, observation: PoseObservation) -> np.ndarray:
     return out
 
 
+def draw_numbers(image: np.ndarray, boxes: dict[int, np.ndarray], title: str) -> np.ndarray:
+    """Copy of the image (H, W, 3) uint8 BGR with a number at each box (4,) px and a title at the top."""
+    import cv2
+
+    out = image.copy()
+    line_px = max(1, round(max(image.shape[:2]) / 640))
+    for number, box in boxes.items():
+        x0, y0, x1, y1 = (round(float(v)) for v in box)
+        cv2.rectangle(out, (x0, y0), (x1, y1), (0, 220, 255), 2 * line_px)
+        _label(out, str(number), (x0 + 2 * line_px, max(y0 - 6 * line_px, 30 * line_px)), 2 * line_px)
+    _label(out, title, (8, 20 * line_px), line_px)
+    return out
+
+
 def _colour(joint: str) -> tuple[int, int, int]:
     if joint in ("pelvis", "neck", "head"):
         return _MIDDLE

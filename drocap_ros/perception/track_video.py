@@ -22,6 +22,7 @@ def observe(
     frames: Iterable[Frame],
     estimator: PoseEstimator,
     on_frame: Callable[[Frame, PoseObservation], None] | None = None,
+    begin_ns: int | None = None,
 ) -> list[PoseObservation]:
     """Observations of all frames; a second thread decodes ahead.
 
@@ -30,10 +31,14 @@ def observe(
     frames : a source, or frames in the order of time
     estimator : a fresh one; it keeps its subject between calls
     on_frame : called with each frame and its observation, for progress and overlays
+    begin_ns : frames before it are observations without a subject
     """
     observations = []
     for frame in prefetch(frames):
-        observation = estimator.process(frame.image, frame.stamp_ns)
+        if begin_ns is not None and frame.stamp_ns < begin_ns:
+            observation = PoseObservation(frame.stamp_ns, 0, (frame.image.shape[1], frame.image.shape[0]))
+        else:
+            observation = estimator.process(frame.image, frame.stamp_ns)
         observations.append(observation)
         if on_frame is not None:
             on_frame(frame, observation)

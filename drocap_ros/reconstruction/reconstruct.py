@@ -12,6 +12,7 @@ import numpy as np
 
 from drocap_ros import __version__
 from drocap_ros.errors import InputError
+from drocap_ros.joint_maps import TABLES, joint_map, joint_set_of
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.lifted.lifted_config import lifted_config
@@ -41,7 +42,8 @@ def reconstruct(
 
     Parameters
     ----------
-    tracks : joints by the names of BODY_15; the model estimates missing ones, others are ignored
+    tracks : joints by the names of BODY_15 or of a set in :mod:`drocap_ros.joint_maps`, COCO for one; the model
+        estimates missing ones, others are ignored
     method : a name in :data:`~drocap_ros.reconstruction.methods.METHODS`
     progress : called with a stage and its fraction done
 
@@ -75,13 +77,14 @@ def reconstruct(
     with blas_threads(adjuster.threads):
         result = run_method(method, data)
     motion = _to_motion(tracks, keypoints, result, initializer)
+    total = time.perf_counter() - started
     motion.meta.update(
         method=method,
         versions=_versions(),
         git_revision=git_revision(),
         parameters={"initializer": dataclasses.asdict(initializer), "adjuster": dataclasses.asdict(adjuster)},
         dictionary=dictionary.metadata,
-        seconds={**result.seconds, "total": time.perf_counter() - started},
+        seconds={**result.seconds, "other": total - sum(result.seconds.values()), "total": total},
         iterations=result.iterations,
         stop_reason=result.stop_reason,
         cost_terms=result.cost_terms,
@@ -97,32 +100,37 @@ def reconstruct(
 def body_keypoints(tracks: Tracks) -> Keypoints2D:
     """Keypoints in BODY_15's order; joints that the tracks lack are NaN.
 
+    Names of BODY_15, COCO, COCO-WholeBody, Halpe, MPII and Human3.6M are known (:mod:`drocap_ros.joint_maps`).
+
     Raises
     ------
     InputError
-        When too few joints have a name of BODY_15.
+        When the names give too few joints of BODY_15.
     """
-    place = {name: i for i, name in enumerate(tracks.joints)}
-    have = [(j, place[name]) for j, name in enumerate(BODY_15.joints) if name in place]
-    if len(have) < 4:
+    source, place = joint_set_of(tracks.joints)
+    have = place >= 0
+    names = tuple(np.array(source.joints)[have])
+    given = sum(set(parts) <= set(names) for parts in TABLES[source.name].values())
+    if given < 4:
         raise InputError(
-            f"joints: expected at least 4 of {', '.join(BODY_15.joints)}, got {len(have)} of them; rename the joints"
+            f"joints: expected at least 4 of {', '.join(BODY_15.joints)}, or names of {', '.join(list(TABLES)[1:])},"
+            f" got {given} of them; rename the joints"
         )
-    ours, theirs = np.array(have).T
-    frames, p = len(tracks), len(BODY_15)
-    keypoints = np.full((frames, p, 2), np.nan)
-    keypoints[:, ours] = tracks.keypoints[:, theirs]
+    shape = (len(tracks), len(source))
+    keypoints, confidence, covariance = np.full((*shape, 2), np.nan), np.zeros(shape), np.full((*shape, 3), np.nan)
+    keypoints[:, have] = tracks.keypoints[:, place[have]]
     keypoints[np.isnan(keypoints).any(-1)] = np.nan
-    confidence = covariance = None
-    if tracks.confidence is not None:
-        confidence = np.zeros((frames, p))
-        confidence[:, ours] = tracks.confidence[:, theirs]
     if tracks.covariance is not None:
-        covariance = np.full((frames, p, 3), np.nan)
-        covariance[:, ours] = tracks.covariance[:, theirs]
-        if confidence is None:
-            confidence = np.isfinite(keypoints).all(-1).astype(float)
-    return Keypoints2D(keypoints, confidence, covariance)
+        covariance[:, have] = tracks.covariance[:, place[have]]
+    seen = np.isfinite(keypoints).all(-1)
+    confidence[:, have] = tracks.confidence[:, place[have]] if tracks.confidence is not None else seen[:, have]
+    if source.name != BODY_15.name:
+        high, low = (np.where(seen[..., None], keypoints, end) for end in (-np.inf, np.inf))
+        extent = np.where(seen.any(1), (high.max(1) - low.min(1)).max(1), 0.0)
+        keypoints, covariance, confidence = joint_map(source.name).apply(keypoints, covariance, confidence, extent)
+    elif tracks.confidence is None and tracks.covariance is None:
+        return Keypoints2D(keypoints, None, None)
+    return Keypoints2D(keypoints, confidence, covariance if tracks.covariance is not None else None)
 
 
 def _to_motion(

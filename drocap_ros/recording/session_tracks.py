@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -49,18 +50,30 @@ def read_pose2d(session: Session, mount_pitch_deg: float | None = None) -> Track
     ordered = [poses[stamp] for stamp in sorted(poses)]
     try:
         stamps = np.array(sorted(poses), dtype=np.int64)
-        tracks = Tracks(stamp_ns=stamps, **_pose_arrays(ordered), camera_matrix=_camera_matrix(session, chosen.name))
-        vehicle = read_vehicle_track(session, chosen.name)
-        if vehicle is None:
-            return tracks
-        if mount_pitch_deg is not None and np.isfinite(vehicle.gimbal).all(axis=1).any():
-            raise InputError("--mount-pitch: expected no recorded camera attitude, found one; leave the option out")
-        tracks, reason = with_camera(tracks, vehicle, tracks.stamp_ns, mount_pitch_deg)
-        if reason:
-            session.warn(f"camera telemetry incomplete: {reason}")
-        return tracks
+        tracks = Tracks(stamp_ns=stamps, **_pose_arrays(ordered))
+        return with_recorded_camera(session, tracks, chosen.name, mount_pitch_deg)
     except InputError as error:
         raise InputError(f"{session.path}: {chosen.name}: {error}") from None
+
+
+def with_recorded_camera(session: Session, tracks: Tracks, near: str, mount_pitch_deg: float | None = None) -> Tracks:
+    """Tracks with the camera's matrix and poses where the recording holds them, those nearest to a topic's name.
+
+    Raises
+    ------
+    InputError
+        When ``mount_pitch_deg`` contradicts the recording.
+    """
+    tracks = dataclasses.replace(tracks, camera_matrix=_camera_matrix(session, near))
+    vehicle = read_vehicle_track(session, near)
+    if vehicle is None:
+        return tracks
+    if mount_pitch_deg is not None and np.isfinite(vehicle.gimbal).all(axis=1).any():
+        raise InputError("--mount-pitch: expected no recorded camera attitude, found one; leave the option out")
+    tracks, reason = with_camera(tracks, vehicle, tracks.stamp_ns, mount_pitch_deg)
+    if reason:
+        session.warn(f"camera telemetry incomplete: {reason}")
+    return tracks
 
 
 def read_vehicle_track(session: Session, near: str = "") -> VehicleTrack | None:

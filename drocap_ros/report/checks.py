@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -23,6 +24,11 @@ _OUTLYING = 0.08
 _SOME_OUTLIERS, _MANY_OUTLIERS = 0.01, 0.1
 _BONE_SPREAD = 0.1
 _MIRRORED_SHARE, _MIRRORED_COUNT = 0.5, 10
+#: Speed of the lower foot, and its share of the pelvis's speed: no take of 523 with real walks, runs, jumps and squats
+#: exceeds the larger of the two.
+_SLIDING_M_S, _SLIDING_SHARE = 0.4, 0.3
+#: So many warnings make a motion doubtful.
+_MANY_WARNINGS = 3
 
 
 class Level(Enum):
@@ -40,6 +46,7 @@ class Check(Enum):
     LOW_CAMERA_MOTION = auto()
     HIGH_ERROR = auto()
     OUTLIERS = auto()
+    SLIDING_FEET = auto()
     MISSING_JOINTS = auto()
     SHORT = auto()
     BONE_LENGTHS = auto()
@@ -93,6 +100,11 @@ _WORDS: dict[Check, tuple[str, str]] = {
         "{share:.1%} of the keypoints lie more than {limit:.0%} of the body's size from the projected joints. They"
         " raise the RMS ({rms:.1f} px) far above the median ({median:.1f} px).",
     ),
+    Check.SLIDING_FEET: (
+        "Sliding feet",
+        "The lower foot moves at {speed:.2f} m/s (median); the foot of a person that walks or stands rests. The path,"
+        " the scale or the depths are wrong, or the person glides.",
+    ),
     Check.MISSING_JOINTS: (
         "Many missing joints",
         "Keypoints missing in more than {limit:.0%} of the frames: {joints}. Their 3D is filled in.",
@@ -118,6 +130,10 @@ _WORDS: dict[Check, tuple[str, str]] = {
 }
 
 
+#: Checks that alone make a motion doubtful.
+_DOUBTFUL = (Check.MIRRORED, Check.HIGH_ERROR, Check.SLIDING_FEET)
+
+
 def run_checks(motion: Motion, s: Statistics) -> list[CheckResult]:
     """The checks that apply to a motion, warnings first."""
     checks = (
@@ -126,6 +142,7 @@ def run_checks(motion: Motion, s: Statistics) -> list[CheckResult]:
         _low_camera_motion,
         _high_error,
         _outliers,
+        _sliding_feet,
         _missing_joints,
         _short,
         _bone_lengths,
@@ -135,6 +152,16 @@ def run_checks(motion: Motion, s: Statistics) -> list[CheckResult]:
     )
     results = [result for check in checks if (result := check(motion, s)) is not None]
     return sorted(results, key=lambda result: result.level is not Level.WARNING)
+
+
+def quality_sentence(results: Sequence[CheckResult]) -> str:
+    """One sentence on the quality of a motion: good, fair or doubtful, and the warnings."""
+    warnings = [result for result in results if result.level is Level.WARNING]
+    if not warnings:
+        return "quality: good, no check doubts this motion"
+    doubtful = len(warnings) >= _MANY_WARNINGS or any(w.check in _DOUBTFUL for w in warnings)
+    titles = ", ".join(w.title[0].lower() + w.title[1:] for w in warnings)
+    return f"quality: {'doubtful' if doubtful else 'fair'}, {len(warnings)} warning{'s'[: len(warnings) > 1]}: {titles}"
 
 
 def _warn(check: Check, **values: float | str) -> CheckResult:
@@ -177,6 +204,12 @@ def _outliers(motion: Motion, s: Statistics) -> CheckResult | None:
         return None
     result = _warn if share > _MANY_OUTLIERS else _note
     return result(Check.OUTLIERS, share=share, limit=_OUTLYING, rms=s.rms_px, median=s.median_px)
+
+
+def _sliding_feet(motion: Motion, s: Statistics) -> CheckResult | None:
+    if not s.foot_m_s > max(_SLIDING_M_S, _SLIDING_SHARE * s.pelvis_m_s):
+        return None
+    return _warn(Check.SLIDING_FEET, speed=s.foot_m_s)
 
 
 def _missing_joints(motion: Motion, s: Statistics) -> CheckResult | None:

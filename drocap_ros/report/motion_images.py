@@ -6,13 +6,14 @@ import contextlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.motion import Motion
-from drocap_ros.perception.sources import Frame, open_source
-from drocap_ros.recording.image_messages import read_images
+from drocap_ros.perception.sources import Frame
+from drocap_ros.recording.open_images import Images, open_images
 from drocap_ros.recording.open_session import is_recording, open_session
 
 MAX_IMAGES = 300
@@ -22,6 +23,8 @@ _LONG_SIDE = 640
 _QUALITIES = (75, 60, 45, 30)
 #: Margin of the crop, as a share of its size.
 _MARGIN = 0.12
+#: Tolerances of the checks whether images belong to a motion; re-encoding loses a few frames.
+_LENGTH_SHARE, _RATE_SHARE, _OUTSIDE_SHARE = 0.02, 0.03, 0.05
 
 
 @dataclass(frozen=True)
@@ -65,8 +68,8 @@ def read_motion_images(path: Path, motion: Motion) -> MotionImages:
     encode = None
     frames: list[int] = []
     jpegs: list[bytes] = []
-    with _opened(path) as source:
-        for index, image in _matched(source, motion.stamp_ns, wanted):
+    with _opened(path, motion) as source:
+        for index, image in _matched(source, motion, wanted):
             encode = encode or _Encoder(motion, image.shape, len(wanted))
             frames.append(index)
             jpegs.append(encode(image))
@@ -84,8 +87,8 @@ def each_image(path: Path, motion: Motion) -> Iterator[tuple[int, np.ndarray]]:
         When there are no images, or none at the motion's times.
     """
     found = False
-    with _opened(path) as source:
-        for index, image in _matched(source, motion.stamp_ns, np.arange(len(motion.stamp_ns))):
+    with _opened(path, motion) as source:
+        for index, image in _matched(source, motion, np.arange(len(motion.stamp_ns))):
             found = True
             yield index, image
     if not found:
@@ -97,19 +100,69 @@ def _no_images(path: Path) -> InputError:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Iterable[Frame]]:
+def _opened(path: Path, motion: Motion) -> Iterator[Iterable[Frame]]:
+    """Images of a path; refused when they cannot be those of the motion."""
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
-    if is_recording(path):
-        with open_session(path) as session:
-            yield read_images(session)
-    else:
-        with open_source(path) as source:
-            yield source
+    with open_images(path) as images:
+        if not is_recording(path):  # a recording may hold more images than poses, with the same clock
+            _check_times(path, images, motion)
+        yield _checked_sizes(path, images.frames, motion)
 
 
-def _matched(source: Iterable[Frame], stamp_ns: np.ndarray, wanted: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+def _check_times(path: Path, images: Images, motion: Motion) -> None:
+    """Refuse images of another number or rate than ``meta`` states, or else that cannot be at the motion's times."""
+    stated, found = _stated(motion, "images"), {"length": images.length, "rate_hz": images.rate_hz}
+    for name, share in (("length", _LENGTH_SHARE), ("rate_hz", _RATE_SHARE)):
+        expected, got = stated.get(name), found[name]
+        if isinstance(expected, int | float) and got and abs(got - expected) > share * expected + (name == "length"):
+            words = {"length": "images", "rate_hz": "images per second"}[name]
+            raise _other(path, f"{expected:.4g} {words}", f"{got:.4g}")
+    if stated.get("length") or images.rate_hz is None or images.duration_s is None or len(motion.stamp_ns) < 2:
+        return
+    step_s = float(np.median(np.diff(motion.stamp_ns))) * 1e-9
+    ratio = step_s * images.rate_hz  # images per frame of the motion
+    if ratio < 0.5 or abs(ratio - round(ratio)) > _RATE_SHARE * ratio:
+        raise _other(path, f"{1 / step_s:.4g} images per second or a multiple", f"{images.rate_hz:.4g}")
+    last_s = float(motion.stamp_ns[-1] - motion.stamp_ns[0]) * 1e-9
+    if last_s > images.duration_s + max(0.5, _LENGTH_SHARE * last_s):
+        raise _other(path, f"at least {last_s:.1f} s", f"{images.duration_s:.1f} s")
+
+
+def _checked_sizes(path: Path, frames: Iterable[Frame], motion: Motion) -> Iterator[Frame]:
+    """The frames; refused when the first has another size than the images of the motion."""
+    for number, frame in enumerate(frames):
+        if number == 0:
+            _check_size(path, frame.image.shape[1], frame.image.shape[0], motion)
+        yield frame
+
+
+def _check_size(path: Path, width: int, height: int, motion: Motion) -> None:
+    if size := _stated(motion, "images").get("size"):
+        if size != [width, height]:
+            raise _other(path, f"size {size} px", f"{width}x{height} px")
+        return
+    known = motion.keypoints[np.isfinite(motion.keypoints).all(axis=2)]
+    outside = float(((known < 0) | (known > (width, height))).any(axis=1).mean()) if len(known) else 0.0
+    if outside > _OUTSIDE_SHARE:
+        raise _other(path, "its keypoints inside the images", f"{outside:.0%} of them outside {width}x{height} px")
+
+
+def _stated(motion: Motion, name: str) -> dict[str, Any]:
+    """An entry of ``meta`` that is a table; empty where it is none."""
+    value = motion.meta.get(name)
+    return value if isinstance(value, dict) else {}
+
+
+def _other(path: Path, expected: str, found: str) -> InputError:
+    return InputError(f"{path}: expected the images of this motion with {expected}, found {found}; name its own video")
+
+
+def _matched(source: Iterable[Frame], motion: Motion, wanted: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
     """Images of the wanted frames: the nearest to each stamp within half a frame."""
+    stamp_ns = motion.stamp_ns
+    start_s = _stated(motion, "clip").get("start_s")
+    start_ns = round(1e9 * start_s) if isinstance(start_s, int | float) else 0
     half = int(np.median(np.diff(stamp_ns)) / 2) if len(stamp_ns) > 1 else 50_000_000
     waiting = [int(index) for index in wanted]
     offset: int | None = None
@@ -124,8 +177,9 @@ def _matched(source: Iterable[Frame], stamp_ns: np.ndarray, wanted: np.ndarray) 
 
     for frame in source:
         if offset is None:
-            elsewhere = not stamp_ns[0] - half <= frame.stamp_ns <= stamp_ns[-1] + half
-            offset = int(stamp_ns[0]) - frame.stamp_ns if elsewhere else 0
+            begin_ns = frame.stamp_ns + start_ns
+            elsewhere = not stamp_ns[0] - half <= begin_ns <= stamp_ns[-1] + half
+            offset = int(stamp_ns[0]) - begin_ns if elsewhere else 0
         now = (frame.stamp_ns + offset, frame.image)
         while waiting and now[0] >= int(stamp_ns[waiting[0]]):
             yield from nearest([before, now])

@@ -16,7 +16,7 @@ from drocap_ros.report import plots
 from drocap_ros.report.checks import CheckResult, Level, run_checks
 from drocap_ros.report.motion_images import MotionImages, read_motion_images
 from drocap_ros.report.page_data import page_data, script_json
-from drocap_ros.report.statistics import Statistics, mean_known, motion_statistics
+from drocap_ros.report.statistics import Statistics, mean_known, motion_statistics, stage_seconds
 from drocap_ros.skeleton import side_of
 
 _SCRIPTS = ("data.js", "scene.js", "image.js", "player.js")
@@ -103,7 +103,7 @@ def _figure(title: str, caption: str, svg: str) -> str:
 def _plots(motion: Motion, s: Statistics) -> list[tuple[str, str, str]]:
     sides = [side_of(joint, motion.joints) for joint in motion.joints]
     bone_sides = [side_of(bone.split(" - ")[1], motion.joints) for bone in s.bones]
-    seconds = _stages(motion.meta.get("seconds"))
+    seconds = stage_seconds(motion.meta)
     out = [
         (
             "Reprojection error",
@@ -132,18 +132,9 @@ def _plots(motion: Motion, s: Statistics) -> list[tuple[str, str, str]]:
         ),
     ]
     if seconds:
-        caption = "Seconds per stage; the total excludes the 2D poses."
+        caption = "Seconds per stage."
         out.append(("Time", caption, plots.bar_plot(list(seconds), np.array([*seconds.values()]), form="{:.2f} s")))
     return out
-
-
-def _stages(seconds: Any) -> dict[str, float]:
-    """Seconds per stage in the order of the stages; values that are no numbers are left out."""
-    if not isinstance(seconds, dict):
-        return {}
-    known = ("pose2d", "initial", "ba", "total")
-    order = [*(k for k in known if k in seconds), *sorted(k for k in seconds if k not in known)]
-    return {k: float(seconds[k]) for k in order if isinstance(seconds[k], int | float)}
 
 
 def _provenance(motion: Motion, command: str) -> str:

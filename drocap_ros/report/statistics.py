@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +37,9 @@ class Statistics:
     heading_rad : (F,) direction that the body faces, about the vertical
     knees_forward : share of bent knees that bend forward; NaN where none is bent
     bent_knees : number of bent knees
+    foot_m_s : median speed of the lower ankle in the half of the frames in which it is lowest; of a person that stands
+        or walks it is near 0.  NaN where the path in the world is not known
+    pelvis_m_s : median horizontal speed of the pelvis, NaN likewise
     """
 
     times_s: np.ndarray
@@ -55,6 +59,8 @@ class Statistics:
     heading_rad: np.ndarray
     knees_forward: float
     bent_knees: int
+    foot_m_s: float
+    pelvis_m_s: float
 
     @property
     def rate_hz(self) -> float:
@@ -84,6 +90,7 @@ def motion_statistics(motion: Motion) -> Statistics:
     speed = np.abs(np.gradient(view, times)) if len(times) > 1 else np.zeros(1)
     bones, lengths = _bones(joints, motion)
     forward, judged = _knees(joints, motion, torso[..., 0])
+    foot, pelvis = _path_speeds(motion, times)
     return Statistics(
         times_s=times,
         seen=found.any(axis=1),
@@ -102,7 +109,19 @@ def motion_statistics(motion: Motion) -> Statistics:
         heading_rad=_heading(torso, times),
         knees_forward=forward,
         bent_knees=judged,
+        foot_m_s=foot,
+        pelvis_m_s=pelvis,
     )
+
+
+def stage_seconds(meta: dict[str, Any]) -> dict[str, float]:
+    """Seconds per stage of a motion's ``meta`` in the order of the stages, the total last; others are left out."""
+    seconds = meta.get("seconds")
+    if not isinstance(seconds, dict):
+        return {}
+    first, last = ("pose2d", "initial", "ba"), ("other", "total")
+    order = [*first, *sorted(seconds.keys() - {*first, *last}), *last]
+    return {k: float(seconds[k]) for k in order if isinstance(seconds.get(k), int | float)}
 
 
 def mean_known(values: np.ndarray, axis: int | None) -> np.ndarray:
@@ -199,6 +218,26 @@ def _knees(joints: np.ndarray, motion: Motion, forward: np.ndarray) -> tuple[flo
         bent += int(judged.sum())
         ahead += int((np.sum((thigh - shank) * forward, axis=1)[judged] > 0).sum())
     return (ahead / bent if bent else float("nan")), bent
+
+
+def _path_speeds(motion: Motion, times_s: np.ndarray) -> tuple[float, float]:
+    """``foot_m_s`` and ``pelvis_m_s`` of :class:`Statistics`."""
+    ankles = ("rankle", "lankle")
+    if motion.frame != "world" or len(times_s) < 2 or not set(ankles) <= set(motion.joints):
+        return float("nan"), float("nan")
+    use = indices(motion.joints, ("pelvis", *ankles))
+    at = motion.joints3d[:, use]
+    at, times_s = at[(known := np.isfinite(at).all(axis=(1, 2)))], times_s[known]
+    # Without the camera's position the pelvis stays at the origin.
+    if len(at) < 2 or not np.ptp(at[:, 0], axis=0).any():
+        return float("nan"), float("nan")
+    step = np.diff(at, axis=0) / np.diff(times_s)[:, None, None]
+    height = 0.5 * (at[1:, 1:, 2] + at[:-1, 1:, 2])
+    lower = height.argmin(axis=1)[:, None]
+    speed = np.take_along_axis(np.linalg.norm(step[:, 1:], axis=2), lower, axis=1)[:, 0]
+    height = np.take_along_axis(height, lower, axis=1)[:, 0]
+    resting = speed[height <= np.median(height)]
+    return float(np.median(resting)), float(np.median(np.linalg.norm(step[:, 0, :2], axis=1)))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from drocap_ros.errors import DrocapError, InputError
+from drocap_ros.errors import InputError
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -97,12 +97,10 @@ def describe(path: Path) -> str:
 
 def run_fetch(args: argparse.Namespace) -> int:
     """Download the named models."""
-    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.cli.models.on_demand import fetch_models
     from drocap_ros.perception.load_models import models_folder
-    from drocap_ros.perception.models.fetch import fetch
     from drocap_ros.perception.models.registry import DEFAULT_FETCH, KNOWN_MODELS, known_model
 
-    folder = models_folder(args.models)
     chosen = []
     for name in args.names or DEFAULT_FETCH:
         model = known_model(name)
@@ -111,26 +109,10 @@ def run_fetch(args: argparse.Namespace) -> int:
                 f"{name}: expected one of {', '.join(m.name for m in KNOWN_MODELS)}; see `drocap models list`"
             )
         chosen.append(model)
-    failed = 0
-    with progress_bars(args.quiet) as progress:
-        for model in chosen:
-            try:
-                path = fetch(
-                    model,
-                    folder,
-                    unverified=args.unverified,
-                    progress=lambda have, total, name=model.name: progress(name, have / total if total else -1.0),  # type: ignore[misc]
-                )
-            except InputError:
-                raise
-            except DrocapError as error:
-                print(f"drocap: {error}", file=sys.stderr)
-                failed += 1
-                continue
-            if not args.quiet:
-                verified = "SHA-256 verified" if model.sha256 else "checksum recorded, not verified"
-                print(f"{model.name}: {path} ({verified})")
-    return 1 if failed else 0
+    errors = fetch_models(chosen, models_folder(args.models), unverified=args.unverified, quiet=args.quiet)
+    for error in errors:
+        print(f"drocap: {error}", file=sys.stderr)
+    return 1 if errors else 0
 
 
 def run_check(args: argparse.Namespace) -> int:

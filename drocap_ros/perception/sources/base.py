@@ -50,11 +50,13 @@ class ImageSource(AbstractContextManager["ImageSource"]):
 
     size : (width, height) px of every frame
     length : number of frames where the source states it (for progress only), else None
+    duration_s : from the first frame to the last where the source states it, else None
     live : whether frames arrive at their own pace and unread ones are lost
     """
 
     size: tuple[int, int]
     length: int | None = None
+    duration_s: float | None = None
     live: bool = False
 
     def __init__(self) -> None:

@@ -86,6 +86,7 @@ class ImageFileSource(ImageSource):
         self._first: np.ndarray | None = read_image(self._paths[0])
         self.size = (self._first.shape[1], self._first.shape[0])
         self.length = len(self._paths)
+        self.duration_s = (self._stamps[-1] - self._stamps[0]) * 1e-9
         self._next = 0
 
     def read(self) -> Frame | None:

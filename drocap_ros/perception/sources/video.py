@@ -85,6 +85,7 @@ class VideoSource(ImageSource):
         stated = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         # A container without an index states a negative or huge number.
         self.length = int(stated) if 0 < stated < 1e9 else None
+        self.duration_s = (self.length - 1) / self._nominal_rate() if self.length else None
         self._pending = self._decode()
         if self._pending is None:
             self.close()

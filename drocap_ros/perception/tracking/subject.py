@@ -67,7 +67,8 @@ class SubjectTracker:
 
     def __init__(self, config: PoseEstimatorConfig) -> None:
         self._config = config
-        self._persons: list[Person] = []
+        #: All persons in view or lately in view, the subject among them.
+        self.persons: list[Person] = []
         self._subject: Person | None = None
         self._track_id = 0
         self._left_image = False
@@ -79,7 +80,7 @@ class SubjectTracker:
 
     def reset(self) -> None:
         """Delete all tracks, for stamps that restarted; track ids continue."""
-        self._persons, self._subject, self._any_detected, self._last_ns = [], None, False, None
+        self.persons, self._subject, self._any_detected, self._last_ns = [], None, False, None
         self._schedule.reset()
 
     def windows(
@@ -100,7 +101,7 @@ class SubjectTracker:
     def _candidate_box(self, stamp_ns: int) -> np.ndarray | None:
         """(4,) px, a possible new subject: a small person needs a window to be confirmed."""
         lost = self._subject
-        recent = [p for p in self._persons if p is not lost and p.undetected_s(stamp_ns) <= _CANDIDATE_S]
+        recent = [p for p in self.persons if p is not lost and p.undetected_s(stamp_ns) <= _CANDIDATE_S]
         if lost is not None:  # persons in view together with the subject cannot be the subject
             recent = [p for p in recent if p.first_ns > lost.confirmed_ns]
         if not recent:
@@ -134,7 +135,7 @@ class SubjectTracker:
         if subject is None or self._schedule.full_image_due(stamp_ns):
             return False
         around = box + _ISOLATED * subject.filter.length * np.array([-1, -1, 1, 1])
-        others = [p for p in self._persons if p is not subject and p.mean_score >= RELIABLE_SCORE]
+        others = [p for p in self.persons if p is not subject and p.mean_score >= RELIABLE_SCORE]
         boxes = np.array([p.filter.box_at(stamp_ns) for p in others]).reshape(-1, 4)
         edge = 0.01 * max(image_size)
         at_edge = (box[:2] < edge).any() or (box[2:] > np.array(image_size) - edge).any()
@@ -145,7 +146,7 @@ class SubjectTracker:
         subject = self._subject
         if subject is None:
             return
-        for person in self._persons:
+        for person in self.persons:
             person.filter.predict(stamp_ns)
         subject.filter.update(box)
         subject.box = np.asarray(box, float)
@@ -176,7 +177,7 @@ class SubjectTracker:
         interval_s = 0.0 if self._last_ns is None else (stamp_ns - self._last_ns) * 1e-9
         self._coast_s = max(self._config.coast_s, min(2.5 * interval_s, FORGET_S))
         self._last_ns = stamp_ns
-        for person in self._persons:
+        for person in self.persons:
             person.filter.predict(stamp_ns)
         appearances = [describe(image, box) for box in boxes]
         assigned = self._assign(boxes, scores, appearances, stamp_ns)
@@ -193,7 +194,7 @@ class SubjectTracker:
     ) -> set[int]:
         """Indices of the assigned detections: first to reliable persons, then to the others, then low scores."""
         subject = self._subject
-        persons = [p for p in self._persons if p is not subject or p.unconfirmed_s(stamp_ns) <= self._coast_s]
+        persons = [p for p in self.persons if p is not subject or p.unconfirmed_s(stamp_ns) <= self._coast_s]
         reliable = [p for p in persons if p is subject or (p.mean_score >= RELIABLE_SCORE and not p.double)]
         unreliable = [p for p in persons if not any(p is q for q in reliable)]
         high = scores >= self._config.detection_threshold
@@ -207,11 +208,11 @@ class SubjectTracker:
                 person, j = free[i], int(at[k])
                 if person is subject:
                     if replaced(subject, boxes[j], appearances[j], stamp_ns):
-                        self._persons.append(Person(boxes[j], float(scores[j]), stamp_ns, appearances[j]))
+                        self.persons.append(Person(boxes[j], float(scores[j]), stamp_ns, appearances[j]))
                         refused.add(id(person))
                         assigned.add(j)
                         continue
-                    if known_other(subject, self._persons, boxes[j], appearances[j]):
+                    if known_other(subject, self.persons, boxes[j], appearances[j]):
                         refused.add(id(person))  # a low-score detection must not replace it either
                         continue
                 person.update(boxes[j], float(scores[j]), stamp_ns)
@@ -242,19 +243,19 @@ class SubjectTracker:
                 continue
             person = Person(boxes[j], float(scores[j]), stamp_ns, appearances[j])
             person.double = subject is not None and is_double(subject, boxes[j], appearances[j], stamp_ns)
-            self._persons.append(person)
+            self.persons.append(person)
 
     def _reidentify(self, stamp_ns: int) -> None:
         """Re-identify a lost subject in a new track."""
         lost = self._subject
         if lost is None or lost.unconfirmed_s(stamp_ns) <= 0:
             return
-        for person in self._persons:
+        for person in self.persons:
             if person is lost or person.detected_ns != stamp_ns or person.first_ns <= lost.confirmed_ns:
                 continue
             if person.hits < self._config.confirm_frames or not same_person(lost, person, self._left_image):
                 continue
-            self._persons.remove(lost)
+            self.persons.remove(lost)
             person.appearance = lost.appearance if lost.appearance is not None else person.appearance
             self._subject = person
             self._left_image = False
@@ -274,13 +275,13 @@ class SubjectTracker:
         if self._chosen_box is None:
             return
         chosen_box, self._chosen_box = self._chosen_box, None
-        detected = [p for p in self._persons if p.detected_ns == stamp_ns]
+        detected = [p for p in self.persons if p.detected_ns == stamp_ns]
         overlap = iou(chosen_box[None], np.array([p.box for p in detected]).reshape(-1, 4))[0]
         if len(overlap) and overlap.max() >= 0.2:
             chosen = detected[int(overlap.argmax())]
         else:
             chosen = Person(chosen_box, 0.0, stamp_ns, None)
-            self._persons.append(chosen)
+            self.persons.append(chosen)
         if chosen is not self._subject:
             self._follow(chosen)
 
@@ -297,7 +298,7 @@ class SubjectTracker:
                 return
         candidates = [
             p
-            for p in self._persons
+            for p in self.persons
             if p.detected_ns == stamp_ns
             and p is not self._subject
             and p.score >= config.detection_threshold
@@ -322,10 +323,10 @@ class SubjectTracker:
         subject = self._subject
         if subject is not None:
             self._left_image = subject.undetected_s(stamp_ns) > 0 and (self._left_image or leaving(subject, shape))
-        kept = [p for p in self._persons if p is subject or p.undetected_s(stamp_ns) <= _BYSTANDER_S]
+        kept = [p for p in self.persons if p is subject or p.undetected_s(stamp_ns) <= _BYSTANDER_S]
         if len(kept) > _MAX_PERSONS:
             kept.sort(key=lambda p: (p is not subject, -p.detected_ns))
-        self._persons = kept[:_MAX_PERSONS]
+        self.persons = kept[:_MAX_PERSONS]
 
     def _current(self, stamp_ns: int) -> Subject | None:
         subject = self._subject
@@ -334,7 +335,7 @@ class SubjectTracker:
         if subject.detected_ns == stamp_ns:
             return Subject(self._track_id, subject.box, subject.score, False)
         box = subject.filter.box()
-        others = [p.box for p in self._persons if p is not subject and not p.double and p.confirmed_ns == stamp_ns]
+        others = [p.box for p in self.persons if p is not subject and not p.double and p.confirmed_ns == stamp_ns]
         hidden = bool(len(others)) and bool((iou(box[None], np.array(others)) > _HIDDEN_IOU).any())
         return Subject(self._track_id, box, 0.0, hidden)
 

@@ -7,6 +7,8 @@ from pathlib import Path
 from drocap_ros.errors import InputError
 from drocap_ros.recording.telemetry.log import TelemetryLog
 
+LOG_SUFFIXES = (".tlog", ".ulg", ".bin", ".srt")
+
 
 def read_telemetry(path: str | Path) -> TelemetryLog:
     """Read a log; the first bytes select the format, else the suffix.

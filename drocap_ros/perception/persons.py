@@ -1,0 +1,135 @@
+"""All persons of a recording, numbered: the choice of a subject by a picture."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.perception.estimator import PoseEstimator
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
+from drocap_ros.perception.sources.base import Frame
+from drocap_ros.perception.sources.prefetch import prefetch
+from drocap_ros.perception.tracking.person import Person
+
+#: Interval of the detections.
+_EVERY_NS = 200_000_000
+#: Least recent mean score of a person; clutter and parts of bodies lie below.
+_LEAST_SCORE = 0.45
+#: A picture shows at most this many images, each at most this wide (px).
+_MOST_IMAGES, _WIDTH = 12, 960
+
+
+@dataclass(frozen=True)
+class FoundPerson:
+    """One person: ``boxes`` holds (4,) x_min y_min x_max y_max px by the stamps of its detections."""
+
+    number: int
+    boxes: dict[int, np.ndarray]
+
+    @property
+    def first_ns(self) -> int:
+        """Stamp of the first detection."""
+        return min(self.boxes)
+
+    @property
+    def last_ns(self) -> int:
+        """Stamp of the last detection."""
+        return max(self.boxes)
+
+
+def find_persons(
+    frames: Iterable[Frame],
+    models_dir: str | Path,
+    config: PoseEstimatorConfig,
+    on_frame: Callable[[Frame, None], None] | None = None,
+) -> list[FoundPerson]:
+    """Persons of a recording in the order of their appearance, then from left to right; five detections a second.
+
+    A person that leaves the image and returns later counts as another one.
+
+    Raises
+    ------
+    InputError
+        When a model is missing, or no person is found.
+    """
+    # Without a box of the drone the rule `roi` never chooses a subject: all persons are bystanders.
+    estimator = PoseEstimator(models_dir, dataclasses.replace(config, subject="roi", subject_box=""))
+    seen: dict[Person, dict[int, np.ndarray]] = {}
+    detected_ns: int | None = None
+    images = 0
+    for frame in prefetch(frames):
+        if on_frame is not None:
+            on_frame(frame, None)
+        if detected_ns is not None and frame.stamp_ns - detected_ns < _EVERY_NS - 5_000_000:
+            continue
+        estimator.process(frame.image, frame.stamp_ns)
+        detected_ns, images = frame.stamp_ns, images + 1
+        for person in estimator.tracker.persons:
+            if person.detected_ns == frame.stamp_ns:
+                seen.setdefault(person, {})[frame.stamp_ns] = person.box
+    least = min(config.confirm_frames, images)
+    found = [boxes for person, boxes in seen.items() if len(boxes) >= least and person.mean_score >= _LEAST_SCORE]
+    if not found:
+        raise InputError(f"expected a person in view, found none in {images} images; try another video or model")
+    found.sort(key=lambda boxes: (min(boxes), float(boxes[min(boxes)][0])))
+    return [FoundPerson(number, boxes) for number, boxes in enumerate(found, 1)]
+
+
+def following(config: PoseEstimatorConfig, persons: Sequence[FoundPerson], number: int) -> PoseEstimatorConfig:
+    """Parameters to follow one of the persons from its first detection on.
+
+    Raises
+    ------
+    InputError
+        When there is no person of that number.
+    """
+    if not 1 <= number <= len(persons):
+        raise InputError(f"--subject {number}: expected 1 to {len(persons)}; `drocap track --list` numbers the persons")
+    person = persons[number - 1]
+    box = ",".join(f"{value:.2f}" for value in person.boxes[person.first_ns])
+    return dataclasses.replace(config, subject="box", subject_box=box, on_loss="wait")
+
+
+def chosen_stamps(persons: Sequence[FoundPerson]) -> list[int]:
+    """Stamps of few images that show all persons, in the order of time: each the one with most of those left."""
+    there = {ns: {p.number: p.boxes[ns] for p in persons if ns in p.boxes} for p in persons for ns in p.boxes}
+
+    def worth(ns: int, left: set[int]) -> tuple[int, float, int]:
+        # The larger the smallest of the new persons, the better the picture.
+        new = [float(np.prod(box[2:] - box[:2])) for number, box in there[ns].items() if number in left]
+        return len(new), min(new, default=0.0), -ns
+
+    left = {person.number for person in persons}
+    stamps: list[int] = []
+    while left and len(stamps) < _MOST_IMAGES:
+        stamps.append(max(there, key=partial(worth, left=left)))
+        left = left - there[stamps[-1]].keys()
+    return sorted(stamps)
+
+
+def persons_picture(frames: Iterable[Frame], persons: Sequence[FoundPerson]) -> tuple[np.ndarray, int]:
+    """(H, W, 3) uint8 BGR, images of :func:`chosen_stamps` with numbered boxes; the first frame's stamp, ns."""
+    import cv2
+
+    from drocap_ros.perception.overlay import draw_numbers
+
+    wanted, tiles, begin_ns = chosen_stamps(persons), [], 0
+    for number, frame in enumerate(frames):
+        begin_ns = begin_ns if number else frame.stamp_ns
+        if frame.stamp_ns not in wanted:
+            continue
+        shrink = min(1.0, _WIDTH / frame.image.shape[1])
+        small = cv2.resize(frame.image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+        boxes = {p.number: p.boxes[frame.stamp_ns] * shrink for p in persons if frame.stamp_ns in p.boxes}
+        tiles.append(draw_numbers(small, boxes, f"{(frame.stamp_ns - begin_ns) * 1e-9:.1f} s"))
+        if frame.stamp_ns == wanted[-1]:
+            break
+    columns = int(np.ceil(np.sqrt(len(tiles))))
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
+    return np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]), begin_ns

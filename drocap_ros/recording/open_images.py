@@ -1,0 +1,79 @@
+"""Images of a video, image folder, stream or recording, one at a time."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from drocap_ros.errors import InputError
+from drocap_ros.perception.sources import Frame, open_source
+from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+from drocap_ros.recording.image_messages import read_images
+from drocap_ros.recording.open_session import is_recording, open_session
+from drocap_ros.recording.telemetry.read import LOG_SUFFIXES
+
+logger = logging.getLogger(__name__)
+
+
+class Images(NamedTuple):
+    """Images in the order of time.
+
+    length : their number, where stated
+    duration_s : from the first to the last, where known
+    """
+
+    frames: Iterable[Frame]
+    length: int | None
+    duration_s: float | None
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Mean rate, where length and duration are known."""
+        return (self.length - 1) / self.duration_s if self.length and self.duration_s else None
+
+
+@contextlib.contextmanager
+def open_images(source: str | Path, config: ImageIngestConfig | None = None) -> Iterator[Images]:
+    """Open a video file, image, folder of images, stream or recording; warnings of a recording are logged at the end.
+
+    Raises
+    ------
+    InputError
+        When there are no images, with the use of an input of another kind.
+    """
+    path = Path(source)
+    if path.exists():
+        refuse_other_inputs(path)
+    if path.exists() and is_recording(path):
+        with open_session(path) as session:
+            yield Images(read_images(session), None, session.info.duration_s)
+            for warning in session.warnings:
+                logger.warning("%s: %s", path, warning)
+        return
+    with open_source(source, config) as images:
+        yield Images(images, images.length, images.duration_s)
+
+
+def refuse_other_inputs(path: Path) -> None:
+    """Refuse the folder of a motion and a telemetry log in the place of images.
+
+    Raises
+    ------
+    InputError
+        When ``path`` is one of them.
+    """
+    if path.is_dir() and (path / "motion.npz").is_file() and not is_recording(path):
+        again = next((path / name for name in ("session", "tracks.npz") if (path / name).exists()), None)
+        hint = f"; `drocap reconstruct {again}` repeats it" if again else ""
+        raise InputError(
+            f"{path}: expected a video, image folder, recording or tracks file, found the folder of a motion;"
+            f" `drocap report {path}` shows it{hint}"
+        )
+    if path.suffix.lower() in LOG_SUFFIXES:
+        raise InputError(
+            f"{path}: expected a video, image folder, recording or tracks file, found a telemetry log; name its video"
+            f" and add --telemetry {path}"
+        )
