@@ -57,16 +57,14 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.perception.estimator import PoseEstimator
     from drocap_ros.perception.load_models import models_folder
     from drocap_ros.perception.persons import find_persons, following
-    from drocap_ros.recording.open_images import open_images, refuse_other_inputs
+    from drocap_ros.recording.open_images import open_images
 
     out = args.out or Path(f"{Path(args.video).name.split('.')[0] or 'drocap'}_tracks")
     check_output_folder(out)
     clip, (person, rule) = clip_of(args), subject_of(args.subject)
     config, ingest = _configs(args, rule)
     folder = models_folder(args.models or config.models_dir or None)
-    if Path(args.video).exists():
-        refuse_other_inputs(Path(args.video))
-        ensure_networks(folder, args.fetch, args.quiet)
+    ensure_networks(folder, args.video, args)
     with output_folder(out) as target, progress_bars(args.quiet) as progress:
         begin_ns, persons = None, []
         if args.list or person is not None:

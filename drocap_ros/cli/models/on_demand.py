@@ -21,21 +21,25 @@ def add_fetch_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def ensure_networks(folder: Path, fetch: bool, quiet: bool) -> None:
-    """Fetch the default networks into a folder without any: with ``fetch``, or after a yes at the terminal.
+def ensure_networks(folder: Path, source: str | Path, args: argparse.Namespace) -> None:
+    """Fetch the default networks into a folder without any: with ``--fetch``, or after a yes at the terminal.
 
     Raises
     ------
     InputError
-        When the folder has no network and none is to be fetched.
+        When the source has no images, or the folder has no network and none is to be fetched.
     """
     from drocap_ros.perception.models.registry import DEFAULT_FETCH, known_model
+    from drocap_ros.recording.open_images import open_images
 
     if folder.is_dir() and any(folder.glob("*.onnx")):
         return
+    with open_images(source):
+        pass  # nothing is downloaded for a source that cannot be used
     models = [model for name in DEFAULT_FETCH if (model := known_model(name)) is not None]
     pair = f"{' and '.join(model.name for model in models)}, {sum(model.size_mb for model in models):.0f} MB"
-    if not fetch and not quiet and sys.stdin.isatty() and sys.stderr.isatty():
+    fetch = args.fetch
+    if not fetch and not args.quiet and sys.stdin.isatty() and sys.stderr.isatty():
         print(f"{folder} has no networks for detection and 2D pose. Download {pair}? [y/N] ", end="", file=sys.stderr)
         sys.stderr.flush()
         fetch = sys.stdin.readline().strip().lower() in ("y", "yes")
@@ -44,7 +48,7 @@ def ensure_networks(folder: Path, fetch: bool, quiet: bool) -> None:
             f"{folder}: expected networks for detection and 2D pose (.onnx), found none; run `drocap models fetch`"
             f" ({pair}), add --fetch, or name a folder with --models or DROCAP_MODELS"
         )
-    if errors := fetch_models(models, folder, quiet=quiet):
+    if errors := fetch_models(models, folder, quiet=args.quiet):
         raise DrocapError("; ".join(errors))
 
 
