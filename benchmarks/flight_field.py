@@ -13,11 +13,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from branches import over_processes
 from figures import table, write_figures
 from flight_field_defects import DEFECTS
 
 from drocap_ros.flight.orbit.states import Action, Command, State
+from drocap_ros.simulation.closed_loop.branches import over_processes
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
 from drocap_ros.simulation.vehicle.loopback import is_setpoint
 

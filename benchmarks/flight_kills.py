@@ -17,10 +17,10 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from branches import branch, over_processes
 from figures import table, write_figures
 
 from drocap_ros.flight.orbit.states import Action, State
+from drocap_ros.simulation.closed_loop.branches import branch, over_processes
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, with_config
 
 AUTOPILOTS = ("ardupilot", "px4")

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from branches import over_processes
 from figures import table as markdown_table
 from figures import write_figures
 from perception_errors import PerceptionErrors
@@ -31,6 +30,7 @@ from perception_errors import PerceptionErrors
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.orbit.states import Command, State
+from drocap_ros.simulation.closed_loop.branches import over_processes
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
 
 SECONDS = 24.0

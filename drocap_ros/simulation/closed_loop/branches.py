@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
+import traceback
 from collections.abc import Callable, Iterable
 from typing import TypeVar
 
@@ -28,6 +29,8 @@ def branch(end: Callable[[], Result]) -> Result:
             with os.fdopen(write, "wb") as file:
                 pickle.dump(end(), file)
             status = 0
+        except BaseException:
+            traceback.print_exc()
         finally:
             os._exit(status)
     os.close(write)
