@@ -53,6 +53,8 @@ class SessionRecorderNode(ManagedComponent):
         self._survey: ParameterSurvey | None = None
         self._calibrated = False
         self._received = False  # any message but diagnostics
+        self._subject = {self.resolve_topic_name(topic) for topic in (_IMAGES, "pose2d")}
+        self._recording = False  # an image or a pose
         self._sources = {name for name in self.peers if NODES[name].source}
         self._source_active = False
         self._sessions = 0
@@ -78,7 +80,7 @@ class SessionRecorderNode(ManagedComponent):
         for topic, entry in TOPICS.items():
             kind = _type_name(entry.message)
             writer.register(self.resolve_topic_name(topic), kind, schema_text(kind), image=topic == _IMAGES)
-        self._writer, self._calibrated, self._received = writer, False, False
+        self._writer, self._calibrated, self._received, self._recording = writer, False, False, False
         self._survey = ParameterSurvey(self, self._on_parameters)
         self._sessions += 1
 
@@ -103,6 +105,7 @@ class SessionRecorderNode(ManagedComponent):
         if self.simulated or not log_ns:
             log_ns = sent_ns = self.now_ns()
         self._received = self._received or name != "/diagnostics"
+        self._recording = self._recording or name in self._subject
         if self._writer is not None:
             # Simulated time waits for the disk; real time does not, and messages are dropped.
             while self.simulated and self._writer.error is None and self._writer.queued_bytes > _MOST_WAITING:
@@ -174,7 +177,7 @@ class SessionRecorderNode(ManagedComponent):
         elif writer.dropped:
             self.report(WARN, f"{writer.dropped} messages dropped: the disk is too slow; lower jpeg_quality")
         else:
-            waiting = "" if self._received else "; no message has arrived yet"
+            waiting = "" if self._recording else "; no image and no pose has arrived yet"
             self.report(OK, f"recording to {writer.folder}{waiting}")
 
 
