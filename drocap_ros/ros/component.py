@@ -83,7 +83,7 @@ class ComponentNode(Node):
         self.failure: BaseException | None = None
         self.callbacks_done = 0
         self._heard_s: dict[str, float] = {}
-        self._begin_s = time.monotonic()
+        self._begin_s = 0.0
         self._level = OK
         self._text = "running"
         #: Publishers by the names of their topics.
@@ -156,7 +156,7 @@ class ComponentNode(Node):
 
         def run(*arguments: Any) -> None:
             self.callbacks_done += 1
-            self._heard_s[topic] = time.monotonic()
+            self._heard_s[topic] = self.now_s()
             if not self.active:
                 return
             try:
@@ -200,7 +200,7 @@ class ComponentNode(Node):
         if self.peers and not self._matched():
             return
         self._matching.cancel()
-        self.ready = True
+        self.ready, self._begin_s = True, self.now_s()
         self.details[Key.READY] = "true"
         self.on_ready()
         self.publish_diagnostics()
@@ -237,7 +237,7 @@ class ComponentNode(Node):
             return ""
         if not self.ready:
             return "waiting for the other nodes of the graph"
-        now_s = time.monotonic()
+        now_s = self.now_s()
         for topic in self.needs:
             heard_s = self._heard_s.get(topic)
             silent_s = now_s - (self._begin_s if heard_s is None else heard_s)
