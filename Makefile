@@ -18,7 +18,7 @@ $(VENV)/.requirements: requirements.lock
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 10) <= v <= (3, 13) else f"make setup: expected Python 3.10 to 3.13, found {v[0]}.{v[1]}; run: make PYTHON=python3.11 ...")'
 	@echo "setup: virtual environment, ROS 2 Jazzy and dependencies from PyPI (about a minute)"
 	@$(CLEAN) $(PYTHON) -m venv $(VENV)
-	@$(CLEAN) $(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	@$(CLEAN) $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -r requirements.lock
 	@touch $@
 
 # The ROS wheels on PyPI lack tf2_msgs (TF) and hri_msgs (REP 155).
@@ -36,9 +36,9 @@ $(VENV)/.package: $(VENV)/.requirements $(VENV)/.tf2_msgs $(VENV)/.hri_msgs $(SO
 demo: setup  ## a whole simulated capture, reconstructed and compared with its truth
 	@$(CLEAN) $(BIN)/drocap demo --out demo_out
 
-test: setup  ## the whole test suite: two tests at a time, then tests with clocks or nodes, alone
+test: setup  ## the whole test suite: two tests at a time, then tests with clocks or nodes, alone and up to three times
 	$(CLEAN) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not clock" -n 2 --dist loadfile
-	$(CLEAN) $(BIN)/python -m pytest -m clock
+	$(CLEAN) $(BIN)/python -m pytest -m clock --reruns 2 -r sR
 
 lint: setup  ## ruff and mypy
 	$(CLEAN) $(BIN)/ruff check .

@@ -19,7 +19,7 @@ CLOCKED = (
     "perception/models/test_fetch.py", "recording/mcap/test_bounded_queue.py",
     "recording/mcap/test_recover.py", "recording/mcap/test_session_writer.py",
 )  # fmt: skip
-COMPUTING = ("system/test_packaging.py",)
+COMPUTING = ("system/test_packaging.py", "system/test_simulated_demo.py")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

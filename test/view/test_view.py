@@ -149,7 +149,7 @@ def flown(tmp_path_factory):
                 graph.wait_until(lambda: graph.node.count_subscribers("pose2d") > 0, 60, "the viewer")
             with bringup(config, FLIGHT, domain_id=domain) as graph:
                 graph.wait_finished("capture_simulator", timeout_s=60)
-                graph.spin_for(0.5)
+                graph.spin_for(2.0)
             live.send_signal(signal.SIGINT)
             text, _ = live.communicate(timeout=60)
         finally:
