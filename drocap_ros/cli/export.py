@@ -22,6 +22,10 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("motion", metavar="MOTION", type=Path, help=HELP)
     parser.add_argument("--to", metavar="FORMAT", choices=tuple(FORMATS), required=True, help=", ".join(FORMATS))
     parser.add_argument("--out", metavar="FILE", type=Path, help="file to write (default: beside MOTION)")
+    parser.add_argument(
+        "--names", choices=("h36m", "lafan1", "mixamo"), help="joint names of bvh and glb (default: h36m)"
+    )
+    parser.add_argument("--rest", choices=("t", "a"), help="rest pose of bvh and glb: T or A (default: t)")
     parser.add_argument("--quiet", action="store_true", help="no output, only errors")
     parser.set_defaults(run=run)
     return parser
@@ -37,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     if out.suffix[1:] in set(FORMATS) - {args.to}:
         raise InputError(f"--out {out}: expected a name that ends in .{args.to}, found {out.suffix}; change it or --to")
     with output_file(out) as file:
-        notes = export_motion(motion, args.to, file)
+        notes = export_motion(motion, args.to, file, names=args.names, rest=args.rest)
     if not args.quiet:
         print(f"written: {out} ({len(motion.joints)} joints, {FORMATS[args.to]})")
         for note in notes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,23 +19,30 @@ FORMATS = {
     "csv": "metres, z up",
     "glb": "metres, y up",
 }
+#: Formats with an animation skeleton: names of its joints and its rest pose can be chosen.
+RIGGED = ("bvh", "glb")
 
 
-def export_motion(motion: Motion, form: str, path: str | Path) -> tuple[str, ...]:
+def export_motion(
+    motion: Motion, form: str, path: str | Path, *, names: str | None = None, rest: str | None = None
+) -> tuple[str, ...]:
     """Write a motion to a file of another format.
 
     Parameters
     ----------
     form : one of :data:`FORMATS`
+    names : joint names of BVH and glTF, one of :data:`drocap_ros.export.rig.NAMES`; None: "h36m"
+    rest : rest pose of BVH and glTF, one of :data:`drocap_ros.export.rig.RESTS`; None: "t"
 
     Returns
     -------
-    Notes on changes, as sentences: resampling, interpolation, constant bones, unknown vertical.
+    Notes on changes, as sentences: resampling, interpolation, constant bones, floor, unknown vertical.
 
     Raises
     ------
     InputError
-        When the format is unknown, or the motion has fewer than two frames or lacks data that the format needs.
+        When the format or an option is unknown, or the motion has fewer than two frames or lacks data that the format
+        needs.
     """
     from drocap_ros.export.bvh import write_bvh
     from drocap_ros.export.c3d_file import write_c3d
@@ -43,7 +51,16 @@ def export_motion(motion: Motion, form: str, path: str | Path) -> tuple[str, ...
     from drocap_ros.export.glb import write_glb
     from drocap_ros.export.trc import write_trc
 
-    writers = {"bvh": write_bvh, "c3d": write_c3d, "trc": write_trc, "csv": write_csv, "glb": write_glb}
+    writers: dict[str, Callable[..., tuple[str, ...]]] = {
+        "bvh": write_bvh,
+        "c3d": write_c3d,
+        "trc": write_trc,
+        "csv": write_csv,
+        "glb": write_glb,
+    }
     if form not in writers:
         raise InputError(f"format: expected one of {', '.join(FORMATS)}, got {form!r}")
-    return writers[form](Path(path), clip_of(motion))
+    chosen = {name: value for name, value in (("names", names), ("rest", rest)) if value is not None}
+    if chosen and form not in RIGGED:
+        raise InputError(f"{', '.join(chosen)}: expected with format {' or '.join(RIGGED)}, got {form}; leave it out")
+    return writers[form](Path(path), clip_of(motion), **chosen)

@@ -1,7 +1,7 @@
-"""Binary glTF 2.0: an animated skeleton with a simple visible body; metres, y up, the frames' own times.
+"""Binary glTF 2.0: an animated skeleton with constant bones and a plain skinned body; metres, y up, own times.
 
-Each joint is a node of the skin's hierarchy with animated rotation (as in :mod:`drocap_ros.export.rig`) and
-translation: the positions equal those of the motion although its bone lengths vary a little.
+Each joint of :mod:`drocap_ros.export.rig` is a node of the skin's hierarchy with animated rotation; the root's
+translation is animated too.
 """
 
 from __future__ import annotations
@@ -12,34 +12,38 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from drocap_ros.errors import InputError
-from drocap_ros.export.body_mesh import COLOURS, body_mesh
-from drocap_ros.export.clip import Clip, without_gaps, y_up
-from drocap_ros.export.rig import Rig, fit_rig
+from drocap_ros.export.body_mesh import COLOURS, MeshPart, body_mesh
+from drocap_ros.export.clip import Clip, y_up
+from drocap_ros.export.rig import Rig, rig_of
+from drocap_ros.export.rigid_body import BODY
 
-_ARRAY_BUFFER = 34962
+_ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-_COMPONENTS = {"float32": 5126, "uint8": 5121}
+_COMPONENTS = {"float32": 5126, "uint8": 5121, "uint16": 5123}
 #: A GLB stores its length in 32 bits.
 _MAX_BYTES = 2**32 - 2**20
 
 
-def write_glb(path: Path, clip: Clip) -> tuple[str, ...]:
+def write_glb(path: Path, clip: Clip, *, names: str = "h36m", rest: str = "t") -> tuple[str, ...]:
     """Write a GLB file of a z-up clip; returns notes on changes.
+
+    Parameters
+    ----------
+    names, rest : as of :func:`~drocap_ros.export.rig.rig_of`
 
     Raises
     ------
     InputError
-        When a joint is never known, or the file would exceed 4 GiB.
+        When an option is unknown, a joint of ``BODY_15`` is missing or never known, or the file would exceed 4 GiB.
     """
-    clip = without_gaps(y_up(clip))
-    if clip.positions.size * 14 > _MAX_BYTES:
+    if len(clip.positions) * len(BODY) * 16 > _MAX_BYTES:
         raise InputError(f"motion: expected less than 4 GiB of glTF, got {len(clip.positions)} frames; cut it")
-    rig = fit_rig(clip.positions, clip.joints, clip.parents, clip.rate_hz)
-    path.write_bytes(_container(*_document(clip, rig)))
-    return clip.notes
+    rig, notes = rig_of(y_up(clip), names=names, rest=rest)
+    facts = {"units": "m", "up_axis": "Y", "frame_rate_hz": round(clip.rate_hz, 6), "notes": list(notes)}
+    path.write_bytes(_container(*_document(rig, clip.times_s, facts)))
+    return notes
 
 
 class _Buffer:
@@ -71,24 +75,22 @@ class _Buffer:
         return len(self.accessors) - 1
 
 
-def _document(clip: Clip, rig: Rig) -> tuple[dict[str, Any], bytes]:
+def _document(rig: Rig, times_s: np.ndarray, facts: dict[str, Any]) -> tuple[dict[str, Any], bytes]:
     buffer = _Buffer()
-    rest = _rest_positions(rig, clip.parents)
-    inverse_bind = np.tile(np.eye(4, dtype=np.float32), (len(rest), 1, 1))
-    inverse_bind[:, :3, 3] = -rest
+    inverse_bind = np.tile(np.eye(4, dtype=np.float32), (len(rig.rest), 1, 1))
+    inverse_bind[:, :3, 3] = -rig.rest
     skin = buffer.add(np.ascontiguousarray(inverse_bind.transpose(0, 2, 1)).reshape(-1, 16))
-    primitives = [_primitive(buffer, part, number) for number, part in enumerate(body_mesh(rest, clip))]
-    animation = _animation(buffer, clip, rig)
-    roots = [joint for joint, parent in enumerate(clip.parents) if parent < 0]
-    body = len(clip.joints)
+    primitives = [_primitive(buffer, part) for part in body_mesh(rig)]
+    animation = _animation(buffer, rig, times_s)
+    body = len(rig.names)
     document = {
-        "asset": {"version": "2.0", "generator": "drocap_ros", "extras": _facts(clip)},
+        "asset": {"version": "2.0", "generator": "drocap_ros", "extras": facts},
         "scene": 0,
-        "scenes": [{"name": "motion", "nodes": [*roots, body]}],
-        "nodes": [*_joint_nodes(clip, rest), {"name": "body", "mesh": 0, "skin": 0}],
+        "scenes": [{"name": "motion", "nodes": [0, body]}],
+        "nodes": [*_joint_nodes(rig), {"name": "body", "mesh": 0, "skin": 0}],
         "meshes": [{"name": "body", "primitives": primitives}],
         "materials": [_material(name, colour) for name, colour in COLOURS.items()],
-        "skins": [{"name": "skeleton", "joints": list(range(body)), "inverseBindMatrices": skin, "skeleton": roots[0]}],
+        "skins": [{"name": "skeleton", "joints": list(range(body)), "inverseBindMatrices": skin, "skeleton": 0}],
         "animations": [animation],
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,
@@ -97,38 +99,25 @@ def _document(clip: Clip, rig: Rig) -> tuple[dict[str, Any], bytes]:
     return document, bytes(buffer.data)
 
 
-def _facts(clip: Clip) -> dict[str, Any]:
-    return {"units": "m", "up_axis": "Y", "frame_rate_hz": round(clip.rate_hz, 6), "notes": list(clip.notes)}
-
-
-def _rest_positions(rig: Rig, parents: tuple[int, ...]) -> np.ndarray:
-    """(P, 3) joints in the rest pose, standing on the ground."""
-    rest = np.zeros((len(parents), 3))
-    for joint in rig.order:
-        if parents[joint] >= 0:
-            rest[joint] = rest[parents[joint]] + rig.offsets[joint]
-    rest[:, 1] -= rest[:, 1].min()
-    return rest
-
-
-def _joint_nodes(clip: Clip, rest: np.ndarray) -> list[dict[str, Any]]:
+def _joint_nodes(rig: Rig) -> list[dict[str, Any]]:
     nodes: list[dict[str, Any]] = []
-    for joint, (name, parent) in enumerate(zip(clip.joints, clip.parents, strict=True)):
-        place = rest[joint] - rest[parent] if parent >= 0 else rest[joint]
-        node: dict[str, Any] = {"name": name, "translation": np.round(place, 6).tolist()}
-        children = [c for c, p in enumerate(clip.parents) if p == joint]
+    for joint, (name, parent) in enumerate(zip(rig.names, rig.parents, strict=True)):
+        place = rig.rest[joint] - (rig.rest[parent] if parent >= 0 else 0.0)
+        node: dict[str, Any] = {"name": name, "translation": np.round(place, 7).tolist()}
+        children = [c for c, p in enumerate(rig.parents) if p == joint]
         nodes.append({**node, "children": children} if children else node)
     return nodes
 
 
-def _primitive(buffer: _Buffer, part: Any, material: int) -> dict[str, Any]:
+def _primitive(buffer: _Buffer, part: MeshPart) -> dict[str, Any]:
     attributes = {
         "POSITION": buffer.add(part.vertices, bounds=True, target=_ARRAY_BUFFER),
         "NORMAL": buffer.add(part.normals, target=_ARRAY_BUFFER),
         "JOINTS_0": buffer.add(part.joints, target=_ARRAY_BUFFER),
         "WEIGHTS_0": buffer.add(part.weights, target=_ARRAY_BUFFER),
     }
-    return {"attributes": attributes, "material": material}
+    corners = buffer.add(part.triangles.reshape(-1), target=_ELEMENT_BUFFER)
+    return {"attributes": attributes, "indices": corners, "material": list(COLOURS).index(part.material)}
 
 
 def _material(name: str, colour: tuple[float, float, float]) -> dict[str, Any]:
@@ -136,22 +125,16 @@ def _material(name: str, colour: tuple[float, float, float]) -> dict[str, Any]:
     return {"name": name, "pbrMetallicRoughness": surface}
 
 
-def _animation(buffer: _Buffer, clip: Clip, rig: Rig) -> dict[str, Any]:
-    times = buffer.add(clip.times_s.astype(np.float32), bounds=True)
+def _animation(buffer: _Buffer, rig: Rig, times_s: np.ndarray) -> dict[str, Any]:
+    times = buffer.add(times_s.astype(np.float32), bounds=True)
+    tracks = [(0, "translation", rig.root)]
+    tracks += [(joint, "rotation", _continuous(rig.local(joint).as_quat())) for joint in range(len(rig.names))]
     samplers: list[dict[str, Any]] = []
     channels: list[dict[str, Any]] = []
-    identity = Rotation.identity(len(clip.positions))
-    for joint, parent in enumerate(clip.parents):
-        above = rig.turned[parent] if parent >= 0 else identity
-        origin = clip.positions[:, parent] if parent >= 0 else 0.0
-        tracks = {
-            "translation": above.inv().apply(clip.positions[:, joint] - origin),
-            "rotation": _continuous((above.inv() * rig.turned[joint]).as_quat()),
-        }
-        for kind, values in tracks.items():
-            channels.append({"sampler": len(samplers), "target": {"node": joint, "path": kind}})
-            output = buffer.add(values.astype(np.float32))
-            samplers.append({"input": times, "interpolation": "LINEAR", "output": output})
+    for node, kind, values in tracks:
+        channels.append({"sampler": len(samplers), "target": {"node": node, "path": kind}})
+        output = buffer.add(values.astype(np.float32))
+        samplers.append({"input": times, "interpolation": "LINEAR", "output": output})
     return {"name": "motion", "samplers": samplers, "channels": channels}
 
 

@@ -1,8 +1,7 @@
-"""A skeleton with constant bones, and its rotations in each frame.
+"""An animation skeleton on the fitted rigid body: names, rest pose, joint rotations, feet on the floor.
 
-Rest pose: a standing T, y up, facing +z, left at +x.  A joint with one child has the smallest rotation relative to its
-parent that brings the child into its measured direction, without twist about the bone, which positions do not show.  A
-joint with several children has the rotation that fits their directions best.
+A bone has the smallest rotation relative to its parent that brings it from its rest direction into its direction:
+positions do not show the twist of forearms, thighs and other bones about their own axis.
 """
 
 from __future__ import annotations
@@ -13,91 +12,194 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from drocap_ros.geometry.rotations import project_to_so3
+from drocap_ros.errors import InputError
+from drocap_ros.export.clip import Clip, without_gaps
+from drocap_ros.export.rigid_body import BODY, PARENTS, TOES, RigidBody, fit_rigid_body
+from drocap_ros.geometry.rotations import exp_so3, log_so3
+from drocap_ros.skeleton import BODY_15
 
 #: Fading time of the twist that keeps a rotation continuous where a bone points against its rest direction.
 TWIST_FADE_S = 0.5
+#: Cosine between a bone and its rest direction below which the smallest rotation turns too fast.
+_AGAINST = -0.7
+#: Rest poses: angle of the arms below the horizontal, degrees.
+RESTS = {"t": 0.0, "a": 45.0}
 
-#: Direction of each joint from its parent in the rest pose.
-_REST = {
-    "rhip": (-1, 0, 0), "rknee": (0, -1, 0), "rankle": (0, -1, 0),
-    "lhip": (1, 0, 0), "lknee": (0, -1, 0), "lankle": (0, -1, 0),
-    "spine": (0, 1, 0), "thorax": (0, 1, 0), "neck": (0, 1, 0), "head": (0, 1, 0),
-    "lshoulder": (0.8, -0.6, 0), "lelbow": (1, 0, 0), "lwrist": (1, 0, 0),
-    "rshoulder": (-0.8, -0.6, 0), "relbow": (-1, 0, 0), "rwrist": (-1, 0, 0),
-}  # fmt: skip
+_LAFAN1 = (
+    "Hips", "LeftUpLeg", "LeftLeg", "LeftFoot", "LeftToe", "RightUpLeg", "RightLeg", "RightFoot", "RightToe",
+    "Spine", "Spine1", "Spine2", "Neck", "Head", "", "LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand",
+    "RightShoulder", "RightArm", "RightForeArm", "RightHand",
+)  # fmt: skip
+_MIXAMO = {"LeftToe": "LeftToeBase", "RightToe": "RightToeBase", "": "HeadTop_End"}
+#: Naming -> name of each joint of :data:`BODY`; without a name it is the end of its parent's bone.
+NAMES = {
+    "h36m": dict(zip(BODY, BODY, strict=True)),
+    "lafan1": dict(zip(BODY, _LAFAN1, strict=True)),
+    "mixamo": {joint: "mixamorig:" + _MIXAMO.get(name, name) for joint, name in zip(BODY, _LAFAN1, strict=True)},
+}
+#: Assumed sizes as shares of the shank: the foot's length from below the ankle to the toes, the ankle's height.
+_FOOT, _SOLE = 0.45, 0.16
+#: Length of a hand as a share of the forearm; of what the head's joint is below the crown, of neck to head.
+_HAND, _CROWN = 0.7, 0.9
+#: Percentile of the lower foot's height that is the floor; a root that moves less than this stands still, m.
+_FLOOR_PERCENTILE, _STILL_M = 5.0, 1e-3
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Constant skeleton and its pose in each frame; y up, m.
+    """Constant skeleton and its pose in each frame; y up, m; rest pose faces +z, left at +x, soles at y = 0.
 
-    order : joints from the root outwards, each after its parent
-    offsets : (P, 3) of each joint from its parent in the rest pose (0 at the root)
-    turned : per joint, (F,) rotations of its children from the rest pose to the world
-    aimed : per joint, (F,) rotations of its own bone from the rest pose to the world
+    names : J joint names, each after its parent
+    joints : J, the same joints as named in :data:`~drocap_ros.export.rigid_body.BODY`
+    parents : J indices, -1 at the root, which is the first
+    rest : (J, 3) positions in the rest pose
+    ends : index of a last joint -> (3,) end of its bone relative to it in the rest pose
+    root : (F, 3) positions of the root
+    turned : J rotations (F,) from the rest pose to the world
     """
 
-    order: tuple[int, ...]
-    offsets: np.ndarray
+    names: tuple[str, ...]
+    joints: tuple[str, ...]
+    parents: tuple[int, ...]
+    rest: np.ndarray
+    ends: dict[int, np.ndarray]
+    root: np.ndarray
     turned: tuple[Rotation, ...]
-    aimed: tuple[Rotation, ...]
 
-    def positions(self, root: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
-        """(F, P, 3) joints of the posed skeleton with its root at ``root`` (F, 3)."""
-        out = np.empty((len(root), len(parents), 3))
-        for joint in self.order:
-            parent = parents[joint]
-            out[:, joint] = root if parent < 0 else out[:, parent] + self.aimed[joint].apply(self.offsets[joint])
+    def positions(self) -> np.ndarray:
+        """(F, J, 3) joints by forward kinematics."""
+        out = np.empty((len(self.root), len(self.parents), 3))
+        out[:, 0] = self.root
+        for joint, parent in enumerate(self.parents[1:], start=1):
+            out[:, joint] = out[:, parent] + self.turned[parent].apply(self.rest[joint] - self.rest[parent])
         return out
 
+    def local(self, joint: int) -> Rotation:
+        """(F,) rotations of a joint relative to its parent."""
+        parent = self.parents[joint]
+        return self.turned[joint] if parent < 0 else self.turned[parent].inv() * self.turned[joint]
 
-def fit_rig(positions: np.ndarray, joints: tuple[str, ...], parents: tuple[int, ...], rate_hz: float) -> Rig:
-    """Rig of a clip.
+
+def rig_of(clip: Clip, *, names: str = "h36m", rest: str = "t") -> tuple[Rig, tuple[str, ...]]:
+    """Rig of a clip, and notes on the changes.
 
     Parameters
     ----------
-    positions : (F, P, 3) m, y up, without NaN
-    rate_hz : frames per second
+    clip : y up; gaps are interpolated
+    names : one of :data:`NAMES`
+    rest : one of :data:`RESTS`
 
-    Bone lengths are medians over the frames.
+    Raises
+    ------
+    InputError
+        When an option is unknown, a joint of ``BODY_15`` is missing, or a joint is never known.
     """
-    order = _outwards(parents)
-    children = [[c for c in order if parents[c] == j] for j in range(len(parents))]
-    bones = positions - positions[:, np.maximum(parents, 0)]
-    lengths = np.median(np.linalg.norm(bones, axis=2), axis=0)
-    directions = bones / np.maximum(np.linalg.norm(bones, axis=2, keepdims=True), 1e-9)
-    rest = _rest_directions(directions, joints, children[order[0]])
-    identity = Rotation.identity(len(positions))
-    turned, aimed = [identity] * len(parents), [identity] * len(parents)
-    for joint in order:
-        above = turned[parents[joint]] if parents[joint] >= 0 else identity
-        hanging = children[joint]
-        if len(hanging) > 1:
-            fit = np.einsum("fci,cj->fij", directions[:, hanging], rest[hanging])
-            above = Rotation.from_matrix(project_to_so3(fit))
-        for child in hanging:
-            aimed[child] = above * _swing(rest[child], above.inv().apply(directions[:, child]), rate_hz)
-        turned[joint] = aimed[hanging[0]] if len(hanging) == 1 else above
-    return Rig(order, rest * lengths[:, None] * (np.array(parents) >= 0)[:, None], tuple(turned), tuple(aimed))
+    for option, value, table in (("names", names, NAMES), ("rest", rest, RESTS)):
+        if value not in table:
+            raise InputError(f"{option}: expected one of {', '.join(table)}, got {value!r}")
+    known = np.isfinite(clip.positions).all(axis=2)
+    clip = without_gaps(clip)
+    body = fit_rigid_body(clip.positions, clip.joints, known)
+    common = [name for name in clip.joints if name in (*BODY_15.joints, *TOES) and name in body.joints]
+    off = np.stack([body.at(name) for name in common], axis=1)
+    off -= clip.positions[:, [clip.joints.index(name) for name in common]]
+    moved = 1000.0 * np.linalg.norm(off, axis=2)
+    path = clip.positions[:, clip.joints.index("pelvis")]
+    lift, floor_note = _onto_the_floor(body, bool(np.ptp(path, axis=0).max() > _STILL_M))
+    rig = _rig(body, clip.rate_hz, lift, NAMES[names], rest)
+    notes = [
+        *clip.notes,
+        f"bones made constant: joints moved by {moved.mean():.1f} mm on average, at most {moved.max():.1f} mm",
+        floor_note,
+    ]
+    if not set(TOES) <= set(body.joints):
+        notes.append("no toes in the motion: each foot is assumed, at a right angle to its shank")
+    if left := [name for name in clip.joints if name not in common]:
+        notes.append(f"left out, not in the rig: {', '.join(left)}")
+    return rig, tuple(notes)
 
 
-def _outwards(parents: tuple[int, ...]) -> tuple[int, ...]:
-    order = [j for j, parent in enumerate(parents) if parent < 0]
-    for joint in order:
-        order.extend(j for j, parent in enumerate(parents) if parent == joint)
-    return tuple(order)
+def _onto_the_floor(body: RigidBody, root_moves: bool) -> tuple[np.ndarray, str]:
+    """(F,) heights to add, and a note.
+
+    A moving root has one constant: the floor is a low percentile of the lower sole.  A root that stands still has no
+    known height: in each frame the lower sole stands on the floor.
+    """
+    ends = TOES if set(TOES) <= set(body.joints) else ("rankle", "lankle")
+    soles = [body.at(end)[:, 1] - (0.0 if end in TOES else _SOLE * body.lengths[end]) for end in ends]
+    lower = np.min(soles, axis=0)
+    if not root_moves:
+        return -lower, "no root motion known: the lower foot stands on the floor in each frame"
+    floor = float(np.percentile(lower, _FLOOR_PERCENTILE))
+    return np.full(
+        len(lower), -floor
+    ), f"floor at 0: {'lowered' if floor > 0 else 'raised'} by {abs(floor):.3f} m so that the feet stand on it"
 
 
-def _rest_directions(directions: np.ndarray, joints: tuple[str, ...], below_root: list[int]) -> np.ndarray:
-    rest = np.array([_REST.get(name, (0, 0, 0)) for name in joints], float)
-    # A joint without an entry rests in its median direction relative to the root.
-    known = [j for j in below_root if joints[j] in _REST]
-    body = project_to_so3(np.einsum("fci,cj->fij", directions[:, known], rest[known]))
-    usual = np.median(np.einsum("fji,fpj->fpi", body, directions), axis=0)
-    rest = np.where(np.any(rest != 0, axis=1, keepdims=True), rest, usual)
-    norm = np.linalg.norm(rest, axis=1, keepdims=True)
-    return np.where(norm > 1e-6, rest / np.maximum(norm, 1e-9), (0.0, 1.0, 0.0))
+def _rig(body: RigidBody, rate_hz: float, lift: np.ndarray, naming: dict[str, str], rest: str) -> Rig:
+    measured_toes = set(TOES) <= set(body.joints)
+    offsets = _rest_offsets(body, RESTS[rest])
+    turned = _rotations(body, offsets, rate_hz)
+    # An assumed toe is a joint only where a naming is not complete without it.
+    dropped = {joint for joint in BODY if naming[joint] == ""}
+    if naming is NAMES["h36m"] and not measured_toes:
+        dropped |= set(TOES)
+    kept = [joint for joint in BODY if joint not in dropped]
+    parents = tuple(kept.index(PARENTS[joint]) if PARENTS[joint] else -1 for joint in kept)
+    positions = np.zeros((len(kept), 3))
+    for i, parent in enumerate(parents):
+        if parent >= 0:
+            positions[i] = positions[parent] + offsets[kept[i]]
+    positions[:, 1] += _SOLE * body.lengths["lankle"] - positions[kept.index("lankle"), 1]
+    tips = {
+        "lwrist": _HAND * offsets["lwrist"], "rwrist": _HAND * offsets["rwrist"], "head": _CROWN * offsets["head"],
+        "ltoe": 0.25 * offsets["ltoe"] * (1, 0, 1), "rtoe": 0.25 * offsets["rtoe"] * (1, 0, 1),
+        "neck": (1 + _CROWN) * offsets["head"], "lankle": offsets["ltoe"], "rankle": offsets["rtoe"],
+    }  # fmt: skip
+    ends = {i: np.asarray(tips[joint]) for i, joint in enumerate(kept) if i not in parents}
+    root = body.positions[:, 0] + lift[:, None] * (0.0, 1.0, 0.0)
+    return Rig(
+        tuple(naming[joint] for joint in kept),
+        tuple(kept), parents, positions, ends, root, tuple(turned[joint] for joint in kept),
+    )  # fmt: skip
+
+
+def _rest_offsets(body: RigidBody, arms_down_deg: float) -> dict[str, np.ndarray]:
+    """Offset of each joint of ``BODY`` from its parent in the rest pose."""
+    cosine, sine = np.cos(np.radians(arms_down_deg)), np.sin(np.radians(arms_down_deg))
+    toe = np.array([0.0, -_SOLE, _FOOT]) * 0.5 * (body.lengths["lankle"] + body.lengths["rankle"])
+    arm, down, up = (cosine, -sine, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)
+    directions = {
+        "knee": down, "ankle": down, "neck": up, "head": up, "shoulder": (1.0, 0.0, 0.0), "elbow": arm, "wrist": arm,
+        "toe": tuple(toe / np.linalg.norm(toe)),
+    }  # fmt: skip
+    out = {"pelvis": np.zeros(3), **body.fixed}
+    for joint in set(BODY) - set(out):
+        side = np.array([-1.0 if joint.startswith("r") else 1.0, 1.0, 1.0])
+        direction = np.array(directions[joint if joint in directions else joint[1:]])
+        out[joint] = body.lengths.get(joint, float(np.linalg.norm(toe))) * side * direction
+    return out
+
+
+def _rotations(body: RigidBody, offsets: dict[str, np.ndarray], rate_hz: float) -> dict[str, Rotation]:
+    """Joint of ``BODY`` -> rotations (F,) of its bones from the rest pose to the world."""
+    bend = log_so3(np.swapaxes(body.pelvis, 1, 2) @ body.chest)
+    out = {
+        joint: Rotation.from_matrix(body.pelvis @ exp_so3(share * bend))
+        for joint, share in (("pelvis", 0.0), ("spine", 1 / 3), ("chest", 2 / 3), ("upperchest", 1.0))
+    }
+    for joint in BODY:
+        if joint in out:
+            continue
+        above = out[PARENTS[joint]]
+        child = next((c for c, parent in PARENTS.items() if parent == joint and c in body.joints), None)
+        out[joint] = above
+        if child is not None:
+            rest = offsets[child] / np.linalg.norm(offsets[child])
+            direction = body.at(child) - body.at(joint)
+            direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
+            out[joint] = above * _swing(rest, above.inv().apply(direction), rate_hz)
+    return out
 
 
 def _swing(rest: np.ndarray, direction: np.ndarray, rate_hz: float) -> Rotation:
@@ -113,6 +215,8 @@ def _swing(rest: np.ndarray, direction: np.ndarray, rate_hz: float) -> Rotation:
     quaternion = (swing[1:].inv() * carried).as_quat()
     jump = 2.0 * np.arctan2(quaternion[:, :3] @ rest, quaternion[:, 3])
     jump = (jump + np.pi) % (2.0 * np.pi) - np.pi
+    against = np.minimum(direction[1:] @ rest, direction[:-1] @ rest) < _AGAINST
+    jump = np.where(against, jump, 0.0)
     keep = float(np.exp(-1.0 / (rate_hz * TWIST_FADE_S)))
     twist = lfilter([keep], [1.0, -keep], np.concatenate([[0.0], jump]))
     return swing * Rotation.from_rotvec(twist[:, None] * rest)

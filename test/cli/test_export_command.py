@@ -8,7 +8,7 @@ from export_readers import READERS
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
-from drocap_ros.export import FORMATS, export_motion
+from drocap_ros.export import FORMATS, RIGGED, export_motion
 from drocap_ros.motion import load_motion, save_motion
 
 
@@ -31,7 +31,17 @@ def refused(arguments, folder, capsys, words):
 def test_folder_of_a_motion_is_accepted(folder, form, capsys):
     assert main(["export", str(folder), "--to", form]) == 0
     assert "15 joints" in capsys.readouterr().out
-    assert len(READERS[form](folder / f"motion.{form}").joints) == 15
+    # A rig has the motion's joints, and those of spine and collar bones.
+    assert len(READERS[form](folder / f"motion.{form}").joints) == (21 if form in RIGGED else 15)
+
+
+def test_names_and_rest_pose_are_chosen_for_rigs_only(folder, capsys):
+    out = folder / "rig.bvh"
+    options = ["--names", "mixamo", "--rest", "a", "--out", str(out)]
+    assert main(["export", str(folder), "--to", "bvh", *options]) == 0
+    assert "mixamorig:LeftForeArm" in READERS["bvh"](out).joints
+    assert "joints moved by" in capsys.readouterr().out
+    refused(["export", folder, "--to", "trc", "--names", "mixamo"], folder, capsys, "expected with format bvh or glb")
 
 
 def test_out_names_the_file_and_replaces_it(folder, capsys):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from export_readers import READERS, gltf_array
 
-from drocap_ros.export import FORMATS, export_motion
+from drocap_ros.export import FORMATS, RIGGED, export_motion
 from drocap_ros.skeleton import BODY_15
 
 TOLERANCE_M = {"bvh": 0.005, "c3d": 0.001, "trc": 0.001, "csv": 0.001, "glb": 0.001}
@@ -18,21 +18,25 @@ def written(motion, form, folder):
     return READERS[form](path), notes
 
 
-def in_order(back):
-    """Positions in the order of BODY_15: a hierarchy has its own."""
-    assert set(back.joints) == set(BODY_15.joints)
+def in_order(back, form="csv"):
+    """Positions in the order of BODY_15: a hierarchy has its own, with more joints."""
+    assert set(back.joints) == set(BODY_15.joints) or (form in RIGGED and set(back.joints) > set(BODY_15.joints))
     return back.positions[:, [back.joints.index(name) for name in BODY_15.joints]]
 
 
-def worst(back, truth):
-    return np.nanmax(np.linalg.norm(in_order(back) - truth, axis=-1))
+def worst(back, truth, form="csv", moved=None):
+    """Largest distance, m; rigs stand on the floor: one unknown height, or one per frame if ``moved``."""
+    off = in_order(back, form) - truth
+    if form in RIGGED:
+        off[..., 2] -= off[..., 2].mean() if moved is None else off[:, :1, 2]
+    return np.nanmax(np.linalg.norm(off, axis=-1))
 
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_positions_names_and_rate_are_kept(walker, tmp_path, form):
     back, _ = written(walker, form, tmp_path)
-    assert back.positions.shape == (48, 15, 3)
-    assert worst(back, walker.joints3d) < TOLERANCE_M[form]
+    assert len(back.positions) == 48
+    assert worst(back, walker.joints3d, form) < TOLERANCE_M[form]
     assert back.rate_hz == pytest.approx(24.0, rel=1e-5)
     np.testing.assert_allclose(back.times_s, np.arange(48) / 24.0, atol=1e-5)
 
@@ -41,8 +45,8 @@ def test_positions_names_and_rate_are_kept(walker, tmp_path, form):
 def test_motion_in_the_camera_frame_is_upright(in_camera, tmp_path, form):
     back, notes = written(in_camera, form, tmp_path)
     x, y, z = np.moveaxis(in_camera.joints3d, -1, 0)
-    assert worst(back, np.stack([x, z, -y], axis=-1)) < TOLERANCE_M[form]
-    positions = in_order(back)
+    assert worst(back, np.stack([x, z, -y], axis=-1), form, moved="per frame") < TOLERANCE_M[form]
+    positions = in_order(back, form)
     assert (positions[:, BODY_15.index("head"), 2] > positions[:, BODY_15.index("rankle"), 2] + 1.0).all()
     assert any("gravity" in note for note in notes)
 
@@ -58,7 +62,9 @@ def test_gaps_are_kept_by_formats_with_missing_values(with_gaps, tmp_path, form)
 @pytest.mark.parametrize("form", ["bvh", "glb"])
 def test_gaps_are_interpolated_in_formats_without_missing_values(walker, with_gaps, tmp_path, form):
     back, notes = written(with_gaps, form, tmp_path)
-    error = np.linalg.norm(in_order(back) - walker.joints3d, axis=2)
+    off = in_order(back, form) - walker.joints3d
+    off[..., 2] -= np.median(off[..., 2])
+    error = np.linalg.norm(off, axis=2)
     known = np.isfinite(with_gaps.joints3d).all(axis=2)
     # The bones are constant in the truth, not where a joint was interpolated along a chord.
     assert error[known].max() < TOLERANCE_M[form]
@@ -84,7 +90,7 @@ def test_uneven_stamps_are_kept_or_resampled(walker, tmp_path, form):
     )
     back, notes = written(motion, form, tmp_path)
     expected = walker.joints3d[0] + (np.arange(3)[None] * back.times_s[:, None])[:, None]
-    assert worst(back, expected) < TOLERANCE_M[form]
+    assert worst(back, expected, form) < TOLERANCE_M[form]
     assert back.rate_hz == pytest.approx(25.0)
     if form in ("csv", "glb"):
         np.testing.assert_allclose(back.times_s, stamps * 1e-9, atol=1e-6)
@@ -104,7 +110,7 @@ def test_long_gap_between_frames_stays_unknown(walker, tmp_path):
     assert hole.sum() > 40
 
 
-def test_glb_has_a_body_bound_to_the_joints(walker, tmp_path):
+def test_glb_has_a_person_bound_to_the_joints(walker, tmp_path):
     import pygltflib
 
     export_motion(walker, "glb", tmp_path / "motion.glb")
@@ -112,21 +118,60 @@ def test_glb_has_a_body_bound_to_the_joints(walker, tmp_path):
     assert document.asset.extras["up_axis"] == "Y"
     assert document.asset.extras["units"] == "m"
     primitives = document.meshes[0].primitives
-    assert {document.materials[p.material].name for p in primitives} == {"left", "right", "middle"}
+    assert {document.materials[p.material].name for p in primitives} == {"skin", "shirt", "trousers", "shoes"}
     inverse = gltf_array(document, document.skins[0].inverseBindMatrices).reshape(-1, 4, 4)
     rest = -inverse[:, 3, :3]
+    everything, volume = [], 0.0
     for primitive in primitives:
         vertices = gltf_array(document, primitive.attributes.POSITION)
-        owner = gltf_array(document, primitive.attributes.JOINTS_0)[:, 0].astype(int)
+        owners = gltf_array(document, primitive.attributes.JOINTS_0).astype(int)
+        weights = gltf_array(document, primitive.attributes.WEIGHTS_0)
         normals = gltf_array(document, primitive.attributes.NORMAL)
-        assert len(vertices) % 3 == 0
-        np.testing.assert_allclose(gltf_array(document, primitive.attributes.WEIGHTS_0).sum(axis=1), 1.0)
+        corners = gltf_array(document, primitive.indices).astype(int).reshape(-1, 3)
+        everything.append(vertices)
+        np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-6)
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
-        assert np.linalg.norm(vertices - rest[owner], axis=1).max() < 0.12
-        # Faces look outwards: counter-clockwise corners turn as the normal says.
-        corners = vertices.reshape(-1, 3, 3)
-        turn = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        assert (np.sum(turn * normals[::3], axis=1) > 0).all()
+        assert owners.max() < len(rest)
+        # No vertex follows a joint more than a bone away.
+        assert np.linalg.norm(vertices - rest[owners[:, 0]], axis=1).max() < 0.6
+        # Faces look outwards: counter-clockwise corners turn as the normals say.
+        a, b, c = vertices[corners].transpose(1, 0, 2)
+        turn = np.cross(b - a, c - a)
+        real = np.linalg.norm(turn, axis=1) > 1e-7
+        assert np.mean(np.sum(turn * normals[corners].mean(axis=1), axis=1)[real] > 0) > 0.99
+        volume += np.sum(a * np.cross(b, c)) / 6
+    low, high = np.concatenate(everything).min(axis=0), np.concatenate(everything).max(axis=0)
+    assert -0.01 < low[1] < 0.02
+    assert 1.5 < high[1] < 2.1
+    # The fixture is 1.75 m tall; bodies weigh some 1000 kg/m^3, and the tubes overlap.
+    assert 0.04 < volume < 0.11
+
+
+@pytest.mark.parametrize("form", RIGGED)
+@pytest.mark.parametrize("rest", ["t", "a"])
+@pytest.mark.parametrize("names", ["lafan1", "mixamo"])
+def test_rigs_have_the_names_of_other_programs(walker, tmp_path, form, names, rest):
+    export_motion(walker, form, tmp_path / f"rig.{form}", names=names, rest=rest)
+    back = READERS[form](tmp_path / f"rig.{form}")
+    prefix, toe = ("", "Toe") if names == "lafan1" else ("mixamorig:", "ToeBase")
+    expected = {"Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"} | {
+        side + name
+        for side in ("Left", "Right")
+        for name in ("UpLeg", "Leg", "Foot", toe, "Shoulder", "Arm", "ForeArm", "Hand")
+    }
+    assert {prefix + name for name in expected} == set(back.joints) - {"mixamorig:HeadTop_End"}
+    at = {name.removeprefix(prefix): back.positions[:, i] for i, name in enumerate(back.joints)}
+    for ours, theirs in (
+        ("lwrist", "LeftHand"),
+        ("rankle", "RightFoot"),
+        ("lknee", "LeftLeg"),
+        ("relbow", "RightForeArm"),
+    ):
+        off = at[theirs] - walker.joints3d[:, BODY_15.index(ours)]
+        assert np.linalg.norm(off - off.mean(axis=0), axis=1).max() < 0.002
+    # Constant bones.
+    bone = np.linalg.norm(at["LeftHand"] - at["LeftForeArm"], axis=1)
+    assert np.ptp(bone) < 1e-4
 
 
 @pytest.mark.parametrize("form", FORMATS)

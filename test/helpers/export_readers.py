@@ -22,12 +22,12 @@ def z_up(y_up: np.ndarray) -> np.ndarray:
 
 
 def read_bvh(path: Path) -> ReadBack:
-    """Forward kinematics by bvhio, without the zero-length joints."""
+    """Forward kinematics by bvhio."""
     import bvhio
 
     root = bvhio.readAsHierarchy(str(path))
     document = bvhio.readAsBvh(str(path))
-    nodes = [node for node, _, _ in root.layout() if "_to_" not in node.Name]
+    nodes = [node for node, _, _ in root.layout()]
     positions = []
     for frame in range(document.FrameCount):
         root.loadPose(frame)
@@ -90,7 +90,9 @@ def read_glb(path: Path) -> ReadBack:
     times = gltf_array(document, animation.samplers[0].input)
     placed: dict[int, tuple[np.ndarray, Rotation]] = {}
     for joint in skin.joints:
-        position = gltf_array(document, tracks[joint, "translation"].output)
+        node = document.nodes[joint]
+        moving = (joint, "translation") in tracks
+        position = gltf_array(document, tracks[joint, "translation"].output) if moving else np.array(node.translation)
         rotation = Rotation.from_quat(gltf_array(document, tracks[joint, "rotation"].output))
         if joint in above:
             origin, turned = placed[above[joint]]
@@ -106,7 +108,7 @@ def gltf_array(document, number: int) -> np.ndarray:
     accessor = document.accessors[number]
     view = document.bufferViews[accessor.bufferView]
     width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor.type]
-    kind = {5126: np.float32, 5121: np.uint8}[accessor.componentType]
+    kind = {5126: np.float32, 5121: np.uint8, 5123: np.uint16}[accessor.componentType]
     blob = document.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
     return np.frombuffer(blob, kind).reshape(accessor.count, width).astype(float)
 
