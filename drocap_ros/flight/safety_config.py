@@ -18,8 +18,8 @@ class SafetyConfig(Parameters):
         False, "whether the operator's `engage` may change the mode to GUIDED or OFFBOARD; `start` never does"
     )
     max_subject_age_s: float = param(
-        0.4, "greatest age of the subject's position at which the vehicle is moved; from 0.2 s on the orbit slows "
-        "down, to a stop at this age", unit="s", minimum=0.05, maximum=2,
+        0.4, "greatest age of the subject's position at which an orbit may begin; one that is flown slows down from "
+        "0.24 s on, and its setpoints stand from 5/6 of this age, 0.33 s, on", unit="s", minimum=0.05, maximum=2,
     )  # fmt: skip
     max_subject_gap_s: float = param(
         1.0, "age of the subject's position beyond which an orbit that has slowed down ends by a hold; with a younger "

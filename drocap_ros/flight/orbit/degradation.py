@@ -1,8 +1,8 @@
 """The first of three levels (degrade, hold, hand over): an orbit by old data slows down, and goes on with fresh data.
 
 The pace is the share of its speed at which the orbit is flown: the time of the reference runs slower by this factor.
-Old data reduce it at once; fresh data restore the speed that is left, and the rest along a ramp.  At pace 0 the vehicle
-stops at the reference, and the orbit has not ended: only the ages of ``motion_checks.py`` end it.
+Old data reduce it at once; fresh data restore the speed that is left, and the rest along a ramp.  At pace 0 the
+setpoint stands where the vehicle was then, and the orbit has not ended: only the ages of ``motion_checks.py`` end it.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from drocap_ros.flight.setpoint import Setpoint
 from drocap_ros.flight.subject.framing import framed_pace
 
 _C = ConditionCode
-_USUAL_SUBJECT_AGE_S = 0.2  # a camera at 15 Hz and its network
+_USUAL_SUBJECT_AGE_S = 0.24  # a camera at 15 Hz, and 0.17 s for its network
+_STANDING_AGE = 5 / 6  # of max_subject_age_s, 0.33 s: the last moving setpoint
 _CONTRADICTED_PACE = 0.3
+_WHOLE_WAY_PACE = 0.3  # below it the setpoint is nearer than the reference
 _CHANGE = 0.6  # 1/s; how fast a vehicle of 2 m/s brakes and accelerates, 1.2 m/s^2
 
 
@@ -35,7 +37,7 @@ def allowed_pace(seen: Observed, limits: Limits) -> Allowed:
     safety = limits.safety
     usual_s = safety.max_state_age_s
     halt_s = 0.5 * (usual_s + oldest_state_s(safety, patient=True))
-    subject_s = oldest_subject_s(seen, safety)
+    subject_s = min(oldest_subject_s(seen, safety), _STANDING_AGE * safety.max_subject_age_s)
     ages = (
         (seen.subject_age_s, min(_USUAL_SUBJECT_AGE_S, 0.8 * subject_s), subject_s, _C.SUBJECT_OUTDATED),
         (seen.link_age_s, usual_s, halt_s, _C.LINK_SILENT),
@@ -56,24 +58,36 @@ def allowed_pace(seen: Observed, limits: Limits) -> Allowed:
     return allowed
 
 
-def next_pace(pace: Pace, allowed: float, now_s: float) -> Pace:
+def next_pace(
+    pace: Pace, allowed: float, now_s: float, vehicle: np.ndarray | None = None, *, contradicted: bool = False
+) -> Pace:
     """The pace now: at most the allowed one, and at most the one that the vehicle has kept meanwhile.
 
-    A vehicle does not lose its speed at once: after a short gap the orbit goes on from the speed that is left.
+    A vehicle does not lose its speed at once: after a short gap the orbit goes on from the speed that is left.  After
+    a stand for pictures of something else it goes on along the whole ramp: the subject may be at another place.
+
+    vehicle : (3,) m, its position
+    contradicted : whether the pictures show something else
     """
     dt = now_s - pace.at_s
     kept = min(max(allowed, pace.kept - _CHANGE * dt), pace.kept + _CHANGE * dt)
     value = min(allowed, kept)
-    return Pace(value, (kept - pace.kept) / dt if dt > 0.0 else 0.0, kept, now_s)
+    if contradicted and value == 0.0:
+        kept = 0.0
+    place = vehicle if value > 0.0 or pace.place is None else pace.place
+    return Pace(value, (kept - pace.kept) / dt if dt > 0.0 else 0.0, kept, now_s, place)
 
 
 def slowed(setpoint: Setpoint, pace: Pace, max_acceleration_m_s2: float) -> Setpoint:
     """The setpoint of a reference whose time runs at this pace; a change of the pace is an acceleration.
 
-    None at pace 0: an autopilot integrates the acceleration, and the setpoint stands.
+    None at pace 0: an autopilot integrates the acceleration, and the setpoint stands where the vehicle was.
     """
     if pace.value == 1.0 and pace.rate == 0.0:
         return setpoint
+    if pace.place is not None:
+        way = min(pace.value / _WHOLE_WAY_PACE, 1.0)
+        setpoint = setpoint._replace(position=pace.place + way * (setpoint.position - pace.place))
     acceleration = pace.value**2 * setpoint.acceleration
     if pace.value > 0.0:
         acceleration = acceleration + pace.rate * setpoint.velocity

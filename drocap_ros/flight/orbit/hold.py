@@ -39,7 +39,9 @@ def begin_hold(
     fresh = known and max(seen.link_age_s, age_s) <= _FRESH_S
     behind_s = 0.0 if fresh else max(seen.position_age_s - seen.state_age_s, 0.0)
     place = seen.position + seen.velocity * behind_s if known else None
-    if place is not None and seen.subject is not None and seen.subject_distance_m < _NEAR_M and seen.closing_m_s < 0:
+    if place is not None and state.pace.value == 0.0 and reason.code in _HARMLESS:
+        place = state.pace.place  # the setpoint has stood there
+    elif place is not None and seen.subject is not None and seen.subject_distance_m < _NEAR_M and seen.closing_m_s < 0:
         # A vehicle that moves away from a near subject does not return to where it was: the subject may follow.
         outward = (seen.position - seen.subject)[:2] / max(seen.subject_distance_m, 1e-3)
         way = min((max(seen.approach_m_s, 0.0) - seen.closing_m_s) * _STOPPING_S, _MAX_WAY_OUT_M)

@@ -156,11 +156,13 @@ def stopping_room(seen: Observed, safety: SafetyConfig) -> float:
     """Distance (m) that may be lost between vehicle and subject until the vehicle stands, uncertainty included.
 
     A subject that recedes may stand in truth: what the vehicle flies towards him counts whole, and at least the speed
-    at which it follows him.  One that comes nearer cannot be stopped: his steps count until the vehicle stands.  A
-    standard deviation of his position, and of his speed until the vehicle reacts, is added.
+    at which it follows him.  One that comes nearer cannot be stopped: his steps count until the vehicle stands, less
+    the way that it flies away from him until it reacts.  A standard deviation of his position, and of his speed until
+    the vehicle reacts, is added.
     """
     toward = max(seen.closing_m_s, -seen.approach_m_s, 0.0) + _OWN_SPEED_SD_M_S  # own speed and chase together
-    steps = max(seen.approach_m_s, 0.0) * (_REACTION_S + toward / safety.braking_m_s2)
+    gaining = seen.approach_m_s + min(seen.closing_m_s, 0.0)  # on a vehicle that flies away
+    steps = max(gaining, 0.0) * _REACTION_S + max(seen.approach_m_s, 0.0) * toward / safety.braking_m_s2
     return braking_distance(toward, safety) + steps + math.hypot(seen.subject_sd_m, _REACTION_S * seen.approach_sd_m_s)
 
 

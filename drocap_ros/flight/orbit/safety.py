@@ -91,7 +91,7 @@ def _orbit(state: SafetyState, seen: Observed, now_s: float, blind: bool, limits
     if problem:
         return begin_hold(state, problem, seen, now_s, blind, retreats=problem.code == _C.SUBJECT_NEAR)
     allowed, cause = allowed_pace(seen, limits)
-    pace = next_pace(state.pace, allowed, now_s)
+    pace = next_pace(state.pace, allowed, now_s, seen.position, contradicted=seen.subject_contradicted)
     reason = state.condition
     if cause is not None:
         reason = condition(_C.DEGRADED, cause=cause)

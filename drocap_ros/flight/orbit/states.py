@@ -136,12 +136,14 @@ class Pace(NamedTuple):
 
     kept : the share that a vehicle still has that brakes and accelerates as usual
     at_s : monotonic
+    place : (3,) m, of the vehicle; at pace 0 where it was when the pace became 0
     """
 
     value: float = 1.0
     rate: float = 0.0
     kept: float = 1.0
     at_s: float = 0.0
+    place: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

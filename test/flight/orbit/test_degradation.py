@@ -53,7 +53,15 @@ def test_pace_falls_with_every_age_from_one_to_zero(name):
 def test_pace_ends_sooner_at_speed():
     fast = seen(subject_age_s=0.3, velocity=np.array([0.0, 3.4, 0.0]))
     assert allowed_pace(fast, LIMITS).pace == 0.0
-    assert allowed_pace(dataclasses.replace(fast, velocity=np.zeros(3)), LIMITS).pace == pytest.approx(0.5)
+    assert 0.2 < allowed_pace(dataclasses.replace(fast, velocity=np.zeros(3)), LIMITS).pace < 0.5
+
+
+def test_usual_age_is_flown_at_full_speed_and_setpoints_stand_before_a_third_of_a_second():
+    assert allowed_pace(seen(subject_age_s=0.17 + 1 / 15), LIMITS).pace == 1.0
+    assert allowed_pace(seen(subject_age_s=0.32), LIMITS).pace > 0.0
+    assert allowed_pace(seen(subject_age_s=0.335), LIMITS).pace == 0.0
+    slow_network = LIMITS._replace(safety=dataclasses.replace(LIMITS.safety, max_subject_age_s=1.2))
+    assert allowed_pace(seen(subject_age_s=0.5, velocity=np.zeros(3)), slow_network).pace > 0.5
 
 
 def test_orbit_slows_down_for_a_late_picture_and_goes_on_from_the_speed_that_is_left():
@@ -82,6 +90,33 @@ def test_orbit_that_stood_goes_on_along_a_ramp():
     assert values[-1] == 1.0
     assert max(np.diff(values)) < 0.05
     assert 1.0 < np.argmax(np.array(values) == 1.0) * 0.05 < 2.0
+
+
+def test_orbit_that_stood_for_pictures_of_something_else_goes_on_from_a_stand():
+    late, other = (next_pace(Pace(), 0.0, 0.05, contradicted=something_else) for something_else in (False, True))
+    assert next_pace(late, 1.0, 0.1).value > 0.9
+    assert next_pace(other, 1.0, 0.1).value < 0.05
+
+
+def test_standing_setpoint_stays_where_the_vehicle_was_and_leaves_along_the_way():
+    far = Setpoint(np.array([1.5, 0.0, 0.0]), np.array([2.0, 0.0, 0.0]), np.zeros(3), 1.0, 0.3)
+    pace, places = Pace(), []
+    for i in range(1, 21):
+        pace = next_pace(pace, 0.0 if i < 10 else 1.0, 0.05 * i, np.array([-0.1 * i, 0.0, 0.0]))
+        places.append(slowed(far, pace, 2.0).position[0])
+    assert places[:9] == [pytest.approx(-0.1)] * 9
+    assert places[9] == pytest.approx(1.5)  # after a short gap, with the speed that is left
+    stood = next_pace(Pace(0.0, 0.0, 0.0, 1.0, np.zeros(3)), 1.0, 1.05, np.zeros(3))
+    assert 0.0 < slowed(far, stood, 2.0).position[0] < 0.2
+
+
+def test_hold_after_a_stand_keeps_the_standing_place():
+    state, _ = fly(orbiting(), seen(subject_age_s=0.35), 0.2, 1.0)
+    moved = seen(subject_age_s=1.1, position=GOOD.position + 0.5)
+    late, _ = reduce(state, moved, 1.2, None, LIMITS)
+    assert np.array_equal(late.hold_position, GOOD.position)
+    stopped, _ = reduce(state, moved, 1.2, Command.STOP, LIMITS)
+    assert np.array_equal(stopped.hold_position, moved.position)
 
 
 @pytest.mark.parametrize("name", OLD)

@@ -318,8 +318,8 @@ def test_speed_shortens_the_allowed_age_of_the_subject():
         assert decision.action == Action.ORBIT  # the orbit stands, and goes on when the subject is located again
         return state.pace.value == 0.0
 
-    assert not stopped(2.0, 0.39)
-    assert stopped(2.0, 0.41)
+    assert not stopped(2.0, 0.33)
+    assert stopped(2.0, 0.34)
     assert stopped(2.5, 0.36)
     assert not stopped(2.5, 0.33)
     assert not stopped(4.4, 0.24)  # not below what a camera and a network take

@@ -37,6 +37,15 @@ def test_own_speed_and_chase_count_together():
     assert stopping_room(seen(closing_m_s=-2.0), SAFETY) < 0.1
 
 
+def test_vehicle_that_flies_away_as_fast_as_the_person_comes_needs_no_room_for_his_steps():
+    # The vehicle followed him, and he turned: a hold would end the flight away from him.
+    away = stopping_room(seen(closing_m_s=-1.3, approach_m_s=1.3), SAFETY)
+    assert away < 0.2
+    gains = stopping_room(seen(closing_m_s=-0.5, approach_m_s=1.3), SAFETY)
+    assert gains >= away + 0.8 * 0.5
+    assert stopping_room(seen(closing_m_s=0.0, approach_m_s=1.3), SAFETY) >= 1.3 * 0.5
+
+
 def test_uncertainty_of_position_and_speeds_is_added():
     calm = dataclasses.replace(seen(closing_m_s=1.0), subject_sd_m=0.4)
     assert stopping_room(calm, SAFETY) >= braking(1.0) + 0.4
