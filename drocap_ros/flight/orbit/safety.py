@@ -146,6 +146,9 @@ def _execute(
         return state, CommandAnswer(False, problem)
     if state.requesting:
         return state, _accepted(_C.ALREADY_REQUESTING_CONTROL)
+    if seen.in_control and state.modes > {seen.mode} and not math.isnan(state.hold_mode_s):
+        # The hold mode has been requested: it would arrive during the orbit, and count as the pilot's.
+        return state, _refused(_C.HOLD_MODE_PENDING)
     if seen.in_control:
         return _begin_orbit(seen, now_s), _accepted(_C.ORBITING)
     if command == Command.START:

@@ -217,6 +217,20 @@ def test_starting_again_after_a_hold_is_one_command():
     assert state.state == State.TAKEN_OVER
 
 
+@pytest.mark.parametrize("command", [Command.START, Command.ENGAGE])
+def test_start_while_our_own_hold_mode_is_on_its_way_is_refused_and_the_mode_is_no_take_over(command):
+    state, _ = reduce(orbiting(), GOOD, 1.0, Command.STOP, LIMITS)
+    state, _ = fly(state, GOOD, 1.5, 1.05)
+    state = permit_mode(state, "BRAKE")  # as with the request
+    state, decision = reduce(state, GOOD, 2.6, command, LIMITS)
+    assert not decision.answer.accepted
+    assert decision.answer.condition.code == ConditionCode.HOLD_MODE_PENDING
+    state, _ = reduce(state, BRAKE, 2.65, None, LIMITS)
+    assert state.state == State.HOLDING
+    state, decision = reduce(state, BRAKE, 2.7, Command.ENGAGE, LIMITS)
+    assert decision.answer.accepted
+
+
 def test_slowed_setpoint_scales_velocity_and_stands_without_acceleration():
     full = Setpoint(np.ones(3), np.array([2.0, 0.0, 0.0]), np.array([0.0, 0.6, 0.0]), 1.0, 0.3)
     assert slowed(full, Pace(), 2.0) is full
