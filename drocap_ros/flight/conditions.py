@@ -142,8 +142,8 @@ _SENTENCES = {
     "OFFBOARD only while setpoints arrive), or switch to GUIDED by hand (ArduPilot)",
     _C.PERSON_LEAVES_PICTURE: "at {radius_m:g} m, {height_m:g} m high and {speed_deg_s:.0f} deg/s the person "
     "leaves the picture of the fixed camera by {missing_percent:.0f} % of its height, as the body leans; {remedy}",
-    _C.HOLD_MODE_PENDING: "the autopilot's hold mode has just been requested and is not reported yet; send engage when it "
-    "is, or switch to GUIDED by hand (ArduPilot)",
+    _C.HOLD_MODE_PENDING: "the autopilot's hold mode has just been requested and is not reported yet; send engage when "
+    "it is, or switch to GUIDED by hand (ArduPilot)",
     _C.COMMANDS_DISABLED: "no motion: commands are disabled; set commands_enabled to true to allow it",
     _C.CLOCK_JUMPED: "our clock jumped by {jump_s:.1f} s",
     _C.POSITION_JUMPED: "the reported position jumped by {jump_m:.1f} m",
