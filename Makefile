@@ -1,5 +1,7 @@
 # `make demo` and `make test` do all the set-up by themselves.
 PYTHON ?= python3
+# pyenv's shim of python3.X refuses to run unless that version is named.
+export PYENV_VERSION := $(or $(PYENV_VERSION),$(patsubst python%,%,$(filter python3.%,$(PYTHON))))
 VENV := .venv
 BIN := $(VENV)/bin
 # Libraries of a ROS environment around this process must not leak into ours.

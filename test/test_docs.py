@@ -1,7 +1,9 @@
 """The documents agree with the code and with each other."""
 
+import os
 import re
 import runpy
+import subprocess
 
 import pytest
 
@@ -81,3 +83,15 @@ def test_every_page_of_figures_names_its_command_date_revision_and_machine(root)
         assert script, f"{page.name}: {head}"
         assert (root / script[1]).exists()
         assert f"({page.name})" in index, f"{page.name} is missing in docs/figures/README.md"
+
+
+def test_make_takes_a_python_that_pyenv_has_but_does_not_select(root, tmp_path):
+    """A shim as pyenv's: it refuses to run unless its version is named."""
+    shim = tmp_path / "python3.12"
+    shim.write_text('#!/bin/sh\n[ "$PYENV_VERSION" = 3.12 ] && echo found || exit 127\n')
+    shim.chmod(0o755)
+    (tmp_path / "makefile").write_text(f"include {root}/Makefile\nwhich:\n\t@$(PYTHON)\n")
+    command = ["make", "-s", "-C", str(root), "-f", str(tmp_path / "makefile"), "which", "PYTHON=python3.12"]
+    env = {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    done = subprocess.run(command, capture_output=True, text=True, env=env)
+    assert done.stdout.strip() == "found", done.stderr

@@ -20,6 +20,9 @@ from drocap_ros.parameters import Parameters
 
 P = TypeVar("P", bound=Parameters)
 
+#: Parameters of :class:`~drocap_ros.ros.lifecycle.ManagedComponent`.
+_DECLARED_LATER = ("autostart", "graph_running")
+
 
 def declare_parameters(node: Node, defaults: P) -> P:
     """Declare every field of ``defaults`` on the node and return the values after ROS's overrides.
@@ -27,10 +30,12 @@ def declare_parameters(node: Node, defaults: P) -> P:
     Raises
     ------
     ParameterError
-        When an override has the wrong type or lies outside its range.
+        When an override is unknown, has the wrong type or lies outside its range.
     """
-    for name in sorted(defaults.RETIRED.keys() & node._parameter_overrides.keys()):  # ROS ignores unknown ones
-        type(defaults).from_mapping({name: None}, node.get_name())
+    known = {*_DECLARED_LATER, *(spec.name for spec in dataclasses.fields(defaults))}
+    for name in sorted(node._parameter_overrides.keys() - known):  # ROS ignores unknown ones
+        if not node.has_parameter(name) and not name.startswith("qos_overrides."):
+            type(defaults).from_mapping({name: None}, node.get_name())
     values = {}
     for spec in dataclasses.fields(defaults):
         default = getattr(defaults, spec.name)
@@ -39,6 +44,15 @@ def declare_parameters(node: Node, defaults: P) -> P:
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
             raise ParameterError(f"{node.get_name()}.{spec.name}: {error}; correct the parameter file") from None
     return type(defaults).from_mapping(values, node.get_name())
+
+
+def parameter_help(component: str) -> str:
+    """One line for each parameter of a component: name, default, unit, description."""
+    lines = []
+    for spec in dataclasses.fields(section_types()[component]):
+        unit = f" {spec.metadata['unit']}" if spec.metadata.get("unit") else ""
+        lines.append(f"  {spec.name} ({spec.default!r}{unit}): {spec.metadata['description']}")
+    return "\n".join(lines)
 
 
 def _descriptor(spec: dataclasses.Field, default: object) -> ParameterDescriptor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import inspect
 import multiprocessing
 import os
 import signal
@@ -17,9 +18,11 @@ import rclpy
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.experimental import EventsExecutor
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 
-from drocap_ros.errors import DrocapError
+from drocap_ros.errors import DrocapError, InputError
 from drocap_ros.ros.component import ComponentNode
+from drocap_ros.ros.parameters import parameter_help
 from drocap_ros.ros.topics import NODES
 
 #: After the order to stop, messages that have arrived are still processed, for this long at most.
@@ -92,7 +95,18 @@ def lower_priority(niceness: int) -> None:
 
 
 def node_main(node_class: type[ComponentNode]) -> int:
-    """Run one node as a process until SIGINT or SIGTERM; returns the exit status."""
+    """Run one node as a process until SIGINT or SIGTERM; returns the exit status.
+
+    ``--help`` prints the node's description and parameters and ends.
+    """
+    words = remove_ros_args(sys.argv)[1:]
+    if "-h" in words or "--help" in words:
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `--help | head`
+        print(_help(node_class))
+        return 0
+    if words:
+        print(f"drocap: {words[0]}: expected ROS arguments after --ros-args; see --help", file=sys.stderr)
+        return InputError.exit_status
     stop = threading.Event()
     _stop_on_signal(stop)
     rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
@@ -108,6 +122,16 @@ def node_main(node_class: type[ComponentNode]) -> int:
     finally:
         rclpy.try_shutdown()
     return 0
+
+
+def _help(node_class: type[ComponentNode]) -> str:
+    """Description of a node, its parameters, and how to give them."""
+    text = inspect.getdoc(inspect.getmodule(node_class)) or ""
+    return (
+        f"{text.strip()}\n\nusage: python -m drocap_ros.nodes.{node_class.component}"
+        " [--ros-args -p NAME:=VALUE ... | --params-file FILE]\n\n"
+        f"parameters (default):\n{parameter_help(node_class.component)}"
+    )
 
 
 def _stop_on_signal(stop: threading.Event) -> None:

@@ -58,6 +58,7 @@ def test_a_video_file_goes_live_into_a_session_and_the_command_ends_with_it(vide
         live = start("live", *common, *nodes, *option, log=tmp_path / "log")
         assert live.wait(120) == 0, (tmp_path / "log").read_text()
     assert "running image_ingest, session_recorder" in (tmp_path / "log").read_text()
+    assert f"session: {tmp_path / 'session'}\n" in (tmp_path / "log").read_text()
     # Pictures are best effort; on one machine at this size nearly all arrive.
     assert 30 <= counts(tmp_path / "session")[IMAGES] <= 40
 

@@ -1,6 +1,9 @@
 """The graph, brought up from a script."""
 
 import os
+import re
+import subprocess
+import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -189,3 +192,17 @@ def test_every_node_has_a_module_and_a_section_of_the_configuration():
     assert set(NODES) == set(section_types())
     for name in NODES:
         assert node_class(name).component == name
+
+
+def test_readme_s_example_runs_as_printed(root, tmp_path):
+    blocks = re.findall(r"```python\n(.*?)```", (root / "README.md").read_text(), re.DOTALL)
+    (block,) = (block for block in blocks if "with bringup(" in block)
+    (tmp_path / "example.py").write_text(block)
+    writer = cv2.VideoWriter(str(tmp_path / "walk.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (320, 240))
+    for _ in range(3):
+        writer.write(np.full((240, 320, 3), 90, np.uint8))
+    writer.release()
+    env = {**os.environ, "PYTHONPATH": str(root), "DROCAP_MODELS": "simulation"}
+    command = [sys.executable, "example.py"]
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr

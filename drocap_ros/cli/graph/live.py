@@ -8,6 +8,7 @@ import importlib
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -16,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 from drocap_ros.cli.graph.dashboard import Dashboard, dashboard_on_terminal
 from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
 from drocap_ros.errors import InputError
+from drocap_ros.recording.mcap.metadata import METADATA_FILE
+from drocap_ros.recording.provenance import dated_name
 
 if TYPE_CHECKING:
     from drocap_ros.bringup import Graph
@@ -81,6 +84,11 @@ def run_graph(config: DrocapConfig, nodes: list[str], args: argparse.Namespace) 
     """Start nodes, show their diagnostics, stop on Ctrl-C or when the source has ended."""
     domain_id = chosen_domain(args)
     bringup = import_bringup().bringup
+    if "session_recorder" in nodes and not config.session_recorder.session_dir:
+        name = dated_name(time.time_ns())
+        config = config.replace("session_recorder", session_dir=str(Path(name).absolute()))
+    recorded = Path(config.session_recorder.session_dir)
+    before = _session_folders(recorded)
     with bringup(
         config,
         nodes,
@@ -98,7 +106,16 @@ def run_graph(config: DrocapConfig, nodes: list[str], args: argparse.Namespace) 
                 draw()
                 while graph.events:
                     print(f"drocap: {graph.events.popleft()}", file=sys.stderr, flush=True)
+    if "session_recorder" in nodes and not args.quiet:
+        folders = sorted(_session_folders(recorded) - before)
+        print("\n".join(f"session: {folder}" for folder in folders) or "no session: nothing was recorded")
     return 0
+
+
+def _session_folders(first: Path) -> set[Path]:
+    """Finished sessions of a recorder: a restarted one takes the next free name."""
+    folders = [first, *first.parent.glob(f"{first.name}_[0-9]*")]
+    return {folder for folder in folders if (folder / METADATA_FILE).is_file()}
 
 
 @contextlib.contextmanager
