@@ -38,8 +38,9 @@ def run(args: argparse.Namespace) -> int:
 
     path, motion = read_motion(args.motion)
     out = args.out or path.with_suffix(f".{args.to}")
-    if out.suffix[1:] in set(FORMATS) - {args.to}:
-        raise InputError(f"--out {out}: expected a name that ends in .{args.to}, found {out.suffix}; change it or --to")
+    ending, *_ = args.to.split("-")
+    if out.suffix[1:] in {form.split("-")[0] for form in FORMATS} - {ending}:
+        raise InputError(f"--out {out}: expected a name that ends in .{ending}, found {out.suffix}; change it or --to")
     with output_file(out) as file:
         notes = export_motion(motion, args.to, file, names=args.names, rest=args.rest)
     if not args.quiet:
