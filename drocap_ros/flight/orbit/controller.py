@@ -22,7 +22,7 @@ from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.orbit.command_checks import command_condition, commanded_goal
 from drocap_ros.flight.orbit.control_status import ControlStatus
 from drocap_ros.flight.orbit.degradation import slowed
-from drocap_ros.flight.orbit.following import Following
+from drocap_ros.flight.orbit.following import Following, Keeping
 from drocap_ros.flight.orbit.last_setpoint import coast_speed, harmless, slowed_condition
 from drocap_ros.flight.orbit.observer import observe, position_jump_m
 from drocap_ros.flight.orbit.planner import (
@@ -87,7 +87,7 @@ class OrbitController:
         self._commands: deque[OperatorCommand] = deque()
         self._answers: list[tuple[OperatorCommand, CommandAnswer]] = []
         self._queue = CommandQueue()
-        self._following = Following(config.max_echo_age_s)
+        self._following, self._keeping = Following(config.max_echo_age_s), Keeping(config)
         self._lock = threading.Lock()
         self.safety = SafetyState()
         self._goal: OrbitGoal = goal_of(config)
@@ -168,7 +168,7 @@ class OrbitController:
         setpoints, echo = self._link.sent_setpoints(), self._link.echo()
         not_followed = self._following.step(now_s, orbiting_s, setpoints, echo, self._vehicle)
         seen = observe(self._link, self._config, self._vehicle, estimate, disturbance, not_followed, now_ns)
-        seen = self._framing.watch(self._vehicle, seen, dt)
+        seen = self._keeping.watch(self._orbit, self._framing.watch(self._vehicle, seen, dt), now_s)
         seen = dataclasses.replace(self._guard.doubt(seen, self._history.offset, now_ns), intruder=self.intruder)
         command, kind = self._next_command(now_ns)
         dialect = DIALECTS.get(seen.autopilot, ARDUPILOT)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.orbit.motion_checks import oldest_state_s, oldest_subject_s
+from drocap_ros.flight.orbit.motion_checks import keeping_condition, oldest_state_s, oldest_subject_s
 from drocap_ros.flight.orbit.states import Limits, Observed, Pace
 from drocap_ros.flight.setpoint import Setpoint
 from drocap_ros.flight.subject.framing import framed_pace
@@ -21,6 +21,7 @@ _C = ConditionCode
 _USUAL_SUBJECT_AGE_S = 0.24  # a camera at 15 Hz, and 0.17 s for its network
 _STANDING_AGE = 5 / 6  # of max_subject_age_s, 0.33 s: the last moving setpoint
 _CONTRADICTED_PACE = 0.3
+_AWAY_S = 1.0
 _WHOLE_WAY_PACE = 0.3  # below it the setpoint is nearer than the reference
 _CHANGE = 0.6  # 1/s; how fast a vehicle of 2 m/s brakes and accelerates, 1.2 m/s^2
 
@@ -52,6 +53,8 @@ def allowed_pace(seen: Observed, limits: Limits) -> Allowed:
             pace = max(none_s - age_s, 0.0) / (none_s - full_s) if none_s > full_s else 0.0
             if pace < allowed.pace:
                 allowed = Allowed(pace, condition(code, age_s=age_s))
+    if allowed.cause is None:  # the reference waits by itself
+        allowed = allowed._replace(cause=keeping_condition(seen, limits, _AWAY_S))
     framed = framed_pace(seen.framing_margin)
     if framed < allowed.pace:
         allowed = Allowed(framed, condition(_C.SUBJECT_AT_BORDER, margin_percent=100 * seen.framing_margin))

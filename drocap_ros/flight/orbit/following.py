@@ -1,4 +1,4 @@
-"""Whether the vehicle follows the setpoints: by the content of the autopilot's echo and by the vehicle's motion.
+"""Whether the vehicle follows the setpoints, by the autopilot's echo and the vehicle's motion, and keeps the orbit.
 
 ArduPilot streams POSITION_TARGET_LOCAL_NED throughout GUIDED and PX4 in every mode, whether or not setpoints arrive:
 its age shows nothing but the loss of the stream.  It contains the target that is followed.  ArduPilot integrates the
@@ -7,6 +7,7 @@ last setpoint until GUID_TIMEOUT, and then sets its velocity to zero; PX4 adds t
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections import deque
 from collections.abc import Sequence
@@ -14,6 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from drocap_ros.flight.orbit.motion_checks import away_limit_m
+from drocap_ros.flight.orbit.planner import OrbitState, reference_position
+from drocap_ros.flight.orbit.states import Observed
+from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.vehicle_state import VehicleState
 
 _SENT_S = 0.7  # a setpoint may be echoed for so long: two transmissions and the period of the echo
@@ -84,6 +89,24 @@ class Following:
         if whole and fastest < _STANDING * mean:
             return f"it flies at {fastest:.1f} m/s where {mean:.1f} m/s are commanded"
         return ""
+
+
+class Keeping:
+    """How long the vehicle has been too far from its place on the orbit: the reference waits, and it does not come.
+
+    Wind can be stronger than the vehicle, and a subject faster.
+    """
+
+    def __init__(self, config: OrbitConfig) -> None:
+        self._limit_m = away_limit_m(config)
+        self._near_s = 0.0
+
+    def watch(self, orbit: OrbitState | None, seen: Observed, now_s: float) -> Observed:
+        """The observation with the distance from the place on the orbit, and for how long it has been too far."""
+        away_m = 0.0 if orbit is None else float(np.hypot(*(reference_position(orbit) - seen.position)[:2]))
+        if not away_m > self._limit_m:  # NaN: other conditions decide
+            self._near_s = now_s
+        return dataclasses.replace(seen, away_m=away_m, away_s=now_s - self._near_s)
 
 
 def _agrees(echo: Any, sent: list[Any], *, with_velocity: bool) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
 from drocap_ros.flight.orbit.states import Limits, Observed
+from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.safety_config import SafetyConfig
 from drocap_ros.flight.vehicle_state import LANDED_LANDING, LANDED_ON_GROUND, LANDED_TAKEOFF
 
@@ -17,6 +18,9 @@ _REACTION_S = 0.5
 _OWN_SPEED_SD_M_S = 0.1
 _LEAST_SUBJECT_AGE_S = 0.25
 _TIMEOUT_ROUNDING_S = 1e-3
+_WAITING_LEADS = 1.3  # of max_lead_m, as in planner.advance
+_CARRIED_OFF, _CARRIED_OFF_S = 3.0, 1.0  # times that limit: beyond the 3.7 m behind walking subjects
+_LONGEST_AWAY_S = 20.0  # behind walking subjects in 8 m/s of wind: 10 s
 #: The clocks of image and step differ by a transmission at most.
 _FUTURE_S = 0.2
 _LANDED_STATES = {LANDED_ON_GROUND: "on the ground", LANDED_TAKEOFF: "taking off", LANDED_LANDING: "landing"}
@@ -120,6 +124,24 @@ def limit_condition(seen: Observed, fence_centre: np.ndarray | None, limits: Lim
         if distance + braking_distance(outward, safety) > safety.fence_radius_m:
             return condition(_C.AT_FENCE, distance_m=distance, limit_m=safety.fence_radius_m)
     return None
+
+
+def keeping_condition(seen: Observed, limits: Limits, longest_s: float = _LONGEST_AWAY_S) -> Condition | None:
+    """Why the vehicle counts as unable to keep the orbit, after ``longest_s`` away from its place; None = it is not.
+
+    Sooner at three times the distance: the vehicle is carried off.
+    """
+    limit_m = away_limit_m(limits.orbit)
+    if seen.away_m > _CARRIED_OFF * limit_m:
+        longest_s = min(longest_s, _CARRIED_OFF_S)
+    if seen.away_s <= longest_s:
+        return None
+    return condition(_C.ORBIT_NOT_KEPT, away_m=seen.away_m, for_s=seen.away_s, limit_m=limit_m)
+
+
+def away_limit_m(orbit: OrbitConfig) -> float:
+    """Distance from its place on the orbit beyond which the reference stands and waits for the vehicle."""
+    return _WAITING_LEADS * orbit.max_lead_m
 
 
 def subject_condition(seen: Observed, limits: Limits, *, patient: bool = False) -> Condition | None:

@@ -8,7 +8,12 @@ import math
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.degradation import allowed_pace, next_pace
 from drocap_ros.flight.orbit.hold import begin_hold, request_hold_mode, resumption, retreat, update_hold
-from drocap_ros.flight.orbit.motion_checks import limit_condition, subject_condition, vehicle_condition
+from drocap_ros.flight.orbit.motion_checks import (
+    keeping_condition,
+    limit_condition,
+    subject_condition,
+    vehicle_condition,
+)
 from drocap_ros.flight.orbit.sight import foreign_mode, is_lost, is_silent, mode_visible, stream_ended, watch
 from drocap_ros.flight.orbit.states import (
     Action,
@@ -87,7 +92,7 @@ def _orbit(state: SafetyState, seen: Observed, now_s: float, blind: bool, limits
     """Slow the orbit down by the age of the data, or end it."""
     vehicle = vehicle_condition(seen, limits, patient=True)
     place = None if vehicle else limit_condition(seen, state.fence_centre, limits)
-    problem = vehicle or place or subject_condition(seen, limits, patient=True)
+    problem = vehicle or place or subject_condition(seen, limits, patient=True) or keeping_condition(seen, limits)
     if problem:
         return begin_hold(state, problem, seen, now_s, blind, retreats=problem.code == _C.SUBJECT_NEAR)
     allowed, cause = allowed_pace(seen, limits)

@@ -6,8 +6,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from orbit_observations import GOOD, LIMITS, orbiting
 
-from drocap_ros.flight.orbit.following import Following
+from drocap_ros.flight.conditions import ConditionCode
+from drocap_ros.flight.orbit.following import Following, Keeping
+from drocap_ros.flight.orbit.planner import begin_orbit
+from drocap_ros.flight.orbit.safety import reduce
+from drocap_ros.flight.orbit.states import Action, State
 from drocap_ros.flight.vehicle_state import VehicleState
 
 MAX_ECHO_AGE_S = 0.5
@@ -96,6 +101,30 @@ def test_each_orbit_is_judged_anew():
     assert following.step(3.5, 0.0, sent, (0.1, setpoint(0.0, 0.0)), slow) == ""
     assert following.step(9.0, 0.2, sent, (0.1, setpoint(0.0, 0.0)), slow) == ""
     assert following.step(9.1, 0.3, sent, None, dataclasses.replace(slow, velocity_enu_m_s=np.full(3, np.nan))) == ""
+
+
+def test_vehicle_that_does_not_reach_its_place_on_the_orbit_slows_down_and_then_holds():
+    keeping, state, codes = Keeping(LIMITS.orbit), orbiting(), []
+    place = begin_orbit(GOOD.position, GOOD.velocity, GOOD.subject, LIMITS.orbit)
+    for i in range(500):
+        t = 1.0 + 0.05 * i
+        blown_m = 2.5 if t >= 4.0 else 1.9  # 1.95 m is the limit
+        blown = dataclasses.replace(GOOD, position=GOOD.position + np.array([0.0, blown_m, 0.0]))
+        state, _ = reduce(state, keeping.watch(place, blown, t), t, None, LIMITS)
+        codes.append((round(t, 2), state.condition.values.get("cause", state.condition).code, state.state))
+    kept = [(t, now) for t, code, now in codes if code == ConditionCode.ORBIT_NOT_KEPT]
+    assert 5.0 <= kept[0][0] <= 5.1
+    assert kept[0][1] == State.ORBITING
+    assert 23.9 <= next(t for t, now in kept if now == State.HOLDING) <= 24.0
+    carried_off = dataclasses.replace(blown, away_m=6.0, away_s=1.1)
+    assert reduce(orbiting(), carried_off, 1.0, None, LIMITS)[0].condition.code == ConditionCode.ORBIT_NOT_KEPT
+    assert (
+        reduce(orbiting(), dataclasses.replace(blown, away_m=5.7, away_s=1.1), 1.0, None, LIMITS)[1].action
+        == Action.ORBIT
+    )
+    back = keeping.watch(place, GOOD, 12.0)
+    assert (back.away_m, back.away_s) == (0.0, 0.0)
+    assert keeping.watch(None, blown, 12.1).away_s == 0.0
 
 
 def test_no_recorded_flight_of_a_real_autopilot_counts_as_standing(shared):

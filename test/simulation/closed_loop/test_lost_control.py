@@ -1,5 +1,6 @@
 """Setpoints that are lost on the way, a bridge that stood still: nothing follows until the operator commands."""
 
+import numpy as np
 import pytest
 
 from drocap_ros.flight.conditions import ConditionCode
@@ -111,3 +112,16 @@ def test_the_pilots_mode_is_noticed_within_a_fifth_of_a_second(autopilot):
         loop.command(Command.ENGAGE)
         loop.run(loop.t + 2.5)
     assert max(late) <= (0.2 if autopilot == "px4" else 0.3), late
+
+
+def test_wind_that_is_stronger_than_the_vehicle_ends_the_orbit():
+    loop = orbit("ardupilot")
+    loop.copter.body.wind = np.array([0.0, 12.0, 0.0])
+    loop.run(20.0)
+    assert loop.controller.safety.state == State.HOLDING
+    assert loop.controller.safety.condition.code == ConditionCode.ORBIT_NOT_KEPT
+    assert "wind" in loop.controller.safety.reason
+    flown = [row for row in loop.rows if row.action == Action.ORBIT]
+    assert max(row.distance_m for row in flown) < 14.0
+    degraded = [reason.values["cause"].code for _, _, reason in loop.reasons if reason.code == ConditionCode.DEGRADED]
+    assert ConditionCode.ORBIT_NOT_KEPT in degraded
