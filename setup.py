@@ -103,7 +103,7 @@ setup(
     python_requires=">=3.10",
     packages=find_packages(include=["drocap_ros", "drocap_ros.*"]),
     package_data={
-        "drocap_ros": ["py.typed", "data/*", "data/*/*", "report/page/*", "config/*.yaml", "definitions/*.msg"]
+        "drocap_ros": ["py.typed", "*.pyi", "data/*", "data/*/*", "report/page/*", "config/*.yaml", "definitions/*.msg"]
     },
     install_requires=[
         "numpy>=1.26",

@@ -12,6 +12,8 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.tracks import MAX_FRAMES, read_npz
 
+#: Name of a motion in its folder.
+FILE = "motion.npz"
 #: Joints farther than this from the origin are refused: no unit makes them a person's motion.
 _FARTHEST_M = 1e6
 
@@ -89,15 +91,34 @@ _ARRAYS = (
 )  # fmt: skip
 
 
+def motion_file(path: str | Path, *names: str) -> Path:
+    """The path, or in a folder the first of ``names`` and ``motion.npz`` that exists.
+
+    Raises
+    ------
+    InputError
+        When the folder holds none of them.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return path
+    for name in (*names, FILE):
+        if (path / name).is_file():
+            return path / name
+    raise InputError(
+        f"{path / FILE}: no such file; name the folder of a motion, or make one: `drocap reconstruct {path}`"
+    )
+
+
 def load_motion(path: str | Path) -> Motion:
-    """Read a ``motion.npz``.
+    """Read a ``motion.npz``, by its path or that of its folder.
 
     Raises
     ------
     InputError
         When the file cannot be used.
     """
-    path = Path(path)
+    path = motion_file(path)
     a = read_npz(path, _ARRAYS)
     joints3d = a["joints3d"]
     if joints3d.ndim != 3 or joints3d.shape[2] != 3 or joints3d.shape[1] != a["joints"].size:

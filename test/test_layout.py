@@ -13,7 +13,7 @@ LAYERS = (
     ("errors", "parameters", "skeleton", "joint_maps", "leg_sides", "geometry", "keypoints", "observation", "tracks",
      "motion", "mocap", "clip"),
     ("perception", "flight", "reconstruction", "recording", "simulation"),
-    ("config", "pipeline", "live_replay", "training", "evaluation", "export", "report", "view"),
+    ("api", "config", "pipeline", "live_replay", "training", "evaluation", "export", "report", "view"),
     ("ros",),
     ("nodes", "bringup"),
     ("cli",),

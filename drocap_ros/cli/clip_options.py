@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from drocap_ros.clip import Clip
-
-RULES = ("largest", "centre")
 
 
 def add_clip_options(parser: argparse.ArgumentParser) -> None:
@@ -32,21 +30,3 @@ def clip_of(args: argparse.Namespace) -> Clip:
     from drocap_ros.clip import Clip
 
     return Clip(args.start, args.end)
-
-
-def subject_of(text: str) -> tuple[int | None, dict[str, Any]]:
-    """Number of a person, and changed parameters of the pose estimator, of ``--subject``.
-
-    Raises
-    ------
-    ParameterError
-        When it is neither a number, a rule nor a box.
-    """
-    from drocap_ros.perception.pose_estimator_config import parse_box
-
-    if text.isdecimal():
-        return int(text), {}
-    if not text or text in RULES:
-        return None, {"subject": text} if text else {}
-    parse_box(text)
-    return None, {"subject": "box", "subject_box": text}

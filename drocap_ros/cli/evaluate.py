@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from drocap_ros.cli import reconstruct
-from drocap_ros.cli.motion_input import HELP, TRUTH, motion_path, read_motion
+from drocap_ros.cli.motion_input import HELP, read_motion
 
 #: ``live`` needs a recording of the live graph.
 METHODS = tuple(method for method in reconstruct.METHODS if method != "live")
@@ -106,7 +106,7 @@ def _compare(args: argparse.Namespace) -> int:
     if args.out is not None:
         check_output_folder(args.out)
     path, motion = read_motion(args.motion)
-    errors = compare(motion, *load_truth(motion_path(args.truth, TRUTH)))
+    errors = compare(motion, *load_truth(args.truth))
     name = path.parent.name if path.name == "motion.npz" else path.stem
     text = tables.comparison_markdown(name, errors)
     print(text, end="")

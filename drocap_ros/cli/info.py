@@ -9,7 +9,6 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from drocap_ros.cli.motion_input import FILE
 from drocap_ros.errors import InputError
 
 
@@ -64,8 +63,8 @@ def summarize(path: Path) -> Summary:
     """
     if not path.exists():
         raise InputError(f"{path}: expected a recording, motion or tracks file, found no such file; check the path")
-    if path.is_dir() and (path / FILE).is_file():
-        path = path / FILE
+    if path.is_dir() and (path / "motion.npz").is_file():
+        path = path / "motion.npz"
     return _of_arrays(path) if path.suffix == ".npz" else _of_session(path)
 
 

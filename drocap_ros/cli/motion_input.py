@@ -5,14 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drocap_ros.errors import InputError
-
 if TYPE_CHECKING:
     from drocap_ros.motion import Motion
 
 HELP = "motion.npz, or its folder"
-FILE = "motion.npz"
-TRUTH = "truth.npz"
 
 
 def read_motion(argument: Path) -> tuple[Path, Motion]:
@@ -23,25 +19,7 @@ def read_motion(argument: Path) -> tuple[Path, Motion]:
     InputError
         When it is not a motion.
     """
-    from drocap_ros.motion import load_motion
+    from drocap_ros.motion import load_motion, motion_file
 
-    path = motion_path(argument)
+    path = motion_file(argument)
     return path, load_motion(path)
-
-
-def motion_path(argument: Path, *names: str) -> Path:
-    """File of an argument: itself, or in a folder the first of ``names`` and ``motion.npz`` that exists.
-
-    Raises
-    ------
-    InputError
-        When the folder holds none of them.
-    """
-    if not argument.is_dir():
-        return argument
-    for name in (*names, FILE):
-        if (argument / name).is_file():
-            return argument / name
-    raise InputError(
-        f"{argument / FILE}: no such file; name the folder of a motion, or make one: `drocap reconstruct {argument}`"
-    )

@@ -75,12 +75,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 def run(args: argparse.Namespace) -> int:
     """Reconstruct and write the output folder."""
     from drocap_ros.cli.atomic_output import check_output_folder, output_folder
-    from drocap_ros.cli.clip_options import clip_of, subject_of
+    from drocap_ros.cli.clip_options import clip_of
     from drocap_ros.cli.models.on_demand import ensure_networks
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.config import DrocapConfig, load_config
     from drocap_ros.motion import save_motion
     from drocap_ros.perception.load_models import models_folder
+    from drocap_ros.perception.pose_estimator_config import parse_subject
     from drocap_ros.pipeline import Selection, needs_networks, reconstruct_input
     from drocap_ros.report.motion_images import has_images
     from drocap_ros.report.page import save_report
@@ -92,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
     config = load_config(args.config) if args.config else DrocapConfig()
     if args.dictionary:
         config = config.replace("initializer", dictionary=str(args.dictionary))
-    person, rule = subject_of(args.subject)
+    person, rule = parse_subject(args.subject)
     config = config.replace("pose_estimator", **rule)
     telemetry, selection = _telemetry(args), Selection(clip_of(args), person, args.redetect)
     if needs_networks(args.input, args.redetect):

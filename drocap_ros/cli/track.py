@@ -51,17 +51,18 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 def run(args: argparse.Namespace) -> int:
     """Track, or find all persons, and write the output folder."""
     from drocap_ros.cli.atomic_output import check_output_folder, output_folder
-    from drocap_ros.cli.clip_options import clip_of, subject_of
+    from drocap_ros.cli.clip_options import clip_of
     from drocap_ros.cli.models.on_demand import ensure_networks
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.perception.estimator import PoseEstimator
     from drocap_ros.perception.load_models import models_folder
     from drocap_ros.perception.persons import find_persons, following
+    from drocap_ros.perception.pose_estimator_config import parse_subject
     from drocap_ros.recording.open_images import open_images
 
     out = args.out or Path(f"{Path(args.video).name.split('.')[0] or 'drocap'}_tracks")
     check_output_folder(out)
-    clip, (person, rule) = clip_of(args), subject_of(args.subject)
+    clip, (person, rule) = clip_of(args), parse_subject(args.subject)
     config, ingest = _configs(args, rule)
     folder = models_folder(args.models or config.models_dir or None)
     ensure_networks(folder, args.video, args)

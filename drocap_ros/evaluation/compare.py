@@ -19,7 +19,7 @@ from drocap_ros.evaluation.metrics import (
 )
 from drocap_ros.evaluation.world_errors import WorldErrors, world_errors
 from drocap_ros.mocap import load_mocap
-from drocap_ros.motion import Motion, load_motion
+from drocap_ros.motion import Motion, load_motion, motion_file
 from drocap_ros.skeleton import BODY_15, LIMB_JOINTS, in_body_order, indices
 from drocap_ros.tracks import kind_of, read_npz, wrong_kind
 
@@ -50,25 +50,28 @@ class MotionErrors:
     world: WorldErrors | None = None
 
 
-def load_truth(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
-    """True joints (T, 15, 3) in m, their times (T,) in s and their frame, of a MoCap or motion ``.npz``.
+def load_truth(truth: Motion | str | Path) -> tuple[np.ndarray, np.ndarray, str]:
+    """True joints (T, 15, 3) in m, their times (T,) in s and their frame, of a motion, or a MoCap or motion ``.npz``.
 
-    The file has to hold the twelve limb joints; others that it lacks are NaN.
+    In a folder ``truth.npz`` is the truth, else ``motion.npz``.  It has to hold the twelve limb joints; others that it
+    lacks are NaN.
 
     Raises
     ------
     InputError
         When the file is neither.
     """
-    names = read_npz(path, ())
-    kind = kind_of(names)
-    if kind == "MoCap":
-        x, fps = load_mocap(path, LIMB_JOINTS)
-        return x / 1000.0, np.arange(len(x)) / fps, "world"
-    if kind == "motion":
-        motion = load_motion(path)
-        return in_body_order(motion.joints3d, motion.joints, LIMB_JOINTS), motion.stamp_ns * 1e-9, motion.frame
-    raise wrong_kind(path, names, "MoCap or a motion as the truth")
+    if not isinstance(truth, Motion):
+        path = motion_file(truth, "truth.npz")
+        names = read_npz(path, ())
+        kind = kind_of(names)
+        if kind == "MoCap":
+            x, fps = load_mocap(path, LIMB_JOINTS)
+            return x / 1000.0, np.arange(len(x)) / fps, "world"
+        if kind != "motion":
+            raise wrong_kind(path, names, "MoCap or a motion as the truth")
+        truth = load_motion(path)
+    return in_body_order(truth.joints3d, truth.joints, LIMB_JOINTS), truth.stamp_ns * 1e-9, truth.frame
 
 
 def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -> MotionErrors:

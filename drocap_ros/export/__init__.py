@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from drocap_ros.errors import InputError
@@ -64,3 +66,30 @@ def export_motion(
     if chosen and form not in RIGGED:
         raise InputError(f"{', '.join(chosen)}: expected with format {' or '.join(RIGGED)}, got {form}; leave it out")
     return writers[form](Path(path), clip_of(motion), **chosen)
+
+
+def export(
+    motion: Motion | str | Path,
+    path: str | Path,
+    form: str | None = None,
+    *,
+    names: str | None = None,
+    rest: str | None = None,
+) -> tuple[str, ...]:
+    """Write a motion, or the motion of a file or folder; without ``form`` the ending of ``path`` names the format.
+
+    Parameters, results and errors of :func:`export_motion`.
+    """
+    from drocap_ros.motion import Motion, load_motion
+
+    whole = motion if isinstance(motion, Motion) else load_motion(motion)
+    return export_motion(whole, form or Path(path).suffix[1:], path, names=names, rest=rest)
+
+
+class _CallableModule(ModuleType):
+    """``drocap_ros.export`` is a function for users and this room; an import of the room would hide the function."""
+
+    __call__ = staticmethod(export)
+
+
+sys.modules[__name__].__class__ = _CallableModule

@@ -75,3 +75,21 @@ def parse_box(text: str) -> np.ndarray:
     if box.shape != (4,) or not np.isfinite(box).all() or (box[2:] <= box[:2]).any():
         raise ParameterError(f"subject_box: expected x_min,y_min,x_max,y_max px, got {text!r}; correct it")
     return box
+
+
+def parse_subject(text: str) -> tuple[int | None, dict[str, str]]:
+    """A person's number or None, and parameters, of "3", "largest", "centre", a box of :func:`parse_box`, or "".
+
+    Raises
+    ------
+    ParameterError
+        When the text is none of them.
+    """
+    if text.isdecimal():
+        return int(text), {}
+    if not text or text in ("largest", "centre"):
+        return None, {"subject": text} if text else {}
+    if "," not in text:
+        raise ParameterError(f"subject: expected a person's number, largest, centre or a box, got {text!r}; correct it")
+    parse_box(text)
+    return None, {"subject": "box", "subject_box": text}
