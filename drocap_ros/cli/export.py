@@ -37,8 +37,8 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.export import export_motion
 
     path, motion = read_motion(args.motion)
-    out = args.out or path.with_suffix(f".{args.to}")
-    ending, *_ = args.to.split("-")
+    ending, *kind = args.to.split("-")
+    out = args.out or path.with_suffix("".join(f".{word}" for word in (*kind, ending)))
     if out.suffix[1:] in {form.split("-")[0] for form in FORMATS} - {ending}:
         raise InputError(f"--out {out}: expected a name that ends in .{ending}, found {out.suffix}; change it or --to")
     with output_file(out) as file:

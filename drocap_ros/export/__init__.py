@@ -1,4 +1,4 @@
-"""Motions in the formats of other tools: BVH, C3D, TRC, CSV and binary glTF (``docs/export.md``)."""
+"""Motions in the formats of other tools: BVH, C3D, TRC, CSV, binary glTF and joint angles (``docs/export.md``)."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ FORMATS = {
     "c3d": "millimetres, z up",
     "trc": "millimetres, y up",
     "csv": "metres, z up",
+    "csv-angles": "joint angles, degrees",
     "glb": "metres, y up",
 }
 #: Formats with an animation skeleton: names of its joints and its rest pose can be chosen.
@@ -49,7 +50,7 @@ def export_motion(
     from drocap_ros.export.bvh import write_bvh
     from drocap_ros.export.c3d_file import write_c3d
     from drocap_ros.export.clip import clip_of
-    from drocap_ros.export.csv_table import write_csv
+    from drocap_ros.export.csv_table import write_csv, write_csv_angles
     from drocap_ros.export.glb import write_glb
     from drocap_ros.export.trc import write_trc
 
@@ -58,6 +59,7 @@ def export_motion(
         "c3d": write_c3d,
         "trc": write_trc,
         "csv": write_csv,
+        "csv-angles": write_csv_angles,
         "glb": write_glb,
     }
     if form not in writers:

@@ -97,6 +97,25 @@ def rig_of(clip: Clip, *, names: str = "h36m", rest: str = "t") -> tuple[Rig, tu
     for option, value, table in (("names", names, NAMES), ("rest", rest, RESTS)):
         if value not in table:
             raise InputError(f"{option}: expected one of {', '.join(table)}, got {value!r}")
+    body, notes = body_of(clip)
+    pelvis = clip.positions[:, clip.joints.index("pelvis")]
+    path = np.nanmax(pelvis, axis=0) - np.nanmin(pelvis, axis=0)
+    lift, floor_note = _onto_the_floor(body, bool(path.max() > _STILL_M))
+    rig = _rig(body, clip.rate_hz, lift, NAMES[names], rest)
+    feet = (
+        () if set(TOES) <= set(body.joints) else ("no toes in the motion: each foot is assumed, square to its shank",)
+    )
+    return rig, (*notes, floor_note, *feet)
+
+
+def body_of(clip: Clip) -> tuple[RigidBody, tuple[str, ...]]:
+    """Rigid body of a clip, y up, with its gaps interpolated, and notes on the changes.
+
+    Raises
+    ------
+    InputError
+        When a joint of ``BODY_15`` is missing, or a joint is never known.
+    """
     known = np.isfinite(clip.positions).all(axis=2)
     clip = without_gaps(clip)
     body = fit_rigid_body(clip.positions, clip.joints, known)
@@ -104,19 +123,13 @@ def rig_of(clip: Clip, *, names: str = "h36m", rest: str = "t") -> tuple[Rig, tu
     off = np.stack([body.at(name) for name in common], axis=1)
     off -= clip.positions[:, [clip.joints.index(name) for name in common]]
     moved = 1000.0 * np.linalg.norm(off, axis=2)
-    path = clip.positions[:, clip.joints.index("pelvis")]
-    lift, floor_note = _onto_the_floor(body, bool(np.ptp(path, axis=0).max() > _STILL_M))
-    rig = _rig(body, clip.rate_hz, lift, NAMES[names], rest)
     notes = [
         *clip.notes,
         f"bones made constant: joints moved by {moved.mean():.1f} mm on average, at most {moved.max():.1f} mm",
-        floor_note,
     ]
-    if not set(TOES) <= set(body.joints):
-        notes.append("no toes in the motion: each foot is assumed, at a right angle to its shank")
     if left := [name for name in clip.joints if name not in common]:
-        notes.append(f"left out, not in the rig: {', '.join(left)}")
-    return rig, tuple(notes)
+        notes.append(f"left out, not in the rigid body: {', '.join(left)}")
+    return body, tuple(notes)
 
 
 def _onto_the_floor(body: RigidBody, root_moves: bool) -> tuple[np.ndarray, str]:
@@ -131,9 +144,8 @@ def _onto_the_floor(body: RigidBody, root_moves: bool) -> tuple[np.ndarray, str]
     if not root_moves:
         return -lower, "no root motion known: the lower foot stands on the floor in each frame"
     floor = float(np.percentile(lower, _FLOOR_PERCENTILE))
-    return np.full(
-        len(lower), -floor
-    ), f"floor at 0: {'lowered' if floor > 0 else 'raised'} by {abs(floor):.3f} m so that the feet stand on it"
+    way = "lowered" if floor > 0 else "raised"
+    return np.full(len(lower), -floor), f"floor at 0: {way} by {abs(floor):.3f} m so that the feet stand on it"
 
 
 def _rig(body: RigidBody, rate_hz: float, lift: np.ndarray, naming: dict[str, str], rest: str) -> Rig:
@@ -198,11 +210,11 @@ def _rotations(body: RigidBody, offsets: dict[str, np.ndarray], rate_hz: float) 
             rest = offsets[child] / np.linalg.norm(offsets[child])
             direction = body.at(child) - body.at(joint)
             direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
-            out[joint] = above * _swing(rest, above.inv().apply(direction), rate_hz)
+            out[joint] = above * least_rotation(rest, above.inv().apply(direction), rate_hz)
     return out
 
 
-def _swing(rest: np.ndarray, direction: np.ndarray, rate_hz: float) -> Rotation:
+def least_rotation(rest: np.ndarray, direction: np.ndarray, rate_hz: float) -> Rotation:
     """Smallest rotations (F,) from ``rest`` (3,) to ``direction`` (F, 3), made continuous over time.
 
     Where a bone points against its rest direction, the smallest rotation is ambiguous and jumps; there the rotation

@@ -8,7 +8,7 @@ from export_readers import READERS
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
-from drocap_ros.export import FORMATS, RIGGED, export_motion
+from drocap_ros.export import RIGGED, export_motion
 from drocap_ros.motion import load_motion, save_motion
 
 
@@ -27,7 +27,7 @@ def refused(arguments, folder, capsys, words):
     assert sorted(folder.iterdir()) == before
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", READERS)
 def test_folder_of_a_motion_is_accepted(folder, form, capsys):
     assert main(["export", str(folder), "--to", form]) == 0
     assert "15 joints" in capsys.readouterr().out
@@ -66,7 +66,7 @@ def test_other_files_are_refused(folder, capsys):
         refused(["export", folder / name, "--to", "bvh"], folder, capsys, words)
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", READERS)
 def test_motions_without_content_are_refused(walker, folder, capsys, form):
     nothing = dataclasses.replace(walker, joints3d=np.full_like(walker.joints3d, np.nan))
     save_motion(folder / "nothing.npz", nothing)

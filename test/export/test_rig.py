@@ -134,7 +134,7 @@ def test_measured_toes_make_the_feet_and_other_joints_are_left_out(walker):
     rig, notes = rig_of(clip_with(walker, joints, names, parents))
     used = (*BODY_15.joints, "rtoe", "ltoe")
     assert off(rig, np.stack([at[name] for name in used], axis=1), used).max() < 1e-3
-    assert any("left out, not in the rig: spine, thorax" in note for note in notes)
+    assert any("left out, not in the rigid body: spine, thorax" in note for note in notes)
     assert not any("assumed" in note for note in notes)
     toe = rig.rest[rig.joints.index("ltoe")] - rig.rest[rig.joints.index("lankle")]
     assert np.linalg.norm(toe) == pytest.approx(np.hypot(0.15, 0.05), abs=1e-6)
