@@ -76,7 +76,9 @@ def test_same_seed_gives_the_same_flight_beside_busy_processes(tmp_path, capsys)
     for name, busy in (("quiet", 0), ("busy", 2)):
         out = tmp_path / name / "demo"
         with busy_processes(busy):
-            assert main(["demo", "--seconds", "3", "--seed", "2", "--out", str(out), "--quiet"]) == 0
+            assert (
+                main(["demo", "--seconds", "3", "--seed", "2", "--mount", "fixed", "--out", str(out), "--quiet"]) == 0
+            )
         printed.append(capsys.readouterr().out.replace(str(out), "OUT"))
         contents.append(session_contents(out / "session"))
         truth, motion = load_flight_truth(out / "truth.npz"), load_motion(out / "motion.npz")
@@ -89,6 +91,12 @@ def test_same_seed_gives_the_same_flight_beside_busy_processes(tmp_path, capsys)
     assert len(contents[0]["/drocap/pose2d"]) > 100
     for quiet, busy in zip(*arrays, strict=True):
         np.testing.assert_array_equal(quiet, busy)
+    # The camera is fixed: it leans with the body, and the motion knows where it looked.
+    exposure = np.searchsorted(truth.stamp_ns, motion.stamp_ns)
+    along, up = truth.camera_rotation[exposure, 2], truth.camera_rotation[exposure, 2, 2]
+    cosine = np.einsum("fi,fi->f", motion.camera_rotation[:, 2], along)
+    assert np.degrees(np.arccos(np.median(cosine))) < 3.0
+    assert np.ptp(np.degrees(np.arcsin(up))) > 2.0
 
 
 @contextlib.contextmanager

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 #: The networks of this package, for simulated images only.
 MODELS = "simulation"
+MOUNTS = ("gimbal", "servo", "fixed")
 _LEAST_S, _MOST_S = 2.0, 3600.0
 
 
@@ -36,6 +37,10 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument(
         "--autopilot", choices=("ardupilot", "px4"), default="ardupilot", help="which one is simulated (default"
         " ardupilot)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--mount", choices=MOUNTS, default="gimbal", help="of the simulated camera (default gimbal); a fixed one is"
+        " tilted for the orbit",
     )  # fmt: skip
     parser.add_argument(
         "--models", metavar="DIR", default=MODELS, help="folder of ONNX models instead of those for simulation"
@@ -67,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     check_output_folder(args.out)
     operator = Operator(args.seconds, requests_control=args.autopilot == "px4")
     with interruptible() as interrupted, output_folder(args.out) as folder:
-        config = demo_config(folder, args.seed, args.autopilot, args.models)
+        config = demo_config(folder, args.seed, args.autopilot, args.models, args.mount)
         if args.real_time:
             config = with_link(config)
         how = _fly(config, operator, args, interrupted)
@@ -111,16 +116,18 @@ def _fly(config: DrocapConfig, operator: Operator, args: argparse.Namespace, int
     return f"simulated time: {flown_s:.1f} s in {time.monotonic() - begin:.1f} s on this machine"
 
 
-def demo_config(folder: Path, seed: int, autopilot: str, models: str) -> DrocapConfig:
+def demo_config(folder: Path, seed: int, autopilot: str, models: str, mount: str = "gimbal") -> DrocapConfig:
     """The demo's graph, with motion enabled for the simulated vehicle."""
     from drocap_ros.config import DrocapConfig
 
     config = DrocapConfig().replace(
-        "flight_simulator", autopilot=autopilot, seed=seed, truth_file=str(folder / "truth.npz"),
+        "flight_simulator", autopilot=autopilot, seed=seed, mount=mount, truth_file=str(folder / "truth.npz"),
     )  # fmt: skip
     config = config.replace(
         "mavlink_bridge", commands_enabled=True, mode_change_allowed=True,
-        gimbal_control=True, body_height_m=config.flight_simulator.stature_m, attitude_hz=25.0,
+        gimbal_control=mount != "fixed", body_height_m=config.flight_simulator.stature_m, attitude_hz=25.0,
+        mount="auto" if mount == "gimbal" else mount,
+        camera_pitch_deg=config.flight_simulator.camera_pitch_deg if mount == "fixed" else 0.0,
     )  # fmt: skip
     # The stature is known, as an operator would ask for it before a flight.
     config = config.replace("initializer", assumed_height_m=config.flight_simulator.stature_m)
