@@ -16,7 +16,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     units = "; ".join(f"{form}: {facts}" for form, facts in FORMATS.items())
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "export",
-        help="write a motion as BVH, C3D, TRC, CSV or glTF",
+        help="write a motion as BVH, C3D, TRC, CSV or glTF, or its joint angles",
         description=f"Write a motion in the format of another tool. {units}. Conventions: docs/export.md.",
     )
     parser.add_argument("motion", metavar="MOTION", type=Path, help=HELP)
@@ -43,6 +43,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--out {out}: expected a name that ends in .{ending}, found {out.suffix}; change it or --to")
     with output_file(out) as file:
         notes = export_motion(motion, args.to, file, names=args.names, rest=args.rest)
+        if (model := file.with_suffix(".osim")).exists():  # of --to mot
+            model.replace(out.with_suffix(".osim"))
     if not args.quiet:
         print(f"written: {out} ({len(motion.joints)} joints, {FORMATS[args.to]})")
         for note in notes:

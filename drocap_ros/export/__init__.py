@@ -1,4 +1,4 @@
-"""Motions in the formats of other tools: BVH, C3D, TRC, CSV, binary glTF and joint angles (``docs/export.md``)."""
+"""Motions in the formats of other tools: BVH, C3D, TRC, CSV, glTF, joint angles, OpenSim (``docs/export.md``)."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ FORMATS = {
     "csv": "metres, z up",
     "csv-angles": "joint angles, degrees",
     "glb": "metres, y up",
+    "mot": "OpenSim coordinates, degrees and metres, y up",
 }
 #: Formats with an animation skeleton: names of its joints and its rest pose can be chosen.
 RIGGED = ("bvh", "glb")
@@ -52,6 +53,7 @@ def export_motion(
     from drocap_ros.export.clip import clip_of
     from drocap_ros.export.csv_table import write_csv, write_csv_angles
     from drocap_ros.export.glb import write_glb
+    from drocap_ros.export.mot import write_mot
     from drocap_ros.export.trc import write_trc
 
     writers: dict[str, Callable[..., tuple[str, ...]]] = {
@@ -61,6 +63,7 @@ def export_motion(
         "csv": write_csv,
         "csv-angles": write_csv_angles,
         "glb": write_glb,
+        "mot": write_mot,
     }
     if form not in writers:
         raise InputError(f"format: expected one of {', '.join(FORMATS)}, got {form!r}")

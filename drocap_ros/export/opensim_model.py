@@ -1,0 +1,135 @@
+"""A plain skeletal model for OpenSim, of this project's own making, in the sizes of a motion.
+
+Rigid segments without muscles; axes X forwards, Y up, Z to the right.  A marker stands at each joint of the motion.
+Coordinates have the names of OpenSim's usual full-body models; left joints are mirrored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from drocap_ros.export.rigid_body import TOES, RigidBody
+
+_X, _Y, _Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
+_SIX = [(kind, i) for kind in ("rotation", "translation") for i in (1, 2, 3)]
+_LINEAR = '<LinearFunction name="function"><coefficients>1 0</coefficients></LinearFunction>'
+_ZERO = '<Constant name="function"><value>0</value></Constant>'
+#: Ranges of coordinates, degrees; inverse kinematics stays within them.
+_RANGES = {"knee_angle": (-5.0, 160.0), "elbow_flex": (-5.0, 160.0)}
+#: Weights in inverse kinematics, m^2 per rad^2, of coordinates that joint positions show badly or not at all.
+WEIGHTS = {
+    "lumbar_extension": 2.5e-3, "hip_rotation_r": 2e-4, "hip_rotation_l": 2e-4, "arm_rot_r": 2e-4, "arm_rot_l": 2e-4,
+}  # fmt: skip
+
+
+def model_xml(body: RigidBody) -> str:
+    """OpenSim 4 model (``.osim``) in the sizes of a rigid body."""
+    trunk = float(sum(body.fixed[name][1] for name in ("spine", "chest", "upperchest", "thorax")))
+    lumbar = float(body.fixed["spine"][1])
+    half = float(body.fixed["lcollar"][0]) + 0.5 * (body.lengths["lshoulder"] + body.lengths["rshoulder"])
+    model = _Model()
+    pelvis = [("pelvis_rotation", _Y), ("pelvis_list", _X), ("pelvis_tilt", _Z)]
+    model.segment("pelvis", "", (0, 0, 0), pelvis, [("pelvis_tx", _X), ("pelvis_ty", _Y), ("pelvis_tz", _Z)])
+    spine = [("lumbar_extension", _Z), ("lumbar_bending", _X), ("lumbar_rotation", _Y)]
+    model.segment("torso", "pelvis", (0, lumbar, 0), spine)
+    model.segment("neck", "torso", (0, trunk - lumbar, 0), [("neck_extension", _Z), ("neck_bending", _X)])
+    model.segment("head", "neck", (0, body.lengths["neck"], 0), [("head_extension", _Z), ("head_bending", _X)])
+    model.markers += [("pelvis", "pelvis", (0, 0, 0)), ("neck", "head", (0, 0, 0))]
+    model.markers.append(("head", "head", (0, body.lengths["head"], 0)))
+    for side, sign in (("r", 1), ("l", -1)):
+        _limbs(model, body, side, sign, (0, trunk - lumbar, sign * half))
+    return model.xml()
+
+
+def _limbs(model: _Model, body: RigidBody, side: str, sign: int, shoulder: tuple[float, ...]) -> None:
+    x, y, backwards = (sign, 0, 0), (0, sign, 0), (0, 0, -1)
+    hip = (0, 0, sign * float(body.fixed["lhip"][0]))
+    thigh, shank, upper, fore = ((0, -body.lengths[side + name], 0) for name in ("knee", "ankle", "elbow", "wrist"))
+    femur, tibia, humerus, forearm = (f"{name}_{side}" for name in ("femur", "tibia", "humerus", "forearm"))
+    ball = [(f"hip_flexion_{side}", _Z), (f"hip_adduction_{side}", x), (f"hip_rotation_{side}", y)]
+    model.segment(femur, "pelvis", hip, ball)
+    model.segment(tibia, femur, thigh, [(f"knee_angle_{side}", backwards)])
+    ball = [(f"arm_flex_{side}", _Z), (f"arm_add_{side}", x), (f"arm_rot_{side}", y)]
+    model.segment(humerus, "torso", shoulder, ball)
+    model.segment(forearm, humerus, upper, [(f"elbow_flex_{side}", _Z)])
+    if set(TOES) <= set(body.joints):
+        model.segment(f"foot_{side}", tibia, shank, [(f"ankle_angle_{side}", _Z)])
+        model.markers.append((side + "toe", f"foot_{side}", (body.lengths[side + "toe"], 0, 0)))
+    model.markers += [
+        (side + "hip", "pelvis", hip), (side + "knee", tibia, (0, 0, 0)), (side + "ankle", tibia, shank),
+        (side + "shoulder", "torso", shoulder), (side + "elbow", forearm, (0, 0, 0)), (side + "wrist", forearm, fore),
+    ]  # fmt: skip
+
+
+class _Model:
+    """Bodies, joints and markers as XML of OpenSim 4."""
+
+    def __init__(self) -> None:
+        self.bodies: list[str] = []
+        self.joints: list[str] = []
+        self.markers: list[tuple[str, str, tuple[float, ...]]] = []
+
+    def segment(
+        self,
+        name: str,
+        parent: str,
+        place: tuple[float, ...],
+        turns: Sequence[tuple[str, tuple[float, ...]]],
+        moves: Sequence[tuple[str, tuple[float, ...]]] | None = None,
+    ) -> None:
+        """Add a body and its joint at ``place`` of the parent ("": the ground): rotations in order, translations."""
+        # Inverse kinematics needs no masses; the reader refuses bodies without.
+        self.bodies.append(
+            f'<Body name="{name}"><mass>1</mass><mass_center>0 0 0</mass_center>'
+            "<inertia>0.01 0.01 0.01 0 0 0</inertia></Body>"
+        )
+        # Rotations without a coordinate need axes too, not parallel to the others.
+        used = np.abs([axis for _, axis in turns])
+        fixed = [("", axis) for axis in (_Z, _X, _Y) if not (used @ axis).any()]
+        axes = [*turns, *fixed, *(moves or [("", axis) for axis in (_X, _Y, _Z)])]
+        transform = "".join(
+            f'<TransformAxis name="{kind}{i}"><coordinates>{coordinate}</coordinates><axis>{_numbers(axis)}</axis>'
+            f"{_LINEAR if coordinate else _ZERO}</TransformAxis>"
+            for (coordinate, axis), (kind, i) in zip(axes, _SIX, strict=True)
+        )
+        above = f"/bodyset/{parent}" if parent else "/ground"
+        self.joints.append(
+            f'<CustomJoint name="{name}_joint"><socket_parent_frame>{name}_place</socket_parent_frame>'
+            f"<socket_child_frame>/bodyset/{name}</socket_child_frame>"
+            f"<coordinates>{''.join(_coordinate(c) for c, _ in axes if c)}</coordinates>"
+            f'<frames><PhysicalOffsetFrame name="{name}_place"><socket_parent>{above}</socket_parent><translation>'
+            f"{_numbers(place)}</translation><orientation>0 0 0</orientation></PhysicalOffsetFrame></frames>"
+            f"<SpatialTransform>{transform}</SpatialTransform></CustomJoint>"
+        )
+
+    def xml(self) -> str:
+        """The whole document."""
+        markers = "\n".join(
+            f'<Marker name="{name}"><socket_parent_frame>/bodyset/{segment}</socket_parent_frame>'
+            f"<location>{_numbers(place)}</location></Marker>"
+            for name, segment, place in self.markers
+        )
+        sets = "\n".join(
+            f'<{kind} name="{kind.lower()}"><objects>\n{objects}\n</objects></{kind}>'
+            for kind, objects in (
+                ("BodySet", "\n".join(self.bodies)), ("JointSet", "\n".join(self.joints)), ("MarkerSet", markers),
+            )
+        )  # fmt: skip
+        return (
+            '<?xml version="1.0" encoding="UTF-8" ?>\n<OpenSimDocument Version="40500"><Model name="drocap_ros">\n'
+            "<credits>drocap_ros: plain skeleton in the sizes of one motion, without muscles</credits>\n"
+            f"<length_units>meters</length_units><force_units>N</force_units>\n{sets}\n</Model></OpenSimDocument>\n"
+        )
+
+
+def _coordinate(name: str) -> str:
+    if (span := _RANGES.get(name[:-2])) is None:
+        return f'<Coordinate name="{name}" />'
+    limits = f"<range>{_numbers(np.radians(span))}</range><clamped>true</clamped>"
+    return f'<Coordinate name="{name}">{limits}</Coordinate>'
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return " ".join(f"{value:.9g}" for value in values)
