@@ -83,7 +83,8 @@ def _limb(upper: np.ndarray, lower: np.ndarray, bends: float, rate_hz: float) ->
     bent = bends * _in(axes, lower)
     # Weighted by the squared sine of the flexion, in the complex plane of X and -Z.
     plane = (bent[:, 0] - 1j * bent[:, 2]) * np.abs(bent[:, 0] - 1j * bent[:, 2])
-    sigma = max(_AXIAL_S * rate_hz, 1e-3)
+    # The bound keeps invalid stamps (a counter for nanoseconds) from a kernel of 10^9 taps.
+    sigma = min(max(_AXIAL_S * rate_hz, 1e-3), 1000.0)
     smooth = gaussian_filter1d(plane.real, sigma) + 1j * gaussian_filter1d(plane.imag, sigma)
     turn = np.unwrap(np.angle(smooth + np.sin(np.radians(_CLEAR_DEG)) ** 2))
     axes = axes @ Rotation.from_rotvec(turn[:, None] * (0.0, 1.0, 0.0)).as_matrix()

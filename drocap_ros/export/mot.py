@@ -32,6 +32,7 @@ def write_mot(path: Path, clip: Clip) -> tuple[str, ...]:
 
     clip = at_constant_rate(clip)
     body, notes = body_of(y_up(clip))
+    opensim.Logger.removeFileSink()  # opensim.log in the current folder
     opensim.Logger.setLevelString("Off")
     # The tool writes further files into the working folder of its model.
     with tempfile.TemporaryDirectory(prefix="drocap_ik_") as folder:

@@ -65,13 +65,15 @@ def test_without_opensim_the_command_says_how_to_get_it(walker, tmp_path, monkey
     assert [path.name for path in tmp_path.iterdir()] == ["motion.npz"]
 
 
-def test_inverse_kinematics_of_a_simulated_walk_gives_its_angles(walker, tmp_path, capfd):
+def test_inverse_kinematics_of_a_simulated_walk_gives_its_angles(walker, tmp_path, monkeypatch, capfd):
     pytest.importorskip("opensim")
+    monkeypatch.chdir(tmp_path)
     joints = make_walk(48).shape.copy()
     joints[10:12, BODY_15.index("rwrist")] = np.nan
     save_motion(tmp_path / "motion.npz", dataclasses.replace(walker, joints3d=joints))
     assert main(["export", str(tmp_path), "--to", "mot"]) == 0
     assert "motion.osim" in capfd.readouterr().out
+    assert {path.name for path in tmp_path.iterdir()} == {"motion.npz", "motion.mot", "motion.osim"}
     assert (tmp_path / "motion.osim").read_text().startswith("<?xml")
     head, table = (tmp_path / "motion.mot").read_text().split("endheader\n")
     assert "inDegrees=yes" in head
