@@ -14,9 +14,11 @@ from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.live_replay import reconstruct_live, recorded_config
 from drocap_ros.motion import Motion
+from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
-from drocap_ros.perception.persons import find_persons, following
+from drocap_ros.perception.persons import find_persons, following, in_view
+from drocap_ros.perception.sources import Frame
 from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
 from drocap_ros.reconstruction.methods.method_input import Progress
 from drocap_ros.reconstruction.reconstruct import reconstruct
@@ -208,27 +210,32 @@ def _track(
     try:
         if selection.person is not None:
             with open_images(path, config.image_ingest) as images:
-                count = clip.meter(progress, "persons", images.duration_s)
-                persons = find_persons(clip.select(images.frames), folder, settings, count)
+                meter = clip.meter(progress, "persons", images.duration_s)
+                persons = find_persons(clip.select(images.frames), folder, settings, meter)
             settings = following(settings, persons, selection.person)
             begin_ns = persons[selection.person - 1].first_ns
-        estimator = PoseEstimator(folder, settings)
+        estimator, together = PoseEstimator(folder, settings), 0
         with open_images(path, config.image_ingest) as images:
-            count = clip.meter(progress, "2D pose", images.duration_s)
-            observations = observe(clip.select(images.frames), estimator, count, begin_ns)
+            meter = clip.meter(progress, "2D pose", images.duration_s)
+
+            def on_frame(frame: Frame, observation: PoseObservation) -> None:
+                nonlocal together
+                meter(frame, observation)
+                together += in_view(estimator.tracker.persons, frame.stamp_ns) > 1
+
+            observations = observe(clip.select(images.frames), estimator, on_frame, begin_ns)
         tracks = tracks_from_observations(observations)
     except InputError as error:
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
-    found = subjects(observations)
-    if len(found) > 1:
-        share = found[0][1] / len(observations)
-        logger.warning(
-            "%s: %d persons one after another; the one in most images (%.0f %%) is reconstructed;"
-            " `drocap track %s --list` numbers them for --subject N", path, len(found), 100 * share, path,
-        )  # fmt: skip
-    more: dict[str, Any] = {"pose2d": "estimated"}
-    more["images"] = {"size": list(tracks.image_size), "length": images.length, "rate_hz": images.rate_hz}
-    return tracks, more if selection.person is None else {**more, "person": selection.person}
+    origin: dict[str, Any] = {"pose2d": "estimated"}
+    origin["images"] = {"size": list(tracks.image_size), "length": images.length, "rate_hz": images.rate_hz}
+    if selection.person is not None:
+        return tracks, {**origin, "person": selection.person}
+    if (in_turn := len(subjects(observations)) > 1) or together > 1:  # the whole image is searched once a second
+        chosen = "the one in most images" if in_turn else "one of them"
+        text = "%s: several persons, %s is reconstructed; `drocap track %s --list` numbers them for --subject N"
+        logger.warning(text, path, chosen, path)
+    return tracks, origin
 
 
 def _log_warnings(session: Session) -> None:

@@ -81,6 +81,11 @@ def find_persons(
     return [FoundPerson(number, boxes) for number, boxes in enumerate(found, 1)]
 
 
+def in_view(persons: Sequence[Person], stamp_ns: int) -> int:
+    """Number of persons detected in the image of this stamp and in one before."""
+    return sum(p.detected_ns == stamp_ns and p.hits > 1 and p.mean_score >= _LEAST_SCORE for p in persons)
+
+
 def following(config: PoseEstimatorConfig, persons: Sequence[FoundPerson], number: int) -> PoseEstimatorConfig:
     """Parameters to follow one of the persons from its first detection on.
 

@@ -145,7 +145,7 @@ def test_clip_of_tracks_keeps_its_stamps(made, tmp_path, capture, capsys):
     assert "--redetect" in refused(capsys, *words, "--subject", 1)
 
 
-def test_persons_are_listed_and_chosen_by_number(crowd, tmp_path, capsys, monkeypatch):
+def test_persons_are_listed_and_chosen_by_number(crowd, tmp_path, capsys, caplog, monkeypatch):
     monkeypatch.setenv("DROCAP_MODELS", "simulation")
     assert run("track", crowd, "--list", "--out", tmp_path) == 0
     said = capsys.readouterr().out
@@ -156,6 +156,12 @@ def test_persons_are_listed_and_chosen_by_number(crowd, tmp_path, capsys, monkey
         keypoints = load_tracks(tmp_path / "tracks.npz").keypoints
         assert np.isfinite(keypoints).mean() > 0.5
         assert ((keypoints[..., 0] > low) & (keypoints[..., 0] < high))[np.isfinite(keypoints[..., 0])].all()
+    slow = tmp_path / "slow"  # at one image per second each one is searched
+    slow.mkdir()
+    for path in crowd.iterdir():
+        (slow / f"{17 * 10**17 + int(path.stem) * 10**9}.png").symlink_to(path)
+    assert run("reconstruct", slow, "--method", "initial", "--out", tmp_path / "out", "--quiet", "--no-report") == 0
+    assert f"several persons, one of them is reconstructed; `drocap track {slow} --list`" in caplog.text
     assert "expected 1 to 2" in refused(capsys, "reconstruct", crowd, "--subject", 3, "--out", tmp_path / "out")
 
 
