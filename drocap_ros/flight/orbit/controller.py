@@ -36,6 +36,7 @@ from drocap_ros.flight.orbit.planner import (
 )
 from drocap_ros.flight.orbit.pose_history import PoseHistory
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
+from drocap_ros.flight.orbit.shortfall import Shortfall
 from drocap_ros.flight.orbit.states import (
     Action,
     Command,
@@ -92,6 +93,7 @@ class OrbitController:
         self.safety = SafetyState()
         self._goal: OrbitGoal = goal_of(config)
         self._orbit: OrbitState | None = None
+        self._shortfall = Shortfall()
         self._before: tuple[int, float] | None = None
         self._fallback: Setpoint | None = None  # what the watchdog holds if this loop hangs
         self._jump_m = 0.0  # of the reported position, since the last step
@@ -108,6 +110,7 @@ class OrbitController:
             self._jump_m = max(self._jump_m, position_jump_m(self._vehicle, state))
             self._vehicle = state
             self._history.add(state)
+            self._subject.height_wanders = state.autopilot == "px4"
 
     def on_camera(self, camera_matrix: np.ndarray) -> None:
         """Take the camera matrix (3, 3) px.
@@ -242,6 +245,7 @@ class OrbitController:
 
     def _on_change(self, seen: Observed, estimate: SubjectEstimate | None) -> None:
         if self.safety.state == State.ORBITING and estimate is not None:
+            self._shortfall = Shortfall()
             self._orbit = begin_orbit(seen.position, seen.velocity, estimate.position, self._config)
         else:
             self._orbit = self._unsafe = None
@@ -272,8 +276,10 @@ class OrbitController:
                 dt * pace.value, config, least, coast_speed(seen, self._limits),
             )  # fmt: skip
             setpoint = setpoint_of(self._orbit, seen.position, estimate.position, estimate.velocity, config)
+            setpoint = self._shortfall.added(setpoint, seen, estimate.position, self._orbit.centre_velocity)
             setpoint = self._guard.limit(slowed(setpoint, pace, config.max_acceleration_m_s2), seen)
             setpoint, self._unsafe = harmless(setpoint, seen, estimate.velocity, self.safety.fence_centre, self._limits)
+            self._shortfall.learn(setpoint, seen, dt)
         elif action == Action.HOLD and self.safety.hold_position is not None:
             setpoint = hold_setpoint(self.safety.hold_position, self.safety.hold_yaw)
         if setpoint is not None and setpoint.is_finite():

@@ -15,6 +15,7 @@ from drocap_ros.observation import PoseObservation
 _NS = 1_000_000_000
 _DRIFT = 0.05  # m/sqrt(s), of the vehicle's position and of the feet that are set down; no motion of the subject
 _RATIO_MEMORY_NS, _LEAST_RATIOS, _RATIO_QUANTILE = 4 * _NS, 15, 0.4  # of size over ground
+_WANDERING_MEMORY_NS, _WANDERING_RATIOS = 2 * _NS, 12  # where the height wanders: a longer memory lags behind it
 _MAX_BENDING = 0.3  # of a body whose size counts; 0.1 by noise alone
 _MAX_SURPRISE = 0.3  # share of the range, beyond which the gate decides
 
@@ -67,6 +68,8 @@ class SubjectFilter:
 
     def __init__(self, config: SubjectConfig) -> None:
         self._config = config
+        #: Whether the vehicle's height wanders within seconds, as PX4's does.
+        self.height_wanders = False
         self._state: np.ndarray | None = None
         self._covariance = np.eye(6)
         self._systematic = np.eye(3)
@@ -149,9 +152,12 @@ class SubjectFilter:
         ratio = measurement.range_size_m / measurement.range_ground_m
         if 0.5 < ratio < 2.0 and measurement.bending < _MAX_BENDING:  # NaN is not
             self._ratios.append((stamp_ns, ratio))
-        while self._ratios and stamp_ns - self._ratios[0][0] > _RATIO_MEMORY_NS:
+        memory_ns, least = _RATIO_MEMORY_NS, _LEAST_RATIOS
+        if self.height_wanders:
+            memory_ns, least = _WANDERING_MEMORY_NS, _WANDERING_RATIOS
+        while self._ratios and stamp_ns - self._ratios[0][0] > memory_ns:
             self._ratios.popleft()
-        if len(self._ratios) >= _LEAST_RATIOS:
+        if len(self._ratios) >= least:
             self._ratio = float(np.quantile([ratio for _, ratio in self._ratios], _RATIO_QUANTILE))
 
     def _start(self, observation: PoseObservation, measurement: SubjectMeasurement) -> None:

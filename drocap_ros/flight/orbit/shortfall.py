@@ -1,0 +1,49 @@
+"""Acceleration that a vehicle behind a walking subject lacks: wind and friction slow it down.
+
+The integral of an autopilot's velocity loop adapts within several seconds, a walking subject turns sooner.  PX4 passes
+the acceleration of a setpoint on to the thrust and ends it with the setpoints.  ArduPilot continues its path by it,
+also after the last setpoint, so it gets none.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from drocap_ros.flight.orbit.states import Observed
+from drocap_ros.flight.setpoint import Setpoint
+
+_POSITION_GAIN = 0.95  # 1/s, of PX4's position loop (MPC_XY_P)
+_RATE, _FORGETTING = 0.8, 0.1  # 1/s^2 of the missing velocity; 1/s
+_STANDING_M_S, _SHARE, _GREATEST_M_S2 = 0.3, 0.6, 0.6  # m/s, 1/s of the subject's speed beyond: standing needs none
+
+
+class Shortfall:
+    """Integral of the commanded velocity that the vehicle does not reach; it reads no clock."""
+
+    def __init__(self) -> None:
+        self._integral: np.ndarray = np.zeros(2)  # m/s^2 ENU
+
+    def added(self, setpoint: Setpoint, seen: Observed, subject: np.ndarray, subject_velocity: np.ndarray) -> Setpoint:
+        """The setpoint with the missing acceleration along the line of sight.
+
+        subject : (3,) m;  subject_velocity : (2,) m/s or more, horizontal first; ENU, estimated
+        """
+        if seen.autopilot != "px4":
+            return setpoint
+        sight = subject[:2] - seen.position[:2]
+        toward = sight / max(float(np.hypot(*sight)), 0.5)
+        speed = float(np.hypot(*subject_velocity[:2]))
+        most = min(_SHARE * max(speed - _STANDING_M_S, 0.0), _GREATEST_M_S2)
+        along = min(max(float(self._integral @ toward), -most), most)
+        return setpoint._replace(acceleration=setpoint.acceleration + np.append(along * toward, 0.0))
+
+    def learn(self, sent: Setpoint, seen: Observed, dt: float) -> None:
+        """Take the setpoint that was sent, ``dt`` s after the one before."""
+        wanted = sent.velocity + _POSITION_GAIN * (sent.position - seen.position)
+        missing = (wanted - seen.velocity)[:2]
+        dt = min(max(dt, 0.0), 0.2)
+        self._integral = self._integral + (_RATE * missing - _FORGETTING * self._integral) * dt
+        size = math.hypot(*self._integral)
+        self._integral = self._integral * min(1.0, 1.0 / max(size, 1e-9))  # m/s^2 at most
