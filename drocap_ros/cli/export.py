@@ -26,6 +26,15 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "--names", choices=("h36m", "lafan1", "mixamo"), help="joint names of bvh and glb (default: h36m)"
     )
     parser.add_argument("--rest", choices=("t", "a"), help="rest pose of bvh and glb: T or A (default: t)")
+    parser.add_argument(
+        "--smooth",
+        metavar="HZ",
+        type=float,
+        nargs="?",
+        const=6.0,
+        help="low-pass filter, cut-off in Hz (6 without a number)",
+    )
+    parser.add_argument("--lock-feet", action="store_true", help="resting feet keep their place")
     parser.add_argument("--quiet", action="store_true", help="no output, only errors")
     parser.set_defaults(run=run)
     return parser
@@ -42,7 +51,9 @@ def run(args: argparse.Namespace) -> int:
     if out.suffix[1:] in {form.split("-")[0] for form in FORMATS} - {ending}:
         raise InputError(f"--out {out}: expected a name that ends in .{ending}, found {out.suffix}; change it or --to")
     with output_file(out) as file:
-        notes = export_motion(motion, args.to, file, names=args.names, rest=args.rest)
+        notes = export_motion(
+            motion, args.to, file, names=args.names, rest=args.rest, smooth_hz=args.smooth, lock_feet=args.lock_feet
+        )
         if (model := file.with_suffix(".osim")).exists():  # of --to mot
             model.replace(out.with_suffix(".osim"))
     if not args.quiet:

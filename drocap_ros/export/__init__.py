@@ -28,7 +28,14 @@ RIGGED = ("bvh", "glb")
 
 
 def export_motion(
-    motion: Motion, form: str, path: str | Path, *, names: str | None = None, rest: str | None = None
+    motion: Motion,
+    form: str,
+    path: str | Path,
+    *,
+    names: str | None = None,
+    rest: str | None = None,
+    smooth_hz: float | None = None,
+    lock_feet: bool = False,
 ) -> tuple[str, ...]:
     """Write a motion to a file of another format.
 
@@ -37,10 +44,12 @@ def export_motion(
     form : one of :data:`FORMATS`
     names : joint names of BVH and glTF, one of :data:`drocap_ros.export.rig.NAMES`; None: "h36m"
     rest : rest pose of BVH and glTF, one of :data:`drocap_ros.export.rig.RESTS`; None: "t"
+    smooth_hz : cut-off of :func:`drocap_ros.export.cleaning.smooth`; None: no filter
+    lock_feet : :func:`drocap_ros.export.cleaning.lock_feet`, after the filter
 
     Returns
     -------
-    Notes on changes, as sentences: resampling, interpolation, constant bones, floor, unknown vertical.
+    Notes on changes, as sentences: resampling, interpolation, cleaning, constant bones, floor, unknown vertical.
 
     Raises
     ------
@@ -48,6 +57,7 @@ def export_motion(
         When the format or an option is unknown, or the motion has fewer than two frames or lacks data that the format
         needs.
     """
+    from drocap_ros.export import cleaning
     from drocap_ros.export.bvh import write_bvh
     from drocap_ros.export.c3d_file import write_c3d
     from drocap_ros.export.clip import clip_of
@@ -70,7 +80,12 @@ def export_motion(
     chosen = {name: value for name, value in (("names", names), ("rest", rest)) if value is not None}
     if chosen and form not in RIGGED:
         raise InputError(f"{', '.join(chosen)}: expected with format {' or '.join(RIGGED)}, got {form}; leave it out")
-    return writers[form](Path(path), clip_of(motion), **chosen)
+    clip = clip_of(motion)
+    if smooth_hz is not None:
+        clip = cleaning.smooth(clip, smooth_hz)
+    if lock_feet:
+        clip = cleaning.lock_feet(clip)
+    return writers[form](Path(path), clip, **chosen)
 
 
 def export(
@@ -80,6 +95,8 @@ def export(
     *,
     names: str | None = None,
     rest: str | None = None,
+    smooth_hz: float | None = None,
+    lock_feet: bool = False,
 ) -> tuple[str, ...]:
     """Write a motion, or the motion of a file or folder; without ``form`` the ending of ``path`` names the format.
 
@@ -88,7 +105,8 @@ def export(
     from drocap_ros.motion import Motion, load_motion
 
     whole = motion if isinstance(motion, Motion) else load_motion(motion)
-    return export_motion(whole, form or Path(path).suffix[1:], path, names=names, rest=rest)
+    form = form or Path(path).suffix[1:]
+    return export_motion(whole, form, path, names=names, rest=rest, smooth_hz=smooth_hz, lock_feet=lock_feet)
 
 
 class _CallableModule(ModuleType):

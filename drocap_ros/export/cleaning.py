@@ -1,0 +1,145 @@
+"""Optional cleaning of an export, off by default: a low-pass filter over time, and feet that keep their place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import butter, filtfilt
+
+from drocap_ros.errors import InputError
+from drocap_ros.export.clip import Clip, at_constant_rate
+from drocap_ros.skeleton import indices
+
+#: A filter of order 2 applied twice has its -3 dB at this share of its cut-off.
+_TWICE = (np.sqrt(2.0) - 1.0) ** 0.25
+#: A foot rests while its ankle, averaged over a time, is slower than this, for at least a time.
+_STILL_M_S, _AVERAGE_S, _SHORTEST_S = 0.4, 0.15, 0.2
+#: Time in which a foot leaves or reaches its place; farther than this from its median place it is not at rest, m.
+_FADE_S, _FARTHEST_M = 0.2, 0.08
+#: A root that moves less than this is not known in the world, m.
+_ROOT_MOVES_M = 0.05
+
+
+def smooth(clip: Clip, cut_off_hz: float) -> Clip:
+    """Clip filtered by a zero-phase Butterworth filter of order 4: order 2, both ways (Winter 2009, 3.4.4).
+
+    Unknown joints stay unknown; the filter passes over them by linear interpolation.  An uneven time line is resampled.
+
+    Raises
+    ------
+    InputError
+        When the cut-off is not between 0 and half the frame rate, or there are too few frames.
+    """
+    clip = at_constant_rate(clip)
+    corrected = cut_off_hz / _TWICE
+    if not 0.0 < corrected < 0.5 * clip.rate_hz:
+        most = 0.5 * clip.rate_hz * _TWICE
+        raise InputError(f"smooth: expected a cut-off between 0 and {most:.3g}, got {cut_off_hz:g} Hz; choose another")
+    b, a = butter(2, corrected, fs=clip.rate_hz)
+    out = clip.positions.copy()
+    if len(out) <= 3 * max(len(a), len(b)):
+        raise InputError(f"smooth: expected more than 9 frames to filter, got {len(out)}; leave it out")
+    known = np.isfinite(out).all(axis=2)
+    for joint in np.flatnonzero(known.any(axis=0)):
+        seen = known[:, joint]
+        for axis in range(3):
+            line = np.interp(clip.times_s, clip.times_s[seen], out[seen, joint, axis])
+            out[seen, joint, axis] = filtfilt(b, a, line)[seen]
+    note = f"smoothed (Butterworth, zero phase, order 4, {cut_off_hz:g} Hz): {_moved(clip.positions, out)}"
+    return replace(clip, positions=out, notes=(*clip.notes, note))
+
+
+def lock_feet(clip: Clip) -> Clip:
+    """Clip, z up, whose resting feet keep their place; knees follow by two-bone inverse kinematics.
+
+    A foot rests while its ankle is slower than 0.4 m/s for at least 0.2 s; its place is the median over that time.
+    Hips stay, thigh and shank keep the frame's lengths, toes move with the ankle.
+
+    Raises
+    ------
+    InputError
+        When the root does not move through the world, or a joint of the legs is missing.
+    """
+    pelvis = clip.positions[:, indices(clip.joints, ("pelvis",))[0]]
+    pelvis = pelvis[np.isfinite(pelvis).all(axis=1)]
+    if not len(pelvis) or np.ptp(pelvis, axis=0).max() < _ROOT_MOVES_M:
+        raise InputError(
+            "lock-feet: expected a root that moves through the world, it stands still; reconstruct with telemetry"
+        )
+    out = clip.positions.copy()
+    before, after, count = [], [], 0
+    for side in "rl":
+        hip, knee, ankle = indices(clip.joints, tuple(side + name for name in ("hip", "knee", "ankle")))
+        rests = _rests(clip.positions[:, ankle], clip.rate_hz)
+        moved = clip.positions[:, ankle] + _offsets(clip.positions[:, ankle], rests, clip.rate_hz)
+        out[:, knee], out[:, ankle] = _two_bones(clip.positions[:, [hip, knee, ankle]], moved)
+        if side + "toe" in clip.joints:
+            toe = clip.joints.index(side + "toe")
+            out[:, toe] += out[:, ankle] - clip.positions[:, ankle]
+        for first, last in rests:
+            speeds = [np.diff(x[first:last, ankle], axis=0) * clip.rate_hz for x in (clip.positions, out)]
+            before.append(np.linalg.norm(speeds[0], axis=1))
+            after.append(np.linalg.norm(speeds[1], axis=1))
+        count += len(rests)
+    if not count:
+        return replace(clip, notes=(*clip.notes, "feet not locked: none rests"))
+    note = (
+        f"feet locked in {count} rests, their speed {np.nanmean(np.concatenate(before)):.2f} ->"
+        f" {np.nanmean(np.concatenate(after)):.2f} m/s: {_moved(clip.positions, out)}"
+    )
+    return replace(clip, positions=out, notes=(*clip.notes, note))
+
+
+def _moved(before: np.ndarray, after: np.ndarray) -> str:
+    off = 1000.0 * np.linalg.norm(after - before, axis=2)
+    return f"joints moved by {np.nanmean(off):.1f} mm on average, at most {np.nanmax(off):.1f} mm"
+
+
+def _rests(ankle: np.ndarray, rate_hz: float) -> list[tuple[int, int]]:
+    """First and end frame of each time in which an ankle (F, 3) rests."""
+    velocity = np.gradient(ankle, axis=0) * rate_hz
+    width = min(max(round(_AVERAGE_S * rate_hz), 1), len(ankle))
+    speed = np.linalg.norm(uniform_filter1d(velocity, width, axis=0, mode="nearest"), axis=1)
+    # Unknown is NaN, which the average spreads: it compares as moving.
+    still = np.concatenate([[0], (np.nan_to_num(speed, nan=np.inf) < _STILL_M_S).astype(int), [0]])
+    edges = np.flatnonzero(np.diff(still)).reshape(-1, 2)
+    return [(int(a), int(b)) for a, b in edges if b - a >= max(_SHORTEST_S * rate_hz, 2)]
+
+
+def _offsets(ankle: np.ndarray, rests: list[tuple[int, int]], rate_hz: float) -> np.ndarray:
+    """(F, 3) from the ankle to its place: whole at rest, fading before and after."""
+    out = np.zeros_like(ankle)
+    resting = np.zeros(len(ankle), bool)
+    for first, last in rests:
+        resting[first:last] = True
+    fade = max(round(_FADE_S * rate_hz), 1)
+    for first, last in rests:
+        away = np.median(ankle[first:last], axis=0) - ankle[first:last]
+        far = np.linalg.norm(away, axis=1, keepdims=True)
+        away *= np.minimum(1.0, _FARTHEST_M / np.maximum(far, 1e-9))
+        out[first:last] = away
+        for frame, edge, step in ((first, away[0], -1), (last - 1, away[-1], 1)):
+            for k in range(1, fade):
+                at = frame + step * k
+                if 0 <= at < len(ankle) and not resting[at]:
+                    out[at] += edge * 0.5 * (1.0 + np.cos(np.pi * k / fade))
+    return out
+
+
+def _two_bones(leg: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Knee and ankle (F, 3) of hip, knee, ankle (F, 3, 3) with the ankle as near to ``target`` as the bones reach."""
+    hip, knee, ankle = np.swapaxes(leg, 0, 1)
+    thigh, shank = np.linalg.norm(knee - hip, axis=1), np.linalg.norm(ankle - knee, axis=1)
+    way = target - hip
+    reach = np.linalg.norm(way, axis=1)
+    along = way / np.maximum(reach, 1e-9)[:, None]
+    reach = np.clip(reach, np.abs(thigh - shank) + 1e-9, thigh + shank - 1e-9)
+    foot = (thigh**2 - shank**2 + reach**2) / (2.0 * np.maximum(reach, 1e-9))
+    height = np.sqrt(np.maximum(thigh**2 - foot**2, 0.0))
+    aside = (knee - hip) - along * np.sum((knee - hip) * along, axis=1, keepdims=True)
+    aside /= np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-9)
+    moved = np.any(target != ankle, axis=1)[:, None]
+    new_knee = hip + along * foot[:, None] + aside * height[:, None]
+    return np.where(moved, new_knee, knee), np.where(moved, hip + along * reach[:, None], ankle)

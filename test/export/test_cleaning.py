@@ -1,0 +1,100 @@
+"""The filter and the locked feet of an export: what they keep, what they change, what they say."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from drocap_ros.cli import main
+from drocap_ros.errors import InputError
+from drocap_ros.export import export_motion
+from drocap_ros.export.cleaning import lock_feet, smooth
+from drocap_ros.export.clip import clip_of
+from drocap_ros.motion import save_motion
+from drocap_ros.skeleton import BODY_15
+
+KNEES_AND_ANKLES = [BODY_15.index(side + name) for side in "rl" for name in ("knee", "ankle")]
+
+
+def swinging(walker, hz, rate_hz=120.0, frames=240):
+    """A clip whose joints swing by 10 mm along x at one frequency."""
+    times = np.arange(frames) / rate_hz
+    positions = np.zeros((frames, 15, 3))
+    positions[..., 0] = 0.01 * np.sin(2.0 * np.pi * hz * times)[:, None]
+    return dataclasses.replace(clip_of(walker), positions=positions, times_s=times, rate_hz=rate_hz)
+
+
+@pytest.mark.parametrize(("hz", "gain", "within"), [(1.0, 1.0, 0.01), (6.0, np.sqrt(0.5), 0.01), (24.0, 0.0, 0.01)])
+def test_filter_has_the_stated_cut_off_and_no_phase(walker, hz, gain, within):
+    clip = swinging(walker, hz)
+    out = smooth(clip, 6.0)
+    middle = slice(60, 180)
+    off = out.positions[middle, 0, 0] - gain * clip.positions[middle, 0, 0]
+    assert np.abs(off).max() < within * 0.01
+    assert np.all(out.positions[..., 1:] == 0.0)
+
+
+def test_filter_keeps_gaps_and_states_the_change(with_gaps):
+    clip = clip_of(with_gaps)
+    out = smooth(clip, 5.0)
+    np.testing.assert_array_equal(np.isnan(out.positions), np.isnan(clip.positions))
+    moved = 1000.0 * np.linalg.norm(out.positions - clip.positions, axis=2)
+    assert f"on average, at most {np.nanmax(moved):.1f} mm" in out.notes[-1]
+    assert "zero phase" in out.notes[-1]
+
+
+def test_locked_feet_keep_their_place_and_the_bones_their_lengths(walker):
+    rng = np.random.default_rng(4)
+    clip = clip_of(walker)
+    truth = clip.positions
+    wander = np.cumsum(rng.normal(0, 0.004, (len(truth), 1, 3)), axis=0)
+    noisy = dataclasses.replace(clip, positions=truth + wander)
+    out = lock_feet(noisy)
+    for name in ("rankle", "lankle"):
+        ankle = BODY_15.index(name)
+        still = np.linalg.norm(np.diff(truth[:, ankle], axis=0), axis=1) * 24.0 < 0.05
+        inner = still[1:-1] & still[:-2] & still[2:]
+        assert inner.sum() > 5
+        speeds = [
+            np.linalg.norm(np.diff(x.positions[:, ankle], axis=0), axis=1)[1:-1][inner].mean() * 24.0
+            for x in (noisy, out)
+        ]
+        assert speeds[0] > 0.1
+        assert speeds[1] < 0.35 * speeds[0]
+    others = [joint for joint in range(15) if joint not in KNEES_AND_ANKLES]
+    np.testing.assert_array_equal(out.positions[:, others], noisy.positions[:, others])
+    for side in "rl":
+        hip, knee, ankle = (BODY_15.index(side + name) for name in ("hip", "knee", "ankle"))
+        for a, b in ((hip, knee), (knee, ankle)):
+            lengths = [np.linalg.norm(x.positions[:, a] - x.positions[:, b], axis=1) for x in (noisy, out)]
+            np.testing.assert_allclose(lengths[0], lengths[1], atol=1e-6)
+    # The correction of the ankles sets in and ends gradually.
+    ankles = [BODY_15.index("rankle"), BODY_15.index("lankle")]
+    step = np.linalg.norm(np.diff((out.positions - noisy.positions)[:, ankles], axis=0), axis=2)
+    assert step.max() < 0.02
+    assert "feet locked in" in out.notes[-1]
+    assert "mm" in out.notes[-1]
+
+
+def test_both_are_off_by_default_and_printed_when_chosen(walker, tmp_path, capsys):
+    save_motion(tmp_path / "motion.npz", walker)
+    assert main(["export", str(tmp_path), "--to", "csv"]) == 0
+    assert "smoothed" not in (plain := capsys.readouterr().out)
+    assert "locked" not in plain
+    assert main(["export", str(tmp_path), "--to", "csv", "--smooth", "--lock-feet"]) == 0
+    printed = capsys.readouterr().out
+    assert "order 4, 6 Hz): joints moved by" in printed
+    assert "feet locked in" in printed
+    assert main(["export", str(tmp_path), "--to", "csv", "--smooth", "50"]) == 2
+    assert "between 0 and 9.63, got 50" in capsys.readouterr().err
+
+
+def test_what_cannot_be_cleaned_is_refused(walker, in_camera, tmp_path):
+    with pytest.raises(InputError, match="root that moves through the world"):
+        export_motion(in_camera, "csv", tmp_path / "a.csv", lock_feet=True)
+    for cut_off in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(InputError, match="between 0 and"):
+            smooth(clip_of(walker), cut_off)
+    few = swinging(walker, 1.0, frames=6)
+    with pytest.raises(InputError, match="more than 9 frames"):
+        smooth(few, 6.0)
