@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 from rendered_person import rendered_images
+from telemetry_logs import dji_subtitle, srt_text
 
 from drocap_ros.cli import main
 from drocap_ros.motion import load_motion, save_motion
@@ -192,6 +193,34 @@ def test_report_takes_the_images_of_the_motion_alone(crowd, tmp_path, capsys, mo
         writer.write(cv2.imread(str(path)))
     writer.release()
     assert "30 images per second, found 10" in refused(capsys, "report", out, "--video", slow)
+
+
+def test_a_clip_of_a_video_takes_the_telemetry_of_its_own_seconds(crowd, tmp_path, monkeypatch):
+    monkeypatch.setenv("DROCAP_MODELS", "simulation")
+    writer = cv2.VideoWriter(str(tmp_path / "walk.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (640, 360))
+    for number in range(8):
+        writer.write(cv2.imread(str(crowd / f"{number}.png")))
+    writer.release()
+    t = np.arange(8) / 30.0
+    angles = np.stack([0 * t, 0 * t - 0.5, 2.0 * t], axis=1)
+    lines = [dji_subtitle(i, (47.0, 8.0, 500.0 + i), angles[i]) for i in range(8)]
+    (tmp_path / "walk.srt").write_text(srt_text(t, lines))
+    rotations = []
+    for start in (0.0, 0.1):
+        words = (
+            "--telemetry",
+            tmp_path / "walk.srt",
+            "--start",
+            start,
+            "--method",
+            "initial",
+            "--no-report",
+            "--quiet",
+        )
+        assert run("reconstruct", tmp_path / "walk.mp4", *words, "--out", tmp_path / "out") == 0
+        rotations.append(load_tracks(tmp_path / "out" / "tracks.npz").camera_rotation)
+    assert len(rotations[0]) == 8
+    np.testing.assert_array_equal(rotations[0][3:], rotations[1])
 
 
 def test_without_networks_one_line_names_the_ways_to_get_them(crowd, tmp_path, capsys, monkeypatch):
