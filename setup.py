@@ -123,7 +123,7 @@ setup(
     ],
     extras_require={
         "live": ["onnx>=1.16"],  # lets a detector take smaller inputs where time is short
-        "opensim": ["opensim>=4.6,<5"],  # drocap export --to mot; its wheels do not exist for every Python
+        "opensim": ["opensim>=4.6,<5"],  # drocap export --to mot; wheels from Python 3.11 on
         "view": ["rerun-sdk>=0.39,<0.40"],
         "train": ["torch>=2.9", "onnx>=1.16"],
         "test": [

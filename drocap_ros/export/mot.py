@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from drocap_ros.errors import InputError
-from drocap_ros.export.clip import Clip, at_constant_rate, y_up
+from drocap_ros.export.clip import Clip, at_constant_rate, without_gaps, y_up
 from drocap_ros.export.opensim_model import WEIGHTS, model_xml
 from drocap_ros.export.rig import body_of
 from drocap_ros.export.trc import write_trc
@@ -37,7 +37,8 @@ def write_mot(path: Path, clip: Clip) -> tuple[str, ...]:
     # The tool writes further files into the working folder of its model.
     with tempfile.TemporaryDirectory(prefix="drocap_ik_") as folder:
         markers = Path(folder) / "markers.trc"
-        write_trc(markers, clip)
+        # OpenSim stops at a frame without any marker.
+        write_trc(markers, without_gaps(clip))
         path.with_suffix(".osim").write_text(model_xml(body), encoding="utf-8")
         model = opensim.Model(str(path.with_suffix(".osim")))
         tool = opensim.InverseKinematicsTool()

@@ -70,6 +70,7 @@ def test_inverse_kinematics_of_a_simulated_walk_gives_its_angles(walker, tmp_pat
     monkeypatch.chdir(tmp_path)
     joints = make_walk(48).shape.copy()
     joints[10:12, BODY_15.index("rwrist")] = np.nan
+    joints[20] = np.nan
     save_motion(tmp_path / "motion.npz", dataclasses.replace(walker, joints3d=joints))
     assert main(["export", str(tmp_path), "--to", "mot"]) == 0
     assert "motion.osim" in capfd.readouterr().out
