@@ -7,7 +7,8 @@ size in the image, 1 plus a piecewise linear function of time.  The cost is
 - the distance from the lifter's joints, weighted by its expected errors, robust in depth,
 - the deviation of every bone from its length times the zoom, as in the paper's articulation term,
 - the acceleration of the joints,
-- the change of the zoom.
+- the change of the zoom,
+- the distance of the lengths from the expected ones.
 
 Its normal equations couple neighbouring frames only: a band, bordered by the lengths and the zoom.
 """
@@ -47,6 +48,7 @@ class AdjustmentProblem:
     acceleration_weight : 1/mm^2, of second differences
     zoom_basis : (F, K) value in each frame of the zoom's piecewise linear basis functions
     zoom_precision : (K, K) inverse covariance of their coefficients
+    lengths : (16,) of :data:`SPANS`, expected; length_weight : 1/mm^2, of the distance from them
     """
 
     keypoints: np.ndarray
@@ -57,6 +59,8 @@ class AdjustmentProblem:
     acceleration_weight: float
     zoom_basis: np.ndarray
     zoom_precision: np.ndarray
+    lengths: np.ndarray
+    length_weight: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -92,6 +96,7 @@ class _Residuals:
         self.lengths = lengths
         self.zoom = 1.0 + p.zoom_basis @ zooms
         self.zoom_pull = p.zoom_precision @ zooms
+        self.growth = lengths - p.lengths
         self.image = joints[..., :2] - p.keypoints
         square = np.square(self.image).sum(axis=-1) * p.weight
         self.robust = 1.0 / (1.0 + square / _OUTLIER_SQUARE)
@@ -110,6 +115,7 @@ class _Residuals:
             "articulation": 0.5 * float(np.square(self.stretch).sum()),
             "acceleration": 0.5 * p.acceleration_weight * float(np.square(self.swing).sum()),
             "zoom": 0.5 * float(zooms @ self.zoom_pull),
+            "lengths": 0.5 * p.length_weight * float(np.square(self.growth).sum()),
         }
         self.cost = sum(self.terms.values())
 
@@ -127,7 +133,7 @@ def _gradient(p: AdjustmentProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarr
     g[2:] += swing
     g[1:-1] -= 2 * swing
     g[:-2] += swing
-    by_length = -(r.zoom[:, None] * r.stretch / SPAN_STD_MM).sum(axis=0)
+    by_length = p.length_weight * r.growth - (r.zoom[:, None] * r.stretch / SPAN_STD_MM).sum(axis=0)
     by_zoom = r.zoom_pull - p.zoom_basis.T @ (r.stretch @ (r.lengths / SPAN_STD_MM))
     return g, np.concatenate([by_length, by_zoom])
 
@@ -177,7 +183,7 @@ def _border(p: AdjustmentProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray
     by_zoom = p.zoom_basis.T[:, :, None] * by_size.reshape(1, frames, -1)
     precision = 1.0 / np.square(SPAN_STD_MM)
     corner = np.zeros((count + knots, count + knots))
-    corner[:count, :count] = np.diag(precision * np.square(r.zoom).sum())
+    corner[:count, :count] = np.diag(precision * np.square(r.zoom).sum() + p.length_weight)
     # The product of the two unknowns bends the cost: its second derivative is left out, as in Gauss-Newton.
     corner[:count, count:] = (precision * r.lengths)[:, None] * (r.zoom @ p.zoom_basis)
     corner[count:, :count] = corner[:count, count:].T
@@ -188,7 +194,6 @@ def _border(p: AdjustmentProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray
 def adjust(
     problem: AdjustmentProblem,
     joints: np.ndarray,
-    lengths: np.ndarray,
     iterations: int,
     tolerance: float = 1e-3,
     cancelled: Callable[[], bool] | None = None,
@@ -198,7 +203,6 @@ def adjust(
     Parameters
     ----------
     joints : (F, 15, 3) mm, initial; the signs of depth stay as they are
-    lengths : (16,) mm of :data:`SPANS`, initial
     iterations : most accepted steps
     tolerance : relative decrease of the cost that ends the solve
     cancelled : called before every step but the first; True ends the solve with reason DEADLINE
@@ -206,7 +210,7 @@ def adjust(
     from scipy.linalg.lapack import dpbtrf, dtbtrs
 
     damping, stop = 1e-4, ITERATIONS
-    zooms = np.zeros(problem.zoom_basis.shape[1])
+    lengths, zooms = problem.lengths, np.zeros(problem.zoom_basis.shape[1])
     here = _Residuals(problem, joints, lengths, zooms)
     done = 0
     while done < iterations:

@@ -12,6 +12,7 @@ import numpy as np
 
 from drocap_ros.geometry.bones import bone_lengths
 from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
 from drocap_ros.reconstruction.lifted.lifter import LiftedMotion, Lifter
 from drocap_ros.reconstruction.lifted.window_solver import (
@@ -26,6 +27,8 @@ _BONES = BODY_15.bones
 #: Bones whose total length defines the mm of an ordinary person.
 YARDSTICK = [0, 1, 2, 6, 7]
 YARDSTICK_MM = 1550.0
+#: Noise of the 2D joints at which the lifter's bone lengths are as good as the adjustment's.
+_LENGTHENING_NOISE_MM = 5.0
 
 
 @dataclass(frozen=True)
@@ -81,11 +84,12 @@ def measure_size(
     prior *= mm / zoom[:, None, None]
     flat = _orthographic(keypoints.xy, prior[..., 2], centre, zoom, mm, focal)
     found = solve_signs_and_adjust(model, flat, prior, lifted.sigma * mm, None, config.first_iterations, cancelled)
+    lengths = _without_noise(found.lengths, np.median(span_lengths(prior), axis=0), model.lasting_noise_mm)
     zoom = zoom * found.zoom
     flat = _orthographic(keypoints.xy, found.joints[..., 2] - found.joints[:, :1, 2], centre, zoom, mm, focal)
     seconds = time.perf_counter() - clock
-    lifted = lifter.lift(flat, keypoints.confidence, fps, found.lengths[: len(_BONES)])
-    return SizedWindow(model, flat, lifted, found.lengths, centre, zoom, mm, seconds, found.iterations)
+    lifted = lifter.lift(flat, keypoints.confidence, fps, lengths[: len(_BONES)])
+    return SizedWindow(model, flat, lifted, lengths, centre, zoom, mm, seconds, found.iterations)
 
 
 def apply_size(
@@ -111,6 +115,15 @@ def apply_size(
 def magnification(depth_mm: np.ndarray, distance_mm: np.ndarray) -> np.ndarray:
     """(F, 15, 1) true over seen distance from the axis, for joints behind a pelvis at the distance (F,) mm."""
     return np.maximum(1.0 + depth_mm / distance_mm[:, None], 0.2)[..., None]
+
+
+def _without_noise(found: np.ndarray, lifted: np.ndarray, noise_mm: float) -> np.ndarray:
+    """Lengths (16,) mm between those of the adjustment and of the lifter.
+
+    The depth of a bone is free: noise lengthens the bones that the adjustment finds, and hardly those of the network.
+    """
+    mixed: np.ndarray = lifted + (found - lifted) / (1.0 + (noise_mm / _LENGTHENING_NOISE_MM) ** 2)
+    return mixed
 
 
 def _orthographic(

@@ -28,6 +28,8 @@ from drocap_ros.skeleton import BODY_15
 Cancelled = Callable[[], bool]
 
 _BONES = BODY_15.bones
+#: Lasting noise of the 2D joints at which known bone lengths change little: noise lengthens free bones.
+_HELD_NOISE_MM = 10.0
 
 
 @dataclass(frozen=True)
@@ -35,10 +37,12 @@ class WindowModel:
     """Weights and priors common to both adjustments of a window.
 
     weight : (F, 15) 1/mm^2 of the 2D joints, 0 where not seen
+    noise_mm, lasting_noise_mm : standard deviation of their errors, and of those that last for some frames
     """
 
     weight: np.ndarray
     noise_mm: float
+    lasting_noise_mm: float
     fps: float
     config: LiftedConfig
     zoom_basis: np.ndarray
@@ -62,7 +66,8 @@ def window_model(keypoints: Keypoints2D, mm: float, fps: float, config: LiftedCo
     weight = np.where(seen, 1.0 / square, 0.0)
     if confidence is not None:
         weight = weight * np.clip(np.nan_to_num(confidence), 0.0, 1.0)
-    return WindowModel(weight, noise, fps, config, *zoom_model(len(keypoints), fps, config.zoom_std_per_s))
+    lasting = _lasting_noise(points_mm)
+    return WindowModel(weight, noise, lasting, fps, config, *zoom_model(len(keypoints), fps, config.zoom_std_per_s))
 
 
 def difference_noise(points: np.ndarray) -> float:
@@ -72,6 +77,14 @@ def difference_noise(points: np.ndarray) -> float:
     """
     third = nanmedian_small(np.abs(np.diff(points, n=3, axis=0)).reshape(-1), axis=0)
     return float(1.48 / np.sqrt(20) * float(np.nan_to_num(third)))
+
+
+def _lasting_noise(points: np.ndarray) -> float:
+    """Noise of points (F, P, 2) that lasts for more than one frame: no smoothing removes it."""
+    if len(points) < 8:
+        return 0.0
+    all_frames, every_second = (difference_noise(points[::stride]) for stride in (1, 2))
+    return float(np.sqrt(max(every_second**2 - all_frames**2, 0.0)))
 
 
 def solve_signs_and_adjust(
@@ -99,6 +112,7 @@ def solve_signs_and_adjust(
     flat = _smooth(points, weight * inlier, prior[..., :2], prior_xy, smoothing)
 
     image = span_lengths(flat)
+    length_weight = 0.0 if lengths is None else (model.lasting_noise_mm / _HELD_NOISE_MM) ** 2
     if lengths is None:
         seen_lengths = np.median(span_lengths(np.concatenate([flat, prior[..., 2:]], axis=-1)), axis=0)
         # A bone is at least as long as its image, up to the noise.
@@ -125,8 +139,10 @@ def solve_signs_and_adjust(
         acceleration_weight=(1000 * config.acceleration_std_m_s2 / fps**2) ** -2,
         zoom_basis=model.zoom_basis,
         zoom_precision=model.zoom_precision,
+        lengths=lengths,
+        length_weight=length_weight,
     )
-    return adjust(problem, np.concatenate([flat, depth[..., None]], axis=-1), lengths, iterations, cancelled=cancelled)
+    return adjust(problem, np.concatenate([flat, depth[..., None]], axis=-1), iterations, cancelled=cancelled)
 
 
 def _smooth(

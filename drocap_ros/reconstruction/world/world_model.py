@@ -41,6 +41,10 @@ class WorldConfig(Parameters):
         3, "further steps that keep feet in contact in their places", minimum=0, maximum=100
     )
     stature_std: float = param(0.08, "relative standard deviation of the assumed stature", minimum=0.001, maximum=1)
+    length_std: float = param(
+        0.005, "relative standard deviation of the lifter's bone lengths: noise lengthens free bones", minimum=1e-4,
+        maximum=1,
+    )  # fmt: skip
     tilt_error_deg: float = param(
         0.3,
         "standard deviation of the camera's constant error of pitch and roll",
@@ -66,9 +70,6 @@ class WorldConfig(Parameters):
         3.0, "ordinary acceleration of the camera", unit="m/s^2", minimum=0.01, maximum=100
     )
     acceleration_m_s2: float = param(10.0, "ordinary acceleration of a joint", unit="m/s^2", minimum=0.01, maximum=1000)
-    image_weight: float = param(
-        0.25, "weight of the 2D joints: their errors last for some frames", minimum=0, maximum=10
-    )
     depth_weight: float = param(0.2, "weight of the lifter's depths", minimum=0, maximum=100)
     contact_weight: float = param(
         0.2, "weight of feet in contact: contacts last for some frames", minimum=0, maximum=100

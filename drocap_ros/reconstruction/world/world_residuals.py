@@ -6,7 +6,7 @@
 - the accelerations of the joints and of the camera,
 - the step of a foot between two frames in contact, and its height above the floor,
 - the errors of the camera's position and attitude that wander (Gauss-Markov),
-- the priors of scale, misalignment and latencies.
+- the priors of lengths, scale, misalignment and latencies.
 """
 
 from __future__ import annotations
@@ -66,6 +66,7 @@ def weights_of(data: WorldInput) -> Weights:
     first = np.repeat([position**-2, attitude**-2], 3)
     wander = first * np.repeat([0.5 * _POSITION_WANDER_S * fps, 0.5 * _ATTITUDE_WANDER_S * fps], 3)
     shared = np.zeros(GLOBALS)
+    shared[LENGTHS] = (config.length_std * data.lengths) ** -2
     shared[SCALE] = config.stature_std**-2
     shared[MISALIGNMENT] = np.deg2rad([config.tilt_error_deg, config.yaw_error_deg, config.tilt_error_deg]) ** -2
     shared[[ATTITUDE_LATENCY, POSITION_LATENCY]] = config.latency_std_s**-2
@@ -125,6 +126,7 @@ class Residuals:
         self.drift = np.diff(state.camera, axis=0)
         self.gauge = (shared[:BONES].sum() - data.lengths[:BONES].sum()) / GAUGE_M
         self.prior = shared.copy()
+        self.prior[LENGTHS] -= data.lengths
         self.prior[SCALE] = np.log(shared[SCALE])
         self.terms = {
             "reprojection": 0.5 * float((square * self.robust).sum()),

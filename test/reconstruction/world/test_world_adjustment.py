@@ -152,9 +152,7 @@ def test_body_scale_yaw_and_latency_are_recovered_from_exact_images() -> None:
     yaw = exp_so3(np.array([0.0, np.deg2rad(2.0), 0.0]))
     telemetry = CameraTelemetry(yaw.T @ reported, place, FPS)
     data = exact_input(joints, rotation[late : 360 + late], position[late : 360 + late], telemetry)
-    exact = WorldConfig(
-        iterations=60, image_weight=10.0, contact_weight=1.0, contact_speed_m_s=0.02, frames_per_fact=1.0
-    )
+    exact = WorldConfig(iterations=60, length_std=1.0, contact_weight=1.0, contact_speed_m_s=0.02, frames_per_fact=1.0)
     short = replace(data, lengths=data.lengths / 1.08, depth=data.depth / 1.08, config=exact)
     found = adjust_in_world(short, joints / 1.08 + [0.05, -0.05, 0.02], 1.0)
     shared, std = found.state.globals, found.std
