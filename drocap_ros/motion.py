@@ -36,6 +36,7 @@ class Motion:
     reprojection_px : (F, P) px, distance of the projected joint from its keypoint, NaN where not seen
     meta : JSON-compatible: versions, revision, parameters, seconds per stage, solver's outcome
     camera_position : (F, 3) m in that frame, None where unknown
+    covariance : (F, P, 6) m^2 of the joints: xx, xy, xz, yy, yz, zz; None where unknown
     """
 
     joints3d: np.ndarray
@@ -51,6 +52,7 @@ class Motion:
     reprojection_px: np.ndarray
     meta: dict[str, Any] = field(default_factory=dict)
     camera_position: np.ndarray | None = None
+    covariance: np.ndarray | None = None
 
 
 def upright_joints(motion: Motion) -> np.ndarray:
@@ -67,6 +69,8 @@ def save_motion(path: str | Path, motion: Motion, **further: np.ndarray) -> None
     """Write ``motion.npz``; ``further`` arrays are added, and :func:`load_motion` ignores them."""
     if motion.camera_position is not None:
         further = {"camera_position": motion.camera_position, **further}
+    if motion.covariance is not None:
+        further = {"covariance": motion.covariance, **further}
     np.savez_compressed(
         path,
         joints3d=motion.joints3d.astype(np.float64),
@@ -143,6 +147,7 @@ def load_motion(path: str | Path) -> Motion:
         reprojection_px=a["reprojection_px"],
         meta=meta if isinstance(meta, dict) else {},
         camera_position=a.get("camera_position"),
+        covariance=a.get("covariance"),
     )
     try:
         _check(motion)
@@ -165,6 +170,8 @@ def _check(m: Motion) -> None:
     }
     if m.camera_position is not None:
         shapes["camera_position"] = (frames, 3)
+    if m.covariance is not None:
+        shapes["covariance"] = (frames, joints, 6)
     for name, shape in shapes.items():
         value = getattr(m, name)
         if value.shape != shape or value.dtype.kind not in "fiu":

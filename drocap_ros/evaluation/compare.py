@@ -102,6 +102,9 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
     if not np.isfinite(true[:, known]).all():
         raise InputError("evaluate compare: expected a truth of finite joints, got NaN or infinity; fill the gaps in")
     world = motion.frame == "world" and frame == "world"
+    covariance = None
+    if motion.covariance is not None:
+        covariance = motion.covariance[:, indices(motion.joints, BODY_15.joints)][usable]
     return MotionErrors(
         frames=len(estimate),
         error_mm=1000.0 * float(pa_mpjpe(estimate, true).mean()),
@@ -112,7 +115,7 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
         mirrored_share=float(mirrored_frames(estimate, true).mean()),
         scale_error=scale_error(estimate, true),
         metric=motion.metric,
-        world=world_errors(estimate, true, _rate(at[usable])) if world else None,
+        world=world_errors(estimate, true, _rate(at[usable]), covariance) if world else None,
     )
 
 

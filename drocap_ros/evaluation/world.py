@@ -36,7 +36,7 @@ def measure_world(
     """Reconstruct one view of one sequence and compare it with the truth."""
     view = world_view(sequence, telemetry, still=still, seed=seed)
     motion = reconstruct(view.tracks, method=method)
-    errors = world_errors(motion.joints3d, view.truth, FPS)
+    errors = world_errors(motion.joints3d, view.truth, FPS, motion.covariance)
     return WorldRow(
         sequence.name, len(view.truth), motion.frame, motion.metric, float(motion.meta["seconds"]["total"]), errors
     )

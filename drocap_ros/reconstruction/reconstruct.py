@@ -146,7 +146,7 @@ def _to_motion(
     joints = (result.joints_px - result.joints_px[:, pelvis][:, None]) * per_px[:, None, None]
     metric, scale_source = False, "assumed_height"
     meta: dict[str, Any] = {"assumed_height_m": config.assumed_height_m, "reference_stature_m": REFERENCE_STATURE_M}
-    position = None
+    position = covariance = None
     rotation, frame = np.broadcast_to(np.eye(3), (len(tracks), 3, 3)).copy(), "camera"
     if tracks.camera_rotation is None and tracks.camera_matrix is not None:
         # Undo the perspective, as place_in_world: it moves joints behind the pelvis towards the axis.
@@ -172,6 +172,7 @@ def _to_motion(
             if found is not None:
                 joints, rotation, position, metric = found.joints, found.rotation, found.position, found.metric
                 scale_source = "telemetry" if metric else "assumed_height"
+                covariance = found.covariance
                 reprojection = _reprojection(joints, rotation, position, tracks.camera_matrix, keypoints.xy)
                 meta["calibration"] = found.calibration
     return Motion(
@@ -188,6 +189,7 @@ def _to_motion(
         reprojection_px=reprojection,
         meta=meta,
         camera_position=position,
+        covariance=covariance,
     )
 
 

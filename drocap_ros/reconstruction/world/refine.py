@@ -42,6 +42,7 @@ class RefinedWorld:
 
     joints : (F, 15, 3) m; rotation : (F, 3, 3) world -> camera; position : (F, 3) m
     metric : whether the scale was measured
+    covariance : (F, 15, 6) m^2: xx, xy, xz, yy, yz, zz; NaN = unknown
     rejected : why the telemetry cannot be true, in words; "" = it can
     calibration : JSON-compatible, of every window: errors of the telemetry and their standard deviations
     """
@@ -50,6 +51,7 @@ class RefinedWorld:
     rotation: np.ndarray
     position: np.ndarray
     metric: bool
+    covariance: np.ndarray
     rejected: str
     calibration: list[dict[str, Any]]
 
@@ -91,6 +93,7 @@ def refine_in_world(
     turn = project_to_so3(_at_all_slots(rotation, slot))
     joints: np.ndarray = np.zeros(body.shape)
     camera: np.ndarray = np.zeros((frames, CAMERA))
+    covariance: np.ndarray = np.zeros((*body.shape, 3))
     total, calibration = np.zeros(frames), []
     measured, cost, contact = True, 0.0, 0.0
     lengths = np.median(span_lengths(body), axis=0)
@@ -103,14 +106,16 @@ def refine_in_world(
         fade = fade_weights(rows, frames, _OVERLAP)
         joints[rows] += fade[:, None, None] * found.joints
         camera[rows] += fade[:, None] * _correction(found, telemetry)
+        covariance[rows] += fade[:, None, None, None] * found.covariance
         total[rows] += fade
         calibration.append(_calibration(found, poses.factor))
         cost = max(cost, found.cost_terms["telemetry"] / len(found.joints))
         contact = max(contact, float(found.contact.mean()))
         measured &= bool(found.std[SCALE] < _MEASURED * found.state.globals[SCALE])
+    covariance = (covariance / total[:, None, None, None])[slot][..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     joints, camera = joints / total[:, None, None] + origin, camera / total[:, None]
     corrected, moved = exp_so3(camera[slot, 3:]) @ rotation, position + camera[slot, :3]
-    return RefinedWorld(joints[slot], corrected, moved, measured, _rejection(cost, contact), calibration)
+    return RefinedWorld(joints[slot], corrected, moved, measured, covariance, _rejection(cost, contact), calibration)
 
 
 def _rejection(cost: float, contact: float) -> str:

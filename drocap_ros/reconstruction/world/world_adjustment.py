@@ -13,6 +13,7 @@ import numpy as np
 
 from drocap_ros.reconstruction.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
 from drocap_ros.reconstruction.world.contacts import contact_probability
+from drocap_ros.reconstruction.world.posterior import posterior
 from drocap_ros.reconstruction.world.world_equations import normal_matrix
 from drocap_ros.reconstruction.world.world_model import (
     CAMERA,
@@ -40,13 +41,15 @@ class WorldSolution:
 
     joints : (F, 15, 3) m in the world
     contact : (F - 1, 2) of the right and the left ankle
-    std : (GLOBALS,) posterior standard deviations of the shared unknowns
+    std : (GLOBALS,) posterior standard deviations of the shared unknowns, NaN = unknown
+    covariance : (F, 15, 3, 3) m^2 of the joints, NaN = unknown
     """
 
     joints: np.ndarray
     state: WorldState
     contact: np.ndarray
     std: np.ndarray
+    covariance: np.ndarray
     cost_terms: dict[str, float]
     iterations: int
     stop_reason: str
@@ -66,7 +69,6 @@ def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) ->
     state = initial_state(data, joints, scale)
     damping, stop, done = 1e-4, ITERATIONS, 0
     contact = np.zeros((len(joints) - 1, len(FEET)))
-    std = np.full(GLOBALS, np.nan)
     for done in range(1, config.iterations + config.locking_iterations + 1):
         locking = done > config.iterations
         speed = _CONTACT_SPEEDS[done - 1] if done <= len(_CONTACT_SPEEDS) else _LAST_CONTACT_SPEED
@@ -89,13 +91,18 @@ def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) ->
             stop = NO_DESCENT
             break
         state, damping = there.state, 0.2 * damping
-        if not locking:
-            std = step[2] * np.sqrt(config.frames_per_fact)
         if locking and here.cost - there.cost <= _CONVERGED * here.cost:
             stop = CONVERGED
             break
     final = Residuals(data, weights, state, contact, config.contact_weight)
-    return WorldSolution(state.joints / state.globals[SCALE], state, contact, std, final.terms, done, stop)
+    found = posterior(normal_matrix(final), state)
+    fact = config.frames_per_fact
+    std, covariance = np.full(GLOBALS, np.nan), np.full((*state.joints.shape, 3), np.nan)
+    if found is not None:
+        std, covariance = np.sqrt(fact * np.diag(found.shared)), fact * found.joints
+    return WorldSolution(
+        state.joints / state.globals[SCALE], state, contact, std, covariance, final.terms, done, stop
+    )
 
 
 def _solve(
@@ -104,8 +111,8 @@ def _solve(
     shared: np.ndarray,
     damping: float,
     fixed: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Step of the frames' and the shared unknowns, and the latter's standard deviations; None = not positive definite.
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Step of the frames' and the shared unknowns; None = not positive definite.
 
     fixed : the shared unknowns stay as they are
     """
@@ -119,10 +126,9 @@ def _solve(
         return None
     right = -frames.reshape(1, -1) if fixed else np.concatenate([-frames.reshape(1, -1), border])
     y = dtbtrs(factor, right.T, uplo="L")[0]
-    step, std = np.zeros(GLOBALS), np.full(GLOBALS, np.nan)
+    step = np.zeros(GLOBALS)
     if not fixed:
         schur = corner + np.diag(damping * np.diag(corner)) - y[:, 1:].T @ y[:, 1:]
         step = np.linalg.solve(schur, -shared - y[:, 1:].T @ y[:, 0])
-        std = np.sqrt(np.maximum(np.diag(np.linalg.inv(schur)), 0.0))
     x = dtbtrs(factor, y[:, 0] - y[:, 1:] @ (step if not fixed else np.zeros(0)), uplo="L", trans="T")[0]
-    return x.reshape(-1, FRAME), step, std
+    return x.reshape(-1, FRAME), step

@@ -36,11 +36,11 @@ GLOBALS = POSITION_LATENCY + 1
 class WorldConfig(Parameters):
     """Weights of the adjustment in the world, and the accuracy of the telemetry."""
 
-    iterations: int = param(12, "steps", minimum=0, maximum=1000)
+    iterations: int = param(8, "steps", minimum=0, maximum=1000)
     locking_iterations: int = param(
         3, "further steps that keep feet in contact in their places", minimum=0, maximum=100
     )
-    stature_std: float = param(0.08, "relative standard deviation of the assumed stature", minimum=0.001, maximum=1)
+    stature_std: float = param(0.06, "relative standard deviation of the assumed stature", minimum=0.001, maximum=1)
     length_std: float = param(
         0.005, "relative standard deviation of the lifter's bone lengths: noise lengthens free bones", minimum=1e-4,
         maximum=1,
@@ -69,7 +69,7 @@ class WorldConfig(Parameters):
     camera_acceleration_m_s2: float = param(
         3.0, "ordinary acceleration of the camera", unit="m/s^2", minimum=0.01, maximum=100
     )
-    acceleration_m_s2: float = param(10.0, "ordinary acceleration of a joint", unit="m/s^2", minimum=0.01, maximum=1000)
+    acceleration_m_s2: float = param(13.0, "ordinary acceleration of a joint", unit="m/s^2", minimum=0.01, maximum=1000)
     depth_weight: float = param(0.2, "weight of the lifter's depths", minimum=0, maximum=100)
     contact_weight: float = param(
         0.2, "weight of feet in contact: contacts last for some frames", minimum=0, maximum=100
@@ -79,7 +79,7 @@ class WorldConfig(Parameters):
         0.1, "standard deviation of the speed of a foot in contact", unit="m/s", minimum=0.001, maximum=10
     )
     frames_per_fact: float = param(
-        7.0, "frames that carry one independent piece of information: the priors count as much more", minimum=1,
+        4.0, "frames that carry one independent piece of information: the priors count as much more", minimum=1,
         maximum=1000,
     )  # fmt: skip
 

@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from drocap_ros.evaluation.world_metrics import still_foot_speed
+from drocap_ros.evaluation.world_metrics import ellipsoid_coverage, still_foot_speed
 from drocap_ros.geometry.rotations import exp_so3, left_jacobian, log_so3
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
+from drocap_ros.reconstruction.world.posterior import posterior
 from drocap_ros.reconstruction.world.world_adjustment import adjust_in_world
 from drocap_ros.reconstruction.world.world_equations import normal_matrix
 from drocap_ros.reconstruction.world.world_model import (
     ATTITUDE_LATENCY,
+    CAMERA,
     FLOOR,
     FRAME,
     GLOBALS,
@@ -142,6 +144,30 @@ def test_normal_matrix_is_the_curvature_of_the_quadratic_terms() -> None:
     np.testing.assert_allclose(change.reshape(-1), matrix @ camera.reshape(-1), rtol=1e-8, atol=1e-6)
 
 
+def test_covariances_are_those_of_the_whole_inverse() -> None:
+    """Selected inversion gives the blocks of the dense inverse; joints in the world depend on the scale too."""
+    here, _, state, _ = random_point()
+    matrix = normal_matrix(here)
+    band, border, corner = matrix
+    size = len(band)
+    full = np.zeros((size, size))
+    for offset in range(band.shape[1]):
+        at = np.arange(size - offset)
+        full[at, at + offset] = full[at + offset, at] = band[: size - offset, offset]
+    inverse = np.linalg.inv(np.block([[full, border.T], [border, corner]]))
+    found = posterior(matrix, state)
+    assert found is not None
+    np.testing.assert_allclose(found.shared, inverse[size:, size:], rtol=1e-5, atol=1e-12)
+    scale = state.globals[SCALE]
+    for frame, joint in ((0, 0), (3, 8), (6, 14)):
+        at = FRAME * frame + CAMERA + 3 * joint
+        which = np.r_[at : at + 3, size + SCALE]
+        by = np.column_stack([np.eye(3) / scale, -state.joints[frame, joint] / scale**2])
+        np.testing.assert_allclose(
+            found.joints[frame, joint], by @ inverse[np.ix_(which, which)] @ by.T, rtol=1e-4, atol=1e-10
+        )
+
+
 def test_body_scale_yaw_and_latency_are_recovered_from_exact_images() -> None:
     """The telemetry has a yaw error and is late; the person is 8 % taller than the lengths say."""
     longer = walker(400)
@@ -182,6 +208,8 @@ def test_feet_in_contact_keep_their_place() -> None:
     assert motion.metric
     assert motion.camera_position is not None
     assert still_foot_speed(motion.joints3d, joints, FPS) < 0.1
+    assert motion.covariance is not None
+    assert ellipsoid_coverage(motion.joints3d, joints, motion.covariance) > 0.9
 
 
 @pytest.mark.parametrize("wrong", ["jump", "yaw", "other flight"])

@@ -1,0 +1,67 @@
+"""Posterior covariances from the normal equations: selected inversion of their band, and the shared unknowns' part."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.reconstruction.world.world_equations import WIDTH
+from drocap_ros.reconstruction.world.world_model import CAMERA, FRAME, GLOBALS, JOINTS, SCALE, WorldState
+
+
+class Posterior(NamedTuple):
+    """Covariances at a unit variance of every residual.
+
+    joints : (F, 15, 3, 3) m^2 in the world; shared : (GLOBALS, GLOBALS)
+    """
+
+    joints: np.ndarray
+    shared: np.ndarray
+
+
+def posterior(matrix: tuple[np.ndarray, np.ndarray, np.ndarray], state: WorldState) -> Posterior | None:
+    """Covariances from the band, border and corner of :func:`normal_matrix`; None = not positive definite."""
+    from scipy.linalg.lapack import dpbtrf, dtbtrs
+
+    band, border, corner = matrix
+    factor, info = dpbtrf(band.T, lower=1)
+    if info != 0:
+        return None
+    half = dtbtrs(factor, border.T, uplo="L")[0]
+    by_shared = dtbtrs(factor, half, uplo="L", trans="T")[0]
+    try:
+        shared = np.linalg.inv(corner - half.T @ half)
+    except np.linalg.LinAlgError:
+        return None
+    frames, scale = len(state.joints), float(state.globals[SCALE])
+    lever = by_shared.reshape(frames, FRAME, GLOBALS)[:, CAMERA:].reshape(frames, JOINTS, 3, GLOBALS) / scale
+    lever[..., SCALE] += state.joints / scale**2
+    joints = np.empty((frames, JOINTS, 3, 3))
+    blocks = _diagonal_blocks(factor, frames)
+    for joint in range(JOINTS):
+        at = slice(CAMERA + 3 * joint, CAMERA + 3 * joint + 3)
+        joints[:, joint] = blocks[:, at, at] / scale**2
+    return Posterior(joints + lever @ shared @ np.swapaxes(lever, -1, -2), shared)
+
+
+def _diagonal_blocks(factor: np.ndarray, frames: int) -> np.ndarray:
+    """(F, FRAME, FRAME) blocks of the inverse of a band, from its Cholesky factor, last frame first.
+
+    Source: Takahashi, Fagan, Chin 1973, by blocks: of the inverse only what the band couples is computed.
+    """
+    columns = np.zeros((frames, 3 * FRAME, FRAME))
+    by_frame = factor.reshape(WIDTH, frames, FRAME)
+    for i in range(FRAME):
+        columns[:, i : i + WIDTH, i] = by_frame[:, :, i].T
+    inverse = np.linalg.inv(columns[:, :FRAME])
+    coupling = columns[:, FRAME:] @ inverse
+    own = np.swapaxes(inverse, 1, 2) @ inverse
+    out = np.empty((frames, FRAME, FRAME))
+    later = np.zeros((2 * FRAME, 2 * FRAME))
+    for frame in range(frames - 1, -1, -1):
+        off = -later @ coupling[frame]
+        block = own[frame] - coupling[frame].T @ off
+        out[frame] = 0.5 * (block + block.T)  # rounding of the skew part would grow from frame to frame
+        later = np.block([[out[frame], off[:FRAME].T], [off[:FRAME], later[:FRAME, :FRAME]]])
+    return out
