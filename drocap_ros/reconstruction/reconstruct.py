@@ -25,6 +25,7 @@ from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.reconstruction.threads import blas_threads
 from drocap_ros.reconstruction.world.placement import metres_per_px, place_in_world
 from drocap_ros.reconstruction.world.refine import PlacedPoses, refine_in_world
+from drocap_ros.reconstruction.world.world_model import WorldConfig, world_config
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
 
@@ -76,7 +77,7 @@ def reconstruct(
     )
     with blas_threads(adjuster.threads):
         result = run_method(method, data)
-    motion = _to_motion(tracks, keypoints, result, initializer)
+    motion = _to_motion(tracks, keypoints, result, initializer, world_config(adjuster))
     total = time.perf_counter() - started
     motion.meta.update(
         method=method,
@@ -93,6 +94,7 @@ def reconstruct(
     if method == "ba":
         own = lifted_config(adjuster)
         motion.meta["parameters"]["default_method"] = dataclasses.asdict(own)
+        motion.meta["parameters"]["world"] = dataclasses.asdict(world_config(adjuster))
         motion.meta["lifter"] = Lifter.load(own.lifter or None).origin
     return motion
 
@@ -138,6 +140,7 @@ def _to_motion(
     keypoints: Keypoints2D,
     result: CameraPoses,
     config: InitializerConfig,
+    world_config: WorldConfig,
 ) -> Motion:
     projected = result.joints_px[..., :2] + result.translation_px[:, None]
     reprojection = np.linalg.norm(projected - keypoints.xy, axis=-1)
@@ -163,11 +166,13 @@ def _to_motion(
             factor = world.scale.factor if world.metric and world.scale is not None else 1.0
             size = per_px[:, None]
             depth = (result.joints_px[..., 2] - result.joints_px[:, [pelvis], 2]) * size
-            found = refine_in_world(tracks, keypoints, PlacedPoses(joints, factor, depth, result.depth_sigma_px * size))
-            if found is not None and found.rejected:
+            found = refine_in_world(
+                tracks, keypoints, PlacedPoses(joints, factor, depth, result.depth_sigma_px * size), world_config
+            )
+            if isinstance(found, str):
                 without = dataclasses.replace(tracks, camera_rotation=None, camera_position=None)
-                motion = _to_motion(without, keypoints, result, config)
-                motion.meta["telemetry_rejected"] = found.rejected
+                motion = _to_motion(without, keypoints, result, config, world_config)
+                motion.meta["telemetry_rejected"] = found
                 return motion
             if found is not None:
                 joints, rotation, position, metric = found.joints, found.rotation, found.position, found.metric

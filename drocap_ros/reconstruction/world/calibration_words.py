@@ -43,7 +43,12 @@ def _calibration(found: Mapping[str, Any]) -> str:
     scale = f"scale known to {100 * float(found['scale_std']):.1f} %"
     feet = f"feet in contact for {100 * float(found['contact_share']):.0f} % of the time"
     corrections = ", ".join(stated) if stated else "no error of the telemetry is clear"
-    return f"{corrections[0].upper()}{corrections[1:]}; {scale}, {feet}."
+    still = (
+        ""
+        if found.get("camera_moves", True)
+        else "; the reported camera never moves: it is fixed, or its log is frozen"
+    )
+    return f"{corrections[0].upper()}{corrections[1:]}; {scale}, {feet}{still}."
 
 
 def _correction(name: str, value: float, std: float, unit: str) -> str:

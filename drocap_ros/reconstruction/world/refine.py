@@ -14,6 +14,7 @@ from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.lifted.window_solver import difference_noise
 from drocap_ros.reconstruction.methods.windows import fade_weights, windows
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
+from drocap_ros.reconstruction.world.telemetry_checks import frozen, other_time
 from drocap_ros.reconstruction.world.world_adjustment import WorldSolution, adjust_in_world
 from drocap_ros.reconstruction.world.world_model import (
     ATTITUDE_LATENCY,
@@ -43,7 +44,6 @@ class RefinedWorld:
     joints : (F, 15, 3) m; rotation : (F, 3, 3) world -> camera; position : (F, 3) m
     metric : whether the scale was measured
     covariance : (F, 15, 6) m^2: xx, xy, xz, yy, yz, zz; NaN = unknown
-    rejected : why the telemetry cannot be true, in words; "" = it can
     calibration : JSON-compatible, of every window: errors of the telemetry and their standard deviations
     """
 
@@ -52,7 +52,6 @@ class RefinedWorld:
     position: np.ndarray
     metric: bool
     covariance: np.ndarray
-    rejected: str
     calibration: list[dict[str, Any]]
 
 
@@ -72,8 +71,12 @@ class PlacedPoses:
 
 def refine_in_world(
     tracks: Tracks, keypoints: Keypoints2D, poses: PlacedPoses, config: WorldConfig | None = None
-) -> RefinedWorld | None:
-    """Adjust poses and camera; None where the tracks lack a finite camera or are shorter than twelve frames."""
+) -> RefinedWorld | str | None:
+    """Adjust poses and camera; None where the tracks lack a finite camera or are shorter than twelve frames.
+
+    The answer is a reason, in words, where the telemetry cannot be true.
+    """
+    config = config or WorldConfig()
     rotation, position, matrix = tracks.camera_rotation, tracks.camera_position, tracks.camera_matrix
     if rotation is None or position is None or matrix is None or len(tracks) < _LEAST_FRAMES:
         return None
@@ -91,6 +94,9 @@ def refine_in_world(
         _at_all_slots(values, slot) for values in (body, poses.depth, poses.depth_sigma, position - origin)
     )
     turn = project_to_so3(_at_all_slots(rotation, slot))
+    poses_at = body * poses.factor
+    if reason := frozen(turn, path, fps) or other_time(poses_at, turn, path, fps):
+        return reason
     joints: np.ndarray = np.zeros(body.shape)
     camera: np.ndarray = np.zeros((frames, CAMERA))
     covariance: np.ndarray = np.zeros((*body.shape, 3))
@@ -99,23 +105,23 @@ def refine_in_world(
     lengths = np.median(span_lengths(body), axis=0)
     for rows in windows(frames, _WINDOW, _OVERLAP):
         telemetry = CameraTelemetry(turn[rows], path[rows], fps)
-        data = WorldInput(
-            points[rows], weight[rows], depth[rows], sigma[rows], lengths, telemetry, matrix, config or WorldConfig()
-        )
+        data = WorldInput(points[rows], weight[rows], depth[rows], sigma[rows], lengths, telemetry, matrix, config)
         found = adjust_in_world(data, body[rows], 1.0 / poses.factor)
         fade = fade_weights(rows, frames, _OVERLAP)
         joints[rows] += fade[:, None, None] * found.joints
         camera[rows] += fade[:, None] * _correction(found, telemetry)
         covariance[rows] += fade[:, None, None, None] * found.covariance
         total[rows] += fade
-        calibration.append(_calibration(found, poses.factor))
+        calibration.append(_calibration(found, poses.factor, path[rows]))
         cost = max(cost, found.cost_terms["telemetry"] / len(found.joints))
         contact = max(contact, float(found.contact.mean()))
         measured &= bool(found.std[SCALE] < _MEASURED * found.state.globals[SCALE])
     covariance = (covariance / total[:, None, None, None])[slot][..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     joints, camera = joints / total[:, None, None] + origin, camera / total[:, None]
     corrected, moved = exp_so3(camera[slot, 3:]) @ rotation, position + camera[slot, :3]
-    return RefinedWorld(joints[slot], corrected, moved, measured, covariance, _rejection(cost, contact), calibration)
+    if reason := _rejection(cost, contact if config.feet else 1.0):
+        return reason
+    return RefinedWorld(joints[slot], corrected, moved, measured, covariance, calibration)
 
 
 def _rejection(cost: float, contact: float) -> str:
@@ -138,7 +144,7 @@ def _correction(found: WorldSolution, telemetry: CameraTelemetry) -> np.ndarray:
     return np.concatenate([position, turned], axis=1)
 
 
-def _calibration(found: WorldSolution, factor: float) -> dict[str, Any]:
+def _calibration(found: WorldSolution, factor: float, camera_position: np.ndarray) -> dict[str, Any]:
     shared, std = found.state.globals, found.std
     return {
         "scale": 1.0 / float(shared[SCALE]),
@@ -150,6 +156,7 @@ def _calibration(found: WorldSolution, factor: float) -> dict[str, Any]:
         "position_latency_s": -float(shared[POSITION_LATENCY]),
         "position_latency_std_s": float(std[POSITION_LATENCY]),
         "contact_share": float(found.contact.mean()),
+        "camera_moves": bool(np.ptp(camera_position, axis=0).max() > 0),
         "iterations": found.iterations,
         "stop_reason": found.stop_reason,
     }

@@ -68,11 +68,12 @@ def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) ->
     config, weights = data.config, weights_of(data)
     state = initial_state(data, joints, scale)
     damping, stop, done = 1e-4, ITERATIONS, 0
-    contact = np.zeros((len(joints) - 1, len(FEET)))
+    contact: np.ndarray = np.zeros((len(joints) - 1, len(FEET)))
     for done in range(1, config.iterations + config.locking_iterations + 1):
         locking = done > config.iterations
         speed = _CONTACT_SPEEDS[done - 1] if done <= len(_CONTACT_SPEEDS) else _LAST_CONTACT_SPEED
-        contact = contact_probability(state, data.fps, speed)
+        if config.feet:
+            contact = contact_probability(state, data.fps, speed)
         weight = config.locked_weight if locking else config.contact_weight
         here = Residuals(data, weights, state, contact, weight)
         frames, shared = gradient(here)
@@ -97,12 +98,11 @@ def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) ->
     final = Residuals(data, weights, state, contact, config.contact_weight)
     found = posterior(normal_matrix(final), state)
     fact = config.frames_per_fact
-    std, covariance = np.full(GLOBALS, np.nan), np.full((*state.joints.shape, 3), np.nan)
+    std: np.ndarray = np.full(GLOBALS, np.nan)
+    covariance: np.ndarray = np.full((*state.joints.shape, 3), np.nan)
     if found is not None:
         std, covariance = np.sqrt(fact * np.diag(found.shared)), fact * found.joints
-    return WorldSolution(
-        state.joints / state.globals[SCALE], state, contact, std, covariance, final.terms, done, stop
-    )
+    return WorldSolution(state.joints / state.globals[SCALE], state, contact, std, covariance, final.terms, done, stop)
 
 
 def _solve(

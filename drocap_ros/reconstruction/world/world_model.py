@@ -12,6 +12,7 @@ import numpy as np
 
 from drocap_ros.parameters import Parameters, param
 from drocap_ros.reconstruction.lifted.adjustment import SPAN_STD_MM, SPANS
+from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.reconstruction.world.camera_telemetry import CameraPath, CameraTelemetry
 from drocap_ros.skeleton import BODY_15, indices
 
@@ -78,10 +79,24 @@ class WorldConfig(Parameters):
     contact_speed_m_s: float = param(
         0.1, "standard deviation of the speed of a foot in contact", unit="m/s", minimum=0.001, maximum=10
     )
+    feet: bool = param(True, "feet in contact keep their place")
     frames_per_fact: float = param(
         4.0, "frames that carry one independent piece of information: the priors count as much more", minimum=1,
         maximum=1000,
     )  # fmt: skip
+
+
+def world_config(adjuster: BundleAdjusterConfig) -> WorldConfig:
+    """The parameters that the bundle adjuster's section sets; the weights keep their defaults."""
+    return WorldConfig(
+        stature_std=adjuster.stature_std,
+        tilt_error_deg=adjuster.telemetry_tilt_deg,
+        yaw_error_deg=adjuster.telemetry_yaw_deg,
+        latency_std_s=adjuster.telemetry_latency_s,
+        position_wander_m=adjuster.telemetry_position_m,
+        attitude_wander_deg=adjuster.telemetry_attitude_deg,
+        feet=adjuster.feet,
+    )
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,53 @@
+"""Reasons, in words, why the telemetry cannot belong to the images; "" = none is found."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drocap_ros.reconstruction.world.world_model import FEET
+
+#: A moving camera whose pose stays the same, bit for bit, for so long has no new measurement.
+_FROZEN_S, _MOVING_M_S = 1.0, 0.2
+_SHIFTS_S, _SHIFT_STEP_S = 3.0, 0.5
+_LAG_S, _SMOOTHING_S, _STILL_M = 0.4, 0.06, 0.06
+#: Share of still feet at another time over that at the reported time, and its least value.
+_CLEARLY_BETTER, _LEAST_SHARE = 1.8, 0.06
+
+
+def frozen(rotation: np.ndarray, position: np.ndarray, fps: float) -> str:
+    """Whether the poses (F, 3, 3), (F, 3) m stop and the camera moves otherwise."""
+    same = (np.diff(position, axis=0) == 0).all(-1) & (np.diff(rotation, axis=0) == 0).all((-1, -2))
+    speed = np.linalg.norm(np.diff(position, axis=0), axis=-1) * fps
+    if same.all() or not float(np.median(speed[~same])) > _MOVING_M_S:
+        return ""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
+    longest = float((edges[1::2] - edges[::2]).max(initial=0)) / fps
+    if longest < _FROZEN_S:
+        return ""
+    return f"the camera's reported pose stops for {longest:.1f} s between motions; check the log for gaps"
+
+
+def other_time(joints: np.ndarray, rotation: np.ndarray, position: np.ndarray, fps: float) -> str:
+    """Whether the feet of joints (F, 15, 3) m, placed by the poses, rest more often with poses of another time."""
+    seen = (joints[:, FEET] - position[:, None]) @ np.swapaxes(rotation, 1, 2)
+    shifts = np.arange(-_SHIFTS_S, _SHIFTS_S + 1e-9, _SHIFT_STEP_S)
+    share = np.array([_still_share(seen, rotation, position, round(shift * fps), fps) for shift in shifts])
+    best, own = int(share.argmax()), float(share[len(shifts) // 2])
+    if share[best] < max(_CLEARLY_BETTER * own, _LEAST_SHARE):
+        return ""
+    return f"the feet rest more with poses {shifts[best]:+.1f} s later; check the log's time offset"
+
+
+def _still_share(seen: np.ndarray, rotation: np.ndarray, position: np.ndarray, later: int, fps: float) -> float:
+    """Share of steps over a lag that end where they began, of points (F, 2, 3) m in camera axes."""
+    from scipy.ndimage import gaussian_filter1d
+
+    lag = max(round(_LAG_S * fps), 1)
+    frames = len(seen) - abs(later)
+    if frames <= 2 * lag:
+        return 0.0
+    of, at = max(-later, 0), max(later, 0)
+    placed = seen[of : of + frames] @ rotation[at : at + frames] + position[at : at + frames, None]
+    feet = gaussian_filter1d(placed, _SMOOTHING_S * fps, axis=0, mode="nearest")
+    square = np.square(feet[lag:] - feet[:-lag]).sum(-1)
+    return float(np.exp(-0.5 * square / _STILL_M**2).mean())
