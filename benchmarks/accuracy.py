@@ -4,6 +4,8 @@ rotation     every method at four orbit speeds, clean and noisy 2D (`drocap eval
 live         the live method beside the offline one, clean and noisy 2D (`drocap evaluate live`): page accuracy_live
 perspective  the default method with a camera 6 m and 10 m away, lens known and unknown: page accuracy_perspective
 world        placement and scale from telemetry, on simulated captures: page accuracy_world
+telemetry    the motion in the world by telemetry that errs (`drocap evaluate world`), every third sequence: page
+             accuracy_telemetry
 
 Needs ../shared/mocap/dev, `world` excepted.  `--limit 2` takes the first two sequences only (a minute in all).
 """
@@ -32,6 +34,7 @@ from drocap_ros.evaluation.protocol import (
 )  # fmt: skip
 from drocap_ros.evaluation.rotation import rotation_study
 from drocap_ros.evaluation.tables import study_markdown
+from drocap_ros.evaluation.world import world_markdown, world_study
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.capture_config import SimulationConfig
@@ -113,8 +116,18 @@ def world(args: argparse.Namespace) -> None:
     write_figures("accuracy_world", "Placement and scale in the world", text + table(head, rows))
 
 
+def telemetry(args: argparse.Namespace) -> None:
+    pages = []
+    for level, still in (("exact", False), ("rtk", False), ("gps", False), ("exact", True)):
+        with progress_bars() as progress:
+            rows = world_study(args.mocap, level, still=still, every=3, limit=args.limit, progress=progress)
+        pages.append(world_markdown(rows, level, still))
+    write_figures("accuracy_telemetry", "Motion in the world by telemetry that errs", "\n".join(pages))
+
+
 PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
-    "rotation": rotation, "live": live, "perspective": perspective, "world": world
+    "rotation": rotation, "live": live, "perspective": perspective, "world": world,
+    "telemetry": telemetry,
 }  # fmt: skip
 
 

@@ -6,7 +6,7 @@ elsewhere: `DROCAP_FIGURES=DIR` writes the pages to DIR instead of docs/figures.
 One page per part that can run alone:
 
     demo.py             demo
-    accuracy.py         accuracy, accuracy_live, accuracy_perspective, accuracy_world
+    accuracy.py         accuracy, accuracy_live, accuracy_perspective, accuracy_world, accuracy_telemetry
     reconstruction.py   reconstruction
     perception.py       perception
     recording.py        recording_load, recording_kills, recording_mutations, recording_long, recording_live

@@ -33,6 +33,8 @@ _CONVERGED = 1e-4
 _CONTACT_SPEEDS = (0.6, 0.4, 0.3, 0.2)
 _LAST_CONTACT_SPEED = 0.15
 _LEAST_SCALE = 0.2
+#: Errors of the shared unknowns over their formal standard deviations: contacts are chosen by the same data.
+_STD_FACTOR = 1.5
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,9 @@ def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) ->
     std: np.ndarray = np.full(GLOBALS, np.nan)
     covariance: np.ndarray = np.full((*state.joints.shape, 3), np.nan)
     if found is not None:
-        std, covariance = np.sqrt(fact * np.diag(found.shared)), fact * found.joints
+        prior = np.sqrt(fact / np.maximum(weights.shared, 1e-300))
+        std = np.minimum(_STD_FACTOR * np.sqrt(fact * np.diag(found.shared)), prior)
+        covariance = fact * found.joints
     return WorldSolution(state.joints / state.globals[SCALE], state, contact, std, covariance, final.terms, done, stop)
 
 
