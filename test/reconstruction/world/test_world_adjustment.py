@@ -12,6 +12,8 @@ from drocap_ros.evaluation.world_metrics import ellipsoid_coverage, still_foot_s
 from drocap_ros.geometry.rotations import exp_so3, left_jacobian, log_so3
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.reconstruct import reconstruct
+from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
+from drocap_ros.reconstruction.world.calibration_words import telemetry_words
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.posterior import posterior
 from drocap_ros.reconstruction.world.world_adjustment import adjust_in_world
@@ -212,7 +214,7 @@ def test_feet_in_contact_keep_their_place() -> None:
     assert ellipsoid_coverage(motion.joints3d, joints, motion.covariance) > 0.9
 
 
-@pytest.mark.parametrize("wrong", ["jump", "yaw", "other flight"])
+@pytest.mark.parametrize("wrong", ["jump", "yaw", "other flight", "stopped", "two seconds late"])
 def test_wrong_telemetry_is_noticed_and_the_motion_falls_back_to_the_camera(wrong: str) -> None:
     view = tracks(walker(240))
     rotation, position = view.camera_rotation, view.camera_position
@@ -222,6 +224,12 @@ def test_wrong_telemetry_is_noticed_and_the_motion_falls_back_to_the_camera(wron
         position = position + np.where(np.arange(240)[:, None] > 100, [5.0, 0.0, 0.0], 0.0)
     elif wrong == "yaw":
         rotation = rotation @ exp_so3(np.array([0.0, 0.0, np.deg2rad(40.0)]))
+    elif wrong == "stopped":
+        at = np.minimum(np.arange(240), 150)
+        rotation, position = rotation[at], position[at]
+    elif wrong == "two seconds late":
+        view = replace(view, keypoints=view.keypoints[48:], stamp_ns=view.stamp_ns[48:])
+        rotation, position = rotation[:-48], position[:-48]
     else:
         rotation, position = rotation[::-1], 1.5 * position[::-1] + [20.0, 5.0, 3.0]
     motion = reconstruct(replace(view, camera_rotation=rotation.copy(), camera_position=position.copy()))
@@ -251,3 +259,25 @@ def tracks(joints: np.ndarray, noise_px: float = 0.0) -> Tracks:
         keypoints, BODY_15.joints, np.round(np.arange(frames) * 1e9 / FPS).astype(np.int64), (1280, 720),
         camera_rotation=rotation, camera_position=position, camera_matrix=MATRIX,
     )  # fmt: skip
+
+
+def test_parameters_of_the_section_reach_the_adjustment() -> None:
+    view = tracks(walker(120))
+    accurate = BundleAdjusterConfig(telemetry_yaw_deg=0.01, telemetry_latency_s=0.001, feet=False)
+    usual, stated = reconstruct(view), reconstruct(view, adjuster=accurate)
+    yaw = [motion.meta["calibration"][0]["misalignment_std_deg"][1] for motion in (usual, stated)]
+    assert yaw[1] < 0.02 < yaw[0]
+    assert stated.meta["calibration"][0]["contact_share"] == 0.0
+    assert stated.frame == "world"
+
+
+def test_a_camera_that_never_moves_is_accepted_and_mentioned() -> None:
+    joints = walker(96)
+    view = tracks(joints)
+    rotation, position = orbit(np.zeros(96), np.zeros((96, 2)))
+    fixed = replace(
+        view, keypoints=project(joints, rotation, position), camera_rotation=rotation, camera_position=position
+    )
+    for motion, mentioned in ((reconstruct(fixed), True), (reconstruct(view), False)):
+        assert motion.frame == "world"
+        assert ("never moves" in telemetry_words(motion.meta)) is mentioned
