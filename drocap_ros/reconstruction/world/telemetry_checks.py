@@ -39,12 +39,12 @@ def other_time(joints: np.ndarray, rotation: np.ndarray, position: np.ndarray, f
 
 
 def _still_share(seen: np.ndarray, rotation: np.ndarray, position: np.ndarray, later: int, fps: float) -> float:
-    """Share of steps over a lag that end where they began, of points (F, 2, 3) m in camera axes."""
+    """Share of steps over a lag that end where they began, of points (F, 2, 3) m in camera axes; 0 = too few."""
     from scipy.ndimage import gaussian_filter1d
 
     lag = max(round(_LAG_S * fps), 1)
     frames = len(seen) - abs(later)
-    if frames <= 2 * lag:
+    if frames < max(8 * lag, len(seen) // 2):
         return 0.0
     of, at = max(-later, 0), max(later, 0)
     placed = seen[of : of + frames] @ rotation[at : at + frames] + position[at : at + frames, None]

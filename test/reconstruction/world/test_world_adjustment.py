@@ -228,7 +228,9 @@ def test_wrong_telemetry_is_noticed_and_the_motion_falls_back_to_the_camera(wron
         at = np.minimum(np.arange(240), 150)
         rotation, position = rotation[at], position[at]
     elif wrong == "two seconds late":
-        view = replace(view, keypoints=view.keypoints[48:], stamp_ns=view.stamp_ns[48:])
+        view = replace(
+            view, keypoints=view.keypoints[48:], stamp_ns=view.stamp_ns[48:], camera_rotation=None, camera_position=None
+        )
         rotation, position = rotation[:-48], position[:-48]
     else:
         rotation, position = rotation[::-1], 1.5 * position[::-1] + [20.0, 5.0, 3.0]
