@@ -38,6 +38,8 @@ _OUTLIER_SQUARE = 9.0
 _DEPTH_ROUNDING_M = 0.015
 _NEAREST_M = 0.3
 _FLOOR_STD_M = 0.1
+#: Spread of the floor's height where no foot is in contact.
+_ANY_FLOOR_M = 1000.0
 #: Standard deviation (m) of the body's total bone length, which sets the unit.
 GAUGE_M = 0.0005
 _POSITION_WANDER_S, _ATTITUDE_WANDER_S = 60.0, 10.0
@@ -67,6 +69,7 @@ def weights_of(data: WorldInput) -> Weights:
     wander = first * np.repeat([0.5 * _POSITION_WANDER_S * fps, 0.5 * _ATTITUDE_WANDER_S * fps], 3)
     shared = np.zeros(GLOBALS)
     shared[LENGTHS] = (config.length_std * data.lengths) ** -2
+    shared[FLOOR] = _ANY_FLOOR_M**-2
     shared[SCALE] = config.stature_std**-2
     shared[MISALIGNMENT] = np.deg2rad([config.tilt_error_deg, config.yaw_error_deg, config.tilt_error_deg]) ** -2
     shared[[ATTITUDE_LATENCY, POSITION_LATENCY]] = config.latency_std_s**-2
