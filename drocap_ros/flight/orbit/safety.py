@@ -90,9 +90,7 @@ def _returned(state: SafetyState, seen: Observed) -> bool:
 
 def _orbit(state: SafetyState, seen: Observed, now_s: float, blind: bool, limits: Limits) -> SafetyState:
     """Slow the orbit down by the age of the data, or end it."""
-    vehicle = vehicle_condition(seen, limits, patient=True)
-    place = None if vehicle else limit_condition(seen, state.fence_centre, limits)
-    problem = vehicle or place or subject_condition(seen, limits, patient=True) or keeping_condition(seen, limits)
+    problem = _ending(state, seen, limits) or keeping_condition(seen, limits)
     if problem:
         return begin_hold(state, problem, seen, now_s, blind, retreats=problem.code == _C.SUBJECT_NEAR)
     allowed, cause = allowed_pace(seen, limits)
@@ -103,6 +101,13 @@ def _orbit(state: SafetyState, seen: Observed, now_s: float, blind: bool, limits
     elif pace.value == 1.0:
         reason = condition(_C.ORBITING)
     return dataclasses.replace(state, pace=pace, condition=reason)
+
+
+def _ending(state: SafetyState, seen: Observed, limits: Limits) -> Condition | None:
+    """Why an orbit that is flown or requested must end; gaps of the data end it later than they forbid its start."""
+    vehicle = vehicle_condition(seen, limits, patient=True)
+    place = None if vehicle else limit_condition(seen, state.fence_centre, limits)
+    return vehicle or place or subject_condition(seen, limits, patient=True)
 
 
 def _yield(state: SafetyState, seen: Observed, mode: str, now_s: float) -> SafetyState:
@@ -187,9 +192,9 @@ def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> t
 def _wait(state: SafetyState, seen: Observed, now_s: float, problem: Condition | None, limits: Limits) -> SafetyState:
     """Idle and ready, and while control is requested."""
     if state.requesting:
-        if problem:
-            return _enter(State.IDLE, problem, now_s)
-        if seen.in_control:
+        if problem and (ending := _ending(state, seen, limits)):  # a short gap delays the orbit
+            return _enter(State.IDLE, ending, now_s)
+        if seen.in_control and not problem:
             return _begin_orbit(seen, now_s)
         if now_s - state.requesting_s > limits.safety.engage_timeout_s + limits.warm_up_s:
             return _enter(State.READY, condition(_C.CONTROL_NOT_GRANTED), now_s)

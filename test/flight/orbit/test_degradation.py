@@ -217,6 +217,21 @@ def test_starting_again_after_a_hold_is_one_command():
     assert state.state == State.TAKEN_OVER
 
 
+@pytest.mark.parametrize("name", OLD)
+def test_gap_of_data_while_control_is_requested_delays_the_orbit(name):
+    gap = {
+        "late picture": {"subject_age_s": 0.5},
+        "attitude": {"state_age_s": 0.3},
+        "position": {"position_age_s": 0.3},
+    }
+    state, decision = reduce(in_hold_mode(), BRAKE, 5.0, Command.ENGAGE, LIMITS)
+    assert decision.answer.accepted
+    state, decision = reduce(permit_mode(state, "GUIDED"), seen(**gap[name]), 5.1, None, LIMITS)
+    assert (state.state, decision.action) == (State.READY, Action.HOLD)
+    assert reduce(state, GOOD, 5.2, None, LIMITS)[0].state == State.ORBITING
+    assert reduce(state, seen(**OLD[name]), 5.2, None, LIMITS)[0].state == State.IDLE
+
+
 @pytest.mark.parametrize("command", [Command.START, Command.ENGAGE])
 def test_start_while_our_own_hold_mode_is_on_its_way_is_refused_and_the_mode_is_no_take_over(command):
     state, _ = reduce(orbiting(), GOOD, 1.0, Command.STOP, LIMITS)
