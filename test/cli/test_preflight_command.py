@@ -47,53 +47,42 @@ def write_config(path, url, models, **values):
     return path
 
 
-class Runs(dict):
-    """Status, table, error and JSON of each case; two vehicles at a time, so that each keeps its rates."""
-
-    def __init__(self, folder):
-        super().__init__()
-        self.folder = folder
-        for together in (("silent", "garbage", "rates"), ("ready", "timeout"), ("ready_px4", "timeout_px4")):
-            self.fly(together)
-
-    def fly(self, names):
-        folder, running, vehicles = self.folder, {}, []
-        for name in names:
-            autopilot, words, _, _ = CASES[name]
-            port = free_udp_port()
-            config = write_config(folder / f"{name}.yaml", f"udpin:127.0.0.1:{port}", "simulation")
-            if autopilot:
-                more = words if words[:1] == ("--max-rate",) else ()
-                settings = (*(ARDUPILOT if autopilot == "ardupilot" else PX4), *(words if not more else ()))
-                module = "drocap_ros.simulation.vehicle.mavlink_vehicle"
-                place = ("--url", f"udpout:127.0.0.1:{port}", "--autopilot", autopilot)
-                vehicles.append(start(module, *place, *more, "--set", *settings, log=folder / f"{name}.vehicle"))
-            options = ("--config", config, "--seconds", "5", "--json", folder / f"{name}.json")
-            running[name] = start("drocap_ros.cli", "preflight", *options, log=folder / f"{name}.txt"), port
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as noise:
-            end = time.monotonic() + 90
-            while any(process.poll() is None for process, _ in running.values()) and time.monotonic() < end:
-                if "garbage" in running:
-                    noise.sendto(os.urandom(200), ("127.0.0.1", running["garbage"][1]))
-                time.sleep(0.02)
-        for vehicle in vehicles:
-            vehicle.send_signal(signal.SIGINT)
-            assert vehicle.wait(20) == 0
-        for name, (process, _) in running.items():
-            table, error = ((folder / f"{name}{ending}").read_text() for ending in (".txt", ".err"))
-            self[name] = process.returncode, table, error, json.loads((folder / f"{name}.json").read_text())
+def fly(folder, names):
+    """Status, table, error and JSON of each case."""
+    found, running, vehicles = {}, {}, []
+    for name in names:
+        autopilot, words, _, _ = CASES[name]
+        port = free_udp_port()
+        config = write_config(folder / f"{name}.yaml", f"udpin:127.0.0.1:{port}", "simulation")
+        if autopilot:
+            more = words if words[:1] == ("--max-rate",) else ()
+            settings = (*(ARDUPILOT if autopilot == "ardupilot" else PX4), *(words if not more else ()))
+            module = "drocap_ros.simulation.vehicle.mavlink_vehicle"
+            place = ("--url", f"udpout:127.0.0.1:{port}", "--autopilot", autopilot)
+            vehicles.append(start(module, *place, *more, "--set", *settings, log=folder / f"{name}.vehicle"))
+        options = ("--config", config, "--seconds", "5", "--json", folder / f"{name}.json")
+        running[name] = start("drocap_ros.cli", "preflight", *options, log=folder / f"{name}.txt"), port
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as noise:
+        end = time.monotonic() + 90
+        while any(process.poll() is None for process, _ in running.values()) and time.monotonic() < end:
+            if "garbage" in running:
+                noise.sendto(os.urandom(200), ("127.0.0.1", running["garbage"][1]))
+            time.sleep(0.02)
+    for vehicle in vehicles:
+        vehicle.send_signal(signal.SIGINT)
+        assert vehicle.wait(20) == 0
+    for name, (process, _) in running.items():
+        table, error = ((folder / f"{name}{ending}").read_text() for ending in (".txt", ".err"))
+        found[name] = process.returncode, table, error, json.loads((folder / f"{name}.json").read_text())
+    return found
 
 
 @pytest.fixture(scope="module")
-def all_runs(tmp_path_factory):
-    return Runs(tmp_path_factory.mktemp("preflight"))
-
-
-@pytest.fixture
-def runs(all_runs, request):
-    if getattr(request.node, "execution_count", 1) > 1:  # a repeated test looks again
-        all_runs.fly([request.node.callspec.params["name"]])
-    return all_runs
+def runs(tmp_path_factory):
+    """All cases; two vehicles at a time, so that each keeps its rates."""
+    folder = tmp_path_factory.mktemp("preflight")
+    groups = ("silent", "garbage", "rates"), ("ready", "timeout"), ("ready_px4", "timeout_px4")
+    return {name: run for names in groups for name, run in fly(folder, names).items()}
 
 
 @pytest.mark.parametrize("name", CASES)
