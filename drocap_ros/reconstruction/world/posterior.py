@@ -42,7 +42,8 @@ def posterior(matrix: tuple[np.ndarray, np.ndarray, np.ndarray], state: WorldSta
     for joint in range(JOINTS):
         at = slice(CAMERA + 3 * joint, CAMERA + 3 * joint + 3)
         joints[:, joint] = blocks[:, at, at] / scale**2
-    return Posterior(joints + lever @ shared @ np.swapaxes(lever, -1, -2), shared)
+    weighted = (lever.reshape(-1, GLOBALS) @ shared).reshape(lever.shape)
+    return Posterior(joints + weighted @ np.swapaxes(lever, -1, -2), shared)
 
 
 def _diagonal_blocks(factor: np.ndarray, frames: int) -> np.ndarray:
