@@ -2,7 +2,7 @@
 
 After the death of the bridge the autopilot flies the last setpoint until its time-out.  ArduPilot integrates the
 velocity and the acceleration, then brakes along a path limited in acceleration and jerk, and overshoots; PX4 keeps its
-speed, then brakes.  Both models are compared with recorded flights of the real autopilots
+speed, brakes, then creeps on.  Both models are compared with recorded flights of the real autopilots
 (``test/flight/orbit/test_coast.py``).  Vectors of the plane are complex numbers here: a step costs microseconds.
 """
 
@@ -21,20 +21,25 @@ _STEP_S, _LONGEST_S = 0.05, 5.0
 _ACCELERATION, _JERK = 2.5, 5.0  # m/s^2, m/s^3, of ArduPilot's path, as shipped
 _EXCESS = 1.1  # of ArduPilot's real distances over the predicted ones: lag, wind
 _PX4_DELAY_S, _PX4_FOLLOWS_S, _PX4_BRAKING = 0.1, 0.5, 1.4  # s, s, m/s^2: measured
-_STANDING_M_S = {"ardupilot": 0.2, "px4": 0.5}  # PX4 creeps at up to 0.4 m/s for seconds: 0.8 m more (measured)
+_STANDING_M_S = {"ardupilot": 0.2, "px4": 0.5}
+_CREEP_M = 0.8  # PX4 creeps at up to 0.4 m/s for seconds (measured)
 
 
 class Coast(NamedTuple):
-    """Predicted motion after a setpoint that stays the last one: times (N,) s, places (N,) and speeds (N,)."""
+    """Predicted motion after a setpoint that stays the last one: times (N,) s, places (N,) and speeds (N,).
+
+    creep_m : way that the vehicle creeps afterwards
+    """
 
     time_s: np.ndarray
     place: np.ndarray
     speed_m_s: np.ndarray
+    creep_m: float = 0.0
 
     @property
     def length_m(self) -> float:
-        """Greatest distance from the first place, m."""
-        return float(np.abs(self.place - self.place[0]).max())
+        """Greatest distance from the first place, m, the creep included."""
+        return float(np.abs(self.place - self.place[0]).max()) + self.creep_m
 
 
 def coast_of(setpoint: Setpoint, position: np.ndarray, velocity: np.ndarray, autopilot: str, timeout_s: float) -> Coast:
@@ -101,7 +106,8 @@ def _px4(place: complex, velocity: complex, wanted: complex, timeout_s: float) -
         place += velocity * dt
         t += dt
         rows.append((t, place, abs(velocity)))
-    return _coast(rows)
+    coast = _coast(rows)
+    return coast._replace(creep_m=_CREEP_M * min(float(coast.speed_m_s.max()) / _STANDING_M_S["px4"], 1.0))
 
 
 def _approach(error: complex, gain: float, limit: float) -> complex:

@@ -14,7 +14,7 @@ PX4 = [f"px4_bridge_sigkill_{i}" for i in range(3)]
 
 
 def recorded(shared_files, name):
-    """Prediction, real places (N, 2) from the last setpoint on, until slower than 0.5 m/s, and times from there."""
+    """Prediction, places (N, 2) since the last setpoint until slower than 0.5 m/s, their times, farthest place (m)."""
     flight = np.load(shared_files / "flight" / f"{name}.npz")
     start = flight["setpoint_time_s"][-1]
     after = flight["time_s"] >= start
@@ -27,15 +27,17 @@ def recorded(shared_files, name):
     coast = coast_of(
         last, flight["position_m"][after][0], flight["velocity_m_s"][after][0], "px4" if px4 else "ardupilot", timeout_s
     )
-    return coast, places[:stands], times[:stands]
+    farthest = float(np.linalg.norm(places - places[0], axis=1).max())
+    return coast, places[:stands], times[:stands], farthest
 
 
 @pytest.mark.parametrize("name", ARDUPILOT + PX4)
 def test_prediction_agrees_with_the_recorded_flight(shared, name):
-    coast, places, times = recorded(shared, name)
-    real = float(np.linalg.norm(places - places[0], axis=1).max())
-    print(f"{name:32s} predicted {coast.length_m:.2f} m, flown {real:.2f} m")
-    assert 0.82 * real < coast.length_m < 1.3 * real
+    coast, places, times, farthest = recorded(shared, name)
+    real, braking = float(np.linalg.norm(places - places[0], axis=1).max()), coast.length_m - coast.creep_m
+    print(f"{name:32s} predicted {braking:.2f} + {coast.creep_m:.2f} m, flown {real:.2f}, at last {farthest:.2f} m")
+    assert 0.82 * real < braking < 1.3 * real
+    assert 0.82 * farthest < coast.length_m
     predicted = np.interp(times, coast.time_s, coast.place.real), np.interp(times, coast.time_s, coast.place.imag)
     assert np.hypot(predicted[0] - places[:, 0], predicted[1] - places[:, 1]).max() < 1.0
 
@@ -53,7 +55,7 @@ def test_noise_of_the_acceleration_lengthens_the_coast():
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
 def test_greatest_speed_stops_within_the_distance(autopilot):
     speed = greatest_speed(autopilot, 0.5, 2.5)
-    assert 1.7 < speed < 2.5
+    assert 1.5 < speed < 2.5  # PX4 creeps on after its stop
     assert steady(speed, autopilot).length_m == pytest.approx(2.5, abs=0.05)
     assert greatest_speed(autopilot, 0.3, 2.5) > speed > greatest_speed(autopilot, 1.0, 2.5)
 
@@ -65,6 +67,7 @@ def test_prediction_is_fast_enough_for_every_setpoint():
     assert (time.process_time() - start) / 20 < 0.005
 
 
-def test_a_vehicle_at_rest_stays():
-    assert steady(0.0).length_m == 0.0
-    assert math.isfinite(steady(0.0).time_s[-1])
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_a_vehicle_at_rest_stays(autopilot):
+    assert steady(0.0, autopilot).length_m == 0.0
+    assert math.isfinite(steady(0.0, autopilot).time_s[-1])
