@@ -73,12 +73,16 @@ class World(NamedTuple):
 
 
 class Kill(NamedTuple):
-    """One kill: greatest horizontal distance from there, m; how much nearer to the subject, m; speeds, m/s."""
+    """One kill: greatest horizontal distance from there, m; speeds, m/s.
+
+    nearer_m, own_m : how much nearer to the subject, and to the place where the subject was at the kill, m
+    """
 
     world: World
     at_s: float
     moved_m: float
     nearer_m: float
+    own_m: float
     speed_m_s: float
     top_m_s: float
 
@@ -87,13 +91,15 @@ def killed(world: World, loop: OrbitLoop) -> Kill:
     """The bridge sends nothing from now on."""
     first, place = len(loop.rows), loop.copter.body.position.copy()
     at_s, speed = loop.t, float(np.linalg.norm(loop.copter.body.velocity))
-    distance = float(np.hypot(*(loop.pelvis()[:2] - place[:2])))
+    subject = loop.pelvis()[:2]
+    distance = float(np.hypot(*(subject - place[:2])))
     loop.stopped = True
     loop.run(loop.t + TAIL_S)
     rows = loop.rows[first:]
     return Kill(
         world, at_s, max(float(np.hypot(*(row.position - place)[:2])) for row in rows),
-        distance - min(nearness(row, loop) for row in rows), speed,
+        distance - min(nearness(row, loop) for row in rows),
+        distance - min(float(np.hypot(*(row.position[:2] - subject))) for row in rows), speed,
         max(float(np.linalg.norm(row.velocity)) for row in rows),
     )  # fmt: skip
 
@@ -166,7 +172,7 @@ def kills(moments: int, jobs: int) -> int:
         print("  ".join(str(cell) for cell in lines[-1]), flush=True)
     head = [
         "autopilot", "radius, m", "wind, m/s", "person", "kills", "moved: median, m", "95 %", "most",
-        "share <= 2.5 m, %", "nearer by, most, m", "top speed / at the kill, m/s",
+        "share <= 2.5 m, %", "nearer by, most, m", "to where he was, m", "top speed / at the kill, m/s",
     ]  # fmt: skip
     write_figures("flight_kills", "The bridge's death at random moments", table(head, lines))
     return bad
@@ -179,6 +185,7 @@ def figures_of(part: list[Kill]) -> list[str]:
     return [
         str(len(part)), f"{np.median(moved):.2f}", f"{np.quantile(moved, 0.95):.2f}", f"{moved.max():.2f}",
         f"{100 * np.mean(moved <= OFTEN_M):.0f}", f"{max(kill.nearer_m for kill in part):.2f}",
+        f"{max(kill.own_m for kill in part):.2f}",
         f"{worst.top_m_s:.2f} / {worst.speed_m_s:.2f}",
     ]  # fmt: skip
 
