@@ -26,27 +26,10 @@ from drocap_ros.recording.open_images import open_images, refuse_other_inputs
 from drocap_ros.recording.open_session import is_recording, open_session
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Session
 from drocap_ros.recording.session_tracks import read_pose2d, with_recorded_camera
-from drocap_ros.recording.telemetry.camera_poses import with_camera
-from drocap_ros.recording.telemetry.log import TelemetryLog
-from drocap_ros.recording.telemetry.read import read_telemetry
-from drocap_ros.recording.telemetry.time_offset import find_offset
+from drocap_ros.recording.telemetry.video_telemetry import EMBEDDED, Telemetry, read_video_telemetry, with_telemetry
 from drocap_ros.tracks import Tracks, load_tracks
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Telemetry:
-    """A telemetry log beside a video.
-
-    path : .tlog, .ulg, .bin or .srt
-    time_offset_s : from the log's first state to the video's first image; None = known or estimated
-    mount_pitch_deg : of a camera fixed to the body of a vehicle without a gimbal, negative down
-    """
-
-    path: Path
-    time_offset_s: float | None = None
-    mount_pitch_deg: float | None = None
 
 
 @dataclass(frozen=True)
@@ -69,7 +52,7 @@ def reconstruct_input(
     config: DrocapConfig,
     models: Path | None = None,
     progress: Progress | None = None,
-    telemetry: Telemetry | None = None,
+    telemetry: Telemetry | None = EMBEDDED,
     mount_pitch_deg: float | None = None,
     selection: Selection | None = None,
 ) -> tuple[Motion, Tracks]:
@@ -82,7 +65,7 @@ def reconstruct_input(
         graph on a recording with ``pose2d``, with the recorded parameters unless ``config`` differs from the defaults
     models : folder of ONNX files; None = ``DROCAP_MODELS`` or the user's own
     progress : called with a stage and its fraction done
-    telemetry : log beside a video, with the camera's pose
+    telemetry : log beside a video, or the track inside it, with the camera's pose; None = use none
     mount_pitch_deg : of a camera fixed to the body, negative down, for a recording without the camera's attitude
     selection : part of the input; default: all images, the person in most of them
 
@@ -97,10 +80,12 @@ def reconstruct_input(
             raise InputError("--method live: expected a whole recording with its recorded poses; choose another method")
         return _reconstruct_live(Path(path), config, progress)
     begin = time.perf_counter()
-    log = read_telemetry(telemetry.path) if telemetry is not None else None
+    log = read_video_telemetry(Path(path), telemetry) if telemetry is not None else None
     tracks, origin = _read(Path(path), config, models, progress, mount_pitch_deg, selection)
     if telemetry is not None and log is not None:
-        tracks = _with_telemetry(Path(path), tracks, telemetry, log, progress)
+        tracks, origin["telemetry"] = with_telemetry(
+            Path(path), tracks, telemetry, log, config.image_ingest, progress
+        )
     seconds = time.perf_counter() - begin
     motion = reconstruct(
         tracks, method=method, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress
@@ -121,24 +106,6 @@ def _reconstruct_live(path: Path, config: DrocapConfig, progress: Progress | Non
         motion, tracks, _ = reconstruct_live(session, config, progress)
         _log_warnings(session)
     return dataclasses.replace(motion, meta={**motion.meta, "input": path.name}), tracks
-
-
-def _with_telemetry(
-    path: Path, tracks: Tracks, telemetry: Telemetry, log: TelemetryLog, progress: Progress | None
-) -> Tracks:
-    """Tracks of a video with the camera's poses of the log beside it; warns of missing data."""
-    if path.is_dir() or path.suffix == ".npz" or is_recording(path):
-        raise InputError(f"--telemetry: expected a video file as input, found {path}; recordings hold their telemetry")
-    pitch = telemetry.mount_pitch_deg
-    offset = find_offset(path, log, telemetry.time_offset_s, pitch, progress)
-    logger.warning("%s: %s; %s", telemetry.path, log.kind, offset)
-    for lack in log.lacks:
-        logger.warning("%s: %s", telemetry.path, lack)
-    at_ns = tracks.stamp_ns + int(log.track.stamp_ns[0]) + round(offset.seconds * 1e9)
-    tracks, reason = with_camera(tracks, log.track, at_ns, pitch)
-    if reason:
-        logger.warning("%s: camera telemetry incomplete: %s", telemetry.path, reason)
-    return tracks
 
 
 def read_input(

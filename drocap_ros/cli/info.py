@@ -9,6 +9,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from drocap_ros.cli.telemetry_summary import is_video_or_log, telemetry_summary
 from drocap_ros.errors import InputError
 
 
@@ -27,10 +28,10 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "info",
         help="print the content of a recording, motion or tracks file",
         description="Print topics, types, counts and duration of a recording (session folder, .mcap, .bag, rosbag2 "
-        "folder), or arrays and shapes of a motion.npz or tracks .npz.",
+        "folder), arrays and shapes of a motion.npz or tracks .npz, or the telemetry of a video file or log.",
     )
     parser.add_argument(
-        "session", metavar="SESSION", type=Path, help="recording, motion.npz or its folder, or tracks .npz"
+        "session", metavar="SESSION", type=Path, help="recording, motion.npz or its folder, tracks .npz, video or log"
     )
     parser.add_argument(
         "--metadata", action="store_true", help="print the session's configuration and other metadata in full"
@@ -65,7 +66,9 @@ def summarize(path: Path) -> Summary:
         raise InputError(f"{path}: expected a recording, motion or tracks file, found no such file; check the path")
     if path.is_dir() and (path / "motion.npz").is_file():
         path = path / "motion.npz"
-    return _of_arrays(path) if path.suffix == ".npz" else _of_session(path)
+    if path.suffix == ".npz":
+        return _of_arrays(path)
+    return Summary(*telemetry_summary(path)) if is_video_or_log(path) else _of_session(path)
 
 
 def _of_session(path: Path) -> Summary:

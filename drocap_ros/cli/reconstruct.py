@@ -47,7 +47,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "--telemetry",
         metavar="LOG",
         type=Path,
-        help="log beside a video: MAVLink .tlog, PX4 .ulg, ArduPilot .bin, DJI .srt",
+        help="log beside a video: MAVLink .tlog, PX4 .ulg, ArduPilot .bin, DJI .srt, Airdata .csv (default: the DJI"
+        " track inside the video, where there is one); none: no telemetry",
     )
     parser.add_argument(
         "--time-offset",
@@ -59,7 +60,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "--mount-pitch",
         metavar="DEG",
         type=float,
-        help="pitch of a camera fixed to a vehicle without a gimbal, negative looks down; for a log, or a session"
+        help="pitch of a camera fixed to a vehicle without a gimbal, negative looks down; for telemetry, or a session,"
         " without the camera's attitude",
     )
     parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
@@ -128,16 +129,19 @@ def _telemetry(args: argparse.Namespace) -> Any:
     from drocap_ros.errors import InputError
     from drocap_ros.pipeline import Telemetry
     from drocap_ros.recording.open_session import is_recording
+    from drocap_ros.recording.telemetry.djmd.reader import has_djmd
 
+    refused = args.telemetry == Path("none")
     for name, value in (("--time-offset", args.time_offset), ("--mount-pitch", args.mount_pitch)):
         if value is None:
             continue
         session = name == "--mount-pitch" and args.input.exists() and is_recording(args.input)
-        if args.telemetry is None and not session:
+        embedded = args.telemetry is None and has_djmd(args.input)
+        if (args.telemetry is None or refused) and not session and not embedded:
             raise InputError(f"{name}: expected --telemetry LOG with it, found none; add the log")
         if not math.isfinite(value):
             raise InputError(f"{name}: expected a finite number, got {value}; correct the value")
-    return Telemetry(args.telemetry, args.time_offset, args.mount_pitch) if args.telemetry else None
+    return None if refused else Telemetry(args.telemetry, args.time_offset, args.mount_pitch)
 
 
 def summary(motion: Motion, method: str) -> str:

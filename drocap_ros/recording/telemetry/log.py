@@ -9,7 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.flight.frames import orientation_to_ros, quaternion_from_euler
 from drocap_ros.geometry.rotations import unit_quaternions
+from drocap_ros.recording.telemetry.lens import Lens
 from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack, interpolate
 
 _SERIES_GAP_S = 1.0
@@ -26,6 +28,10 @@ class Lack(Enum):
     MOUNT_YAW = "no yaw of the mount relative to north in the log ({})"
     DROPOUTS = "{} dropouts in the log: parts of the flight are missing"
     DAMAGED = "the log is damaged: read up to the damage"
+    DAMAGED_STATES = "{} of the states are damaged: left out"
+    AIRCRAFT_ZERO = "the aircraft's angles are zero throughout: left out"
+    QUATERNION = "the gimbal's quaternion contradicts its angles: the angles are used"
+    ZOOM = "the digital zoom changes ({}): one camera matrix cannot hold it"
 
 
 class LogLack(NamedTuple):
@@ -45,6 +51,8 @@ class TelemetryLog(NamedTuple):
     utc_minus_stamp_ns : added to a stamp gives UTC; None where unknown
     lacks : limitations of the log
     video_clock : whether stamps start with the video
+    video_parts : (first, last) stamp ns of each part during which the camera recorded; () = unknown
+    lens : of the camera, None = unknown
     """
 
     kind: str
@@ -52,6 +60,8 @@ class TelemetryLog(NamedTuple):
     utc_minus_stamp_ns: int | None
     lacks: tuple[LogLack, ...] = ()
     video_clock: bool = False
+    video_parts: tuple[tuple[int, int], ...] = ()
+    lens: Lens | None = None
 
     @property
     def duration_s(self) -> float:
@@ -70,6 +80,8 @@ def make_log(
     utc_minus_stamp_ns: int | None = None,
     lacks: tuple[LogLack, ...] = (),
     video_clock: bool = False,
+    video_parts: tuple[tuple[int, int], ...] = (),
+    lens: Lens | None = None,
 ) -> TelemetryLog:
     """Log from its series (N, ...) at ``stamp_ns``; states are sorted, missing series are NaN and listed as lacks.
 
@@ -101,7 +113,13 @@ def make_log(
     missing = [LogLack(lack) for lack, values in found.items() if not np.isfinite(values).all(axis=1).any()]
     if len(missing) == len(found):
         raise InputError(f"{path}: expected attitude or position in the {kind}, found neither; check the log")
-    return TelemetryLog(kind, track, utc_minus_stamp_ns, (*missing, *lacks), video_clock)
+    return TelemetryLog(kind, track, utc_minus_stamp_ns, (*missing, *lacks), video_clock, video_parts, lens)
+
+
+def dji_attitude(pitch_roll_yaw_deg: np.ndarray) -> np.ndarray:
+    """(N, 4) x y z w FLU -> ENU of DJI's angles (N, 3): pitch positive up, yaw clockwise from north."""
+    pitch, roll, yaw = np.deg2rad(pitch_roll_yaw_deg).T
+    return orientation_to_ros(quaternion_from_euler(roll, pitch, yaw).T)
 
 
 def at_stamps(known_ns: np.ndarray, values: np.ndarray, stamp_ns: np.ndarray, *, spherical: bool) -> np.ndarray:

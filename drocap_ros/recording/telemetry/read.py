@@ -1,4 +1,7 @@
-"""Reads a telemetry log in any supported format: MAVLink .tlog, PX4 .ulg, ArduPilot .bin, DJI .srt."""
+"""Reads a telemetry log in any supported format.
+
+MAVLink .tlog, PX4 .ulg, ArduPilot .bin, DJI .srt, Airdata .csv, and the djmd track inside a video of DJI.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,8 @@ from pathlib import Path
 from drocap_ros.errors import InputError
 from drocap_ros.recording.telemetry.log import TelemetryLog
 
-LOG_SUFFIXES = (".tlog", ".ulg", ".bin", ".srt")
+#: Names of logs beside a video.
+LOG_SUFFIXES = (".tlog", ".ulg", ".bin", ".srt", ".csv")
 
 
 def read_telemetry(path: str | Path) -> TelemetryLog:
@@ -33,8 +37,14 @@ def read_telemetry(path: str | Path) -> TelemetryLog:
         from drocap_ros.recording.telemetry.dataflash import read_dataflash as read
     elif suffix == ".srt":
         from drocap_ros.recording.telemetry.srt import read_srt as read
+    elif suffix == ".csv":
+        from drocap_ros.recording.telemetry.airdata import read_airdata as read
+    elif head[4:8] == b"ftyp":
+        from drocap_ros.recording.telemetry.djmd.reader import read_djmd as read
     elif suffix == ".tlog":
         from drocap_ros.recording.telemetry.tlog import read_tlog as read
     else:
-        raise InputError(f"{path}: expected a telemetry log .tlog, .ulg, .bin or .srt, found another; check the path")
+        raise InputError(
+            f"{path}: expected a telemetry log (.tlog, .ulg, .bin, .srt, .csv, DJI video), found another; check it"
+        )
     return read(path)

@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.frames import geodetic_to_enu, orientation_to_ros, quaternion_from_euler
-from drocap_ros.recording.telemetry.log import Lack, LogLack, TelemetryLog, make_log
+from drocap_ros.flight.frames import geodetic_to_enu
+from drocap_ros.recording.telemetry.lens import Lens, assumed_lens
+from drocap_ros.recording.telemetry.log import Lack, LogLack, TelemetryLog, dji_attitude, make_log
 from drocap_ros.tracks import MAX_FRAMES
 
 _LINE = 8192
@@ -30,11 +31,15 @@ _VALUE = re.compile(
 )
 _GPS = re.compile(rf"\bGPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER}")
 _BAROMETER = re.compile(rf"\bBAROMETER\s*:\s*{_NUMBER}|,\s*H\s*{_NUMBER}\s*m")
+_LENS = re.compile(rf"\b(focal_len|dzoom_ratio)\s*:\s*{_NUMBER}", re.IGNORECASE)
 _PRY = re.compile(rf"\b([FG])_PRY\s*\(\s*{_NUMBER}°?\s*,\s*{_NUMBER}°?\s*,\s*{_NUMBER}°?\s*\)")
 
 
 class _Entry(NamedTuple):
-    """One subtitle: time ns in the video, geodetic, and pitch, roll, yaw in degrees of gimbal and body."""
+    """One subtitle: time ns in the video, geodetic, and pitch, roll, yaw in degrees of gimbal and body.
+
+    lens : 35 mm equivalent in mm and digital zoom
+    """
 
     stamp_ns: int
     latitude: float
@@ -42,6 +47,7 @@ class _Entry(NamedTuple):
     height: float
     gimbal: tuple[float, float, float]
     body: tuple[float, float, float]
+    lens: tuple[float, float]
 
 
 _UNKNOWN = (math.nan, math.nan, math.nan)
@@ -78,17 +84,12 @@ def read_srt(path: Path) -> TelemetryLog:
         "DJI subtitles",
         stamps,
         video_clock=True,
-        orientation=_attitude([e.body for e in entries]),
+        orientation=dji_attitude(np.array([e.body for e in entries])),
         position=position,
-        gimbal=_attitude([e.gimbal for e in entries]),
+        gimbal=dji_attitude(np.array([e.gimbal for e in entries])),
         lacks=tuple(lacks),
+        lens=_lens(np.array([e.lens for e in entries])),
     )
-
-
-def _attitude(pitch_roll_yaw: list[tuple[float, float, float]]) -> np.ndarray:
-    """(N, 4) x y z w FLU -> ENU; DJI's yaw is clockwise from north, its pitch positive up."""
-    pitch, roll, yaw = np.deg2rad(np.array(pitch_roll_yaw)).T
-    return orientation_to_ros(quaternion_from_euler(roll, pitch, yaw).T)
 
 
 def _entries(path: Path) -> tuple[list[_Entry], str]:
@@ -138,4 +139,26 @@ def _add(entries: list[_Entry], kinds: set[str], stamp_ns: int | None, text: str
     if kind is not None:
         kinds.add(kind)
     height = heights[kind] if kind is not None else math.nan
-    entries.append(_Entry(stamp_ns, latitude, longitude, height, gimbal, angles.get("F", _UNKNOWN)))
+    entries.append(_Entry(stamp_ns, latitude, longitude, height, gimbal, angles.get("F", _UNKNOWN), _focal(text)))
+
+
+def _focal(text: str) -> tuple[float, float]:
+    """35 mm equivalent in mm and digital zoom, NaN and 1 where the subtitle has none."""
+    found = {name.lower(): number for name, number in _LENS.findall(text)}
+    focal, zoom = found.get("focal_len", "nan"), found.get("dzoom_ratio", "1")
+    # Without a decimal point they count tenths of a mm and ten thousandths.
+    return (
+        float(focal) * (1.0 if "." in focal else 0.1),
+        float(zoom) * (1.0 if "." in zoom or float(zoom) < 100 else 1e-4),
+    )
+
+
+def _lens(values: np.ndarray) -> Lens | None:
+    """The lens of all subtitles (N, 2); the usual one where they state none; None where it changes."""
+    stated = values[(values[:, 0] >= 5) & (values[:, 0] <= 1000) & (values[:, 1] >= 1) & (values[:, 1] <= 100)]
+    if not len(stated):
+        return assumed_lens()
+    focal, zoom = np.median(stated, axis=0)
+    if (np.ptp(stated, axis=0) > 0.01 * np.array([focal, zoom])).any():
+        return None
+    return Lens(float(focal), f"{focal:g} mm equivalent of the subtitles, full sensor width assumed", float(zoom))

@@ -1,19 +1,19 @@
 """Time offset between a video and the telemetry log beside it.
 
 The offset is the time from the log's first state to the video's first image.  Its sources, in this order: the user;
-the log itself, where its clock is the video's (DJI subtitles); the correlation of the image's sideways motion with the
-camera's turning in the log; the container's creation time, accurate to a second at best.  A camera that turns evenly,
-or not at all, allows no correlation: without a creation time the user must give the offset.
+the log itself, where its clock is the video's (DJI); the correlation of the image's sideways motion with the camera's
+turning in the log; the part of the log during which the camera recorded (Airdata); the container's creation time,
+accurate to a second at best.  A camera that turns evenly, or not at all, allows no correlation: without such a part or
+a creation time the user must give the offset.
 """
 
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.recording.telemetry.camera_poses import camera_attitude
 from drocap_ros.recording.telemetry.log import TelemetryLog
+from drocap_ros.recording.telemetry.mp4 import creation_time_ns, duration_s
 from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack, interpolate
 
 #: Sampling rate of the correlation.
@@ -34,8 +35,9 @@ MIN_CORRELATION, MIN_LEAD = 0.7, 0.1
 MIN_TURN_DEG_S = 1.5
 #: Largest error of the container's creation time; the correlation searches within it.
 CREATION_SLACK_S = 5.0
+#: Largest difference between a video's length and the part of a log that is marked as video.
+PART_SLACK_S = 2.0
 _WIDTH = 160
-_MP4_EPOCH_S = 2_082_844_800  # 1904 to 1970
 
 Progress = Callable[[str, float], None]
 
@@ -46,6 +48,7 @@ class OffsetSource(Enum):
     GIVEN = "as given"
     VIDEO_CLOCK = "the log's clock is the video's"
     CORRELATION = "by the camera's turning"
+    RECORDED_PART = "by the part of the log that is marked as video, accurate to about half a second"
     CREATION_TIME = (
         "by the container's creation time, accurate to a second at best, which at 25 deg/s is 25 deg of camera"
         " rotation; give --time-offset"
@@ -86,11 +89,14 @@ def find_offset(
     if log.video_clock:
         return TimeOffset(0.0 - float(log.track.stamp_ns[0]) * 1e-9, OffsetSource.VIDEO_CLOCK)
     created_s = _offset_by_creation(video, log)
+    part_s = _offset_by_part(video, log, created_s)
     moved = image_motion(video, progress)
-    found = correlate_turning(log.track, *moved, mount_pitch_deg, near_s=created_s)
+    found = correlate_turning(log.track, *moved, mount_pitch_deg, near_s=created_s if part_s is None else part_s)
     if found is not None:
         seconds, correlation = found
         return TimeOffset(seconds, OffsetSource.CORRELATION, correlation)
+    if part_s is not None:
+        return TimeOffset(part_s, OffsetSource.RECORDED_PART)
     if created_s is not None:
         return TimeOffset(created_s, OffsetSource.CREATION_TIME)
     raise InputError(
@@ -109,47 +115,17 @@ def _offset_by_creation(video: Path, log: TelemetryLog) -> float | None:
     return seconds if -CREATION_SLACK_S <= seconds <= log.duration_s else None
 
 
-def creation_time_ns(video: Path) -> int | None:
-    """Creation time (UTC ns) in the ``mvhd`` box of an MP4 or MOV container, None where there is none."""
-    try:
-        with video.open("rb") as file:
-            size = file.seek(0, 2)
-            body = _find_box(file, 0, size, (b"moov", b"mvhd"))
-            if body is None:
-                return None
-            file.seek(body)
-            data = file.read(12)
-    except OSError:
-        return None
-    if len(data) < 12:
-        return None
-    seconds = struct.unpack(">Q", data[4:12])[0] if data[0] == 1 else struct.unpack(">I", data[4:8])[0]
-    unix_s = seconds - _MP4_EPOCH_S
-    return unix_s * 10**9 if 946_684_800 < unix_s < 4_102_444_800 else None
-
-
-def _find_box(file: IO[bytes], start: int, end: int, names: tuple[bytes, ...]) -> int | None:
-    """Offset of the content of a nested box."""
-    place, boxes = start, 0
-    while place + 8 <= end and boxes < 1000:
-        boxes += 1
-        file.seek(place)
-        head = file.read(16)
-        if len(head) < 8:
-            return None
-        length, name, skip = struct.unpack(">I", head[:4])[0], head[4:8], 8
-        if length == 1 and len(head) == 16:
-            length, skip = struct.unpack(">Q", head[8:16])[0], 16
-        elif length == 0:
-            length = end - place
-        if length < skip:
-            return None
-        if name == names[0]:
-            if len(names) == 1:
-                return place + skip
-            return _find_box(file, place + skip, min(place + length, end), names[1:])
-        place += length
-    return None
+def _offset_by_part(video: Path, log: TelemetryLog, created_s: float | None) -> float | None:
+    """Start of the part of the log that lasts as long as the video; of several the one nearest the creation time."""
+    length_s = duration_s(video)
+    starts = [
+        (first - int(log.track.stamp_ns[0])) * 1e-9
+        for first, last in log.video_parts
+        if length_s is None or abs((last - first) * 1e-9 - length_s) <= max(PART_SLACK_S, 0.05 * length_s)
+    ]
+    if len(starts) > 1 and created_s is not None:
+        starts = sorted(starts, key=lambda s: abs(s - created_s))[:1]
+    return starts[0] if len(starts) == 1 else None
 
 
 def image_motion(video: Path, progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray]:

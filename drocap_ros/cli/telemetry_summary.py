@@ -1,0 +1,94 @@
+"""Telemetry of a video file or a log, for ``drocap info``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from drocap_ros.recording.telemetry.log import TelemetryLog
+
+_VIDEOS = (".mp4", ".mov", ".lrf")
+
+#: Facts by name, names of the columns, rows, warnings.
+Parts = tuple[list[tuple[str, str]], tuple[str, ...], list[tuple[str, ...]], list[str]]
+
+
+def is_video_or_log(path: Path) -> bool:
+    """Whether a file's name is that of a video container or a telemetry log."""
+    from drocap_ros.recording.telemetry.read import LOG_SUFFIXES
+
+    return path.is_file() and path.suffix.lower() in (*_VIDEOS, *LOG_SUFFIXES)
+
+
+def telemetry_summary(path: Path) -> Parts:
+    """What a video or log holds: rates, shares, lens, and what is missing.
+
+    Raises
+    ------
+    InputError
+        When a log or a video's index cannot be used; damage of the telemetry inside a video is a warning.
+    """
+    from drocap_ros.errors import InputError
+    from drocap_ros.recording.telemetry.read import read_telemetry
+
+    columns = ("telemetry", "states", "share", "rate")
+    warnings: list[str] = []
+    facts, log = [("path", str(path))], None
+    if path.suffix.lower() not in _VIDEOS:
+        log = read_telemetry(path)
+    else:
+        from drocap_ros.recording.telemetry.djmd.reader import has_djmd, read_djmd
+
+        facts += _video_facts(path)
+        try:
+            log = read_djmd(path) if has_djmd(path) else None
+        except InputError as error:
+            warnings.append(str(error))
+    if log is None:
+        return [*facts, ("telemetry", "not usable" if warnings else "none in the file")], columns, [], warnings
+    return [*facts, *_log_facts(log)], columns, _rows(log), warnings
+
+
+def _video_facts(path: Path) -> list[tuple[str, str]]:
+    from drocap_ros.errors import InputError
+    from drocap_ros.recording.telemetry.mp4 import read_samples, read_tracks
+
+    facts = []
+    with path.open("rb") as file:
+        for track in read_tracks(file):
+            words = track.sample_format
+            if track.handler == "vide":
+                words += f", {track.size[0]}x{track.size[1]} px"
+            try:
+                stamp_ns = read_samples(file, track).stamp_ns
+                span = float(stamp_ns[-1] - stamp_ns[0]) * 1e-9 if len(stamp_ns) else 0.0
+                words += f", {len(stamp_ns)} samples" + (f", {(len(stamp_ns) - 1) / span:.2f}/s" if span > 0 else "")
+            except InputError as error:
+                words += f", damaged: {error}"
+            facts.append((f"track {track.handler}", words))
+    if not facts:
+        raise InputError(f"{path}: expected a video file (MP4, MOV) with its index, found none; copy it again")
+    return facts
+
+
+def _log_facts(log: TelemetryLog) -> list[tuple[str, str]]:
+    facts = [("source", log.kind), ("duration", f"{log.duration_s:.3f} s")]
+    if log.video_parts:
+        parts = ", ".join(f"{a * 1e-9:.1f} to {b * 1e-9:.1f} s" for a, b in log.video_parts[:20])
+        facts.append(("on video", parts))
+    if log.lens is not None:
+        facts.append(("lens", str(log.lens)))
+    return facts + [("missing", str(lack)) for lack in log.lacks]
+
+
+def _rows(log: TelemetryLog) -> list[tuple[str, ...]]:
+    import numpy as np
+
+    series = {"camera attitude": log.track.gimbal, "aircraft attitude": log.track.orientation}
+    rows: list[tuple[str, ...]] = []
+    for name, values in {**series, "position": log.track.position}.items():
+        known = np.isfinite(values).all(axis=1)
+        rate = (known.sum() - 1) / log.duration_s if known.any() and log.duration_s > 0 else 0.0
+        rows.append((name, str(known.sum()), f"{known.mean():.1%}", f"{max(rate, 0.0):.2f}/s"))
+    return rows

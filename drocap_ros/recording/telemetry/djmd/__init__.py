@@ -1,0 +1,1 @@
+"""The timed-metadata track ``djmd`` inside the video files of DJI drones."""

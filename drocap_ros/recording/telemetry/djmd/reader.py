@@ -1,0 +1,245 @@
+"""States of the camera from the timed-metadata track ``djmd`` inside the video files of DJI drones.
+
+One protobuf message belongs to each image.  The format is not published: values are read at known places and checked.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from drocap_ros.errors import InputError
+from drocap_ros.flight.frames import geodetic_to_enu, orientation_to_ros
+from drocap_ros.geometry.rotations import unit_quaternions
+from drocap_ros.recording.telemetry.djmd.layouts import (
+    LATITUDE,
+    LONGITUDE,
+    MODELS,
+    SCHEMA,
+    UNIT,
+    Layout,
+    Model,
+    find_layout,
+    lens_of,
+)
+from drocap_ros.recording.telemetry.djmd.protobuf import Message, Value
+from drocap_ros.recording.telemetry.log import Lack, LogLack, TelemetryLog, dji_attitude, make_log
+from drocap_ros.recording.telemetry.mp4 import Samples, Track, read_samples, read_tracks
+from drocap_ros.recording.telemetry.plausibility import Series, plausible
+
+FORMAT = "djmd"
+#: A message has some kilobytes.
+_MAX_MESSAGE, _MIN_MESSAGE = 1 << 18, 4
+#: Messages from which the layout is found.
+_PROBED = 32
+_TENTH_DEG, _MM = 0.1, 1e-3
+#: Largest angle between the gimbal's quaternion and its angles, which are rounded to 0.1 deg.
+_AGREEMENT_DEG = 0.5
+_ZOOM_RANGE = (1.0, 60.0)
+#: Of an unknown schema: largest median roll of a gimbal, and turn of the gimbal from the nose.
+_ROLL_DEG, _TURN_DEG = 45.0, 90.0
+#: Numbers of one message: gimbal 3, aircraft 3, quaternion 4, latitude, longitude, unit, two heights, zoom.
+_COLUMNS = (3, 6, 10, 13, 15, 16)
+
+
+def find_track(file: IO[bytes]) -> Track | None:
+    """The telemetry track of an open video file, None where there is none."""
+    return next((track for track in read_tracks(file) if track.sample_format == FORMAT), None)
+
+
+def has_djmd(path: Path) -> bool:
+    """Whether a file is a video with such a track."""
+    try:
+        with path.open("rb") as file:
+            return find_track(file) is not None
+    except OSError:
+        return False
+
+
+def read_djmd(path: Path) -> TelemetryLog:
+    """Gimbal and aircraft attitude, position and lens of every image, by the video's own clock.
+
+    Raises
+    ------
+    InputError
+        When there is no such track, or its content is damaged or cannot be true.
+    """
+    try:
+        with path.open("rb") as file:
+            track = find_track(file)
+            if track is None:
+                raise InputError(f"{path}: expected a DJI djmd track in the video, found none; give a log beside it")
+            try:
+                samples = _in_order(read_samples(file, track))
+            except InputError as error:
+                raise InputError(f"{path}: djmd track: {error}; copy the file again") from None
+            return _to_log(path, file, samples)
+    except OSError as error:
+        raise InputError(f"{path}: expected a readable video file; {error.strerror}") from None
+
+
+def _in_order(samples: Samples) -> Samples:
+    """The samples that can hold a message, at times that increase."""
+    fits = (samples.size >= _MIN_MESSAGE) & (samples.size <= _MAX_MESSAGE)
+    fits &= np.diff(samples.stamp_ns, prepend=-1) > 0
+    if fits.sum() < 0.5 * len(fits) or not fits.any():
+        raise InputError(f"expected messages at times that increase, found {fits.sum()} of {len(fits)} samples")
+    return Samples(samples.offset[fits], samples.size[fits], samples.stamp_ns[fits])
+
+
+def _message(file: IO[bytes], samples: Samples, index: int) -> Message | None:
+    file.seek(int(samples.offset[index]))
+    try:
+        return Message(file.read(int(samples.size[index])))
+    except ValueError:
+        return None
+
+
+def _to_log(path: Path, file: IO[bytes], samples: Samples) -> TelemetryLog:
+    count = len(samples.stamp_ns)
+    probed = np.unique(np.concatenate([np.arange(min(count, 4)), np.linspace(0, count - 1, _PROBED).astype(int)]))
+    messages = [m for i in probed if (m := _message(file, samples, int(i))) is not None]
+    schema = next((v for m in messages if isinstance(v := m.at(SCHEMA), bytes)), b"")
+    name = "".join(c for c in schema.decode("latin1")[:60] if c.isascii() and c.isprintable()).removesuffix(".proto")
+    model = MODELS.get(name)
+    layout = find_layout(messages, model)
+    if layout is None:
+        raise InputError(
+            f"{path}: expected attitude or position at the known places of a djmd track, found neither (schema"
+            f" {name or 'without a name'}); give a log beside the video with --telemetry"
+        )
+    rows = np.full((count, _COLUMNS[-1]), np.nan)
+    for i in range(count):
+        message = _message(file, samples, i)
+        if message is not None:
+            rows[i] = _numbers_of(message, layout, model)
+    damaged = int(np.isnan(rows).all(axis=1).sum())
+    if damaged > 0.5 * count:
+        raise InputError(f"{path}: expected djmd messages, found {damaged} of {count} damaged; copy the file again")
+    lacks = [LogLack(Lack.DAMAGED_STATES, str(damaged))] if damaged else []
+    with np.errstate(all="ignore"):  # damaged numbers may be infinite
+        return _from_rows(path, samples.stamp_ns, rows, _title(name, model), model, lacks)
+
+
+def _title(name: str, model: Model | None) -> str:
+    if model:
+        return f"DJI djmd track ({model.name})"
+    return f"DJI djmd track (unknown schema {name or 'without a name'}, read at the places of known ones and plausible)"
+
+
+def _numbers_of(message: Message, layout: Layout, model: Model | None) -> tuple[float, ...]:
+    """The numbers of one message in the units of the file, NaN where missing."""
+    place = _numbers(message, layout.position, (LATITUDE, LONGITUDE, UNIT))
+    relative = _numbers(message, layout.relative_height[:-1], layout.relative_height[-1:])
+    return (
+        *(_numbers(message, layout.gimbal, (1, 2, 3)) if layout.gimbal else (np.nan,) * 3),
+        *_numbers(message, layout.aircraft, (2, 1, 3)),  # pitch, roll, yaw
+        *(_numbers(message, layout.quaternion, (1, 2, 3, 4)) if layout.quaternion else (np.nan,) * 4),
+        *place,
+        *relative,
+        _number(message.at((*layout.position[:-1], 2)), np.nan),
+        _number(message.at(model.zoom), np.nan) if model and model.zoom else np.nan,
+    )
+
+
+def _numbers(message: Message, path: tuple[int, ...], fields: tuple[int, ...]) -> tuple[float, ...]:
+    """Numbers in fields of the message at a path: zero where one is left out, NaN where there is no message."""
+    found = message.fields(path)
+    missing = 0.0 if message.holds(path) else np.nan  # proto3 leaves out zeros
+    return tuple(_number(found.get(field), missing) for field in fields)
+
+
+def _number(value: Value | None, missing: float) -> float:
+    if value is None:
+        return missing
+    return np.nan if isinstance(value, bytes) else float(value)
+
+
+def _from_rows(
+    path: Path, stamp_ns: np.ndarray, rows: np.ndarray, kind: str, model: Model | None, lacks: list[LogLack]
+) -> TelemetryLog:
+    gimbal, aircraft, quaternion, place, heights, zoom = np.split(rows, _COLUMNS[:-1], axis=1)
+    relative, absolute = heights.T * _MM
+    above_takeoff = np.isfinite(relative).any()
+    geodetic = _degrees(place, model)
+    geodetic[:, 2] = relative if above_takeoff else absolute
+    found, more = plausible(path, Series(stamp_ns, gimbal * _TENTH_DEG, aircraft * _TENTH_DEG, geodetic))
+    lacks += more
+    if model is None:
+        _check_unknown(path, found)
+    fixed = np.isfinite(found.geodetic).all(axis=1)
+    position = None
+    if fixed.any():
+        origin = found.geodetic[fixed][0].copy()
+        if above_takeoff:
+            origin[2] = 0.0
+        else:
+            lacks.append(LogLack(Lack.HEIGHT, "absolute altitude"))
+        position = geodetic_to_enu(found.geodetic, origin)
+    attitude, agrees = _with_quaternion(dji_attitude(found.gimbal), quaternion)
+    if not agrees:
+        lacks.append(LogLack(Lack.QUATERNION))
+    factor, steady = _zoom(zoom[:, 0])
+    if not steady:
+        lacks.append(LogLack(Lack.ZOOM, f"{np.nanmin(zoom):.1f} to {np.nanmax(zoom):.1f}"))
+    return make_log(
+        path,
+        kind,
+        stamp_ns,
+        video_clock=True,
+        orientation=dji_attitude(found.aircraft),
+        position=position,
+        gimbal=attitude,
+        lacks=tuple(lacks),
+        lens=lens_of(model, factor) if steady else None,
+    )
+
+
+def _check_unknown(path: Path, series: Series) -> None:
+    """Refuses an attitude at the known places that is no gimbal's: with roll, or turned away from the aircraft."""
+    roll = np.nanmedian(np.abs(series.gimbal[:, 1])) if np.isfinite(series.gimbal).any() else 0.0
+    turn = np.abs((series.gimbal[:, 2] - series.aircraft[:, 2] + 180.0) % 360.0 - 180.0)
+    away = np.nanmedian(turn) if np.isfinite(turn).any() else 0.0
+    if roll > _ROLL_DEG or away > _TURN_DEG:
+        raise InputError(
+            f"{path}: expected a level gimbal that follows the aircraft at the places of known djmd schemas, found a"
+            f" roll of {roll:.0f} deg and a turn of {away:.0f} deg; give a log beside the video with --telemetry"
+        )
+
+
+def _degrees(place: np.ndarray, model: Model | None) -> np.ndarray:
+    """(N, 3) latitude and longitude in degrees, of coordinates and their unit; the third column is free."""
+    known = np.isfinite(place).all(axis=1)
+    beyond_radians = known & ((np.abs(place[:, 0]) > np.pi / 2) | (np.abs(place[:, 1]) > np.pi))
+    degrees = (model.degrees if model else False) or beyond_radians.any()
+    factor = np.where((place[:, 2] == 1) | degrees, 1.0, np.rad2deg(1.0))
+    return np.column_stack([place[:, :2] * factor[:, None], place[:, 2]])
+
+
+def _with_quaternion(attitude: np.ndarray, quaternion: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Attitude by the quaternion, which is finer, where one of both orders of components agrees with the angles.
+
+    The second value is False where quaternions are given and disagree.
+    """
+    given = np.isfinite(quaternion).all(axis=1) & (np.abs(np.linalg.norm(quaternion, axis=1) - 1) < 0.01)
+    given &= np.isfinite(attitude).all(axis=1)
+    if not given.any():
+        return attitude, True
+    for order in ([1, 2, 3, 0], [0, 1, 2, 3]):  # w x y z; x y z w
+        finer = orientation_to_ros(unit_quaternions(quaternion[given][:, order]))
+        cosine = np.clip(np.abs(np.sum(finer * attitude[given], axis=1)), 0.0, 1.0)
+        if np.percentile(np.rad2deg(2 * np.arccos(cosine)), 95) < _AGREEMENT_DEG:
+            attitude = attitude.copy()
+            attitude[given] = finer
+            return attitude, True
+    return attitude, False
+
+
+def _zoom(zoom: np.ndarray) -> tuple[float, bool]:
+    """The digital zoom, and whether it is the same throughout."""
+    known = zoom[(zoom >= _ZOOM_RANGE[0]) & (zoom <= _ZOOM_RANGE[1])]
+    if not len(known):
+        return 1.0, True
+    return float(np.median(known)), bool(np.ptp(known) < 0.01 * np.median(known))

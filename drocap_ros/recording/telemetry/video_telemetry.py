@@ -1,0 +1,103 @@
+"""Telemetry of a video: from a log beside it or from the file itself, to the camera of its tracks."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+from drocap_ros.errors import InputError
+from drocap_ros.perception.calibration import camera_model
+from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+from drocap_ros.recording.open_session import is_recording
+from drocap_ros.recording.telemetry.camera_poses import with_camera
+from drocap_ros.recording.telemetry.log import TelemetryLog
+from drocap_ros.recording.telemetry.read import read_telemetry
+from drocap_ros.recording.telemetry.time_offset import Progress, find_offset
+from drocap_ros.tracks import Tracks
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """Source of a video's telemetry.
+
+    path : log beside it (.tlog, .ulg, .bin, .srt, .csv); None = the DJI track inside the video, where there is one
+    time_offset_s : from the log's first state to the video's first image; None = known or estimated
+    mount_pitch_deg : of a camera fixed to the body of a vehicle without a gimbal, negative down
+    """
+
+    path: Path | None = None
+    time_offset_s: float | None = None
+    mount_pitch_deg: float | None = None
+
+
+#: What a video file itself holds.
+EMBEDDED = Telemetry()
+
+
+def read_video_telemetry(video: Path, telemetry: Telemetry) -> TelemetryLog | None:
+    """The log beside a video, else the telemetry inside it; None where there is none.
+
+    Content inside the video that cannot be true is warned of and not used.
+
+    Raises
+    ------
+    InputError
+        When the log beside it cannot be used, or the input is no video.
+    """
+    if telemetry.path is not None:
+        if video.is_dir() or video.suffix == ".npz" or is_recording(video):
+            raise InputError(
+                f"--telemetry: expected a video file as input, found {video}; recordings hold their telemetry"
+            )
+        return read_telemetry(telemetry.path)
+    from drocap_ros.recording.telemetry.djmd.reader import has_djmd, read_djmd
+
+    if not video.is_file() or not has_djmd(video):
+        return None
+    try:
+        return read_djmd(video)
+    except InputError as error:
+        logger.warning("%s; the video is used without telemetry", error)
+        return None
+
+
+def with_telemetry(
+    video: Path,
+    tracks: Tracks,
+    telemetry: Telemetry,
+    log: TelemetryLog,
+    ingest: ImageIngestConfig,
+    progress: Progress | None = None,
+) -> tuple[Tracks, dict[str, str]]:
+    """Tracks of a video with the camera of its telemetry, and the sources by name; warns of what is missing or assumed.
+
+    The camera matrix comes from the configuration, else from the lens that the log describes.
+
+    Raises
+    ------
+    InputError
+        When the time offset is unknown or the calibration cannot be used.
+    """
+    name, pitch = telemetry.path or video, telemetry.mount_pitch_deg
+    offset = find_offset(video, log, telemetry.time_offset_s, pitch, progress)
+    logger.warning("%s: %s; %s", name, log.kind, offset)
+    for lack in log.lacks:
+        logger.warning("%s: %s", name, lack)
+    at_ns = tracks.stamp_ns + int(log.track.stamp_ns[0]) + round(offset.seconds * 1e9)
+    tracks, reason = with_camera(tracks, log.track, at_ns, pitch)
+    if reason:
+        logger.warning("%s: camera telemetry incomplete: %s", name, reason)
+    sources = {"file": name.name, "kind": log.kind, "time_offset": str(offset)}
+    camera = camera_model(ingest, tracks.image_size)
+    if camera is None and log.lens is not None and tracks.camera_rotation is not None:
+        fov_deg = log.lens.horizontal_fov_deg(tracks.image_size)
+        sources["lens"] = f"{fov_deg:.1f} deg across the image: {log.lens}"
+        logger.warning("%s: %s; image_ingest.horizontal_fov_deg in --config replaces it", video, sources["lens"])
+        camera = camera_model(dataclasses.replace(ingest, horizontal_fov_deg=fov_deg), tracks.image_size)
+    if camera is not None:
+        tracks = dataclasses.replace(tracks, camera_matrix=camera.matrix)
+    return tracks, sources
