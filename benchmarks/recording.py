@@ -2,7 +2,7 @@
 
 load       recorder node under 1280x720 JPEG 30 Hz + poses 30 Hz + telemetry 50 Hz (`--seconds 300` for the full time)
 kills      SIGKILL at random moments, recover, read by three libraries (`--kills 200`)
-mutations  mutated copies of a session, tracks, tlog, ULog, DataFlash and SRT (`--mutations 1000`)
+mutations  mutated copies of a session, tracks and every telemetry format (`--mutations 1000`, `--kinds mp4 csv`)
 long       a session of `--minutes 30` against one of a minute: time per frame, memory
 live       a simulated flight of `--flight 60` s, repeated offline bit for bit
 
@@ -34,6 +34,7 @@ from recorder_load import make_sources, process_usage, publish_all, watch_proces
 
 sys.path[:0] = [str(ROOT), str(ROOT / "test" / "helpers")]
 PARTS = ("load", "kills", "mutations", "long", "live")
+KINDS = ("mcap", "npz", "tlog", "srt", "bin", "ulg", "csv", "mp4")
 
 
 def main() -> int:
@@ -42,6 +43,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--mutations", type=int, default=100)
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS, help="only these are printed, not written")
     parser.add_argument("--minutes", type=int, default=5)
     parser.add_argument("--flight", type=float, default=20.0)
     parser.add_argument("--seed", type=int, default=0)
@@ -156,15 +158,19 @@ def part_kills(args: argparse.Namespace, folder: Path) -> None:
 
 
 def part_mutations(args: argparse.Namespace, folder: Path) -> None:
-    kinds = ("mcap", "npz", "tlog", "srt", "bin", "ulg")
-    results = {kind: cell("mutations", kind, args.mutations, args.seed, folder) for kind in kinds}
+    results = {kind: cell("mutations", kind, args.mutations, args.seed, folder) for kind in args.kinds}
     head = ("format", "copies", "used", "refused", "faults", "longest, s", "memory, MiB", "memory at the start, MiB")
     rows = [(kind, *list(result.values())[:4], *list(result.values())[5:]) for kind, result in results.items()]
     faults = [f"- {kind} {fault}" for kind, result in results.items() for fault in result["examples"]]
-    write_figures("recording_mutations", "Mutated files", table(head, rows) + "\n" + "\n".join(faults))
+    text = table(head, rows) + "\n" + "\n".join(faults)
+    if tuple(args.kinds) == KINDS:
+        write_figures("recording_mutations", "Mutated files", text)
+    else:
+        print(text)
 
 
 def cell_mutations(kind: str, count: str, seed: str, folder: str) -> dict[str, Any]:
+    from djmd_clips import damaged_boxes
     from telemetry_logs import mutated
 
     whole = whole_file(kind, Path(folder))
@@ -175,7 +181,8 @@ def cell_mutations(kind: str, count: str, seed: str, folder: str) -> dict[str, A
     worst_s, faults = 0.0, []
     signal.signal(signal.SIGALRM, _too_long)
     for i in range(int(count)):
-        path.write_bytes(mutated(whole, rng))
+        # Every other copy of a video has a box that lies; else damage would mostly hit its images.
+        path.write_bytes(damaged_boxes(whole, rng) if kind == "mp4" and i % 2 else mutated(whole, rng))
         begin = time.monotonic()
         signal.setitimer(signal.ITIMER_REAL, 10.0)
         try:
@@ -211,15 +218,15 @@ def use(kind: str, path: Path) -> tuple[int, str]:
     said, out = io.StringIO(), io.StringIO()
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(out):
         try:
-            if kind in ("mcap", "npz"):
-                status = drocap(["info", str(path)])
-                if status == 0:
-                    said.truncate(0)
-                    read_input(path, DrocapConfig(), None)
-            else:
+            status = drocap(["info", str(path)]) if kind in ("mcap", "npz", "mp4") else 0
+            if status == 0:
+                said.seek(0)
+                said.truncate(0)
+            if status == 0 and kind in ("mcap", "npz"):
+                read_input(path, DrocapConfig(), None)
+            elif status == 0:
                 log = read_telemetry(path)
                 camera_poses(log.track, log.track.stamp_ns[:100])
-                status = 0
         except InputError as error:
             said.write(f"{error}\n")
             status = 2
@@ -228,7 +235,9 @@ def use(kind: str, path: Path) -> tuple[int, str]:
 
 def whole_file(kind: str, folder: Path) -> bytes:
     import numpy as np
+    from airdata_tables import write_airdata
     from dataflash import write_dataflash
+    from djmd_clips import whole_clip
     from recorded import START_NS, Messages, write_poses
     from telemetry_logs import dji_subtitle, srt_text
 
@@ -248,6 +257,10 @@ def whole_file(kind: str, folder: Path) -> bytes:
         return srt_text(
             t, [dji_subtitle(i, g, a) for i, (g, a) in enumerate(zip(geodetic, angles, strict=True))]
         ).encode()
+    if kind == "csv":
+        return write_airdata(folder / "whole.csv", [(1.0, 7.0)]).read_bytes()
+    if kind == "mp4":
+        return whole_clip(folder / "whole.mp4").read_bytes()
     if kind == "bin":
         return write_dataflash(folder / "whole.bin", t, angles, geodetic, angles).read_bytes()
     tracks = simulate_capture(4, 30, seed=2, start_ns=START_NS).tracks

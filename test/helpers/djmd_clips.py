@@ -176,6 +176,13 @@ def plain_video(path, count):
     return path
 
 
+def whole_clip(path, count=45):
+    """A clip of a Mini 4 Pro."""
+    angles, aircraft, geodetic = flight(count)
+    fields = [mini_sample(i, angles[i], aircraft[i], geodetic[i]) for i in range(count)]
+    return add_track(plain_video(path, count).read_bytes(), samples("dvtm_Mini4_Pro", fields), path)
+
+
 def damaged_boxes(data, rng: random.Random):
     """A copy with one box that lies: a huge or zero size or count, a loop to an earlier place, or an end cut off."""
     data = bytearray(data)
