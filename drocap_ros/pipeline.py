@@ -26,7 +26,7 @@ from drocap_ros.recording.open_images import open_images, refuse_other_inputs
 from drocap_ros.recording.open_session import is_recording, open_session
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Session
 from drocap_ros.recording.session_tracks import read_pose2d, with_recorded_camera
-from drocap_ros.recording.telemetry.video_telemetry import EMBEDDED, Telemetry, read_video_telemetry, with_telemetry
+from drocap_ros.recording.telemetry.video_telemetry import Telemetry, read_video_telemetry, with_telemetry
 from drocap_ros.tracks import Tracks, load_tracks
 
 logger = logging.getLogger(__name__)
@@ -52,7 +52,7 @@ def reconstruct_input(
     config: DrocapConfig,
     models: Path | None = None,
     progress: Progress | None = None,
-    telemetry: Telemetry | None = EMBEDDED,
+    telemetry: Telemetry | None = None,
     mount_pitch_deg: float | None = None,
     selection: Selection | None = None,
 ) -> tuple[Motion, Tracks]:
@@ -65,7 +65,7 @@ def reconstruct_input(
         graph on a recording with ``pose2d``, with the recorded parameters unless ``config`` differs from the defaults
     models : folder of ONNX files; None = ``DROCAP_MODELS`` or the user's own
     progress : called with a stage and its fraction done
-    telemetry : log beside a video, or the track inside it, with the camera's pose; None = use none
+    telemetry : source of the camera's pose of a video; default: the DJI track inside it, where there is one
     mount_pitch_deg : of a camera fixed to the body, negative down, for a recording without the camera's attitude
     selection : part of the input; default: all images, the person in most of them
 
@@ -80,12 +80,11 @@ def reconstruct_input(
             raise InputError("--method live: expected a whole recording with its recorded poses; choose another method")
         return _reconstruct_live(Path(path), config, progress)
     begin = time.perf_counter()
-    log = read_video_telemetry(Path(path), telemetry) if telemetry is not None else None
+    telemetry = telemetry or Telemetry()
+    log = read_video_telemetry(Path(path), telemetry)
     tracks, origin = _read(Path(path), config, models, progress, mount_pitch_deg, selection)
-    if telemetry is not None and log is not None:
-        tracks, origin["telemetry"] = with_telemetry(
-            Path(path), tracks, telemetry, log, config.image_ingest, progress
-        )
+    if log is not None:
+        tracks, origin["telemetry"] = with_telemetry(Path(path), tracks, telemetry, log, config.image_ingest, progress)
     seconds = time.perf_counter() - begin
     motion = reconstruct(
         tracks, method=method, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress

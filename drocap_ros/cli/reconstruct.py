@@ -130,18 +130,18 @@ def _telemetry(args: argparse.Namespace) -> Any:
     from drocap_ros.pipeline import Telemetry
     from drocap_ros.recording.open_session import is_recording
     from drocap_ros.recording.telemetry.djmd.reader import has_djmd
+    from drocap_ros.recording.telemetry.video_telemetry import NO_TELEMETRY
 
-    refused = args.telemetry == Path("none")
     for name, value in (("--time-offset", args.time_offset), ("--mount-pitch", args.mount_pitch)):
         if value is None:
             continue
         session = name == "--mount-pitch" and args.input.exists() and is_recording(args.input)
         embedded = args.telemetry is None and has_djmd(args.input)
-        if (args.telemetry is None or refused) and not session and not embedded:
+        if args.telemetry in (None, NO_TELEMETRY) and not session and not embedded:
             raise InputError(f"{name}: expected --telemetry LOG with it, found none; add the log")
         if not math.isfinite(value):
             raise InputError(f"{name}: expected a finite number, got {value}; correct the value")
-    return None if refused else Telemetry(args.telemetry, args.time_offset, args.mount_pitch)
+    return Telemetry(args.telemetry, args.time_offset, args.mount_pitch)
 
 
 def summary(motion: Motion, method: str) -> str:

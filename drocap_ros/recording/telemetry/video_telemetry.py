@@ -20,11 +20,16 @@ from drocap_ros.tracks import Tracks
 logger = logging.getLogger(__name__)
 
 
+#: In the place of a log: use none.
+NO_TELEMETRY = Path("none")
+
+
 @dataclass(frozen=True)
 class Telemetry:
     """Source of a video's telemetry.
 
-    path : log beside it (.tlog, .ulg, .bin, .srt, .csv); None = the DJI track inside the video, where there is one
+    path : log beside it (.tlog, .ulg, .bin, .srt, .csv), or ``NO_TELEMETRY``; None = the DJI track inside the video,
+        where there is one
     time_offset_s : from the log's first state to the video's first image; None = known or estimated
     mount_pitch_deg : of a camera fixed to the body of a vehicle without a gimbal, negative down
     """
@@ -32,10 +37,6 @@ class Telemetry:
     path: Path | None = None
     time_offset_s: float | None = None
     mount_pitch_deg: float | None = None
-
-
-#: What a video file itself holds.
-EMBEDDED = Telemetry()
 
 
 def read_video_telemetry(video: Path, telemetry: Telemetry) -> TelemetryLog | None:
@@ -48,6 +49,8 @@ def read_video_telemetry(video: Path, telemetry: Telemetry) -> TelemetryLog | No
     InputError
         When the log beside it cannot be used, or the input is no video.
     """
+    if telemetry.path == NO_TELEMETRY:
+        return None
     if telemetry.path is not None:
         if video.is_dir() or video.suffix == ".npz" or is_recording(video):
             raise InputError(
