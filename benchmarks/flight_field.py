@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,12 +17,13 @@ import numpy as np
 from figures import table, write_figures
 from flight_field_defects import DEFECTS
 
-from drocap_ros.flight.orbit.states import Action, Command, State
+from drocap_ros.flight.orbit.states import Command, State
 from drocap_ros.simulation.closed_loop.branches import over_processes
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
 from drocap_ros.simulation.vehicle.loopback import is_setpoint
 
 FAULT_S, WATCH_S = 14.0, 7.0
+MOVING_M_S = 0.05
 Inject = Callable[[OrbitLoop], None]
 
 
@@ -143,7 +145,8 @@ def fly_orbit(row: OrbitRow, seed: int) -> str:
         autopilot=row.autopilot, action=row.action, wind_m_s=(row.wind_m_s, 0.0, 0.0), mount=row.mount, seed=seed,
         seconds=46.0,
     )  # fmt: skip
-    loop = OrbitLoop(with_config(settings, gimbal_control=row.mount != "fixed"))
+    # The person is measured before the flight, as `drocap preflight` asks.
+    loop = OrbitLoop(with_config(settings, gimbal_control=row.mount != "fixed", body_height_m=settings.stature_m))
     loop.start()
     loop.run(45.0)
     quality = orbit_quality(loop, 6.0, 13.0)
@@ -170,13 +173,19 @@ def fly_fault(row: FaultRow, seed: int) -> str:
     if loop.controller.safety.state != State.ORBITING:
         return f"not orbiting before: {loop.controller.safety.reason}"
     place, first = loop.copter.body.position.copy(), len(loop.rows)
+    sent: list[tuple[float, Any]] = []
+
+    def watch(loop: OrbitLoop) -> None:
+        sent.extend(loop.link.sent_setpoints()[-1:])
+
     row.inject(loop)
     if row.later is not None:
-        loop.run(FAULT_S + row.later[0])
+        loop.run(FAULT_S + row.later[0], watch)
         row.later[1](loop)
-    loop.run(FAULT_S + WATCH_S)
+    loop.run(FAULT_S + WATCH_S, watch)
     rows = loop.rows[first:]
-    last_s = max((r.t_s for r in rows if r.action == Action.ORBIT), default=FAULT_S) - FAULT_S
+    moving = [t for t, setpoint in sent if math.hypot(setpoint.vx, setpoint.vy) > MOVING_M_S]
+    last_s = max([t - FAULT_S for t in moving if t > FAULT_S], default=0.0)
     moved = max(float(np.hypot(*(r.position - place)[:2])) for r in rows if r.t_s < FAULT_S + 5.0)
     top = max(float(np.linalg.norm(r.velocity)) for r in rows)
     code = loop.controller.safety.condition.code.name
