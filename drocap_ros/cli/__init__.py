@@ -16,8 +16,8 @@ from drocap_ros.errors import DrocapError
 #: Modules under ``drocap_ros.cli``, in the order of ``drocap --help``.
 COMMANDS = (
     "demo.command", "graph.live", "preflight", "graph.view", "graph.orbit", "graph.record", "graph.replay", "track",
-    "reconstruct", "models.learn_dictionary", "export", "report", "info", "recover", "graph.top", "models.command",
-    "evaluate", "models.train_lifter", "models.train_simulation_models",
+    "reconstruct", "batch.command", "models.learn_dictionary", "export", "report", "info", "recover", "graph.top",
+    "models.command", "evaluate", "models.train_lifter", "models.train_simulation_models",
 )  # fmt: skip
 
 

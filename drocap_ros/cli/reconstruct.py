@@ -31,6 +31,14 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="video file, image folder, .mcap, rosbag1 .bag, rosbag2 folder, or tracks .npz",
     )
     parser.add_argument("--out", metavar="DIR", type=Path, help="output folder (default: INPUT's name + _motion)")
+    add_options(parser)
+    parser.add_argument("--quiet", action="store_true", help="no progress, only errors")
+    parser.set_defaults(run=run)
+    return parser
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of one reconstruction; ``drocap batch`` has them too."""
     parser.add_argument(
         "--method",
         choices=METHODS,
@@ -68,9 +76,6 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("--dictionary", metavar="NPZ", type=Path, help="pose dictionary instead of the shipped one")
     parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
     parser.add_argument("--no-report", action="store_true", help="do not write report.html")
-    parser.add_argument("--quiet", action="store_true", help="no progress, only errors")
-    parser.set_defaults(run=run)
-    return parser
 
 
 def run(args: argparse.Namespace) -> int:
