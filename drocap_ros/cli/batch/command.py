@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 LOG_FILE, PAGE_FILE = "batch.jsonl", "summary.html"
 _PAGE_EVERY_S = 60.0
 _FAILURES_PRINTED = 10
-#: Names of the temporary folders that a killed batch leaves.
+#: Names of the temporary folders that killed processes leave.
 _LEFT_OVER = re.compile(r"\.+[\w-]*-[0-9a-f]{16}\.\w+(\.\w+)?")
 
 
@@ -67,9 +67,11 @@ def run(args: argparse.Namespace) -> int:
         records, todo = _split(tasks, args.out)
         earlier = len(records)
         _reconstruct(args, records, todo)
+        _remove_left_overs(args.out)
     failures = [record for record in records if record["status"] != "done"]
     for record in failures[:_FAILURES_PRINTED]:
-        print(f"failed: {record['input']}: {record['error']}", file=sys.stderr)
+        name, error = record["input"], record["error"]
+        print(f"failed: {error if error.startswith(name) else f'{name}: {error}'}", file=sys.stderr)
     if not args.quiet:
         print(
             f"{len(tasks)} recordings: {len(records) - len(failures)} done, {earlier} of them earlier,"
