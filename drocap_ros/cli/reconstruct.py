@@ -15,9 +15,6 @@ METHODS = ("ba", "paper", "paper-no-articulation", "initial", "mf-nnm", "live")
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Add the command's options; ``run`` is its action."""
-    from drocap_ros.cli.clip_options import add_clip_options
-    from drocap_ros.cli.models.on_demand import add_fetch_option
-
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "reconstruct",
         help="3D motion from a video, recording or tracks file",
@@ -39,6 +36,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of one reconstruction; ``drocap batch`` has them too."""
+    from drocap_ros.cli.clip_options import add_clip_options
+    from drocap_ros.cli.models.on_demand import add_fetch_option
+
     parser.add_argument(
         "--method",
         choices=METHODS,

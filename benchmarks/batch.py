@@ -1,0 +1,302 @@
+"""Figures of batches: `python benchmarks/batch.py [PART ...]`.
+
+kills    `--recordings 200` (default 20) tracks and short videos, a twentieth of them broken; SIGKILL three times
+cluster  the same on a local Dask cluster: a killed worker, and a recording that needs more memory than a worker has
+equal    the arrays of `reconstruct`, of one process, of four, and of a cluster
+speed    time with one and with two processes; the load of the machine stands beside it
+scale    10,000 recordings: start, log, page and scheduler, measured; disk and time from the other parts' sizes
+
+Each part writes the page batch_PART of docs/figures.  cluster, equal and scale need dask.distributed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from batch_season import make_season
+from figures import ROOT, table, write_figures
+
+PARTS = ("kills", "cluster", "equal", "speed", "scale")
+WORKER_MEMORY = "700MiB"
+ARRAYS = ("joints3d", "camera_rotation", "confidence", "keypoints", "reprojection_px", "stamp_ns")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []])
+    parser.add_argument("--recordings", type=int, default=20)
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of the tracks")
+    parser.add_argument("--scale", type=int, default=10_000)
+    args = parser.parse_args()
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    for part in args.parts or PARTS:
+        with tempfile.TemporaryDirectory(prefix="drocap_bench_") as folder:
+            globals()[f"part_{part}"](args, Path(folder))
+    return 0
+
+
+def batch(folder: Path | str, out: Path, *words: object) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "drocap_ros.cli", "batch", str(folder), "--out", str(out)]
+    command += ["--models", "simulation", *map(str, words)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finish(process: subprocess.Popen[str]) -> str:
+    printed, errors = process.communicate()
+    if process.returncode not in (0, 1):
+        raise SystemExit(errors)
+    return printed.splitlines()[0]
+
+
+def log_lines(out: Path) -> list[dict[str, Any]]:
+    log = out / "batch.jsonl"
+    lines = log.read_text().splitlines() if log.exists() else []
+    return [json.loads(line) for line in lines if line.endswith("}")]
+
+
+def wait_for_lines(process: subprocess.Popen[str], out: Path, count: int) -> None:
+    while len(log_lines(out)) < count and process.poll() is None:
+        time.sleep(0.05)
+
+
+def write_times(out: Path) -> dict[str, int]:
+    return {path.parent.name: path.stat().st_mtime_ns for path in out.glob("[!.]*/record.json")}
+
+
+def load() -> str:
+    return f"{os.getloadavg()[0]:.1f}"
+
+
+def failures_table(out: Path) -> str:
+    records = [record for record in log_lines(out) if record["status"] != "done"]
+    rows = [(Path(r["input"]).name, r["error"].replace(str(Path(r["input"]).parent) + "/", "")[:150]) for r in records]
+    return table(("recording", "error"), sorted(rows))
+
+
+def count_status(out: Path) -> Counter[str]:
+    return Counter(record["status"] for record in log_lines(out))
+
+
+# -- kills -------------------------------------------------------------------------------------------------
+
+
+def part_kills(args: argparse.Namespace, folder: Path) -> None:
+    good, broken = make_season(folder / "season", args.recordings, args.seconds)
+    out = folder / "out"
+    rows, known, repeated, incomplete = [], {}, 0, 0
+    for start in range(4):
+        begin = time.monotonic()
+        process = batch(folder / "season", out, "--jobs", 2)
+        if start < 3:
+            wait_for_lines(process, out, round(args.recordings * (start + 1) / 4))
+            time.sleep(random.Random(start).random())
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+            time.sleep(2.0)
+        else:
+            finish(process)
+        times = write_times(out)
+        repeated += sum(times[name] != at for name, at in known.items())
+        incomplete += sum(not (out / name / "motion.npz").exists() for name in times)
+        known = times
+        end = "SIGKILL" if start < 3 else f"by itself, status {process.returncode}"
+        rows.append((start + 1, end, f"{time.monotonic() - begin:.0f} s", len(times)))
+    status = count_status(out)
+    write_figures(
+        "batch_kills",
+        "A batch that is killed three times",
+        f"{args.recordings} recordings, {broken} of them broken; `--jobs 2`.\n\n"
+        + table(("start", "ended", "after", "recordings done so far"), rows)
+        + f"\nDone: {status['done']} of {good}; failed: {status['failed']} of {broken}; reconstructed twice:"
+        f" {repeated}; incomplete folders: {incomplete}; lines in the log: {len(log_lines(out))}.\n\n"
+        + failures_table(out),
+    )
+
+
+# -- cluster -----------------------------------------------------------------------------------------------
+
+
+def part_cluster(args: argparse.Namespace, folder: Path) -> None:
+    from distributed import LocalCluster
+
+    good, broken = make_season(folder / "season", args.recordings, args.seconds)
+    with np.load(folder / "season" / "walk_000.npz") as archive:
+        arrays = dict(archive)
+    times = 600_000 // len(arrays["stamp_ns"])
+    long = {name: np.concatenate([value] * times) for name, value in arrays.items() if name == "keypoints"}
+    stamps = np.arange(len(long["keypoints"]), dtype=np.int64) * 40_000_000
+    fixed = {name: arrays[name] for name in ("joints", "image_size")}
+    np.savez(folder / "season" / "walk_long.npz", **long, **fixed, stamp_ns=stamps)
+    out = folder / "out"
+    with LocalCluster(2, threads_per_worker=1, memory_limit=WORKER_MEMORY, dashboard_address=None) as cluster:
+        begin = time.monotonic()
+        process = batch(folder / "season", out, "--cluster", cluster.scheduler_address)
+        wait_for_lines(process, out, args.recordings // 3)
+        killed = cluster.workers[0].pid
+        os.kill(killed, signal.SIGKILL)
+        finish(process)
+        seconds = time.monotonic() - begin
+        restarted = cluster.workers[0].pid not in (None, killed)
+    status = count_status(out)
+    write_figures(
+        "batch_cluster",
+        "A batch on a local Dask cluster",
+        f"{args.recordings} recordings, {broken} of them broken, and one of {len(stamps)} frames; two workers of"
+        f" {WORKER_MEMORY}, one killed by SIGKILL after {args.recordings // 3} recordings.\n\n"
+        f"Done: {status['done']} of {good}; failed: {status['failed']} of {broken + 1}; folders:"
+        f" {len(write_times(out))}; {seconds:.0f} s; killed worker {'' if restarted else 'not '}restarted.\n\n"
+        + failures_table(out),
+    )
+
+
+# -- equal -------------------------------------------------------------------------------------------------
+
+
+def part_equal(args: argparse.Namespace, folder: Path) -> None:
+    from distributed import LocalCluster
+
+    from drocap_ros.motion import load_motion
+
+    make_season(folder / "season", 12, args.seconds)
+    recordings = sorted((folder / "season").iterdir())
+    for path in recordings:
+        words = ["reconstruct", path, "--models", "simulation", "--out", folder / "one" / path.stem, "--quiet"]
+        subprocess.run([sys.executable, "-m", "drocap_ros.cli", *map(str, words)], check=True)
+    outs = {"--jobs 1": folder / "out1", "--jobs 4": folder / "out4", "--cluster": folder / "cluster"}
+    finish(batch(folder / "season", outs["--jobs 1"]))
+    finish(batch(folder / "season", outs["--jobs 4"], "--jobs", 4))
+    with LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
+        finish(batch(folder / "season", outs["--cluster"], "--cluster", cluster.scheduler_address))
+    rows = []
+    for name, out in outs.items():
+        equal = 0
+        for path in recordings:
+            (ours,) = out.glob(f"{path.stem}-*")
+            a, b = load_motion(ours / "motion.npz"), load_motion(folder / "one" / path.stem / "motion.npz")
+            equal += all(getattr(a, array).tobytes() == getattr(b, array).tobytes() for array in ARRAYS)
+        rows.append((f"`{name}`", f"{equal} of {len(recordings)}"))
+    text = f"Recordings of which every byte of {', '.join(ARRAYS)} is that of `drocap reconstruct`.\n\n"
+    write_figures("batch_equal", "The same arrays everywhere", text + table(("batch", "equal"), rows))
+
+
+# -- speed -------------------------------------------------------------------------------------------------
+
+
+def part_speed(args: argparse.Namespace, folder: Path) -> None:
+    count = min(args.recordings, 24)
+    make_season(folder / "season", count, args.seconds)
+    rows, seconds = [], {}
+    for jobs in (1, 2, 2, 1):
+        out = folder / f"out{len(rows)}"
+        before, begin = load(), time.monotonic()
+        finish(batch(folder / "season", out, "--jobs", jobs))
+        wall = time.monotonic() - begin
+        seconds.setdefault(jobs, []).append(wall)
+        rows.append((jobs, f"{wall:.1f} s", f"{wall / count:.2f} s", before, load()))
+    speedup = sum(seconds[1]) / sum(seconds[2])
+    write_figures(
+        "batch_speed",
+        "Speed-up of a batch",
+        f"{count} recordings of {args.seconds:g} s; speed-up of two processes over one: **{speedup:.2f}**.\n\n"
+        + table(("jobs", "time", "per recording", "load before", "load after"), rows),
+    )
+
+
+# -- scale -------------------------------------------------------------------------------------------------
+
+
+def part_scale(args: argparse.Namespace, folder: Path) -> None:
+    """Fabricated results of `--scale` recordings around one real result of each kind."""
+    import psutil
+    from distributed import Client
+
+    from drocap_ros.cli import build_parser
+    from drocap_ros.cli.batch.command import _read_tasks
+    from drocap_ros.cli.batch.recording import reconstruct_recording
+
+    make_season(folder / "real", 20, args.seconds)
+    finish(batch(folder / "real", folder / "real_out", "--jobs", 2))
+    records = [record for record in log_lines(folder / "real_out") if record["status"] == "done"]
+    sizes = {}
+    for kind in ("walk", "clip"):
+        own = [record for record in records if Path(record["input"]).name.startswith(kind)]
+        disk = [sum(f.stat().st_size for f in (folder / "real_out" / r["folder"]).iterdir()) for r in own]
+        sizes[kind] = (np.mean(disk) / 1e6, np.mean([r["seconds"] for r in own]), max(r["peak_memory_mb"] for r in own))
+
+    many, out = folder / "many", folder / "many_out"
+    many.mkdir()
+    out.mkdir()
+    for i in range(args.scale):
+        os.link(folder / "real" / "walk_000.npz", many / f"walk_{i:05}.npz")
+    parsed = build_parser().parse_args(["batch", str(many), "--out", str(out), "--models", "simulation"])
+    parsed.command_line = "drocap batch"
+    tasks = _read_tasks(parsed)
+    lines = []
+    for i, task in enumerate(tasks):
+        record = {**records[i % len(records)], **task.record, "folder": f"walk_{i:05}-0123456789abcdef"}
+        (out / record["folder"]).mkdir()
+        (out / record["folder"] / "record.json").write_text(json.dumps(record))
+        lines.append(json.dumps(record) + "\n")
+    (out / "batch.jsonl").write_text("".join(lines))
+    begin = time.monotonic()
+    process = batch(many, out)
+    peak = 0.0
+    while process.poll() is None:
+        try:
+            peak = max(peak, psutil.Process(process.pid).memory_info().rss / 1e6)
+        except psutil.NoSuchProcess:
+            break
+        time.sleep(0.02)
+    print(finish(process))
+    start_s = time.monotonic() - begin
+
+    words = ["scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", str(folder / "file")]
+    scheduler = subprocess.Popen([sys.executable, "-m", "dask", *words], stderr=subprocess.DEVNULL)
+    while not (folder / "file").exists():
+        time.sleep(0.1)
+    with Client(scheduler_file=str(folder / "file")) as client:
+        memory = [psutil.Process(scheduler.pid).memory_info().rss / 1e6]
+        begin = time.monotonic()
+        futures = client.map(reconstruct_recording, tasks, pure=False)
+        while client.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.tasks)) < len(tasks):
+            time.sleep(0.1)
+        submit_s = time.monotonic() - begin
+        memory.append(psutil.Process(scheduler.pid).memory_info().rss / 1e6)
+        del futures
+    scheduler.terminate()
+    scheduler.wait()
+
+    n = args.scale
+    rows = [
+        ("start that finds everything done", f"{start_s:.1f} s, {peak:.0f} MB"),
+        ("`batch.jsonl`", f"{(out / 'batch.jsonl').stat().st_size / 1e6:.1f} MB"),
+        ("`summary.html`", f"{(out / 'summary.html').stat().st_size / 1e6:.1f} MB"),
+        ("scheduler with all of them waiting", f"{memory[1]:.0f} MB, {memory[0]:.0f} MB without; {submit_s:.1f} s"),
+    ]
+    for kind, what in (("walk", f"tracks of {args.seconds:g} s"), ("clip", "videos of 1.5 s")):
+        disk, seconds, most = sizes[kind]
+        rows.append((
+            f"{what}: folders, computing, most memory of one",
+            f"{disk * n / 1e3:.1f} GB ({disk:.2f} MB each), {seconds * n / 3600:.1f} core hours ({seconds:.1f} s each),"
+            f" {most:.0f} MB",
+        ))  # fmt: skip
+    text = "Start, log, page and scheduler are measured, folders and computing extrapolated from a few recordings.\n\n"
+    write_figures("batch_scale", f"{n} recordings", text + table(("of all recordings", ""), rows))
+    shutil.rmtree(many)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
