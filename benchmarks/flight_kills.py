@@ -75,7 +75,7 @@ class World(NamedTuple):
 class Kill(NamedTuple):
     """One kill: greatest horizontal distance from there, m; speeds, m/s.
 
-    nearer_m, own_m : how much nearer to the subject, and to the place where the subject was at the kill, m
+    nearer_m, own_m : how much nearer to the subject, m; so much of it by the vehicle's motion, not by his
     """
 
     world: World
@@ -91,15 +91,15 @@ def killed(world: World, loop: OrbitLoop) -> Kill:
     """The bridge sends nothing from now on."""
     first, place = len(loop.rows), loop.copter.body.position.copy()
     at_s, speed = loop.t, float(np.linalg.norm(loop.copter.body.velocity))
-    subject = loop.pelvis()[:2]
-    distance = float(np.hypot(*(subject - place[:2])))
+    distance = float(np.hypot(*(loop.pelvis()[:2] - place[:2])))
     loop.stopped = True
     loop.run(loop.t + TAIL_S)
     rows = loop.rows[first:]
+    stood = [float(np.hypot(*(loop.pelvis(row.t_s)[:2] - place[:2]))) for row in rows]
     return Kill(
         world, at_s, max(float(np.hypot(*(row.position - place)[:2])) for row in rows),
         distance - min(nearness(row, loop) for row in rows),
-        distance - min(float(np.hypot(*(row.position[:2] - subject))) for row in rows), speed,
+        max(min(distance, alone) - row.distance_m for row, alone in zip(rows, stood, strict=True)), speed,
         max(float(np.linalg.norm(row.velocity)) for row in rows),
     )  # fmt: skip
 
@@ -172,7 +172,7 @@ def kills(moments: int, jobs: int) -> int:
         print("  ".join(str(cell) for cell in lines[-1]), flush=True)
     head = [
         "autopilot", "radius, m", "wind, m/s", "person", "kills", "moved: median, m", "95 %", "most",
-        "share <= 2.5 m, %", "nearer by, most, m", "to where he was, m", "top speed / at the kill, m/s",
+        "share <= 2.5 m, %", "nearer by, most, m", "by its own motion, m", "top speed / at the kill, m/s",
     ]  # fmt: skip
     write_figures("flight_kills", "The bridge's death at random moments", table(head, lines))
     return bad
