@@ -85,12 +85,13 @@ def _read_tasks(args: argparse.Namespace) -> list[Task]:
     """A task for each recording that the arguments name, each once."""
     from drocap_ros.cli.batch.inputs import read_inputs
     from drocap_ros.cli.batch.recording import Task, content_digest, fingerprint, stat_digest, version
+    from drocap_ros.recording.telemetry.video_telemetry import NO_TELEMETRY
 
     options = argparse.ArgumentParser()
     add_options(options)
     defaults = argparse.Namespace(**{name: getattr(args, name) for name in vars(options.parse_args([]))})
     for name, value in vars(defaults).items():
-        if isinstance(value, Path) and name != "models" and not value.exists():
+        if isinstance(value, Path) and name != "models" and value != NO_TELEMETRY and not value.exists():
             raise InputError(f"--{name} {value}: no such file; check the path")
     shared = [value for value in vars(_resolved(defaults)).values() if isinstance(value, Path)]
     digests = {path: content_digest(path) for path in shared}
@@ -106,11 +107,13 @@ def _resolved(arguments: argparse.Namespace) -> argparse.Namespace:
     """Copy with absolute paths, and with the folder of models that ``reconstruct`` would use."""
     from drocap_ros.config import DrocapConfig, load_config
     from drocap_ros.perception.load_models import models_folder
+    from drocap_ros.recording.telemetry.video_telemetry import NO_TELEMETRY
 
     values = dict(vars(arguments))
     config = load_config(arguments.config) if arguments.config else DrocapConfig()
     values["models"] = models_folder(arguments.models or config.pose_estimator.models_dir or None)
-    return argparse.Namespace(**{k: v.absolute() if isinstance(v, Path) else v for k, v in values.items()})
+    relative = {k: v for k, v in values.items() if isinstance(v, Path) and v != NO_TELEMETRY}
+    return argparse.Namespace(**values | {name: path.absolute() for name, path in relative.items()})
 
 
 @contextlib.contextmanager

@@ -123,6 +123,18 @@ def test_killed_batch_goes_on_and_repeats_nothing(season, tmp_path):
     assert done_times(out) == finished
 
 
+def test_telemetry_none_is_no_file(tmp_path):
+    clip, listed, out = tmp_path / "clip.mp4", tmp_path / "list.txt", tmp_path / "out"
+    clip.write_text("no video")
+    listed.write_text(f"'{clip}' --telemetry none\n")
+    for words in ([clip, "--telemetry", "none"], [listed]):
+        process = batch(*words, "--out", out, "--models", "simulation")
+        _, errors = process.communicate(timeout=100)
+        assert process.returncode == 1, errors
+        (record,) = log_lines(out)
+        assert "expected a video" in record["error"]
+
+
 class Crash:
     """Ends the process that receives it."""
 
