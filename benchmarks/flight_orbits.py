@@ -100,14 +100,20 @@ def fly(seed: int) -> tuple[LoopSettings, OrbitLoop]:
     return settings, loop
 
 
-def closing_speed(loop: OrbitLoop) -> float:
-    """Highest speed of the vehicle towards the person, m/s."""
-    top = 0.0
-    for row in loop.rows:
-        if row.t_s > SETTLE_S:
-            away = (loop.pelvis(row.t_s) - row.position)[:2]
-            top = max(top, float(row.velocity[:2] @ away) / max(float(np.hypot(*away)), 1e-3))
-    return top
+def closing_speeds(loop: OrbitLoop) -> tuple[float, float, float]:
+    """Highest speeds (m/s): the vehicle's towards the person, what of it does not follow one who walks away, and the
+    loss of distance, the person's own approach included.
+    """
+    rows = [row for row in loop.rows if row.t_s > SETTLE_S]
+    parts = np.zeros((len(rows) + 1, 3))
+    for part, row in zip(parts[1:], rows, strict=True):
+        away = (loop.pelvis(row.t_s) - row.position)[:2]
+        toward = away / max(float(np.hypot(*away)), 1e-3)
+        walked = (loop.pelvis(row.t_s + 0.25) - loop.pelvis(row.t_s - 0.25))[:2] / 0.5
+        own, receding = float(row.velocity[:2] @ toward), float(walked @ toward)
+        part[:] = own, own - max(receding, 0.0), own - receding
+    own_m_s, beyond_m_s, loss_m_s = parts.max(axis=0)
+    return float(own_m_s), float(beyond_m_s), float(loss_m_s)
 
 
 def breaches(settings: LoopSettings, loop: OrbitLoop) -> list[str]:
@@ -153,11 +159,13 @@ def outcome(seed: int) -> dict[str, Any]:
         if before == "ORBITING" and state != "ORBITING"
     ]  # fmt: skip
     refusals = [answer.condition.code.name for _, answer in loop.answers if not answer.accepted]
+    own, beyond, loss = closing_speeds(loop)
     whole = all(row.state == State.ORBITING for row in rows if row.t_s > 14.0)
     return {
         "seed": seed, "code": _CODE, "autopilot": settings.autopilot, "action": settings.action,
         "breaches": breaches(settings, loop), "least_distance_m": round(least_distance(loop), 3),
-        "closing_m_s": round(closing_speed(loop), 2), "perception": PerceptionErrors.drawn(seed).kind,
+        "closing_m_s": round(own, 2), "beyond_m_s": round(beyond, 2), "loss_m_s": round(loss, 2),
+        "perception": PerceptionErrors.drawn(seed).kind,
         "orbiting": round(float(np.mean(orbiting)), 3), "flown": any(orbiting), "held": stops[:3],
         "refused": refusals[:1] if not any(orbiting) else [],
         "radius_error_m": round(float(np.mean(np.abs(settled))), 3) if whole else None,
@@ -191,7 +199,6 @@ def table(first: int, count: int) -> int:
     flown = [row for row in rows if row["flown"]]
     errors = [row["radius_error_m"] for row in rows if row["radius_error_m"] is not None]
     near = sorted(row["least_distance_m"] for row in flown)
-    closing = sorted((row["closing_m_s"] for row in flown), reverse=True)
     lines = [
         ["orbits", f"{len(rows)} of {count}, {len({row['code'] for row in rows})} version(s) of the code"],
         ["with a breach", f"{len(bad)} " + "; ".join(f"seed {r['seed']}: {', '.join(r['breaches'])}" for r in bad)],
@@ -203,7 +210,13 @@ def table(first: int, count: int) -> int:
         lines.append(["radius error of those, m: mean, worst", f"{np.mean(errors):.2f}, {max(errors):.2f}"])
     if near:
         lines.append(["least true distances, m", ", ".join(f"{value:.2f}" for value in near[:3])])
-        lines.append(["highest speeds towards the person, m/s", ", ".join(f"{value:.2f}" for value in closing[:3])])
+    for title, key in (
+        ("highest own speeds towards the person, m/s", "closing_m_s"),
+        ("of it beyond following one who walks away, m/s", "beyond_m_s"),
+        ("highest loss of distance, his own approach included, m/s", "loss_m_s"),
+    ):
+        highest = sorted((row[key] for row in flown), reverse=True)
+        lines.append([title, ", ".join(f"{value:.2f}" for value in highest[:3])])
     for kind in sorted({row["perception"] for row in rows}):
         part = [row for row in rows if row["perception"] == kind]
         least = min((row["least_distance_m"] for row in part if row["flown"]), default=math.inf)

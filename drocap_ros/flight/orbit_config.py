@@ -10,6 +10,7 @@ from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.parameters import Parameters, param
 
 _ROOM_M = 0.5
+LEAST_REVERSAL_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,23 @@ class OrbitConfig(Parameters):
         1.5, "greatest distance of the position setpoint from the vehicle", unit="m", minimum=0.2, maximum=10
     )
 
+    reverse_every_s: float = param(
+        0.0, "time after which the orbit turns its direction, again and again: turns tell the camera's yaw from the "
+        "latency; 0 = never, else at least 10 s", unit="s", minimum=0, maximum=3600,
+    )  # fmt: skip
+    calibrate_telemetry: bool = param(
+        False, "whether the orbit begins against its direction and turns once, after 15 s, so that a reconstruction "
+        "can calibrate the telemetry; reverse_every_s replaces it",
+    )  # fmt: skip
+
     def __post_init__(self) -> None:
         super().__post_init__()
+        if 0.0 < self.reverse_every_s < LEAST_REVERSAL_S:
+            raise ParameterError(
+                f"reverse_every_s: expected 0 (never) or at least {LEAST_REVERSAL_S:g} s, "
+                f"got {self.reverse_every_s:g}; "
+                "a turn takes two ramps"
+            )
         if (refusal := orbit_condition(self, self.radius_m, self.angular_speed_deg_s)) is not None:
             raise ParameterError(str(refusal))
 

@@ -270,7 +270,10 @@ class OrbitController:
         if action == Action.ORBIT and self._orbit is not None and estimate is not None:
             config, pace = self._config, self.safety.pace
             speed = float(np.hypot(*estimate.velocity[:2]))
-            least = least_radius(config, estimate.position_sd_m, speed, config.braking_m_s2)
+            least = least_radius(
+                config, estimate.position_sd_m, speed, config.braking_m_s2, config.size_error,
+                estimate.nearer * seen.subject_distance_m,
+            )  # fmt: skip
             self._orbit = advance(
                 self._orbit, self._goal, seen.position, estimate.position, estimate.velocity, config.ground_height_m,
                 dt * pace.value, config, least, coast_speed(seen, self._limits),

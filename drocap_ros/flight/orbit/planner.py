@@ -27,6 +27,8 @@ _FORWARD_RATE, _MAX_FORWARD = (
 )  # 1/s, m/s^2: so much of it is passed on, by the centre's speed: noise if it stands
 _MAX_HASTE = 0.3  # m/s^2 along the path that the setpoint passes on: the reference waits for a vehicle that lags
 _STANDING_M_S, _SURPRISE_S, _FLIGHT_ERROR_M = 0.3, 0.5, 0.5  # of the least radius
+_CALIBRATION_S = 15.0  # against the wanted direction, with calibrate_telemetry
+_WORST_RANGE = 5.0  # of size_error: 40 % where the body is not measured, as by a wrong lens or a child
 
 
 class OrbitGoal(NamedTuple):
@@ -53,6 +55,7 @@ class OrbitState(NamedTuple):
     radius, height : m; height in the map frame
     centre, centre_velocity, centre_acceleration : (2,) m, m/s, m/s^2; the acceleration filtered
     trim : m, added to the radius: integrated mean radius error (wind, lag)
+    flown_s : time of the reference
     """
 
     phase: float
@@ -63,6 +66,7 @@ class OrbitState(NamedTuple):
     centre_velocity: np.ndarray
     centre_acceleration: np.ndarray
     trim: float = 0.0
+    flown_s: float = 0.0
 
 
 def goal_of(
@@ -80,15 +84,23 @@ def goal_of(
     return OrbitGoal(radius, height, math.radians(speed))
 
 
-def least_radius(config: OrbitConfig, subject_sd_m: float, subject_speed_m_s: float, braking_m_s2: float) -> float:
-    """Radius (m) at which an orbit stays clear of the minimum distance.
+def least_radius(
+    config: OrbitConfig, subject_sd_m: float, subject_speed_m_s: float, braking_m_s2: float,
+    size_error: float = 0.0, nearer_m: float = 0.0,
+) -> float:  # fmt: skip
+    """Radius (m) at which an orbit stays clear of the minimum distance, whatever is wrong with the range.
 
-    It includes two standard deviations of the subject's position, and a walking subject that turns towards the vehicle
-    or stops at once.
+    It includes two standard deviations of the subject's position, the worst error of a range by body size, what one of
+    two ranges says beyond the other, and a walking subject that turns towards the vehicle or stops at once.
+
+    size_error : standard deviation of the range by body size, a share
+    nearer_m : by so much the nearer of body size and ground puts the subject nearer
     """
     speed = min(max(subject_speed_m_s - _STANDING_M_S, 0.0), config.max_subject_speed_m_s)
     surprise = max(_SURPRISE_S * speed, speed**2 / (2 * braking_m_s2))
-    return config.min_distance_m + 2 * subject_sd_m + surprise + _FLIGHT_ERROR_M
+    worst = _WORST_RANGE * size_error * config.min_distance_m
+    nearer = max(2 * subject_sd_m, nearer_m + subject_sd_m, worst)
+    return config.min_distance_m + nearer + surprise + _FLIGHT_ERROR_M
 
 
 def begin_orbit(vehicle: np.ndarray, velocity: np.ndarray, subject: np.ndarray, config: OrbitConfig) -> OrbitState:
@@ -130,6 +142,7 @@ def advance(
     dt = min(max(dt, 0.0), 0.2)
     if dt == 0.0:
         return state
+    goal = goal._replace(angular_speed_rad_s=sense(config, state.flown_s) * goal.angular_speed_rad_s)
     centre, centre_velocity, centre_acceleration = _follow(state, subject[:2], subject_velocity[:2], dt, config)
     jerk = config.max_jerk_m_s3
     slow = min(0.5 * config.max_acceleration_m_s2, 1.0)
@@ -156,10 +169,19 @@ def advance(
     if creep == 1.0:
         error = radius.value - float(np.hypot(*(vehicle[:2] - subject[:2])))
         error = min(max(error, -1.0), 1.0)
-        trim = min(max(trim + _TRIM_RATE * error * dt, -_MAX_TRIM_M), _MAX_TRIM_M)
+        most = min(max(radius.value - least_radius_m, 0.0), _MAX_TRIM_M)  # no nearer than the least radius
+        trim = min(max(trim + _TRIM_RATE * error * dt, -most), _MAX_TRIM_M)
     return OrbitState(
-        math.remainder(phase, 2 * math.pi), omega, radius, height, centre, centre_velocity, centre_acceleration, trim
-    )
+        math.remainder(phase, 2 * math.pi), omega, radius, height, centre, centre_velocity, centre_acceleration, trim,
+        state.flown_s + dt,
+    )  # fmt: skip
+
+
+def sense(config: OrbitConfig, flown_s: float) -> float:
+    """1, or -1 while the orbit is flown against its wanted direction: a one-way orbit cannot tell yaw from latency."""
+    if config.reverse_every_s > 0:
+        return -1.0 if int(flown_s / config.reverse_every_s) % 2 else 1.0
+    return -1.0 if config.calibrate_telemetry and flown_s < _CALIBRATION_S else 1.0
 
 
 def reference_position(state: OrbitState) -> np.ndarray:

@@ -30,6 +30,7 @@ _ACCELERATION = 0.7  # m/s^2: standard deviation of the change of the subject's 
 _MAX_BENDING, _BENT = 0.3, 4.0  # a bent body looks smaller: its size counts for less
 _BEARING_GATE, _SIZE_GATE = 4.0, 0.35  # standard deviations across the sight; share of the range along it
 _SURE = 0.5  # standard deviations of the speed at which he walks away that are left out
+_AWAY_M_S2 = 0.4  # growth of the speed at which he may be followed: a body that swings or crouches shrinks too
 _RESTART_S = 1.0
 _POSITION_GAIN = 1.0  # 1/s, of both autopilots' position loops: 1.0 (PSC_POSXY_P) and 0.95 (MPC_XY_P)
 _REACTION_S = 0.5
@@ -45,6 +46,7 @@ class Guard:
         self._covariance = np.eye(4)
         self._stamp_ns, self._track_id, self._contradicted = 0, 0, False
         self._last_keypoints: np.ndarray | None = None
+        self._away = 0.0  # m/s, at which he has walked away for long enough
         self._offset, self._now_ns = np.zeros(3), 0
 
     def see(
@@ -68,6 +70,7 @@ class Guard:
             elif gap_s > 0 and not other:
                 bent = _BENT if not found.bending < _MAX_BENDING else 1.0
                 sure = self._correct(found.position[:2], camera.position[:2], gap_s, bent)
+                self._learn_away(camera.position[:2], gap_s)
         if sure:
             self._stamp_ns, self._contradicted = observation.stamp_ns, False
         elif found is not None and observation.stamp_ns > self._stamp_ns:
@@ -97,14 +100,15 @@ class Guard:
         distance, inward, _ = self._sight(seen.position)
         nearest = (1 - 2 * self._size_error) * distance
         room = math.sqrt(2 * self._braking * max(nearest - self._orbit.min_distance_m, 0.0))
-        allowed = min(max(self._orbit.max_closing_m_s + self._receding(inward), 0.0), room)
+        receding = min(self._receding(inward, self._now()), self._away)
+        allowed = min(max(self._orbit.max_closing_m_s + receding, 0.0), room)
         return _bounded(
             setpoint, seen.position, seen.velocity, inward, distance, allowed, self._orbit.max_acceleration_m_s2
         )
 
     def _start(self, place: np.ndarray, observation: PoseObservation) -> None:
         self._state = np.concatenate([place, np.zeros(2)])
-        self._covariance = np.eye(4)
+        self._covariance, self._away = np.eye(4), 0.0
         self._track_id = observation.track_id
 
     def _correct(self, place: np.ndarray, camera: np.ndarray, gap_s: float, bent: float) -> bool:
@@ -130,6 +134,12 @@ class Guard:
         self._covariance = 0.5 * (covariance + covariance.T)
         return True
 
+    def _learn_away(self, camera: np.ndarray, gap_s: float) -> None:
+        assert self._state is not None
+        sight = self._state[:2] - camera
+        receding = self._receding(sight / max(float(np.hypot(*sight)), 1e-3), (self._state, self._covariance))
+        self._away = max(min(receding, self._away + _AWAY_M_S2 * min(gap_s, 0.5)), 0.0)
+
     def _predicted(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
         assert self._state is not None
         move = np.eye(4)
@@ -146,9 +156,9 @@ class Guard:
         inward = sight / distance
         return distance, inward, math.sqrt(max(float(inward @ covariance[:2, :2] @ inward), 0.0))
 
-    def _receding(self, inward: np.ndarray) -> float:
+    def _receding(self, inward: np.ndarray, estimate: tuple[np.ndarray, np.ndarray]) -> float:
         """Speed (m/s) at which the subject walks away by his image, negative towards the vehicle; 0 = not sure."""
-        state, covariance = self._now()
+        state, covariance = estimate
         speed = float(state[2:] @ inward)
         sd = math.sqrt(max(float(inward @ covariance[2:, 2:] @ inward), 0.0))
         return math.copysign(max(abs(speed) - _SURE * sd, 0.0), speed)

@@ -17,6 +17,7 @@ _DRIFT = 0.05  # m/sqrt(s), of the vehicle's position and of the feet that are s
 _RATIO_MEMORY_NS, _LEAST_RATIOS, _RATIO_QUANTILE = 4 * _NS, 15, 0.4  # of size over ground
 _WANDERING_MEMORY_NS, _WANDERING_RATIOS = 2 * _NS, 12  # where the height wanders: a longer memory lags behind it
 _MAX_BENDING = 0.3  # of a body whose size counts; 0.1 by noise alone
+_NEARER_S = 1.0  # filter of what the two ranges disagree by
 _MAX_SURPRISE = 0.3  # share of the range, beyond which the gate decides
 
 
@@ -29,6 +30,7 @@ class SubjectEstimate:
     stamp_ns : exposure of the last image that was accepted
     age_s : since then
     contradicted : whether an image since then showed another track, or a subject where this one cannot be
+    nearer : share of his distance from the camera by which the nearer of body size and ground puts him nearer
     """
 
     position: np.ndarray
@@ -39,6 +41,7 @@ class SubjectEstimate:
     age_s: float
     track_id: int
     contradicted: bool = False
+    nearer: float = 0.0
 
 
 def _range_noise(
@@ -78,6 +81,7 @@ class SubjectFilter:
         self._contradicted = False
         self._last_keypoints: np.ndarray | None = None
         self._ratio, self._ratios = float("nan"), deque[tuple[int, float]]()
+        self._nearer = 0.0
 
     def update(
         self,
@@ -127,6 +131,7 @@ class SubjectFilter:
         self._covariance = 0.5 * (covariance + covariance.T)
         self._systematic = measurement.systematic
         self._stamp_ns, self._contradicted = observation.stamp_ns, False
+        self._nearer += (measurement.nearer - self._nearer) * min(gap_s / _NEARER_S, 1.0)
         self._learn_ratio(measurement, observation.stamp_ns)
         return True
 
@@ -141,6 +146,7 @@ class SubjectFilter:
             position=state[:3], velocity=state[3:], covariance=covariance,
             position_sd_m=float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[-1])),
             stamp_ns=self._stamp_ns, age_s=age_s, track_id=self._track_id, contradicted=self._contradicted,
+            nearer=self._nearer,
         )  # fmt: skip
 
     def _learn_ratio(self, measurement: SubjectMeasurement, stamp_ns: int) -> None:
@@ -164,7 +170,7 @@ class SubjectFilter:
         self._state = np.concatenate([measurement.position, np.zeros(3)])
         self._covariance = np.diag([0.0] * 3 + [1.0, 1.0, 0.1])
         self._covariance[:3, :3] = measurement.noise
-        self._systematic = measurement.systematic
+        self._systematic, self._nearer = measurement.systematic, measurement.nearer
         if observation.track_id != self._track_id:  # another person
             self._ratios.clear()
             self._ratio = float("nan")

@@ -56,6 +56,7 @@ class SubjectMeasurement(NamedTuple):
     systematic : (3, 3) m^2, constant: assumed stature, height above ground, attitude
     range_size_m, range_ground_m : horizontal range of each source, NaN without
     bending : foreshortening of unequal bones, logarithm of a ratio; about 0.1 by noise alone
+    nearer : share of the range by which the nearer of the two sources puts the subject nearer; 0 with one source
     """
 
     position: np.ndarray
@@ -64,6 +65,7 @@ class SubjectMeasurement(NamedTuple):
     range_size_m: float
     range_ground_m: float
     bending: float
+    nearer: float = 0.0
 
 
 def locate_subject(
@@ -109,12 +111,11 @@ def locate_subject(
     size, bending = _range_from_size(rays, seen, pelvis[:2] / flat, config)
     size_error = float(np.hypot(config.size_error, _LEAN_RAD * slope))
     ground, ground_sd, noise = _range_from_ground(rays, seen, camera.position, config)
-    if np.isfinite(size_over_ground) and np.isfinite(ground):
-        distance, sd = _fuse(size_over_ground * ground, size_error, ground, ground_sd)
-    else:
-        distance, sd = _fuse(size, size_error, ground, ground_sd)
+    steady = size_over_ground * ground if np.isfinite(size_over_ground) and np.isfinite(ground) else size
+    distance, sd = _fuse(steady, size_error, ground, ground_sd)
     if not 0.3 < distance < _MAX_RANGE_M:
         return None
+    nearer = 1.0 - float(np.nanmin([steady, ground])) / distance
     ahead = np.array([pelvis[0], pelvis[1], 0.0]) / flat
     position = camera.position + distance * (pelvis / flat)
     aside = np.array([-ahead[1], ahead[0], 0.0])
@@ -132,8 +133,9 @@ def locate_subject(
     # Feet give a precise range from image to image, bones do not.
     noise = noise if np.isfinite(noise) else _SIZE_NOISE * distance + 0.05
     return SubjectMeasurement(
-        position, spread(noise, _BEARING_NOISE * distance + 0.03), spread(sd, turn), size, ground, bending
-    )
+        position, spread(noise, _BEARING_NOISE * distance + 0.03), spread(sd, turn), size, ground, bending,
+        nearer,
+    )  # fmt: skip
 
 
 def _range_from_size(

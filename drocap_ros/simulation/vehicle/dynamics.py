@@ -24,7 +24,9 @@ class Airframe(NamedTuple):
 
 
 #: Fitted to the recorded flights.  PX4's SIH simulator has a friction of 1 N s/m for its 1 kg; with the wind's part of
-#: it nothing would fly in 8 m/s, so that wind acts by the drag alone.
+#: it nothing would fly in 8 m/s, so that wind pushes by the drag alone.  Its own motion is slowed down by the friction
+#: alone, at 1.4 m/s against 8 m/s of wind by 1.4 m/s^2, where the drag would add 0.4 (a real copter has no friction).
+#: No recorded flight of PX4 is in wind.
 AIRFRAMES = {
     "ardupilot": Airframe((0.088, 0.057), 0.04, 0.0),
     "px4": Airframe((0.1, 0.04), 0.016, 1.0),
@@ -70,9 +72,12 @@ class Body:
 
     def drag(self) -> np.ndarray:
         """(3,) m/s^2 by the air."""
-        relative = self.wind + self._gust - self.velocity
+        friction = self._airframe.friction
+        relative = self.wind + self._gust
+        if not friction:
+            relative = relative - self.velocity
         drag: np.ndarray = self._airframe.drag * math.sqrt(relative @ relative) * relative
-        return drag - self._airframe.friction * self.velocity
+        return drag - friction * self.velocity
 
     def orientation_xyzw(self) -> np.ndarray:
         """(4,) body FLU -> ENU: the thrust tilts the body, also against the wind."""

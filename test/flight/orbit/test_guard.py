@@ -119,3 +119,11 @@ def test_without_a_sure_image_the_last_sure_one_grows_old(spoil, contradicts):
         assert allowed_pace(doubted, LIMITS).pace < 0.5
     assert guard.see(image(3.6), MATRIX, CameraPose(LEVEL, place), locked=True)
     assert not guard.doubt(seen, np.zeros(3), round(3.65 * S) + S).subject_contradicted
+
+
+def test_a_body_that_shrinks_for_a_moment_may_not_be_followed():
+    """A crouch or a swing of the range looks like a person who walks away."""
+    guard, place, now = flown(lambda t: -1.4 * max(t - 2.3, 0.0), lambda t: 0.0)
+    assert asked(guard, place, now, 2.2)[0] < 1.2
+    guard, place, now = flown(lambda t: -1.4 * max(t - 2.3, 0.0), lambda t: -1.4 * max(t - 2.3, 0.0), 6.0)
+    assert asked(guard, place, now, 2.2, own=1.4)[0] > 1.6

@@ -201,3 +201,28 @@ def test_nan_in_a_command_keeps_the_present_value():
     goal = goal_of(config, radius_m=8.0)
     assert goal.height_m == 2.5
     assert goal_of(config, height_m=4.0, present=goal) == (8.0, 4.0, goal.angular_speed_rad_s)
+
+
+@pytest.mark.parametrize(
+    ("changes", "turns_s"),
+    [({"reverse_every_s": 20.0}, [20.0, 40.0]), ({"calibrate_telemetry": True}, [15.0]), ({}, [])],
+)
+def test_orbit_turns_its_direction_inside_all_limits(changes, turns_s):
+    config = OrbitConfig(**changes)
+    state = begin_orbit(np.array([6.0, 0.0, 2.5]), np.zeros(3), np.zeros(3), config)
+    omega, places, accelerations = [], [], []
+    for _ in range(int(55 / DT)):
+        vehicle = reference_position(state)
+        state = advance(state, goal_of(config), vehicle, np.zeros(3), np.zeros(3), 0.0, DT, config)
+        setpoint = setpoint_of(state, vehicle, np.zeros(3), np.zeros(3), config)
+        omega.append(math.degrees(state.omega.value))
+        places.append(reference_position(state)[:2])
+        accelerations.append(np.linalg.norm(setpoint.acceleration))
+    changed = [(i + 1) * DT for i in range(len(omega) - 1) if omega[i] * omega[i + 1] < 0]
+    assert len(changed) == len(turns_s)
+    assert all(0 < at - turn < 4.0 for at, turn in zip(changed, turns_s, strict=True))
+    assert max(omega) == pytest.approx(19.0, abs=0.5)
+    assert abs(min(omega) + 19.0 * bool(turns_s)) < 0.5
+    assert np.abs(np.diff(omega)).max() < 1.5 * 19.0 / config.ramp_s * 2.5 * DT
+    assert max(accelerations) <= config.max_acceleration_m_s2
+    assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() / DT < 2.05

@@ -34,7 +34,6 @@ def fault_named(name):
 #: Cases that miss a bound; the bound stays.
 _MISSED = {
     ("setpoints ignored", "px4"): "0.76 s of motion: the echo's content is judged after 0.7 s",
-    ("the autopilot's position jumps by 15 m", "px4"): "2.79 m by the jump; the bound of 2.53 m falls with the speed",
 }
 
 
