@@ -6,15 +6,77 @@ import numpy as np
 
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient
 from drocap_ros.perception.tracking.person import Person
+from drocap_ros.perception.tracking.reidentification import MIXED_IOU, RELIABLE_SCORE, known_other, replaced
 
 _IMPOSSIBLE = 1e6
 #: Weights of size, appearance and score against the distance: another person's appearance differs by 0.05 to 0.2, the
 #: own by 0.02; a whole person scores higher than a part.
 _SIZE_WEIGHT, _APPEARANCE_WEIGHT, _SCORE_WEIGHT = 0.4, 5.0, 2.0
+#: Cost per second without detection: of two persons near one detection the one who was just seen takes it.
+_GAP_WEIGHT = 1.0
 #: Overlap with the last box from which a large change of size is possible: a person enters the image.
 _SAME_PLACE, _ENTRANCE_GROWTH = 0.6, 1.3
 #: Least overlap of a low-score detection with the prediction.
 _LOW_SCORE_IOU = 0.35
+
+
+def assign_all(
+    subject: Person | None,
+    others: list[Person],
+    boxes: np.ndarray,
+    scores: np.ndarray,
+    appearances: list[np.ndarray | None],
+    stamp_ns: int,
+    threshold: float,
+) -> tuple[set[int], list[Person]]:
+    """Update persons with their detections: first the reliable ones, then the others, then with low scores.
+
+    Parameters
+    ----------
+    subject : None while it is lost
+    boxes : (N, 4) px; scores : (N,); appearances : N descriptors
+    threshold : score below which a detection only continues a reliable track
+
+    Returns
+    -------
+    Indices of the assigned detections, and new persons who stand at once in the subject's place.
+    """
+    persons = others if subject is None else [subject, *others]
+    reliable = [p for p in persons if p is subject or (p.mean_score >= RELIABLE_SCORE and p.plausible and not p.double)]
+    unreliable = [p for p in persons if not any(p is q for q in reliable)]
+    high = scores >= threshold
+    assigned: set[int] = set()
+    refused: set[int] = set()
+    replacements: list[Person] = []
+    for owners, group in ((reliable, high), (unreliable, high), (reliable, ~high)):
+        free = [p for p in owners if p.detected_ns < stamp_ns and id(p) not in refused]
+        at = np.array([j for j in np.nonzero(group)[0] if j not in assigned], int)
+        pairs = assign(free, boxes[at], scores[at], [appearances[j] for j in at], stamp_ns, group is not high)
+        for i, k in pairs:
+            person, j = free[i], int(at[k])
+            if person is subject:
+                if replaced(subject, boxes[j], appearances[j], stamp_ns):
+                    replacements.append(Person(boxes[j], float(scores[j]), stamp_ns, appearances[j]))
+                    refused.add(id(person))
+                    assigned.add(j)
+                    continue
+                if known_other(subject, others, boxes[j], appearances[j]):
+                    refused.add(id(person))  # a low-score detection must not replace it either
+                    continue
+            person.update(boxes[j], float(scores[j]), stamp_ns)
+            if group is high:
+                person.confirm(stamp_ns)
+            if person.pose.believed and not _mixed(boxes, j):
+                person.update_appearance(appearances[j])
+            assigned.add(j)
+    return assigned, replacements
+
+
+def _mixed(boxes: np.ndarray, j: int) -> bool:
+    """Whether detection ``j`` overlaps another one, so that its appearance is mixed."""
+    overlap = iou(boxes[j][None], boxes)[0]
+    overlap[j] = 0.0
+    return bool((overlap > MIXED_IOU).any())
 
 
 def assign(
@@ -50,8 +112,9 @@ def assign(
     )
     reach, scope = 0.35 + 2.0 * gap, 0.55 + 0.6 * gap
     possible = (distance < reach) & (growth < scope) | (overlap > _SAME_PLACE) & (growth < _ENTRANCE_GROWTH)
-    if low_score:
-        possible &= iou(predicted, boxes) > _LOW_SCORE_IOU
+    # What is no person stays in its place: a person who comes out from behind it is a new track.
+    strict = np.array([low_score or not p.plausible for p in persons])[:, None]
+    possible &= ~strict | (iou(predicted, boxes) > _LOW_SCORE_IOU)
     cost = np.full(possible.shape, _IMPOSSIBLE)
     for i, j in zip(*np.nonzero(possible), strict=True):
         difference = 1.0 - persons[i].similarity(appearances[j])
@@ -60,6 +123,7 @@ def assign(
             + _SIZE_WEIGHT * growth[i, j] / scope[i, 0]
             + _APPEARANCE_WEIGHT * difference
             + _SCORE_WEIGHT * (1.0 - scores[j])
+            + _GAP_WEIGHT * gap[i, 0]
         )
     rows, columns = linear_sum_assignment(cost)
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if cost[i, j] < _IMPOSSIBLE]

@@ -23,6 +23,7 @@ class WindowSchedule:
         self._full_ns: int | None = None
         self._tile = 0
         self._alternate = False
+        self._turn = 0
 
     def reset(self) -> None:
         """Forget the time of the last detection over the whole image."""
@@ -46,23 +47,26 @@ class WindowSchedule:
         return [near]
 
     def search(
-        self, candidate: np.ndarray | None, image_size: tuple[int, int], stamp_ns: int, single: bool
+        self, candidates: list[np.ndarray], image_size: tuple[int, int], stamp_ns: int, single: bool
     ) -> list[Window | None]:
-        """Windows without a subject: the whole image, and a window around a candidate's box (4,) px or the next tile.
+        """Windows without a subject: the whole image, and in turn one around each candidate's box (4,) px or a tile.
 
-        With ``single`` the two alternate.
+        With ``single`` whole image and others alternate.
         """
         self._full_ns = stamp_ns
         self._alternate = not self._alternate
         if single and not self._alternate:
             return [None]
-        near, tiled = None if candidate is None else wide_window(candidate, image_size), tiles(image_size)
-        if near is None and tiled:
+        self._turn += 1
+        near, tiled = [wide_window(box, image_size) for box in candidates], tiles(image_size)
+        at = self._turn % (len(near) + bool(tiled)) if near or tiled else 0
+        window = near[at] if at < len(near) else None
+        if window is None and tiled:
             self._tile = (self._tile + 1) % len(tiled)
-            near = tiled[self._tile]
-        if near is None:
+            window = tiled[self._tile]
+        if window is None:
             return [None]
-        return [near] if single else [None, near]
+        return [window] if single else [None, window]
 
 
 def wide_window(box: np.ndarray, image_size: tuple[int, int]) -> Window | None:

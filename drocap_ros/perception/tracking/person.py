@@ -6,6 +6,7 @@ import numpy as np
 
 from drocap_ros.perception.tracking.appearance import similarity
 from drocap_ros.perception.tracking.box_filter import BoxFilter
+from drocap_ros.perception.tracking.pose_belief import PoseBelief
 
 #: Weight of a new descriptor in the mean appearance.
 _APPEARANCE_RATE = 0.08
@@ -22,6 +23,7 @@ class Person:
     score : of the last detection; mean_score : recent mean, low for body parts and clutter
     hits : number of detections
     double : whether it began as a second box around the subject, see :func:`.reidentification.is_double`
+    pose : what its poses say about it
     """
 
     def __init__(self, box: np.ndarray, score: float, stamp_ns: int, appearance: np.ndarray | None) -> None:
@@ -34,6 +36,7 @@ class Person:
         self.mean_score = score
         self.hits = 1
         self.double = False
+        self.pose = PoseBelief(stamp_ns)
         self.appearance = appearance
         self._descriptors = 1 if appearance is not None else 0
 
@@ -45,6 +48,16 @@ class Person:
         """Seconds since the last confirmed detection."""
         return (stamp_ns - self.confirmed_ns) * 1e-9
 
+    @property
+    def certain_ns(self) -> int:
+        """Last time at which it was certainly this person: by its pose, without poses by its detection."""
+        return self.confirmed_ns if self.pose.believed_ns is None else min(self.pose.believed_ns, self.confirmed_ns)
+
+    @property
+    def plausible(self) -> bool:
+        """Whether its poses leave it to be a person."""
+        return self.pose.plausible_ns is not None
+
     def update(self, box: np.ndarray, score: float, stamp_ns: int) -> None:
         """Update with a detection, not yet confirmed."""
         self.filter.update(box)
@@ -53,6 +66,13 @@ class Person:
         self.score = score
         self.mean_score += _SCORE_RATE * (score - self.mean_score)
         self.hits += 1
+
+    def move(self, box: np.ndarray, score: float, stamp_ns: int) -> None:
+        """Continue at another box (4,) px: the last ones were not this person's."""
+        self.filter = BoxFilter(box, stamp_ns)
+        self.box = np.asarray(box, float)
+        self.score = self.mean_score = score
+        self.confirm(stamp_ns)
 
     def confirm(self, stamp_ns: int) -> None:
         """Confirm the detection at this time."""

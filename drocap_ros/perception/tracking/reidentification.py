@@ -6,6 +6,7 @@ import numpy as np
 
 from drocap_ros.perception.detection.nms import iou
 from drocap_ros.perception.tracking.person import Person
+from drocap_ros.perception.tracking.pose_belief import SURE_CONFIDENCE
 
 #: Least mean score of a bystander in comparisons with the subject; body parts and clutter score below.
 RELIABLE_SCORE = 0.4
@@ -26,6 +27,12 @@ _CLEAR_SCORE = 0.6
 _DOUBLE_IOU, _DOUBLE_SIMILARITY = 0.35, 0.93
 #: Least similarity of a new track with the lost subject.
 _REIDENTIFY_SIMILARITY = 0.92
+#: The same for the only person who may be the subject, within this time.
+_ALONE_SIMILARITY, _ALONE_S = 0.85, 6.0
+#: Longest gap of a person that the search without a subject centres on.
+_CANDIDATE_S = 0.3
+#: Growth of the search around the last place, lengths per second, and its farthest reach, lengths.
+_WIDER_PER_S, _WIDEST = 0.5, 2.0
 #: Outward speed, lengths/s, of a box at the image's edge that counts as leaving.
 _LEAVING_SPEED = 0.15
 
@@ -59,25 +66,70 @@ def known_other(subject: Person, persons: list[Person], box: np.ndarray, appeara
     own = subject.similarity(appearance)
     if own >= _OWN_SIMILARITY:
         return False
-    others = [p for p in persons if p is not subject and p.mean_score >= RELIABLE_SCORE]
+    others = [p for p in persons if p is not subject and p.plausible and p.mean_score >= RELIABLE_SCORE]
     predicted = np.array([p.filter.box() for p in others]).reshape(-1, 4)
     near = iou(box[None].astype(float), predicted)[0] > MIXED_IOU
     return any(p.similarity(appearance) > own + _SIMILARITY_MARGIN for p, at in zip(others, near, strict=True) if at)
 
 
-def same_person(lost: Person, person: Person, left_image: bool) -> bool:
-    """Whether a new track fits the lost subject's appearance, and its distance and size the elapsed time."""
-    gap = (person.first_ns - lost.confirmed_ns) * 1e-9
+def could_be(lost: Person, person: Person) -> bool:
+    """Whether a person may be the lost subject: not certainly in view together with it.
+
+    Someone in view may be the subject if the track of the subject was no person's by then, or its own was none before.
+    """
+    since_ns = person.pose.plausible_ns
+    return since_ns is not None and max(since_ns, person.first_ns) > lost.certain_ns and not person.pose.other
+
+
+def same_person(lost: Person, person: Person, left_image: bool, alone: bool = False) -> bool:
+    """Whether a track fits the lost subject's appearance, and its distance and size the elapsed time.
+
+    alone : no one else in view may be the subject; then a certain pose makes up for some change of the light
+    """
+    since_ns = max(person.first_ns, person.pose.plausible_ns or 0)
+    gap = (since_ns - lost.certain_ns) * 1e-9
     if gap > FORGET_S:
         return False
-    start, end = lost.box, person.box
-    length = max(lost.filter.length, 1.0)
+    start, end = lost.box if lost.pose.box is None else lost.pose.box, person.box
+    length = max(lost.filter.length, lost.pose.length, 1.0)
     distance = float(np.linalg.norm((start[:2] + start[2:] - end[:2] - end[2:]) / 2)) / length
     growth = abs(float(np.log(max(end[3] - end[1], end[2] - end[0], 1.0) / length)))
+    if lost.pose.box is not None:
+        growth = lost.pose.growth(end)
     similarity = person.similarity(lost.appearance)
     if left_image:  # re-entry at the place of leaving, at half the usual difference of appearance
         return distance < 1.5 and similarity >= 0.5 * (1 + _REIDENTIFY_SIMILARITY)
-    return distance < 1.0 + 1.5 * gap and growth < 0.5 + 0.3 * gap and similarity >= _REIDENTIFY_SIMILARITY
+    least = _REIDENTIFY_SIMILARITY
+    if alone and gap < _ALONE_S and person.pose.value >= SURE_CONFIDENCE:
+        least = _ALONE_SIMILARITY
+    return distance < 1.0 + 1.5 * gap and growth < 0.5 + 0.3 * gap and similarity >= least
+
+
+def confirming_hits(person: Person, confirm_frames: int) -> int:
+    """Number of detections that confirm a track; a certain pose makes up for some."""
+    return min(2, confirm_frames) if person.pose.value >= SURE_CONFIDENCE else confirm_frames
+
+
+def search_boxes(
+    lost: Person | None, persons: list[Person], left_image: bool, confirm_frames: int, stamp_ns: int
+) -> list[np.ndarray]:
+    """(4,) px each, where to look closely without a subject: a possible new one, and around the last place.
+
+    A small person needs a window around it to be confirmed.
+
+    lost : the last subject; left_image : whether it left the image
+    """
+    recent = [p for p in persons if p is not lost and p.plausible and p.undetected_s(stamp_ns) <= _CANDIDATE_S]
+    if lost is not None:  # persons in view together with the subject cannot be the subject
+        recent = [p for p in recent if could_be(lost, p)]
+    boxes = []
+    if recent:
+        best = max(recent, key=lambda p: (p.hits < confirm_frames, p.mean_score))
+        boxes.append(best.filter.box_at(stamp_ns))
+    if lost is not None and not left_image and lost.unconfirmed_s(stamp_ns) <= FORGET_S:
+        reach = min(_WIDER_PER_S * lost.unconfirmed_s(stamp_ns), _WIDEST) * lost.filter.length
+        boxes.append(lost.box + reach * np.array([-1, -1, 1, 1]))
+    return boxes
 
 
 def leaving(person: Person, image_shape: tuple[int, ...]) -> bool:

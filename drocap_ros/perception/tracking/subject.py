@@ -9,36 +9,37 @@ import numpy as np
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig, parse_box
 from drocap_ros.perception.tracking.appearance import describe
-from drocap_ros.perception.tracking.association import assign
+from drocap_ros.perception.tracking.association import assign_all
+from drocap_ros.perception.tracking.box_filter import BoxFilter
 from drocap_ros.perception.tracking.detection_windows import Window, WindowSchedule, tight_window, wide_window
 from drocap_ros.perception.tracking.person import Person
+from drocap_ros.perception.tracking.pose_belief import SURE_CONFIDENCE
 from drocap_ros.perception.tracking.reidentification import (
     FORGET_S,
-    MIXED_IOU,
     RELIABLE_SCORE,
+    confirming_hits,
+    could_be,
     is_double,
-    known_other,
     leaving,
-    replaced,
     same_person,
+    search_boxes,
 )
+from drocap_ros.perception.tracking.rivals import clutter_of, due_bystander, owner_of, rivals
+from drocap_ros.perception.tracking.selection import select
 
 #: Overlap with another person from which a predicted box counts as hidden.
 _HIDDEN_IOU = 0.25
 #: Least overlap of a detection with the predicted box that needs no second pass.
 _CLEAR_IOU = 0.5
-#: Overlap coefficient above which an unassigned detection is a part of a tracked person, or that person and more.
-_PART = 0.75
+#: Overlap coefficient above which an unassigned detection is a part of a tracked person, or that person and more, and
+#: below which a bystander with a certain pose is someone else.
+_PART, _APART = 0.75, 0.5
 #: Free margin around an isolated subject, lengths.
 _ISOLATED = 0.4
-#: Longest gap of a person that the search without a subject centres on.
-_CANDIDATE_S = 0.3
 #: For ``on_loss = next``: time beyond coasting after which a subject lost inside the image is given up.
 _GIVE_UP_S = 3.0
 #: Longest gap of a bystander, and the largest number of persons.
 _BYSTANDER_S, _MAX_PERSONS = 2.0, 30
-#: Score from which the first person ever needs no confirmation by further images.
-_CERTAIN_SCORE = 0.6
 
 
 @dataclass(frozen=True)
@@ -95,19 +96,13 @@ class SubjectTracker:
             return [near] if single else list({near: None, None: None})
         subject = self._subject
         if subject is not None and subject.unconfirmed_s(stamp_ns) <= self._coast_s:
-            return self._schedule.near_subject(subject.filter.box_at(stamp_ns), image_size, stamp_ns, single, close)
-        return self._schedule.search(self._candidate_box(stamp_ns), image_size, stamp_ns, single)
-
-    def _candidate_box(self, stamp_ns: int) -> np.ndarray | None:
-        """(4,) px, a possible new subject: a small person needs a window to be confirmed."""
-        lost = self._subject
-        recent = [p for p in self.persons if p is not lost and p.undetected_s(stamp_ns) <= _CANDIDATE_S]
-        if lost is not None:  # persons in view together with the subject cannot be the subject
-            recent = [p for p in recent if p.first_ns > lost.confirmed_ns]
-        if not recent:
-            return None
-        best = max(recent, key=lambda p: (p.hits < self._config.confirm_frames, p.mean_score))
-        return best.filter.box_at(stamp_ns)
+            box = subject.filter.box_at(stamp_ns)
+            windows = self._schedule.near_subject(box, image_size, stamp_ns, single, close)
+            if subject.pose.questioned and windows != [None]:  # whoever it is: the search goes on beside it
+                windows += [w for w in self._schedule.search([], image_size, stamp_ns, True) if w not in windows]
+            return windows[-1:] if single else windows
+        boxes = search_boxes(subject, self.persons, self._left_image, self._config.confirm_frames, stamp_ns)
+        return self._schedule.search(boxes, image_size, stamp_ns, single)
 
     def second_pass_window(
         self, image_size: tuple[int, int], stamp_ns: int, boxes: np.ndarray, scores: np.ndarray
@@ -135,7 +130,7 @@ class SubjectTracker:
         if subject is None or self._schedule.full_image_due(stamp_ns):
             return False
         around = box + _ISOLATED * subject.filter.length * np.array([-1, -1, 1, 1])
-        others = [p for p in self.persons if p is not subject and p.mean_score >= RELIABLE_SCORE]
+        others = [p for p in self.persons if p is not subject and p.plausible and p.mean_score >= RELIABLE_SCORE]
         boxes = np.array([p.filter.box_at(stamp_ns) for p in others]).reshape(-1, 4)
         edge = 0.01 * max(image_size)
         at_edge = (box[:2] < edge).any() or (box[2:] > np.array(image_size) - edge).any()
@@ -159,6 +154,56 @@ class SubjectTracker:
             self._subject.filter.update(box, noise=2.0)
             self._subject.confirm(stamp_ns)
 
+    def judge(self, confidence: float, box: np.ndarray, stamp_ns: int) -> None:
+        """Add the mean confidence of the subject's pose, found in a box (4,) px.
+
+        A subject that has shown no person for seconds is lost from its last certain time on.
+        """
+        subject = self._subject
+        if subject is None:
+            return
+        subject.pose.judge(confidence, box, stamp_ns)
+        if subject.pose.refuted and subject.pose.box is not None:
+            self.persons.append(clutter_of(subject, stamp_ns))
+            subject.box, subject.filter = subject.pose.box, BoxFilter(subject.pose.box, subject.certain_ns)
+            subject.detected_ns = subject.confirmed_ns = subject.certain_ns
+
+    def bystander_to_judge(self, stamp_ns: int) -> Person | None:
+        """The person detected in this image whose pose should be looked at, beside a certain subject or without one."""
+        return due_bystander(self._subject, self.persons, stamp_ns)
+
+    def judge_bystander(self, person: Person, confidence: float, stamp_ns: int) -> None:
+        """Add the mean confidence of a bystander's pose."""
+        subject = self._subject
+        person.pose.judge(confidence, person.box, stamp_ns)
+        if subject is not None and subject.pose.believed_ns == stamp_ns and confidence >= SURE_CONFIDENCE:
+            # Of two boxes in each other one may hold the person and its shadow.
+            person.pose.other |= bool(overlap_coefficient(person.box[None], subject.box[None])[0, 0] < _APART)
+
+    def rivals(
+        self, image: np.ndarray, stamp_ns: int, boxes: np.ndarray, scores: np.ndarray, confidence: float
+    ) -> list[int]:
+        """Indices of the detections (N, 4), (N,) that could be the subject instead, by falling score.
+
+        confidence : mean of the subject's pose in this image
+        """
+        subject = self._subject
+        found = [] if subject is None else rivals(subject, self.persons, image, boxes, confidence, stamp_ns)
+        return sorted(found, key=lambda j: -scores[j])
+
+    def exchange(self, image: np.ndarray, stamp_ns: int, box: np.ndarray, score: float) -> Subject:
+        """Continue the subject at a rival's box (4,) px; a track of what it was before remains."""
+        subject = self._subject
+        assert subject is not None
+        owner = owner_of(box, self.persons, stamp_ns)
+        clutter = clutter_of(subject, stamp_ns)
+        clutter.double = bool(overlap_coefficient(clutter.box[None], box[None].astype(float))[0, 0] > 0.3)
+        self.persons = [*(p for p in self.persons if p is subject or p is not owner), clutter]
+        if subject.pose.believed_ns is None:  # what it learned was not this person's
+            subject.appearance = describe(image, box)
+        subject.move(box, score, stamp_ns)
+        return Subject(self._track_id, subject.box, score, False)
+
     def update(
         self, image: np.ndarray, stamp_ns: int, boxes: np.ndarray, scores: np.ndarray, roi: np.ndarray | None = None
     ) -> Subject | None:
@@ -180,7 +225,14 @@ class SubjectTracker:
         for person in self.persons:
             person.filter.predict(stamp_ns)
         appearances = [describe(image, box) for box in boxes]
-        assigned = self._assign(boxes, scores, appearances, stamp_ns)
+        subject = self._subject
+        if subject is not None and subject.unconfirmed_s(stamp_ns) > self._coast_s:
+            subject = None
+        others = [p for p in self.persons if p is not self._subject]
+        assigned, replacements = assign_all(
+            subject, others, boxes, scores, appearances, stamp_ns, self._config.detection_threshold
+        )
+        self.persons += replacements
         self._spawn(boxes, scores, appearances, assigned, stamp_ns)
         self._reidentify(stamp_ns)
         self._apply_choice(stamp_ns)
@@ -188,40 +240,6 @@ class SubjectTracker:
         self._prune(image.shape, stamp_ns)
         self._any_detected = self._any_detected or bool(len(boxes))
         return self._current(stamp_ns)
-
-    def _assign(
-        self, boxes: np.ndarray, scores: np.ndarray, appearances: list[np.ndarray | None], stamp_ns: int
-    ) -> set[int]:
-        """Indices of the assigned detections: first to reliable persons, then to the others, then low scores."""
-        subject = self._subject
-        persons = [p for p in self.persons if p is not subject or p.unconfirmed_s(stamp_ns) <= self._coast_s]
-        reliable = [p for p in persons if p is subject or (p.mean_score >= RELIABLE_SCORE and not p.double)]
-        unreliable = [p for p in persons if not any(p is q for q in reliable)]
-        high = scores >= self._config.detection_threshold
-        assigned: set[int] = set()
-        refused: set[int] = set()
-        for owners, group in ((reliable, high), (unreliable, high), (reliable, ~high)):
-            free = [p for p in owners if p.detected_ns < stamp_ns and id(p) not in refused]
-            at = np.array([j for j in np.nonzero(group)[0] if j not in assigned], int)
-            pairs = assign(free, boxes[at], scores[at], [appearances[j] for j in at], stamp_ns, group is not high)
-            for i, k in pairs:
-                person, j = free[i], int(at[k])
-                if person is subject:
-                    if replaced(subject, boxes[j], appearances[j], stamp_ns):
-                        self.persons.append(Person(boxes[j], float(scores[j]), stamp_ns, appearances[j]))
-                        refused.add(id(person))
-                        assigned.add(j)
-                        continue
-                    if known_other(subject, self.persons, boxes[j], appearances[j]):
-                        refused.add(id(person))  # a low-score detection must not replace it either
-                        continue
-                person.update(boxes[j], float(scores[j]), stamp_ns)
-                if group is high:
-                    person.confirm(stamp_ns)
-                if not _mixed(boxes, j):
-                    person.update_appearance(appearances[j])
-                assigned.add(j)
-        return assigned
 
     def _spawn(
         self,
@@ -250,10 +268,11 @@ class SubjectTracker:
         lost = self._subject
         if lost is None or lost.unconfirmed_s(stamp_ns) <= 0:
             return
-        for person in self.persons:
-            if person is lost or person.detected_ns != stamp_ns or person.first_ns <= lost.confirmed_ns:
+        seen = [p for p in self.persons if p is not lost and p.detected_ns == stamp_ns and could_be(lost, p)]
+        for person in seen:
+            if person.hits < confirming_hits(person, self._config.confirm_frames):
                 continue
-            if person.hits < self._config.confirm_frames or not same_person(lost, person, self._left_image):
+            if not same_person(lost, person, self._left_image, alone=len(seen) == 1):
                 continue
             self.persons.remove(lost)
             person.appearance = lost.appearance if lost.appearance is not None else person.appearance
@@ -283,12 +302,13 @@ class SubjectTracker:
             chosen = Person(chosen_box, 0.0, stamp_ns, None)
             self.persons.append(chosen)
         if chosen is not self._subject:
+            chosen.pose.choose(chosen.box, stamp_ns)
             self._follow(chosen)
 
     def _select(self, shape: tuple[int, ...], stamp_ns: int) -> None:
         """Choose a subject by the configured rule when there is none to wait for."""
         config = self._config
-        if config.subject in ("box", "roi"):
+        if config.subject in ("box", "roi") and (not self._track_id or config.on_loss == "wait"):
             return
         if self._subject is not None:
             if config.on_loss == "wait":
@@ -296,27 +316,16 @@ class SubjectTracker:
             patience_s = 0.0 if self._left_image else self._coast_s + _GIVE_UP_S
             if self._subject.unconfirmed_s(stamp_ns) <= patience_s:
                 return
-        candidates = [
-            p
-            for p in self.persons
-            if p.detected_ns == stamp_ns
-            and p is not self._subject
-            and p.score >= config.detection_threshold
-            and (p.hits >= config.confirm_frames or (not self._any_detected and p.score >= _CERTAIN_SCORE))
-        ]
-        if not candidates:
-            return
-        if config.subject == "largest":
-            best = max(candidates, key=lambda p: float(np.prod(p.box[2:] - p.box[:2])))
-        else:
-            middle = np.array([shape[1], shape[0]]) / 2
-            best = min(candidates, key=lambda p: float(np.linalg.norm((p.box[:2] + p.box[2:]) / 2 - middle)))
-        self._follow(best)
+        best = select(self.persons, self._subject, config, shape, stamp_ns, not self._track_id, not self._any_detected)
+        if best is not None:
+            self._follow(best)
 
     def _follow(self, person: Person) -> None:
         self._subject = person
         self._track_id += 1
         self._left_image = False
+        for bystander in self.persons:  # others than the last subject may be this one
+            bystander.pose.other = False
 
     def _prune(self, shape: tuple[int, ...], stamp_ns: int) -> None:
         """Delete the tracks of bystanders out of view."""
@@ -335,13 +344,7 @@ class SubjectTracker:
         if subject.detected_ns == stamp_ns:
             return Subject(self._track_id, subject.box, subject.score, False)
         box = subject.filter.box()
-        others = [p.box for p in self.persons if p is not subject and not p.double and p.confirmed_ns == stamp_ns]
-        hidden = bool(len(others)) and bool((iou(box[None], np.array(others)) > _HIDDEN_IOU).any())
+        persons = [p for p in self.persons if p is not subject and p.plausible and not p.double]
+        others = np.array([p.box for p in persons if p.confirmed_ns == stamp_ns]).reshape(-1, 4)
+        hidden = bool((iou(box[None], others) > _HIDDEN_IOU).any())
         return Subject(self._track_id, box, 0.0, hidden)
-
-
-def _mixed(boxes: np.ndarray, j: int) -> bool:
-    """Whether detection ``j`` overlaps another one, so that its appearance is mixed."""
-    overlap = iou(boxes[j][None], boxes)[0]
-    overlap[j] = 0.0
-    return bool((overlap > MIXED_IOU).any())

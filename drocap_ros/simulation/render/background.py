@@ -8,7 +8,6 @@ from drocap_ros.simulation.render.scenery import FAR_M, NEAR_M, Scenery
 
 #: Distance over which the fine pattern of the ground fades into the coarse one.
 _FADE_M = 14.0
-_SHADE = 0.62  # brightness of the ground in the shadow, with all light from the sun
 _CIRCLE = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)
 
 
@@ -196,7 +195,7 @@ def draw_shadow(
     mask = np.zeros((high[1] - low[1], high[0] - low[0]), np.float32)
     for shape in shapes:
         cv2.fillConvexPoly(mask, cv2.convexHull(shape - low.astype(np.int32)), 1.0)
-    strength = (1 - _SHADE) * min(1.0, scene.sunlight / 0.5)
+    strength = (1 - scene.shade) * min(1.0, scene.sunlight / 0.5)
     part = image[low[1] : high[1], low[0] : high[0]]
     weight = 1 - np.float32(strength) * cv2.GaussianBlur(mask, (5, 5), 0)
     part[:] = cv2.blendLinear(part, np.zeros_like(part), weight, 1 - weight)

@@ -1,4 +1,4 @@
-"""Surfaces of a simulated person around the joints of ``BODY_15``, and their colours."""
+"""Surfaces of a simulated person around the joints of ``BODY_17``, and their colours."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.simulation.render.quadrics import Quadrics, cones, ellipsoids, joined
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_17
 
 _Add = Callable[[str, np.ndarray, np.ndarray, tuple[float, float, float], float], None]
-
-_J = {name: i for i, name in enumerate(BODY_15.joints)}
 
 #: From joint, to joint, radius at both (m at 1.75 m stature), part of the look.
 _LIMBS = (
@@ -23,6 +21,8 @@ _LIMBS = (
 )
 #: Length of the bones below over which the radii are scaled, m at 1.75 m stature (both thighs and shanks).
 _LEG_M = 0.491 * 1.75
+#: Tip of a shoe before and below the ankle, m at 1.75 m stature.
+_TIP = (0.197, 0.038)
 
 
 @dataclass(frozen=True)
@@ -81,9 +81,9 @@ def _axes(left: np.ndarray, up: np.ndarray) -> np.ndarray:
 def body(joints: np.ndarray, look: Look) -> tuple[Quadrics, list[str]]:
     """Surfaces of one person in the frame of its joints, and the part of the look of each.
 
-    joints : (15, 3) m, ``BODY_15``, in a frame with z up
+    joints : (17, 3) m, ``BODY_17``, or its first 15, in a frame with z up
     """
-    at = {name: joints[i] for name, i in _J.items()}
+    at = dict(zip(BODY_17.joints, joints, strict=False))
     leg = sum(np.linalg.norm(at[s + a] - at[s + b]) for s in "lr" for a, b in (("hip", "knee"), ("knee", "ankle")))
     unit = 0.5 * float(leg) / _LEG_M  # metres of this person per metre of one of 1.75 m
     stout = unit * look.girth
@@ -160,12 +160,22 @@ def _add_hand_and_foot(add: _Add, at: dict[str, np.ndarray], side: str, hips: np
     add("skin", at[side + "wrist"] + 0.075 * unit * arm, hand, (0.095, 0.024, 0.045), unit)
     ankle = at[side + "ankle"]
     shank = _unit(ankle - at[side + "knee"])
+    if side + "toe" in at:
+        tip = _unit(at[side + "toe"] - ankle)
+        across = _unit(_cross(-shank, tip))
+        # The tip lies below the middle line of the shoe.
+        toes = _unit(_TIP[0] * tip + _TIP[1] * _cross(tip, across))
+        _add_shoe(add, ankle, _axes(across, _cross(toes, across)), unit)
+        return
     toes = _unit(hips[0] - (hips[0] @ shank) * shank)
     # The toes stay above the ground.
     drop = max((0.035 * unit - ankle[2]) / (0.19 * unit), -0.95)
     if toes[2] < drop:
         flat = _unit(np.array([toes[0], toes[1], 0.0]))
         toes = np.append(flat[:2] * np.sqrt(1 - min(drop, 0.95) ** 2), min(drop, 0.95))
-    sole = _axes(_cross(-shank, toes), _cross(toes, _cross(-shank, toes)))
+    _add_shoe(add, ankle, _axes(_cross(-shank, toes), _cross(toes, _cross(-shank, toes))), unit)
+
+
+def _add_shoe(add: _Add, ankle: np.ndarray, sole: np.ndarray, unit: float) -> None:
     centre = ankle + unit * (0.062 * sole[0] - 0.038 * sole[2])
     add("shoes", centre, sole, (0.135, 0.048, 0.045), unit)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from drocap_ros.errors import InputError
@@ -9,7 +11,7 @@ from drocap_ros.simulation.render.background import draw_background, draw_shadow
 from drocap_ros.simulation.render.body import Look, body, dress
 from drocap_ros.simulation.render.quadrics import Layer, Quadrics, rasterize
 from drocap_ros.simulation.render.scenery import Scenery, make_scenery
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_15, BODY_17
 
 #: Larger images have a background of half the resolution.
 _FULL_BACKGROUND_PX = 300_000
@@ -48,7 +50,7 @@ class Renderer:
 
         Parameters
         ----------
-        joints3d : (15, 3) m, world ENU, order of ``BODY_15``
+        joints3d : (17, 3) m, world ENU, order of ``BODY_17``; (15, 3) without toes, which the feet then assume
         rotation : (3, 3) world -> camera (x right, y down, z forward)
         position : (3,) m, of the camera, world ENU
 
@@ -58,7 +60,7 @@ class Renderer:
             When an array has another shape or is not finite.
         """
         arrays = {
-            "joints3d": (joints3d, (len(BODY_15), 3)),
+            "joints3d": (joints3d, (len(BODY_17 if np.shape(joints3d) == (len(BODY_17), 3) else BODY_15), 3)),
             "rotation": (rotation, (3, 3)),
             "position": (position, (3,)),
         }
@@ -88,30 +90,53 @@ def draw(
 
     The arguments are those of :class:`Renderer`, unvalidated.
     """
+    image, boxes = draw_people(scene, [(joints, look)], matrix, width, height, rotation, position)
+    return image, boxes[0]
+
+
+def draw_people(
+    scene: Scenery,
+    people: Sequence[tuple[np.ndarray, Look]],
+    matrix: np.ndarray,
+    width: int,
+    height: int,
+    rotation: np.ndarray,
+    position: np.ndarray,
+) -> tuple[np.ndarray, list[np.ndarray | None]]:
+    """Image of several persons, each joints (15, 3) m and a look, and their boxes as in :func:`draw`.
+
+    Nearer persons cover farther ones; the boxes show each person as if it were alone.
+    """
     import cv2
 
-    surfaces, parts = body(joints, look)
+    bodies = [body(joints, look) for joints, look in people]
     coarse = 2 if width * height > _FULL_BACKGROUND_PX else 1
     small = _scaled(matrix, 1 / coarse)
     size = (-(-width // coarse), -(-height // coarse))
     image = draw_background(scene, small, *size, rotation, position)
-    draw_shadow(scene, image, surfaces.ends, surfaces.reach, small, rotation, position)
+    for surfaces, _ in bodies:
+        draw_shadow(scene, image, surfaces.ends, surfaces.reach, small, rotation, position)
     if coarse > 1:
         image = cv2.resize(image, (size[0] * coarse, size[1] * coarse), interpolation=cv2.INTER_LINEAR)
         image = np.ascontiguousarray(image[:height, :width])
-    visible = _in_camera(surfaces, rotation, position)
-    colours = np.array([look.colours[part] for part in parts], np.float32)
-    light = rotation @ scene.sun
-    factor = 2 if _person_px(visible, matrix, width, height) > _FULL_PERSON_PX else 1
-    layer = rasterize(visible, _scaled(matrix, 1 / factor), -(-width // factor), -(-height // factor), light)
-    if layer is None:
-        return image, None
-    mask, painted = _shaded(layer, colours, scene.sunlight, rotation)
-    if factor > 1:
-        double = (mask.shape[1] * factor, mask.shape[0] * factor)
-        mask = np.where(cv2.resize(mask, double, interpolation=cv2.INTER_LINEAR) > 127, np.uint8(255), np.uint8(0))
-        painted = cv2.resize(painted, double, interpolation=cv2.INTER_LINEAR)
-    return image, _overlay_person(image, mask, painted, layer.x * factor, layer.y * factor)
+    boxes: list[np.ndarray | None] = [None] * len(people)
+    distance = [float(np.linalg.norm(joints[0] - position)) for joints, _ in people]
+    for i in sorted(range(len(people)), key=lambda i: -distance[i]):
+        (surfaces, parts), look = bodies[i], people[i][1]
+        visible = _in_camera(surfaces, rotation, position)
+        colours = np.array([look.colours[part] for part in parts], np.float32)
+        factor = 2 if _person_px(visible, matrix, width, height) > _FULL_PERSON_PX else 1
+        shrunk = (_scaled(matrix, 1 / factor), -(-width // factor), -(-height // factor))
+        layer = rasterize(visible, *shrunk, rotation @ scene.sun)
+        if layer is None:
+            continue
+        mask, painted = _shaded(layer, colours, scene.sunlight, rotation)
+        if factor > 1:
+            double = (mask.shape[1] * factor, mask.shape[0] * factor)
+            mask = np.where(cv2.resize(mask, double, interpolation=cv2.INTER_LINEAR) > 127, np.uint8(255), np.uint8(0))
+            painted = cv2.resize(painted, double, interpolation=cv2.INTER_LINEAR)
+        boxes[i] = _overlay_person(image, mask, painted, layer.x * factor, layer.y * factor)
+    return image, boxes
 
 
 def _scaled(matrix: np.ndarray, scale: float) -> np.ndarray:

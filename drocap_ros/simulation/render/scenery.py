@@ -37,6 +37,7 @@ class Scenery:
     near, far : (S, S) uint32, packed BGRX patterns of the ground that repeat every NEAR_M and FAR_M
     horizon, zenith : (3,) BGR colours of the sky
     sun : (3,) unit vector towards the sun; sunlight : its share of the light
+    shade : brightness of the ground in the shadow, with all light from the sun
     haze_m : distance at which the haze replaces 63 % of the colour
     houses : (H, 8, 3) m corners, the first four on the ground; house_colours (H, 3)
     trees : (T, 4) x, y, height, radius of the crown, m; tree_colours (T, 3)
@@ -53,6 +54,7 @@ class Scenery:
     house_colours: np.ndarray
     trees: np.ndarray
     tree_colours: np.ndarray
+    shade: float = 0.62
 
 
 def make_scenery(seed: int) -> Scenery:

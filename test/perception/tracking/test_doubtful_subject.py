@@ -1,0 +1,195 @@
+"""Tracker and poses: what has no believable joints is not followed on, and someone in view may be the subject."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_subject_tracking import BLUE, GREEN, RED, SIZE, STEP, Scene, offset
+
+from drocap_ros.perception.tracking.pose_belief import PoseBelief
+from drocap_ros.perception.tracking.shadow import shadow_share, without_shadow
+
+SECOND = 1_000_000_000
+
+
+def box_of(x: float, y: float, height: float) -> np.ndarray:
+    return np.array([x - 0.2 * height, y - height / 2, x + 0.2 * height, y + height / 2])
+
+
+def drawn(persons) -> np.ndarray:
+    image = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
+    for x, y, height, (shirt, trousers) in persons:
+        x0, y0, x1, y1 = box_of(x, y, height).astype(int)
+        image[y0:y1, x0:x1] = trousers
+        image[y0 : int(y), x0:x1] = shirt
+    return image
+
+
+def judged(scene: Scene, confidence: float, subject) -> None:
+    scene.tracker.judge(confidence, subject.box, (scene.index - 1) * STEP)
+
+
+def test_given_box_obeys_on_loss_next():
+    scene = Scene(subject="box", subject_box="270,100,330,260", on_loss="next")
+    for t in range(60):
+        scene.show([(300 + 8 * t, 180, 160, RED)])
+    after = [scene.show([(40 + 4 * t, 180, 160, BLUE)]) for t in range(12)]
+    assert after[-1].track_id == 2
+    assert offset(after[-1], 84) < 10
+
+
+def test_given_box_obeys_on_loss_wait():
+    scene = Scene(subject="box", subject_box="270,100,330,260", on_loss="wait")
+    for t in range(60):
+        scene.show([(300 + 8 * t, 180, 160, RED)])
+    assert {scene.show([(40 + 3 * t, 180, 160, BLUE)]) for t in range(150)} == {None}
+
+
+def test_drone_box_obeys_on_loss_next_and_without_any_box_nobody_is_chosen():
+    scene = Scene(subject="roi", on_loss="next")
+    assert {scene.show([(300, 180, 160, RED)]) for _ in range(20)} == {None}
+    first = scene.show([(300, 180, 160, RED)], roi=box_of(300, 180, 160))
+    assert first.track_id == 1
+    after = [scene.show([(60, 200, 150, BLUE)]) for _ in range(200)]
+    assert after[-1].track_id == 2
+
+
+def test_subject_that_slid_to_a_shadow_goes_back_to_the_person_in_view():
+    scene = Scene()
+    person = (300, 180, 160, RED)
+    for _ in range(20):
+        judged(scene, 0.9, scene.show([person]))
+    # The detector sees nothing but the shadow beside the person for some images, then both.
+    shadow = box_of(360, 190, 150)
+    for _ in range(8):
+        subject = scene.show([person], detections=[(shadow, 0.6)])
+        judged(scene, 0.3, subject)
+    both = [(shadow, 0.6), (box_of(300, 180, 160), 0.7)]
+    subject = scene.show([person], detections=both)
+    stamp = (scene.index - 1) * STEP
+    boxes, scores = np.array([box for box, _ in both]), np.array([score for _, score in both])
+    if offset(subject, 300) > 20:
+        rivals = scene.tracker.rivals(drawn([person]), stamp, boxes, scores, 0.3)
+        assert rivals == [1]
+        subject = scene.tracker.exchange(drawn([person]), stamp, boxes[1], 0.7)
+    judged(scene, 0.9, subject)
+    for _ in range(10):
+        subject = scene.show([person], detections=both)
+        judged(scene, 0.9, subject)
+        assert offset(subject, 300) < 20
+        assert subject.track_id == 1
+        assert not subject.hidden
+
+
+def test_certain_bystander_is_no_rival():
+    scene = Scene()
+    persons = [(300, 180, 160, RED), (380, 180, 160, BLUE)]
+    for _ in range(20):
+        subject = scene.show(persons)
+        judged(scene, 0.9, subject)
+        stamp = (scene.index - 1) * STEP
+        bystander = scene.tracker.bystander_to_judge(stamp)
+        if bystander is not None:
+            scene.tracker.judge_bystander(bystander, 0.9, stamp)
+    subject = scene.show(persons)
+    boxes = np.array([box_of(*p[:3]) for p in persons])
+    stamp = (scene.index - 1) * STEP
+    assert scene.tracker.rivals(drawn(persons), stamp, boxes, np.full(2, 0.8), 0.4) == []
+
+
+def test_rival_of_another_appearance_is_refused():
+    scene = Scene()
+    for _ in range(20):
+        judged(scene, 0.9, scene.show([(300, 180, 160, RED)]))
+    scene.show([(300, 180, 160, RED), (370, 180, 160, GREEN)])
+    image = drawn([(300, 180, 160, RED), (370, 180, 160, GREEN)])
+    boxes = np.array([box_of(370, 180, 160)])
+    assert scene.tracker.rivals(image, (scene.index - 1) * STEP, boxes, np.array([0.8]), 0.4) == []
+
+
+def test_doubted_subject_is_searched_over_the_whole_picture_after_a_second():
+    scene = Scene()
+    windows_of, seen = scene.tracker.windows, []
+    scene.tracker.windows = lambda _, stamp: seen.append(windows_of((1920, 1080), stamp))
+    for _ in range(20):
+        judged(scene, 0.9, scene.show([(300, 180, 160, RED)]))
+    seen.clear()
+    for _ in range(60):
+        judged(scene, 0.2, scene.show([(300, 180, 160, RED)]))
+    assert all(len(windows) <= 2 for windows in seen)  # bounded in every image
+    early, late = seen[:25], seen[35:60]
+    assert sum(len(windows) > 1 for windows in early) <= 2  # the usual interval
+    assert all(len(windows) == 2 for windows in late)
+    others = {window for windows in late for window in windows[1:]}
+    assert None in others
+    assert len(others) > 4  # tiles as well
+
+
+def test_refuted_subject_is_lost_and_its_person_in_view_is_the_same():
+    scene = Scene()
+    person = (200, 180, 160, RED)
+    for _ in range(20):
+        judged(scene, 0.9, scene.show([person]))
+    tree = box_of(330, 180, 170)
+    states = []
+    for _ in range(120):  # the track slid onto a tree, the person stays undetected
+        subject = scene.show([person], detections=[(tree, 0.6)])
+        states.append(subject)
+        if subject is not None:
+            judged(scene, 0.15, subject)
+    assert states[-1] is None
+    back = [scene.show([person], detections=[(tree, 0.6), (box_of(200, 180, 160), 0.7)]) for _ in range(10)]
+    assert back[-1] is not None
+    assert back[-1].track_id == 1
+    assert offset(back[-1], 200) < 15
+
+
+def test_track_is_questioned_after_a_second_and_refuted_after_more():
+    belief = PoseBelief(0)
+    box = box_of(100, 100, 80)
+    assert belief.believed
+    for i in range(10):
+        belief.judge(0.9, box, i * SECOND // 10)
+    assert belief.believed
+    states = []
+    for i in range(10, 50):
+        belief.judge(0.2, box + 50, i * SECOND // 10)
+        states.append((belief.believed, belief.questioned, belief.refuted))
+    assert states[5] == (False, False, False)
+    assert states[12] == (False, True, False)
+    assert states[30] == (False, True, True)
+    assert belief.plausible_ns is None
+    np.testing.assert_array_equal(belief.box, box)  # the last certain place stays
+    belief.judge(0.8, box + 50, 5 * SECOND)
+    assert belief.believed
+    assert belief.plausible_ns == 5 * SECOND
+
+
+def test_persons_seen_badly_from_the_start_are_believed_at_their_usual_confidence():
+    belief = PoseBelief(0)
+    for i in range(100):
+        belief.judge(0.55, box_of(100, 100, 40), i * SECOND // 10)
+    assert belief.believed
+    assert not belief.questioned
+
+
+@pytest.mark.parametrize("ground", [(60, 115, 85), (112, 112, 115), (205, 205, 200)])
+def test_shadow_is_the_ground_but_darker(ground):
+    rng = np.random.default_rng(0)
+    image = np.clip(np.array(ground) + rng.normal(0, 6, (200, 300, 3)), 0, 255)
+    box = np.array([120.0, 40, 160, 160])
+    image[50:150, 128:152] *= 0.48
+    shadow = image.astype(np.uint8)
+    person = shadow.copy()
+    person[50:100, 128:152] = (40, 40, 200)
+    person[100:150, 128:152] = (90, 40, 30)
+    assert shadow_share(shadow, box) > 0.8
+    assert shadow_share(person, box) < 0.2
+    assert without_shadow(0.6, shadow, box) < 0.5 < without_shadow(0.6, person, box)
+
+
+def test_empty_ground_and_cut_boxes_are_no_shadow():
+    image = np.full((100, 100, 3), 120, np.uint8)
+    assert shadow_share(image, np.array([20.0, 20, 60, 90])) == 0.0
+    assert shadow_share(image, np.array([95.0, 95, 140, 180])) == 0.0
+    assert shadow_share(image, np.array([0.0, 0, 100, 100])) == 0.0
