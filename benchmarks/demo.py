@@ -6,7 +6,6 @@ Equal rows of one seed have the same digits and the same session, whose messages
 from __future__ import annotations
 
 import argparse
-import contextlib
 import hashlib
 import os
 import re
@@ -14,7 +13,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 from figures import ROOT, table, write_figures
@@ -27,6 +25,7 @@ from drocap_ros.recording.open_session import open_session
 from drocap_ros.simulation.flight_simulator.truth import load_flight_truth
 
 sys.path[:0] = [str(ROOT / "test" / "helpers")]
+from busy_processes import busy_processes  # noqa: E402
 from session_contents import session_contents  # noqa: E402
 
 HEAD = [
@@ -66,18 +65,6 @@ def flown(out: Path, seed: int, busy: int, args: argparse.Namespace) -> list[str
         f"{error:.5f}",
         content[:8],
     ]
-
-
-@contextlib.contextmanager
-def busy_processes(count: int) -> Iterator[None]:
-    """Processes that use all of the processor's time that they get."""
-    processes = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
-    try:
-        yield
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
 
 
 def main() -> int:

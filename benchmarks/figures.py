@@ -7,8 +7,10 @@ One page per part that can run alone:
 
     demo.py             demo
     accuracy.py         accuracy, accuracy_live, accuracy_perspective, accuracy_world, accuracy_telemetry
+    body.py             accuracy_body
     reconstruction.py   reconstruction
     perception.py       perception
+    perception_scenes.py perception_scenes
     recording.py        recording_load, recording_kills, recording_mutations, recording_long, recording_live
     live.py             live_load, live_memory, live_kills
     flight_*.py         flight_faults, flight_processes, flight_orbits, flight_quality, flight_pixels, flight_fuzz,

@@ -1,10 +1,10 @@
-"""Maps from the joint sets of public networks to ``BODY_15``: positions, covariance and confidence.
+"""Maps from the joint sets of public networks to the body's joints: positions, covariance and confidence.
 
-Each joint of ``BODY_15`` is a weighted mean of a network's joints.  Most are one joint; the pelvis is the middle of
-the hips where the network has none; ``neck`` and ``head`` are extrapolated along the line from the middle of the
-shoulders: in the MoCap convention the neck lies 135 mm and the head 232 mm above it, the ears about 190 mm.
-Extrapolated joints have an extra variance for the lean of the head, in units of the network's own shoulder-to-ear or
-neck-to-crown distance, and less confidence.
+The result is ``BODY_15``, or ``BODY_19`` for networks that see toes and heels.  Each of its joints is a weighted mean
+of a network's joints.  Most are one joint; the pelvis is the middle of the hips where the network has none; ``neck``
+and ``head`` are extrapolated along the line from the middle of the shoulders: in the MoCap convention the neck lies
+135 mm and the head 232 mm above it, the ears about 190 mm.  Extrapolated joints have an extra variance for the lean of
+the head, in units of the network's own shoulder-to-ear or neck-to-crown distance, and less confidence.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from functools import cache
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.skeleton import BODY_15, JOINT_SETS, JointSet
+from drocap_ros.skeleton import BODY_15, BODY_17, BODY_19, JOINT_SETS, JointSet
 
 #: Shares of the way from the middle of the shoulders to the middle of the ears.
 _NECK_ON_EARS, _HEAD_ON_EARS = 135 / 190, 232 / 190
@@ -42,22 +42,29 @@ def _limbs_by_side() -> dict[str, Weights]:
     return {short + part: {long + part: 1.0} for short, long in _SIDES for part in _LIMBS}
 
 
-def _coco_like(pelvis: Weights | None = None) -> dict[str, Weights]:
+def _coco_like() -> dict[str, Weights]:
     shoulders = {"left_shoulder": 0.5, "right_shoulder": 0.5}
     ears = {"left_ear": 0.5, "right_ear": 0.5}
     return _limbs_by_side() | {
-        "pelvis": pelvis or {"left_hip": 0.5, "right_hip": 0.5},
+        "pelvis": {"left_hip": 0.5, "right_hip": 0.5},
         "neck": _mix(shoulders, ears, _NECK_ON_EARS),
         "head": _mix(shoulders, ears, _HEAD_ON_EARS),
     }
 
 
-#: Joint of BODY_15 -> weights of the network's joints; they sum to 1.
+#: Tips of the big toes, and heels.
+_FEET: dict[str, Weights] = {
+    f"{short}{ours}": {f"{long}{theirs}": 1.0}
+    for short, long in _SIDES
+    for ours, theirs in (("toe", "big_toe"), ("heel", "heel"))
+}
+
+#: Joint of the body -> weights of the network's joints; they sum to 1.
 TABLES: dict[str, dict[str, Weights]] = {
-    "body15": {name: {name: 1.0} for name in BODY_15.joints},
+    **{body.name: {name: {name: 1.0} for name in body.joints} for body in (BODY_15, BODY_17, BODY_19)},
     "coco17": _coco_like(),
-    "wholebody133": _coco_like(),
-    "halpe26": _coco_like(pelvis={"left_hip": 0.5, "right_hip": 0.5}),
+    "wholebody133": _coco_like() | _FEET,
+    "halpe26": _coco_like() | _FEET,
     # MPII's upper neck is BODY_15's neck; the crown lies about 310 mm above the middle of the shoulders.
     "mpii16": _limbs_by_side() | {
         "pelvis": {"left_hip": 0.5, "right_hip": 0.5},
@@ -84,13 +91,15 @@ _EXTRA: dict[str, dict[str, tuple[Weights, Weights, float]]] = {
 
 @dataclass(frozen=True)
 class JointMap:
-    """Linear map of one joint set to ``BODY_15``.
+    """Linear map of one joint set to the body's joints.
 
-    weights : (15, P), rows summing to 1
-    lines : (15, P), rows summing to 0: the line that scales the extra spread, 0 where there is none
-    spread : (15,) standard deviation as a share of the line's length
+    joints : the B joints of the result, ``BODY_15`` at least
+    weights : (B, P), rows summing to 1
+    lines : (B, P), rows summing to 0: the line that scales the extra spread, 0 where there is none
+    spread : (B,) standard deviation as a share of the line's length
     """
 
+    joints: JointSet
     weights: np.ndarray
     lines: np.ndarray
     spread: np.ndarray
@@ -98,7 +107,7 @@ class JointMap:
     def apply(
         self, xy: np.ndarray, covariance: np.ndarray, confidence: np.ndarray, box_size: float | np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Keypoints (..., P, 2) px, covariance (..., P, 3) px^2 and confidence (..., P) -> the same for ``BODY_15``.
+        """Keypoints (..., P, 2) px, covariance (..., P, 3) px^2 and confidence (..., P) -> the same for ``joints``.
 
         A joint is NaN, its confidence 0, where one of its parts is NaN.  The line's length is at least 5 % of
         ``box_size`` (...) px: a view from above shortens the line, not the uncertainty of the head.
@@ -121,7 +130,7 @@ class JointMap:
 
 
 def joint_set_of(names: Sequence[str]) -> tuple[JointSet, np.ndarray]:
-    """The joint set whose map gives most joints of ``BODY_15`` from these names, and its names' places (P,), -1 = none.
+    """The joint set whose map gives most joints of the body from these names, and its names' places (P,), -1 = none.
 
     The spelling is free: ``left_shoulder``, ``leftShoulder`` and ``Left shoulder`` are one name.
     """
@@ -133,7 +142,7 @@ def joint_set_of(names: Sequence[str]) -> tuple[JointSet, np.ndarray]:
 
 @cache
 def joint_map(skeleton: str) -> JointMap:
-    """Map of a joint set to ``BODY_15``.
+    """Map of a joint set to those joints of the body that it gives.
 
     Raises
     ------
@@ -147,10 +156,11 @@ def joint_map(skeleton: str) -> JointMap:
             f"skeleton: expected one of {', '.join(TABLES)}, got {skeleton!r}; add a table to joint_maps.py"
         )
     source = joint_set(skeleton)
-    weights = np.zeros((len(BODY_15), len(source)))
+    joints = next(body for body in (BODY_15, BODY_17, BODY_19) if len(body) == len(TABLES[skeleton]))
+    weights = np.zeros((len(joints), len(source)))
     lines = np.zeros_like(weights)
-    spread = np.zeros(len(BODY_15))
-    for row, joint in enumerate(BODY_15.joints):
+    spread = np.zeros(len(joints))
+    for row, joint in enumerate(joints.joints):
         for name, weight in TABLES[skeleton][joint].items():
             weights[row, source.index(name)] = weight
         if joint in _EXTRA.get(skeleton, {}):
@@ -159,4 +169,4 @@ def joint_map(skeleton: str) -> JointMap:
                 lines[row, source.index(name)] = weight
             for name, weight in end.items():
                 lines[row, source.index(name)] = weight
-    return JointMap(weights, lines, spread)
+    return JointMap(joints, weights, lines, spread)

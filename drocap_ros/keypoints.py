@@ -28,6 +28,32 @@ class Keypoints2D:
         """The keypoints of some frames; ``frames`` indexes the leading axis as it does in numpy."""
         return replace(self, **{name: value[frames] for name, value in vars(self).items() if value is not None})
 
+    def with_joints(self, count: int) -> Keypoints2D:
+        """The first ``count`` joints of a body set; those that it lacks are not seen."""
+        added = max(count - self.xy.shape[-2], 0)
+
+        def fit(values: np.ndarray, unknown: float) -> np.ndarray:
+            # The joints are the axis before the columns; confidences have none.
+            axis = self.xy.ndim - 2
+            width = [(0, added if i == axis else 0) for i in range(values.ndim)]
+            kept = (*[slice(None)] * axis, slice(count))
+            return np.pad(values, width, constant_values=unknown)[kept]
+
+        return Keypoints2D(
+            fit(self.xy, np.nan),
+            None if self.confidence is None else fit(self.confidence, 0.0),
+            None if self.covariance is None else fit(self.covariance, np.nan),
+        )
+
+    def without_joints(self, count: int) -> Keypoints2D:
+        """The joints after the first ``count``."""
+        later = slice(count, None)
+        return Keypoints2D(
+            self.xy[..., later, :],
+            None if self.confidence is None else self.confidence[..., later],
+            None if self.covariance is None else self.covariance[..., later, :],
+        )
+
     @property
     def seen(self) -> np.ndarray:
         """(F, P) bool, both coordinates are finite."""
@@ -42,8 +68,3 @@ class Keypoints2D:
     def variance(self) -> np.ndarray | None:
         """(F, P) px^2 per coordinate, the mean of xx and yy; None without a covariance."""
         return None if self.covariance is None else 0.5 * (self.covariance[..., 0] + self.covariance[..., 2])
-
-
-def isotropic_covariance(variance: np.ndarray) -> np.ndarray:
-    """(..., 3) xx xy yy of variances (...) that both coordinates share."""
-    return np.stack([variance, np.zeros_like(variance), variance], axis=-1)

@@ -11,10 +11,12 @@ from __future__ import annotations
 import numpy as np
 
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_15, BODY_19
 
 _LEFT = np.array([BODY_15.index("lknee"), BODY_15.index("lankle")])
 _RIGHT = np.array([BODY_15.index("rknee"), BODY_15.index("rankle")])
+#: The joints below the hip, which a network exchanges together.
+_BELOW = ("knee", "ankle", "toe", "heel")
 _HIPS = np.array([BODY_15.index("lhip"), BODY_15.index("rhip")])
 
 #: Standard deviation of a leg joint's step relative to the hips between two images, share of the box.
@@ -34,7 +36,7 @@ def with_own_legs(keypoints: Keypoints2D, stamp_ns: np.ndarray, box_size: np.nda
 
     Parameters
     ----------
-    keypoints : of ``BODY_15``, px
+    keypoints : of ``BODY_15``, ``BODY_17`` or ``BODY_19``, px
     stamp_ns : (F,)
     box_size : (F,) px, longer side of the person's box
     """
@@ -84,9 +86,13 @@ def exchange_legs(keypoints: Keypoints2D, exchanged: np.ndarray) -> Keypoints2D:
     """Keypoints with the legs of the images ``exchanged`` (F,) bool exchanged, and a lower confidence in them."""
     if not exchanged.any():
         return keypoints
-    order = np.arange(len(BODY_15))
-    order[_LEFT], order[_RIGHT] = _RIGHT, _LEFT
-    trust = np.where(order != np.arange(len(BODY_15)), _EXCHANGED_CONFIDENCE, 1.0)
+    names = BODY_19.joints[: keypoints.xy.shape[1]]
+    order = np.arange(len(names))
+    for side, other in (("l", "r"), ("r", "l")):
+        for part in _BELOW:
+            if side + part in names:
+                order[names.index(side + part)] = names.index(other + part)
+    trust = np.where(order != np.arange(len(names)), _EXCHANGED_CONFIDENCE, 1.0)
     confidence, covariance, which = keypoints.confidence, keypoints.covariance, exchanged[:, None]
     return Keypoints2D(
         np.where(which[..., None], keypoints.xy[:, order], keypoints.xy),

@@ -16,6 +16,7 @@ import numpy as np
 
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
+from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.live.effort import Effort
@@ -24,7 +25,7 @@ from drocap_ros.reconstruction.stop_reason import NO_WINDOW
 from drocap_ros.recording.pose_messages import read_observations
 from drocap_ros.recording.provenance import CONFIGURATION
 from drocap_ros.recording.session import POSE2D, POSE3D, POSE3D_WINDOW, Session, header_stamp_ns
-from drocap_ros.skeleton import BODY_15, indices
+from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
 
 _INITIAL = 1  # Pose3D.INITIAL
@@ -226,22 +227,20 @@ def _arrays(session: Session, frames: dict[int, tuple[PoseObservation, np.ndarra
 
 
 def _motion(tracks: Tracks, joints3d: np.ndarray, config: DrocapConfig) -> Motion:
-    order = indices(tracks.joints, BODY_15.joints)
-    keypoints = tracks.keypoints[:, order]
-    seen = np.isfinite(keypoints).all(axis=2)
-    assert tracks.confidence is not None
+    keypoints = Keypoints2D(tracks.keypoints, tracks.confidence).with_joints(len(BODY_17))
+    seen = keypoints.seen
     return Motion(
         joints3d=joints3d,
-        joints=BODY_15.joints,
-        parents=BODY_15.parents,
+        joints=BODY_17.joints,
+        parents=BODY_17.parents,
         stamp_ns=tracks.stamp_ns,
         frame="camera",
         metric=False,
         scale_source="assumed_height",
         camera_rotation=np.broadcast_to(np.eye(3), (len(tracks), 3, 3)).copy(),
-        confidence=np.where(seen, np.nan_to_num(tracks.confidence[:, order]), 0.0),
-        keypoints=np.where(seen[..., None], keypoints, np.nan),
-        reprojection_px=_reprojection_px(joints3d, keypoints, seen),
+        confidence=keypoints.weights,
+        keypoints=np.where(seen[..., None], keypoints.xy, np.nan),
+        reprojection_px=_reprojection_px(joints3d, keypoints.xy, seen),
         meta={"assumed_height_m": config.initializer.assumed_height_m},
     )
 

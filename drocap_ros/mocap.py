@@ -1,4 +1,4 @@
-"""Motion capture files: one take per ``.npz``, read as joints of ``BODY_15``."""
+"""Motion capture files: one take per ``.npz``, read as joints of ``BODY_17`` or ``BODY_15``."""
 
 from __future__ import annotations
 
@@ -8,22 +8,30 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.skeleton import BODY_15, in_body_order
+from drocap_ros.skeleton import BODY_15, JointSet, in_body_order
 from drocap_ros.tracks import read_npz
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """MoCap of one take: ``x`` (F, 15, 3) mm, world z up, joints of BODY_15."""
+    """MoCap of one take: ``x`` (F, P, 3) mm, world z up, joints of BODY_17, or of BODY_15 without known toes."""
 
     name: str
     x: np.ndarray
 
 
-def load_mocap(path: Path, required: tuple[str, ...] = BODY_15.joints) -> tuple[np.ndarray, float]:
-    """Joints (T, 15, 3) mm, world z up, and frames per second of one MoCap ``.npz``.
+def load_mocap(
+    path: Path, required: tuple[str, ...] = BODY_15.joints, joints: JointSet = BODY_15
+) -> tuple[np.ndarray, float]:
+    """Joints (T, P, 3) mm, world z up, and frames per second of one MoCap ``.npz``.
 
-    Joints that are neither in the file nor ``required`` are NaN.
+    Toes are further joints of ``X``, or the array ``toes`` (T, 2, 3) with their names in ``toe_joints``.  Where
+    ``toe_kind`` is "ball", the array holds the balls of the feet, which are no joints of the body.
+
+    Parameters
+    ----------
+    required : joints that the file must hold; others that it lacks are NaN
+    joints : ``BODY_15`` or ``BODY_17``, those of the result
 
     Raises
     ------
@@ -33,13 +41,19 @@ def load_mocap(path: Path, required: tuple[str, ...] = BODY_15.joints) -> tuple[
     a = read_npz(path, ("X", "fps", "joints"))
     if a["X"].ndim != 3 or a["X"].shape[1:] != (a["joints"].size, 3) or len(a["X"]) == 0:
         raise InputError(f"{path}: X: expected (T, {a['joints'].size}, 3), got {a['X'].shape}")
-    x = a["X"].astype(np.float64)
+    x, names = a["X"], [str(j) for j in a["joints"]]
+    if "toes" in a and str(a.get("toe_kind", "tip")) == "tip":
+        toes = [str(j) for j in np.atleast_1d(a.get("toe_joints", ("rtoe", "ltoe")))]
+        if a["toes"].shape != (len(x), len(toes), 3):
+            raise InputError(f"{path}: toes: expected {(len(x), len(toes), 3)}, got {a['toes'].shape}")
+        x, names = np.concatenate([x, a["toes"]], axis=1), [*names, *toes]
+    x = x.astype(np.float64)
     if not np.isfinite(x).all():
-        raise InputError(f"{path}: X: expected finite millimetres, got NaN or infinity; fill the gaps in")
+        raise InputError(f"{path}: X, toes: expected finite millimetres, got NaN or infinity; fill the gaps in")
     fps = float(a["fps"])
     if not 1.0 <= fps <= 1000.0:
         raise InputError(f"{path}: fps: expected 1 to 1000, got {fps:g}")
-    return in_body_order(x, [str(j) for j in a["joints"]], required), fps
+    return in_body_order(x, names, required)[:, : len(joints)], fps
 
 
 def mocap_files(folder: str | Path, include: str = "*") -> list[Path]:
@@ -60,11 +74,17 @@ def mocap_files(folder: str | Path, include: str = "*") -> list[Path]:
 
 
 def resample(x: np.ndarray, fps: float, wanted_fps: float) -> np.ndarray:
-    """Cubic interpolation of joints (T, P, 3) at another frame rate, over the same span of time."""
+    """Cubic interpolation of joints (T, P, 3) at another frame rate, over the same span of time.
+
+    Joints that are NaN in any frame are NaN in all.
+    """
     from scipy.interpolate import CubicSpline
 
     if len(x) < 2 or fps == wanted_fps:
         return x
     t = np.arange(len(x)) / fps
     wanted = np.arange(int(np.floor(t[-1] * wanted_fps + 1e-9)) + 1) / wanted_fps
-    return CubicSpline(t, x, axis=0)(wanted)
+    known = np.isfinite(x).all(axis=(0, 2))
+    out = np.full((len(wanted), *x.shape[1:]), np.nan)
+    out[:, known] = CubicSpline(t, x[:, known], axis=0)(wanted)
+    return out

@@ -6,7 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drocap_ros.skeleton import BODY_15, JointSet
+from drocap_ros.errors import InputError
+from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.skeleton import BODY_15, BODY_17, JointSet, body_set
 
 
 def _empty(*shape: int) -> np.ndarray:
@@ -44,3 +46,20 @@ class PoseObservation:
     def has_subject(self) -> bool:
         """Whether the image has a subject."""
         return self.track_id > 0
+
+    def body_keypoints(self) -> Keypoints2D:
+        """The image's keypoints of ``BODY_17``, float64; toes that the network does not give are NaN.
+
+        Raises
+        ------
+        InputError
+            When the joints are no body set, or an array does not fit them.
+        """
+        if not body_set(self.joints):
+            raise InputError(f"skeleton: expected body15, body17 or body19, got {self.joints.name}; map the joints")
+        for name, columns in (("keypoints", (2,)), ("confidence", ()), ("covariance", (3,))):
+            shape, expected = getattr(self, name).shape, (len(self.joints), *columns)
+            if shape != expected:
+                raise InputError(f"{name}: expected shape {expected}, got {shape}; use the {self.joints.name} joints")
+        arrays = (values.astype(np.float64) for values in (self.keypoints, self.confidence, self.covariance))
+        return Keypoints2D(*arrays).with_joints(len(BODY_17))

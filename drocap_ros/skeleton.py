@@ -1,8 +1,10 @@
 """Named joint sets and their bones.
 
-``BODY_15`` is the set of every 3D result.  Its joints follow the MoCap convention of Human3.6M:
-``pelvis`` is the middle of the hips, ``neck`` the top of the neck (not the line of the shoulders) and
-``head`` the middle of the skull's upper half.
+``BODY_17`` is the set of the default method's 3D results, ``BODY_15`` (its first fifteen joints) that of the paper's
+methods; ``BODY_19`` adds the heels where a 2D network sees them.  Each set begins with the joints of the one before.
+The joints follow the MoCap convention of Human3.6M: ``pelvis`` is the middle of the hips, ``neck`` the top of the neck
+(not the line of the shoulders), ``head`` the middle of the skull's upper half, ``rtoe`` and ``ltoe`` the tips of the
+big toes.
 """
 
 from __future__ import annotations
@@ -57,6 +59,13 @@ BODY_15 = JointSet(
     (-1, 0, 1, 2, 0, 4, 5, 0, 7, 7, 9, 10, 7, 12, 13),
 )  # fmt: skip
 
+TOES = ("rtoe", "ltoe")
+
+BODY_17 = JointSet("body17", (*BODY_15.joints, *TOES), (*BODY_15.parents, 3, 6))
+
+#: ``BODY_17`` and the heels, which only some 2D networks see.
+BODY_19 = JointSet("body19", (*BODY_17.joints, "rheel", "lheel"), (*BODY_17.parents, 3, 6))
+
 COCO_17 = JointSet(
     "coco17",
     (
@@ -110,7 +119,9 @@ H36M_17 = JointSet(
     (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 9, 8, 11, 12, 8, 14, 15),
 )  # fmt: skip
 
-JOINT_SETS: dict[str, JointSet] = {s.name: s for s in (BODY_15, COCO_17, HALPE_26, WHOLEBODY_133, MPII_16, H36M_17)}
+JOINT_SETS: dict[str, JointSet] = {
+    s.name: s for s in (BODY_15, BODY_17, BODY_19, COCO_17, HALPE_26, WHOLEBODY_133, MPII_16, H36M_17)
+}
 
 #: The twelve joints of the averages in the paper's tables.
 LIMB_JOINTS = (
@@ -164,7 +175,7 @@ def indices(joints: tuple[str, ...] | list[str], wanted: tuple[str, ...]) -> np.
 
 
 def in_body_order(values: np.ndarray, joints: tuple[str, ...] | list[str], required: tuple[str, ...]) -> np.ndarray:
-    """Values (F, P, D) of named joints as (F, 15, D) of ``BODY_15``; NaN for a missing joint that is not required.
+    """Values (F, P, D) of named joints as (F, 17, D) of ``BODY_17``; NaN for a missing joint that is not required.
 
     A missing pelvis is the middle of the hips.
 
@@ -174,10 +185,15 @@ def in_body_order(values: np.ndarray, joints: tuple[str, ...] | list[str], requi
         When a required joint is missing.
     """
     indices(joints, required)
-    out = np.full((len(values), len(BODY_15), values.shape[2]), np.nan)
-    for row, name in enumerate(BODY_15.joints):
+    out = np.full((len(values), len(BODY_17), values.shape[2]), np.nan)
+    for row, name in enumerate(BODY_17.joints):
         if name in joints:
             out[:, row] = values[:, list(joints).index(name)]
     if "pelvis" not in joints:
-        out[:, BODY_15.index("pelvis")] = out[:, indices(BODY_15.joints, ("rhip", "lhip"))].mean(axis=1)
+        out[:, BODY_17.index("pelvis")] = out[:, indices(BODY_17.joints, ("rhip", "lhip"))].mean(axis=1)
     return out
+
+
+def body_set(joints: JointSet) -> bool:
+    """Whether a set is ``BODY_15`` or begins with it: joints then have their places in every such set."""
+    return joints.joints[: len(BODY_15)] == BODY_15.joints

@@ -47,7 +47,7 @@ def test_examples_of_the_page_run_as_printed(folder, root):
     examples = re.findall(r"```python\n(.*?)```", (root / "docs" / "api.md").read_text(), re.DOTALL)
     assert len(examples) == 2
     said = python(examples[0], folder, root)
-    assert said.startswith("(8, 15, 3) camera\n")
+    assert said.startswith("(8, 17, 3) camera\n")
     assert 0 < float(said.split()[-2]) < 300
     assert (folder / "walk.bvh").read_text().startswith("HIERARCHY")
     assert python(examples[1], folder, root).endswith(" px\n")

@@ -5,7 +5,7 @@ import pytest
 
 from drocap_ros.errors import InputError
 from drocap_ros.joint_maps import TABLES, joint_map
-from drocap_ros.skeleton import BODY_15, LIMB_JOINTS, joint_set
+from drocap_ros.skeleton import BODY_15, BODY_19, LIMB_JOINTS, joint_set
 
 
 @pytest.mark.parametrize("name", sorted(TABLES))
@@ -28,6 +28,7 @@ def test_every_set_maps_an_upright_person_to_the_same_joints(name):
     places = {
         "hip": (90, 0), "knee": (95, 420), "ankle": (100, 830), "shoulder": (170, -480), "elbow": (220, -190),
         "wrist": (230, 60), "ear": (75, -670), "eye": (30, -690),
+        "toe": (120, 880), "big_toe": (120, 880), "heel": (95, 900),
     }  # fmt: skip
     middle = {
         "nose": (0, -660), "pelvis": (0, 0), "hip": (0, 0), "neck": (0, -615), "upper_neck": (0, -615),
@@ -43,8 +44,10 @@ def test_every_set_maps_an_upright_person_to_the_same_joints(name):
 
     s = joint_set(name)
     xy = np.array([place(j) for j in s.joints], float)
-    out, covariance, confidence = joint_map(name).apply(xy, np.ones((len(s), 3)), np.ones(len(s)), 1700.0)
-    expected = np.array([place(j) for j in BODY_15.joints], float)
+    table = joint_map(name)
+    out, covariance, confidence = table.apply(xy, np.ones((len(s), 3)), np.ones(len(s)), 1700.0)
+    assert table.joints is (BODY_19 if name in ("halpe26", "wholebody133") else BODY_15)
+    expected = np.array([place(j) for j in table.joints.joints], float)
     np.testing.assert_allclose(out, expected, atol=12)
     assert (covariance[:, 0] > 0).all()
     assert (confidence > 0.8).all()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.keypoints import Keypoints2D, isotropic_covariance
+from drocap_ros.keypoints import Keypoints2D
 
 XY = np.arange(24.0).reshape(4, 3, 2)
 XY[1, 2, 0] = np.nan
@@ -25,8 +25,3 @@ def test_weights_are_zero_where_not_seen_and_one_without_confidence() -> None:
     np.testing.assert_array_equal(Keypoints2D(XY).weights, seen)
     np.testing.assert_array_equal(Keypoints2D(XY, np.full((4, 3), np.nan)).weights, 0.0)
     np.testing.assert_array_equal(Keypoints2D(XY, np.full((4, 3), 0.5)).weights, 0.5 * seen)
-
-
-def test_isotropic_covariance_has_its_variance_bit_for_bit() -> None:
-    variance = np.random.default_rng(0).uniform(0.0, 9.0, (4, 3))
-    np.testing.assert_array_equal(Keypoints2D(XY, None, isotropic_covariance(variance)).variance, variance)

@@ -10,6 +10,7 @@ from walking import write_mocap
 
 from drocap_ros.errors import InputError
 from drocap_ros.mocap import load_mocap, resample
+from drocap_ros.skeleton import BODY_17
 
 
 def test_resampling_keeps_the_motion() -> None:
@@ -32,3 +33,17 @@ def test_bad_files_are_refused(tmp_path: Path, changes: dict[str, np.ndarray], m
     write_mocap(tmp_path, "bad", frames=200, **changes)
     with pytest.raises(InputError, match=match):
         load_mocap(tmp_path / "bad.npz")
+
+
+@pytest.mark.parametrize("kind", ["tip", "ball"])
+def test_toes_are_read_where_they_are_tips(tmp_path: Path, kind: str) -> None:
+    left, right = np.full((90, 3), 1.0), np.full((90, 3), 2.0)
+    further = {"toes": np.stack([left, right], axis=1), "toe_joints": np.array(["ltoe", "rtoe"])}
+    write_mocap(tmp_path, "toes", frames=90, toe_kind=np.array(kind), **further)
+    x, fps = load_mocap(tmp_path / "toes.npz", joints=BODY_17)
+    expected = np.stack([right, left], axis=1) if kind == "tip" else np.full((90, 2, 3), np.nan)
+    np.testing.assert_array_equal(x[:, 15:], expected)
+    np.testing.assert_array_equal(load_mocap(tmp_path / "toes.npz")[0], x[:, :15])
+    resampled = resample(x, fps, 0.5 * fps)
+    assert np.isfinite(resampled[:, :15]).all()
+    assert np.isfinite(resampled[:, 15:]).all() == (kind == "tip")

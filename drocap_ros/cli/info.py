@@ -101,6 +101,7 @@ def _print_metadata(path: Path) -> int:
 
 
 def _of_arrays(path: Path) -> Summary:
+    from drocap_ros.geometry.flexion import flexion_words
     from drocap_ros.motion import load_motion
     from drocap_ros.reconstruction.world.calibration_words import telemetry_words
     from drocap_ros.tracks import load_tracks, read_npz, wrong_kind
@@ -116,6 +117,7 @@ def _of_arrays(path: Path) -> Summary:
             ("joints", ", ".join(motion.joints)),
             ("frame", motion.frame),
             ("scale", f"{scale} ({motion.scale_source})"),
+            *((("median flexion", bent),) if (bent := flexion_words(motion.joints3d, motion.joints)) else ()),
             *((("telemetry", words),) if (words := telemetry_words(motion.meta)) else ()),
             *((key, str(motion.meta[key])) for key in ("method", "input", "version") if key in motion.meta),
         ]

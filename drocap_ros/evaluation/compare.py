@@ -15,12 +15,13 @@ from drocap_ros.evaluation.metrics import (
     mirrored_frames,
     pa_mpjpe,
     scale_error,
+    toe_error,
     w_mpjpe,
 )
 from drocap_ros.evaluation.world_errors import WorldErrors, world_errors
 from drocap_ros.mocap import load_mocap
 from drocap_ros.motion import Motion, load_motion, motion_file
-from drocap_ros.skeleton import BODY_15, LIMB_JOINTS, in_body_order, indices
+from drocap_ros.skeleton import BODY_15, BODY_17, LIMB_JOINTS, in_body_order, indices
 from drocap_ros.tracks import kind_of, read_npz, wrong_kind
 
 _LIMBS = indices(BODY_15.joints, LIMB_JOINTS)
@@ -36,6 +37,7 @@ class MotionErrors:
     scale_error : estimated over true mean limb length, less 1
     metric : the motion's scale is measured, not assumed
     world : errors in the world where both motions are in world frames, else None
+    toe_mm : error of the toes after the alignment over the limb joints, NaN where either motion has none
     """
 
     frames: int
@@ -48,10 +50,11 @@ class MotionErrors:
     scale_error: float
     metric: bool
     world: WorldErrors | None = None
+    toe_mm: float = float("nan")
 
 
 def load_truth(truth: Motion | str | Path) -> tuple[np.ndarray, np.ndarray, str]:
-    """True joints (T, 15, 3) in m, their times (T,) in s and their frame, of a motion, or a MoCap or motion ``.npz``.
+    """True joints (T, 17, 3) in m, their times (T,) in s and their frame, of a motion, or a MoCap or motion ``.npz``.
 
     In a folder ``truth.npz`` is the truth, else ``motion.npz``.  It has to hold the twelve limb joints; others that it
     lacks are NaN.
@@ -75,7 +78,7 @@ def load_truth(truth: Motion | str | Path) -> tuple[np.ndarray, np.ndarray, str]
 
 
 def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -> MotionErrors:
-    """Errors of a motion against joints (T, 15, 3) m at increasing times (T,) s.
+    """Errors of a motion against joints (T, P, 3) m, of BODY_15 or BODY_17, at increasing times (T,) s.
 
     Only joints that both have are compared; the twelve limb joints are required.  Times are absolute where both ranges
     overlap; otherwise both start at zero.  The truth is interpolated at the motion's times; frames outside its range
@@ -87,6 +90,7 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
         When no finite frame lies within the truth's range, or the truth is not finite.
     """
     estimate = in_body_order(motion.joints3d, motion.joints, LIMB_JOINTS)
+    truth = in_body_order(truth, BODY_17.joints[: truth.shape[1]], LIMB_JOINTS)
     known = np.isfinite(estimate).any(axis=(0, 2)) & np.isfinite(truth).any(axis=(0, 2))
     known[_LIMBS] = True
     at = motion.stamp_ns * 1e-9
@@ -104,7 +108,7 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
     world = motion.frame == "world" and frame == "world"
     covariance = None
     if motion.covariance is not None:
-        covariance = motion.covariance[:, indices(motion.joints, BODY_15.joints)][usable]
+        covariance = in_body_order(motion.covariance, motion.joints, LIMB_JOINTS)[usable]
     return MotionErrors(
         frames=len(estimate),
         error_mm=1000.0 * float(pa_mpjpe(estimate, true).mean()),
@@ -116,6 +120,7 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
         scale_error=scale_error(estimate, true),
         metric=motion.metric,
         world=world_errors(estimate, true, _rate(at[usable]), covariance) if world else None,
+        toe_mm=1000.0 * toe_error(estimate, true),
     )
 
 

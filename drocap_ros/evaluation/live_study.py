@@ -21,6 +21,7 @@ from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_pos
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.skeleton import BODY_15, BODY_17
 
 #: Age at which the error of a refined pose counts.
 REFINED_AFTER_S = 2.0
@@ -107,6 +108,7 @@ def observations(view: OrbitView) -> Iterator[PoseObservation]:
             stamp_ns,
             1,
             t.image_size,
+            joints=BODY_15 if len(points) == len(BODY_15) else BODY_17,
             keypoints=points,
             covariance=np.full((len(points), 3), np.nan, np.float32),
             confidence=np.isfinite(points).all(axis=-1).astype(np.float32),
@@ -117,8 +119,8 @@ def observations(view: OrbitView) -> Iterator[PoseObservation]:
 class LiveResult:
     """Published poses: F frames, m, camera axes.
 
-    refined : (F, 15, 3) as of :data:`REFINED_AFTER_S` later; NaN where the sequence ended before
-    initial_std_m, refined_std_m : (F, 15, 3) by the published covariances
+    refined : (F, 17, 3) as of :data:`REFINED_AFTER_S` later; NaN where the sequence ended before
+    initial_std_m, refined_std_m : (F, 17, 3) by the published covariances
     step_m : (F,) largest step of a joint by the change of the correction since the previous image
     """
 
@@ -138,7 +140,7 @@ def simulate_live(
     """Run the live method over a view; a window's solution arrives ``delay_s`` after its newest image."""
     stamps = view.tracks.stamp_ns
     place = {int(stamp): i for i, stamp in enumerate(stamps)}
-    shape = (len(stamps), 15, 3)
+    shape = (len(stamps), len(BODY_17), 3)
     initial, latest, refined = (np.full(shape, np.nan) for _ in range(3))
     initial_std, refined_std = np.full(shape, np.nan), np.full(shape, np.nan)
     seconds: dict[type, list[float]] = {LivePose: [], LiveWindow: []}
@@ -206,13 +208,14 @@ def _row(sequence: Sequence, speed_deg_s: float, noisy: bool, view: OrbitView, r
 def standardized_error(
     joints_m: np.ndarray, std_m: np.ndarray, truth_mm: np.ndarray, axes: slice | int = slice(None)
 ) -> float:
-    """RMS over frames, joints but the pelvis, and axes of the error over its standard deviation.
+    """RMS over frames, joints of ``BODY_15`` but the pelvis, and axes of the error over its standard deviation.
 
-    joints_m, std_m : (F, 15, 3) camera axes, pelvis at the origin; truth_mm : (F, 15, 3).  The scale of a monocular
+    joints_m, std_m : (F, 17, 3) camera axes, pelvis at the origin; truth_mm : (F, 17, 3).  The scale of a monocular
     pose rests on an assumed stature, so the limbs' mean length over the sequence is made the true one.
     """
     scale = limb_lengths(truth_mm).mean() / limb_lengths(joints_m).mean()
-    gap = (joints_m * scale - truth_mm)[:, 1:] / (std_m[:, 1:] * scale)
+    body = slice(1, len(BODY_15))
+    gap = (joints_m[:, body] * scale - truth_mm[:, body]) / (std_m[:, body] * scale)
     return float(np.sqrt(np.mean(np.square(gap[..., axes]))))
 
 

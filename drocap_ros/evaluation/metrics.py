@@ -1,6 +1,6 @@
 """Error measures of a reconstruction against the truth; lengths keep the unit of the input.
 
-Poses are (F, 15, 3) in the joint order of BODY_15 unless said otherwise.
+Poses are (F, 15, 3) of BODY_15 or (F, 17, 3) of BODY_17 unless said otherwise.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import numpy as np
 
 from drocap_ros.geometry.alignment import apply_similarity, similarity
 from drocap_ros.geometry.bones import limb_lengths
-from drocap_ros.skeleton import BODY_15, LIMB_JOINTS, indices
+from drocap_ros.skeleton import BODY_15, BODY_17, LIMB_JOINTS, indices
 
 #: The groups of the paper's table of errors per joint.
 JOINT_GROUPS = {
@@ -21,6 +21,7 @@ JOINT_GROUPS = {
     "ankle": ("lankle", "rankle"),
 }
 _LIMBS = indices(BODY_15.joints, LIMB_JOINTS)
+_TOES = indices(BODY_17.joints, ("rtoe", "ltoe"))
 _MIRROR = np.array([1.0, 1.0, -1.0])
 
 
@@ -82,3 +83,13 @@ def group_errors(estimate: np.ndarray, truth: np.ndarray) -> dict[str, float]:
     """Mean error per group of :data:`JOINT_GROUPS`, after the alignment over the twelve limb joints."""
     errors = dict(zip(LIMB_JOINTS, aligned_error(estimate[:, _LIMBS], truth[:, _LIMBS]).mean(0), strict=True))
     return {group: float(np.mean([errors[joint] for joint in members])) for group, members in JOINT_GROUPS.items()}
+
+
+def toe_error(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """Mean error of the toes after the alignment over the twelve limb joints; NaN where either has no toes."""
+    if min(estimate.shape[1], truth.shape[1]) < len(BODY_17):
+        return float("nan")
+    fit = similarity(estimate[:, _LIMBS], truth[:, _LIMBS])
+    gap = np.linalg.norm(apply_similarity(estimate[:, _TOES], *fit) - truth[:, _TOES], axis=-1)
+    known = np.isfinite(gap)
+    return float(gap[known].mean()) if known.any() else float("nan")

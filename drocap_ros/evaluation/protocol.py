@@ -1,8 +1,8 @@
 """The project's measuring protocol: MoCap seen by a virtual orthographic camera that orbits the subject.
 
-All sequences of at least 5 s, their first 10 s, resampled to 24 fps, 15 joints; the camera looks down by
-0.3 rad.  Noisy input: Gaussian noise of 10 mm per coordinate, then each joint of each frame replaced with
-probability 0.05 by a point uniform within +-300 mm of its true place.
+All sequences of at least 5 s, their first 10 s, resampled to 24 fps, 15 joints and the toes where they are known; the
+camera looks down by 0.3 rad.  Noisy input: Gaussian noise of 10 mm per coordinate, then each joint of each frame
+replaced with probability 0.05 by a point uniform within +-300 mm of its true place.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.mocap import Sequence, load_mocap, mocap_files, resample
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_15, BODY_17
 from drocap_ros.tracks import Tracks
 
 FPS = 24.0
@@ -32,7 +32,7 @@ class OrbitView:
     """A sequence as the virtual camera sees it.
 
     tracks : keypoints in px, no confidences, no telemetry
-    truth : (F, 15, 3) mm, camera frame (x right, y down, z forward)
+    truth : (F, P, 3) mm, camera frame (x right, y down, z forward)
     rotation : (F, 3, 3) world -> camera
     """
 
@@ -44,7 +44,7 @@ class OrbitView:
 def protocol_sequences(
     folder: str | Path, *, shortest_s: float = 5.0, longest_s: float = 10.0, limit: int | None = None
 ) -> list[Sequence]:
-    """Sequences of a MoCap folder as the protocol takes them, by name.
+    """Sequences of a MoCap folder as the protocol takes them, by name; with ``BODY_15`` where there are no toes.
 
     Raises
     ------
@@ -53,7 +53,9 @@ def protocol_sequences(
     """
     out = []
     for path in mocap_files(folder):
-        x, fps = load_mocap(path)
+        x, fps = load_mocap(path, joints=BODY_17)
+        if np.isnan(x).any():
+            x = x[:, : len(BODY_15)]
         if len(x) >= shortest_s * fps:
             out.append(Sequence(path.stem, resample(x, fps, FPS)[: round(longest_s * FPS)]))
             if limit is not None and len(out) >= limit:
@@ -74,27 +76,34 @@ def orbit_rotations(frames: int, speed_deg_s: float, *, elevation_rad: float = E
 
 
 def orbit_view(x: np.ndarray, speed_deg_s: float, *, noisy: bool = False, seed: int = 0) -> OrbitView:
-    """View of joints (F, 15, 3) mm by the protocol's camera; it follows the pelvis.
+    """View of joints (F, P, 3) mm of BODY_15 or BODY_17 by the protocol's camera; it follows the pelvis.
 
     Parameters
     ----------
-    x : (F, 15, 3) mm, world z up, at 24 fps
+    x : (F, P, 3) mm, world z up, at 24 fps
     speed_deg_s : orbit speed, counter-clockwise seen from above
     noisy : add the protocol's noise and outliers, drawn from ``seed``
     """
     rotation = orbit_rotations(len(x), speed_deg_s)
     truth = (x - x[:, :1]) @ np.swapaxes(rotation, 1, 2)
-    flat = truth[..., :2].copy()
+    flat = truth[..., :2]
     if noisy:
-        rng = np.random.default_rng(seed)
-        clean = flat.copy()
-        flat += rng.normal(0.0, NOISE_MM, flat.shape)
-        gross = rng.random(flat.shape[:2]) < OUTLIER_PROBABILITY
-        flat[gross] = (clean + rng.uniform(-OUTLIER_RANGE_MM, OUTLIER_RANGE_MM, flat.shape))[gross]
+        # The toes have draws of their own: those of the other joints are the same with and without them.
+        body, toes = np.split(flat, [len(BODY_15)], axis=1)
+        flat = np.concatenate([_with_noise(body, seed), _with_noise(toes, [seed, len(BODY_15)])], axis=1)
     tracks = Tracks(
         keypoints=flat * PX_PER_MM + np.array(IMAGE_SIZE) / 2.0,
-        joints=BODY_15.joints,
+        joints=BODY_17.joints[: x.shape[1]],
         stamp_ns=np.round(np.arange(len(x)) * (1e9 / FPS)).astype(np.int64),
         image_size=IMAGE_SIZE,
     )
     return OrbitView(tracks, truth, rotation)
+
+
+def _with_noise(flat: np.ndarray, seed: int | list[int]) -> np.ndarray:
+    """Places (F, P, 2) mm with the protocol's noise and outliers."""
+    rng = np.random.default_rng(seed)
+    noisy = flat + rng.normal(0.0, NOISE_MM, flat.shape)
+    gross = rng.random(flat.shape[:2]) < OUTLIER_PROBABILITY
+    thrown = flat + rng.uniform(-OUTLIER_RANGE_MM, OUTLIER_RANGE_MM, flat.shape)
+    return np.where(gross[..., None], thrown, noisy)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.evaluation.metrics import JOINT_GROUPS, group_errors, is_mirrored, mirrored_frames, pa_mpjpe
+from drocap_ros.evaluation.metrics import JOINT_GROUPS, group_errors, is_mirrored, mirrored_frames, pa_mpjpe, toe_error
 from drocap_ros.evaluation.protocol import orbit_view, protocol_sequences
 from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.mocap import Sequence
@@ -24,7 +24,8 @@ SPEEDS_DEG_S = (0.0, 10.0, 25.0, 50.0)
 class StudyRow:
     """One sequence, seen at one speed, by one method.
 
-    error_mm : reconstruction error, mean over frames and the twelve limb joints; the others per joint group
+    error_mm : reconstruction error, mean over frames and the twelve limb joints; the others per joint group; of the
+        toes None where truth or method has none
     mirrored, mirrored_share : handedness of the whole sequence, share of mirrored frames
     limb_spread : standard deviation over mean of each limb's length, averaged; 0 for a rigid skeleton
     seconds_initial, seconds_adjust : wall-clock of the two stages
@@ -42,6 +43,7 @@ class StudyRow:
     hip_mm: float
     knee_mm: float
     ankle_mm: float
+    toe_mm: float | None
     mirrored: bool
     mirrored_share: float
     limb_spread: float
@@ -65,6 +67,7 @@ def measure(sequence: Sequence, method: str, speed_deg_s: float, noisy: bool, se
         frames=len(estimate),
         error_mm=float(pa_mpjpe(estimate, view.truth).mean()),
         **{f"{group}_mm": groups[group] for group in JOINT_GROUPS},
+        toe_mm=None if np.isnan(toes := toe_error(estimate, view.truth)) else toes,
         mirrored=is_mirrored(estimate, view.truth),
         mirrored_share=float(mirrored_frames(estimate, view.truth).mean()),
         limb_spread=float(np.mean(lengths.std(axis=0) / lengths.mean(axis=0))),

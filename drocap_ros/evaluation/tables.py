@@ -66,9 +66,9 @@ def study_markdown(rows: list[StudyRow]) -> str:
     speed = 25.0 if 25.0 in speeds else speeds[-1]
     lines += ["", f"Per joint group at {speed:g} deg/s, mm.", ""]
     lines += markdown_table(
-        ["method", *JOINT_GROUPS],
+        ["method", *JOINT_GROUPS, "toe"],
         [
-            [LABELS[m], *(f"{np.mean([getattr(r, f'{g}_mm') for r in at]):.1f}" for g in JOINT_GROUPS)]
+            [LABELS[m], *(_mean_cell([getattr(r, f"{g}_mm") for r in at]) for g in (*JOINT_GROUPS, "toe"))]
             for m in methods
             if (at := [r for r in rows if r.method == m and r.speed_deg_s == speed])
         ],
@@ -82,10 +82,17 @@ def study_markdown(rows: list[StudyRow]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _mean_cell(values: list[float | None]) -> str:
+    """Mean of the known values, "-" without any."""
+    known = [v for v in values if v is not None and not np.isnan(v)]
+    return f"{np.mean(known):.1f}" if known else "-"
+
+
 def comparison_markdown(name: str, e: MotionErrors) -> str:
     """Errors of one motion as Markdown."""
-    head = ["motion", "frames", "error mm", *(f"{g} mm" for g in JOINT_GROUPS)]
+    head = ["motion", "frames", "error mm", *(f"{g} mm" for g in JOINT_GROUPS), "toe mm"]
     line = [name, str(e.frames), f"{e.error_mm:.1f}", *(f"{e.per_group_mm[g]:.1f}" for g in JOINT_GROUPS)]
+    line.append(_mean_cell([e.toe_mm]))
     more = ["scale error", "scale is", "mirrored", "mirrored frames", "W-MPJPE mm", "horizon deg"]
     rest = [
         f"{e.scale_error:+.1%}",

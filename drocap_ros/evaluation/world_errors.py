@@ -8,6 +8,7 @@ import numpy as np
 
 from drocap_ros.evaluation import world_metrics
 from drocap_ros.evaluation.metrics import horizon_error, pa_mpjpe, scale_error, w_mpjpe
+from drocap_ros.skeleton import BODY_15
 
 WORLD_HEAD = [
     "PA-MPJPE mm", "MPJPE mm", "W-MPJPE mm", "WA-MPJPE mm", "not aligned mm", "RTE %", "scale %", "horizon deg",
@@ -47,12 +48,13 @@ class WorldErrors:
 def world_errors(
     estimate: np.ndarray, truth: np.ndarray, fps: float, covariance: np.ndarray | None = None
 ) -> WorldErrors:
-    """Errors of joints (F, 15, 3) m in the world against the truth, both z up at ``fps``.
+    """Errors of joints (F, P, 3) m in the world against the truth, both z up at ``fps``; means are over ``BODY_15``.
 
     Neck and head may be NaN: the means are then over the other joints.
 
-    covariance : (F, 15, 6) m^2 of the estimate, or None
+    covariance : (F, P, 6) m^2 of the estimate, or None
     """
+    estimate, truth = estimate[:, : len(BODY_15)], truth[:, : len(BODY_15)]
     nan = float("nan")
     moving = len(truth) > 2
     foot = world_metrics.still_foot_speed(estimate, truth, fps) if moving else nan
@@ -72,7 +74,9 @@ def world_errors(
         penetration_mm=1000 * world_metrics.penetration(estimate, truth),
         acceleration_ratio=world_metrics.acceleration_ratio(est, tru, fps) if moving else nan,
         acceleration_error_m_s2=world_metrics.acceleration_error(est, tru, fps) if moving else nan,
-        coverage=nan if covariance is None else world_metrics.ellipsoid_coverage(est, tru, covariance[:, known]),
+        coverage=nan
+        if covariance is None
+        else world_metrics.ellipsoid_coverage(est, tru, covariance[:, : len(BODY_15)][:, known]),
     )
 
 

@@ -1,6 +1,6 @@
-"""Error measures of a motion in the world, against the truth; poses are (F, 15, 3) m in the order of BODY_15, z up.
+"""Error measures of a motion in the world, against the truth; poses are (F, P, 3) m, first those of BODY_15, z up.
 
-The names and definitions are those of the world-grounded literature (EMDB, WHAM); every mean is over all 15 joints
+The names and definitions are those of the world-grounded literature (EMDB, WHAM); every mean is over all given joints
 unless said otherwise.
 """
 
@@ -57,7 +57,7 @@ def penetration(estimate: np.ndarray, truth: np.ndarray) -> float:
 
 
 def accelerations(joints: np.ndarray, fps: float) -> np.ndarray:
-    """(F - 2, 15, 3) m/s^2, second differences."""
+    """(F - 2, P, 3) m/s^2, second differences."""
     return (joints[2:] - 2 * joints[1:-1] + joints[:-2]) * fps**2
 
 
@@ -75,7 +75,7 @@ def acceleration_error(estimate: np.ndarray, truth: np.ndarray, fps: float) -> f
 def ellipsoid_coverage(estimate: np.ndarray, truth: np.ndarray, covariance: np.ndarray) -> float:
     """Share of the true joints within the ellipsoid that should hold 90 % of them.
 
-    covariance : (F, 15, 6) m^2: xx, xy, xz, yy, yz, zz; joints without a finite one are left out
+    covariance : (F, P, 6) m^2: xx, xy, xz, yy, yz, zz; joints without a finite one are left out
     """
     rows = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
     known = np.isfinite(covariance).all(-1)

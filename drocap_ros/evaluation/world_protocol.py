@@ -15,7 +15,7 @@ import numpy as np
 from drocap_ros.evaluation.protocol import FPS
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.mocap import Sequence
-from drocap_ros.skeleton import BODY_15, indices
+from drocap_ros.skeleton import BODY_15, BODY_17, indices
 from drocap_ros.tracks import Tracks
 
 SHORTEST_S, LONGEST_S = 8.0, 20.0
@@ -51,7 +51,7 @@ class WorldView:
     """A sequence as the simulated drone records it.
 
     tracks : keypoints in px and the telemetry
-    truth : (F, 15, 3) m, ENU; the lowest ankles stand 7 cm above z = 0
+    truth : (F, P, 3) m, ENU; the lowest ankles stand 7 cm above z = 0
     camera_rotation : (F, 3, 3) true, world -> camera
     """
 
@@ -75,17 +75,16 @@ def world_view(sequence: Sequence, telemetry: str = "exact", *, still: bool = Fa
     frames = len(truth)
     phase, rate = rng.uniform(0, 2 * np.pi), 0.0 if still else np.deg2rad(SPEED_DEG_S)
     position, rotation = _camera(truth, phase, rate, 0.0)
-    keypoints = _project(truth, position, rotation)
-    keypoints = keypoints + _NOISE_PX * _wander(rng, frames, _NOISE_S, keypoints[0].size).reshape(keypoints.shape)
-    thrown = rng.random(keypoints.shape[:2]) < _OUTLIERS
-    keypoints = keypoints + thrown[..., None] * rng.uniform(-_OUTLIER_PX, _OUTLIER_PX, keypoints.shape)
+    # The toes have draws of their own: those of the other joints are the same with and without them.
+    body, toes = np.split(_project(truth, position, rotation), [len(BODY_15)], axis=1)
+    body, toes = _with_noise(rng, body), _with_noise(np.random.default_rng([seed, len(BODY_15)]), toes)
     reported_position, reported_rotation = _camera(truth, phase, rate, errors.late_s)
     drift = _wander(rng, frames, _POSITION_WANDER_S, 3) * [1.0, 1.0, 0.7]
     misalignment = np.deg2rad(errors.misalignment_deg) * rng.choice([-1.0, 1.0], 3)
     wander = np.deg2rad(errors.attitude_deg) * _wander(rng, frames, _ATTITUDE_WANDER_S, 3)
     tracks = Tracks(
-        keypoints=keypoints,
-        joints=BODY_15.joints,
+        keypoints=np.concatenate([body, toes], axis=1),
+        joints=BODY_17.joints[: truth.shape[1]],
         stamp_ns=np.round(np.arange(frames) * (1e9 / FPS)).astype(np.int64),
         image_size=IMAGE_SIZE,
         camera_rotation=exp_so3(misalignment) @ exp_so3(wander) @ reported_rotation,
@@ -124,6 +123,15 @@ def _camera(truth: np.ndarray, phase: float, rate: float, ahead_s: float) -> tup
 def _project(joints: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     seen = (joints - position[:, None]) @ np.swapaxes(rotation, 1, 2)
     return FOCAL_PX * seen[..., :2] / seen[..., 2:] + np.array(IMAGE_SIZE) / 2
+
+
+def _with_noise(rng: np.random.Generator, keypoints: np.ndarray) -> np.ndarray:
+    """Keypoints (F, P, 2) px with correlated noise and outliers."""
+    frames, joints = keypoints.shape[:2]
+    keypoints = keypoints + _NOISE_PX * _wander(rng, frames, _NOISE_S, 2 * joints).reshape(keypoints.shape)
+    thrown = rng.random((frames, joints)) < _OUTLIERS
+    noisy: np.ndarray = keypoints + thrown[..., None] * rng.uniform(-_OUTLIER_PX, _OUTLIER_PX, keypoints.shape)
+    return noisy
 
 
 def _wander(rng: np.random.Generator, frames: int, correlated_s: float, dims: int) -> np.ndarray:

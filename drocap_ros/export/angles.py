@@ -13,7 +13,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from drocap_ros.export.rig import least_rotation
-from drocap_ros.export.rigid_body import TOES, RigidBody
+from drocap_ros.export.rigid_body import RigidBody
+from drocap_ros.skeleton import TOES
 
 #: Columns: ISB axes X, Y, Z in the axes of the rigid body (x left, y up, z forwards).
 _ISB = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])

@@ -9,7 +9,8 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, filtfilt
 
 from drocap_ros.errors import InputError
-from drocap_ros.export.clip import Clip, at_constant_rate
+from drocap_ros.export.clip import Clip, at_constant_rate, interpolated
+from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.skeleton import indices
 
 #: A filter of order 2 applied twice has its -3 dB at this share of its cut-off.
@@ -38,15 +39,12 @@ def smooth(clip: Clip, cut_off_hz: float) -> Clip:
         most = 0.5 * clip.rate_hz * _TWICE
         raise InputError(f"smooth: expected a cut-off between 0 and {most:.3g}, got {cut_off_hz:g} Hz; choose another")
     b, a = butter(2, corrected, fs=clip.rate_hz)
-    out = clip.positions.copy()
+    out = clip.positions
     if len(out) <= 3 * max(len(a), len(b)):
         raise InputError(f"smooth: expected more than 9 frames to filter, got {len(out)}; leave it out")
     known = np.isfinite(out).all(axis=2)
-    for joint in np.flatnonzero(known.any(axis=0)):
-        seen = known[:, joint]
-        for axis in range(3):
-            line = np.interp(clip.times_s, clip.times_s[seen], out[seen, joint, axis])
-            out[seen, joint, axis] = filtfilt(b, a, line)[seen]
+    out = filtfilt(b, a, interpolated(clip.times_s, out, known), axis=0)
+    out = np.where(known[..., None], out, clip.positions)
     note = f"smoothed (Butterworth, zero phase, order 4, {cut_off_hz:g} Hz): {_moved(clip.positions, out)}"
     return replace(clip, positions=out, notes=(*clip.notes, note))
 
@@ -103,9 +101,8 @@ def _rests(ankle: np.ndarray, rate_hz: float) -> list[tuple[int, int]]:
     width = min(max(round(_AVERAGE_S * rate_hz), 1), len(ankle))
     speed = np.linalg.norm(uniform_filter1d(velocity, width, axis=0, mode="nearest"), axis=1)
     # Unknown is NaN, which the average spreads: it compares as moving.
-    still = np.concatenate([[0], (np.nan_to_num(speed, nan=np.inf) < _STILL_M_S).astype(int), [0]])
-    edges = np.flatnonzero(np.diff(still)).reshape(-1, 2)
-    return [(int(a), int(b)) for a, b in edges if b - a >= max(_SHORTEST_S * rate_hz, 2)]
+    still = np.nan_to_num(speed, nan=np.inf) < _STILL_M_S
+    return [(int(a), int(b)) for a, b in true_runs(still) if b - a >= max(_SHORTEST_S * rate_hz, 2)]
 
 
 def _offsets(ankle: np.ndarray, rests: list[tuple[int, int]], rate_hz: float) -> np.ndarray:
@@ -115,16 +112,17 @@ def _offsets(ankle: np.ndarray, rests: list[tuple[int, int]], rate_hz: float) ->
     for first, last in rests:
         resting[first:last] = True
     fade = max(round(_FADE_S * rate_hz), 1)
+    ramp = 0.5 * (1.0 + np.cos(np.pi * np.arange(1, fade) / fade))
     for first, last in rests:
         away = np.median(ankle[first:last], axis=0) - ankle[first:last]
         far = np.linalg.norm(away, axis=1, keepdims=True)
         away *= np.minimum(1.0, _FARTHEST_M / np.maximum(far, 1e-9))
         out[first:last] = away
         for frame, edge, step in ((first, away[0], -1), (last - 1, away[-1], 1)):
-            for k in range(1, fade):
-                at = frame + step * k
-                if 0 <= at < len(ankle) and not resting[at]:
-                    out[at] += edge * 0.5 * (1.0 + np.cos(np.pi * k / fade))
+            at = frame + step * np.arange(1, fade)
+            inside = (at >= 0) & (at < len(ankle))
+            inside[inside] = ~resting[at[inside]]
+            out[at[inside]] += ramp[inside, None] * edge
     return out
 
 

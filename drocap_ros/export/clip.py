@@ -128,10 +128,16 @@ def without_gaps(clip: Clip) -> Clip:
         raise InputError(f"motion: expected every joint in at least one frame, never known: {', '.join(never)}")
     if known.all():
         return clip
-    filled = clip.positions.copy()
-    for joint in np.flatnonzero(~known.all(axis=0)):
-        seen = known[:, joint]
-        for axis in range(3):
-            filled[:, joint, axis] = np.interp(clip.times_s, clip.times_s[seen], clip.positions[seen, joint, axis])
+    filled = interpolated(clip.times_s, clip.positions, known)
     note = f"{np.count_nonzero(~known.all(axis=1))} frames with unknown joints interpolated over time"
     return replace(clip, positions=filled, notes=(*clip.notes, note))
+
+
+def interpolated(times_s: np.ndarray, positions: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Positions (F, P, 3) of joints known (F, P) in part, interpolated over time; the others as they are."""
+    filled: np.ndarray = positions.copy()
+    for joint in np.flatnonzero(known.any(axis=0) & ~known.all(axis=0)):
+        seen = known[:, joint]
+        for axis in range(3):
+            filled[:, joint, axis] = np.interp(times_s, times_s[seen], positions[seen, joint, axis])
+    return filled

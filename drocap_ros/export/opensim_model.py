@@ -10,7 +10,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from drocap_ros.export.rigid_body import TOES, RigidBody
+from drocap_ros.export.rigid_body import RigidBody
+from drocap_ros.skeleton import TOES
 
 _X, _Y, _Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
 _SIX = [(kind, i) for kind in ("rotation", "translation") for i in (1, 2, 3)]

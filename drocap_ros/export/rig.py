@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from drocap_ros.errors import InputError
 from drocap_ros.export.clip import Clip, without_gaps
-from drocap_ros.export.rigid_body import BODY, PARENTS, TOES, RigidBody, fit_rigid_body
+from drocap_ros.export.rigid_body import BODY, PARENTS, RigidBody, fit_rigid_body
 from drocap_ros.geometry.rotations import exp_so3, log_so3
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_15, TOES
 
 #: Fading time of the twist that keeps a rotation continuous where a bone points against its rest direction.
 TWIST_FADE_S = 0.5

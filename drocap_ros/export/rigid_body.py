@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.geometry.rotations import exp_so3, hat, log_so3
-from drocap_ros.skeleton import BODY_15, indices
+from drocap_ros.skeleton import BODY_15, TOES, indices
 
 #: Joints of the body, each after its parent, with their parents.
 PARENTS = {
@@ -27,7 +27,6 @@ PARENTS = {
     "rcollar": "upperchest", "rshoulder": "rcollar", "relbow": "rshoulder", "rwrist": "relbow",
 }  # fmt: skip
 BODY = tuple(PARENTS)
-TOES = ("rtoe", "ltoe")
 #: Share of the chest's rotation in the rotation of the segment that ends at a joint; other segments turn freely.
 _SHARE = {
     "lhip": 0.0, "rhip": 0.0, "spine": 0.0, "chest": 1 / 3, "upperchest": 2 / 3, "thorax": 1.0,

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from drocap_ros.skeleton import BODY_15, RIGID_BONES, indices
+from drocap_ros.skeleton import BODY_15, BODY_17, RIGID_BONES, indices
 
 #: Sum of the ten rigid limb lengths over stature: 1.876 over the head joint's standing height on the native CMU
 #: skeletons of the training set; that joint lies about 9 cm below the top of the head.
@@ -19,8 +19,8 @@ def pair_lengths(joints: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def bone_lengths(joints: np.ndarray) -> np.ndarray:
-    """Length (..., 14) of every bone of BODY_15 poses (..., 15, D): that of joint j to its parent stands at j - 1."""
-    return pair_lengths(joints, BODY_15.bones)
+    """Length (..., P - 1) of every bone of poses (..., P, D) of BODY_15 or BODY_17: that of joint j stands at j - 1."""
+    return pair_lengths(joints, BODY_17.bones[: joints.shape[-2] - 1])
 
 
 def limb_lengths(poses: np.ndarray, joints: tuple[str, ...] = BODY_15.joints) -> np.ndarray:

@@ -34,3 +34,9 @@ def fill_frames(stamp_ns: np.ndarray, joints: np.ndarray) -> np.ndarray:
     turned = matrix_from_quaternion(slerp(q[before], q[after], s))
     bent = (1.0 - s)[:, None, None] * shape[before] + s[:, None, None] * shape[after]
     return np.where(known[:, None, None], joints, bent @ np.swapaxes(turned, 1, 2))
+
+
+def true_runs(flags: np.ndarray) -> np.ndarray:
+    """(R, 2) first index and the one after the last of each run of true flags (N,)."""
+    edges: np.ndarray = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return edges.reshape(-1, 2)

@@ -17,7 +17,7 @@ from drocap_ros.ros.component import OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_to_ros
 from drocap_ros.ros.diagnostics import Key, of
 from drocap_ros.ros.spin import node_main
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_17
 
 
 class InitializerNode(ComponentNode):
@@ -49,7 +49,7 @@ class InitializerNode(ComponentNode):
                 message.header,
                 track_id=message.track_id,
                 stage=Pose3D.INITIAL,
-                skeleton=BODY_15.name,
+                skeleton=BODY_17.name,
                 joints=pose.joints3d,
                 covariance=pose.covariance,
                 confidence=pose.confidence,

@@ -12,23 +12,27 @@ from drocap_ros.errors import InputError
 from drocap_ros.joint_maps import joint_map
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.detection.detector import Detections
-from drocap_ros.perception.detection.nms import suppress, without_parts
+from drocap_ros.perception.detection.nms import iou, suppress, without_parts
 from drocap_ros.perception.flow import KeypointFlow
 from drocap_ros.perception.load_models import limited_use, load_detector, load_pose_model
 from drocap_ros.perception.pose import NetworkKeypoints
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking import Subject, SubjectTracker
 from drocap_ros.perception.tracking.detection_windows import Window, uncut
+from drocap_ros.perception.tracking.pose_belief import CONFIRM_CONFIDENCE
+from drocap_ros.perception.tracking.rivals import wins
+from drocap_ros.perception.tracking.shadow import without_shadow
 from drocap_ros.perception.uncertainty import calibrate
 from drocap_ros.skeleton import BODY_15
 
-#: Mean confidence of the joints that confirms a predicted or low-score box: below 0.33 on boxes without a person, 0.5
-#: to 0.9 on persons in bad light.
-_CONFIRM_CONFIDENCE = 0.5
 #: Detection score and mean confidence from which the next images need no detection.
 _CLEAR_SCORE, _CLEAR_CONFIDENCE = 0.6, 0.8
 #: Tolerance of the detection interval against jitter of the stamps.
 _SLACK_S = 0.005
+#: Largest number of rivals of a doubtful subject whose poses one image looks at, and the same under load shedding.
+_RIVALS, _FEW_RIVALS = 2, 1
+#: Time for which a rival that lost is not looked at again, and the overlap from which a box is that rival's.
+_REJECTED_NS, _SAME_IOU = 300_000_000, 0.6
 #: Under load shedding, share of the detector's input for a window.
 _REDUCED_INPUT = 0.8
 #: Under load shedding, longest pause of the pose network, over the one after a first failure: 0.4 s at 30 Hz.
@@ -40,11 +44,16 @@ log = logging.getLogger(__name__)
 
 
 class _Pose(NamedTuple):
-    """Calibrated keypoints of ``BODY_15``: (15, 2) px, (15, 3) px^2, (15,)."""
+    """Calibrated keypoints of the joints that the network gives, ``BODY_15`` first: (P, 2) px, (P, 3) px^2, (P,)."""
 
     xy: np.ndarray
     covariance: np.ndarray
     confidence: np.ndarray
+
+    @property
+    def mean_confidence(self) -> float:
+        """Over ``BODY_15``: the thresholds hold for networks with and without feet."""
+        return float(self.confidence[: len(BODY_15)].mean())
 
 
 class PoseEstimator:
@@ -82,6 +91,8 @@ class PoseEstimator:
         self._failures = self._paused = 0
         #: Keypoints of the pose network in the last image; None where it did not run.
         self.keypoints: NetworkKeypoints | None = None
+        #: Boxes (4,) px and stamps of the rivals that lost lately.
+        self._rejected: list[tuple[np.ndarray, int]] = []
 
     def process(
         self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None = None, load_level: int = 0
@@ -104,7 +115,7 @@ class PoseEstimator:
             log.warning("stamps went back by %.3f s: the tracker restarts", (self._last_ns - stamp_ns) * 1e-9)
             self.tracker.reset()
             self._flow.start(None, None)
-            self._margins = None
+            self._margins, self._rejected = None, []
         self._last_ns = stamp_ns
         roi = _validated_roi(roi)
         self.keypoints = None
@@ -128,22 +139,31 @@ class PoseEstimator:
     ) -> tuple[PoseObservation, bool]:
         """The subject by detection, and whether it is certainly a person."""
         size = (image.shape[1], image.shape[0])
-        found = self._detect(image, stamp_ns, load_level > 0)
+        everything = self._detect(image, stamp_ns, load_level > 0)
+        kept = without_parts(everything.boxes, everything.scores)
+        found = Detections(everything.boxes[kept], everything.scores[kept])
         subject = self.tracker.update(image, stamp_ns, found.boxes, found.scores, roi)
         self._detected_ns, self._score, self._confidence = stamp_ns, 0.0 if subject is None else subject.score, 0.0
         if subject is None:
             self._failures = 0
+            self._judge_bystander(image, stamp_ns)
             return PoseObservation(stamp_ns, 0, size), False
         if subject.hidden:
-            return _without_keypoints(stamp_ns, size, subject), False
+            return self._without_keypoints(stamp_ns, size, subject), False
         pause = load_level * min(2 ** (self._failures - 1), _LONGEST_PAUSE) if self._failures else 0
         if subject.score < _CLEAR_SCORE and self._paused < pause:
             self._paused += 1
-            return _without_keypoints(stamp_ns, size, subject), False
+            return self._without_keypoints(stamp_ns, size, subject), False
         self.keypoints = self.pose_model.estimate(image, subject.box)
         pose = self._calibrated(self.keypoints)
-        self._confidence = float(pose.confidence.mean())
-        is_person = self._confidence >= _CONFIRM_CONFIDENCE
+        self._confidence = pose.mean_confidence
+        belief = _belief(pose, image, subject.box)
+        if belief < _CLEAR_CONFIDENCE:
+            subject, pose = self._compete(image, stamp_ns, subject, pose, belief, everything, load_level)
+        self.tracker.judge(self._confidence, subject.box, stamp_ns)
+        if not load_level:
+            self._judge_bystander(image, stamp_ns)
+        is_person = self._confidence >= CONFIRM_CONFIDENCE
         self._failures, self._paused = 0 if is_person else self._failures + 1, 0
         self._margins = None
         extent = _extent(pose)
@@ -155,6 +175,46 @@ class PoseEstimator:
             self._margins = (subject.box - extent) / (extent[2:] - extent[:2]).max()
         certain = is_person or subject.score >= self.config.detection_threshold
         return self._observation(stamp_ns, size, subject, pose), certain
+
+    def _compete(
+        self,
+        image: np.ndarray,
+        stamp_ns: int,
+        subject: Subject,
+        pose: _Pose,
+        belief: float,
+        found: Detections,
+        load_level: int,
+    ) -> tuple[Subject, _Pose]:
+        """Subject and pose, or those of a detection in whose pose the belief is clearly greater: it was a shadow."""
+        boxes = found.boxes.astype(float)
+        joints = _extent(pose, CONFIRM_CONFIDENCE, 0.4) if subject.score > 0 else None
+        if joints is not None:  # a box around person and shadow: its clear joints are the person's
+            margin = 0.06 * (joints[2:] - joints[:2]).max()
+            boxes = np.concatenate([boxes, [joints + margin * np.array([-1, -1, 1, 1])]])
+        scores = np.append(found.scores, subject.score)[: len(boxes)]
+        self._rejected = [(box, ns) for box, ns in self._rejected if stamp_ns - ns < _REJECTED_NS]
+        known = np.array([box for box, _ in self._rejected]).reshape(-1, 4)
+        rivals = self.tracker.rivals(image, stamp_ns, boxes, scores, belief)
+        rivals = [j for j in rivals if not (iou(boxes[j][None], known) > _SAME_IOU).any()]
+        for j in rivals[: _FEW_RIVALS if load_level else _RIVALS]:
+            keypoints = self.pose_model.estimate(image, boxes[j])
+            rival = self._calibrated(keypoints)
+            rivals_belief = _belief(rival, image, boxes[j])
+            if not wins(rivals_belief, belief):
+                self._rejected.append((boxes[j], stamp_ns))
+                continue
+            subject = self.tracker.exchange(image, stamp_ns, boxes[j], float(scores[j]))
+            self.keypoints, pose, belief = keypoints, rival, rivals_belief
+            self._score, self._confidence = subject.score, pose.mean_confidence
+        return subject, pose
+
+    def _judge_bystander(self, image: np.ndarray, stamp_ns: int) -> None:
+        """Let the tracker know the pose of at most one other person: whether it is one."""
+        person = self.tracker.bystander_to_judge(stamp_ns)
+        if person is not None:
+            pose = self._calibrated(self.pose_model.estimate(image, person.box))
+            self.tracker.judge_bystander(person, _belief(pose, image, person.box), stamp_ns)
 
     def _estimate_predicted(
         self, image: np.ndarray, stamp_ns: int, load_level: int
@@ -178,17 +238,18 @@ class PoseEstimator:
             return None
         keypoints = self.pose_model.estimate(image, predicted.box)
         pose = self._calibrated(keypoints)
-        confidence = float(pose.confidence.mean())
+        confidence = pose.mean_confidence
         extent = _extent(pose)
         if margins is not None and extent is not None and confidence >= _CLEAR_CONFIDENCE:
             box = extent + margins * (extent[2:] - extent[:2]).max()
             box = np.clip(box, 0, np.array([*size, *size], float))
             self.tracker.propagate(box, stamp_ns)
+            self.tracker.judge(confidence, box, stamp_ns)
             predicted = Subject(predicted.track_id, box, predicted.score, False)
         elif not shedding:
             return None
         self.keypoints, self._confidence = keypoints, confidence
-        return self._observation(stamp_ns, size, predicted, pose), confidence >= _CONFIRM_CONFIDENCE
+        return self._observation(stamp_ns, size, predicted, pose), confidence >= CONFIRM_CONFIDENCE
 
     def _observation(self, stamp_ns: int, size: tuple[int, int], subject: Subject, pose: _Pose) -> PoseObservation:
         xy, covariance, confidence = pose
@@ -198,12 +259,12 @@ class PoseEstimator:
         unseen = outside | (confidence < self.config.keypoint_threshold)
         xy[unseen], covariance[unseen] = np.nan, np.nan
         return PoseObservation(
-            stamp_ns, subject.track_id, size, BODY_15, subject.box.astype(np.float32), subject.score,
+            stamp_ns, subject.track_id, size, self._joint_map.joints, subject.box.astype(np.float32), subject.score,
             xy.astype(np.float32), covariance.astype(np.float32), confidence.astype(np.float32),
         )  # fmt: skip
 
     def _detect(self, image: np.ndarray, stamp_ns: int, shedding: bool) -> Detections:
-        """Detections of all windows together, one per person."""
+        """Detections of all windows together, parts of persons among them."""
         size = (image.shape[1], image.shape[0])
         found = Detections(np.empty((0, 4), np.float32), np.empty(0, np.float32))
         close = shedding and self._score >= _CLEAR_SCORE
@@ -212,8 +273,7 @@ class PoseEstimator:
         tight = None if shedding else self.tracker.second_pass_window(size, stamp_ns, found.boxes, found.scores)
         if tight is not None:
             found = _merged(found, self._detect_in(image, tight))
-        kept = without_parts(found.boxes, found.scores)
-        return Detections(found.boxes[kept], found.scores[kept])
+        return found
 
     def _detect_in(self, image: np.ndarray, window: Window | None, shedding: bool = False) -> Detections:
         """Detections in a window, without those that its edge cuts."""
@@ -223,9 +283,18 @@ class PoseEstimator:
         return Detections(found.boxes[kept], found.scores[kept])
 
     def _calibrated(self, keypoints: NetworkKeypoints) -> _Pose:
-        """The network's keypoints as ``BODY_15``, with covariance and confidence."""
+        """The network's keypoints as joints of the body, with covariance and confidence."""
         covariance, confidence = calibrate(keypoints, self.pose_model.spec.layout)
         return _Pose(*self._joint_map.apply(keypoints.xy.astype(float), covariance, confidence, keypoints.box_size))
+
+    def _without_keypoints(self, stamp_ns: int, size: tuple[int, int], subject: Subject) -> PoseObservation:
+        """The subject at its predicted box, without keypoints."""
+        joints = self._joint_map.joints
+        points, spread = (np.full((len(joints), n), np.nan, np.float32) for n in (2, 3))
+        return PoseObservation(
+            stamp_ns, subject.track_id, size, joints, subject.box.astype(np.float32), 0.0,
+            points, spread, np.zeros(len(joints), np.float32),
+        )  # fmt: skip
 
 
 def _merged(a: Detections, b: Detections) -> Detections:
@@ -236,21 +305,19 @@ def _merged(a: Detections, b: Detections) -> Detections:
     return Detections(boxes[kept], scores[kept])
 
 
-def _extent(pose: _Pose) -> np.ndarray | None:
-    """(4,) px box of the joints; None when fewer than 70 % of them are seen."""
-    seen = pose.confidence >= _BOX_JOINT_CONFIDENCE
-    if seen.sum() < 0.7 * len(seen):
+def _belief(pose: _Pose, image: np.ndarray, box: np.ndarray) -> float:
+    """Confidence in a person of a pose found in a box (4,) px."""
+    confidence = pose.mean_confidence
+    return confidence if confidence >= _CLEAR_CONFIDENCE else without_shadow(confidence, image, box)
+
+
+def _extent(pose: _Pose, least: float = _BOX_JOINT_CONFIDENCE, share: float = 0.7) -> np.ndarray | None:
+    """(4,) px box of the joints; None when fewer than a share of ``BODY_15`` are seen with the least confidence."""
+    seen = pose.confidence[: len(BODY_15)] >= least
+    if seen.sum() < share * len(seen):
         return None
-    return np.concatenate([pose.xy[seen].min(axis=0), pose.xy[seen].max(axis=0)])
-
-
-def _without_keypoints(stamp_ns: int, size: tuple[int, int], subject: Subject) -> PoseObservation:
-    """The subject at its predicted box, without keypoints."""
-    count = len(BODY_15)
-    return PoseObservation(
-        stamp_ns, subject.track_id, size, BODY_15, subject.box.astype(np.float32), 0.0,
-        np.full((count, 2), np.nan, np.float32), np.full((count, 3), np.nan, np.float32), np.zeros(count, np.float32),
-    )  # fmt: skip
+    xy = pose.xy[: len(BODY_15)][seen]
+    return np.concatenate([xy.min(axis=0), xy.max(axis=0)])
 
 
 def _check_image(image: np.ndarray) -> None:

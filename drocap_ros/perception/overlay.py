@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from drocap_ros.observation import PoseObservation
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import side_of
 
-_LEFT, _RIGHT, _MIDDLE = (60, 60, 255), (255, 160, 40), (90, 220, 90)
+_COLOURS = {"left": (60, 60, 255), "right": (255, 160, 40), "middle": (90, 220, 90)}
 #: Radius of the ellipses in standard deviations.
 _SIGMAS = 2.0
 
@@ -33,12 +33,14 @@ def draw(image: np.ndarray, observation: PoseObservation) -> np.ndarray:
         line_px,
     )
     points, seen = observation.keypoints, np.isfinite(observation.keypoints).all(axis=1)
-    for parent, child in BODY_15.bones:
+    joints = observation.joints
+    colours = [_COLOURS[side_of(name, joints.joints)] for name in joints.joints]
+    for parent, child in joints.bones:
         if seen[parent] and seen[child]:
             start, end = (np.round(points[j]).astype(int).tolist() for j in (parent, child))
-            cv2.line(out, start, end, _colour(BODY_15.joints[child]), 2 * line_px, cv2.LINE_AA)
+            cv2.line(out, start, end, colours[child], 2 * line_px, cv2.LINE_AA)
     for joint in np.nonzero(seen)[0]:
-        _ellipse(out, points[joint], observation.covariance[joint], _colour(BODY_15.joints[joint]), line_px)
+        _ellipse(out, points[joint], observation.covariance[joint], colours[joint], line_px)
     return out
 
 
@@ -54,12 +56,6 @@ def draw_numbers(image: np.ndarray, boxes: dict[int, np.ndarray], title: str) ->
         _label(out, str(number), (x0 + 2 * line_px, max(y0 - 6 * line_px, 30 * line_px)), 2 * line_px)
     _label(out, title, (8, 20 * line_px), line_px)
     return out
-
-
-def _colour(joint: str) -> tuple[int, int, int]:
-    if joint in ("pelvis", "neck", "head"):
-        return _MIDDLE
-    return _LEFT if joint.startswith("l") else _RIGHT
 
 
 def _ellipse(

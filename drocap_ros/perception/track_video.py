@@ -14,7 +14,6 @@ from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.sources.base import Frame
 from drocap_ros.perception.sources.prefetch import prefetch
-from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
 
 
@@ -76,7 +75,8 @@ def tracks_from_observations(observations: Sequence[PoseObservation], track_id: 
         raise InputError(
             f"expected a person in view, found none in {len(observations)} images; try another video or model"
         )
-    shape = (len(observations), len(BODY_15))
+    joints = observations[int(np.argmax(mine))].joints
+    shape = (len(observations), len(joints))
     keypoints = np.full((*shape, 2), np.nan)
     covariance = np.full((*shape, 3), np.nan)
     confidence = np.zeros(shape)
@@ -89,7 +89,7 @@ def tracks_from_observations(observations: Sequence[PoseObservation], track_id: 
     corrected = with_own_legs(Keypoints2D(keypoints, confidence, covariance), stamp_ns, box_size)
     return Tracks(
         keypoints=corrected.xy,
-        joints=BODY_15.joints,
+        joints=joints.joints,
         stamp_ns=stamp_ns,
         image_size=observations[0].image_size,
         confidence=corrected.confidence,

@@ -15,8 +15,10 @@ from drocap_ros.errors import InputError
 from drocap_ros.joint_maps import TABLES, joint_map, joint_set_of
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
+from drocap_ros.reconstruction.heels import with_heels
 from drocap_ros.reconstruction.lifted.lifted_config import lifted_config
 from drocap_ros.reconstruction.lifted.lifter import Lifter
+from drocap_ros.reconstruction.lifted.method import ACROSS, ALONG
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput, Progress
 from drocap_ros.reconstruction.methods.run import run_method
@@ -26,7 +28,7 @@ from drocap_ros.reconstruction.threads import blas_threads
 from drocap_ros.reconstruction.world.placement import metres_per_px, place_in_world
 from drocap_ros.reconstruction.world.refine import PlacedPoses, refine_in_world
 from drocap_ros.reconstruction.world.world_model import WorldConfig, world_config
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_15, BODY_17, BODY_19, JointSet, body_set
 from drocap_ros.tracks import Tracks
 
 
@@ -43,7 +45,7 @@ def reconstruct(
 
     Parameters
     ----------
-    tracks : joints by the names of BODY_15 or of a set in :mod:`drocap_ros.joint_maps`, COCO for one; the model
+    tracks : joints by the names of BODY_17 or of a set in :mod:`drocap_ros.joint_maps`, COCO for one; the model
         estimates missing ones, others are ignored
     method : a name in :data:`~drocap_ros.reconstruction.methods.METHODS`
     progress : called with a stage and its fraction done
@@ -51,7 +53,8 @@ def reconstruct(
     Returns
     -------
     Motion
-        In frame "world" when the tracks hold the camera's rotation, else in frame "camera".
+        In frame "world" when the tracks hold the camera's rotation, else in frame "camera"; with the joints of the
+        method, ``BODY_17`` or ``BODY_15``, and by the default method with the heels where the tracks hold them.
 
     Raises
     ------
@@ -64,7 +67,9 @@ def reconstruct(
     adjuster = adjuster or BundleAdjusterConfig()
     dictionary = dictionary or load_dictionary(initializer.dictionary or None)
     started = time.perf_counter()
-    keypoints = body_keypoints(tracks)
+    joints = METHODS[method].joints
+    seen = body_keypoints(tracks, BODY_19)
+    keypoints = seen.with_joints(len(joints))
     k = tracks.camera_matrix
     data = MethodInput(
         stamp_ns=tracks.stamp_ns,
@@ -74,10 +79,21 @@ def reconstruct(
         adjuster=adjuster,
         dictionary=dictionary,
         progress=progress or (lambda stage, fraction: None),
+        rotation=tracks.camera_rotation,
     )
     with blas_threads(adjuster.threads):
         result = run_method(method, data)
-    motion = _to_motion(tracks, keypoints, result, initializer, world_config(adjuster))
+    motion = _to_motion(tracks, joints, keypoints, result, initializer, world_config(adjuster))
+    if isinstance(motion, str):
+        # The lifter saw the camera's rotation: without it the poses differ too.
+        without = dataclasses.replace(tracks, camera_rotation=None, camera_position=None)
+        again = reconstruct(
+            without, method=method, initializer=initializer, adjuster=adjuster, dictionary=dictionary, progress=progress
+        )
+        again.meta["telemetry_rejected"] = motion
+        return again
+    if joints is BODY_17:
+        motion = with_heels(motion, seen.without_joints(len(joints)), _in_image(result))
     total = time.perf_counter() - started
     motion.meta.update(
         method=method,
@@ -99,10 +115,10 @@ def reconstruct(
     return motion
 
 
-def body_keypoints(tracks: Tracks) -> Keypoints2D:
-    """Keypoints in BODY_15's order; joints that the tracks lack are NaN.
+def body_keypoints(tracks: Tracks, joints: JointSet = BODY_17) -> Keypoints2D:
+    """Keypoints in the order of ``joints``, a body set; those that the tracks lack are NaN.
 
-    Names of BODY_15, COCO, COCO-WholeBody, Halpe, MPII and Human3.6M are known (:mod:`drocap_ros.joint_maps`).
+    Names of the body sets, COCO, COCO-WholeBody, Halpe, MPII and Human3.6M are known (:mod:`drocap_ros.joint_maps`).
 
     Raises
     ------
@@ -115,7 +131,7 @@ def body_keypoints(tracks: Tracks) -> Keypoints2D:
     given = sum(set(parts) <= set(names) for parts in TABLES[source.name].values())
     if given < 4:
         raise InputError(
-            f"joints: expected at least 4 of {', '.join(BODY_15.joints)}, or names of {', '.join(list(TABLES)[1:])},"
+            f"joints: expected at least 4 of {', '.join(BODY_15.joints)}, or names of {', '.join(list(TABLES)[3:])},"
             f" got {given} of them; rename the joints"
         )
     shape = (len(tracks), len(source))
@@ -126,22 +142,25 @@ def body_keypoints(tracks: Tracks) -> Keypoints2D:
         covariance[:, have] = tracks.covariance[:, place[have]]
     seen = np.isfinite(keypoints).all(-1)
     confidence[:, have] = tracks.confidence[:, place[have]] if tracks.confidence is not None else seen[:, have]
-    if source.name != BODY_15.name:
+    if not body_set(source):
         high, low = (np.where(seen[..., None], keypoints, end) for end in (-np.inf, np.inf))
         extent = np.where(seen.any(1), (high.max(1) - low.min(1)).max(1), 0.0)
         keypoints, covariance, confidence = joint_map(source.name).apply(keypoints, covariance, confidence, extent)
     elif tracks.confidence is None and tracks.covariance is None:
-        return Keypoints2D(keypoints, None, None)
-    return Keypoints2D(keypoints, confidence, covariance if tracks.covariance is not None else None)
+        return Keypoints2D(keypoints, None, None).with_joints(len(joints))
+    found = Keypoints2D(keypoints, confidence, covariance if tracks.covariance is not None else None)
+    return found.with_joints(len(joints))
 
 
 def _to_motion(
     tracks: Tracks,
+    body: JointSet,
     keypoints: Keypoints2D,
     result: CameraPoses,
     config: InitializerConfig,
     world_config: WorldConfig,
-) -> Motion:
+) -> Motion | str:
+    """The motion, or in words why the telemetry cannot be true."""
     projected = result.joints_px[..., :2] + result.translation_px[:, None]
     reprojection = np.linalg.norm(projected - keypoints.xy, axis=-1)
     pelvis = BODY_15.index("pelvis")
@@ -162,28 +181,30 @@ def _to_motion(
         if world.scale is not None:
             meta["scale"] = dataclasses.asdict(world.scale)
         position = tracks.camera_position
-        if result.depth_sigma_px is not None:
+        if result.sigma_px is not None:
             factor = world.scale.factor if world.metric and world.scale is not None else 1.0
             size = per_px[:, None]
             depth = (result.joints_px[..., 2] - result.joints_px[:, [pelvis], 2]) * size
             found = refine_in_world(
-                tracks, keypoints, PlacedPoses(joints, factor, depth, result.depth_sigma_px * size), world_config
+                tracks,
+                keypoints,
+                PlacedPoses(joints, factor, depth, result.sigma_px[..., 1] * size, projected, result.sigma_px[..., 0]),
+                world_config,
             )
             if isinstance(found, str):
-                without = dataclasses.replace(tracks, camera_rotation=None, camera_position=None)
-                motion = _to_motion(without, keypoints, result, config, world_config)
-                motion.meta["telemetry_rejected"] = found
-                return motion
+                return found
             if found is not None:
                 joints, rotation, position, metric = found.joints, found.rotation, found.position, found.metric
                 scale_source = "telemetry" if metric else "assumed_height"
                 covariance = found.covariance
                 reprojection = _reprojection(joints, rotation, position, tracks.camera_matrix, keypoints.xy)
                 meta["calibration"] = found.calibration
+    if covariance is None and result.sigma_px is not None:
+        covariance = _covariance(result.sigma_px * per_px[:, None, None], rotation)
     return Motion(
         joints3d=np.ascontiguousarray(joints),
-        joints=BODY_15.joints,
-        parents=BODY_15.parents,
+        joints=body.joints,
+        parents=body.parents,
         stamp_ns=tracks.stamp_ns,
         frame=frame,
         metric=metric,
@@ -196,6 +217,21 @@ def _to_motion(
         camera_position=position,
         covariance=covariance,
     )
+
+
+def _covariance(sigma: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """(F, P, 6) m^2 about the pelvis of expected errors (F, P, 2) m across and along the ray; world -> camera."""
+    variance = np.square(sigma * np.array([ACROSS, ALONG]))[..., [0, 0, 1]]
+    full = np.einsum("fki,fpk,fkj->fpij", rotation, variance, rotation)
+    packed: np.ndarray = full[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    return packed
+
+
+def _in_image(result: CameraPoses) -> np.ndarray:
+    """(F, P, 3) px, the method's joints, x and y in the image."""
+    joints = result.joints_px.copy()
+    joints[..., :2] += result.translation_px[:, None]
+    return joints
 
 
 def _reprojection(

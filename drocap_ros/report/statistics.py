@@ -34,6 +34,8 @@ class Statistics:
     bone_spread : (B,) standard deviation over mean of each bone's length
     view_deg : (F,) azimuth of the camera from the body (0 in front, positive to its left), unwrapped
     view_speed_dps, view_span_deg : median speed and range of that
+    elevation_deg : median elevation of the camera above the body: above the horizon where the vertical is known, else
+        above the plane across the trunk
     heading_rad : (F,) direction that the body faces, about the vertical
     knees_forward : share of bent knees that bend forward; NaN where none is bent
     bent_knees : number of bent knees
@@ -56,6 +58,7 @@ class Statistics:
     view_deg: np.ndarray
     view_speed_dps: float
     view_span_deg: float
+    elevation_deg: float
     heading_rad: np.ndarray
     knees_forward: float
     bent_knees: int
@@ -106,6 +109,7 @@ def motion_statistics(motion: Motion) -> Statistics:
         view_deg=np.degrees(view),
         view_speed_dps=float(np.degrees(np.median(speed))),
         view_span_deg=float(np.degrees(np.ptp(view))),
+        elevation_deg=_elevation(motion, torso, camera_axes(motion)[:, 2]),
         heading_rad=_heading(torso, times),
         knees_forward=forward,
         bent_knees=judged,
@@ -165,6 +169,11 @@ def _view_azimuth(torso: np.ndarray, forward: np.ndarray, times_s: np.ndarray) -
     to_camera = -np.einsum("fij,fi->fj", torso, forward)
     to_camera = smooth(to_camera, times_s)
     return np.unwrap(np.arctan2(to_camera[:, 1], to_camera[:, 0]))
+
+
+def _elevation(motion: Motion, torso: np.ndarray, forward: np.ndarray) -> float:
+    up = -forward[:, 2] if motion.frame == "world" else -np.einsum("fi,fi->f", torso[..., 2], forward)
+    return float(np.degrees(np.arcsin(np.clip(np.median(up), -1.0, 1.0))))
 
 
 def _heading(torso: np.ndarray, times_s: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.recording.pose_messages import float_array, observation_from_message
-from drocap_ros.skeleton import BODY_15, joint_set
+from drocap_ros.skeleton import BODY_15, BODY_17, joint_set
 
 
 def stamp_to_ros(stamp_ns: int) -> Time:
@@ -137,7 +137,7 @@ def window_to_ros(
             header_at(stamp_ns, frame_id),
             track_id=track_id,
             stage=Pose3D.REFINED,
-            skeleton=BODY_15.name,
+            skeleton=(BODY_17 if window.joints3d.shape[1] == len(BODY_17) else BODY_15).name,
             joints=window.joints3d[i],
             covariance=window.covariance[i],
             confidence=window.confidence[i],

@@ -11,7 +11,7 @@ from drocap_ros.simulation.capture_config import SimulationConfig
 from drocap_ros.simulation.keypoint_errors import NoisyKeypoints, detect_person
 from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_15, JointSet
 from drocap_ros.tracks import MAX_FRAMES, Tracks
 
 
@@ -20,9 +20,9 @@ class SimulatedCapture:
     """Recording of a flight, and its truth.
 
     tracks : keypoints with noise, and camera telemetry with its slow errors
-    joints3d_world : (F, 15, 3) m ENU, truth
+    joints3d_world : (F, P, 3) m ENU, truth
     camera_rotation, camera_position : (F, 3, 3) world -> camera, (F, 3) m ENU, truth
-    keypoints_exact : (F, 15, 2) px, truth
+    keypoints_exact : (F, P, 2) px, truth
     detection : the noisy keypoints, with the occluded ones and the outliers marked
     """
 
@@ -35,7 +35,12 @@ class SimulatedCapture:
 
 
 def simulate_capture(
-    seconds: float, fps: float = 30.0, seed: int = 0, config: SimulationConfig | None = None, start_ns: int = 0
+    seconds: float,
+    fps: float = 30.0,
+    seed: int = 0,
+    config: SimulationConfig | None = None,
+    start_ns: int = 0,
+    joint_set: JointSet = BODY_15,
 ) -> SimulatedCapture:
     """Simulate a capture flight.
 
@@ -44,6 +49,7 @@ def simulate_capture(
     seconds, fps : length and image rate; at least one frame
     seed : person, take and noise
     start_ns : stamp of the first image
+    joint_set : ``BODY_15`` or ``BODY_17``
 
     Raises
     ------
@@ -56,7 +62,7 @@ def simulate_capture(
     if not (np.isfinite(seconds) and 0 < seconds <= 36_000) or seconds * fps > MAX_FRAMES:
         raise InputError(f"seconds: expected above 0 and at most {MAX_FRAMES} images, got {seconds!r} s at {fps:g}/s")
     t = np.arange(max(1, round(seconds * fps))) / fps
-    joints = simulate_person(t, config.action, seed, config.stature_m)
+    joints = simulate_person(t, config.action, seed, config.stature_m, joint_set)
     centre = _aim(t, seed, config)
     rng = np.random.default_rng([seed, 0xCA])
     rotation, position = orbit_camera(
@@ -72,7 +78,7 @@ def simulate_capture(
     reported_rotation, reported_position = _telemetry(t, rotation, position, rng, config)
     tracks = Tracks(
         keypoints=detection.keypoints,
-        joints=BODY_15.joints,
+        joints=joint_set.joints,
         stamp_ns=start_ns + np.round(t * 1e9).astype(np.int64),
         image_size=size,
         confidence=detection.confidence,

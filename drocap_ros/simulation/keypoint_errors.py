@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.simulation.orbit_camera import project, to_camera
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_15, BODY_17
 
 #: Standard deviation over the box height, per kind of joint (detectors are worst at the ends of the limbs).
 _SPREAD = {
     "pelvis": 0.007, "hip": 0.008, "knee": 0.007, "ankle": 0.010, "neck": 0.006, "head": 0.006,
-    "shoulder": 0.006, "elbow": 0.008, "wrist": 0.011,
+    "shoulder": 0.006, "elbow": 0.008, "wrist": 0.011, "toe": 0.010,
 }  # fmt: skip
 _CORRELATION = 0.6  # of the noise of one image with that of the previous one
 _LIMB_RADIUS_M = 0.07
@@ -21,7 +21,7 @@ _CHUNK = 4096
 
 
 class NoisyKeypoints(NamedTuple):
-    """Keypoints (F, 15, 2) px, confidence (F, 15), covariance (F, 15, 3) px^2, and (F, 15) bool of what was simulated.
+    """Keypoints (F, P, 2) px, confidence (F, P), covariance (F, P, 3) px^2, and (F, P) bool of what was simulated.
 
     visible : inside the image, found or not
     """
@@ -43,7 +43,7 @@ def detect_person(
     seed: int,
     **errors: float,
 ) -> NoisyKeypoints:
-    """Keypoints of joints (F, 15, 3) m ENU in a camera, with self-occlusion; NaN outside the image.
+    """Keypoints of joints (F, P, 3) m ENU in a camera, with self-occlusion; NaN outside the image.
 
     Parameters
     ----------
@@ -57,14 +57,15 @@ def detect_person(
 
 
 def occlusion(px: np.ndarray, depth: np.ndarray, focal_px: float) -> np.ndarray:
-    """(F, 15) bool, joints behind another limb or the trunk.
+    """(F, P) bool, joints behind another limb or the trunk.
 
-    px (F, 15, 2), depth (F, 15) m.  Limbs are capsules of 7 cm radius, the trunk of 14 cm.
+    px (F, P, 2), depth (F, P) m.  Limbs are capsules of 7 cm radius, the trunk of 14 cm.
     """
     hidden = np.zeros(depth.shape, dtype=bool)
     parent, child = BODY_15.bones.T
     radius = np.where((parent == 0) & (child == BODY_15.index("neck")), 2 * _LIMB_RADIUS_M, _LIMB_RADIUS_M)
-    own = (np.arange(len(BODY_15))[:, None] == parent) | (np.arange(len(BODY_15))[:, None] == child)
+    joint = np.arange(px.shape[1])[:, None]
+    own = (joint == parent) | (joint == child)
     for start in range(0, len(px), _CHUNK):
         part = slice(start, start + _CHUNK)
         a, b = px[part, None, parent], px[part, None, child]
@@ -95,16 +96,37 @@ def noisy_keypoints(
 
     Parameters
     ----------
-    px : (F, 15, 2) exact projections, NaN outside the image
-    occluded : (F, 15) bool, see :func:`occlusion`
+    px : (F, P, 2) exact projections, NaN outside the image
+    occluded : (F, P) bool, see :func:`occlusion`
     """
+    hidden = np.zeros(px.shape[:2], bool) if occluded is None else occluded
+    height, count = _box_height(px[:, : len(BODY_15)]), len(BODY_15)
+    # The toes have draws of their own: those of the other joints are the same with and without them.
+    parts = [
+        _noisy(
+            px[:, part], hidden[:, part], height, BODY_17.joints[part], np.random.default_rng(key), noise_scale,
+            outlier_fraction, missed_fraction,
+        )
+        for part, key in ((slice(count), [seed, 0x0B5]), (slice(count, px.shape[1]), [seed, 0x0B5, count]))
+    ]  # fmt: skip
+    return NoisyKeypoints(*(np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True)))
+
+
+def _noisy(
+    px: np.ndarray,
+    hidden: np.ndarray,
+    height: np.ndarray,
+    names: tuple[str, ...],
+    rng: np.random.Generator,
+    noise_scale: float,
+    outlier_fraction: float,
+    missed_fraction: float,
+) -> NoisyKeypoints:
+    """Keypoints (F, P, 2) of the joints ``names`` with errors, in persons of ``height`` (F,) px."""
     from scipy.signal import lfilter
 
-    rng = np.random.default_rng([seed, 0x0B5])
     frames, joints = px.shape[:2]
-    hidden = np.zeros((frames, joints), bool) if occluded is None else occluded
-    height = _box_height(px)
-    share = np.array([_SPREAD[name.lstrip("lr") if name[1:] in _SPREAD else name] for name in BODY_15.joints])
+    share = np.array([_SPREAD[name.lstrip("lr") if name[1:] in _SPREAD else name] for name in names])
     sigma = height[:, None] * share * np.where(hidden, _OCCLUDED_NOISE, 1.0)
     white = rng.standard_normal((frames, joints, 2))
     white[1:] *= np.sqrt(1 - _CORRELATION**2)

@@ -1,7 +1,7 @@
 """An articulated person that walks, boxes, kicks and squats.
 
 Every action is written as smooth controls (path of the root, trunk angles, goals of wrists and ankles); two-bone
-inverse kinematics turns the goals into joints, so that all bone lengths of ``BODY_15`` are constant.
+inverse kinematics turns the goals into joints, so that all bone lengths are constant.
 World: ENU, m, z up, the ground at z = 0.  Body: x forward, y left, z up.
 """
 
@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.simulation.simulated_feet import add_toes
+from drocap_ros.skeleton import BODY_15, BODY_17, JointSet
 
 _SINGLE = ("walk", "boxing", "kicking", "squats")
 #: Motions of the person; "mixed" repeats the last four in turn.
@@ -66,7 +67,9 @@ def _style(seed: int, stature_m: float) -> _Style:
     )
 
 
-def simulate_person(t: np.ndarray, action: str = "mixed", seed: int = 0, stature_m: float = 1.75) -> np.ndarray:
+def simulate_person(
+    t: np.ndarray, action: str = "mixed", seed: int = 0, stature_m: float = 1.75, joint_set: JointSet = BODY_15
+) -> np.ndarray:
     """Joints of a moving person.
 
     Parameters
@@ -75,10 +78,11 @@ def simulate_person(t: np.ndarray, action: str = "mixed", seed: int = 0, stature
     action : one of ``ACTIONS``
     seed : of the person's proportions and of the take
     stature_m : height of the person
+    joint_set : ``BODY_15`` or ``BODY_17``
 
     Returns
     -------
-    (F, 15, 3) m, order of ``BODY_15``, world ENU.
+    (F, P, 3) m, order of ``joint_set``, world ENU.
 
     Raises
     ------
@@ -92,10 +96,13 @@ def simulate_person(t: np.ndarray, action: str = "mixed", seed: int = 0, stature
         raise InputError("t: expected (F,) seconds from 0 to 36000; give times from the start of the take")
     style = _style(seed, stature_m)
     if t.size == 0:
-        return np.empty((0, len(BODY_15), 3))
+        return np.empty((0, len(joint_set), 3))
     weight = action_weights(t, action)
     root, yaw = _walk_path(t, action, style)
-    return _assemble(t, weight, root, yaw, action, style)
+    joints = _assemble(t, weight, root, yaw, action, style)
+    if joint_set is not BODY_17:
+        return joints
+    return add_toes(joints, np.stack([_foot_heading(t, side, style) for side in (-1, 1)], axis=1), stature_m)
 
 
 def action_weights(t: np.ndarray, action: str) -> np.ndarray:
@@ -150,16 +157,32 @@ def _walk_path(t: np.ndarray, action: str, style: _Style) -> tuple[np.ndarray, n
     return np.stack([np.interp(t, grid, path[:, i]) for i in range(2)], axis=1), _heading(t, style)
 
 
+def _steps(t: np.ndarray, side: int, style: _Style) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Number of the stride (F,), its phase in [0, 1) and the swing phase of a foot, 0 while it stands."""
+    stride = style.stride_hz * t + style.phase + (0.5 if side > 0 else 0.0)
+    part = stride % 1.0
+    return np.floor(stride), part, np.clip((part - _STANCE) / (1 - _STANCE), 0.0, 1.0)
+
+
+def _stance_middle(number: np.ndarray, side: int, style: _Style) -> np.ndarray:
+    """(F,) s, middle of the stance of a stride."""
+    return np.maximum((number + _STANCE / 2 - style.phase - (0.5 if side > 0 else 0.0)) / style.stride_hz, 0.0)
+
+
+def _foot_heading(t: np.ndarray, side: int, style: _Style) -> np.ndarray:
+    """(F,) rad: constant while the foot stands, turned in the swing."""
+    count, _, swing = _steps(t, side, style)
+    now, then = (_heading(_stance_middle(number, side, style), style) for number in (count, count + 1))
+    return now + _smooth(swing) * (then - now)
+
+
 def _footprints(t: np.ndarray, side: int, action: str, style: _Style) -> tuple[np.ndarray, np.ndarray]:
     """Ankle goal (F, 3) m of the stepping leg and its swing phase (F,), 0 while it stands."""
     grid, path = _grid_path(float(t.max()), action, style)
-    stride = style.stride_hz * t + style.phase + (0.5 if side > 0 else 0.0)
-    count, part = np.floor(stride), stride % 1.0
-    swing = np.clip((part - _STANCE) / (1 - _STANCE), 0.0, 1.0)
+    count, part, swing = _steps(t, side, style)
 
     def place(number: np.ndarray) -> np.ndarray:
-        middle = (number + _STANCE / 2 - style.phase - (0.5 if side > 0 else 0.0)) / style.stride_hz
-        middle = np.maximum(middle, 0.0)
+        middle = _stance_middle(number, side, style)
         yaw = _heading(middle, style)
         across = side * 0.9 * style.size["hip"] * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
         return np.stack([np.interp(middle, grid, path[:, i]) for i in range(2)], axis=1) + across

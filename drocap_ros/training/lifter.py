@@ -18,17 +18,18 @@ import numpy as np
 
 from drocap_ros.errors import DrocapError
 from drocap_ros.parameters import Parameters, param
-from drocap_ros.reconstruction.lifted.lifter_input import FEATURES
-from drocap_ros.skeleton import BODY_15, LIMB_JOINTS, indices
+from drocap_ros.reconstruction.lifted.lifter_input import BONES, FEATURES
+from drocap_ros.skeleton import BODY_17, LIMB_JOINTS, indices
 from drocap_ros.tracks import read_npz
-from drocap_ros.training.lifter_samples import MocapBank, sample_batch
+from drocap_ros.training.initial_weights import origin_of, start_from
+from drocap_ros.training.lifter_samples import Batch, sample_batch
+from drocap_ros.training.mocap_bank import MocapBank
 from drocap_ros.training.torch_extra import pytorch, write_onnx
 
 if TYPE_CHECKING:
     import torch
 
-_JOINTS = len(BODY_15)
-_BONES = BODY_15.bones
+_JOINTS = len(BODY_17)
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class LifterTraining(Parameters):
     """Parameters of the lifter's training."""
 
     minutes: float = param(80.0, "wall-clock time of the training", unit="min", minimum=0.01, maximum=10000.0)
+    steps: int = param(0, "batches instead of minutes: the same seed gives the same weights", minimum=0)
     width: int = param(240, "channels of the network", minimum=8, maximum=2048)
     frames_per_batch: int = param(4800, "frames of a batch, all windows together", minimum=64, maximum=1_000_000)
     learning_rate: float = param(2e-3, "peak of the schedule, AdamW", minimum=1e-6, maximum=1.0)
@@ -45,25 +47,35 @@ class LifterTraining(Parameters):
     weight_decay: float = param(0.02, "decoupled weight decay", minimum=0.0, maximum=1.0)
     seed: int = param(0, "of the samples and of the first weights", minimum=0)
 
+    def length(self) -> str:
+        """The option that ends the training."""
+        return f"--steps {self.steps}" if self.steps else f"--minutes {self.minutes:g}"
+
 
 def describe_training(
-    files: list[Path], include: str, options: LifterTraining, facts: dict[str, Any]
+    files: list[Path], include: str, options: LifterTraining, facts: dict[str, Any], initial: Path | None = None
 ) -> dict[str, str]:
     """Metadata of the ONNX file: training data, licence and command."""
     arrays = [read_npz(path, ("X",)) for path in files]
+    begun = {"initial": origin_of(initial)} if initial else {}
     return {
         "origin": "; ".join(sorted({str(a["source"]) for a in arrays if "source" in a})),
         "licence": "; ".join(sorted({str(a["licence"]) for a in arrays if "licence" in a})),
         "files": str(len(files)),
         "mocap_frames": str(sum(len(a["X"]) for a in arrays)),
-        "command": f"drocap train-lifter MOCAP_DIR --include '{include}' --minutes {options.minutes:g}"
-        f" --width {options.width} --seed {options.seed} --out ONNX",
+        "command": f"drocap train-lifter MOCAP_DIR --include '{include}' {options.length()}"
+        f" --width {options.width} --seed {options.seed}{' --initial ONNX' if initial else ''} --out ONNX",
+        **begun,
         **{name: str(value) for name, value in facts.items()},
     }
 
 
 def build_network(width: int) -> torch.nn.Module:
-    """Network (B, T, 73) -> joints (B, T, 15, 3), log sigma (B, T, 15, 2) of x, y and of depth; T even."""
+    """Network of features (B, T, 143), T even.
+
+    Its outputs are joints (B, T, 17, 3), log sigma (B, T, 17, 2) of x, y and of depth, and logits: (B, T, 16) that a
+    bone's child lies behind its parent, (B, T, 2) that the right and the left foot stand still.
+    """
     torch = pytorch()
     nn, functional = torch.nn, torch.nn.functional
     module: Any = nn.Module
@@ -100,43 +112,58 @@ def build_network(width: int) -> torch.nn.Module:
             super().__init__()
             self.embed = nn.Linear(2 * FEATURES, width)
             self.body = nn.Sequential(
-                Block(1), Block(2), Pool(), Block(4), Block(8), Pool(), Block(16), Block(1), Pool(), Block(2)
-            )
+                Block(1), Block(2), Pool(), Block(4), Block(8), Pool(), Block(16), Block(1), Pool(), Block(2),
+                Block(4), Block(32), Pool(), Block(8), Block(1),
+            )  # fmt: skip
             self.norm = nn.LayerNorm(width)
             self.head = nn.Linear(width, 2 * _JOINTS * 5)
+            self.signs = nn.Linear(width, 2 * (len(BONES) + 2))
 
-        def forward(self, x: Any) -> tuple[Any, Any]:
+        def forward(self, x: Any) -> tuple[Any, Any, Any, Any]:
             batch, frames = x.shape[0], x.shape[1]
             y = self.embed(x.reshape(batch, frames // 2, 2 * FEATURES))
-            y = self.head(self.norm(self.body(y))).float()
-            y = y.reshape(batch, frames, _JOINTS, 5)
-            return y[..., :3], y[..., 3:]
+            y = self.norm(self.body(y))
+            place = self.head(y).float().reshape(batch, frames, _JOINTS, 5)
+            sign = self.signs(y).float().reshape(batch, frames, len(BONES) + 2)
+            return place[..., :3], place[..., 3:], sign[..., :-2], sign[..., -2:]
 
     return Lifting()
 
 
-def lifting_loss(joints: torch.Tensor, log_sigma: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, float]:
-    """Loss of a batch and, for the log, the mean joint distance of the twelve limb joints.
+def lifting_loss(outputs: tuple[torch.Tensor, ...], batch: Batch) -> tuple[torch.Tensor, float]:
+    """Loss of the network's outputs and, for the log, the mean joint distance of the twelve limb joints.
 
-    Distances of the joints, of their displacements over one frame and of bone lengths, and the Laplace likelihood of
-    the residuals, whose gradient reaches the uncertainties only.
+    Distances of the joints, of their displacements over one frame and of bone lengths; the Laplace likelihood of the
+    residuals, whose gradient reaches the uncertainties only; the cross-entropies of the depth signs, weighted by the
+    depth differences, and of the still feet.
     """
     torch = pytorch()
-    error = joints - target
+    joints, log_sigma, deeper, still = outputs
+    target = torch.from_numpy(batch.target)
+    known = torch.isfinite(target[..., 0])
+    target = torch.nan_to_num(target)
+    error = (joints - target) * known[..., None]
     distance = torch.sqrt(error.square().sum(dim=-1) + 1e-8)
-    weight = torch.full((_JOINTS,), 0.6)
-    weight[torch.as_tensor(indices(BODY_15.joints, LIMB_JOINTS))] = 1.0
+    limb = torch.zeros(_JOINTS, dtype=torch.bool)
+    limb[torch.as_tensor(indices(BODY_17.joints, LIMB_JOINTS))] = True
+    weight = torch.where(limb, 1.0, 0.6)
     place = (distance * weight).mean() / weight.mean()
     motion = torch.sqrt((error[:, 1:] - error[:, :-1]).square().sum(dim=-1) + 1e-8).mean()
-    child, parent = torch.as_tensor(_BONES[:, 1]), torch.as_tensor(_BONES[:, 0])
-    length = torch.linalg.norm(joints[:, :, child] - joints[:, :, parent] + 1e-6, dim=-1)
-    true_length = torch.linalg.norm(target[:, :, child] - target[:, :, parent] + 1e-6, dim=-1)
-    bones = (length - true_length).abs().mean()
+    child, parent = torch.as_tensor(BONES[:, 1]), torch.as_tensor(BONES[:, 0])
+    bone, true_bone = joints[:, :, child] - joints[:, :, parent], target[:, :, child] - target[:, :, parent]
+    there = known[:, :, child]
+    length, true_length = (torch.linalg.norm(b + 1e-6, dim=-1) for b in (bone, true_bone))
+    bones = ((length - true_length).abs() * there).mean()
     size = error.detach().abs()
     residual = torch.stack([size[..., :2].mean(dim=-1), size[..., 2]], dim=-1)
-    likelihood = (residual * torch.exp(-log_sigma) + log_sigma).mean()
-    loss = place + motion + 0.3 * bones + 0.02 * likelihood
-    return loss, float(distance.detach()[:, :, weight > 0.9].mean())
+    likelihood = ((residual * torch.exp(-log_sigma) + log_sigma) * known[..., None]).mean()
+    entropy = torch.nn.functional.binary_cross_entropy_with_logits
+    depth = true_bone[..., 2]
+    signs = entropy(deeper, (depth > 0).float(), weight=torch.clamp(depth.abs(), max=1.0) * there)
+    foot = torch.from_numpy(batch.still)
+    feet = entropy(still, torch.nan_to_num(foot), weight=torch.isfinite(foot).float())
+    loss = place + motion + 0.3 * bones + 0.02 * likelihood + 0.05 * signs + 0.02 * feet
+    return loss, float(distance.detach()[:, :, limb].mean())
 
 
 def _rate(progress: float) -> float:
@@ -163,9 +190,11 @@ def train(
     report: Callable[[str], None],
     checkpoint: Callable[[torch.nn.Module, dict[str, Any]], None],
     checkpoint_minutes: float = 5.0,
-    initial: dict[str, Any] | None = None,
+    initial: Path | None = None,
 ) -> tuple[torch.nn.Module, dict[str, Any]]:
-    """Train on virtual views for ``options.minutes``; returns averaged weights and the counts of steps and frames.
+    """Train on virtual views; returns averaged weights and the counts of steps and frames.
+
+    ``initial`` is a lifter whose weights begin the training.
 
     ``checkpoint(network, facts)`` is called every ``checkpoint_minutes`` with the averaged weights.
     """
@@ -174,20 +203,26 @@ def train(
     rng = np.random.default_rng(options.seed)
     network = build_network(options.width)
     if initial is not None:
-        network.load_state_dict(initial)
+        start_from(network, initial)
     average = copy.deepcopy(network)
     optimisers = _optimisers(network, options)
-    peaks = [options.learning_rate, options.matrix_learning_rate]
+    # Weights that were trained before would be forgotten at the full rate.
+    share = 1.0 if initial is None else 0.5
+    peaks = [share * options.learning_rate, share * options.matrix_learning_rate]
     begin = time.monotonic()
     step, frames_seen, reported, saved, smooth = 0, 0, 0.0, 0.0, math.nan
-    while (elapsed := (time.monotonic() - begin) / 60) < options.minutes:
+    while True:
+        elapsed = (time.monotonic() - begin) / 60
+        progress = step / options.steps if options.steps else elapsed / options.minutes
+        if progress >= 1:
+            break
         frames = int(rng.choice([16, 64, 160, 240], p=[0.05, 0.1, 0.45, 0.4]))
         batch = sample_batch(bank, rng, max(options.frames_per_batch // frames, 1), frames)
         for optimiser, peak in zip(optimisers, peaks, strict=True):
-            optimiser.param_groups[0]["lr"] = peak * _rate(elapsed / options.minutes)
+            optimiser.param_groups[0]["lr"] = peak * _rate(progress)
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            joints, log_sigma = network(torch.from_numpy(batch.features))
-        loss, distance = lifting_loss(joints, log_sigma, torch.from_numpy(batch.target))
+            outputs = network(torch.from_numpy(batch.features))
+        loss, distance = lifting_loss(outputs, batch)
         network.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -213,6 +248,6 @@ def train(
 def export_onnx(network: torch.nn.Module, path: Path, facts: dict[str, str]) -> None:
     """Write the lifter as ONNX, with :func:`drocap_ros.training.torch_extra.write_onnx`."""
     torch = pytorch()
-    names = (["features"], ["joints", "log_sigma"])
+    names = (["features"], ["joints", "log_sigma", "deeper", "still"])
     axes = {name: {0: "windows", 1: "frames"} for name in (*names[0], *names[1])}
     write_onnx(network, torch.zeros(2, 16, FEATURES), path, *names, axes, facts)

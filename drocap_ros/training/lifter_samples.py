@@ -6,72 +6,59 @@ Lengths in metres, angles in rad, times in frames of 24 fps.  Arrays are (B, T, 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from drocap_ros.errors import InputError
-from drocap_ros.geometry.bones import bone_lengths
-from drocap_ros.mocap import load_mocap
-from drocap_ros.reconstruction.lifted.lifter_input import LIFTER_FPS, normalise
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.geometry.bones import pair_lengths
+from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.reconstruction.lifted.lifter_input import BONES, LIFTER_FPS, normalise
+from drocap_ros.skeleton import BODY_17
+from drocap_ros.training.keypoint_errors import as_drawn, detect
+from drocap_ros.training.mocap_bank import MocapBank, straighten_legs
+from drocap_ros.training.slow_curves import slow
 
-_J = {name: i for i, name in enumerate(BODY_15.joints)}
+_J = {name: i for i, name in enumerate(BODY_17.joints)}
 _UPPER = np.array([_J[j] for j in ("rknee", "lknee", "lelbow", "relbow")])
 _LOWER = np.array([_J[j] for j in ("rankle", "lankle", "lwrist", "rwrist")])
-_LEGS = np.array([_J[j] for j in ("rknee", "lknee", "rankle", "lankle")])
-_ABOVE_PELVIS = np.arange(_J["neck"], len(BODY_15))
+_FEET = np.array([_J[j] for j in ("rtoe", "ltoe")])
+_KNEES, _SHINS = _UPPER[:2], _LOWER[:2]
+_ABOVE_PELVIS = np.arange(_J["neck"], _J["rwrist"] + 1)
 _SIDES = ((_J["rhip"], _J["lhip"]), (_J["rknee"], _J["lknee"]), (_J["rankle"], _J["lankle"]),
-          (_J["lshoulder"], _J["rshoulder"]), (_J["lelbow"], _J["relbow"]), (_J["lwrist"], _J["rwrist"]))  # fmt: skip
-
-
-@dataclass(frozen=True)
-class MocapBank:
-    """Concatenated sequences: joints (N, 15, 3) float32 m, z up; first frame, length and rate of each."""
-
-    joints: np.ndarray
-    start: np.ndarray
-    length: np.ndarray
-    fps: np.ndarray
-
-
-def load_bank(paths: list[Path]) -> MocapBank:
-    """Read MoCap ``.npz`` files (X in mm, joints, fps).
-
-    Raises
-    ------
-    InputError
-        When a file cannot be used or there is none.
-    """
-    if not paths:
-        raise InputError("MoCap: expected at least one .npz file, found none; check the folder and the pattern")
-    parts, rates = [], []
-    for path in paths:
-        x, fps = load_mocap(path)
-        if len(x) < 2:
-            raise InputError(f"{path}: expected at least 2 frames, got {len(x)}; leave the file out")
-        parts.append(x.astype(np.float32) / 1000)
-        rates.append(fps)
-    length = np.array([len(p) for p in parts])
-    return MocapBank(np.concatenate(parts), np.cumsum(length) - length, length, np.array(rates))
+          (_J["lshoulder"], _J["rshoulder"]), (_J["lelbow"], _J["relbow"]), (_J["lwrist"], _J["rwrist"]),
+          (_J["rtoe"], _J["ltoe"]))  # fmt: skip
+#: Speed below which a foot counts as still.
+STILL_M_S = 0.1
 
 
 @dataclass(frozen=True)
 class Batch:
-    """features (B, T, 73); target (B, T, 15, 3) in the features' units, x and y in the image."""
+    """features (B, T, 143); target (B, T, 17, 3) in the features' units, x and y in the image, NaN = unknown toe.
+
+    still : (B, T, 2) 1 where the right and the left foot are slower than 0.1 m/s, 0 where not, NaN = unknown
+    """
 
     features: np.ndarray
     target: np.ndarray
+    still: np.ndarray
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """joints (B, T, 17, 3) about the pelvis, z up; still as of :class:`Batch`."""
+
+    joints: np.ndarray
+    still: np.ndarray
 
 
 def sample_batch(bank: MocapBank, rng: np.random.Generator, windows: int, frames: int) -> Batch:
     """Draw ``windows`` training windows of ``frames`` frames."""
     # Two cameras per body halve the cost of the bodies.
-    body = _vary_body(_draw_motion(bank, rng, (windows + 1) // 2, frames), rng)
-    return _project(np.concatenate([body, body])[:windows], rng)
+    bodies = _vary_body(_draw_motion(bank, rng, (windows + 1) // 2, frames), rng)
+    twice = Bodies(*(np.concatenate([part, part])[:windows] for part in (bodies.joints, bodies.still)))
+    return _project(twice, rng)
 
 
-def _draw_motion(bank: MocapBank, rng: np.random.Generator, windows: int, frames: int) -> np.ndarray:
+def _draw_motion(bank: MocapBank, rng: np.random.Generator, windows: int, frames: int) -> Bodies:
     weight = bank.length**0.75
     pick = rng.choice(len(weight), size=windows, p=weight / weight.sum())
     step = bank.fps[pick] / LIFTER_FPS * np.exp(rng.uniform(np.log(0.7), np.log(1.4), windows))
@@ -87,11 +74,14 @@ def _draw_motion(bank: MocapBank, rng: np.random.Generator, windows: int, frames
     part = (time - low).astype(np.float32)[..., None, None]
     at = bank.start[pick][:, None] + low
     motion = bank.joints[at] * (1 - part) + bank.joints[at + 1] * part
+    still = (bank.foot_speed[at] < STILL_M_S).astype(np.float32)
+    motion = straighten_legs(motion, bank.reach[pick], rng)
     flip = rng.random(windows) < 0.5
-    mirrored = motion[flip][:, :, BODY_15.mirror]
-    mirrored[..., 0] *= -1
-    motion[flip] = mirrored
-    return motion - motion[:, :, :1]
+    flipped = motion[flip][:, :, BODY_17.mirror]
+    flipped[..., 0] *= -1
+    motion[flip] = flipped
+    still[flip] = still[flip][..., ::-1]
+    return Bodies(motion - motion[:, :, :1], still)
 
 
 def _turn(vector: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
@@ -106,26 +96,16 @@ def _turn(vector: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
     return vector * cosine + cross * sine + axis * along * (1 - cosine)
 
 
-def _slow(rng: np.random.Generator, windows: int, frames: int, shape: tuple[int, ...]) -> np.ndarray:
-    """(B, T, *shape) float32 of about unit variance: a constant plus a slow oscillation of random period."""
-    tail = (1,) * len(shape)
-    period = rng.uniform(24, 240, (windows, 1, *shape))
-    phase = rng.uniform(0, 2 * np.pi, (windows, 1, *shape))
-    time = np.arange(frames).reshape(1, frames, *tail)
-    wave = np.sin(2 * np.pi * time / period + phase)
-    constant = rng.standard_normal((windows, 1, *shape))
-    return (0.8 * constant + 0.8 * wave).astype(np.float32)
-
-
-def _vary_body(motion: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Other bones, slightly other poses, other attitudes; root-relative (B, T, 15, 3) in and out."""
+def _vary_body(bodies: Bodies, rng: np.random.Generator) -> Bodies:
+    """Other bones, slightly other poses, other attitudes."""
+    motion = bodies.joints
     windows, frames, joints, _ = motion.shape
-    bone = motion - motion[:, :, np.maximum(BODY_15.parents, 0)]
+    bone = motion - motion[:, :, np.maximum(BODY_17.parents, 0)]
 
     # Poses: every limb is turned a little (the lower limb with the upper one), the trunk as a whole; postures
     # bend trunk, hips and knees about the axis of the hips.
     strength = np.where(rng.random(windows) < 0.5, rng.uniform(0, 0.22, windows), 0).astype(np.float32)
-    turn = _slow(rng, windows, frames, (9, 3)) * strength[:, None, None, None]
+    turn = slow(rng, windows, frames, (11, 3)) * strength[:, None, None, None]
     posture = _posture(rng, windows, frames)
     pitch = bone[:, :, _J["rhip"]] - bone[:, :, _J["lhip"]]
     pitch = (pitch / (np.linalg.norm(pitch, axis=-1, keepdims=True) + 1e-6))[:, :, None]
@@ -133,11 +113,19 @@ def _vary_body(motion: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     knees = -posture[:, :, (4, 5), None] * pitch
     trunk = -posture[:, :, 1, None, None] * pitch
     bone[:, :, _ABOVE_PELVIS] = _turn(bone[:, :, _ABOVE_PELVIS], 0.6 * turn[:, :, 8:9] + trunk)
-    bone[:, :, _LEGS] = _turn(bone[:, :, _LEGS], np.concatenate([hips, hips], axis=2))
-    bone[:, :, _LEGS[2:]] = _turn(bone[:, :, _LEGS[2:]], knees)
-    both = np.concatenate([_UPPER, _LOWER])
-    bone[:, :, both] = _turn(bone[:, :, both], np.concatenate([turn[:, :, :4], turn[:, :, :4]], axis=2))
-    bone[:, :, _LOWER] = _turn(bone[:, :, _LOWER], turn[:, :, 4:8])
+    legs = np.concatenate([_KNEES, _SHINS, _FEET])
+    bone[:, :, legs] = _turn(bone[:, :, legs], np.concatenate([hips, hips, hips], axis=2))
+    shins = legs[2:]
+    bone[:, :, shins] = _turn(bone[:, :, shins], np.concatenate([knees, knees], axis=2))
+    whole = np.concatenate([_UPPER, _LOWER, _FEET])
+    limb = turn[:, :, :4]
+    bone[:, :, whole] = _turn(bone[:, :, whole], np.concatenate([limb, limb, limb[:, :, :2]], axis=2))
+    lower = np.concatenate([_LOWER, _FEET])
+    bone[:, :, lower] = _turn(bone[:, :, lower], np.concatenate([turn[:, :, 4:8], turn[:, :, 4:6]], axis=2))
+    bone[:, :, _FEET] = _turn(bone[:, :, _FEET], turn[:, :, 9:11])
+    # A foot of a changed pose slides where the recorded one stood.
+    changed = (strength > 0) | (posture[..., 2:] != 0).any(axis=(1, 2))
+    still = np.where(changed[:, None, None], np.float32(np.nan), bodies.still)
 
     # Proportions: one size, then each kind of bone, then a trace of asymmetry.
     size = np.exp(0.08 * rng.standard_normal((windows, 1, 1, 1)) + 0.08 * rng.standard_normal((windows, 1, joints, 1)))
@@ -160,7 +148,7 @@ def _vary_body(motion: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
     body = np.empty_like(bone)
     body[:, :, 0] = 0
-    for joint, parent in enumerate(BODY_15.parents):
+    for joint, parent in enumerate(BODY_17.parents):
         if parent >= 0:
             body[:, :, joint] = body[:, :, parent] + bone[:, :, joint]
 
@@ -175,7 +163,7 @@ def _vary_body(motion: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     # Some lie on a side: the axis of the tilt is not that of the hips.
     aside = np.where(rng.random(windows) < 0.4, rng.uniform(-np.pi, np.pi, windows), 0.2 * rng.standard_normal(windows))
     pitch = _turn(pitch, (aside[:, None] * np.array([0.0, 0.0, 1.0])).astype(np.float32)[:, None])
-    return _turn(body, (posture[:, :, 0, None] * pitch)[:, :, None])
+    return Bodies(_turn(body, (posture[:, :, 0, None] * pitch)[:, :, None]), still)
 
 
 def _posture(rng: np.random.Generator, windows: int, frames: int) -> np.ndarray:
@@ -219,81 +207,61 @@ def camera_rotation(azimuth: np.ndarray, elevation: np.ndarray, roll: np.ndarray
 def _orbit(rng: np.random.Generator, windows: int, frames: int) -> np.ndarray:
     """(B, T, 3, 3) rotations of orbiting cameras: still, slow and fast, both ways, of every height."""
     kind = rng.random(windows)
-    speed = np.where(kind < 0.1, 0, np.where(kind < 0.3, rng.uniform(0, 12, windows), rng.uniform(8, 60, windows)))
+    speed = np.where(kind < 0.15, 0, np.where(kind < 0.35, rng.uniform(0, 12, windows), rng.uniform(8, 60, windows)))
     speed = np.radians(speed) / LIFTER_FPS * rng.choice([-1, 1], windows)
-    wobble = _slow(rng, windows, frames, (3,)) * (rng.random((windows, 1, 1)) < 0.7)
+    wobble = slow(rng, windows, frames, (3,)) * (rng.random((windows, 1, 1)) < 0.7)
     time = np.arange(frames)
     azimuth = rng.uniform(0, 2 * np.pi, (windows, 1)) + speed[:, None] * time + 0.03 * wobble[..., 0]
-    level = np.where(rng.random(windows) < 0.75, rng.normal(0.33, 0.15, windows), rng.uniform(-0.2, 1.05, windows))
-    elevation = np.clip(level, -0.25, 1.1)[:, None] + 0.03 * wobble[..., 1]
+    level = np.where(rng.random(windows) < 0.65, rng.normal(0.33, 0.17, windows), rng.uniform(-0.3, 1.3, windows))
+    elevation = np.clip(level, -0.35, 1.3)[:, None] + 0.03 * wobble[..., 1]
     return camera_rotation(azimuth, elevation, 0.04 * wobble[..., 2]).astype(np.float32)
 
 
-def _project(body: np.ndarray, rng: np.random.Generator) -> Batch:
+def _known_rotation(rotation: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """What a gimbal reports: turned by 1.5 degrees and slowly wandering; NaN in half of the windows."""
+    windows, frames = rotation.shape[:2]
+    error = 0.026 * rng.standard_normal((windows, 1, 3)) + 0.006 * slow(rng, windows, frames, (3,))
+    reported = exp_so3(error) @ rotation
+    reported[rng.random(windows) < 0.5] = np.nan
+    return reported
+
+
+def _project(bodies: Bodies, rng: np.random.Generator) -> Batch:
+    body = bodies.joints
     windows, frames = body.shape[:2]
-    seen = np.einsum("btij,btpj->btpi", _orbit(rng, windows, frames), body, optimize=True)
+    rotation = _orbit(rng, windows, frames)
+    seen = np.einsum("btij,btpj->btpi", rotation, body, optimize=True)
+    drawn = np.einsum("btij,btpj->btpi", rotation, as_drawn(body, rng), optimize=True)
 
-    # Half of the cameras are orthographic; the others are 3-15 m away, and the distance drifts.
-    away = np.exp(rng.uniform(np.log(3), np.log(15), (windows, 1))) * (1 + 0.05 * _slow(rng, windows, frames, ()))
-    inverse = np.where(rng.random((windows, 1)) < 0.6, 0, 1 / away).astype(np.float32)
+    # Half of the cameras are orthographic; the others are 3-30 m away, and the distance drifts.
+    away = np.exp(rng.uniform(np.log(3), np.log(30), (windows, 1))) * (1 + 0.05 * slow(rng, windows, frames, ()))
+    inverse = np.where(rng.random((windows, 1)) < 0.5, 0, 1 / away).astype(np.float32)
     zoom = np.where(inverse > 0, inverse / np.maximum(inverse.mean(axis=1, keepdims=True), 1e-6), 1).astype(np.float32)
-    exact = seen[..., :2] / (1 + inverse[..., None, None] * seen[..., 2:]) * zoom[..., None, None]
-    truth = np.concatenate([exact, seen[..., 2:] * zoom[..., None, None]], axis=-1)
 
-    keypoints, confidence = _detect(exact, rng)
-    features, centre, scale = normalise(keypoints, confidence, _estimated_lengths(truth, rng))
+    def image(points: np.ndarray) -> np.ndarray:
+        flat: np.ndarray = points[..., :2] / (1 + inverse[..., None, None] * points[..., 2:]) * zoom[..., None, None]
+        return flat
+
+    truth = np.concatenate([image(seen), seen[..., 2:] * zoom[..., None, None]], axis=-1)
+    found = detect(image(drawn), rng)
+    # At the mean distance a length in metres is a share of the focal length.
+    focal = np.where(inverse[:, 0] > 0, 1 / np.maximum(inverse.mean(axis=1), 1e-6), np.inf)
+    focal[rng.random(windows) < 0.5] = np.nan
+    features, centre, scale = normalise(
+        found.keypoints,
+        found.confidence,
+        _estimated_lengths(truth, rng),
+        found.covariance,
+        _known_rotation(rotation, rng),
+        focal,
+    )
     truth[..., :2] -= centre[:, :, None]
     truth /= scale[:, None, None, None]
-    return Batch(features, truth.astype(np.float32))
+    return Batch(features, truth.astype(np.float32), bodies.still)
 
 
 def _estimated_lengths(truth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(B, 14) bone lengths with the errors of an estimate; unknown (NaN) in two windows of five."""
-    length = np.median(bone_lengths(truth), axis=1)
+    """(B, 16) bone lengths with the errors of an estimate; unknown (NaN) in two windows of five."""
+    length = np.median(pair_lengths(truth, BONES), axis=1)
     error = np.abs(0.025 * rng.standard_normal((len(length), 1))) * rng.standard_normal(length.shape)
     return np.where(rng.random((len(length), 1)) < 0.4, np.nan, length * np.exp(error))
-
-
-def _runs(rng: np.random.Generator, shape: tuple[int, ...], frames: int, share: np.ndarray, longest: int) -> np.ndarray:
-    """(B, T, *rest) bool: for a ``share`` of (B, *rest), one run of up to ``longest`` frames is True."""
-    tail = (1,) * (len(shape) - 1)
-    chosen = (rng.random(shape) < share.reshape(-1, *tail))[:, None]
-    begin = rng.integers(0, max(frames, 1), shape)[:, None]
-    length = rng.integers(1, longest + 1, shape)[:, None]
-    time = np.arange(frames).reshape(1, frames, *tail)
-    return chosen & (time >= begin) & (time < begin + length)
-
-
-def _detect(exact: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """A detector's output for exact 2D joints (B, T, 15, 2) m: keypoints with NaN, and confidences."""
-    windows, frames, joints, _ = exact.shape
-
-    def share(probability: float, most: float) -> np.ndarray:
-        return np.where(rng.random(windows) < probability, rng.uniform(0, most, windows), 0)
-
-    noise = rng.standard_normal(exact.shape, dtype=np.float32)
-    keypoints = exact + noise * share(0.7, 0.02).astype(np.float32)[:, None, None, None]
-    drift = _slow(rng, windows, frames, (joints, 2))
-    keypoints += drift * share(0.3, 0.015).astype(np.float32)[:, None, None, None]
-
-    swapped = _runs(rng, (windows, 2), frames, share(0.15, 0.6), 12)
-    arms, legs = np.arange(_J["lshoulder"], joints), np.arange(_J["rhip"], _J["neck"])
-    for group, swap in ((arms, swapped[..., 0]), (legs, swapped[..., 1])):
-        both = keypoints[:, :, group]
-        keypoints[:, :, group] = np.where(swap[..., None, None], keypoints[:, :, BODY_15.mirror[group]], both)
-
-    gross = rng.random((windows, frames, joints)) < share(0.6, 0.09)[:, None, None]
-    gross |= _runs(rng, (windows, joints), frames, share(0.15, 0.2), 10)
-    where = np.nonzero(gross)
-    keypoints[where] = exact[where] + rng.uniform(-0.3, 0.3, (len(where[0]), 2))
-
-    missing = rng.random((windows, frames, joints)) < share(0.3, 0.2)[:, None, None]
-    missing |= _runs(rng, (windows, joints), frames, share(0.3, 0.5), 48)
-    missing |= _runs(rng, (windows, 1), frames, share(0.2, 0.7), 16)
-    keypoints[missing] = np.nan
-
-    # Confidences are informative in a third of the windows; otherwise every seen joint has the same.
-    error = np.sqrt(np.square(keypoints - exact).sum(axis=-1))
-    informative = np.exp(-error / 0.1) * rng.uniform(0.6, 1, error.shape)
-    confidence = np.where(rng.random((windows, 1, 1)) < 0.33, informative, 1.0)
-    return keypoints, confidence.astype(np.float32)

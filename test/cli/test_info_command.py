@@ -1,4 +1,5 @@
 import argparse
+import re
 
 import numpy as np
 import pytest
@@ -67,6 +68,7 @@ def test_info_of_tracks_and_motion_lists_arrays_and_rates(tmp_path, capture, cap
     out = capsys.readouterr().out
     assert "kind: motion" in out
     assert "scale: assumed (assumed_height)" in out
+    assert re.search(r"median flexion: knees \d+ and \d+, hips \d+ and \d+, elbows \d+ and \d+ degrees", out)
     assert "method: ba" in out
 
 

@@ -61,7 +61,7 @@ def changed(path, **arrays):
 
 def test_outdoor_walk_gives_an_upright_motion_of_every_frame(shared, tmp_path):
     motion = reconstructed(shared / "media" / "outdoor_walk.mp4", tmp_path, "--models", shared / "models")
-    assert motion.joints3d.shape == (230, 15, 3)
+    assert motion.joints3d.shape == (230, 17, 3)
     assert motion.joints3d.dtype == np.float64
     assert motion.frame == "camera"
     seen = np.isfinite(motion.keypoints).all(axis=2)
@@ -107,7 +107,7 @@ def test_one_frame_gives_a_pose(tracks_file, tmp_path):
     capture = simulate_capture(0.05, 20.0, seed=1)
     save_tracks(tmp_path / "one.npz", capture.tracks)
     motion = reconstructed(tmp_path / "one.npz", tmp_path)
-    assert motion.joints3d.shape == (1, 15, 3)
+    assert motion.joints3d.shape == (1, 17, 3)
     assert np.isfinite(motion.joints3d).all()
 
 

@@ -9,6 +9,8 @@ from drocap_ros.motion import upright_joints
 from drocap_ros.report.checks import _WORDS, Check, Level, run_checks
 from drocap_ros.report.statistics import motion_statistics, smooth
 from drocap_ros.simulation.capture import simulate_capture
+from drocap_ros.simulation.orbit_camera import look_at
+from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15
 
 
@@ -63,6 +65,36 @@ def test_a_still_camera_and_a_still_body_are_low_camera_motion(person):
     )
     assert Check.LOW_CAMERA_MOTION in checks(still, Level.WARNING)
     assert motion_statistics(still).view_span_deg == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("elevation", "level"), [(30.0, None), (52.0, Level.NOTE), (69.0, Level.WARNING)])
+@pytest.mark.parametrize("frame", ["world", "camera"])
+def test_steep_view_is_named_with_its_elevation(person, frame, elevation, level):
+    """A camera that orbits a standing body at an elevation."""
+    frames = len(person.joints3d)
+    bearing = np.linspace(0, np.pi, frames)
+    tilt = np.deg2rad(elevation)
+    away = np.stack([np.cos(tilt) * np.cos(bearing), np.cos(tilt) * np.sin(bearing), np.full(frames, np.sin(tilt))], 1)
+    rotation = look_at(away, np.zeros((frames, 3)))
+    body = np.repeat(simulate_person(np.array([1.0]), "stand"), frames, axis=0)
+    body = body - body[:, :1]
+    if frame == "camera":
+        body, rotation = np.einsum("fij,fpj->fpi", rotation, body), np.tile(np.eye(3), (frames, 1, 1))
+    motion = dataclasses.replace(
+        person, joints3d=body, camera_rotation=rotation, frame=frame, camera_position=None, covariance=None
+    )
+    assert motion_statistics(motion).elevation_deg == pytest.approx(elevation, abs=6.0)
+    found = [r for r in results(motion) if r.check is Check.STEEP_VIEW]
+    assert [r.level for r in found] == ([] if level is None else [level])
+    assert level is None or f"{motion_statistics(motion).elevation_deg:.0f}° above" in found[0].text
+
+
+@pytest.mark.parametrize(("rate_hz", "level"), [(24, None), (15, Level.NOTE), (10, Level.WARNING), (5, Level.WARNING)])
+def test_low_image_rate_is_named(person, rate_hz, level):
+    stamps = np.arange(len(person.stamp_ns), dtype=np.int64) * round(1e9 / rate_hz)
+    found = [r for r in results(dataclasses.replace(person, stamp_ns=stamps)) if r.check is Check.LOW_RATE]
+    assert [r.level for r in found] == ([] if level is None else [level])
+    assert level is None or f"{rate_hz:.1f} images per second" in found[0].text
 
 
 def test_a_body_that_turns_is_enough_camera_motion(reported_in_camera):

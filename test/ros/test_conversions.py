@@ -100,9 +100,9 @@ def adjusted(effort):
     frames = 3
     return AdjustedWindow(
         stamp_ns=np.arange(frames) * 10**8,
-        joints3d=np.random.default_rng(2).normal(size=(frames, 15, 3)),
-        covariance=np.ones((frames, 15, 6)),
-        confidence=np.ones((frames, 15)),
+        joints3d=np.random.default_rng(2).normal(size=(frames, 17, 3)),
+        covariance=np.ones((frames, 17, 6)),
+        confidence=np.ones((frames, 17)),
         reprojection_rms_px=np.full(frames, 2.0),
         iterations=9,
         cost=4.0,

@@ -3,12 +3,10 @@
 The flight is in simulated time, so that other tests may run beside these.
 """
 
-import contextlib
 import re
-import subprocess
-import sys
 
 import numpy as np
+from busy_processes import busy_processes
 from session_contents import session_contents
 
 from drocap_ros.cli import main
@@ -97,15 +95,3 @@ def test_same_seed_gives_the_same_flight_beside_busy_processes(tmp_path, capsys)
     cosine = np.einsum("fi,fi->f", motion.camera_rotation[:, 2], along)
     assert np.degrees(np.arccos(np.median(cosine))) < 3.0
     assert np.ptp(np.degrees(np.arcsin(up))) > 2.0
-
-
-@contextlib.contextmanager
-def busy_processes(count):
-    """Processes that use all of the processor's time that they get."""
-    processes = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
-    try:
-        yield
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()

@@ -6,26 +6,32 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.reconstruction.lifted.lifter_input import FEATURES
-from drocap_ros.skeleton import BODY_15
-from drocap_ros.training.lifter_samples import (
-    MocapBank,
-    camera_rotation,
-    load_bank,
-    sample_batch,
-)
+from drocap_ros.geometry.leg_lengths import refit_knees
+from drocap_ros.reconstruction.lifted.lifter_input import BONES, FEATURES, PARTS
+from drocap_ros.skeleton import BODY_17, indices
+from drocap_ros.training.keypoint_errors import detect
+from drocap_ros.training.lifter_samples import camera_rotation, sample_batch
+from drocap_ros.training.mocap_bank import MocapBank, load_bank, straighten_legs
 
 
 def bank(frames: int = 90) -> MocapBank:
     """Two sequences of a swinging stick figure."""
     rng = np.random.default_rng(0)
-    body = np.zeros((15, 3))
-    for joint, parent in enumerate(BODY_15.parents):
+    body = np.zeros((17, 3))
+    for joint, parent in enumerate(BODY_17.parents):
         if parent >= 0:
-            body[joint] = body[parent] + rng.normal(0, 0.1, 3) + (0, 0, 0.25 if joint >= 7 else -0.25)
-    phase = rng.uniform(0, 6, (1, 15, 3))
+            body[joint] = body[parent] + rng.normal(0, 0.1, 3) + (0, 0, 0.25 if 7 <= joint < 15 else -0.25)
+    phase = rng.uniform(0, 6, (1, 17, 3))
     x = body + 0.05 * np.sin(0.2 * np.arange(2 * frames)[:, None, None] + phase)
-    return MocapBank(x.astype(np.float32), np.array([0, frames]), np.array([frames, frames]), np.array([30.0, 30.0]))
+    both = np.array([frames, frames])
+    speed = np.full((2 * frames, 2), 0.3, np.float32)
+    return MocapBank(x.astype(np.float32), np.array([0, frames]), both, np.array([30.0, 30.0]), speed, np.ones(2))
+
+
+def part(features: np.ndarray, number: int) -> np.ndarray:
+    """One of the parts of the features, by its place in PARTS."""
+    begin = sum(PARTS[:number])
+    return features[..., begin : begin + PARTS[number]]
 
 
 def test_virtual_camera_sees_the_head_above_the_feet():
@@ -48,33 +54,85 @@ def test_samples_are_finite_repeatable_and_mostly_show_the_target(frames):
     first = sample_batch(bank(), np.random.default_rng(3), 12, frames)
     again = sample_batch(bank(), np.random.default_rng(3), 12, frames)
     assert first.features.shape == (12, frames, FEATURES)
-    assert first.target.shape == (12, frames, 15, 3)
+    assert first.target.shape == (12, frames, 17, 3)
     assert np.isfinite(first.features).all()
     assert np.isfinite(first.target).all()
     assert np.array_equal(first.features, again.features)
     assert np.array_equal(first.target, again.target)
-    seen = first.features[..., 30:45] > 0
-    gap = np.linalg.norm(first.features[..., :30].reshape(12, frames, 15, 2) - first.target[..., :2], axis=-1)
+    seen = part(first.features, 1) > 0
+    gap = np.linalg.norm(part(first.features, 0).reshape(12, frames, 17, 2) - first.target[..., :2], axis=-1)
     assert np.median(gap[seen]) < 0.1
+    assert set(np.unique(first.still[np.isfinite(first.still)])) <= {0.0}
 
 
 def test_length_and_reach_features_agree_with_the_truth():
     batch = sample_batch(bank(), np.random.default_rng(5), 60, 64)
-    length, reach = batch.features[..., 45:59], batch.features[..., 59:73]
+    length, reach = part(batch.features, 2), part(batch.features, 3)
     told = (length > 0).all(axis=(1, 2))
     assert 0.3 < told.mean() < 0.9
-    bones = BODY_15.bones
-    span = batch.target[:, :, bones[:, 1]] - batch.target[:, :, bones[:, 0]]
+    span = batch.target[:, :, BONES[:, 1]] - batch.target[:, :, BONES[:, 0]]
     true = np.median(np.linalg.norm(span, axis=-1), axis=1)
     np.testing.assert_allclose(np.median(length[told, 0] / true[told]), 1.0, atol=0.02)
     shown = reach[told] > 0
     assert np.median(np.abs(reach[told] - np.abs(span[told][..., 2]))[shown]) < 0.15
 
 
+def test_known_camera_turns_and_gravity_agree_with_the_poses():
+    batch = sample_batch(bank(), np.random.default_rng(6), 80, 64)
+    gravity, known = part(batch.features, 7), part(batch.features, 8)[..., 0] > 0
+    told = known.all(axis=1)
+    assert 0.3 < told.mean() < 0.7
+    assert not gravity[~told].any()
+    np.testing.assert_allclose(np.linalg.norm(gravity[told], axis=-1), 1.0, atol=1e-5)
+    # Most cameras look at upright people: gravity points down the image.
+    assert np.median(gravity[told][..., 1]) > 0.7
+    turning = np.abs(part(batch.features, 6)[told]).max(axis=(1, 2))
+    assert (turning > 0.02).mean() > 0.5
+
+
+def test_given_covariances_are_those_of_the_errors():
+    exact = np.zeros((400, 64, 17, 2), np.float32)
+    found = detect(exact, np.random.default_rng(1))
+    given = np.isfinite(found.covariance[..., 0]).all(axis=(1, 2))
+    assert 0.3 < given.mean() < 0.6
+    size = np.square(found.keypoints[given]).sum(axis=-1)
+    told = found.covariance[given][..., 0] + found.covariance[given][..., 2]
+    use = np.isfinite(size) & (told > 1e-4)
+    # The median of a chi-squared variable of two degrees of freedom over its mean is 0.69; gross errors are not told.
+    assert 0.4 < np.median((size / told)[use]) < 1.2
+
+
+def test_legs_are_refitted_between_hip_and_ankle():
+    x = bank().joints[None]
+    x[:, :, indices(BODY_17.joints, ("rknee", "lknee"))] += np.array([0.15, 0.0, 0.0], np.float32)
+    hip, knee, ankle = (x[..., indices(BODY_17.joints, ("r" + p, "l" + p)), :] for p in ("hip", "knee", "ankle"))
+    shorter = refit_knees(x, np.array([0.97]))
+    moved = shorter[..., indices(BODY_17.joints, ("rknee", "lknee")), :]
+    still = [j for j in range(17) if BODY_17.joints[j] not in ("rknee", "lknee")]
+    assert np.array_equal(shorter[:, :, still], x[:, :, still])
+    reached = np.linalg.norm(ankle - hip, axis=-1) < 0.97 * (
+        np.linalg.norm(knee - hip, axis=-1) + np.linalg.norm(ankle - knee, axis=-1)
+    )
+    assert reached.mean() > 0.5
+    for end in (hip, ankle):
+        ratio = np.linalg.norm(moved - end, axis=-1) / np.linalg.norm(knee - end, axis=-1)
+        np.testing.assert_allclose(ratio[reached], 0.97, atol=1e-4)
+    reach = np.linalg.norm(ankle - hip, axis=-1) / (
+        np.linalg.norm(knee - hip, axis=-1) + np.linalg.norm(ankle - knee, axis=-1)
+    )
+    many = straighten_legs(np.repeat(x, 40, axis=0), np.full(40, np.quantile(reach, 0.99)), np.random.default_rng(0))
+    bend = np.linalg.norm(many[..., (3, 6), :] - many[..., (1, 4), :], axis=-1) / (
+        np.linalg.norm(many[..., (2, 5), :] - many[..., (1, 4), :], axis=-1)
+        + np.linalg.norm(many[..., (3, 6), :] - many[..., (2, 5), :], axis=-1)
+    )
+    # cos(10 degrees / 2): no refitted leg's straightest posture is more bent.
+    assert (np.quantile(bend, 0.99, axis=(1, 2)) > 0.996).mean() > 0.5
+
+
 def test_unusable_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="at least one"):
         load_bank([])
-    np.savez(tmp_path / "a.npz", X=np.full((5, 15, 3), np.nan), fps=30.0, joints=np.array(BODY_15.joints))
+    np.savez(tmp_path / "a.npz", X=np.full((5, 15, 3), np.nan), fps=30.0, joints=np.array(BODY_17.joints[:15]))
     with pytest.raises(InputError, match="finite"):
         load_bank([tmp_path / "a.npz"])
 
@@ -82,8 +140,8 @@ def test_unusable_files_are_refused(tmp_path):
 def test_a_short_training_learns_and_its_network_runs(tmp_path):
     pytest.importorskip("torch", reason="the extra 'train' is not installed")
     pytest.importorskip("onnx", reason="the extra 'train' is not installed")
-    from drocap_ros.reconstruction.lifted.lifter import Lifter
-    from drocap_ros.training.lifter import LifterTraining, export_onnx, train
+    from drocap_ros.reconstruction.lifted.lifter import Lifter, LifterInput
+    from drocap_ros.training.lifter import LifterTraining, build_network, export_onnx, train
 
     def error(network) -> float:
         export_onnx(network, tmp_path / "t.onnx", {"command": "test"})
@@ -94,14 +152,25 @@ def test_a_short_training_learns_and_its_network_runs(tmp_path):
         joints = session.run(["joints"], {"features": batch.features})[0]
         return float(np.linalg.norm(joints - batch.target, axis=-1).mean())
 
-    options = LifterTraining(minutes=0.05, width=32, frames_per_batch=640)
+    options = LifterTraining(steps=12, width=32, frames_per_batch=640)
     kept = []
     network, facts = train(bank(), options, lambda line: None, lambda n, f: kept.append(f), checkpoint_minutes=0.0)
-    assert facts["steps"] >= 2
+    assert facts["steps"] == 12
     assert facts["frames_seen"] > 0
     assert kept
-    from drocap_ros.training.lifter import build_network
-
     assert error(network) < error(build_network(32))
-    lifted = Lifter.load(tmp_path / "t.onnx").lift(np.random.default_rng(0).normal(size=(9, 15, 2)))
+    again, _ = train(bank(), options, lambda line: None, lambda n, f: None)
+    assert all(np.array_equal(a, b) for a, b in zip(weights(network), weights(again), strict=True))
+    lifted = Lifter.load(tmp_path / "t.onnx").lift(LifterInput(np.random.default_rng(0).normal(size=(9, 17, 2))))
     assert np.isfinite(lifted.joints).all()
+
+    # A training that begins with these weights starts where they are.
+    error(network)
+    options = LifterTraining(steps=1, width=32, frames_per_batch=640, learning_rate=1e-6, matrix_learning_rate=1e-6)
+    begun, _ = train(bank(), options, lambda line: None, lambda n, f: None, initial=tmp_path / "t.onnx")
+    for a, b in zip(weights(network), weights(begun), strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-3)
+
+
+def weights(network) -> list[np.ndarray]:
+    return [weight.detach().numpy() for weight in network.parameters()]

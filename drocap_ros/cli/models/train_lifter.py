@@ -20,6 +20,10 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("folder", metavar="MOCAP_DIR", type=Path, help="folder of MoCap .npz files")
     parser.add_argument("--out", metavar="ONNX", type=Path, required=True, help="network file to write")
     parser.add_argument("--include", metavar="GLOB", default="*", help="only files of this name, e.g. 'cmu_*'")
+    parser.add_argument(
+        "--steps", type=int, default=0, help="batches instead of --minutes: the same seed gives the same weights"
+    )
+    parser.add_argument("--initial", metavar="ONNX", type=Path, help="lifter whose weights begin the training")
     parser.add_argument("--width", type=int, default=240, help="channels of the network (default 240)")
     add_training_options(parser, minutes=80.0)
     parser.set_defaults(run=run)
@@ -37,19 +41,19 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.errors import InputError
     from drocap_ros.mocap import mocap_files
     from drocap_ros.training.lifter import LifterTraining, describe_training, export_onnx, train
-    from drocap_ros.training.lifter_samples import load_bank
+    from drocap_ros.training.mocap_bank import load_bank
 
     if args.out.suffix != ".onnx" or not args.out.absolute().parent.is_dir():
         raise InputError(f"--out: expected an .onnx in a folder that exists, got {args.out}")
     use_threads(args.threads)
-    options = LifterTraining(minutes=args.minutes, width=args.width, seed=args.seed)
+    options = LifterTraining(minutes=args.minutes, steps=args.steps, width=args.width, seed=args.seed)
     files = mocap_files(args.folder, args.include)
     bank = load_bank(files)
 
     def save(network: Any, facts: dict[str, Any]) -> None:
-        export_onnx(network, args.out, describe_training(files, args.include, options, facts))
+        export_onnx(network, args.out, describe_training(files, args.include, options, facts, args.initial))
 
-    network, facts = train(bank, options, progress_lines(args.quiet), save)
+    network, facts = train(bank, options, progress_lines(args.quiet), save, initial=args.initial)
     save(network, facts)
     print(f"{args.out}: {facts['steps']} steps, {facts['frames_seen']} frames seen, {len(files)} MoCap files")
     return 0

@@ -22,18 +22,20 @@ import numpy as np
 
 from drocap_ros.geometry.bones import pair_lengths
 from drocap_ros.reconstruction.stop_reason import CONVERGED, DEADLINE, ITERATIONS, NO_DESCENT
-from drocap_ros.skeleton import BODY_15, RIGID_BONES, indices
+from drocap_ros.skeleton import BODY_17, RIGID_BONES, indices
 
-_CHAIN = BODY_15.bones
+_CHAIN = BODY_17.bones
 #: Pairs of joints of (nearly) constant distance: the tree's bones, then the hips and the shoulders.
 SPANS = np.concatenate(
-    [_CHAIN, [indices(BODY_15.joints, ("rhip", "lhip")), indices(BODY_15.joints, ("lshoulder", "rshoulder"))]]
+    [_CHAIN, [indices(BODY_17.joints, ("rhip", "lhip")), indices(BODY_17.joints, ("lshoulder", "rshoulder"))]]
 )
-_RIGID = {tuple(indices(BODY_15.joints, pair)) for pair in RIGID_BONES} | {(0, 1), (0, 4)}
-#: Spread of each span's length on one person, mm: limbs are rigid, trunk and shoulder girdle are not.
-SPAN_STD_MM = np.array([4.0 if (p, c) in _RIGID else 20.0 for p, c in _CHAIN] + [4.0, 25.0])
+_RIGID = {tuple(indices(BODY_17.joints, pair)) for pair in RIGID_BONES} | {(0, 1), (0, 4)}
+_FEET = {tuple(indices(BODY_17.joints, (side + "ankle", side + "toe"))) for side in "rl"}
+#: Spread of each span's length on one person, mm: limbs are rigid, feet bend at the toes, trunk and shoulder girdle
+#: are not rigid.
+SPAN_STD_MM = np.array([4.0 if (p, c) in _RIGID else 6.0 if (p, c) in _FEET else 20.0 for p, c in _CHAIN] + [4.0, 25.0])
 
-_SIZE = 3 * len(BODY_15)
+_SIZE = 3 * len(BODY_17)
 #: Squared residual, in standard deviations, at which a 2D joint has half its weight.
 _OUTLIER_SQUARE = 9.0
 _DEPTH_ROUNDING_MM = 15.0
@@ -43,16 +45,16 @@ _DEPTH_ROUNDING_MM = 15.0
 class AdjustmentProblem:
     """A window in mm of an ordinary person.
 
-    keypoints : (F, 15, 2); weight : (F, 15) 1/mm^2, 0 where not seen
-    prior : (F, 15, 3); prior_weight_xy : (F, 15) 1/mm^2; prior_weight_z : (F, 15) 1/mm
+    keypoints : (F, 17, 2); information : (F, 17, 3) 1/mm^2, xx, xy, yy of their inverse covariance, 0 where not seen
+    prior : (F, 17, 3); prior_weight_xy : (F, 17) 1/mm^2; prior_weight_z : (F, 17) 1/mm
     acceleration_weight : 1/mm^2, of second differences
     zoom_basis : (F, K) value in each frame of the zoom's piecewise linear basis functions
     zoom_precision : (K, K) inverse covariance of their coefficients
-    lengths : (16,) of :data:`SPANS`, expected; length_weight : 1/mm^2, of the distance from them
+    lengths : (18,) of :data:`SPANS`, expected; length_weight : 1/mm^2, of the distance from them
     """
 
     keypoints: np.ndarray
-    weight: np.ndarray
+    information: np.ndarray
     prior: np.ndarray
     prior_weight_xy: np.ndarray
     prior_weight_z: np.ndarray
@@ -65,7 +67,7 @@ class AdjustmentProblem:
 
 @dataclass(frozen=True)
 class AdjustmentSolution:
-    """joints (F, 15, 3) mm, lengths (16,) mm of :data:`SPANS`, zoom (F,), cost per term, iterations, stop reason."""
+    """joints (F, 17, 3) mm, lengths (18,) mm of :data:`SPANS`, zoom (F,), cost per term, iterations, stop reason."""
 
     joints: np.ndarray
     lengths: np.ndarray
@@ -76,7 +78,7 @@ class AdjustmentSolution:
 
 
 def span_lengths(joints: np.ndarray) -> np.ndarray:
-    """(..., 16) distances over :data:`SPANS` of joints (..., 15, D)."""
+    """(..., 18) distances over :data:`SPANS` of joints (..., 17, D)."""
     return pair_lengths(joints, SPANS)
 
 
@@ -98,7 +100,14 @@ class _Residuals:
         self.zoom_pull = p.zoom_precision @ zooms
         self.growth = lengths - p.lengths
         self.image = joints[..., :2] - p.keypoints
-        square = np.square(self.image).sum(axis=-1) * p.weight
+        self.pull = np.stack(
+            [
+                p.information[..., 0] * self.image[..., 0] + p.information[..., 1] * self.image[..., 1],
+                p.information[..., 1] * self.image[..., 0] + p.information[..., 2] * self.image[..., 1],
+            ],
+            axis=-1,
+        )
+        square = (self.image * self.pull).sum(axis=-1)
         self.robust = 1.0 / (1.0 + square / _OUTLIER_SQUARE)
         self.flat = joints[..., :2] - p.prior[..., :2]
         self.depth = joints[..., 2] - p.prior[..., 2]
@@ -121,9 +130,9 @@ class _Residuals:
 
 
 def _gradient(p: AdjustmentProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of the cost: (F, 15, 3) by the joints, (16 + K,) by the lengths and the zoom's coefficients."""
+    """Derivatives of the cost: (F, 17, 3) by the joints, (18 + K,) by the lengths and the zoom's coefficients."""
     g = np.zeros(p.prior.shape)
-    g[..., :2] = (p.weight * np.square(r.robust))[..., None] * r.image + p.prior_weight_xy[..., None] * r.flat
+    g[..., :2] = np.square(r.robust)[..., None] * r.pull + p.prior_weight_xy[..., None] * r.flat
     g[..., 2] = p.prior_weight_z * r.depth / r.rounded
     pull = (r.stretch / SPAN_STD_MM)[..., None] * r.direction
     for k, (a, b) in enumerate(SPANS):
@@ -139,19 +148,22 @@ def _gradient(p: AdjustmentProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarr
 
 
 def _band(p: AdjustmentProblem, r: _Residuals) -> np.ndarray:
-    """Gauss-Newton matrix of the joints, (F * 45, 91): element [i, d] couples unknowns i and i + d."""
+    """Gauss-Newton matrix of the joints, (F * 51, 103): element [i, d] couples unknowns i and i + d."""
     frames = len(p.prior)
     diagonal = np.zeros(p.prior.shape)
-    diagonal[..., :2] = (p.weight * np.square(r.robust) + p.prior_weight_xy)[..., None]
+    seen = np.square(r.robust)[..., None] * p.information
+    diagonal[..., :2] = seen[..., [0, 2]] + p.prior_weight_xy[..., None]
     diagonal[..., 2] = p.prior_weight_z / r.rounded
     outer = r.direction[..., :, None] * r.direction[..., None, :] / np.square(SPAN_STD_MM)[:, None, None]
-    block = np.zeros((frames, len(BODY_15), 3, len(BODY_15), 3))
+    block = np.zeros((frames, len(BODY_17), 3, len(BODY_17), 3))
     for k, (a, b) in enumerate(SPANS):
         m = outer[:, k]
         block[:, a, :, a] += m
         block[:, b, :, b] += m
         block[:, a, :, b] -= m
         block[:, b, :, a] -= m
+    each = np.arange(block.shape[1])
+    block[:, each, 0, each, 1] += seen[..., 1]
     rows = block.reshape(frames, _SIZE, _SIZE)
     band = np.zeros((frames, _SIZE, 2 * _SIZE + 1))
     for i in range(_SIZE):
@@ -168,11 +180,11 @@ def _band(p: AdjustmentProblem, r: _Residuals) -> np.ndarray:
 
 
 def _border(p: AdjustmentProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
-    """(16 + K, F * 45) coupling of lengths and zoom with the joints, and (16 + K, 16 + K) with each other."""
+    """(18 + K, F * 51) coupling of lengths and zoom with the joints, and (18 + K, 16 + K) with each other."""
     frames, knots = p.zoom_basis.shape
     count = len(SPANS)
-    by_length = np.zeros((count, frames, len(BODY_15), 3))
-    by_size = np.zeros((frames, len(BODY_15), 3))
+    by_length = np.zeros((count, frames, len(BODY_17), 3))
+    by_size = np.zeros((frames, len(BODY_17), 3))
     slope = r.direction / np.square(SPAN_STD_MM)[:, None]
     for k, (a, b) in enumerate(SPANS):
         pull = r.zoom[:, None] * slope[:, k]
@@ -202,7 +214,7 @@ def adjust(
 
     Parameters
     ----------
-    joints : (F, 15, 3) mm, initial; the signs of depth stay as they are
+    joints : (F, 17, 3) mm, initial; the signs of depth stay as they are
     iterations : most accepted steps
     tolerance : relative decrease of the cost that ends the solve
     cancelled : called before every step but the first; True ends the solve with reason DEADLINE

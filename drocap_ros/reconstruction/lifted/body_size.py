@@ -6,7 +6,7 @@ A new person is measured by the lifter and a first adjustment; a known person's 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,16 +14,16 @@ from drocap_ros.geometry.bones import bone_lengths
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
-from drocap_ros.reconstruction.lifted.lifter import LiftedMotion, Lifter
+from drocap_ros.reconstruction.lifted.lifter import LiftedMotion, Lifter, LifterInput
 from drocap_ros.reconstruction.lifted.window_solver import (
     Cancelled,
     WindowModel,
     solve_signs_and_adjust,
     window_model,
 )
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_17
 
-_BONES = BODY_15.bones
+_BONES = BODY_17.bones
 #: Bones whose total length defines the mm of an ordinary person.
 YARDSTICK = [0, 1, 2, 6, 7]
 YARDSTICK_MM = 1550.0
@@ -35,7 +35,7 @@ _LENGTHENING_NOISE_MM = 5.0
 class BodySize:
     """Sizes that an earlier window found.
 
-    lengths_mm : (16,) of :data:`~drocap_ros.reconstruction.lifted.adjustment.SPANS`, in mm of an ordinary person
+    lengths_mm : (18,) of :data:`~drocap_ros.reconstruction.lifted.adjustment.SPANS`, in mm of an ordinary person
     unit_per_mm : (F,) size in the image of each frame: units of the keypoints per such mm
     """
 
@@ -47,8 +47,8 @@ class BodySize:
 class SizedWindow:
     """A window with known size and bone lengths, before the final adjustment.
 
-    flat : (F, 15, 2) mm, the keypoints in a distant camera about ``centre`` (F, 2)
-    lifted : the lifter's joints in mm, from ``flat`` and the lengths (16,) mm
+    flat : (F, 17, 2) mm, the keypoints in a distant camera about ``centre`` (F, 2)
+    lifted : the lifter's joints in mm, from ``flat`` and the lengths (18,) mm
     zoom : (F,) the person's relative size; ``mm`` per unit of the keypoints at zoom 1
     seconds, iterations : of the first adjustment
     """
@@ -70,10 +70,12 @@ def measure_size(
     focal: float | None,
     config: LiftedConfig,
     lifter: Lifter,
+    rotation: np.ndarray | None,
     cancelled: Cancelled | None,
 ) -> SizedWindow:
     """Size of a new person: lift, adjust, and lift again with the lengths found."""
-    lifted = lifter.lift(keypoints.xy, keypoints.confidence, fps)
+    seen = LifterInput(keypoints.xy, keypoints.confidence, None, keypoints.covariance, rotation, focal)
+    lifted = lifter.lift(seen, fps)
     clock = time.perf_counter()
     mm = YARDSTICK_MM / max(float(np.median(bone_lengths(lifted.joints), axis=0)[YARDSTICK].sum()), 1e-12)
     model = window_model(keypoints, mm, fps, config)
@@ -83,42 +85,63 @@ def measure_size(
     prior[..., :2] -= centre[:, None]
     prior *= mm / zoom[:, None, None]
     flat = _orthographic(keypoints.xy, prior[..., 2], centre, zoom, mm, focal)
-    found = solve_signs_and_adjust(model, flat, prior, lifted.sigma * mm, None, config.first_iterations, cancelled)
+    rough = replace(lifted, joints=prior, sigma=lifted.sigma * mm)
+    found = solve_signs_and_adjust(model, flat, rough, None, config.first_iterations, cancelled)
     lengths = _without_noise(found.lengths, np.median(span_lengths(prior), axis=0), model.lasting_noise_mm)
     zoom = zoom * found.zoom
     flat = _orthographic(keypoints.xy, found.joints[..., 2] - found.joints[:, :1, 2], centre, zoom, mm, focal)
     seconds = time.perf_counter() - clock
-    lifted = lifter.lift(flat, keypoints.confidence, fps, lengths[: len(_BONES)])
+    lifted = lifter.lift(_flattened(flat, keypoints, mm / zoom, lengths, rotation, focal), fps)
     return SizedWindow(model, flat, lifted, lengths, centre, zoom, mm, seconds, found.iterations)
 
 
 def apply_size(
-    known: BodySize, keypoints: Keypoints2D, fps: float, focal: float | None, config: LiftedConfig, lifter: Lifter
+    known: BodySize,
+    keypoints: Keypoints2D,
+    fps: float,
+    focal: float | None,
+    config: LiftedConfig,
+    lifter: Lifter,
+    rotation: np.ndarray | None,
 ) -> SizedWindow:
     """Size from an earlier window: one lift, no first adjustment."""
     mm = 1.0 / float(np.median(known.unit_per_mm))
     zoom = known.unit_per_mm * mm
-    lengths = known.lengths_mm[: len(_BONES)]
     frames, joints_count = keypoints.xy.shape[:2]
     rough = _orthographic(keypoints.xy, np.zeros((frames, joints_count)), np.zeros((frames, 2)), zoom, mm, None)
-    lifted = lifter.lift(rough, keypoints.confidence, fps, lengths)
+    seen = _flattened(rough, keypoints, mm / zoom, known.lengths_mm, rotation, None)
+    lifted = lifter.lift(replace(seen, focal=None if focal is None else focal * mm), fps)
     middle = np.median(lifted.joints[..., :2], axis=1)
     centre = middle * (zoom / mm)[:, None]
     joints = lifted.joints.copy()
     joints[..., :2] -= middle[:, None]
     flat = _orthographic(keypoints.xy, joints[..., 2], centre, zoom, mm, focal)
     model = window_model(keypoints, mm, fps, config)
-    lifted = LiftedMotion(joints, lifted.sigma)
+    lifted = replace(lifted, joints=joints)
     return SizedWindow(model, flat, lifted, known.lengths_mm, centre, zoom, mm, seconds=0.0, iterations=0)
 
 
+def _flattened(
+    flat: np.ndarray,
+    keypoints: Keypoints2D,
+    scale: np.ndarray,
+    lengths: np.ndarray,
+    rotation: np.ndarray | None,
+    focal: float | None,
+) -> LifterInput:
+    """Keypoints in mm of a distant camera, ``scale`` (F,) mm per unit: the lens is known to be flat where it was."""
+    covariance = None if keypoints.covariance is None else keypoints.covariance * np.square(scale)[:, None, None]
+    lens = None if focal is None else np.inf
+    return LifterInput(flat, keypoints.confidence, lengths[: len(_BONES)], covariance, rotation, lens)
+
+
 def magnification(depth_mm: np.ndarray, distance_mm: np.ndarray) -> np.ndarray:
-    """(F, 15, 1) true over seen distance from the axis, for joints behind a pelvis at the distance (F,) mm."""
+    """(F, 17, 1) true over seen distance from the axis, for joints behind a pelvis at the distance (F,) mm."""
     return np.maximum(1.0 + depth_mm / distance_mm[:, None], 0.2)[..., None]
 
 
 def _without_noise(found: np.ndarray, lifted: np.ndarray, noise_mm: float) -> np.ndarray:
-    """Lengths (16,) mm between those of the adjustment and of the lifter.
+    """Lengths (18,) mm between those of the adjustment and of the lifter.
 
     The depth of a bone is free: noise lengthens the bones that the adjustment finds, and hardly those of the network.
     """
@@ -129,10 +152,10 @@ def _without_noise(found: np.ndarray, lifted: np.ndarray, noise_mm: float) -> np
 def _orthographic(
     keypoints: np.ndarray, depth_mm: np.ndarray, centre: np.ndarray, zoom: np.ndarray, mm: float, focal: float | None
 ) -> np.ndarray:
-    """(F, 15, 2) mm, positions in a distant camera about each frame's centre (F, 2).
+    """(F, 17, 2) mm, positions in a distant camera about each frame's centre (F, 2).
 
     ``mm`` per unit of the keypoints at zoom 1.  With the focal length the scale gives the pelvis' distance: joints
-    ``depth_mm`` (F, 15) behind the pelvis move outwards, those before it inwards.
+    ``depth_mm`` (F, 17) behind the pelvis move outwards, those before it inwards.
     """
     flat = (keypoints - centre[:, None]) * (mm / zoom)[:, None, None]
     if focal is None:
@@ -141,7 +164,7 @@ def _orthographic(
 
 
 def _zoom_of(joints: np.ndarray, fps: float) -> np.ndarray:
-    """(F,) relative size of the lifter's bodies (F, 15, 3) over time, smooth, of median 1."""
+    """(F,) relative size of the lifter's bodies (F, 17, 3) over time, smooth, of median 1."""
     from scipy.ndimage import gaussian_filter1d
 
     size = bone_lengths(joints).sum(axis=-1)

@@ -28,13 +28,14 @@ def spread_keypoints(keypoints: Keypoints2D, slot: np.ndarray) -> Keypoints2D:
     """Keypoints at their slots of the even grid; empty slots have no seen joint."""
     confidence, covariance = keypoints.confidence, keypoints.covariance
     return Keypoints2D(
-        _spread(keypoints.xy, slot, np.nan),
-        None if confidence is None else _spread(confidence, slot, 0.0),
-        None if covariance is None else _spread(covariance, slot, np.nan),
+        spread(keypoints.xy, slot, np.nan),
+        None if confidence is None else spread(confidence, slot, 0.0),
+        None if covariance is None else spread(covariance, slot, np.nan),
     )
 
 
-def _spread(values: np.ndarray, slot: np.ndarray, empty: float) -> np.ndarray:
+def spread(values: np.ndarray, slot: np.ndarray, empty: float) -> np.ndarray:
+    """Values (F, ...) at their slots of the even grid, ``empty`` between them."""
     out = np.full((slot[-1] + 1, *values.shape[1:]), empty)
     out[slot] = values
     return out

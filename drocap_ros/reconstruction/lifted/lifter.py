@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -10,14 +11,14 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.reconstruction.lifted.lifter_input import FEATURES, LIFTER_FPS, normalise
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.geometry.rotations import exp_so3, log_so3
+from drocap_ros.reconstruction.lifted.lifter_input import BONES, FEATURES, LIFTER_FPS, mirrored, normalise
+from drocap_ros.skeleton import BODY_17
 
 SHIPPED = Path(__file__).parents[2] / "data" / "lifter_cmu.onnx"
 
-_JOINTS = len(BODY_15)
-#: Where the parts of the features begin: confidences, bone lengths, depth ranges.
-_PARTS = np.cumsum([2 * _JOINTS, _JOINTS, _JOINTS - 1])
+_JOINTS = len(BODY_17)
+_OUTPUTS = ("joints", "log_sigma", "deeper", "still")
 #: Frames of one window and overlap of neighbouring windows; about the length of the training windows.
 _WINDOW, _OVERLAP = 240, 80
 #: Frame rates, in units of LIFTER_FPS, of the network's training.
@@ -30,13 +31,77 @@ _LINE = np.array([-0.2, 0.0, 0.2, 0.4, 0.6])
 class LiftedMotion:
     """Result of the lifter.
 
-    joints : (F, 15, 3) in the camera frame (x right, y down, z forward) and the unit of the keypoints; x and y
+    joints : (F, 17, 3) in the camera frame (x right, y down, z forward) and the unit of the keypoints; x and y
         in the image, outliers and gaps corrected; depth relative to the pelvis
-    sigma : (F, 15, 2) expected absolute error of x, y (each) and of depth, in the same unit
+    sigma : (F, 17, 2) expected absolute error of x, y (each) and of depth, in the same unit
+    deeper : (F, 16) probability that the child of bone j - 1 (joint j) lies behind its parent
+    still : (F, 2) probability that the right and the left foot move slower than 0.1 m/s in the world
     """
 
     joints: np.ndarray
     sigma: np.ndarray
+    deeper: np.ndarray
+    still: np.ndarray
+
+    def map(self, change: Callable[[np.ndarray], np.ndarray]) -> LiftedMotion:
+        """The result with the same change of every array."""
+        return LiftedMotion(*(change(getattr(self, field.name)) for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class LifterInput:
+    """Evenly spaced frames as the lifter takes them.
+
+    keypoints : (F, 17, 2) of ``BODY_17``, any unit, y down; NaN where not seen
+    confidence : (F, 17) in [0, 1]; None = all seen joints alike
+    lengths : (16,) of the bones (joint j to its parent at j - 1) in the keypoints' unit, where known
+    covariance : (F, 17, 3) xx, xy, yy of the keypoints in their unit squared, where known
+    rotation : (F, 3, 3) world (z up) -> camera (x right, y down, z forward), where known
+    focal : focal length in the keypoints' unit, infinite for a distant camera; None = unknown
+    """
+
+    keypoints: np.ndarray
+    confidence: np.ndarray | None = None
+    lengths: np.ndarray | None = None
+    covariance: np.ndarray | None = None
+    rotation: np.ndarray | None = None
+    focal: float | None = None
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+    def __getitem__(self, frames: slice) -> LifterInput:
+        """Some of the frames."""
+        return self._over_time(lambda values: values[frames])
+
+    def _over_time(self, change: Callable[[np.ndarray], np.ndarray]) -> LifterInput:
+        def maybe(values: np.ndarray | None) -> np.ndarray | None:
+            return None if values is None else change(values)
+
+        return replace(
+            self,
+            keypoints=change(self.keypoints),
+            confidence=maybe(self.confidence),
+            covariance=maybe(self.covariance),
+            rotation=maybe(self.rotation),
+        )
+
+    def spread(self, factor: int) -> LifterInput:
+        """``factor - 1`` frames without a seen joint after each frame but the last; the camera turns evenly."""
+
+        def apart(values: np.ndarray) -> np.ndarray:
+            out = np.full(((len(values) - 1) * factor + 1, *values.shape[1:]), np.nan)
+            out[::factor] = values
+            return out
+
+        out = self._over_time(apart)
+        if self.rotation is None:
+            return out
+        before, after = self.rotation[:-1], self.rotation[1:]
+        turn = log_so3(after @ np.swapaxes(before, -1, -2))
+        share = np.arange(factor).reshape(1, -1, 1) / factor
+        dense = exp_so3(share * turn[:, None]) @ before[:, None]
+        return replace(out, rotation=np.concatenate([dense.reshape(-1, 3, 3), self.rotation[-1:]]))
 
 
 class Lifter:
@@ -61,87 +126,61 @@ class Lifter:
         """The network's metadata: data, command, samples seen."""
         return dict(self._session.get_modelmeta().custom_metadata_map)
 
-    def lift(
-        self,
-        keypoints: np.ndarray,
-        confidence: np.ndarray | None = None,
-        fps: float = LIFTER_FPS,
-        lengths: np.ndarray | None = None,
-    ) -> LiftedMotion:
-        """Lift a sequence of evenly spaced frames.
-
-        Parameters
-        ----------
-        keypoints : (F, 15, 2) of ``BODY_15``, any unit, y down; NaN where not seen
-        confidence : (F, 15) in [0, 1]; None = all seen joints alike
-        fps : frames per second, 1 to 1000
-        lengths : (14,) of the bones (joint j to its parent at j - 1) in the keypoints' unit, where known
+    def lift(self, seen: LifterInput, fps: float = LIFTER_FPS) -> LiftedMotion:
+        """Lift a sequence of evenly spaced frames at 1 to 1000 frames per second.
 
         Raises
         ------
         InputError
             On other shapes, or when no joint is ever seen.
         """
-        keypoints, confidence = _checked(keypoints, confidence, fps)
+        seen = _checked(seen, fps)
         pace = fps / LIFTER_FPS
         if pace > _FASTEST:
-            return self._lift_fast(keypoints, confidence, lengths, round(pace))
-        if pace < _SLOWEST and len(keypoints) > 1:
-            return self._lift_slow(keypoints, confidence, lengths, round(1 / pace))
-        return self._lift_long(keypoints, confidence, lengths)
+            return self._lift_fast(seen, round(pace))
+        if pace < _SLOWEST and len(seen) > 1:
+            factor = round(1 / pace)
+            return self._lift_long(seen.spread(factor)).map(lambda values: values[::factor])
+        return self._lift_long(seen)
 
-    def lift_last(
-        self,
-        keypoints: np.ndarray,
-        confidence: np.ndarray | None = None,
-        fps: float = LIFTER_FPS,
-        lengths: np.ndarray | None = None,
-    ) -> LiftedMotion:
-        """The newest frame of a short sequence, in half the time: arguments as of :meth:`lift`, F = 1 in the result.
+    def lift_last(self, seen: LifterInput, fps: float = LIFTER_FPS) -> LiftedMotion:
+        """The newest frame of a short sequence, in half the time: input as of :meth:`lift`, F = 1 in the result.
 
         Of the two ways of pairing frames it uses the one in which the last frame has no partner.  The pose is the end
         of the straight line through the network's last five.
         """
-        keypoints, confidence = _checked(keypoints, confidence, fps)
+        seen = _checked(seen, fps)
         pace = fps / LIFTER_FPS
         if pace > _FASTEST:
-            keypoints, confidence = (values[::-1][:: round(pace)][::-1] for values in (keypoints, confidence))
-        elif pace < _SLOWEST and len(keypoints) > 1:
-            factor = round(1 / pace)
-            keypoints, confidence = _between(keypoints, factor), _between(confidence, factor)
-        keypoints, confidence = keypoints[-_WINDOW:], confidence[-_WINDOW:]
-        if not np.isfinite(keypoints).any():
+            stride = round(pace)
+            seen = seen[(len(seen) - 1) % stride :: stride]
+        elif pace < _SLOWEST and len(seen) > 1:
+            seen = seen.spread(round(1 / pace))
+        seen = seen[-_WINDOW:]
+        if not np.isfinite(seen.keypoints).any():
             raise InputError("keypoints: expected a seen joint among the last frames, got none; check the detector")
-        joints, sigma = self._lift_window(keypoints, confidence, lengths, shifts=(1 - len(keypoints) % 2,))
+        lifted = self._lift_window(seen, shifts=(1 - len(seen) % 2,))
+        joints = lifted.joints
         if len(joints) >= len(_LINE):
             joints = np.tensordot(_LINE, joints[-len(_LINE) :], axes=1)[None]
-        return LiftedMotion(joints[-1:], sigma[-1:])
+        return replace(lifted.map(lambda values: values[-1:]), joints=joints[-1:])
 
-    def _lift_fast(
-        self, keypoints: np.ndarray, confidence: np.ndarray, lengths: np.ndarray | None, stride: int
-    ) -> LiftedMotion:
+    def _lift_fast(self, seen: LifterInput, stride: int) -> LiftedMotion:
         """Every ``stride``-th frame is a separate sequence: no frame is interpolated."""
-        joints = np.empty((*keypoints.shape[:2], 3))
-        sigma = np.empty((*keypoints.shape[:2], 2))
-        for phase in range(min(stride, len(keypoints))):
-            part = self._lift_long(keypoints[phase::stride], confidence[phase::stride], lengths)
-            joints[phase::stride], sigma[phase::stride] = part.joints, part.sigma
-        return LiftedMotion(joints, sigma)
+        parts = [self._lift_long(seen[phase::stride]) for phase in range(min(stride, len(seen)))]
+        out = parts[0].map(lambda values: np.empty((len(seen), *values.shape[1:])))
+        for phase, part in enumerate(parts):
+            for field in fields(part):
+                getattr(out, field.name)[phase::stride] = getattr(part, field.name)
+        return out
 
-    def _lift_slow(
-        self, keypoints: np.ndarray, confidence: np.ndarray, lengths: np.ndarray | None, factor: int
-    ) -> LiftedMotion:
-        """Lifts with interpolated frames between the real ones, and returns the real ones."""
-        dense = _between(keypoints, factor)
-        result = self._lift_long(dense, _between(confidence, factor), lengths)
-        return LiftedMotion(result.joints[::factor], result.sigma[::factor])
-
-    def _lift_long(self, keypoints: np.ndarray, confidence: np.ndarray, lengths: np.ndarray | None) -> LiftedMotion:
+    def _lift_long(self, seen: LifterInput) -> LiftedMotion:
         """Windows that overlap and fade into each other: linear time, bounded memory."""
-        frames = len(keypoints)
-        joints = np.zeros((frames, _JOINTS, 3))
-        sigma = np.zeros((frames, _JOINTS, 2))
+        frames = len(seen)
+        if frames <= _WINDOW:
+            return self._lift_window(seen)
         total = np.zeros(frames)
+        out: LiftedMotion | None = None
         hop = _WINDOW - _OVERLAP
         for begin in range(0, max(frames - _OVERLAP, 1), hop):
             window = slice(begin, min(begin + _WINDOW, frames))
@@ -149,62 +188,52 @@ class Lifter:
             fade = np.minimum(1.0, (there - begin + 1) / (_OVERLAP + 1)) if begin else np.ones(len(there))
             if window.stop < frames:
                 fade = np.minimum(fade, (window.stop - there) / (_OVERLAP + 1))
-            part_joints, part_sigma = self._lift_window(keypoints[window], confidence[window], lengths)
-            joints[window] += fade[:, None, None] * part_joints
-            sigma[window] += fade[:, None, None] * part_sigma
+            part = self._lift_window(seen[window])
+            out = out or part.map(lambda values: np.zeros((frames, *values.shape[1:])))
+            for field in fields(part):
+                values = getattr(part, field.name)
+                getattr(out, field.name)[window] += fade.reshape(-1, *(1,) * (values.ndim - 1)) * values
             total[window] += fade
-        return LiftedMotion(joints / total[:, None, None], sigma / total[:, None, None])
+        assert out is not None
+        return out.map(lambda values: values / total.reshape(-1, *(1,) * (values.ndim - 1)))
 
-    def _lift_window(
-        self,
-        keypoints: np.ndarray,
-        confidence: np.ndarray,
-        lengths: np.ndarray | None,
-        shifts: tuple[int, ...] = (0, 1),
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _lift_window(self, seen: LifterInput, shifts: tuple[int, ...] = (0, 1)) -> LiftedMotion:
         """One window, averaged over its mirror image and over the ways of pairing frames."""
-        features, centre, scale = normalise(keypoints, confidence, lengths)
+        confidence = np.ones(seen.keypoints.shape[:2]) if seen.confidence is None else seen.confidence
+        features, centre, scale = normalise(
+            seen.keypoints, confidence, seen.lengths, seen.covariance, seen.rotation, seen.focal
+        )
         frames = len(features)
         length = frames + 2 - frames % 2
         count = len(shifts)
         variants = np.zeros((2 * count, length, FEATURES), np.float32)
-        mirrored = _mirrored(features)
+        mirror = mirrored(features)
         for i, shift in enumerate(shifts):
             variants[i, shift : shift + frames] = features
-            variants[count + i, shift : shift + frames] = mirrored
-        joints, log_sigma = self._session.run(None, {"features": variants})
-        joints[count:] = joints[count:, :, BODY_15.mirror] * np.array([-1, 1, 1], np.float32)
-        log_sigma[count:] = log_sigma[count:, :, BODY_15.mirror]
+            variants[count + i, shift : shift + frames] = mirror
+        joints, log_sigma, deeper, still = self._session.run(list(_OUTPUTS), {"features": variants})
+        joints[count:] = joints[count:, :, BODY_17.mirror] * np.array([-1, 1, 1], np.float32)
+        log_sigma[count:] = log_sigma[count:, :, BODY_17.mirror]
+        deeper[count:] = deeper[count:, :, BODY_17.mirror[1:] - 1]
+        still[count:] = still[count:, :, ::-1]
         each = list(enumerate((*shifts, *shifts)))
-        mean = np.mean([joints[k, s : s + frames] for k, s in each], axis=0, dtype=np.float64)
-        spread = np.mean([np.exp(log_sigma[k, s : s + frames]) for k, s in each], axis=0, dtype=np.float64)
-        mean *= scale
-        mean[..., :2] += centre[:, None]
-        mean[..., 2] -= mean[:, :1, 2]
-        return mean, spread * scale
+
+        def mean(values: np.ndarray) -> np.ndarray:
+            return np.stack([values[k, s : s + frames] for k, s in each]).mean(axis=0, dtype=np.float64)
+
+        place = mean(joints) * scale
+        place[..., :2] += centre[:, None]
+        place[..., 2] -= place[:, :1, 2]
+        return LiftedMotion(place, mean(np.exp(log_sigma)) * scale, _logistic(mean(deeper)), _logistic(mean(still)))
 
 
-def _between(values: np.ndarray, factor: int) -> np.ndarray:
-    """(F, ...) with ``factor - 1`` interpolated frames between neighbours; the real ones are unchanged."""
-    share = (np.arange(factor) / factor).reshape(1, -1, *(1,) * (values.ndim - 1))
-    dense = values[:-1, None] * (1 - share) + values[1:, None] * share
-    dense = np.concatenate([dense.reshape(-1, *values.shape[1:]), values[-1:]])
-    dense[::factor] = values
-    return dense
+def _logistic(logit: np.ndarray) -> np.ndarray:
+    probability: np.ndarray = np.asarray(1.0 / (1.0 + np.exp(-logit)))
+    return probability
 
 
-def _mirrored(features: np.ndarray) -> np.ndarray:
-    """Features (F, 73) of the scene seen in a mirror: x negated, left and right exchanged."""
-    xy, weight, length, reach = np.split(features, _PARTS, axis=1)
-    xy = xy.reshape(-1, _JOINTS, 2)[:, BODY_15.mirror] * np.array([-1, 1], np.float32)
-    bones = BODY_15.mirror[1:] - 1
-    return np.concatenate(
-        [xy.reshape(len(features), -1), weight[:, BODY_15.mirror], length[:, bones], reach[:, bones]], axis=1
-    )
-
-
-def _checked(keypoints: np.ndarray, confidence: np.ndarray | None, fps: float) -> tuple[np.ndarray, np.ndarray]:
-    keypoints = np.asarray(keypoints, dtype=np.float64)
+def _checked(seen: LifterInput, fps: float) -> LifterInput:
+    keypoints = np.asarray(seen.keypoints, dtype=np.float64)
     if keypoints.ndim != 3 or keypoints.shape[1:] != (_JOINTS, 2) or len(keypoints) == 0:
         raise InputError(
             f"keypoints: expected (F, {_JOINTS}, 2) with F >= 1, got {keypoints.shape}; map the joints first"
@@ -214,12 +243,16 @@ def _checked(keypoints: np.ndarray, confidence: np.ndarray | None, fps: float) -
     keypoints = np.where(np.isfinite(keypoints).all(axis=-1, keepdims=True), keypoints, np.nan)
     if not np.isfinite(keypoints).any():
         raise InputError("keypoints: expected at least one seen joint, got none; check the detector's output")
-    if confidence is None:
-        return keypoints, np.ones(keypoints.shape[:2])
-    confidence = np.asarray(confidence, dtype=np.float64)
-    if confidence.shape != keypoints.shape[:2]:
-        raise InputError(f"confidence: expected {keypoints.shape[:2]}, got {confidence.shape}; one per keypoint")
-    return keypoints, np.clip(np.nan_to_num(confidence), 0.0, 1.0)
+    for name, values, shape in (
+        ("confidence", seen.confidence, keypoints.shape[:2]),
+        ("covariance", seen.covariance, (*keypoints.shape[:2], 3)),
+        ("rotation", seen.rotation, (len(keypoints), 3, 3)),
+        ("lengths", seen.lengths, (len(BONES),)),
+    ):
+        if values is not None and np.shape(values) != shape:
+            raise InputError(f"{name}: expected {shape}, got {np.shape(values)}; one row per frame and joint")
+    confidence = None if seen.confidence is None else np.clip(np.nan_to_num(seen.confidence), 0.0, 1.0)
+    return replace(seen, keypoints=keypoints, confidence=confidence)
 
 
 @lru_cache(maxsize=4)
@@ -239,6 +272,9 @@ def _load(path: str) -> Lifter:
         raise InputError(f"{path}: expected an ONNX network; {str(error).splitlines()[0][:120]}") from None
     inputs = [(i.name, i.shape[-1]) for i in session.get_inputs()]
     outputs = [o.name for o in session.get_outputs()]
-    if inputs != [("features", FEATURES)] or outputs != ["joints", "log_sigma"]:
-        raise InputError(f"{path}: expected a lifter (features -> joints, log_sigma), got {inputs} -> {outputs}")
+    if inputs != [("features", FEATURES)] or outputs != list(_OUTPUTS):
+        raise InputError(
+            f"{path}: expected a lifter (features {FEATURES} -> {', '.join(_OUTPUTS)}), got {inputs} -> {outputs};"
+            " train one by drocap train-lifter"
+        )
     return Lifter(session)

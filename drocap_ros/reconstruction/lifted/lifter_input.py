@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.skeleton import BODY_15, indices
+from drocap_ros.skeleton import BODY_17, indices
 
 #: Frame rate of the network; other rates are resampled.
 LIFTER_FPS = 24.0
 #: Bones whose lengths are input features: that of joint j to its parent stands at j - 1.
-BONES = BODY_15.bones
-#: Input features of a frame: x, y and confidence of every joint, length and depth range of every bone.
-FEATURES = 3 * len(BODY_15) + 2 * len(BONES)
+BONES = BODY_17.bones
 
-_TORSO = indices(BODY_15.joints, ("pelvis", "rhip", "lhip", "neck", "lshoulder", "rshoulder"))
+_JOINTS = len(BODY_17)
+#: Widths of the parts of a frame's features: x and y, confidence, bones' lengths, their reaches in depth, standard
+#: deviations of x and y, their correlation, turn of the camera, direction of gravity, whether both are known,
+#: size over distance, whether the lens is known.
+PARTS = (2 * _JOINTS, _JOINTS, len(BONES), len(BONES), 2 * _JOINTS, _JOINTS, 3, 3, 1, 1, 1)
+#: Input features of a frame.
+FEATURES = sum(PARTS)
+
+_TORSO = indices(BODY_17.joints, ("pelvis", "rhip", "lhip", "neck", "lshoulder", "rshoulder"))
 _CLIP = 6.0
+#: Factors that bring standard deviations (share of the size) and turns (rad per frame) to the order of one.
+_STD_FACTOR, _TURN_FACTOR = 10.0, 20.0
 
 
 def nanmedian_small(values: np.ndarray, axis: int) -> np.ndarray:
@@ -27,7 +35,7 @@ def nanmedian_small(values: np.ndarray, axis: int) -> np.ndarray:
 
 
 def centre_of(keypoints: np.ndarray) -> np.ndarray:
-    """(..., F, 2) median of the seen torso joints of (..., F, 15, 2); gaps in time are filled from neighbours."""
+    """(..., F, 2) median of the seen torso joints of (..., F, 17, 2); gaps in time are filled from neighbours."""
     centre = nanmedian_small(keypoints[..., _TORSO, :], axis=-2)
     missing = ~np.isfinite(centre[..., 0])
     if missing.any():
@@ -47,7 +55,7 @@ def _fill_gaps(centre: np.ndarray) -> None:
 
 
 def scale_of(centred: np.ndarray) -> np.ndarray:
-    """(...) size of (..., F, 15, 2) centred joints: median over frames of the mean distance from the centre."""
+    """(...) size of (..., F, 17, 2) centred joints: median over frames of the mean distance from the centre."""
     distance = np.sqrt(np.square(centred).sum(axis=-1))
     seen = np.isfinite(distance)
     count = seen.sum(axis=-1)
@@ -57,20 +65,27 @@ def scale_of(centred: np.ndarray) -> np.ndarray:
 
 
 def normalise(
-    keypoints: np.ndarray, confidence: np.ndarray, lengths: np.ndarray | None = None
+    keypoints: np.ndarray,
+    confidence: np.ndarray,
+    lengths: np.ndarray | None = None,
+    covariance: np.ndarray | None = None,
+    rotation: np.ndarray | None = None,
+    focal: np.ndarray | float | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Features of windows of 2D joints.
 
     Parameters
     ----------
-    keypoints : (..., F, 15, 2), any unit, y down; NaN where not seen
-    confidence : (..., F, 15) in [0, 1]
-    lengths : (..., 14) of the bones in the unit of the keypoints, NaN where unknown; None = unknown
+    keypoints : (..., F, 17, 2), any unit, y down; NaN where not seen
+    confidence : (..., F, 17) in [0, 1]
+    lengths : (..., 16) of the bones in the unit of the keypoints, NaN where unknown; None = unknown
+    covariance : (..., F, 17, 3) xx, xy, yy of the keypoints in their unit squared, NaN where unknown; None = unknown
+    rotation : (..., F, 3, 3) world (z up) -> camera (x right, y down, z forward), NaN where unknown; None = unknown
+    focal : (...) focal length in the keypoints' unit, infinite for a distant camera, NaN where unknown; None = unknown
 
     Returns
     -------
-    features : (..., F, 73) float32: x, y of every joint (0 where not seen), its confidence, then the length of
-        every bone and its reach in depth at that length (0 where unknown)
+    features : (..., F, 143) float32, 0 where unknown; their order is that of :data:`PARTS`
     centre : (..., F, 2) of every frame
     scale : (...) one for the window
     """
@@ -80,7 +95,14 @@ def normalise(
     seen = np.isfinite(centred[..., 0])
     xy = np.clip(np.where(seen[..., None], centred, 0) / scale[..., None, None, None], -_CLIP, _CLIP)
     weight = np.where(seen, confidence, 0)
-    features = [xy.reshape(*xy.shape[:-2], -1), weight, *_bone_features(xy, seen, scale, lengths)]
+    features = [
+        xy.reshape(*xy.shape[:-2], -1),
+        weight,
+        *_bone_features(xy, seen, scale, lengths),
+        *_error_features(seen, scale, covariance),
+        *_camera_features(seen.shape[:-1], rotation),
+        *_lens_features(seen.shape[:-1], scale, focal),
+    ]
     return np.concatenate(features, axis=-1, dtype=np.float32), centre, scale
 
 
@@ -95,3 +117,66 @@ def _bone_features(
     both = seen[..., BONES[:, 1]] & seen[..., BONES[:, 0]] & (length > 0)
     reach = np.sqrt(np.where(both, np.maximum(np.square(length) - flat, 0), 0))
     return np.broadcast_to(length, shape), reach
+
+
+def _error_features(
+    seen: np.ndarray, scale: np.ndarray, covariance: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    if covariance is None:
+        return np.zeros((*seen.shape[:-1], 2 * _JOINTS), np.float32), np.zeros(seen.shape, np.float32)
+    known = np.where(seen[..., None], np.nan_to_num(covariance), 0.0)
+    std = np.sqrt(np.maximum(known[..., [0, 2]], 0.0))
+    correlation = known[..., 1] / np.maximum(std[..., 0] * std[..., 1], 1e-12)
+    size = np.minimum(_STD_FACTOR * std / scale[..., None, None, None], _CLIP)
+    return size.reshape(*seen.shape[:-1], -1), np.clip(correlation, -1.0, 1.0)
+
+
+def _camera_features(shape: tuple[int, ...], rotation: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Turn of the camera since the frame before as a rotation vector, gravity in camera axes, 1 where known."""
+    if rotation is None:
+        return np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32), np.zeros((*shape, 1), np.float32)
+    known = np.isfinite(rotation).all(axis=(-2, -1))
+    usual = np.where(known[..., None, None], rotation, np.eye(3))
+    step = usual[..., 1:, :, :] @ np.swapaxes(usual[..., :-1, :, :], -1, -2)
+    # The turn of a frame is small: the skew part is the rotation vector.
+    skew = step - np.swapaxes(step, -1, -2)
+    turn = np.zeros((*shape, 3))
+    turn[..., 1:, :] = 0.5 * _TURN_FACTOR * np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
+    turn[..., 1:, :] *= (known[..., 1:] & known[..., :-1])[..., None]
+    return turn, -usual[..., :, 2] * known[..., None], known[..., None]
+
+
+def _lens_features(
+    shape: tuple[int, ...], scale: np.ndarray, focal: np.ndarray | float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Size of the person over the focal length, and 1 where the latter is known."""
+    if focal is None:
+        return np.zeros((*shape, 1), np.float32), np.zeros((*shape, 1), np.float32)
+    width = np.broadcast_to(np.asarray(scale / focal), scale.shape)[..., None, None]
+    known = np.isfinite(width)
+    full = (*shape, 1)
+    return np.broadcast_to(np.where(known, _STD_FACTOR * width, 0.0), full), np.broadcast_to(known, full)
+
+
+def mirrored(features: np.ndarray) -> np.ndarray:
+    """Features (..., 143) of the scene seen in a mirror: x negated, left and right exchanged."""
+    xy, weight, length, reach, std, correlation, turn, gravity, *rest = np.split(
+        features, np.cumsum(PARTS)[:-1], axis=-1
+    )
+    shape = (*features.shape[:-1], _JOINTS, 2)
+    joints, bones = BODY_17.mirror, BODY_17.mirror[1:] - 1
+    flip = np.array([-1, 1], np.float32)
+    return np.concatenate(
+        [
+            (xy.reshape(shape)[..., joints, :] * flip).reshape(xy.shape),
+            weight[..., joints],
+            length[..., bones],
+            reach[..., bones],
+            std.reshape(shape)[..., joints, :].reshape(std.shape),
+            -correlation[..., joints],
+            turn * np.array([1, -1, -1], np.float32),
+            gravity * np.array([-1, 1, 1], np.float32),
+            *rest,
+        ],
+        axis=-1,
+    )

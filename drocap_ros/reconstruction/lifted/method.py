@@ -25,11 +25,15 @@ from drocap_ros.reconstruction.lifted.body_size import (
     magnification,
     measure_size,
 )
-from drocap_ros.reconstruction.lifted.even_frames import even_slots, spread_keypoints
+from drocap_ros.reconstruction.lifted.even_frames import even_slots, spread, spread_keypoints
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
 from drocap_ros.reconstruction.lifted.lifter import Lifter
 from drocap_ros.reconstruction.lifted.lifter_input import LIFTER_FPS
 from drocap_ros.reconstruction.lifted.window_solver import Cancelled, solve_signs_and_adjust
+
+#: Standard deviation of an adjusted pose over the lifter's expected errors, about the pelvis: across and along the
+#: ray (measured on the HDM05 sequences of mocap/train, which are not among the lifter's training data).
+ACROSS, ALONG = 1.2, 1.5
 
 
 def prepare(config: LiftedConfig) -> None:
@@ -54,9 +58,9 @@ def import_libraries() -> None:
 class WindowSolution:
     """Result of a window.
 
-    joints : (F, 15, 3) in camera axes and the unit of the keypoints; x and y in the image, depth in the scale of the
+    joints : (F, 17, 3) in camera axes and the unit of the keypoints; x and y in the image, depth in the scale of the
         pelvis
-    sigma : (F, 15, 2) the lifter's expected absolute error of x, y (each) and of depth, in the same unit
+    sigma : (F, 17, 2) the lifter's expected absolute error of x, y (each) and of depth, in the same unit
     body : the size for the next window
     steps : of the first and of the final adjustment
     seconds : wall-clock of "initial" (the lifter) and of "ba" (the rest)
@@ -78,6 +82,7 @@ def solve_window(
     config: LiftedConfig,
     known: BodySize | None = None,
     cancelled: Cancelled | None = None,
+    rotation: np.ndarray | None = None,
 ) -> WindowSolution:
     """:func:`solve_even_window` for frames at any increasing times ``stamp_ns`` (F,).
 
@@ -85,10 +90,11 @@ def solve_window(
     """
     slot, fps = even_slots(stamp_ns)
     if slot[-1] + 1 == len(slot):
-        return solve_even_window(keypoints, fps, focal, config, known=known, cancelled=cancelled)
+        return solve_even_window(keypoints, fps, focal, config, known, cancelled, rotation)
     if known is not None:
         known = replace(known, unit_per_mm=np.interp(np.arange(slot[-1] + 1), slot, known.unit_per_mm))
-    r = solve_even_window(spread_keypoints(keypoints, slot), fps, focal, config, known=known, cancelled=cancelled)
+    turn = None if rotation is None else spread(rotation, slot, np.nan)
+    r = solve_even_window(spread_keypoints(keypoints, slot), fps, focal, config, known, cancelled, turn)
     body = replace(r.body, unit_per_mm=r.body.unit_per_mm[slot])
     return replace(r, joints=r.joints[slot], sigma=r.sigma[slot], body=body)
 
@@ -100,17 +106,19 @@ def solve_even_window(
     config: LiftedConfig | None = None,
     known: BodySize | None = None,
     cancelled: Cancelled | None = None,
+    rotation: np.ndarray | None = None,
 ) -> WindowSolution:
     """Poses of one window of evenly spaced frames.
 
     Parameters
     ----------
-    keypoints : of ``BODY_15``, any unit, y down; without a covariance the noise is estimated from the sequence
+    keypoints : of ``BODY_17``, any unit, y down; without a covariance the noise is estimated from the sequence
     fps : frames per second
     focal : focal length in the keypoints' unit; None = unknown, the camera is taken as distant
     config : the defaults if None
     known : size from an earlier window, for a warm start
     cancelled : called before every step of the adjustments but the first; True ends them
+    rotation : (F, 3, 3) world (z up) -> camera, NaN where unknown; None = unknown
 
     Raises
     ------
@@ -121,15 +129,13 @@ def solve_even_window(
     lifter = Lifter.load(config.lifter or None)
     begin = time.perf_counter()
     if known is None:
-        sized = measure_size(keypoints, fps, focal, config, lifter, cancelled)
+        sized = measure_size(keypoints, fps, focal, config, lifter, rotation, cancelled)
     else:
-        sized = apply_size(known, keypoints, fps, focal, config, lifter)
+        sized = apply_size(known, keypoints, fps, focal, config, lifter, rotation)
     mm, zoom = sized.mm, sized.zoom
 
     clock = time.perf_counter()
-    found = solve_signs_and_adjust(
-        sized.model, sized.flat, sized.lifted.joints, sized.lifted.sigma, sized.lengths, config.iterations, cancelled
-    )
+    found = solve_signs_and_adjust(sized.model, sized.flat, sized.lifted, sized.lengths, config.iterations, cancelled)
     size = (zoom / mm)[:, None, None]
     joints = found.joints.copy()
     if focal is not None:

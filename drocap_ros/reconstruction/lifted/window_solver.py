@@ -21,13 +21,14 @@ from drocap_ros.reconstruction.lifted.adjustment import (
 )
 from drocap_ros.reconstruction.lifted.depth_signs import depth_signs
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
+from drocap_ros.reconstruction.lifted.lifter import LiftedMotion
 from drocap_ros.reconstruction.lifted.lifter_input import nanmedian_small
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_17
 
 #: Returns True when an adjustment should end.
 Cancelled = Callable[[], bool]
 
-_BONES = BODY_15.bones
+_BONES = BODY_17.bones
 #: Lasting noise of the 2D joints at which known bone lengths change little: noise lengthens free bones.
 _HELD_NOISE_MM = 10.0
 
@@ -36,11 +37,11 @@ _HELD_NOISE_MM = 10.0
 class WindowModel:
     """Weights and priors common to both adjustments of a window.
 
-    weight : (F, 15) 1/mm^2 of the 2D joints, 0 where not seen
+    information : (F, 17, 3) 1/mm^2, xx, xy, yy of the 2D joints' inverse covariance, 0 where not seen
     noise_mm, lasting_noise_mm : standard deviation of their errors, and of those that last for some frames
     """
 
-    weight: np.ndarray
+    information: np.ndarray
     noise_mm: float
     lasting_noise_mm: float
     fps: float
@@ -54,20 +55,35 @@ def window_model(keypoints: Keypoints2D, mm: float, fps: float, config: LiftedCo
 
     Without a covariance the noise comes from the third difference in time, to which motion contributes little.
     """
-    points_mm, confidence, variance = keypoints.xy * mm, keypoints.confidence, keypoints.variance
+    points_mm, confidence = keypoints.xy * mm, keypoints.confidence
     seen = np.isfinite(points_mm[..., 0])
     noise = config.noise_mm
     if len(keypoints) > 3:
         noise = max(noise, difference_noise(points_mm))
-    square = np.full(seen.shape, noise**2)
-    if variance is not None:
-        square = np.where(np.isfinite(variance), np.maximum(variance * mm**2, config.noise_mm**2), square)
-        noise = float(np.sqrt(np.median(square[seen]))) if seen.any() else noise
-    weight = np.where(seen, 1.0 / square, 0.0)
+    covariance = np.broadcast_to(noise**2 * np.array([1.0, 0.0, 1.0]), (*seen.shape, 3))
+    if keypoints.covariance is not None:
+        known = np.isfinite(keypoints.covariance).all(axis=-1, keepdims=True)
+        covariance = np.where(
+            known, _at_least(np.nan_to_num(keypoints.covariance) * mm**2, config.noise_mm), covariance
+        )
+        noise = float(np.sqrt(np.median(0.5 * (covariance[seen, 0] + covariance[seen, 2])))) if seen.any() else noise
+    determinant = covariance[..., 0] * covariance[..., 2] - np.square(covariance[..., 1])
+    weight = seen / determinant
     if confidence is not None:
         weight = weight * np.clip(np.nan_to_num(confidence), 0.0, 1.0)
+    information = weight[..., None] * covariance[..., [2, 1, 0]] * np.array([1.0, -1.0, 1.0])
     lasting = _lasting_noise(points_mm)
-    return WindowModel(weight, noise, lasting, fps, config, *zoom_model(len(keypoints), fps, config.zoom_std_per_s))
+    return WindowModel(
+        information, noise, lasting, fps, config, *zoom_model(len(keypoints), fps, config.zoom_std_per_s)
+    )
+
+
+def _at_least(covariance: np.ndarray, std: float) -> np.ndarray:
+    """Covariances (..., 3) whose smallest standard deviation is at least ``std``."""
+    middle, half = 0.5 * (covariance[..., 0] + covariance[..., 2]), 0.5 * (covariance[..., 0] - covariance[..., 2])
+    smallest = middle - np.hypot(half, covariance[..., 1])
+    wider: np.ndarray = covariance + np.maximum(std**2 - smallest, 0.0)[..., None] * np.array([1.0, 0.0, 1.0])
+    return wider
 
 
 def difference_noise(points: np.ndarray) -> float:
@@ -90,20 +106,20 @@ def _lasting_noise(points: np.ndarray) -> float:
 def solve_signs_and_adjust(
     model: WindowModel,
     keypoints: np.ndarray,
-    prior: np.ndarray,
-    sigma: np.ndarray,
+    lifted: LiftedMotion,
     lengths: np.ndarray | None,
     iterations: int,
     cancelled: Cancelled | None,
 ) -> AdjustmentSolution:
-    """Adjusted joints from the 2D joints (F, 15, 2) and the lifter's joints (F, 15, 3), all in mm.
+    """Adjusted joints from the 2D joints (F, 17, 2) and the lifter's result, all in mm.
 
     Parameters
     ----------
-    sigma : (F, 15, 2) the lifter's expected errors of x, y (each) and of depth
-    lengths : (16,) of the adjustment's spans; None = from the 2D joints and the lifter's depths
+    lengths : (18,) of the adjustment's spans; None = from the 2D joints and the lifter's depths
     """
-    config, weight, fps = model.config, model.weight, model.fps
+    config, fps = model.config, model.fps
+    prior, sigma = lifted.joints, lifted.sigma
+    weight = 0.5 * (model.information[..., 0] + model.information[..., 2])
     points = np.where(weight[..., None] > 0, np.nan_to_num(keypoints), 0.0)
     prior_xy = config.image_weight / (2 * np.square(sigma[..., 0]) + 5.0**2)
     gap = np.square(points - prior[..., :2]).sum(axis=-1)
@@ -128,11 +144,13 @@ def solve_signs_and_adjust(
         1000 * config.sign_acceleration_m_s2 / fps**2,
     )
     depth = np.zeros(flat.shape[:2])
+    # Where the lifter sees a bone flatter than its length says, it starts as it is seen.
+    start = sign * np.minimum(reach, np.abs(prior[:, child, 2] - prior[:, parent, 2]))
     for bone, (p, c) in enumerate(_BONES):
-        depth[:, c] = depth[:, p] + sign[:, bone] * reach[:, bone]
+        depth[:, c] = depth[:, p] + start[:, bone]
     problem = AdjustmentProblem(
         keypoints=points,
-        weight=weight,
+        information=model.information,
         prior=prior,
         prior_weight_xy=prior_xy,
         prior_weight_z=config.depth_weight / np.maximum(sigma[..., 1], 10.0),
@@ -148,7 +166,7 @@ def solve_signs_and_adjust(
 def _smooth(
     points: np.ndarray, weight: np.ndarray, other: np.ndarray, other_weight: np.ndarray, smoothing: float
 ) -> np.ndarray:
-    """Least-squares fit (F, 15, 2) to two noisy tracks with small accelerations: a banded solve per joint."""
+    """Least-squares fit (F, 17, 2) to two noisy tracks with small accelerations: a banded solve per joint."""
     from scipy.linalg import solveh_banded
 
     frames, joints, _ = points.shape

@@ -12,7 +12,7 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
 from drocap_ros.reconstruction.lifted.body_size import BodySize
 from drocap_ros.reconstruction.lifted.lifted_config import lifted_config
-from drocap_ros.reconstruction.lifted.method import WindowSolution, prepare, solve_window
+from drocap_ros.reconstruction.lifted.method import ACROSS, ALONG, WindowSolution, prepare, solve_window
 from drocap_ros.reconstruction.lifted.window_solver import Cancelled
 from drocap_ros.reconstruction.live.effort import Effort
 from drocap_ros.reconstruction.live.paper_adjustment import adjust_by_equations
@@ -30,10 +30,6 @@ SOLVER_ERRORS = (InputError, ValueError, ArithmeticError)
 
 #: Sizes from windows of fewer frames do not start the next window: too few views.
 WARM_FRAMES = 72
-
-#: Standard deviation of an adjusted pose over the lifter's expected errors, about the pelvis: across and along the
-#: ray (measured on the HDM05 sequences of mocap/train, which are not among the lifter's training data).
-ACROSS, ALONG = 1.2, 1.5
 
 
 class LiveAdjuster:

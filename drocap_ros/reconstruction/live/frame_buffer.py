@@ -35,7 +35,7 @@ class FrameBuffer:
     def push(self, observation: PoseObservation, initial_joints: np.ndarray) -> bool:
         """Add a frame; True when an adjustment is due.
 
-        initial_joints : (15, 3) m, camera axes
+        initial_joints : (17, 3) m, camera axes; (15, 3) from older recordings
         """
         self.event = self._order.classify(observation.stamp_ns, observation.track_id)
         if self.event.dropped:
@@ -60,13 +60,15 @@ class FrameBuffer:
     def window(self) -> Window:
         """Copy of the frames, float64."""
         observations = [observation for observation, _ in self._frames]
+        count = min(len(joints) for _, joints in self._frames)
+        keypoints = [observation.body_keypoints() for observation in observations]
         return Window(
             np.array([o.stamp_ns for o in observations], np.int64),
             Keypoints2D(
-                np.array([o.keypoints for o in observations], np.float64),
-                np.array([o.confidence for o in observations], np.float64),
-                np.array([o.covariance for o in observations], np.float64),
+                np.array([k.xy for k in keypoints]),
+                np.array([k.confidence for k in keypoints]),
+                np.array([k.covariance for k in keypoints]),
             ),
-            np.array([joints for _, joints in self._frames], np.float64),
+            np.array([joints[:count] for _, joints in self._frames], np.float64),
             self.subject,
         )

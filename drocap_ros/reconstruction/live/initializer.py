@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,16 +14,16 @@ from drocap_ros.reconstruction.live.stream_lifter import StreamLifter
 from drocap_ros.reconstruction.live.stream_order import StreamEvent, StreamOrder
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS, check_uncertainty
 from drocap_ros.reconstruction.reconstruction_config import InitializerConfig
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_17
 
 
 @dataclass(frozen=True)
 class InitialPose:
     """Pose of one image.
 
-    joints3d : (15, 3) m, camera axes, pelvis at the origin; NaN when the image shows too little
-    covariance : (15, 6) m^2, xx xy xz yy yz zz
-    confidence : (15,) in [0, 1], 0 where the joint was not seen and the model filled it in
+    joints3d : (17, 3) m, camera axes, pelvis at the origin; NaN when the image shows too little
+    covariance : (17, 6) m^2, xx xy xz yy yz zz
+    confidence : (17,) in [0, 1], 0 where the joint was not seen and the model filled it in
     """
 
     joints3d: np.ndarray
@@ -71,10 +71,10 @@ class LiveInitializer:
         points = np.where(seen[:, None], keypoints.xy, np.nan)
         joints, std, metres = self._lifter.push(observation.stamp_ns, points, confidence)
         gap = joints[seen, :2] - keypoints.xy[seen]
-        covariance = np.zeros((len(BODY_15), 6))
+        covariance = np.zeros((len(BODY_17), 6))
         covariance[:, [0, 3, 5]] = std[:, [0, 0, 1]] ** 2
         return InitialPose(
-            joints3d=(joints - joints[BODY_15.index("pelvis")]) * metres,
+            joints3d=(joints - joints[BODY_17.index("pelvis")]) * metres,
             covariance=covariance * metres**2,
             confidence=confidence,
             reprojection_rms_px=float(np.sqrt(np.mean(np.sum(gap**2, axis=-1)))),
@@ -82,22 +82,14 @@ class LiveInitializer:
 
 
 def _keypoints(observation: PoseObservation) -> Keypoints2D:
-    """The image's keypoints in float64; a covariance of NaN alone is left out."""
-    p = len(BODY_15)
-    for name, columns in (("keypoints", (2,)), ("confidence", ()), ("covariance", (3,))):
-        shape = getattr(observation, name).shape
-        if shape != (p, *columns):
-            raise InputError(f"{name}: expected shape {(p, *columns)}, got {shape}; use the body15 joints")
+    """The image's keypoints of ``BODY_17``; a covariance of NaN alone is left out."""
+    keypoints = observation.body_keypoints()
     if np.isinf(observation.keypoints).any():
         raise InputError("keypoints: expected finite px or NaN, got infinity; check the 2D joints")
-    covariance = observation.covariance.astype(np.float64)
-    return Keypoints2D(
-        observation.keypoints.astype(np.float64),
-        observation.confidence.astype(np.float64),
-        None if np.isnan(covariance).all() else covariance,
-    )
+    assert keypoints.covariance is not None
+    return replace(keypoints, covariance=None) if np.isnan(keypoints.covariance).all() else keypoints
 
 
 def _unknown() -> InitialPose:
-    p = len(BODY_15)
+    p = len(BODY_17)
     return InitialPose(np.full((p, 3), np.nan), np.full((p, 6), np.nan), np.zeros(p), float("nan"))

@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from drocap_ros.geometry.bones import bone_lengths
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_17
 
-_BONES = BODY_15.bones
+_BONES = BODY_17.bones
 
 
 def median_bone_lengths(joints: np.ndarray) -> np.ndarray:
-    """Median length (14,) of each bone over the poses (F, 15, 3) of a window."""
+    """Median length (16,) of each bone over the poses (F, 17, 3) of a window."""
     lengths: np.ndarray = np.median(bone_lengths(joints), axis=0)
     return lengths
 
@@ -44,14 +44,14 @@ class LatestPose:
         return self._to is not None
 
     def set_solution(self, lengths: np.ndarray, stamp_ns: int) -> None:
-        """Blend in a solution's bone lengths (14,) m from the image of ``stamp_ns`` on."""
+        """Blend in a solution's bone lengths (16,) m from the image of ``stamp_ns`` on."""
         if not np.isfinite(lengths).all():
             return
         self._from = self._lengths(stamp_ns)
         self._to, self._begin_ns = lengths, stamp_ns
 
     def pose(self, stamp_ns: int, joints: np.ndarray) -> np.ndarray:
-        """Joints (15, 3) m in camera axes, pelvis at the origin, from the image's initial ones; NaN stays NaN."""
+        """Joints (P, 3) m in camera axes, pelvis at the origin, from the image's initial ones; NaN stays NaN."""
         lengths = self._lengths(stamp_ns)
         if lengths is None or not np.isfinite(joints).all():
             return joints
@@ -74,10 +74,11 @@ class LatestPose:
 
 
 def _with_lengths(joints: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Joints (15, 3) whose bones keep their directions and have these lengths (14,); pelvis at the origin."""
-    way = joints[_BONES[:, 1]] - joints[_BONES[:, 0]]
-    way *= (lengths / np.maximum(np.linalg.norm(way, axis=-1), 1e-9))[:, None]
+    """Joints (P, 3) whose bones keep their directions and have these lengths; pelvis at the origin."""
+    bones = _BONES[: len(joints) - 1]
+    way = joints[bones[:, 1]] - joints[bones[:, 0]]
+    way *= (lengths[: len(bones)] / np.maximum(np.linalg.norm(way, axis=-1), 1e-9))[:, None]
     out = np.zeros_like(joints)
-    for bone, (parent, child) in enumerate(_BONES):
+    for bone, (parent, child) in enumerate(bones):
         out[child] = out[parent] + way[bone]
     return out

@@ -16,7 +16,7 @@ from drocap_ros.reconstruction.paper.normalize import normalize_tracks
 from drocap_ros.reconstruction.paper.reprojection import Projection, frames_first, frames_last
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.reconstruction.stop_reason import TOO_SHORT
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_15, BODY_17, indices
 
 #: Least standard deviations of an adjusted pose, in units of the 2D joints: across the image, along the ray.
 ACROSS_STD, DEPTH_STD = 0.02, 0.22
@@ -24,9 +24,17 @@ ACROSS_STD, DEPTH_STD = 0.02, 0.22
 #: Standard deviation of 2D joints about the initial poses, in units of the 2D joints.
 INITIAL_STD = 0.1
 
+#: Factor on the variance of an unseen joint.
+_UNSEEN = 4.0
+
+#: The ankles in the order of the toes.
+_ANKLES = np.array(indices(BODY_15.joints, ("rankle", "lankle")))
+
 
 def adjust_by_equations(window: Window, config: BundleAdjusterConfig | None = None) -> AdjustedWindow:
     """Bundle adjustment of one window; frames whose initial pose is NaN are interpolated from their neighbours.
+
+    The paper's method has no feet: each toe keeps its place from the ankle in the initial pose.
 
     Raises
     ------
@@ -36,12 +44,13 @@ def adjust_by_equations(window: Window, config: BundleAdjusterConfig | None = No
     config = config or BundleAdjusterConfig()
     stamp_ns, keypoints, initial_joints = window.stamp_ns, window.keypoints, window.initial_joints
     frames = len(keypoints)
-    if initial_joints.shape != (frames, len(BODY_15), 3) or len(stamp_ns) != frames:
+    if initial_joints.shape not in _shapes(frames) or len(stamp_ns) != frames:
         raise InputError(
-            f"initial_joints: expected shape {(frames, len(BODY_15), 3)} and {frames} stamps, got"
+            f"initial_joints: expected shape {' or '.join(map(str, _shapes(frames)))} and {frames} stamps, got"
             f" {initial_joints.shape} and {len(stamp_ns)}; give one pose and stamp per image"
         )
-    initial = fill_frames(stamp_ns, initial_joints)
+    whole = fill_frames(stamp_ns, initial_joints)
+    initial, keypoints = whole[:, : len(BODY_15)], keypoints.with_joints(len(BODY_15))
     if keypoints.covariance is not None and np.isnan(keypoints.covariance).all():
         keypoints = replace(keypoints, covariance=None)
     n = normalize_tracks(keypoints)
@@ -64,17 +73,24 @@ def adjust_by_equations(window: Window, config: BundleAdjusterConfig | None = No
     joints = joints - joints[:, BODY_15.index("pelvis")][:, None]
     # The scale of a monocular result is that of the initial poses: keep the mean limb length.
     metres = float(limb_lengths(initial).mean() / limb_lengths(joints).mean())
+    feet = _ANKLES[: whole.shape[1] - len(BODY_15)]
+    toes = (joints * metres)[:, feet] + whole[:, len(BODY_15) :] - whole[:, feet]
+    covariance = _window_covariance(gap, seen) * metres**2
     return AdjustedWindow(
         stamp_ns=np.asarray(stamp_ns, dtype=np.int64),
-        joints3d=joints * metres,
-        covariance=_window_covariance(gap, seen) * metres**2,
-        confidence=n.weights,
+        joints3d=np.concatenate([joints * metres, toes], axis=1),
+        covariance=np.concatenate([covariance, _UNSEEN * covariance[:, feet]], axis=1),
+        confidence=np.concatenate([n.weights, np.zeros((frames, len(feet)))], axis=1),
         reprojection_rms_px=np.where(seen.any(1), rms, np.nan),
         iterations=iterations,
         cost=float(sum(terms.values())),
         stop_reason=stop,
         cost_terms=terms,
     )
+
+
+def _shapes(frames: int) -> tuple[tuple[int, int, int], ...]:
+    return (frames, len(BODY_15), 3), (frames, len(BODY_17), 3)
 
 
 def _camera_residual(projection: Projection, joints: np.ndarray) -> np.ndarray:
@@ -92,7 +108,7 @@ def _window_covariance(gap: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """
     square = np.where(seen, 0.5 * np.sum(gap**2, axis=-1), 0.0)
     across = square.sum() / max(int(seen.sum()), 1) + ACROSS_STD**2
-    factor = np.where(seen, 1.0, 4.0)
+    factor = np.where(seen, 1.0, _UNSEEN)
     out = np.zeros((*gap.shape[:2], 6))
     out[..., 0] = out[..., 3] = factor * across
     out[..., 5] = factor * (9.0 * across + DEPTH_STD**2)

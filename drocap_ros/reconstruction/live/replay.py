@@ -22,7 +22,7 @@ from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 
 
 class LivePose(NamedTuple):
-    """An image's initial pose as published: joints (15, 3) float32 m in camera axes.
+    """An image's initial pose as published: joints (17, 3) float32 m in camera axes.
 
     restarted : the subject or the pass of time differs from the image before
     """
@@ -34,7 +34,7 @@ class LivePose(NamedTuple):
 
 
 class LiveWindow(NamedTuple):
-    """An adjusted window as published: joints (F, 15, 3) float32 m in camera axes."""
+    """An adjusted window as published: joints (F, 17, 3) float32 m in camera axes."""
 
     joints3d: np.ndarray
     window: AdjustedWindow

@@ -12,7 +12,7 @@ from drocap_ros.geometry.bones import LIMBS_PER_STATURE, bone_lengths, limb_leng
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
-from drocap_ros.reconstruction.lifted.lifter import Lifter
+from drocap_ros.reconstruction.lifted.lifter import Lifter, LifterInput
 
 #: Images before the first estimate of the proportions, images between two estimates, and estimates kept.
 FIRST_ESTIMATE, ESTIMATE_EVERY, ESTIMATES = 12, 24, 40
@@ -29,7 +29,7 @@ ACROSS, ALONG = 1.35, 1.5
 
 
 class LiftedImage(NamedTuple):
-    """joints (15, 3) px in camera axes, x and y in the image; std (15, 2) px across and along the ray; m per px."""
+    """joints (17, 3) px in camera axes, x and y in the image; std (17, 2) px across and along the ray; m per px."""
 
     joints: np.ndarray
     std: np.ndarray
@@ -60,7 +60,7 @@ class StreamLifter:
         self._proportions.clear()
 
     def push(self, stamp_ns: int, keypoints: np.ndarray, confidence: np.ndarray) -> LiftedImage:
-        """Lift the next image: keypoints (15, 2) px, NaN where not seen; confidence (15,)."""
+        """Lift the next image: keypoints (17, 2) px, NaN where not seen; confidence (17,)."""
         self._past.append((stamp_ns, keypoints, confidence))
         while self._past[0][0] < stamp_ns - self._past_ns:
             self._past.popleft()
@@ -73,7 +73,7 @@ class StreamLifter:
         if self._since_estimate >= (ESTIMATE_EVERY if self._proportions else FIRST_ESTIMATE):
             self._since_estimate = 0
             self._estimate_proportions(points, weight, fps)
-        lifted = self._lifter.lift_last(points, weight, fps, self._lengths_px())
+        lifted = self._lifter.lift_last(LifterInput(points, weight, self._lengths_px()), fps)
         joints = lifted.joints[0]
         self._limbs_px.append(max(float(limb_lengths(joints).sum()), 1e-9))
         metres = self._limbs_m / median(self._limbs_px)
@@ -88,7 +88,7 @@ class StreamLifter:
 
     def _estimate_proportions(self, points: np.ndarray, weight: np.ndarray, fps: float) -> None:
         # The lifter gets no lengths here: fed with its own estimates, it drifts within a second.
-        joints = self._lifter.lift(points, weight, fps).joints
+        joints = self._lifter.lift(LifterInput(points, weight), fps).joints
         lengths = bone_lengths(joints)
         self._proportions.append(np.median(lengths / limb_lengths(joints).sum(axis=-1, keepdims=True), axis=0))
 
@@ -100,7 +100,7 @@ class StreamLifter:
 
 
 def person_size(keypoints: np.ndarray) -> np.ndarray:
-    """(F,) px, the median over the images of the person's longer side, for keypoints (F, 15, 2)."""
+    """(F,) px, the median over the images of the person's longer side, for keypoints (F, P, 2)."""
     low = np.fmin.reduce(keypoints, axis=1)
     high = np.fmax.reduce(keypoints, axis=1)
     size = (high - low).max(axis=-1)

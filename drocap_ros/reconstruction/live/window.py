@@ -15,8 +15,8 @@ class Window(NamedTuple):
     """F frames of one subject.
 
     stamp_ns : (F,) increasing
-    keypoints : of BODY_15, with confidence and covariance (NaN where unknown)
-    initial_joints : (F, 15, 3) m, camera axes
+    keypoints : of BODY_17, with confidence and covariance (NaN where unknown)
+    initial_joints : (F, 17, 3) m, camera axes
     subject : differs for every subject and for every pass of time
     """
 
@@ -33,7 +33,7 @@ class Window(NamedTuple):
 
 @dataclass(frozen=True)
 class AdjustedWindow:
-    """Poses of a window: joints3d (F, 15, 3) m and covariance (F, 15, 6) m^2 in camera axes, pelvis at the origin.
+    """Poses of a window: joints3d (F, 17, 3) m and covariance (F, 17, 6) m^2 in camera axes, pelvis at the origin.
 
     effort : repeats the adjustment bit for bit
     """

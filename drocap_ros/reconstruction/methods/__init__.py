@@ -10,18 +10,20 @@ from dataclasses import dataclass
 
 from drocap_ros.reconstruction.methods import ba, initial, mf_nnm, paper
 from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput
+from drocap_ros.skeleton import BODY_15, BODY_17, JointSet
 
 
 @dataclass(frozen=True)
 class Method:
-    """A method of reconstruction and its help text."""
+    """A method of reconstruction, its help text and its joints: those of the paper are fifteen."""
 
     run: Callable[[MethodInput], CameraPoses]
     summary: str
+    joints: JointSet = BODY_15
 
 
 METHODS = {
-    "ba": Method(ba.run, "the default: learned lifter, depth signs, adjustment with constant bone lengths"),
+    "ba": Method(ba.run, "the default: learned lifter, depth signs, adjustment with constant bone lengths", BODY_17),
     "paper": Method(paper.run, "single-view initializer and equations (2) to (4) of the paper"),
     "paper-no-articulation": Method(paper.run_without_articulation, "paper with gamma = 0"),
     "initial": Method(initial.run, "the paper's single-view initializer alone"),

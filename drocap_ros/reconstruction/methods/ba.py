@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drocap_ros.keypoints import Keypoints2D, isotropic_covariance
+from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.lifted.lifted_config import lifted_config
 from drocap_ros.reconstruction.lifted.method import solve_window
 from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput
@@ -20,13 +20,15 @@ def run(data: MethodInput) -> CameraPoses:
     seconds = {"initial": 0.0, "ba": 0.0}
 
     def solve(rows: slice, n: NormalizedTracks) -> WindowResult:
-        variance = data.keypoints[rows].variance
-        covariance = None if variance is None else isotropic_covariance(variance / n.scale_px**2)
+        covariance = data.keypoints.covariance
+        covariance = None if covariance is None else covariance[rows] / n.scale_px**2
+        rotation = None if data.rotation is None else data.rotation[rows]
         points = np.where((n.weights > 0.0)[..., None], n.w, np.nan)
         focal = None if data.focal_px is None else data.focal_px / n.scale_px
-        found = solve_window(data.stamp_ns[rows], Keypoints2D(points, n.weights, covariance), focal, config)
+        seen = Keypoints2D(points, n.weights, covariance)
+        found = solve_window(data.stamp_ns[rows], seen, focal, config, rotation=rotation)
         for stage, value in found.seconds.items():
             seconds[stage] += value
-        return WindowResult(found.joints, found.cost_terms, found.steps[1], found.stop_reason, found.sigma[..., 1])
+        return WindowResult(found.joints, found.cost_terms, found.steps[1], found.stop_reason, found.sigma)
 
     return replace(over_windows(data, solve), seconds=seconds)

@@ -19,8 +19,9 @@ class MethodInput:
     """Keypoints of one person and the parameters of the methods.
 
     stamp_ns : (F,) increasing
-    keypoints : of BODY_15, px
+    keypoints : of the method's joints, px
     focal_px : of the camera, None = unknown
+    rotation : (F, 3, 3) world (z up) -> camera, None = unknown
     progress : called with a stage and its fraction done
     """
 
@@ -31,20 +32,22 @@ class MethodInput:
     adjuster: BundleAdjusterConfig
     dictionary: Dictionary
     progress: Progress
+    rotation: np.ndarray | None = None
 
     def frames(self, use: np.ndarray) -> MethodInput:
         """The input of the frames ``use`` (F,) bool."""
-        return replace(self, stamp_ns=self.stamp_ns[use], keypoints=self.keypoints[use])
+        rotation = None if self.rotation is None else self.rotation[use]
+        return replace(self, stamp_ns=self.stamp_ns[use], keypoints=self.keypoints[use], rotation=rotation)
 
 
 @dataclass(frozen=True)
 class CameraPoses:
     """Poses in camera axes, in px, and the solver's report.
 
-    joints_px : (F, 15, 3), centred; ``keypoints ~ joints_px[..., :2] + translation_px``
+    joints_px : (F, P, 3), centred; ``keypoints ~ joints_px[..., :2] + translation_px``
     translation_px : (F, 2)
     seconds : wall-clock per stage
-    depth_sigma_px : (F, 15) expected error of the depths, None = the method has none
+    sigma_px : (F, P, 2) expected error of x, y (each) and of depth, None = the method has none
     """
 
     joints_px: np.ndarray
@@ -53,4 +56,4 @@ class CameraPoses:
     iterations: int
     stop_reason: str
     cost_terms: dict[str, float]
-    depth_sigma_px: np.ndarray | None = None
+    sigma_px: np.ndarray | None = None

@@ -44,7 +44,8 @@ def _spread(found: CameraPoses, use: np.ndarray, stamp_ns: np.ndarray) -> Camera
     joints[use] = found.joints_px
     t = (stamp_ns - stamp_ns[0]).astype(np.float64)
     translation = np.stack([np.interp(t, t[use], found.translation_px[:, i]) for i in range(2)], axis=-1)
-    sigma = found.depth_sigma_px
+    sigma = found.sigma_px
     if sigma is not None:
-        sigma = np.stack([np.interp(t, t[use], sigma[:, i]) for i in range(sigma.shape[1])], axis=-1)
-    return replace(found, joints_px=fill_frames(stamp_ns, joints), translation_px=translation, depth_sigma_px=sigma)
+        flat = sigma.reshape(len(sigma), -1).T
+        sigma = np.stack([np.interp(t, t[use], column) for column in flat], axis=-1).reshape(-1, *sigma.shape[1:])
+    return replace(found, joints_px=fill_frames(stamp_ns, joints), translation_px=translation, sigma_px=sigma)

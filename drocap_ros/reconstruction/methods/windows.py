@@ -14,9 +14,9 @@ from drocap_ros.reconstruction.paper.reprojection import Projection, frames_last
 
 
 class WindowResult(NamedTuple):
-    """Poses (F, 15, 3) in camera axes, x and y in the window's normalized image; the solver's report.
+    """Poses (F, P, 3) in camera axes, x and y in the window's normalized image; the solver's report.
 
-    sigma : (F, 15) expected error of the depths, in the same unit; None = the method has none
+    sigma : (F, P, 2) expected error of x, y (each) and of depth, in the same unit; None = the method has none
     """
 
     poses: np.ndarray
@@ -40,14 +40,14 @@ def over_windows(data: MethodInput, solve: Callable[[slice, NormalizedTracks], W
         out[rows] += fade[:, None, None] * in_image
         weight[rows] += fade
         if found.sigma is not None:
-            sigma = np.zeros(keypoints.xy.shape[:2]) if sigma is None else sigma
-            sigma[rows] += fade[:, None] * found.sigma * n.scale_px
+            sigma = np.zeros(keypoints.xy.shape) if sigma is None else sigma
+            sigma[rows] += fade[:, None, None] * found.sigma * n.scale_px
         iterations += found.iterations
         stops.add(found.stop_reason)
         for name, value in found.cost_terms.items():
             terms[name] = terms.get(name, 0.0) + value
         data.progress("ba", rows.stop / len(keypoints))
-    sigma = None if sigma is None else sigma / weight[:, None]
+    sigma = None if sigma is None else sigma / weight[:, None, None]
     return CameraPoses(*split(out / weight[:, None, None]), {}, iterations, ", ".join(sorted(stops)), terms, sigma)
 
 

@@ -13,7 +13,7 @@ from drocap_ros.reconstruction.world.world_model import CAMERA, FRAME, GLOBALS, 
 class Posterior(NamedTuple):
     """Covariances at a unit variance of every residual.
 
-    joints : (F, 15, 3, 3) m^2 in the world; shared : (GLOBALS, GLOBALS)
+    joints : (F, 17, 3, 3) m^2 in the world; shared : (GLOBALS, GLOBALS)
     """
 
     joints: np.ndarray

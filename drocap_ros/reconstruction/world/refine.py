@@ -17,6 +17,7 @@ from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.telemetry_checks import frozen, other_time
 from drocap_ros.reconstruction.world.world_adjustment import WorldSolution, adjust_in_world
 from drocap_ros.reconstruction.world.world_model import (
+    ANKLES,
     ATTITUDE_LATENCY,
     CAMERA,
     MISALIGNMENT,
@@ -31,6 +32,8 @@ _LEAST_FRAMES = 12
 #: Frames that are adjusted together, and that neighbouring windows of a long recording share.
 _WINDOW, _OVERLAP = 960, 48
 _LEAST_NOISE_PX = 0.5
+#: Weight of the lifter's image position of a joint that is not seen: its errors last for many frames.
+_GUESS_WEIGHT = 0.1
 #: Relative standard deviation of the scale below which it counts as measured.
 _MEASURED = 0.03
 #: Cost of the telemetry per frame that no camera's flight explains, and least share of contacts: jogging has 0.2,
@@ -42,9 +45,9 @@ _LARGEST_COST, _LEAST_CONTACT = 100.0, 0.03
 class RefinedWorld:
     """Poses and camera after the adjustment.
 
-    joints : (F, 15, 3) m; rotation : (F, 3, 3) world -> camera; position : (F, 3) m
+    joints : (F, 17, 3) m; rotation : (F, 3, 3) world -> camera; position : (F, 3) m
     metric : whether the scale was measured
-    covariance : (F, 15, 6) m^2: xx, xy, xz, yy, yz, zz; NaN = unknown
+    covariance : (F, 17, 6) m^2: xx, xy, xz, yy, yz, zz; NaN = unknown
     calibration : JSON-compatible, of every window: errors of the telemetry and their standard deviations
     """
 
@@ -60,14 +63,17 @@ class RefinedWorld:
 class PlacedPoses:
     """Input of the refinement: F frames.
 
-    joints : (F, 15, 3) m in the world; factor : their scale over that of the assumed stature
-    depth, depth_sigma : (F, 15) m at the assumed stature: depth behind the pelvis and its expected error
+    joints : (F, 17, 3) m in the world; factor : their scale over that of the assumed stature
+    depth, depth_sigma : (F, 17) m at the assumed stature: depth behind the pelvis and its expected error
+    image, image_sigma : (F, 17, 2), (F, 17) px: place in the image and its expected error
     """
 
     joints: np.ndarray
     factor: float
     depth: np.ndarray
     depth_sigma: np.ndarray
+    image: np.ndarray
+    image_sigma: np.ndarray
 
 
 def refine_in_world(
@@ -89,7 +95,9 @@ def refine_in_world(
     origin = position.mean(axis=0)
     weight = np.zeros((frames, keypoints.xy.shape[1]))
     points = np.zeros((*weight.shape, 2))
-    weight[slot], points[slot] = _weights(keypoints), np.nan_to_num(keypoints.xy)
+    seen = np.zeros(weight.shape, bool)
+    seen[slot] = keypoints.weights > 0
+    weight[slot], points[slot] = _weights(keypoints, poses.image_sigma), _points(keypoints, poses.image)
     body = (poses.joints - origin) / poses.factor
     body, depth, sigma, path = (
         _at_all_slots(values, slot) for values in (body, poses.depth, poses.depth_sigma, position - origin)
@@ -106,7 +114,9 @@ def refine_in_world(
     lengths = np.median(span_lengths(body), axis=0)
     for rows in windows(frames, _WINDOW, _OVERLAP):
         telemetry = CameraTelemetry(turn[rows], path[rows], fps)
-        data = WorldInput(points[rows], weight[rows], depth[rows], sigma[rows], lengths, telemetry, matrix, config)
+        data = WorldInput(
+            points[rows], weight[rows], depth[rows], sigma[rows], lengths, telemetry, matrix, config, seen[rows]
+        )
         found = adjust_in_world(data, body[rows], 1.0 / poses.factor)
         fade = fade_weights(rows, frames, _OVERLAP)
         joints[rows] += fade[:, None, None] * found.joints
@@ -115,7 +125,7 @@ def refine_in_world(
         total[rows] += fade
         calibration.append(_calibration(found, poses.factor, path[rows]))
         cost = max(cost, found.cost_terms["telemetry"] / len(found.joints))
-        contact = max(contact, float(found.contact.mean()))
+        contact = max(contact, float(found.contact[:, : len(ANKLES)].mean()))
         measured &= bool(found.std[SCALE] < _MEASURED * found.state.globals[SCALE])
     covariance = (covariance / total[:, None, None, None])[slot][..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     joints, camera = joints / total[:, None, None] + origin, camera / total[:, None]
@@ -156,15 +166,20 @@ def _calibration(found: WorldSolution, factor: float, camera_position: np.ndarra
         "attitude_latency_std_s": float(std[ATTITUDE_LATENCY]),
         "position_latency_s": -float(shared[POSITION_LATENCY]),
         "position_latency_std_s": float(std[POSITION_LATENCY]),
-        "contact_share": float(found.contact.mean()),
+        "contact_share": float(found.contact[:, : len(ANKLES)].mean()),
         "camera_moves": bool(np.ptp(camera_position, axis=0).max() > 0),
         "iterations": found.iterations,
         "stop_reason": found.stop_reason,
     }
 
 
-def _weights(keypoints: Keypoints2D) -> np.ndarray:
-    """(F, 15) 1/px^2; without a covariance the noise comes from the third difference in time.
+def _points(keypoints: Keypoints2D, image: np.ndarray) -> np.ndarray:
+    """(F, 17, 2) px; joints that are not seen, as toes by many networks, stand where the lifter expects them."""
+    return np.where(keypoints.seen[..., None], keypoints.xy, image)
+
+
+def _weights(keypoints: Keypoints2D, image_sigma: np.ndarray) -> np.ndarray:
+    """(F, 17) 1/px^2; without a covariance the noise comes from the third difference in time.
 
     Errors of 2D joints last for some frames, which halves their differences.
     """
@@ -172,8 +187,8 @@ def _weights(keypoints: Keypoints2D) -> np.ndarray:
     square = np.full(xy.shape[:2], max(2 * difference_noise(xy), _LEAST_NOISE_PX) ** 2)
     if variance is not None:
         square = np.where(np.isfinite(variance), np.maximum(variance, _LEAST_NOISE_PX**2), square)
-    weights: np.ndarray = np.clip(keypoints.weights, 0.0, 1.0) / square
-    return weights
+    weights = np.clip(keypoints.weights, 0.0, 1.0) / square
+    return np.where(keypoints.seen, weights, _GUESS_WEIGHT / np.square(np.maximum(image_sigma, _LEAST_NOISE_PX)))
 
 
 def _at_all_slots(values: np.ndarray, slot: np.ndarray) -> np.ndarray:

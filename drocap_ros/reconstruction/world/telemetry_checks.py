@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.reconstruction.world.world_model import FEET
+from drocap_ros.geometry.interpolation import true_runs
+from drocap_ros.reconstruction.world.world_model import ANKLES
 
 #: A moving camera whose pose stays the same, bit for bit, for so long has no new measurement.
 _FROZEN_S, _MOVING_M_S = 1.0, 0.2
@@ -20,16 +21,15 @@ def frozen(rotation: np.ndarray, position: np.ndarray, fps: float) -> str:
     speed = np.linalg.norm(np.diff(position, axis=0), axis=-1) * fps
     if same.all() or not float(np.median(speed[~same])) > _MOVING_M_S:
         return ""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
-    longest = float((edges[1::2] - edges[::2]).max(initial=0)) / fps
+    longest = float(np.ptp(true_runs(same), axis=1).max(initial=0)) / fps
     if longest < _FROZEN_S:
         return ""
     return f"the camera's reported pose stops for {longest:.1f} s between motions; check the log for gaps"
 
 
 def other_time(joints: np.ndarray, rotation: np.ndarray, position: np.ndarray, fps: float) -> str:
-    """Whether the feet of joints (F, 15, 3) m, placed by the poses, rest more often with poses of another time."""
-    seen = (joints[:, FEET] - position[:, None]) @ np.swapaxes(rotation, 1, 2)
+    """Whether the feet of joints (F, 17, 3) m, placed by the poses, rest more often with poses of another time."""
+    seen = (joints[:, ANKLES] - position[:, None]) @ np.swapaxes(rotation, 1, 2)
     shifts = np.arange(-_SHIFTS_S, _SHIFTS_S + 1e-9, _SHIFT_STEP_S)
     share = np.array([_still_share(seen, rotation, position, round(shift * fps), fps) for shift in shifts])
     best, own = int(share.argmax()), float(share[len(shifts) // 2])

@@ -16,6 +16,7 @@ from drocap_ros.reconstruction.world.contacts import contact_probability
 from drocap_ros.reconstruction.world.posterior import posterior
 from drocap_ros.reconstruction.world.world_equations import normal_matrix
 from drocap_ros.reconstruction.world.world_model import (
+    ANKLES,
     CAMERA,
     FEET,
     FLOOR,
@@ -41,10 +42,10 @@ _STD_FACTOR = 1.5
 class WorldSolution:
     """Result of the adjustment.
 
-    joints : (F, 15, 3) m in the world
-    contact : (F - 1, 2) of the right and the left ankle
+    joints : (F, 17, 3) m in the world
+    contact : (F - 1, 4) of ``FEET``, right and left ankle, right and left toe
     std : (GLOBALS,) posterior standard deviations of the shared unknowns, NaN = unknown
-    covariance : (F, 15, 3, 3) m^2 of the joints, NaN = unknown
+    covariance : (F, 17, 3, 3) m^2 of the joints, NaN = unknown
     """
 
     joints: np.ndarray
@@ -58,24 +59,25 @@ class WorldSolution:
 
 
 def initial_state(data: WorldInput, joints: np.ndarray, scale: float = 1.0) -> WorldState:
-    """The point from joints (F, 15, 3) m of the body."""
+    """The point from joints (F, 17, 3) m of the body."""
     shared = np.zeros(GLOBALS)
     shared[LENGTHS], shared[SCALE] = data.lengths, scale
-    shared[FLOOR] = np.percentile(joints[:, FEET, 2], 10)
+    shared[FLOOR] = np.percentile(joints[:, ANKLES, 2], 10)
     return WorldState(joints, np.zeros((len(joints), CAMERA)), shared)
 
 
 def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) -> WorldSolution:
-    """Adjust from initial joints (F, 15, 3) m of the body, ``scale`` of which are a metre of the world."""
+    """Adjust from initial joints (F, 17, 3) m of the body, ``scale`` of which are a metre of the world."""
     config, weights = data.config, weights_of(data)
     state = initial_state(data, joints, scale)
     damping, stop, done = 1e-4, ITERATIONS, 0
     contact: np.ndarray = np.zeros((len(joints) - 1, len(FEET)))
+    seen = data.weight > 0 if data.seen is None else data.seen
     for done in range(1, config.iterations + config.locking_iterations + 1):
         locking = done > config.iterations
         speed = _CONTACT_SPEEDS[done - 1] if done <= len(_CONTACT_SPEEDS) else _LAST_CONTACT_SPEED
         if config.feet:
-            contact = contact_probability(state, data.fps, speed)
+            contact = contact_probability(state, data.fps, speed, seen)
         weight = config.locked_weight if locking else config.contact_weight
         here = Residuals(data, weights, state, contact, weight)
         frames, shared = gradient(here)

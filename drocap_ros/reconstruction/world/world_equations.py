@@ -53,7 +53,7 @@ def _image_part(r: Residuals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     information = np.einsum("fp,fpki,fpkj->fpij", r.image_weight(), by_seen, by_seen)
     frames = len(by_seen)
     turn = np.swapaxes(r.rotation, 1, 2)[:, None]
-    by_joint = turn @ information  # (F, 15, 3, 3): rows in world axes
+    by_joint = turn @ information  # (F, 17, 3, 3): rows in world axes
     camera = np.empty((frames, JOINTS, 3, CAMERA))
     camera[..., :3] = -r.state.globals[SCALE] * r.rotation[:, None]
     camera[..., 3:] = r.by_turn()

@@ -14,10 +14,14 @@ from drocap_ros.parameters import Parameters, param
 from drocap_ros.reconstruction.lifted.adjustment import SPAN_STD_MM, SPANS
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.reconstruction.world.camera_telemetry import CameraPath, CameraTelemetry
-from drocap_ros.skeleton import BODY_15, indices
+from drocap_ros.skeleton import BODY_15, BODY_17, indices
 
-JOINTS = len(BODY_15)
-FEET = np.array(indices(BODY_15.joints, ("rankle", "lankle")))
+JOINTS = len(BODY_17)
+#: Points of the feet that rest on the ground, ankles first, and their height over that of a standing ankle.
+FEET = np.array(indices(BODY_17.joints, ("rankle", "lankle", "rtoe", "ltoe")))
+FEET_HEIGHT_M = np.array([0.0, 0.0, -0.06, -0.06])
+ANKLES = FEET[:2]
+#: Bones whose total length is the unit: those without the feet.
 BONES = len(BODY_15.bones)
 SPAN_STD_M = SPAN_STD_MM / 1000.0
 #: Unknowns of one frame: position error (3), rotation error (3) of the camera, joints.
@@ -103,10 +107,11 @@ def world_config(adjuster: BundleAdjusterConfig) -> WorldConfig:
 class WorldInput:
     """What is measured and assumed, of evenly spaced frames.
 
-    keypoints : (F, 15, 2) px; weight : (F, 15) 1/px^2, 0 where not seen
-    depth, depth_sigma : (F, 15) m of the body, the lifter's depth behind the pelvis and its expected error
-    lengths : (16,) m of the body, of the adjustment's spans; the first 14 set the unit
+    keypoints : (F, 17, 2) px; weight : (F, 17) 1/px^2, 0 where not seen
+    depth, depth_sigma : (F, 17) m of the body, the lifter's depth behind the pelvis and its expected error
+    lengths : (18,) m of the body, of the adjustment's spans; the first 14 set the unit
     camera_matrix : (3, 3) px
+    seen : (F, 17) bool, the keypoints that a network saw, the others are the lifter's; None = those with a weight
     """
 
     keypoints: np.ndarray
@@ -117,6 +122,7 @@ class WorldInput:
     telemetry: CameraTelemetry
     camera_matrix: np.ndarray
     config: WorldConfig = field(default_factory=WorldConfig)
+    seen: np.ndarray | None = None
 
     @property
     def fps(self) -> float:
@@ -128,7 +134,7 @@ class WorldInput:
 class WorldState:
     """One point in the space of the unknowns.
 
-    joints : (F, 15, 3) m of the body, world axes
+    joints : (F, 17, 3) m of the body, world axes
     camera : (F, 6) error of the reported position (m) and rotation (rad, camera axes) that wanders
     globals : (GLOBALS,) lengths, floor (m of the body), scale, misalignment (rad), latencies (s)
     """

@@ -22,6 +22,7 @@ from drocap_ros.reconstruction.world.world_model import (
     BONES,
     CAMERA,
     FEET,
+    FEET_HEIGHT_M,
     FLOOR,
     FRAME,
     GLOBALS,
@@ -87,7 +88,7 @@ def weights_of(data: WorldInput) -> Weights:
 class Residuals:
     """Residuals at one point.
 
-    contact : (F - 1, 2) probability that a foot of ``FEET`` keeps its place between two frames
+    contact : (F - 1, 4) probability that a point of ``FEET`` keeps its place between two frames
     contact_weight : of that step, 1 = its standard deviation as configured
     """
 
@@ -124,7 +125,7 @@ class Residuals:
         feet = joints[:, FEET]
         self.step = feet[1:] - feet[:-1]
         self.step_weight = contact_weight * contact / (config.contact_speed_m_s / data.fps) ** 2
-        self.height = 0.5 * (feet[1:, :, 2] + feet[:-1, :, 2]) - shared[FLOOR]
+        self.height = 0.5 * (feet[1:, :, 2] + feet[:-1, :, 2]) - shared[FLOOR] - FEET_HEIGHT_M
         self.height_weight = contact / _FLOOR_STD_M**2
         self.drift = np.diff(state.camera, axis=0)
         self.gauge = (shared[:BONES].sum() - data.lengths[:BONES].sum()) / GAUGE_M
@@ -146,12 +147,12 @@ class Residuals:
         self.cost = sum(self.terms.values())
 
     def image_weight(self) -> np.ndarray:
-        """(F, 15) weight of the squared image residual at this point."""
+        """(F, 17) weight of the squared image residual at this point."""
         weight: np.ndarray = self.data.weight * np.square(self.robust)
         return weight
 
     def image_by_seen(self) -> np.ndarray:
-        """(F, 15, 2, 3) derivative of the image point by the joint in camera axes."""
+        """(F, 17, 2, 3) derivative of the image point by the joint in camera axes."""
         focal = np.diagonal(self.data.camera_matrix)[:2]
         out = np.zeros((*self.seen.shape[:2], 2, 3))
         out[..., 0, 0], out[..., 1, 1] = focal[0] / self.depth, focal[1] / self.depth
@@ -162,12 +163,12 @@ class Residuals:
         return out
 
     def by_turn(self) -> np.ndarray:
-        """(F, 15, 3, 3) derivative of the joints in camera axes by the rotation's error."""
+        """(F, 17, 3, 3) derivative of the joints in camera axes by the rotation's error."""
         turned: np.ndarray = -hat(self.seen) @ left_jacobian(self.turn)[:, None]
         return turned
 
     def by_shared(self) -> tuple[np.ndarray, np.ndarray]:
-        """Derivative (F, 15, 3, 6) of the joints in camera axes by the shared unknowns of the camera, and which."""
+        """Derivative (F, 17, 3, 6) of the joints in camera axes by the shared unknowns of the camera, and which."""
         scale = self.state.globals[SCALE]
         columns = np.empty((*self.seen.shape, 6))
         columns[..., 0] = -np.einsum("fij,fj->fi", self.rotation, self.position)[:, None]

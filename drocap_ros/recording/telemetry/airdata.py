@@ -12,6 +12,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import geodetic_to_enu
+from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.recording.telemetry.lens import assumed_lens
 from drocap_ros.recording.telemetry.log import TelemetryLog, dji_attitude, make_log
 from drocap_ros.recording.telemetry.plausibility import Series, plausible
@@ -82,8 +83,7 @@ def read_airdata(path: Path) -> TelemetryLog:
 
 
 def _parts(stamp_ns: np.ndarray, video: np.ndarray) -> tuple[tuple[int, int], ...]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], video, [False]]).astype(np.int8)))
-    return tuple((int(stamp_ns[a]), int(stamp_ns[b - 1])) for a, b in edges.reshape(-1, 2))
+    return tuple((int(stamp_ns[a]), int(stamp_ns[b - 1])) for a, b in true_runs(video))
 
 
 def _table(path: Path, file: IO[str]) -> tuple[list[str], list[list[float]]]:

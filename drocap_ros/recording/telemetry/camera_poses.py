@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drocap_ros.flight.frames import camera_rotation, quaternion_multiply
+from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack, interpolate
 from drocap_ros.tracks import Tracks
 
@@ -107,9 +108,5 @@ def _series(
 
 
 def _longest_run(flags: np.ndarray) -> slice:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    starts, stops = edges[::2], edges[1::2]
-    if not len(starts):
-        return slice(0, 0)
-    best = int(np.argmax(stops - starts))
-    return slice(int(starts[best]), int(stops[best]))
+    runs = true_runs(flags)
+    return slice(*runs[np.ptp(runs, axis=1).argmax()].tolist()) if len(runs) else slice(0, 0)

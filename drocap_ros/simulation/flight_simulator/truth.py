@@ -15,7 +15,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.motion import Motion, load_motion, save_motion
 from drocap_ros.simulation.orbit_camera import project
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import read_npz
 
 #: The world keeps this many exposures: two hours at 15 Hz.
@@ -27,7 +27,7 @@ class FlightTruth:
     """Truth at F exposures, rendered or not.
 
     stamp_ns : (F,) int64, increasing
-    joints3d : (F, 15, 3) m ENU, order of ``BODY_15``
+    joints3d : (F, P, 3) m ENU, order of ``BODY_17``, of ``BODY_15`` in older files
     camera_rotation, camera_position : (F, 3, 3) world -> optical, (F, 3) m ENU, the vehicle's position
     camera_matrix, image_size : (3, 3) px; width, height px
     """
@@ -41,7 +41,7 @@ class FlightTruth:
 
     @property
     def keypoints(self) -> np.ndarray:
-        """(F, 15, 2) px, exact; NaN behind the camera."""
+        """(F, P, 2) px, exact; NaN behind the camera."""
         return project(self.joints3d, self.camera_rotation, self.camera_position, self.camera_matrix)
 
 
@@ -49,9 +49,9 @@ def save_flight_truth(path: Path, truth: FlightTruth) -> None:
     """Write the file atomically."""
     frames, joints = truth.joints3d.shape[:2]
     motion = Motion(
-        joints3d=truth.joints3d, joints=BODY_15.joints, parents=BODY_15.parents, stamp_ns=truth.stamp_ns,
-        frame="world", metric=True, scale_source="simulation", camera_rotation=truth.camera_rotation,
-        confidence=np.ones((frames, joints)), keypoints=truth.keypoints,
+        joints3d=truth.joints3d, joints=BODY_17.joints[:joints], parents=BODY_17.parents[:joints],
+        stamp_ns=truth.stamp_ns, frame="world", metric=True, scale_source="simulation",
+        camera_rotation=truth.camera_rotation, confidence=np.ones((frames, joints)), keypoints=truth.keypoints,
         reprojection_px=np.zeros((frames, joints)), meta={"method": "truth of a simulated flight"},
     )  # fmt: skip
     work = path.with_name(f".{path.name}.part.npz")

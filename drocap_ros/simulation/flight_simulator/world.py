@@ -16,6 +16,7 @@ from drocap_ros.simulation.orbit_camera import pinhole_matrix
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.autopilot_modes import CONTROL_MODE
 from drocap_ros.simulation.vehicle.mount import SimulatedMount
+from drocap_ros.skeleton import BODY_17
 
 #: The person stands until setpoints have steered the vehicle for this long, and pauses whenever they stop: a filmed
 #: person sees the drone stop.
@@ -27,7 +28,7 @@ _TAKE_HZ, _TAKE_CHUNK_S = 100.0, 20.0
 class Exposure(NamedTuple):
     """State at the exposure of one image.
 
-    joints3d (15, 3) m ENU; rotation (3, 3) world -> optical; position (3,) m ENU
+    joints3d (17, 3) m ENU; rotation (3, 3) world -> optical; position (3,) m ENU
     """
 
     stamp_ns: int
@@ -90,7 +91,7 @@ class FlightWorld:
         rows = self._rows
         return FlightTruth(
             np.array([row.stamp_ns for row in rows], np.int64),
-            np.array([row.joints3d for row in rows]).reshape(-1, 15, 3),
+            np.array([row.joints3d for row in rows]).reshape(-1, len(BODY_17), 3),
             np.array([row.rotation for row in rows]).reshape(-1, 3, 3),
             np.array([row.position for row in rows]).reshape(-1, 3),
             self.camera_matrix,
@@ -108,15 +109,15 @@ class Take:
     def __init__(self, config: FlightSimulatorConfig) -> None:
         self._config = config
         self._chunk = -1
-        self._joints: np.ndarray = np.empty((0, 15, 3))
+        self._joints: np.ndarray = np.empty((0, len(BODY_17), 3))
 
     def at(self, t_s: float) -> np.ndarray:
-        """(15, 3) m ENU."""
+        """(17, 3) m ENU."""
         chunk = int(t_s // _TAKE_CHUNK_S)
         if chunk != self._chunk:
             samples = np.arange(round(_TAKE_CHUNK_S * _TAKE_HZ) + 2) / _TAKE_HZ + chunk * _TAKE_CHUNK_S
             config = self._config
-            self._joints = simulate_person(samples, config.action, config.seed, config.stature_m)
+            self._joints = simulate_person(samples, config.action, config.seed, config.stature_m, BODY_17)
             self._chunk = chunk
         place = (t_s - chunk * _TAKE_CHUNK_S) * _TAKE_HZ
         i = int(place)

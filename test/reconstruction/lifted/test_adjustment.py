@@ -24,13 +24,15 @@ from drocap_ros.reconstruction.lifted.adjustment import (
 def problem(frames: int = 6, seed: int = 0) -> tuple[AdjustmentProblem, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     basis, precision = zoom_model(frames, 3.0, 0.05)
-    joints = rng.normal(0, 300, (frames, 15, 3))
+    joints = rng.normal(0, 300, (frames, 17, 3))
+    size = rng.uniform(0, 0.1, (frames, 17, 2)) * (rng.random((frames, 17, 1)) < 0.8)
+    across = rng.uniform(-0.9, 0.9, (frames, 17)) * np.sqrt(size.prod(axis=-1))
     p = AdjustmentProblem(
-        keypoints=joints[..., :2] + rng.normal(0, 10, (frames, 15, 2)),
-        weight=rng.uniform(0, 0.1, (frames, 15)) * (rng.random((frames, 15)) < 0.8),
+        keypoints=joints[..., :2] + rng.normal(0, 10, (frames, 17, 2)),
+        information=np.stack([size[..., 0], across, size[..., 1]], axis=-1),
         prior=joints + rng.normal(0, 30, joints.shape),
-        prior_weight_xy=rng.uniform(0, 0.01, (frames, 15)),
-        prior_weight_z=rng.uniform(0, 0.05, (frames, 15)),
+        prior_weight_xy=rng.uniform(0, 0.01, (frames, 17)),
+        prior_weight_z=rng.uniform(0, 0.05, (frames, 17)),
         acceleration_weight=1e-3,
         zoom_basis=basis,
         zoom_precision=precision,
@@ -97,3 +99,19 @@ def test_lasting_noise_does_not_lengthen_bones_that_are_known():
     held = replace(free, length_weight=1e3)
     change = [float(np.abs(adjust(q, joints, 10).lengths / lengths - 1).mean()) for q in (free, held)]
     assert change[1] < 0.1 * change[0]
+
+
+def test_a_joint_moves_along_the_direction_in_which_it_is_uncertain():
+    p, joints, lengths = problem(frames=8)
+    none = np.zeros((8, 17, 3))
+    none[..., [0, 2]] = 0.01
+    none[:, 11] = [0.01, -0.0099, 0.01]  # certain across the diagonal, free along it
+    zero = np.zeros((8, 17))
+    target = joints[..., :2].copy()
+    target[:, 11] += [30.0, 0.0]
+    p = replace(p, keypoints=target, information=none, prior=joints, prior_weight_xy=zero + 1e-4, prior_weight_z=zero)
+    p = replace(p, acceleration_weight=0.0, lengths=lengths)
+    moved = adjust(p, joints, 30).joints - joints
+    along, across = moved[:, 11, :2] @ [0.5**0.5, 0.5**0.5], moved[:, 11, :2] @ [0.5**0.5, -(0.5**0.5)]
+    assert np.median(np.abs(across)) > 10.0
+    assert np.median(np.abs(along)) < 0.7 * np.median(np.abs(across))

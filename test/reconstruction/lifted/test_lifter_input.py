@@ -13,11 +13,11 @@ def test_median_ignores_nan():
 
 
 def test_features_are_centred_scaled_and_zero_where_not_seen():
-    points = np.random.default_rng(0).normal(500.0, 60.0, (20, 15, 2))
+    points = np.random.default_rng(0).normal(500.0, 60.0, (20, 17, 2))
     points[3, 5] = np.nan
-    features, centre, scale = normalise(points, np.ones((20, 15)), np.full(14, 1e-3))
+    features, centre, scale = normalise(points, np.ones((20, 17)), np.full(16, 1e-3))
     assert features.shape == (20, FEATURES)
-    assert features[3, 10] == features[3, 11] == features[3, 35] == 0.0
+    assert features[3, 10] == features[3, 11] == features[3, 39] == 0.0
     np.testing.assert_allclose(
-        features[0, :30].reshape(15, 2) * scale + centre[0], points[0], atol=1e-3 * np.nanmax(points)
+        features[0, :34].reshape(17, 2) * scale + centre[0], points[0], atol=1e-3 * np.nanmax(points)
     )

@@ -15,12 +15,12 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
 from drocap_ros.reconstruction.lifted.method import solve_even_window
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_15, BODY_17
 from drocap_ros.tracks import Tracks
 
 
 def sway(frames: int) -> np.ndarray:
-    """(F, 15, 3) mm, z up: a person who sways and swings arms and legs, all limbs of constant length."""
+    """(F, 17, 3) mm, z up: a person who sways and swings arms and legs, all limbs of constant length."""
     t = np.arange(frames) / 24.0
 
     def limb(parent: np.ndarray, length: float, swing: np.ndarray, spread: float) -> np.ndarray:
@@ -35,10 +35,11 @@ def sway(frames: int) -> np.ndarray:
         joints[f"{side}hip"] = joints["pelvis"] + np.array([95.0 * x, 0.0, -20.0])
         joints[f"{side}knee"] = limb(joints[f"{side}hip"], 430.0, 0.5 * np.sin(3 * t + phase), 0.05 * x)
         joints[f"{side}ankle"] = limb(joints[f"{side}knee"], 410.0, 0.5 * np.sin(3 * t + phase) - 0.5, 0.05 * x)
+        joints[f"{side}toe"] = limb(joints[f"{side}ankle"], 190.0, 1.2 + 0.3 * np.sin(3 * t + phase), 0.05 * x)
         joints[f"{side}shoulder"] = joints["neck"] + np.array([180.0 * x, -10.0, -90.0])
         joints[f"{side}elbow"] = limb(joints[f"{side}shoulder"], 290.0, 0.6 * np.sin(3 * t + phase + 3), 0.3 * x)
         joints[f"{side}wrist"] = limb(joints[f"{side}elbow"], 250.0, 0.6 * np.sin(3 * t + phase + 3) + 0.7, 0.2 * x)
-    return np.stack([joints[name] for name in BODY_15.joints], axis=1)
+    return np.stack([joints[name] for name in BODY_17.joints], axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -113,13 +114,13 @@ def test_growing_image_size_hardly_changes_the_error(view, plain):
 @pytest.mark.parametrize("frames", [1, 2, 3, 5])
 def test_short_windows_give_finite_poses(view, frames):
     result = solve_even_window(Keypoints2D(view.tracks.keypoints[:frames]))
-    assert result.joints.shape == (frames, 15, 3)
+    assert result.joints.shape == (frames, 17, 3)
     assert np.isfinite(result.joints).all()
 
 
 def test_windows_without_a_seen_joint_are_refused():
     with pytest.raises(InputError, match="at least one seen joint"):
-        solve_even_window(Keypoints2D(np.full((5, 15, 2), np.nan)))
+        solve_even_window(Keypoints2D(np.full((5, 17, 2), np.nan)))
     with pytest.raises(InputError, match="depth_weight"):
         LiftedConfig(depth_weight=-1.0)
 
@@ -135,7 +136,7 @@ def test_known_focal_length_lowers_the_error_of_a_near_camera(shared):
     keypoints = focal_px * truth[..., :2] / truth[..., 2:] + np.array([640.0, 512.0])
     matrix = np.array([[focal_px, 0.0, 640.0], [0.0, focal_px, 512.0], [0.0, 0.0, 1.0]])
     stamp_ns = np.round(np.arange(len(x)) * 1e9 / 24.0).astype(np.int64)
-    tracks = Tracks(keypoints, BODY_15.joints, stamp_ns, (1280, 1024))
+    tracks = Tracks(keypoints, BODY_17.joints[: x.shape[1]], stamp_ns, (1280, 1024))
 
     def found(tracks: Tracks) -> float:
         return 1000.0 * float(pa_mpjpe(reconstruct(tracks).joints3d, truth / 1000.0).mean())

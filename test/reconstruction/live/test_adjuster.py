@@ -31,7 +31,7 @@ def window(begin: int = 0, end: int = FRAMES, subject: int = 1) -> Window:
     initial = WALK.in_camera[part] - WALK.in_camera[part, :1]
     return Window(
         stamps(FRAMES)[part],
-        Keypoints2D((WALK.keypoints + NOISE)[part], np.ones((count, 15)), np.full((count, 15, 3), np.nan)),
+        Keypoints2D((WALK.keypoints + NOISE)[part], np.ones((count, 15))).with_joints(17),
         initial,
         subject,
     )
@@ -82,7 +82,7 @@ def test_a_failure_keeps_the_known_sizes() -> None:
     adjuster.adjust(window(0, 96))
     blind = window(24, 120)
     with pytest.raises(InputError, match="seen joints"):
-        adjuster.adjust(blind._replace(keypoints=replace(blind.keypoints, confidence=np.zeros((96, 15)))))
+        adjuster.adjust(blind._replace(keypoints=replace(blind.keypoints, confidence=np.zeros((96, 17)))))
     with pytest.raises(InputError, match="a pose in at least one frame"):
         adjuster.adjust(blind._replace(initial_joints=np.full((96, 15, 3), np.nan)))
     _, expected = adjust_twice(LiveAdjuster(BundleAdjusterConfig()))

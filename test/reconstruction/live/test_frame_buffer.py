@@ -57,7 +57,7 @@ def test_every_nth_frame_is_counted_from_the_newest() -> None:
         buffer.push(o, JOINTS)
     part = buffer.window().every(3)
     np.testing.assert_array_equal(part.stamp_ns, stamps(10)[[0, 3, 6, 9]])
-    assert part.keypoints.xy.shape == (4, 15, 2)
+    assert part.keypoints.xy.shape == (4, 17, 2)
 
 
 def test_memory_is_bounded_at_any_frame_rate() -> None:

@@ -34,7 +34,7 @@ from drocap_ros.reconstruction.world.world_model import (
 )
 from drocap_ros.reconstruction.world.world_residuals import Residuals, gradient, weights_of
 from drocap_ros.simulation.simulated_person import simulate_person
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
 
 FPS = 24.0
@@ -64,8 +64,8 @@ def project(joints: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> n
 
 
 def walker(frames: int, seed: int = 1) -> np.ndarray:
-    """(F, 15, 3) m: a person whose feet rest on the ground in turn."""
-    return simulate_person(np.arange(frames) / FPS, "walk", seed, 1.75)
+    """(F, 17, 3) m: a person whose feet rest on the ground in turn."""
+    return simulate_person(np.arange(frames) / FPS, "walk", seed, 1.75, BODY_17)
 
 
 def bearing_with_reversal(frames: int) -> np.ndarray:
@@ -87,7 +87,7 @@ def exact_input(
 
 def random_point() -> tuple[Residuals, WorldInput, WorldState, np.ndarray]:
     rng = np.random.default_rng(0)
-    joints = rng.normal(0.0, 0.4, (7, 15, 3)) + np.array([0.0, 0.0, 1.0])
+    joints = rng.normal(0.0, 0.4, (7, 17, 3)) + np.array([0.0, 0.0, 1.0])
     rotation, position = orbit(0.1 * np.arange(7), np.zeros((7, 2)))
     data = exact_input(joints, rotation, position, CameraTelemetry(rotation, position, FPS))
     data = replace(data, keypoints=data.keypoints + rng.normal(0, 4, data.keypoints.shape))
@@ -95,7 +95,7 @@ def random_point() -> tuple[Residuals, WorldInput, WorldState, np.ndarray]:
     shared[LENGTHS], shared[SCALE], shared[FLOOR] = 1.01 * data.lengths, 1.04, 0.1
     shared[MISALIGNMENT], shared[[ATTITUDE_LATENCY, POSITION_LATENCY]] = [0.03, -0.05, 0.02], [0.03, 0.02]
     state = WorldState(joints, rng.normal(0, 0.01, (7, 6)), shared)
-    contact = rng.random((6, 2))
+    contact = rng.random((6, 4))
     return Residuals(data, weights_of(data), state, contact, 0.2), data, state, contact
 
 
@@ -161,7 +161,7 @@ def test_covariances_are_those_of_the_whole_inverse() -> None:
     assert found is not None
     np.testing.assert_allclose(found.shared, inverse[size:, size:], rtol=1e-5, atol=1e-12)
     scale = state.globals[SCALE]
-    for frame, joint in ((0, 0), (3, 8), (6, 14)):
+    for frame, joint in ((0, 0), (3, 8), (6, 14), (5, 16)):
         at = FRAME * frame + CAMERA + 3 * joint
         which = np.r_[at : at + 3, size + SCALE]
         by = np.column_stack([np.eye(3) / scale, -state.joints[frame, joint] / scale**2])
@@ -258,7 +258,7 @@ def tracks(joints: np.ndarray, noise_px: float = 0.0) -> Tracks:
     keypoints = project(joints, rotation, position)
     keypoints = keypoints + noise_px * np.random.default_rng(0).normal(size=keypoints.shape)
     return Tracks(
-        keypoints, BODY_15.joints, np.round(np.arange(frames) * 1e9 / FPS).astype(np.int64), (1280, 720),
+        keypoints, BODY_17.joints, np.round(np.arange(frames) * 1e9 / FPS).astype(np.int64), (1280, 720),
         camera_rotation=rotation, camera_position=position, camera_matrix=MATRIX,
     )  # fmt: skip
 

@@ -12,6 +12,7 @@ from drocap_ros.simulation.flight_simulator.world import BEGINS_AFTER_S, FlightW
 from drocap_ros.simulation.orbit_camera import look_at, pinhole_matrix
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
+from drocap_ros.skeleton import BODY_17
 
 ON_GROUND, IN_AIR, TAKING_OFF = 1, 2, 3
 
@@ -92,7 +93,7 @@ def test_person_moves_while_setpoints_steer_the_vehicle_and_the_truth_records_it
 def test_take_equals_the_simulated_person_across_its_pieces():
     config = FlightSimulatorConfig(seed=1, action="mixed")
     take, times = Take(config), np.array([0.0, 0.123, 19.996, 20.0, 47.3])
-    exact = simulate_person(times, "mixed", 1, config.stature_m)
+    exact = simulate_person(times, "mixed", 1, config.stature_m, BODY_17)
     assert np.abs(np.array([take.at(t) for t in times]) - exact).max() < 0.002
 
 
