@@ -59,7 +59,7 @@ class Row(NamedTuple):
     hidden: str = ""
     least_flexion_deg: float = -1.0
     toes_seen: bool = False
-    told: bool = False
+    covariance_given: bool = False
 
 
 ROWS: dict[str, Row] = {
@@ -69,7 +69,7 @@ ROWS: dict[str, Row] = {
     "noisy, legs refitted to 3 degrees": Row(noise="protocol", least_flexion_deg=3.0),
     "still camera, clean": Row(speed=0.0),
     "still camera, noisy": Row(speed=0.0, noise="protocol"),
-    "correlated noise, covariance given": Row(noise="correlated", told=True),
+    "correlated noise, covariance given": Row(noise="correlated", covariance_given=True),
     "correlated noise": Row(noise="correlated"),
     "noisy, 10 fps": Row(noise="protocol", fps=10.0),
     "noisy, 5 fps": Row(noise="protocol", fps=5.0),
@@ -96,7 +96,7 @@ class Score:
 
 
 def keypoints_of(flat: np.ndarray, row: Row, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray | None]:
-    """Keypoints (F, 17, 2) mm of the exact ones, and their covariance (F, 17, 3) where it is told."""
+    """Keypoints (F, 17, 2) mm of the exact ones, and their covariance (F, 17, 3) where it is given."""
     out, covariance = flat.copy(), None
     if row.noise in ("protocol", "white"):
         out += rng.normal(0.0, NOISE_MM, flat.shape)
@@ -122,7 +122,7 @@ def keypoints_of(flat: np.ndarray, row: Row, rng: np.random.Generator) -> tuple[
         out[np.ix_(away, _ARM if row.hidden == "arm" else _LEGS)] = np.nan
     if not row.toes_seen:
         out[:, _TOES] = np.nan
-    return out, covariance if row.told else None
+    return out, covariance if row.covariance_given else None
 
 
 def _mahalanobis(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -233,10 +233,10 @@ def summary(name: str, scores: list[Score]) -> list[str]:
     floor = [s.error_mm for s in scores if any(word in s.name.lower() for word in _FLOOR)]
     toes = np.array([s.toes_mm for s in scores])
     covered = np.array([s.covered for s in scores])
-    told = np.concatenate([s.speed.ravel() for s in scores])
+    true_speed = np.concatenate([s.speed.ravel() for s in scores])
     shown = np.concatenate([s.still.ravel() for s in scores])
-    known = np.isfinite(told)
-    roc = area_under_roc(told[known] < _STILL_M_S, shown[known]) if known.any() else np.nan
+    known = np.isfinite(true_speed)
+    roc = area_under_roc(true_speed[known] < _STILL_M_S, shown[known]) if known.any() else np.nan
     return [
         name,
         f"{mean:.1f}",

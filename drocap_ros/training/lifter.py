@@ -44,6 +44,9 @@ class LifterTraining(Parameters):
     matrix_learning_rate: float = param(
         0.02, "peak of the schedule, Muon, for the matrices of the body", minimum=1e-6, maximum=1.0
     )
+    rate: float = param(
+        1.0, "share of both peaks: trained weights are forgotten at the full one", minimum=1e-4, maximum=1.0
+    )
     weight_decay: float = param(0.02, "decoupled weight decay", minimum=0.0, maximum=1.0)
     seed: int = param(0, "of the samples and of the first weights", minimum=0)
 
@@ -64,7 +67,8 @@ def describe_training(
         "files": str(len(files)),
         "mocap_frames": str(sum(len(a["X"]) for a in arrays)),
         "command": f"drocap train-lifter MOCAP_DIR --include '{include}' {options.length()}"
-        f" --width {options.width} --seed {options.seed}{' --initial ONNX' if initial else ''} --out ONNX",
+        f" --rate {options.rate:g} --width {options.width} --seed {options.seed}"
+        f"{' --initial ONNX' if initial else ''} --out ONNX",
         **begun,
         **{name: str(value) for name, value in facts.items()},
     }
@@ -206,9 +210,7 @@ def train(
         start_from(network, initial)
     average = copy.deepcopy(network)
     optimisers = _optimisers(network, options)
-    # Weights that were trained before would be forgotten at the full rate.
-    share = 1.0 if initial is None else 0.5
-    peaks = [share * options.learning_rate, share * options.matrix_learning_rate]
+    peaks = [options.rate * options.learning_rate, options.rate * options.matrix_learning_rate]
     begin = time.monotonic()
     step, frames_seen, reported, saved, smooth = 0, 0, 0.0, 0.0, math.nan
     while True:

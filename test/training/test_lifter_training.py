@@ -68,25 +68,25 @@ def test_samples_are_finite_repeatable_and_mostly_show_the_target(frames):
 def test_length_and_reach_features_agree_with_the_truth():
     batch = sample_batch(bank(), np.random.default_rng(5), 60, 64)
     length, reach = part(batch.features, 2), part(batch.features, 3)
-    told = (length > 0).all(axis=(1, 2))
-    assert 0.3 < told.mean() < 0.9
+    given = (length > 0).all(axis=(1, 2))
+    assert 0.3 < given.mean() < 0.9
     span = batch.target[:, :, BONES[:, 1]] - batch.target[:, :, BONES[:, 0]]
     true = np.median(np.linalg.norm(span, axis=-1), axis=1)
-    np.testing.assert_allclose(np.median(length[told, 0] / true[told]), 1.0, atol=0.02)
-    shown = reach[told] > 0
-    assert np.median(np.abs(reach[told] - np.abs(span[told][..., 2]))[shown]) < 0.15
+    np.testing.assert_allclose(np.median(length[given, 0] / true[given]), 1.0, atol=0.02)
+    shown = reach[given] > 0
+    assert np.median(np.abs(reach[given] - np.abs(span[given][..., 2]))[shown]) < 0.15
 
 
 def test_known_camera_turns_and_gravity_agree_with_the_poses():
     batch = sample_batch(bank(), np.random.default_rng(6), 80, 64)
     gravity, known = part(batch.features, 7), part(batch.features, 8)[..., 0] > 0
-    told = known.all(axis=1)
-    assert 0.3 < told.mean() < 0.7
-    assert not gravity[~told].any()
-    np.testing.assert_allclose(np.linalg.norm(gravity[told], axis=-1), 1.0, atol=1e-5)
+    given = known.all(axis=1)
+    assert 0.3 < given.mean() < 0.7
+    assert not gravity[~given].any()
+    np.testing.assert_allclose(np.linalg.norm(gravity[given], axis=-1), 1.0, atol=1e-5)
     # Most cameras look at upright people: gravity points down the image.
-    assert np.median(gravity[told][..., 1]) > 0.7
-    turning = np.abs(part(batch.features, 6)[told]).max(axis=(1, 2))
+    assert np.median(gravity[given][..., 1]) > 0.7
+    turning = np.abs(part(batch.features, 6)[given]).max(axis=(1, 2))
     assert (turning > 0.02).mean() > 0.5
 
 
@@ -96,10 +96,10 @@ def test_given_covariances_are_those_of_the_errors():
     given = np.isfinite(found.covariance[..., 0]).all(axis=(1, 2))
     assert 0.3 < given.mean() < 0.6
     size = np.square(found.keypoints[given]).sum(axis=-1)
-    told = found.covariance[given][..., 0] + found.covariance[given][..., 2]
-    use = np.isfinite(size) & (told > 1e-4)
-    # The median of a chi-squared variable of two degrees of freedom over its mean is 0.69; gross errors are not told.
-    assert 0.4 < np.median((size / told)[use]) < 1.2
+    expected = found.covariance[given][..., 0] + found.covariance[given][..., 2]
+    use = np.isfinite(size) & (expected > 1e-4)
+    # The median of a chi-squared variable of two degrees of freedom over its mean is 0.69; gross errors have none.
+    assert 0.4 < np.median((size / expected)[use]) < 1.2
 
 
 def test_legs_are_refitted_between_hip_and_ankle():
@@ -140,7 +140,7 @@ def test_unusable_files_are_refused(tmp_path):
 def test_a_short_training_learns_and_its_network_runs(tmp_path):
     pytest.importorskip("torch", reason="the extra 'train' is not installed")
     pytest.importorskip("onnx", reason="the extra 'train' is not installed")
-    from drocap_ros.reconstruction.lifted.lifter import Lifter, LifterInput
+    from drocap_ros.reconstruction.lifted.lifter import SHIPPED, Lifter, LifterInput
     from drocap_ros.training.lifter import LifterTraining, build_network, export_onnx, train
 
     def error(network) -> float:
@@ -170,6 +170,9 @@ def test_a_short_training_learns_and_its_network_runs(tmp_path):
     begun, _ = train(bank(), options, lambda line: None, lambda n, f: None, initial=tmp_path / "t.onnx")
     for a, b in zip(weights(network), weights(begun), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3)
+    for wrong in (tmp_path / "none.onnx", SHIPPED):
+        with pytest.raises(InputError, match="--initial"):
+            train(bank(), options, lambda line: None, lambda n, f: None, initial=wrong)
 
 
 def weights(network) -> list[np.ndarray]:

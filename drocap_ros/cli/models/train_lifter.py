@@ -24,6 +24,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "--steps", type=int, default=0, help="batches instead of --minutes: the same seed gives the same weights"
     )
     parser.add_argument("--initial", metavar="ONNX", type=Path, help="lifter whose weights begin the training")
+    parser.add_argument(
+        "--rate", type=float, default=1.0, help="share of the usual learning rates; less with --initial (default 1)"
+    )
     parser.add_argument("--width", type=int, default=240, help="channels of the network (default 240)")
     add_training_options(parser, minutes=80.0)
     parser.set_defaults(run=run)
@@ -46,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out.suffix != ".onnx" or not args.out.absolute().parent.is_dir():
         raise InputError(f"--out: expected an .onnx in a folder that exists, got {args.out}")
     use_threads(args.threads)
-    options = LifterTraining(minutes=args.minutes, steps=args.steps, width=args.width, seed=args.seed)
+    options = LifterTraining(minutes=args.minutes, steps=args.steps, width=args.width, rate=args.rate, seed=args.seed)
     files = mocap_files(args.folder, args.include)
     bank = load_bank(files)
 

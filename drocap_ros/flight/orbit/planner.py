@@ -178,7 +178,7 @@ def advance(
 
 
 def sense(config: OrbitConfig, flown_s: float) -> float:
-    """1, or -1 while the orbit is flown against its wanted direction: a one-way orbit cannot tell yaw from latency."""
+    """1, or -1 while the orbit is flown against its direction: a one-way orbit cannot separate yaw from latency."""
     if config.reverse_every_s > 0:
         return -1.0 if int(flown_s / config.reverse_every_s) % 2 else 1.0
     return -1.0 if config.calibrate_telemetry and flown_s < _CALIBRATION_S else 1.0

@@ -41,8 +41,8 @@ class PoseBelief:
 
     def judge(self, confidence: float, box: np.ndarray, stamp_ns: int) -> None:
         """Add a pose by its mean confidence, found in a box (4,) px."""
-        anew = self.judged_ns is None or (self.plausible_ns is None and confidence >= CONFIRM_CONFIDENCE)
-        self.value = confidence if anew else self.value + _RATE * (confidence - self.value)
+        first = self.judged_ns is None or (self.plausible_ns is None and confidence >= CONFIRM_CONFIDENCE)
+        self.value = confidence if first else self.value + _RATE * (confidence - self.value)
         self.judged_ns = stamp_ns
         if confidence >= max(CONFIRM_CONFIDENCE, _USUAL_SHARE * self._usual):
             self.choose(box, stamp_ns)

@@ -44,6 +44,20 @@ class BodySize:
 
 
 @dataclass(frozen=True)
+class EvenView:
+    """Evenly spaced frames: keypoints of ``BODY_17``, frames per second, and what is known of the camera.
+
+    focal : focal length in the keypoints' unit; None = unknown, the camera is taken as distant
+    rotation : (F, 3, 3) world (z up) -> camera, NaN where unknown; None = unknown
+    """
+
+    keypoints: Keypoints2D
+    fps: float
+    focal: float | None
+    rotation: np.ndarray | None
+
+
+@dataclass(frozen=True)
 class SizedWindow:
     """A window with known size and bone lengths, before the final adjustment.
 
@@ -64,17 +78,10 @@ class SizedWindow:
     iterations: int
 
 
-def measure_size(
-    keypoints: Keypoints2D,
-    fps: float,
-    focal: float | None,
-    config: LiftedConfig,
-    lifter: Lifter,
-    rotation: np.ndarray | None,
-    cancelled: Cancelled | None,
-) -> SizedWindow:
+def measure_size(view: EvenView, config: LiftedConfig, lifter: Lifter, cancelled: Cancelled | None) -> SizedWindow:
     """Size of a new person: lift, adjust, and lift again with the lengths found."""
-    seen = LifterInput(keypoints.xy, keypoints.confidence, None, keypoints.covariance, rotation, focal)
+    keypoints, fps, focal = view.keypoints, view.fps, view.focal
+    seen = LifterInput(keypoints.xy, keypoints.confidence, None, keypoints.covariance, view.rotation, focal)
     lifted = lifter.lift(seen, fps)
     clock = time.perf_counter()
     mm = YARDSTICK_MM / max(float(np.median(bone_lengths(lifted.joints), axis=0)[YARDSTICK].sum()), 1e-12)
@@ -91,25 +98,18 @@ def measure_size(
     zoom = zoom * found.zoom
     flat = _orthographic(keypoints.xy, found.joints[..., 2] - found.joints[:, :1, 2], centre, zoom, mm, focal)
     seconds = time.perf_counter() - clock
-    lifted = lifter.lift(_flattened(flat, keypoints, mm / zoom, lengths, rotation, focal), fps)
+    lifted = lifter.lift(_flattened(flat, view, mm / zoom, lengths), fps)
     return SizedWindow(model, flat, lifted, lengths, centre, zoom, mm, seconds, found.iterations)
 
 
-def apply_size(
-    known: BodySize,
-    keypoints: Keypoints2D,
-    fps: float,
-    focal: float | None,
-    config: LiftedConfig,
-    lifter: Lifter,
-    rotation: np.ndarray | None,
-) -> SizedWindow:
+def apply_size(known: BodySize, view: EvenView, config: LiftedConfig, lifter: Lifter) -> SizedWindow:
     """Size from an earlier window: one lift, no first adjustment."""
+    keypoints, fps, focal = view.keypoints, view.fps, view.focal
     mm = 1.0 / float(np.median(known.unit_per_mm))
     zoom = known.unit_per_mm * mm
     frames, joints_count = keypoints.xy.shape[:2]
     rough = _orthographic(keypoints.xy, np.zeros((frames, joints_count)), np.zeros((frames, 2)), zoom, mm, None)
-    seen = _flattened(rough, keypoints, mm / zoom, known.lengths_mm, rotation, None)
+    seen = _flattened(rough, view, mm / zoom, known.lengths_mm)
     lifted = lifter.lift(replace(seen, focal=None if focal is None else focal * mm), fps)
     middle = np.median(lifted.joints[..., :2], axis=1)
     centre = middle * (zoom / mm)[:, None]
@@ -121,18 +121,12 @@ def apply_size(
     return SizedWindow(model, flat, lifted, known.lengths_mm, centre, zoom, mm, seconds=0.0, iterations=0)
 
 
-def _flattened(
-    flat: np.ndarray,
-    keypoints: Keypoints2D,
-    scale: np.ndarray,
-    lengths: np.ndarray,
-    rotation: np.ndarray | None,
-    focal: float | None,
-) -> LifterInput:
+def _flattened(flat: np.ndarray, view: EvenView, scale: np.ndarray, lengths: np.ndarray) -> LifterInput:
     """Keypoints in mm of a distant camera, ``scale`` (F,) mm per unit: the lens is known to be flat where it was."""
+    keypoints = view.keypoints
     covariance = None if keypoints.covariance is None else keypoints.covariance * np.square(scale)[:, None, None]
-    lens = None if focal is None else np.inf
-    return LifterInput(flat, keypoints.confidence, lengths[: len(_BONES)], covariance, rotation, lens)
+    lens = None if view.focal is None else np.inf
+    return LifterInput(flat, keypoints.confidence, lengths[: len(_BONES)], covariance, view.rotation, lens)
 
 
 def magnification(depth_mm: np.ndarray, distance_mm: np.ndarray) -> np.ndarray:

@@ -21,6 +21,7 @@ from drocap_ros.reconstruction.lifted.body_size import (
     YARDSTICK,
     YARDSTICK_MM,
     BodySize,
+    EvenView,
     apply_size,
     magnification,
     measure_size,
@@ -128,10 +129,8 @@ def solve_even_window(
     config = config or LiftedConfig()
     lifter = Lifter.load(config.lifter or None)
     begin = time.perf_counter()
-    if known is None:
-        sized = measure_size(keypoints, fps, focal, config, lifter, rotation, cancelled)
-    else:
-        sized = apply_size(known, keypoints, fps, focal, config, lifter, rotation)
+    view = EvenView(keypoints, fps, focal, rotation)
+    sized = measure_size(view, config, lifter, cancelled) if known is None else apply_size(known, view, config, lifter)
     mm, zoom = sized.mm, sized.zoom
 
     clock = time.perf_counter()
