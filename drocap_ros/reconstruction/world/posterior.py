@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.reconstruction.banded import backward, band_factor, forward
 from drocap_ros.reconstruction.world.world_equations import WIDTH
 from drocap_ros.reconstruction.world.world_model import CAMERA, FRAME, GLOBALS, JOINTS, SCALE, WorldState
 
@@ -22,14 +23,12 @@ class Posterior(NamedTuple):
 
 def posterior(matrix: tuple[np.ndarray, np.ndarray, np.ndarray], state: WorldState) -> Posterior | None:
     """Covariances from the band, border and corner of :func:`normal_matrix`; None = not positive definite."""
-    from scipy.linalg.lapack import dpbtrf, dtbtrs
-
     band, border, corner = matrix
-    factor, info = dpbtrf(band.T, lower=1)
-    if info != 0:
+    factor = band_factor(band)
+    if factor is None:
         return None
-    half = dtbtrs(factor, border.T, uplo="L")[0]
-    by_shared = dtbtrs(factor, half, uplo="L", trans="T")[0]
+    half = forward(factor, border)
+    by_shared = backward(factor, half)
     try:
         shared = np.linalg.inv(corner - half.T @ half)
     except np.linalg.LinAlgError:
@@ -59,10 +58,12 @@ def _diagonal_blocks(factor: np.ndarray, frames: int) -> np.ndarray:
     coupling = columns[:, FRAME:] @ inverse
     own = np.swapaxes(inverse, 1, 2) @ inverse
     out = np.empty((frames, FRAME, FRAME))
-    later = np.zeros((2 * FRAME, 2 * FRAME))
+    later, before = np.zeros((2 * FRAME, 2 * FRAME)), np.empty((2 * FRAME, 2 * FRAME))
     for frame in range(frames - 1, -1, -1):
         off = -later @ coupling[frame]
         block = own[frame] - coupling[frame].T @ off
         out[frame] = 0.5 * (block + block.T)  # rounding of the skew part would grow from frame to frame
-        later = np.block([[out[frame], off[:FRAME].T], [off[:FRAME], later[:FRAME, :FRAME]]])
+        before[:FRAME, :FRAME], before[FRAME:, FRAME:] = out[frame], later[:FRAME, :FRAME]
+        before[FRAME:, :FRAME], before[:FRAME, FRAME:] = off[:FRAME], off[:FRAME].T
+        later, before = before, later
     return out

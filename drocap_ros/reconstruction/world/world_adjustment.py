@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drocap_ros.reconstruction.banded import backward, band_factor, forward
 from drocap_ros.reconstruction.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
 from drocap_ros.reconstruction.world.contacts import contact_probability
 from drocap_ros.reconstruction.world.posterior import posterior
@@ -34,6 +35,8 @@ _CONVERGED = 1e-4
 _CONTACT_SPEEDS = (0.6, 0.4, 0.3, 0.2)
 _LAST_CONTACT_SPEED = 0.15
 _LEAST_SCALE = 0.2
+#: Most points that are tried on the line of a step.
+_TRIALS = 10
 #: Errors of the shared unknowns over their formal standard deviations: contacts are chosen by the same data.
 _STD_FACTOR = 1.5
 
@@ -70,8 +73,9 @@ def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) ->
     """Adjust from initial joints (F, 17, 3) m of the body, ``scale`` of which are a metre of the world."""
     config, weights = data.config, weights_of(data)
     state = initial_state(data, joints, scale)
-    damping, stop, done = 1e-4, ITERATIONS, 0
+    stop, done = ITERATIONS, 0
     contact: np.ndarray = np.zeros((len(joints) - 1, len(FEET)))
+    outlier = Residuals(data, weights, state, contact, 0.0).usual_outlier()
     seen = data.weight > 0 if data.seen is None else data.seen
     for done in range(1, config.iterations + config.locking_iterations + 1):
         locking = done > config.iterations
@@ -79,23 +83,19 @@ def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) ->
         if config.feet:
             contact = contact_probability(state, data.fps, speed, seen)
         weight = config.locked_weight if locking else config.contact_weight
-        here = Residuals(data, weights, state, contact, weight)
+        here = Residuals(data, weights, state, contact, weight, outlier)
         frames, shared = gradient(here)
         matrix = normal_matrix(here)
-        there = None
-        for _ in range(6):
-            step = _solve(matrix, frames, shared, damping, locking)
-            if step is not None:
-                moved = state.moved(step[0], step[1])
-                if moved.globals[SCALE] > _LEAST_SCALE:
-                    there = Residuals(data, weights, moved, contact, weight)
-                    if there.cost <= here.cost:
-                        break
-            there, damping = None, max(damping, 1e-6) * 10
-        if there is None or step is None:
+        step = _solve(matrix, frames, shared, locking)
+        if step is None:
             stop = NO_DESCENT
             break
-        state, damping = there.state, 0.2 * damping
+        slope = float((frames * step[0]).sum() + shared @ step[1])
+        there = _search(here, step, slope)
+        if there is None:
+            stop = NO_DESCENT
+            break
+        state, outlier = there.state, there.usual_outlier()
         if locking and here.cost - there.cost <= _CONVERGED * here.cost:
             stop = CONVERGED
             break
@@ -111,30 +111,34 @@ def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) ->
     return WorldSolution(state.joints / state.globals[SCALE], state, contact, std, covariance, final.terms, done, stop)
 
 
+def _search(here: Residuals, step: tuple[np.ndarray, np.ndarray], slope: float) -> Residuals | None:
+    """A lower point on the step's line: its end, or where parabolas through the points put the minimum."""
+    share = 1.0
+    for _ in range(_TRIALS):
+        there = here.moved(share * step[0], share * step[1])
+        if there.cost <= here.cost and there.state.globals[SCALE] > _LEAST_SCALE:
+            return there
+        bend = (there.cost - here.cost) / share - slope
+        share *= float(np.clip(-0.5 * slope / max(bend, 1e-300), 0.1, 0.5))
+    return None
+
+
 def _solve(
     matrix: tuple[np.ndarray, np.ndarray, np.ndarray],
     frames: np.ndarray,
     shared: np.ndarray,
-    damping: float,
     fixed: bool,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Step of the frames' and the shared unknowns; None = not positive definite.
 
     fixed : the shared unknowns stay as they are
     """
-    from scipy.linalg.lapack import dpbtrf, dtbtrs
-
     band, border, corner = matrix
-    damped = band.copy()
-    damped[:, 0] *= 1 + damping
-    factor, info = dpbtrf(damped.T, lower=1, overwrite_ab=1)
-    if info != 0:
+    factor = band_factor(band)
+    if factor is None:
         return None
-    right = -frames.reshape(1, -1) if fixed else np.concatenate([-frames.reshape(1, -1), border])
-    y = dtbtrs(factor, right.T, uplo="L")[0]
-    step = np.zeros(GLOBALS)
-    if not fixed:
-        schur = corner + np.diag(damping * np.diag(corner)) - y[:, 1:].T @ y[:, 1:]
-        step = np.linalg.solve(schur, -shared - y[:, 1:].T @ y[:, 0])
-    x = dtbtrs(factor, y[:, 0] - y[:, 1:] @ (step if not fixed else np.zeros(0)), uplo="L", trans="T")[0]
-    return x.reshape(-1, FRAME), step
+    if fixed:
+        return backward(factor, forward(factor, -frames.reshape(-1, 1))).reshape(-1, FRAME), np.zeros(GLOBALS)
+    y = forward(factor, np.concatenate([-frames.reshape(-1, 1), border], axis=1))
+    step = np.linalg.solve(corner - y[:, 1:].T @ y[:, 1:], -shared - y[:, 1:].T @ y[:, 0])
+    return backward(factor, y[:, :1] - y[:, 1:] @ step[:, None]).reshape(-1, FRAME), step

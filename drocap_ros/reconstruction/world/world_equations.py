@@ -6,6 +6,7 @@ Gauss-Newton: second derivatives of the residuals are left out, and robust terms
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 
 from drocap_ros.reconstruction.lifted.adjustment import SPANS
 from drocap_ros.reconstruction.world.world_model import (
@@ -20,96 +21,88 @@ from drocap_ros.reconstruction.world.world_model import (
     SCALE,
     SPAN_STD_M,
 )
-from drocap_ros.reconstruction.world.world_residuals import GAUGE_M, Residuals
+from drocap_ros.reconstruction.world.world_residuals import CAMERA_COLUMNS, GAUGE_M, OF_CAMERA, Residuals
 
 _BODY = 3 * JOINTS
+#: (17, 18) whether a joint is an end of a span.
+_ENDS = np.array([[float(joint in span) for span in SPANS] for joint in range(JOINTS)])
 #: Couplings reach two frames on.
 WIDTH = 2 * FRAME + 1
 
 
 def normal_matrix(r: Residuals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Band (F * FRAME, WIDTH), border (GLOBALS, F * FRAME) and corner (GLOBALS, GLOBALS).
+    """Band (F * FRAME, WIDTH), border (F * FRAME, GLOBALS) and corner (GLOBALS, GLOBALS).
 
     Element [i, d] of the band couples unknowns i and i + d.
     """
-    blocks, border, corner = _image_part(r)
+    frames = len(r.state.joints)
+    band, border = np.zeros((frames, FRAME, WIDTH)), np.zeros((frames, FRAME, GLOBALS))
+    corner = np.zeros((GLOBALS, GLOBALS))
+    # In the band's memory, element [r, c] of a frame's block is r (WIDTH - 1) + c.
+    step = band.itemsize
+    blocks = as_strided(band, (frames, FRAME, FRAME), (FRAME * WIDTH * step, (WIDTH - 1) * step, step))
+    _set_image_part(r, blocks, border, corner)
     _add_body(r, blocks, border, corner)
-    frames = len(blocks)
-    band = np.zeros((frames, FRAME, WIDTH))
-    for i in range(FRAME):
-        band[:, i, : FRAME - i] = blocks[:, i, i:]
+    # Elements below the diagonal lie here, in the rows before theirs.
+    band[:, :, FRAME:] = 0.0
     _add_time(r, band)
     corner[:BONES, :BONES] += GAUGE_M**-2
     prior = r.weights.shared.copy()
     prior[SCALE] /= r.state.globals[SCALE] ** 2
     corner[np.arange(GLOBALS), np.arange(GLOBALS)] += prior
-    return band.reshape(frames * FRAME, WIDTH), border.reshape(GLOBALS, -1), corner
+    return band.reshape(frames * FRAME, WIDTH), border.reshape(frames * FRAME, GLOBALS), corner
 
 
-def _image_part(r: Residuals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Blocks (F, FRAME, FRAME), border (GLOBALS, F, FRAME) and corner of the reprojection."""
-    by_seen = r.image_by_seen()
-    # The weight of a joint as a matrix in camera axes: every derivative below is one of the joint in these axes.
-    information = np.einsum("fp,fpki,fpkj->fpij", r.image_weight(), by_seen, by_seen)
-    frames = len(by_seen)
-    turn = np.swapaxes(r.rotation, 1, 2)[:, None]
-    by_joint = turn @ information  # (F, 17, 3, 3): rows in world axes
-    camera = np.empty((frames, JOINTS, 3, CAMERA))
-    camera[..., :3] = -r.state.globals[SCALE] * r.rotation[:, None]
-    camera[..., 3:] = r.by_turn()
-    shared, which = r.by_shared()
-    blocks = np.zeros((frames, FRAME, FRAME))
-    joint_blocks = by_joint @ r.rotation[:, None]
+def _set_image_part(r: Residuals, blocks: np.ndarray, border: np.ndarray, corner: np.ndarray) -> None:
+    """Set the reprojection's part of the blocks (upper triangles), border and corner."""
+    _, by_joint, camera = r.image_derivatives()
+    frames = len(by_joint)
+    own = np.swapaxes(camera, 1, 2) @ camera
+    blocks[:, :CAMERA, :CAMERA] = own[:, :CAMERA, :CAMERA]
+    border[:, :CAMERA, OF_CAMERA] = own[:, :CAMERA, CAMERA_COLUMNS]
+    corner[np.ix_(OF_CAMERA, OF_CAMERA)] = own[:, CAMERA_COLUMNS[:, None], CAMERA_COLUMNS].sum(axis=0)
+    rows = by_joint.reshape(frames, JOINTS, 2, 3)
+    joint = rows[:, :, 0, :, None] * rows[:, :, 0, None, :] + rows[:, :, 1, :, None] * rows[:, :, 1, None, :]
     for j in range(JOINTS):
         at = slice(CAMERA + 3 * j, CAMERA + 3 * j + 3)
-        blocks[:, at, at] = joint_blocks[:, j]
-    coupling = (by_joint @ camera).reshape(frames, _BODY, CAMERA)
-    blocks[:, CAMERA:, :CAMERA] = coupling
-    blocks[:, :CAMERA, CAMERA:] = np.swapaxes(coupling, 1, 2)
-    weighted = information @ camera
-    blocks[:, :CAMERA, :CAMERA] = np.einsum("fpij,fpik->fjk", camera, weighted)
-    border = np.zeros((GLOBALS, frames, FRAME))
-    border[which, :, CAMERA:] = (by_joint @ shared).reshape(frames, _BODY, -1).transpose(2, 0, 1)
-    border[which, :, :CAMERA] = np.einsum("fpij,fpik->kfj", weighted, shared)
-    corner = np.zeros((GLOBALS, GLOBALS))
-    corner[np.ix_(which, which)] = np.einsum("fpij,fpik->jk", shared, information @ shared)
-    return blocks, border, corner
+        blocks[:, at, at] = joint[:, j]
+    both = camera.reshape(frames, JOINTS, 2, 9)
+    coupling = rows[:, :, 0, :, None] * both[:, :, 0, None, :] + rows[:, :, 1, :, None] * both[:, :, 1, None, :]
+    coupling = coupling.reshape(frames, _BODY, 9)
+    blocks[:, :CAMERA, CAMERA:] = np.swapaxes(coupling[..., :CAMERA], 1, 2)
+    border[:, CAMERA:, OF_CAMERA] = coupling[..., CAMERA_COLUMNS]
 
 
 def _add_body(r: Residuals, blocks: np.ndarray, border: np.ndarray, corner: np.ndarray) -> None:
-    """Add the terms within a frame: depths, bones, feet and floor."""
+    """Add the terms within a frame, in upper triangles: depths, bones, feet and floor."""
     frames = len(blocks)
-    body = np.zeros((frames, JOINTS, 3, JOINTS, 3))
+    own = np.zeros((frames, JOINTS, 3, 3))
     along = r.weights.depth / r.rounded
-    view = r.view[:, :, None] * r.view[:, None, :]
-    for j in range(1, JOINTS):
-        m = along[:, j, None, None] * view
-        body[:, j, :, j] += m
-        body[:, 0, :, 0] += m
-        body[:, j, :, 0] -= m
-        body[:, 0, :, j] -= m
+    depth = along[:, 1:, None, None] * (r.view[:, :, None] * r.view[:, None, :])[:, None]
+    own[:, 1:] += depth
+    own[:, 0] += depth.sum(axis=1)
     precision = SPAN_STD_M**-2
-    outer = precision[:, None, None] * r.direction[..., :, None] * r.direction[..., None, :]
     slope = precision[:, None] * r.direction
-    by_length = border[LENGTHS, :, CAMERA:].reshape(len(SPANS), frames, JOINTS, 3)
-    for k, (a, b) in enumerate(SPANS):
-        m = outer[:, k]
-        body[:, a, :, a] += m
-        body[:, b, :, b] += m
-        body[:, a, :, b] -= m
-        body[:, b, :, a] -= m
-        by_length[k, :, b] -= slope[:, k]
-        by_length[k, :, a] += slope[:, k]
-    border[LENGTHS, :, CAMERA:] = by_length.reshape(len(SPANS), frames, _BODY)
-    corner[LENGTHS, LENGTHS] += np.diag(frames * precision)
+    outer = slope[..., :, None] * r.direction[..., None, :]
+    own += (_ENDS @ outer.reshape(frames, len(SPANS), 9)).reshape(own.shape)
     for i, foot in enumerate(FEET):
         step, height = r.step_weight[:, i], 0.25 * r.height_weight[:, i]
         for part in (slice(1, None), slice(None, -1)):
-            body[part, foot, :, foot] += step[:, None, None] * np.eye(3)
-            body[part, foot, 2, foot, 2] += height
-            border[FLOOR, part, CAMERA + 3 * foot + 2] -= 2 * height
+            own[part, foot] += step[:, None, None] * np.eye(3)
+            own[part, foot, 2, 2] += height
+            border[part, CAMERA + 3 * foot + 2, FLOOR] -= 2 * height
+    for j in range(JOINTS):
+        at = slice(CAMERA + 3 * j, CAMERA + 3 * j + 3)
+        blocks[:, at, at] += own[:, j]
+        if j:
+            blocks[:, CAMERA : CAMERA + 3, at] -= depth[:, j - 1]
+    for k, (a, b) in enumerate(np.sort(SPANS, axis=1)):
+        blocks[:, CAMERA + 3 * a : CAMERA + 3 * a + 3, CAMERA + 3 * b : CAMERA + 3 * b + 3] -= outer[:, k]
+    for k, (a, b) in enumerate(SPANS):
+        border[:, CAMERA + 3 * b : CAMERA + 3 * b + 3, k] -= slope[:, k]
+        border[:, CAMERA + 3 * a : CAMERA + 3 * a + 3, k] += slope[:, k]
+    corner[LENGTHS, LENGTHS] += np.diag(frames * precision)
     corner[FLOOR, FLOOR] += float(r.height_weight.sum())
-    blocks[:, CAMERA:, CAMERA:] += body.reshape(frames, _BODY, _BODY)
 
 
 def _add_time(r: Residuals, band: np.ndarray) -> None:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.geometry.rotations import exp_so3, hat, left_jacobian
+from drocap_ros.geometry.rotations import exp_so3, left_jacobian
 from drocap_ros.reconstruction.lifted.adjustment import SPANS
 from drocap_ros.reconstruction.world.world_model import (
     ATTITUDE_LATENCY,
@@ -35,7 +35,9 @@ from drocap_ros.reconstruction.world.world_model import (
     WorldState,
 )
 
-_OUTLIER_SQUARE = 9.0
+#: Squared image residual, in standard deviations, at which a joint has half its weight.
+OUTLIER_SQUARE = 9.0
+_OVER_MEDIAN = 4.0
 _DEPTH_ROUNDING_M = 0.015
 _NEAREST_M = 0.3
 _FLOOR_STD_M = 0.1
@@ -43,6 +45,9 @@ _FLOOR_STD_M = 0.1
 _ANY_FLOOR_M = 1000.0
 #: Standard deviation (m) of the body's total bone length, which sets the unit.
 GAUGE_M = 0.0005
+#: The shared unknowns of the camera, and their columns in its derivatives: a misalignment turns every frame.
+OF_CAMERA = np.r_[SCALE, MISALIGNMENT, ATTITUDE_LATENCY, POSITION_LATENCY]
+CAMERA_COLUMNS = np.array([6, 3, 4, 5, 7, 8])
 _POSITION_WANDER_S, _ATTITUDE_WANDER_S = 60.0, 10.0
 
 
@@ -90,13 +95,21 @@ class Residuals:
 
     contact : (F - 1, 4) probability that a point of ``FEET`` keeps its place between two frames
     contact_weight : of that step, 1 = its standard deviation as configured
+    outlier : squared image residual, in standard deviations, at which a joint has half its weight
     """
 
     def __init__(
-        self, data: WorldInput, weights: Weights, state: WorldState, contact: np.ndarray, contact_weight: float
+        self,
+        data: WorldInput,
+        weights: Weights,
+        state: WorldState,
+        contact: np.ndarray,
+        contact_weight: float,
+        outlier: float = OUTLIER_SQUARE,
     ) -> None:
         config, shared = data.config, state.globals
         self.data, self.weights, self.state = data, weights, state
+        self.contact, self.contact_weight, self.outlier = contact, contact_weight, outlier
         path = state.path(data.telemetry)
         self.turn = shared[MISALIGNMENT] + state.camera[:, 3:]
         correction = exp_so3(self.turn)
@@ -111,7 +124,7 @@ class Residuals:
         pixels = focal * self.seen[..., :2] / self.depth[..., None] + centre
         self.image = np.where(data.weight[..., None] > 0, pixels - data.keypoints, 0.0)
         square = np.square(self.image).sum(-1) * data.weight
-        self.robust = 1.0 / (1.0 + square / _OUTLIER_SQUARE)
+        self.square, self.robust = square, 1.0 / (1.0 + square / outlier)
         self.view = data.telemetry.view
         self.relief = np.einsum("fpi,fi->fp", joints - joints[:, :1], self.view) - data.depth
         self.rounded = np.sqrt(np.square(self.relief) + _DEPTH_ROUNDING_M**2)
@@ -146,37 +159,43 @@ class Residuals:
         }
         self.cost = sum(self.terms.values())
 
-    def image_weight(self) -> np.ndarray:
-        """(F, 17) weight of the squared image residual at this point."""
-        weight: np.ndarray = self.data.weight * np.square(self.robust)
-        return weight
+    def moved(self, frames: np.ndarray, shared: np.ndarray) -> Residuals:
+        """Residuals of the same cost after a step."""
+        state = self.state.moved(frames, shared)
+        return Residuals(self.data, self.weights, state, self.contact, self.contact_weight, self.outlier)
 
-    def image_by_seen(self) -> np.ndarray:
-        """(F, 17, 2, 3) derivative of the image point by the joint in camera axes."""
-        focal = np.diagonal(self.data.camera_matrix)[:2]
-        out = np.zeros((*self.seen.shape[:2], 2, 3))
-        out[..., 0, 0], out[..., 1, 1] = focal[0] / self.depth, focal[1] / self.depth
-        out[..., 2] = np.where(
-            (self.seen[..., 2] > _NEAREST_M)[..., None],
-            -focal * self.seen[..., :2] / np.square(self.depth)[..., None], 0.0,
-        )  # fmt: skip
-        return out
+    def usual_outlier(self) -> float:
+        """Squared residual that sets outliers apart from the rest: far from the solution all are large."""
+        weighed = self.square[self.data.weight > 0]
+        return max(OUTLIER_SQUARE, _OVER_MEDIAN * float(np.median(weighed))) if len(weighed) else OUTLIER_SQUARE
 
-    def by_turn(self) -> np.ndarray:
-        """(F, 17, 3, 3) derivative of the joints in camera axes by the rotation's error."""
-        turned: np.ndarray = -hat(self.seen) @ left_jacobian(self.turn)[:, None]
-        return turned
+    def image_derivatives(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The image residuals (F, 34) at the present robust weight, and their derivatives.
 
-    def by_shared(self) -> tuple[np.ndarray, np.ndarray]:
-        """Derivative (F, 17, 3, 6) of the joints in camera axes by the shared unknowns of the camera, and which."""
-        scale = self.state.globals[SCALE]
-        columns = np.empty((*self.seen.shape, 6))
-        columns[..., 0] = -np.einsum("fij,fj->fi", self.rotation, self.position)[:, None]
-        columns[..., 1:4] = self.by_turn()
-        columns[..., 4] = -np.einsum("fpij,fj->fpi", hat(self.seen), self.turn_rate)
-        columns[..., 5] = -scale * np.einsum("fij,fj->fi", self.rotation, self.velocity)[:, None]
-        which = np.r_[SCALE, MISALIGNMENT, ATTITUDE_LATENCY, POSITION_LATENCY]
-        return columns, which
+        By the joint (F, 34, 3), and by the camera (F, 34, 9): position, rotation, scale, latencies; rows are u and v of
+        every joint.
+        """
+        frames, scale = len(self.seen), self.state.globals[SCALE]
+        root = np.sqrt(self.data.weight) * self.robust
+        x, y, z = np.moveaxis(self.seen, -1, 0)
+        far = z > _NEAREST_M
+        slope = np.where(far[..., None], self.seen[..., :2] / self.depth[..., None], 0.0)
+        per_m = root[..., None] * np.diagonal(self.data.camera_matrix)[:2] / self.depth[..., None]
+        by_joint = per_m[..., None] * (self.rotation[:, None, :2] - slope[..., None] * self.rotation[:, None, 2:])
+        # Rows of the joints' change by a rotation, less the slope times that of the depth.
+        by_turn = np.empty(by_joint.shape)
+        by_turn[:, :, 0, 0], by_turn[:, :, 1, 0] = -slope[..., 0] * y, -z - slope[..., 1] * y
+        by_turn[:, :, 0, 1], by_turn[:, :, 1, 1] = z + slope[..., 0] * x, slope[..., 1] * x
+        by_turn[:, :, 0, 2], by_turn[:, :, 1, 2] = -y, x
+        by_turn *= per_m[..., None]
+        by_joint, by_turn = by_joint.reshape(frames, -1, 3), by_turn.reshape(frames, -1, 3)
+        camera = np.empty((*by_joint.shape[:2], 9))
+        camera[..., :3] = -scale * by_joint
+        camera[..., 3:6] = by_turn @ left_jacobian(self.turn)
+        camera[..., 6:7] = by_joint @ -self.position[..., None]
+        camera[..., 7:8] = by_turn @ self.turn_rate[..., None]
+        camera[..., 8:9] = by_joint @ (-scale * self.velocity[..., None])
+        return (root[..., None] * self.image).reshape(frames, -1), by_joint, camera
 
 
 def gradient(r: Residuals) -> tuple[np.ndarray, np.ndarray]:
@@ -186,12 +205,11 @@ def gradient(r: Residuals) -> tuple[np.ndarray, np.ndarray]:
     camera = frames[:, :CAMERA]
     joints = frames[:, CAMERA:].reshape(state.joints.shape)
     shared = np.zeros(GLOBALS)
-    pull = np.einsum("fp,fpki,fpk->fpi", r.image_weight(), r.image_by_seen(), r.image)  # by the joint in camera axes
-    joints += pull @ r.rotation
-    camera[:, :3] -= state.globals[SCALE] * np.einsum("fpi,fij->fj", pull, r.rotation)
-    camera[:, 3:] += np.einsum("fpi,fpij->fj", pull, r.by_turn())
-    columns, which = r.by_shared()
-    shared[which] += np.einsum("fpi,fpij->j", pull, columns)
+    image, by_joint, by_camera = r.image_derivatives()
+    joints += (image[..., None] * by_joint).reshape(*joints.shape[:2], 2, 3).sum(axis=2)
+    pull = (image[:, None] @ by_camera)[:, 0]
+    camera += pull[:, :CAMERA]
+    shared[OF_CAMERA] += pull[:, CAMERA_COLUMNS].sum(axis=0)
     relief = (weights.depth * r.relief / r.rounded)[..., None] * r.view[:, None]
     joints += relief
     joints[:, 0] -= relief.sum(axis=1)

@@ -127,7 +127,7 @@ def test_normal_matrix_is_the_curvature_of_the_quadratic_terms() -> None:
     for offset in range(band.shape[1]):
         at = np.arange(size - offset)
         full[at, at + offset] = full[at + offset, at] = band[: size - offset, offset]
-    whole = np.block([[full, border.T], [border, corner]])
+    whole = np.block([[full, border], [border.T, corner]])
     assert np.linalg.eigvalsh(whole).min() > -1e-6 * np.abs(whole).max()  # a sum of squares
     # Feet, floor, accelerations, lengths and telemetry are quadratic: their rows agree exactly.
     rng = np.random.default_rng(2)
@@ -156,7 +156,7 @@ def test_covariances_are_those_of_the_whole_inverse() -> None:
     for offset in range(band.shape[1]):
         at = np.arange(size - offset)
         full[at, at + offset] = full[at + offset, at] = band[: size - offset, offset]
-    inverse = np.linalg.inv(np.block([[full, border.T], [border, corner]]))
+    inverse = np.linalg.inv(np.block([[full, border], [border.T, corner]]))
     found = posterior(matrix, state)
     assert found is not None
     np.testing.assert_allclose(found.shared, inverse[size:, size:], rtol=1e-5, atol=1e-12)
