@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.geometry.bones import pair_lengths
+from drocap_ros.reconstruction.banded import backward, band_factor, forward
 from drocap_ros.reconstruction.stop_reason import CONVERGED, DEADLINE, ITERATIONS, NO_DESCENT
 from drocap_ros.skeleton import BODY_17, RIGID_BONES, indices
 
@@ -180,19 +181,19 @@ def _band(p: AdjustmentProblem, r: _Residuals) -> np.ndarray:
 
 
 def _border(p: AdjustmentProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray]:
-    """(18 + K, F * 51) coupling of lengths and zoom with the joints, and (18 + K, 16 + K) with each other."""
+    """(F * 51, 18 + K) coupling of the joints with lengths and zoom, and (18 + K, 18 + K) of these with each other."""
     frames, knots = p.zoom_basis.shape
     count = len(SPANS)
-    by_length = np.zeros((count, frames, len(BODY_17), 3))
+    border = np.zeros((frames, len(BODY_17), 3, count + knots))
     by_size = np.zeros((frames, len(BODY_17), 3))
     slope = r.direction / np.square(SPAN_STD_MM)[:, None]
     for k, (a, b) in enumerate(SPANS):
         pull = r.zoom[:, None] * slope[:, k]
-        by_length[k, :, b] = -pull
-        by_length[k, :, a] = pull
+        border[:, b, :, k] = -pull
+        border[:, a, :, k] = pull
         by_size[:, b] -= r.lengths[k] * slope[:, k]
         by_size[:, a] += r.lengths[k] * slope[:, k]
-    by_zoom = p.zoom_basis.T[:, :, None] * by_size.reshape(1, frames, -1)
+    border[..., count:] = by_size[..., None] * p.zoom_basis[:, None, None]
     precision = 1.0 / np.square(SPAN_STD_MM)
     corner = np.zeros((count + knots, count + knots))
     corner[:count, :count] = np.diag(precision * np.square(r.zoom).sum() + p.length_weight)
@@ -200,7 +201,7 @@ def _border(p: AdjustmentProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarray
     corner[:count, count:] = (precision * r.lengths)[:, None] * (r.zoom @ p.zoom_basis)
     corner[count:, :count] = corner[:count, count:].T
     corner[count:, count:] = (precision * np.square(r.lengths)).sum() * p.zoom_basis.T @ p.zoom_basis + p.zoom_precision
-    return np.concatenate([by_length.reshape(count, -1), by_zoom.reshape(knots, -1)]), corner
+    return border.reshape(-1, count + knots), corner
 
 
 def adjust(
@@ -219,8 +220,6 @@ def adjust(
     tolerance : relative decrease of the cost that ends the solve
     cancelled : called before every step but the first; True ends the solve with reason DEADLINE
     """
-    from scipy.linalg.lapack import dpbtrf, dtbtrs
-
     damping, stop = 1e-4, ITERATIONS
     lengths, zooms = problem.lengths, np.zeros(problem.zoom_basis.shape[1])
     here = _Residuals(problem, joints, lengths, zooms)
@@ -231,18 +230,18 @@ def adjust(
             break
         g, g_sizes = _gradient(problem, here)
         band, (border, corner) = _band(problem, here), _border(problem, here)
-        right = np.concatenate([-g.reshape(1, -1), border])
+        right = np.concatenate([-g.reshape(-1, 1), border], axis=1)
         accepted = False
         for _ in range(8):
             damped = band.copy()
             damped[:, 0] = damped[:, 0] * (1 + damping) + 1e-2 * damping
-            factor, info = dpbtrf(damped.T, lower=1, overwrite_ab=1)
-            if info == 0:
+            factor = band_factor(damped)
+            if factor is not None:
                 # Eliminate the joints: half of a solve for every column, the other half for the answer alone.
-                y = dtbtrs(factor, right.T, uplo="L")[0]
+                y = forward(factor, right)
                 schur = corner + np.diag(damping * np.diag(corner)) - y[:, 1:].T @ y[:, 1:]
                 sizes = np.linalg.solve(schur, -g_sizes - y[:, 1:].T @ y[:, 0])
-                step = dtbtrs(factor, y[:, 0] - y[:, 1:] @ sizes, uplo="L", trans="T")[0].reshape(joints.shape)
+                step = backward(factor, y[:, :1] - y[:, 1:] @ sizes[:, None]).reshape(joints.shape)
                 step_lengths, step_zooms = sizes[: len(SPANS)], sizes[len(SPANS) :]
                 there = _Residuals(problem, joints + step, lengths + step_lengths, zooms + step_zooms)
                 if there.cost <= here.cost:
