@@ -72,7 +72,7 @@ def test_normal_equations_are_positive_and_their_corner_is_the_second_derivative
         i = np.arange(n - d)
         dense[i + d, i] = dense[i, i + d] = band[: n - d, d]
     border, corner = _border(p, r)
-    whole = np.block([[dense, border.T], [border, corner]])
+    whole = np.block([[dense, border], [border.T, corner]])
     assert np.linalg.eigvalsh(whole).min() > -1e-9 * np.abs(whole).max()
     # The cost of lengths and zoom is (nearly) quadratic: the corner is its second derivative.
     _, before = _gradient(p, r)
