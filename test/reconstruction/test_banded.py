@@ -1,0 +1,26 @@
+"""Triangular solves by pieces against those of the whole band."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg.lapack import dtbtrs
+
+from drocap_ros.reconstruction.banded import backward, band_factor, forward
+
+
+@pytest.mark.parametrize(("size", "width"), [(5, 9), (1200, 115), (1203, 115), (2500, 115), (3700, 7), (2600, 1300)])
+def test_pieces_give_the_solution_of_the_whole(size: int, width: int) -> None:
+    rng = np.random.default_rng(0)
+    band = rng.normal(size=(size, width))
+    band[:, 0] = 3.0 * width
+    factor = band_factor(band)
+    assert factor is not None
+    right = rng.normal(size=(size, 4))
+    for ours, trans in ((forward, "N"), (backward, "T")):
+        whole = dtbtrs(factor, right, uplo="L", trans=trans)[0]
+        np.testing.assert_allclose(ours(factor, right), whole, rtol=1e-9, atol=1e-12)
+
+
+def test_a_band_that_is_not_positive_definite_has_no_factor() -> None:
+    assert band_factor(np.array([[1.0, 2.0], [1.0, 0.0]])) is None
