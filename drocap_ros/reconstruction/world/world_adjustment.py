@@ -1,8 +1,8 @@
 """Adjustment of body and camera together in the world, by Gauss-Newton with a search along each step.
 
 Every step has three parts: the probability that a foot is in contact at the present point, the normal equations, and
-their solution with the frames eliminated; a step that raises the cost is shortened.  After the last step, feet in contact are locked in their places while the
-unknowns of the whole recording stay as they are.
+their solution with the frames eliminated; a step that raises the cost is shortened.  After the last step, feet in
+contact are locked in their places while the unknowns of the whole recording stay as they are.
 """
 
 from __future__ import annotations
