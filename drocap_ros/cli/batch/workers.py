@@ -72,7 +72,7 @@ def run_on_cluster(tasks: Sequence[Task], address: str) -> Generator[Record, Non
         When the scheduler is lost.
     """
     try:
-        from distributed import Client, as_completed
+        from distributed import Client, KilledWorker, as_completed
     except ImportError:
         raise InputError("--cluster: expected dask.distributed; install it: pip install drocap_ros[cluster]") from None
     try:
@@ -92,4 +92,8 @@ def run_on_cluster(tasks: Sequence[Task], address: str) -> Generator[Record, Non
             if future.cancelled():
                 raise DrocapError(f"--cluster {address}: the scheduler was lost; start the batch again to go on")
             cause = future.exception()
-            yield future.result() if cause is None else failure(task, f"{type(cause).__name__}: {cause}")
+            if isinstance(cause, KilledWorker):
+                lost = f"KilledWorker: {cause.allowed_failures + 1} workers ended during this recording"
+                yield failure(task, f"{lost}: more memory than a worker's limit, or a crash; see the workers' logs")
+            else:
+                yield future.result() if cause is None else failure(task, f"{type(cause).__name__}: {cause}")
