@@ -7,6 +7,7 @@ The metadata of :func:`param` is the only source of the YAML loader, the ROS par
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -51,7 +52,7 @@ class Parameters:
     RETIRED: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
-        types = get_type_hints(type(self))
+        types = _types(type(self))  # type: ignore[arg-type]  # a class is hashable
         for spec in dataclasses.fields(self):
             value = _checked(spec, types[spec.name], getattr(self, spec.name), type(self).__name__)
             object.__setattr__(self, spec.name, value)
@@ -68,6 +69,11 @@ class Parameters:
                 f"{where or cls.__name__}: unknown parameter {unknown[0]!r}; expected one of {', '.join(sorted(known))}"
             )
         return cls(**values)
+
+
+@functools.cache
+def _types(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)  # a millisecond of compilation
 
 
 def _checked(spec: dataclasses.Field[Any], kind: type, value: Any, owner: str) -> Any:

@@ -2,7 +2,8 @@
 
 The pelvis and the chest are rigid; the spine between them divides their relative rotation evenly.  Neck, head, collar
 bones and limb bones have constant lengths and free directions.  Damped Gauss-Newton minimizes the squared distances of
-the joints from their measured positions (frames are independent).  What positions do not show is held by weak priors:
+the joints from their measured positions (frames are independent); where a joint stays far from its position, the
+farther joints gain weight.  What positions do not show is held by weak priors:
 the spine stays straight forwards, neck and collar bones stay near their usual directions.
 """
 
@@ -42,6 +43,9 @@ _BENDS, _USUAL = np.array([0.05, 0.02, 0.02]), 0.02
 _PRIORS = ("neck", "lshoulder", "rshoulder")
 #: Weight of an interpolated joint relative to a known one.
 _INTERPOLATED = 0.02
+#: A joint farther from its position than this, m, gains weight, so that few joints do not bear a frame's whole misfit.
+FAR_M = 0.02
+_ROUNDS = 20
 _STEPS, _CONVERGED, _DAMPING, _CHUNK = 30, 3e-4, 1e-6, 256
 
 
@@ -68,7 +72,9 @@ class RigidBody:
         return self.positions[:, self.joints.index(joint)]
 
 
-def fit_rigid_body(positions: np.ndarray, joints: tuple[str, ...], known: np.ndarray) -> RigidBody:
+def fit_rigid_body(
+    positions: np.ndarray, joints: tuple[str, ...], known: np.ndarray, far_m: float = FAR_M
+) -> RigidBody:
     """Rigid body of a motion.
 
     Parameters
@@ -76,6 +82,7 @@ def fit_rigid_body(positions: np.ndarray, joints: tuple[str, ...], known: np.nda
     positions : (F, P, 3) m, y up, without NaN
     joints : P names, those of ``BODY_15`` at least; ``rtoe``, ``ltoe`` are used, others are ignored
     known : (F, P) bool, False where a position was interpolated
+    far_m : joints that stay farther from their position gain weight until they are nearer, or for a few rounds
 
     Lengths are those of the frames in which both ends are known.
 
@@ -94,6 +101,15 @@ def fit_rigid_body(positions: np.ndarray, joints: tuple[str, ...], known: np.nda
     parts = [slice(i, i + _CHUNK) for i in range(0, len(positions), _CHUNK)]
     solved = [problem.solve(_Pose(*(v[p] for v in start)), measured[p], weights[p]) for p in parts]
     pose = _Pose(*(np.concatenate(values) for values in zip(*solved, strict=True)))
+    for _ in range(_ROUNDS):
+        off = np.linalg.norm(problem.observed @ problem.segments(pose) - measured, axis=2) * sure
+        (far,) = np.nonzero((off > far_m).any(axis=1))
+        if not len(far):
+            break
+        weights[far] *= 1.0 + 0.5 * (off[far] / far_m) ** 2
+        again = problem.solve(_Pose(*(values[far] for values in pose)), measured[far], weights[far])
+        for values, changed in zip(pose, again, strict=True):
+            values[far] = changed
     posed = problem.path @ problem.segments(pose)
     return RigidBody(problem.joints, posed, problem.lengths, problem.offsets, pose.pelvis, pose.chest)
 
