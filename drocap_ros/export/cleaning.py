@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 from scipy.signal import butter, filtfilt
 
 from drocap_ros.errors import InputError
@@ -19,6 +19,10 @@ _TWICE = (np.sqrt(2.0) - 1.0) ** 0.25
 _STILL_M_S, _AVERAGE_S, _SHORTEST_S = 0.4, 0.15, 0.2
 #: Time in which a foot leaves or reaches its place; farther than this from its median place it is not at rest, m.
 _FADE_S, _FARTHEST_M = 0.2, 0.08
+#: Change of a leg's half length per turn of its knee at which half of the turn is made; 0.07 is that of 8 degrees.
+_DAMPING = 0.07
+#: Distance of a knee from the line of its leg at which its direction counts as much as the moments around, m.
+_CLEAR_M = 0.02
 #: A root that moves less than this is not known in the world, m.
 _ROOT_MOVES_M = 0.05
 
@@ -72,7 +76,7 @@ def lock_feet(clip: Clip) -> Clip:
         hip, knee, ankle = indices(clip.joints, tuple(side + name for name in ("hip", "knee", "ankle")))
         rests = _rests(clip.positions[:, ankle], clip.rate_hz)
         moved = clip.positions[:, ankle] + _offsets(clip.positions[:, ankle], rests, clip.rate_hz)
-        out[:, knee], out[:, ankle] = _two_bones(clip.positions[:, [hip, knee, ankle]], moved)
+        out[:, knee], out[:, ankle] = _two_bones(clip.positions[:, [hip, knee, ankle]], moved, clip.rate_hz)
         if side + "toe" in clip.joints:
             toe = clip.joints.index(side + "toe")
             out[:, toe] += out[:, ankle] - clip.positions[:, ankle]
@@ -126,18 +130,47 @@ def _offsets(ankle: np.ndarray, rests: list[tuple[int, int]], rate_hz: float) ->
     return out
 
 
-def _two_bones(leg: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Knee and ankle (F, 3) of hip, knee, ankle (F, 3, 3) with the ankle as near to ``target`` as the bones reach."""
+def _two_bones(leg: np.ndarray, target: np.ndarray, rate_hz: float) -> tuple[np.ndarray, np.ndarray]:
+    """Knee and ankle (F, 3) of hip, knee, ankle (F, 3, 3) with the ankle near ``target``.
+
+    A nearly straight leg changes its length little even by a large turn of the knee.  The damping gives up a part of
+    the way there: the knee moves at most a few times as far as the ankle.
+    """
     hip, knee, ankle = np.swapaxes(leg, 0, 1)
     thigh, shank = np.linalg.norm(knee - hip, axis=1), np.linalg.norm(ankle - knee, axis=1)
-    way = target - hip
-    reach = np.linalg.norm(way, axis=1)
-    along = way / np.maximum(reach, 1e-9)[:, None]
-    reach = np.clip(reach, np.abs(thigh - shank) + 1e-9, thigh + shank - 1e-9)
+    before, wanted = np.linalg.norm(ankle - hip, axis=1), np.linalg.norm(target - hip, axis=1)
+    both = np.maximum(thigh * shank, 1e-9)
+
+    def flexion(reach: np.ndarray) -> np.ndarray:
+        return np.arccos(np.clip((reach**2 - thigh**2 - shank**2) / (2.0 * both), -1.0, 1.0))
+
+    def reach_at(bend: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.maximum(thigh**2 + shank**2 + 2.0 * both * np.cos(bend), 1e-12))
+
+    bend = flexion(before)
+    turn = flexion(wanted) - bend
+    turn = np.where(np.abs(turn) < 1e-6, 1e-6, turn)
+    # Change of length per turn, of the leg's half length.
+    effect = 2.0 * np.abs(reach_at(bend + turn) - before) / (np.abs(turn) * np.maximum(thigh + shank, 1e-9))
+    reach = reach_at(bend + turn * effect**2 / (effect**2 + _DAMPING**2))
+    along = (target - hip) / np.maximum(wanted, 1e-9)[:, None]
     foot = (thigh**2 - shank**2 + reach**2) / (2.0 * np.maximum(reach, 1e-9))
     height = np.sqrt(np.maximum(thigh**2 - foot**2, 0.0))
-    aside = (knee - hip) - along * np.sum((knee - hip) * along, axis=1, keepdims=True)
+    aside = _aside(knee - hip, ankle - hip, rate_hz)
+    aside = aside - along * np.sum(aside * along, axis=1, keepdims=True)
     aside /= np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-9)
     moved = np.any(target != ankle, axis=1)[:, None]
     new_knee = hip + along * foot[:, None] + aside * height[:, None]
     return np.where(moved, new_knee, knee), np.where(moved, hip + along * reach[:, None], ankle)
+
+
+def _aside(knee: np.ndarray, ankle: np.ndarray, rate_hz: float) -> np.ndarray:
+    """(F, 3) direction in which a knee leaves the line from hip to ankle, both (F, 3) from the hip.
+
+    Of a straight leg it is chance: there the bent knees of the moments around count.
+    """
+    line = ankle / np.maximum(np.linalg.norm(ankle, axis=1, keepdims=True), 1e-9)
+    own = knee - line * np.sum(knee * line, axis=1, keepdims=True)
+    around = np.nan_to_num(own) * np.linalg.norm(np.nan_to_num(own), axis=1, keepdims=True)
+    around = gaussian_filter1d(around, min(max(_AVERAGE_S * rate_hz, 1e-3), 1000.0), axis=0)
+    return own + _CLEAR_M * around / np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-12)

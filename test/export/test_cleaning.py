@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
@@ -74,6 +75,27 @@ def test_locked_feet_keep_their_place_and_the_bones_their_lengths(walker):
     assert step.max() < 0.02
     assert "feet locked in" in out.notes[-1]
     assert "mm" in out.notes[-1]
+
+
+def test_knee_of_an_almost_straight_leg_does_not_jump(walker):
+    """A leg bent by 5 degrees whose ankle wanders along it: a knee that followed fully would move ten times as far."""
+    clip = clip_of(walker)
+    positions = clip.positions.copy()
+    wander = gaussian_filter1d(np.random.default_rng(5).normal(0, 0.02, len(positions)), 2.0)
+    for side in "rl":
+        hip, knee, ankle = (BODY_15.index(side + name) for name in ("hip", "knee", "ankle"))
+        positions[:, [hip, knee, ankle]] = positions[:1, [hip]] + [(0, 0, 0), (0.0, 0.018, -0.42), (0, 0, -0.84)]
+        # The leg keeps its bones: hip and knee rise and fall with the ankle.
+        positions[:, [hip, knee, ankle], 2] += wander[:, None]
+    out = lock_feet(dataclasses.replace(clip, positions=positions))
+    for side in "rl":
+        knee, ankle = BODY_15.index(side + "knee"), BODY_15.index(side + "ankle")
+        moved = out.positions - positions
+        assert np.abs(moved[:, ankle]).max() > 0.001
+        assert np.linalg.norm(np.diff(moved[:, knee], axis=0), axis=1).max() < 1.2 * np.abs(wander).max()
+        # It stays on its side.
+        line = out.positions[:, knee] - 0.5 * (out.positions[:, BODY_15.index(side + "hip")] + out.positions[:, ankle])
+        assert np.all(line[:, 1] > 0.0)
 
 
 def test_both_are_off_by_default_and_printed_when_chosen(walker, tmp_path, capsys):
