@@ -35,6 +35,9 @@ from drocap_ros.reconstruction.lifted.window_solver import Cancelled, solve_sign
 #: Standard deviation of an adjusted pose over the lifter's expected errors, about the pelvis: across and along the
 #: ray (measured on the HDM05 sequences of mocap/train, which are not among the lifter's training data).
 ACROSS, ALONG = 1.2, 1.5
+#: The lifter expects no noise that lasts unless a covariance states it: share of it in the errors across the ray,
+#: measured on the same sequences.
+_LASTING = 1.5
 
 
 def prepare(config: LiftedConfig) -> None:
@@ -61,7 +64,8 @@ class WindowSolution:
 
     joints : (F, 17, 3) in camera axes and the unit of the keypoints; x and y in the image, depth in the scale of the
         pelvis
-    sigma : (F, 17, 2) the lifter's expected absolute error of x, y (each) and of depth, in the same unit
+    sigma : (F, 17, 2) expected absolute error of x, y (each) and of depth, in the same unit: the lifter's and, for
+        keypoints without a covariance, their noise that lasts for some frames
     body : the size for the next window
     steps : of the first and of the final adjustment
     seconds : wall-clock of "initial" (the lifter) and of "ba" (the rest)
@@ -143,10 +147,13 @@ def solve_even_window(
     joints[..., :2] += sized.centre[:, None]
     end = time.perf_counter()
     adjusting = sized.seconds + end - clock
+    sigma = sized.lifted.sigma * size
+    if keypoints.covariance is None:
+        sigma[..., 0] = np.hypot(sigma[..., 0], _LASTING * sized.model.lasting_noise_mm * size[..., 0])
     yardstick = YARDSTICK_MM / max(float(found.lengths[YARDSTICK].sum()), 1e-12)
     return WindowSolution(
         joints=joints,
-        sigma=sized.lifted.sigma * size,
+        sigma=sigma,
         body=BodySize(found.lengths * yardstick, zoom * found.zoom / (mm * yardstick)),
         cost_terms=found.cost_terms,
         steps=(sized.iterations, found.iterations),

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
@@ -116,6 +117,18 @@ def test_short_windows_give_finite_poses(view, frames):
     result = solve_even_window(Keypoints2D(view.tracks.keypoints[:frames]))
     assert result.joints.shape == (frames, 17, 3)
     assert np.isfinite(result.joints).all()
+
+
+def test_noise_that_lasts_widens_the_expected_errors(view, plain):
+    rng, exact = np.random.default_rng(3), view.tracks.keypoints
+    decay, noise_px = np.exp(-1 / 2.4), 12.0 * PX_PER_MM
+    fresh = rng.normal(0, noise_px * np.sqrt(1 - decay**2), exact.shape)
+    keypoints = exact + lfilter([1.0], [1.0, -decay], fresh, axis=0)
+    covariance = np.broadcast_to([noise_px**2, 0.0, noise_px**2], (*exact.shape[:2], 3))
+    silent, stated = (solve_even_window(Keypoints2D(keypoints, covariance=c)).sigma for c in (None, covariance))
+    # The lifter knows the stated noise; without a covariance the noise that lasts counts on top.
+    assert np.median(silent[..., 0] / plain.sigma[..., 0]) > 1.3
+    assert np.median(silent[..., 0] / stated[..., 0]) > 1.0
 
 
 def test_windows_without_a_seen_joint_are_refused():
