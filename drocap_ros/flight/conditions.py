@@ -34,6 +34,7 @@ class ConditionCode(enum.IntEnum):
     HOLD_MODE_MISSING = 15
     DEGRADED = 16
     SLOWED = 17
+    WIDENED = 18
     # Commands that are refused for what they ask, or for the state in which they come
     UNKNOWN_COMMAND = 40
     COMMAND_OUTDATED = 41
@@ -120,6 +121,8 @@ _SENTENCES = {
     _C.DEGRADED: "the orbit is slowed down: {cause}",
     _C.SLOWED: "{cause}, at {speed_deg_s:.1f} deg/s instead of {wanted_deg_s:.1f}: without setpoints the autopilot "
     "flies on for {timeout_s:g} s, and the vehicle must stop within max_coast_m, {limit_m:g} m",
+    _C.WIDENED: "{cause}, {radius_m:.1f} m away instead of {wanted_m:.1f}: clear of min_distance_m, {limit_m:g} m, if "
+    "the range is wrong; size_error, {size_error:g}, may be 0.04 where body_height_m is the subject's",
     _C.UNKNOWN_COMMAND: "no command has the number {number}",
     _C.COMMAND_OUTDATED: "the command is {age_s:.1f} s old, and {limit_s:g} s is the limit",
     _C.TOO_MANY_COMMANDS: "more than {limit} commands are waiting",

@@ -68,7 +68,7 @@ class SafetyConfig(Parameters):
     )  # fmt: skip
     max_coast_m: float = param(
         3.0, "distance that the vehicle may fly on if setpoints end, the autopilot's time-out included: it limits the "
-        "speed, to 1.8 m/s with GUID_TIMEOUT 0.5, 2.1 m/s with 0.3, 1.4 m/s with COM_OF_LOSS_T 0.5", unit="m",
+        "speed, to 1.8 m/s with GUID_TIMEOUT 0.5, 2.1 m/s with 0.3, 1.3 m/s with COM_OF_LOSS_T 0.5", unit="m",
         minimum=0.5, maximum=50,
     )  # fmt: skip
     speed_margin: float = param(

@@ -1,9 +1,10 @@
 """The vehicle's motion until it stands if no setpoint followed: every setpoint may be the last one.
 
 After the death of the bridge the autopilot flies the last setpoint until its time-out.  ArduPilot integrates the
-velocity and the acceleration, then brakes along a path limited in acceleration and jerk, and overshoots; PX4 keeps its
-speed, brakes, then creeps on.  Both models are compared with recorded flights of the real autopilots
-(``test/flight/orbit/test_coast.py``).  Vectors of the plane are complex numbers here: a step costs microseconds.
+velocity and the acceleration, then brakes along a path limited in acceleration and jerk, and overshoots; PX4 follows
+velocity and position as they are, brakes, then creeps on.  Both models are compared with recorded flights of the real
+autopilots (``test/flight/orbit/test_coast.py``).  Vectors of the plane are complex numbers here: a step costs
+microseconds.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from drocap_ros.flight.setpoint import Setpoint
 _STEP_S, _LONGEST_S = 0.05, 5.0
 _ACCELERATION, _JERK = 2.5, 5.0  # m/s^2, m/s^3, of ArduPilot's path, as shipped
 _EXCESS = 1.1  # of ArduPilot's real distances over the predicted ones: lag, wind
+PX4_POSITION_GAIN = 0.95  # 1/s, of its position loop (MPC_XY_P)
+_PULL = 0.6  # 1/s: so much of it is left, the rest makes up for friction (recorded flights lie 1 m behind their place)
 _PX4_DELAY_S, _PX4_FOLLOWS_S, _PX4_BRAKING = 0.1, 0.5, 1.4  # s, s, m/s^2: measured
 _STANDING_M_S = {"ardupilot": 0.2, "px4": 0.5}
 _CREEP_M = 0.8  # PX4 creeps at up to 0.4 m/s for seconds (measured)
@@ -53,7 +56,7 @@ def coast_of(setpoint: Setpoint, position: np.ndarray, velocity: np.ndarray, aut
     place, moving = complex(*position[:2]), complex(*velocity[:2])
     goal, wanted, push = (complex(*v[:2]) for v in (setpoint.position, setpoint.velocity, setpoint.acceleration))
     if autopilot == "px4":
-        return _px4(place, moving, wanted, timeout_s)
+        return _px4(place, moving, goal, wanted, timeout_s)
     return _ardupilot(place, moving, goal, wanted, push, timeout_s)
 
 
@@ -95,12 +98,12 @@ def _ardupilot(
     return _coast(rows, _EXCESS)
 
 
-def _px4(place: complex, velocity: complex, wanted: complex, timeout_s: float) -> Coast:
+def _px4(place: complex, velocity: complex, goal: complex, wanted: complex, timeout_s: float) -> Coast:
     rows = [(0.0, place, abs(velocity))]
     dt, t = _STEP_S, 0.0
     while t < _LONGEST_S and (t <= timeout_s or abs(velocity) > _STANDING_M_S["px4"]):
-        if t < timeout_s + _PX4_DELAY_S:  # towards the velocity; the position error hardly changes it (measured)
-            velocity += (wanted - velocity) * dt / _PX4_FOLLOWS_S
+        if t < timeout_s + _PX4_DELAY_S:
+            velocity += (wanted + _PULL * (goal - place) - velocity) * dt / _PX4_FOLLOWS_S
         else:
             velocity *= max(1.0 - _PX4_BRAKING * dt / max(abs(velocity), 1e-9), 0.0)
         place += velocity * dt

@@ -6,8 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.conditions import Condition
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.orbit.planner import OrbitGoal, OrbitState
 from drocap_ros.flight.orbit.states import Action, CommandAnswer, OperatorCommand, State
+
+_WIDER = 1.05
 
 
 class ControlStatus(NamedTuple):
@@ -32,3 +36,16 @@ class ControlStatus(NamedTuple):
     def reason(self) -> str:
         """Why the controller is in its state, as a sentence."""
         return f"{self.condition} ({self.mode_failure})" if self.mode_failure else str(self.condition)
+
+
+def widened_condition(
+    present: Condition, goal: OrbitGoal, orbit: OrbitState, config: MavlinkBridgeConfig
+) -> tuple[Condition, OrbitGoal]:
+    """The condition of a flown orbit, with its radius if that is wider than the goal's, and the goal that is flown."""
+    if present.code != ConditionCode.ORBITING or orbit.goal_radius <= _WIDER * goal.radius_m:
+        return present, goal
+    widened = condition(
+        ConditionCode.WIDENED, cause=present, radius_m=orbit.goal_radius, wanted_m=goal.radius_m,
+        limit_m=config.min_distance_m, size_error=config.size_error,
+    )  # fmt: skip
+    return widened, goal._replace(radius_m=orbit.goal_radius)

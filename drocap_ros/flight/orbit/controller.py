@@ -20,7 +20,7 @@ from drocap_ros.flight.mavlink.commands import CommandQueue, command_message
 from drocap_ros.flight.mavlink.dialects import ARDUPILOT, DIALECTS, Dialect, halt_message, setpoint_message
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.orbit.command_checks import command_condition, commanded_goal
-from drocap_ros.flight.orbit.control_status import ControlStatus
+from drocap_ros.flight.orbit.control_status import ControlStatus, widened_condition
 from drocap_ros.flight.orbit.degradation import slowed
 from drocap_ros.flight.orbit.following import Following, Keeping
 from drocap_ros.flight.orbit.last_setpoint import coast_speed, harmless, slowed_condition
@@ -334,8 +334,9 @@ class OrbitController:
             bearing = math.atan2(-sight[1], -sight[0])
             yaw_error = math.degrees(math.remainder(seen.yaw - bearing, 2 * math.pi)) if sight.any() else math.nan
         orbiting, present = self.safety.state == State.ORBITING, self.safety.condition
-        if orbiting:
-            present = slowed_condition(present, self._goal, seen, self._limits)
+        if orbiting and self._orbit is not None:
+            present, flown = widened_condition(present, self._goal, self._orbit, self._config)
+            present = slowed_condition(present, flown, seen, self._limits)
         answers, self._answers = self._answers, []
         return ControlStatus(
             state=self.safety.state, condition=present, mode_failure=self._queue.failure(_SET_MODE),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +19,23 @@ _SHARES = (
     (1.0, 1.0, 1.0), (0.5, 1.0, 1.0), (0.0, 1.0, 1.0), (0.0, 0.8, 0.5), (0.0, 0.6, 0.0), (0.0, 0.4, 0.0),
     (0.0, 0.2, 0.0),
 )  # fmt: skip
-_MEAN = 0.75  # share of max_coast_m that a steady flight uses: gusts, turns and the way to the reference add to it
+#: Shares across the line of sight that PX4 tries first: it falls behind along the orbit and keeps its radius.
+_ACROSS = (
+    (1.0, 1.0, 1.0), (0.75, 1.0, 1.0), (0.5, 1.0, 1.0), (0.25, 1.0, 1.0), (0.0, 1.0, 1.0), (0.0, 0.8, 0.5),
+    (0.0, 0.6, 0.0), (0.0, 0.4, 0.0),
+)  # fmt: skip
+
+
+class _Use(NamedTuple):
+    """Shares of max_coast_m: of a steady flight, to which gusts, turns and the way add, and of any setpoint."""
+
+    steady: float
+    greatest: float
+
+
+#: PX4's estimate wanders by up to 0.9 m while the vehicle stops, and the vehicle follows it.  With less than this it
+#: falls behind subjects who walk at 1.4 m/s, and loses them.
+_USES, _USE = {"px4": _Use(0.63, 0.82)}, _Use(0.75, 1.0)
 _NEARER_M = 1.0
 _SLACK_M, _SLACK_M_S = 0.2, 0.1  # what the vehicle has already is no effect of the setpoint
 _SHIPPED_S = {"ardupilot": 3.0, "px4": 1.0}  # time-outs, where they are not reported
@@ -27,14 +44,14 @@ _SLOWED = 0.95
 
 def coast_speed(seen: Observed, limits: Limits) -> float:
     """Speed in m/s of a steady flight whose coast leaves room to ``max_coast_m``."""
-    return greatest_speed(seen.autopilot, _timeout_s(seen), _MEAN * limits.safety.max_coast_m)
+    return greatest_speed(seen.autopilot, _timeout_s(seen), _use(seen).steady * limits.safety.max_coast_m)
 
 
 def slowed_condition(present: Condition, goal: OrbitGoal, seen: Observed, limits: Limits) -> Condition:
     """The condition of a flown orbit, with the angular speed that is flown if the coast limits it."""
     wanted = abs(goal.angular_speed_rad_s)
     allowed = coast_speed(seen, limits) / goal.radius_m
-    if present.code != ConditionCode.ORBITING or allowed >= _SLOWED * wanted:
+    if present.code not in (ConditionCode.ORBITING, ConditionCode.WIDENED) or allowed >= _SLOWED * wanted:
         return present
     return condition(
         ConditionCode.SLOWED, cause=present, speed_deg_s=math.degrees(allowed), wanted_deg_s=math.degrees(wanted),
@@ -49,8 +66,8 @@ def harmless(
 
     Where no motion is harmless, the setpoint holds the present position, and the condition is why.
 
-    The coast must stay inside the fence and the greatest speed.  It must stay clear of the minimum distance from a
-    subject that stands and from one that moves as estimated, and come at most 1 m nearer to that one.
+    The coast must be short, and stay inside the fence and the greatest speed.  It must stay clear of the minimum
+    distance from a subject that stands and from one that moves as estimated, and come at most 1 m nearer to that one.
 
     Parameters
     ----------
@@ -58,17 +75,33 @@ def harmless(
     fence_centre : (2,) m; None = there is no fence
     """
     problem: Condition | None = None
-    for way, speed, push in _SHARES:
-        part = setpoint._replace(
-            position=seen.position + way * (setpoint.position - seen.position),
-            velocity=speed * setpoint.velocity, acceleration=push * setpoint.acceleration,
+    longest = _use(seen).greatest * limits.safety.max_coast_m
+    tries = [(share, share) for share in _SHARES]
+    if seen.autopilot == "px4" and seen.subject is not None:
+        tries = [(_SHARES[0], share) for share in _ACROSS] + [(share, min(share, _ACROSS[-1])) for share in _SHARES[1:]]
+    for along, across in tries:
+        way, velocity, acceleration = (
+            _shared(vector, seen, *shares) for vector, *shares in zip(
+                (setpoint.position - seen.position, setpoint.velocity, setpoint.acceleration), along, across,
+                strict=True,
+            )
         )  # fmt: skip
+        part = setpoint._replace(position=seen.position + way, velocity=velocity, acceleration=acceleration)
         coast = coast_of(part, seen.position, seen.velocity, seen.autopilot, _timeout_s(seen))
         problem = _danger(coast, seen, complex(*subject_velocity[:2]), fence_centre, limits)
         # A coast that is only long is not shorter after a hold: the slowest setpoint is sent.
-        if problem is None and (coast.length_m <= limits.safety.max_coast_m or speed == _SHARES[-1][1]):
+        if problem is None and (coast.length_m <= longest or along == _SHARES[-1]):
             return part, None
     return hold_setpoint(seen.position, seen.yaw), problem
+
+
+def _shared(vector: np.ndarray, seen: Observed, along: float, across: float) -> np.ndarray:
+    """Shares of a vector along the horizontal line of sight, and of the rest of it."""
+    if seen.subject is None or along == across:
+        return along * vector
+    sight = np.append((seen.subject - seen.position)[:2], 0.0)
+    part = (vector @ sight) / max(float(sight @ sight), 0.01) * sight
+    return across * vector + (along - across) * part
 
 
 def _danger(
@@ -94,6 +127,10 @@ def _danger(
         ) if distance.min() < limit), default=math.nan,
     )  # fmt: skip
     return None if math.isnan(near) else condition(ConditionCode.COAST_UNSAFE, reach=f"come to {near:.1f} m")
+
+
+def _use(seen: Observed) -> _Use:
+    return _USES.get(seen.autopilot, _USE)
 
 
 def _timeout_s(seen: Observed) -> float:

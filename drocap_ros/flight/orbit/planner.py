@@ -56,6 +56,7 @@ class OrbitState(NamedTuple):
     centre, centre_velocity, centre_acceleration : (2,) m, m/s, m/s^2; the acceleration filtered
     trim : m, added to the radius: integrated mean radius error (wind, lag)
     flown_s : time of the reference
+    goal_radius : m, of the goal, or of the wider orbit that is flown for it
     """
 
     phase: float
@@ -67,6 +68,7 @@ class OrbitState(NamedTuple):
     centre_acceleration: np.ndarray
     trim: float = 0.0
     flown_s: float = 0.0
+    goal_radius: float = 0.0
 
 
 def goal_of(
@@ -147,8 +149,8 @@ def advance(
     jerk = config.max_jerk_m_s3
     slow = min(0.5 * config.max_acceleration_m_s2, 1.0)
     approach = _approach_speed(state, config)
-    wanted = max(goal.radius_m, config.min_distance_m, min(least_radius_m, config.max_distance_m))
-    radius = _toward(state.radius, wanted, approach, slow, jerk, dt)
+    goal_radius = max(goal.radius_m, config.min_distance_m, min(least_radius_m, config.max_distance_m))
+    radius = _toward(state.radius, goal_radius, approach, slow, jerk, dt)
     height = _toward(state.height, ground_m + goal.height_m, config.approach_speed_m_s, slow, jerk, dt)
     outward = np.array([math.cos(state.phase), math.sin(state.phase)])
     moving = centre_velocity + radius.rate * outward
@@ -173,7 +175,7 @@ def advance(
         trim = min(max(trim + _TRIM_RATE * error * dt, -most), _MAX_TRIM_M)
     return OrbitState(
         math.remainder(phase, 2 * math.pi), omega, radius, height, centre, centre_velocity, centre_acceleration, trim,
-        state.flown_s + dt,
+        state.flown_s + dt, goal_radius,
     )  # fmt: skip
 
 

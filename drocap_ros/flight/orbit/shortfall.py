@@ -11,10 +11,10 @@ import math
 
 import numpy as np
 
+from drocap_ros.flight.orbit.coast import PX4_POSITION_GAIN
 from drocap_ros.flight.orbit.states import Observed
 from drocap_ros.flight.setpoint import Setpoint
 
-_POSITION_GAIN = 0.95  # 1/s, of PX4's position loop (MPC_XY_P)
 _RATE, _FORGETTING = 0.8, 0.1  # 1/s^2 of the missing velocity; 1/s
 _STANDING_M_S, _SHARE, _GREATEST_M_S2 = 0.3, 0.6, 0.6  # m/s, 1/s of the subject's speed beyond: standing needs none
 
@@ -41,7 +41,7 @@ class Shortfall:
 
     def learn(self, sent: Setpoint, seen: Observed, dt: float) -> None:
         """Take the setpoint that was sent, ``dt`` s after the one before."""
-        wanted = sent.velocity + _POSITION_GAIN * (sent.position - seen.position)
+        wanted = sent.velocity + PX4_POSITION_GAIN * (sent.position - seen.position)
         missing = (wanted - seen.velocity)[:2]
         dt = min(max(dt, 0.0), 0.2)
         self._integral = self._integral + (_RATE * missing - _FORGETTING * self._integral) * dt

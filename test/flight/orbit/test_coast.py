@@ -71,3 +71,10 @@ def test_prediction_is_fast_enough_for_every_setpoint():
 def test_a_vehicle_at_rest_stays(autopilot):
     assert steady(0.0, autopilot).length_m == 0.0
     assert math.isfinite(steady(0.0, autopilot).time_s[-1])
+
+
+def test_a_place_far_ahead_lengthens_the_coast_of_px4():
+    velocity, zero = np.array([1.2, 0.0, 0.0]), np.zeros(3)
+    near, far = (Setpoint(np.array([way, 0.0, 0.0]), velocity, zero, 0.0, 0.0) for way in (0.4, 1.4))
+    lengths = [coast_of(last, zero, velocity, "px4", 0.5).length_m for last in (near, far)]
+    assert lengths[1] > lengths[0] + 0.5

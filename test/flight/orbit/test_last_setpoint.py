@@ -8,6 +8,7 @@ import pytest
 
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
+from drocap_ros.flight.orbit.coast import coast_of
 from drocap_ros.flight.orbit.last_setpoint import coast_speed, harmless, slowed_condition
 from drocap_ros.flight.orbit.planner import OrbitGoal
 from drocap_ros.flight.orbit.states import Limits, Observed
@@ -19,9 +20,9 @@ LIMITS = Limits(SafetyConfig(), OrbitConfig())
 ZERO, CENTRE = np.zeros(3), np.zeros(2)
 
 
-def seen(position=(6.0, 0.0, 2.5), velocity=(0.0, 2.0, 0.0), subject=(0.0, 0.0, 1.0), timeout_s=0.5):
+def seen(position=(6.0, 0.0, 2.5), velocity=(0.0, 2.0, 0.0), subject=(0.0, 0.0, 1.0), timeout_s=0.5, by="ardupilot"):
     return Observed(
-        autopilot="ardupilot", position=np.array(position), velocity=np.array(velocity), yaw=math.pi,
+        autopilot=by, position=np.array(position), velocity=np.array(velocity), yaw=math.pi,
         subject=np.array(subject), loss_settings=LossSettings("GUID_TIMEOUT", timeout_s, "", math.nan),
     )  # fmt: skip
 
@@ -50,6 +51,19 @@ def test_setpoint_of_a_long_coast_is_slowed_down():
     sent = sent_of(flight(now), now, ZERO, CENTRE, LIMITS)
     assert isinstance(sent, Setpoint)
     assert np.linalg.norm(sent.velocity) < 2.4
+
+
+def test_px4_falls_behind_along_the_orbit_before_it_yields_the_radius():
+    """A walker ahead of it was chased from far behind: after kills it moved by 3.7 m."""
+    now = seen(velocity=(-0.9, 0.9, 0.0), by="px4")
+    wanted = flight(now, acceleration=ZERO)._replace(position=now.position + np.array([-0.3, 1.4, 0.0]))
+    sent = sent_of(wanted, now, ZERO, CENTRE, LIMITS)
+    assert isinstance(sent, Setpoint)
+    assert (sent.position - now.position)[0] == pytest.approx(-0.3)
+    assert sent.velocity[0] == pytest.approx(-0.9)
+    assert (sent.position - now.position)[1] < 1.2
+    coast = coast_of(sent, now.position, now.velocity, "px4", 0.5)
+    assert coast.length_m <= 0.82 * LIMITS.safety.max_coast_m
 
 
 @pytest.mark.parametrize("speed", [1.0, 2.0])

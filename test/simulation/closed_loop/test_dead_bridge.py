@@ -23,3 +23,19 @@ def test_a_killed_bridge_is_harmless(radius_m, killed_s):
     rows = loop.rows[at - 1 :]
     assert max(np.linalg.norm(row.position - rows[0].position) for row in rows) < 2.8
     assert min(row.distance_m for row in rows) > rows[0].distance_m - 1.0
+
+
+@pytest.mark.parametrize("killed_s", [9.18, 11.5])
+def test_px4_stops_near_after_the_death_of_a_bridge_that_follows_a_walker_in_wind(killed_s):
+    """It moved by 3.2 and 3.7 m here: the setpoint's place was 1.4 m ahead, and PX4 flies there."""
+    settings = LoopSettings(
+        autopilot="px4", action="walk", seed=140, seconds=25, distance_m=7.0, wind_m_s=(8.0, 0.0, 0.0)
+    )
+    loop = OrbitLoop(with_config(settings, fence_radius_m=60.0))
+    loop.start()
+    loop.run(killed_s)
+    assert loop.controller.safety.state == State.ORBITING
+    place = loop.copter.body.position.copy()
+    at, loop.stopped = len(loop.rows), True
+    loop.run(killed_s + 5.0)
+    assert max(np.hypot(*(row.position - place)[:2]) for row in loop.rows[at:]) <= 2.5

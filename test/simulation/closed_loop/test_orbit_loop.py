@@ -97,6 +97,18 @@ def test_start_adjust_stop_and_second_start_are_answered():
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(("radius_m", "code"), [(4.0, ConditionCode.WIDENED), (6.0, ConditionCode.ORBITING)])
+def test_status_names_the_radius_that_is_flown_instead_of_a_small_one(radius_m, code):
+    """A 4 m orbit was flown at 4.7 m, and nothing said so."""
+    loop = OrbitLoop(with_config(LoopSettings(seconds=16), radius_m=radius_m, angular_speed_deg_s=10.0))
+    loop.start()
+    loop.run(14.0)
+    assert loop.status.condition.code == code
+    assert ("4.7 m away instead of 4.0" in str(loop.status.condition)) == (code == ConditionCode.WIDENED)
+    if code == ConditionCode.WIDENED:
+        assert loop.rows[-1].distance_m == pytest.approx(4.7, abs=0.5)
+
+
 def test_random_and_mutated_packets_cause_no_motion():
     chance = random.Random(11)
     loop = OrbitLoop(LoopSettings(seconds=12, seed=3))
