@@ -9,6 +9,7 @@ One page per part that can run alone:
     accuracy.py         accuracy, accuracy_live, accuracy_perspective, accuracy_world, accuracy_telemetry
     body.py             accuracy_body
     batch.py            batch_kills, batch_cluster, batch_equal, batch_speed, batch_scale
+    export.py           export
     reconstruction.py   reconstruction
     perception.py       perception
     perception_scenes.py perception_scenes

@@ -14,7 +14,7 @@ from drocap_ros.errors import InputError
 
 
 class Summary(NamedTuple):
-    """Facts by name, one table, and warnings."""
+    """Facts by name, one table (none without columns), and warnings."""
 
     facts: list[tuple[str, str]]
     columns: tuple[str, ...]
@@ -171,12 +171,15 @@ def _print_table(summary: Summary) -> None:
     for row in summary.rows:
         table.add_row(*(Text(cell) for cell in row))
     console.print(facts)
-    console.print(table)
+    if summary.columns:
+        console.print(table)
 
 
 def _print_plain(summary: Summary) -> None:
     for name, value in summary.facts:
         print(f"{name}: {_one_line(value)}")
+    if not summary.columns:
+        return
     table = [summary.columns, *summary.rows]
     widths = [max(len(row[i]) for row in table) for i in range(len(summary.columns))]
     for row in table:

@@ -46,7 +46,7 @@ def telemetry_summary(path: Path) -> Parts:
         except InputError as error:
             warnings.append(str(error))
     if log is None:
-        return [*facts, ("telemetry", "not usable" if warnings else "none in the file")], columns, [], warnings
+        return [*facts, ("telemetry", "not usable" if warnings else "none in the file")], (), [], warnings
     return [*facts, *_log_facts(log)], columns, _rows(log), warnings
 
 

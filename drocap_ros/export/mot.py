@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import os
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,7 +28,8 @@ def write_mot(path: Path, clip: Clip) -> tuple[str, ...]:
     if path.suffix == ".osim":
         raise InputError(f"{path.name}: expected a name for the coordinates, found that of the model; end it in .mot")
     if importlib.util.find_spec("opensim") is None:
-        raise InputError("opensim: expected the Python package, found none; pip install 'drocap_ros[opensim]'")
+        install = f"{sys.executable} -m pip install 'drocap_ros[opensim]'"
+        raise InputError(f"opensim: expected the Python package, found none; run {install}")
     import opensim
 
     clip = at_constant_rate(clip)

@@ -74,7 +74,8 @@ def run(args: argparse.Namespace) -> int:
         print(f"failed: {error if error.startswith(name) else f'{name}: {error}'}", file=sys.stderr)
     if not args.quiet:
         print(
-            f"{len(tasks)} recordings: {len(records) - len(failures)} done, {earlier} of them earlier,"
+            f"{len(tasks)} recording{'s' * (len(tasks) != 1)}: {len(records) - len(failures)} done,"
+            f" {earlier} of them earlier,"
             f" {len(failures)} failed; {time.monotonic() - begin:.1f} s\n"
             f"written: {args.out}/{LOG_FILE}, {PAGE_FILE}"
         )

@@ -74,7 +74,8 @@ def run_on_cluster(tasks: Sequence[Task], address: str) -> Generator[Record, Non
     try:
         from distributed import Client, KilledWorker, as_completed
     except ImportError:
-        raise InputError("--cluster: expected dask.distributed; install it: pip install drocap_ros[cluster]") from None
+        install = f"{sys.executable} -m pip install 'drocap_ros[cluster]'"
+        raise InputError(f"--cluster: expected dask.distributed, found none; run {install}") from None
     try:
         client = Client(address, timeout=_CONNECT_S)
     except (OSError, ValueError, TimeoutError) as error:
