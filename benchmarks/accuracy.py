@@ -39,7 +39,7 @@ from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.capture_config import SimulationConfig
 from drocap_ros.simulation.orbit_camera import project, to_camera
-from drocap_ros.skeleton import BODY_15, indices
+from drocap_ros.skeleton import BODY_15, BODY_17, indices
 from drocap_ros.tracks import Tracks
 
 SPEED_DEG_S = 25.0
@@ -86,10 +86,12 @@ def perspective(args: argparse.Namespace) -> None:
         for label, noise_px in (("clean", 0.0), (f"{NOISE_MM:g} mm noise", NOISE_MM * PX_PER_MM)):
             errors = []
             for sequence in sequences:
-                tracks, matrix, truth = perspective_view(sequence.x, distance_m, noise_px)
+                body = sequence.x[:, indices(BODY_17.joints, BODY_15.joints)]
+                tracks, matrix, truth = perspective_view(body, distance_m, noise_px)
                 cases = ((tracks, "ba"), (replace(tracks, camera_matrix=matrix), "ba"), (tracks, "initial"))
                 motions = (reconstruct(case, method=method) for case, method in cases)
-                errors.append([pa_mpjpe(1000.0 * motion.joints3d, truth).mean() for motion in motions])
+                found = (m.joints3d[:, indices(m.joints, BODY_15.joints)] for m in motions)
+                errors.append([pa_mpjpe(1000.0 * joints, truth).mean() for joints in found])
             rows.append([f"{distance_m:g} m", label, *(f"{error:.1f}" for error in np.mean(errors, axis=0))])
     head = ["distance", "2D", "ba, lens unknown", "ba, lens known (`camera_matrix`)", "initial"]
     text = f"Reconstruction error in mm, mean over {len(sequences)} sequences, {SPEED_DEG_S:g} deg/s.\n\n"
