@@ -1,4 +1,4 @@
-"""Weights of an earlier lifter as the beginning of a training."""
+"""Weights of an earlier lifter as the beginning of a training: fewer joints, features and blocks are possible."""
 
 from __future__ import annotations
 
@@ -9,36 +9,54 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.reconstruction.lifted.lifter_input import FEATURES, PARTS
+from drocap_ros.skeleton import BODY_15, BODY_17
 from drocap_ros.training.torch_extra import pytorch
 
 if TYPE_CHECKING:
     import torch
 
+#: Outputs of a joint: its place, and the logarithms of two expected errors.
+_PER_JOINT = 5
+
 
 def start_from(network: torch.nn.Module, path: Path) -> None:
-    """Give a network the weights of the lifter ``path``.
+    """Give a network the weights of the lifter ``path``; its further blocks begin without effect.
+
+    A lifter of ``BODY_15`` is widened: new features begin without effect, new joints at random weights.
 
     Raises
     ------
     InputError
-        When the file is no lifter of the same layers.
+        When the file is no lifter of this width.
     """
     torch = pytorch()
     vectors, matrices = _weights(path)
-    own = [weight for _, weight in network.named_parameters() if weight.ndim == 2]
-    named = {name: weight for name, weight in network.named_parameters() if weight.ndim == 1}
-    if [m.shape for m in matrices] != [w.shape for w in own] or any(
-        name not in vectors or vectors[name].shape != weight.shape for name, weight in named.items()
-    ):
-        raise InputError(
-            f"--initial: expected a lifter of {len(own)} layers and {len(own[0])} channels, found other layers in"
-            f" {path.name}; leave it out"
-        )
+    own = [(name, weight) for name, weight in network.named_parameters() if weight.ndim == 2]
+    embed, head = network.get_parameter("embed.weight"), network.get_parameter("head.weight")
+    same = len(matrices) == len(own)
+    body = [(n, w) for n, w in own if n.startswith("body.")]
+    found = matrices[1:-2] if same else matrices[1:-1]
+    if len(found) > len(body) or any(m.shape != w.shape for m, (_, w) in zip(found, body, strict=False)):
+        raise InputError(f"--initial: expected a lifter of {embed.shape[0]} channels, got {path.name}; leave it out")
     with torch.no_grad():
-        for weight, matrix in zip(own, matrices, strict=True):
+        for name, vector in vectors.items():
+            if name in dict(network.named_parameters()) and network.get_parameter(name).shape == vector.shape:
+                network.get_parameter(name).copy_(torch.from_numpy(vector))
+        for matrix, (_, weight) in zip(found, body, strict=False):
             weight.copy_(torch.from_numpy(matrix))
-        for name, weight in named.items():
-            weight.copy_(torch.from_numpy(vectors[name]))
+        for name, weight in body[len(found) :]:
+            if name.endswith("out.weight"):
+                weight.zero_()
+        if same:
+            for matrix, weight in zip((matrices[0], *matrices[-2:]), (embed, head, network.signs.weight), strict=True):
+                weight.copy_(torch.from_numpy(matrix))
+            return
+        columns, rows = _widened_features(), _widened_outputs()
+        embed.zero_()
+        embed[:, columns] = torch.from_numpy(matrices[0])
+        head[rows] = torch.from_numpy(matrices[-1])
+        network.get_parameter("head.bias")[rows] = torch.from_numpy(vectors["head.bias"])
 
 
 def origin_of(path: Path) -> str:
@@ -65,3 +83,17 @@ def _weights(path: Path) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
     vectors = {name.removesuffix("_half"): value for name, value in arrays.items() if value.ndim == 1}
     matrices = [np.ascontiguousarray(value.T) for value in arrays.values() if value.ndim == 2]
     return vectors, matrices
+
+
+def _widened_features() -> np.ndarray:
+    """Places of the features of two frames of ``BODY_15`` among those of ``BODY_17``."""
+    few, bones = len(BODY_15), len(BODY_15.bones)
+    begin = np.concatenate([[0], np.cumsum(PARTS)])
+    frame = np.concatenate([begin[k] + np.arange(count) for k, count in enumerate((2 * few, few, bones, bones))])
+    return np.concatenate([frame, FEATURES + frame])
+
+
+def _widened_outputs() -> np.ndarray:
+    """Places of the outputs of two frames of ``BODY_15`` among those of ``BODY_17``."""
+    frame = np.arange(len(BODY_15) * _PER_JOINT)
+    return np.concatenate([frame, len(BODY_17) * _PER_JOINT + frame])
