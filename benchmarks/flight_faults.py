@@ -66,7 +66,12 @@ def main() -> int:
         for fault in FAULTS[part - 1 :: parts]:
             if args.words and not any(word in fault.name for word in args.words):
                 continue
-            results = [fly_fault(fault, autopilot, 4 + i) for i in range(args.seeds)]
+            try:
+                results = [fly_fault(fault, autopilot, 4 + i) for i in range(args.seeds)]
+            except AssertionError as error:  # the flight did not come to where the fault begins
+                worst.append(["-", autopilot, fault.name, *[""] * 6, f"NOT FLOWN: {error}"])
+                print("  ".join(worst[-1]), flush=True)
+                continue
             rows = [row(fault, autopilot, result) for result in results]
             worst.append(rows[max(range(args.seeds), key=lambda i: ("+hc-".index(rows[i][0]), results[i].excursion_m))])
             print("  ".join(worst[-1]), flush=True)

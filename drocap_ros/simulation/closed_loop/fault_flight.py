@@ -93,6 +93,7 @@ class Fault:
     change : of the settings of the flight
     before, state : (s of the flight, action) each, which lead to the state at the injection
     later : (s after the injection, second injection)
+    watch_s : after the injection
     check : additional requirement; returns "" or the violation in words
     """
 
@@ -106,11 +107,12 @@ class Fault:
     before: tuple[tuple[float, Injection], ...] = ((4.0, start),)
     state: State = State.ORBITING
     later: tuple[float, Injection] | None = None
+    watch_s: float = _WATCH_S
     check: Callable[[OrbitLoop], str] = field(default=lambda loop: "")
 
     def settings(self, autopilot: str, seed: int = 4) -> LoopSettings:
         """Settings of the flight."""
-        return self.change(LoopSettings(autopilot=autopilot, seed=seed, seconds=FAULT_S + _WATCH_S + 1.0))
+        return self.change(LoopSettings(autopilot=autopilot, seed=seed, seconds=FAULT_S + self.watch_s + 1.0))
 
     def bounds(self, autopilot: str, speed_m_s: float) -> Bounds:
         """Required bounds at this speed."""
@@ -118,7 +120,7 @@ class Fault:
 
 
 def fly_fault(fault: Fault, autopilot: str, seed: int = 4) -> FaultResult:
-    """Lead the loop to the case's state, inject the fault at ``FAULT_S``, record 7 s.
+    """Lead the loop to the case's state, inject the fault at ``FAULT_S``, record for ``watch_s``.
 
     Raises
     ------
@@ -150,7 +152,7 @@ def fly_fault(fault: Fault, autopilot: str, seed: int = 4) -> FaultResult:
         after_s, inject = fault.later
         loop.run(FAULT_S + after_s, record)
         inject(loop)
-    loop.run(FAULT_S + _WATCH_S, record)
+    loop.run(FAULT_S + fault.watch_s, record)
     rows = loop.rows[observable:]
     actions = [row.action for row in loop.rows[injected:]]
     orbiting = [i for i, action in enumerate(actions) if action == Action.ORBIT]

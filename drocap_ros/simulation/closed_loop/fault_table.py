@@ -163,7 +163,7 @@ _VEHICLE = (
     Fault("setpoints ignored", assign("copter", deaf=True), ECHO_S, codes=(_C.SETPOINTS_NOT_FOLLOWED, *_TAKEN)),
     Fault(
         "hold mode denied", _LOSE_SUBJECT, FRAME_S, before=((0.0, _DENY_HOLD), (4.0, start)),
-        codes=(_C.HOLD_MODE_MISSING,),
+        codes=(_C.HOLD_MODE_MISSING,), watch_s=12.0,  # the orbit slows down for a second, holds, and asks for 5 s
     ),
 )  # fmt: skip
 _PILOT = (

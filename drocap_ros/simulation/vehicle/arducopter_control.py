@@ -43,6 +43,11 @@ class ArduCopterControl(FlightControl):
             self.place = None if target.position is None else self.place
         super().take(target)
 
+    def reset_estimate(self, shift: np.ndarray) -> None:
+        """The path moves with a reset of the estimate, as by AC_PosControl; the setpoint that was sent stays."""
+        if self.place is not None:
+            self.place = [self.place[i] + float(shift[i]) for i in (0, 1)]
+
     def _shape(self, here: tuple[float, float], speed: tuple[float, float], expired: bool, dt: float) -> None:
         if self.manner == Manner.BRAKE:
             self._stop_pace(_BRAKE_GAIN, 7.5, _JERK_M_S3, dt)

@@ -71,7 +71,9 @@ class ReportingCopter(SimulatedVehicle):
 
     @gps_error.setter
     def gps_error(self, value: np.ndarray) -> None:
-        self.error.offset = self.error.offset + value - self.error.position
+        shift = value - self.error.position
+        self.error.offset = self.error.offset + shift
+        self.control.reset_estimate(shift)
 
     @property
     def estimate(self) -> np.ndarray:

@@ -77,6 +77,9 @@ class FlightControl:
         """Take a setpoint."""
         self.target = target
 
+    def reset_estimate(self, shift: np.ndarray) -> None:
+        """The estimated position jumps by (3,) m."""
+
     def command(self, position: np.ndarray, velocity: np.ndarray, expired: bool, dt: float) -> np.ndarray:
         """(3,) m/s^2 of thrust, from the estimated place and velocity; ``expired`` the last setpoint is too old."""
         here, speed = (float(position[0]), float(position[1])), (float(velocity[0]), float(velocity[1]))

@@ -16,6 +16,8 @@ SUBSET = {
     ("pilot takes over and gives back", "ardupilot"),
     ("pilot takes position while engaging", "px4"),
     ("the autopilot's position jumps by 15 m", "px4"),
+    ("the autopilot's position jumps by 15 m", "ardupilot"),
+    ("hold mode denied", "ardupilot"),
     ("telemetry frozen with its clock", "ardupilot"),
     ("setpoints ignored", "px4"),
     ("a foreign system on the link", "px4"),
