@@ -23,6 +23,8 @@ IMAGE_SIZE = (1280, 720)
 FOCAL_PX = 0.5 * IMAGE_SIZE[0] / np.tan(np.deg2rad(35.0))
 RADIUS_M, HEIGHT_M, SPEED_DEG_S = 6.0, 2.5, 19.0
 _AIM_M = 0.95
+#: Half the time that the orbit takes to turn round.
+_TURN_S = 0.5
 _ANKLE_M = 0.07
 _AIM_SMOOTHING_S = 1.0
 _NOISE_PX, _NOISE_S = 3.0, 0.1
@@ -31,12 +33,16 @@ _POSITION_WANDER_S, _ATTITUDE_WANDER_S = 60.0, 10.0
 
 
 class TelemetryErrors(NamedTuple):
-    """Wander of the position, misalignment about each axis, wander of the attitude (standard deviations), and delay."""
+    """Wander of the position, misalignment about each axis, wander of the attitude (standard deviations), and delay.
+
+    yaw_deg turns every attitude about the vertical, counter-clockwise seen from above.
+    """
 
     position_m: float = 0.0
     misalignment_deg: float = 0.0
     attitude_deg: float = 0.0
     late_s: float = 0.0
+    yaw_deg: float = 0.0
 
 
 TELEMETRY = {
@@ -60,34 +66,44 @@ class WorldView:
     camera_rotation: np.ndarray
 
 
-def world_view(sequence: Sequence, telemetry: str = "exact", *, still: bool = False, seed: int = 0) -> WorldView:
+def world_view(
+    sequence: Sequence,
+    telemetry: str | TelemetryErrors = "exact",
+    *,
+    still: bool = False,
+    reverse: bool = False,
+    seed: int = 0,
+) -> WorldView:
     """View of one sequence.
 
     Parameters
     ----------
-    telemetry : a key of ``TELEMETRY``
+    telemetry : a key of ``TELEMETRY``, or other errors
     still : the camera keeps its bearing from the person instead of orbiting
+    reverse : the orbit turns round in the middle, within a second
     seed : of the orbit's phase, the 2D noise and the errors of the telemetry
     """
-    errors = TELEMETRY[telemetry]
+    errors = TELEMETRY[telemetry] if isinstance(telemetry, str) else telemetry
     rng = np.random.default_rng(seed)
     truth = _on_ground(sequence.x / 1000.0)
     frames = len(truth)
     phase, rate = rng.uniform(0, 2 * np.pi), 0.0 if still else np.deg2rad(SPEED_DEG_S)
-    position, rotation = _camera(truth, phase, rate, 0.0)
+    turn_s = 0.5 * frames / FPS if reverse else np.inf
+    position, rotation = _camera(truth, phase, rate, 0.0, turn_s)
     # The toes have draws of their own: those of the other joints are the same with and without them.
     body, toes = np.split(_project(truth, position, rotation), [len(BODY_15)], axis=1)
     body, toes = _with_noise(rng, body), _with_noise(np.random.default_rng([seed, len(BODY_15)]), toes)
-    reported_position, reported_rotation = _camera(truth, phase, rate, errors.late_s)
+    reported_position, reported_rotation = _camera(truth, phase, rate, errors.late_s, turn_s)
     drift = _wander(rng, frames, _POSITION_WANDER_S, 3) * [1.0, 1.0, 0.7]
     misalignment = np.deg2rad(errors.misalignment_deg) * rng.choice([-1.0, 1.0], 3)
+    north = exp_so3(np.array([0.0, 0.0, -np.deg2rad(errors.yaw_deg)]))
     wander = np.deg2rad(errors.attitude_deg) * _wander(rng, frames, _ATTITUDE_WANDER_S, 3)
     tracks = Tracks(
         keypoints=np.concatenate([body, toes], axis=1),
         joints=BODY_17.joints[: truth.shape[1]],
         stamp_ns=np.round(np.arange(frames) * (1e9 / FPS)).astype(np.int64),
         image_size=IMAGE_SIZE,
-        camera_rotation=exp_so3(misalignment) @ exp_so3(wander) @ reported_rotation,
+        camera_rotation=exp_so3(misalignment) @ exp_so3(wander) @ reported_rotation @ north,
         camera_position=reported_position + errors.position_m * drift,
         camera_matrix=np.array(
             [[FOCAL_PX, 0.0, IMAGE_SIZE[0] / 2], [0.0, FOCAL_PX, IMAGE_SIZE[1] / 2], [0.0, 0.0, 1.0]]
@@ -103,14 +119,21 @@ def _on_ground(joints: np.ndarray) -> np.ndarray:
     return moved
 
 
-def _camera(truth: np.ndarray, phase: float, rate: float, ahead_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Position (F, 3) and rotation (F, 3, 3) world -> camera, each ``ahead_s`` after its frame."""
+def _camera(
+    truth: np.ndarray, phase: float, rate: float, ahead_s: float, turn_s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position (F, 3) and rotation (F, 3, 3) world -> camera, each ``ahead_s`` after its frame.
+
+    turn_s : time at which the orbit is half turned round
+    """
     from scipy.ndimage import gaussian_filter1d
 
     time = np.arange(len(truth)) / FPS
     aim = gaussian_filter1d(truth[:, 0], _AIM_SMOOTHING_S * FPS, axis=0, mode="nearest", truncate=3.0)
     aim = np.stack([np.interp(time + ahead_s, time, aim[:, axis]) for axis in range(3)], axis=1)
-    bearing = phase + rate * (time + ahead_s)
+    at = time + ahead_s
+    past = np.clip(at - turn_s + _TURN_S, 0.0, 2 * _TURN_S)
+    bearing = phase + rate * (at - np.square(past) / (2 * _TURN_S) - 2 * np.maximum(at - turn_s - _TURN_S, 0.0))
     flat = aim[:, :2] + RADIUS_M * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
     position = np.column_stack([flat, np.full(len(time), HEIGHT_M)])
     forward = np.column_stack([aim[:, :2], np.full(len(time), _AIM_M)]) - position

@@ -8,6 +8,8 @@ from drocap_ros.reconstruction.world.world_model import ANKLES, FEET, FEET_HEIGH
 
 _AVERAGE_FRAMES = 5
 _HEIGHT_STD_M = 0.1
+#: Spread of the heights of resting feet on level ground, as the body's errors leave it, and on steps.
+_LEVEL_M, _STEPS_M = 0.025, 0.06
 #: Likelihood of a foot that moves, against that of one that rests at the floor.
 _MOVING = 0.15
 
@@ -29,3 +31,18 @@ def contact_probability(state: WorldState, fps: float, speed_std_m_s: float, see
     toes = FEET[len(ANKLES) :]
     probability[:, len(ANKLES) :] *= seen[1:, toes] & seen[:-1, toes]
     return probability
+
+
+def ground_spread(state: WorldState, contact: np.ndarray) -> float:
+    """Standard deviation (m) of the heights of feet in contact (F - 1, 4) above the floor; NaN = no contact."""
+    feet = state.joints[:, FEET, 2]
+    height = 0.5 * (feet[1:] + feet[:-1]) - state.globals[FLOOR] - FEET_HEIGHT_M
+    total = float(contact.sum())
+    return float(np.sqrt((contact * np.square(height)).sum() / total)) if total > 1.0 else float("nan")
+
+
+def floor_std(spread: float, loose: float) -> float:
+    """Standard deviation (m) of the floor's term: tight on level ground, ``loose`` and more on steps or a slope."""
+    if not np.isfinite(spread):
+        return loose
+    return max(_LEVEL_M, loose * (spread / _STEPS_M) ** 2)

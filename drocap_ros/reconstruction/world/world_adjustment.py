@@ -13,7 +13,7 @@ import numpy as np
 
 from drocap_ros.reconstruction.banded import backward, band_factor, forward
 from drocap_ros.reconstruction.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
-from drocap_ros.reconstruction.world.contacts import contact_probability
+from drocap_ros.reconstruction.world.contacts import contact_probability, floor_std, ground_spread
 from drocap_ros.reconstruction.world.posterior import posterior
 from drocap_ros.reconstruction.world.world_equations import normal_matrix
 from drocap_ros.reconstruction.world.world_model import (
@@ -28,7 +28,7 @@ from drocap_ros.reconstruction.world.world_model import (
     WorldInput,
     WorldState,
 )
-from drocap_ros.reconstruction.world.world_residuals import Residuals, gradient, weights_of
+from drocap_ros.reconstruction.world.world_residuals import FLOOR_STD_M, Residuals, gradient, weights_of
 
 _CONVERGED = 1e-4
 #: Standard deviation (m/s) of the speed of feet in contact in the first steps, when the body still slides.
@@ -73,7 +73,7 @@ def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) ->
     """Adjust from initial joints (F, 17, 3) m of the body, ``scale`` of which are a metre of the world."""
     config, weights = data.config, weights_of(data)
     state = initial_state(data, joints, scale)
-    stop, done = ITERATIONS, 0
+    stop, done, ground, floor = ITERATIONS, 0, float("nan"), FLOOR_STD_M
     contact: np.ndarray = np.zeros((len(joints) - 1, len(FEET)))
     outlier = Residuals(data, weights, state, contact, 0.0).usual_outlier()
     seen = data.weight > 0 if data.seen is None else data.seen
@@ -83,7 +83,10 @@ def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) ->
         if config.feet:
             contact = contact_probability(state, data.fps, speed, seen)
         weight = config.locked_weight if locking else config.contact_weight
-        here = Residuals(data, weights, state, contact, weight, outlier)
+        if done == len(_CONTACT_SPEEDS) + 1:
+            ground = ground_spread(state, contact)
+            floor = floor_std(ground, FLOOR_STD_M)
+        here = Residuals(data, weights, state, contact, weight, outlier, floor)
         frames, shared = gradient(here)
         matrix = normal_matrix(here)
         step = _solve(matrix, frames, shared, locking)
@@ -99,13 +102,13 @@ def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) ->
         if locking and here.cost - there.cost <= _CONVERGED * here.cost:
             stop = CONVERGED
             break
-    final = Residuals(data, weights, state, contact, config.contact_weight)
+    final = Residuals(data, weights, state, contact, config.contact_weight, floor_std=floor)
     found = posterior(normal_matrix(final), state)
     fact = config.frames_per_fact
     std: np.ndarray = np.full(GLOBALS, np.nan)
     covariance: np.ndarray = np.full((*state.joints.shape, 3), np.nan)
     if found is not None:
-        prior = np.sqrt(fact / np.maximum(weights.shared, 1e-300))
+        prior = np.sqrt(fact * np.diag(np.linalg.inv(weights.shared)))
         std = np.minimum(_STD_FACTOR * np.sqrt(fact * np.diag(found.shared)), prior)
         covariance = fact * found.joints
     return WorldSolution(state.joints / state.globals[SCALE], state, contact, std, covariance, final.terms, done, stop)

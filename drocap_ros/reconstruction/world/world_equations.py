@@ -48,8 +48,9 @@ def normal_matrix(r: Residuals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     _add_time(r, band)
     corner[:BONES, :BONES] += GAUGE_M**-2
     prior = r.weights.shared.copy()
-    prior[SCALE] /= r.state.globals[SCALE] ** 2
-    corner[np.arange(GLOBALS), np.arange(GLOBALS)] += prior
+    prior[SCALE] /= r.state.globals[SCALE]
+    prior[:, SCALE] /= r.state.globals[SCALE]
+    corner += prior
     return band.reshape(frames * FRAME, WIDTH), border.reshape(frames * FRAME, GLOBALS), corner
 
 

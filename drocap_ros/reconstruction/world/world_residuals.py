@@ -40,7 +40,8 @@ OUTLIER_SQUARE = 9.0
 _OVER_MEDIAN = 4.0
 _DEPTH_ROUNDING_M = 0.015
 _NEAREST_M = 0.3
-_FLOOR_STD_M = 0.1
+#: Spread (m) of the heights of feet in contact, as long as the ground is not known.
+FLOOR_STD_M = 0.1
 #: Spread of the floor's height where no foot is in contact.
 _ANY_FLOOR_M = 1000.0
 #: Standard deviation (m) of the body's total bone length, which sets the unit.
@@ -49,13 +50,15 @@ GAUGE_M = 0.0005
 OF_CAMERA = np.r_[SCALE, MISALIGNMENT, ATTITUDE_LATENCY, POSITION_LATENCY]
 CAMERA_COLUMNS = np.array([6, 3, 4, 5, 7, 8])
 _POSITION_WANDER_S, _ATTITUDE_WANDER_S = 60.0, 10.0
+#: Share of the latencies' variance that attitude and position do not have in common: one log holds both.
+_OWN_LATENCY = 0.2
 
 
 class Weights(NamedTuple):
     """Weights of one adjustment that do not depend on the unknowns; the names are those of the terms.
 
     wander, first : (6,) of the change of the camera's errors between frames, and of the first ones
-    shared : (GLOBALS,) of the priors, 0 = none
+    shared : (GLOBALS, GLOBALS) inverse covariance of the priors
     """
 
     acceleration: float
@@ -73,12 +76,19 @@ def weights_of(data: WorldInput) -> Weights:
     position, attitude = max(config.position_wander_m, rough), np.deg2rad(config.attitude_wander_deg)
     first = np.repeat([position**-2, attitude**-2], 3)
     wander = first * np.repeat([0.5 * _POSITION_WANDER_S * fps, 0.5 * _ATTITUDE_WANDER_S * fps], 3)
-    shared = np.zeros(GLOBALS)
-    shared[LENGTHS] = (config.length_std * data.lengths) ** -2
-    shared[FLOOR] = _ANY_FLOOR_M**-2
-    shared[SCALE] = config.stature_std**-2
-    shared[MISALIGNMENT] = np.deg2rad([config.tilt_error_deg, config.yaw_error_deg, config.tilt_error_deg]) ** -2
-    shared[[ATTITUDE_LATENCY, POSITION_LATENCY]] = config.latency_std_s**-2
+    shared = np.zeros((GLOBALS, GLOBALS))
+    shared[LENGTHS, LENGTHS] = np.diag((config.length_std * data.lengths) ** -2)
+    shared[FLOOR, FLOOR] = _ANY_FLOOR_M**-2
+    shared[SCALE, SCALE] = config.stature_std**-2
+    # Gimbals know the horizon, not north: the large error turns about the vertical, which is not an axis of the camera.
+    vertical = data.telemetry.rotation[:, :, 2].mean(axis=0)
+    tilt, yaw = np.deg2rad([config.tilt_error_deg, config.yaw_error_deg])
+    shared[MISALIGNMENT, MISALIGNMENT] = np.linalg.inv(
+        tilt**2 * np.eye(3) + yaw**2 * np.outer(vertical, vertical) / max(float(vertical @ vertical), 1e-12)
+    )
+    own = _OWN_LATENCY * np.eye(2) + (1.0 - _OWN_LATENCY)
+    latencies = slice(ATTITUDE_LATENCY, POSITION_LATENCY + 1)
+    shared[latencies, latencies] = np.linalg.inv(config.latency_std_s**2 * own)
     fact = config.frames_per_fact
     return Weights(
         acceleration=(config.acceleration_m_s2 / fps**2) ** -2,
@@ -96,6 +106,7 @@ class Residuals:
     contact : (F - 1, 4) probability that a point of ``FEET`` keeps its place between two frames
     contact_weight : of that step, 1 = its standard deviation as configured
     outlier : squared image residual, in standard deviations, at which a joint has half its weight
+    floor_std : m, spread of the heights of feet in contact
     """
 
     def __init__(
@@ -106,10 +117,11 @@ class Residuals:
         contact: np.ndarray,
         contact_weight: float,
         outlier: float = OUTLIER_SQUARE,
+        floor_std: float = FLOOR_STD_M,
     ) -> None:
         config, shared = data.config, state.globals
         self.data, self.weights, self.state = data, weights, state
-        self.contact, self.contact_weight, self.outlier = contact, contact_weight, outlier
+        self.contact, self.contact_weight, self.outlier, self.floor_std = contact, contact_weight, outlier, floor_std
         path = state.path(data.telemetry)
         self.turn = shared[MISALIGNMENT] + state.camera[:, 3:]
         correction = exp_so3(self.turn)
@@ -139,7 +151,7 @@ class Residuals:
         self.step = feet[1:] - feet[:-1]
         self.step_weight = contact_weight * contact / (config.contact_speed_m_s / data.fps) ** 2
         self.height = 0.5 * (feet[1:, :, 2] + feet[:-1, :, 2]) - shared[FLOOR] - FEET_HEIGHT_M
-        self.height_weight = contact / _FLOOR_STD_M**2
+        self.height_weight = contact / floor_std**2
         self.drift = np.diff(state.camera, axis=0)
         self.gauge = (shared[:BONES].sum() - data.lengths[:BONES].sum()) / GAUGE_M
         self.prior = shared.copy()
@@ -155,14 +167,16 @@ class Residuals:
             "telemetry": 0.5 * float((weights.wander * np.square(self.drift)).sum())
             + 0.5 * float((weights.first * np.square(state.camera[0])).sum())
             + 0.5 * weights.camera_acceleration * float(np.square(self.camera_swing).sum()),
-            "priors": 0.5 * float((weights.shared * np.square(self.prior)).sum()) + 0.5 * self.gauge**2,
+            "priors": 0.5 * float(self.prior @ weights.shared @ self.prior) + 0.5 * self.gauge**2,
         }
         self.cost = sum(self.terms.values())
 
     def moved(self, frames: np.ndarray, shared: np.ndarray) -> Residuals:
         """Residuals of the same cost after a step."""
         state = self.state.moved(frames, shared)
-        return Residuals(self.data, self.weights, state, self.contact, self.contact_weight, self.outlier)
+        return Residuals(
+            self.data, self.weights, state, self.contact, self.contact_weight, self.outlier, self.floor_std
+        )
 
     def usual_outlier(self) -> float:
         """Squared residual that sets outliers apart from the rest: far from the solution all are large."""
@@ -237,6 +251,6 @@ def gradient(r: Residuals) -> tuple[np.ndarray, np.ndarray]:
     camera[1:] += drift
     camera[:-1] -= drift
     camera[0] += weights.first * state.camera[0]
-    by_prior = weights.shared * r.prior
+    by_prior = weights.shared @ r.prior
     by_prior[SCALE] /= state.globals[SCALE]
     return frames, shared + by_prior
