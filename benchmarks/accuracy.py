@@ -6,6 +6,8 @@ perspective  the default method with a camera 6 m and 10 m away, lens known and 
 world        placement and scale from telemetry, on simulated captures: page accuracy_world
 telemetry    the motion in the world by telemetry that errs (`drocap evaluate world`), every third sequence: page
              accuracy_telemetry
+calibration  gimbal yaw and latency found from telemetry that errs, an orbit that reverses once, `--runs` flights: page
+             accuracy_calibration
 
 Needs ../shared/mocap/dev, `world` excepted.  `--limit 2` takes the first two sequences only (a minute in all).
 """
@@ -21,6 +23,7 @@ import numpy as np
 from figures import ROOT, table, write_figures
 
 from drocap_ros.cli.progress import progress_bars
+from drocap_ros.evaluation.calibration import calibration_markdown, calibration_study
 from drocap_ros.evaluation.live_study import live_study
 from drocap_ros.evaluation.live_study_table import live_markdown
 from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error, w_mpjpe
@@ -127,9 +130,15 @@ def telemetry(args: argparse.Namespace) -> None:
     write_figures("accuracy_telemetry", "Motion in the world by telemetry that errs", "\n".join(pages))
 
 
+def calibration(args: argparse.Namespace) -> None:
+    with progress_bars() as progress:
+        rows = calibration_study(args.mocap, runs=args.runs, limit=args.limit, progress=progress)
+    write_figures("accuracy_calibration", "Yaw and latency of the telemetry, found", calibration_markdown(rows))
+
+
 PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
     "rotation": rotation, "live": live, "perspective": perspective, "world": world,
-    "telemetry": telemetry,
+    "telemetry": telemetry, "calibration": calibration,
 }  # fmt: skip
 
 
@@ -138,6 +147,7 @@ def main() -> int:
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []])
     parser.add_argument("--mocap", type=Path, default=ROOT.parent / "shared" / "mocap" / "dev")
     parser.add_argument("--limit", type=int, help="only the first N sequences")
+    parser.add_argument("--runs", type=int, default=20, help="flights of the calibration study (default 20)")
     parser.add_argument("--processes", type=int, default=1)
     args = parser.parse_args()
     for part in args.parts or PARTS:

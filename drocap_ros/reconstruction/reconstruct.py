@@ -188,7 +188,15 @@ def _to_motion(
             found = refine_in_world(
                 tracks,
                 keypoints,
-                PlacedPoses(joints, factor, depth, result.sigma_px[..., 1] * size, projected, result.sigma_px[..., 0]),
+                PlacedPoses(
+                    joints,
+                    factor,
+                    depth,
+                    result.sigma_px[..., 1] * size,
+                    projected,
+                    result.sigma_px[..., 0],
+                    result.still,
+                ),
                 world_config,
             )
             if isinstance(found, str):

@@ -66,6 +66,7 @@ class WindowSolution:
         pelvis
     sigma : (F, 17, 2) expected absolute error of x, y (each) and of depth, in the same unit: the lifter's and, for
         keypoints without a covariance, their noise that lasts for some frames
+    still : (F, 2) the lifter's probability that the right and the left foot rest in the world
     body : the size for the next window
     steps : of the first and of the final adjustment
     seconds : wall-clock of "initial" (the lifter) and of "ba" (the rest)
@@ -73,6 +74,7 @@ class WindowSolution:
 
     joints: np.ndarray
     sigma: np.ndarray
+    still: np.ndarray
     body: BodySize
     cost_terms: dict[str, float]
     steps: tuple[int, int]
@@ -101,7 +103,7 @@ def solve_window(
     turn = None if rotation is None else spread(rotation, slot, np.nan)
     r = solve_even_window(spread_keypoints(keypoints, slot), fps, focal, config, known, cancelled, turn)
     body = replace(r.body, unit_per_mm=r.body.unit_per_mm[slot])
-    return replace(r, joints=r.joints[slot], sigma=r.sigma[slot], body=body)
+    return replace(r, joints=r.joints[slot], sigma=r.sigma[slot], still=r.still[slot], body=body)
 
 
 def solve_even_window(
@@ -154,6 +156,7 @@ def solve_even_window(
     return WindowSolution(
         joints=joints,
         sigma=sigma,
+        still=sized.lifted.still,
         body=BodySize(found.lengths * yardstick, zoom * found.zoom / (mm * yardstick)),
         cost_terms=found.cost_terms,
         steps=(sized.iterations, found.iterations),

@@ -29,6 +29,6 @@ def run(data: MethodInput) -> CameraPoses:
         found = solve_window(data.stamp_ns[rows], seen, focal, config, rotation=rotation)
         for stage, value in found.seconds.items():
             seconds[stage] += value
-        return WindowResult(found.joints, found.cost_terms, found.steps[1], found.stop_reason, found.sigma)
+        return WindowResult(found.joints, found.cost_terms, found.steps[1], found.stop_reason, found.sigma, found.still)
 
     return replace(over_windows(data, solve), seconds=seconds)

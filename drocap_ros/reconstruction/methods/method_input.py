@@ -48,6 +48,7 @@ class CameraPoses:
     translation_px : (F, 2)
     seconds : wall-clock per stage
     sigma_px : (F, P, 2) expected error of x, y (each) and of depth, None = the method has none
+    still : (F, 2) probability that the right and the left foot rest in the world, None = the method has none
     """
 
     joints_px: np.ndarray
@@ -57,3 +58,4 @@ class CameraPoses:
     stop_reason: str
     cost_terms: dict[str, float]
     sigma_px: np.ndarray | None = None
+    still: np.ndarray | None = None

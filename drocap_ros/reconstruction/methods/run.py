@@ -48,4 +48,8 @@ def _spread(found: CameraPoses, use: np.ndarray, stamp_ns: np.ndarray) -> Camera
     if sigma is not None:
         flat = sigma.reshape(len(sigma), -1).T
         sigma = np.stack([np.interp(t, t[use], column) for column in flat], axis=-1).reshape(-1, *sigma.shape[1:])
-    return replace(found, joints_px=fill_frames(stamp_ns, joints), translation_px=translation, sigma_px=sigma)
+    still = found.still
+    if still is not None:
+        still = np.stack([np.interp(t, t[use], column) for column in still.T], axis=-1)
+    joints = fill_frames(stamp_ns, joints)
+    return replace(found, joints_px=joints, translation_px=translation, sigma_px=sigma, still=still)

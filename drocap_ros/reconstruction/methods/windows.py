@@ -17,6 +17,7 @@ class WindowResult(NamedTuple):
     """Poses (F, P, 3) in camera axes, x and y in the window's normalized image; the solver's report.
 
     sigma : (F, P, 2) expected error of x, y (each) and of depth, in the same unit; None = the method has none
+    still : (F, 2) probability that the right and the left foot rest, None = the method has none
     """
 
     poses: np.ndarray
@@ -24,12 +25,14 @@ class WindowResult(NamedTuple):
     iterations: int
     stop_reason: str
     sigma: np.ndarray | None = None
+    still: np.ndarray | None = None
 
 
 def over_windows(data: MethodInput, solve: Callable[[slice, NormalizedTracks], WindowResult]) -> CameraPoses:
     """Solve window by window and cross-fade the poses where windows overlap."""
     keypoints, overlap = data.keypoints, data.adjuster.overlap_frames
     sigma: np.ndarray | None = None
+    still: np.ndarray | None = None
     out, weight = np.zeros((*keypoints.xy.shape[:2], 3)), np.zeros(len(keypoints))
     iterations, terms, stops = 0, dict[str, float](), set[str]()
     for rows, n in normalized_windows(keypoints, data.adjuster.window_frames, overlap):
@@ -42,13 +45,19 @@ def over_windows(data: MethodInput, solve: Callable[[slice, NormalizedTracks], W
         if found.sigma is not None:
             sigma = np.zeros(keypoints.xy.shape) if sigma is None else sigma
             sigma[rows] += fade[:, None, None] * found.sigma * n.scale_px
+        if found.still is not None:
+            still = np.zeros((len(keypoints), 2)) if still is None else still
+            still[rows] += fade[:, None] * found.still
         iterations += found.iterations
         stops.add(found.stop_reason)
         for name, value in found.cost_terms.items():
             terms[name] = terms.get(name, 0.0) + value
         data.progress("ba", rows.stop / len(keypoints))
     sigma = None if sigma is None else sigma / weight[:, None, None]
-    return CameraPoses(*split(out / weight[:, None, None]), {}, iterations, ", ".join(sorted(stops)), terms, sigma)
+    still = None if still is None else still / weight[:, None]
+    return CameraPoses(
+        *split(out / weight[:, None, None]), {}, iterations, ", ".join(sorted(stops)), terms, sigma, still
+    )
 
 
 def placed(poses: np.ndarray, w: np.ndarray, information: np.ndarray) -> np.ndarray:

@@ -40,6 +40,7 @@ class CameraTelemetry:
         self.rotation, self.position = rotation, position
         #: (F, 3) the reported direction of view in the world.
         self.view = rotation[:, 2]
+        self.view_of_vertical = rotation[:, :, 2].mean(axis=0)
         turn: np.ndarray = np.zeros((self.frames, 3))
         if self.frames > 1:
             step = log_so3(rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2)) * fps
@@ -48,6 +49,15 @@ class CameraTelemetry:
         self._turn_rate = gaussian_filter1d(turn, smoothing, axis=0, mode="nearest")
         self._smooth = gaussian_filter1d(_extended(position), smoothing, axis=0, mode="nearest")[_MARGIN:-_MARGIN]
         self._velocity = np.gradient(self._smooth, axis=0) * fps if self.frames > 1 else np.zeros((self.frames, 3))
+
+    def gimbal_axes(self) -> np.ndarray:
+        """(3, 3) rows in camera axes, of the whole recording: pitch, yaw (about the vertical, clockwise) and roll."""
+        up = self.view_of_vertical
+        down = -up / max(float(np.linalg.norm(up)), 1e-12)
+        right = np.eye(3)[np.argmin(np.abs(down) * [0.5, 1.0, 1.0])]
+        right = right - (right @ down) * down
+        right /= np.linalg.norm(right)
+        return np.stack([right, down, np.cross(right, down)])
 
     def shifted(self, attitude_s: float, position_s: float) -> CameraPath:
         """The path with the attitude and the position of so many seconds later."""

@@ -14,7 +14,7 @@ from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.lifted.window_solver import difference_noise
 from drocap_ros.reconstruction.methods.windows import fade_weights, windows
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
-from drocap_ros.reconstruction.world.telemetry_checks import frozen, other_time
+from drocap_ros.reconstruction.world.telemetry_checks import frozen, other_time, resting_feet_move
 from drocap_ros.reconstruction.world.world_adjustment import WorldSolution, adjust_in_world
 from drocap_ros.reconstruction.world.world_model import (
     ANKLES,
@@ -66,6 +66,7 @@ class PlacedPoses:
     joints : (F, 17, 3) m in the world; factor : their scale over that of the assumed stature
     depth, depth_sigma : (F, 17) m at the assumed stature: depth behind the pelvis and its expected error
     image, image_sigma : (F, 17, 2), (F, 17) px: place in the image and its expected error
+    still : (F, 2) probability that the right and the left foot rest in the world, None = unknown
     """
 
     joints: np.ndarray
@@ -74,6 +75,7 @@ class PlacedPoses:
     depth_sigma: np.ndarray
     image: np.ndarray
     image_sigma: np.ndarray
+    still: np.ndarray | None = None
 
 
 def refine_in_world(
@@ -105,6 +107,8 @@ def refine_in_world(
     turn = project_to_so3(_at_all_slots(rotation, slot))
     poses_at = body * poses.factor
     if reason := frozen(turn, path, fps) or other_time(poses_at, turn, path, fps):
+        return reason
+    if poses.still is not None and (reason := resting_feet_move(poses_at, _at_all_slots(poses.still, slot), fps)):
         return reason
     joints: np.ndarray = np.zeros(body.shape)
     camera: np.ndarray = np.zeros((frames, CAMERA))
@@ -160,12 +164,13 @@ def _calibration(found: WorldSolution, factor: float, camera_position: np.ndarra
     return {
         "scale": 1.0 / float(shared[SCALE]),
         "scale_std": float(std[SCALE] / shared[SCALE]),
-        "misalignment_deg": np.degrees(shared[MISALIGNMENT]).tolist(),
-        "misalignment_std_deg": np.degrees(std[MISALIGNMENT]).tolist(),
+        "misalignment_deg": np.degrees(found.turned).tolist(),
+        "misalignment_std_deg": np.degrees(found.turned_std).tolist(),
         "attitude_latency_s": -float(shared[ATTITUDE_LATENCY]),
         "attitude_latency_std_s": float(std[ATTITUDE_LATENCY]),
         "position_latency_s": -float(shared[POSITION_LATENCY]),
         "position_latency_std_s": float(std[POSITION_LATENCY]),
+        "ground_spread_m": None if np.isnan(found.ground_spread) else found.ground_spread,
         "contact_share": float(found.contact[:, : len(ANKLES)].mean()),
         "camera_moves": bool(np.ptp(camera_position, axis=0).max() > 0),
         "iterations": found.iterations,

@@ -13,6 +13,10 @@ _SHIFTS_S, _SHIFT_STEP_S = 3.0, 0.5
 _LAG_S, _SMOOTHING_S, _STILL_M = 0.4, 0.06, 0.06
 #: Share of still feet at another time over that at the reported time, and its least value.
 _CLEARLY_BETTER, _LEAST_SHARE = 1.8, 0.06
+#: Feet at rest on a true path move at 0.5 m/s at most and slower than the others: the placement jitters.
+_RESTING_M_S, _RESTING_RATIO = 0.55, 0.7
+#: Share of the time in which a foot has to look at rest, and the times between which its speed is taken.
+_RESTING_SHARE, _RESTING_LAG_S, _RESTING_SMOOTHING_S = 0.05, 0.33, 0.08
 
 
 def frozen(rotation: np.ndarray, position: np.ndarray, fps: float) -> str:
@@ -36,6 +40,38 @@ def other_time(joints: np.ndarray, rotation: np.ndarray, position: np.ndarray, f
     if share[best] < max(_CLEARLY_BETTER * own, _LEAST_SHARE):
         return ""
     return f"the feet rest more with poses {shifts[best]:+.1f} s later; check the log's time offset"
+
+
+def resting_feet_move(joints: np.ndarray, still: np.ndarray, fps: float) -> str:
+    """Whether feet that look at rest move on their path in the world.
+
+    joints : (F, 17, 3) m in the world; still : (F, 2) the network's probability that the right and the left foot rest
+    """
+    from scipy.ndimage import gaussian_filter1d
+
+    lag = max(round(_RESTING_LAG_S * fps), 1)
+    if len(joints) <= 2 * lag:
+        return ""
+    feet = gaussian_filter1d(joints[:, ANKLES], _RESTING_SMOOTHING_S * fps, axis=0, mode="nearest")
+    speed = np.linalg.norm(feet[lag:] - feet[:-lag], axis=-1) * fps / lag
+    rests = still[lag // 2 :][: len(speed)]
+    weight = np.where(rests > 0.5, rests, 0.0)
+    if weight.mean() < _RESTING_SHARE:
+        return ""
+    resting, moving = _median(speed, weight), _median(speed, np.where(rests > 0.5, 0.0, 1.0 - rests))
+    if not (resting > _RESTING_M_S and resting > _RESTING_RATIO * moving):
+        return ""
+    return (
+        f"feet that look at rest move at {resting:.1f} m/s on their path; check that the log belongs to the video and "
+        "is not frozen"
+    )
+
+
+def _median(values: np.ndarray, weights: np.ndarray) -> float:
+    """Weighted median; 0 without any weight."""
+    order = np.argsort(values, axis=None)
+    total = np.cumsum(weights.reshape(-1)[order])
+    return float(values.reshape(-1)[order][np.searchsorted(total, 0.5 * total[-1])]) if total[-1] > 0 else 0.0
 
 
 def _still_share(seen: np.ndarray, rotation: np.ndarray, position: np.ndarray, later: int, fps: float) -> float:

@@ -24,6 +24,7 @@ from drocap_ros.reconstruction.world.world_model import (
     FRAME,
     GLOBALS,
     LENGTHS,
+    MISALIGNMENT,
     SCALE,
     WorldInput,
     WorldState,
@@ -48,14 +49,19 @@ class WorldSolution:
     joints : (F, 17, 3) m in the world
     contact : (F - 1, 4) of ``FEET``, right and left ankle, right and left toe
     std : (GLOBALS,) posterior standard deviations of the shared unknowns, NaN = unknown
+    turned, turned_std : (3,) rad about the gimbal's axes: pitch, yaw, roll
     covariance : (F, 17, 3, 3) m^2 of the joints, NaN = unknown
+    ground_spread : m, of the heights of resting feet; NaN = no foot rests
     """
 
     joints: np.ndarray
     state: WorldState
     contact: np.ndarray
     std: np.ndarray
+    turned: np.ndarray
+    turned_std: np.ndarray
     covariance: np.ndarray
+    ground_spread: float
     cost_terms: dict[str, float]
     iterations: int
     stop_reason: str
@@ -106,12 +112,28 @@ def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) ->
     found = posterior(normal_matrix(final), state)
     fact = config.frames_per_fact
     std: np.ndarray = np.full(GLOBALS, np.nan)
+    axes, turned_std = data.telemetry.gimbal_axes(), np.full(3, np.nan)
     covariance: np.ndarray = np.full((*state.joints.shape, 3), np.nan)
     if found is not None:
         prior = np.sqrt(fact * np.diag(np.linalg.inv(weights.shared)))
         std = np.minimum(_STD_FACTOR * np.sqrt(fact * np.diag(found.shared)), prior)
         covariance = fact * found.joints
-    return WorldSolution(state.joints / state.globals[SCALE], state, contact, std, covariance, final.terms, done, stop)
+        turns = _STD_FACTOR**2 * fact * axes @ found.shared[MISALIGNMENT, MISALIGNMENT] @ axes.T
+        least = fact * axes @ np.linalg.inv(weights.shared[MISALIGNMENT, MISALIGNMENT]) @ axes.T
+        turned_std = np.sqrt(np.minimum(np.diag(turns), np.diag(least)))
+    return WorldSolution(
+        joints=state.joints / state.globals[SCALE],
+        state=state,
+        contact=contact,
+        std=std,
+        turned=axes @ state.globals[MISALIGNMENT],
+        turned_std=turned_std,
+        covariance=covariance,
+        ground_spread=ground,
+        cost_terms=final.terms,
+        iterations=done,
+        stop_reason=stop,
+    )
 
 
 def _search(here: Residuals, step: tuple[np.ndarray, np.ndarray], slope: float) -> Residuals | None:

@@ -80,12 +80,9 @@ def weights_of(data: WorldInput) -> Weights:
     shared[LENGTHS, LENGTHS] = np.diag((config.length_std * data.lengths) ** -2)
     shared[FLOOR, FLOOR] = _ANY_FLOOR_M**-2
     shared[SCALE, SCALE] = config.stature_std**-2
-    # Gimbals know the horizon, not north: the large error turns about the vertical, which is not an axis of the camera.
-    vertical = data.telemetry.rotation[:, :, 2].mean(axis=0)
-    tilt, yaw = np.deg2rad([config.tilt_error_deg, config.yaw_error_deg])
-    shared[MISALIGNMENT, MISALIGNMENT] = np.linalg.inv(
-        tilt**2 * np.eye(3) + yaw**2 * np.outer(vertical, vertical) / max(float(vertical @ vertical), 1e-12)
-    )
+    axes = data.telemetry.gimbal_axes()
+    turned = np.deg2rad([config.tilt_error_deg, config.yaw_error_deg, config.tilt_error_deg])
+    shared[MISALIGNMENT, MISALIGNMENT] = axes.T @ np.diag(turned**-2) @ axes
     own = _OWN_LATENCY * np.eye(2) + (1.0 - _OWN_LATENCY)
     latencies = slice(ATTITUDE_LATENCY, POSITION_LATENCY + 1)
     shared[latencies, latencies] = np.linalg.inv(config.latency_std_s**2 * own)

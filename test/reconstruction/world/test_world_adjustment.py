@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
+from drocap_ros.evaluation.metrics import scale_error
 from drocap_ros.evaluation.world_metrics import ellipsoid_coverage, still_foot_speed
 from drocap_ros.geometry.rotations import exp_so3, left_jacobian, log_so3
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
+from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.world.calibration_words import telemetry_words
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.posterior import posterior
@@ -214,7 +215,19 @@ def test_feet_in_contact_keep_their_place() -> None:
     assert ellipsoid_coverage(motion.joints3d, joints, motion.covariance) > 0.9
 
 
-@pytest.mark.parametrize("wrong", ["jump", "yaw", "other flight", "stopped", "two seconds late"])
+@pytest.mark.xfail(strict=True, reason="scale off by 3.6 % of 2 %: the adjustment makes bodies 1 to 2 % too tall")
+def test_a_short_person_gets_the_right_scale_from_still_feet() -> None:
+    """1.60 m where 1.75 m are assumed; feet of a walker rest for more than a fifth of the time."""
+    joints = simulate_person(np.arange(360) / FPS, "walk", 2, 1.60, BODY_17)
+    motion = reconstruct(tracks(joints, noise_px=2.0), initializer=InitializerConfig(assumed_height_m=1.75))
+    assert motion.meta["calibration"][0]["contact_share"] > 0.2
+    assert motion.metric
+    assert abs(scale_error(motion.joints3d[:, :15], joints[:, :15])) < 0.02
+
+
+@pytest.mark.parametrize(
+    "wrong", ["jump", "yaw", "other flight", "similar flight", "stopped", "wholly frozen", "two seconds late"]
+)
 def test_wrong_telemetry_is_noticed_and_the_motion_falls_back_to_the_camera(wrong: str) -> None:
     view = tracks(walker(240))
     rotation, position = view.camera_rotation, view.camera_position
@@ -227,6 +240,14 @@ def test_wrong_telemetry_is_noticed_and_the_motion_falls_back_to_the_camera(wron
     elif wrong == "stopped":
         at = np.minimum(np.arange(240), 150)
         rotation, position = rotation[at], position[at]
+    elif wrong == "wholly frozen":
+        at = np.zeros(240, int)
+        rotation, position = rotation[at], position[at]
+    elif wrong == "similar flight":
+        other = tracks(walker(240, seed=5))
+        assert other.camera_rotation is not None
+        assert other.camera_position is not None
+        rotation, position = other.camera_rotation, other.camera_position
     elif wrong == "two seconds late":
         view = replace(
             view, keypoints=view.keypoints[48:], stamp_ns=view.stamp_ns[48:], camera_rotation=None, camera_position=None
