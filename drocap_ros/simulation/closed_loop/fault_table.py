@@ -201,9 +201,7 @@ _OPERATOR = (
 _SUBJECT = (
     Fault("subject walks towards the vehicle", walk_to_vehicle, harmless=True),
     Fault(
-        # The last setpoint's coast reaches the fence before the vehicle does.
-        "subject leaves the fence", walk_east, harmless=True, codes=(_C.AT_FENCE, _C.COAST_UNSAFE),
-        check=inside_fence, watch_s=14.0,
+        "subject leaves the fence", walk_east, harmless=True, codes=(_C.AT_FENCE,), check=inside_fence, watch_s=14.0,
         change=lambda settings: with_config(settings, fence_radius_m=9.0),
     ),
 )  # fmt: skip
