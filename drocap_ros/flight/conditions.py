@@ -114,8 +114,8 @@ _SENTENCES = {
     _C.ALREADY_HOLDING: "already holding",
     _C.NOT_ORBITING: "not orbiting",
     _C.DISARMED: "the motors were disarmed",
-    _C.PILOT_TOOK_OVER: "the mode changed to {mode} without a request of ours: the pilot has taken over; silent until "
-    "the operator acknowledges it by stop",
+    _C.PILOT_TOOK_OVER: "the mode changed to {mode} without a request of ours: the pilot has taken over, or a "
+    "failsafe of the autopilot; silent until the operator acknowledges it by stop",
     _C.CONTROL_NOT_GRANTED: "the autopilot did not grant control",
     _C.HOLD_MODE_MISSING: "{cause}; the autopilot does not enter its hold mode: take over by hand",
     _C.DEGRADED: "the orbit is slowed down: {cause}",

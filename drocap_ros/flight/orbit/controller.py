@@ -169,7 +169,8 @@ class OrbitController:
             estimate = dataclasses.replace(estimate, position=estimate.position + self._history.offset)
         orbiting_s = now_s - self.safety.since_s if self.safety.state == State.ORBITING else 0.0
         setpoints, echo = self._link.sent_setpoints(), self._link.echo()
-        not_followed = self._following.step(now_s, orbiting_s, setpoints, echo, self._vehicle)
+        trip_s = self._link.answer_age_s()
+        not_followed = self._following.step(now_s, orbiting_s, setpoints, echo, self._vehicle, trip_s)
         seen = observe(self._link, self._config, self._vehicle, estimate, disturbance, not_followed, now_ns)
         seen = self._keeping.watch(self._orbit, self._framing.watch(self._vehicle, seen, dt), now_s)
         seen = dataclasses.replace(self._guard.doubt(seen, self._history.offset, now_ns), intruder=self.intruder)

@@ -21,9 +21,11 @@ from drocap_ros.flight.orbit.states import Observed
 from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.vehicle_state import VehicleState
 
-_SENT_S = 0.7  # a setpoint may be echoed for so long: two transmissions and the period of the echo
+_SENT_S = 0.7  # a setpoint may be echoed for so long at most: two transmissions and the period of the echo
+_ECHOED_S = 0.25  # beyond the age of the echo and two transmissions: two periods of it, and a step
 _AHEAD_S = 0.5  # along its velocity: ArduPilot's integration
-_PLACE_M, _VELOCITY_M_S = 0.5, 0.75
+_PLACE_M, _VELOCITY_M_S = {"px4": 0.2}, 0.75  # PX4 echoes the place as it came
+_INTEGRATED_M = 0.5  # of a place that ArduPilot has integrated
 _MISMATCH_S = 0.25  # longer than two echoes
 _WINDOW_S, _COMMANDED_M_S = 1.0, 0.6
 #: Of the commanded speed; the vehicle is slower for all of the window.  In every recorded flight it reached 0.46.
@@ -50,6 +52,7 @@ class Following:
         sent: Sequence[tuple[float, Any]],
         echo: tuple[float, Any] | None,
         vehicle: VehicleState | None,
+        trip_s: float = math.nan,
     ) -> str:
         """Why the setpoints count as not followed, in words; "" = they are followed, or it is not known.
 
@@ -59,6 +62,7 @@ class Following:
         orbiting_s : how long the orbit has been flown; 0 = it is not
         sent : (monotonic s, SET_POSITION_TARGET_LOCAL_NED) in order of time
         echo : (age in s, POSITION_TARGET_LOCAL_NED), or None before the first
+        trip_s : since the sending of the message that was answered last: two transmissions at least; NaN = unknown
         """
         if orbiting_s == 0.0 or not sent or vehicle is None:
             self._matched_s = math.nan
@@ -68,8 +72,9 @@ class Following:
             age_s, target = echo
             if min(age_s, orbiting_s) > self._max_echo_age_s:
                 return f"no echo of a target for {age_s:.1f} s"
-            recent = [message for at_s, message in sent if now_s - at_s <= _SENT_S]
-            if _agrees(target, recent, with_velocity=vehicle.autopilot != "px4"):
+            oldest_s = min(_SENT_S, age_s + trip_s + _ECHOED_S) if math.isfinite(trip_s) else _SENT_S
+            recent = [message for at_s, message in sent if now_s - at_s <= oldest_s]
+            if _agrees(target, recent, vehicle.autopilot):
                 self._matched_s = now_s
             elif now_s - self._matched_s > _MISMATCH_S:  # NaN: its content has not agreed yet, and is not judged
                 return "the autopilot's target is none that was sent"
@@ -109,7 +114,7 @@ class Keeping:
         return dataclasses.replace(seen, away_m=away_m, away_s=now_s - self._near_s)
 
 
-def _agrees(echo: Any, sent: list[Any], *, with_velocity: bool) -> bool:
+def _agrees(echo: Any, sent: list[Any], autopilot: str) -> bool:
     """Whether the echoed target lies on the way of a setpoint, and has its velocity."""
     place = np.array([echo.x, echo.y], dtype=float)
     if not sent or not np.isfinite(place).all():
@@ -119,7 +124,7 @@ def _agrees(echo: Any, sent: list[Any], *, with_velocity: bool) -> bool:
     way = _AHEAD_S * velocity
     part = ((place - begin) * way).sum(axis=1) / np.maximum((way * way).sum(axis=1), 1e-9)
     nearest = begin + np.clip(part, 0.0, 1.0)[:, None] * way
-    near = np.hypot(*(place - nearest).T) <= _PLACE_M
-    if with_velocity:
+    near = np.hypot(*(place - nearest).T) <= _PLACE_M.get(autopilot, _INTEGRATED_M)
+    if autopilot != "px4":
         near &= np.hypot(*(np.array([echo.vx, echo.vy], dtype=float) - velocity).T) <= _VELOCITY_M_S
     return bool(near.any())

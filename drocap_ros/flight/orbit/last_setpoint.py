@@ -113,7 +113,8 @@ def _danger(
     if fence_centre is not None:
         away = np.abs(coast.place - complex(*fence_centre))
         if away.max() > max(limits.safety.fence_radius_m, float(away[0]) + _SLACK_M):
-            return condition(ConditionCode.COAST_UNSAFE, reach=f"reach {away.max():.1f} m from where the orbit began")
+            fence_m = limits.safety.fence_radius_m
+            return condition(ConditionCode.AT_FENCE, distance_m=float(away[0]), limit_m=fence_m)
     if seen.subject is None:
         return None
     subject, least = complex(*seen.subject[:2]), limits.orbit.min_distance_m

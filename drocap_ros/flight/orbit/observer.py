@@ -18,6 +18,8 @@ from drocap_ros.geometry.rotations import matrix_from_quaternion
 _NS = 1_000_000_000
 _MAX_EXTRAPOLATION_S = 0.3
 _POSITION_JUMP_M, _JUMP_PERIOD_S = 1.0, 0.5
+#: Modes that PX4 enters for the loss of setpoints, by COM_OBL_RC_ACT; without the setting any mode may be it.
+_LOSS_MODES = {3: "RTL", 4: "LAND", 5: "LOITER"}
 _STATUS_MESSAGES = (("GPS_RAW_INT",), ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"), ("SYS_STATUS",))
 
 
@@ -62,10 +64,13 @@ def observe(
         disturbance = condition(ConditionCode.SETPOINTS_NOT_FOLLOWED, evidence=not_followed)
     # PX4 needs another mode; ArduPilot's GUID_TIMEOUT has ended the motion by now, and BRAKE would take longer.
     followed = not not_followed or latest.autopilot != "px4"
+    loss = link.settings.loss_settings()
+    action = math.nan if loss is None else loss.action
+    loss_mode = _LOSS_MODES.get(int(action) if math.isfinite(action) else -1, latest.mode)
     return Observed(
         autopilot=latest.autopilot, mode=latest.mode, in_control=latest.mode == dialect.control_mode,
         in_hold=latest.mode == dialect.hold_mode, heard=heard | {latest.mode},
-        left_by_itself=estimator.modes.intended == dialect.control_mode != latest.mode,
+        left_by_itself=estimator.modes.intended == dialect.control_mode != latest.mode == loss_mode,
         armed=latest.armed, landed_state=latest.landed_state, link_age_s=latest.link_age_s,
         heartbeat_age_s=estimator.modes.age_s(now_ns),
         state_age_s=abs(age_s), position_age_s=(now_ns - estimator.position_changed_ns) / _NS,
@@ -79,7 +84,7 @@ def observe(
         subject_contradicted=estimate is not None and estimate.contradicted,
         subject_sd_m=math.inf if estimate is None else estimate.position_sd_m,
         subject_distance_m=distance, closing_m_s=closing, approach_m_s=approach, approach_sd_m_s=approach_sd,
-        disturbance=disturbance, followed=followed, loss_settings=link.settings.loss_settings(),
+        disturbance=disturbance, followed=followed, loss_settings=loss,
         camera_problem=estimator.mount.problem(latest.autopilot, now_ns),
     )  # fmt: skip
 

@@ -58,7 +58,7 @@ class Observed:
 
     in_control, in_hold : the mode is GUIDED or OFFBOARD; it is the autopilot's hold mode
     heard : all modes that were reported since the last step, late ones too; empty = the mode alone
-    left_by_itself : whether the autopilot left the control mode while nobody chose another one: a failsafe
+    left_by_itself : whether the autopilot left the control mode as for the loss of setpoints, and nobody chose this
     heartbeat_age_s : since the newest report of the mode
     position_age_s : since the reported position last changed, so frozen telemetry ages too
     round_trip_s : since the sending of the message that was answered last; NaN = no answer yet

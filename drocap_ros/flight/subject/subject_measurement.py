@@ -110,9 +110,13 @@ def locate_subject(
     slope = float(pelvis[2] / flat)
     size, bending = _range_from_size(rays, seen, pelvis[:2] / flat, config)
     size_error = float(np.hypot(config.size_error, _LEAN_RAD * slope))
-    ground, ground_sd, noise = _range_from_ground(rays, seen, camera.position, config)
+    ground, height, noise = _range_from_ground(rays, seen, camera.position, config)
     steady = size_over_ground * ground if np.isfinite(size_over_ground) and np.isfinite(ground) else size
-    distance, sd = _fuse(steady, size_error, ground, ground_sd)
+    distance, sd = _fuse(steady, size_error, ground, _ground_sd(ground, height, config))
+    if _contradict(steady, size_error, ground, height, config):
+        # On another ground than assumed the ratio changes with the camera's height: the size of this image counts.
+        steady = distance = size if np.isfinite(size) else steady
+        sd, noise = 2 * size_error * distance, np.nan
     if not 0.3 < distance < _MAX_RANGE_M:
         return None
     nearer = 1.0 - float(np.nanmin([steady, ground])) / distance
@@ -165,7 +169,7 @@ def _range_from_size(
 def _range_from_ground(
     rays: np.ndarray, seen: np.ndarray, position: np.ndarray, config: SubjectConfig
 ) -> tuple[float, float, float]:
-    """Horizontal range of the ankles on level ground, its standard deviation and that of one image; NaN without."""
+    """Horizontal range of the ankles on level ground, height above them, noise of one image; NaN without."""
     ankles = rays[_ANKLES[seen[_ANKLES]]]
     # A foot kicked up to the horizon is left out; the other one stands.
     ankles = ankles[-ankles[:, 2] >= _SHALLOW * np.linalg.norm(ankles, axis=1)]
@@ -177,23 +181,32 @@ def _range_from_ground(
     # A lifted foot appears farther than the one that stands; feet a stride apart stand about the pelvis.
     lifted = apart > _LIFTED * nearer
     distance = nearer if lifted else float(ranges.mean())
+    noise = _GROUND_NOISE * distance + 0.05 + _APART_NOISE * min(apart, 0.5 * nearer)
+    return distance, height, noise
+
+
+def _ground_sd(distance: float, height: float, config: SubjectConfig) -> float:
+    """Standard deviation of a range of this length by the ground."""
     turn = np.deg2rad(config.attitude_error_deg)
     errors = (turn * (height**2 + distance**2) / height, config.height_error_m * distance / height, _STRIDE_M)
-    noise = _GROUND_NOISE * distance + 0.05 + _APART_NOISE * min(apart, 0.5 * nearer)
-    return distance, float(np.linalg.norm(errors)), noise
+    return float(np.linalg.norm(errors))
+
+
+def _contradict(size: float, size_error: float, ground: float, height: float, config: SubjectConfig) -> bool:
+    """Whether the two ranges contradict each other.
+
+    A range that the ground puts far too far has a large standard deviation too: that of the nearer one counts.
+    """
+    spread = np.hypot(size_error * size, _ground_sd(min(size, ground), height, config))
+    return bool(abs(size - ground) > 3 * spread)  # NaN: one source alone
 
 
 def _fuse(size: float, size_error: float, ground: float, ground_sd: float) -> tuple[float, float]:
-    """Information-weighted mean and its standard deviation; ``size_error`` is a share.
-
-    Contradicting ranges give body size alone, with twice its standard deviation.
-    """
+    """Information-weighted mean and its standard deviation; ``size_error`` is a share."""
     if not np.isfinite(size):
         return ground, ground_sd
     size_sd = size_error * size
     if not np.isfinite(ground):
         return size, size_sd
-    if abs(size - ground) > 3 * np.hypot(size_sd, ground_sd):
-        return size, 2 * size_sd
     wa, wb = size_sd**-2, ground_sd**-2
     return (wa * size + wb * ground) / (wa + wb), float((wa + wb) ** -0.5)

@@ -267,9 +267,19 @@ def busy_machine(settings: LoopSettings) -> LoopSettings:
     return dataclasses.replace(settings, gaps_hz=0.5)
 
 
-def wrong_ground(settings: LoopSettings) -> LoopSettings:
-    """The ground is configured 2 m too low."""
-    return with_config(settings, ground_height_m=settings.config.ground_height_m - 2.0, max_height_m=8.0)
+def wrong_ground(lower_m: float) -> Callable[[LoopSettings], LoopSettings]:
+    """The ground lies lower by so much than it is configured; 2.5 m above the higher of the two, body measured."""
+
+    def change(settings: LoopSettings) -> LoopSettings:
+        config = settings.config
+        settings = dataclasses.replace(settings, height_m=settings.height_m + max(lower_m, 0.0))
+        return with_config(
+            settings, ground_height_m=config.ground_height_m + lower_m,
+            height_m=config.height_m + max(-lower_m, 0.0), max_height_m=8.0, gimbal_control=True,
+            size_error=0.04,
+        )  # fmt: skip
+
+    return change
 
 
 def ready_late(settings: LoopSettings) -> LoopSettings:

@@ -31,7 +31,7 @@ def setpoint(x, vx):
     return SimpleNamespace(x=x, y=0.0, vx=vx, vy=0.0)
 
 
-def fly(echo_of, seconds=6.0, autopilot="ardupilot", commanded=2.0, flown=lambda t: 2.0):
+def fly(echo_of, seconds=6.0, autopilot="ardupilot", commanded=2.0, flown=lambda t: 2.0, trip_s=math.nan):
     """(time, evidence) of the first step that does not follow; ``echo_of(t, x)`` is the echo, where the path is x."""
     following, sent, echoed = Following(MAX_ECHO_AGE_S), [], None
     for i in range(1, round(seconds * 20)):
@@ -40,7 +40,7 @@ def fly(echo_of, seconds=6.0, autopilot="ardupilot", commanded=2.0, flown=lambda
         if i % 2 == 0 and (echo := echo_of(t - 0.1, x - 0.1 * commanded)) is not None:
             echoed = (t, echo)
         judged = None if echoed is None else (t - echoed[0], echoed[1])
-        if evidence := following.step(t, t, sent, judged, vehicle(autopilot, flown(t))):
+        if evidence := following.step(t, t, sent, judged, vehicle(autopilot, flown(t)), trip_s):
             return t, evidence
         sent = [*sent[-79:], (t, setpoint(x, commanded))]
     return math.inf, ""
@@ -70,6 +70,16 @@ def test_px4_echoes_the_velocity_of_its_controller():
     assert fly(lambda t, x: setpoint(x, 3.1), autopilot="px4") == (math.inf, "")
     t, _ = fly(lambda t, x: setpoint(min(x, 6.0), 0.4), autopilot="px4")  # the target stays
     assert t <= 4.7
+
+
+def test_on_a_quick_link_the_echo_must_be_of_a_recent_setpoint():
+    def deaf(t, x):
+        return setpoint(min(x, 6.0), 0.4)  # from 3 s on
+
+    assert fly(deaf, autopilot="px4", trip_s=0.05)[0] <= 3.85
+    assert fly(deaf, autopilot="px4", trip_s=0.4)[0] <= 4.4
+    assert fly(lambda t, x: setpoint(x, 3.1), autopilot="px4", trip_s=0.05) == (math.inf, "")
+    assert fly(lambda t, x: setpoint(x - 0.4, 2.0), autopilot="px4", trip_s=0.2) == (math.inf, "")  # 0.2 s late
 
 
 def test_no_echo_at_all_counts_after_its_time_and_a_link_without_one_is_judged_by_the_motion():

@@ -101,6 +101,7 @@ def test_the_coast_stays_inside_the_fence():
     late = dataclasses.replace(now, position=np.array([9.3, 0.0, 2.5]))
     sent = sent_of(flight(late), late, ZERO, CENTRE, limits)
     assert isinstance(sent, Condition)
+    assert sent.code == ConditionCode.AT_FENCE
     assert "from where the orbit began" in str(sent)
     slow = dataclasses.replace(now, velocity=np.array([0.8, 0.0, 0.0]))
     sent = sent_of(flight(slow), slow, ZERO, CENTRE, limits)

@@ -54,6 +54,23 @@ def test_a_wrong_ground_is_doubted_by_the_image():
     assert (1 - estimate.nearer) * distance < 1.1 * truth
 
 
+def test_a_camera_that_descends_over_another_ground_sees_a_standing_person_stand():
+    loop = OrbitLoop(with_config(LoopSettings(seed=4, seconds=8.0), ground_height_m=-2.0, max_height_m=8.0))
+    loop.start(4.0)
+    speeds, distances = [], []
+
+    def note(loop):
+        estimate = loop.controller._subject.estimate(loop.clock_ns())
+        if loop.t > 4.5:
+            speeds.append(np.hypot(*estimate.velocity[:2]))
+            distances.append(loop.status.radius_m - loop.rows[-1].distance_m)
+
+    loop.run(7.0, note)
+    assert loop.copter.body.position[2] < 1.2  # 3 m at the start
+    assert max(speeds) < 0.7
+    assert np.abs(distances).max() < 0.7
+
+
 def test_least_radius_counts_the_worst_error_of_the_range():
     config = OrbitConfig()
     usual = least_radius(config, 0.1, 0.0, 1.3)
