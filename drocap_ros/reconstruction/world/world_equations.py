@@ -84,7 +84,9 @@ def _add_body(r: Residuals, blocks: np.ndarray, border: np.ndarray, corner: np.n
     own[:, 0] += depth.sum(axis=1)
     precision = SPAN_STD_M**-2
     slope = precision[:, None] * r.direction
-    outer = slope[..., :, None] * r.direction[..., None, :]
+    # A bone that is too long is stiff across, too: without this term its turn and its length take turns for many steps.
+    across = (precision * np.maximum(r.excess, 0.0))[..., None]
+    outer = (slope - across * r.direction)[..., :, None] * r.direction[..., None, :] + across[..., None] * np.eye(3)
     own += (_ENDS @ outer.reshape(frames, len(SPANS), 9)).reshape(own.shape)
     for i, foot in enumerate(FEET):
         step, height = r.step_weight[:, i], 0.25 * r.height_weight[:, i]

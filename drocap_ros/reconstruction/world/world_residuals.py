@@ -141,6 +141,7 @@ class Residuals:
         length = np.sqrt(np.square(span).sum(-1) + 1e-10)
         self.direction = span / length[..., None]
         self.stretch = (length - shared[LENGTHS]) / SPAN_STD_M
+        self.excess = 1.0 - shared[LENGTHS] / length
         self.swing = joints[2:] - 2 * joints[1:-1] + joints[:-2]
         flown = data.telemetry.position + state.camera[:, :3]
         self.camera_swing = flown[2:] - 2 * flown[1:-1] + flown[:-2]
