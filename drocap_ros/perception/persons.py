@@ -71,10 +71,11 @@ def find_persons(
         estimator.process(frame.image, frame.stamp_ns)
         detected_ns, images = frame.stamp_ns, images + 1
         for person in estimator.tracker.persons:
-            if person.detected_ns == frame.stamp_ns:
+            # A track that clutter has taken over is a person's up to there.
+            if person.detected_ns == frame.stamp_ns and person.mean_score >= _LEAST_SCORE:
                 seen.setdefault(person, {})[frame.stamp_ns] = person.box
     least = min(config.confirm_frames, images)
-    found = [boxes for person, boxes in seen.items() if len(boxes) >= least and person.mean_score >= _LEAST_SCORE]
+    found = [boxes for boxes in seen.values() if len(boxes) >= least]
     if not found:
         raise InputError(f"expected a person in view, found none in {images} images; try another video or model")
     found.sort(key=lambda boxes: (min(boxes), float(boxes[min(boxes)][0])))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.perception.estimator import PoseEstimator
+from drocap_ros.perception.persons import find_persons
 from drocap_ros.perception.pose.network_keypoints import NetworkKeypoints
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.sources import open_source
@@ -151,3 +152,13 @@ def test_small_person_in_a_large_image_is_found_and_kept(models, shared, size, i
     ids = [estimator.process(image, i * 33_000_000).track_id for i in range(images + 4)]
     assert set(ids[images:]) == {1}
     assert set(ids) <= {0, 1}
+
+
+def test_person_whose_track_goes_over_to_clutter_keeps_his_number(models, shared):
+    """The man on the wall of `outdoor_walk` jumps off; his box then follows a hole in the leaves."""
+    with open_source(shared / "media" / "outdoor_walk.mp4") as source:
+        frames = [frame for i, frame in enumerate(source) if 72 <= i < 192]
+    man, woman = find_persons(frames, models, PoseEstimatorConfig())
+    assert man.first_ns == frames[0].stamp_ns
+    assert all(box[3] < 470 for box in man.boxes.values())  # px: on the wall
+    assert woman.last_ns > man.last_ns
