@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import re
 import time
-from collections import defaultdict, deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from itertools import islice
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,34 +14,20 @@ from drocap_ros.errors import InputError
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
 from drocap_ros.observation import PoseObservation
-from drocap_ros.reconstruction.live.effort import Effort
-from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
+from drocap_ros.reconstruction.live.replay import LivePose, live_poses
+from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.reconstruction.stop_reason import NO_WINDOW
 from drocap_ros.recording.pose_messages import read_observations
 from drocap_ros.recording.provenance import CONFIGURATION
-from drocap_ros.recording.session import POSE2D, POSE3D, POSE3D_WINDOW, Session, header_stamp_ns
+from drocap_ros.recording.published_poses import Agreement, PublishedPoses, RecordedCamera
+from drocap_ros.recording.session import (
+    POSE2D,
+    Session,
+)
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
 
-_INITIAL = 1  # Pose3D.INITIAL
 Progress = Callable[[str, float], None]
-
-
-@dataclass
-class Agreement:
-    """Offline results compared with the published ones, bit for bit.
-
-    initial, windows : number compared, number equal
-    """
-
-    initial: list[int] = field(default_factory=lambda: [0, 0])
-    windows: list[int] = field(default_factory=lambda: [0, 0])
-
-    def __str__(self) -> str:
-        return (
-            f"equal to the live graph bit for bit: {self.initial[1]} of {self.initial[0]} initial poses,"
-            f" {self.windows[1]} of {self.windows[0]} windows"
-        )
 
 
 def recorded_config(session: Session) -> DrocapConfig | None:
@@ -77,11 +58,11 @@ def recorded_config(session: Session) -> DrocapConfig | None:
 def reconstruct_live(
     session: Session, config: DrocapConfig, progress: Progress | None = None
 ) -> tuple[Motion, Tracks, Agreement]:
-    """Motion by the live method, from the session's ``pose2d`` messages alone.
+    """Motion by the live method, from the session's ``pose2d``, ``vehicle/state`` and ``camera_info`` messages.
 
-    A frame's pose is that of the last window that holds it, else its initial one; in frame "camera", as the graph
-    publishes it.  The windows are those that the live graph adjusted where the session holds them, else all that are
-    due.  Memory: the poses and one window.
+    A frame's pose is that of the last window that holds it, else its initial one.  Where at least half of the frames
+    are in ``map``, the motion has these, in frame "world"; else all, in frame "camera".  The windows are those that the
+    live graph adjusted where the session holds them, else all that are due.  Memory: the poses and one window.
 
     Raises
     ------
@@ -89,31 +70,38 @@ def reconstruct_live(
         When the session holds no keypoints of a person.
     """
     topic = session.choose_topic(POSE2D)
-    published = _Published(session, topic.name)
+    published = PublishedPoses(session, topic.name)
     begin = time.perf_counter()
-    frames: dict[int, tuple[PoseObservation, np.ndarray]] = {}
+    frames: dict[int, _Frame] = {}
+    camera = RecordedCamera(session, topic.name, config.bundle_adjuster.window_s)
     stop_reason, iterations = NO_WINDOW, 0
     results = live_poses(
         read_observations(session, topic.name),
         config.initializer,
         config.bundle_adjuster,
         published.effort_at if published.has_windows else None,
+        lambda stamp_ns: camera.along(stamp_ns, published.telemetry_ns if published.has_windows else int(stamp_ns[-1])),
     )
     for done, result in enumerate(results):
         if isinstance(result, LivePose):
             stamp_ns = result.observation.stamp_ns
             published.compare_initial(stamp_ns, result.joints3d)
-            frames[stamp_ns] = (result.observation, result.joints3d)
+            frames[stamp_ns] = _Frame(result.observation, result.joints3d)
         else:
             published.compare_window(result)
             window = result.window
-            for stamp_ns, joints in zip(window.stamp_ns.tolist(), result.joints3d, strict=True):
-                frames[stamp_ns] = (frames[stamp_ns][0], joints)
+            for i, stamp_ns in enumerate(window.stamp_ns.tolist()):
+                frames[stamp_ns] = _Frame(frames[stamp_ns].observation, result.joints3d[i], _camera_of(window, i))
             stop_reason, iterations = window.stop_reason, iterations + window.iterations
         if progress is not None and done % 50 == 0:
             progress("live", min(1.0, done / max(topic.count, 1)))
-    tracks, joints3d = _arrays(session, frames)
-    motion = _motion(tracks, joints3d, config)
+    in_map = {stamp: frame for stamp, frame in frames.items() if frame.camera is not None}
+    if in_map and 2 * len(in_map) >= len(frames):
+        tracks, joints3d = _arrays(session, in_map, camera.matrix)
+        motion = _motion_in_world(tracks, joints3d, config)
+    else:
+        tracks, joints3d = _arrays(session, {stamp: frame.in_camera_axes() for stamp, frame in frames.items()})
+        motion = _motion(tracks, joints3d, config)
     motion.meta.update(
         method="live",
         parameters={
@@ -129,89 +117,33 @@ def reconstruct_live(
     return motion, tracks, published.agreement
 
 
-class _Published:
-    """Results of the live graph; a stamp repeats where a recording was played in a loop."""
+class _Frame(NamedTuple):
+    """A frame's pose (17, 3) m: in ``map`` with the camera's rotation and position there, or in camera axes."""
 
-    def __init__(self, session: Session, near: str) -> None:
-        base = near.rsplit("/", 1)[0]
-        # Fingerprints save memory: the windows of half an hour overlap twelvefold.
-        self._initial: defaultdict[int, deque[bytes]] = defaultdict(deque)
-        self._windows: deque[_PublishedWindow] = deque()
-        self._current: _PublishedWindow | None = None
-        self.agreement = Agreement()
-        for m in _messages(session, POSE3D, f"{base}/pose3d/initial"):
-            if m.stage == _INITIAL:
-                self._initial[header_stamp_ns(m)].append(_fingerprint(_joints(m)))
-        for m in _messages(session, POSE3D_WINDOW, f"{base}/pose3d/refined"):
-            stamps = np.array([header_stamp_ns(pose) for pose in m.poses], np.int64)
-            joints = np.array([_joints(pose) for pose in m.poses])
-            self._windows.append(_PublishedWindow(header_stamp_ns(m), _fingerprint(stamps, joints), _effort(m)))
-        self.has_windows = bool(self._windows)
+    observation: PoseObservation
+    joints: np.ndarray
+    camera: tuple[np.ndarray, np.ndarray] | None = None
 
-    def effort_at(self, stamp_ns: int) -> Effort | None:
-        """Effort of the window that ends here, the next in order; None when the graph adjusted none."""
-        ahead = next((i for i, w in enumerate(self._windows) if w.stamp_ns == stamp_ns), None)
-        if ahead is None or any(w.stamp_ns > stamp_ns for w in islice(self._windows, ahead)):
-            return None
-        for _ in range(ahead + 1):
-            self._current = self._windows.popleft()
-        assert self._current is not None
-        return self._current.effort
-
-    def compare_initial(self, stamp_ns: int, joints: np.ndarray) -> None:
-        """Compare with the published pose of the same stamp, if any."""
-        theirs = self._initial.get(stamp_ns)
-        if theirs:
-            _count(self.agreement.initial, theirs.popleft() == _fingerprint(joints))
-
-    def compare_window(self, result: LiveWindow) -> None:
-        """Compare with the window that :meth:`effort_at` returned last."""
-        theirs, self._current = self._current, None
-        if theirs is not None:
-            equal = theirs.fingerprint == _fingerprint(result.window.stamp_ns, result.joints3d)
-            _count(self.agreement.windows, equal)
+    def in_camera_axes(self) -> _Frame:
+        """The pose with its pelvis at the origin."""
+        if self.camera is None:
+            return self
+        rotation, _ = self.camera
+        return _Frame(self.observation, (self.joints - self.joints[0]) @ rotation.T)
 
 
-class _PublishedWindow(NamedTuple):
-    stamp_ns: int
-    fingerprint: bytes
-    effort: Effort
+def _camera_of(window: AdjustedWindow, frame: int) -> tuple[np.ndarray, np.ndarray] | None:
+    return None if window.in_map is None else (window.in_map.rotation[frame], window.in_map.position[frame])
 
 
-def _effort(window: Any) -> Effort:
-    """Effort of a Pose3DWindow; recordings older than its field ``stride`` hold it in the stop reason."""
-    if hasattr(window, "stride"):
-        return Effort(int(window.stride), (int(window.steps[0]), int(window.steps[1])) if len(window.steps) else None)
-    stride = re.search(r"every (\d+)\. image", window.stop_reason)
-    steps = re.search(r"(\d+) \+ (\d+) steps", window.stop_reason)
-    return Effort(int(stride[1]) if stride else 1, (int(steps[1]), int(steps[2])) if steps else None)
-
-
-def _messages(session: Session, kind: str, name: str) -> Iterator[Any]:
-    """Messages of a topic, none when the session lacks it."""
-    if any(topic.name == name for topic in session.topics_of(kind)):
-        yield from (message for _, message in session.messages((name,)))
-
-
-def _fingerprint(*arrays: np.ndarray) -> bytes:
-    """Equal only where every bit is; any NaN counts as any other."""
-    digest = hashlib.blake2b(digest_size=16)
-    for array in arrays:
-        digest.update(str(array.shape).encode())
-        digest.update(np.where(np.isnan(array), np.float32(np.nan), array).astype(array.dtype).tobytes())
-    return digest.digest()
-
-
-def _count(pair: list[int], equal: bool) -> None:
-    pair[0] += 1
-    pair[1] += equal
-
-
-def _arrays(session: Session, frames: dict[int, tuple[PoseObservation, np.ndarray]]) -> tuple[Tracks, np.ndarray]:
-    stamps = sorted(stamp for stamp, (_, joints) in frames.items() if np.isfinite(joints).all())
+def _arrays(session: Session, frames: dict[int, _Frame], matrix: np.ndarray | None = None) -> tuple[Tracks, np.ndarray]:
+    """Tracks of the frames with a pose, with the camera's poses where all have one, and their poses."""
+    stamps = sorted(stamp for stamp, frame in frames.items() if np.isfinite(frame.joints).all())
     if not stamps:
         raise InputError(f"{session.path}: expected keypoints of a person, found none that gives a pose; check them")
-    observations = [frames[stamp][0] for stamp in stamps]
+    observations = [frames[stamp].observation for stamp in stamps]
+    cameras = [frames[stamp].camera for stamp in stamps]
+    known = [camera for camera in cameras if camera is not None]
     first = observations[0]
     return (
         Tracks(
@@ -221,8 +153,30 @@ def _arrays(session: Session, frames: dict[int, tuple[PoseObservation, np.ndarra
             image_size=first.image_size,
             confidence=np.array([o.confidence for o in observations], np.float64),
             covariance=np.array([o.covariance for o in observations], np.float64),
+            camera_rotation=np.array([rotation for rotation, _ in known]) if known else None,
+            camera_position=np.array([position for _, position in known]) if known else None,
+            camera_matrix=matrix,
         ),
-        np.array([frames[stamp][1] for stamp in stamps], np.float64),
+        np.array([frames[stamp].joints for stamp in stamps], np.float64),
+    )
+
+
+def _motion_in_world(tracks: Tracks, joints3d: np.ndarray, config: DrocapConfig) -> Motion:
+    assert tracks.camera_rotation is not None
+    assert tracks.camera_position is not None
+    assert tracks.camera_matrix is not None
+    motion = _motion(tracks, joints3d, config)
+    k = tracks.camera_matrix
+    seen = (joints3d - tracks.camera_position[:, None]) @ np.swapaxes(tracks.camera_rotation, 1, 2)
+    image = seen[..., :2] / np.maximum(seen[..., 2:], 1e-3) * np.diagonal(k)[:2] + k[:2, 2]
+    return dataclasses.replace(
+        motion,
+        frame="world",
+        metric=True,
+        scale_source="telemetry",
+        camera_rotation=tracks.camera_rotation,
+        camera_position=tracks.camera_position,
+        reprojection_px=np.linalg.norm(image - motion.keypoints, axis=-1),
     )
 
 
@@ -255,7 +209,3 @@ def _reprojection_px(joints3d: np.ndarray, keypoints: np.ndarray, seen: np.ndarr
     scale = (weight * x * y).sum(axis=(1, 2)) / np.maximum((weight * x * x).sum(axis=(1, 2)), 1e-12)
     gap = np.linalg.norm(scale[:, None, None] * x - y, axis=-1)
     return np.where(seen, gap, np.nan)
-
-
-def _joints(message: Any) -> np.ndarray:
-    return np.asarray(message.joints, np.float32).reshape(-1, 3)

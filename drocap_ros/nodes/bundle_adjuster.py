@@ -1,8 +1,9 @@
 """Node ``bundle_adjuster``: adjusts the last seconds of poses together.
 
-Subscribes ``pose2d`` and ``pose3d/initial``; publishes ``pose3d/refined`` (drocap_ros/Pose3DWindow), and for every
-image ``pose3d/latest`` (drocap_ros/Pose3D): its initial pose with the bone lengths of the last window, stage INITIAL
-until there is one.
+Subscribes ``pose2d``, ``pose3d/initial``, ``vehicle/state`` and ``camera_info``; publishes ``pose3d/refined``
+(drocap_ros/Pose3DWindow), and for every image ``pose3d/latest`` (drocap_ros/Pose3D): its initial pose with the bone
+lengths of the last window, stage INITIAL until there is one.  With the camera's pose and a measured scale both are in
+``map``, else in the camera's optical frame; ``/diagnostics`` says why.
 """
 
 from __future__ import annotations
@@ -11,20 +12,25 @@ import math
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from std_msgs.msg import Header
 
 from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.live.adjuster import SOLVER_ERRORS, LiveAdjuster
+from drocap_ros.reconstruction.live.camera_history import CameraHistory
 from drocap_ros.reconstruction.live.effort import Effort, EffortControl
 from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer
+from drocap_ros.reconstruction.live.latest_place import LatestPlace
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.stamp_join import StampJoin
 from drocap_ros.reconstruction.live.stream_order import StreamEvent
-from drocap_ros.reconstruction.live.window import AdjustedWindow, Window
-from drocap_ros.ros.component import ERROR, OK, ComponentNode
+from drocap_ros.reconstruction.live.window import AdjustedWindow, Telemetry, Window
+from drocap_ros.recording.pose_messages import add_calibration, add_state, float_array
+from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import (
     latest_pose_to_ros,
     pose2d_from_ros,
@@ -35,13 +41,23 @@ from drocap_ros.ros.conversions import (
 from drocap_ros.ros.diagnostics import Key, of
 from drocap_ros.ros.spin import node_main
 
+#: Words of the use of telemetry.
+_WORDS = {
+    Telemetry.NONE: "",
+    Telemetry.LATE: "poses in the camera's frame: the newest images have no reported camera pose",
+    Telemetry.REFUSED: "poses in the camera's frame, telemetry not used: {}",
+    Telemetry.UNSCALED: "poses in the camera's frame: the camera's motion has not measured the scale yet",
+    Telemetry.USED: "poses in the world",
+}
+
 
 class _Solved(NamedTuple):
     """The adjusted window, or why there is none; ``seconds`` on the wall clock."""
 
     result: AdjustedWindow | str
-    frame_id: str
+    header: Header
     track_id: int
+    telemetry_ns: int
     seconds: float
 
 
@@ -50,8 +66,9 @@ class BundleAdjusterNode(ComponentNode):
 
     The period is counted in image stamps, so that a replay at another speed adjusts the same windows.  An adjustment
     ends after the step in which ``max_solve_s`` is over; after a slow one the next takes fewer images.  The message's
-    ``stride`` and ``steps`` state both.  In simulated time an adjustment is never cut, and its result comes with the
-    first image ``max_solve_s`` after the newest one of its window.
+    ``stride`` and ``steps`` state both, its ``telemetry_stamp`` the newest vehicle state that was known.  In simulated
+    time an adjustment is never cut, and its result comes with the first image ``max_solve_s`` after the newest one of
+    its window.
     """
 
     component = "bundle_adjuster"
@@ -63,6 +80,8 @@ class BundleAdjusterNode(ComponentNode):
         self._adjuster = LiveAdjuster(self.config)
         self._control = EffortControl(self.config.max_solve_s, self.config.max_stride)
         self._latest_pose = LatestPose(self.config.blend_s)
+        self._latest_place = LatestPlace(self.config.blend_s)
+        self._cameras = CameraHistory(self.config.window_s)
         self._join: StampJoin[PoseObservation, Pose3D] = StampJoin(self.config.max_pending)
         self._worker = ThreadPoolExecutor(1, "bundle_adjuster")
         self._job: Future[Any] | None = None  # in simulated time of a result that is still to be published
@@ -70,10 +89,13 @@ class BundleAdjusterNode(ComponentNode):
         self._job_due_ns = 0  # in simulated time
         self._sequence = 0
         self._subject_in_view = True
+        self._had_telemetry = False
         self._refined = self.output("pose3d/refined")
         self._latest = self.output("pose3d/latest")
         self.input("pose2d", self._on_pose2d)
         self.input("pose3d/initial", self._on_initial)
+        self.input("vehicle/state", partial(add_state, self._cameras))
+        self.input("camera_info", partial(add_calibration, self._cameras))
 
     def on_stop(self) -> None:
         """In simulated time publish the running adjustment."""
@@ -118,10 +140,9 @@ class BundleAdjusterNode(ComponentNode):
             return
         if event.restarted:
             self._latest_pose.reset()
+            self._latest_place.reset()
         self._take_solution(observation.stamp_ns)
-        latest = self._latest_pose.pose(observation.stamp_ns, joints)
-        self._latest.publish(latest_pose_to_ros(initial, latest, refined=self._latest_pose.corrected))
-        self.count(Key.LATEST_POSES)
+        self._publish_latest(observation, initial, joints)
         if not due:
             return
         if self._is_running(observation.stamp_ns):
@@ -131,8 +152,22 @@ class BundleAdjusterNode(ComponentNode):
         self._job_subject = self._buffer.subject
         self._job_due_ns = observation.stamp_ns + round(self.config.max_solve_s * 1e9)
         work: Callable[..., Any] = self._solve if self.simulated else self._adjust
-        arguments = self._buffer.window(), initial.header.frame_id, observation.track_id, self._control.stride
-        self._job = self._worker.submit(work, *arguments)
+        window = self._buffer.window()
+        window = window._replace(camera=self._cameras.along(window.stamp_ns))
+        arguments = initial.header, observation.track_id, self._cameras.newest_ns, self._control.stride
+        self._job = self._worker.submit(work, window, *arguments)
+
+    def _publish_latest(self, observation: PoseObservation, initial: Pose3D, joints: np.ndarray) -> None:
+        stamp_ns = observation.stamp_ns
+        latest = self._latest_pose.pose(stamp_ns, joints)
+        camera = self._cameras.along(np.array([stamp_ns], np.int64))
+        covariance = float_array(initial.covariance, (len(latest), 6), "covariance").astype(np.float64)
+        keypoints = observation.body_keypoints().xy[: len(latest)]
+        placed = self._latest_place.place(stamp_ns, (latest, covariance), keypoints, camera)
+        message = latest_pose_to_ros(initial, latest, refined=self._latest_pose.corrected, placed=placed)
+        self._latest.publish(message)
+        self.details[Key.FRAME] = message.header.frame_id
+        self.count(Key.LATEST_POSES)
 
     def _is_running(self, stamp_ns: int) -> bool:
         if self._job is None:
@@ -144,15 +179,18 @@ class BundleAdjusterNode(ComponentNode):
         if self._job is None or self._is_running(stamp_ns):
             return
         job, self._job = self._job, None
-        lengths = self._publish(job.result()) if self.simulated else job.result()
-        if lengths is not None and self._job_subject == self._buffer.subject:
-            self._latest_pose.set_solution(lengths, stamp_ns)
+        solution = self._publish(job.result()) if self.simulated else job.result()
+        if solution is not None and self._job_subject == self._buffer.subject:
+            self._latest_pose.set_solution(median_bone_lengths(solution.joints3d), stamp_ns)
+            self._latest_place.set_solution(solution, stamp_ns)
 
-    def _adjust(self, window: Window, frame_id: str, track_id: int, stride: int) -> np.ndarray | None:
-        """Adjust, publish and return the bone lengths, in the worker; None after a failure."""
-        return self._publish(self._solve(window, frame_id, track_id, stride))
+    def _adjust(
+        self, window: Window, header: Header, track_id: int, telemetry_ns: int, stride: int
+    ) -> AdjustedWindow | None:
+        """Adjust, publish and return the solution, in the worker; None after a failure."""
+        return self._publish(self._solve(window, header, track_id, telemetry_ns, stride))
 
-    def _solve(self, window: Window, frame_id: str, track_id: int, stride: int) -> _Solved:
+    def _solve(self, window: Window, header: Header, track_id: int, telemetry_ns: int, stride: int) -> _Solved:
         begin = time.perf_counter()
         deadline = math.inf if self.simulated else begin + self.config.max_solve_s
         try:
@@ -161,9 +199,9 @@ class BundleAdjusterNode(ComponentNode):
             )
         except SOLVER_ERRORS as error:
             result = str(error)
-        return _Solved(result, frame_id, track_id, time.perf_counter() - begin)
+        return _Solved(result, header, track_id, telemetry_ns, time.perf_counter() - begin)
 
-    def _publish(self, solved: _Solved) -> np.ndarray | None:
+    def _publish(self, solved: _Solved) -> AdjustedWindow | None:
         window, seconds = solved.result, solved.seconds
         if isinstance(window, str):
             self.count(Key.ADJUSTMENTS_FAILED)
@@ -175,13 +213,24 @@ class BundleAdjusterNode(ComponentNode):
             self.count(Key.ADJUSTMENTS_CUT)
         if window.effort.stride > 1:
             self.count(Key.ADJUSTMENTS_STRIDED)
-        self._refined.publish(window_to_ros(window, solved.frame_id, solved.track_id, self._sequence, seconds))
+        self._refined.publish(
+            window_to_ros(window, solved.header, solved.track_id, self._sequence, seconds, solved.telemetry_ns)
+        )
         self._sequence += 1
         self.count(Key.ADJUSTMENTS)
         self.produced(int(window.stamp_ns[-1]))
         took = "" if self.simulated else f" in {seconds:.2f} s"
-        self.report(OK, f"{len(window.stamp_ns)} poses{took}: {window.stop_reason}")
-        return median_bone_lengths(window.joints3d)
+        self._report_telemetry(window, f"{len(window.stamp_ns)} poses{took}: {window.stop_reason}")
+        return window
+
+    def _report_telemetry(self, window: AdjustedWindow, done: str) -> None:
+        use = window.telemetry
+        self.details[Key.TELEMETRY] = use.name.lower()
+        self.details[Key.TELEMETRY_REFUSED] = window.reason
+        self._had_telemetry |= use is Telemetry.USED
+        words = _WORDS[use].format(window.reason)
+        refused = use is Telemetry.REFUSED or (self._had_telemetry and use in (Telemetry.NONE, Telemetry.LATE))
+        self.report(WARN if refused else OK, f"{done}; {words}" if words else done)
 
 
 def main() -> int:

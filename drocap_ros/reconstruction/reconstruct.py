@@ -25,8 +25,8 @@ from drocap_ros.reconstruction.methods.run import run_method
 from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.threads import blas_threads
-from drocap_ros.reconstruction.world.placement import metres_per_px, place_in_world
-from drocap_ros.reconstruction.world.refine import PlacedPoses, refine_in_world
+from drocap_ros.reconstruction.world.in_world import in_camera_axes, in_world
+from drocap_ros.reconstruction.world.placement import metres_per_px
 from drocap_ros.reconstruction.world.world_model import WorldConfig, world_config
 from drocap_ros.skeleton import BODY_15, BODY_17, BODY_19, JointSet, body_set
 from drocap_ros.tracks import Tracks
@@ -163,9 +163,8 @@ def _to_motion(
     """The motion, or in words why the telemetry cannot be true."""
     projected = result.joints_px[..., :2] + result.translation_px[:, None]
     reprojection = np.linalg.norm(projected - keypoints.xy, axis=-1)
-    pelvis = BODY_15.index("pelvis")
     per_px = metres_per_px(result.joints_px, tracks.stamp_ns, config.assumed_height_m)
-    joints = (result.joints_px - result.joints_px[:, pelvis][:, None]) * per_px[:, None, None]
+    joints = in_camera_axes(result, per_px)
     metric, scale_source = False, "assumed_height"
     meta: dict[str, Any] = {"assumed_height_m": config.assumed_height_m, "reference_stature_m": REFERENCE_STATURE_M}
     position = covariance = None
@@ -176,37 +175,19 @@ def _to_motion(
         joints[..., :2] *= np.maximum(1.0 + joints[..., 2] / range_m[:, None], 0.1)[..., None]
     if tracks.camera_rotation is not None:
         rotation, frame = tracks.camera_rotation, "world"
-        world = place_in_world(joints, projected, per_px, tracks)
+        world, found = in_world(tracks, keypoints, result, per_px, world_config)
         joints, metric, scale_source = world.joints, world.metric, world.scale_source
         if world.scale is not None:
             meta["scale"] = dataclasses.asdict(world.scale)
         position = tracks.camera_position
-        if result.sigma_px is not None:
-            factor = world.scale.factor if world.metric and world.scale is not None else 1.0
-            size = per_px[:, None]
-            depth = (result.joints_px[..., 2] - result.joints_px[:, [pelvis], 2]) * size
-            found = refine_in_world(
-                tracks,
-                keypoints,
-                PlacedPoses(
-                    joints,
-                    factor,
-                    depth,
-                    result.sigma_px[..., 1] * size,
-                    projected,
-                    result.sigma_px[..., 0],
-                    result.still,
-                ),
-                world_config,
-            )
-            if isinstance(found, str):
-                return found
-            if found is not None:
-                joints, rotation, position, metric = found.joints, found.rotation, found.position, found.metric
-                scale_source = "telemetry" if metric else "assumed_height"
-                covariance = found.covariance
-                reprojection = _reprojection(joints, rotation, position, tracks.camera_matrix, keypoints.xy)
-                meta["calibration"] = found.calibration
+        if isinstance(found, str):
+            return found
+        if found is not None:
+            joints, rotation, position, metric = found.joints, found.rotation, found.position, found.metric
+            scale_source = "telemetry" if metric else "assumed_height"
+            covariance = found.covariance
+            reprojection = _reprojection(joints, rotation, position, tracks.camera_matrix, keypoints.xy)
+            meta["calibration"] = found.calibration
     if covariance is None and result.sigma_px is not None:
         covariance = _covariance(result.sigma_px * per_px[:, None, None], rotation)
     return Motion(

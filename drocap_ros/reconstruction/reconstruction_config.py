@@ -63,6 +63,8 @@ class BundleAdjusterConfig(Parameters):
     rotation_every: int = param(3, "proximal steps per update of the rotations", minimum=1, maximum=1000)
     tolerance: float = param(1e-5, "relative decrease of the cost over 10 steps that ends the solve", minimum=0.0)
     window_s: float = param(12.0, "length of an adjustment window", unit="s", minimum=0.5, maximum=120.0)
+    world_window_s: float = param(6.0, "length of its newest part that the live node adjusts in the world", unit="s",
+                                  minimum=2.0, maximum=120.0)  # fmt: skip
     period_s: float = param(1.0, "time between two adjustments of the live node", unit="s", minimum=0.05, maximum=60.0)
     window_frames: int = param(480, "most frames in a window", minimum=8, maximum=5000)
     overlap_frames: int = param(30, "frames that neighbouring windows of a long recording share", minimum=0,

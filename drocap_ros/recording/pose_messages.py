@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.flight.frames import optical_orientation
 from drocap_ros.observation import PoseObservation
+from drocap_ros.reconstruction.live.camera_history import CameraHistory
+from drocap_ros.recording.session import header_stamp_ns
 from drocap_ros.skeleton import joint_set
 
 if TYPE_CHECKING:
@@ -48,6 +51,21 @@ def observation_from_message(message: Any) -> PoseObservation:
         covariance=covariance,
         confidence=confidence,
     )
+
+
+def add_state(history: CameraHistory, message: Any) -> None:
+    """Give a camera's history a ``VehicleState``; one without position or camera attitude changes nothing."""
+    q = message.gimbal_orientation
+    orientation = optical_orientation(np.array([q.x, q.y, q.z, q.w], np.float64))
+    history.add_pose(header_stamp_ns(message), np.asarray(message.position_enu_m, np.float64), orientation)
+
+
+def add_calibration(history: CameraHistory, message: Any) -> None:
+    """Give a camera's history a ``CameraInfo``; an uncalibrated one changes nothing."""
+    # ROS 2 names the matrix k, ROS 1 names it K.
+    matrix = np.asarray(getattr(message, "k", getattr(message, "K", ())), np.float64)
+    if matrix.size == 9:
+        history.add_matrix(header_stamp_ns(message), matrix.reshape(3, 3))
 
 
 def float_array(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:

@@ -11,12 +11,17 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_msgs.msg import Header
 
 from drocap_ros.flight.vehicle_state import VehicleState as VehicleStateData
+from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.msg import Pose2D, Pose3D, Pose3DWindow, VehicleState
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.calibration import CameraModel
+from drocap_ros.reconstruction.live.latest_place import PlacedPose
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.recording.pose_messages import float_array, observation_from_message
 from drocap_ros.skeleton import BODY_15, BODY_17, joint_set
+
+#: The world's frame: ENU, z up.
+MAP = "map"
 
 
 def stamp_to_ros(stamp_ns: int) -> Time:
@@ -96,8 +101,13 @@ def pose3d_to_ros(
     covariance: np.ndarray,
     confidence: np.ndarray,
     reprojection_rms_px: float,
+    camera_rotation: np.ndarray | None = None,
+    metric: bool = False,
 ) -> Pose3D:
-    """Pose (P, 3) m in the camera's frame, with covariance (P, 6) m^2 -> message; scale and orientation unknown."""
+    """Pose (P, 3) m with covariance (P, 6) m^2 in the header's frame -> message.
+
+    camera_rotation : (3, 3) map -> camera, None = unknown
+    """
     return Pose3D(
         header=header,
         track_id=track_id,
@@ -106,14 +116,33 @@ def pose3d_to_ros(
         joints=floats(joints),
         covariance=floats(covariance),
         confidence=floats(confidence),
-        camera_orientation=quaternion_to_ros(np.full(4, np.nan)),
-        metric=False,
+        camera_orientation=_camera_orientation(camera_rotation),
+        metric=metric,
         reprojection_rms=float(reprojection_rms_px),
     )
 
 
-def latest_pose_to_ros(initial: Pose3D, joints: np.ndarray, *, refined: bool) -> Pose3D:
-    """The initial pose's message with other joints (P, 3) m."""
+def _camera_orientation(rotation: np.ndarray | None) -> Quaternion:
+    return quaternion_to_ros(np.full(4, np.nan) if rotation is None else quaternion_from_matrix(rotation))
+
+
+def latest_pose_to_ros(
+    initial: Pose3D, joints: np.ndarray, *, refined: bool, placed: PlacedPose | None = None
+) -> Pose3D:
+    """The initial pose's message with other joints (P, 3) m, or with those that are placed in ``map``."""
+    if placed is not None:
+        return pose3d_to_ros(
+            Header(stamp=initial.header.stamp, frame_id=MAP),
+            track_id=initial.track_id,
+            stage=Pose3D.REFINED if refined else Pose3D.INITIAL,
+            skeleton=initial.skeleton,
+            joints=placed.joints,
+            covariance=placed.covariance,
+            confidence=np.array(initial.confidence, np.float32),
+            reprojection_rms_px=initial.reprojection_rms,
+            camera_rotation=placed.rotation,
+            metric=True,
+        )
     return Pose3D(
         header=initial.header,
         track_id=initial.track_id,
@@ -129,9 +158,19 @@ def latest_pose_to_ros(initial: Pose3D, joints: np.ndarray, *, refined: bool) ->
 
 
 def window_to_ros(
-    window: AdjustedWindow, frame_id: str, track_id: int, sequence: int, solve_seconds: float
+    window: AdjustedWindow,
+    header: Header,
+    track_id: int,
+    sequence: int,
+    solve_seconds: float,
+    telemetry_ns: int = 0,
 ) -> Pose3DWindow:
-    """Adjusted window -> message."""
+    """Adjusted window -> message.
+
+    header : stamp of the newest image and frame of its initial pose; telemetry_ns : stamp of the newest vehicle state
+    """
+    in_map = window.in_map
+    frame_id = header.frame_id if in_map is None else MAP
     poses = [
         pose3d_to_ros(
             header_at(stamp_ns, frame_id),
@@ -142,11 +181,13 @@ def window_to_ros(
             covariance=window.covariance[i],
             confidence=window.confidence[i],
             reprojection_rms_px=float(window.reprojection_rms_px[i]),
+            camera_rotation=None if in_map is None else in_map.rotation[i],
+            metric=in_map is not None,
         )
         for i, stamp_ns in enumerate(window.stamp_ns)
     ]
     return Pose3DWindow(
-        header=poses[-1].header,
+        header=Header(stamp=header.stamp, frame_id=frame_id),
         poses=poses,
         window_seq=sequence,
         iterations=window.iterations,
@@ -155,6 +196,7 @@ def window_to_ros(
         solve_seconds=solve_seconds,
         stride=window.effort.stride,
         steps=array("I", window.effort.steps or ()),
+        telemetry_stamp=stamp_to_ros(telemetry_ns),
     )
 
 

@@ -49,6 +49,9 @@ class Key:
     LATEST_POSES = "latest_poses"
     ADJUSTMENTS, ADJUSTMENTS_FAILED, ADJUSTMENTS_SKIPPED = "adjustments", "adjustments_failed", "adjustments_skipped"
     ADJUSTMENTS_CUT, ADJUSTMENTS_STRIDED = "adjustments_cut", "adjustments_strided"
+    FRAME = "frame"  # of pose3d/latest
+    TELEMETRY = "telemetry"  # use of the camera's reported poses in the last adjustment
+    TELEMETRY_REFUSED = "telemetry_refused"  # why, in words
     VEHICLE_STATES, SUBJECT_SEEN = "vehicle_states", "subject_seen"
     ORBIT_COMMANDS, ORBIT_COMMANDS_REFUSED = "orbit_commands", "orbit_commands_refused"
     STREAM_RATE = "stream_rate_hz"

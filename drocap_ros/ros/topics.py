@@ -91,7 +91,10 @@ NODES: dict[str, NodeEntry] = {
     "capture_simulator": NodeEntry(("pose2d", "camera_info"), source=True),
     "initializer": NodeEntry(("pose3d/initial",), ("pose2d",), live=True),
     "bundle_adjuster": NodeEntry(
-        ("pose3d/refined", "pose3d/latest"), ("pose2d", "pose3d/initial"), live=True, niceness=15
+        ("pose3d/refined", "pose3d/latest"),
+        ("pose2d", "pose3d/initial", "vehicle/state", "camera_info"),
+        live=True,
+        niceness=15,
     ),
     "mavlink_bridge": NodeEntry(
         ("vehicle/state", "orbit/status", *_TF), ("pose2d", "camera_info", "orbit/status"), live=True

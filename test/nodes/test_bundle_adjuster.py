@@ -6,13 +6,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from telemetry_stream import orbit
 
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
+from drocap_ros.flight.frames import OPTICAL_FROM_FLU
+from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.live_replay import reconstruct_live, recorded_config
 from drocap_ros.observation import PoseObservation
+from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.recording.open_session import open_session
-from drocap_ros.ros.conversions import pose2d_to_ros, stamp_from_ros
+from drocap_ros.ros.conversions import (
+    camera_info_to_ros,
+    header_at,
+    pose2d_to_ros,
+    stamp_from_ros,
+    vehicle_state_to_ros,
+)
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import TOPICS
 from drocap_ros.simulation.capture import simulate_capture
@@ -134,3 +145,77 @@ def test_the_recording_repeats_the_windows_bit_for_bit(flown, tmp_path, late):
         _, _, agreement = reconstruct_live(session, recorded_config(session))
     assert agreement.initial[0] == agreement.initial[1] >= 80
     assert agreement.windows[0] == agreement.windows[1] >= 4
+
+
+@pytest.fixture(scope="module")
+def orbited(tmp_path_factory):
+    """An orbit whose telemetry ends before its images; the session, the messages and the texts of /diagnostics."""
+    folder, flown = tmp_path_factory.mktemp("orbit") / "session", orbit(14.0, begin_ns=BEGIN)
+    config = DrocapConfig().replace("session_recorder", session_dir=str(folder))
+    # A busy machine takes its time here, instead of every fourth image.
+    config = config.replace("bundle_adjuster", max_solve_s=5.0)
+    seen = {topic: [] for topic in ("pose3d/latest", "pose3d/refined", "/diagnostics")}
+    width, height = flown.observations[0].image_size
+    camera = CameraModel(width, height, flown.matrix)
+    gimbal = quaternion_from_matrix(np.swapaxes(OPTICAL_FROM_FLU.T @ flown.rotation, 1, 2))
+    with bringup(config, NODES) as graph:
+        for topic, messages in seen.items():
+            graph.node.create_subscription(TOPICS[topic].message, topic, messages.append, TOPICS[topic].qos)
+        publishers = {
+            topic: graph.node.create_publisher(TOPICS[topic].message, topic, TOPICS[topic].qos)
+            for topic in ("pose2d", "vehicle/state", "camera_info")
+        }
+        graph.wait_until(
+            lambda: [p.get_subscription_count() for p in publishers.values()] == [3, 2, 2], 20, "the nodes to listen"
+        )
+        for i, observation in enumerate(flown.observations):
+            stamp_ns = observation.stamp_ns
+            if stamp_ns < BEGIN + 9.2 * S:
+                state = VehicleState(stamp_ns, position_enu_m=flown.position[i], gimbal_orientation_xyzw=gimbal[i])
+                publishers["vehicle/state"].publish(vehicle_state_to_ros(state))
+            publishers["camera_info"].publish(camera_info_to_ros(header_at(stamp_ns, "camera"), camera))
+            publishers["pose2d"].publish(pose2d_to_ros(observation, "camera"))
+            graph.spin_for(0.066)
+        reports = len(seen["/diagnostics"])
+        graph.wait_until(lambda: len(seen["/diagnostics"]) > reports + 6, 20, "the counts on /diagnostics")
+    texts = [s for m in seen["/diagnostics"] for s in m.status if s.name.endswith("bundle_adjuster")]
+    return folder, flown, seen, texts
+
+
+def test_poses_with_telemetry_are_in_map_and_metric_until_it_stops(orbited):
+    _, flown, seen, texts = orbited
+    place = {int(stamp): i for i, stamp in enumerate(flown.stamp_ns)}
+    frames = [window.header.frame_id for window in seen["pose3d/refined"]]
+    assert frames[0] == frames[-1] == "camera"
+    assert "map" in frames
+    for window in seen["pose3d/refined"]:
+        in_map = window.header.frame_id == "map"
+        assert {(pose.header.frame_id, pose.metric) for pose in window.poses} == {(window.header.frame_id, in_map)}
+        assert in_map == all(np.isfinite(pose.camera_orientation.w) for pose in window.poses)
+    assert {m.header.frame_id for m in seen["pose3d/latest"]} == {"camera", "map"}
+    placed = [m for m in seen["pose3d/latest"] if m.header.frame_id == "map"]
+    off = [
+        np.linalg.norm(np.reshape(m.joints, (-1, 3))[0] - flown.truth[place[stamp_from_ros(m.header.stamp)], 0])
+        for m in placed
+    ]
+    assert np.median(off) < 0.4
+    assert all(m.metric and np.isfinite(m.camera_orientation.w) for m in placed)
+    # 0.1 s after the last state there is no camera pose to hold.
+    assert max(stamp_from_ros(m.header.stamp) for m in placed) < BEGIN + 9.4 * S
+    used = [{v.key: v.value for v in status.values} for status in texts]
+    assert {"used", "late"} <= {values.get(Key.TELEMETRY) for values in used}
+    assert used[-1][Key.FRAME] == "camera"
+    assert texts[-1].level == b"\1"
+    assert "no reported camera pose" in texts[-1].message
+
+
+def test_the_recording_of_windows_in_map_repeats_them_bit_for_bit(orbited):
+    folder = orbited[0]
+    with open_session(folder) as session:
+        motion, _, agreement = reconstruct_live(session, recorded_config(session))
+        assert session.warnings == []
+    windows = len(orbited[2]["pose3d/refined"])
+    assert agreement.initial == [210, 210]
+    assert agreement.windows[0] >= windows >= 5
+    assert agreement.windows[0] == agreement.windows[1]
+    assert motion.frame in ("world", "camera")

@@ -1,16 +1,18 @@
 """Conversions between messages and arrays."""
 
 from array import array
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.msg import Pose3D
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.live.effort import Effort
-from drocap_ros.reconstruction.live.window import AdjustedWindow
+from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap
 from drocap_ros.reconstruction.stop_reason import DEADLINE
 from drocap_ros.ros import conversions as c
 from drocap_ros.skeleton import BODY_15
@@ -115,13 +117,28 @@ def adjusted(effort):
 @pytest.mark.parametrize(("steps", "sent"), [(None, []), ((4, 2), [4, 2]), ((0, 3), [0, 3])])
 def test_a_window_message_states_its_effort(steps, sent):
     window = adjusted(Effort(2, steps))
-    message = c.window_to_ros(window, "camera", 7, 5, 0.25)
+    message = c.window_to_ros(window, c.header_at(int(window.stamp_ns[-1]), "camera"), 7, 5, 0.25)
     assert (message.window_seq, message.stride, list(message.steps)) == (5, 2, sent)
-    assert message.header.frame_id == "camera"
+    assert {m.header.frame_id for m in (message, *message.poses)} == {"camera"}
+    assert not any(pose.metric for pose in message.poses)
     assert c.stamp_from_ros(message.header.stamp) == window.stamp_ns[-1]
     assert {pose.stage for pose in message.poses} == {Pose3D.REFINED}
     for pose, joints in zip(message.poses, window.joints3d, strict=True):
         np.testing.assert_array_equal(c.pose3d_from_ros(pose)[0], joints.astype(np.float32))
+
+
+def test_a_window_in_map_states_frame_scale_camera_and_the_newest_state():
+    rotation = np.stack([matrix_from_quaternion(np.array([0.5, -0.5, 0.1 * i, 0.7])) for i in range(3)])
+    window = replace(adjusted(Effort()), in_map=InMap(rotation, np.zeros((3, 3)), np.zeros(6)))
+    # The newest image is later than the newest pose: the camera's pose there was not known yet.
+    message = c.window_to_ros(window, c.header_at(10**9, "camera"), 7, 5, 0.25, telemetry_ns=950_000_000)
+    assert c.stamp_from_ros(message.header.stamp) == 10**9
+    assert c.stamp_from_ros(message.telemetry_stamp) == 950_000_000
+    assert {m.header.frame_id for m in (message, *message.poses)} == {"map"}
+    for pose, turn in zip(message.poses, rotation, strict=True):
+        q = pose.camera_orientation
+        assert pose.metric
+        np.testing.assert_allclose(matrix_from_quaternion(np.array([q.x, q.y, q.z, q.w])), turn, atol=1e-12)
 
 
 def test_unknown_values_of_the_vehicle_stay_nan():

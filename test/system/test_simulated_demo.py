@@ -11,10 +11,10 @@ from session_contents import session_contents
 
 from drocap_ros.cli import main
 from drocap_ros.flight.orbit.states import State
+from drocap_ros.geometry.interpolation import interpolate
 from drocap_ros.motion import load_motion
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_vehicle_track
-from drocap_ros.recording.telemetry.vehicle_track import interpolate
 from drocap_ros.simulation.flight_simulator.truth import flown_orbit, load_flight_truth
 
 

@@ -10,14 +10,16 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
-from drocap_ros.reconstruction.lifted.body_size import BodySize
-from drocap_ros.reconstruction.lifted.lifted_config import lifted_config
+from drocap_ros.reconstruction.lifted.body_size import BodySize, magnification
+from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig, lifted_config
 from drocap_ros.reconstruction.lifted.method import ACROSS, ALONG, WindowSolution, prepare, solve_window
 from drocap_ros.reconstruction.lifted.window_solver import Cancelled
+from drocap_ros.reconstruction.live.camera_history import WindowCamera
 from drocap_ros.reconstruction.live.effort import Effort
 from drocap_ros.reconstruction.live.paper_adjustment import adjust_by_equations
 from drocap_ros.reconstruction.live.stream_lifter import person_size
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Window
+from drocap_ros.reconstruction.live.world_windows import WorldWindows
 from drocap_ros.reconstruction.paper.bundle_adjustment import MIN_WINDOW
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
@@ -46,6 +48,7 @@ class LiveAdjuster:
             prepare(lifted_config(config))
         self._config = config
         self._known: tuple[int, np.ndarray, BodySize] | None = None
+        self._world = WorldWindows(config)
 
     def adjust(
         self, window: Window, effort: Effort | None = None, cancelled: Cancelled | None = None
@@ -85,14 +88,36 @@ class LiveAdjuster:
         variance = w.keypoints.variance
         covariance = w.keypoints.covariance if variance is not None and np.isfinite(variance[seen]).any() else None
         keypoints = Keypoints2D(np.where(seen[..., None], w.keypoints.xy, np.nan), confidence, covariance)
-        found = solve_window(w.stamp_ns, keypoints, None, config, known=self._sizes(w), cancelled=cancelled)
+        w = w._replace(keypoints=keypoints)
+        camera = w.camera if self._world.trusted else None
+        result, found = self._solve(w, camera, config, effort, cancelled)
+        final = self._world.adjust(w, found, result)
+        if camera is not None and not self._world.trusted:
+            # The lifter saw the camera's rotation: without it the poses differ too.  The same steps repeat this.
+            if (steps := result.effort.steps) is not None:
+                config = replace(config, first_iterations=steps[0], iterations=steps[1])
+            again, found = self._solve(w, None, config, effort, None)
+            final = replace(again, effort=result.effort, telemetry=final.telemetry, reason=final.reason)
+        if len(w.stamp_ns) * effort.stride >= WARM_FRAMES:
+            self._known = (w.subject, w.stamp_ns, found.body)
+        return final
+
+    def _solve(
+        self,
+        w: Window,
+        camera: WindowCamera | None,
+        config: LiftedConfig,
+        effort: Effort,
+        cancelled: Cancelled | None,
+    ) -> tuple[AdjustedWindow, WindowSolution]:
+        """Poses in camera axes and in px, with what is known of the camera."""
+        focal = None if camera is None else camera.focal_px
+        rotation = None if camera is None else camera.rotation
+        found = solve_window(w.stamp_ns, w.keypoints, focal, config, self._sizes(w), cancelled, rotation)
         if not np.isfinite(found.joints).all():
             raise FloatingPointError("the solver found no finite poses")
         steps = found.steps if found.stop_reason == DEADLINE or effort.steps is not None else None
-        result = _adjusted(w, seen, confidence, found, Effort(effort.stride, steps))
-        if len(w.stamp_ns) * effort.stride >= WARM_FRAMES:
-            self._known = (w.subject, w.stamp_ns, found.body)
-        return result
+        return _adjusted(w, found, focal, Effort(effort.stride, steps)), found
 
     def _sizes(self, w: Window) -> BodySize | None:
         if self._known is None or self._known[0] != w.subject:
@@ -103,14 +128,17 @@ class LiveAdjuster:
         return BodySize(body.lengths_mm, size)
 
 
-def _adjusted(
-    w: Window, seen: np.ndarray, confidence: np.ndarray, found: WindowSolution, effort: Effort
-) -> AdjustedWindow:
+def _adjusted(w: Window, found: WindowSolution, focal: float | None, effort: Effort) -> AdjustedWindow:
+    confidence = w.keypoints.weights
+    seen = confidence > 0.0
     gap = np.where(seen[..., None], found.joints[..., :2] - w.keypoints.xy, 0.0)
     rms = np.sqrt(np.sum(gap**2, axis=(1, 2)) / np.maximum(seen.sum(axis=1), 1))
     pelvis = BODY_15.index("pelvis")
     # Each image in its own unit: bones keep their length although the person's size in the image changes.
     joints = (found.joints - found.joints[:, pelvis, None]) / found.body.unit_per_mm[:, None, None]
+    if focal is not None:
+        # The image is a perspective one: joints behind the pelvis lie towards the axis.
+        joints[..., :2] *= magnification(joints[..., 2], focal / found.body.unit_per_mm)
     known = np.isfinite(w.initial_joints).all(axis=(1, 2))
     if not known.any():
         raise InputError("initial_joints: expected a pose in at least one frame, got NaN in all; check the 2D joints")

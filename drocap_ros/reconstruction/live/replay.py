@@ -14,6 +14,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.live.adjuster import SOLVER_ERRORS, LiveAdjuster
+from drocap_ros.reconstruction.live.camera_history import WindowCamera
 from drocap_ros.reconstruction.live.effort import Effort
 from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer
 from drocap_ros.reconstruction.live.initializer import InitialPose, LiveInitializer
@@ -34,7 +35,7 @@ class LivePose(NamedTuple):
 
 
 class LiveWindow(NamedTuple):
-    """An adjusted window as published: joints (F, 17, 3) float32 m in camera axes."""
+    """An adjusted window as published: joints (F, 17, 3) float32 m in the frame of the window."""
 
     joints3d: np.ndarray
     window: AdjustedWindow
@@ -45,6 +46,7 @@ def live_poses(
     initializer: InitializerConfig,
     adjuster: BundleAdjusterConfig,
     effort_at: Callable[[int], Effort | None] | None = None,
+    camera_at: Callable[[np.ndarray], WindowCamera | None] | None = None,
 ) -> Iterator[LivePose | LiveWindow]:
     """Poses and windows in the order of the live graph; memory is that of one window.
 
@@ -53,6 +55,7 @@ def live_poses(
     observations : in the order of their messages; those that the nodes drop are skipped
     effort_at : gives by the stamp of a window's newest image the effort of the live graph, None where it skipped the
         window (one is skipped while another is running); without it all windows that are due, with full effort
+    camera_at : gives the reported camera at the stamps (F,) of a window that is adjusted; without it none is known
     """
     initial, buffer, solver = LiveInitializer(initializer), FrameBuffer(adjuster), LiveAdjuster(adjuster)
     for observation in observations:
@@ -70,8 +73,11 @@ def live_poses(
         effort = (Effort() if effort_at is None else effort_at(observation.stamp_ns)) if due else None
         if effort is None:
             continue
+        window = buffer.window()
+        if camera_at is not None:
+            window = window._replace(camera=camera_at(window.stamp_ns))
         try:
-            result = solver.adjust(buffer.window(), effort)
+            result = solver.adjust(window, effort)
         except SOLVER_ERRORS:
             continue
         yield LiveWindow(result.joints3d.astype(np.float32), result)

@@ -13,6 +13,7 @@ from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.lifted.window_solver import difference_noise
 from drocap_ros.reconstruction.methods.windows import fade_weights, windows
+from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.telemetry_checks import frozen, other_time, resting_feet_move
 from drocap_ros.reconstruction.world.world_adjustment import WorldSolution, adjust_in_world
@@ -39,6 +40,8 @@ _MEASURED = 0.03
 #: Cost of the telemetry per frame that no camera's flight explains, and least share of contacts: jogging has 0.2,
 #: a yaw off by 40 degrees less than 0.01.
 _LARGEST_COST, _LEAST_CONTACT = 100.0, 0.03
+#: Frames per second below which a step of a foot ends between two frames: contacts are not seen.
+_CONTACTS_FPS = 8.0
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,7 @@ class RefinedWorld:
     metric : whether the scale was measured
     covariance : (F, 17, 6) m^2: xx, xy, xz, yy, yz, zz; NaN = unknown
     calibration : JSON-compatible, of every window: errors of the telemetry and their standard deviations
+    found : findings of the last window
     """
 
     joints: np.ndarray
@@ -57,6 +61,7 @@ class RefinedWorld:
     metric: bool
     covariance: np.ndarray
     calibration: list[dict[str, Any]]
+    found: Calibration
 
 
 @dataclass(frozen=True)
@@ -79,11 +84,15 @@ class PlacedPoses:
 
 
 def refine_in_world(
-    tracks: Tracks, keypoints: Keypoints2D, poses: PlacedPoses, config: WorldConfig | None = None
+    tracks: Tracks,
+    keypoints: Keypoints2D,
+    poses: PlacedPoses,
+    config: WorldConfig | None = None,
+    known: Calibration | None = None,
 ) -> RefinedWorld | str | None:
     """Adjust poses and camera; None where the tracks lack a finite camera or are shorter than twelve frames.
 
-    The answer is a reason, in words, where the telemetry cannot be true.
+    The answer is a reason, in words, where the telemetry cannot be true.  ``known`` : findings of earlier windows.
     """
     config = config or WorldConfig()
     rotation, position, matrix = tracks.camera_rotation, tracks.camera_position, tracks.camera_matrix
@@ -119,7 +128,7 @@ def refine_in_world(
     for rows in windows(frames, _WINDOW, _OVERLAP):
         telemetry = CameraTelemetry(turn[rows], path[rows], fps)
         data = WorldInput(
-            points[rows], weight[rows], depth[rows], sigma[rows], lengths, telemetry, matrix, config, seen[rows]
+            points[rows], weight[rows], depth[rows], sigma[rows], lengths, telemetry, matrix, config, seen[rows], known
         )
         found = adjust_in_world(data, body[rows], 1.0 / poses.factor)
         fade = fade_weights(rows, frames, _OVERLAP)
@@ -134,9 +143,9 @@ def refine_in_world(
     covariance = (covariance / total[:, None, None, None])[slot][..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     joints, camera = joints / total[:, None, None] + origin, camera / total[:, None]
     corrected, moved = exp_so3(camera[slot, 3:]) @ rotation, position + camera[slot, :3]
-    if reason := _rejection(cost, contact if config.feet else 1.0):
+    if reason := _rejection(cost, contact if config.feet and fps >= _CONTACTS_FPS else 1.0):
         return reason
-    return RefinedWorld(joints[slot], corrected, moved, measured, covariance, calibration)
+    return RefinedWorld(joints[slot], corrected, moved, measured, covariance, calibration, found.calibration)
 
 
 def _rejection(cost: float, contact: float) -> str:

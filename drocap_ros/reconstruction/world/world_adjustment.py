@@ -13,11 +13,13 @@ import numpy as np
 
 from drocap_ros.reconstruction.banded import backward, band_factor, forward
 from drocap_ros.reconstruction.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
+from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.contacts import contact_probability, floor_std, ground_spread
 from drocap_ros.reconstruction.world.posterior import posterior
 from drocap_ros.reconstruction.world.world_equations import normal_matrix
 from drocap_ros.reconstruction.world.world_model import (
     ANKLES,
+    CALIBRATED,
     CAMERA,
     FEET,
     FLOOR,
@@ -52,6 +54,7 @@ class WorldSolution:
     turned, turned_std : (3,) rad about the gimbal's axes: pitch, yaw, roll
     covariance : (F, 17, 3, 3) m^2 of the joints, NaN = unknown
     ground_spread : m, of the heights of resting feet; NaN = no foot rests
+    calibration : findings of this adjustment's measurements, without those known before
     """
 
     joints: np.ndarray
@@ -62,14 +65,15 @@ class WorldSolution:
     turned_std: np.ndarray
     covariance: np.ndarray
     ground_spread: float
+    calibration: Calibration
     cost_terms: dict[str, float]
     iterations: int
     stop_reason: str
 
 
-def initial_state(data: WorldInput, joints: np.ndarray, scale: float = 1.0) -> WorldState:
-    """The point from joints (F, 17, 3) m of the body."""
-    shared = np.zeros(GLOBALS)
+def initial_state(data: WorldInput, joints: np.ndarray, scale: float, expected: np.ndarray) -> WorldState:
+    """The point from joints (F, 17, 3) m of the body, where earlier findings expect the shared unknowns."""
+    shared = expected.copy()
     shared[LENGTHS], shared[SCALE] = data.lengths, scale
     shared[FLOOR] = np.percentile(joints[:, ANKLES, 2], 10)
     return WorldState(joints, np.zeros((len(joints), CAMERA)), shared)
@@ -78,7 +82,7 @@ def initial_state(data: WorldInput, joints: np.ndarray, scale: float = 1.0) -> W
 def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) -> WorldSolution:
     """Adjust from initial joints (F, 17, 3) m of the body, ``scale`` of which are a metre of the world."""
     config, weights = data.config, weights_of(data)
-    state = initial_state(data, joints, scale)
+    state = initial_state(data, joints, scale, weights.expected)
     stop, done, ground, floor = ITERATIONS, 0, float("nan"), FLOOR_STD_M
     contact: np.ndarray = np.zeros((len(joints) - 1, len(FEET)))
     outlier = Residuals(data, weights, state, contact, 0.0).usual_outlier()
@@ -114,6 +118,7 @@ def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) ->
     std: np.ndarray = np.full(GLOBALS, np.nan)
     axes, turned_std = data.telemetry.gimbal_axes(), np.full(3, np.nan)
     covariance: np.ndarray = np.full((*state.joints.shape, 3), np.nan)
+    calibration = Calibration.unknown()
     if found is not None:
         prior = np.sqrt(fact * np.diag(np.linalg.inv(weights.shared)))
         std = np.minimum(_STD_FACTOR * np.sqrt(fact * np.diag(found.shared)), prior)
@@ -121,6 +126,7 @@ def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) ->
         turns = _STD_FACTOR**2 * fact * axes @ found.shared[MISALIGNMENT, MISALIGNMENT] @ axes.T
         least = fact * axes @ np.linalg.inv(weights.shared[MISALIGNMENT, MISALIGNMENT]) @ axes.T
         turned_std = np.sqrt(np.minimum(np.diag(turns), np.diag(least)))
+        calibration = _findings(fact * found.shared, weights.shared / fact, weights.expected, state.globals)
     return WorldSolution(
         joints=state.joints / state.globals[SCALE],
         state=state,
@@ -130,9 +136,24 @@ def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) ->
         turned_std=turned_std,
         covariance=covariance,
         ground_spread=ground,
+        calibration=calibration,
         cost_terms=final.terms,
         iterations=done,
         stop_reason=stop,
+    )
+
+
+def _findings(covariance: np.ndarray, prior: np.ndarray, expected: np.ndarray, at: np.ndarray) -> Calibration:
+    """What the measurements add to the prior, from the posterior covariance and point of the shared unknowns."""
+    by_log = np.ones(GLOBALS)
+    by_log[SCALE] = at[SCALE]
+    point = at.copy()
+    point[SCALE] = np.log(at[SCALE])
+    after = np.linalg.inv((covariance / by_log / by_log[:, None])[CALIBRATED, CALIBRATED])
+    before = prior[CALIBRATED, CALIBRATED]
+    return Calibration(
+        (after - before) / _STD_FACTOR**2,
+        (after @ point[CALIBRATED] - before @ expected[CALIBRATED]) / _STD_FACTOR**2,
     )
 
 

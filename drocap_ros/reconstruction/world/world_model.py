@@ -13,6 +13,7 @@ import numpy as np
 from drocap_ros.parameters import Parameters, param
 from drocap_ros.reconstruction.lifted.adjustment import SPAN_STD_MM, SPANS
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
+from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.camera_telemetry import CameraPath, CameraTelemetry
 from drocap_ros.skeleton import BODY_15, BODY_17, indices
 
@@ -35,6 +36,8 @@ MISALIGNMENT = slice(SCALE + 1, SCALE + 4)
 ATTITUDE_LATENCY = MISALIGNMENT.stop
 POSITION_LATENCY = ATTITUDE_LATENCY + 1
 GLOBALS = POSITION_LATENCY + 1
+#: The unknowns of a :class:`~drocap_ros.reconstruction.world.calibration.Calibration`.
+CALIBRATED = slice(SCALE, GLOBALS)
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,7 @@ class WorldInput:
     lengths : (18,) m of the body, of the adjustment's spans; the first 14 set the unit
     camera_matrix : (3, 3) px
     seen : (F, 17) bool, the keypoints that a network saw, the others are the lifter's; None = those with a weight
+    known : findings of earlier windows
     """
 
     keypoints: np.ndarray
@@ -123,6 +127,7 @@ class WorldInput:
     camera_matrix: np.ndarray
     config: WorldConfig = field(default_factory=WorldConfig)
     seen: np.ndarray | None = None
+    known: Calibration | None = None
 
     @property
     def fps(self) -> float:

@@ -20,6 +20,7 @@ from drocap_ros.reconstruction.lifted.adjustment import SPANS
 from drocap_ros.reconstruction.world.world_model import (
     ATTITUDE_LATENCY,
     BONES,
+    CALIBRATED,
     CAMERA,
     FEET,
     FEET_HEIGHT_M,
@@ -59,6 +60,7 @@ class Weights(NamedTuple):
 
     wander, first : (6,) of the change of the camera's errors between frames, and of the first ones
     shared : (GLOBALS, GLOBALS) inverse covariance of the priors
+    expected : (GLOBALS,) their means: the logarithm of the scale, and differences from the lifter's lengths
     """
 
     acceleration: float
@@ -67,6 +69,7 @@ class Weights(NamedTuple):
     wander: np.ndarray
     first: np.ndarray
     shared: np.ndarray
+    expected: np.ndarray
 
 
 def weights_of(data: WorldInput) -> Weights:
@@ -86,6 +89,10 @@ def weights_of(data: WorldInput) -> Weights:
     own = _OWN_LATENCY * np.eye(2) + (1.0 - _OWN_LATENCY)
     latencies = slice(ATTITUDE_LATENCY, POSITION_LATENCY + 1)
     shared[latencies, latencies] = np.linalg.inv(config.latency_std_s**2 * own)
+    expected = np.zeros(GLOBALS)
+    if data.known is not None:
+        shared[CALIBRATED, CALIBRATED] += data.known.precision
+        expected[CALIBRATED] = np.linalg.solve(shared[CALIBRATED, CALIBRATED], data.known.vector)
     fact = config.frames_per_fact
     return Weights(
         acceleration=(config.acceleration_m_s2 / fps**2) ** -2,
@@ -94,6 +101,7 @@ def weights_of(data: WorldInput) -> Weights:
         wander=fact * wander,
         first=fact * first,
         shared=fact * shared,
+        expected=expected,
     )
 
 
@@ -155,6 +163,7 @@ class Residuals:
         self.prior = shared.copy()
         self.prior[LENGTHS] -= data.lengths
         self.prior[SCALE] = np.log(shared[SCALE])
+        self.prior -= weights.expected
         self.terms = {
             "reprojection": 0.5 * float((square * self.robust).sum()),
             "lifter_depth": float((weights.depth * (self.rounded - _DEPTH_ROUNDING_M)).sum()),

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drocap_ros.flight.frames import camera_rotation, quaternion_multiply
-from drocap_ros.geometry.interpolation import true_runs
-from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack, interpolate
+from drocap_ros.geometry.interpolation import interpolate, true_runs
+from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack
 from drocap_ros.tracks import Tracks
 
 #: Interpolation over longer gaps than this is reported.

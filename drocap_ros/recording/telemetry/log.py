@@ -10,9 +10,10 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import orientation_to_ros, quaternion_from_euler
+from drocap_ros.geometry.interpolation import interpolate
 from drocap_ros.geometry.rotations import unit_quaternions
 from drocap_ros.recording.telemetry.lens import Lens
-from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack, interpolate
+from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack
 
 _SERIES_GAP_S = 1.0
 

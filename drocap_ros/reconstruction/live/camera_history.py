@@ -1,0 +1,113 @@
+"""The camera's reported poses of the last seconds, and their values at the images of a window."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.geometry.interpolation import MAX_GAP_S, interpolate
+from drocap_ros.geometry.rotations import matrix_from_quaternion, unit_quaternions
+
+#: Poses kept: the longest window at 100 Hz, and the most changes of the calibration.
+_MOST_POSES, _MOST_MATRICES = 15_000, 20
+#: A stamp further back than this restarts the history; others out of order are left out.
+_LATE_NS = 10**9
+#: Images may be so much older than the newest pose.
+_BEHIND_NS = 5 * 10**9
+_GAP_NS = round(MAX_GAP_S * 1e9)
+
+
+class WindowCamera(NamedTuple):
+    """The camera at F images.
+
+    rotation : (F, 3, 3) world (ENU) -> camera, NaN where unknown
+    position : (F, 3) m ENU, NaN where unknown
+    matrix : (3, 3) px
+    """
+
+    rotation: np.ndarray
+    position: np.ndarray
+    matrix: np.ndarray
+
+    @property
+    def known(self) -> np.ndarray:
+        """(F,) bool."""
+        known: np.ndarray = np.isfinite(self.position).all(axis=1) & np.isfinite(self.rotation).all(axis=(1, 2))
+        return known
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length."""
+        return 0.5 * float(self.matrix[0, 0] + self.matrix[1, 1])
+
+    def frames(self, use: slice) -> WindowCamera:
+        """The camera at some of the images."""
+        return self._replace(rotation=self.rotation[use], position=self.position[use])
+
+
+class CameraHistory:
+    """Takes reported poses and calibrations in the order of their arrival; the same order gives the same answers.
+
+    Parameters
+    ----------
+    keep_s : length of the longest window
+    """
+
+    def __init__(self, keep_s: float) -> None:
+        self._keep_ns = round(keep_s * 1e9) + _BEHIND_NS
+        self._stamps: list[int] = []
+        self._poses: list[np.ndarray] = []
+        self._matrices: list[tuple[int, np.ndarray]] = []
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest pose; 0 = there is none."""
+        return self._stamps[-1] if self._stamps else 0
+
+    def add_pose(self, stamp_ns: int, position: np.ndarray, orientation: np.ndarray) -> None:
+        """Take a pose: position (3,) m ENU, orientation (4,) x y z w optical frame -> ENU; one with NaN is left out."""
+        pose = np.concatenate([position, unit_quaternions(orientation[None])[0]])
+        if not np.isfinite(pose).all():
+            return
+        if self._stamps and stamp_ns <= self._stamps[-1]:
+            if self._stamps[-1] - stamp_ns <= _LATE_NS:
+                return
+            self._stamps.clear()
+            self._poses.clear()
+        self._stamps.append(stamp_ns)
+        self._poses.append(pose)
+        old = max(bisect_left(self._stamps, stamp_ns - self._keep_ns), len(self._stamps) - _MOST_POSES)
+        del self._stamps[:old], self._poses[:old]
+
+    def add_matrix(self, stamp_ns: int, matrix: np.ndarray) -> None:
+        """Take the calibration (3, 3) px of the image of a stamp; an unusable one is left out."""
+        if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
+            return
+        if not self._matrices or not np.array_equal(self._matrices[-1][1], matrix):
+            self._matrices = [*self._matrices[1 - _MOST_MATRICES :], (stamp_ns, matrix)]
+
+    def along(self, stamp_ns: np.ndarray) -> WindowCamera | None:
+        """The camera at images of increasing stamps (F,); None where no pose or no calibration is known.
+
+        Between two poses up to 2 s apart values are interpolated; beyond the newest one they hold for 0.1 s.
+        """
+        matrix = self._matrix(int(stamp_ns[-1]))
+        if matrix is None or not self._stamps:
+            return None
+        begin = bisect_left(self._stamps, int(stamp_ns[0]) - _GAP_NS)
+        end = bisect_right(self._stamps, int(stamp_ns[-1]) + _GAP_NS)
+        if begin == end:
+            unknown = np.full((len(stamp_ns), 3, 3), np.nan)
+            return WindowCamera(unknown, unknown[:, 0], matrix)
+        known_ns, poses = np.array(self._stamps[begin:end], np.int64), np.array(self._poses[begin:end])
+        position, _ = interpolate(known_ns, poses[:, :3], stamp_ns, spherical=False)
+        orientation, _ = interpolate(known_ns, poses[:, 3:], stamp_ns, spherical=True)
+        rotation = np.swapaxes(matrix_from_quaternion(orientation), 1, 2)
+        return WindowCamera(rotation, position, matrix)
+
+    def _matrix(self, stamp_ns: int) -> np.ndarray | None:
+        """Calibration of the last change up to a stamp; the first one before that."""
+        before = [matrix for since_ns, matrix in self._matrices if since_ns <= stamp_ns]
+        return before[-1] if before else self._matrices[0][1] if self._matrices else None

@@ -1,0 +1,127 @@
+"""Live windows in the world: the adjustment of ``world/``, with its findings as the prior of the next window.
+
+A frame's information counts once: a window hands on its share of the frames that the next one has no longer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
+from drocap_ros.geometry.interpolation import true_runs
+from drocap_ros.geometry.rotations import log_so3
+from drocap_ros.reconstruction.lifted.method import WindowSolution
+from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, Telemetry, Window
+from drocap_ros.reconstruction.methods.method_input import CameraPoses
+from drocap_ros.reconstruction.methods.windows import split
+from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
+from drocap_ros.reconstruction.world.calibration import Calibration
+from drocap_ros.reconstruction.world.in_world import in_world
+from drocap_ros.reconstruction.world.placement import metres_per_px
+from drocap_ros.reconstruction.world.refine import RefinedWorld
+from drocap_ros.reconstruction.world.world_model import world_config
+from drocap_ros.skeleton import BODY_17
+from drocap_ros.tracks import Tracks
+
+#: Steps of a window, and those that lock feet: most frames have been adjusted in the windows before.
+_STEPS, _LOCKING_STEPS = 4, 1
+#: The newest images may lack a reported pose for so long, and shorter windows than this determine nothing.
+_LATE_S, _LEAST_S = 0.5, 2.0
+
+
+class WorldWindows:
+    """Adjusts one window after the other; what was found out is forgotten with the subject."""
+
+    def __init__(self, config: BundleAdjusterConfig) -> None:
+        self._config = replace(world_config(config), iterations=_STEPS, locking_iterations=_LOCKING_STEPS)
+        self._length_ns = round(config.world_window_s * 1e9)
+        self._subject: int | None = None
+        self._known = Calibration.unknown()
+        #: The window before: its first and last stamp, and its findings.
+        self._before: tuple[int, int, Calibration] | None = None
+        #: Whether the last window's telemetry was true: the lifter may see the camera's rotation.
+        self.trusted = False
+
+    def adjust(self, w: Window, found: WindowSolution, camera_result: AdjustedWindow) -> AdjustedWindow:
+        """The window's result in ``map``, or that in the camera's axes with the use of the telemetry.
+
+        Parameters
+        ----------
+        w : its keypoints are NaN where not seen
+        found : the window's poses in px
+        camera_result : its result in camera axes
+        """
+        if w.subject != self._subject:
+            self._subject, self._known, self._before = w.subject, Calibration.unknown(), None
+        result = self._adjust(w, found, camera_result)
+        self.trusted = result.telemetry in (Telemetry.USED, Telemetry.UNSCALED)
+        return result
+
+    def _adjust(self, w: Window, found: WindowSolution, camera_result: AdjustedWindow) -> AdjustedWindow:
+        if w.camera is None:
+            return camera_result
+        use = self._frames(w)
+        if use is None:
+            return replace(camera_result, telemetry=Telemetry.LATE)
+        camera, stamps, keypoints = w.camera.frames(use), w.stamp_ns[use], w.keypoints[use]
+        tracks = Tracks(
+            keypoints.xy, BODY_17.joints, stamps, (1, 1), camera_rotation=camera.rotation,
+            camera_position=camera.position, camera_matrix=camera.matrix,
+        )  # fmt: skip
+        poses = CameraPoses(*split(found.joints[use]), {}, 0, "", {}, sigma_px=found.sigma[use], still=found.still[use])
+        per_px = metres_per_px(poses.joints_px, stamps, _assumed_height(w.initial_joints))
+        known = self._prior(stamps)
+        _, refined = in_world(tracks, keypoints, poses, per_px, self._config, known)
+        if refined is None:
+            return replace(camera_result, telemetry=Telemetry.LATE)
+        if isinstance(refined, str):
+            return replace(camera_result, telemetry=Telemetry.REFUSED, reason=refined)
+        self._known, self._before = known, (int(stamps[0]), int(stamps[-1]), refined.found)
+        if not refined.metric:
+            return replace(camera_result, telemetry=Telemetry.UNSCALED)
+        return replace(
+            camera_result,
+            stamp_ns=stamps,
+            joints3d=refined.joints,
+            covariance=refined.covariance,
+            confidence=camera_result.confidence[use],
+            reprojection_rms_px=camera_result.reprojection_rms_px[use],
+            telemetry=Telemetry.USED,
+            in_map=InMap(refined.rotation, refined.position, _correction(refined, tracks)),
+        )
+
+    def _prior(self, stamps: np.ndarray) -> Calibration:
+        """Findings of earlier windows that the window of these stamps has not itself."""
+        if self._before is None:
+            return self._known
+        begin, end, found = self._before
+        share = float(np.clip((int(stamps[0]) - begin) / max(end - begin, 1), 0.0, 1.0))
+        return self._known.later(found, share, max(int(stamps[-1]) - end, 0) * 1e-9)
+
+    def _frames(self, w: Window) -> slice | None:
+        """The last seconds, as far as the camera is known all the time."""
+        assert w.camera is not None
+        runs = true_runs(w.camera.known)
+        if not len(runs):
+            return None
+        begin, end = (int(i) for i in runs[-1])
+        stamps = w.stamp_ns
+        begin = max(begin, int(np.searchsorted(stamps, stamps[end - 1] - self._length_ns)))
+        if stamps[-1] - stamps[end - 1] > _LATE_S * 1e9 or stamps[end - 1] - stamps[begin] < _LEAST_S * 1e9:
+            return None
+        return slice(begin, end)
+
+
+def _correction(refined: RefinedWorld, tracks: Tracks) -> np.ndarray:
+    assert tracks.camera_rotation is not None
+    assert tracks.camera_position is not None
+    turned = refined.rotation[-1:] @ np.swapaxes(tracks.camera_rotation[-1:], 1, 2)
+    return np.concatenate([refined.position[-1] - tracks.camera_position[-1], log_so3(turned)[0]])
+
+
+def _assumed_height(initial: np.ndarray) -> float:
+    """Stature (m) that the initial poses (F, 17, 3) m assume."""
+    known = np.isfinite(initial).all(axis=(1, 2))
+    return float(np.median(limb_lengths(initial[known]).sum(axis=-1)) / LIMBS_PER_STATURE)

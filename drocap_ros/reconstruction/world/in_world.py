@@ -1,0 +1,54 @@
+"""Poses in the image to poses in the world: placed by the reported camera, then adjusted together with it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.methods.method_input import CameraPoses
+from drocap_ros.reconstruction.world.calibration import Calibration
+from drocap_ros.reconstruction.world.placement import WorldPoses, place_in_world
+from drocap_ros.reconstruction.world.refine import PlacedPoses, RefinedWorld, refine_in_world
+from drocap_ros.reconstruction.world.world_model import WorldConfig
+from drocap_ros.skeleton import BODY_15
+from drocap_ros.tracks import Tracks
+
+_PELVIS = BODY_15.index("pelvis")
+
+
+def in_camera_axes(poses: CameraPoses, per_px: np.ndarray) -> np.ndarray:
+    """(F, P, 3) m in the camera's axes, pelvis at the origin, at (F,) metres per px."""
+    joints: np.ndarray = (poses.joints_px - poses.joints_px[:, _PELVIS][:, None]) * per_px[:, None, None]
+    return joints
+
+
+def in_world(
+    tracks: Tracks,
+    keypoints: Keypoints2D,
+    poses: CameraPoses,
+    per_px: np.ndarray,
+    config: WorldConfig,
+    known: Calibration | None = None,
+) -> tuple[WorldPoses, RefinedWorld | str | None]:
+    """Poses placed by ``tracks.camera_rotation`` and, with the camera's position and matrix, adjusted with it.
+
+    Parameters
+    ----------
+    keypoints : of the method's joints
+    per_px : (F,) metres per px at the assumed stature
+    known : findings of earlier windows
+
+    Returns
+    -------
+    WorldPoses, and as of :func:`~drocap_ros.reconstruction.world.refine.refine_in_world`
+    """
+    projected = poses.joints_px[..., :2] + poses.translation_px[:, None]
+    placed = place_in_world(in_camera_axes(poses, per_px), projected, per_px, tracks)
+    if poses.sigma_px is None:
+        return placed, None
+    size = per_px[:, None]
+    depth = (poses.joints_px[..., 2] - poses.joints_px[:, [_PELVIS], 2]) * size
+    factor = placed.scale.factor if placed.metric and placed.scale is not None else 1.0
+    sigma = poses.sigma_px
+    given = PlacedPoses(placed.joints, factor, depth, sigma[..., 1] * size, projected, sigma[..., 0], poses.still)
+    return placed, refine_in_world(tracks, keypoints, given, config, known)

@@ -1,0 +1,166 @@
+"""What a recording holds of the live graph's results, and of the camera as the graph knew it at each of them."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections import defaultdict, deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from drocap_ros.reconstruction.live.camera_history import CameraHistory, WindowCamera
+from drocap_ros.reconstruction.live.effort import Effort
+from drocap_ros.reconstruction.live.replay import LiveWindow
+from drocap_ros.recording.pose_messages import add_calibration, add_state
+from drocap_ros.recording.session import (
+    CAMERA_INFO,
+    POSE3D,
+    POSE3D_WINDOW,
+    VEHICLE_STATE,
+    Session,
+    header_stamp_ns,
+)
+
+_INITIAL = 1  # Pose3D.INITIAL
+
+
+@dataclass
+class Agreement:
+    """Offline results compared with the published ones, bit for bit.
+
+    initial, windows : number compared, number equal
+    """
+
+    initial: list[int] = field(default_factory=lambda: [0, 0])
+    windows: list[int] = field(default_factory=lambda: [0, 0])
+
+    def __str__(self) -> str:
+        return (
+            f"equal to the live graph bit for bit: {self.initial[1]} of {self.initial[0]} initial poses,"
+            f" {self.windows[1]} of {self.windows[0]} windows"
+        )
+
+
+class RecordedCamera:
+    """The camera's history as the live graph had it at each of its adjustments; messages are streamed."""
+
+    def __init__(self, session: Session, near: str, keep_s: float) -> None:
+        base = near.rsplit("/", 1)[0]
+        self._history = CameraHistory(keep_s)
+        self._states = _messages(session, VEHICLE_STATE, f"{base}/vehicle/state")
+        self._next = next(self._states, None)
+        for message in _messages(session, CAMERA_INFO, f"{base}/camera_info"):
+            add_calibration(self._history, message)
+        self.matrix: np.ndarray | None = None
+
+    def along(self, stamp_ns: np.ndarray, newest_ns: int) -> WindowCamera | None:
+        """The camera at a window's images (F,), by the states up to that of the stamp ``newest_ns``."""
+        history = self._history
+        while self._next is not None and history.newest_ns != newest_ns:
+            if history.newest_ns < newest_ns < header_stamp_ns(self._next):
+                break  # the recording lacks that state
+            add_state(history, self._next)
+            self._next = next(self._states, None)
+        camera = history.along(stamp_ns)
+        self.matrix = self.matrix if camera is None else camera.matrix
+        return camera
+
+
+class PublishedPoses:
+    """Results of the live graph; a stamp repeats where a recording was played in a loop."""
+
+    def __init__(self, session: Session, near: str) -> None:
+        base = near.rsplit("/", 1)[0]
+        # Fingerprints save memory: the windows of half an hour overlap twelvefold.
+        self._initial: defaultdict[int, deque[bytes]] = defaultdict(deque)
+        self._windows: deque[_PublishedWindow] = deque()
+        self._current: _PublishedWindow | None = None
+        self.agreement = Agreement()
+        for m in _messages(session, POSE3D, f"{base}/pose3d/initial"):
+            if m.stage == _INITIAL:
+                self._initial[header_stamp_ns(m)].append(_fingerprint(_joints(m)))
+        for m in _messages(session, POSE3D_WINDOW, f"{base}/pose3d/refined"):
+            stamps = np.array([header_stamp_ns(pose) for pose in m.poses], np.int64)
+            joints = np.array([_joints(pose) for pose in m.poses])
+            self._windows.append(
+                _PublishedWindow(header_stamp_ns(m), _fingerprint(stamps, joints), _effort(m), _telemetry_ns(m))
+            )
+        self.has_windows = bool(self._windows)
+
+    def effort_at(self, stamp_ns: int) -> Effort | None:
+        """Effort of the window that ends here, the next in order; None when the graph adjusted none."""
+        ahead = next((i for i, w in enumerate(self._windows) if w.stamp_ns == stamp_ns), None)
+        if ahead is None or any(w.stamp_ns > stamp_ns for w in islice(self._windows, ahead)):
+            return None
+        for _ in range(ahead + 1):
+            self._current = self._windows.popleft()
+        assert self._current is not None
+        return self._current.effort
+
+    @property
+    def telemetry_ns(self) -> int:
+        """Of the window that :meth:`effort_at` returned last: stamp of the newest state that it knew, 0 = none."""
+        return 0 if self._current is None else self._current.telemetry_ns
+
+    def compare_initial(self, stamp_ns: int, joints: np.ndarray) -> None:
+        """Compare with the published pose of the same stamp, if any."""
+        theirs = self._initial.get(stamp_ns)
+        if theirs:
+            _count(self.agreement.initial, theirs.popleft() == _fingerprint(joints))
+
+    def compare_window(self, result: LiveWindow) -> None:
+        """Compare with the window that :meth:`effort_at` returned last."""
+        theirs, self._current = self._current, None
+        if theirs is not None:
+            equal = theirs.fingerprint == _fingerprint(result.window.stamp_ns, result.joints3d)
+            _count(self.agreement.windows, equal)
+
+
+class _PublishedWindow(NamedTuple):
+    stamp_ns: int
+    fingerprint: bytes
+    effort: Effort
+    telemetry_ns: int
+
+
+def _telemetry_ns(window: Any) -> int:
+    """Stamp of the newest vehicle state that a Pose3DWindow knew; recordings older than the field used none."""
+    stamp = getattr(window, "telemetry_stamp", None)
+    return 0 if stamp is None else int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def _effort(window: Any) -> Effort:
+    """Effort of a Pose3DWindow; recordings older than its field ``stride`` hold it in the stop reason."""
+    if hasattr(window, "stride"):
+        return Effort(int(window.stride), (int(window.steps[0]), int(window.steps[1])) if len(window.steps) else None)
+    stride = re.search(r"every (\d+)\. image", window.stop_reason)
+    steps = re.search(r"(\d+) \+ (\d+) steps", window.stop_reason)
+    return Effort(int(stride[1]) if stride else 1, (int(steps[1]), int(steps[2])) if steps else None)
+
+
+def _messages(session: Session, kind: str, name: str) -> Iterator[Any]:
+    """Messages of a topic, none when the session lacks it."""
+    if any(topic.name == name for topic in session.topics_of(kind)):
+        yield from (message for _, message in session.messages((name,)))
+
+
+def _fingerprint(*arrays: np.ndarray) -> bytes:
+    """Equal only where every bit is; any NaN counts as any other."""
+    digest = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        digest.update(str(array.shape).encode())
+        digest.update(np.where(np.isnan(array), np.float32(np.nan), array).astype(array.dtype).tobytes())
+    return digest.digest()
+
+
+def _count(pair: list[int], equal: bool) -> None:
+    pair[0] += 1
+    pair[1] += equal
+
+
+def _joints(message: Any) -> np.ndarray:
+    return np.asarray(message.joints, np.float32).reshape(-1, 3)

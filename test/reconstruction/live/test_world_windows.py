@@ -1,0 +1,194 @@
+"""Live windows in the world: near the truth with telemetry, in the camera's axes without, and the latest pose there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from telemetry_stream import FPS, Orbit, orbit
+
+from drocap_ros.evaluation.metrics import pa_mpjpe
+from drocap_ros.evaluation.world_errors import WorldErrors, world_errors
+from drocap_ros.geometry.rotations import exp_so3, quaternion_from_matrix
+from drocap_ros.observation import PoseObservation
+from drocap_ros.reconstruction.live.camera_history import WindowCamera
+from drocap_ros.reconstruction.live.latest_place import LatestPlace
+from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
+from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
+from drocap_ros.reconstruction.live.window import Telemetry
+from drocap_ros.reconstruction.reconstruct import reconstruct
+from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.tracks import Tracks
+
+S = 10**9
+ADJUSTER = BundleAdjusterConfig()
+CameraAt = Callable[[np.ndarray], WindowCamera | None]
+
+
+def run(observations: list[PoseObservation], camera_at: CameraAt) -> list[LivePose | LiveWindow]:
+    return list(live_poses(observations, InitializerConfig(), ADJUSTER, camera_at=camera_at))
+
+
+def windows_of(results: list[LivePose | LiveWindow]) -> list[LiveWindow]:
+    return [r for r in results if isinstance(r, LiveWindow)]
+
+
+@lru_cache(maxsize=1)
+def flown() -> Orbit:
+    return orbit(13.0)
+
+
+@lru_cache(maxsize=1)
+def followed() -> list[LivePose | LiveWindow]:
+    return run(flown().observations, flown().history(keep_s=60.0).along)
+
+
+def errors(poses: dict[int, np.ndarray], truth: Orbit) -> WorldErrors:
+    place = {int(stamp): i for i, stamp in enumerate(truth.stamp_ns)}
+    stamps = sorted(poses)
+    return world_errors(np.array([poses[s] for s in stamps], float), truth.truth[[place[s] for s in stamps]], FPS)
+
+
+def newest(windows: list[LiveWindow]) -> dict[int, np.ndarray]:
+    return {int(s): j for w in windows for s, j in zip(w.window.stamp_ns, w.joints3d, strict=True)}
+
+
+def test_windows_with_telemetry_are_in_map_and_as_near_the_truth_as_offline() -> None:
+    windows = windows_of(followed())
+    use = [w.window.telemetry for w in windows]
+    # Too short at first, then without a measured scale.
+    assert use[0] is Telemetry.LATE
+    first = use.index(Telemetry.USED)
+    assert first < 12
+    assert set(use[first:]) == {Telemetry.USED}
+    found = [w for w in windows if w.window.in_map is not None]
+    for w in found:
+        assert w.window.in_map is not None
+        assert len(w.window.stamp_ns) == len(w.joints3d) == len(w.window.covariance) == len(w.window.in_map.rotation)
+        assert np.linalg.norm(w.window.in_map.correction[:3]) < 0.2
+    live = errors(newest(found), flown())
+    o = flown().observations
+    tracks = Tracks(
+        np.array([x.keypoints for x in o], float), o[0].joints.joints, flown().stamp_ns, o[0].image_size,
+        np.array([x.confidence for x in o], float), np.array([x.covariance for x in o], float), flown().rotation,
+        flown().position, flown().matrix,
+    )  # fmt: skip
+    motion = reconstruct(tracks)
+    part = {int(s): j for s, j in zip(motion.stamp_ns, motion.joints3d, strict=True) if int(s) in newest(found)}
+    offline = errors(part, flown())
+    assert live.absolute_mm < 1.5 * offline.absolute_mm + 20.0
+    assert live.w_mm < 1.5 * offline.w_mm + 20.0
+    assert live.absolute_mm < 150.0
+    assert abs(live.scale) < 0.03
+    assert live.foot_m_s < 0.25
+
+
+def test_findings_are_carried_from_window_to_window() -> None:
+    """After the orbit the camera stands still: no window of its own measures the scale any more."""
+    still = orbit(21.0, action="stand")
+    stop = round(10.0 * FPS)
+    held = still.history(keep_s=60.0)
+
+    def camera_at(stamp_ns: np.ndarray) -> WindowCamera | None:
+        return held.along(np.minimum(stamp_ns, still.stamp_ns[stop]))
+
+    # The person is projected again, as the standing camera sees her.
+    joints = still.truth
+    at = np.minimum(np.arange(len(joints)), stop)
+    seen = (joints - still.position[at][:, None]) @ np.swapaxes(still.rotation[at], 1, 2)
+    image = seen[..., :2] / seen[..., 2:] * np.diagonal(still.matrix)[:2] + still.matrix[:2, 2]
+    noise = np.random.default_rng(0).normal(0.0, 1.5, image.shape)
+    stream = [
+        replace(o, keypoints=p.astype(np.float32)) for o, p in zip(still.observations, image + noise, strict=True)
+    ]
+    use = [w.window.telemetry for w in windows_of(run(stream, camera_at))]
+    assert use[-1] is Telemetry.USED
+    # Without the orbit before, the same last seconds measure no scale.
+    alone = [w.window.telemetry for w in windows_of(run(stream[stop:], camera_at))]
+    assert Telemetry.USED not in alone
+    assert alone[-1] is Telemetry.UNSCALED
+
+
+def test_windows_fall_back_to_the_camera_when_telemetry_stops() -> None:
+    history = flown().history(slice(0, round(10.0 * FPS)), keep_s=60.0)
+    windows = windows_of(run(flown().observations, history.along))
+    use = {round(float(w.window.stamp_ns[-1] / S), 1): w.window for w in windows}
+    assert use[9.3].telemetry is Telemetry.USED
+    for last in (11.3, 12.3):
+        w = use[last]
+        assert w.telemetry is Telemetry.LATE
+        assert w.in_map is None
+        # Camera axes, pelvis at the origin, all images of the window.
+        assert np.abs(w.joints3d[:, 0]).max() < 1e-9
+        assert w.stamp_ns[-1] - w.stamp_ns[0] > 10.5 * S
+
+
+@pytest.mark.parametrize("kind", ["yaw", "frozen", "other time"])
+def test_wrong_telemetry_is_refused_and_bends_no_body(kind: str) -> None:
+    true = flown()
+    rotation, position = true.rotation.copy(), true.position.copy()
+    if kind == "yaw":
+        turn = exp_so3(np.array([0.0, 0.0, np.deg2rad(40.0)]))
+        rotation = rotation @ turn
+    elif kind == "frozen":
+        stop = round(8.0 * FPS)
+        rotation[stop:], position[stop:] = rotation[stop], position[stop]
+    else:
+        late = round(2.0 * FPS)
+        rotation, position = np.roll(rotation, late, axis=0), np.roll(position, late, axis=0)
+        rotation[:late], position[:late] = rotation[late], position[late]
+    history = replace(true, rotation=rotation, position=position).history(keep_s=60.0)
+    windows = windows_of(run(true.observations, history.along))
+    last = windows[-1].window
+    assert last.telemetry is Telemetry.REFUSED
+    assert last.in_map is None
+    assert "feet" in last.reason or "foot" in last.reason or "stops" in last.reason
+    # The poses are those of a graph without telemetry.
+    without = windows_of(run(true.observations, lambda stamp_ns: None))[-1]
+    place = np.searchsorted(true.stamp_ns, last.stamp_ns)
+    bent, free = (pa_mpjpe(w.joints3d.astype(float), true.truth[place]).mean() for w in (windows[-1], without))
+    assert bent < 1.05 * free + 0.001
+
+
+def test_another_subject_starts_without_the_findings_of_the_first() -> None:
+    second = orbit(6.0, begin_ns=40 * S, track_id=2)
+    history = flown().history(keep_s=100.0)
+    for stamp, position, turn in zip(second.stamp_ns.tolist(), second.position, second.rotation, strict=True):
+        history.add_pose(stamp, position, quaternion_from_matrix(turn.T))
+    both = windows_of(run([*flown().observations, *second.observations], history.along))
+    alone = windows_of(run(second.observations, history.along))
+    for a, b in zip(alone, both[-len(alone) :], strict=True):
+        assert a.window.telemetry is b.window.telemetry
+        np.testing.assert_array_equal(a.joints3d, b.joints3d)
+
+
+def test_the_latest_pose_is_in_its_place_in_map() -> None:
+    true = flown()
+    history = true.history(keep_s=60.0)
+    lengths, latest = LatestPose(0.5), LatestPlace(0.5)
+    poses: dict[int, np.ndarray] = {}
+    for result in followed():
+        if isinstance(result, LiveWindow):
+            # Half a second later in the graph; at once here.
+            now = int(result.window.stamp_ns[-1])
+            lengths.set_solution(median_bone_lengths(result.window.joints3d), now)
+            latest.set_solution(result.window, now)
+            continue
+        o = result.observation
+        rigid = lengths.pose(o.stamp_ns, result.joints3d.astype(float))
+        camera = history.along(np.array([o.stamp_ns], np.int64))
+        placed = latest.place(o.stamp_ns, (rigid, result.pose.covariance), o.keypoints.astype(float), camera)
+        if placed is not None:
+            poses[o.stamp_ns] = placed.joints
+            assert placed.covariance.shape == (17, 6)
+    found = errors(poses, true)
+    assert len(poses) > 30
+    assert found.absolute_mm < 250.0
+    # Without the camera's pose there is no place.
+    assert latest.place(o.stamp_ns, (rigid, result.pose.covariance), o.keypoints.astype(float), None) is None
+    unsolved = next(r.window for r in followed() if isinstance(r, LiveWindow) and r.window.in_map is None)
+    latest.set_solution(unsolved, o.stamp_ns)
+    assert latest.place(o.stamp_ns, (rigid, result.pose.covariance), o.keypoints.astype(float), camera) is None
