@@ -2,8 +2,8 @@
 
 Subscribes ``pose2d``, ``pose3d/initial``, ``pose3d/latest`` and ``vehicle/state``; publishes ``markers/keypoints``
 (visualization_msgs/ImageMarker), ``markers/initial``, ``markers/latest`` and ``markers/camera_path``
-(visualization_msgs/MarkerArray) and the joints of the newest pose on TF.  With ``human_topics`` it also publishes the
-subject by REP 155, see :mod:`drocap_ros.ros.rep155`.
+(visualization_msgs/MarkerArray) and the joints of the newest pose on TF, those of the latest one where it is in
+``map``.  With ``human_topics`` it also publishes the subject by REP 155, see :mod:`drocap_ros.ros.rep155`.
 """
 
 from __future__ import annotations
@@ -12,12 +12,11 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import TransformStamped
 from visualization_msgs.msg import MarkerArray
 
 from drocap_ros.msg import Pose2D, Pose3D, VehicleState
 from drocap_ros.ros.component import OK, WARN, ComponentNode
-from drocap_ros.ros.conversions import pose3d_from_ros, stamp_from_ros
+from drocap_ros.ros.conversions import MAP, pose3d_from_ros, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.markers import body_transforms, keypoint_marker, path_marker, pose_markers
 from drocap_ros.ros.rep155 import MISSING, HumanTopics, hri, human_transforms
@@ -27,6 +26,8 @@ from drocap_ros.view.rate_limit import RateLimit
 
 #: Time after which a marker without a successor disappears.
 INITIAL_LIFETIME_S, LATEST_LIFETIME_S = 0.5, 3.0
+#: Time after a pose in ``map`` in which initial poses, whose place is unknown, are not on TF.
+_PLACED_NS = 10**9
 
 
 class VisualizerNode(ComponentNode):
@@ -44,7 +45,7 @@ class VisualizerNode(ComponentNode):
         self._tf = self.output("/tf") if TFMessage is not None else None
         self._pace = {stage: RateLimit(self.config.marker_rate_hz) for stage in ("initial", "latest")}
         self._path: deque[np.ndarray] = deque(maxlen=self.config.path_points)
-        self._path_ns = -(10**18)
+        self._path_ns = self._placed_ns = -(10**18)
         self._humans = HumanTopics(self, self.config.frame_prefix) if self.config.human_topics and hri else None
         if self.config.human_topics and hri is None:
             self.get_logger().warning(MISSING)
@@ -62,23 +63,29 @@ class VisualizerNode(ComponentNode):
         pose3d_from_ros(message)  # refuses a malformed pose even when it is not drawn
         if self._pace["initial"].due(stamp_from_ros(message.header.stamp)):
             self._initial.publish(pose_markers(message, INITIAL_LIFETIME_S))
-        if self._tf is not None and (transforms := self._transforms(message)):
-            self._tf.publish(TFMessage(transforms=transforms))
+        if abs(stamp_from_ros(message.header.stamp) - self._placed_ns) > _PLACED_NS:
+            self._publish_transforms(message)
         self.count(Key.POSES)
         if self.config.human_topics and self._humans is None:
             self.report(WARN, f"drawing; {MISSING}")
         else:
             self.report(OK, "drawing")
 
-    def _transforms(self, message: Pose3D) -> list[TransformStamped]:
+    def _publish_transforms(self, message: Pose3D) -> None:
         prefix = self.config.frame_prefix
         human = human_transforms(message, prefix) if self.config.human_topics else []
-        return body_transforms(message, prefix) + human
+        transforms = body_transforms(message, prefix) + human
+        if self._tf is not None and transforms:
+            self._tf.publish(TFMessage(transforms=transforms))
 
     def _on_latest(self, message: Pose3D) -> None:
         pose3d_from_ros(message)
-        if self._pace["latest"].due(stamp_from_ros(message.header.stamp)):
+        stamp_ns = stamp_from_ros(message.header.stamp)
+        if self._pace["latest"].due(stamp_ns):
             self._latest.publish(pose_markers(message, LATEST_LIFETIME_S))
+        if message.header.frame_id == MAP:
+            self._placed_ns = stamp_ns
+            self._publish_transforms(message)
 
     def _on_state(self, message: VehicleState) -> None:
         stamp_ns = stamp_from_ros(message.header.stamp)

@@ -133,8 +133,12 @@ class LatestPlace:
         passed = (stamp_ns - self._begin_ns) / self._blend_ns if self._blend_ns else 1.0
         if self._before is None or passed >= 1.0:
             return self._solution
-        share = max(passed, 0.0)
-        return _Solution(*((1.0 - share) * a + share * b for a, b in zip(self._before, self._solution, strict=True)))
+        share, old, new = max(passed, 0.0), self._before, self._solution
+        return _Solution(
+            (1.0 - share) * old.correction + share * new.correction,
+            (1.0 - share) * old.factor + share * new.factor,
+            (1.0 - share) * old.place + share * new.place,
+        )
 
 
 def _covariance(packed: np.ndarray, rotation: np.ndarray, sight: np.ndarray) -> np.ndarray:
