@@ -24,6 +24,7 @@ _EXCESS = 1.1  # of ArduPilot's real distances over the predicted ones: lag, win
 PX4_POSITION_GAIN = 0.95  # 1/s, of its position loop (MPC_XY_P)
 _PULL = 0.6  # 1/s: so much of it is left, the rest makes up for friction (recorded flights lie 1 m behind their place)
 _PX4_DELAY_S, _PX4_FOLLOWS_S, _PX4_BRAKING = 0.1, 0.5, 1.4  # s, s, m/s^2: measured
+_PX4_PUSH_S = 0.3  # s: its velocity loop passes acceleration on; with more, recorded flights stop too soon
 _STANDING_M_S = {"ardupilot": 0.2, "px4": 0.5}
 _CREEP_M = 0.8  # PX4 creeps at up to 0.4 m/s for seconds (measured)
 
@@ -56,7 +57,7 @@ def coast_of(setpoint: Setpoint, position: np.ndarray, velocity: np.ndarray, aut
     place, moving = complex(*position[:2]), complex(*velocity[:2])
     goal, wanted, push = (complex(*v[:2]) for v in (setpoint.position, setpoint.velocity, setpoint.acceleration))
     if autopilot == "px4":
-        return _px4(place, moving, goal, wanted, timeout_s)
+        return _px4(place, moving, goal, wanted + _PX4_PUSH_S * push, timeout_s)
     return _ardupilot(place, moving, goal, wanted, push, timeout_s)
 
 

@@ -281,7 +281,8 @@ class OrbitController:
             )  # fmt: skip
             setpoint = setpoint_of(self._orbit, seen.position, estimate.position, estimate.velocity, config)
             setpoint = self._shortfall.added(setpoint, seen, estimate.position, self._orbit.centre_velocity)
-            setpoint = self._guard.limit(slowed(setpoint, pace, config.max_acceleration_m_s2), seen)
+            setpoint = slowed(setpoint, pace, config.max_acceleration_m_s2)
+            setpoint = self._guard.limit(setpoint, seen, -seen.approach_m_s)
             setpoint, self._unsafe = harmless(setpoint, seen, estimate.velocity, self.safety.fence_centre, self._limits)
             self._shortfall.learn(setpoint, seen, dt)
         elif action == Action.HOLD and self.safety.hold_position is not None:

@@ -21,7 +21,7 @@ _C = ConditionCode
 _USUAL_SUBJECT_AGE_S = 0.24  # a camera at 15 Hz, and 0.17 s for its network
 _STANDING_AGE = 5 / 6  # of max_subject_age_s, 0.33 s: the last moving setpoint
 _CONTRADICTED_PACE = 0.3
-_AWAY_S = 1.0
+_AWAY_S, _COMES_M_S = 1.0, 0.3
 _WHOLE_WAY_PACE = 0.3  # below it the setpoint is nearer than the reference
 _CHANGE = 0.6  # 1/s; how fast a vehicle of 2 m/s brakes and accelerates, 1.2 m/s^2
 
@@ -55,7 +55,8 @@ def allowed_pace(seen: Observed, limits: Limits) -> Allowed:
                 allowed = Allowed(pace, condition(code, age_s=age_s))
     if allowed.cause is None:  # the reference waits by itself
         allowed = allowed._replace(cause=keeping_condition(seen, limits, _AWAY_S))
-    framed = framed_pace(seen.framing_margin)
+    # A slower orbit gives way more slowly: a subject who comes nearer leaves the picture, and is near.
+    framed = min(max(framed_pace(seen.framing_margin), seen.approach_m_s / _COMES_M_S), 1.0)
     if framed < allowed.pace:
         allowed = Allowed(framed, condition(_C.SUBJECT_AT_BORDER, margin_percent=100 * seen.framing_margin))
     return allowed

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.orbit.coast import Coast, coast_of, greatest_speed
+from drocap_ros.flight.orbit.coast import PX4_POSITION_GAIN, Coast, coast_of, greatest_speed
 from drocap_ros.flight.orbit.planner import OrbitGoal
 from drocap_ros.flight.orbit.states import Limits, Observed
 from drocap_ros.flight.setpoint import Setpoint, hold_setpoint
@@ -35,7 +35,10 @@ class _Use(NamedTuple):
 
 #: PX4's estimate wanders by up to 0.9 m while the vehicle stops, and the vehicle follows it.  With less than this it
 #: falls behind subjects who walk at 1.4 m/s, and loses them.
-_USES, _USE = {"px4": _Use(0.63, 0.82)}, _Use(0.75, 1.0)
+_USES, _USE = {"px4": _Use(0.63, 0.82)}, _Use(0.75, 0.935)
+#: A far place lets PX4 fly faster than predicted: a vehicle that caught up with a walking subject went on for 3.1 m.
+#: Greatest speed of setpoint and way together beyond a steady flight's, m/s, and share of the subject's speed added.
+_PULLED_M_S, _PULLED_BEHIND = 0.3, 0.25
 _NEARER_M = 1.0
 _SLACK_M, _SLACK_M_S = 0.2, 0.1  # what the vehicle has already is no effect of the setpoint
 _SHIPPED_S = {"ardupilot": 3.0, "px4": 1.0}  # time-outs, where they are not reported
@@ -75,7 +78,10 @@ def harmless(
     fence_centre : (2,) m; None = there is no fence
     """
     problem: Condition | None = None
-    longest = _use(seen).greatest * limits.safety.max_coast_m
+    longest, fastest = _use(seen).greatest * limits.safety.max_coast_m, math.inf
+    if seen.autopilot == "px4":
+        walking = float(np.hypot(*subject_velocity[:2]))
+        fastest = coast_speed(seen, limits) + _PULLED_M_S + _PULLED_BEHIND * walking
     tries = [(share, share) for share in _SHARES]
     if seen.autopilot == "px4" and seen.subject is not None:
         tries = [(_SHARES[0], share) for share in _ACROSS] + [(share, min(share, _ACROSS[-1])) for share in _SHARES[1:]]
@@ -89,10 +95,16 @@ def harmless(
         part = setpoint._replace(position=seen.position + way, velocity=velocity, acceleration=acceleration)
         coast = coast_of(part, seen.position, seen.velocity, seen.autopilot, _timeout_s(seen))
         problem = _danger(coast, seen, complex(*subject_velocity[:2]), fence_centre, limits)
+        long = coast.length_m > longest or _pulled(part, seen) > fastest
         # A coast that is only long is not shorter after a hold: the slowest setpoint is sent.
-        if problem is None and (coast.length_m <= longest or along == _SHARES[-1]):
+        if problem is None and (not long or along == _SHARES[-1]):
             return part, None
     return hold_setpoint(seen.position, seen.yaw), problem
+
+
+def _pulled(setpoint: Setpoint, seen: Observed) -> float:
+    """Speed (m/s) that PX4 commands: of the setpoint, and of the way to its place."""
+    return float(np.hypot(*(setpoint.velocity + PX4_POSITION_GAIN * (setpoint.position - seen.position))[:2]))
 
 
 def _shared(vector: np.ndarray, seen: Observed, along: float, across: float) -> np.ndarray:

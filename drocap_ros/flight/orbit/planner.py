@@ -21,11 +21,9 @@ _FREE_LEAD = 0.6  # share of the greatest lead, below which the reference does n
 _CENTRE_RATE = 3.0  # 1/s; a slower centre is an error of the radius, a faster one passes on the estimate's noise
 _CENTRE_ACCELERATION = 8.0  # m/s^2; above any acceleration of a subject, so it limits only jumps
 _FORWARD_S = 0.5  # s; filter of the centre's acceleration
-_FORWARD_RATE, _MAX_FORWARD = (
-    0.4,
-    0.5,
-)  # 1/s, m/s^2: so much of it is passed on, by the centre's speed: noise if it stands
-_MAX_HASTE = 0.3  # m/s^2 along the path that the setpoint passes on: the reference waits for a vehicle that lags
+#: 1/s, m/s^2: so much of it is passed on, by the centre's speed beyond that of one who stands: noise.
+_FORWARD_RATE, _MAX_FORWARD = 0.5, 0.5
+_MAX_HASTE = 0.12  # m/s^2 along the path that the setpoint passes on: the reference waits for a vehicle that lags
 _STANDING_M_S, _SURPRISE_S, _FLIGHT_ERROR_M = 0.3, 0.5, 0.5  # of the least radius
 _CALIBRATION_S = 15.0  # against the wanted direction, with calibrate_telemetry
 _WORST_RANGE = 5.0  # of size_error: 40 % where the body is not measured, as by a wrong lens or a child
@@ -204,9 +202,10 @@ def setpoint_of(
     c, s = math.cos(state.phase), math.sin(state.phase)
     outward, along = np.array([c, s]), np.array([-s, c])
     r, omega = state.radius, state.omega
+    walking = max(float(np.hypot(*state.centre_velocity)) - _STANDING_M_S, 0.0)
     flat_velocity = state.centre_velocity + r.rate * outward + r.value * omega.value * along
     flat_acceleration = (
-        _limited(state.centre_acceleration, min(_FORWARD_RATE * float(np.hypot(*state.centre_velocity)), _MAX_FORWARD))
+        _limited(state.centre_acceleration, min(_FORWARD_RATE * walking, _MAX_FORWARD))
         + (r.acceleration - omega.value**2 * r.value) * outward
         + (min(max(r.value * omega.rate, -_MAX_HASTE), _MAX_HASTE) + 2 * r.rate * omega.value) * along
     )

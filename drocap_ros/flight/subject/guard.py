@@ -6,7 +6,7 @@ slows down at once.
 
 No setpoint moves faster towards the subject than ``max_closing_m_s``, and than leaves room to stop before
 ``min_distance_m`` if the body is smaller than assumed.  A subject who recedes may be followed as fast as his image
-surely shrinks: while it keeps its size, following does not close.
+surely shrinks, and little faster than his estimated place recedes: while it keeps its size, following does not close.
 """
 
 from __future__ import annotations
@@ -30,8 +30,12 @@ _ACCELERATION = 0.7  # m/s^2: standard deviation of the change of the subject's 
 _MAX_BENDING, _BENT = 0.3, 4.0  # a bent body looks smaller: its size counts for less
 _BEARING_GATE, _SIZE_GATE = 4.0, 0.35  # standard deviations across the sight; share of the range along it
 _SURE = 0.5  # standard deviations of the speed at which he walks away that are left out
-_AWAY_M_S2 = 0.4  # growth of the speed at which he may be followed: a body that swings or crouches shrinks too
+#: m/s over the square of the seconds for which he recedes: the speed at which he may be followed.  A body that swings
+#: or crouches shrinks too, for a second or two.
+_AWAY = 0.14
 _RESTART_S = 1.0
+_OVERSHOOT = 0.85  # of the greatest closing speed that a setpoint has: the vehicle overshoots
+_SURELY_M_S = 0.1  # so much faster than by the estimated place he may recede by his image, which shrinks as he bends
 _POSITION_GAIN = 1.0  # 1/s, of both autopilots' position loops: 1.0 (PSC_POSXY_P) and 0.95 (MPC_XY_P)
 _REACTION_S = 0.5
 
@@ -93,15 +97,19 @@ class Guard:
             subject_distance_m=min(seen.subject_distance_m, farthest),
         )  # fmt: skip
 
-    def limit(self, setpoint: Setpoint, seen: Observed) -> Setpoint:
-        """The setpoint that may be sent in the step of the last :meth:`doubt`."""
+    def limit(self, setpoint: Setpoint, seen: Observed, receding_m_s: float = math.inf) -> Setpoint:
+        """The setpoint that may be sent in the step of the last :meth:`doubt`.
+
+        receding_m_s : speed at which the subject walks away by another estimate
+        """
         if self._state is None:
             return setpoint
         distance, inward, _ = self._sight(seen.position)
         nearest = (1 - 2 * self._size_error) * distance
         room = math.sqrt(2 * self._braking * max(nearest - self._orbit.min_distance_m, 0.0))
         receding = min(self._receding(inward, self._now()), self._away)
-        allowed = min(max(self._orbit.max_closing_m_s + receding, 0.0), room)
+        receding = min(receding, max(receding_m_s, 0.0) + _SURELY_M_S)
+        allowed = min(max(_OVERSHOOT * self._orbit.max_closing_m_s + receding, 0.0), room)
         return _bounded(
             setpoint, seen.position, seen.velocity, inward, distance, allowed, self._orbit.max_acceleration_m_s2
         )
@@ -138,7 +146,8 @@ class Guard:
         assert self._state is not None
         sight = self._state[:2] - camera
         receding = self._receding(sight / max(float(np.hypot(*sight)), 1e-3), (self._state, self._covariance))
-        self._away = max(min(receding, self._away + _AWAY_M_S2 * min(gap_s, 0.5)), 0.0)
+        receding_s = math.sqrt(self._away / _AWAY) + min(gap_s, 0.5)
+        self._away = max(min(receding, _AWAY * receding_s**2), 0.0)
 
     def _predicted(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
         assert self._state is not None

@@ -73,6 +73,13 @@ def test_a_vehicle_at_rest_stays(autopilot):
     assert math.isfinite(steady(0.0, autopilot).time_s[-1])
 
 
+def test_acceleration_lengthens_the_coast_of_px4():
+    velocity, zero = np.array([1.2, 0.0, 0.0]), np.zeros(3)
+    plain, pushed = (Setpoint(zero, velocity, np.array([a, 0.0, 0.0]), 0.0, 0.0) for a in (0.0, 0.8))
+    lengths = [coast_of(last, zero, velocity, "px4", 0.5).length_m for last in (plain, pushed)]
+    assert lengths[1] > lengths[0] + 0.1
+
+
 def test_a_place_far_ahead_lengthens_the_coast_of_px4():
     velocity, zero = np.array([1.2, 0.0, 0.0]), np.zeros(3)
     near, far = (Setpoint(np.array([way, 0.0, 0.0]), velocity, zero, 0.0, 0.0) for way in (0.4, 1.4))

@@ -86,6 +86,15 @@ def test_following_is_no_closing_while_the_image_keeps_its_size():
     assert asked(guard, place, now, 2.2, own=0.8)[0] < 1.5
 
 
+def test_a_person_who_stays_in_place_is_not_followed_however_his_image_shrinks():
+    guard, place, now = flown(lambda t: -1.4 * t, lambda t: -1.4 * t)
+    seen = dataclasses.replace(GOOD, position=place, velocity=np.zeros(3))
+    guard.doubt(seen, np.zeros(3), now)
+    setpoint = STILL._replace(position=place, velocity=np.array([-2.2, 0.0, 0.0]))
+    assert -guard.limit(setpoint, seen, 0.0).velocity[0] == pytest.approx(0.85 + 0.1)
+    assert -guard.limit(setpoint, seen, 1.4).velocity[0] > 1.7
+
+
 def test_no_speed_towards_a_person_whose_image_is_large():
     guard, place, now = flown(lambda t: 2.9, lambda t: 0.0)  # 3.1 m; 2.6 m if he is 1.43 m tall
     assert asked(guard, place, now, 1.0)[0] < 0.35

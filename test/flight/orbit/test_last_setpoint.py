@@ -8,7 +8,7 @@ import pytest
 
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
-from drocap_ros.flight.orbit.coast import coast_of
+from drocap_ros.flight.orbit.coast import PX4_POSITION_GAIN, coast_of
 from drocap_ros.flight.orbit.last_setpoint import coast_speed, harmless, slowed_condition
 from drocap_ros.flight.orbit.planner import OrbitGoal
 from drocap_ros.flight.orbit.states import Limits, Observed
@@ -64,6 +64,18 @@ def test_px4_falls_behind_along_the_orbit_before_it_yields_the_radius():
     assert (sent.position - now.position)[1] < 1.2
     coast = coast_of(sent, now.position, now.velocity, "px4", 0.5)
     assert coast.length_m <= 0.82 * LIMITS.safety.max_coast_m
+
+
+def test_px4_is_not_pulled_to_a_far_place_faster_than_it_may_fly():
+    now = seen(velocity=(0.0, 0.9, 0.0), by="px4")
+    for way, walking in ((1.4, 0.0), (1.4, 1.4), (0.2, 0.0)):
+        wanted = flight(now, acceleration=ZERO)._replace(position=now.position + np.array([0.0, way, 0.0]))
+        sent = sent_of(wanted, now, np.array([0.0, walking, 0.0]), CENTRE, LIMITS)
+        assert isinstance(sent, Setpoint)
+        commanded = sent.velocity[1] + PX4_POSITION_GAIN * (sent.position - now.position)[1]
+        assert commanded <= coast_speed(now, LIMITS) + 0.3 + 0.25 * walking
+        assert sent.velocity[1] == pytest.approx(0.9)
+    assert sent.position[1] == pytest.approx(now.position[1] + 0.2)
 
 
 @pytest.mark.parametrize("speed", [1.0, 2.0])

@@ -103,6 +103,9 @@ def test_the_margin_now_follows_the_lean():
     assert 0.0 < slowed.pace < 0.5
     assert slowed.cause.code == ConditionCode.SUBJECT_AT_BORDER
     assert allowed_pace(dataclasses.replace(FRESH, framing_margin=0.2), limits).pace == 1.0
+    # From a person who comes nearer a slower orbit would not give way.
+    coming = dataclasses.replace(FRESH, framing_margin=last.framing_margin, approach_m_s=0.8)
+    assert allowed_pace(coming, limits).pace == 1.0
     assert orbit_margin(View(MATRIX, SIZE, math.radians(-11)), goal_of(CONFIG), 1.7, 0.0) > 0.1
 
 
