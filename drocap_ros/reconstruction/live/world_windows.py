@@ -20,13 +20,13 @@ from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.in_world import in_world
 from drocap_ros.reconstruction.world.placement import metres_per_px
-from drocap_ros.reconstruction.world.refine import RefinedWorld
+from drocap_ros.reconstruction.world.refine import Before, RefinedWorld
 from drocap_ros.reconstruction.world.world_model import world_config
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
 
-#: Steps of a window, and those that lock feet: most frames have been adjusted in the windows before.
-_STEPS, _LOCKING_STEPS = 4, 1
+#: Steps of a first window, and of one that continues another; and those of both that lock feet.
+_STEPS, _FEWER_STEPS, _LOCKING_STEPS = 4, 2, 1
 #: The newest images may lack a reported pose for so long, and shorter windows than this determine nothing.
 _LATE_S, _LEAST_S = 0.5, 2.0
 
@@ -39,8 +39,8 @@ class WorldWindows:
         self._length_ns = round(config.world_window_s * 1e9)
         self._subject: int | None = None
         self._known = Calibration.unknown()
-        #: The window before: its first and last stamp, and its findings.
-        self._before: tuple[int, int, Calibration] | None = None
+        #: The window before and its findings.
+        self._before: tuple[Before, Calibration] | None = None
         #: Whether the last window's telemetry was true: the lifter may see the camera's rotation.
         self.trusted = False
 
@@ -73,12 +73,15 @@ class WorldWindows:
         poses = CameraPoses(*split(found.joints[use]), {}, 0, "", {}, sigma_px=found.sigma[use], still=found.still[use])
         per_px = metres_per_px(poses.joints_px, stamps, _assumed_height(w.initial_joints))
         known = self._prior(stamps)
-        _, refined = in_world(tracks, keypoints, poses, per_px, self._config, known)
+        before = None if self._before is None or stamps[0] > self._before[0].stamp_ns[-1] else self._before[0]
+        config = self._config if before is None else replace(self._config, iterations=_FEWER_STEPS)
+        _, refined = in_world(tracks, keypoints, poses, per_px, config, known, before)
         if refined is None:
             return replace(camera_result, telemetry=Telemetry.LATE)
         if isinstance(refined, str):
+            self._before = None
             return replace(camera_result, telemetry=Telemetry.REFUSED, reason=refined)
-        self._known, self._before = known, (int(stamps[0]), int(stamps[-1]), refined.found)
+        self._known, self._before = known, (refined.before, refined.found)
         if not refined.metric:
             return replace(camera_result, telemetry=Telemetry.UNSCALED)
         return replace(
@@ -96,7 +99,8 @@ class WorldWindows:
         """Findings of earlier windows that the window of these stamps has not itself."""
         if self._before is None:
             return self._known
-        begin, end, found = self._before
+        (before, *_), found = self._before
+        begin, end = int(before[0]), int(before[-1])
         share = float(np.clip((int(stamps[0]) - begin) / max(end - begin, 1), 0.0, 1.0))
         return self._known.later(found, share, max(int(stamps[-1]) - end, 0) * 1e-9)
 

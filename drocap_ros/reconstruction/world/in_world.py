@@ -8,7 +8,7 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.methods.method_input import CameraPoses
 from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.placement import WorldPoses, place_in_world
-from drocap_ros.reconstruction.world.refine import PlacedPoses, RefinedWorld, refine_in_world
+from drocap_ros.reconstruction.world.refine import Before, PlacedPoses, RefinedWorld, refine_in_world
 from drocap_ros.reconstruction.world.world_model import WorldConfig
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
@@ -29,6 +29,7 @@ def in_world(
     per_px: np.ndarray,
     config: WorldConfig,
     known: Calibration | None = None,
+    before: Before | None = None,
 ) -> tuple[WorldPoses, RefinedWorld | str | None]:
     """Poses placed by ``tracks.camera_rotation`` and, with the camera's position and matrix, adjusted with it.
 
@@ -36,7 +37,7 @@ def in_world(
     ----------
     keypoints : of the method's joints
     per_px : (F,) metres per px at the assumed stature
-    known : findings of earlier windows
+    known, before : findings of earlier windows, and the last of them
 
     Returns
     -------
@@ -51,4 +52,4 @@ def in_world(
     factor = placed.scale.factor if placed.metric and placed.scale is not None else 1.0
     sigma = poses.sigma_px
     given = PlacedPoses(placed.joints, factor, depth, sigma[..., 1] * size, projected, sigma[..., 0], poses.still)
-    return placed, refine_in_world(tracks, keypoints, given, config, known)
+    return placed, refine_in_world(tracks, keypoints, given, config, known, before)

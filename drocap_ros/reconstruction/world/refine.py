@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,18 +20,24 @@ from drocap_ros.reconstruction.world.world_adjustment import WorldSolution, adju
 from drocap_ros.reconstruction.world.world_model import (
     ANKLES,
     ATTITUDE_LATENCY,
+    CALIBRATED,
     CAMERA,
+    GLOBALS,
     MISALIGNMENT,
     POSITION_LATENCY,
     SCALE,
     WorldConfig,
     WorldInput,
+    WorldState,
 )
+from drocap_ros.reconstruction.world.world_residuals import WANDER_S
 from drocap_ros.tracks import Tracks
 
 _LEAST_FRAMES = 12
 #: Frames that are adjusted together, and that neighbouring windows of a long recording share.
 _WINDOW, _OVERLAP = 960, 48
+#: Frames whose solution a live window takes over from the one before: two hold place and speed.
+_HELD = 2
 _LEAST_NOISE_PX = 0.5
 #: Weight of the lifter's image position of a joint that is not seen: its errors last for many frames.
 _GUESS_WEIGHT = 0.1
@@ -52,7 +58,7 @@ class RefinedWorld:
     metric : whether the scale was measured
     covariance : (F, 17, 6) m^2: xx, xy, xz, yy, yz, zz; NaN = unknown
     calibration : JSON-compatible, of every window: errors of the telemetry and their standard deviations
-    found : findings of the last window
+    found : findings of the last window; before : that window, for the next one
     """
 
     joints: np.ndarray
@@ -62,6 +68,20 @@ class RefinedWorld:
     covariance: np.ndarray
     calibration: list[dict[str, Any]]
     found: Calibration
+    before: Before
+
+
+class Before(NamedTuple):
+    """The solution of the window before, of N frames.
+
+    stamp_ns : (N,); joints : (N, 17, 3) m in the world; wander : (N, 6) slow errors of the reported camera
+    shared : (GLOBALS,)
+    """
+
+    stamp_ns: np.ndarray
+    joints: np.ndarray
+    wander: np.ndarray
+    shared: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -89,10 +109,12 @@ def refine_in_world(
     poses: PlacedPoses,
     config: WorldConfig | None = None,
     known: Calibration | None = None,
+    before: Before | None = None,
 ) -> RefinedWorld | str | None:
     """Adjust poses and camera; None where the tracks lack a finite camera or are shorter than twelve frames.
 
-    The answer is a reason, in words, where the telemetry cannot be true.  ``known`` : findings of earlier windows.
+    The answer is a reason, in words, where the telemetry cannot be true.  ``known`` : findings of earlier windows;
+    ``before`` : the last of them, which a live window continues.
     """
     config = config or WorldConfig()
     rotation, position, matrix = tracks.camera_rotation, tracks.camera_position, tracks.camera_matrix
@@ -102,8 +124,8 @@ def refine_in_world(
         return None
     slot, fps = even_slots(tracks.stamp_ns)
     frames = int(slot[-1]) + 1
-    # A common origin near the path: the scale turns about it.
-    origin = position.mean(axis=0)
+    # The scale turns about the origin: near the camera's path, or the held person.
+    origin = position.mean(axis=0) if before is None else _held_pelvis(before, int(tracks.stamp_ns[0]))
     weight = np.zeros((frames, keypoints.xy.shape[1]))
     points = np.zeros((*weight.shape, 2))
     seen = np.zeros(weight.shape, bool)
@@ -119,6 +141,8 @@ def refine_in_world(
         return reason
     if poses.still is not None and (reason := resting_feet_move(poses_at, _at_all_slots(poses.still, slot), fps)):
         return reason
+    start, held = _start(tracks.stamp_ns, (poses.joints - origin) / poses.factor, origin, 1.0 / poses.factor, before)
+    start = start._replace(joints=_at_all_slots(start.joints, slot), wander=_at_all_slots(start.wander, slot))
     joints: np.ndarray = np.zeros(body.shape)
     camera: np.ndarray = np.zeros((frames, CAMERA))
     covariance: np.ndarray = np.zeros((*body.shape, 3))
@@ -130,7 +154,8 @@ def refine_in_world(
         data = WorldInput(
             points[rows], weight[rows], depth[rows], sigma[rows], lengths, telemetry, matrix, config, seen[rows], known
         )
-        found = adjust_in_world(data, body[rows], 1.0 / poses.factor)
+        state = WorldState(start.joints[rows], start.wander[rows], start.shared)
+        found = adjust_in_world(data, start.joints[rows], start=state, held=held)
         fade = fade_weights(rows, frames, _OVERLAP)
         joints[rows] += fade[:, None, None] * found.joints
         camera[rows] += fade[:, None] * _correction(found, telemetry)
@@ -145,7 +170,39 @@ def refine_in_world(
     corrected, moved = exp_so3(camera[slot, 3:]) @ rotation, position + camera[slot, :3]
     if reason := _rejection(cost, contact if config.feet and fps >= _CONTACTS_FPS else 1.0):
         return reason
-    return RefinedWorld(joints[slot], corrected, moved, measured, covariance, calibration, found.calibration)
+    last = Before(tracks.stamp_ns, joints[slot], found.state.camera[slot], found.state.globals)
+    return RefinedWorld(joints[slot], corrected, moved, measured, covariance, calibration, found.calibration, last)
+
+
+def _held_pelvis(before: Before, stamp_ns: int) -> np.ndarray:
+    """(3,) m of the first held frame."""
+    at = min(int(np.searchsorted(before.stamp_ns, stamp_ns)), len(before.stamp_ns) - 1)
+    pelvis: np.ndarray = before.joints[at, 0]
+    return pelvis
+
+
+def _start(
+    stamp_ns: np.ndarray, body: np.ndarray, origin: np.ndarray, scale: float, before: Before | None
+) -> tuple[Before, int]:
+    """The point to start from, joints in m of the body about ``origin``, and the number of held frames.
+
+    Frames of the window before start from its solution, and the first ones keep it: the path goes on without a step.
+    """
+    wander, shared = np.zeros((len(body), CAMERA)), np.zeros(GLOBALS)
+    shared[SCALE] = scale
+    common = np.isin(stamp_ns, () if before is None else before.stamp_ns)
+    if before is None or not common[:_HELD].all():
+        return Before(stamp_ns, body, wander, shared), 0
+    theirs = np.searchsorted(before.stamp_ns, stamp_ns[common])
+    shared[CALIBRATED] = before.shared[CALIBRATED]
+    joints, last = body.copy(), int(np.flatnonzero(common)[-1])
+    joints[common] = (before.joints[theirs] - origin) * shared[SCALE]
+    joints[last + 1 :] += joints[last, 0] - body[last, 0]
+    passed_s = float(stamp_ns[-1] - before.stamp_ns[-1]) * 1e-9
+    # The errors' steps from frame to frame have no pull to zero: without this they would drift on an endless stream.
+    wander[common] = before.wander[theirs] * np.exp(-passed_s / WANDER_S)
+    wander[last + 1 :] = wander[last]
+    return Before(stamp_ns, joints, wander, shared), _HELD
 
 
 def _rejection(cost: float, contact: float) -> str:

@@ -38,6 +38,8 @@ _CONVERGED = 1e-4
 _CONTACT_SPEEDS = (0.6, 0.4, 0.3, 0.2)
 _LAST_CONTACT_SPEED = 0.15
 _LEAST_SCALE = 0.2
+#: Weight of a held unknown, per m^2 or rad^2: a hundred thousand times that of a clear keypoint.
+_HOLD = 1e10
 #: Most points that are tried on the line of a step.
 _TRIALS = 10
 #: Errors of the shared unknowns over their formal standard deviations: contacts are chosen by the same data.
@@ -71,34 +73,49 @@ class WorldSolution:
     stop_reason: str
 
 
-def initial_state(data: WorldInput, joints: np.ndarray, scale: float, expected: np.ndarray) -> WorldState:
-    """The point from joints (F, 17, 3) m of the body, where earlier findings expect the shared unknowns."""
-    shared = expected.copy()
-    shared[LENGTHS], shared[SCALE] = data.lengths, scale
-    shared[FLOOR] = np.percentile(joints[:, ANKLES, 2], 10)
-    return WorldState(joints, np.zeros((len(joints), CAMERA)), shared)
+def initial_state(data: WorldInput, start: WorldState) -> WorldState:
+    """The point to start from, with the lifter's lengths and a floor under the feet."""
+    shared = start.globals.copy()
+    shared[LENGTHS] = data.lengths
+    shared[FLOOR] = np.percentile(start.joints[:, ANKLES, 2], 10)
+    return WorldState(start.joints, start.camera, shared)
 
 
-def adjust_in_world(data: WorldInput, joints: np.ndarray, scale: float = 1.0) -> WorldSolution:
-    """Adjust from initial joints (F, 17, 3) m of the body, ``scale`` of which are a metre of the world."""
+def adjust_in_world(
+    data: WorldInput, joints: np.ndarray, scale: float = 1.0, start: WorldState | None = None, held: int = 0
+) -> WorldSolution:
+    """Adjust from initial joints (F, 17, 3) m of the body, ``scale`` of which are a metre of the world.
+
+    Parameters
+    ----------
+    start : the initial point instead; its lengths and floor do not matter
+    held : so many frames at the begin keep their joints and their camera's errors
+    """
     config, weights = data.config, weights_of(data)
-    state = initial_state(data, joints, scale, weights.expected)
+    if start is None:
+        shared = np.zeros(GLOBALS)
+        shared[SCALE] = scale
+        start = WorldState(joints, np.zeros((len(joints), CAMERA)), shared)
+    state = initial_state(data, start)
     stop, done, ground, floor = ITERATIONS, 0, float("nan"), FLOOR_STD_M
     contact: np.ndarray = np.zeros((len(joints) - 1, len(FEET)))
     outlier = Residuals(data, weights, state, contact, 0.0).usual_outlier()
     seen = data.weight > 0 if data.seen is None else data.seen
     for done in range(1, config.iterations + config.locking_iterations + 1):
         locking = done > config.iterations
-        speed = _CONTACT_SPEEDS[done - 1] if done <= len(_CONTACT_SPEEDS) else _LAST_CONTACT_SPEED
+        # A window that continues another one does not slide any more.
+        stage = done + (len(_CONTACT_SPEEDS) if held else 0)
+        speed = _CONTACT_SPEEDS[stage - 1] if stage <= len(_CONTACT_SPEEDS) else _LAST_CONTACT_SPEED
         if config.feet:
             contact = contact_probability(state, data.fps, speed, seen)
         weight = config.locked_weight if locking else config.contact_weight
-        if done == len(_CONTACT_SPEEDS) + 1:
+        if stage == len(_CONTACT_SPEEDS) + 1:
             ground = ground_spread(state, contact)
             floor = floor_std(ground, FLOOR_STD_M)
         here = Residuals(data, weights, state, contact, weight, outlier, floor)
         frames, shared = gradient(here)
         matrix = normal_matrix(here)
+        matrix[0][: held * FRAME, 0] += _HOLD
         step = _solve(matrix, frames, shared, locking)
         if step is None:
             stop = NO_DESCENT

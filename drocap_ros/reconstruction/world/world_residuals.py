@@ -50,7 +50,8 @@ GAUGE_M = 0.0005
 #: The shared unknowns of the camera, and their columns in its derivatives: a misalignment turns every frame.
 OF_CAMERA = np.r_[SCALE, MISALIGNMENT, ATTITUDE_LATENCY, POSITION_LATENCY]
 CAMERA_COLUMNS = np.array([6, 3, 4, 5, 7, 8])
-_POSITION_WANDER_S, _ATTITUDE_WANDER_S = 60.0, 10.0
+#: (6,) time constants of the slow errors of position and attitude.
+WANDER_S = np.repeat([60.0, 10.0], 3)
 #: Share of the latencies' variance that attitude and position do not have in common: one log holds both.
 _OWN_LATENCY = 0.2
 
@@ -75,10 +76,10 @@ class Weights(NamedTuple):
 def weights_of(data: WorldInput) -> Weights:
     """Weights from the parameters and from the telemetry's roughness."""
     config, fps = data.config, data.fps
-    rough = data.telemetry.roughness() / np.sqrt(2.0 / (_POSITION_WANDER_S * fps))
+    rough = data.telemetry.roughness() / np.sqrt(2.0 / (WANDER_S[0] * fps))
     position, attitude = max(config.position_wander_m, rough), np.deg2rad(config.attitude_wander_deg)
     first = np.repeat([position**-2, attitude**-2], 3)
-    wander = first * np.repeat([0.5 * _POSITION_WANDER_S * fps, 0.5 * _ATTITUDE_WANDER_S * fps], 3)
+    wander = first * (0.5 * WANDER_S * fps)
     shared = np.zeros((GLOBALS, GLOBALS))
     shared[LENGTHS, LENGTHS] = np.diag((config.length_std * data.lengths) ** -2)
     shared[FLOOR, FLOOR] = _ANY_FLOOR_M**-2

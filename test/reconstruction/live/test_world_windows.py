@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -84,6 +85,21 @@ def test_windows_with_telemetry_are_in_map_and_as_near_the_truth_as_offline() ->
     assert live.absolute_mm < 150.0
     assert abs(live.scale) < 0.03
     assert live.foot_m_s < 0.25
+
+
+def test_a_window_continues_the_one_before_without_a_step() -> None:
+    found = [w for w in windows_of(followed()) if w.window.in_map is not None]
+    steps, changes = [], []
+    for before, after in itertools.pairwise(found):
+        same, _, there = np.intersect1d(before.window.stamp_ns, after.window.stamp_ns, return_indices=True)
+        here = np.searchsorted(before.window.stamp_ns, same)
+        gap = np.linalg.norm(after.joints3d[there] - before.joints3d[here], axis=-1).max(axis=1)
+        steps.append(gap[:2].max())
+        changes.append(gap[2:].max())
+    # The scale may change a little, and turns about the middle of the camera's path.
+    assert max(steps) < 0.02
+    # Later frames are adjusted again.
+    assert max(changes) > 0.03
 
 
 def test_findings_are_carried_from_window_to_window() -> None:
