@@ -21,6 +21,7 @@ from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.in_world import in_world
 from drocap_ros.reconstruction.world.placement import metres_per_px
 from drocap_ros.reconstruction.world.refine import Before, RefinedWorld
+from drocap_ros.reconstruction.world.telemetry_checks import stopped, unchanged
 from drocap_ros.reconstruction.world.world_model import world_config
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
@@ -41,6 +42,7 @@ class WorldWindows:
         self._known = Calibration.unknown()
         #: The window before and its findings.
         self._before: tuple[Before, Calibration] | None = None
+        self._moved = False
         #: Whether the last window's telemetry was true: the lifter may see the camera's rotation.
         self.trusted = False
 
@@ -66,6 +68,10 @@ class WorldWindows:
         if use is None:
             return replace(camera_result, telemetry=Telemetry.LATE)
         camera, stamps, keypoints = w.camera.frames(use), w.stamp_ns[use], w.keypoints[use]
+        self._moved |= not unchanged(camera.rotation, camera.position).all()
+        if self._moved and (reason := stopped(camera.rotation, camera.position, stamps)):
+            self._before = None
+            return replace(camera_result, telemetry=Telemetry.REFUSED, reason=reason)
         tracks = Tracks(
             keypoints.xy, BODY_17.joints, stamps, (1, 1), camera_rotation=camera.rotation,
             camera_position=camera.position, camera_matrix=camera.matrix,

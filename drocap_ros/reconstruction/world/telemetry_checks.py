@@ -7,8 +7,8 @@ import numpy as np
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.reconstruction.world.world_model import ANKLES
 
-#: A moving camera whose pose stays the same, bit for bit, for so long has no new measurement.
-_FROZEN_S, _MOVING_M_S = 1.0, 0.2
+#: A moving camera whose pose stays the same for so long, to the rounding of its interpolation, has no new measurement.
+_FROZEN_S, _MOVING_M_S, _SAME = 1.0, 0.2, 1e-9
 _SHIFTS_S, _SHIFT_STEP_S = 3.0, 0.5
 _LAG_S, _SMOOTHING_S, _STILL_M = 0.4, 0.06, 0.06
 #: Share of still feet at another time over that at the reported time, and its least value.
@@ -21,7 +21,7 @@ _RESTING_SHARE, _RESTING_LAG_S, _RESTING_SMOOTHING_S = 0.05, 0.33, 0.08
 
 def frozen(rotation: np.ndarray, position: np.ndarray, fps: float) -> str:
     """Whether the poses (F, 3, 3), (F, 3) m stop and the camera moves otherwise."""
-    same = (np.diff(position, axis=0) == 0).all(-1) & (np.diff(rotation, axis=0) == 0).all((-1, -2))
+    same = unchanged(rotation, position)
     speed = np.linalg.norm(np.diff(position, axis=0), axis=-1) * fps
     if same.all() or not float(np.median(speed[~same])) > _MOVING_M_S:
         return ""
@@ -29,6 +29,21 @@ def frozen(rotation: np.ndarray, position: np.ndarray, fps: float) -> str:
     if longest < _FROZEN_S:
         return ""
     return f"the camera's reported pose stops for {longest:.1f} s between motions; check the log for gaps"
+
+
+def unchanged(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """(F - 1,) whether each pose of (F, 3, 3), (F, 3) m is the one before."""
+    place, turn = (np.abs(np.diff(values, axis=0)) < _SAME for values in (position, rotation))
+    same: np.ndarray = place.all(-1) & turn.all((-1, -2))
+    return same
+
+
+def stopped(rotation: np.ndarray, position: np.ndarray, stamp_ns: np.ndarray) -> str:
+    """Whether the newest poses of a camera that has moved before stay the same: no report of a flight does that."""
+    changes = np.flatnonzero(~unchanged(rotation, position))
+    since = int(changes[-1]) + 1 if len(changes) else 0
+    still_s = float(stamp_ns[-1] - stamp_ns[since]) * 1e-9
+    return f"the camera's reported pose has stopped for {still_s:.1f} s; check the link" if still_s >= _FROZEN_S else ""
 
 
 def other_time(joints: np.ndarray, rotation: np.ndarray, position: np.ndarray, fps: float) -> str:
