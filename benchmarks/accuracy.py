@@ -2,6 +2,7 @@
 
 rotation     every method at four orbit speeds, clean and noisy 2D (`drocap evaluate rotation`): page accuracy
 live         the live method beside the offline one, clean and noisy 2D (`drocap evaluate live`): page accuracy_live
+live-world   the live method in the world beside the offline one, every third sequence: page accuracy_live_world
 perspective  the default method with a camera 6 m and 10 m away, lens known and unknown: page accuracy_perspective
 world        placement and scale from telemetry, on simulated captures: page accuracy_world
 telemetry    the motion in the world by telemetry that errs (`drocap evaluate world`), every third sequence: page
@@ -26,6 +27,7 @@ from drocap_ros.cli.progress import progress_bars
 from drocap_ros.evaluation.calibration import calibration_markdown, calibration_study
 from drocap_ros.evaluation.live_study import live_study
 from drocap_ros.evaluation.live_study_table import live_markdown
+from drocap_ros.evaluation.live_world import live_world_markdown, live_world_study
 from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error, w_mpjpe
 from drocap_ros.evaluation.protocol import (
     FPS,
@@ -66,6 +68,18 @@ def live(args: argparse.Namespace) -> None:
         rows = live_study(args.mocap, noisy=noisy, delay_s=SOLUTION_DELAY_S, limit=args.limit)
         pages.append(f"## {'Noisy' if noisy else 'Clean'} 2D\n\n{live_markdown(rows, SOLUTION_DELAY_S)}")
     write_figures("accuracy_live", "Accuracy of the live method beside the offline one", "\n".join(pages))
+
+
+def live_world(args: argparse.Namespace) -> None:
+    pages = []
+    for telemetry in ("exact", "gps"):
+        with progress_bars() as progress:
+            rows = live_world_study(
+                args.mocap, telemetry, every=3, delay_s=SOLUTION_DELAY_S, limit=args.limit, progress=progress
+            )  # fmt: skip
+        pages.append(live_world_markdown(rows, telemetry))
+    title = "Live motion in the world beside the offline one"
+    write_figures("accuracy_live_world", title, "\n".join(pages))
 
 
 def perspective_view(x: np.ndarray, distance_m: float, noise_px: float) -> tuple[Tracks, np.ndarray, np.ndarray]:
@@ -137,7 +151,7 @@ def calibration(args: argparse.Namespace) -> None:
 
 
 PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
-    "rotation": rotation, "live": live, "perspective": perspective, "world": world,
+    "rotation": rotation, "live": live, "live-world": live_world, "perspective": perspective, "world": world,
     "telemetry": telemetry, "calibration": calibration,
 }  # fmt: skip
 

@@ -13,6 +13,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.evaluation.protocol import OrbitView, orbit_view, protocol_sequences
+from drocap_ros.evaluation.world_protocol import WorldView
 from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.mocap import Sequence
 from drocap_ros.observation import PoseObservation
@@ -98,7 +99,7 @@ def live_study(
     return rows
 
 
-def observations(view: OrbitView) -> Iterator[PoseObservation]:
+def observations(view: OrbitView | WorldView) -> Iterator[PoseObservation]:
     """The view's keypoints as the pose estimator publishes them, without a covariance."""
     t = view.tracks
     keypoints = t.keypoints.astype(np.float32)

@@ -9,10 +9,11 @@ import pytest
 
 from drocap_ros.cli import main
 from drocap_ros.evaluation.live_study import live_study, simulate_live, standardized_error
+from drocap_ros.evaluation.live_world import live_world_markdown, live_world_study
 from drocap_ros.evaluation.protocol import orbit_view
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.simulation.simulated_person import simulate_person
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_15, BODY_17
 
 
 def walk_mm(seconds: float) -> np.ndarray:
@@ -74,3 +75,21 @@ def test_live_poses_of_unseen_people_are_near_the_offline_ones(shared, tmp_path)
     for row in rows:
         assert 0.7 <= row.refined_std <= 1.5
         assert 0.7 <= row.initial_std <= 1.5
+
+
+def test_live_poses_in_map_are_measured_beside_the_offline_ones(tmp_path):
+    """With exact telemetry the refined poses in ``map`` are nearly as good as offline; the latest ones err more."""
+    truth = simulate_person(np.arange(24 * 17) / 24.0, "walk", 0, 1.75, BODY_17)
+    np.savez(
+        tmp_path / "walk.npz", X=(1000.0 * truth[:, : len(BODY_15)]).astype(np.float32), fps=24.0,
+        joints=np.array(BODY_15.joints),
+    )  # fmt: skip
+    (row,) = live_world_study(tmp_path, "exact")
+    assert 2.0 < row.first_s < 12.0
+    assert row.share > 0.9
+    assert row.refined.w_mm < 1.3 * row.offline.w_mm + 30.0
+    assert row.refined.foot_m_s < 0.2
+    assert row.refined.wa_mm < row.latest.wa_mm < 250.0
+    text = live_world_markdown([row], "exact")
+    assert "walk, latest" in text
+    assert f"after {row.first_s:.1f} s" in text
