@@ -60,9 +60,10 @@ def reconstruct_live(
 ) -> tuple[Motion, Tracks, Agreement]:
     """Motion by the live method, from the session's ``pose2d``, ``vehicle/state`` and ``camera_info`` messages.
 
-    A frame's pose is that of the last window that holds it, else its initial one.  Where at least half of the frames
-    are in ``map``, the motion has these, in frame "world"; else all, in frame "camera".  The windows are those that the
-    live graph adjusted where the session holds them, else all that are due.  Memory: the poses and one window.
+    A frame's pose is that of the last window that holds it, one in ``map`` first, else its initial one.  Where at least
+    half of the frames are in ``map``, the motion has these, in frame "world"; else all, in frame "camera".  The windows
+    are those that the live graph adjusted where the session holds them, else all that are due.  Memory: the poses and
+    one window.
 
     Raises
     ------
@@ -91,7 +92,9 @@ def reconstruct_live(
             published.compare_window(result)
             window = result.window
             for i, stamp_ns in enumerate(window.stamp_ns.tolist()):
-                frames[stamp_ns] = _Frame(frames[stamp_ns].observation, result.joints3d[i], _camera_of(window, i))
+                # A pose in map stays: a window after the end of the telemetry holds older frames too.
+                if window.in_map is not None or frames[stamp_ns].camera is None:
+                    frames[stamp_ns] = _Frame(frames[stamp_ns].observation, result.joints3d[i], _camera_of(window, i))
             stop_reason, iterations = window.stop_reason, iterations + window.iterations
         if progress is not None and done % 50 == 0:
             progress("live", min(1.0, done / max(topic.count, 1)))
