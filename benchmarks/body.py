@@ -60,10 +60,12 @@ class Row(NamedTuple):
     least_flexion_deg: float = -1.0
     toes_seen: bool = False
     covariance_given: bool = False
+    rotation_known: bool = False
 
 
 ROWS: dict[str, Row] = {
     "clean": Row(),
+    "clean, camera's rotation known": Row(rotation_known=True),
     "noisy": Row(noise="protocol"),
     "clean, legs refitted to 3 degrees": Row(least_flexion_deg=3.0),
     "noisy, legs refitted to 3 degrees": Row(noise="protocol", least_flexion_deg=3.0),
@@ -155,16 +157,19 @@ def score(job: tuple[Path, str]) -> Score:
         stamp_ns=np.round(np.arange(len(x)) * (1e9 / row.fps)).astype(np.int64),
         image_size=IMAGE_SIZE,
         covariance=None if covariance is None else covariance * PX_PER_MM**2,
+        camera_rotation=turn if row.rotation_known else None,
     )
     motion = reconstruct(tracks, method="ba")
     found = motion.joints3d * 1000.0
+    if motion.frame == "world":
+        found = (found - found[:, :1]) @ np.swapaxes(turn, 1, 2)
     fit = similarity(found[:, _LIMBS], truth[:, _LIMBS])
     aligned = apply_similarity(found, *fit)
     toes = np.linalg.norm(aligned - truth, axis=-1)[:, _TOES]
     ours, true = (v[:, _SIGNED[:, 1], 2] - v[:, _SIGNED[:, 0], 2] for v in (found, truth))
     wrong = ((ours * true < 0) & (np.abs(true) > _SIGNED_MM) & (np.abs(ours) > 0.5 * _SIGNED_MM)).any(axis=1)
     covered = np.nan
-    if motion.covariance is not None:
+    if motion.covariance is not None and motion.frame == "camera":
         limbs = [np.linalg.norm(v[:, 1:15] - v[:, :1], axis=-1).mean() for v in (truth, found)]
         scale = limbs[0] / limbs[1]
         error = (found - found[:, :1]) * scale - (truth - truth[:, :1])
@@ -201,7 +206,7 @@ def main() -> int:
     parser.add_argument("--processes", type=int, default=1)
     args = parser.parse_args()
 
-    paths = [p for p in mocap_files(args.mocap) if _long_enough(p)][:: args.every]
+    paths = [p for p in mocap_files(args.mocap) if long_enough(p)][:: args.every]
     lines = []
     with multiprocessing.get_context("forkserver").Pool(args.processes) as pool:
         for name in args.rows:
@@ -222,7 +227,7 @@ def main() -> int:
     return 0
 
 
-def _long_enough(path: Path) -> bool:
+def long_enough(path: Path) -> bool:
     x, fps = load_mocap(path, joints=BODY_17)
     return len(x) >= 5.0 * fps
 
