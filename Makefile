@@ -9,7 +9,7 @@ CLEAN := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE -u LD_LIBRARY_PATH -u PYTHONPATH 
 BENCHMARK = $(CLEAN) $(BIN)/python benchmarks
 SOURCES := $(shell find drocap_ros msg srv config resource -type f -not -path '*/__pycache__/*') setup.py CMakeLists.txt package.xml
 
-.PHONY: help setup demo test test-computing test-clocked lint bench bench-quick bench-flight clean
+.PHONY: help setup demo test lint bench bench-quick bench-flight clean
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
 
@@ -38,14 +38,8 @@ $(VENV)/.package: $(VENV)/.requirements $(VENV)/.tf2_msgs $(VENV)/.hri_msgs $(SO
 demo: setup  ## a whole simulated capture, reconstructed and compared with its truth
 	@$(CLEAN) $(BIN)/drocap demo --out demo_out
 
-# Tests with clocks or nodes mostly wait; those that only compute run beside them at the lowest priority.
-test: setup  ## the whole test suite: tests that compute beside those with clocks or nodes; each part prints when it ends
-	@$(MAKE) --no-print-directory -j 2 --output-sync=target test-computing test-clocked
-
-test-computing:
-	$(CLEAN) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 19 $(BIN)/python -m pytest -m "not clock" -n 2 --dist loadfile
-
-test-clocked:
+test: setup  ## the whole test suite: two tests at a time, then tests with clocks or nodes, alone and up to three times
+	$(CLEAN) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not clock" -n 2 --dist loadfile
 	$(CLEAN) $(BIN)/python -m pytest -m clock --reruns 2 -r sR
 
 lint: setup  ## ruff and mypy
