@@ -20,10 +20,7 @@ from drocap_ros.reconstruction.stop_reason import NO_WINDOW
 from drocap_ros.recording.pose_messages import read_observations
 from drocap_ros.recording.provenance import CONFIGURATION
 from drocap_ros.recording.published_poses import Agreement, PublishedPoses, RecordedCamera
-from drocap_ros.recording.session import (
-    POSE2D,
-    Session,
-)
+from drocap_ros.recording.session import POSE2D, Session
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
 

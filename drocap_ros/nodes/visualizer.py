@@ -72,10 +72,11 @@ class VisualizerNode(ComponentNode):
             self.report(OK, "drawing")
 
     def _publish_transforms(self, message: Pose3D) -> None:
+        if self._tf is None:
+            return
         prefix = self.config.frame_prefix
         human = human_transforms(message, prefix) if self.config.human_topics else []
-        transforms = body_transforms(message, prefix) + human
-        if self._tf is not None and transforms:
+        if transforms := body_transforms(message, prefix) + human:
             self._tf.publish(TFMessage(transforms=transforms))
 
     def _on_latest(self, message: Pose3D) -> None:

@@ -24,8 +24,8 @@ from drocap_ros.flight.vehicle_state import VehicleState
 _SENT_S = 0.7  # a setpoint may be echoed for so long at most: two transmissions and the period of the echo
 _ECHOED_S = 0.25  # beyond the age of the echo and two transmissions: two periods of it, and a step
 _AHEAD_S = 0.5  # along its velocity: ArduPilot's integration
-_PLACE_M, _VELOCITY_M_S = {"px4": 0.2}, 0.75  # PX4 echoes the place as it came
-_INTEGRATED_M = 0.5  # of a place that ArduPilot has integrated
+_PLACE_M, _VELOCITY_M_S = 0.5, 0.75  # ArduPilot's target is integrated
+_PX4_PLACE_M = 0.2  # PX4 echoes the place as it came
 _MISMATCH_S = 0.25  # longer than two echoes
 _WINDOW_S, _COMMANDED_M_S = 1.0, 0.6
 #: Of the commanded speed; the vehicle is slower for all of the window.  In every recorded flight it reached 0.46.
@@ -124,7 +124,7 @@ def _agrees(echo: Any, sent: list[Any], autopilot: str) -> bool:
     way = _AHEAD_S * velocity
     part = ((place - begin) * way).sum(axis=1) / np.maximum((way * way).sum(axis=1), 1e-9)
     nearest = begin + np.clip(part, 0.0, 1.0)[:, None] * way
-    near = np.hypot(*(place - nearest).T) <= _PLACE_M.get(autopilot, _INTEGRATED_M)
+    near = np.hypot(*(place - nearest).T) <= (_PX4_PLACE_M if autopilot == "px4" else _PLACE_M)
     if autopilot != "px4":
         near &= np.hypot(*(np.array([echo.vx, echo.vy], dtype=float) - velocity).T) <= _VELOCITY_M_S
     return bool(near.any())

@@ -155,7 +155,7 @@ def refine_in_world(
             points[rows], weight[rows], depth[rows], sigma[rows], lengths, telemetry, matrix, config, seen[rows], known
         )
         state = WorldState(start.joints[rows], start.wander[rows], start.shared)
-        found = adjust_in_world(data, start.joints[rows], start=state, held=held)
+        found = adjust_in_world(data, state, held)
         fade = fade_weights(rows, frames, _OVERLAP)
         joints[rows] += fade[:, None, None] * found.joints
         camera[rows] += fade[:, None] * _correction(found, telemetry)

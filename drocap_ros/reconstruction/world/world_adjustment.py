@@ -20,7 +20,6 @@ from drocap_ros.reconstruction.world.world_equations import normal_matrix
 from drocap_ros.reconstruction.world.world_model import (
     ANKLES,
     CALIBRATED,
-    CAMERA,
     FEET,
     FLOOR,
     FRAME,
@@ -81,24 +80,18 @@ def initial_state(data: WorldInput, start: WorldState) -> WorldState:
     return WorldState(start.joints, start.camera, shared)
 
 
-def adjust_in_world(
-    data: WorldInput, joints: np.ndarray, scale: float = 1.0, start: WorldState | None = None, held: int = 0
-) -> WorldSolution:
-    """Adjust from initial joints (F, 17, 3) m of the body, ``scale`` of which are a metre of the world.
+def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> WorldSolution:
+    """Adjust from a point.
 
     Parameters
     ----------
-    start : the initial point instead; its lengths and floor do not matter
+    start : its lengths and floor do not matter
     held : so many frames at the begin keep their joints and their camera's errors
     """
     config, weights = data.config, weights_of(data)
-    if start is None:
-        shared = np.zeros(GLOBALS)
-        shared[SCALE] = scale
-        start = WorldState(joints, np.zeros((len(joints), CAMERA)), shared)
     state = initial_state(data, start)
     stop, done, ground, floor = ITERATIONS, 0, float("nan"), FLOOR_STD_M
-    contact: np.ndarray = np.zeros((len(joints) - 1, len(FEET)))
+    contact: np.ndarray = np.zeros((len(start.joints) - 1, len(FEET)))
     outlier = Residuals(data, weights, state, contact, 0.0).usual_outlier()
     seen = data.weight > 0 if data.seen is None else data.seen
     for done in range(1, config.iterations + config.locking_iterations + 1):

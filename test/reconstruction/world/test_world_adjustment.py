@@ -183,7 +183,10 @@ def test_body_scale_yaw_and_latency_are_recovered_from_exact_images() -> None:
     data = exact_input(joints, rotation[late : 360 + late], position[late : 360 + late], telemetry)
     exact = WorldConfig(iterations=60, length_std=1.0, contact_weight=1.0, contact_speed_m_s=0.02, frames_per_fact=1.0)
     short = replace(data, lengths=data.lengths / 1.08, depth=data.depth / 1.08, config=exact)
-    found = adjust_in_world(short, joints / 1.08 + [0.05, -0.05, 0.02], 1.0)
+    shared = np.zeros(GLOBALS)
+    shared[SCALE] = 1.0
+    start = WorldState(joints / 1.08 + [0.05, -0.05, 0.02], np.zeros((len(joints), CAMERA)), shared)
+    found = adjust_in_world(short, start)
     shared, std = found.state.globals, found.std
     assert 1.0 / shared[SCALE] == pytest.approx(1.08, abs=0.015)
     assert np.degrees(shared[MISALIGNMENT][1]) == pytest.approx(2.0, abs=0.6)
