@@ -12,18 +12,30 @@ _MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, _MAV_MODE_FLAG_SAFETY_ARMED = 1, 128
 #: Packets; farther back a sequence number counts as the beginning of a new sequence.
 _MAX_LATE = 32
 _HISTORY_S = 1.0
+#: Share of lost packets above which no mode is requested: the pilot may have chosen one unseen.
+MAX_LOSS = 0.25
+_LOSS_RATE = 1 / 64  # a packet: the share of lost ones is that of the last 64, about half a second of telemetry
 
 
 class PacketOrder:
-    """Which packets of one sender arrive after newer ones, by the sequence number that MAVLink counts modulo 256."""
+    """Which packets of one sender are late or lost, by the sequence number that MAVLink counts modulo 256.
+
+    loss : share of the last packets that have not arrived
+    """
 
     def __init__(self) -> None:
+        self.loss = 0.0
         self._newest: int | None = None
 
     def is_late(self, sequence: int) -> bool:
-        """Take the next packet."""
-        if self._newest is not None and 0 < (self._newest - sequence) % 256 <= _MAX_LATE:
+        """Take the next packet; returns whether it arrives after newer ones."""
+        sent = 0 if self._newest is None else (sequence - self._newest) % 256
+        if sent >= 256 - _MAX_LATE:
+            self.loss = max(self.loss - _LOSS_RATE, 0.0)  # it had counted as lost
             return True
+        if sent > 0:
+            missing = 1.0 - (1.0 - self.loss) * (1.0 - _LOSS_RATE) ** (sent - 1)
+            self.loss = missing * (1.0 - _LOSS_RATE)
         self._newest = sequence
         return False
 

@@ -16,7 +16,7 @@ from drocap_ros.flight.frames import (
 )
 from drocap_ros.flight.mavlink import mount
 from drocap_ros.flight.mavlink.clock_offset import ClockOffset
-from drocap_ros.flight.mavlink.mode_reports import ModeReports, PacketOrder
+from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS, ModeReports, PacketOrder
 from drocap_ros.flight.vehicle_state import VehicleState
 
 _NS = 1_000_000_000
@@ -59,7 +59,7 @@ class VehicleStateEstimator:
         self._heard_ns: int | None = None
         self._stamp_ns = -(10**18)
         self.modes = ModeReports()
-        self._order = PacketOrder()
+        self.packets = PacketOrder()
         self._attitude: tuple[int, np.ndarray, np.ndarray] | None = None  # boot ns, FRD -> NED x y z w, rates FRD
         self._quaternion_ns = -(10**18)
         self._position: tuple[int, np.ndarray, np.ndarray] | None = None  # boot ns, ENU m, ENU m/s
@@ -90,7 +90,7 @@ class VehicleStateEstimator:
         if from_autopilot:
             self._heard_ns = receive_time_ns
             self.received_ns[name] = receive_time_ns
-            late = self._order.is_late(message.get_seq())
+            late = self.packets.is_late(message.get_seq())
             if name == "CURRENT_MODE":
                 self.modes.take_current_mode(message, late, receive_time_ns)
                 return None
@@ -112,9 +112,12 @@ class VehicleStateEstimator:
         return math.inf if latest is None else (now_ns - latest) / _NS
 
     def fresh_mode(self, now_ns: int, mode_s: float, attitude_s: float) -> str:
-        """The mode, if its report and the attitude are not older than this; "" = it cannot be seen.  Needs no lock."""
-        late = abs(now_ns - self._stamp_ns) / _NS > attitude_s
-        return "" if late or self.modes.age_s(now_ns) > mode_s else self.modes.mode
+        """The mode, if its report and the attitude are not older than this; "" = it cannot be seen.  Needs no lock.
+
+        Nor can it be seen where many packets are lost.
+        """
+        unseen = abs(now_ns - self._stamp_ns) / _NS > attitude_s or self.packets.loss > MAX_LOSS
+        return "" if unseen or self.modes.age_s(now_ns) > mode_s else self.modes.mode
 
     def snapshot(self, now_ns: int) -> VehicleState | None:
         """The state at ``now_ns``; None before the first heartbeat and attitude."""
@@ -152,7 +155,7 @@ class VehicleStateEstimator:
         self.system_id, self.component_id = system, message.get_srcComponent()
         self._heard_ns = now_ns
         self.received_ns["HEARTBEAT"] = now_ns
-        self.modes.take_heartbeat(message, self._order.is_late(message.get_seq()), now_ns)
+        self.modes.take_heartbeat(message, self.packets.is_late(message.get_seq()), now_ns)
 
     def _boot_ns(self, message: Any, now_ns: int) -> int:
         boot_ns = int(message.time_boot_ms) * _MS

@@ -8,6 +8,7 @@ import math
 import numpy as np
 
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
 from drocap_ros.flight.orbit.motion_checks import braking_distance, subject_located
 from drocap_ros.flight.orbit.states import Limits, Observed, SafetyState, State
 from drocap_ros.flight.safety_config import SafetyConfig
@@ -107,10 +108,10 @@ def retreat(state: SafetyState, seen: Observed, now_s: float, limits: Limits) ->
 
 
 def request_hold_mode(state: SafetyState, seen: Observed, now_s: float, config: SafetyConfig) -> SafetyState:
-    """Allow the request of the hold mode once the vehicle is at rest, or after ``hold_s``."""
+    """Allow the request of the hold mode once the vehicle is at rest, or after ``hold_s``; not on a lossy link."""
     if state.state != State.HOLDING or not math.isnan(state.hold_mode_s) or state.blind or not math.isnan(state.lost_s):
         return state
-    if state.resumable and now_s - state.since_s <= config.resume_after_hold_s:
+    if seen.packet_loss > MAX_LOSS or (state.resumable and now_s - state.since_s <= config.resume_after_hold_s):
         return state
     held_s = now_s - max(state.since_s, state.retreated_s)
     if not np.linalg.norm(seen.velocity) < _AT_REST_M_S:

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
 from drocap_ros.flight.orbit.states import Limits, Observed, SafetyState, State
 
 #: Telemetry must arrive for so long after a loss before a mode is requested: longer than the 1 s between two
@@ -52,11 +53,12 @@ def is_silent(state: SafetyState, now_s: float, limits: Limits) -> bool:
 def mode_visible(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> bool:
     """Whether a mode may be requested now: the present one has just been reported, by a link that works both ways.
 
-    The pilot's choice within the age of this report is the only one that a request can override.
+    The pilot's choice within the age of this report is the only one that a request can override.  Where many packets
+    are lost none is requested: such a link ends orbits, and the pilot takes over just then.
     """
     steady = now_s - state.seen_s >= _STEADY_S and not is_lost(state)
     late = seen.round_trip_s > limits.safety.max_round_trip_s  # the request would arrive late too
-    return steady and not late and seen.heartbeat_age_s <= limits.max_mode_age_s
+    return steady and not late and seen.packet_loss <= MAX_LOSS and seen.heartbeat_age_s <= limits.max_mode_age_s
 
 
 def foreign_mode(state: SafetyState, seen: Observed) -> str:

@@ -62,6 +62,7 @@ class Observed:
     heartbeat_age_s : since the newest report of the mode
     position_age_s : since the reported position last changed, so frozen telemetry ages too
     round_trip_s : since the sending of the message that was answered last; NaN = no answer yet
+    packet_loss : share of the vehicle's last packets that have not arrived
     stream_gap_s : since the last setpoint left
     position, velocity : (3,) ENU; the position is extrapolated over the age of the state
     height_m : above the subject's ground
@@ -92,6 +93,7 @@ class Observed:
     position_age_s: float = math.inf
     status_age_s: float = math.inf
     round_trip_s: float = math.nan
+    packet_loss: float = 0.0
     stream_gap_s: float = 0.0
     gps_fix_type: int = 0
     position_ok: bool = False

@@ -36,6 +36,9 @@ _AWAY = 0.14
 _RESTART_S = 1.0
 _OVERSHOOT = 0.85  # of the greatest closing speed that a setpoint has: the vehicle overshoots
 _SURELY_M_S = 0.1  # so much faster than by the estimated place he may recede by his image, which shrinks as he bends
+#: m, and m/s that his receding must exceed at the second distance: an error of the size is an error of the speed in
+#: proportion to the distance, and from 12 m one who stands recedes at up to 0.4 m/s for a second.
+_NEAR_M, _FAR_M, _FAR_ERROR_M_S = 8.0, 12.0, 0.3
 _POSITION_GAIN = 1.0  # 1/s, of both autopilots' position loops: 1.0 (PSC_POSXY_P) and 0.95 (MPC_XY_P)
 _REACTION_S = 0.5
 
@@ -109,6 +112,8 @@ class Guard:
         room = math.sqrt(2 * self._braking * max(nearest - self._orbit.min_distance_m, 0.0))
         receding = min(self._receding(inward, self._now()), self._away)
         receding = min(receding, max(receding_m_s, 0.0) + _SURELY_M_S)
+        doubted = min(max((distance - _NEAR_M) / (_FAR_M - _NEAR_M), 0.0), 1.0)
+        receding = min(receding, max(receding - doubted * _FAR_ERROR_M_S, 0.0))
         allowed = min(max(_OVERSHOOT * self._orbit.max_closing_m_s + receding, 0.0), room)
         return _bounded(
             setpoint, seen.position, seen.velocity, inward, distance, allowed, self._orbit.max_acceleration_m_s2

@@ -1,11 +1,14 @@
 """Which mode counts, in whatever order its reports arrive."""
 
+import random
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.mavlink.current_mode import CurrentMode
+from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS, PacketOrder
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
 
@@ -52,6 +55,47 @@ def test_the_newer_report_counts_and_refreshes_the_age():
 def test_a_failsafe_keeps_the_intention_and_the_pilot_changes_it():
     modes = read(packets([heartbeat("OFFBOARD"), current_mode("LOITER", "OFFBOARD"), heartbeat("LOITER")]))
     assert (modes.mode, modes.intended) == ("LOITER", "OFFBOARD")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9])
+def test_the_share_of_lost_packets_is_measured_by_their_sequence_numbers(share):
+    chance, order, found = random.Random(7), PacketOrder(), []
+    for sequence in range(3000):
+        if chance.random() >= share:
+            assert not order.is_late(sequence % 256)
+            found.append(order.loss)
+    settled = found[len(found) // 10 :]
+    assert sum(settled) / len(settled) == pytest.approx(share, abs=0.06)
+    assert (max(settled) < MAX_LOSS) if share < 0.3 else (min(settled) > MAX_LOSS)
+
+
+def test_packets_in_another_order_are_not_lost():
+    chance, order = random.Random(7), PacketOrder()
+    arrivals = sorted(range(3000), key=lambda sequence: sequence + chance.uniform(0, 8))
+    late = [order.is_late(sequence % 256) for sequence in arrivals]
+    assert any(late)
+    assert order.loss < 0.1
+
+
+def test_a_lossy_link_is_noticed_within_half_a_second_of_telemetry_and_forgotten_within_a_second():
+    chance, order, sequence = random.Random(7), PacketOrder(), 0
+    while order.loss <= MAX_LOSS:
+        sequence += 1
+        if chance.random() >= 0.5:
+            order.is_late(sequence % 256)
+    assert sequence < 90
+    for after in range(1, 90):
+        order.is_late((sequence + after) % 256)
+    assert order.loss < MAX_LOSS
+
+
+def test_a_mode_is_not_fresh_where_many_packets_are_lost():
+    beats = packets([heartbeat("OFFBOARD")] * 60)
+    for lost, mode in ((1, "OFFBOARD"), (3, "")):
+        estimator = VehicleStateEstimator()
+        for i, beat in enumerate(beats[::lost]):
+            estimator.update(beat, round((1 + 0.02 * i) * S))
+        assert estimator.fresh_mode(round((1 + 0.02 * i) * S), 0.1, 1e12) == mode
 
 
 def test_before_the_first_heartbeat_a_number_has_no_name():

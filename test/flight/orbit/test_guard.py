@@ -95,6 +95,15 @@ def test_a_person_who_stays_in_place_is_not_followed_however_his_image_shrinks()
     assert -guard.limit(setpoint, seen, 1.4).velocity[0] > 1.7
 
 
+def test_a_person_far_away_is_followed_only_where_he_surely_walks():
+    """From 12 m the images of one who stands shrink at up to 0.4 m/s for a second."""
+    near = flown(lambda t: -0.6 * t, lambda t: 0.0, 2.5)
+    far = flown(lambda t: -0.6 * t, lambda t: 6.0, 2.5)
+    assert asked(*near, 2.2)[0] > 1.1
+    assert asked(*far, 2.2)[0] == pytest.approx(0.85, abs=0.05)
+    assert asked(*flown(lambda t: -1.4 * t, lambda t: 6.0 - 1.4 * t), 2.2, own=1.4)[0] > 1.2
+
+
 def test_no_speed_towards_a_person_whose_image_is_large():
     guard, place, now = flown(lambda t: 2.9, lambda t: 0.0)  # 3.1 m; 2.6 m if he is 1.43 m tall
     assert asked(guard, place, now, 1.0)[0] < 0.35

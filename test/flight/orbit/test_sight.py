@@ -64,3 +64,23 @@ def test_a_mode_is_requested_only_right_after_a_heartbeat_and_with_a_short_round
     engaging, _ = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, LIMITS)
     unseen = dataclasses.replace(LOITER, heartbeat_age_s=0.15)
     assert reduce(engaging, unseen, 0.2, None, LIMITS)[1].mode_request == ModeRequest.NONE
+
+
+def test_no_mode_is_requested_while_many_packets_are_lost_and_the_hold_waits_for_a_better_link():
+    lossy = dataclasses.replace(GOOD, packet_loss=0.5)
+    state, _ = reduce(orbiting(), lossy, 10.0, Command.STOP, LIMITS)
+    for i in range(1, 200):
+        state, decision = reduce(state, lossy, 10.0 + 0.05 * i, None, LIMITS)
+        assert (state.state, decision[:2]) == (State.HOLDING, (Action.HOLD, ModeRequest.NONE))
+    assert reduce(state, GOOD, 20.0, None, LIMITS)[1].mode_request == ModeRequest.HOLD
+    engaging, _ = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, LIMITS)
+    unseen = dataclasses.replace(LOITER, packet_loss=0.5)
+    assert reduce(engaging, unseen, 0.2, None, LIMITS)[1].mode_request == ModeRequest.NONE
+
+
+def test_a_link_that_becomes_lossy_after_the_request_ends_the_requests():
+    state, _ = reduce(orbiting(), GOOD, 10.0, Command.STOP, LIMITS)
+    state, decision = reduce(state, GOOD, 11.0, None, LIMITS)
+    assert decision.mode_request == ModeRequest.HOLD
+    lossy = dataclasses.replace(GOOD, packet_loss=0.3)
+    assert reduce(state, lossy, 11.1, None, LIMITS)[1] == (Action.HOLD, ModeRequest.NONE, None)

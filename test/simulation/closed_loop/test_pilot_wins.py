@@ -36,12 +36,15 @@ def chosen(loop, fault, moment):
     """The downlink fails, the pilot chooses a mode, the downlink returns: modes that replaced the pilot's."""
     chance = random.Random(f"{loop.settings.autopilot} {fault} {moment}")
     damage(loop, fault, chance)
+    damaged_s = loop.t
     loop.run(loop.t + chance.uniform(0.2, 5.0))
     mode, chosen_s = chance.choice(MODES[loop.settings.autopilot]), loop.t
     loop.copter.set_mode(mode, "pilot")
     loop.run(loop.t + WATCHED_S)
     repair(loop)
     loop.run(loop.t + RETURNED_S)
+    if fault == "lossy":  # a request could reach the vehicle a moment after the pilot's choice
+        assert [entry for entry in loop.copter.mode_log if entry[0] > damaged_s and entry[2] == "command"] == []
     if loop.copter.mode != mode:
         return (
             fault,
