@@ -126,7 +126,7 @@ setup(
         "opensim": ["opensim>=4.6,<5"],  # drocap export --to mot; wheels from Python 3.11 on
         "view": ["rerun-sdk>=0.39,<0.40"],
         "cluster": ["distributed>=2024.8", "bokeh>=3.1"],  # bokeh draws the scheduler's dashboard
-        "train": ["torch>=2.9", "onnx>=1.16"],
+        "train": ["torch>=2.13", "onnx>=1.16"],
         "test": [
             "pytest",
             "pytest-timeout",

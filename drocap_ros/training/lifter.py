@@ -24,7 +24,8 @@ from drocap_ros.tracks import read_npz
 from drocap_ros.training.initial_weights import origin_of, start_from
 from drocap_ros.training.lifter_samples import Batch, sample_batch
 from drocap_ros.training.mocap_bank import MocapBank
-from drocap_ros.training.torch_extra import pytorch, write_onnx
+from drocap_ros.training.muon import muon
+from drocap_ros.training.torch_extra import mixed_precision, pytorch, write_onnx
 
 if TYPE_CHECKING:
     import torch
@@ -184,7 +185,7 @@ def _optimisers(network: torch.nn.Module, options: LifterTraining) -> list[Any]:
         (matrices if weight.ndim == 2 and name.startswith("body") else others).append(weight)
     return [
         torch.optim.AdamW(others, lr=options.learning_rate, weight_decay=options.weight_decay, betas=(0.9, 0.98)),
-        torch.optim.Muon(matrices, lr=options.matrix_learning_rate, weight_decay=options.weight_decay),
+        muon(matrices, options.weight_decay),
     ]
 
 
@@ -222,7 +223,7 @@ def train(
         batch = sample_batch(bank, rng, max(options.frames_per_batch // frames, 1), frames)
         for optimiser, peak in zip(optimisers, peaks, strict=True):
             optimiser.param_groups[0]["lr"] = peak * _rate(progress)
-        with torch.autocast("cpu", dtype=torch.bfloat16):
+        with mixed_precision():
             outputs = network(torch.from_numpy(batch.features))
         loss, distance = lifting_loss(outputs, batch)
         network.zero_grad(set_to_none=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.training.rendered_samples import DETECTOR_SIZE, POSE_SIZE
-from drocap_ros.training.torch_extra import pytorch
+from drocap_ros.training.torch_extra import mixed_precision, pytorch
 
 if TYPE_CHECKING:
     import torch
@@ -123,7 +123,7 @@ def detector_targets(boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def detector_loss(network: Any, images: torch.Tensor, boxes: np.ndarray) -> tuple[torch.Tensor, float]:
     """Loss of a batch and, for the log, the mean overlap (IoU) of the positive cells."""
     torch = pytorch()
-    with torch.autocast("cpu", dtype=torch.bfloat16):
+    with mixed_precision():
         raw = network.raw(images)
     raw = raw.float()
     positive, free = (torch.from_numpy(v) for v in detector_targets(boxes))
@@ -214,7 +214,7 @@ def pose_loss(
     joints (B, 15, 2) px of the crop, seen (B, 15) bool, box_px (B,)
     """
     torch = pytorch()
-    with torch.autocast("cpu", dtype=torch.bfloat16):
+    with mixed_precision():
         columns, rows, certain = network.raw(images)
     at, there = torch.from_numpy(joints), torch.from_numpy(seen)
     loss = torch.zeros(())

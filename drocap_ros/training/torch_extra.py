@@ -30,6 +30,12 @@ def pytorch() -> Any:
     return torch
 
 
+def mixed_precision() -> Any:
+    """Context of bfloat16 where the processor has it; others emulate it, many times slower than single precision."""
+    torch = pytorch()
+    return torch.autocast("cpu", dtype=torch.bfloat16, enabled=torch.cpu.get_capabilities().get("avx512_bf16", False))
+
+
 def set_threads(count: int) -> None:
     """Threads of PyTorch and OpenCV."""
     import cv2
