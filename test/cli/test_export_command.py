@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from export_readers import READERS
+from refusals import refused
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
@@ -16,15 +17,6 @@ from drocap_ros.motion import load_motion, save_motion
 def folder(walker, tmp_path):
     save_motion(tmp_path / "motion.npz", walker)
     return tmp_path
-
-
-def refused(arguments, folder, capsys, words):
-    before = sorted(folder.iterdir())
-    assert main([str(a) for a in arguments]) == 2
-    error = capsys.readouterr().err
-    assert len(error.strip().splitlines()) == 1
-    assert words in error
-    assert sorted(folder.iterdir()) == before
 
 
 @pytest.mark.parametrize("form", READERS)

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from drocap_ros.cli import main
 from drocap_ros.motion import load_motion, save_motion
@@ -15,15 +16,6 @@ from drocap_ros.tracks import save_tracks
 def folder(person, tmp_path):
     save_motion(tmp_path / "motion.npz", person)
     return tmp_path
-
-
-def refused(arguments, folder, capsys, words):
-    before = sorted(folder.iterdir())
-    assert main([str(a) for a in arguments]) == 2
-    error = capsys.readouterr().err
-    assert len(error.strip().splitlines()) == 1
-    assert words in error
-    assert sorted(folder.iterdir()) == before
 
 
 def test_the_folder_of_a_motion_is_enough(folder, capsys):

@@ -7,13 +7,11 @@ from array import array
 
 import numpy as np
 import pytest
-import rclpy
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
 
-from drocap_ros.bringup import bringup, free_domain
+from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import ParameterError
 from drocap_ros.nodes.initializer import InitializerNode
@@ -23,15 +21,6 @@ from drocap_ros.ros.conversions import pose2d_to_ros
 from drocap_ros.ros.diagnostics import Key, values_of
 from drocap_ros.ros.topics import RESULT_QOS, TOPICS
 from drocap_ros.simulation.capture import simulate_capture
-
-
-@pytest.fixture
-def context():
-    with free_domain() as domain_id:
-        context = Context()
-        rclpy.init(args=[], context=context, domain_id=domain_id)
-        yield context
-        context.try_shutdown()
 
 
 @contextlib.contextmanager

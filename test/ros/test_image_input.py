@@ -7,11 +7,8 @@ import time
 import cv2
 import numpy as np
 import pytest
-import rclpy
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
-from drocap_ros.bringup import free_domain
 from drocap_ros.errors import InputError
 from drocap_ros.nodes.image_ingest import ImageIngestNode
 from drocap_ros.nodes.initializer import InitializerNode
@@ -20,15 +17,6 @@ from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.ros.conversions import header_at
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.image_input import ImageInput, ImageQueue
-
-
-@pytest.fixture
-def context():
-    with free_domain() as domain_id:
-        context = Context()
-        rclpy.init(args=[], context=context, domain_id=domain_id)
-        yield context
-        context.try_shutdown()
 
 
 @pytest.fixture
