@@ -39,7 +39,7 @@ demo: setup  ## a whole simulated capture, reconstructed and compared with its t
 	@$(CLEAN) $(BIN)/drocap demo --out demo_out
 
 test: setup  ## the whole test suite: two tests at a time, then tests with clocks or nodes, alone and up to three times
-	$(CLEAN) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not clock" -n 2 --dist loadfile
+	$(CLEAN) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not clock" -n 2 --dist loadfile --no-loadscope-reorder
 	$(CLEAN) $(BIN)/python -m pytest -m clock --reruns 2 -r sR
 
 lint: setup  ## ruff and mypy

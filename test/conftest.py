@@ -18,16 +18,26 @@ CLOCKED = (
     "perception/sources/test_live_sources.py",
     "perception/models/test_fetch.py", "recording/mcap/test_bounded_queue.py",
     "recording/mcap/test_recover.py", "recording/mcap/test_session_writer.py",
+    "recording/telemetry/test_flight_to_tracks.py",
 )  # fmt: skip
 COMPUTING = ("system/test_packaging.py", "system/test_simulated_demo.py")
+#: Files that take longest begin, so that none of them ends alone.
+LONG = (
+    "system/test_simulated_demo.py", "system/test_packaging.py", "simulation/closed_loop/test_pilot_wins.py",
+    "reconstruction/live/test_world_windows.py", "cli/batch/test_batch_command.py",
+)  # fmt: skip
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what has to run alone."""
+    """Mark what has to run alone; long files first."""
+
+    def file(item: pytest.Item) -> str:
+        return item.path.relative_to(ROOT / "test").as_posix()
+
     for item in items:
-        path = item.path.relative_to(ROOT / "test").as_posix()
-        if path.startswith(CLOCKED) and path not in COMPUTING:
+        if file(item).startswith(CLOCKED) and file(item) not in COMPUTING:
             item.add_marker("clock")
+    items.sort(key=lambda item: file(item) not in LONG)
 
 
 @pytest.hookimpl(tryfirst=True)
