@@ -38,8 +38,6 @@ class CameraTelemetry:
 
         self.fps, self.frames = fps, len(rotation)
         self.rotation, self.position = rotation, position
-        #: (F, 3) the reported direction of view in the world.
-        self.view = rotation[:, 2]
         self.view_of_vertical = rotation[:, :, 2].mean(axis=0)
         turn: np.ndarray = np.zeros((self.frames, 3))
         if self.frames > 1:

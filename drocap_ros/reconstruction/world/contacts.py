@@ -1,4 +1,4 @@
-"""Probability that ankles and toes are in contact with the ground, from their speed and height above the floor."""
+"""Probability that ankles and toes are in contact with the ground: from their speed, height and looks."""
 
 from __future__ import annotations
 
@@ -6,19 +6,24 @@ import numpy as np
 
 from drocap_ros.reconstruction.world.world_model import ANKLES, FEET, FEET_HEIGHT_M, FLOOR, WorldState
 
-_AVERAGE_FRAMES = 5
+_AVERAGE_FRAMES = 3
 _HEIGHT_STD_M = 0.1
 #: Spread of the heights of resting feet on level ground, as the body's errors leave it, and on steps.
 _LEVEL_M, _STEPS_M = 0.025, 0.06
 #: Likelihood of a foot that moves, against that of one that rests at the floor.
-_MOVING = 0.15
+_MOVING = 0.25
+#: Least and largest probability of the network: neither a foot in contact nor a moving one depends on it alone.
+_SURE = np.array([0.01, 0.99])
 
 
-def contact_probability(state: WorldState, fps: float, speed_std_m_s: float, seen: np.ndarray) -> np.ndarray:
+def contact_probability(
+    state: WorldState, fps: float, speed_std_m_s: float, seen: np.ndarray, still: np.ndarray | None = None
+) -> np.ndarray:
     """(F - 1, 4) for each step between two frames of each of ``FEET``.
 
     seen : (F, P) bool, of the joints; a toe that no network sees is the lifter's guess and holds no foot
     speed_std_m_s : of a foot in contact, as far as the present joints are accurate
+    still : (F, 2) the network's probability that the right and the left foot rest, None = unknown
     """
     from scipy.ndimage import uniform_filter1d
 
@@ -27,6 +32,9 @@ def contact_probability(state: WorldState, fps: float, speed_std_m_s: float, see
     speed = uniform_filter1d(speed, min(_AVERAGE_FRAMES, max(len(speed), 1)), axis=0, mode="nearest")
     height = 0.5 * (feet[1:, :, 2] + feet[:-1, :, 2]) - state.globals[FLOOR] - FEET_HEIGHT_M
     resting = np.exp(-0.5 * np.square(speed / speed_std_m_s) - 0.5 * np.square(height / _HEIGHT_STD_M))
+    if still is not None:
+        looks = np.clip(0.5 * (still[1:] + still[:-1]), *_SURE)
+        resting *= np.tile(looks / (1.0 - looks), 2)
     probability: np.ndarray = resting / (resting + _MOVING)
     toes = FEET[len(ANKLES) :]
     probability[:, len(ANKLES) :] *= seen[1:, toes] & seen[:-1, toes]

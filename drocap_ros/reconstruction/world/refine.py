@@ -139,7 +139,8 @@ def refine_in_world(
     poses_at = body * poses.factor
     if reason := frozen(turn, path, fps) or other_time(poses_at, turn, path, fps):
         return reason
-    if poses.still is not None and (reason := resting_feet_move(poses_at, _at_all_slots(poses.still, slot), fps)):
+    still = None if poses.still is None else _at_all_slots(poses.still, slot)
+    if still is not None and (reason := resting_feet_move(poses_at, still, fps)):
         return reason
     start, held = _start(tracks.stamp_ns, (poses.joints - origin) / poses.factor, origin, 1.0 / poses.factor, before)
     start = start._replace(joints=_at_all_slots(start.joints, slot), wander=_at_all_slots(start.wander, slot))
@@ -152,8 +153,9 @@ def refine_in_world(
     for rows in windows(frames, _WINDOW, _OVERLAP):
         telemetry = CameraTelemetry(turn[rows], path[rows], fps)
         data = WorldInput(
-            points[rows], weight[rows], depth[rows], sigma[rows], lengths, telemetry, matrix, config, seen[rows], known
-        )
+            points[rows], weight[rows], depth[rows], sigma[rows], lengths, telemetry, matrix, config, seen[rows], known,
+            None if still is None else still[rows],
+        )  # fmt: skip
         state = WorldState(start.joints[rows], start.wander[rows], start.shared)
         found = adjust_in_world(data, state, held)
         fade = fade_weights(rows, frames, _OVERLAP)

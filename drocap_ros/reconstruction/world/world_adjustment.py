@@ -42,7 +42,7 @@ _HOLD = 1e10
 #: Most points that are tried on the line of a step.
 _TRIALS = 10
 #: Errors of the shared unknowns over their formal standard deviations: contacts are chosen by the same data.
-_STD_FACTOR = 1.5
+_STD_FACTOR = 1.25
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
         stage = done + (len(_CONTACT_SPEEDS) if held else 0)
         speed = _CONTACT_SPEEDS[stage - 1] if stage <= len(_CONTACT_SPEEDS) else _LAST_CONTACT_SPEED
         if config.feet:
-            contact = contact_probability(state, data.fps, speed, seen)
+            contact = contact_probability(state, data.fps, speed, seen, data.still)
         weight = config.locked_weight if locking else config.contact_weight
         if stage == len(_CONTACT_SPEEDS) + 1:
             ground = ground_spread(state, contact)

@@ -55,10 +55,11 @@ def normal_matrix(r: Residuals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _set_image_part(r: Residuals, blocks: np.ndarray, border: np.ndarray, corner: np.ndarray) -> None:
-    """Set the reprojection's part of the blocks (upper triangles), border and corner."""
+    """Set the part of the reprojection, and that of the depths that the camera has, of blocks, border and corner."""
     _, by_joint, camera = r.image_derivatives()
     frames = len(by_joint)
-    own = np.swapaxes(camera, 1, 2) @ camera
+    turned, along = r.depth_derivatives(), (r.weights.depth / r.rounded)[..., None]
+    own = np.swapaxes(camera, 1, 2) @ camera + np.swapaxes(turned, 1, 2) @ (along * turned)
     blocks[:, :CAMERA, :CAMERA] = own[:, :CAMERA, :CAMERA]
     border[:, :CAMERA, OF_CAMERA] = own[:, :CAMERA, CAMERA_COLUMNS]
     corner[np.ix_(OF_CAMERA, OF_CAMERA)] = own[:, CAMERA_COLUMNS[:, None], CAMERA_COLUMNS].sum(axis=0)
@@ -69,6 +70,9 @@ def _set_image_part(r: Residuals, blocks: np.ndarray, border: np.ndarray, corner
         blocks[:, at, at] = joint[:, j]
     both = camera.reshape(frames, JOINTS, 2, 9)
     coupling = rows[:, :, 0, :, None] * both[:, :, 0, None, :] + rows[:, :, 1, :, None] * both[:, :, 1, None, :]
+    by_depth = r.view[:, None, :, None] * (along * turned)[:, :, None]
+    coupling += by_depth
+    coupling[:, 0] -= by_depth.sum(axis=1)
     coupling = coupling.reshape(frames, _BODY, 9)
     blocks[:, :CAMERA, CAMERA:] = np.swapaxes(coupling[..., :CAMERA], 1, 2)
     border[:, CAMERA:, OF_CAMERA] = coupling[..., CAMERA_COLUMNS]

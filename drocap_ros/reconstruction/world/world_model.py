@@ -48,7 +48,7 @@ class WorldConfig(Parameters):
     locking_iterations: int = param(
         2, "further steps that keep feet in contact in their places", minimum=0, maximum=100
     )
-    stature_std: float = param(0.04, "relative standard deviation of the assumed stature", minimum=0.001, maximum=1)
+    stature_std: float = param(0.05, "relative standard deviation of the assumed stature", minimum=0.001, maximum=1)
     length_std: float = param(
         0.002, "relative standard deviation of the lifter's bone lengths: noise lengthens free bones", minimum=1e-4,
         maximum=1,
@@ -61,7 +61,7 @@ class WorldConfig(Parameters):
         maximum=45,
     )
     yaw_error_deg: float = param(
-        6.0, "standard deviation of its constant error of yaw: gimbals know the horizon, not north", unit="deg",
+        2.0, "standard deviation of its constant error of yaw: gimbals know the horizon, not north", unit="deg",
         minimum=0.001, maximum=45,
     )  # fmt: skip
     latency_std_s: float = param(
@@ -77,7 +77,7 @@ class WorldConfig(Parameters):
     camera_acceleration_m_s2: float = param(
         3.0, "ordinary acceleration of the camera", unit="m/s^2", minimum=0.01, maximum=100
     )
-    acceleration_m_s2: float = param(13.0, "ordinary acceleration of a joint", unit="m/s^2", minimum=0.01, maximum=1000)
+    acceleration_m_s2: float = param(16.0, "ordinary acceleration of a joint", unit="m/s^2", minimum=0.01, maximum=1000)
     depth_weight: float = param(0.2, "weight of the lifter's depths", minimum=0, maximum=100)
     contact_weight: float = param(
         0.2, "weight of feet in contact: contacts last for some frames", minimum=0, maximum=100
@@ -116,6 +116,7 @@ class WorldInput:
     camera_matrix : (3, 3) px
     seen : (F, 17) bool, the keypoints that a network saw, the others are the lifter's; None = those with a weight
     known : findings of earlier windows
+    still : (F, 2) the network's probability that the right and the left foot rest, None = unknown
     """
 
     keypoints: np.ndarray
@@ -128,6 +129,7 @@ class WorldInput:
     config: WorldConfig = field(default_factory=WorldConfig)
     seen: np.ndarray | None = None
     known: Calibration | None = None
+    still: np.ndarray | None = None
 
     @property
     def fps(self) -> float:

@@ -1,7 +1,7 @@
 """Residuals of the adjustment in the world, their cost and its derivatives.
 
 - a robust (Geman-McClure) distance of the projected joints from the 2D joints,
-- the distance from the lifter's depths, robust, along the reported view,
+- the distance from the lifter's depths, robust, along the camera's corrected view,
 - the deviation of every bone from its length,
 - the accelerations of the joints and of the camera,
 - the step of a foot between two frames in contact, and its height above the floor,
@@ -143,8 +143,9 @@ class Residuals:
         self.image = np.where(data.weight[..., None] > 0, pixels - data.keypoints, 0.0)
         square = np.square(self.image).sum(-1) * data.weight
         self.square, self.robust = square, 1.0 / (1.0 + square / outlier)
-        self.view = data.telemetry.view
-        self.relief = np.einsum("fpi,fi->fp", joints - joints[:, :1], self.view) - data.depth
+        # Along the reported view, a lifter whose bodies lean would turn the camera.
+        self.view = self.rotation[:, 2]
+        self.relief = self.seen[..., 2] - self.seen[:, :1, 2] - data.depth
         self.rounded = np.sqrt(np.square(self.relief) + _DEPTH_ROUNDING_M**2)
         span = joints[:, SPANS[:, 1]] - joints[:, SPANS[:, 0]]
         length = np.sqrt(np.square(span).sum(-1) + 1e-10)
@@ -219,6 +220,15 @@ class Residuals:
         camera[..., 8:9] = by_joint @ (-scale * self.velocity[..., None])
         return (root[..., None] * self.image).reshape(frames, -1), by_joint, camera
 
+    def depth_derivatives(self) -> np.ndarray:
+        """Derivatives (F, 17, 9) of the depths behind the pelvis by the camera, as in :meth:`image_derivatives`."""
+        x, y, _ = np.moveaxis(self.seen - self.seen[:, :1], -1, 0)
+        by_turn = np.stack([y, -x, np.zeros(x.shape)], axis=-1)
+        out = np.zeros((*x.shape, 9))
+        out[..., 3:6] = by_turn @ left_jacobian(self.turn)
+        out[..., 7:8] = by_turn @ self.turn_rate[..., None]
+        return out
+
 
 def gradient(r: Residuals) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives of the cost by the unknowns of every frame (F, FRAME) and by the shared ones (GLOBALS,)."""
@@ -229,12 +239,12 @@ def gradient(r: Residuals) -> tuple[np.ndarray, np.ndarray]:
     shared = np.zeros(GLOBALS)
     image, by_joint, by_camera = r.image_derivatives()
     joints += (image[..., None] * by_joint).reshape(*joints.shape[:2], 2, 3).sum(axis=2)
-    pull = (image[:, None] @ by_camera)[:, 0]
+    relief = weights.depth * r.relief / r.rounded
+    pull = (image[:, None] @ by_camera + relief[:, None] @ r.depth_derivatives())[:, 0]
     camera += pull[:, :CAMERA]
     shared[OF_CAMERA] += pull[:, CAMERA_COLUMNS].sum(axis=0)
-    relief = (weights.depth * r.relief / r.rounded)[..., None] * r.view[:, None]
-    joints += relief
-    joints[:, 0] -= relief.sum(axis=1)
+    joints += relief[..., None] * r.view[:, None]
+    joints[:, 0] -= relief.sum(axis=1)[:, None] * r.view
     stretch = (r.stretch / SPAN_STD_M)[..., None] * r.direction
     for k, (a, b) in enumerate(SPANS):
         joints[:, b] += stretch[:, k]
