@@ -56,9 +56,9 @@ def normal_matrix(r: Residuals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _set_image_part(r: Residuals, blocks: np.ndarray, border: np.ndarray, corner: np.ndarray) -> None:
     """Set the part of the reprojection, and that of the depths that the camera has, of blocks, border and corner."""
-    _, by_joint, camera = r.image_derivatives()
+    _, by_joint, camera = r.image_derivatives
     frames = len(by_joint)
-    turned, along = r.depth_derivatives(), (r.weights.depth / r.rounded)[..., None]
+    turned, along = r.depth_derivatives, (r.weights.depth / r.rounded)[..., None]
     own = np.swapaxes(camera, 1, 2) @ camera + np.swapaxes(turned, 1, 2) @ (along * turned)
     blocks[:, :CAMERA, :CAMERA] = own[:, :CAMERA, :CAMERA]
     border[:, :CAMERA, OF_CAMERA] = own[:, :CAMERA, CAMERA_COLUMNS]

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -192,6 +193,7 @@ class Residuals:
         weighed = self.square[self.data.weight > 0]
         return max(OUTLIER_SQUARE, _OVER_MEDIAN * float(np.median(weighed))) if len(weighed) else OUTLIER_SQUARE
 
+    @cached_property
     def image_derivatives(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The image residuals (F, 34) at the present robust weight, and their derivatives.
 
@@ -220,6 +222,7 @@ class Residuals:
         camera[..., 8:9] = by_joint @ (-scale * self.velocity[..., None])
         return (root[..., None] * self.image).reshape(frames, -1), by_joint, camera
 
+    @cached_property
     def depth_derivatives(self) -> np.ndarray:
         """Derivatives (F, 17, 9) of the depths behind the pelvis by the camera, as in :meth:`image_derivatives`."""
         x, y, _ = np.moveaxis(self.seen - self.seen[:, :1], -1, 0)
@@ -237,10 +240,10 @@ def gradient(r: Residuals) -> tuple[np.ndarray, np.ndarray]:
     camera = frames[:, :CAMERA]
     joints = frames[:, CAMERA:].reshape(state.joints.shape)
     shared = np.zeros(GLOBALS)
-    image, by_joint, by_camera = r.image_derivatives()
+    image, by_joint, by_camera = r.image_derivatives
     joints += (image[..., None] * by_joint).reshape(*joints.shape[:2], 2, 3).sum(axis=2)
     relief = weights.depth * r.relief / r.rounded
-    pull = (image[:, None] @ by_camera + relief[:, None] @ r.depth_derivatives())[:, 0]
+    pull = (image[:, None] @ by_camera + relief[:, None] @ r.depth_derivatives)[:, 0]
     camera += pull[:, :CAMERA]
     shared[OF_CAMERA] += pull[:, CAMERA_COLUMNS].sum(axis=0)
     joints += relief[..., None] * r.view[:, None]
