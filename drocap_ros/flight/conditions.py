@@ -79,6 +79,7 @@ class ConditionCode(enum.IntEnum):
     CAMERA_UNKNOWN = 122
     MOUNT_TYPE_UNKNOWN = 123
     MOUNT_OUTDATED = 124
+    PACKETS_LOST = 125
     # Others in the graph
     OTHER_POSE_PUBLISHER = 130
     SECOND_BRIDGE = 131
@@ -178,6 +179,8 @@ _SENTENCES = {
     "fixed and camera_pitch_deg to the camera's pitch",
     _C.MOUNT_TYPE_UNKNOWN: "the autopilot has not reported {name}, the kind of its mount; set mount to gimbal or servo",
     _C.MOUNT_OUTDATED: "the camera's attitude is outdated; last report of its mount: {ago}",
+    _C.PACKETS_LOST: "{lost_percent:.0f} % of the autopilot's packets do not arrive: above {most_percent:.0f} % no "
+    "mode is requested; let routers pass all of them, or mend the link",
     _C.OTHER_POSE_PUBLISHER: "pose2d has more than one publisher ({names}): stop the others, or give them another "
     "namespace",
     _C.SECOND_BRIDGE: "another bridge, or a replay of one, publishes in {namespace}: stop it, or give it another "

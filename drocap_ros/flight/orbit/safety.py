@@ -6,6 +6,7 @@ import dataclasses
 import math
 
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
 from drocap_ros.flight.orbit.degradation import allowed_pace, next_pace
 from drocap_ros.flight.orbit.hold import begin_hold, request_hold_mode, resumption, retreat, update_hold
 from drocap_ros.flight.orbit.motion_checks import (
@@ -165,6 +166,8 @@ def _execute(
         return state, _refused(_C.NOT_IN_CONTROL_MODE, mode=seen.mode)
     if not limits.safety.mode_change_allowed:
         return state, _refused(_C.MODE_CHANGE_FORBIDDEN, mode=seen.mode)
+    if seen.packet_loss > MAX_LOSS:
+        return state, _refused(_C.PACKETS_LOST, lost_percent=100 * seen.packet_loss, most_percent=100 * MAX_LOSS)
     answer = _accepted(_C.REQUESTING_CONTROL)
     state = _enter(
         State.READY, answer.condition, now_s, modes=frozenset({seen.mode}), requesting_s=now_s,

@@ -76,6 +76,7 @@ class Measured:
     offsets_s : (N,) our clock minus its clock, one by each exchange; their spread counts
     delays_s : (N,) age of each state at its arrival
     good_count, bad_count, unsigned_count : messages; data that is none; messages without our signature
+    packet_loss : share of the autopilot's last packets that did not arrive
     systems : MAVLink systems of all autopilots on the link
     conditions : conditions for motion that failed, with the share of the time, in the order of the checks; as if the
         vehicle were armed and in the air
@@ -94,6 +95,7 @@ class Measured:
     good_count: int = 0
     bad_count: int = 0
     unsigned_count: int = 0
+    packet_loss: float = 0.0
     systems: frozenset[int] = frozenset()
     conditions: tuple[tuple[Condition, float], ...] = ()
     bridge: str = ""

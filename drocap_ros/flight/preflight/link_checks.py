@@ -10,6 +10,7 @@ import numpy as np
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.mavlink.dialects import ARDUPILOT, DIALECTS
+from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
 from drocap_ros.flight.preflight.findings import Finding, Level, Measured, Stream
 
 _C = ConditionCode
@@ -26,6 +27,8 @@ _OWN_PORT = (
 def link_findings(config: MavlinkBridgeConfig, measured: Measured) -> Iterator[Finding]:
     """Everything about the link; the vehicle has been heard."""
     yield _packets(measured)
+    if not measured.bridge:
+        yield _losses(measured)
     if len(measured.systems) > 1:
         yield _several(config, measured)
     for name, stream in measured.streams.items():
@@ -47,6 +50,17 @@ def _packets(measured: Measured) -> Finding:
         "" if measured.bridge else f"at most {100 * _MOST_BAD:.0f} %",
         "check the baud rate and the wiring (ground, RX and TX)" if bad else "",
         {"messages": measured.good_count, "bad": measured.bad_count, "unsigned": measured.unsigned_count},
+    )  # fmt: skip
+
+
+def _losses(measured: Measured) -> Finding:
+    lost = measured.packet_loss
+    level = Level.MISSING if lost > MAX_LOSS else Level.WARNING if lost > 0.5 * MAX_LOSS else Level.OK
+    return Finding(
+        "packet_loss", "packets of the autopilot", level, f"{100 * lost:.0f} % lost",
+        f"below {100 * MAX_LOSS:.0f} %, above it no mode is requested",
+        "" if level == Level.OK else "let routers pass all packets of the autopilot, or mend the link",
+        {"lost": lost}, (_C.PACKETS_LOST,),
     )  # fmt: skip
 
 

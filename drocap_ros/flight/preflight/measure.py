@@ -176,7 +176,8 @@ class Listening:
             round_trips_s=trips[:, 0] / _NS, offsets_s=(trips[:, 1] - trips[:1, 1].sum()) / _NS,
             delays_s=np.array([delay for at, delay in self._delays if at >= from_ns]),
             good_count=sum(map(len, link.arrivals.values())), bad_count=status.bad_count,
-            unsigned_count=status.refused_count, systems=frozenset(link.systems),
+            unsigned_count=status.refused_count, packet_loss=link.estimator.packets.loss,
+            systems=frozenset(link.systems),
             conditions=tuple(
                 (self._examples[code], self._failed[code] / self._samples) for code in sorted(self._failed)
             ),

@@ -207,6 +207,11 @@ def test_start_never_changes_the_mode_and_engage_only_when_allowed():
     state, decision = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, forbidden)
     assert refusal(decision) == ConditionCode.MODE_CHANGE_FORBIDDEN
     assert decision.mode_request == ModeRequest.NONE
+    lossy = dataclasses.replace(LOITER, packet_loss=0.4)
+    state, decision = reduce(SafetyState(), lossy, 0.0, Command.ENGAGE, LIMITS)
+    assert refusal(decision) == ConditionCode.PACKETS_LOST
+    assert "40 % of the autopilot's packets" in str(decision.answer.condition)
+    assert decision.mode_request == ModeRequest.NONE
     state, decision = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, LIMITS)
     assert decision.mode_request == ModeRequest.CONTROL
     state, decision = reduce(permit_mode(state, "GUIDED"), GOOD, 0.3, None, LIMITS)

@@ -69,6 +69,17 @@ def test_a_vehicle_with_everything_set_is_ready_on_the_ground(autopilot):
 
 
 @BOTH
+def test_a_link_that_loses_packets_is_named(autopilot):
+    def lose(share):
+        return lambda scene: setattr(scene.down, "loss", share)
+
+    scene = Scene(autopilot, before=lose(0.5))
+    assert "packet_loss" in scene.missing()
+    assert scene.findings["packet_loss"].values["lost"] == pytest.approx(0.5, abs=0.2)
+    assert Scene(autopilot).findings["packet_loss"].values["lost"] == pytest.approx(0.0, abs=0.02)
+
+
+@BOTH
 def test_nothing_but_requests_for_telemetry_is_sent(autopilot):
     allowed = {"HEARTBEAT", "TIMESYNC", "COMMAND_LONG", "PARAM_REQUEST_READ"}
     scene = Scene(autopilot)
