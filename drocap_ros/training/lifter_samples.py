@@ -23,10 +23,6 @@ _LOWER = np.array([_J[j] for j in ("rankle", "lankle", "lwrist", "rwrist")])
 _FEET = np.array([_J[j] for j in ("rtoe", "ltoe")])
 _KNEES, _SHINS = _UPPER[:2], _LOWER[:2]
 _ABOVE_PELVIS = np.arange(_J["neck"], _J["rwrist"] + 1)
-#: Upper arms and forearms of the right and of the left arm, by the joint at their ends.
-_ARMS = np.array([[_J[side + "elbow"], _J[side + "wrist"]] for side in "rl"])
-#: Share of the windows whose arms are those of another window.
-_EXCHANGED = 0.25
 _SIDES = ((_J["rhip"], _J["lhip"]), (_J["rknee"], _J["lknee"]), (_J["rankle"], _J["lankle"]),
           (_J["lshoulder"], _J["rshoulder"]), (_J["lelbow"], _J["relbow"]), (_J["lwrist"], _J["rwrist"]),
           (_J["rtoe"], _J["ltoe"]))  # fmt: skip
@@ -105,7 +101,6 @@ def _vary_body(bodies: Bodies, rng: np.random.Generator) -> Bodies:
     motion = bodies.joints
     windows, frames, joints, _ = motion.shape
     bone = motion - motion[:, :, np.maximum(BODY_17.parents, 0)]
-    exchange_arms(bone, rng)
 
     # Poses: every limb is turned a little (the lower limb with the upper one), the trunk as a whole; postures
     # bend trunk, hips and knees about the axis of the hips.
@@ -122,10 +117,6 @@ def _vary_body(bodies: Bodies, rng: np.random.Generator) -> Bodies:
     bone[:, :, legs] = _turn(bone[:, :, legs], np.concatenate([hips, hips, hips], axis=2))
     shins = legs[2:]
     bone[:, :, shins] = _turn(bone[:, :, shins], np.concatenate([knees, knees], axis=2))
-    for arm, shoulder, elbow in zip(_ARMS, (6, 7), (8, 9), strict=True):
-        axis = _reaching_axis(pitch, rng)
-        bone[:, :, arm] = _turn(bone[:, :, arm], posture[:, :, None, shoulder, None] * axis)
-        bone[:, :, arm[1:]] = _turn(bone[:, :, arm[1:]], posture[:, :, None, elbow, None] * axis)
     whole = np.concatenate([_UPPER, _LOWER, _FEET])
     limb = turn[:, :, :4]
     bone[:, :, whole] = _turn(bone[:, :, whole], np.concatenate([limb, limb, limb[:, :, :2]], axis=2))
@@ -133,7 +124,7 @@ def _vary_body(bodies: Bodies, rng: np.random.Generator) -> Bodies:
     bone[:, :, lower] = _turn(bone[:, :, lower], np.concatenate([turn[:, :, 4:8], turn[:, :, 4:6]], axis=2))
     bone[:, :, _FEET] = _turn(bone[:, :, _FEET], turn[:, :, 9:11])
     # A foot of a changed pose slides where the recorded one stood.
-    changed = (strength > 0) | (posture[..., 2:6] != 0).any(axis=(1, 2))
+    changed = (strength > 0) | (posture[..., 2:] != 0).any(axis=(1, 2))
     still = np.where(changed[:, None, None], np.float32(np.nan), bodies.still)
 
     # Proportions: one size, then each kind of bone, then a trace of asymmetry.
@@ -143,7 +134,12 @@ def _vary_body(bodies: Bodies, rng: np.random.Generator) -> Bodies:
     bone *= size.astype(np.float32)
 
     # Marker sets differ in the positions of neck, head, shoulders and hips: shift them in the trunk's frame.
-    right, front, up = np.moveaxis(_trunk(bone), -2, 0)
+    up = bone[:, :, _J["neck"]]
+    up = up / np.linalg.norm(up, axis=-1, keepdims=True)
+    right = bone[:, :, _J["rhip"]] - bone[:, :, _J["lhip"]]
+    right = right - (right * up).sum(axis=-1, keepdims=True) * up
+    right /= np.linalg.norm(right, axis=-1, keepdims=True) + 1e-6
+    front = np.cross(up, right)
     shift = (0.02 * rng.standard_normal((windows, 1, 4, 3, 1))).astype(np.float32)
     places = (("neck", 0), ("head", 0), ("rshoulder", 1), ("lshoulder", -1), ("rhip", 1), ("lhip", -1))
     for (joint_name, side), k in zip(places, (0, 1, 2, 2, 3, 3), strict=True):
@@ -170,61 +166,29 @@ def _vary_body(bodies: Bodies, rng: np.random.Generator) -> Bodies:
     return Bodies(_turn(body, (posture[:, :, 0, None] * pitch)[:, :, None]), still)
 
 
-def _trunk(bone: np.ndarray) -> np.ndarray:
-    """(B, T, 3, 3) right, front and up of the trunk of bones (B, T, 17, 3), as rows."""
-    up = bone[:, :, _J["neck"]]
-    up = up / np.linalg.norm(up, axis=-1, keepdims=True)
-    right = bone[:, :, _J["rhip"]] - bone[:, :, _J["lhip"]]
-    right = right - (right * up).sum(axis=-1, keepdims=True) * up
-    right /= np.linalg.norm(right, axis=-1, keepdims=True) + 1e-6
-    return np.stack([right, np.cross(up, right), up], axis=-2)
-
-
-def exchange_arms(bone: np.ndarray, rng: np.random.Generator) -> None:
-    """Give some windows of bones (B, T, 17, 3) the arms of others, in the trunk's frame: MoCap lacks combinations."""
-    windows = len(bone)
-    taker = np.flatnonzero(rng.random(windows) < _EXCHANGED)
-    giver = rng.integers(0, windows, len(taker))
-    trunk = _trunk(bone)
-    turn = np.swapaxes(trunk[taker], 2, 3) @ trunk[giver]
-    arms = _ARMS.ravel()
-    bone[taker[:, None], :, arms] = np.einsum("btij,btpj->bpti", turn, bone[giver][:, :, arms], optimize=True)
-
-
-def _reaching_axis(pitch: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(B, T, 1, 3) axes of an arm that reaches forward, aside or across, about that of the hips (B, T, 1, 3)."""
-    axis = pitch + 0.5 * rng.standard_normal((len(pitch), 1, 1, 3)).astype(np.float32)
-    return axis / (np.linalg.norm(axis, axis=-1, keepdims=True) + 1e-6)
-
-
 def _posture(rng: np.random.Generator, windows: int, frames: int) -> np.ndarray:
-    """(B, T, 10) float32 rad: pitch of the body (back > 0), flexion of the trunk, and of right and left hip, knee,
-    shoulder and elbow.
+    """(B, T, 6) float32 rad: pitch of the body (back > 0), flexion of trunk, right and left hip and knees.
 
-    Zero in half of the windows; in the others the body sits, crouches, kneels, bends, lies down or reaches out, and may
-    end it again: postures that everyday MoCap lacks.
+    Zero in most windows; in the others the body sits, crouches, kneels, bends or lies down, and may get up again:
+    postures that everyday MoCap lacks.
     """
     kind = rng.random(windows)
-    low = np.array([-0.4, -0.4, -0.2, -0.2, 0.0, 0.0, -0.5, -0.5, 0.0, 0.0])
-    high = np.array([0.4, 1.3, 1.9, 1.9, 2.0, 2.0, 2.4, 2.4, 1.8, 1.8])
-    angle = rng.uniform(low, high, (windows, 10))
+    low = np.array([-0.4, -0.4, -0.2, -0.2, 0.0, 0.0])
+    high = np.array([0.4, 1.3, 1.9, 1.9, 2.0, 2.0])
+    angle = rng.uniform(low, high, (windows, 6))
     lying = kind < 0.2
     flat = rng.choice([-1, 1], windows) * rng.normal(1.55, 0.15, windows)
     angle[lying, 0] = np.where(rng.random(windows) < 0.7, flat, rng.uniform(-1.5, 1.5, windows))[lying]
     angle[lying & (rng.random(windows) < 0.4), 1:] *= 0.2
-    # The arms of some keep to the trunk; some reach out and do nothing else.
-    angle[rng.random(windows) < 0.3, 6:] = 0.0
-    angle[kind > 0.4, :6] = 0.0
-    angle[kind > 0.5] = 0.0
+    angle[kind > 0.36] = 0.0
     together = rng.random(windows) < 0.6
-    for right, left in ((2, 3), (4, 5), (6, 7), (8, 9)):
+    for right, left in ((2, 3), (4, 5)):
         angle[together, left] = angle[together, right] * (1 + 0.2 * rng.standard_normal(together.sum()))
     time = np.arange(frames)[None, :, None]
-    apart = np.where(np.arange(10) < 6, 10.0, 30.0)
-    begin = rng.uniform(-1.2 * frames, 0.8 * frames, (windows, 1, 1)) + rng.uniform(-apart, apart, (windows, 1, 10))
-    rise = np.clip((time - begin) / rng.uniform(15, 60, (windows, 1, 10)), 0, 1)
-    end = begin + rng.uniform(40, 300, (windows, 1, 1)) + rng.uniform(-apart, apart, (windows, 1, 10))
-    fall = np.clip((time - end) / rng.uniform(15, 60, (windows, 1, 10)), 0, 1)
+    begin = rng.uniform(-1.2 * frames, 0.8 * frames, (windows, 1, 1)) + rng.uniform(-10, 10, (windows, 1, 6))
+    rise = np.clip((time - begin) / rng.uniform(15, 60, (windows, 1, 6)), 0, 1)
+    end = begin + rng.uniform(40, 300, (windows, 1, 1)) + rng.uniform(-10, 10, (windows, 1, 6))
+    fall = np.clip((time - end) / rng.uniform(15, 60, (windows, 1, 6)), 0, 1)
     curve = rise * (1 - fall)
     return (angle[:, None] * curve**2 * (3 - 2 * curve)).astype(np.float32)
 

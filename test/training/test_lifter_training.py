@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.leg_lengths import refit_knees
 from drocap_ros.reconstruction.lifted.lifter_input import BONES, FEATURES, PARTS
 from drocap_ros.skeleton import BODY_17, indices
 from drocap_ros.training.keypoint_errors import detect
-from drocap_ros.training.lifter_samples import camera_rotation, exchange_arms, sample_batch
+from drocap_ros.training.lifter_samples import camera_rotation, sample_batch
 from drocap_ros.training.mocap_bank import MocapBank, load_bank, straighten_legs
 
 
@@ -76,32 +75,6 @@ def test_length_and_reach_features_agree_with_the_truth():
     np.testing.assert_allclose(np.median(length[given, 0] / true[given]), 1.0, atol=0.02)
     shown = reach[given] > 0
     assert np.median(np.abs(reach[given] - np.abs(span[given][..., 2]))[shown]) < 0.15
-
-
-def test_exchanged_arms_keep_their_place_in_the_trunk():
-    rng = np.random.default_rng(7)
-    joints = bank().joints[:20][None] @ Rotation.random(60, rng=rng).as_matrix().astype(np.float32)[:, None]
-    joints[:30, :, indices(BODY_17.joints, ("relbow", "rwrist"))] += np.float32(0.2)
-    bone = joints - joints[:, :, np.maximum(BODY_17.parents, 0)]
-    own = bone.copy()
-    exchange_arms(bone, rng)
-
-    def angles(bones: np.ndarray) -> np.ndarray:
-        """Of both upper arms and forearms with the trunk's axis and with the line of the hips."""
-        unit = bones / (np.linalg.norm(bones, axis=-1, keepdims=True) + 1e-9)
-        arm = unit[:, :, indices(BODY_17.joints, ("relbow", "rwrist", "lelbow", "lwrist"))]
-        neck, rhip, lhip = (bones[:, :, BODY_17.joints.index(name)] for name in ("neck", "rhip", "lhip"))
-        across = np.cross(neck, rhip - lhip)
-        trunk = np.stack([v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (neck, across)], axis=-1)
-        return arm @ trunk
-
-    taken = np.abs(bone - own).max(axis=(1, 2, 3)) > 1e-3
-    assert 0.05 < taken.mean() < 0.5
-    before, after = angles(own), angles(bone)
-    gap = np.abs(after[taken][:, None] - before[None]).max(axis=(2, 3, 4)).min(axis=1)
-    np.testing.assert_allclose(gap, 0.0, atol=1e-4)
-    rest = [j for j in range(17) if BODY_17.joints[j][1:] not in ("elbow", "wrist")]
-    assert np.array_equal(bone[:, :, rest], own[:, :, rest])
 
 
 def test_known_camera_turns_and_gravity_agree_with_the_poses():
