@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from drocap_ros.cli.demo.desk import NODES, Desk, longest_s
@@ -32,9 +33,7 @@ def fly_in_simulated_time(
     """
     down, up = (Channel(lambda: graph.now_s, config.flight_simulator.seed + i) for i in (1, 2))
     transports = {"mavlink_bridge": LoopbackTransport(down, up), "flight_simulator": LoopbackTransport(up, down)}
-    # The nodes report on /diagnostics; with a process each, their logs are not shown either.
-    logging.getLogger("drocap_ros").setLevel(logging.ERROR)
-    with import_bringup().lockstep(config, NODES, transports=transports) as graph:
+    with _errors_only(), import_bringup().lockstep(config, NODES, transports=transports) as graph:
         desk = Desk(graph.node, operator, lambda text: say(graph.now_s, text), lambda: graph.now_s)
         requests = next(node for node in graph.components if node.component == "mavlink_bridge").requests
 
@@ -52,3 +51,15 @@ def fly_in_simulated_time(
         if operator.failure:
             graph.run_for(REST_S)  # for the hold after the operator's last command
         return graph.now_s
+
+
+@contextmanager
+def _errors_only() -> Iterator[None]:
+    """The nodes report on /diagnostics; with a process each, their logs are not shown either."""
+    logger = logging.getLogger("drocap_ros")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
