@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
@@ -67,11 +65,5 @@ def _coupling(factor: np.ndarray, begin: int) -> np.ndarray:
     rows = min(reach, factor.shape[1] - begin)
     item = flat.itemsize
     square = as_strided(flat, (rows, reach), (item, item * reach), writeable=False)
-    return square * _upper(reach)[:rows]
-
-
-@cache
-def _upper(size: int) -> np.ndarray:
-    """(size, size) ones in the upper triangle."""
-    ones: np.ndarray = np.triu(np.ones((size, size)))
-    return ones
+    upper: np.ndarray = np.triu(square)
+    return upper

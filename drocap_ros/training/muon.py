@@ -1,4 +1,4 @@
-"""Muon in single precision: PyTorch's own works in bfloat16, which processors without it emulate forty times slower."""
+"""Muon in single precision: PyTorch's own works in bfloat16, which processors without it emulate, many times slower."""
 
 from __future__ import annotations
 
@@ -41,7 +41,10 @@ def muon(matrices: list[torch.nn.Parameter], weight_decay: float) -> Any:
         def step(self) -> None:
             for group in self.param_groups:
                 for weight in group["params"]:
-                    momentum = self.state[weight].setdefault("momentum", torch.zeros_like(weight))
+                    state = self.state[weight]
+                    if not state:
+                        state["momentum"] = torch.zeros_like(weight)
+                    momentum = state["momentum"]
                     momentum.lerp_(weight.grad, 1 - _MOMENTUM)
                     update = orthogonalised(weight.grad.lerp(momentum, _MOMENTUM))
                     rate = group["lr"] * math.sqrt(max(1.0, weight.shape[0] / weight.shape[1]))

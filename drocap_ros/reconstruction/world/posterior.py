@@ -55,13 +55,13 @@ def _diagonal_blocks(factor: np.ndarray, frames: int) -> np.ndarray:
     for i in range(FRAME):
         columns[:, i : i + WIDTH, i] = by_frame[:, :, i].T
     inverse = np.linalg.inv(columns[:, :FRAME])
-    coupling = -columns[:, FRAME:] @ inverse
+    coupling = columns[:, FRAME:] @ inverse
     own = np.swapaxes(inverse, 1, 2) @ inverse
     out = np.empty((frames, FRAME, FRAME))
     later, before = np.zeros((2 * FRAME, 2 * FRAME)), np.empty((2 * FRAME, 2 * FRAME))
     for frame in range(frames - 1, -1, -1):
-        off = later @ coupling[frame]
-        block = own[frame] + coupling[frame].T @ off
+        off = -later @ coupling[frame]
+        block = own[frame] - coupling[frame].T @ off
         out[frame] = 0.5 * (block + block.T)  # rounding of the skew part would grow from frame to frame
         before[:FRAME, :FRAME], before[FRAME:, FRAME:] = out[frame], later[:FRAME, :FRAME]
         before[FRAME:, :FRAME], before[:FRAME, FRAME:] = off[:FRAME], off[:FRAME].T
