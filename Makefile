@@ -6,6 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Libraries of a ROS environment around this process must not leak into ours.
 CLEAN := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE -u LD_LIBRARY_PATH -u PYTHONPATH -u AMENT_PREFIX_PATH -u CMAKE_PREFIX_PATH
+TEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
 BENCHMARK = $(CLEAN) $(BIN)/python benchmarks
 SOURCES := $(shell find drocap_ros msg srv config resource -type f -not -path '*/__pycache__/*') setup.py CMakeLists.txt package.xml
 
@@ -38,9 +39,11 @@ $(VENV)/.package: $(VENV)/.requirements $(VENV)/.tf2_msgs $(VENV)/.hri_msgs $(SO
 demo: setup  ## a whole simulated capture, reconstructed and compared with its truth
 	@$(CLEAN) $(BIN)/drocap demo --out demo_out
 
-test: setup  ## the whole test suite: two tests at a time, then tests with clocks or nodes, alone and up to three times
-	$(CLEAN) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not clock" -n 2 --dist loadfile --no-loadscope-reorder
-	$(CLEAN) $(BIN)/python -m pytest -m clock --reruns 2 -r sR
+# All parts run in workers, which end with the run: an interpreter that held nodes may hang at its exit.
+test: setup  ## the whole test suite, two tests at a time: computing, then clocks and nodes (up to three times), then one by one
+	$(CLEAN) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(TEST) -m "not clock and not alone" -n 2
+	$(CLEAN) $(TEST) -m clock -n 2 --reruns 2 -r sR
+	$(CLEAN) $(TEST) -m alone -n 1 --reruns 2 -r sR
 
 lint: setup  ## ruff and mypy
 	$(CLEAN) $(BIN)/ruff check .
