@@ -202,6 +202,7 @@ def table(first: int, count: int) -> int:
     lines = [
         ["orbits", f"{len(rows)} of {count}, {len({row['code'] for row in rows})} version(s) of the code"],
         ["with a breach", f"{len(bad)} " + "; ".join(f"seed {r['seed']}: {', '.join(r['breaches'])}" for r in bad)],
+        ["of them flown, not refused", sum(row["flown"] for row in bad)],
         ["flown", len(flown)],
         ["orbited without a stop from 14 s to the end", len(errors)],
         ["time in ORBITING after the first start, %", f"{100 * np.mean([row['orbiting'] for row in rows]):.0f}"],
