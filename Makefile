@@ -72,6 +72,7 @@ bench-flight: setup  ## simulated faults, orbits by keypoints and by images, fuz
 	$(BENCHMARK)/flight_faults.py processes
 	$(BENCHMARK)/flight_orbits.py
 	$(BENCHMARK)/flight_orbits.py quality
+	$(BENCHMARK)/flight_orbits.py busy
 	$(BENCHMARK)/flight_field.py
 	$(BENCHMARK)/flight_kills.py
 	$(BENCHMARK)/flight_kills.py pilot

@@ -318,31 +318,46 @@ def needed_acceleration(times: np.ndarray, vehicle: np.ndarray, person: np.ndarr
     return float(np.mean(omega**2 * radius) + np.mean(walking)), math.degrees(float(np.mean(np.abs(omega))))
 
 
-def busy(first: int, count: int) -> int:
+BUSY = tuple(itertools.product(("ardupilot", "px4"), ("gimbal", "fixed"), ("stand", "walk"), (0.0, 8.0)))
+
+
+def busy(first: int, count: int, jobs: int) -> int:
     """Orbits of 60 s with late pictures and gaps of telemetry, by mount, person and wind: share of time orbiting."""
-    missed = 0
-    for autopilot, mount, action, wind in itertools.product(
-        ("ardupilot", "px4"), ("gimbal", "fixed"), ("stand", "walk"), (0.0, 8.0)
-    ):
-        for seed in range(first, first + count):
-            settings = LoopSettings(
-                autopilot=autopilot, mount=mount, action=action, wind_m_s=(wind, 0.0, 0.0), seed=seed, seconds=65,
-                late_share=0.05, gaps_hz=0.5,
-            )  # fmt: skip
-            rates = {"attitude_hz": 50.0, "position_hz": 20.0}  # that arrived on real links
-            loop = OrbitLoop(with_config(settings, body_height_m=settings.stature_m, size_error=0.04, **rates))
-            loop.start()
-            loop.run(64.0)
-            quality = orbit_quality(loop, 6.0, 6.0)
-            ended = [str(reason) for _, state, reason in loop.reasons if state in ("HOLDING", "TAKEN_OVER", "FAULT")]
-            refused = [str(answer) for _, answer in loop.answers if not answer.accepted]
-            print(
-                f"{autopilot} {mount} {action} {wind:g} m/s, seed {seed}: orbiting {100 * quality.orbiting:.0f} %, "
-                f"{quality.radius_error_m:.2f} m, {quality.yaw_error_deg:.1f} deg",
-                *ended[:1], *refused[:1], sep="; ",
-            )  # fmt: skip
-            missed += quality.orbiting < 0.9
+    flights = [(*flight, seed) for flight in BUSY for seed in range(first, first + count)]
+    lines, missed = [], 0
+    for orbiting, *line in over_processes(busy_orbit, flights, jobs):
+        lines.append([*line[:5], f"{100 * orbiting:.0f}", *line[5:]])
+        missed += orbiting < 0.9
+        print(*lines[-1], sep="; ")
+    head = [
+        "autopilot", "camera", "person", "wind, m/s", "seed", "orbiting, %", "radius error, m", "yaw error, deg", "why",
+    ]  # fmt: skip
+    text = (
+        "Orbit of 6 m, 19 deg/s wanted, body height known, 60 s: one picture in twenty up to 0.3 s late, pauses of the"
+        " telemetry as on a busy machine. Errors from 6 s on, whether or not it orbits. Required: 90 % of the time.\n\n"
+    )
+    write_figures("flight_busy", "Orbits on a busy machine", text + markdown_table(head, lines))
     return 1 if missed else 0
+
+
+def busy_orbit(flight: tuple[str, str, str, float, int]) -> tuple[float, str, str, str, str, int, str, str, str]:
+    """One of them: share of time orbiting, the flight in words, its errors, and why it ended or was refused."""
+    autopilot, mount, action, wind, seed = flight
+    settings = LoopSettings(
+        autopilot=autopilot, mount=mount, action=action, wind_m_s=(wind, 0.0, 0.0), seed=seed, seconds=65,
+        late_share=0.05, gaps_hz=0.5,
+    )  # fmt: skip
+    rates = {"attitude_hz": 50.0, "position_hz": 20.0}  # that arrived on real links
+    loop = OrbitLoop(with_config(settings, body_height_m=settings.stature_m, size_error=0.04, **rates))
+    loop.start()
+    loop.run(64.0)
+    quality = orbit_quality(loop, 6.0, 6.0)
+    reasons = [str(reason) for _, state, reason in loop.reasons if state in ("HOLDING", "TAKEN_OVER", "FAULT")]
+    reasons += [str(answer.condition) for _, answer in loop.answers if not answer.accepted]
+    return (
+        quality.orbiting, autopilot, mount, action, f"{wind:g}", seed, f"{quality.radius_error_m:.2f}",
+        f"{quality.yaw_error_deg:.1f}", "; ".join(reasons[:1]),
+    )  # fmt: skip
 
 
 def main() -> int:
@@ -358,7 +373,7 @@ def main() -> int:
     if args.what == "quality":
         return quality(args.first, args.count or 1)
     if args.what == "busy":
-        return busy(args.first, args.count or 1)
+        return busy(args.first, args.count or 1, args.jobs)
     if args.what == "table":
         return table(args.first, args.count or 1000)
     return randomized(args.first, args.count or 1000, args.again, args.seconds, args.jobs)
