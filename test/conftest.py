@@ -23,8 +23,8 @@ CLOCKED = (
 COMPUTING = ("system/test_packaging.py", "system/test_simulated_demo.py")
 #: Those of them that count messages or frames while the graph is busy: beside another test they fail now and then.
 ALONE = (
-    "nodes/test_bundle_adjuster.py", "system/test_bringup.py", "system/test_live_faults.py",
-    "system/test_orbit", "view",
+    "nodes/test_bundle_adjuster.py", "nodes/test_live_replay.py", "system/test_bringup.py",
+    "system/test_live_faults.py", "system/test_orbit", "view",
 )  # fmt: skip
 #: Files that take longest begin, so that none of them ends alone.
 LONG = (

@@ -8,9 +8,9 @@ from captured_flight import FLIGHT, flight_config
 from drocap_ros.bringup import bringup
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def captured(tmp_path_factory):
-    """Session of a simulated capture of four seconds."""
+    """Session of a simulated capture of four seconds; of the module, so that a repeated test flies it again."""
     folder = tmp_path_factory.mktemp("flight") / "session"
     with bringup(flight_config(folder), FLIGHT, processes=True) as graph:
         graph.wait_finished("capture_simulator", timeout_s=60)
