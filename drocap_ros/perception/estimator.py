@@ -143,10 +143,12 @@ class PoseEstimator:
         kept = without_parts(everything.boxes, everything.scores)
         found = Detections(everything.boxes[kept], everything.scores[kept])
         subject = self.tracker.update(image, stamp_ns, found.boxes, found.scores, roi)
-        self._detected_ns, self._score, self._confidence = stamp_ns, 0.0 if subject is None else subject.score, 0.0
         if subject is None:
             self._failures = 0
             self._judge_bystander(image, stamp_ns)
+            subject = self.tracker.search_again(stamp_ns)
+        self._detected_ns, self._score, self._confidence = stamp_ns, 0.0 if subject is None else subject.score, 0.0
+        if subject is None:
             return PoseObservation(stamp_ns, 0, size), False
         if subject.hidden:
             return self._without_keypoints(stamp_ns, size, subject), False

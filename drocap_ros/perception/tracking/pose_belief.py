@@ -22,14 +22,14 @@ class PoseBelief:
     """History of the pose confidence of one track.
 
     length : px, usual longer side of the believable boxes; partly hidden persons have shorter ones
-    value : recent mean of the confidence, NaN before the first pose
+    value, last : recent mean of the confidence, and that of the last pose; NaN before the first one
     judged_ns : last pose; believed_ns, box : last believable one and its box (4,) px, None = none yet
     plausible_ns : from when on the track was a person, as far as its poses show; None = it is none
     other : whether track and subject were certainly persons at the same time, hence two of them
     """
 
     def __init__(self, stamp_ns: int) -> None:
-        self.value = float("nan")
+        self.value = self.last = float("nan")
         self.judged_ns: int | None = None
         self.believed_ns: int | None = None
         self.box: np.ndarray | None = None
@@ -43,7 +43,7 @@ class PoseBelief:
         """Add a pose by its mean confidence, found in a box (4,) px."""
         first = self.judged_ns is None or (self.plausible_ns is None and confidence >= CONFIRM_CONFIDENCE)
         self.value = confidence if first else self.value + _RATE * (confidence - self.value)
-        self.judged_ns = stamp_ns
+        self.last, self.judged_ns = confidence, stamp_ns
         if confidence >= max(CONFIRM_CONFIDENCE, _USUAL_SHARE * self._usual):
             self.choose(box, stamp_ns)
             self._usual = confidence if not self._usual else self._usual + _USUAL_RATE * (confidence - self._usual)
@@ -69,7 +69,7 @@ class PoseBelief:
 
     def refute(self, confidence: float, stamp_ns: int) -> None:
         """Mark the track as no person, by a pose that lost against another one."""
-        self.value, self.judged_ns, self.plausible_ns = confidence, stamp_ns, None
+        self.value, self.last, self.judged_ns, self.plausible_ns = confidence, confidence, stamp_ns, None
         self._failing_ns = stamp_ns
 
     @property

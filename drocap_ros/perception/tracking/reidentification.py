@@ -100,14 +100,14 @@ def same_person(lost: Person, person: Person, left_image: bool, alone: bool = Fa
     if left_image:  # re-entry at the place of leaving, at half the usual difference of appearance
         return distance < 1.5 and similarity >= 0.5 * (1 + _REIDENTIFY_SIMILARITY)
     least = _REIDENTIFY_SIMILARITY
-    if alone and gap < _ALONE_S and person.pose.value >= SURE_CONFIDENCE:
+    if alone and gap < _ALONE_S and person.pose.last >= SURE_CONFIDENCE:
         least = _ALONE_SIMILARITY
     return distance < 1.0 + 1.5 * gap and growth < 0.5 + 0.3 * gap and similarity >= least
 
 
 def confirming_hits(person: Person, confirm_frames: int) -> int:
     """Number of detections that confirm a track; a certain pose makes up for some."""
-    return min(2, confirm_frames) if person.pose.value >= SURE_CONFIDENCE else confirm_frames
+    return min(2, confirm_frames) if person.pose.last >= SURE_CONFIDENCE else confirm_frames
 
 
 def search_boxes(

@@ -7,7 +7,7 @@ import numpy as np
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient
 from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.person import Person
-from drocap_ros.perception.tracking.pose_belief import CONFIRM_CONFIDENCE
+from drocap_ros.perception.tracking.pose_belief import CONFIRM_CONFIDENCE, SURE_CONFIDENCE
 from drocap_ros.perception.tracking.reidentification import MIXED_IOU
 
 #: Confidence by which a rival's pose has to exceed the subject's.
@@ -115,6 +115,13 @@ def due_bystander(subject: Person | None, persons: list[Person], stamp_ns: int) 
     if subject is not None and subject.detected_ns == stamp_ns and subject.pose.believed_ns != stamp_ns:
         return None
     seen = [p for p in persons if p is not subject and p.detected_ns == stamp_ns and p.hits > 1 and not p.double]
-    every_ns = _JUDGE_EVERY_NS if subject is not None and subject.detected_ns == stamp_ns else _SEARCH_EVERY_NS
-    due = [p for p in seen if p.pose.judged_ns is None or stamp_ns - p.pose.judged_ns >= every_ns]
+    searching = subject is None or subject.detected_ns != stamp_ns
+
+    def every_ns(person: Person) -> int:
+        if not searching:
+            return _JUDGE_EVERY_NS
+        # A person who comes out of cover shows more joints in every image.
+        return 0 if CONFIRM_CONFIDENCE <= person.pose.last < SURE_CONFIDENCE else _SEARCH_EVERY_NS
+
+    due = [p for p in seen if p.pose.judged_ns is None or stamp_ns - p.pose.judged_ns >= every_ns(p)]
     return min(due, key=lambda p: p.pose.judged_ns or 0, default=None)

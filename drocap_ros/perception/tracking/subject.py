@@ -180,6 +180,11 @@ class SubjectTracker:
             # Of two boxes in each other one may hold the person and its shadow.
             person.pose.other |= bool(overlap_coefficient(person.box[None], subject.box[None])[0, 0] < _APART)
 
+    def search_again(self, stamp_ns: int) -> Subject | None:
+        """The lost subject if the pose that was judged in this image re-identifies it."""
+        self._reidentify(stamp_ns)
+        return self._current(stamp_ns)
+
     def rivals(
         self, image: np.ndarray, stamp_ns: int, boxes: np.ndarray, scores: np.ndarray, confidence: float
     ) -> list[int]:
@@ -250,8 +255,10 @@ class SubjectTracker:
         stamp_ns: int,
     ) -> None:
         """Start tracks from unassigned detections, except parts of tracked persons."""
-        known = boxes[sorted(assigned)].astype(float).reshape(-1, 4)
         subject = self._subject
+        # Leaves and signs that were found to be no person may cover one.
+        tracked = [p for p in self.persons if p.detected_ns == stamp_ns and p.plausible]
+        known = np.array([p.box for p in tracked]).reshape(-1, 4)
         if subject is not None and not self._left_image and 0.0 < subject.unconfirmed_s(stamp_ns) <= self._coast_s:
             known = np.concatenate([known, subject.filter.box()[None]])
         for j in range(len(boxes)):

@@ -193,3 +193,53 @@ def test_empty_ground_and_cut_boxes_are_no_shadow():
     assert shadow_share(image, np.array([20.0, 20, 60, 90])) == 0.0
     assert shadow_share(image, np.array([95.0, 95, 140, 180])) == 0.0
     assert shadow_share(image, np.array([0.0, 0, 100, 100])) == 0.0
+
+
+def search(scene: Scene, confidence: dict[int, float]) -> bool:
+    """Judge the person that is due in the last image; whether its pose re-identifies the subject in that image.
+
+    confidence : of the poses, by the rounded centre's x
+    """
+    stamp = (scene.index - 1) * STEP
+    person = scene.tracker.bystander_to_judge(stamp)
+    if person is not None:
+        x = round(float(person.box[[0, 2]].mean()))
+        scene.tracker.judge_bystander(person, confidence[x], stamp)
+    return scene.tracker.search_again(stamp) is not None
+
+
+def lost_subject() -> Scene:
+    scene = Scene()
+    for _ in range(20):
+        judged(scene, 0.9, scene.show([(300, 180, 160, RED)]))
+    for _ in range(60):
+        scene.show([])
+    return scene
+
+
+def test_subject_that_comes_out_of_cover_is_found_in_the_image_of_its_first_certain_pose():
+    scene = lost_subject()
+    leaves = (340, 280, 160, ((40, 90, 60), (40, 90, 60)))  # over the legs: the appearance alone is not enough
+    found = []
+    for pose in (0.55, 0.55, 0.6, 0.65, 0.8):  # more joints are free in every image; the first one starts the track
+        detections = [(box_of(340, 180, 160), 0.8)]
+        assert scene.show([(340, 180, 160, RED), leaves], detections=detections) is None
+        found.append(search(scene, {340: pose}))
+    assert found == [False, False, False, False, True]
+
+
+def test_person_before_leaves_that_were_found_to_be_none_starts_a_track():
+    scene = lost_subject()
+    leaves = box_of(330, 180, 240)
+    for _ in range(20):
+        scene.show([], detections=[(leaves, 0.5)])
+        search(scene, {330: 0.1})
+    person = (335, 190, 150, RED)
+    for _ in range(4):
+        subject = scene.show([person], detections=[(leaves, 0.5), (box_of(335, 190, 150), 0.6)])
+        if subject is not None or search(scene, {330: 0.1, 335: 0.9}):
+            break
+    else:
+        pytest.fail("the person was not found")
+    assert scene.tracker.persons
+    assert offset(scene.tracker.predict((scene.index - 1) * STEP) or scene.show([person]), 335) < 15
