@@ -1,4 +1,4 @@
-"""Adjustment of the default method: poses of a window with constant bone lengths, by damped Gauss-Newton.
+"""Adjustment of the default method: poses of a window with constant bone lengths, by Gauss-Newton with line search.
 
 The unknowns are the joints of all frames in camera axes, one length per bone, and the zoom: the person's relative
 size in the image, 1 plus a piecewise linear function of time.  The cost is
@@ -22,6 +22,7 @@ import numpy as np
 
 from drocap_ros.geometry.bones import pair_lengths
 from drocap_ros.reconstruction.banded import backward, band_factor, forward
+from drocap_ros.reconstruction.line_search import search_line
 from drocap_ros.reconstruction.stop_reason import CONVERGED, DEADLINE, ITERATIONS, NO_DESCENT
 from drocap_ros.skeleton import BODY_17, RIGID_BONES, indices
 
@@ -39,6 +40,8 @@ SPAN_STD_MM = np.array([4.0 if (p, c) in _RIGID else 6.0 if (p, c) in _FEET else
 _SIZE = 3 * len(BODY_17)
 #: Squared residual, in standard deviations, at which a 2D joint has half its weight.
 _OUTLIER_SQUARE = 9.0
+#: Relative addition to the normal equations' diagonal.
+_DAMPING = 1e-4
 _DEPTH_ROUNDING_MM = 15.0
 
 
@@ -96,7 +99,7 @@ class _Residuals:
     """Residuals at one point, shared by the cost and its derivatives."""
 
     def __init__(self, p: AdjustmentProblem, joints: np.ndarray, lengths: np.ndarray, zooms: np.ndarray) -> None:
-        self.lengths = lengths
+        self.joints, self.lengths, self.zooms = joints, lengths, zooms
         self.zoom = 1.0 + p.zoom_basis @ zooms
         self.zoom_pull = p.zoom_precision @ zooms
         self.growth = lengths - p.lengths
@@ -220,42 +223,45 @@ def adjust(
     tolerance : relative decrease of the cost that ends the solve
     cancelled : called before every step but the first; True ends the solve with reason DEADLINE
     """
-    damping, stop = 1e-4, ITERATIONS
-    lengths, zooms = problem.lengths, np.zeros(problem.zoom_basis.shape[1])
-    here = _Residuals(problem, joints, lengths, zooms)
+    stop = ITERATIONS
+    here = _Residuals(problem, joints, problem.lengths, np.zeros(problem.zoom_basis.shape[1]))
     done = 0
     while done < iterations:
         if done and cancelled is not None and cancelled():
             stop = DEADLINE
             break
-        g, g_sizes = _gradient(problem, here)
-        band, (border, corner) = _band(problem, here), _border(problem, here)
-        right = np.concatenate([-g.reshape(-1, 1), border], axis=1)
-        accepted = False
-        for _ in range(8):
-            damped = band.copy()
-            damped[:, 0] = damped[:, 0] * (1 + damping) + 1e-2 * damping
-            factor = band_factor(damped)
-            if factor is not None:
-                # Eliminate the joints: half of a solve for every column, the other half for the answer alone.
-                y = forward(factor, right)
-                schur = corner + np.diag(damping * np.diag(corner)) - y[:, 1:].T @ y[:, 1:]
-                sizes = np.linalg.solve(schur, -g_sizes - y[:, 1:].T @ y[:, 0])
-                step = backward(factor, y[:, :1] - y[:, 1:] @ sizes[:, None]).reshape(joints.shape)
-                step_lengths, step_zooms = sizes[: len(SPANS)], sizes[len(SPANS) :]
-                there = _Residuals(problem, joints + step, lengths + step_lengths, zooms + step_zooms)
-                if there.cost <= here.cost:
-                    accepted = True
-                    break
-            damping = 10 * damping
-        if not accepted:
+        there = _descend(problem, here)
+        if there is None:
             stop = NO_DESCENT
             break
         decrease = here.cost - there.cost
-        joints, lengths, zooms, here = joints + step, lengths + step_lengths, zooms + step_zooms, there
-        damping *= 0.2
+        here = there
         done += 1
         if decrease <= tolerance * here.cost:
             stop = CONVERGED
             break
-    return AdjustmentSolution(joints, lengths, here.zoom, here.terms, done, stop)
+    return AdjustmentSolution(here.joints, here.lengths, here.zoom, here.terms, done, stop)
+
+
+def _descend(p: AdjustmentProblem, here: _Residuals) -> _Residuals | None:
+    """A lower point along the Gauss-Newton step, or None."""
+    by_joints, by_sizes = _gradient(p, here)
+    band, (border, corner) = _band(p, here), _border(p, here)
+    band[:, 0] += _DAMPING * (band[:, 0] + 1e-2)
+    factor = band_factor(band)
+    if factor is None:
+        return None
+    # Eliminate the joints: half of a solve for every column, the other half for the answer alone.
+    y = forward(factor, np.concatenate([-by_joints.reshape(-1, 1), border], axis=1))
+    schur = corner + np.diag(_DAMPING * np.diag(corner)) - y[:, 1:].T @ y[:, 1:]
+    sizes = np.linalg.solve(schur, -by_sizes - y[:, 1:].T @ y[:, 0])
+    joints = backward(factor, y[:, :1] - y[:, 1:] @ sizes[:, None]).reshape(by_joints.shape)
+    lengths, zooms = sizes[: len(SPANS)], sizes[len(SPANS) :]
+    slope = float((by_joints * joints).sum() + by_sizes @ sizes)
+    return search_line(
+        here.cost,
+        slope,
+        lambda share: _Residuals(
+            p, here.joints + share * joints, here.lengths + share * lengths, here.zooms + share * zooms
+        ),
+    )

@@ -8,10 +8,12 @@ contact are locked in their places while the unknowns of the whole recording sta
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from drocap_ros.reconstruction.banded import backward, band_factor, forward
+from drocap_ros.reconstruction.line_search import search_line
 from drocap_ros.reconstruction.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
 from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.contacts import contact_probability, floor_std, ground_spread
@@ -39,8 +41,6 @@ _LAST_CONTACT_SPEED = 0.15
 _LEAST_SCALE = 0.2
 #: Weight of a held unknown, per m^2 or rad^2: a hundred thousand times that of a clear keypoint.
 _HOLD = 1e10
-#: Most points that are tried on the line of a step.
-_TRIALS = 10
 #: Errors of the shared unknowns over their formal standard deviations: contacts are chosen by the same data.
 _STD_FACTOR = 1.25
 
@@ -114,7 +114,7 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
             stop = NO_DESCENT
             break
         slope = float((frames * step[0]).sum() + shared @ step[1])
-        there = _search(here, step, slope)
+        there = search_line(here.cost, slope, partial(_moved, here, step))
         if there is None:
             stop = NO_DESCENT
             break
@@ -167,16 +167,9 @@ def _findings(covariance: np.ndarray, prior: np.ndarray, expected: np.ndarray, a
     )
 
 
-def _search(here: Residuals, step: tuple[np.ndarray, np.ndarray], slope: float) -> Residuals | None:
-    """A lower point on the step's line: its end, or where parabolas through the points put the minimum."""
-    share = 1.0
-    for _ in range(_TRIALS):
-        there = here.moved(share * step[0], share * step[1])
-        if there.cost <= here.cost and there.state.globals[SCALE] > _LEAST_SCALE:
-            return there
-        bend = (there.cost - here.cost) / share - slope
-        share *= float(np.clip(-0.5 * slope / max(bend, 1e-300), 0.1, 0.5))
-    return None
+def _moved(here: Residuals, step: tuple[np.ndarray, np.ndarray], share: float) -> Residuals | None:
+    there = here.moved(share * step[0], share * step[1])
+    return there if there.state.globals[SCALE] > _LEAST_SCALE else None
 
 
 def _solve(
