@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
@@ -9,44 +11,53 @@ from numpy.lib.stride_tricks import as_strided
 _PIECE = 1200
 
 
-def band_factor(band: np.ndarray) -> np.ndarray | None:
-    """Lower factor (W, N) of the band (N, W), whose element [i, d] couples unknowns i and i + d; destroys the band.
+def band_factor(band: np.ndarray, single: bool = False) -> np.ndarray | None:
+    """Lower factor (W, N) of the band (N, W), whose element [i, d] couples unknowns i and i + d.
 
     None = not positive definite.
-    """
-    from scipy.linalg.lapack import dpbtrf
 
-    factor, info = dpbtrf(band.T, lower=1, overwrite_ab=1)
+    single : in single precision, in half the time: enough for a step that a line search checks.  In double precision
+        the factor takes the band's memory
+    """
+    from scipy.linalg.lapack import dpbtrf, spbtrf
+
+    columns = band.astype(np.float32).T if single else band.T
+    factor, info = (spbtrf if single else dpbtrf)(columns, lower=1, overwrite_ab=1)
     return factor if info == 0 else None
 
 
 def forward(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """(N, K) solution of factor times solution = right."""
-    from scipy.linalg.lapack import dtbtrs
-
-    out = np.empty(right.shape)
+    """(N, K) solution of factor times solution = right, in double precision whatever that of the factor."""
+    solve = _triangular(factor)
+    out = np.empty(right.shape, factor.dtype)
     reach = len(factor) - 1
     for begin, end in _pieces(factor):
-        part = np.array(right[begin:end], order="F")
+        part = np.array(right[begin:end], factor.dtype, order="F")
         if begin:
             part[:reach] -= (_coupling(factor, begin) @ out[begin - reach : begin])[: len(part)]
-        out[begin:end] = dtbtrs(factor[:, begin:end], part, uplo="L", overwrite_b=1)[0]
-    return out
+        out[begin:end] = solve(factor[:, begin:end], part, uplo="L", overwrite_b=1)[0]
+    return out.astype(np.float64, copy=False)
 
 
 def backward(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """(N, K) solution of the factor's transpose times solution = right."""
-    from scipy.linalg.lapack import dtbtrs
-
-    out = np.empty(right.shape)
+    """(N, K) solution of the factor's transpose times solution = right, as of :func:`forward`."""
+    solve = _triangular(factor)
+    out = np.empty(right.shape, factor.dtype)
     reach = len(factor) - 1
     for begin, end in reversed(_pieces(factor)):
-        part = np.array(right[begin:end], order="F")
+        part = np.array(right[begin:end], factor.dtype, order="F")
         if end < len(right):
             after = out[end : end + reach]
             part[-reach:] -= (_coupling(factor, end)[: len(after)].T @ after)[-len(part) :]
-        out[begin:end] = dtbtrs(factor[:, begin:end], part, uplo="L", trans="T", overwrite_b=1)[0]
-    return out
+        out[begin:end] = solve(factor[:, begin:end], part, uplo="L", trans="T", overwrite_b=1)[0]
+    return out.astype(np.float64, copy=False)
+
+
+def _triangular(factor: np.ndarray) -> Any:
+    """LAPACK's solver of triangular bands for the factor's precision."""
+    from scipy.linalg.lapack import dtbtrs, stbtrs
+
+    return stbtrs if factor.dtype == np.float32 else dtbtrs
 
 
 def _pieces(factor: np.ndarray) -> list[tuple[int, int]]:

@@ -248,7 +248,7 @@ def _descend(p: AdjustmentProblem, here: _Residuals) -> _Residuals | None:
     by_joints, by_sizes = _gradient(p, here)
     band, (border, corner) = _band(p, here), _border(p, here)
     band[:, 0] += _DAMPING * (band[:, 0] + 1e-2)
-    factor = band_factor(band)
+    factor = band_factor(band, single=True)
     if factor is None:
         return None
     # Eliminate the joints: half of a solve for every column, the other half for the answer alone.

@@ -183,7 +183,9 @@ def _solve(
     fixed : the shared unknowns stay as they are
     """
     band, border, corner = matrix
-    factor = band_factor(band)
+    factor = band_factor(band, single=True)
+    if factor is None:
+        factor = band_factor(band)
     if factor is None:
         return None
     if fixed:
