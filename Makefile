@@ -4,8 +4,9 @@ PYTHON ?= python3
 export PYENV_VERSION := $(or $(PYENV_VERSION),$(patsubst python%,%,$(filter python3.%,$(PYTHON))))
 VENV := .venv
 BIN := $(VENV)/bin
-# Libraries of a ROS environment around this process must not leak into ours.
-CLEAN := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE -u LD_LIBRARY_PATH -u PYTHONPATH -u AMENT_PREFIX_PATH -u CMAKE_PREFIX_PATH
+# Libraries of a ROS environment around this process must not leak into ours.  Bytecode is kept, whatever the shell says:
+# pip compiles none here, and each process that a test or a graph starts would compile ROS, NumPy and SciPy again.
+CLEAN := env -u PYTHONDONTWRITEBYTECODE -u _ROS_WHEELS_BOOTSTRAP_COMPLETE -u LD_LIBRARY_PATH -u PYTHONPATH -u AMENT_PREFIX_PATH -u CMAKE_PREFIX_PATH
 TEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
 BENCHMARK = $(CLEAN) $(BIN)/python benchmarks
 SOURCES := $(shell find drocap_ros msg srv config resource -type f -not -path '*/__pycache__/*') setup.py CMakeLists.txt package.xml

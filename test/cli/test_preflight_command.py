@@ -60,7 +60,7 @@ def fly(folder, names):
             module = "drocap_ros.simulation.vehicle.mavlink_vehicle"
             place = ("--url", f"udpout:127.0.0.1:{port}", "--autopilot", autopilot)
             vehicles.append(start(module, *place, *more, "--set", *settings, log=folder / f"{name}.vehicle"))
-        options = ("--config", config, "--seconds", "5", "--json", folder / f"{name}.json")
+        options = ("--config", config, "--seconds", "4", "--json", folder / f"{name}.json")
         running[name] = start("drocap_ros.cli", "preflight", *options, log=folder / f"{name}.txt"), port
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as noise:
         end = time.monotonic() + 90
@@ -150,10 +150,14 @@ def test_an_option_out_of_range_is_refused(tmp_path, option):
 
 
 def test_ctrl_c_ends_it_at_once_and_leaves_no_file(tmp_path):
-    config = write_config(tmp_path / "c.yaml", f"udpin:127.0.0.1:{free_udp_port()}", "simulation")
+    port = free_udp_port()
+    config = write_config(tmp_path / "c.yaml", f"udpin:127.0.0.1:{port}", "simulation")
     options = ("--config", config, "--seconds", "200", "--json", tmp_path / "out.json")
     process = start("drocap_ros.cli", "preflight", *options, log=tmp_path / "out")
-    time.sleep(5.0)
+    end = time.monotonic() + 60
+    while f":{port:04X} " not in Path("/proc/net/udp").read_text() and time.monotonic() < end:
+        time.sleep(0.1)
+    time.sleep(0.5)  # it listens
     assert process.poll() is None
     begin = time.monotonic()
     process.send_signal(signal.SIGINT)

@@ -5,7 +5,7 @@ import os
 import signal
 
 import numpy as np
-from captured_flight import flight_config
+from captured_flight import FLIGHT, flight_config
 from sensor_msgs.msg import CompressedImage
 
 from drocap_ros.bringup import bringup
@@ -15,13 +15,15 @@ from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, TOPICS
 
 
-def test_a_session_holds_its_provenance(captured):
-    with open_session(captured) as session:
+def test_a_session_holds_its_provenance(tmp_path):
+    with bringup(flight_config(tmp_path / "s", seconds=0.5), FLIGHT) as graph:
+        graph.wait_finished("capture_simulator", timeout_s=60)
+    with open_session(tmp_path / "s") as session:
         metadata = session.info.metadata
     assert metadata["namespace"] == "/drocap"
     assert json.loads(metadata["versions"])["numpy"] == np.__version__
     assert "k: [" in metadata["calibration"]
-    for name in ("capture_simulator", "initializer", "bundle_adjuster", "session_recorder"):
+    for name in FLIGHT:
         assert f"/**/{name}:" in metadata["configuration"]
 
 

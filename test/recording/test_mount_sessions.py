@@ -1,6 +1,7 @@
 """A flight with each kind of mount is rebuilt in the world from its session alone."""
 
 import dataclasses
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -80,11 +81,23 @@ def flown(mount, folder, messages):
     return loop, np.arange(len(loop._joints)) / settings.perception_hz + EPOCH_NS * 1e-9
 
 
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory, messages):
+    """Gives the session, the loop and the time line of a flight with a mount; each is flown once."""
+
+    @lru_cache
+    def flight_with(mount):
+        folder = tmp_path_factory.mktemp(mount) / "s"
+        return folder, *flown(mount, folder, messages)
+
+    return flight_with
+
+
 @pytest.mark.parametrize("mount", ["gimbal", "servo", "fixed"])
-def test_a_flight_is_rebuilt_in_the_world_from_its_session(mount, tmp_path, messages):
-    loop, time_s = flown(mount, tmp_path / "s", messages)
+def test_a_flight_is_rebuilt_in_the_world_from_its_session(mount, flight):
+    folder, loop, time_s = flight(mount)
     config = DrocapConfig().replace("initializer", assumed_height_m=loop.settings.stature_m)
-    motion, tracks = reconstruct_input(tmp_path / "s", method="ba", config=config)
+    motion, tracks = reconstruct_input(folder, method="ba", config=config)
     assert motion.frame == "world"
     true = np.array([loop.true_cameras[stamp] for stamp in tracks.stamp_ns.tolist()])
     camera_deg = np.rad2deg(angle_between(tracks.camera_rotation, true))
@@ -98,8 +111,8 @@ def test_a_flight_is_rebuilt_in_the_world_from_its_session(mount, tmp_path, mess
     assert errors.world.w_mm < 700.0  # the reported position wanders by 0.4 m: 435 mm with a gimbal
 
 
-def test_a_session_of_a_fixed_camera_without_its_attitude_needs_the_pitch(tmp_path, messages, capsys):
-    loop, _ = flown("fixed", tmp_path / "s", messages)
+def test_a_session_of_a_fixed_camera_without_its_attitude_needs_the_pitch(tmp_path, flight, messages, capsys):
+    folder, loop, _ = flight("fixed")
     pitch = loop.settings.camera_pitch_deg
     unknown = messages.quaternion(np.full(4, np.nan))
     old = []
@@ -109,7 +122,7 @@ def test_a_session_of_a_fixed_camera_without_its_attitude_needs_the_pitch(tmp_pa
             cdr = messages.cdr(message)
         old.append((topic, message, stamp_ns, cdr))
     record(tmp_path / "old", old)
-    with open_session(tmp_path / "s") as session:
+    with open_session(folder) as session:
         recorded = read_pose2d(session)
         with pytest.raises(InputError, match="--mount-pitch"):
             read_pose2d(session, pitch)
@@ -120,7 +133,7 @@ def test_a_session_of_a_fixed_camera_without_its_attitude_needs_the_pitch(tmp_pa
     same = np.isin(given.stamp_ns, recorded.stamp_ns)
     assert np.abs(given.camera_rotation[same] - recorded.camera_rotation).max() < 1e-3
     options = ["--out", str(tmp_path / "out"), "--no-report", "--quiet", "--mount-pitch", f"{pitch:.3f}"]
-    assert main(["reconstruct", str(tmp_path / "s"), *options]) == 2
+    assert main(["reconstruct", str(folder), *options]) == 2
     assert "leave the option out" in capsys.readouterr().err
     assert main(["reconstruct", str(tmp_path / "old"), *options]) == 0
     assert load_motion(tmp_path / "out" / "motion.npz").frame == "world"

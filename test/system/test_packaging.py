@@ -59,13 +59,12 @@ def copied_to(workspace):
     return folder
 
 
-@pytest.mark.parametrize("option", ["", "--symlink-install"])
-def test_colcon_installs_messages_nodes_and_launch_file(workspace, option):
-    # The second build reuses the compiled messages and links the Python modules instead of copying them.
+def assert_colcon_installs(workspace, *option):
+    """Build, and import every node of the installation; the second build of a workspace reuses compiled messages."""
     for left in ("install", "build/drocap_ros/ament_cmake_python/drocap_ros/drocap_ros"):
         shutil.rmtree(workspace / left, ignore_errors=True)
     ros = environment(AMENT_PREFIX_PATH=str(PREFIX), CMAKE_PREFIX_PATH=str(PREFIX))
-    build = ["colcon", "build", *option.split(), "--cmake-args", f"-DPython3_EXECUTABLE={sys.executable}"]
+    build = ["colcon", "build", *option, "--cmake-args", f"-DPython3_EXECUTABLE={sys.executable}"]
     run(*build, "-DBUILD_TESTING=OFF", "-GNinja", cwd=workspace, env=ros)
     imports = "; ".join(f"import drocap_ros.nodes.{name}" for name in NODES)
     check = f"import drocap_ros.msg as m; m.Pose2D(); print(m.__file__); {imports}; print(drocap_ros.nodes.__file__)"
@@ -82,10 +81,16 @@ def test_colcon_installs_messages_nodes_and_launch_file(workspace, option):
     )
 
 
-def test_wheel_contains_interfaces_libraries_and_data(source, tmp_path):
+def test_colcon_installs_messages_nodes_and_launch_file(workspace):
+    assert_colcon_installs(workspace)
+
+
+def test_wheel_contains_interfaces_libraries_and_data(workspace, tmp_path):
+    # Both builds run the same CMakeLists.txt: this one links what colcon compiled.  `make setup` compiles by pip.
+    compiled = environment(DROCAP_BUILD_DIR=str(workspace / "build" / "drocap_ros"))
     run(
-        sys.executable, "-m", "pip", "wheel", source, "--no-deps", "--no-build-isolation", "-w", tmp_path / "wheels",
-        cwd=tmp_path, env=environment(),
+        sys.executable, "-m", "pip", "wheel", workspace / "src" / "drocap_ros", "--no-deps", "--no-build-isolation",
+        "-w", tmp_path / "wheels", cwd=tmp_path, env=compiled,
     )  # fmt: skip
     (wheel,) = (tmp_path / "wheels").glob("*.whl")
     assert "none-any" not in wheel.name
@@ -101,6 +106,10 @@ def test_wheel_contains_interfaces_libraries_and_data(source, tmp_path):
         assert wanted in names
     assert any(name.endswith("/lib/libdrocap_ros__rosidl_typesupport_c.so") for name in names)
     assert any(name.endswith("/share/drocap_ros/msg/Pose2D.msg") for name in names)
+
+
+def test_colcon_links_the_modules_of_the_sources(workspace):
+    assert_colcon_installs(workspace, "--symlink-install")
 
 
 def test_package_without_ros_imports_all_but_nodes_and_messages(source, tmp_path):

@@ -127,6 +127,11 @@ def fly_fault(fault: Fault, autopilot: str, seed: int = 4) -> FaultResult:
     AssertionError
         When the loop is not in the case's state before the fault.
     """
+    return inject_fault(fault, lead_to_fault(fault, autopilot, seed))
+
+
+def lead_to_fault(fault: Fault, autopilot: str, seed: int = 4) -> OrbitLoop:
+    """First part of :func:`fly_fault`: the loop at ``FAULT_S``."""
     loop = OrbitLoop(fault.settings(autopilot, seed))
     for at_s, act in fault.before:
         loop.run(at_s)
@@ -135,6 +140,11 @@ def fly_fault(fault: Fault, autopilot: str, seed: int = 4) -> FaultResult:
     safety = loop.controller.safety
     if safety.state != fault.state:
         raise AssertionError(f"{fault.name}: {safety.state.name} before the fault: {safety.reason}")
+    return loop
+
+
+def inject_fault(fault: Fault, loop: OrbitLoop) -> FaultResult:
+    """Second part of :func:`fly_fault`, from ``FAULT_S`` on."""
     times: list[float] = []
     accepted: list[int] = []
 

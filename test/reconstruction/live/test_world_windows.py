@@ -47,6 +47,12 @@ def followed() -> list[LivePose | LiveWindow]:
     return run(flown().observations, flown().history(keep_s=60.0).along)
 
 
+@lru_cache(maxsize=1)
+def without_telemetry() -> LiveWindow:
+    """The last window of the same flight when no pose of the camera arrives."""
+    return windows_of(run(flown().observations, lambda stamp_ns: None))[-1]
+
+
 def errors(poses: dict[int, np.ndarray], truth: Orbit) -> WorldErrors:
     place = {int(stamp): i for i, stamp in enumerate(truth.stamp_ns)}
     stamps = sorted(poses)
@@ -161,7 +167,7 @@ def test_wrong_telemetry_is_refused_and_bends_no_body(kind: str) -> None:
     assert last.in_map is None
     assert {"yaw": "foot", "frozen": "stopped", "other time": "feet"}[kind] in last.reason
     # The poses are those of a graph without telemetry.
-    without = windows_of(run(true.observations, lambda stamp_ns: None))[-1]
+    without = without_telemetry()
     place = np.searchsorted(true.stamp_ns, last.stamp_ns)
     bent, free = (pa_mpjpe(w.joints3d.astype(float), true.truth[place]).mean() for w in (windows[-1], without))
     assert bent < 1.05 * free + 0.001

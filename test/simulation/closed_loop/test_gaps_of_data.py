@@ -1,9 +1,11 @@
 """Gaps of pictures and telemetry in flight: the orbit slows down and goes on, or holds and starts again."""
 
 import dataclasses
+from functools import lru_cache
 
 import numpy as np
 import pytest
+from branched import branched
 
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.states import Action, Command, State
@@ -22,6 +24,15 @@ def orbit(autopilot, **config):
     return loop
 
 
+begun = lru_cache(orbit)
+
+
+@pytest.fixture
+def loop(autopilot):
+    """An orbit that has begun, flown once of each autopilot."""
+    return begun(autopilot)
+
+
 def blind(loop, seconds):
     """No picture arrives for a while."""
     loop.perceive = lambda seen: None
@@ -38,8 +49,8 @@ def silence(loop, seconds):
 
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
 @pytest.mark.parametrize(("gap", "seconds"), [(blind, 0.5), (silence, 0.3)])
-def test_orbit_goes_on_after_a_gap(autopilot, gap, seconds):
-    loop = orbit(autopilot)
+@branched
+def test_orbit_goes_on_after_a_gap(loop, gap, seconds):
     paces = []
     for _ in range(3):
         gap(loop, seconds)
@@ -67,8 +78,8 @@ def jump(loop):
     ("autopilot", "fault"),
     [("ardupilot", nothing), ("ardupilot", freeze), ("ardupilot", jump), ("px4", nobody), ("px4", jump)],
 )
-def test_commanded_motion_ends_in_time_after_a_fault_of_perception(autopilot, fault):
-    loop = orbit(autopilot)
+@branched
+def test_commanded_motion_ends_in_time_after_a_fault_of_perception(loop, fault):
     position = loop.copter.body.position.copy()
     fault(loop)
     sent = []
@@ -83,8 +94,9 @@ def test_commanded_motion_ends_in_time_after_a_fault_of_perception(autopilot, fa
     assert loop.controller.safety.state == State.HOLDING
 
 
-def test_hold_that_dead_perception_began_stays():
-    loop = orbit("ardupilot")
+@pytest.mark.parametrize("autopilot", ["ardupilot"])
+@branched
+def test_hold_that_dead_perception_began_stays(loop):
     blind(loop, 4.0)
     assert loop.controller.safety.state == State.HOLDING
     loop.run(loop.t + 4.0)
@@ -107,8 +119,8 @@ def test_orbit_resumes_after_a_short_hold_where_the_operator_allows_it(autopilot
 
 
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
-def test_starting_again_after_a_hold_is_one_command(autopilot):
-    loop = orbit(autopilot)
+@branched
+def test_starting_again_after_a_hold_is_one_command(loop, autopilot):
     blind(loop, 6.0)
     loop.run(loop.t + 2.0)
     assert loop.controller.safety.state == State.HOLDING
@@ -118,8 +130,9 @@ def test_starting_again_after_a_hold_is_one_command(autopilot):
     assert loop.controller.safety.state == State.ORBITING, loop.reasons[-3:]
 
 
-def test_start_is_enough_when_the_pilot_gives_control_back_after_a_hold():
-    loop = orbit("ardupilot")
+@pytest.mark.parametrize("autopilot", ["ardupilot"])
+@branched
+def test_start_is_enough_when_the_pilot_gives_control_back_after_a_hold(loop):
     blind(loop, 6.0)
     assert loop.copter.mode == "BRAKE"
     loop.copter.set_mode("GUIDED", "pilot")

@@ -1,7 +1,10 @@
 """Setpoints that are lost on the way, a bridge that stood still: nothing follows until the operator commands."""
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
+from branched import branched
 
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.states import Action, Command, State
@@ -17,6 +20,15 @@ def orbit(autopilot):
     loop.run(7.0)
     assert loop.controller.safety.state == State.ORBITING
     return loop
+
+
+begun = lru_cache(orbit)
+
+
+@pytest.fixture
+def loop(autopilot):
+    """An orbit that has begun, flown once of each autopilot."""
+    return begun(autopilot)
 
 
 def drop_setpoints(loop):
@@ -35,8 +47,8 @@ def speed_at(loop, t_s):
 
 
 @BOTH
-def test_setpoints_alone_are_dropped_on_the_way(autopilot):
-    loop = orbit(autopilot)
+@branched
+def test_setpoints_alone_are_dropped_on_the_way(loop):
     end = drop_setpoints(loop)
     loop.run(12.0)
     noticed = [(t, cause) for t, state, cause in loop.reasons if state == "HOLDING"]
@@ -52,8 +64,8 @@ def test_setpoints_alone_are_dropped_on_the_way(autopilot):
 
 
 @BOTH
-def test_a_bridge_that_was_stopped_and_continues_sends_nothing_until_it_is_engaged(autopilot):
-    loop = orbit(autopilot)
+@branched
+def test_a_bridge_that_was_stopped_and_continues_sends_nothing_until_it_is_engaged(loop, autopilot):
     loop.stopped = True
     loop.run(10.0)
     loop.stopped = False
@@ -66,8 +78,9 @@ def test_a_bridge_that_was_stopped_and_continues_sends_nothing_until_it_is_engag
     assert loop.controller.safety.state == State.ORBITING
 
 
-def test_a_step_that_was_interrupted_sends_no_old_setpoint():
-    loop = orbit("px4")
+@pytest.mark.parametrize("autopilot", ["px4"])
+@branched
+def test_a_step_that_was_interrupted_sends_no_old_setpoint(loop):
     sent = len(loop.link.sent_setpoints()), loop.link.sent_setpoints()[-1][0]
     step, loop.link.decided_s = loop.controller.step, 0.0
     state = loop.copter.mode
@@ -82,8 +95,9 @@ def test_a_step_that_was_interrupted_sends_no_old_setpoint():
     assert state == "OFFBOARD"
 
 
-def test_with_the_downlink_lost_px4_ends_in_its_own_hold_and_offboard_does_not_return():
-    loop = orbit("px4")
+@pytest.mark.parametrize("autopilot", ["px4"])
+@branched
+def test_with_the_downlink_lost_px4_ends_in_its_own_hold_and_offboard_does_not_return(loop):
     loop.down.cut = True
     loop.run(13.0)
     loop.down.cut = False
@@ -98,8 +112,9 @@ def test_with_the_downlink_lost_px4_ends_in_its_own_hold_and_offboard_does_not_r
 
 
 @BOTH
-def test_the_pilots_mode_is_noticed_within_a_fifth_of_a_second(autopilot):
-    loop, late = orbit(autopilot), []
+@branched
+def test_the_pilots_mode_is_noticed_within_a_fifth_of_a_second(loop, autopilot):
+    late = []
     for i in range(3):
         loop.run(loop.t + 0.047 * i)
         assert loop.controller.safety.state == State.ORBITING
@@ -114,8 +129,9 @@ def test_the_pilots_mode_is_noticed_within_a_fifth_of_a_second(autopilot):
     assert max(late) <= (0.2 if autopilot == "px4" else 0.3), late
 
 
-def test_wind_that_is_stronger_than_the_vehicle_ends_the_orbit():
-    loop = orbit("ardupilot")
+@pytest.mark.parametrize("autopilot", ["ardupilot"])
+@branched
+def test_wind_that_is_stronger_than_the_vehicle_ends_the_orbit(loop):
     loop.copter.body.wind = np.array([0.0, 12.0, 0.0])
     loop.run(20.0)
     assert loop.controller.safety.state == State.HOLDING
