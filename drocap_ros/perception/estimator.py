@@ -146,7 +146,7 @@ class PoseEstimator:
         if subject is None:
             self._failures = 0
             self._judge_bystander(image, stamp_ns)
-            subject = self.tracker.search_again(stamp_ns)
+            subject = self.tracker.current(stamp_ns)
         self._detected_ns, self._score, self._confidence = stamp_ns, 0.0 if subject is None else subject.score, 0.0
         if subject is None:
             return PoseObservation(stamp_ns, 0, size), False

@@ -173,17 +173,14 @@ class SubjectTracker:
         return due_bystander(self._subject, self.persons, stamp_ns)
 
     def judge_bystander(self, person: Person, confidence: float, stamp_ns: int) -> None:
-        """Add the mean confidence of a bystander's pose."""
+        """Add the mean confidence of a bystander's pose, which may re-identify a lost subject."""
         subject = self._subject
         person.pose.judge(confidence, person.box, stamp_ns)
         if subject is not None and subject.pose.believed_ns == stamp_ns and confidence >= SURE_CONFIDENCE:
             # Of two boxes in each other one may hold the person and its shadow.
             person.pose.other |= bool(overlap_coefficient(person.box[None], subject.box[None])[0, 0] < _APART)
-
-    def search_again(self, stamp_ns: int) -> Subject | None:
-        """The lost subject if the pose that was judged in this image re-identifies it."""
-        self._reidentify(stamp_ns)
-        return self._current(stamp_ns)
+        if self.current(stamp_ns) is None:
+            self._reidentify(stamp_ns)
 
     def rivals(
         self, image: np.ndarray, stamp_ns: int, boxes: np.ndarray, scores: np.ndarray, confidence: float
@@ -223,9 +220,8 @@ class SubjectTracker:
         """
         if roi is not None:
             self._apply_roi(np.asarray(roi, float), stamp_ns)
-        # At a low image rate coasting spans at least two missed images.
-        interval_s = 0.0 if self._last_ns is None else (stamp_ns - self._last_ns) * 1e-9
-        self._coast_s = max(self._config.coast_s, min(2.5 * interval_s, FORGET_S))
+        if self._last_ns is not None:  # at a low image rate coasting spans at least two missed images
+            self._coast_s = max(self._config.coast_s, min(2.5e-9 * (stamp_ns - self._last_ns), FORGET_S))
         self._last_ns = stamp_ns
         for person in self.persons:
             person.filter.predict(stamp_ns)
@@ -243,8 +239,8 @@ class SubjectTracker:
         self._apply_choice(stamp_ns)
         self._select(image.shape, stamp_ns)
         self._prune(image.shape, stamp_ns)
-        self._any_detected = self._any_detected or bool(len(boxes))
-        return self._current(stamp_ns)
+        self._any_detected |= bool(len(boxes))
+        return self.current(stamp_ns)
 
     def _spawn(
         self,
@@ -257,8 +253,7 @@ class SubjectTracker:
         """Start tracks from unassigned detections, except parts of tracked persons."""
         subject = self._subject
         # Leaves and signs that were found to be no person may cover one.
-        tracked = [p for p in self.persons if p.detected_ns == stamp_ns and p.plausible]
-        known = np.array([p.box for p in tracked]).reshape(-1, 4)
+        known = np.array([p.box for p in self.persons if p.detected_ns == stamp_ns and p.plausible]).reshape(-1, 4)
         if subject is not None and not self._left_image and 0.0 < subject.unconfirmed_s(stamp_ns) <= self._coast_s:
             known = np.concatenate([known, subject.filter.box()[None]])
         for j in range(len(boxes)):
@@ -277,9 +272,8 @@ class SubjectTracker:
             return
         seen = [p for p in self.persons if p is not lost and p.detected_ns == stamp_ns and could_be(lost, p)]
         for person in seen:
-            if person.hits < confirming_hits(person, self._config.confirm_frames):
-                continue
-            if not same_person(lost, person, self._left_image, alone=len(seen) == 1):
+            early = person.hits < confirming_hits(person, self._config.confirm_frames)
+            if early or not same_person(lost, person, self._left_image, alone=len(seen) == 1):
                 continue
             self.persons.remove(lost)
             person.appearance = lost.appearance if lost.appearance is not None else person.appearance
@@ -318,10 +312,8 @@ class SubjectTracker:
         if config.subject in ("box", "roi") and (not self._track_id or config.on_loss == "wait"):
             return
         if self._subject is not None:
-            if config.on_loss == "wait":
-                return
             patience_s = 0.0 if self._left_image else self._coast_s + _GIVE_UP_S
-            if self._subject.unconfirmed_s(stamp_ns) <= patience_s:
+            if config.on_loss == "wait" or self._subject.unconfirmed_s(stamp_ns) <= patience_s:
                 return
         best = select(self.persons, self._subject, config, shape, stamp_ns, not self._track_id, not self._any_detected)
         if best is not None:
@@ -344,7 +336,8 @@ class SubjectTracker:
             kept.sort(key=lambda p: (p is not subject, -p.detected_ns))
         self.persons = kept[:_MAX_PERSONS]
 
-    def _current(self, stamp_ns: int) -> Subject | None:
+    def current(self, stamp_ns: int) -> Subject | None:
+        """The subject in the image of the last update."""
         subject = self._subject
         if subject is None or subject.unconfirmed_s(stamp_ns) > (0.0 if self._left_image else self._coast_s):
             return None

@@ -205,7 +205,7 @@ def search(scene: Scene, confidence: dict[int, float]) -> bool:
     if person is not None:
         x = round(float(person.box[[0, 2]].mean()))
         scene.tracker.judge_bystander(person, confidence[x], stamp)
-    return scene.tracker.search_again(stamp) is not None
+    return scene.tracker.current(stamp) is not None
 
 
 def lost_subject() -> Scene:
