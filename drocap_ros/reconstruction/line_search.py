@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Protocol, TypeVar
 
@@ -27,13 +28,14 @@ def search_line(cost: float, slope: float, point_at: Callable[[float], _Point | 
 
     Returns
     -------
-    None where ten points have a higher cost or are not allowed.
+    None where ten points have a higher cost, one that is not finite, or are not allowed.
     """
     share = 1.0
     for _ in range(_TRIALS):
         there = point_at(share)
         if there is not None and there.cost <= cost:
             return there
-        bend = ((float("inf") if there is None else there.cost) - cost) / share - slope
+        high = there.cost if there is not None and math.isfinite(there.cost) else math.inf
+        bend = (high - cost) / share - slope
         share *= min(max(-0.5 * slope / max(bend, 1e-300), 0.1), 0.5)
     return None

@@ -22,5 +22,20 @@ def test_pieces_give_the_solution_of_the_whole(size: int, width: int) -> None:
         np.testing.assert_allclose(ours(factor, right), whole, rtol=1e-9, atol=1e-12)
 
 
+def test_single_precision_solves_a_well_conditioned_band_to_six_digits() -> None:
+    rng = np.random.default_rng(1)
+    band = rng.normal(size=(2500, 115))
+    band[:, 0] = 3.0 * 115
+    single, double = band_factor(band, single=True), band_factor(band.copy())
+    assert single is not None
+    assert double is not None
+    assert single.dtype == np.float32
+    right = rng.normal(size=(2500, 4))
+    for solve in (forward, backward):
+        found = solve(single, right)
+        assert found.dtype == np.float64
+        np.testing.assert_allclose(found, solve(double, right), rtol=1e-4, atol=1e-7)
+
+
 def test_a_band_that_is_not_positive_definite_has_no_factor() -> None:
     assert band_factor(np.array([[1.0, 2.0], [1.0, 0.0]])) is None
