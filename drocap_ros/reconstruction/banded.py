@@ -11,18 +11,15 @@ from numpy.lib.stride_tricks import as_strided
 _PIECE = 1200
 
 
-def band_factor(band: np.ndarray, single: bool = False) -> np.ndarray | None:
-    """Lower factor (W, N) of the band (N, W), whose element [i, d] couples unknowns i and i + d.
+def band_factor(band: np.ndarray) -> np.ndarray | None:
+    """Lower factor (W, N) of the band (N, W), whose element [i, d] couples unknowns i and i + d; destroys the band.
 
-    None = not positive definite.
-
-    single : in single precision, in half the time: enough for a step that a line search checks.  In double precision
-        the factor takes the band's memory
+    None = not positive definite.  In single precision it takes half the time: enough for a step that a line search
+    checks.
     """
     from scipy.linalg.lapack import dpbtrf, spbtrf
 
-    columns = band.astype(np.float32).T if single else band.T
-    factor, info = (spbtrf if single else dpbtrf)(columns, lower=1, overwrite_ab=1)
+    factor, info = (spbtrf if band.dtype == np.float32 else dpbtrf)(band.T, lower=1, overwrite_ab=1)
     return factor if info == 0 else None
 
 

@@ -152,7 +152,7 @@ def _gradient(p: AdjustmentProblem, r: _Residuals) -> tuple[np.ndarray, np.ndarr
 
 
 def _band(p: AdjustmentProblem, r: _Residuals) -> np.ndarray:
-    """Gauss-Newton matrix of the joints, (F * 51, 103): element [i, d] couples unknowns i and i + d."""
+    """Gauss-Newton matrix of the joints, (F * 51, 103) float32: element [i, d] couples unknowns i and i + d."""
     frames = len(p.prior)
     diagonal = np.zeros(p.prior.shape)
     seen = np.square(r.robust)[..., None] * p.information
@@ -169,7 +169,7 @@ def _band(p: AdjustmentProblem, r: _Residuals) -> np.ndarray:
     each = np.arange(block.shape[1])
     block[:, each, 0, each, 1] += seen[..., 1]
     rows = block.reshape(frames, _SIZE, _SIZE)
-    band = np.zeros((frames, _SIZE, 2 * _SIZE + 1))
+    band = np.zeros((frames, _SIZE, 2 * _SIZE + 1), np.float32)
     for i in range(_SIZE):
         band[:, i, : _SIZE - i] = rows[:, i, i:]
     band[:, :, 0] += diagonal.reshape(frames, _SIZE)
@@ -248,7 +248,7 @@ def _descend(p: AdjustmentProblem, here: _Residuals) -> _Residuals | None:
     by_joints, by_sizes = _gradient(p, here)
     band, (border, corner) = _band(p, here), _border(p, here)
     band[:, 0] += _DAMPING * (band[:, 0] + 1e-2)
-    factor = band_factor(band, single=True)
+    factor = band_factor(band)
     if factor is None:
         return None
     # Eliminate the joints: half of a solve for every column, the other half for the answer alone.

@@ -107,9 +107,7 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
             floor = floor_std(ground, FLOOR_STD_M)
         here = Residuals(data, weights, state, contact, weight, outlier, floor)
         frames, shared = gradient(here)
-        matrix = normal_matrix(here)
-        matrix[0][: held * FRAME, 0] += _HOLD
-        step = _solve(matrix, frames, shared, locking)
+        step = _solve(here, frames, shared, locking, held)
         if step is None:
             stop = NO_DESCENT
             break
@@ -173,20 +171,19 @@ def _moved(here: Residuals, step: tuple[np.ndarray, np.ndarray], share: float) -
 
 
 def _solve(
-    matrix: tuple[np.ndarray, np.ndarray, np.ndarray],
-    frames: np.ndarray,
-    shared: np.ndarray,
-    fixed: bool,
+    here: Residuals, frames: np.ndarray, shared: np.ndarray, fixed: bool, held: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Step of the frames' and the shared unknowns; None = not positive definite.
 
-    fixed : the shared unknowns stay as they are
+    fixed : the shared unknowns stay as they are; held : so many frames at the begin do, too
     """
-    band, border, corner = matrix
-    factor = band_factor(band, single=True)
-    if factor is None:
+    for single in (True, False):
+        band, border, corner = normal_matrix(here, single)
+        band[: held * FRAME, 0] += _HOLD
         factor = band_factor(band)
-    if factor is None:
+        if factor is not None:
+            break
+    else:
         return None
     if fixed:
         return backward(factor, forward(factor, -frames.reshape(-1, 1))).reshape(-1, FRAME), np.zeros(GLOBALS)
