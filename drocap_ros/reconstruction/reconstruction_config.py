@@ -79,7 +79,7 @@ class BundleAdjusterConfig(Parameters):
     gap_s: float = param(1.0, "after a longer gap the live window keeps only the person's bone lengths and size",
                          unit="s", minimum=0.05, maximum=60.0)  # fmt: skip
     max_pending: int = param(1000, "most images of the live node without their initial pose", minimum=1, maximum=10000)
-    stature_std: float = param(0.07, "relative standard deviation of the assumed stature", minimum=0.001, maximum=1.0)
+    stature_std: float = param(0.05, "relative standard deviation of the assumed stature", minimum=0.001, maximum=1.0)
     telemetry_tilt_deg: float = param(0.3, "accuracy (standard deviation) of the camera's pitch and roll", unit="deg",
                                       minimum=0.001, maximum=45.0)  # fmt: skip
     telemetry_yaw_deg: float = param(2.0, "accuracy of its yaw: gimbals know the horizon, not north", unit="deg",

@@ -48,7 +48,7 @@ class WorldConfig(Parameters):
     locking_iterations: int = param(
         2, "further steps that keep feet in contact in their places", minimum=0, maximum=100
     )
-    stature_std: float = param(0.07, "relative standard deviation of the assumed stature", minimum=0.001, maximum=1)
+    stature_std: float = param(0.05, "relative standard deviation of the assumed stature", minimum=0.001, maximum=1)
     length_std: float = param(
         0.002, "relative standard deviation of the lifter's bone lengths: noise lengthens free bones", minimum=1e-4,
         maximum=1,
