@@ -14,7 +14,7 @@ class LiftedConfig(Parameters):
 
     lifter: str = param("", "lifter's ONNX file; empty for the shipped one")
     first_iterations: int = param(3, "steps that find the bone lengths", minimum=0, maximum=1000)
-    iterations: int = param(5, "steps of the final adjustment", minimum=0, maximum=1000)
+    iterations: int = param(12, "steps of the final adjustment", minimum=0, maximum=1000)
     noise_mm: float = param(2.0, "least standard deviation of a 2D joint", unit="mm", minimum=0.01, maximum=100.0)
     depth_weight: float = param(0.2, "weight of the lifter's depth", minimum=0.0, maximum=100.0)
     image_weight: float = param(1.0, "weight of the lifter's image position", minimum=0.0, maximum=100.0)
