@@ -177,13 +177,10 @@ def _solve(
 
     fixed : the shared unknowns stay as they are; held : so many frames at the begin do, too
     """
-    for single in (True, False):
-        band, border, corner = normal_matrix(here, single)
-        band[: held * FRAME, 0] += _HOLD
-        factor = band_factor(band)
-        if factor is not None:
-            break
-    else:
+    band, border, corner = normal_matrix(here)
+    band[: held * FRAME, 0] += _HOLD
+    factor = band_factor(band)
+    if factor is None:
         return None
     if fixed:
         return backward(factor, forward(factor, -frames.reshape(-1, 1))).reshape(-1, FRAME), np.zeros(GLOBALS)

@@ -30,16 +30,14 @@ _ENDS = np.array([[float(joint in span) for span in SPANS] for joint in range(JO
 WIDTH = 2 * FRAME + 1
 
 
-def normal_matrix(r: Residuals, single: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def normal_matrix(r: Residuals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Band (F * FRAME, WIDTH), border (F * FRAME, GLOBALS) and corner (GLOBALS, GLOBALS).
 
-    Element [i, d] of the band couples unknowns i and i + d.
-
-    single : the band in single precision
+    Element [i, d] of the band couples unknowns i and i + d.  Steps need double precision: with loose telemetry single
+    precision loses the place of body and camera together, which little more than the first frame holds.
     """
     frames = len(r.state.joints)
-    band = np.zeros((frames, FRAME, WIDTH), np.float32 if single else np.float64)
-    border = np.zeros((frames, FRAME, GLOBALS))
+    band, border = np.zeros((frames, FRAME, WIDTH)), np.zeros((frames, FRAME, GLOBALS))
     corner = np.zeros((GLOBALS, GLOBALS))
     # In the band's memory, element [r, c] of a frame's block is r (WIDTH - 1) + c.
     step = band.itemsize
