@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
@@ -17,15 +15,17 @@ def band_factor(band: np.ndarray) -> np.ndarray | None:
     None = not positive definite.  In single precision it takes half the time: enough for a step that a line search
     checks.
     """
-    from scipy.linalg.lapack import dpbtrf, spbtrf
+    from scipy.linalg import get_lapack_funcs
 
-    factor, info = (spbtrf if band.dtype == np.float32 else dpbtrf)(band.T, lower=1, overwrite_ab=1)
+    factor, info = get_lapack_funcs("pbtrf", (band,))(band.T, lower=1, overwrite_ab=1)
     return factor if info == 0 else None
 
 
 def forward(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
     """(N, K) solution of factor times solution = right, in double precision whatever that of the factor."""
-    solve = _triangular(factor)
+    from scipy.linalg import get_lapack_funcs
+
+    solve = get_lapack_funcs("tbtrs", (factor,))
     out = np.empty(right.shape, factor.dtype)
     reach = len(factor) - 1
     for begin, end in _pieces(factor):
@@ -38,7 +38,9 @@ def forward(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 def backward(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
     """(N, K) solution of the factor's transpose times solution = right, as of :func:`forward`."""
-    solve = _triangular(factor)
+    from scipy.linalg import get_lapack_funcs
+
+    solve = get_lapack_funcs("tbtrs", (factor,))
     out = np.empty(right.shape, factor.dtype)
     reach = len(factor) - 1
     for begin, end in reversed(_pieces(factor)):
@@ -48,13 +50,6 @@ def backward(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
             part[-reach:] -= (_coupling(factor, end)[: len(after)].T @ after)[-len(part) :]
         out[begin:end] = solve(factor[:, begin:end], part, uplo="L", trans="T", overwrite_b=1)[0]
     return out.astype(np.float64, copy=False)
-
-
-def _triangular(factor: np.ndarray) -> Any:
-    """LAPACK's solver of triangular bands for the factor's precision."""
-    from scipy.linalg.lapack import dtbtrs, stbtrs
-
-    return stbtrs if factor.dtype == np.float32 else dtbtrs
 
 
 def _pieces(factor: np.ndarray) -> list[tuple[int, int]]:

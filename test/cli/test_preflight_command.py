@@ -60,7 +60,7 @@ def fly(folder, names):
             module = "drocap_ros.simulation.vehicle.mavlink_vehicle"
             place = ("--url", f"udpout:127.0.0.1:{port}", "--autopilot", autopilot)
             vehicles.append(start(module, *place, *more, "--set", *settings, log=folder / f"{name}.vehicle"))
-        options = ("--config", config, "--seconds", "4", "--json", folder / f"{name}.json")
+        options = ("--config", config, "--seconds", "5", "--json", folder / f"{name}.json")
         running[name] = start("drocap_ros.cli", "preflight", *options, log=folder / f"{name}.txt"), port
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as noise:
         end = time.monotonic() + 90
@@ -178,7 +178,7 @@ def test_with_a_running_graph_it_reads_what_the_bridge_hears(tmp_path):
         while "running" not in (tmp_path / "live").read_text() and time.monotonic() < end:
             time.sleep(0.2)
         time.sleep(5.0)  # for the autopilot's parameters
-        options = ("--config", config, "--seconds", "4", "--json", tmp_path / "out.json")
+        options = ("--config", config, "--seconds", "5", "--json", tmp_path / "out.json")
         process = start("drocap_ros.cli", "preflight", *options, log=tmp_path / "out")
         assert process.wait(60) == 1, (tmp_path / "out.err").read_text()
     finally:

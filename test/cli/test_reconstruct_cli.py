@@ -60,9 +60,7 @@ def changed(path, **arrays):
 
 
 def test_outdoor_walk_gives_an_upright_motion_of_every_frame(shared, tmp_path):
-    video, models = shared / "media" / "outdoor_walk.mp4", shared / "models"
-    # Another test draws the report of a video; the pictures of this one are large.
-    motion = reconstructed(video, tmp_path, "--models", models, "--no-report")
+    motion = reconstructed(shared / "media" / "outdoor_walk.mp4", tmp_path, "--models", shared / "models")
     assert motion.joints3d.shape == (230, 17, 3)
     assert motion.joints3d.dtype == np.float64
     assert motion.frame == "camera"

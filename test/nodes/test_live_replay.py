@@ -27,7 +27,7 @@ def test_the_offline_replay_equals_the_live_graph_bit_for_bit(captured):
     assert len(tracks) == len(motion.joints3d) == 60
     # The comparison notices other parameters.
     with open_session(captured) as session:
-        other = config.replace("bundle_adjuster", limb_iterations=1)
+        other = config.replace("bundle_adjuster", limb_iterations=2)
         _, _, agreement = reconstruct_live(session, other)
     assert agreement.initial == [60, 60]
     assert agreement.windows[1] < agreement.windows[0]
@@ -56,7 +56,7 @@ def test_one_thread_and_two_give_the_same_arrays(captured, tmp_path):
 
 def test_the_command_takes_the_recorded_parameters(captured):
     motion, _ = reconstruct_input(captured, method="live", config=DrocapConfig())
-    assert motion.meta["parameters"]["adjuster"]["limb_iterations"] == 2
+    assert motion.meta["parameters"]["adjuster"]["limb_iterations"] == 3
     assert "60 of 60 initial poses" in motion.meta["live_agreement"]
     with pytest.raises(InputError, match="expected a recording with pose2d"):
         reconstruct_input(captured.parent / "none.mp4", method="live", config=DrocapConfig())

@@ -116,12 +116,12 @@ def due_bystander(subject: Person | None, persons: list[Person], stamp_ns: int) 
         return None
     seen = [p for p in persons if p is not subject and p.detected_ns == stamp_ns and p.hits > 1 and not p.double]
     searching = subject is None or subject.detected_ns != stamp_ns
-
-    def every_ns(person: Person) -> int:
-        if not searching:
-            return _JUDGE_EVERY_NS
-        # A person who comes out of cover shows more joints in every image.
-        return 0 if CONFIRM_CONFIDENCE <= person.pose.last < SURE_CONFIDENCE else _SEARCH_EVERY_NS
-
-    due = [p for p in seen if p.pose.judged_ns is None or stamp_ns - p.pose.judged_ns >= every_ns(p)]
+    due = [p for p in seen if p.pose.judged_ns is None or stamp_ns - p.pose.judged_ns >= _interval_ns(p, searching)]
     return min(due, key=lambda p: p.pose.judged_ns or 0, default=None)
+
+
+def _interval_ns(person: Person, searching: bool) -> int:
+    if not searching:
+        return _JUDGE_EVERY_NS
+    # A person who comes out of cover shows more joints in every image.
+    return 0 if CONFIRM_CONFIDENCE <= person.pose.last < SURE_CONFIDENCE else _SEARCH_EVERY_NS

@@ -107,7 +107,9 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
             floor = floor_std(ground, FLOOR_STD_M)
         here = Residuals(data, weights, state, contact, weight, outlier, floor)
         frames, shared = gradient(here)
-        step = _solve(here, frames, shared, locking, held)
+        matrix = normal_matrix(here)
+        matrix[0][: held * FRAME, 0] += _HOLD
+        step = _solve(matrix, frames, shared, locking)
         if step is None:
             stop = NO_DESCENT
             break
@@ -171,14 +173,16 @@ def _moved(here: Residuals, step: tuple[np.ndarray, np.ndarray], share: float) -
 
 
 def _solve(
-    here: Residuals, frames: np.ndarray, shared: np.ndarray, fixed: bool, held: int
+    matrix: tuple[np.ndarray, np.ndarray, np.ndarray],
+    frames: np.ndarray,
+    shared: np.ndarray,
+    fixed: bool,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Step of the frames' and the shared unknowns; None = not positive definite.
 
-    fixed : the shared unknowns stay as they are; held : so many frames at the begin do, too
+    fixed : the shared unknowns stay as they are
     """
-    band, border, corner = normal_matrix(here)
-    band[: held * FRAME, 0] += _HOLD
+    band, border, corner = matrix
     factor = band_factor(band)
     if factor is None:
         return None

@@ -11,8 +11,7 @@ from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop
 
 MODES = {"ardupilot": ("LOITER", "RTL", "LAND"), "px4": ("RTL", "LOITER", "POSCTL")}
 FAULTS = ("lost", "late", "lossy", "shuffled")
-#: Orbits and ends of each autopilot: each fault with each mode twice.  ``benchmarks/flight_kills.py pilot`` flies 200.
-MOMENTS, FLOWN = 6, 24
+MOMENTS, FLOWN = 14, 52  # orbits and ends of each autopilot; ``benchmarks/flight_kills.py pilot`` flies 200
 WATCHED_S, RETURNED_S = 5.0, 2.5
 
 
@@ -39,8 +38,7 @@ def chosen(loop, fault, moment):
     damage(loop, fault, chance)
     damaged_s = loop.t
     loop.run(loop.t + chance.uniform(0.2, 5.0))
-    modes, chosen_s = MODES[loop.settings.autopilot], loop.t
-    mode = modes[(moment + FAULTS.index(fault)) % len(modes)]
+    mode, chosen_s = chance.choice(MODES[loop.settings.autopilot]), loop.t
     loop.copter.set_mode(mode, "pilot")
     loop.run(loop.t + WATCHED_S)
     repair(loop)
