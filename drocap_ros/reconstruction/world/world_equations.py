@@ -33,8 +33,8 @@ WIDTH = 2 * FRAME + 1
 def normal_matrix(r: Residuals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Band (F * FRAME, WIDTH), border (F * FRAME, GLOBALS) and corner (GLOBALS, GLOBALS).
 
-    Element [i, d] of the band couples unknowns i and i + d.  Steps need double precision: with loose telemetry single
-    precision loses the place of body and camera together, which little more than the first frame holds.
+    Element [i, d] of the band couples unknowns i and i + d.  It needs double precision: the small weight that holds
+    body and camera together in their place is what remains of large elements.
     """
     frames = len(r.state.joints)
     band, border = np.zeros((frames, FRAME, WIDTH)), np.zeros((frames, FRAME, GLOBALS))

@@ -102,6 +102,26 @@ def random_point() -> tuple[Residuals, WorldInput, WorldState, np.ndarray]:
     return Residuals(data, weights_of(data), state, contact, 0.2), data, state, contact
 
 
+def test_normal_matrix_holds_body_and_camera_together_by_the_first_frame_of_the_telemetry_alone() -> None:
+    # Of many large elements a small sum is left: built in single precision, their rounding outweighs it.
+    frames = 600
+    joints = walker(frames)
+    rotation, position = orbit(bearing_with_reversal(frames), followed(joints))
+    data = exact_input(joints, rotation, position, CameraTelemetry(rotation, position, FPS))
+    data = replace(data, config=WorldConfig(position_wander_m=0.5))
+    shared = np.zeros(GLOBALS)
+    shared[LENGTHS], shared[SCALE] = data.lengths, 1.0
+    weights, state = weights_of(data), WorldState(joints, np.zeros((frames, CAMERA)), shared)
+    here = Residuals(data, weights, state, np.ones((frames - 1, 4)), 0.2)
+    band, _, _ = normal_matrix(here)
+    for axis in (0, 1):
+        along = np.zeros((frames, FRAME))
+        along[:, [axis, *range(CAMERA + axis, FRAME, 3)]] = 1.0
+        further = np.append(along.ravel(), np.zeros(band.shape[1]))
+        pulls = [band[:, d] @ (along.ravel() * further[d : d + len(band)]) for d in range(band.shape[1])]
+        assert pulls[0] + 2.0 * sum(pulls[1:]) == pytest.approx(weights.first[axis], rel=1e-3)
+
+
 def test_derivatives_are_those_of_the_cost() -> None:
     here, data, state, contact = random_point()
     by_frame, by_shared = gradient(here)
