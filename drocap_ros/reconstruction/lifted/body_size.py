@@ -85,7 +85,7 @@ def measure_size(view: EvenView, config: LiftedConfig, lifter: Lifter, cancelled
     lifted = lifter.lift(seen, fps)
     clock = time.perf_counter()
     mm = YARDSTICK_MM / max(float(np.median(bone_lengths(lifted.joints), axis=0)[YARDSTICK].sum()), 1e-12)
-    model = window_model(keypoints, mm, fps, config)
+    model = window_model(keypoints, lifted.joints[..., :2], mm, fps, config)
     centre = np.median(lifted.joints[..., :2], axis=1)
     zoom = _zoom_of(lifted.joints, fps)
     prior = lifted.joints.copy()
@@ -116,7 +116,8 @@ def apply_size(known: BodySize, view: EvenView, config: LiftedConfig, lifter: Li
     joints = lifted.joints.copy()
     joints[..., :2] -= middle[:, None]
     flat = _orthographic(keypoints.xy, joints[..., 2], centre, zoom, mm, focal)
-    model = window_model(keypoints, mm, fps, config)
+    place = lifted.joints[..., :2] * (zoom / mm)[:, None, None]
+    model = window_model(keypoints, place, mm, fps, config)
     lifted = replace(lifted, joints=joints)
     return SizedWindow(model, flat, lifted, known.lengths_mm, centre, zoom, mm, seconds=0.0, iterations=0)
 

@@ -18,7 +18,7 @@ class LiftedConfig(Parameters):
     noise_mm: float = param(2.0, "least standard deviation of a 2D joint", unit="mm", minimum=0.01, maximum=100.0)
     depth_weight: float = param(0.2, "weight of the lifter's depth", minimum=0.0, maximum=100.0)
     image_weight: float = param(1.0, "weight of the lifter's image position", minimum=0.0, maximum=100.0)
-    acceleration_std_m_s2: float = param(8.4, "ordinary acceleration", unit="m/s^2", minimum=0.01, maximum=1000.0)
+    acceleration_std_m_s2: float = param(11.0, "ordinary acceleration", unit="m/s^2", minimum=0.01, maximum=1000.0)
     smoothing_std_m_s2: float = param(
         10.0, "ordinary acceleration in the image for the outlier check", unit="m/s^2", minimum=0.01, maximum=1000.0
     )

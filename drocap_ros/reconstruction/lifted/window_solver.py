@@ -22,7 +22,7 @@ from drocap_ros.reconstruction.lifted.adjustment import (
 from drocap_ros.reconstruction.lifted.depth_signs import depth_signs
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
 from drocap_ros.reconstruction.lifted.lifter import LiftedMotion
-from drocap_ros.reconstruction.lifted.lifter_input import nanmedian_small
+from drocap_ros.reconstruction.lifted.lifter_input import LIFTER_FPS, nanmedian_small
 from drocap_ros.skeleton import BODY_17
 
 #: Returns True when an adjustment should end.
@@ -31,6 +31,11 @@ Cancelled = Callable[[], bool]
 _BONES = BODY_17.bones
 #: Lasting noise of the 2D joints at which known bone lengths change little: noise lengthens free bones.
 _HELD_NOISE_MM = 10.0
+#: Shares of fresh noise from which, and up to which, the lifter's places in the image lose weight, and what is left of
+#: it where a joint is seen: smoothing removes fresh noise better than the lifter does, but not noise that lasts.
+_FRESH_FROM, _FRESH_TO, _FRESH_WEIGHT = 0.47, 0.6, 0.1
+#: Standard deviation of keypoints over that of their fresh noise, at most: some of it lasts for a few frames.
+_LASTING_FACTOR = 1.6
 
 
 @dataclass(frozen=True)
@@ -39,27 +44,29 @@ class WindowModel:
 
     information : (F, 17, 3) 1/mm^2, xx, xy, yy of the 2D joints' inverse covariance, 0 where not seen
     noise_mm, lasting_noise_mm : standard deviation of their errors, and of those that last for some frames
+    fresh_share : share of the squared distance from the lifter's places that is fresh in every frame
     """
 
     information: np.ndarray
     noise_mm: float
     lasting_noise_mm: float
+    fresh_share: float
     fps: float
     config: LiftedConfig
     zoom_basis: np.ndarray
     zoom_precision: np.ndarray
 
 
-def window_model(keypoints: Keypoints2D, mm: float, fps: float, config: LiftedConfig) -> WindowModel:
+def window_model(keypoints: Keypoints2D, place: np.ndarray, mm: float, fps: float, config: LiftedConfig) -> WindowModel:
     """Model of a window whose keypoints have ``mm`` per unit.
 
-    Without a covariance the noise comes from the third difference in time, to which motion contributes little.
+    Without a covariance the noise comes from the change between two frames of the keypoints' distance from the lifter's
+    places (F, 17, 2), in their unit: the body's motion does not enter.
     """
     points_mm, confidence = keypoints.xy * mm, keypoints.confidence
     seen = np.isfinite(points_mm[..., 0])
-    noise = config.noise_mm
-    if len(keypoints) > 3:
-        noise = max(noise, difference_noise(points_mm))
+    fresh, share = _fresh_noise(points_mm - place * mm, max(round(fps / LIFTER_FPS), 1))
+    noise = max(config.noise_mm, fresh * min(_LASTING_FACTOR, share**-0.5 if share > 0 else _LASTING_FACTOR))
     covariance = np.broadcast_to(noise**2 * np.array([1.0, 0.0, 1.0]), (*seen.shape, 3))
     if keypoints.covariance is not None:
         known = np.isfinite(keypoints.covariance).all(axis=-1, keepdims=True)
@@ -74,7 +81,7 @@ def window_model(keypoints: Keypoints2D, mm: float, fps: float, config: LiftedCo
     information = weight[..., None] * covariance[..., [2, 1, 0]] * np.array([1.0, -1.0, 1.0])
     lasting = _lasting_noise(points_mm)
     return WindowModel(
-        information, noise, lasting, fps, config, *zoom_model(len(keypoints), fps, config.zoom_std_per_s)
+        information, noise, lasting, share, fps, config, *zoom_model(len(keypoints), fps, config.zoom_std_per_s)
     )
 
 
@@ -93,6 +100,18 @@ def difference_noise(points: np.ndarray) -> float:
     """
     third = nanmedian_small(np.abs(np.diff(points, n=3, axis=0)).reshape(-1), axis=0)
     return float(1.48 / np.sqrt(20) * float(np.nan_to_num(third)))
+
+
+def _fresh_noise(gap: np.ndarray, stride: int) -> tuple[float, float]:
+    """Standard deviation of what changes within ``stride`` frames in gaps (F, P, 2), and its share of their square.
+
+    The lifter takes the frames of a fast video as ``stride`` sequences, whose places differ.
+    """
+    if len(gap) <= stride:
+        return 0.0, 0.0
+    change = float(np.nan_to_num(nanmedian_small(np.abs(gap[stride:] - gap[:-stride]).reshape(-1), axis=0)))
+    size = float(np.nan_to_num(nanmedian_small(np.abs(gap).reshape(-1), axis=0)))
+    return 1.48 * change / np.sqrt(2.0), min(0.5 * (change / max(size, 1e-9)) ** 2, 1.0)
 
 
 def _lasting_noise(points: np.ndarray) -> float:
@@ -122,6 +141,7 @@ def solve_signs_and_adjust(
     weight = 0.5 * (model.information[..., 0] + model.information[..., 2])
     points = np.where(weight[..., None] > 0, np.nan_to_num(keypoints), 0.0)
     prior_xy = config.image_weight / (2 * np.square(sigma[..., 0]) + 5.0**2)
+    prior_xy[weight > 0] *= np.interp(model.fresh_share, (_FRESH_FROM, _FRESH_TO), (1.0, _FRESH_WEIGHT))
     gap = np.square(points - prior[..., :2]).sum(axis=-1)
     inlier = gap < 9 * (2 * model.noise_mm**2 + 2 * np.square(sigma[..., 0]) + 8.0**2)
     smoothing = (1000 * config.smoothing_std_m_s2 / fps**2) ** -2
