@@ -16,7 +16,12 @@ from drocap_ros.reconstruction.banded import backward, band_factor, forward
 from drocap_ros.reconstruction.line_search import search_line
 from drocap_ros.reconstruction.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
 from drocap_ros.reconstruction.world.calibration import Calibration
-from drocap_ros.reconstruction.world.contacts import contact_probability, floor_std, ground_spread
+from drocap_ros.reconstruction.world.contacts import (
+    contact_probability,
+    floor_std,
+    ground_spread,
+    parting_speed,
+)
 from drocap_ros.reconstruction.world.posterior import posterior
 from drocap_ros.reconstruction.world.world_equations import normal_matrix
 from drocap_ros.reconstruction.world.world_model import (
@@ -94,13 +99,14 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
     contact: np.ndarray = np.zeros((len(start.joints) - 1, len(FEET)))
     outlier = Residuals(data, weights, state, contact, 0.0).usual_outlier()
     seen = data.weight > 0 if data.seen is None else data.seen
+    parting = parting_speed(start.joints, data.fps)
     for done in range(1, config.iterations + config.locking_iterations + 1):
         locking = done > config.iterations
         # A window that continues another one does not slide any more.
         stage = done + (len(_CONTACT_SPEEDS) if held else 0)
         speed = _CONTACT_SPEEDS[stage - 1] if stage <= len(_CONTACT_SPEEDS) else _LAST_CONTACT_SPEED
         if config.feet:
-            contact = contact_probability(state, data.fps, speed, seen, data.still)
+            contact = contact_probability(state, data.fps, speed, seen, data.still, parting)
         weight = config.locked_weight if locking else config.contact_weight
         if stage == len(_CONTACT_SPEEDS) + 1:
             ground = ground_spread(state, contact)
