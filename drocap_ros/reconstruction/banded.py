@@ -21,18 +21,22 @@ def band_factor(band: np.ndarray) -> np.ndarray | None:
     return factor if info == 0 else None
 
 
-def forward(factor: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """(N, K) solution of factor times solution = right, in double precision whatever that of the factor."""
+def forward(factor: np.ndarray, right: np.ndarray, first: np.ndarray | None = None) -> np.ndarray:
+    """(N, K) solution of factor times solution = right, in double precision whatever that of the factor.
+
+    first : (K,) ascending, row of the first element of each column that is not 0; None = row 0
+    """
     from scipy.linalg import get_lapack_funcs
 
     solve = get_lapack_funcs("tbtrs", (factor,))
-    out = np.empty(right.shape, factor.dtype)
+    out = np.zeros(right.shape, factor.dtype)
     reach = len(factor) - 1
     for begin, end in _pieces(factor):
-        part = np.array(right[begin:end], factor.dtype, order="F")
+        begun = right.shape[1] if first is None else int(np.searchsorted(first, end))
+        part = np.array(right[begin:end, :begun], factor.dtype, order="F")
         if begin:
-            part[:reach] -= (_coupling(factor, begin) @ out[begin - reach : begin])[: len(part)]
-        out[begin:end] = solve(factor[:, begin:end], part, uplo="L", overwrite_b=1)[0]
+            part[:reach] -= (_coupling(factor, begin) @ out[begin - reach : begin, :begun])[: len(part)]
+        out[begin:end, :begun] = solve(factor[:, begin:end], part, uplo="L", overwrite_b=1)[0]
     return out.astype(np.float64, copy=False)
 
 

@@ -22,6 +22,17 @@ def test_pieces_give_the_solution_of_the_whole(size: int, width: int) -> None:
         np.testing.assert_allclose(ours(factor, right), whole, rtol=1e-9, atol=1e-12)
 
 
+def test_columns_that_begin_late_have_the_same_solution() -> None:
+    rng = np.random.default_rng(2)
+    band = rng.normal(size=(3700, 115))
+    band[:, 0] = 3.0 * 115
+    factor = band_factor(band)
+    assert factor is not None
+    first = np.array([0, 0, 1199, 1200, 1201, 3699])
+    right = rng.normal(size=(3700, 6)) * (np.arange(3700)[:, None] >= first)
+    np.testing.assert_array_equal(forward(factor, right, first), forward(factor, right))
+
+
 def test_single_precision_solves_a_well_conditioned_band_to_six_digits() -> None:
     rng = np.random.default_rng(1)
     band = rng.normal(size=(2500, 115))

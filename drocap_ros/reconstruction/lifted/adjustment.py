@@ -252,7 +252,9 @@ def _descend(p: AdjustmentProblem, here: _Residuals) -> _Residuals | None:
     if factor is None:
         return None
     # Eliminate the joints: half of a solve for every column, the other half for the answer alone.
-    y = forward(factor, np.concatenate([-by_joints.reshape(-1, 1), border], axis=1))
+    begun = _SIZE * np.argmax(p.zoom_basis > 0, axis=0)
+    first = np.concatenate([np.zeros(1 + len(SPANS), np.intp), begun])
+    y = forward(factor, np.concatenate([-by_joints.reshape(-1, 1), border], axis=1), first)
     schur = corner + np.diag(_DAMPING * np.diag(corner)) - y[:, 1:].T @ y[:, 1:]
     sizes = np.linalg.solve(schur, -by_sizes - y[:, 1:].T @ y[:, 0])
     joints = backward(factor, y[:, :1] - y[:, 1:] @ sizes[:, None]).reshape(by_joints.shape)

@@ -44,7 +44,7 @@ CALIBRATED = slice(SCALE, GLOBALS)
 class WorldConfig(Parameters):
     """Weights of the adjustment in the world, and the accuracy of the telemetry."""
 
-    iterations: int = param(5, "steps", minimum=0, maximum=1000)
+    iterations: int = param(4, "steps", minimum=0, maximum=1000)
     locking_iterations: int = param(
         2, "further steps that keep feet in contact in their places", minimum=0, maximum=100
     )
