@@ -29,6 +29,9 @@ YARDSTICK = [0, 1, 2, 6, 7]
 YARDSTICK_MM = 1550.0
 #: Noise of the 2D joints at which the lifter's bone lengths are as good as the adjustment's.
 _LENGTHENING_NOISE_MM = 5.0
+#: A keypoint counts as an outlier farther than so many standard deviations and mm from where the others put it, if its
+#: distance is no more usual over so many frames.
+_OUTLIER_STDS, _OUTLIER_MM, _OUTLIER_FRAMES = 4.0, 40.0, 5
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,8 @@ def measure_size(view: EvenView, config: LiftedConfig, lifter: Lifter, cancelled
     zoom = zoom * found.zoom
     flat = _orthographic(keypoints.xy, found.joints[..., 2] - found.joints[:, :1, 2], centre, zoom, mm, focal)
     seconds = time.perf_counter() - clock
-    lifted = lifter.lift(_flattened(flat, view, mm / zoom, lengths), fps)
+    believed = _without_outliers(flat, found.joints[..., :2], model.noise_mm)
+    lifted = lifter.lift(_flattened(believed, view, mm / zoom, lengths), fps)
     return SizedWindow(model, flat, lifted, lengths, centre, zoom, mm, seconds, found.iterations)
 
 
@@ -142,6 +146,19 @@ def _without_noise(found: np.ndarray, lifted: np.ndarray, noise_mm: float) -> np
     """
     mixed: np.ndarray = lifted + (found - lifted) / (1.0 + (noise_mm / _LENGTHENING_NOISE_MM) ** 2)
     return mixed
+
+
+def _without_outliers(flat: np.ndarray, place: np.ndarray, noise_mm: float) -> np.ndarray:
+    """Keypoints (F, 17, 2) without those that are alone in their frame far from the adjusted places: NaN there.
+
+    Where the distance lasts, the adjustment may be wrong instead.
+    """
+    from scipy.ndimage import median_filter
+
+    gap = np.nan_to_num(flat - place)
+    alone = np.linalg.norm(gap - median_filter(gap, size=(_OUTLIER_FRAMES, 1, 1), mode="nearest"), axis=-1)
+    limit_mm = _OUTLIER_STDS * noise_mm + _OUTLIER_MM
+    return np.where((alone > limit_mm)[..., None], np.nan, flat)
 
 
 def _orthographic(
