@@ -20,7 +20,7 @@ from body import ROOT, Score, long_enough, score
 from figures import table, write_figures
 
 from drocap_ros.mocap import mocap_files
-from drocap_ros.reconstruction.lifted import adjustment, window_solver
+from drocap_ros.reconstruction.lifted import adjustment, body_size, window_solver
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig, lifted_config
 from drocap_ros.reconstruction.lifted.lifter import LiftedMotion, Lifter, LifterInput
 from drocap_ros.reconstruction.methods import ba
@@ -51,11 +51,16 @@ def _signs_of_each_frame(reach: np.ndarray, depth: np.ndarray, *_: Any) -> np.nd
     return np.where(depth < 0, -1.0, 1.0)
 
 
+def _every_keypoint(flat: np.ndarray, *_: Any) -> np.ndarray:
+    return flat
+
+
 LEFT_OUT: dict[str, Callable[[], AbstractContextManager[Any]]] = {
     "nothing": nullcontext,
     "rotation of the camera, as an input": lambda: _blind(rotation=None),
     "covariances, as an input": lambda: _blind(covariance=None),
     "bone lengths of the first look, as an input of the second": lambda: _blind(lengths=None),
+    "hiding outliers from the second look": lambda: patch.object(body_size, "_without_outliers", _every_keypoint),
     "both adjustments": lambda: _with(first_iterations=0, iterations=0),
     "constant bone lengths in the adjustment": lambda: patch.object(
         adjustment, "SPAN_STD_MM", np.full(len(adjustment.SPAN_STD_MM), 1e4)
@@ -66,6 +71,7 @@ LEFT_OUT: dict[str, Callable[[], AbstractContextManager[Any]]] = {
     "accelerations": lambda: _with(acceleration_std_m_s2=1000.0),
     "network's depths in the adjustment": lambda: _with(depth_weight=0.0),
     "network's places in the image in the adjustment": lambda: _with(image_weight=0.01),
+    "lighter places where noise is fresh": lambda: patch.object(window_solver, "_FRESH_WEIGHT", 1.0),
 }
 
 
