@@ -65,8 +65,9 @@ def window_model(keypoints: Keypoints2D, place: np.ndarray, mm: float, fps: floa
     """
     points_mm, confidence = keypoints.xy * mm, keypoints.confidence
     seen = np.isfinite(points_mm[..., 0])
-    fresh, share = _fresh_noise(points_mm - place * mm, max(round(fps / LIFTER_FPS), 1))
-    noise = max(config.noise_mm, fresh * min(_LASTING_FACTOR, share**-0.5 if share > 0 else _LASTING_FACTOR))
+    fresh, whole = _gap_noise(points_mm - place * mm, max(round(fps / LIFTER_FPS), 1))
+    share = (fresh / whole) ** 2 if whole > 0 else 0.0
+    noise = max(config.noise_mm, min(whole, _LASTING_FACTOR * fresh))
     covariance = np.broadcast_to(noise**2 * np.array([1.0, 0.0, 1.0]), (*seen.shape, 3))
     if keypoints.covariance is not None:
         known = np.isfinite(keypoints.covariance).all(axis=-1, keepdims=True)
@@ -102,16 +103,18 @@ def difference_noise(points: np.ndarray) -> float:
     return float(1.48 / np.sqrt(20) * float(np.nan_to_num(third)))
 
 
-def _fresh_noise(gap: np.ndarray, stride: int) -> tuple[float, float]:
-    """Standard deviation of what changes within ``stride`` frames in gaps (F, P, 2), and its share of their square.
+def _gap_noise(gap: np.ndarray, stride: int) -> tuple[float, float]:
+    """Standard deviations of what changes within ``stride`` frames in gaps (F, P, 2), and of the gaps, no less.
 
     The lifter takes the frames of a fast video as ``stride`` sequences, whose places differ.
     """
     if len(gap) <= stride:
         return 0.0, 0.0
-    change = float(np.nan_to_num(nanmedian_small(np.abs(gap[stride:] - gap[:-stride]).reshape(-1), axis=0)))
-    size = float(np.nan_to_num(nanmedian_small(np.abs(gap).reshape(-1), axis=0)))
-    return 1.48 * change / np.sqrt(2.0), min(0.5 * (change / max(size, 1e-9)) ** 2, 1.0)
+    change = (gap[stride:] - gap[:-stride]) / np.sqrt(2.0)
+    fresh, whole = (
+        1.48 * float(np.nan_to_num(nanmedian_small(np.abs(values).reshape(-1), axis=0))) for values in (change, gap)
+    )
+    return fresh, max(fresh, whole)
 
 
 def _lasting_noise(points: np.ndarray) -> float:
