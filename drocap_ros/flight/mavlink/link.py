@@ -107,10 +107,7 @@ class MavlinkLink:
                 on_state(state)
 
     def spin_once(self, timeout_s: float = 0.0) -> list[VehicleState]:
-        """Read for at most ``timeout_s``, then send what is due.
-
-        Returns one state per attitude message.  No input raises.
-        """
+        """Read for at most ``timeout_s``, then send what is due: one state per attitude message.  No input raises."""
         data = self._read(timeout_s)
         now_ns = self._clock_ns()
         with self._lock:
@@ -140,8 +137,7 @@ class MavlinkLink:
         """
         self.check_motion(message)
         with self._lock:
-            late_s = self._monotonic_s() - self.decided_s
-            if late_s > self.config.watchdog_s:
+            if (late_s := self.decision_age_s()) > self.config.watchdog_s:
                 logger.warning("dropped a %s that was decided %.1f s ago", message.get_type(), late_s)
                 return
             self._note_stream(message)
@@ -195,6 +191,10 @@ class MavlinkLink:
     def answer_age_s(self) -> float:
         """Time in s since the sending of the message that was answered last: it covers both directions; NaN before."""
         return self._monotonic_s() - self._answered_s
+
+    def decision_age_s(self) -> float:
+        """Time in s since the control step began that decides what is sent; minus infinity before."""
+        return self._monotonic_s() - self.decided_s
 
     def status(self) -> LinkStatus:
         """State of the link now."""

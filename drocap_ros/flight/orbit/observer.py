@@ -67,6 +67,10 @@ def observe(
     loss = link.settings.loss_settings()
     action = math.nan if loss is None else loss.action
     loss_mode = _LOSS_MODES.get(int(action) if math.isfinite(action) else -1, latest.mode)
+    trip_s, gap_s = link.answer_age_s(), link.stream_gap_s()
+    if (stood_s := link.decision_age_s()) > config.watchdog_s:
+        # The process stood still within this step: what it has read belongs to different instants.
+        disturbance = condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=stood_s)
     return Observed(
         autopilot=latest.autopilot, mode=latest.mode, in_control=latest.mode == dialect.control_mode,
         in_hold=latest.mode == dialect.hold_mode, heard=heard | {latest.mode},
@@ -74,8 +78,8 @@ def observe(
         armed=latest.armed, landed_state=latest.landed_state, link_age_s=latest.link_age_s,
         heartbeat_age_s=estimator.modes.age_s(now_ns),
         state_age_s=abs(age_s), position_age_s=(now_ns - estimator.position_changed_ns) / _NS,
-        status_age_s=status_age, round_trip_s=link.answer_age_s(), packet_loss=estimator.packets.loss,
-        stream_gap_s=link.stream_gap_s(),
+        status_age_s=status_age, round_trip_s=trip_s, packet_loss=estimator.packets.loss,
+        stream_gap_s=gap_s,
         gps_fix_type=latest.gps_fix_type, position_ok=latest.position_ok, battery_fraction=latest.battery_fraction,
         battery_voltage_v=latest.battery_voltage_v,
         position=position, velocity=np.asarray(vehicle.velocity_enu_m_s, float), yaw=_yaw(vehicle),

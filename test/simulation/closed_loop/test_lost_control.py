@@ -80,19 +80,27 @@ def test_a_bridge_that_was_stopped_and_continues_sends_nothing_until_it_is_engag
 
 @pytest.mark.parametrize("autopilot", ["px4"])
 @branched
-def test_a_step_that_was_interrupted_sends_no_old_setpoint(loop):
+def test_a_step_that_was_interrupted_sends_no_old_setpoint_and_says_that_it_stood_still(loop):
     sent = len(loop.link.sent_setpoints()), loop.link.sent_setpoints()[-1][0]
     step, loop.link.decided_s = loop.controller.step, 0.0
     state = loop.copter.mode
 
     def stopped_within(now_ns, now_s):
-        loop.t += 3.0  # between its observation and its setpoint
+        estimate = loop.controller._subject.estimate
+
+        def late(stamp_ns):
+            loop.t += 3.0  # between the beginning of the step and its observation
+            return estimate(stamp_ns)
+
+        loop.controller._subject.estimate = late
         return step(now_ns, now_s)
 
     loop.controller.step = stopped_within
     loop.controller.step(loop.clock_ns(), loop.t)
     assert (len(loop.link.sent_setpoints()), loop.link.sent_setpoints()[-1][0]) == sent
     assert state == "OFFBOARD"
+    assert loop.controller.safety.state == State.HOLDING
+    assert loop.controller.safety.condition.code == ConditionCode.CONTROL_LOOP_STALLED
 
 
 @pytest.mark.parametrize("autopilot", ["px4"])
