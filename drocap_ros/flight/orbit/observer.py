@@ -69,7 +69,7 @@ def observe(
     loss_mode = _LOSS_MODES.get(int(action) if math.isfinite(action) else -1, latest.mode)
     trip_s, gap_s = link.answer_age_s(), link.stream_gap_s()
     if (stood_s := link.decision_age_s()) > config.watchdog_s:
-        # The process stood still within this step: what it has read belongs to different instants.
+        # The process stood still within this step: what was read above belongs to different instants.
         disturbance = condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=stood_s)
     return Observed(
         autopilot=latest.autopilot, mode=latest.mode, in_control=latest.mode == dialect.control_mode,
