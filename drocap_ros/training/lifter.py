@@ -9,7 +9,8 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -189,6 +190,21 @@ def _optimisers(network: torch.nn.Module, options: LifterTraining) -> list[Any]:
     ]
 
 
+def _batches(bank: MocapBank, rng: np.random.Generator, frames_per_batch: int) -> Iterator[Batch]:
+    """Endless batches; each is drawn while the one before it is used."""
+
+    def draw() -> Batch:
+        frames = int(rng.choice([16, 64, 160, 240], p=[0.05, 0.1, 0.45, 0.4]))
+        return sample_batch(bank, rng, max(frames_per_batch // frames, 1), frames)
+
+    with ThreadPoolExecutor(1) as ahead:
+        coming = ahead.submit(draw)
+        while True:
+            batch = coming.result()
+            coming = ahead.submit(draw)
+            yield batch
+
+
 def train(
     bank: MocapBank,
     options: LifterTraining,
@@ -214,15 +230,14 @@ def train(
     peaks = [options.rate * options.learning_rate, options.rate * options.matrix_learning_rate]
     begin = time.monotonic()
     step, frames_seen, reported, saved, smooth = 0, 0, 0.0, 0.0, math.nan
-    while True:
+    for batch in _batches(bank, rng, options.frames_per_batch):
         elapsed = (time.monotonic() - begin) / 60
         progress = step / options.steps if options.steps else elapsed / options.minutes
         if progress >= 1:
             break
-        frames = int(rng.choice([16, 64, 160, 240], p=[0.05, 0.1, 0.45, 0.4]))
-        batch = sample_batch(bank, rng, max(options.frames_per_batch // frames, 1), frames)
         for optimiser, peak in zip(optimisers, peaks, strict=True):
-            optimiser.param_groups[0]["lr"] = peak * _rate(progress)
+            for group in optimiser.param_groups:
+                group["lr"] = peak * _rate(progress)
         with mixed_precision():
             outputs = network(torch.from_numpy(batch.features))
         loss, distance = lifting_loss(outputs, batch)
@@ -232,7 +247,7 @@ def train(
         for optimiser in optimisers:
             optimiser.step()
         step += 1
-        frames_seen += batch.features.shape[0] * frames
+        frames_seen += batch.features.shape[0] * batch.features.shape[1]
         keep = min(0.9995, step / (step + 10))
         with torch.no_grad():
             torch._foreach_lerp_(list(average.parameters()), list(network.parameters()), 1 - keep)

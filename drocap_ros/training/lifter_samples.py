@@ -15,17 +15,19 @@ from drocap_ros.reconstruction.lifted.lifter_input import BONES, LIFTER_FPS, nor
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.training.keypoint_errors import as_drawn, detect
 from drocap_ros.training.mocap_bank import MocapBank, straighten_legs
+from drocap_ros.training.postures import balance, bend, draw_postures, tilt, turn
 from drocap_ros.training.slow_curves import slow
 
 _J = {name: i for i, name in enumerate(BODY_17.joints)}
 _UPPER = np.array([_J[j] for j in ("rknee", "lknee", "lelbow", "relbow")])
 _LOWER = np.array([_J[j] for j in ("rankle", "lankle", "lwrist", "rwrist")])
 _FEET = np.array([_J[j] for j in ("rtoe", "ltoe")])
-_KNEES, _SHINS = _UPPER[:2], _LOWER[:2]
 _ABOVE_PELVIS = np.arange(_J["neck"], _J["rwrist"] + 1)
 _SIDES = ((_J["rhip"], _J["lhip"]), (_J["rknee"], _J["lknee"]), (_J["rankle"], _J["lankle"]),
           (_J["lshoulder"], _J["rshoulder"]), (_J["lelbow"], _J["relbow"]), (_J["lwrist"], _J["rwrist"]),
           (_J["rtoe"], _J["ltoe"]))  # fmt: skip
+#: Share of the people who go from posture to posture.
+_POSED = 0.4
 #: Speed below which a foot counts as still.
 STILL_M_S = 0.1
 
@@ -59,7 +61,8 @@ def sample_batch(bank: MocapBank, rng: np.random.Generator, windows: int, frames
 
 
 def _draw_motion(bank: MocapBank, rng: np.random.Generator, windows: int, frames: int) -> Bodies:
-    weight = bank.length**0.75
+    # Few recorded people bend, crouch or lie: their sequences are drawn more often.
+    weight = bank.length**0.75 * (1 + 5 * bank.low)
     pick = rng.choice(len(weight), size=windows, p=weight / weight.sum())
     step = bank.fps[pick] / LIFTER_FPS * np.exp(rng.uniform(np.log(0.7), np.log(1.4), windows))
     last = bank.length[pick] - 1.0
@@ -84,47 +87,29 @@ def _draw_motion(bank: MocapBank, rng: np.random.Generator, windows: int, frames
     return Bodies(motion - motion[:, :, :1], still)
 
 
-def _turn(vector: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
-    """Rodrigues' rotation of vectors (..., 3) by rotation vectors that broadcast to them."""
-    angle = np.sqrt(np.square(rotvec).sum(axis=-1, keepdims=True)) + 1e-9
-    axis = rotvec / angle
-    cosine, sine = np.cos(angle), np.sin(angle)
-    ax, ay, az = axis[..., 0], axis[..., 1], axis[..., 2]
-    vx, vy, vz = vector[..., 0], vector[..., 1], vector[..., 2]
-    cross = np.stack([ay * vz - az * vy, az * vx - ax * vz, ax * vy - ay * vx], axis=-1)
-    along = (axis * vector).sum(axis=-1, keepdims=True)
-    return vector * cosine + cross * sine + axis * along * (1 - cosine)
-
-
 def _vary_body(bodies: Bodies, rng: np.random.Generator) -> Bodies:
     """Other bones, slightly other poses, other attitudes."""
     motion = bodies.joints
     windows, frames, joints, _ = motion.shape
     bone = motion - motion[:, :, np.maximum(BODY_17.parents, 0)]
 
-    # Poses: every limb is turned a little (the lower limb with the upper one), the trunk as a whole; postures
-    # bend trunk, hips and knees about the axis of the hips.
+    # Poses: every limb is turned a little (the lower limb with the upper one), the trunk as a whole.
     strength = np.where(rng.random(windows) < 0.5, rng.uniform(0, 0.22, windows), 0).astype(np.float32)
-    turn = slow(rng, windows, frames, (11, 3)) * strength[:, None, None, None]
-    posture = _posture(rng, windows, frames)
-    pitch = bone[:, :, _J["rhip"]] - bone[:, :, _J["lhip"]]
-    pitch = (pitch / (np.linalg.norm(pitch, axis=-1, keepdims=True) + 1e-6))[:, :, None]
-    hips = posture[:, :, (2, 3), None] * pitch
-    knees = -posture[:, :, (4, 5), None] * pitch
-    trunk = -posture[:, :, 1, None, None] * pitch
-    bone[:, :, _ABOVE_PELVIS] = _turn(bone[:, :, _ABOVE_PELVIS], 0.6 * turn[:, :, 8:9] + trunk)
-    legs = np.concatenate([_KNEES, _SHINS, _FEET])
-    bone[:, :, legs] = _turn(bone[:, :, legs], np.concatenate([hips, hips, hips], axis=2))
-    shins = legs[2:]
-    bone[:, :, shins] = _turn(bone[:, :, shins], np.concatenate([knees, knees], axis=2))
+    little = slow(rng, windows, frames, (11, 3)) * strength[:, None, None, None]
+    bone[:, :, _ABOVE_PELVIS] = turn(bone[:, :, _ABOVE_PELVIS], 0.6 * little[:, :, 8:9])
     whole = np.concatenate([_UPPER, _LOWER, _FEET])
-    limb = turn[:, :, :4]
-    bone[:, :, whole] = _turn(bone[:, :, whole], np.concatenate([limb, limb, limb[:, :, :2]], axis=2))
+    limb = little[:, :, :4]
+    bone[:, :, whole] = turn(bone[:, :, whole], np.concatenate([limb, limb, limb[:, :, :2]], axis=2))
     lower = np.concatenate([_LOWER, _FEET])
-    bone[:, :, lower] = _turn(bone[:, :, lower], np.concatenate([turn[:, :, 4:8], turn[:, :, 4:6]], axis=2))
-    bone[:, :, _FEET] = _turn(bone[:, :, _FEET], turn[:, :, 9:11])
+    bone[:, :, lower] = turn(bone[:, :, lower], np.concatenate([little[:, :, 4:8], little[:, :, 4:6]], axis=2))
+    bone[:, :, _FEET] = turn(bone[:, :, _FEET], little[:, :, 9:11])
+    # Others go from posture to posture.
+    posed = np.nonzero(rng.random(windows) < _POSED)[0]
+    angles = draw_postures(rng, len(posed), frames)
+    bone[posed] = bend(bone[posed], angles)
     # A foot of a changed pose slides where the recorded one stood.
-    changed = (strength > 0) | (posture[..., 2:] != 0).any(axis=(1, 2))
+    changed = strength > 0
+    changed[posed] = True
     still = np.where(changed[:, None, None], np.float32(np.nan), bodies.still)
 
     # Proportions: one size, then each kind of bone, then a trace of asymmetry.
@@ -152,45 +137,13 @@ def _vary_body(bodies: Bodies, rng: np.random.Generator) -> Bodies:
         if parent >= 0:
             body[:, :, joint] = body[:, :, parent] + bone[:, :, joint]
 
-    # Attitude: mostly as recorded, sometimes leaning, and with a posture up to lying on the back or the belly.
+    # Attitude: as recorded, sometimes leaning, or that of the posture.
     lean = np.where(rng.random(windows) < 0.2, 0.25 * rng.standard_normal(windows), 0.0)
     heading = rng.uniform(0, 2 * np.pi, windows)
     level = np.stack([np.cos(heading), np.sin(heading), np.zeros(windows)], axis=-1)
-    body = _turn(body, (lean[:, None] * level).astype(np.float32)[:, None, None])
-    pitch = body[:, :, _J["rhip"]] - body[:, :, _J["lhip"]]
-    pitch = pitch.mean(axis=1, keepdims=True) + 1e-6
-    pitch /= np.linalg.norm(pitch, axis=-1, keepdims=True)
-    # Some lie on a side: the axis of the tilt is not that of the hips.
-    aside = np.where(rng.random(windows) < 0.4, rng.uniform(-np.pi, np.pi, windows), 0.2 * rng.standard_normal(windows))
-    pitch = _turn(pitch, (aside[:, None] * np.array([0.0, 0.0, 1.0])).astype(np.float32)[:, None])
-    return Bodies(_turn(body, (posture[:, :, 0, None] * pitch)[:, :, None]), still)
-
-
-def _posture(rng: np.random.Generator, windows: int, frames: int) -> np.ndarray:
-    """(B, T, 6) float32 rad: pitch of the body (back > 0), flexion of trunk, right and left hip and knees.
-
-    Zero in most windows; in the others the body sits, crouches, kneels, bends or lies down, and may get up again:
-    postures that everyday MoCap lacks.
-    """
-    kind = rng.random(windows)
-    low = np.array([-0.4, -0.4, -0.2, -0.2, 0.0, 0.0])
-    high = np.array([0.4, 1.3, 1.9, 1.9, 2.0, 2.0])
-    angle = rng.uniform(low, high, (windows, 6))
-    lying = kind < 0.2
-    flat = rng.choice([-1, 1], windows) * rng.normal(1.55, 0.15, windows)
-    angle[lying, 0] = np.where(rng.random(windows) < 0.7, flat, rng.uniform(-1.5, 1.5, windows))[lying]
-    angle[lying & (rng.random(windows) < 0.4), 1:] *= 0.2
-    angle[kind > 0.36] = 0.0
-    together = rng.random(windows) < 0.6
-    for right, left in ((2, 3), (4, 5)):
-        angle[together, left] = angle[together, right] * (1 + 0.2 * rng.standard_normal(together.sum()))
-    time = np.arange(frames)[None, :, None]
-    begin = rng.uniform(-1.2 * frames, 0.8 * frames, (windows, 1, 1)) + rng.uniform(-10, 10, (windows, 1, 6))
-    rise = np.clip((time - begin) / rng.uniform(15, 60, (windows, 1, 6)), 0, 1)
-    end = begin + rng.uniform(40, 300, (windows, 1, 1)) + rng.uniform(-10, 10, (windows, 1, 6))
-    fall = np.clip((time - end) / rng.uniform(15, 60, (windows, 1, 6)), 0, 1)
-    curve = rise * (1 - fall)
-    return (angle[:, None] * curve**2 * (3 - 2 * curve)).astype(np.float32)
+    body = turn(body, (lean[:, None] * level).astype(np.float32)[:, None, None])
+    body[posed] = balance(tilt(body[posed], angles))
+    return Bodies(body, still)
 
 
 def camera_rotation(azimuth: np.ndarray, elevation: np.ndarray, roll: np.ndarray) -> np.ndarray:

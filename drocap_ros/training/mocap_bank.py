@@ -13,6 +13,8 @@ from drocap_ros.mocap import load_mocap
 from drocap_ros.skeleton import BODY_17, indices
 
 _FEET = np.stack([indices(BODY_17.joints, (s + "ankle", s + "toe")) for s in "rl"])
+_PELVIS, _NECK = indices(BODY_17.joints, ("pelvis", "neck"))
+_RIGHT_LEG = indices(BODY_17.joints, ("rhip", "rknee", "rankle"))
 #: Least flexion of the knees in a refitted sequence.
 _LEAST_FLEXION = np.radians([0.0, 10.0])
 _REFITTED = 0.7
@@ -24,6 +26,7 @@ class MocapBank:
 
     foot_speed : (N, 2) m/s of the right and the left foot, that of its faster joint
     reach : (S,) longest distance of hip and ankle over the length of thigh and shank
+    low : (S,) share of the frames that show a person bent, crouching or on the floor
     """
 
     joints: np.ndarray
@@ -32,6 +35,7 @@ class MocapBank:
     fps: np.ndarray
     foot_speed: np.ndarray
     reach: np.ndarray
+    low: np.ndarray
 
 
 def load_bank(paths: list[Path]) -> MocapBank:
@@ -60,6 +64,7 @@ def load_bank(paths: list[Path]) -> MocapBank:
         np.array(rates),
         np.concatenate(speeds),
         np.array([leg_reach(p) for p in parts]),
+        np.array([_low(p) for p in parts]),
     )
 
 
@@ -67,6 +72,15 @@ def _foot_speed(joints: np.ndarray, fps: float) -> np.ndarray:
     speed = np.linalg.norm(np.gradient(joints[:, _FEET], axis=0), axis=-1) * fps
     fastest: np.ndarray = np.fmax.reduce(speed, axis=-1).astype(np.float32)
     return fastest
+
+
+def _low(joints: np.ndarray) -> float:
+    """Share of the frames (F, 17, 3) whose trunk leans by 45 degrees or whose pelvis is lower than 0.65 of the legs."""
+    trunk = joints[:, _NECK] - joints[:, _PELVIS]
+    legs = np.linalg.norm(np.diff(joints[:, _RIGHT_LEG], axis=1), axis=-1).sum(axis=1)
+    height = joints[:, _PELVIS, 2] - np.nanmin(joints[..., 2], axis=1)
+    leaning = trunk[:, 2] < np.sqrt(0.5) * np.linalg.norm(trunk, axis=-1)
+    return float((leaning | (height < 0.65 * np.median(legs))).mean())
 
 
 def straighten_legs(motion: np.ndarray, reach: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -1,11 +1,11 @@
-"""Muon in single precision: PyTorch's own works in bfloat16, which processors without it emulate, many times slower."""
+"""Muon, in bfloat16 where the processor has it: PyTorch's own emulates it elsewhere, many times slower."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING, Any
 
-from drocap_ros.training.torch_extra import pytorch
+from drocap_ros.training.torch_extra import pytorch, reduced
 
 if TYPE_CHECKING:
     import torch
@@ -24,11 +24,11 @@ def orthogonalised(matrix: torch.Tensor) -> torch.Tensor:
     a, b, c = _POLYNOMIAL
     tall = matrix.shape[0] > matrix.shape[1]
     x = matrix.T if tall else matrix
-    x = x / x.norm().clamp(min=1e-7)
+    x = reduced(x / x.norm().clamp(min=1e-7))
     for _ in range(_ITERATIONS):
         gram = x @ x.T
         x = a * x + (b * gram + c * (gram @ gram)) @ x
-    return x.T if tall else x
+    return (x.T if tall else x).float()
 
 
 def muon(matrices: list[torch.nn.Parameter], weight_decay: float) -> Any:

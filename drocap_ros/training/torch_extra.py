@@ -30,10 +30,20 @@ def pytorch() -> Any:
     return torch
 
 
+def _has_bfloat16() -> bool:
+    """Whether the processor has bfloat16; others emulate it, many times slower than single precision."""
+    return bool(pytorch().cpu.get_capabilities().get("avx512_bf16", False))
+
+
 def mixed_precision() -> Any:
-    """Context of bfloat16 where the processor has it; others emulate it, many times slower than single precision."""
+    """Context of bfloat16 where the processor has it."""
     torch = pytorch()
-    return torch.autocast("cpu", dtype=torch.bfloat16, enabled=torch.cpu.get_capabilities().get("avx512_bf16", False))
+    return torch.autocast("cpu", dtype=torch.bfloat16, enabled=_has_bfloat16())
+
+
+def reduced(tensor: torch.Tensor) -> torch.Tensor:
+    """The tensor in bfloat16 where the processor has it."""
+    return tensor.bfloat16() if _has_bfloat16() else tensor
 
 
 def set_threads(count: int) -> None:

@@ -25,7 +25,8 @@ def bank(frames: int = 90) -> MocapBank:
     x = body + 0.05 * np.sin(0.2 * np.arange(2 * frames)[:, None, None] + phase)
     both = np.array([frames, frames])
     speed = np.full((2 * frames, 2), 0.3, np.float32)
-    return MocapBank(x.astype(np.float32), np.array([0, frames]), both, np.array([30.0, 30.0]), speed, np.ones(2))
+    rate, low = np.array([30.0, 30.0]), np.zeros(2)
+    return MocapBank(x.astype(np.float32), np.array([0, frames]), both, rate, speed, np.ones(2), low)
 
 
 def part(features: np.ndarray, number: int) -> np.ndarray:
