@@ -20,6 +20,8 @@ from figures import ROOT, table, write_figures
 
 FRAMES = (30, 100, 300, 1000, 3000, 10000)
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+#: The default method with the telemetry of a drone: body and cameras are adjusted in the world.
+WORLD = "ba, telemetry"
 HEAD = (
     "method", "threads", "frames", "initial, ms/frame", "adjustment, s", "total, s", "processor, s",
     "memory above the first, MB",
@@ -30,7 +32,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, nargs="+", default=FRAMES)
     parser.add_argument("--threads", type=int, nargs="+", default=(1, 2))
-    parser.add_argument("--methods", nargs="+", default=("paper", "mf-nnm", "ba"))
+    parser.add_argument("--methods", nargs="+", default=("paper", "mf-nnm", "ba", WORLD))
     parser.add_argument("--repeat", type=int, default=3, help="runs per cell up to 1000 frames; the median counts")
     parser.add_argument("--cell", type=json.loads, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -59,7 +61,7 @@ def run_cell(**cell: Any) -> list[str]:
     )
     row: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
     method, threads, frames = cell["method"], cell["threads"], cell["frames"]
-    print(f"{method:8s} {threads} threads {frames:6d} frames: {row['total']:.3f} s", file=sys.stderr)
+    print(f"{method:13s} {threads} threads {frames:6d} frames: {row['total']:.3f} s", file=sys.stderr)
     return [
         method, str(threads), str(frames), f"{1000.0 * row['initial'] / frames:.2f}", f"{row['ba']:.3f}",
         f"{row['total']:.3f}", f"{row['cpu']:.3f}", f"{row['memory_mb']:.0f}",
@@ -70,8 +72,9 @@ def measure(frames: int, threads: int, method: str, repeat: int) -> dict[str, fl
     """Median seconds per stage of one cell, and the growth of the process's peak memory in MB."""
     from drocap_ros.reconstruction.reconstruct import reconstruct
 
-    tracks = synthetic_tracks(frames)
-    reconstruct(synthetic_tracks(30), method=method)  # imports and warm-up
+    draw, method = (world_tracks, "ba") if method == WORLD else (synthetic_tracks, method)
+    tracks = draw(frames)
+    reconstruct(draw(30), method=method)  # imports and warm-up
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     runs = []
     for _ in range(repeat):
@@ -100,6 +103,18 @@ def synthetic_tracks(frames: int) -> Any:
     noise = np.random.default_rng(0).normal(0.0, 3.0, (frames, 15, 2))
     stamp_ns = np.round(t * 1e9).astype(np.int64)
     return Tracks(400.0 * camera[..., :2] + 600.0 + noise, BODY_15.joints, stamp_ns, (1280, 1024))
+
+
+def world_tracks(frames: int) -> Any:
+    """A walking person, seen and measured by a drone with the errors of GPS (`drocap evaluate world`)."""
+    import numpy as np
+
+    from drocap_ros.evaluation.world_protocol import FPS, world_view
+    from drocap_ros.mocap import Sequence
+    from drocap_ros.simulation.simulated_person import simulate_person
+
+    person = simulate_person(np.arange(frames) / FPS, action="walk", seed=0)
+    return world_view(Sequence("walk", 1000.0 * person), "gps").tracks
 
 
 if __name__ == "__main__":

@@ -119,7 +119,7 @@ def build_network(width: int) -> torch.nn.Module:
             self.embed = nn.Linear(2 * FEATURES, width)
             self.body = nn.Sequential(
                 Block(1), Block(2), Pool(), Block(4), Block(8), Pool(), Block(16), Block(1), Pool(), Block(2),
-                Block(4), Block(32), Pool(), Block(8), Block(1),
+                Block(4), Block(32), Pool(), Block(8), Block(1), Block(2), Block(16), Block(4), Block(1),
             )  # fmt: skip
             self.norm = nn.LayerNorm(width)
             self.head = nn.Linear(width, 2 * _JOINTS * 5)
