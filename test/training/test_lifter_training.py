@@ -176,6 +176,24 @@ def test_a_short_training_learns_and_its_network_runs(tmp_path):
             train(bank(), options, lambda line: None, lambda n, f: None, initial=wrong)
 
 
+def test_a_network_begins_as_the_shorter_one_whose_weights_it_takes(tmp_path):
+    torch = pytest.importorskip("torch", reason="the extra 'train' is not installed")
+    pytest.importorskip("onnx", reason="the extra 'train' is not installed")
+    from drocap_ros.training.initial_weights import start_from
+    from drocap_ros.training.lifter import build_network, export_onnx
+
+    shorter = build_network(32)
+    shorter.body = shorter.body[:11]
+    export_onnx(shorter, tmp_path / "shorter.onnx", {"command": "test"})
+    network = build_network(32)
+    features = torch.from_numpy(sample_batch(bank(), np.random.default_rng(2), 4, 16).features)
+    before = network(features)[0]
+    start_from(network, tmp_path / "shorter.onnx")
+    # Weights are written in half precision.
+    np.testing.assert_allclose(network(features)[0].detach(), shorter(features)[0].detach(), atol=5e-3)
+    assert not np.allclose(before.detach(), shorter(features)[0].detach(), atol=5e-2)
+
+
 def test_muon_steps_along_an_orthogonal_matrix():
     torch = pytest.importorskip("torch", reason="the extra 'train' is not installed")
     from drocap_ros.training.muon import muon, orthogonalised
