@@ -42,6 +42,7 @@ def start_from(network: torch.nn.Module, path: Path) -> None:
         for name in body[len(found) :]:
             if name.endswith("out.weight"):
                 own[name].zero_()
+                own[name.replace("weight", "bias")].zero_()
 
 
 def origin_of(path: Path) -> str:
