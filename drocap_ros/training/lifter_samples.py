@@ -27,7 +27,7 @@ _SIDES = ((_J["rhip"], _J["lhip"]), (_J["rknee"], _J["lknee"]), (_J["rankle"], _
           (_J["lshoulder"], _J["rshoulder"]), (_J["lelbow"], _J["relbow"]), (_J["lwrist"], _J["rwrist"]),
           (_J["rtoe"], _J["ltoe"]))  # fmt: skip
 #: Share of the people who go from posture to posture.
-_POSED = 0.4
+_POSED = 0.45
 #: Speed below which a foot counts as still.
 STILL_M_S = 0.1
 

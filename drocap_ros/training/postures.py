@@ -24,8 +24,14 @@ ANGLES = (
 _DRAWN = (*ANGLES, "rthigh", "rarm", "lthigh", "larm")
 _A = {name: i for i, name in enumerate(_DRAWN)}
 _RIGHT = np.array([i for name, i in _A.items() if name[0] == "r" and name != "roll"])
+_THIGHS = np.array([_A["rthigh"], _A["lthigh"]])
+_POSE = np.arange(2, len(ANGLES))
 _LEFT = np.array([_A["l" + _DRAWN[i][1:]] for i in _RIGHT])
 _ABOVE_PELVIS = np.arange(_J["neck"], _J["rwrist"] + 1)
+
+
+#: Level of the people who lie.
+LYING = 3
 
 
 class Kind(NamedTuple):
@@ -125,6 +131,14 @@ def _draw_angles(rng: np.random.Generator, kinds: np.ndarray) -> np.ndarray:
     # Both sides are drawn alike where the kind's own ranges are the same.
     same = (rng.random(kinds.shape) < 0.5)[..., None] & ~(low[..., _RIGHT] != low[..., _LEFT])
     angle[..., _LEFT] = np.where(same, angle[..., _RIGHT] * rng.uniform(0.85, 1.15, same.shape), angle[..., _LEFT])
+    # Many arms stay near the recorded ones, and many people who lie are stretched out.
+    arms = [_A[side + part] for side in "rl" for part in ("shoulder", "shoulder_out", "elbow")]
+    angle[..., arms] *= rng.random((*kinds.shape, 1))
+    rest = np.where(rng.random(kinds.shape) < 0.6, rng.uniform(0, 0.4, kinds.shape), 1.0)
+    rest = np.where(_LEVELS[kinds] == LYING, rest, 1.0)[..., None]
+    angle[..., _POSE] *= rest
+    flat = np.copysign(np.pi / 2, angle[..., _THIGHS])
+    angle[..., _THIGHS] = flat + rest * (angle[..., _THIGHS] - flat)
     seat = np.array([kind.seat for kind in KINDS])[kinds]
     for side in "rl":
         hip, knee, ankle, shoulder = (angle[..., _A[side + part]] for part in ("hip", "knee", "ankle", "shoulder"))
@@ -149,11 +163,12 @@ def draw_postures(rng: np.random.Generator, windows: int, frames: int) -> np.nda
         for height, of_level in enumerate(_OF_LEVEL):
             here = level == height
             kinds[here, k] = rng.choice(of_level, here.sum())
-        level = np.clip(level + rng.choice([-1, 0, 1], windows, p=[0.4, 0.2, 0.4]), 0, 3)
+        level = np.clip(level + rng.choice([-1, 0, 1], windows, p=[0.36, 0.18, 0.46]), 0, LYING)
     angle = _draw_angles(rng, kinds)[..., : len(ANGLES)]
 
     lasts = rng.uniform(*_CHANGE_FRAMES, (windows, _WAYPOINTS - 1))
-    begin = np.cumsum(lasts + rng.uniform(*_HOLD_FRAMES, lasts.shape), axis=1) - lasts
+    hold = rng.uniform(*_HOLD_FRAMES, lasts.shape) * np.where(_LEVELS[kinds[:, :-1]] == LYING, 2.0, 1.0)
+    begin = np.cumsum(lasts + hold, axis=1) - lasts
     begin -= rng.uniform(0, 1, (windows, 1)) * np.maximum(begin[:, -1:] - 0.5 * frames, 0)
     # The parts of the body do not move all at once.
     begin = begin[..., None] + rng.uniform(-8, 8, (windows, _WAYPOINTS - 1, len(ANGLES)))
