@@ -38,8 +38,6 @@ _FEET = {tuple(indices(BODY_17.joints, (side + "ankle", side + "toe"))) for side
 SPAN_STD_MM = np.array([4.0 if (p, c) in _RIGID else 6.0 if (p, c) in _FEET else 20.0 for p, c in _CHAIN] + [4.0, 25.0])
 
 _SIZE = 3 * len(BODY_17)
-#: Squared residual, in standard deviations, at which a 2D joint has half its weight.
-_OUTLIER_SQUARE = 9.0
 #: Relative addition to the normal equations' diagonal.
 _DAMPING = 1e-4
 _DEPTH_ROUNDING_MM = 15.0
@@ -55,6 +53,7 @@ class AdjustmentProblem:
     zoom_basis : (F, K) value in each frame of the zoom's piecewise linear basis functions
     zoom_precision : (K, K) inverse covariance of their coefficients
     lengths : (18,) of :data:`SPANS`, expected; length_weight : 1/mm^2, of the distance from them
+    outlier_square : squared residual, in standard deviations, at which a 2D joint has half its weight
     """
 
     keypoints: np.ndarray
@@ -67,6 +66,7 @@ class AdjustmentProblem:
     zoom_precision: np.ndarray
     lengths: np.ndarray
     length_weight: float = 0.0
+    outlier_square: float = 9.0
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class _Residuals:
             axis=-1,
         )
         square = (self.image * self.pull).sum(axis=-1)
-        self.robust = 1.0 / (1.0 + square / _OUTLIER_SQUARE)
+        self.robust = 1.0 / (1.0 + square / p.outlier_square)
         self.flat = joints[..., :2] - p.prior[..., :2]
         self.depth = joints[..., 2] - p.prior[..., 2]
         self.rounded = np.sqrt(np.square(self.depth) + _DEPTH_ROUNDING_MM**2)
