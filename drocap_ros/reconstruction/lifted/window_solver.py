@@ -34,8 +34,8 @@ _HELD_NOISE_MM = 10.0
 #: Shares of fresh noise from which, and up to which, the lifter's places in the image lose weight, and what is left of
 #: it where a joint is seen: smoothing removes fresh noise better than the lifter does, but not noise that lasts.
 _FRESH_FROM, _FRESH_TO, _FRESH_WEIGHT = 0.47, 0.6, 0.1
-#: Squared residuals, in standard deviations, at which a 2D joint has half its weight, at these shares: where noise lasts,
-#: it looks like outliers that do.
+#: Squared residuals, in standard deviations, at which a 2D joint has half its weight, at these shares of fresh noise:
+#: noise that lasts looks like outliers that do.
 _OUTLIER_SQUARE = (9.0, 20.0)
 #: Standard deviation of keypoints over that of their fresh noise, at most: some of it lasts for a few frames.
 _LASTING_FACTOR = 1.6
