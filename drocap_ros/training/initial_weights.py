@@ -65,7 +65,8 @@ def _weights(path: Path) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
     except Exception as error:
         # Protocol buffers raise classes of their own.
         raise InputError(f"--initial: {path}: expected an ONNX file; {str(error).splitlines()[0][:120]}") from None
-    arrays = {t.name: numpy_helper.to_array(t).astype(np.float32) for t in graph.initializer}
-    vectors = {name.removesuffix("_half"): value for name, value in arrays.items() if value.ndim == 1}
-    matrices = [np.ascontiguousarray(value.T) for value in arrays.values() if value.ndim == 2]
-    return vectors, matrices
+    arrays = {t.name.removesuffix("_half"): numpy_helper.to_array(t).astype(np.float32) for t in graph.initializer}
+    vectors = {name: value for name, value in arrays.items() if value.ndim == 1}
+    # The initializers stand in the order of their names, which are numbers.
+    used = [name for node in graph.node if node.op_type == "MatMul" for name in node.input if name in arrays]
+    return vectors, [np.ascontiguousarray(arrays[name].T) for name in used]

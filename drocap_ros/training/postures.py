@@ -24,14 +24,14 @@ ANGLES = (
 _DRAWN = (*ANGLES, "rthigh", "rarm", "lthigh", "larm")
 _A = {name: i for i, name in enumerate(_DRAWN)}
 _RIGHT = np.array([i for name, i in _A.items() if name[0] == "r" and name != "roll"])
-_THIGHS = np.array([_A["rthigh"], _A["lthigh"]])
-_POSE = np.arange(2, len(ANGLES))
 _LEFT = np.array([_A["l" + _DRAWN[i][1:]] for i in _RIGHT])
+_THIGHS = np.array([_A["rthigh"], _A["lthigh"]])
+_ARMS = np.array([_A[side + part] for side in "rl" for part in ("shoulder", "shoulder_out", "elbow")])
+#: All but pitch and roll.
+_POSE = np.arange(2, len(ANGLES))
 _ABOVE_PELVIS = np.arange(_J["neck"], _J["rwrist"] + 1)
-
-
-#: Level of the people who lie.
-LYING = 3
+#: Height of the people who lie.
+_LYING_LEVEL = 3
 
 
 class Kind(NamedTuple):
@@ -121,7 +121,7 @@ def _ranges() -> tuple[np.ndarray, np.ndarray]:
 
 _LOW, _HIGH = _ranges()
 _LEVELS = np.array([kind.level for kind in KINDS])
-_OF_LEVEL = [np.flatnonzero(level == _LEVELS) for level in range(4)]
+_OF_LEVEL = [np.flatnonzero(level == _LEVELS) for level in range(_LYING_LEVEL + 1)]
 
 
 def _draw_angles(rng: np.random.Generator, kinds: np.ndarray) -> np.ndarray:
@@ -132,13 +132,12 @@ def _draw_angles(rng: np.random.Generator, kinds: np.ndarray) -> np.ndarray:
     same = (rng.random(kinds.shape) < 0.5)[..., None] & ~(low[..., _RIGHT] != low[..., _LEFT])
     angle[..., _LEFT] = np.where(same, angle[..., _RIGHT] * rng.uniform(0.85, 1.15, same.shape), angle[..., _LEFT])
     # Many arms stay near the recorded ones, and many people who lie are stretched out.
-    arms = [_A[side + part] for side in "rl" for part in ("shoulder", "shoulder_out", "elbow")]
-    angle[..., arms] *= rng.random((*kinds.shape, 1))
+    angle[..., _ARMS] *= rng.random((*kinds.shape, 1))
     rest = np.where(rng.random(kinds.shape) < 0.6, rng.uniform(0, 0.4, kinds.shape), 1.0)
-    rest = np.where(_LEVELS[kinds] == LYING, rest, 1.0)[..., None]
+    rest = np.where(_LEVELS[kinds] == _LYING_LEVEL, rest, 1.0)[..., None]
     angle[..., _POSE] *= rest
-    flat = np.copysign(np.pi / 2, angle[..., _THIGHS])
-    angle[..., _THIGHS] = flat + rest * (angle[..., _THIGHS] - flat)
+    level = np.copysign(np.pi / 2, angle[..., _THIGHS])
+    angle[..., _THIGHS] = level + rest * (angle[..., _THIGHS] - level)
     seat = np.array([kind.seat for kind in KINDS])[kinds]
     for side in "rl":
         hip, knee, ankle, shoulder = (angle[..., _A[side + part]] for part in ("hip", "knee", "ankle", "shoulder"))
@@ -157,17 +156,17 @@ def _draw_angles(rng: np.random.Generator, kinds: np.ndarray) -> np.ndarray:
 
 def draw_postures(rng: np.random.Generator, windows: int, frames: int) -> np.ndarray:
     """(B, T, 22) float32 angles, in the order of ``ANGLES``, of people who go from posture to posture."""
-    level = rng.integers(0, 4, windows)
+    level = rng.integers(0, _LYING_LEVEL + 1, windows)
     kinds = np.empty((windows, _WAYPOINTS), np.int64)
     for k in range(_WAYPOINTS):
         for height, of_level in enumerate(_OF_LEVEL):
             here = level == height
             kinds[here, k] = rng.choice(of_level, here.sum())
-        level = np.clip(level + rng.choice([-1, 0, 1], windows, p=[0.36, 0.18, 0.46]), 0, LYING)
+        level = np.clip(level + rng.choice([-1, 0, 1], windows, p=[0.36, 0.18, 0.46]), 0, _LYING_LEVEL)
     angle = _draw_angles(rng, kinds)[..., : len(ANGLES)]
 
     lasts = rng.uniform(*_CHANGE_FRAMES, (windows, _WAYPOINTS - 1))
-    hold = rng.uniform(*_HOLD_FRAMES, lasts.shape) * np.where(_LEVELS[kinds[:, :-1]] == LYING, 2.0, 1.0)
+    hold = rng.uniform(*_HOLD_FRAMES, lasts.shape) * np.where(_LEVELS[kinds[:, :-1]] == _LYING_LEVEL, 2.0, 1.0)
     begin = np.cumsum(lasts + hold, axis=1) - lasts
     begin -= rng.uniform(0, 1, (windows, 1)) * np.maximum(begin[:, -1:] - 0.5 * frames, 0)
     # The parts of the body do not move all at once.

@@ -138,6 +138,20 @@ def test_unusable_files_are_refused(tmp_path):
         load_bank([tmp_path / "a.npz"])
 
 
+def test_low_postures_are_counted(tmp_path):
+    standing = np.zeros((6, 15, 3))
+    standing[:, :, 2] = [900, 900, 450, 0, 900, 450, 0, 1400, 1600, 1350, 1100, 900, 1350, 1100, 900]
+    bent = standing.copy()
+    bent[3:, 7:, 1], bent[3:, 7:, 2] = standing[3:, 7:, 2] - 900, 900
+    crouching = standing.copy()
+    crouching[..., 2] = np.where(standing[..., 2] > 450, standing[..., 2] - 400, standing[..., 2])
+    crouching[:, [2, 5], 1], crouching[:, [2, 5], 2] = 400, 300
+    for name, x in (("a", standing), ("b", bent), ("c", crouching)):
+        np.savez(tmp_path / f"{name}.npz", X=x, fps=30.0, joints=np.array(BODY_17.joints[:15]))
+    found = load_bank([tmp_path / f"{name}.npz" for name in "abc"])
+    np.testing.assert_allclose(found.low, [0.0, 0.5, 1.0])
+
+
 def test_a_short_training_learns_and_its_network_runs(tmp_path):
     pytest.importorskip("torch", reason="the extra 'train' is not installed")
     pytest.importorskip("onnx", reason="the extra 'train' is not installed")
