@@ -146,6 +146,7 @@ def refine_in_world(
     start = start._replace(joints=_at_all_slots(start.joints, slot), wander=_at_all_slots(start.wander, slot))
     joints: np.ndarray = np.zeros(body.shape)
     camera: np.ndarray = np.zeros((frames, CAMERA))
+    wander: np.ndarray = np.zeros((frames, CAMERA))
     covariance: np.ndarray = np.zeros((*body.shape, 3))
     total, calibration = np.zeros(frames), []
     measured, cost, contact = True, 0.0, 0.0
@@ -161,6 +162,7 @@ def refine_in_world(
         fade = fade_weights(rows, frames, _OVERLAP)
         joints[rows] += fade[:, None, None] * found.joints
         camera[rows] += fade[:, None] * _correction(found, telemetry)
+        wander[rows] += fade[:, None] * found.state.camera
         covariance[rows] += fade[:, None, None, None] * found.covariance
         total[rows] += fade
         calibration.append(_calibration(found, poses.factor, path[rows]))
@@ -172,7 +174,7 @@ def refine_in_world(
     corrected, moved = exp_so3(camera[slot, 3:]) @ rotation, position + camera[slot, :3]
     if reason := _rejection(cost, contact if config.feet and fps >= _CONTACTS_FPS else 1.0):
         return reason
-    last = Before(tracks.stamp_ns, joints[slot], found.state.camera[slot], found.state.globals)
+    last = Before(tracks.stamp_ns, joints[slot], (wander / total[:, None])[slot], found.state.globals)
     return RefinedWorld(joints[slot], corrected, moved, measured, covariance, calibration, found.calibration, last)
 
 
