@@ -37,7 +37,7 @@ def placed(bone: np.ndarray) -> np.ndarray:
 
 
 def posture(**angle: float) -> np.ndarray:
-    """(1, 1, 22) angles, zero but the named ones."""
+    """(1, 1, 24) angles, zero but the named ones."""
     return np.array([[[angle.get(name, 0.0) for name in ANGLES]]], np.float32)
 
 
