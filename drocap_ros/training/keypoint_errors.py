@@ -47,20 +47,22 @@ class Detection:
 
 
 def as_drawn(body: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Bodies (B, T, 17, 3) with the joints where a 2D network draws them: off by the same all through a window.
+    """Bodies (B, T, 17, 3) with the joints where a 2D network draws them.
 
-    Networks draw the hips at mid-shorts, knees and ankles by the clothes; neck and head are extrapolated from
-    shoulders and ears, so that they swing with the head.
+    Networks draw the hips at mid-shorts, knees and ankles by the clothes, and not alike from the front and from the
+    side; neck and head are extrapolated from shoulders and ears, so that they swing with the head.
     """
     windows, frames = body.shape[:2]
     drawn = body.copy()
     biased = (rng.random((windows, 1, 1)) < 0.35).astype(np.float32)
+    low = rng.uniform(0.0, 0.28, (windows, 1, 1)) + 0.05 * slow(rng, windows, frames, (1,))
     for side in "rl":
         hip, knee, ankle = (body[:, :, _J[side + part]] for part in ("hip", "knee", "ankle"))
-        lower = rng.uniform(0.0, 0.28, (windows, 1, 1)).astype(np.float32) * biased
+        lower = np.clip(low + 0.04 * _normal(rng, windows), -0.05, 0.35).astype(np.float32) * biased
         drawn[:, :, _J[side + "hip"]] += lower * (knee - hip)
-        drawn[:, :, _J[side + "knee"]] += 0.04 * _normal(rng, windows) * biased * (ankle - knee)
-        drawn[:, :, _J[side + "ankle"]] += 0.04 * _normal(rng, windows) * biased * (ankle - knee)
+        for joint in ("knee", "ankle"):
+            along = 0.04 * _normal(rng, windows) + 0.025 * slow(rng, windows, frames, (1,))
+            drawn[:, :, _J[side + joint]] += along * biased * (ankle - knee)
     middle = 0.5 * (drawn[:, :, _J["rhip"]] + drawn[:, :, _J["lhip"]])
     drawn[:, :, _J["pelvis"]] = np.where(biased > 0, middle, drawn[:, :, _J["pelvis"]])
     head = (rng.random((windows, 1, 1, 1)) < 0.4) * slow(rng, windows, frames, (1, 3))
