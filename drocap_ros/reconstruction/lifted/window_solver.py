@@ -34,6 +34,10 @@ _HELD_NOISE_MM = 10.0
 #: Shares of fresh noise from which, and up to which, the lifter's places in the image lose weight, and what is left of
 #: it where a joint is seen: smoothing removes fresh noise better than the lifter does, but not noise that lasts.
 _FRESH_FROM, _FRESH_TO, _FRESH_WEIGHT = 0.47, 0.6, 0.1
+#: What a frame's keypoints count for at these shares of fresh noise.  Noise that lasts repeats itself from frame to
+#: frame: of a share s the information of each is worth s / (2 - s), as for a first-order autoregressive process; at
+#: the least shares the errors of the lifter are what lasts.
+_REPEATED_AT, _REPEATED_WORTH = (0.2, 0.3, _FRESH_FROM, _FRESH_TO), (1.0, 0.3, 0.3, 1.0)
 #: Squared residuals, in standard deviations, at which a 2D joint has half its weight, at these shares of fresh noise:
 #: noise that lasts looks like outliers that do.
 _OUTLIER_SQUARE = (9.0, 20.0)
@@ -45,7 +49,8 @@ _LASTING_FACTOR = 1.6
 class WindowModel:
     """Weights and priors common to both adjustments of a window.
 
-    information : (F, 17, 3) 1/mm^2, xx, xy, yy of the 2D joints' inverse covariance, 0 where not seen
+    information : (F, 17, 3) 1/mm^2, xx, xy, yy of the 2D joints' inverse covariance, less where their errors last from
+        frame to frame, 0 where not seen
     noise_mm, lasting_noise_mm : standard deviation of their errors, and of those that last for some frames
     fresh_share : share of the squared distance from the lifter's places that is fresh in every frame
     """
@@ -79,7 +84,7 @@ def window_model(keypoints: Keypoints2D, place: np.ndarray, mm: float, fps: floa
         )
         noise = float(np.sqrt(np.median(0.5 * (covariance[seen, 0] + covariance[seen, 2])))) if seen.any() else noise
     determinant = covariance[..., 0] * covariance[..., 2] - np.square(covariance[..., 1])
-    weight = seen / determinant
+    weight = seen / determinant * np.interp(share, _REPEATED_AT, _REPEATED_WORTH)
     if confidence is not None:
         weight = weight * np.clip(np.nan_to_num(confidence), 0.0, 1.0)
     information = weight[..., None] * covariance[..., [2, 1, 0]] * np.array([1.0, -1.0, 1.0])

@@ -58,6 +58,15 @@ def test_noise_that_lasts_is_told_from_fresh_noise_and_counts_for_more_than_its_
     assert 9.0 < model.noise_mm < 13.0, "its steps alone have 7 mm"
 
 
+def test_noise_that_lasts_counts_for_less_than_fresh_noise_of_the_same_size() -> None:
+    rng = np.random.default_rng(0)
+    models = {"lasting": model_of(lasting(12.0, 0.1)), "fresh": model_of(rng.normal(0.0, 12.0, (FRAMES, 17, 2)))}
+    worth = {name: model.information[..., 0].mean() * model.noise_mm**2 for name, model in models.items()}
+    assert worth["fresh"] == pytest.approx(1.0)
+    assert worth["lasting"] == pytest.approx(0.3, abs=0.05)
+    assert model_of(np.full((FRAMES, 17, 2), 8.0)).information[0, 0, 0] == pytest.approx(LiftedConfig().noise_mm ** -2)
+
+
 def test_a_lifter_that_errs_evenly_does_not_make_exact_keypoints_noisy() -> None:
     model = model_of(np.full((FRAMES, 17, 2), 8.0))
     assert model.noise_mm == LiftedConfig().noise_mm
