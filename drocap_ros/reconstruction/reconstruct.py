@@ -27,9 +27,13 @@ from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.reconstruction.threads import blas_threads
 from drocap_ros.reconstruction.world.in_world import in_camera_axes, in_world
 from drocap_ros.reconstruction.world.placement import metres_per_px
+from drocap_ros.reconstruction.world.refine import refinable
 from drocap_ros.reconstruction.world.world_model import WorldConfig, world_config
 from drocap_ros.skeleton import BODY_15, BODY_17, BODY_19, JointSet, body_set
 from drocap_ros.tracks import Tracks
+
+#: Steps of the body's final adjustment where the adjustment in the world goes on from it: more change nothing there.
+_STEPS_BEFORE_WORLD = 2
 
 
 def reconstruct(
@@ -71,12 +75,13 @@ def reconstruct(
     seen = body_keypoints(tracks, BODY_19)
     keypoints = seen.with_joints(len(joints))
     k = tracks.camera_matrix
+    steps = min(adjuster.limb_iterations, _STEPS_BEFORE_WORLD) if refinable(tracks) else adjuster.limb_iterations
     data = MethodInput(
         stamp_ns=tracks.stamp_ns,
         keypoints=keypoints,
         focal_px=None if k is None else 0.5 * float(k[0, 0] + k[1, 1]),
         initializer=initializer,
-        adjuster=adjuster,
+        adjuster=dataclasses.replace(adjuster, limb_iterations=steps),
         dictionary=dictionary,
         progress=progress or (lambda stage, fraction: None),
         rotation=tracks.camera_rotation,

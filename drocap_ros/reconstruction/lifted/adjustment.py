@@ -159,7 +159,8 @@ def _band(p: AdjustmentProblem, r: _Residuals) -> np.ndarray:
     diagonal[..., :2] = seen[..., [0, 2]] + p.prior_weight_xy[..., None]
     diagonal[..., 2] = p.prior_weight_z / r.rounded
     outer = r.direction[..., :, None] * r.direction[..., None, :] / np.square(SPAN_STD_MM)[:, None, None]
-    block = np.zeros((frames, len(BODY_17), 3, len(BODY_17), 3))
+    outer = outer.astype(np.float32)
+    block = np.zeros((frames, len(BODY_17), 3, len(BODY_17), 3), np.float32)
     for k, (a, b) in enumerate(SPANS):
         m = outer[:, k]
         block[:, a, :, a] += m

@@ -103,6 +103,14 @@ class PlacedPoses:
     still: np.ndarray | None = None
 
 
+def refinable(tracks: Tracks) -> bool:
+    """Whether there are a camera's finite matrix, rotations and positions, and twelve frames."""
+    rotation, position = tracks.camera_rotation, tracks.camera_position
+    if rotation is None or position is None or tracks.camera_matrix is None or len(tracks) < _LEAST_FRAMES:
+        return False
+    return bool(np.isfinite(rotation).all() and np.isfinite(position).all())
+
+
 def refine_in_world(
     tracks: Tracks,
     keypoints: Keypoints2D,
@@ -111,17 +119,18 @@ def refine_in_world(
     known: Calibration | None = None,
     before: Before | None = None,
 ) -> RefinedWorld | str | None:
-    """Adjust poses and camera; None where the tracks lack a finite camera or are shorter than twelve frames.
+    """Adjust poses and camera; None where the tracks are not :func:`refinable`.
 
     The answer is a reason, in words, where the telemetry cannot be true.  ``known`` : findings of earlier windows;
     ``before`` : the last of them, which a live window continues.
     """
     config = config or WorldConfig()
     rotation, position, matrix = tracks.camera_rotation, tracks.camera_position, tracks.camera_matrix
-    if rotation is None or position is None or matrix is None or len(tracks) < _LEAST_FRAMES:
+    if not refinable(tracks) or not np.isfinite(poses.joints).all():
         return None
-    if not (np.isfinite(rotation).all() and np.isfinite(position).all() and np.isfinite(poses.joints).all()):
-        return None
+    assert rotation is not None
+    assert position is not None
+    assert matrix is not None
     slot, fps = even_slots(tracks.stamp_ns)
     frames = int(slot[-1]) + 1
     # The scale turns about the origin: near the camera's path, or the held person.
