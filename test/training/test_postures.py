@@ -49,7 +49,10 @@ def posture(**angle: float) -> np.ndarray:
         ({"lhip_out": 1.57}, "lknee", (-1, 0, 0)),
         ({"rknee": 1.57}, "rankle", (0, -1, 0)),
         ({"lhip": 1.57, "lknee": 1.57}, "lankle", (0, 0, -1)),
+        ({"rhip": 1.57, "rhip_turn": 1.57}, "rknee", (1, 0, 0)),
+        ({"lhip": 1.57, "lhip_turn": 1.57, "lknee": 1.57}, "lankle", (0, 0, -1)),
         ({"lshoulder": 1.57}, "lelbow", (0, 1, 0)),
+        ({"rarm_turn": -1.57, "relbow": 1.57}, "rwrist", (-1, 0, 0)),
         ({"relbow": 1.57}, "rwrist", (0, 1, 0)),
         ({"lshoulder_out": 1.57}, "lwrist", (-1, 0, 0)),
         ({"bend": 1.57}, "neck", (0, 1, 0)),
@@ -100,6 +103,15 @@ def test_a_person_who_would_fall_is_turned_until_the_feet_carry():
         np.linalg.norm(np.diff(leaning[0, 0, :4], axis=0), axis=-1),
         atol=1e-5,
     )
+
+
+def test_a_person_who_sits_leaning_back_stays_on_the_seat():
+    arms = {"rshoulder": 1.2, "lshoulder": 1.2}
+    sitting = posture(pitch=0.4, bend=0.1, rhip=1.3, lhip=1.3, rknee=0.1, lknee=0.1, **arms)
+    body = tilt(placed(bend(standing(1, 40), np.repeat(sitting, 40, axis=1))), np.repeat(sitting, 40, axis=1))
+    held = balance(body)[0, 20]
+    assert held[_J["pelvis"], 2] - np.nanmin(held[:, 2]) < 0.12
+    assert held[_J["neck"], 2] > held[_J["pelvis"], 2] + 0.4
 
 
 def test_a_person_who_lies_stays_lying():
