@@ -45,6 +45,12 @@ class Coast(NamedTuple):
         """Greatest distance from the first place, m, the creep included."""
         return float(np.abs(self.place - self.place[0]).max()) + self.creep_m
 
+    def creep_towards(self, place: complex) -> float:
+        """Part of the creep (m) that leads towards a place, if the vehicle creeps on the way that it went."""
+        way, sight = self.place[-1] - self.place[0], place - self.place[-1]
+        length = abs(way) * abs(sight)
+        return self.creep_m * max(float((way * sight.conjugate()).real) / length, 0.0) if length > 1e-6 else 0.0
+
 
 def coast_of(setpoint: Setpoint, position: np.ndarray, velocity: np.ndarray, autopilot: str, timeout_s: float) -> Coast:
     """Horizontal motion from here until the vehicle stands, if this setpoint is the last one.

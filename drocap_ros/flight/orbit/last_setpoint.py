@@ -39,7 +39,8 @@ _USES, _USE = {"px4": _Use(0.63, 0.82)}, _Use(0.75, 0.935)
 #: A far place lets PX4 fly faster than predicted: a vehicle that caught up with a walking subject went on for 3.1 m.
 #: Greatest speed of setpoint and way together beyond a steady flight's, m/s, and share of the subject's speed added.
 _PULLED_M_S, _PULLED_BEHIND = 0.3, 0.25
-_NEARER_M = 1.0
+#: Way nearer to the subject that forbids a setpoint, and that with the creep from which it is slowed down, m.
+_NEARER_M, _CREEPS_NEARER_M = 1.0, 0.9
 _SLACK_M, _SLACK_M_S = 0.2, 0.1  # what the vehicle has already is no effect of the setpoint
 _SHIPPED_S = {"ardupilot": 3.0, "px4": 1.0}  # time-outs, where they are not reported
 _SLOWED = 0.95
@@ -70,7 +71,8 @@ def harmless(
     Where no motion is harmless, the setpoint holds the present position, and the condition is why.
 
     The coast must be short, and stay inside the fence and the greatest speed.  It must stay clear of the minimum
-    distance from a subject that stands and from one that moves as estimated, and come at most 1 m nearer to that one.
+    distance from a subject that stands and from one that moves as estimated, and come at most 1 m nearer to that one;
+    with the creep of PX4 after its stop, what would come 0.9 m nearer is slowed down.
 
     Parameters
     ----------
@@ -96,6 +98,7 @@ def harmless(
         coast = coast_of(part, seen.position, seen.velocity, seen.autopilot, _timeout_s(seen))
         problem = _danger(coast, seen, complex(*subject_velocity[:2]), fence_centre, limits)
         long = coast.length_m > longest or _pulled(part, seen) > fastest
+        long |= _creeps_nearer(coast, seen, complex(*subject_velocity[:2])) > _CREEPS_NEARER_M
         # A coast that is only long is not shorter after a hold: the slowest setpoint is sent.
         if problem is None and (not long or along == _SHARES[-1]):
             return part, None
@@ -140,6 +143,16 @@ def _danger(
         ) if distance.min() < limit), default=math.nan,
     )  # fmt: skip
     return None if math.isnan(near) else condition(ConditionCode.COAST_UNSAFE, reach=f"come to {near:.1f} m")
+
+
+def _creeps_nearer(coast: Coast, seen: Observed, subject_velocity: complex) -> float:
+    """Way (m) nearer, creep included, to a subject who moves as estimated; his own approach does not count."""
+    if seen.subject is None:
+        return 0.0
+    now = complex(*seen.subject[:2])
+    then = now + subject_velocity * float(coast.time_s[-1])
+    alone = min(abs(coast.place[0] - now), abs(coast.place[0] - then))
+    return alone - abs(coast.place[-1] - then) + coast.creep_towards(then)
 
 
 def _use(seen: Observed) -> _Use:

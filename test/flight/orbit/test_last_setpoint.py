@@ -57,7 +57,7 @@ def test_px4_falls_behind_along_the_orbit_before_it_yields_the_radius():
     """A walker ahead of it was chased from far behind: after kills it moved by 3.7 m."""
     now = seen(velocity=(-0.9, 0.9, 0.0), by="px4")
     wanted = flight(now, acceleration=ZERO)._replace(position=now.position + np.array([-0.3, 1.4, 0.0]))
-    sent = sent_of(wanted, now, ZERO, CENTRE, LIMITS)
+    sent = sent_of(wanted, now, np.array([-0.9, 0.0, 0.0]), CENTRE, LIMITS)
     assert isinstance(sent, Setpoint)
     assert (sent.position - now.position)[0] == pytest.approx(-0.3)
     assert sent.velocity[0] == pytest.approx(-0.9)
@@ -76,6 +76,20 @@ def test_px4_is_not_pulled_to_a_far_place_faster_than_it_may_fly():
         assert commanded <= coast_speed(now, LIMITS) + 0.3 + 0.25 * walking
         assert sent.velocity[1] == pytest.approx(0.9)
     assert sent.position[1] == pytest.approx(now.position[1] + 0.2)
+
+
+def test_px4_creeps_on_after_its_stop_so_it_comes_nearer_more_slowly():
+    now = seen(position=(8.0, 0.0, 2.5), velocity=(-0.3, 0.0, 0.0), by="px4")
+    wanted = flight(now, velocity=(-0.6, 0.0, 0.0), acceleration=ZERO)
+    sent = sent_of(wanted, now, ZERO, CENTRE, LIMITS)
+    assert isinstance(sent, Setpoint)
+    coast = coast_of(sent, now.position, now.velocity, "px4", 0.5)
+    assert coast.creep_towards(0j) > 0.4
+    assert float(coast.place[0].real - coast.place[-1].real) + coast.creep_towards(0j) <= 0.9
+    assert -0.5 < sent.velocity[0] < 0.0
+    follows = sent_of(wanted, now, np.array([-0.6, 0.0, 0.0]), CENTRE, LIMITS)
+    assert isinstance(follows, Setpoint)
+    assert follows.velocity[0] == pytest.approx(-0.6), "he recedes as fast"
 
 
 @pytest.mark.parametrize("speed", [1.0, 2.0])
