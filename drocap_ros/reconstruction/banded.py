@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
@@ -72,5 +74,10 @@ def _coupling(factor: np.ndarray, begin: int) -> np.ndarray:
     rows = min(reach, factor.shape[1] - begin)
     item = flat.itemsize
     square = as_strided(flat, (rows, reach), (item, item * reach), writeable=False)
-    upper: np.ndarray = np.triu(square)
-    return upper
+    return np.where(_upper(rows, reach), square, square.dtype.type(0))
+
+
+@lru_cache(maxsize=16)
+def _upper(rows: int, columns: int) -> np.ndarray:
+    """(R, C) bool, the triangle from the diagonal on: NumPy's ``triu`` draws it anew for each matrix."""
+    return np.triu(np.ones((rows, columns), bool))

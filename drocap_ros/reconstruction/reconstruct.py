@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ from drocap_ros.reconstruction.world.world_model import WorldConfig, world_confi
 from drocap_ros.skeleton import BODY_15, BODY_17, BODY_19, JointSet, body_set
 from drocap_ros.tracks import Tracks
 
-#: Steps of the body's final adjustment where the adjustment in the world goes on from it: more change nothing there.
+#: Steps of each of the body's adjustments where the one in the world goes on from them: more change nothing there.
 _STEPS_BEFORE_WORLD = 2
 
 
@@ -75,13 +76,14 @@ def reconstruct(
     seen = body_keypoints(tracks, BODY_19)
     keypoints = seen.with_joints(len(joints))
     k = tracks.camera_matrix
-    steps = min(adjuster.limb_iterations, _STEPS_BEFORE_WORLD) if refinable(tracks) else adjuster.limb_iterations
+    most = _STEPS_BEFORE_WORLD if refinable(tracks) else sys.maxsize
+    first, final = min(adjuster.limb_iterations_first, most), min(adjuster.limb_iterations, most)
     data = MethodInput(
         stamp_ns=tracks.stamp_ns,
         keypoints=keypoints,
         focal_px=None if k is None else 0.5 * float(k[0, 0] + k[1, 1]),
         initializer=initializer,
-        adjuster=dataclasses.replace(adjuster, limb_iterations=steps),
+        adjuster=dataclasses.replace(adjuster, limb_iterations_first=first, limb_iterations=final),
         dictionary=dictionary,
         progress=progress or (lambda stage, fraction: None),
         rotation=tracks.camera_rotation,
