@@ -79,5 +79,5 @@ def _coupling(factor: np.ndarray, begin: int) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def _upper(rows: int, columns: int) -> np.ndarray:
-    """(R, C) bool, the triangle from the diagonal on: NumPy's ``triu`` draws it anew for each matrix."""
+    """Mask (R, C) of the upper triangle.  It is kept: NumPy's ``triu`` builds a new one for every matrix."""
     return np.triu(np.ones((rows, columns), bool))

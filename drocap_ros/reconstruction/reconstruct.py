@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -76,14 +75,16 @@ def reconstruct(
     seen = body_keypoints(tracks, BODY_19)
     keypoints = seen.with_joints(len(joints))
     k = tracks.camera_matrix
-    most = _STEPS_BEFORE_WORLD if refinable(tracks) else sys.maxsize
-    first, final = min(adjuster.limb_iterations_first, most), min(adjuster.limb_iterations, most)
+    body = adjuster
+    if refinable(tracks):
+        first, final = (min(n, _STEPS_BEFORE_WORLD) for n in (adjuster.limb_iterations_first, adjuster.limb_iterations))
+        body = dataclasses.replace(adjuster, limb_iterations_first=first, limb_iterations=final)
     data = MethodInput(
         stamp_ns=tracks.stamp_ns,
         keypoints=keypoints,
         focal_px=None if k is None else 0.5 * float(k[0, 0] + k[1, 1]),
         initializer=initializer,
-        adjuster=dataclasses.replace(adjuster, limb_iterations_first=first, limb_iterations=final),
+        adjuster=body,
         dictionary=dictionary,
         progress=progress or (lambda stage, fraction: None),
         rotation=tracks.camera_rotation,

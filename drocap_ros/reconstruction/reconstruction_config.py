@@ -52,7 +52,12 @@ class BundleAdjusterConfig(Parameters):
     lifter: str = param("", "the default method's lifter, an ONNX file; empty for the shipped one")
     limb_iterations_first: int = param(3, "steps of the default method that find the bone lengths", minimum=0,
                                        maximum=1000)  # fmt: skip
-    limb_iterations: int = param(12, "steps of the default method's final adjustment", minimum=0, maximum=1000)
+    limb_iterations: int = param(
+        12,
+        "steps of the default method's final adjustment; both have at most 2 before the adjustment in the world",
+        minimum=0,
+        maximum=1000,
+    )
 
     alpha: float = param(0.1, "weight of the nuclear norm at 240 frames; grows with the root of the length",
                          minimum=0.0)  # fmt: skip
