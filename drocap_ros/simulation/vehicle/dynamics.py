@@ -12,14 +12,20 @@ import numpy as np
 
 _YAW_LAG_S, _MAX_YAW_RATE = 0.1, 1.6
 _GUST = 0.09  # share of the wind
-_GUST_TURN = 0.32  # rad/s of yaw per m/s of lateral gust
+_GUST_TURN = 0.27  # rad/s of yaw per m/s of lateral gust
 
 
 class Airframe(NamedTuple):
-    """lags_s : of the thrust, one after the other; drag : per m of air; friction : per s of the own motion."""
+    """Of a copter.
+
+    lags_s : of the thrust, one after the other
+    drag, inflow : of the air, per m and per s: what the body and what the propellers slow down
+    friction : per s of the own motion
+    """
 
     lags_s: tuple[float, float]
     drag: float
+    inflow: float
     friction: float
 
 
@@ -28,8 +34,8 @@ class Airframe(NamedTuple):
 #: alone, at 1.4 m/s against 8 m/s of wind by 1.4 m/s^2, where the drag would add 0.4 (a real copter has no friction).
 #: No recorded flight of PX4 is in wind.
 AIRFRAMES = {
-    "ardupilot": Airframe((0.088, 0.057), 0.04, 0.0),
-    "px4": Airframe((0.1, 0.04), 0.016, 1.0),
+    "ardupilot": Airframe((0.111, 0.052), 0.045, 0.083, 0.0),
+    "px4": Airframe((0.1, 0.04), 0.016, 0.0, 1.0),
 }
 
 
@@ -37,15 +43,19 @@ class Body:
     """State of the vehicle, ENU, stepped in time.
 
     wind : (3,) m/s mean; gusts about it
+    gust : their standard deviation, a share of the wind
     """
 
-    def __init__(self, position: np.ndarray, yaw: float, wind: np.ndarray, airframe: Airframe, seed: int = 0) -> None:
+    def __init__(
+        self, position: np.ndarray, yaw: float, wind: np.ndarray, airframe: Airframe, seed: int = 0, gust: float = _GUST
+    ) -> None:
         self.position: np.ndarray = position.astype(float)
         self.velocity: np.ndarray = np.zeros(3)
         self.acceleration: np.ndarray = np.zeros(3)
         self.yaw, self.yaw_rate = yaw, 0.0
         self.wind: np.ndarray = wind.astype(float)
         self._airframe = airframe
+        self._gustiness = gust
         self._gust: np.ndarray = np.zeros(3)
         self._rng = np.random.default_rng([seed, 0xF1])
         # In hover the thrust already leans into the wind.
@@ -60,7 +70,7 @@ class Body:
         wind = math.sqrt(self.wind @ self.wind)
         if wind > 0:
             decay = math.exp(-dt / 1.5)
-            strength = _GUST * wind * math.sqrt(1 - decay**2)
+            strength = self._gustiness * wind * math.sqrt(1 - decay**2)
             self._gust = decay * self._gust + strength * self._rng.standard_normal(3) * np.array([1, 1, 0.2])
         self.acceleration = self.thrust + self.drag()
         self.position = self.position + self.velocity * dt + 0.5 * self.acceleration * dt * dt
@@ -76,7 +86,7 @@ class Body:
         relative = self.wind + self._gust
         if not friction:
             relative = relative - self.velocity
-        drag: np.ndarray = self._airframe.drag * math.sqrt(relative @ relative) * relative
+        drag: np.ndarray = (self._airframe.inflow + self._airframe.drag * math.sqrt(relative @ relative)) * relative
         return drag - friction * self.velocity
 
     def orientation_xyzw(self) -> np.ndarray:

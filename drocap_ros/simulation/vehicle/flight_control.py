@@ -60,6 +60,8 @@ class FlightControl:
         self.pace, self.push = [0.0, 0.0], [0.0, 0.0]
         self.commanded_velocity: np.ndarray = np.zeros(3)
         self.lean = (0.0, 0.0)  # last horizontal command
+        self._beyond = (0.0, 0.0)  # that command before its limit, where it was above it
+        self._away, self._error = (0.0, 0.0), (0.0, 0.0)  # m/s, towards the place and of the velocity
         # In hover the integrals have already adapted to the wind.
         self._integral = [-float(v) for v in drag]
         self._derivative, self._before = [0.0, 0.0], [0.0, 0.0]
@@ -85,16 +87,19 @@ class FlightControl:
         here, speed = (float(position[0]), float(position[1])), (float(velocity[0]), float(velocity[1]))
         self._shape(here, speed, expired, dt)
         gains, command = self.gains, [0.0, 0.0]
-        toward = self._toward(here)
+        toward = self._away = self._toward(here)
+        error = self._error = toward[0] + self.pace[0] - speed[0], toward[1] + self.pace[1] - speed[1]
         blend = min(1.0, dt * 2 * math.pi * _FILTER_HZ)
         for i in (0, 1):
-            error = toward[i] + self.pace[i] - speed[i]
             self._derivative[i] += ((self._before[i] - speed[i]) / dt - self._derivative[i]) * blend
             self._before[i] = speed[i]
-            command[i] = gains.velocity * error + self._integral[i] + gains.derivative * self._derivative[i]
+            command[i] = gains.velocity * error[i] + self._integral[i] + gains.derivative * self._derivative[i]
             command[i] += gains.feed * self.push[i]
-            self._integral[i] += gains.integral * error * dt
+            if not self._saturated(error):
+                self._integral[i] += gains.integral * error[i] * dt
         self.lean = limited(command[0], command[1], _MAX_LEAN_M_S2)
+        over = math.hypot(*command) > _MAX_LEAN_M_S2
+        self._beyond = (command[0], command[1]) if over else (0.0, 0.0)
         self.commanded_velocity = np.array([toward[0] + self.pace[0], toward[1] + self.pace[1], 0.0])
         return np.array([*self.lean, self._climb(float(position[2]), float(velocity[2]), dt)])
 
@@ -114,6 +119,10 @@ class FlightControl:
             return 0.0, 0.0
         return self.gains.position * (self.place[0] - here[0]), self.gains.position * (self.place[1] - here[1])
 
+    def _saturated(self, way: tuple[float, float]) -> bool:
+        """Whether the vehicle cannot lean farther this way."""
+        return way[0] * self._beyond[0] + way[1] * self._beyond[1] > 0.0
+
     def _climb(self, height: float, climb: float, dt: float) -> float:
         wanted = float(self.target.velocity[2])
         if self.target.position is not None:
@@ -131,13 +140,22 @@ class FlightControl:
         self._advance(wanted, jerk, dt)
 
     def _advance(self, wanted: tuple[float, float], jerk: float, dt: float) -> None:
-        """Move the wanted place and velocity; its acceleration follows ``wanted`` within the jerk."""
+        """Move the wanted place and velocity; its acceleration follows ``wanted`` within the jerk.
+
+        They do not run away from a vehicle that leans as far as it may (as by ArduPilot's AC_PosControl).
+        """
         change = limited(wanted[0] - self.push[0], wanted[1] - self.push[1], jerk * dt)
-        for i in (0, 1):
-            if self.place is not None:
-                self.place[i] += self.pace[i] * dt + 0.5 * self.push[i] * dt * dt
-            self.pace[i] += self.push[i] * dt
-            self.push[i] += change[i]
+        faster = self.push[0] * dt, self.push[1] * dt
+        if self.place is not None:
+            way = (self.pace[0] + 0.5 * faster[0]) * dt, (self.pace[1] + 0.5 * faster[1]) * dt
+            if not (self._saturated(way) and self._saturated(self._away)):
+                self.place = [self.place[0] + way[0], self.place[1] + way[1]]
+        if self._saturated(faster) and self._saturated(self._error):
+            # A wanted velocity the other way may still be taken back.
+            back = math.hypot(*self.pace) if self._saturated((-self.pace[0], -self.pace[1])) else 0.0
+            faster = limited(*faster, back)
+        self.pace = [self.pace[0] + faster[0], self.pace[1] + faster[1]]
+        self.push = [self.push[0] + change[0], self.push[1] + change[1]]
 
 
 def limited(x: float, y: float, most: float) -> tuple[float, float]:

@@ -22,6 +22,8 @@ FAULT_S = 3.0
 #: From the bridge's process to the autopilot's controller.
 _TRANSIT_S = {"ardupilot": 0.027, "px4": 0.07}
 _RUN_UP_S, _TREND_S = 3.0, 2.0
+#: Of the flights in 8 m/s: its direction is not recorded, and was fitted to them.
+_WIND_M_S = (-8.0, -0.8)
 _LOST_S = 0.595  # PX4: from the last setpoint to its hold mode, COM_OF_LOSS_T 0.5
 
 
@@ -51,6 +53,7 @@ class Case(NamedTuple):
     start_s : instant from which the simulated vehicle flies freely
     heard_until_s : setpoints that left later did not arrive
     timeout_s : ArduPilot's GUID_TIMEOUT
+    wind : (2,) m/s ENU, without gusts
     """
 
     name: str
@@ -58,7 +61,7 @@ class Case(NamedTuple):
     events: tuple[Event, ...] = ()
     heard_until_s: float = np.inf
     timeout_s: float = 0.5
-    note: str = ""
+    wind: tuple[float, float] = (0.0, 0.0)
 
 
 class Replayed(NamedTuple):
@@ -117,10 +120,11 @@ def _fly(
         np.stack([np.interp(times, flight.time_s, values[:, i]) for i in range(3)], axis=1)
         for values in (flight.position, flight.velocity)
     )
-    body = Body(position[0], float(flight.yaw[0]), np.zeros(3), AIRFRAMES[autopilot])
+    body = Body(position[0], float(flight.yaw[0]), np.array([*case.wind, 0.0]), AIRFRAMES[autopilot], gust=0.0)
+    hovering = body.drag()
     body.velocity = velocity[0]
     make = ArduCopterControl if autopilot == "ardupilot" else Px4Control
-    control: FlightControl = make(position[0], body.yaw, -np.array([*trim, 0.0]))
+    control: FlightControl = make(position[0], body.yaw, hovering - np.array([*trim, 0.0]))
     control.begin(Manner.SETPOINTS, position[0], velocity[0], body.yaw)
     arrivals = flight.setpoint_s + _TRANSIT_S[autopilot]
     heard = flight.setpoint_s <= case.heard_until_s
@@ -202,5 +206,6 @@ def recorded_cases(flight: RecordedFlight, name: str) -> Sequence[Case]:
         return [Case(name, FAULT_S, (Event(FAULT_S, Manner.BRAKE),))]
     if len(flight.setpoint_s) and ("orbit" in name or "stand" in name or "walk" in name or "override1" in name):
         starts = np.arange(FAULT_S, float(flight.time_s[-1]) - 4.0, 4.0)
-        return [Case(name, float(start)) for start in starts]
+        wind = _WIND_M_S if "wind_8" in name else (0.0, 0.0)
+        return [Case(name, float(start), wind=wind) for start in starts]
     return []

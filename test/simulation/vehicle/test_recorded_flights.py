@@ -1,8 +1,13 @@
 """The simulated vehicle against recorded flights of the real autopilots: the same setpoints, from the same state."""
 
+import math
+
 import numpy as np
 import pytest
 
+from drocap_ros.simulation.vehicle.arducopter_control import ArduCopterControl
+from drocap_ros.simulation.vehicle.dynamics import AIRFRAMES, Body
+from drocap_ros.simulation.vehicle.flight_control import Manner, Target
 from drocap_ros.simulation.vehicle.replay import Case, RecordedFlight, load_recorded, recorded_cases, replay
 
 #: Flights whose every input is recorded: nothing but ArduPilot's control moves the vehicle.
@@ -42,3 +47,26 @@ def test_stale_setpoint_is_continued_until_the_timeout_and_sprung_back_from():
     assert np.diff(long[:70]).max() / 0.01 > 2.3  # faster than at the bridge's death
     assert long.max() > short.max() + 0.3
     assert long.max() - long[-1] > 0.5
+
+
+@pytest.mark.parametrize(("name", "most_m"), [("orbit_standing_wind_8", 0.4), ("orbit_walking_wind_8", 1.0)])
+def test_ardupilot_in_wind_goes_where_the_recorded_one_went(shared, name, most_m):
+    flight = load_recorded(shared / "flight" / f"{name}.npz")
+    errors = [replay(flight, case, "ardupilot").error_m.max() for case in recorded_cases(flight, name)]
+    assert len(errors) >= 10
+    assert np.mean(errors) < most_m
+
+
+def test_path_waits_for_a_vehicle_that_leans_as_far_as_it_may():
+    storm = np.array([-12.0, 0.0, 0.0])
+    body = Body(np.zeros(3), 0.0, storm, AIRFRAMES["ardupilot"], gust=0.0)
+    control = ArduCopterControl(body.position, 0.0, body.drag())
+    control.begin(Manner.SETPOINTS, body.position, body.velocity, 0.0)
+    for step in range(400):
+        ahead = np.array([3.0 * 0.01 * step, 0.0, 0.0])
+        control.take(Target(ahead, np.array([3.0, 0.0, 0.0]), np.zeros(3)))
+        body.step(control.command(body.position, body.velocity, False, 0.01), 0.0, 0.01)
+    assert math.hypot(*control.lean) == pytest.approx(5.66)  # all that 30 degrees give, and less than the wind's push
+    assert body.position[0] < 0
+    assert ahead[0] > 11
+    assert control.place[0] < 3
