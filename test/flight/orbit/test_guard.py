@@ -145,3 +145,15 @@ def test_a_body_that_shrinks_for_a_moment_may_not_be_followed():
     assert asked(guard, place, now, 2.2)[0] < 1.2
     guard, place, now = flown(lambda t: -1.4 * max(t - 2.3, 0.0), lambda t: -1.4 * max(t - 2.3, 0.0), 6.0)
     assert asked(guard, place, now, 2.2, own=1.4)[0] > 1.6
+
+
+def test_ardupilot_that_recedes_is_not_told_to_close_up_at_once():
+    guard, place, now = flown(lambda t: 0.0, lambda t: 0.0)
+    allowed = asked(guard, place, now, 2.5)[0]
+    assert allowed > 0.7
+    assert asked(guard, place, now, 2.5, own=-1.8)[0] == pytest.approx(0.0, abs=1e-3)
+    assert asked(guard, place, now, 2.5, own=-0.2)[0] == pytest.approx(allowed - 0.4, abs=1e-3)
+    seen = dataclasses.replace(GOOD, position=place, velocity=np.array([1.8, 0.0, 0.0]), autopilot="px4")
+    guard.doubt(seen, np.zeros(3), now)
+    sent = guard.limit(STILL._replace(position=place, velocity=np.array([-2.5, 0.0, 0.0])), seen)
+    assert -sent.velocity[0] == pytest.approx(allowed, abs=1e-3)  # its path does not overshoot
