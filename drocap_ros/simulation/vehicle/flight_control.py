@@ -95,7 +95,8 @@ class FlightControl:
             self._before[i] = speed[i]
             command[i] = gains.velocity * error[i] + self._integral[i] + gains.derivative * self._derivative[i]
             command[i] += gains.feed * self.push[i]
-            if not self._saturated(error):
+        if not self._saturated(error):
+            for i in (0, 1):
                 self._integral[i] += gains.integral * error[i] * dt
         self.lean = limited(command[0], command[1], _MAX_LEAN_M_S2)
         over = math.hypot(*command) > _MAX_LEAN_M_S2
