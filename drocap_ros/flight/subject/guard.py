@@ -41,8 +41,8 @@ _SURELY_M_S = 0.1  # so much faster than by the estimated place he may recede by
 _NEAR_M, _FAR_M, _FAR_ERROR_M_S = 8.0, 12.0, 0.3
 _POSITION_GAIN = 1.0  # 1/s, of both autopilots' position loops: 1.0 (PSC_POSXY_P) and 0.95 (MPC_XY_P)
 _REACTION_S = 0.5
-#: While ArduPilot recedes, this multiple of that speed is taken from its setpoints' closing speed.  Its path,
-#: limited in jerk, overshoots a reversal: from 1.8 m/s away it closed up at 2.1 m/s, also in a hold that began meanwhile.
+#: While ArduPilot recedes, this multiple of that speed is taken from its setpoints' closing speed.  Its path, limited
+#: in jerk, overshoots a reversal: from 1.8 m/s away it closed up at 2.1 m/s, and in a hold that began meanwhile, too.
 _REVERSAL = 2.0
 
 
