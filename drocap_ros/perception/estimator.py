@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.joint_maps import joint_map
 from drocap_ros.observation import PoseObservation
+from drocap_ros.perception.body_pose import BodyPose
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import iou, suppress, without_parts
 from drocap_ros.perception.flow import KeypointFlow
@@ -23,7 +23,6 @@ from drocap_ros.perception.tracking.pose_belief import CONFIRM_CONFIDENCE
 from drocap_ros.perception.tracking.rivals import wins
 from drocap_ros.perception.tracking.shadow import without_shadow
 from drocap_ros.perception.uncertainty import calibrate
-from drocap_ros.skeleton import BODY_15
 
 #: Detection score and mean confidence from which the next images need no detection.
 _CLEAR_SCORE, _CLEAR_CONFIDENCE = 0.6, 0.8
@@ -37,23 +36,8 @@ _REJECTED_NS, _SAME_IOU = 300_000_000, 0.6
 _REDUCED_INPUT = 0.8
 #: Under load shedding, longest pause of the pose network, over the one after a first failure: 0.4 s at 30 Hz.
 _LONGEST_PAUSE = 4
-#: Least confidence of a joint that counts for the box.
-_BOX_JOINT_CONFIDENCE = 0.3
 
 log = logging.getLogger(__name__)
-
-
-class _Pose(NamedTuple):
-    """Calibrated keypoints of the joints that the network gives, ``BODY_15`` first: (P, 2) px, (P, 3) px^2, (P,)."""
-
-    xy: np.ndarray
-    covariance: np.ndarray
-    confidence: np.ndarray
-
-    @property
-    def mean_confidence(self) -> float:
-        """Over ``BODY_15``: the thresholds hold for networks with and without feet."""
-        return float(self.confidence[: len(BODY_15)].mean())
 
 
 class PoseEstimator:
@@ -163,12 +147,11 @@ class PoseEstimator:
         if belief < _CLEAR_CONFIDENCE:
             subject, pose = self._compete(image, stamp_ns, subject, pose, belief, everything, load_level)
         self.tracker.judge(self._confidence, subject.box, stamp_ns)
-        if not load_level:
-            self._judge_bystander(image, stamp_ns)
+        self._judge_bystander(image, stamp_ns, pose, load_level > 0)
         is_person = self._confidence >= CONFIRM_CONFIDENCE
         self._failures, self._paused = 0 if is_person else self._failures + 1, 0
         self._margins = None
-        extent = _extent(pose)
+        extent = pose.extent()
         if subject.score < self.config.detection_threshold:
             if extent is not None and is_person:
                 margin = 0.06 * (extent[2:] - extent[:2]).max()
@@ -183,14 +166,14 @@ class PoseEstimator:
         image: np.ndarray,
         stamp_ns: int,
         subject: Subject,
-        pose: _Pose,
+        pose: BodyPose,
         belief: float,
         found: Detections,
         load_level: int,
-    ) -> tuple[Subject, _Pose]:
+    ) -> tuple[Subject, BodyPose]:
         """Subject and pose, or those of a detection in whose pose the belief is clearly greater: it was a shadow."""
         boxes = found.boxes.astype(float)
-        joints = _extent(pose, CONFIRM_CONFIDENCE, 0.4) if subject.score > 0 else None
+        joints = pose.extent(CONFIRM_CONFIDENCE, 0.4) if subject.score > 0 else None
         if joints is not None:  # a box around person and shadow: its clear joints are the person's
             margin = 0.06 * (joints[2:] - joints[:2]).max()
             boxes = np.concatenate([boxes, [joints + margin * np.array([-1, -1, 1, 1])]])
@@ -211,12 +194,15 @@ class PoseEstimator:
             self._score, self._confidence = subject.score, pose.mean_confidence
         return subject, pose
 
-    def _judge_bystander(self, image: np.ndarray, stamp_ns: int) -> None:
-        """Let the tracker know the pose of at most one other person: whether it is one."""
-        person = self.tracker.bystander_to_judge(stamp_ns)
+    def _judge_bystander(
+        self, image: np.ndarray, stamp_ns: int, subject: BodyPose | None = None, shedding: bool = False
+    ) -> None:
+        """Let the tracker know the pose of at most one other person: whether it is one, and not the subject again."""
+        person = self.tracker.bystander_to_judge(stamp_ns, shedding)
         if person is not None:
             pose = self._calibrated(self.pose_model.estimate(image, person.box))
-            self.tracker.judge_bystander(person, _belief(pose, image, person.box), stamp_ns)
+            same = subject is not None and pose.same_person(subject)
+            self.tracker.judge_bystander(person, _belief(pose, image, person.box), stamp_ns, same)
 
     def _estimate_predicted(
         self, image: np.ndarray, stamp_ns: int, load_level: int
@@ -241,7 +227,7 @@ class PoseEstimator:
         keypoints = self.pose_model.estimate(image, predicted.box)
         pose = self._calibrated(keypoints)
         confidence = pose.mean_confidence
-        extent = _extent(pose)
+        extent = pose.extent()
         if margins is not None and extent is not None and confidence >= _CLEAR_CONFIDENCE:
             box = extent + margins * (extent[2:] - extent[:2]).max()
             box = np.clip(box, 0, np.array([*size, *size], float))
@@ -253,7 +239,7 @@ class PoseEstimator:
         self.keypoints, self._confidence = keypoints, confidence
         return self._observation(stamp_ns, size, predicted, pose), confidence >= CONFIRM_CONFIDENCE
 
-    def _observation(self, stamp_ns: int, size: tuple[int, int], subject: Subject, pose: _Pose) -> PoseObservation:
+    def _observation(self, stamp_ns: int, size: tuple[int, int], subject: Subject, pose: BodyPose) -> PoseObservation:
         xy, covariance, confidence = pose
         # Networks extrapolate beyond the image; nothing there was seen.
         outside = ~((xy >= 0) & (xy < np.array(size))).all(axis=1)
@@ -284,10 +270,10 @@ class PoseEstimator:
         kept = uncut(found.boxes, window, (image.shape[1], image.shape[0]))
         return Detections(found.boxes[kept], found.scores[kept])
 
-    def _calibrated(self, keypoints: NetworkKeypoints) -> _Pose:
+    def _calibrated(self, keypoints: NetworkKeypoints) -> BodyPose:
         """The network's keypoints as joints of the body, with covariance and confidence."""
         covariance, confidence = calibrate(keypoints, self.pose_model.spec.layout)
-        return _Pose(*self._joint_map.apply(keypoints.xy.astype(float), covariance, confidence, keypoints.box_size))
+        return BodyPose(*self._joint_map.apply(keypoints.xy.astype(float), covariance, confidence, keypoints.box_size))
 
     def _without_keypoints(self, stamp_ns: int, size: tuple[int, int], subject: Subject) -> PoseObservation:
         """The subject at its predicted box, without keypoints."""
@@ -307,19 +293,10 @@ def _merged(a: Detections, b: Detections) -> Detections:
     return Detections(boxes[kept], scores[kept])
 
 
-def _belief(pose: _Pose, image: np.ndarray, box: np.ndarray) -> float:
+def _belief(pose: BodyPose, image: np.ndarray, box: np.ndarray) -> float:
     """Confidence in a person of a pose found in a box (4,) px."""
     confidence = pose.mean_confidence
     return confidence if confidence >= _CLEAR_CONFIDENCE else without_shadow(confidence, image, box)
-
-
-def _extent(pose: _Pose, least: float = _BOX_JOINT_CONFIDENCE, share: float = 0.7) -> np.ndarray | None:
-    """(4,) px box of the joints; None when fewer than a share of ``BODY_15`` are seen with the least confidence."""
-    seen = pose.confidence[: len(BODY_15)] >= least
-    if seen.sum() < share * len(seen):
-        return None
-    xy = pose.xy[: len(BODY_15)][seen]
-    return np.concatenate([xy.min(axis=0), xy.max(axis=0)])
 
 
 def _check_image(image: np.ndarray) -> None:

@@ -22,7 +22,8 @@ class Person:
     first_ns : first detection; detected_ns : last detection; confirmed_ns : last confirmed detection
     score : of the last detection; mean_score : recent mean, low for body parts and clutter
     hits : number of detections
-    double : whether it began as a second box around the subject, see :func:`.reidentification.is_double`
+    began_at_subject, double : whether its first box lay on the subject's, and whether it is a second box around the
+        subject; see ``doubles.py``
     pose : what its poses say about it
     """
 
@@ -35,7 +36,7 @@ class Person:
         self.score = score
         self.mean_score = score
         self.hits = 1
-        self.double = False
+        self.began_at_subject = self.double = False
         self.pose = PoseBelief(stamp_ns)
         self.appearance = appearance
         self._descriptors = 1 if appearance is not None else 0

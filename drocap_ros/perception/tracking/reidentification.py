@@ -23,8 +23,6 @@ _SIMILARITY_MARGIN = 0.05
 _OTHER_SIMILARITY, _SUDDEN_S, _SAME_SIZE = 0.7, 0.15, 0.2
 #: Mean score from which the subject's appearance is reliable.
 _CLEAR_SCORE = 0.6
-#: Overlap and similarity from which a new track beside the detected subject is a second box around the same person.
-_DOUBLE_IOU, _DOUBLE_SIMILARITY = 0.35, 0.93
 #: Least similarity of a new track with the lost subject.
 _REIDENTIFY_SIMILARITY = 0.92
 #: The same for the only person who may be the subject, within this time.
@@ -45,18 +43,6 @@ def replaced(subject: Person, box: np.ndarray, appearance: np.ndarray | None, st
         return False
     growth = np.abs(np.log(np.maximum(box[2:] - box[:2], 1.0) / np.maximum(subject.box[2:] - subject.box[:2], 1.0)))
     return bool(growth.max() < _SAME_SIZE) and subject.similarity(appearance) < _OTHER_SIMILARITY
-
-
-def is_double(subject: Person, box: np.ndarray, appearance: np.ndarray | None, stamp_ns: int) -> bool:
-    """Whether a detection (4,) px without owner is a second box around the subject, detected in the same image.
-
-    A detector that doubts the extent of a person gives two boxes of it.  As a bystander the second one would take the
-    next detections from the subject and hide it.
-    """
-    if appearance is None or subject.detected_ns != stamp_ns:
-        return False
-    overlap = float(iou(box[None].astype(float), subject.box[None])[0, 0])
-    return overlap > _DOUBLE_IOU and subject.similarity(appearance) > _DOUBLE_SIMILARITY
 
 
 def known_other(subject: Person, persons: list[Person], box: np.ndarray, appearance: np.ndarray | None) -> bool:

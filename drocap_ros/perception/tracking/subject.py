@@ -8,6 +8,7 @@ import numpy as np
 
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig, parse_box
+from drocap_ros.perception.tracking import doubles
 from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.association import assign_all
 from drocap_ros.perception.tracking.box_filter import BoxFilter
@@ -19,7 +20,6 @@ from drocap_ros.perception.tracking.reidentification import (
     RELIABLE_SCORE,
     confirming_hits,
     could_be,
-    is_double,
     leaving,
     same_person,
     search_boxes,
@@ -31,9 +31,8 @@ from drocap_ros.perception.tracking.selection import select
 _HIDDEN_IOU = 0.25
 #: Least overlap of a detection with the predicted box that needs no second pass.
 _CLEAR_IOU = 0.5
-#: Overlap coefficient above which an unassigned detection is a part of a tracked person, or that person and more, and
-#: below which a bystander with a certain pose is someone else.
-_PART, _APART = 0.75, 0.5
+#: Overlap coefficient above which an unassigned detection is a part of a tracked person, or that person and more.
+_PART = 0.75
 #: Free margin around an isolated subject, lengths.
 _ISOLATED = 0.4
 #: For ``on_loss = next``: time beyond coasting after which a subject lost inside the image is given up.
@@ -168,17 +167,16 @@ class SubjectTracker:
             subject.box, subject.filter = subject.pose.box, BoxFilter(subject.pose.box, subject.certain_ns)
             subject.detected_ns = subject.confirmed_ns = subject.certain_ns
 
-    def bystander_to_judge(self, stamp_ns: int) -> Person | None:
-        """The person detected in this image whose pose should be looked at, beside a certain subject or without one."""
-        return due_bystander(self._subject, self.persons, stamp_ns)
+    def bystander_to_judge(self, stamp_ns: int, shedding: bool = False) -> Person | None:
+        """The person detected in this image whose pose should be looked at; see :func:`.rivals.due_bystander`."""
+        return due_bystander(self._subject, self.persons, stamp_ns, shedding)
 
-    def judge_bystander(self, person: Person, confidence: float, stamp_ns: int) -> None:
-        """Add the mean confidence of a bystander's pose, which may re-identify a lost subject."""
+    def judge_bystander(self, person: Person, confidence: float, stamp_ns: int, same: bool = False) -> None:
+        """Add a bystander's pose: mean confidence, and whether its joints are the subject's; it may be a lost one."""
         subject = self._subject
         person.pose.judge(confidence, person.box, stamp_ns)
         if subject is not None and subject.pose.believed_ns == stamp_ns and confidence >= SURE_CONFIDENCE:
-            # Of two boxes in each other one may hold the person and its shadow.
-            person.pose.other |= bool(overlap_coefficient(person.box[None], subject.box[None])[0, 0] < _APART)
+            doubles.on_joints(person, subject, same)
         if self.current(stamp_ns) is None:
             self._reidentify(stamp_ns)
 
@@ -234,6 +232,7 @@ class SubjectTracker:
             subject, others, boxes, scores, appearances, stamp_ns, self._config.detection_threshold
         )
         self.persons += replacements
+        doubles.on_detections(self.persons, subject, stamp_ns)
         self._spawn(boxes, scores, appearances, assigned, stamp_ns)
         self._reidentify(stamp_ns)
         self._apply_choice(stamp_ns)
@@ -262,7 +261,7 @@ class SubjectTracker:
             if len(known) and overlap_coefficient(boxes[j][None].astype(float), known).max() > _PART:
                 continue
             person = Person(boxes[j], float(scores[j]), stamp_ns, appearances[j])
-            person.double = subject is not None and is_double(subject, boxes[j], appearances[j], stamp_ns)
+            doubles.compare(person, subject, appearances[j])
             self.persons.append(person)
 
     def _reidentify(self, stamp_ns: int) -> None:

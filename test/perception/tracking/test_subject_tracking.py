@@ -90,6 +90,46 @@ def test_second_box_of_the_subject_is_no_person_who_hides_it():
     assert subject.track_id == 1
 
 
+def test_second_box_with_the_joints_of_the_subject_takes_nothing_from_it():
+    # Boxes as in an orbit of rendered images in which the subject was lost for good.
+    scene = Scene()
+
+    def show(*boxes):
+        subject = scene.show([(340, 180, 280, RED)], detections=boxes)
+        stamp = (scene.index - 1) * STEP
+        scene.tracker.judge(0.99, subject.box, stamp)
+        bystander = scene.tracker.bystander_to_judge(stamp)
+        if bystander is not None:
+            scene.tracker.judge_bystander(bystander, 0.98, stamp, True)
+        return subject
+
+    for _ in range(20):
+        show(((284, 40, 396, 320), 0.9))
+    for t in range(16):
+        first = (284 - 2 * min(t, 4), 30, 384 - 2 * min(t, 4), 320)
+        show((first, 0.6), ((334, 90, 404, 315) if t < 2 else (330, 60, 394, 318), 0.8))
+    for _ in range(40):
+        subject = show(((330, 60, 394, 318), 0.9))
+        assert subject is not None
+        assert not subject.hidden
+    assert subject.score == 0.9
+
+
+def test_person_who_comes_out_from_behind_the_subject_is_someone_else():
+    scene = Scene()
+    for t in range(60):
+        persons = [(300 + 3 * t, 180, 185, BLUE), (300, 180, 185, RED)]
+        subject = scene.show(persons, unseen=(0,) if t < 10 else ())
+        stamp = (scene.index - 1) * STEP
+        scene.tracker.judge(0.99, subject.box, stamp)
+        bystander = scene.tracker.bystander_to_judge(stamp)
+        if bystander is not None:  # behind the subject the network finds the subject's joints
+            scene.tracker.judge_bystander(bystander, 0.9, stamp, 3 * t < 50)
+    states = [scene.show([(300, 180, 185, RED), (474 - 6 * t, 180, 190, BLUE)], unseen=(0,)) for t in range(28)]
+    assert states[-1].track_id == 1
+    assert states[-1].hidden
+
+
 def test_subject_behind_another_person_is_hidden():
     scene = Scene()
     for t in range(44):

@@ -30,3 +30,13 @@ def test_orbit_by_rendered_images_keeps_radius_and_heading():
     # Images from many sides: a large part of a turn.
     bearings = np.unwrap([np.arctan2(*row.position[1::-1]) for row in loop.rows])
     assert np.degrees(np.ptp(bearings)) > 150
+
+
+def test_two_boxes_of_one_person_do_not_end_the_orbit():
+    settings = LoopSettings(seed=1, bearing_deg=37.0, wind_m_s=(8.0, 0.0, 0.0), seconds=9.0)
+    settings = with_config(settings, body_height_m=1.75)
+    loop = PixelOrbitLoop(settings, PoseEstimator(models_folder(SIMULATION), PoseEstimatorConfig()))
+    loop.start()
+    loop.run(8.0)
+    assert loop.controller.safety.state == State.ORBITING, loop.reasons
+    assert np.isfinite(loop.errors).all(axis=1).mean() > 0.95
