@@ -19,7 +19,9 @@ _SHARES = (
     (1.0, 1.0, 1.0), (0.5, 1.0, 1.0), (0.0, 1.0, 1.0), (0.0, 0.8, 0.5), (0.0, 0.6, 0.0), (0.0, 0.4, 0.0),
     (0.0, 0.2, 0.0),
 )  # fmt: skip
-#: Shares across the line of sight that PX4 tries first: it falls behind along the orbit and keeps its radius.
+#: Shares across the line of sight that PX4 tries first, and ArduPilot about one who walks: a vehicle that falls behind
+#: along the orbit keeps its radius.  About one who stands ArduPilot would come near too fast as the radius shrinks.
+_WALKING_M_S = 0.5
 _ACROSS = (
     (1.0, 1.0, 1.0), (0.75, 1.0, 1.0), (0.5, 1.0, 1.0), (0.25, 1.0, 1.0), (0.0, 1.0, 1.0), (0.0, 0.8, 0.5),
     (0.0, 0.6, 0.0), (0.0, 0.4, 0.0),
@@ -81,11 +83,11 @@ def harmless(
     """
     problem: Condition | None = None
     longest, fastest = _use(seen).greatest * limits.safety.max_coast_m, math.inf
+    walking = float(np.hypot(*subject_velocity[:2]))
     if seen.autopilot == "px4":
-        walking = float(np.hypot(*subject_velocity[:2]))
         fastest = coast_speed(seen, limits) + _PULLED_M_S + _PULLED_BEHIND * walking
     tries = [(share, share) for share in _SHARES]
-    if seen.autopilot == "px4" and seen.subject is not None:
+    if seen.subject is not None and (seen.autopilot == "px4" or walking > _WALKING_M_S):
         tries = [(_SHARES[0], share) for share in _ACROSS] + [(share, min(share, _ACROSS[-1])) for share in _SHARES[1:]]
     for along, across in tries:
         way, velocity, acceleration = (
