@@ -16,7 +16,7 @@ from drocap_ros.flight.safety_config import SafetyConfig
 _AT_REST_M_S, _AT_REST_S, _SETTLED_S = 0.35, 0.5, 0.3
 _DEAD_RECKONING_S = 0.6
 _FRESH_S = 0.25
-_NEAR_M, _STOPPING_S, _MAX_WAY_OUT_M = 5.0, 1.2, 1.5
+_NEAR_M, _FAST_M_S, _STOPPING_S, _MAX_WAY_OUT_M = 5.0, 1.0, 1.2, 1.5
 _LEAD_S, _CLEAR_M, _MAX_LEAD_M = 1.5, 0.3, 3.0
 _HOLD_MODE_PATIENCE_S = 5.0
 #: Causes that pass by themselves.  A silent link is none of them: motion does not resume because a link returns.
@@ -42,8 +42,8 @@ def begin_hold(
     place = seen.position + seen.velocity * behind_s if known else None
     if place is not None and state.pace.value == 0.0 and reason.code in _HARMLESS:
         place = state.pace.place  # the setpoint has stood there
-    elif place is not None and seen.subject is not None and seen.subject_distance_m < _NEAR_M and seen.closing_m_s < 0:
-        # A vehicle that moves away from a near subject does not return to where it was: the subject may follow.
+    elif place is not None and seen.subject is not None and _moves_away(seen):
+        # It does not return to where it was: the subject may follow, and it would come back fast.
         outward = (seen.position - seen.subject)[:2] / max(seen.subject_distance_m, 1e-3)
         way = min((max(seen.approach_m_s, 0.0) - seen.closing_m_s) * _STOPPING_S, _MAX_WAY_OUT_M)
         aside = seen.velocity[:2] - (seen.velocity[:2] @ outward) * outward
@@ -54,6 +54,11 @@ def begin_hold(
         retreats=retreats, retreated_s=-math.inf, slow_s=math.nan, resumable=reason.code in _HARMLESS,
         clear_s=math.nan,
     )  # fmt: skip
+
+
+def _moves_away(seen: Observed) -> bool:
+    """Whether the vehicle moves away from a near subject, or fast."""
+    return seen.closing_m_s < (0.0 if seen.subject_distance_m < _NEAR_M else -_FAST_M_S)
 
 
 def update_hold(state: SafetyState, seen: Observed, now_s: float, blind: bool) -> SafetyState:

@@ -260,6 +260,19 @@ def test_hold_position_retreats_from_an_approaching_subject():
     assert reduce(after, still, 15.0, None, LIMITS)[1].mode_request == ModeRequest.HOLD
 
 
+def test_vehicle_that_moves_away_fast_is_held_where_it_can_stop():
+    """Led back to where the hold began it came back at 1.2 m/s."""
+    begun = [
+        reduce(orbiting(), dataclasses.replace(
+            GOOD, position=np.array([8.0, 0.0, 2.5]), velocity=np.array([away, 0.0, 0.0]), subject_distance_m=8.0,
+            closing_m_s=-away, approach_m_s=0.0, subject_sd_m=2.0,
+        ), 10.0, None, LIMITS)[0] for away in (0.5, 1.8)
+    ]  # fmt: skip
+    assert [state.state for state in begun] == [State.HOLDING] * 2
+    assert begun[0].hold_position[0] == pytest.approx(8.0)
+    assert begun[1].hold_position[0] == pytest.approx(9.5)
+
+
 @pytest.mark.parametrize(
     ("seen", "command"),
     [
