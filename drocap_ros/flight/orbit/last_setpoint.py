@@ -20,12 +20,13 @@ _SHARES = (
     (0.0, 0.2, 0.0),
 )  # fmt: skip
 #: Shares across the line of sight that PX4 tries first, and ArduPilot about one who walks: a vehicle that falls behind
-#: along the orbit keeps its radius.  About one who stands ArduPilot would come near too fast as the radius shrinks.
-_WALKING_M_S = 0.5
+#: along the orbit keeps its radius.
 _ACROSS = (
     (1.0, 1.0, 1.0), (0.75, 1.0, 1.0), (0.5, 1.0, 1.0), (0.25, 1.0, 1.0), (0.0, 1.0, 1.0), (0.0, 0.8, 0.5),
     (0.0, 0.6, 0.0), (0.0, 0.4, 0.0),
 )  # fmt: skip
+#: Speed of one who walks.  About one who stands ArduPilot would come near too fast as the radius shrinks.
+_WALKING_M_S = 0.5
 
 
 class _Use(NamedTuple):

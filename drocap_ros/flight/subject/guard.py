@@ -44,9 +44,10 @@ _REACTION_S = 0.5
 #: While ArduPilot recedes, this multiple of that speed is taken from its setpoints' closing speed.  Its path, limited
 #: in jerk, overshoots a reversal: from 1.8 m/s away it closed up at 2.1 m/s, and in a hold that began meanwhile, too.
 _REVERSAL = 2.0
-#: By so much more than at present it is told to close up on one who stands: told 0.85 m/s at rest, it reached 1.26.
+#: Most that a setpoint adds to ArduPilot's present closing speed towards one who stands.  It overshoots a larger step:
+#: from rest a setpoint of 0.85 m/s led to 1.26 m/s.
 _STEP_M_S = 0.4
-#: Of the speed at which he is followed, taken from the closing up: he may stop, and is seen standing 0.4 s later.
+#: Share of the speed at which ArduPilot follows a walker, by which it closes up more slowly: a stop is seen 0.4 s late.
 _STOPS = 0.3
 
 
