@@ -1,9 +1,10 @@
-"""ArduPilot Copter's way to follow setpoints and to stop, fitted to the recorded flights of its own simulation.
+"""ArduPilot Copter's way to follow setpoints and to stop.
 
 A setpoint of position, velocity and acceleration is not held but continued: velocity grows by the acceleration, the
 position by both, until GUID_TIMEOUT.  Then velocity and acceleration become zero and the place that was reached is the
-target.  A smoothed copy of the target, limited in acceleration and jerk, is what the loops follow: it overshoots and
-springs back.  Gains and limits were fitted together with the airframe's drag, calm and in 8 m/s of wind.
+target.  A copy of the target, limited in acceleration and jerk, is what the loops follow: it overshoots and springs
+back.  Path and loops are those of AC_PosControl with the parameters that Copter ships with; LOITER and the airframe's
+drag were fitted to the recorded flights of its simulation.
 """
 
 from __future__ import annotations
@@ -12,13 +13,25 @@ import math
 
 import numpy as np
 
-from drocap_ros.simulation.vehicle.flight_control import FlightControl, Gains, Manner, Target, limited, rooted
+from drocap_ros.simulation.vehicle.flight_control import (
+    MAX_LEAN_M_S2,
+    FlightControl,
+    Gains,
+    Manner,
+    Target,
+    filter_share,
+    limited,
+    rooted,
+)
 
-_GAINS = Gains(position=1.0, velocity=4.44, integral=0.742, derivative=0.271, feed=0.53)
-_MAX_M_S2, _JERK_M_S3, _MAX_M_S = 2.8, 5.68, 9.2
-_PLACE_GAIN, _PACE_GAIN, _PLACE_M_S2 = 1.43, 1.78, 0.835
+#: PSC_NE_POS_P, PSC_NE_VEL_P, _I and _D.
+_GAINS = Gains(position=1.0, velocity=2.0, integral=1.0, derivative=0.25)
+#: WP_SPD, WP_ACC and PSC_JERK_NE.  Jerk over acceleration is the path's gain for the velocity, half of it that for the
+#: place, which is approached with half of the acceleration.
+_MAX_M_S, _MAX_M_S2, _JERK_M_S3 = 10.0, 2.5, 5.0
+_PACE_GAIN, _PLACE_GAIN, _PLACE_M_S2 = 2.0, 1.0, 1.25
 #: Decay of the velocity, 1/s: in BRAKE its jerk limit over its deceleration, in LOITER of released sticks.
-_BRAKE_GAIN, _LOITER_GAIN, _LOITER_M_S2, _STICK_GAIN, _STICK_M_S2 = 0.688, 1.28, 2.92, 3.0, 2.5
+_BRAKE_GAIN, _LOITER_GAIN, _LOITER_M_S2, _STICK_GAIN, _STICK_M_S2 = 0.667, 1.28, 2.92, 3.0, 2.5
 
 
 class ArduCopterControl(FlightControl):
@@ -26,6 +39,7 @@ class ArduCopterControl(FlightControl):
 
     def __init__(self, position: np.ndarray, yaw: float, drag: np.ndarray) -> None:
         super().__init__(_GAINS, position, yaw, drag)
+        self._filtered = (0.0, 0.0)
 
     def begin(self, manner: Manner, position: np.ndarray, velocity: np.ndarray, yaw: float) -> None:
         """Enter a mode; GUIDED starts with a stop."""
@@ -48,6 +62,25 @@ class ArduCopterControl(FlightControl):
         if self.place is not None:
             self.place = [self.place[i] + float(shift[i]) for i in (0, 1)]
 
+    def _sensed(
+        self, error: tuple[float, float], speed: tuple[float, float], dt: float
+    ) -> tuple[tuple[float, float], tuple[float, float]]:
+        share, (x, y) = filter_share(dt), self._filtered
+        self._filtered = x + (error[0] - x) * share, y + (error[1] - y) * share
+        return self._filtered, self._filtered
+
+    def _leaning(self, x: float, y: float) -> tuple[float, float]:
+        """What turns the path comes before what follows it."""
+        pace = math.hypot(*self.pace)
+        if math.hypot(x, y) <= MAX_LEAN_M_S2 or pace < 1e-6:
+            return limited(x, y, MAX_LEAN_M_S2)
+        ahead = self.pace[0] / pace, self.pace[1] / pace
+        along = x * ahead[0] + y * ahead[1]
+        across = limited(x - along * ahead[0], y - along * ahead[1], MAX_LEAN_M_S2)
+        left = math.sqrt(max(MAX_LEAN_M_S2**2 - across[0] ** 2 - across[1] ** 2, 0.0))
+        along = min(max(along, -left), left)
+        return across[0] + along * ahead[0], across[1] + along * ahead[1]
+
     def _shape(self, here: tuple[float, float], speed: tuple[float, float], expired: bool, dt: float) -> None:
         if self.manner == Manner.BRAKE:
             self._stop_pace(_BRAKE_GAIN, 7.5, _JERK_M_S3, dt)
@@ -64,49 +97,16 @@ class ArduCopterControl(FlightControl):
         target = self.target
         if expired:
             target.velocity, target.acceleration, target.yaw_rate = np.zeros(3), np.zeros(3), 0.0
-        wanted = [float(target.velocity[i]) - self.pace[i] for i in (0, 1)]
+        ahead = float(target.velocity[0]) - self.pace[0], float(target.velocity[1]) - self.pace[1]
+        if self.place is None:
+            self.place = list(here)
         if target.position is not None:
-            if self.place is None:
-                self.place = list(here)
             x, y = (float(target.position[i]) - self.place[i] for i in (0, 1))
-            correction = self._correction(x, y, (-wanted[0], -wanted[1]))
-            wanted = [wanted[0] + correction[0], wanted[1] + correction[1]]
-        ahead = cornering(_PACE_GAIN * wanted[0], _PACE_GAIN * wanted[1], (self.pace[0], self.pace[1]), _MAX_M_S2)
+            closing = limited(*rooted(x, y, _PLACE_GAIN, _PLACE_M_S2), _MAX_M_S)
+            ahead = ahead[0] + closing[0], ahead[1] + closing[1]
+        ahead = limited(*rooted(*ahead, _PACE_GAIN, _JERK_M_S3), _MAX_M_S2)
         forward = float(target.acceleration[0]), float(target.acceleration[1])
         self._advance((ahead[0] + forward[0], ahead[1] + forward[1]), _JERK_M_S3, dt)
         if target.position is not None:
             target.position = target.position + target.velocity * dt + 0.5 * target.acceleration * dt * dt
         target.velocity = target.velocity + target.acceleration * dt
-
-    def _correction(self, x: float, y: float, ahead: tuple[float, float]) -> tuple[float, float]:
-        """(2,) m/s towards the target from its offset (m) and the own velocity beyond the target's.
-
-        The faster the target is approached, the sooner the correction is taken back.
-        """
-        error = math.hypot(x, y)
-        if error < 1e-9:
-            return 0.0, 0.0
-        rate = math.hypot(*rooted(x, y, _PLACE_GAIN, _PLACE_M_S2))
-        closing = (ahead[0] * x + ahead[1] * y) / error
-        if closing > 0:
-            rate -= closing * min(1.0, _PLACE_M_S2 / (rate * _PLACE_GAIN))
-        rate = min(max(rate, -_MAX_M_S), _MAX_M_S) / error
-        return x * rate, y * rate
-
-
-def cornering(x: float, y: float, velocity: tuple[float, float], most: float) -> tuple[float, float]:
-    """The acceleration, no longer than ``most``: braking comes first, then the turn, then speeding up."""
-    speed = math.hypot(*velocity)
-    if speed < 1e-6:
-        return limited(x, y, most)
-    x, y = limited(x, y, 2 * most)
-    ahead = velocity[0] / speed, velocity[1] / speed
-    along = x * ahead[0] + y * ahead[1]
-    across = x - along * ahead[0], y - along * ahead[1]
-    if along > 0:
-        across = limited(*across, most)
-        along = min(along, math.sqrt(max(most**2 - across[0] ** 2 - across[1] ** 2, 0.0)))
-    else:
-        along = max(along, -most)
-        across = limited(*across, math.sqrt(max(most**2 - along**2, 0.0)))
-    return across[0] + along * ahead[0], across[1] + along * ahead[1]

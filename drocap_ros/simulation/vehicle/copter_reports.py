@@ -72,7 +72,7 @@ class ReportingCopter(SimulatedVehicle):
     @gps_error.setter
     def gps_error(self, value: np.ndarray) -> None:
         shift = value - self.error.position
-        self.error.offset = self.error.offset + shift
+        self.error.glitch = self.error.glitch + shift
         self.control.reset_estimate(shift)
 
     @property

@@ -34,7 +34,7 @@ class Airframe(NamedTuple):
 #: alone, at 1.4 m/s against 8 m/s of wind by 1.4 m/s^2, where the drag would add 0.4 (a real copter has no friction).
 #: No recorded flight of PX4 is in wind.
 AIRFRAMES = {
-    "ardupilot": Airframe((0.111, 0.052), 0.045, 0.083, 0.0),
+    "ardupilot": Airframe((0.093, 0.048), 0.0275, 0.25, 0.0),
     "px4": Airframe((0.1, 0.04), 0.016, 0.0, 1.0),
 }
 

@@ -17,7 +17,7 @@ _DEAD_RECKONING_M_S = np.array([0.15, 0.075, 0.0])
 class EstimateError:
     """Error of the estimated position, ENU, stepped in time.
 
-    ``offset`` may be changed: a glitch that the autopilot accepts.
+    ``glitch`` may be changed: (3,) m that the autopilot accepted, and keeps.
 
     Parameters
     ----------
@@ -28,7 +28,8 @@ class EstimateError:
     def __init__(self, noise_m: float, wanders: bool, seed: int) -> None:
         self._rng = np.random.default_rng([seed, 0xC0])
         self._noise = noise_m * np.array([1, 1, 0.5])
-        self.offset: np.ndarray = self._noise * self._rng.standard_normal(3)
+        self._offset: np.ndarray = self._noise * self._rng.standard_normal(3)
+        self.glitch: np.ndarray = np.zeros(3)
         self.velocity: np.ndarray = np.zeros(3)
         # Two lags in a row: the standard deviation of the input is that of the output times the root of two.
         self._wander = math.sqrt(2.0) * _WANDER_M * (noise_m > 0) * wanders
@@ -38,13 +39,13 @@ class EstimateError:
     @property
     def position(self) -> np.ndarray:
         """(3,) m, estimate less truth."""
-        return self.offset + self._smooth
+        return self._offset + self._smooth + self.glitch
 
     def step(self, dead_reckoning: bool, dt: float) -> None:
         """Advance by ``dt`` seconds; without satellites it drifts away."""
         if self._noise.any():
             decay = math.exp(-dt / (_WANDERER_DRIFT_S if self._wander.any() else _DRIFT_S))
-            self.offset = decay * self.offset + self._noise * math.sqrt(1 - decay**2) * self._rng.standard_normal(3)
+            self._offset = decay * self._offset + self._noise * math.sqrt(1 - decay**2) * self._rng.standard_normal(3)
         if self._wander.any():
             decay = math.exp(-dt / _WANDER_S)
             noise = self._wander * math.sqrt(1 - decay**2)
@@ -52,4 +53,4 @@ class EstimateError:
             self.velocity = (1 - decay) * (self._input - self._smooth) / dt
             self._smooth = self._smooth + self.velocity * dt
         if dead_reckoning:
-            self.offset = self.offset + _DEAD_RECKONING_M_S * dt
+            self.glitch = self.glitch + _DEAD_RECKONING_M_S * dt

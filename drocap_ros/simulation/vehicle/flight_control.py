@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-_MAX_LEAN_M_S2 = 5.66  # 30 degrees
-_YAW_GAIN = 6.85
+MAX_LEAN_M_S2 = 5.66  # 30 degrees
+_YAW_GAIN = 5.8
 _CLIMB_GAIN, _CLIMB_RATE_GAIN, _MAX_CLIMB_M_S, _MAX_CLIMB_M_S2 = 1.0, 4.0, 2.5, 3.0
 _FILTER_HZ = 5.0
 
@@ -31,18 +31,17 @@ class Manner(enum.Enum):
 
     SETPOINTS = "follows setpoints"
     HOLD = "stops and stays"
-    BRAKE = "stops, and drifts with the wind"
+    BRAKE = "stops sooner, and stays"
     STICK = "velocity of the pilot's stick"
 
 
 class Gains(NamedTuple):
-    """Of position and velocity; feed : share of the target's acceleration that is passed on."""
+    """Of position and velocity; the wanted acceleration is passed on as it is."""
 
     position: float
     velocity: float
     integral: float
     derivative: float
-    feed: float
 
 
 class FlightControl:
@@ -69,9 +68,8 @@ class FlightControl:
     def begin(self, manner: Manner, position: np.ndarray, velocity: np.ndarray, yaw: float) -> None:
         """Enter a mode at the estimated place and velocity."""
         self.manner = manner
-        free = manner in (Manner.BRAKE, Manner.STICK)
         height = position[2] + velocity[2] * 0.4  # where it stops
-        self.place = None if free else [float(v) for v in position[:2]]
+        self.place = None if manner == Manner.STICK else [float(v) for v in position[:2]]
         self.pace = [float(v) for v in velocity[:2]]
         self.target = Target(position=np.array([*position[:2], height]), yaw=yaw)
 
@@ -88,18 +86,21 @@ class FlightControl:
         self._shape(here, speed, expired, dt)
         gains, command = self.gains, [0.0, 0.0]
         toward = self._away = self._toward(here)
-        error = self._error = toward[0] + self.pace[0] - speed[0], toward[1] + self.pace[1] - speed[1]
-        blend = min(1.0, dt * 2 * math.pi * _FILTER_HZ)
+        error = toward[0] + self.pace[0] - speed[0], toward[1] + self.pace[1] - speed[1]
+        error, changing = self._sensed(error, speed, dt)
+        self._error = error
+        blend = filter_share(dt)
         for i in (0, 1):
-            self._derivative[i] += ((self._before[i] - speed[i]) / dt - self._derivative[i]) * blend
-            self._before[i] = speed[i]
+            self._derivative[i] += ((changing[i] - self._before[i]) / dt - self._derivative[i]) * blend
+            self._before[i] = changing[i]
             command[i] = gains.velocity * error[i] + self._integral[i] + gains.derivative * self._derivative[i]
-            command[i] += gains.feed * self.push[i]
-        if not self._saturated(error):
-            for i in (0, 1):
-                self._integral[i] += gains.integral * error[i] * dt
-        self.lean = limited(command[0], command[1], _MAX_LEAN_M_S2)
-        over = math.hypot(*command) > _MAX_LEAN_M_S2
+            command[i] += self.push[i]
+        x, y = (self._integral[i] + gains.integral * error[i] * dt for i in (0, 1))
+        if self._saturated(error):
+            x, y = limited(x, y, math.hypot(*self._integral[:2]))
+        self._integral[:2] = x, y
+        self.lean = self._leaning(command[0], command[1])
+        over = math.hypot(*command) > MAX_LEAN_M_S2
         self._beyond = (command[0], command[1]) if over else (0.0, 0.0)
         self.commanded_velocity = np.array([toward[0] + self.pace[0], toward[1] + self.pace[1], 0.0])
         return np.array([*self.lean, self._climb(float(position[2]), float(velocity[2]), dt)])
@@ -113,6 +114,16 @@ class FlightControl:
 
     def _shape(self, here: tuple[float, float], speed: tuple[float, float], expired: bool, dt: float) -> None:
         raise NotImplementedError
+
+    def _sensed(
+        self, error: tuple[float, float], speed: tuple[float, float], dt: float
+    ) -> tuple[tuple[float, float], tuple[float, float]]:
+        """(2,) m/s that the proportional and integral terms act on, and what the derivative term follows."""
+        raise NotImplementedError
+
+    def _leaning(self, x: float, y: float) -> tuple[float, float]:
+        """(2,) m/s^2 as far as the vehicle may lean."""
+        return limited(x, y, MAX_LEAN_M_S2)
 
     def _toward(self, here: tuple[float, float]) -> tuple[float, float]:
         """(2,) m/s towards ``place``."""
@@ -157,6 +168,11 @@ class FlightControl:
             faster = limited(*faster, back)
         self.pace = [self.pace[0] + faster[0], self.pace[1] + faster[1]]
         self.push = [self.push[0] + change[0], self.push[1] + change[1]]
+
+
+def filter_share(dt: float) -> float:
+    """Share of a new value in a low pass of 5 Hz, which both autopilots have."""
+    return dt / (dt + 1 / (2 * math.pi * _FILTER_HZ))
 
 
 def limited(x: float, y: float, most: float) -> tuple[float, float]:

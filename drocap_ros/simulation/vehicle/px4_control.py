@@ -11,7 +11,7 @@ import numpy as np
 from drocap_ros.simulation.vehicle.flight_control import FlightControl, Gains, Manner, limited
 
 #: PX4 as it ships.
-_GAINS = Gains(position=0.95, velocity=1.8, integral=0.4, derivative=0.2, feed=1.0)
+_GAINS = Gains(position=0.95, velocity=1.8, integral=0.4, derivative=0.2)
 _STOP_GAIN, _STOP_M_S2, _STOP_JERK_M_S3 = 2.5, 3.3, 9.4
 _STICK_GAIN, _STICK_M_S2 = 3.0, 3.0
 
@@ -27,6 +27,11 @@ class Px4Control(FlightControl):
         super().begin(manner, position, velocity, yaw)
         # The stop begins with the acceleration that is flown, and that of an airframe with friction carries on.
         self.push = list(self.lean)
+
+    def _sensed(
+        self, error: tuple[float, float], speed: tuple[float, float], dt: float
+    ) -> tuple[tuple[float, float], tuple[float, float]]:
+        return error, (-speed[0], -speed[1])
 
     def _shape(self, here: tuple[float, float], speed: tuple[float, float], expired: bool, dt: float) -> None:
         target = self.target

@@ -20,10 +20,11 @@ from drocap_ros.simulation.vehicle.px4_control import Px4Control
 STEP_S = 0.01
 FAULT_S = 3.0
 #: From the bridge's process to the autopilot's controller.
-_TRANSIT_S = {"ardupilot": 0.027, "px4": 0.07}
-_RUN_UP_S, _TREND_S = 3.0, 2.0
+_TRANSIT_S = {"ardupilot": 0.002, "px4": 0.07}
+#: ArduPilot's path depends on all earlier setpoints; PX4 holds the last one.
+_RUN_UP_S, _TREND_S = {"ardupilot": 60.0, "px4": 3.0}, 2.0
 #: Of the flights in 8 m/s: its direction is not recorded, and was fitted to them.
-_WIND_M_S = (-8.0, -0.8)
+WIND_M_S = (-8.0, -0.8)
 _LOST_S = 0.595  # PX4: from the last setpoint to its hold mode, COM_OF_LOSS_T 0.5
 
 
@@ -101,7 +102,8 @@ def replay(flight: RecordedFlight, case: Case, autopilot: str, seconds: float = 
     The integrals of PX4's loops forget more slowly than the run-up lasts: their state at its beginning is fitted to the
     two seconds before the start, and to nothing after it.
     """
-    first_s = max(case.start_s - _RUN_UP_S, float(flight.time_s[0]))
+    earliest_s = float(flight.setpoint_s[0]) + 0.05 if len(flight.setpoint_s) else 0.0
+    first_s = max(case.start_s - _RUN_UP_S[autopilot], float(flight.time_s[0]), earliest_s)
     trim = np.zeros(2)
     if autopilot == "px4":
         before = case._replace(start_s=case.start_s - _TREND_S, events=(), heard_until_s=np.inf)
@@ -126,6 +128,7 @@ def _fly(
     make = ArduCopterControl if autopilot == "ardupilot" else Px4Control
     control: FlightControl = make(position[0], body.yaw, hovering - np.array([*trim, 0.0]))
     control.begin(Manner.SETPOINTS, position[0], velocity[0], body.yaw)
+    control.push = [float(v) for v in _slope(velocity, 0)[:2]]
     arrivals = flight.setpoint_s + _TRANSIT_S[autopilot]
     heard = flight.setpoint_s <= case.heard_until_s
     index = int(np.searchsorted(arrivals, first_s - 0.1))
@@ -133,17 +136,11 @@ def _fly(
     for k, t in enumerate(times.tolist()):
         while index < len(arrivals) and arrivals[index] <= t:
             if heard[index] and control.manner == Manner.SETPOINTS:
-                target = _target(flight, index)
-                control.take(target)
-                if last_s < 0:
-                    _settle(control, target)
+                control.take(_target(flight, index))
                 last_s = t
             index += 1
         if not len(arrivals) and t < case.start_s:
-            target = Target(position[k], velocity[k], _slope(velocity, k))
-            control.take(target)
-            if last_s < 0:
-                _settle(control, target)
+            control.take(Target(position[k], velocity[k], _slope(velocity, k)))
             last_s = t
         if t < case.start_s:
             body.position, body.velocity = position[k].copy(), velocity[k].copy()
@@ -156,13 +153,6 @@ def _fly(
         body.step(command, 0.0, STEP_S)
     table = np.array(rows)
     return Replayed(table[:, 0], table[:, 1:3], table[:, 3:5])
-
-
-def _settle(control: FlightControl, target: Target) -> None:
-    """Begin the run-up with a wanted motion that already follows the target."""
-    assert target.position is not None
-    control.place = [float(v) for v in target.position[:2]]
-    control.pace = [float(v) for v in target.velocity[:2]]
 
 
 def _target(flight: RecordedFlight, index: int) -> Target:
@@ -206,6 +196,6 @@ def recorded_cases(flight: RecordedFlight, name: str) -> Sequence[Case]:
         return [Case(name, FAULT_S, (Event(FAULT_S, Manner.BRAKE),))]
     if len(flight.setpoint_s) and ("orbit" in name or "stand" in name or "walk" in name or "override1" in name):
         starts = np.arange(FAULT_S, float(flight.time_s[-1]) - 4.0, 4.0)
-        wind = _WIND_M_S if "wind_8" in name else (0.0, 0.0)
+        wind = WIND_M_S if "wind_8" in name else (0.0, 0.0)
         return [Case(name, float(start), wind=wind) for start in starts]
     return []
