@@ -43,7 +43,9 @@ _POSITION_GAIN = 1.0  # 1/s, of both autopilots' position loops: 1.0 (PSC_POSXY_
 _REACTION_S = 0.5
 #: Most that a setpoint adds to ArduPilot's present closing speed towards one who stands.  Its path, limited in jerk,
 #: overshoots a larger step.
-_STEP_M_S = 0.55
+_STEP_M_S = 0.5
+#: Share of the speed at which ArduPilot follows a walker, by which it closes up more slowly: a stop is seen 0.4 s late.
+_STOPS = 0.3
 
 
 class Guard:
@@ -117,9 +119,11 @@ class Guard:
         receding = min(receding, max(receding_m_s, 0.0) + _SURELY_M_S)
         doubted = min(max((distance - _NEAR_M) / (_FAR_M - _NEAR_M), 0.0), 1.0)
         receding = min(receding, max(receding - doubted * _FAR_ERROR_M_S, 0.0))
-        allowed = min(max(_OVERSHOOT * self._orbit.max_closing_m_s + receding, 0.0), room)
+        closing_up = _OVERSHOOT * self._orbit.max_closing_m_s
+        allowed = min(max(closing_up + receding, 0.0), room)
         if seen.autopilot == "ardupilot":
             closing = max(float(seen.velocity[:2] @ inward), 0.0)
+            allowed -= _STOPS * min(max(receding, 0.0), closing_up)
             allowed = max(min(allowed, closing + _STEP_M_S + receding), 0.0)
         return _bounded(
             setpoint, seen.position, seen.velocity, inward, distance, allowed, self._orbit.max_acceleration_m_s2

@@ -21,8 +21,8 @@ STEP_S = 0.01
 FAULT_S = 3.0
 #: From the bridge's process to the autopilot's controller.
 _TRANSIT_S = {"ardupilot": 0.002, "px4": 0.07}
-#: ArduPilot's path depends on all earlier setpoints; PX4 holds the last one.
-_RUN_UP_S, _TREND_S = {"ardupilot": 60.0, "px4": 3.0}, 2.0
+#: ArduPilot's path, and the integrals of both, depend on all earlier setpoints.
+_RUN_UP_S, _TREND_S = 60.0, 2.0
 #: Of the flights in 8 m/s: its direction is not recorded, and was fitted to them.
 WIND_M_S = (-8.0, -0.8)
 _LOST_S = 0.595  # PX4: from the last setpoint to its hold mode, COM_OF_LOSS_T 0.5
@@ -103,7 +103,7 @@ def replay(flight: RecordedFlight, case: Case, autopilot: str, seconds: float = 
     two seconds before the start, and to nothing after it.
     """
     earliest_s = float(flight.setpoint_s[0]) + 0.05 if len(flight.setpoint_s) else 0.0
-    first_s = max(case.start_s - _RUN_UP_S[autopilot], float(flight.time_s[0]), earliest_s)
+    first_s = max(case.start_s - _RUN_UP_S, float(flight.time_s[0]), earliest_s)
     trim = np.zeros(2)
     if autopilot == "px4":
         before = case._replace(start_s=case.start_s - _TREND_S, events=(), heard_until_s=np.inf)

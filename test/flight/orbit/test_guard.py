@@ -150,11 +150,19 @@ def test_a_body_that_shrinks_for_a_moment_may_not_be_followed():
 def test_ardupilot_at_rest_closes_up_step_by_step():
     """Told the whole speed at once it overshoots."""
     standing = flown(lambda t: 0.0, lambda t: 0.0)
-    assert asked(*standing, 2.5, autopilot="ardupilot")[0] == pytest.approx(0.55, abs=1e-3)
-    assert asked(*standing, 2.5, own=0.2, autopilot="ardupilot")[0] == pytest.approx(0.75, abs=1e-3)
-    assert asked(*standing, 2.5, own=-1.8, autopilot="ardupilot")[0] == pytest.approx(0.55, abs=1e-3)
+    assert asked(*standing, 2.5, autopilot="ardupilot")[0] == pytest.approx(0.5, abs=1e-3)
+    assert asked(*standing, 2.5, own=0.2, autopilot="ardupilot")[0] == pytest.approx(0.7, abs=1e-3)
+    assert asked(*standing, 2.5, own=-1.8, autopilot="ardupilot")[0] == pytest.approx(0.5, abs=1e-3)
     walking = flown(lambda t: -1.4 * t, lambda t: 0.0, 2.5)  # who walks away is followed at once
     assert asked(*walking, 2.5, autopilot="ardupilot")[0] > 0.8
+
+
+def test_less_is_left_for_closing_up_with_one_who_walks_because_he_may_stop():
+    """What ArduPilot gives up is a share of the speed at which it follows; it still follows."""
+    walking = flown(lambda t: -1.0 * t, lambda t: -1.0 * t)
+    px4, ardupilot = (asked(*walking, 2.5, own=1.0, autopilot=name)[0] for name in ("px4", "ardupilot"))
+    assert 0.15 < px4 - ardupilot <= 0.3 * 0.85 + 1e-6
+    assert ardupilot > 1.2  # he walks at 1.0 m/s
 
 
 @pytest.mark.parametrize("own", [-2.0, -0.5, 0.0, 0.5, 1.5])
