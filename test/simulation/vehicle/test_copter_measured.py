@@ -107,7 +107,7 @@ ORBITS = (
     ("and yaw rate", ALL, "vehicle", {}, 0.12, 0.9),
     pytest.param(
         "all, wind 8 m/s", ALL, "vehicle", {"wind": 8.0}, 0.16, 1.4,
-        marks=pytest.mark.xfail(reason="0.25 m: unkinder than measured; PSC_NE_VEL_P 2 allows it", strict=True),
+        marks=pytest.mark.xfail(reason="0.25 m: in wind the simulated vehicle is worse", strict=True),
     ),
     ("all, centre at 1.4 m/s", ALL, "vehicle", {"centre_speed": 1.4}, 0.13, 0.8),
 )  # fmt: skip
