@@ -38,7 +38,7 @@ class _Use(NamedTuple):
 
 #: PX4's estimate wanders by up to 0.9 m while the vehicle stops, and the vehicle follows it.  With less than this it
 #: falls behind subjects who walk at 1.4 m/s, and loses them.
-_USES, _USE = {"px4": _Use(0.63, 0.82)}, _Use(0.75, 0.935)
+_USES, _USE = {"px4": _Use(0.63, 0.82)}, _Use(0.75, 0.90)
 #: A far place lets PX4 fly faster than predicted: a vehicle that caught up with a walking subject went on for 3.1 m.
 #: Greatest speed of setpoint and way together beyond a steady flight's, m/s, and share of the subject's speed added.
 _PULLED_M_S, _PULLED_BEHIND = 0.3, 0.25
