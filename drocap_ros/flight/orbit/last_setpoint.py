@@ -27,6 +27,7 @@ _ACROSS = (
 )  # fmt: skip
 #: Speed of one who walks.  About one who stands ArduPilot would come near too fast as the radius shrinks.
 _WALKING_M_S = 0.5
+_WALKED = 0.96  # of its longest coast, about one who walks: the vehicle follows him meanwhile
 
 
 class _Use(NamedTuple):
@@ -38,7 +39,7 @@ class _Use(NamedTuple):
 
 #: PX4's estimate wanders by up to 0.9 m while the vehicle stops, and the vehicle follows it.  With less than this it
 #: falls behind subjects who walk at 1.4 m/s, and loses them.
-_USES, _USE = {"px4": _Use(0.63, 0.82)}, _Use(0.75, 0.90)
+_USES, _USE = {"px4": _Use(0.63, 0.82)}, _Use(0.75, 0.935)
 #: A far place lets PX4 fly faster than predicted: a vehicle that caught up with a walking subject went on for 3.1 m.
 #: Greatest speed of setpoint and way together beyond a steady flight's, m/s, and share of the subject's speed added.
 _PULLED_M_S, _PULLED_BEHIND = 0.3, 0.25
@@ -85,6 +86,8 @@ def harmless(
     problem: Condition | None = None
     longest, fastest = _use(seen).greatest * limits.safety.max_coast_m, math.inf
     walking = float(np.hypot(*subject_velocity[:2]))
+    if seen.autopilot != "px4" and walking > _WALKING_M_S:
+        longest *= _WALKED
     if seen.autopilot == "px4":
         fastest = coast_speed(seen, limits) + _PULLED_M_S + _PULLED_BEHIND * walking
     tries = [(share, share) for share in _SHARES]
