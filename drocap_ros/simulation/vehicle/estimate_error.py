@@ -8,7 +8,7 @@ import numpy as np
 
 _DRIFT_S = 20.0
 #: Beside the wandering.  Flown from their setpoints alone, PX4's recorded orbits move off the simulated ones by 0.26 m
-#: (RMS) within 4 s, and never by more than 0.45 m: this vehicle, with its estimate's error, by 0.3 m.
+#: (RMS) within 4 s, and never by more than 0.53 m: this vehicle, with its estimate's error, by 0.3 m.
 _WANDERER_DRIFT_S = 100.0
 _WANDER_S, _WANDER_M = 4.0, np.array([0.3, 0.3, 0.3])
 _DEAD_RECKONING_M_S = np.array([0.15, 0.075, 0.0])
