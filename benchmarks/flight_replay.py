@@ -25,7 +25,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default=ROOT.parent / "shared" / "flight")
     args = parser.parse_args()
-    rows, missed, count, orbits, moves = [], 0, 0, [], []
+    rows, greatest, orbits, moves = [], [], [], []
     for path in sorted(args.folder.glob("*.npz")):
         flight, autopilot = load_recorded(path), "px4" if path.name.startswith("px4") else "ardupilot"
         if path.stem in ORBITS:
@@ -35,29 +35,27 @@ def main() -> int:
         for case in recorded_cases(flight, path.stem):
             got = replay(flight, case, autopilot)
             error = got.error_m
-            count += 1
-            missed += error.max() > BOUND_M
+            greatest.append(error.max())
             after = ", ".join(f"{error[min(100 * s, len(error) - 1)]:.2f}" for s in (1, 2, 3))
             rows.append([
                 path.stem, autopilot, f"{case.start_s:.1f}", after, f"{error.max():.2f}",
                 f"{got.farthest_m(True):.2f}", f"{got.farthest_m(False):.2f}",
             ])  # fmt: skip
             print("  ".join(rows[-1]), flush=True)
-    most = np.array([float(row[4]) for row in rows])
+    most = np.array(greatest)
     ardupilot = np.array([row[1] == "ardupilot" for row in rows])
-    summary = f"{count} comparisons of 4 s: {count - missed} within {BOUND_M:g} m; median {np.median(most):.2f} m."
-    for name, chosen in (("ArduPilot", ardupilot), ("PX4", ~ardupilot)):
+    lines = [f"Comparisons of 4 s, within {BOUND_M:g} m:", ""]
+    for name, chosen in (("both", ardupilot | ~ardupilot), ("ArduPilot", ardupilot), ("PX4", ~ardupilot)):
         part = most[chosen]
-        summary += f" {name}: {(part <= BOUND_M).sum()} of {len(part)}, median {np.median(part):.2f} m, "
-        summary += f"most {part.max(initial=0.0):.2f} m."
-    summary += "\n\n" + "\n".join(f"- {orbit}" for orbit in orbits)
-    if moves := [move for move in moves if np.isfinite(move)]:
-        summary += (
-            f"\n\nPX4 that holds its place, 4.5 s and more after a stop, moved by {np.mean(moves):.2f} m within 3 s "
-        )
-        summary += (
-            f"in the mean of {len(moves)} recordings, by {max(moves):.2f} m at most: no setpoint holds that motion."
-        )
+        within = f"{(part <= BOUND_M).sum()} of {len(part)}"
+        lines.append(f"- {name}: {within}; median {np.median(part):.2f} m, {part.max(initial=0.0):.2f} m at most.")
+    lines += ["", *(f"- {orbit}" for orbit in orbits)]
+    if long := [move for move in moves if np.isfinite(move)]:
+        lines += [
+            "", f"PX4 that holds its place, 4.5 s and more after a stop, moved by {np.mean(long):.2f} m within 3 s in "
+            f"the mean of {len(long)} recordings, by {max(long):.2f} m at most: no setpoint holds that motion.",
+        ]  # fmt: skip
+    summary = "\n".join(lines)
     print(summary)
     write_figures(
         "flight_replay", "Recorded flights against the simulated vehicle", f"{summary}\n\n{table(HEAD, rows)}"

@@ -9,7 +9,7 @@ import numpy as np
 
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.coast import PX4_POSITION_GAIN, Coast, coast_of, greatest_speed
-from drocap_ros.flight.orbit.planner import OrbitGoal
+from drocap_ros.flight.orbit.planner import WALKING_M_S, OrbitGoal
 from drocap_ros.flight.orbit.states import Limits, Observed
 from drocap_ros.flight.setpoint import Setpoint, hold_setpoint
 
@@ -20,13 +20,11 @@ _SHARES = (
     (0.0, 0.2, 0.0),
 )  # fmt: skip
 #: Shares across the line of sight that PX4 tries first, and ArduPilot about one who walks: a vehicle that falls behind
-#: along the orbit keeps its radius.
+#: along the orbit keeps its radius.  About one who stands ArduPilot would come near too fast as the radius shrinks.
 _ACROSS = (
     (1.0, 1.0, 1.0), (0.75, 1.0, 1.0), (0.5, 1.0, 1.0), (0.25, 1.0, 1.0), (0.0, 1.0, 1.0), (0.0, 0.8, 0.5),
     (0.0, 0.6, 0.0), (0.0, 0.4, 0.0),
 )  # fmt: skip
-#: Speed of one who walks.  About one who stands ArduPilot would come near too fast as the radius shrinks.
-_WALKING_M_S = 0.5
 _WALKED = 0.96  # of its longest coast, about one who walks: the vehicle follows him meanwhile
 
 
@@ -37,7 +35,7 @@ class _Use(NamedTuple):
     greatest: float
 
 
-#: PX4's estimate wanders by up to 0.9 m while the vehicle stops, and the vehicle follows it.  With less than this it
+#: PX4's estimate wanders while the vehicle stops, and the vehicle follows it.  With less than this it
 #: falls behind subjects who walk at 1.4 m/s, and loses them.
 _USES, _USE = {"px4": _Use(0.63, 0.82)}, _Use(0.75, 0.935)
 #: A far place lets PX4 fly faster than predicted: a vehicle that caught up with a walking subject went on for 3.1 m.
@@ -86,12 +84,12 @@ def harmless(
     problem: Condition | None = None
     longest, fastest = _use(seen).greatest * limits.safety.max_coast_m, math.inf
     walking = float(np.hypot(*subject_velocity[:2]))
-    if seen.autopilot != "px4" and walking > _WALKING_M_S:
-        longest *= _WALKED
     if seen.autopilot == "px4":
         fastest = coast_speed(seen, limits) + _PULLED_M_S + _PULLED_BEHIND * walking
+    elif walking > WALKING_M_S:
+        longest *= _WALKED
     tries = [(share, share) for share in _SHARES]
-    if seen.subject is not None and (seen.autopilot == "px4" or walking > _WALKING_M_S):
+    if seen.subject is not None and (seen.autopilot == "px4" or walking > WALKING_M_S):
         tries = [(_SHARES[0], share) for share in _ACROSS] + [(share, min(share, _ACROSS[-1])) for share in _SHARES[1:]]
     for along, across in tries:
         way, velocity, acceleration = (

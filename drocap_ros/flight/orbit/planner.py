@@ -16,8 +16,9 @@ import numpy as np
 from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.setpoint import Setpoint
 
-#: 1/s, about one who stands and one who walks: his turns are no lasting error; m; m/s.
-_TRIM_RATE, _WALKING_TRIM_RATE, _MAX_TRIM_M, _WALKING_M_S = 0.15, 0.03, 0.5, 0.5
+WALKING_M_S = 0.5  # speed of one who walks
+#: 1/s, about one who stands and one who walks: his turns are no lasting error; m.
+_TRIM_RATE, _WALKING_TRIM_RATE, _MAX_TRIM_M = 0.15, 0.03, 0.5
 _FREE_LEAD = 0.6  # share of the greatest lead, below which the reference does not wait
 _CENTRE_RATE = 3.0  # 1/s; a slower centre is an error of the radius, a faster one passes on the estimate's noise
 _CENTRE_ACCELERATION = 8.0  # m/s^2; above any acceleration of a subject, so it limits only jumps
@@ -171,7 +172,7 @@ def advance(
         error = radius.value - float(np.hypot(*(vehicle[:2] - subject[:2])))
         error = min(max(error, -1.0), 1.0)
         most = min(max(radius.value - least_radius_m, 0.0), _MAX_TRIM_M)  # no nearer than the least radius
-        rate = _TRIM_RATE if math.hypot(*centre_velocity) < _WALKING_M_S else _WALKING_TRIM_RATE
+        rate = _TRIM_RATE if math.hypot(*centre_velocity) < WALKING_M_S else _WALKING_TRIM_RATE
         trim = min(max(trim + rate * error * dt, -most), _MAX_TRIM_M)
     return OrbitState(
         math.remainder(phase, 2 * math.pi), omega, radius, height, centre, centre_velocity, centre_acceleration, trim,

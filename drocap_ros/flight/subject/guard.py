@@ -41,9 +41,12 @@ _SURELY_M_S = 0.1  # so much faster than by the estimated place he may recede by
 _NEAR_M, _FAR_M, _FAR_ERROR_M_S = 8.0, 12.0, 0.3
 _POSITION_GAIN = 1.0  # 1/s, of both autopilots' position loops: 1.0 (PSC_POSXY_P) and 0.95 (MPC_XY_P)
 _REACTION_S = 0.5
-#: Most that a setpoint adds to ArduPilot's present closing speed towards one who stands.  Its path, limited in jerk,
-#: overshoots a larger step.
-_STEP_M_S = 0.5
+#: While ArduPilot recedes, this multiple of that speed is taken from its setpoints' closing speed.  Its path, limited
+#: in jerk, overshoots a reversal: from 1.8 m/s away it closed up at 2.1 m/s, and in a hold that began meanwhile, too.
+_REVERSAL = 2.0
+#: Most that a setpoint adds to ArduPilot's present closing speed towards one who stands.  It overshoots a larger step:
+#: from rest a setpoint of 0.85 m/s led to 1.26 m/s.
+_STEP_M_S = 0.4
 #: Share of the speed at which ArduPilot follows a walker, by which it closes up more slowly: a stop is seen 0.4 s late.
 _STOPS = 0.3
 
@@ -122,9 +125,10 @@ class Guard:
         closing_up = _OVERSHOOT * self._orbit.max_closing_m_s
         allowed = min(max(closing_up + receding, 0.0), room)
         if seen.autopilot == "ardupilot":
-            closing = max(float(seen.velocity[:2] @ inward), 0.0)
+            closing = float(seen.velocity[:2] @ inward)
             allowed -= _STOPS * min(max(receding, 0.0), closing_up)
-            allowed = max(min(allowed, closing + _STEP_M_S + receding), 0.0)
+            allowed += _REVERSAL * min(closing, 0.0)
+            allowed = max(min(allowed, max(closing, 0.0) + _STEP_M_S + receding), 0.0)
         return _bounded(
             setpoint, seen.position, seen.velocity, inward, distance, allowed, self._orbit.max_acceleration_m_s2
         )

@@ -99,8 +99,8 @@ def load_recorded(path: Path) -> RecordedFlight:
 def replay(flight: RecordedFlight, case: Case, autopilot: str, seconds: float = 4.0) -> Replayed:
     """Fly the case for some seconds.
 
-    The integrals of PX4's loops forget more slowly than the run-up lasts: their state at its beginning is fitted to the
-    two seconds before the start, and to nothing after it.
+    By how much PX4's estimate errs is not recorded: a trim of the integrals, fitted to the two seconds before the
+    start, and to nothing after it, stands for that.
     """
     earliest_s = float(flight.setpoint_s[0]) + 0.05 if len(flight.setpoint_s) else 0.0
     first_s = max(case.start_s - _RUN_UP_S, float(flight.time_s[0]), earliest_s)

@@ -147,12 +147,20 @@ def test_a_body_that_shrinks_for_a_moment_may_not_be_followed():
     assert asked(guard, place, now, 2.2, own=1.4)[0] > 1.6
 
 
+def test_ardupilot_that_recedes_is_not_told_to_close_up_at_once():
+    standing = flown(lambda t: 0.0, lambda t: 0.0)
+    allowed = asked(*standing, 2.5, own=-1.8)[0]  # PX4: its path does not overshoot
+    assert allowed > 0.7
+    assert asked(*standing, 2.5, own=0.6, autopilot="ardupilot")[0] == pytest.approx(allowed, abs=1e-3)
+    assert asked(*standing, 2.5, own=-1.8, autopilot="ardupilot")[0] == pytest.approx(0.0, abs=1e-3)
+    assert asked(*standing, 2.5, own=-0.3, autopilot="ardupilot")[0] == pytest.approx(allowed - 0.6, abs=1e-3)
+
+
 def test_ardupilot_at_rest_closes_up_step_by_step():
     """Told the whole speed at once it overshoots."""
     standing = flown(lambda t: 0.0, lambda t: 0.0)
-    assert asked(*standing, 2.5, autopilot="ardupilot")[0] == pytest.approx(0.5, abs=1e-3)
-    assert asked(*standing, 2.5, own=0.2, autopilot="ardupilot")[0] == pytest.approx(0.7, abs=1e-3)
-    assert asked(*standing, 2.5, own=-1.8, autopilot="ardupilot")[0] == pytest.approx(0.5, abs=1e-3)
+    assert asked(*standing, 2.5, autopilot="ardupilot")[0] == pytest.approx(0.4, abs=1e-3)
+    assert asked(*standing, 2.5, own=0.2, autopilot="ardupilot")[0] == pytest.approx(0.6, abs=1e-3)
     walking = flown(lambda t: -1.4 * t, lambda t: 0.0, 2.5)  # who walks away is followed at once
     assert asked(*walking, 2.5, autopilot="ardupilot")[0] > 0.8
 
