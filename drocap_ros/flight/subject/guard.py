@@ -30,9 +30,9 @@ _ACCELERATION = 0.7  # m/s^2: standard deviation of the change of the subject's 
 _MAX_BENDING, _BENT = 0.3, 4.0  # a bent body looks smaller: its size counts for less
 _BEARING_GATE, _SIZE_GATE = 4.0, 0.35  # standard deviations across the sight; share of the range along it
 _SURE = 0.5  # standard deviations of the speed at which he walks away that are left out
-#: m/s over the square of the seconds for which he recedes: the speed at which he may be followed.  A body that swings
-#: or crouches shrinks too, for a second or two.
-_AWAY = 0.14
+#: m/s over the square of the seconds for which he recedes, far and near: the speed at which he may be followed.  A body
+#: that swings or crouches shrinks too, for a second or two.
+_AWAY_FAR, _AWAY_NEAR = 0.14, 0.3
 _RESTART_S = 1.0
 _OVERSHOOT = 0.85  # of the greatest closing speed that a setpoint has: the vehicle overshoots
 _SURELY_M_S = 0.1  # so much faster than by the estimated place he may recede by his image, which shrinks as he bends
@@ -42,8 +42,8 @@ _NEAR_M, _FAR_M, _FAR_ERROR_M_S = 8.0, 12.0, 0.3
 _POSITION_GAIN = 1.0  # 1/s, of both autopilots' position loops: 1.0 (PSC_POSXY_P) and 0.95 (MPC_XY_P)
 _REACTION_S = 0.5
 #: While ArduPilot recedes, this multiple of that speed is taken from its setpoints' closing speed.  Its path, limited
-#: in jerk, overshoots a reversal: from 1.8 m/s away it closed up at 2.1 m/s, and in a hold that began meanwhile, too.
-_REVERSAL = 2.0
+#: in jerk, overshoots a reversal: from 1.8 m/s away it closed up at 1.2 m/s without this, and at 0.8 with it.
+_REVERSAL = 1.0
 #: Most that a setpoint adds to ArduPilot's present closing speed towards one who stands.  It overshoots a larger step:
 #: from rest a setpoint of 0.85 m/s led to 1.26 m/s.
 _STEP_M_S = 0.4
@@ -120,8 +120,7 @@ class Guard:
         room = math.sqrt(2 * self._braking * max(nearest - self._orbit.min_distance_m, 0.0))
         receding = min(self._receding(inward, self._now()), self._away)
         receding = min(receding, max(receding_m_s, 0.0) + _SURELY_M_S)
-        doubted = min(max((distance - _NEAR_M) / (_FAR_M - _NEAR_M), 0.0), 1.0)
-        receding = min(receding, max(receding - doubted * _FAR_ERROR_M_S, 0.0))
+        receding = min(receding, max(receding - _farness(distance) * _FAR_ERROR_M_S, 0.0))
         closing_up = _OVERSHOOT * self._orbit.max_closing_m_s
         allowed = min(max(closing_up + receding, 0.0), room)
         if seen.autopilot == "ardupilot":
@@ -164,9 +163,11 @@ class Guard:
     def _learn_away(self, camera: np.ndarray, gap_s: float) -> None:
         assert self._state is not None
         sight = self._state[:2] - camera
-        receding = self._receding(sight / max(float(np.hypot(*sight)), 1e-3), (self._state, self._covariance))
-        receding_s = math.sqrt(self._away / _AWAY) + min(gap_s, 0.5)
-        self._away = max(min(receding, _AWAY * receding_s**2), 0.0)
+        distance = float(np.hypot(*sight))
+        receding = self._receding(sight / max(distance, 1e-3), (self._state, self._covariance))
+        growth = _AWAY_NEAR + _farness(distance) * (_AWAY_FAR - _AWAY_NEAR)
+        receding_s = math.sqrt(self._away / growth) + min(gap_s, 0.5)
+        self._away = max(min(receding, growth * receding_s**2), 0.0)
 
     def _predicted(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
         assert self._state is not None
@@ -193,6 +194,10 @@ class Guard:
 
     def _now(self) -> tuple[np.ndarray, np.ndarray]:
         return self._predicted(min(max((self._now_ns - self._stamp_ns) / _NS, 0.0), 0.5))
+
+
+def _farness(distance_m: float) -> float:
+    return min(max((distance_m - _NEAR_M) / (_FAR_M - _NEAR_M), 0.0), 1.0)
 
 
 def _bounded(

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from flown_copter import ALL, Flight
 from orbit_observations import GOOD, LIMITS
 
 from drocap_ros.flight.orbit.degradation import allowed_pace
@@ -153,7 +154,35 @@ def test_ardupilot_that_recedes_is_not_told_to_close_up_at_once():
     assert allowed > 0.7
     assert asked(*standing, 2.5, own=0.6, autopilot="ardupilot")[0] == pytest.approx(allowed, abs=1e-3)
     assert asked(*standing, 2.5, own=-1.8, autopilot="ardupilot")[0] == pytest.approx(0.0, abs=1e-3)
-    assert asked(*standing, 2.5, own=-0.3, autopilot="ardupilot")[0] == pytest.approx(allowed - 0.6, abs=1e-3)
+    assert asked(*standing, 2.5, own=-0.6, autopilot="ardupilot")[0] == pytest.approx(allowed - 0.6, abs=1e-3)
+
+
+@pytest.mark.parametrize("wind", [0.0, 8.0, -8.0])
+@pytest.mark.parametrize("receding", [0.0, 0.5, 1.0, 1.8])
+def test_ardupilot_that_recedes_and_is_told_to_come_near_stays_below_the_closing_speed(receding, wind):
+    """It flies away from one who stands; then every setpoint asks for 2 m/s towards him, from 1 m ahead."""
+    flight, guard = Flight(wind=wind), Guard(SubjectConfig(), OrbitConfig(), 1.3)
+    body = flight.copter.body
+    body.position[0], body.velocity[0] = 9.0 - 4.0 * receding, receding
+    first, ahead = body.position.copy(), np.array([-1.0, 0.0, 0.0])
+
+    def each():
+        place, velocity = body.position.copy(), body.velocity.copy()
+        now_ns = round(flight.t * S) + S
+        camera = np.array([place[0], place[1], 1.2])
+        guard.see(image(flight.t, camera=camera), MATRIX, CameraPose(LEVEL, camera), locked=True)
+        speed = np.array([receding, 0.0, 0.0])
+        sent = Setpoint(first + speed * flight.t, speed, np.zeros(3), np.pi, 0.0)
+        if flight.t > 4.0:
+            sent = limited(
+                guard, Setpoint(place + ahead, 2 * ahead, 2 * ahead, np.pi, 0.0), place, velocity, now_ns, "ardupilot"
+            )
+        flight.send(ALL, sent.position, sent.velocity, sent.acceleration, np.pi)
+
+    flight.fly(8.0, each)
+    rows = np.array(flight.rows)
+    closing = -rows[rows[:, 0] > 4.0, 4]
+    assert 0.6 < closing.max() <= 1.0
 
 
 def test_ardupilot_at_rest_closes_up_step_by_step():
