@@ -272,7 +272,8 @@ class PoseEstimator:
 
     def _calibrated(self, keypoints: NetworkKeypoints) -> BodyPose:
         """The network's keypoints as joints of the body, with covariance and confidence."""
-        covariance, confidence = calibrate(keypoints, self.pose_model.spec.layout)
+        spec = self.pose_model.spec
+        covariance, confidence = calibrate(keypoints, spec.layout, spec.sigma_scale)
         return BodyPose(*self._joint_map.apply(keypoints.xy.astype(float), covariance, confidence, keypoints.box_size))
 
     def _without_keypoints(self, stamp_ns: int, size: tuple[int, int], subject: Subject) -> PoseObservation:

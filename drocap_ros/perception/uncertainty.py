@@ -54,13 +54,14 @@ _ONE_STAGE = CALIBRATIONS["movenet"]
 _FLOOR_PX = 0.3
 
 
-def calibrate(keypoints: NetworkKeypoints, layout: str) -> tuple[np.ndarray, np.ndarray]:
+def calibrate(keypoints: NetworkKeypoints, layout: str, sigma_scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Covariance and confidence of one person's keypoints.
 
     Parameters
     ----------
     keypoints : P joints
     layout : of the pose model's outputs
+    sigma_scale : standard deviations of this model over those of the models of the fit
 
     Returns
     -------
@@ -69,8 +70,9 @@ def calibrate(keypoints: NetworkKeypoints, layout: str) -> tuple[np.ndarray, np.
     c = CALIBRATIONS.get(layout, _ONE_STAGE)
     score = keypoints.score.astype(float)
     spread = np.nan_to_num(keypoints.spread.astype(float))
-    variance = (np.interp(score, c.scores, c.sigmas) * keypoints.box_size) ** 2 + _FLOOR_PX**2
-    covariance = c.spread_share * spread + variance[:, None] * np.array([1.0, 0.0, 1.0])
+    variance = (np.interp(score, c.scores, c.sigmas) * keypoints.box_size) ** 2
+    covariance = sigma_scale**2 * (c.spread_share * spread + variance[:, None] * np.array([1.0, 0.0, 1.0]))
+    covariance += _FLOOR_PX**2 * np.array([1.0, 0.0, 1.0])
     second_peak = np.clip(np.nan_to_num(keypoints.candidates[:, 1, 2].astype(float)), 0.0, None)
     width = np.sqrt((spread[:, 0] + spread[:, 2]) / 2) / max(keypoints.box_size, 1.0)
     logit = c.intercept + c.per_score * score + c.per_second_peak * second_peak + c.per_spread * 10.0 * width

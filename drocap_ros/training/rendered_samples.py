@@ -157,8 +157,8 @@ def detector_sample(world: World, rng: np.random.Generator) -> DetectorSample:
     return DetectorSample(canvas, in_canvas.astype(np.float32))
 
 
-def pose_sample(world: World, rng: np.random.Generator) -> PoseSample:
-    """One crop around a person, by an inexact box."""
+def pose_sample(world: World, rng: np.random.Generator, degraded: bool = True) -> PoseSample:
+    """One crop around a person, by an inexact box; degraded as in :func:`degrade`, covered or cut, or as rendered."""
     joints = _person(world, rng)
     scale = 1.1 * (2.6 / 1.1) ** rng.random()
     size = (int(1.7 * POSE_SIZE[0] * scale), int(1.5 * POSE_SIZE[1] * scale))
@@ -166,12 +166,13 @@ def pose_sample(world: World, rng: np.random.Generator) -> PoseSample:
     look = dress(FIRST_SEED + int(rng.integers(1_000_000_000)))
     image, box = draw(_scene(world, rng), look, view.matrix, *size, joints, view.rotation, view.position)
     if box is None:
-        return pose_sample(world, rng)
+        return pose_sample(world, rng, degraded)
     px = project(joints[None], view.rotation[None], view.position[None], view.matrix)[0]
-    if rng.random() < 0.15:
-        _occlude(rng, image, box)
-    image = degrade(rng, image)
-    box = _cut_by_the_border(rng, image, box)
+    if degraded:
+        if rng.random() < 0.15:
+            _occlude(rng, image, box)
+        image = degrade(rng, image)
+        box = _cut_by_the_border(rng, image, box)
     extent = box[2:] - box[:2]
     px_inside = (px > -0.5).all(axis=1) & (px < np.array(size) - 0.5).all(axis=1)
     px_inside &= _shown(image, px)

@@ -23,6 +23,7 @@ from drocap_ros.training.rendered_samples import (
     make_world,
     pose_sample,
 )
+from drocap_ros.training.sigma_scale import sigma_scale
 from drocap_ros.training.simulation_networks import build_detector, build_pose_network, detector_loss, pose_loss
 from drocap_ros.training.torch_extra import pytorch, write_onnx
 
@@ -201,7 +202,10 @@ def _tensor(images: np.ndarray) -> torch.Tensor:
 
 
 def export(detector: torch.nn.Module, pose: torch.nn.Module, folder: Path, facts: dict[str, str]) -> None:
-    """Write the networks that have steps as ONNX files, with weights in half precision and ``facts`` as metadata."""
+    """Write the networks that have steps as ONNX files, with weights in half precision and ``facts`` as metadata.
+
+    The pose network's standard deviations are measured on new samples, and written beside it.
+    """
     torch = pytorch()
     if int(facts["detector_steps"]):
         write_onnx(
@@ -213,4 +217,7 @@ def export(detector: torch.nn.Module, pose: torch.nn.Module, folder: Path, facts
             pose, torch.zeros(1, 3, POSE_SIZE[1], POSE_SIZE[0]), folder / "person_pose.onnx",
             ["image"], ["columns", "rows"], {}, facts,
         )  # fmt: skip
-        (folder / "person_pose.yaml").write_text("skeleton: body15\n", encoding="utf-8")
+        beside = folder / "person_pose.yaml"
+        beside.write_text("skeleton: body15\n", encoding="utf-8")
+        scale = sigma_scale(folder / "person_pose.onnx")
+        beside.write_text(f"skeleton: body15\nsigma_scale: {scale:.2f}\n", encoding="utf-8")

@@ -41,6 +41,12 @@ def test_standard_deviation_scales_with_the_box():
     assert large == pytest.approx(9 * small, rel=1e-6)
 
 
+def test_a_model_of_its_own_accuracy_has_scaled_covariances_and_the_same_confidence():
+    usual, half = (calibrate(keypoints(0.9, spread=400.0), "simcc", scale) for scale in (1.0, 0.5))
+    assert half[0][0, 0] - 0.09 == pytest.approx(0.25 * (usual[0][0, 0] - 0.09), rel=1e-6)  # 0.3 px is the least
+    assert half[1] == usual[1]
+
+
 def test_extreme_scores_stay_in_range():
     covariance, confidence = calibrate(keypoints([-5.0, 0.0, 1.3, 1e6]), "heatmap")
     assert np.isfinite(covariance).all()

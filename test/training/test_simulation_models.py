@@ -196,6 +196,8 @@ def test_short_training_writes_networks_that_run(tmp_path, capsys):
     estimator = PoseEstimator(tmp_path / "m")
     assert estimator.limited_use
     assert estimator.pose_model.joints is BODY_15
+    assert 0.1 <= estimator.pose_model.spec.sigma_scale <= 10.0
+    assert "sigma_scale: " in (tmp_path / "m" / "person_pose.yaml").read_text()
     image = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
     assert estimator.pose_model.estimate(image, np.array([50.0, 20, 150, 200])).xy.shape == (15, 2)
 

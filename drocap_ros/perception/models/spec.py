@@ -42,6 +42,7 @@ class ModelSpec:
     decoded : for "yolox-grid": whether the outputs are px
     udp : for "heatmap": trained with unit-length coordinates (MMPose's UDPHeatmap; its ViTPose and later HRNets)
     box_padding : side of the pose crop over that of the box
+    sigma_scale : standard deviations of its keypoints over those of :mod:`drocap_ros.perception.uncertainty`
     """
 
     layout: str
@@ -57,6 +58,7 @@ class ModelSpec:
     decoded: bool = False
     udp: bool = False
     box_padding: float = 1.25
+    sigma_scale: float = 1.0
 
 
 def read_spec(model: OnnxModel) -> ModelSpec:
@@ -284,9 +286,14 @@ def _checked(spec: ModelSpec, path: Path) -> ModelSpec:
         (len(spec.mean) == 3 and np.isfinite(spec.mean).all(), "mean", "three numbers", spec.mean),
         (len(spec.std) == 3 and all(v > 0 for v in spec.std), "std", "three positive numbers", spec.std),
         (spec.task == "detector" or spec.skeleton in JOINT_SETS, "skeleton", ", ".join(JOINT_SETS), spec.skeleton),
-        (1 <= spec.box_padding <= 3, "box_padding", "1 to 3", spec.box_padding),
+        (_within(spec.box_padding, 1, 3), "box_padding", "1 to 3", spec.box_padding),
+        (_within(spec.sigma_scale, 0.1, 10), "sigma_scale", "0.1 to 10", spec.sigma_scale),
     ]
     for fine, name, expected, found in problems:
         if not fine:
             raise InputError(f"{path.with_suffix('.yaml')}: {name}: expected {expected}; got {found!r}; correct it")
     return spec
+
+
+def _within(value: Any, least: float, most: float) -> bool:
+    return isinstance(value, (int, float)) and least <= value <= most

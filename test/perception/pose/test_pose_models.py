@@ -110,9 +110,9 @@ def test_h36m_joint_set_comes_from_name_or_yaml(tmp_path):
     write_model(tmp_path / "hrnet_h36m.onnx", (1, 3, 256, 192), outputs)
     assert load(tmp_path).joints.name == "h36m17"
     write_model(tmp_path / "b.onnx", (1, 3, 256, 192), outputs)
-    (tmp_path / "b.yaml").write_text("skeleton: h36m17\nudp: true\n")
+    (tmp_path / "b.yaml").write_text("skeleton: h36m17\nudp: true\nsigma_scale: 0.8\n")
     model = load(tmp_path, pose_model="b")
-    assert (model.joints.name, model.spec.udp) == ("h36m17", True)
+    assert (model.joints.name, model.spec.udp, model.spec.sigma_scale) == ("h36m17", True, 0.8)
 
 
 def test_simcc_model(tmp_path):
@@ -208,6 +208,10 @@ def test_invalid_model_file_is_refused(tmp_path):
         ("skeleton: spider8", "skeleton: expected"),
         ("mean: much", "expected lists of numbers"),
         ("{", "expected YAML"),
+        ("sigma_scale: 0", "sigma_scale: expected 0.1 to 10; got 0"),
+        ("sigma_scale: .nan", "sigma_scale: expected 0.1 to 10"),
+        ("sigma_scale: small", "sigma_scale: expected 0.1 to 10; got 'small'"),
+        ("box_padding: [1]", "box_padding: expected 1 to 3"),
     ],
 )
 def test_invalid_yaml_is_refused(tmp_path, text, complaint):
