@@ -89,10 +89,10 @@ def test_person_is_detected_and_tracked_in_whole_images(flown):
     assert np.mean(flown.followed) >= 0.99
 
 
-def test_mean_keypoint_error_is_within_three_percent_of_the_box(flown):
+def test_mean_keypoint_error_is_within_one_and_a_half_percent_of_the_box(flown):
     off = np.array(flown.off)
     assert np.isfinite(off).mean() > 0.95
-    assert np.nanmean(off) <= 0.03
+    assert np.nanmean(off) <= 0.015
 
 
 def test_left_and_right_are_not_exchanged(flown):
