@@ -41,9 +41,6 @@ _SURELY_M_S = 0.1  # so much faster than by the estimated place he may recede by
 _NEAR_M, _FAR_M, _FAR_ERROR_M_S = 8.0, 12.0, 0.3
 _POSITION_GAIN = 1.0  # 1/s, of both autopilots' position loops: 1.0 (PSC_POSXY_P) and 0.95 (MPC_XY_P)
 _REACTION_S = 0.5
-#: While ArduPilot recedes, this multiple of that speed is taken from its setpoints' closing speed.  Its path, limited
-#: in jerk, overshoots a reversal: from 1.8 m/s away it closed up at 1.2 m/s without this, and at 0.8 with it.
-_REVERSAL = 1.0
 #: Most that a setpoint adds to ArduPilot's present closing speed towards one who stands.  It overshoots a larger step:
 #: from rest a setpoint of 0.85 m/s led to 1.26 m/s.
 _STEP_M_S = 0.4
@@ -126,7 +123,8 @@ class Guard:
         if seen.autopilot == "ardupilot":
             closing = float(seen.velocity[:2] @ inward)
             allowed -= _STOPS * min(max(receding, 0.0), closing_up)
-            allowed += _REVERSAL * min(closing, 0.0)
+            # Its path, limited in jerk, overshoots a reversal: from 1.8 m/s away it closed up at 1.3 m/s without this.
+            allowed += min(closing, 0.0)
             allowed = max(min(allowed, max(closing, 0.0) + _STEP_M_S + receding), 0.0)
         return _bounded(
             setpoint, seen.position, seen.velocity, inward, distance, allowed, self._orbit.max_acceleration_m_s2
