@@ -45,7 +45,7 @@ def main() -> int:
     most = np.array(greatest)
     ardupilot = np.array([row[1] == "ardupilot" for row in rows])
     lines = [f"Comparisons of 4 s, within {BOUND_M:g} m:", ""]
-    for name, chosen in (("both", ardupilot | ~ardupilot), ("ArduPilot", ardupilot), ("PX4", ~ardupilot)):
+    for name, chosen in (("both", np.full(len(rows), True)), ("ArduPilot", ardupilot), ("PX4", ~ardupilot)):
         part = most[chosen]
         within = f"{(part <= BOUND_M).sum()} of {len(part)}"
         lines.append(f"- {name}: {within}; median {np.median(part):.2f} m, {part.max(initial=0.0):.2f} m at most.")

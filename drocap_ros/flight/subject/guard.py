@@ -41,8 +41,7 @@ _SURELY_M_S = 0.1  # so much faster than by the estimated place he may recede by
 _NEAR_M, _FAR_M, _FAR_ERROR_M_S = 8.0, 12.0, 0.3
 _POSITION_GAIN = 1.0  # 1/s, of both autopilots' position loops: 1.0 (PSC_POSXY_P) and 0.95 (MPC_XY_P)
 _REACTION_S = 0.5
-#: Most that a setpoint adds to ArduPilot's present closing speed towards one who stands.  It overshoots a larger step:
-#: from rest a setpoint of 0.85 m/s led to 1.26 m/s.
+#: Most that a setpoint adds to ArduPilot's present closing speed towards one who stands: it overshoots a larger step.
 _STEP_M_S = 0.4
 #: Share of the speed at which ArduPilot follows a walker, by which it closes up more slowly: a stop is seen 0.4 s late.
 _STOPS = 0.3

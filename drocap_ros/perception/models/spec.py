@@ -296,4 +296,4 @@ def _checked(spec: ModelSpec, path: Path) -> ModelSpec:
 
 
 def _within(value: Any, least: float, most: float) -> bool:
-    return isinstance(value, (int, float)) and least <= value <= most
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and least <= value <= most

@@ -155,6 +155,7 @@ def test_ardupilot_that_recedes_is_not_told_to_close_up_at_once():
     assert asked(*standing, 2.5, own=0.6, autopilot="ardupilot")[0] == pytest.approx(allowed, abs=1e-3)
     assert asked(*standing, 2.5, own=-1.8, autopilot="ardupilot")[0] == pytest.approx(0.0, abs=1e-3)
     assert asked(*standing, 2.5, own=-0.6, autopilot="ardupilot")[0] == pytest.approx(allowed - 0.6, abs=1e-3)
+    assert asked(*standing, 2.5, own=-0.3, autopilot="ardupilot")[0] == pytest.approx(0.4, abs=1e-3)  # as at rest
 
 
 @pytest.mark.parametrize("wind", [0.0, 8.0, -8.0])

@@ -210,6 +210,7 @@ def test_invalid_model_file_is_refused(tmp_path):
         ("{", "expected YAML"),
         ("sigma_scale: 0", "sigma_scale: expected 0.1 to 10; got 0"),
         ("sigma_scale: .nan", "sigma_scale: expected 0.1 to 10"),
+        ("sigma_scale: true", "sigma_scale: expected 0.1 to 10; got True"),
         ("sigma_scale: small", "sigma_scale: expected 0.1 to 10; got 'small'"),
         ("box_padding: [1]", "box_padding: expected 1 to 3"),
     ],
