@@ -155,7 +155,7 @@ _SENTENCES = {
     _C.CONTROL_LOOP_STALLED: "the control loop stood still for {gap_s:.1f} s",
     _C.SETPOINTS_NOT_FOLLOWED: "the vehicle does not follow the setpoints: {evidence}",
     _C.LINK_SILENT: "nothing heard from the autopilot; last message: {ago}",
-    _C.AUTOPILOT_UNSUPPORTED: "the autopilot is {autopilot!r}: expected ArduPilot or PX4",
+    _C.AUTOPILOT_UNSUPPORTED: "the autopilot is {autopilot!r}: expected ArduPilot or PX4 of a multirotor or helicopter",
     _C.TIMEOUT_UNKNOWN: "the autopilot has not reported {name}, how long it flies on without setpoints; set {name} to "
     "{limit_s:g} on the autopilot, or change max_control_timeout_s",
     _C.TIMEOUT_TOO_LONG: "the autopilot flies on for {value_s:g} s without setpoints; set {name} to {limit_s:g} on the "
@@ -164,7 +164,7 @@ _SENTENCES = {
     "autopilot",
     _C.MODE_OUTDATED: "the flight mode is outdated; last report: {ago}",
     _C.ATTITUDE_OUTDATED: "the vehicle's attitude is outdated; last one: {ago}",
-    _C.POSITION_FROZEN: "the vehicle's position is not changing, telemetry lost or frozen; last change: {ago}",
+    _C.POSITION_FROZEN: "the vehicle's position is outdated: telemetry lost, late or frozen; last change: {ago}",
     _C.ROUND_TRIP_TOO_LONG: "the autopilot has answered nothing that was sent within the last {age_s:.1f} s",
     _C.VEHICLE_STATE_UNKNOWN: "the vehicle's position, velocity or heading is unknown",
     _C.NOT_ARMED: "the motors are not armed",
@@ -172,8 +172,8 @@ _SENTENCES = {
     _C.NO_SATELLITE_FIX: "no 3D satellite fix (type {fix_type})",
     _C.ESTIMATOR_UNHEALTHY: "the autopilot's estimator reports no usable position",
     _C.STATUS_OUTDATED: "GPS, estimator or battery data is outdated; last report: {ago}",
-    _C.BATTERY_UNKNOWN: "the battery's charge is unknown: set up its monitor on the autopilot, or set "
-    "min_battery_voltage_v to fly by the voltage alone",
+    _C.BATTERY_UNKNOWN: "the battery's charge, or the voltage that min_battery_voltage_v needs, is unknown: set up its "
+    "monitor on the autopilot, or set min_battery_voltage_v to fly by the voltage alone",
     _C.BATTERY_LOW: "the battery is at {level}",
     _C.CAMERA_UNKNOWN: "nothing reports where the camera points; set the mount up on the autopilot, or set mount to "
     "fixed and camera_pitch_deg to the camera's pitch",

@@ -88,6 +88,7 @@ class MavlinkBridgeNode(ComponentNode):
         self._unanswered: list[tuple[OperatorCommand, Any, Any]] = []  # with request and header
         self._last_command: dict[str, Any] = {"command": OrbitStatus.NO_COMMAND}
         self.create_timer(1.0, self._on_second)
+        self._calibrated_size = (0, 0)  # width and height px of camera_info; 0 = not stated
         self._stop = threading.Event()
         self._reported: tuple[State, str] | None = None
         self._reported_s = -math.inf
@@ -128,13 +129,14 @@ class MavlinkBridgeNode(ComponentNode):
         self._link.close()
 
     def _control(self) -> None:
-        """Step the controller at its rate.  An error in it ends the node; the watchdog holds the vehicle."""
+        """Step the controller at its rate.  An error in it holds the vehicle at once, and ends the node."""
         period_s = 1.0 / self.config.control_hz
         due_s = time.monotonic()
         while not self._stop.is_set():
             try:
                 self._control_step()
             except Exception as error:
+                self._watchdog.hold()
                 self.failure = error
                 return
             due_s = max(due_s + period_s, time.monotonic())
@@ -202,6 +204,12 @@ class MavlinkBridgeNode(ComponentNode):
     def _on_pose2d(self, message: Pose2D, info: dict[str, Any]) -> None:
         self._rivals.take_pose2d(info["publication_sequence_number"] or 0, self.now_s())
         observation = pose2d_from_ros(message)
+        if all(self._calibrated_size) and observation.image_size != self._calibrated_size:
+            expected, got = (f"{width}x{height}" for width, height in (self._calibrated_size, observation.image_size))
+            raise InputError(
+                f"pose2d: expected images of {expected} as in camera_info, got {got}: every distance would be wrong; "
+                "publish the camera_info of these images"
+            )
         self._controller.on_pose2d(observation)
         if observation.has_subject:
             self.count(Key.SUBJECT_SEEN)
@@ -211,6 +219,7 @@ class MavlinkBridgeNode(ComponentNode):
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         self._controller.on_camera(np.array(message.k, dtype=float).reshape(3, 3))
+        self._calibrated_size = (message.width, message.height)
 
     def _on_second(self) -> None:
         publishers = self.get_publishers_info_by_topic(self.resolve_topic_name("pose2d"))

@@ -47,12 +47,14 @@ class ModeReports:
     mode : by the newest report, the autopilot's own name; "" before the first
     intended : the mode that the pilot or a command has chosen last, as CURRENT_MODE reported it together with the
         present mode; "" = unknown.  PX4 keeps it where a failsafe enters another mode.
+    vehicle_type : MAV_TYPE, by the last heartbeat
     armed : by the last heartbeat
     received_ns : reception of the newest report that did not arrive late
     """
 
     def __init__(self) -> None:
         self.autopilot = self.mode = self.intended = ""
+        self.vehicle_type = 0
         self.armed = False
         self.received_ns: int | None = None
         self._heartbeat: Any = None
@@ -63,7 +65,7 @@ class ModeReports:
     def take_heartbeat(self, message: Any, late: bool, now_ns: int) -> None:
         """Take a HEARTBEAT; ``late``: it was sent before a packet that has already arrived."""
         self._heartbeat = message
-        self.autopilot = _AUTOPILOTS.get(message.autopilot, "other")
+        self.autopilot, self.vehicle_type = _AUTOPILOTS.get(message.autopilot, "other"), int(message.type)
         if not late:
             self.armed = bool(message.base_mode & _MAV_MODE_FLAG_SAFETY_ARMED)
         # The mode that is intended belongs to the mode with which it was reported.

@@ -111,6 +111,12 @@ class VehicleStateEstimator:
         latest = max((self.received_ns[name] for name in names if name in self.received_ns), default=None)
         return math.inf if latest is None else (now_ns - latest) / _NS
 
+    def position_behind_s(self) -> float:
+        """Time in s by which the position is older than the attitude, by the autopilot's stamps; at least 0."""
+        if self._position is None or self._attitude is None:
+            return 0.0
+        return max((self._attitude[0] - self._position[0]) / _NS, 0.0)
+
     def fresh_mode(self, now_ns: int, mode_s: float, attitude_s: float) -> str:
         """The mode, if its report and the attitude are not older than this; "" = it cannot be seen.  Needs no lock.
 

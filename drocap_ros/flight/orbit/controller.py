@@ -174,14 +174,16 @@ class OrbitController:
         seen = observe(self._link, self._config, self._vehicle, estimate, disturbance, not_followed, now_ns)
         seen = self._keeping.watch(self._orbit, self._framing.watch(self._vehicle, seen, dt), now_s)
         seen = dataclasses.replace(self._guard.doubt(seen, self._history.offset, now_ns), intruder=self.intruder)
-        command, kind = self._next_command(now_ns)
+        command, kind, goal = self._next_command(now_ns)
         dialect = DIALECTS.get(seen.autopilot, ARDUPILOT)
         before = self.safety
         limits = self._limits._replace(warm_up_s=dialect.warm_up_s)
         self.safety, decision = reduce(before, seen, now_s, kind, limits)
         if command is not None and decision.answer is not None:
             self._answers.append((command, decision.answer))
-        if hung and self.safety.state == State.HOLDING and self._fallback is not None:
+            if goal is not None and decision.answer.accepted:
+                self._goal = goal
+        if hung and not seen.jumped and self.safety.state == State.HOLDING and self._fallback is not None:
             # The watchdog already holds a position: a new one, farther on, would let the vehicle move on.
             self.safety = dataclasses.replace(
                 self.safety, hold_position=self._fallback.position, hold_yaw=self._fallback.yaw
@@ -214,10 +216,10 @@ class OrbitController:
             return condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=dt), dt, hung
         return self._unsafe, dt, hung
 
-    def _next_command(self, now_ns: int) -> tuple[OperatorCommand | None, Command | None]:
-        """The command to execute in this step; an invalid one is refused here."""
+    def _next_command(self, now_ns: int) -> tuple[OperatorCommand | None, Command | None, OrbitGoal | None]:
+        """The command to execute in this step, and the orbit that it asks for; an invalid one is refused here."""
         if not self._commands:
-            return None, None
+            return None, None, None
         stop = next((c for c in self._commands if c.kind == Command.STOP), None)
         if stop is not None:
             overruled = condition(ConditionCode.OVERRULED_BY_STOP)
@@ -225,21 +227,20 @@ class OrbitController:
                 (c, CommandAnswer(c.kind == Command.STOP, overruled)) for c in self._commands if c is not stop
             ]
             self._commands.clear()
-            return stop, Command.STOP
+            return stop, Command.STOP, None
         command = self._commands.popleft()
         if (refusal := command_condition(command, now_ns)) is not None:
             self._refuse(command, refusal)
-            return None, None
+            return None, None, None
         kind = Command(command.kind)
         running = self.safety.state == State.ORBITING
         if (kind == Command.ADJUST and not running) or (kind != Command.ADJUST and (running or self.safety.requesting)):
-            return command, kind  # the state decides, and the goal stays
+            return command, kind, None  # the state decides, and the goal stays
         goal = commanded_goal(self._config, command, self._goal if kind == Command.ADJUST else None, self._framing)
         if isinstance(goal, Condition):
             self._refuse(command, goal)
-            return None, None
-        self._goal = goal
-        return command, kind
+            return None, None, None
+        return command, kind, goal
 
     def _refuse(self, command: OperatorCommand, refusal: Condition) -> None:
         self._answers.append((command, CommandAnswer(False, refusal)))

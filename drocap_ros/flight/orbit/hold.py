@@ -62,7 +62,13 @@ def _moves_away(seen: Observed) -> bool:
 
 
 def update_hold(state: SafetyState, seen: Observed, now_s: float, blind: bool) -> SafetyState:
-    """Latch a position that has become known, and enter FAULT when the hold mode is not granted."""
+    """Latch a position that has become known or has jumped, and enter FAULT when the hold mode is not granted.
+
+    After a jump of the reported position (a glitch that comes back, a reset of the autopilot's estimator) the latched
+    one names another place, and the vehicle would fly there.
+    """
+    if seen.jumped and state.hold_position is not None:
+        state = dataclasses.replace(state, hold_position=seen.position.copy())
     if state.blind and not blind:
         state = dataclasses.replace(state, blind=False, since_s=now_s, hold_mode_s=math.nan)
         if state.hold_position is None:

@@ -11,7 +11,7 @@ from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
 from drocap_ros.flight.orbit.states import Limits, Observed
 from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.safety_config import SafetyConfig
-from drocap_ros.flight.vehicle_state import LANDED_LANDING, LANDED_ON_GROUND, LANDED_TAKEOFF
+from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, LANDED_LANDING, LANDED_ON_GROUND, LANDED_TAKEOFF
 
 _C = ConditionCode
 _REACTION_S = 0.5
@@ -63,8 +63,10 @@ def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
         return condition(_C.VEHICLE_STATE_UNKNOWN)
     if not seen.armed:
         return condition(_C.NOT_ARMED)
-    if seen.landed_state in _LANDED_STATES:
-        return condition(_C.NOT_FLYING, landed_state=_LANDED_STATES[seen.landed_state])
+    # Where nothing is reported: a setpoint starts PX4 from the ground; ArduPilot in GUIDED waits for a take-off.
+    if seen.landed_state in _LANDED_STATES or (seen.autopilot == "px4" and seen.landed_state != LANDED_IN_AIR):
+        landed = _LANDED_STATES.get(seen.landed_state, "not reported to be in the air (EXTENDED_SYS_STATE)")
+        return condition(_C.NOT_FLYING, landed_state=landed)
     if seen.gps_fix_type < 3:
         return condition(_C.NO_SATELLITE_FIX, fix_type=seen.gps_fix_type)
     if not seen.position_ok:
@@ -82,7 +84,7 @@ def battery_condition(charge: float, volts: float, safety: SafetyConfig) -> Cond
         return condition(_C.BATTERY_LOW, level=f"{volts:.1f} V")
     if charge < safety.min_battery_fraction:
         return condition(_C.BATTERY_LOW, level=f"{100 * charge:.0f} %")
-    if math.isnan(charge) and (least_v == 0 or math.isnan(volts)):
+    if math.isnan(volts if least_v > 0 else charge):
         return condition(_C.BATTERY_UNKNOWN)
     return None
 

@@ -20,6 +20,8 @@ _MAX_EXTRAPOLATION_S = 0.3
 _POSITION_JUMP_M, _JUMP_PERIOD_S = 1.0, 0.5
 #: Modes that PX4 enters for the loss of setpoints, by COM_OBL_RC_ACT; without the setting any mode may be it.
 _LOSS_MODES = {3: "RTL", 4: "LAND", 5: "LOITER"}
+#: MAV_TYPE of the vehicles for which the control was made: multirotors, and a helicopter under the same autopilot.
+_MULTIROTORS = frozenset({2, 3, 4, 13, 14, 15, 29, 35})
 _STATUS_MESSAGES = (("GPS_RAW_INT",), ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"), ("SYS_STATUS",))
 
 
@@ -67,17 +69,23 @@ def observe(
     loss = link.settings.loss_settings()
     action = math.nan if loss is None else loss.action
     loss_mode = _LOSS_MODES.get(int(action) if math.isfinite(action) else -1, latest.mode)
+    flies = estimator.modes.vehicle_type in _MULTIROTORS
     trip_s, gap_s = link.answer_age_s(), link.stream_gap_s()
-    if (stood_s := link.decision_age_s()) > config.watchdog_s:
+    jumped = disturbance is not None and disturbance.code == ConditionCode.POSITION_JUMPED
+    if not jumped and (stood_s := link.decision_age_s()) > config.watchdog_s:
         # The process stood still within this step: what was read above belongs to different instants.
         disturbance = condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=stood_s)
     return Observed(
-        autopilot=latest.autopilot, mode=latest.mode, in_control=latest.mode == dialect.control_mode,
+        autopilot=latest.autopilot if flies else f"{latest.autopilot}, vehicle type {estimator.modes.vehicle_type}",
+        mode=latest.mode, in_control=latest.mode == dialect.control_mode,
         in_hold=latest.mode == dialect.hold_mode, heard=heard | {latest.mode},
         left_by_itself=estimator.modes.intended == dialect.control_mode != latest.mode == loss_mode,
         armed=latest.armed, landed_state=latest.landed_state, link_age_s=latest.link_age_s,
         heartbeat_age_s=estimator.modes.age_s(now_ns),
-        state_age_s=abs(age_s), position_age_s=(now_ns - estimator.position_changed_ns) / _NS,
+        state_age_s=abs(age_s),
+        position_age_s=max(
+            (now_ns - estimator.position_changed_ns) / _NS, estimator.position_behind_s() + abs(age_s)
+        ),
         status_age_s=status_age, round_trip_s=trip_s, packet_loss=estimator.packets.loss,
         stream_gap_s=gap_s,
         gps_fix_type=latest.gps_fix_type, position_ok=latest.position_ok, battery_fraction=latest.battery_fraction,

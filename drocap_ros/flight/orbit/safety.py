@@ -177,7 +177,7 @@ def _execute(
 
 
 def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> tuple[SafetyState, CommandAnswer]:
-    if state.state == State.ORBITING:
+    if state.state == State.ORBITING or (state.state == State.HOLDING and state.retreats):
         answer = _accepted(_C.STOPPED)
         blind = vehicle_condition(seen, limits) is not None
         return begin_hold(state, answer.condition, seen, now_s, blind), answer

@@ -14,6 +14,8 @@ from drocap_ros.flight.orbit.states import Limits, Observed, SafetyState, State
 #: heartbeats of PX4, and than packets that were late and arrive after newer ones.
 _STEADY_S = 1.3
 _DEFAULT_TIMEOUT_S = 0.5
+#: Out of sight for longer, the reported position may have jumped unseen (observer.position_jump_m).
+_UNSEEN_S = 0.25
 
 
 def watch(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> SafetyState:
@@ -27,14 +29,14 @@ def watch(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> S
         return state if lost else dataclasses.replace(state, lost_s=now_s)
     if not lost or seen.heartbeat_age_s >= now_s - state.lost_s:
         return state
-    silent = is_silent(state, now_s, limits)
+    unseen = now_s - state.lost_s > _UNSEEN_S
     state = dataclasses.replace(state, lost_s=math.nan, seen_s=now_s)
     if state.state not in (State.HOLDING, State.FAULT):
         return state
     state = dataclasses.replace(state, since_s=now_s, hold_mode_s=math.nan)
-    if not silent:
+    if not unseen:
         return state
-    # Setpoints had ended: the vehicle is held where it is now, and not led back.
+    # The vehicle is held where it is now, and not led back: setpoints may have ended, or its position been reset.
     known = bool(np.isfinite(seen.position).all()) and seen.position_ok and seen.gps_fix_type >= 3
     place = seen.position.copy() if known else None
     return dataclasses.replace(state, hold_position=place, hold_yaw=seen.yaw)

@@ -120,6 +120,11 @@ class Observed:
     away_s: float = 0.0
     framing_margin: float = math.inf
 
+    @property
+    def jumped(self) -> bool:
+        """Whether the reported position has jumped: what was latched in it names another place now."""
+        return self.disturbance is not None and self.disturbance.code == ConditionCode.POSITION_JUMPED
+
 
 class Limits(NamedTuple):
     """Parameters of the conditions.

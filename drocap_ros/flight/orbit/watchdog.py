@@ -66,6 +66,11 @@ class Watchdog:
             self.mode_requested = True
             self._send(commands.hold_mode)
 
+    def hold(self) -> None:
+        """Send the hold of the last step, if there is one: the loop has failed, and nothing follows."""
+        if (commands := self._latest[1]) is not None:
+            self._send(commands.hold)
+
     def take_fired(self) -> tuple[bool, bool]:
         """Whether it has acted, and requested the hold mode, since the last call."""
         result = (self.fired, self.mode_requested)

@@ -94,8 +94,10 @@ class Guard:
         offset : (3,) m, from the frame of the camera's poses to that of the reported position
         """
         self._offset, self._now_ns = offset, now_ns
-        if self._state is None or seen.subject is None:
+        if seen.subject is None:
             return seen
+        if self._state is None:  # too few joints for a size: without it nothing bounds the closing speed
+            return dataclasses.replace(seen, subject_age_s=math.inf)
         distance, _, sd = self._sight(seen.position)
         farthest = (1 + 2 * self._size_error) * distance + 2 * sd
         return dataclasses.replace(

@@ -87,6 +87,16 @@ def jump(loop: OrbitLoop) -> None:
     loop.copter.gps_error = loop.copter.gps_error + np.array([12.0, -9.0, 0.0])
 
 
+def reset_position(nearer_m: float) -> Injection:
+    """The autopilot's estimate is reset: a place that was latched before now lies nearer to the person by this."""
+
+    def inject(loop: OrbitLoop) -> None:
+        sight = (loop.pelvis() - loop.copter.body.position)[:2]
+        loop.copter.gps_error = loop.copter.gps_error - np.append(nearer_m * sight / np.hypot(*sight), 0.0)
+
+    return inject
+
+
 def pilot(ardupilot: str, px4: str = "") -> Injection:
     """The pilot switches the mode; its name for ArduPilot, and for PX4 where that differs."""
 

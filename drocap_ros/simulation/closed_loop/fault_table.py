@@ -50,6 +50,7 @@ from drocap_ros.simulation.closed_loop.fault_injections import (
     perceived,
     pilot,
     ready_late,
+    reset_position,
     restart,
     restart_clock,
     same_radius,
@@ -160,6 +161,22 @@ _VEHICLE = (
     _taking_over("the autopilot's own fence is breached", assign("copter", fence_m=0.5)),
     Fault("the autopilot's clock restarts", restart_clock, harmless=True),
     Fault("the autopilot's position jumps by 15 m", jump, LINK_S, cause=JUMPED, codes=(_C.POSITION_JUMPED,)),
+    Fault(
+        "the autopilot's position jumps by 5 m and back", reset_position(-5.0), LINK_S, cause=JUMPED,
+        codes=(_C.POSITION_JUMPED,), later=(0.5, reset_position(5.0)),
+    ),
+    Fault(
+        "the autopilot's position jumps during a hold", reset_position(5.0), LINK_S, cause=JUMPED,
+        before=((4.0, start), (FAULT_S - 0.4, _STOP)), state=State.HOLDING,
+    ),
+    Fault(
+        "the autopilot's position jumps while the control loop hangs", assign(hung=True), cause=JUMPED,
+        codes=(_STALLED, _C.POSITION_JUMPED), later=(0.6, both(reset_position(5.0), assign(hung=False))),
+    ),
+    _link(
+        "the autopilot's position jumps while the downlink is lost", "down", {"cut": True},
+        later=(1.0, both(reset_position(5.0), assign("down", cut=False))),
+    ),
     Fault("setpoints ignored", assign("copter", deaf=True), ECHO_S, codes=(_C.SETPOINTS_NOT_FOLLOWED, *_TAKEN)),
     Fault(
         "hold mode denied", _LOSE_SUBJECT, FRAME_S, before=((0.0, _DENY_HOLD), (4.0, start)),

@@ -266,3 +266,13 @@ def test_link_age_grows_in_silence(ready):
     estimator, sender = ready
     assert estimator.update(attitude(sender), 10 * S).link_age_s == 0
     assert np.isclose(estimator.snapshot(12 * S).link_age_s, 2.0)
+
+
+def test_a_position_is_as_old_as_its_stamp_says(ready):
+    estimator, sender = ready
+    assert estimator.position_behind_s() == 0.0
+    estimator.update(sender("local_position_ned", 600, 1, 2, -3, 0, 0, 0), 10 * S)
+    see(estimator, sender, 1000)
+    assert estimator.position_behind_s() == pytest.approx(0.4)
+    estimator.update(sender("local_position_ned", 1040, 1, 2, -3, 0, 0, 0), 10 * S)
+    assert estimator.position_behind_s() == 0.0

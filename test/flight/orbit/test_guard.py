@@ -209,3 +209,10 @@ def test_ardupilot_never_closes_up_faster_than_the_general_bound(person, own):
     place = flown(lambda t: person * t, lambda t: person * t)
     px4, ardupilot = (asked(*place, 2.5, own=own, autopilot=name)[0] for name in ("px4", "ardupilot"))
     assert 0.0 <= ardupilot <= px4 + 1e-9
+
+
+def test_nothing_is_flown_about_a_person_whose_size_was_never_seen():
+    guard, place = Guard(SubjectConfig(), OrbitConfig(), 1.3), np.array([6.0, 0.0, 1.2])
+    seen = dataclasses.replace(GOOD, position=place)
+    assert allowed_pace(seen, LIMITS)[0] == 1.0
+    assert guard.doubt(seen, np.zeros(3), S).subject_age_s == np.inf

@@ -10,6 +10,7 @@ from orbit_observations import BRAKE, GOOD, LIMITS, LOITER, orbiting
 from drocap_ros.errors import ParameterError
 from drocap_ros.flight.conditions import ConditionCode, condition
 from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
+from drocap_ros.flight.orbit.motion_checks import battery_condition
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
 from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, SafetyState, State
 from drocap_ros.flight.safety_config import SafetyConfig
@@ -25,6 +26,7 @@ BAD = {
     "position nan": {"position": np.array([np.nan, 0, 0])},
     "heading nan": {"yaw": math.nan},
     "landing": {"landed_state": 4},
+    "px4 not known to fly": {"autopilot": "px4", "landed_state": 0},
     "gps": {"gps_fix_type": 1},
     "estimator": {"position_ok": False},
     "status": {"status_age_s": 2.0},
@@ -57,6 +59,7 @@ CODES = {
     "position nan": ConditionCode.VEHICLE_STATE_UNKNOWN,
     "heading nan": ConditionCode.VEHICLE_STATE_UNKNOWN,
     "landing": ConditionCode.NOT_FLYING,
+    "px4 not known to fly": ConditionCode.NOT_FLYING,
     "gps": ConditionCode.NO_SATELLITE_FIX,
     "estimator": ConditionCode.ESTIMATOR_UNHEALTHY,
     "status": ConditionCode.STATUS_OUTDATED,
@@ -273,6 +276,26 @@ def test_vehicle_that_moves_away_fast_is_held_where_it_can_stop():
     assert begun[1].hold_position[0] == pytest.approx(9.5)
 
 
+def test_a_stop_ends_the_retreat():
+    state, _ = reduce(orbiting(), near(4.0), 10.0, None, LIMITS)
+    state, _ = reduce(state, near(3.9), 10.1, None, LIMITS)
+    assert state.hold_position[0] > 5.0
+    state, decision = reduce(state, near(3.8), 10.2, Command.STOP, LIMITS)
+    assert (decision.answer.accepted, state.condition.code) == (True, ConditionCode.STOPPED)
+    for step in range(20):
+        state, decision = reduce(state, near(3.7), 10.3 + 0.05 * step, None, LIMITS)
+        assert (state.hold_position[0], decision.action) == (3.8, Action.HOLD)
+
+
+def test_a_hold_follows_a_jump_of_the_reported_position():
+    """Else the vehicle flies to the old numbers, which name another place now."""
+    state, _ = reduce(orbiting(), GOOD, 10.0, Command.STOP, LIMITS)
+    jumped = condition(ConditionCode.POSITION_JUMPED, jump_m=5.0)
+    seen = dataclasses.replace(GOOD, position=np.array([11.0, 0.0, 2.5]), disturbance=jumped)
+    state, decision = reduce(state, seen, 10.1, None, LIMITS)
+    assert (state.hold_position.tolist(), decision.action) == ([11.0, 0.0, 2.5], Action.HOLD)
+
+
 @pytest.mark.parametrize(
     ("seen", "command"),
     [
@@ -360,3 +383,10 @@ def test_too_long_a_timeout_of_the_autopilot_forbids_motion():
     assert refusal(decision) == ConditionCode.TIMEOUT_TOO_LONG
     assert reduce(orbiting(), seen, 1.0, None, limits)[0].state == State.HOLDING
     assert reduce(orbiting(), seen, 1.0, None, LIMITS)[0].state == State.ORBITING
+
+
+def test_a_least_voltage_needs_a_known_one():
+    safety = SafetyConfig(min_battery_voltage_v=14.0)
+    assert battery_condition(0.9, math.nan, safety).code == ConditionCode.BATTERY_UNKNOWN
+    assert battery_condition(math.nan, 15.0, safety) is None
+    assert battery_condition(0.9, 13.9, safety).code == ConditionCode.BATTERY_LOW

@@ -36,8 +36,8 @@ def test_the_mode_after_a_loss_is_known_by_a_heartbeat_since_the_loss(silent_s):
     assert decision[:2] == (before.action, ModeRequest.NONE)
     pilot, decision = reduce(state, dataclasses.replace(LOITER, mode="RTL"), 1.2 + silent_s, None, LIMITS)
     assert (pilot.state, decision.action) == (State.TAKEN_OVER, Action.NOTHING)
-    # Our own mode: the hold goes on, after silence where the vehicle is now, and the hold mode waits for steadiness.
-    place = early.position if silent_s > 3.5 else GOOD.position
+    # Our own mode: the hold goes on where the vehicle is now, because its position may have been reset unseen, and the
+    # hold mode waits for steadiness.
     for i in range(80):
         t = 1.2 + silent_s + 0.05 * i
         state, decision = reduce(
@@ -45,7 +45,7 @@ def test_the_mode_after_a_loss_is_known_by_a_heartbeat_since_the_loss(silent_s):
         )
         assert decision.mode_request == ModeRequest.NONE or i * 0.05 >= 1.3
     assert decision == (Action.HOLD, ModeRequest.HOLD, None)
-    assert np.array_equal(state.hold_position, place)
+    assert np.array_equal(state.hold_position, early.position)
 
 
 def test_a_mode_of_somebody_else_is_a_take_over_however_late_it_is_heard():

@@ -1,6 +1,7 @@
 """Gaps of pictures and telemetry in flight: the orbit slows down and goes on, or holds and starts again."""
 
 import dataclasses
+from collections import deque
 from functools import lru_cache
 
 import numpy as np
@@ -143,3 +144,54 @@ def test_start_is_enough_when_the_pilot_gives_control_back_after_a_hold(loop):
     loop.command(Command.START)
     loop.run(loop.t + 3.0)
     assert loop.controller.safety.state == State.ORBITING, loop.reasons[-3:]
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_positions_that_are_late_by_their_stamps_start_no_orbit(autopilot):
+    loop = OrbitLoop(LoopSettings(autopilot=autopilot, seed=4, seconds=20))
+    report, late = loop.copter._telemetry, deque()
+
+    def telemetry(number, t, pose):
+        message = report(number, t, pose)
+        if message is None or message.get_type() != "LOCAL_POSITION_NED":
+            return message
+        late.append((t, message))
+        return late.popleft()[1] if late[0][0] <= t - 0.8 else None
+
+    loop.copter._telemetry = telemetry
+    loop.start()
+    loop.run(10.0)
+    assert all(row.action == Action.NOTHING for row in loop.rows)
+    assert loop.status.condition.code == ConditionCode.POSITION_FROZEN
+
+
+def test_a_refused_command_changes_no_orbit_that_resumes_by_itself():
+    loop = orbit("ardupilot", resume_after_hold_s=5.0)
+    loop.perceive = lambda seen: None
+    loop.run(loop.t + 1.6)
+    assert loop.controller.safety.state == State.HOLDING
+    loop.command(Command.START, radius_m=12.0, height_m=6.0, angular_speed_deg_s=-8.0)
+    loop.run(loop.t + 0.2)
+    assert "refused" in str(loop.answers[-1][1])
+    loop.perceive = lambda seen: seen
+    loop.run(loop.t + 12.0)
+    assert loop.controller.safety.state == State.ORBITING
+    assert loop.rows[-1].distance_m < 8.0
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_a_fixed_wing_is_not_commanded(autopilot):
+    loop = OrbitLoop(LoopSettings(autopilot=autopilot, seed=4, seconds=10))
+    heartbeat = loop.copter._heartbeat
+
+    def of_a_plane():
+        message = heartbeat()
+        message.type = 1
+        return message
+
+    loop.copter._heartbeat = of_a_plane
+    loop.start()
+    loop.run(9.0)
+    assert all(row.action == Action.NOTHING for row in loop.rows)
+    assert loop.status.condition.code == ConditionCode.AUTOPILOT_UNSUPPORTED
+    assert f"{autopilot}, vehicle type 1" in loop.status.reason

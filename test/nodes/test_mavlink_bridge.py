@@ -1,0 +1,49 @@
+"""The node around the controller: what it refuses, and what it does when the controller fails."""
+
+import time
+
+import pytest
+import rclpy
+
+from drocap_ros.errors import InputError
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.orbit.watchdog import FallbackCommands
+from drocap_ros.nodes.mavlink_bridge import MavlinkBridgeNode
+from drocap_ros.observation import PoseObservation
+from drocap_ros.perception.calibration import CameraModel
+from drocap_ros.ros.conversions import camera_info_to_ros, header_at, pose2d_to_ros
+from drocap_ros.simulation.orbit_camera import pinhole_matrix
+from drocap_ros.simulation.vehicle.ports import free_udp_port
+
+
+@pytest.fixture
+def node():
+    rclpy.init()
+    node = MavlinkBridgeNode(MavlinkBridgeConfig(commands_enabled=True, url=f"udpin:127.0.0.1:{free_udp_port()}"))
+    yield node
+    node.close()
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def test_keypoints_of_images_of_another_size_are_refused(node):
+    """By a camera_info of larger images the person seems farther away, and the vehicle would come nearer."""
+    camera = CameraModel(1280, 720, pinhole_matrix(1280, 720, 60.0))
+    node._on_camera_info(camera_info_to_ros(header_at(1, "camera"), camera))
+
+    def take(size):
+        node._on_pose2d(pose2d_to_ros(PoseObservation(10**18, 0, size), "camera"), {"publication_sequence_number": 1})
+
+    take((1280, 720))
+    with pytest.raises(InputError, match="expected images of 1280x720 as in camera_info, got 960x540"):
+        take((960, 540))
+
+
+def test_an_error_in_the_control_loop_holds_the_vehicle_at_once(node, monkeypatch):
+    sent = []
+    monkeypatch.setattr(node._watchdog, "_send", sent.append)
+    node._watchdog.kick(time.monotonic(), FallbackCommands("hold", "hold mode", lambda: True))
+    monkeypatch.setattr(node._controller, "step", lambda now_ns, now_s: 1 / 0)
+    node._control()
+    assert sent == ["hold"]
+    assert isinstance(node.failure, ZeroDivisionError)
