@@ -93,7 +93,7 @@ class MavlinkBridgeNode(ComponentNode):
         self._reported: tuple[State, str] | None = None
         self._reported_s = -math.inf
         self._threads = [
-            threading.Thread(target=self._link.run, args=(self._on_state, self._stop), name="mavlink", daemon=True),
+            threading.Thread(target=self._listen, name="mavlink", daemon=True),
             threading.Thread(target=self._control, name="flight-control", daemon=True),
         ]
 
@@ -127,6 +127,13 @@ class MavlinkBridgeNode(ComponentNode):
         self._watchdog.close()
         self.requests.close()
         self._link.close()
+
+    def _listen(self) -> None:
+        """Read the link.  An error in it ends the node: a bridge that hears nothing must not stay."""
+        try:
+            self._link.run(self._on_state, self._stop)
+        except Exception as error:
+            self.failure = error
 
     def _control(self) -> None:
         """Step the controller at its rate.  An error in it holds the vehicle at once, and ends the node."""

@@ -78,7 +78,7 @@ class MavlinkLink:
         if key is not None:
             sign_with(self._mav, key, clock_ns())
             sign_with(self._watchdog_mav, key, clock_ns(), link_id=1)
-        self._autopilot: str | None = None
+        self._autopilot = ""  # "" = none is heard yet
         self._heard_s: float | None = None  # monotonic
         self._due: dict[str, float] = {}
         self._sync_sent: dict[int, float] = {}  # monotonic s by our stamp, ns
@@ -253,11 +253,10 @@ class MavlinkLink:
             return state
         self._heard_s = self._monotonic_s()
         self._transport.accept_peer()
-        if self._autopilot is None:
-            self._autopilot = _autopilot_kind(message)
-            if self._autopilot is not None:
-                self._requests.set_autopilot(self._autopilot)
-                self.settings.set_autopilot(self._autopilot)
+        if (kind := self.estimator.modes.autopilot) != self._autopilot:  # the first one, or another on the same link
+            self._autopilot = kind
+            self._requests.set_autopilot(kind)
+            self.settings.set_autopilot(kind)
         self._requests.count(message.get_msgId(), now_ns)
         if name == "TIMESYNC":
             self._take_time_sync(message, now_ns)
@@ -286,7 +285,7 @@ class MavlinkLink:
                     mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE
                 )
             )
-        if self._autopilot is None:
+        if not self._autopilot:
             return
         now_ns = self._clock_ns()
         if self._is_due("time_sync", 1.0 / config.time_sync_hz):
@@ -322,7 +321,8 @@ class MavlinkLink:
         self._transmit(message)
 
     def _note_stream(self, message: Any) -> None:
-        if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
+        # Over a broken link nothing leaves: the stream counts as interrupted.
+        if self._broken_s is None and message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
             self._sent.append((self._monotonic_s(), message))
 
     def _transmit(self, message: Any) -> None:
@@ -341,9 +341,3 @@ class MavlinkLink:
         packet = bytes(message.pack(mav))
         mav.seq = (mav.seq + 1) % 256
         return packet
-
-
-def _autopilot_kind(message: Any) -> str | None:
-    if message.get_type() != "HEARTBEAT":
-        return None
-    return "px4" if message.autopilot == mavlink.MAV_AUTOPILOT_PX4 else "ardupilot"

@@ -13,6 +13,7 @@ from drocap_ros.flight.mavlink.commands import CommandQueue
 from drocap_ros.flight.mavlink.dialects import ARDUPILOT, DIALECTS, PX4, halt_message, setpoint_message
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.parser import MavlinkParser
+from drocap_ros.flight.mavlink.transport import LinkError
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
 from drocap_ros.flight.setpoint import Setpoint, hold_setpoint
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
@@ -202,3 +203,31 @@ def test_both_acknowledgements_of_a_mode_count():
     assert (queue.failure(SET_MODE), queue.due(4.5)) == ("", [])
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_FAILED, 9.0)  # too late for this request
     assert queue.failure(SET_MODE) == ""
+
+
+def test_a_setpoint_that_does_not_leave_is_no_part_of_the_stream(monkeypatch):
+    """A stream that was interrupted does not resume by itself: the first setpoint would restore OFFBOARD."""
+
+    def unplugged(data):
+        raise LinkError("unplugged")
+
+    sender = link()
+    monkeypatch.setattr(sender._transport, "write", unplugged)
+    for _ in range(3):
+        sender.send_motion(halt_message(sender.mav, (1, 1)))
+    assert len(sender.sent_setpoints()) == 1  # the one at which the link broke
+
+
+def test_the_settings_are_those_of_the_autopilot_that_is_heard_now():
+    channel, receiver = Channel(lambda: 10.0), link()
+    receiver._transport = LoopbackTransport(channel, Channel(lambda: 10.0))
+    channel.delay_s = 0.0
+    vehicle = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    for autopilot, name in ((3, "GUID_TIMEOUT"), (12, "COM_OF_LOSS_T")):
+        for packet in (
+            vehicle.heartbeat_encode(2, autopilot, 129, 4, 4),
+            vehicle.param_value_encode(name.encode(), 0.5, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0),
+        ):
+            channel.write(packet.pack(vehicle))
+        receiver.spin_once()
+        assert receiver.settings.loss_settings()[:2] == (name, 0.5)
