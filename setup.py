@@ -7,6 +7,7 @@ all the same, and all but ``drocap_ros.msg`` and the nodes can be imported.
 from __future__ import annotations
 
 import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -57,8 +58,12 @@ class BuildPy(build_py):
     """``build_py`` that adds the generated messages and their libraries."""
 
     def run(self) -> None:
-        """Build the sources, then the messages where there is a ROS."""
+        """Build the sources with their revision, then the messages where there is a ROS."""
         super().run()
+        if not self.editable_mode:  # an editable installation asks the checkout
+            revision = runpy.run_path(str(ROOT / "drocap_ros" / "revision.py"))
+            target = Path(self.build_lib) / "drocap_ros" / revision["FILE"]
+            target.write_text(revision["git_revision"]() or "", encoding="ascii")
         prefixes = ros_prefixes()
         if not prefixes:
             self.announce("no ROS found: installing without drocap_ros.msg", level=3)

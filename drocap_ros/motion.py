@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.tracks import MAX_FRAMES, read_npz
+from drocap_ros.tracks import MAX_FRAMES, as_stamps, check_stamps, read_npz
 
 #: Name of a motion in its folder.
 FILE = "motion.npz"
@@ -129,27 +129,29 @@ def load_motion(path: str | Path) -> Motion:
         raise InputError(f"{path}: joints3d: expected (F, {a['joints'].size}, 3), got {joints3d.shape}")
     if a["parents"].ndim != 1 or a["parents"].dtype.kind not in "iu" or a["joints"].ndim != 1:
         raise InputError(f"{path}: joints, parents: expected (P) names and (P) integers, got {a['parents'].dtype}")
+    if a["metric"].shape != () or a["metric"].dtype.kind not in "biu":
+        raise InputError(f"{path}: metric: expected one truth value, got {a['metric'].dtype} {a['metric'].shape}")
     try:
         meta = json.loads(str(a["meta"]))
     except ValueError:
         raise InputError(f"{path}: meta: expected JSON text; was the file written by drocap?") from None
-    motion = Motion(
-        joints3d=joints3d,
-        joints=tuple(str(j) for j in a["joints"]),
-        parents=tuple(int(p) for p in a["parents"]),
-        stamp_ns=a["stamp_ns"],
-        frame=str(a["frame"]),
-        metric=bool(a["metric"]),
-        scale_source=str(a["scale_source"]),
-        camera_rotation=a["camera_rotation"],
-        confidence=a["confidence"],
-        keypoints=a["keypoints"],
-        reprojection_px=a["reprojection_px"],
-        meta=meta if isinstance(meta, dict) else {},
-        camera_position=a.get("camera_position"),
-        covariance=a.get("covariance"),
-    )
     try:
+        motion = Motion(
+            joints3d=joints3d,
+            joints=tuple(str(j) for j in a["joints"]),
+            parents=tuple(int(p) for p in a["parents"]),
+            stamp_ns=as_stamps(a["stamp_ns"]),
+            frame=str(a["frame"]),
+            metric=bool(a["metric"]),
+            scale_source=str(a["scale_source"]),
+            camera_rotation=a["camera_rotation"],
+            confidence=a["confidence"],
+            keypoints=a["keypoints"],
+            reprojection_px=a["reprojection_px"],
+            meta=meta if isinstance(meta, dict) else {},
+            camera_position=a.get("camera_position"),
+            covariance=a.get("covariance"),
+        )
         _check(motion)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -180,8 +182,7 @@ def _check(m: Motion) -> None:
             raise InputError(f"{name}: expected finite numbers or NaN, got infinity; use NaN for unknown")
     if np.any(np.abs(m.joints3d) > _FARTHEST_M):
         raise InputError(f"joints3d: expected metres up to {_FARTHEST_M:g}, got larger; is the unit right?")
-    if m.stamp_ns.dtype.kind == "f" or np.any(np.diff(m.stamp_ns.astype(np.int64)) <= 0):
-        raise InputError("stamp_ns: expected strictly increasing integer nanoseconds; sort the frames")
+    check_stamps(m.stamp_ns)
     if m.frame not in ("world", "camera"):
         raise InputError(f"frame: expected 'world' or 'camera', got {m.frame[:40]!r}")
     _check_tree(m.joints, m.parents)

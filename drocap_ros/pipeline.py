@@ -206,4 +206,4 @@ def _track(
 
 def _log_warnings(session: Session) -> None:
     for warning in session.warnings:
-        logger.warning("%s: %s", session.path, warning)
+        logger.warning("%s: %s", session.path.name, warning)

@@ -16,6 +16,12 @@ from drocap_ros.errors import InputError
 MAX_FRAMES = 1_080_000
 #: Upper bound on the arrays of such a sequence, optional ones included.
 MAX_BYTES = 4 * 2**30
+#: Keypoints beyond it are no pixels, and their squares overflow in the solvers.
+_FARTHEST_PX = 1e9
+#: Focal lengths as shares of the image's width or height: a view of 157 degrees, and of 0.6.
+_FOCAL_SHARES = 0.1, 100.0
+#: Longest time from the first to the last frame, ns: a year. More is no recording, and overflows.
+_LONGEST_NS = 365 * 86_400 * 10**9
 
 
 @dataclass(frozen=True)
@@ -77,10 +83,8 @@ def _check(t: Tracks) -> None:
             raise InputError(f"{name}: expected shape {shape}, got {value.shape}; make it fit keypoints {k.shape}")
     if t.stamp_ns.dtype != np.int64:
         raise InputError(f"stamp_ns: expected int64 nanoseconds, got {t.stamp_ns.dtype}")
-    if np.any(np.diff(t.stamp_ns) <= 0):
-        raise InputError("stamp_ns: expected strictly increasing times, got a repeated or earlier one; sort the frames")
-    if np.isinf(k).any():
-        raise InputError("keypoints: expected finite px or NaN where not seen, got infinity; use NaN")
+    check_stamps(t.stamp_ns)
+    check_keypoints(k, t.covariance)
     if min(t.image_size) < 1:
         raise InputError(f"image_size: expected positive width and height, got {t.image_size}")
     _check_telemetry(t)
@@ -94,10 +98,61 @@ def _check_telemetry(t: Tracks) -> None:
             raise InputError("camera_rotation: expected rotation matrices (orthonormal, determinant 1), got others")
     if t.camera_position is not None and not np.isfinite(t.camera_position).all():
         raise InputError("camera_position: expected finite metres, got NaN or infinity; fill the gaps in")
-    if t.camera_matrix is not None and not (
-        np.isfinite(t.camera_matrix).all() and t.camera_matrix[0, 0] > 0 and t.camera_matrix[1, 1] > 0
+    if t.camera_matrix is not None:
+        check_camera_matrix(t.camera_matrix, t.image_size)
+
+
+def check_stamps(stamp_ns: np.ndarray) -> None:
+    """Refuse stamps (F,) that do not increase, or last longer than a year.
+
+    Raises
+    ------
+    InputError
+        When they do.
+    """
+    first, last = int(stamp_ns[0]), int(stamp_ns[-1])
+    if last - first > _LONGEST_NS:
+        raise InputError(f"stamp_ns: expected nanoseconds within a year, got {first} to {last}; is the unit right?")
+    if np.any(stamp_ns[1:] <= stamp_ns[:-1]):
+        raise InputError("stamp_ns: expected strictly increasing times, got a repeated or earlier one; sort the frames")
+
+
+def check_keypoints(keypoints: np.ndarray, covariance: np.ndarray | None) -> None:
+    """Refuse keypoints (..., 2) px and covariances (..., 3) px^2 that no image has.
+
+    Raises
+    ------
+    InputError
+        When a keypoint is infinite, or a value is far too large.
+    """
+    if np.isinf(keypoints).any():
+        raise InputError("keypoints: expected finite px or NaN where not seen, got infinity; use NaN")
+    for name, unit, values, most in (
+        ("keypoints", "px", keypoints, _FARTHEST_PX),
+        ("covariance", "px^2", covariance, _FARTHEST_PX**2),
     ):
-        raise InputError("camera_matrix: expected finite values with positive focal lengths")
+        large = np.empty(0) if values is None else np.abs(values[np.isfinite(values) & (np.abs(values) > most)])
+        if large.size:
+            raise InputError(f"{name}: expected at most {most:g} {unit}, got {large.max():g}; use NaN where not seen")
+
+
+def check_camera_matrix(matrix: np.ndarray, size: tuple[int, int]) -> None:
+    """Refuse a matrix (3, 3) that is none of a camera with images of ``size`` (width, height) px.
+
+    Raises
+    ------
+    InputError
+        When it is not finite, has another last row, or focal lengths in another unit than px.
+    """
+    if not np.isfinite(matrix).all() or not np.allclose(matrix[2], (0.0, 0.0, 1.0)):
+        raise InputError("camera_matrix: expected finite values and the last row 0 0 1, got others; correct it")
+    for i, (axis, length) in enumerate(zip(("width", "height"), size, strict=True)):
+        low, high = (share * length for share in _FOCAL_SHARES)
+        if not low <= matrix[i, i] <= high:
+            raise InputError(
+                f"camera_matrix: expected focal lengths in px, between {low:g} and {high:g} for an image {axis} of"
+                f" {length}, got {matrix[i, i]:g}; multiply normalised ones by the image size"
+            )
 
 
 _REQUIRED = ("keypoints", "joints", "stamp_ns", "image_size")
@@ -169,18 +224,34 @@ def load_tracks(path: str | Path) -> Tracks:
     arrays = read_npz(path, _REQUIRED)
     try:
         size = arrays["image_size"]
-        if size.shape != (2,) or not np.isfinite(size.astype(float)).all():
-            raise InputError(f"image_size: expected (2,) width, height, got shape {size.shape}")
-        stamp = arrays["stamp_ns"]
+        if size.shape != (2,) or size.dtype.kind not in "iuf":
+            raise InputError(f"image_size: expected two numbers, width and height, got {size.dtype} {size.shape}")
+        if not np.isfinite(size).all():
+            raise InputError(f"image_size: expected positive width and height, got {size.tolist()}")
         return Tracks(
             keypoints=_as_float(arrays["keypoints"], "keypoints"),
             joints=tuple(str(name) for name in np.atleast_1d(arrays["joints"])),
-            stamp_ns=stamp.astype(np.int64) if stamp.dtype.kind in "iu" else stamp,
+            stamp_ns=as_stamps(arrays["stamp_ns"]),
             image_size=(int(size[0]), int(size[1])),
             **{name: _as_float(arrays[name], name) for name in _OPTIONAL if name in arrays},
         )
     except (InputError, ValueError) as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def as_stamps(array: np.ndarray) -> np.ndarray:
+    """int64 stamps of a file's array.
+
+    Raises
+    ------
+    InputError
+        When it holds no integers, or larger ones.
+    """
+    if array.dtype.kind not in "iu":
+        raise InputError(f"stamp_ns: expected int64 nanoseconds, got {array.dtype}")
+    if array.size and array.max() > np.iinfo(np.int64).max:
+        raise InputError(f"stamp_ns: expected int64 nanoseconds, got {array.max()}; is the unit right?")
+    return array.astype(np.int64)
 
 
 def _as_float(array: np.ndarray, name: str) -> np.ndarray:

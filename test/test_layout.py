@@ -10,8 +10,8 @@ import pytest
 
 #: Bottom to top; a room imports rooms of its own layer or below.
 LAYERS = (
-    ("errors", "parameters", "skeleton", "joint_maps", "leg_sides", "geometry", "keypoints", "observation", "tracks",
-     "motion", "mocap", "clip"),
+    ("errors", "revision", "parameters", "skeleton", "joint_maps", "leg_sides", "geometry", "keypoints", "observation",
+     "tracks", "motion", "mocap", "clip"),
     ("perception", "flight", "reconstruction", "recording", "simulation"),
     ("api", "config", "pipeline", "live_replay", "training", "evaluation", "export", "report", "view"),
     ("ros",),

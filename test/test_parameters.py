@@ -86,5 +86,10 @@ def test_missing_configuration_file_is_refused(tmp_path):
 
 
 def test_parameters_of_ros_itself_are_ignored():
-    config = parse_config({"/drocap/initializer": {"ros__parameters": {"use_sim_time": True}}}, "x")
+    config = parse_config({"/drocap/initializer": {"ros__parameters": {"use_sim_time": False}}}, "x")
     assert config == DrocapConfig()
+
+
+def test_simulated_time_in_a_configuration_file_is_refused():
+    with pytest.raises(InputError, match=r"x: initializer.use_sim_time: expected false, .*, got True; leave it out"):
+        parse_config({"/drocap/initializer": {"ros__parameters": {"use_sim_time": True}}}, "x")

@@ -6,6 +6,10 @@ from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks, load_tracks, save_tracks
 
 
+def lens(fx, fy=None):
+    return np.array([[fx, 0.0, 320.0], [0.0, fy or fx, 240.0], [0.0, 0.0, 1.0]])
+
+
 def arrays(frames=4, joints=BODY_15.joints):
     rng = np.random.default_rng(0)
     return {
@@ -52,7 +56,20 @@ def test_file_round_trip(tmp_path):
         ({"camera_rotation": np.zeros((4, 3, 3))}, "rotation matrices"),
         ({"camera_rotation": -np.tile(np.eye(3), (4, 1, 1))}, "rotation matrices"),
         ({"camera_position": np.full((4, 3), np.nan)}, "finite metres"),
-        ({"camera_matrix": np.zeros((3, 3))}, "focal"),
+        ({"camera_matrix": np.zeros((3, 3))}, "the last row 0 0 1"),
+        ({"camera_matrix": lens(0.7)}, "focal lengths in px, between 64 and 64000 for an image width of 640, got 0.7"),
+        ({"camera_matrix": lens(500.0, 0.7)}, "for an image height of 480, got 0.7"),
+        ({"camera_matrix": lens(500.0).T}, "the last row 0 0 1"),
+        ({"keypoints": np.full((4, 15, 2), 1e154)}, r"at most 1e\+09 px, got 1e\+154"),
+        ({"covariance": np.full((4, 15, 3), 1e300)}, r"covariance: expected at most 1e\+18 px\^2"),
+        ({"stamp_ns": np.arange(4, dtype=np.uint64) + np.uint64(2**63)}, "expected int64"),
+        ({"stamp_ns": np.array([-9, -1, 1, 9]) * 10**18}, "within a year"),
+        ({"image_size": np.array(["640", "480"])}, "two numbers"),
+        ({"image_size": np.array([640, 480], "datetime64[s]")}, "two numbers"),
+        ({"image_size": np.array([640, 480 + 1j])}, "two numbers"),
+        ({"image_size": np.array([True, True])}, "two numbers"),
+        ({"image_size": np.zeros(2, [("a", int)])}, "two numbers"),
+        ({"image_size": np.array([640, np.nan])}, "image_size: expected positive"),
     ],
 )
 def test_inconsistent_arrays_are_refused_in_one_line(tmp_path, change, words):
@@ -62,6 +79,12 @@ def test_inconsistent_arrays_are_refused_in_one_line(tmp_path, change, words):
         load_tracks(path)
     assert "\n" not in str(caught.value)
     assert "bad.npz" in str(caught.value)
+
+
+@pytest.mark.parametrize("focal_px", [100.0, 30_000.0], ids=["fisheye", "telephoto"])
+def test_every_real_lens_is_taken(tmp_path, focal_px):
+    np.savez(tmp_path / "t.npz", **arrays(), camera_matrix=lens(focal_px))
+    np.testing.assert_array_equal(load_tracks(tmp_path / "t.npz").camera_matrix, lens(focal_px))
 
 
 def test_invalid_files_are_refused(tmp_path):

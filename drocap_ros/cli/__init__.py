@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import logging
 import os
 import shlex
+import signal
 import sys
 from collections.abc import Sequence
 
 from drocap_ros import __version__
+from drocap_ros.cli.options import LineParser
 from drocap_ros.errors import DrocapError
 
 #: Modules under ``drocap_ros.cli``, in the order of ``drocap --help``.
@@ -21,12 +22,12 @@ COMMANDS = (
 )  # fmt: skip
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> LineParser:
     """Parser of the whole command line."""
-    parser = argparse.ArgumentParser(
+    parser = LineParser(
         prog="drocap",
         description="Human motion capture with one drone: 3D motion of a person from the video of an orbiting camera.",
-        epilog="Exit status: 0 done, 2 the input or the options cannot be used, 1 anything else.",
+        epilog="Exit status: 0 done, 2 the input or the options cannot be used, 130 interrupted, 1 anything else.",
     )
     parser.add_argument("--version", action="version", version=f"drocap {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -39,14 +40,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     logging.basicConfig(level=logging.WARNING, format="drocap: %(message)s")
     words = sys.argv[1:] if argv is None else list(argv)
-    args = build_parser().parse_args(words)
-    args.command_line = shlex.join(["drocap", *words])
     try:
-        status: int = args.run(args)
+        args = build_parser().parse_args(words)
+        args.command_line = shlex.join(["drocap", *words])
+        from drocap_ros.cli.graph.live import interruptible
+
+        with interruptible(signal.SIGTERM):
+            status: int = args.run(args)
         sys.stdout.flush()
         return status
     except DrocapError as error:
-        print(f"drocap: {error}", file=sys.stderr)
+        print(f"drocap: {_one_line(error)}", file=sys.stderr)
         return error.exit_status
     except KeyboardInterrupt:
         print("drocap: interrupted", file=sys.stderr)
@@ -58,5 +62,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         if os.environ.get("DROCAP_DEBUG"):
             raise
-        print(f"drocap: unexpected {type(error).__name__}: {error}; DROCAP_DEBUG=1 shows where", file=sys.stderr)
+        what = f"unexpected {type(error).__name__}: {_one_line(error)}"
+        print(f"drocap: {what}; DROCAP_DEBUG=1 shows where", file=sys.stderr)
         return 1
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).splitlines())  # a file's name may have a line break

@@ -9,6 +9,7 @@ from typing import Any
 
 from drocap_ros.cli import reconstruct
 from drocap_ros.cli.motion_input import HELP, read_motion
+from drocap_ros.cli.options import add_seed_option
 
 #: ``live`` needs a recording of the live graph.
 METHODS = tuple(method for method in reconstruct.METHODS if method != "live")
@@ -91,7 +92,7 @@ def _study_parser(
     if noisy:
         parser.add_argument("--noisy", action="store_true", help="10 mm noise and 5 %% gross outliers in the 2D joints")
     parser.add_argument("--limit", metavar="N", type=int, help="only the first N sequences")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the noise (default 0)")
+    add_seed_option(parser, "seed of the noise")
     parser.add_argument("--out", metavar="DIR", type=Path, help=f"also write {files} to DIR")
     parser.add_argument("--quiet", action="store_true", help="no progress, only the tables")
     return parser

@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     out = args.out or path.with_suffix("".join(f".{word}" for word in (*kind, ending)))
     if out.suffix[1:] in {form.split("-")[0] for form in FORMATS} - {ending}:
         raise InputError(f"--out {out}: expected a name that ends in .{ending}, found {out.suffix}; change it or --to")
-    with output_file(out) as file:
+    with output_file(out, inputs=[path]) as file:
         notes = export_motion(
             motion, args.to, file, names=args.names, rest=args.rest, smooth_hz=args.smooth, lock_feet=args.lock_feet
         )

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from drocap_ros.cli.atomic_output import output_file
 from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
+from drocap_ros.cli.options import ros_namespace
 from drocap_ros.cli.progress import progress_bars
 from drocap_ros.errors import InputError
 
@@ -44,7 +45,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     )
     parser.add_argument("--json", metavar="FILE", type=Path, help="write the checks with their values, for programs")
     parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
-    parser.add_argument("--namespace", default="/drocap", help="of a running graph (default /drocap)")
+    parser.add_argument(
+        "--namespace", type=ros_namespace, default="/drocap", help="of a running graph (default /drocap)"
+    )
     add_domain_option(parser)
     parser.add_argument("--quiet", action="store_true", help="print what is missing only")
     parser.set_defaults(run=run)

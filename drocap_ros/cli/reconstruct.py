@@ -80,7 +80,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Reconstruct and write the output folder."""
-    from drocap_ros.cli.atomic_output import check_output_folder, output_folder
+    from drocap_ros.cli.atomic_output import (
+        check_output_folder,
+        default_folder,
+        is_same,
+        output_folder,
+        refuse_inputs,
+    )
     from drocap_ros.cli.clip_options import clip_of
     from drocap_ros.cli.models.on_demand import ensure_networks
     from drocap_ros.cli.progress import progress_bars
@@ -94,8 +100,12 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.report.preview import save_preview
     from drocap_ros.tracks import save_tracks
 
-    out = args.out or Path(f"{args.input.name.split('.')[0] or 'drocap'}_motion")
+    out = args.out or default_folder(args.input, "motion")
     check_output_folder(out)
+    names = ["motion.npz", "tracks.npz", "preview.png", *([] if args.no_report else ["report.html"])]
+    if clip_of(args).whole and is_same(out / "tracks.npz", args.input):
+        names.remove("tracks.npz")  # they stay as they are
+    refuse_inputs([out / name for name in names], [args.input])
     config = load_config(args.config) if args.config else DrocapConfig()
     if args.dictionary:
         config = config.replace("initializer", dictionary=str(args.dictionary))
@@ -118,13 +128,14 @@ def run(args: argparse.Namespace) -> int:
     motion = dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line})
     with output_folder(out) as folder:
         save_motion(folder / "motion.npz", motion)
-        save_tracks(folder / "tracks.npz", tracks)
+        if "tracks.npz" in names:
+            save_tracks(folder / "tracks.npz", tracks)
         save_preview(folder / "preview.png", motion)
-        if not args.no_report:
+        if "report.html" in names:
             save_report(folder / "report.html", motion, video=args.input if has_images(args.input) else None)
     if not args.quiet:
         print(summary(motion, args.method))
-        print(f"written: {out}/motion.npz, tracks.npz, preview.png" + ("" if args.no_report else ", report.html"))
+        print(f"written: {out}/{', '.join(names)}")
     return 0
 
 

@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
 
     path, motion = read_motion(args.motion)
     out = args.out or path.with_name("report.html")
-    with output_file(out) as file:
+    with output_file(out, inputs=[path, args.video]) as file:
         save_report(file, motion, video=args.video, command=args.command_line)
     if not args.quiet:
         print(f"written: {out} ({out.stat().st_size / 1e6:.1f} MB)")

@@ -50,7 +50,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> int:
     """Track, or find all persons, and write the output folder."""
-    from drocap_ros.cli.atomic_output import check_output_folder, output_folder
+    from drocap_ros.cli.atomic_output import check_output_folder, default_folder, output_folder, refuse_inputs
     from drocap_ros.cli.clip_options import clip_of
     from drocap_ros.cli.models.on_demand import ensure_networks
     from drocap_ros.cli.progress import progress_bars
@@ -60,8 +60,9 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.perception.pose_estimator_config import parse_subject
     from drocap_ros.recording.open_images import open_images
 
-    out = args.out or Path(f"{Path(args.video).name.split('.')[0] or 'drocap'}_tracks")
+    out = args.out or default_folder(Path(args.video), "tracks")
     check_output_folder(out)
+    refuse_inputs([out / "persons.jpg"] if args.list else [out / "overlay.mp4"] * args.overlay, [args.video])
     clip, (person, rule) = clip_of(args), parse_subject(args.subject)
     config, ingest = _configs(args, rule)
     folder = models_folder(args.models or config.models_dir or None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,13 +17,14 @@ from drocap_ros.evaluation.metrics import (
     pa_mpjpe,
     scale_error,
     toe_error,
-    w_mpjpe,
 )
 from drocap_ros.evaluation.world_errors import WorldErrors, world_errors
 from drocap_ros.mocap import load_mocap
 from drocap_ros.motion import Motion, load_motion, motion_file
 from drocap_ros.skeleton import BODY_15, BODY_17, LIMB_JOINTS, in_body_order, indices
 from drocap_ros.tracks import kind_of, read_npz, wrong_kind
+
+logger = logging.getLogger(__name__)
 
 _LIMBS = indices(BODY_15.joints, LIMB_JOINTS)
 
@@ -95,6 +97,7 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
     known[_LIMBS] = True
     at = motion.stamp_ns * 1e-9
     if at[-1] < time_s[0] or at[0] > time_s[-1]:
+        logger.warning("the times of motion and truth do not overlap: both are compared from their first frame on")
         at, time_s = at - at[0], time_s - time_s[0]
     usable = (at >= time_s[0] - 1e-6) & (at <= time_s[-1] + 1e-6) & np.isfinite(estimate[:, known]).all(axis=(1, 2))
     if not usable.any():
@@ -107,19 +110,20 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
         raise InputError("evaluate compare: expected a truth of finite joints, got NaN or infinity; fill the gaps in")
     world = motion.frame == "world" and frame == "world"
     covariance = None
-    if motion.covariance is not None:
+    if motion.covariance is not None and motion.meta.get("covariance_about") != "pelvis":
         covariance = in_body_order(motion.covariance, motion.joints, LIMB_JOINTS)[usable]
+    errors_in_world = world_errors(estimate, true, _rate(at[usable]), covariance) if world else None
     return MotionErrors(
         frames=len(estimate),
         error_mm=1000.0 * float(pa_mpjpe(estimate, true).mean()),
         per_group_mm={name: 1000.0 * value for name, value in group_errors(estimate, true).items()},
-        w_error_mm=1000.0 * float(w_mpjpe(estimate, true).mean()) if world else float("nan"),
+        w_error_mm=float("nan") if errors_in_world is None else errors_in_world.w_mm,
         horizon_deg=float(np.degrees(horizon_error(estimate, true)).mean()) if world else float("nan"),
         mirrored=is_mirrored(estimate, true),
         mirrored_share=float(mirrored_frames(estimate, true).mean()),
         scale_error=scale_error(estimate, true),
         metric=motion.metric,
-        world=world_errors(estimate, true, _rate(at[usable]), covariance) if world else None,
+        world=errors_in_world,
         toe_mm=1000.0 * toe_error(estimate, true),
     )
 

@@ -40,13 +40,13 @@ def pa_mpjpe(estimate: np.ndarray, truth: np.ndarray, joints: tuple[str, ...] = 
 
 
 def w_mpjpe(estimate: np.ndarray, truth: np.ndarray, segment: int = 100) -> np.ndarray:
-    """W-MPJPE (F,) of poses in world frames.
+    """W-MPJPE (F,) of poses (F, P, 3) in world frames, over all given joints.
 
     One rigid alignment per segment of 100 frames, on the segment's first two frames, without scale.
     """
     out = np.empty(len(truth))
     for first in range(0, len(truth), segment):
-        est, tru = estimate[first : first + segment, _LIMBS], truth[first : first + segment, _LIMBS]
+        est, tru = estimate[first : first + segment], truth[first : first + segment]
         fit = similarity(est[:2].reshape(-1, 3), tru[:2].reshape(-1, 3), with_scale=False)
         moved = apply_similarity(est.reshape(-1, 3), *fit).reshape(est.shape)
         out[first : first + segment] = np.linalg.norm(moved - tru, axis=-1).mean(-1)

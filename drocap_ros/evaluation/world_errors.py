@@ -25,8 +25,8 @@ class WorldErrors:
     root_percent : RTE, percent of the true path
     scale : estimated over true mean limb length, less 1
     foot_m_s, foot_mm : speed of the ankles where the true ones are still, and their step between two frames
-    acceleration_ratio : mean acceleration over the truth's
-    coverage : share of the joints within their own 90 % ellipsoids; NaN = the motion has no covariance
+    acceleration_ratio : mean acceleration over the truth's; NaN = the truth does not move
+    coverage : share of the joints within their own 90 % ellipsoids; NaN = the motion has none, or one about the pelvis
     """
 
     pa_mm: float
@@ -63,7 +63,7 @@ def world_errors(
     return WorldErrors(
         pa_mm=1000 * float(pa_mpjpe(estimate, truth).mean()),
         mpjpe_mm=1000 * float(world_metrics.mpjpe(est, tru).mean()),
-        w_mm=1000 * float(w_mpjpe(estimate, truth).mean()),
+        w_mm=1000 * float(w_mpjpe(est, tru).mean()),
         wa_mm=1000 * float(world_metrics.wa_mpjpe(est, tru).mean()),
         absolute_mm=1000 * float(np.linalg.norm(est - tru, axis=-1).mean()),
         root_percent=100 * world_metrics.root_error(estimate, truth) if moving else nan,
@@ -86,6 +86,6 @@ def world_cells(e: WorldErrors) -> list[str]:
         f"{e.pa_mm:.1f}", f"{e.mpjpe_mm:.1f}", f"{e.w_mm:.0f}", f"{e.wa_mm:.0f}", f"{e.absolute_mm:.0f}",
         f"{e.root_percent:.1f}", f"{100 * e.scale:+.1f}", f"{e.horizon_deg:.1f}",
         "-" if np.isnan(e.foot_m_s) else f"{e.foot_m_s:.2f} ({e.foot_mm:.1f})", f"{e.penetration_mm:.0f}",
-        f"{e.acceleration_ratio:.2f}", f"{e.acceleration_error_m_s2:.1f}",
+        "-" if np.isnan(e.acceleration_ratio) else f"{e.acceleration_ratio:.2f}", f"{e.acceleration_error_m_s2:.1f}",
         "-" if np.isnan(e.coverage) else f"{e.coverage:.0%}",
     ]  # fmt: skip

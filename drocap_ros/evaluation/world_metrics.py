@@ -14,6 +14,8 @@ from drocap_ros.skeleton import BODY_15, indices
 FEET = indices(BODY_15.joints, ("rankle", "lankle"))
 #: Speed (m/s) below which a true foot counts as still.
 STILL_M_S = 0.1
+#: Mean acceleration (m/s^2) below which a truth is motionless: a person who stands has tenths.
+MOTIONLESS_M_S2 = 1e-3
 #: Squared radius of the ellipsoid that holds 90 % of a normal distribution in three dimensions (chi-squared).
 ELLIPSOID_90 = 6.2514
 _PELVIS = BODY_15.index("pelvis")
@@ -62,9 +64,9 @@ def accelerations(joints: np.ndarray, fps: float) -> np.ndarray:
 
 
 def acceleration_ratio(estimate: np.ndarray, truth: np.ndarray, fps: float) -> float:
-    """Mean acceleration of the estimated joints over that of the true ones."""
-    est, tru = (np.linalg.norm(accelerations(x, fps), axis=-1).mean() for x in (estimate, truth))
-    return float(est / max(float(tru), 1e-9))
+    """Mean acceleration of the estimated joints over that of the true ones; NaN = the truth does not move."""
+    est, tru = (float(np.linalg.norm(accelerations(x, fps), axis=-1).mean()) for x in (estimate, truth))
+    return est / tru if tru > MOTIONLESS_M_S2 else float("nan")
 
 
 def acceleration_error(estimate: np.ndarray, truth: np.ndarray, fps: float) -> float:

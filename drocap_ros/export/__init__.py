@@ -25,6 +25,8 @@ FORMATS = {
 }
 #: Formats with an animation skeleton: names of its joints and its rest pose can be chosen.
 RIGGED = ("bvh", "glb")
+#: Formats of measured positions; the others need a pose in each frame.
+MEASURED = ("c3d", "trc", "csv")
 
 
 def export_motion(
@@ -49,7 +51,8 @@ def export_motion(
 
     Returns
     -------
-    Notes on changes, as sentences: resampling, interpolation, cleaning, constant bones, floor, unknown vertical.
+    Notes on changes, as sentences: frames without the person, resampling, interpolation, cleaning, constant bones,
+    floor, unknown vertical.
 
     Raises
     ------
@@ -80,7 +83,7 @@ def export_motion(
     chosen = {name: value for name, value in (("names", names), ("rest", rest)) if value is not None}
     if chosen and form not in RIGGED:
         raise InputError(f"{', '.join(chosen)}: expected with format {' or '.join(RIGGED)}, got {form}; leave it out")
-    clip = clip_of(motion)
+    clip = clip_of(motion, measured=form in MEASURED)
     if smooth_hz is not None:
         clip = cleaning.smooth(clip, smooth_hz)
     if lock_feet:

@@ -103,9 +103,11 @@ def _rests(ankle: np.ndarray, rate_hz: float) -> list[tuple[int, int]]:
     """First and end frame of each time in which an ankle (F, 3) rests."""
     velocity = np.gradient(ankle, axis=0) * rate_hz
     width = min(max(round(_AVERAGE_S * rate_hz), 1), len(ankle))
-    speed = np.linalg.norm(uniform_filter1d(velocity, width, axis=0, mode="nearest"), axis=1)
-    # Unknown is NaN, which the average spreads: it compares as moving.
-    still = np.nan_to_num(speed, nan=np.inf) < _STILL_M_S
+    known = np.isfinite(velocity).all(axis=1)
+    # The running average would carry NaN on to the end.
+    average = uniform_filter1d(np.where(known[:, None], velocity, 0.0), width, axis=0, mode="nearest")
+    whole = uniform_filter1d(known.astype(np.float64), width, mode="nearest") > 1.0 - 1e-6
+    still = whole & (np.linalg.norm(average, axis=1) < _STILL_M_S)
     return [(int(a), int(b)) for a, b in true_runs(still) if b - a >= max(_SHORTEST_S * rate_hz, 2)]
 
 

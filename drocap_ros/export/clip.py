@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.motion import Motion, upright_joints
 from drocap_ros.tracks import MAX_FRAMES
 
@@ -19,7 +20,7 @@ _SAME_FRAME = 1e-3
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,60}")
 #: glTF skins store a joint in one byte; C3D readers accept no more either.
 _MAX_JOINTS = 255
-#: Resampling leaves a gap between two frames further apart than this.
+#: Between two frames, or two sights of the person, further apart than this positions are unknown.
 LONGEST_BRIDGE_S = 0.5
 
 
@@ -42,8 +43,8 @@ class Clip:
     notes: tuple[str, ...] = ()
 
 
-def clip_of(motion: Motion) -> Clip:
-    """Z-up clip of a motion.
+def clip_of(motion: Motion, *, measured: bool = False) -> Clip:
+    """Z-up clip of a motion; with ``measured`` the positions of :func:`unseen_frames` are unknown.
 
     Frame "world" keeps its axes (x east, y north, z up).  Frame "camera" (x right, y down, z forward) becomes
     x right, y away from the camera, z up: its vertical is the camera's, not gravity's.
@@ -70,7 +71,27 @@ def clip_of(motion: Motion) -> Clip:
         notes.append("upright as the camera saw it: its vertical is the camera's, not gravity's")
     if not motion.metric:
         notes.append(f"scale from {motion.scale_source}, not measured")
-    return Clip(upright_joints(motion), motion.joints, motion.parents, times, 1.0 / step, notes=tuple(notes))
+    positions, unseen = upright_joints(motion), unseen_frames(motion)
+    if unseen.any():
+        poses = "unknown" if measured else "interpolated, not measured"
+        notes.append(f"{np.count_nonzero(unseen)} frames without the person: their poses are {poses}")
+    if measured:
+        positions = np.where(unseen[:, None, None], np.nan, positions)
+    return Clip(positions, motion.joints, motion.parents, times, 1.0 / step, notes=tuple(notes))
+
+
+def unseen_frames(motion: Motion) -> np.ndarray:
+    """(F,) bool, frames of each time longer than ``LONGEST_BRIDGE_S`` in which no joint has a confidence.
+
+    A motion without any confidence has none.
+    """
+    seen = np.asarray((motion.confidence > 0.0).any(axis=1))
+    unseen = np.zeros(len(seen), bool)
+    if seen.any():
+        for first, end in true_runs(~seen):
+            span_ns = motion.stamp_ns[min(end, len(seen) - 1)] - motion.stamp_ns[max(first - 1, 0)]
+            unseen[first:end] = span_ns > 1e9 * LONGEST_BRIDGE_S
+    return unseen
 
 
 def y_up(clip: Clip) -> Clip:

@@ -10,6 +10,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+from drocap_ros.tracks import check_camera_matrix
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,10 @@ def load_calibration(path: Path) -> CameraModel:
             f"{path}: expected image_width, image_height, camera_matrix as camera_calibration writes them;"
             f" found a problem with {str(error).splitlines()[0] or type(error).__name__}"
         ) from None
-    if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0 and min(model.width, model.height) > 0):
-        raise InputError(f"{path}: expected positive focal lengths and image size, found others")
+    if min(model.width, model.height) < 1:
+        raise InputError(f"{path}: expected a positive image size, found {model.width}x{model.height}; correct it")
+    try:
+        check_camera_matrix(matrix, (model.width, model.height))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     return model

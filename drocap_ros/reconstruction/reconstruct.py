@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import subprocess
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,6 +27,7 @@ from drocap_ros.reconstruction.world.in_world import in_camera_axes, in_world
 from drocap_ros.reconstruction.world.placement import metres_per_px
 from drocap_ros.reconstruction.world.refine import refinable
 from drocap_ros.reconstruction.world.world_model import WorldConfig, world_config
+from drocap_ros.revision import git_revision
 from drocap_ros.skeleton import BODY_15, BODY_17, BODY_19, JointSet, body_set
 from drocap_ros.tracks import Tracks
 
@@ -91,6 +90,8 @@ def reconstruct(
     )
     with blas_threads(adjuster.threads):
         result = run_method(method, data)
+    if not np.isfinite(result.joints_px).all(axis=(1, 2)).any():
+        raise InputError("keypoints: expected those of a person, got none that give a finite pose; check the values")
     motion = _to_motion(tracks, joints, keypoints, result, initializer, world_config(adjuster))
     if isinstance(motion, str):
         # The lifter saw the camera's rotation: without it the poses differ too.
@@ -195,9 +196,10 @@ def _to_motion(
             scale_source = "telemetry" if metric else "assumed_height"
             covariance = found.covariance
             reprojection = _reprojection(joints, rotation, position, tracks.camera_matrix, keypoints.xy)
-            meta["calibration"] = found.calibration
+            meta["calibration"], meta["covariance_about"] = found.calibration, "origin"
     if covariance is None and result.sigma_px is not None:
         covariance = _covariance(result.sigma_px * per_px[:, None, None], rotation)
+        meta["covariance_about"] = "pelvis"
     return Motion(
         joints3d=np.ascontiguousarray(joints),
         joints=body.joints,
@@ -246,17 +248,3 @@ def _versions() -> dict[str, str]:
     import platform
 
     return {"drocap_ros": __version__, "numpy": np.__version__, "python": platform.python_version()}
-
-
-def git_revision() -> str | None:
-    """Revision of the source tree this package runs from, or None outside a repository."""
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():
-        return None
-    try:
-        done = subprocess.run(
-            ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5, check=True
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip()

@@ -13,6 +13,7 @@ from drocap_ros.perception.sources import Frame, open_source
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.recording.image_messages import read_images
 from drocap_ros.recording.open_session import is_recording, open_session
+from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE
 from drocap_ros.recording.telemetry.read import LOG_SUFFIXES
 
 logger = logging.getLogger(__name__)
@@ -49,6 +50,7 @@ def open_images(source: str | Path, config: ImageIngestConfig | None = None) -> 
         refuse_other_inputs(path)
     if path.exists() and is_recording(path):
         with open_session(path) as session:
+            session.choose_topic(IMAGE, COMPRESSED_IMAGE)  # read_images refuses only when it begins
             yield Images(read_images(session), None, session.info.duration_s)
             for warning in session.warnings:
                 logger.warning("%s: %s", path, warning)

@@ -13,6 +13,7 @@ from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.live.camera_history import CameraHistory
 from drocap_ros.recording.session import header_stamp_ns
 from drocap_ros.skeleton import joint_set
+from drocap_ros.tracks import check_camera_matrix, check_keypoints
 
 if TYPE_CHECKING:
     from drocap_ros.recording.session import Session
@@ -34,7 +35,9 @@ def observation_from_message(message: Any) -> PoseObservation:
         raise InputError(f"stamp: expected a time after 1970, got {stamp_ns} ns; set the sender's clock")
     if message.image_width < 1 or message.image_height < 1:
         raise InputError(f"image size: expected at least 1x1 px, got {message.image_width}x{message.image_height}")
+    keypoints = float_array(message.keypoints, (count, 2), "keypoints")
     covariance = float_array(message.covariance, (count, 3), "covariance")
+    check_keypoints(keypoints, covariance)
     confidence = float_array(message.confidence, (count,), "confidence")
     if (covariance[:, [0, 2]] < 0).any():
         raise InputError(f"covariance: expected variances xx, yy of at least 0 px^2, got {np.nanmin(covariance):g}")
@@ -47,7 +50,7 @@ def observation_from_message(message: Any) -> PoseObservation:
         image_size=(message.image_width, message.image_height),
         roi=np.array(message.roi, np.float32),
         detection_score=message.detection_score,
-        keypoints=float_array(message.keypoints, (count, 2), "keypoints"),
+        keypoints=keypoints,
         covariance=covariance,
         confidence=confidence,
     )
@@ -61,10 +64,18 @@ def add_state(history: CameraHistory, message: Any) -> None:
 
 
 def add_calibration(history: CameraHistory, message: Any) -> None:
-    """Give a camera's history a ``CameraInfo``; an uncalibrated one changes nothing."""
+    """Give a camera's history a ``CameraInfo``; an uncalibrated one changes nothing.
+
+    Raises
+    ------
+    InputError
+        When the calibration is not one in px.
+    """
     # ROS 2 names the matrix k, ROS 1 names it K.
     matrix = np.asarray(getattr(message, "k", getattr(message, "K", ())), np.float64)
     if matrix.size == 9:
+        if matrix[0] > 0 and min(message.width, message.height) > 0:
+            check_camera_matrix(matrix.reshape(3, 3), (message.width, message.height))
         history.add_matrix(header_stamp_ns(message), matrix.reshape(3, 3))
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-import subprocess
 from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 from drocap_ros import __version__
+from drocap_ros.revision import git_revision
 
 #: Keys of a session's metadata.
 CONFIGURATION, MODELS, CALIBRATION = "configuration", "models", "calibration"
@@ -22,7 +22,7 @@ _BLOCK = 1 << 20
 def session_provenance(namespace: str = "") -> dict[str, str]:
     """First metadata of a session: versions (JSON), git revision and namespace of the graph."""
     values = {"versions": json.dumps(_versions(), sort_keys=True)}
-    revision = _git_revision()
+    revision = git_revision()
     if revision:
         values["git_revision"] = revision
     if namespace:
@@ -63,19 +63,3 @@ def _versions() -> dict[str, str]:
     ours = {"drocap_ros": __version__, "python": platform.python_version(), "machine": platform.machine()}
     there = {d.metadata["Name"]: d.version for d in distributions() if d.metadata["Name"] in _PACKAGES}
     return {**ours, **there}
-
-
-def _git_revision() -> str:
-    """Revision of the running source tree, with ``+`` after changes; empty outside a repository."""
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():
-        return ""
-
-    def git(*words: str) -> str:
-        done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, timeout=5, check=True)
-        return done.stdout.strip()
-
-    try:
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
-    except (OSError, subprocess.SubprocessError):
-        return ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import re
 from collections import defaultdict, deque
@@ -12,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from drocap_ros.errors import InputError
 from drocap_ros.reconstruction.live.camera_history import CameraHistory, WindowCamera
 from drocap_ros.reconstruction.live.effort import Effort
 from drocap_ros.reconstruction.live.replay import LiveWindow
@@ -54,7 +56,8 @@ class RecordedCamera:
         self._states = _messages(session, VEHICLE_STATE, f"{base}/vehicle/state")
         self._next = next(self._states, None)
         for message in _messages(session, CAMERA_INFO, f"{base}/camera_info"):
-            add_calibration(self._history, message)
+            with contextlib.suppress(InputError):  # the live graph refused it too
+                add_calibration(self._history, message)
         self.matrix: np.ndarray | None = None
 
     def along(self, stamp_ns: np.ndarray, newest_ns: int) -> WindowCamera | None:

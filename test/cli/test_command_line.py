@@ -5,6 +5,8 @@ import sys
 
 import pytest
 
+from drocap_ros.cli import COMMANDS, main
+
 HEAVY = ("numpy", "scipy", "cv2", "rclpy", "onnxruntime", "matplotlib", "torch")
 
 
@@ -15,9 +17,53 @@ def test_help_imports_no_heavy_library():
 
 
 def test_help_lists_every_command(capsys):
-    from drocap_ros.cli import COMMANDS, main
-
     with pytest.raises(SystemExit) as done:
         main(["--help"])
     assert done.value.code == 0
     assert len([line for line in capsys.readouterr().out.splitlines() if line.startswith("    ")]) >= len(COMMANDS)
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ("nothing", "argument COMMAND: invalid choice: 'nothing'"),
+        ("export m.npz", "the following arguments are required: --to; see drocap export --help"),
+        ("export m.npz --to xyz", "invalid choice: 'xyz'"),
+        ("track a.mp4 --wrong", "unrecognized arguments: --wrong; see drocap track --help"),
+        ("batch a --out b --jobs two", "--jobs: invalid int value: 'two'; see drocap batch --help"),
+        ("evaluate world m --wrong", "unrecognized arguments: --wrong; see drocap evaluate world --help"),
+        ("evaluate world m --seed -1", "--seed: expected an integer from 0 to 4294967295, got -1"),
+        ("evaluate rotation m --noisy --seed -1", "--seed: expected an integer"),
+        ("evaluate live m --noisy --seed 0.5", "--seed: expected an integer"),
+        ("train-lifter m --out a.onnx --seed 4294967296", "--seed: expected an integer"),
+        ("train-simulation-models --out a --seed -1", "--seed: expected an integer"),
+        ("learn-dictionary m --out a.npz --seed -1", "--seed: expected an integer"),
+        ("demo --seed -1", "--seed: expected an integer"),
+    ],
+)
+def test_wrong_option_gives_one_line(words, line, capsys):
+    assert main(words.split()) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith("drocap: ")
+    assert line in said
+
+
+@pytest.mark.parametrize(
+    ("words", "after"),
+    [
+        (["info", ""], "drocap info"),
+        (["reconstruct", "a.npz", "--out", ""], "--out"),
+        (["export", "m.npz", "--to", "bvh", "--out="], "--out="),
+    ],
+)
+def test_empty_word_is_no_path(words, after, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"expected a value after {after}, got an empty one" in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_name_with_a_line_break_gives_one_line(tmp_path, capsys):
+    assert main(["info", str(tmp_path / "a\nb.npz")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1

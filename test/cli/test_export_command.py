@@ -45,6 +45,23 @@ def test_out_names_the_file_and_replaces_it(folder, capsys):
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.parametrize("form", READERS)
+def test_times_without_the_person_are_no_measurements(walker, folder, capsys, form):
+    confidence = np.ones_like(walker.confidence)
+    for unseen in (slice(0, 14), slice(20, 24), slice(34, 48)):  # at 24 Hz; the one in the middle is short
+        confidence[unseen] = 0.0
+    save_motion(folder / "motion.npz", dataclasses.replace(walker, confidence=confidence))
+    assert main(["export", str(folder), "--to", form]) == 0
+    assert "28 frames without the person: their poses are" in capsys.readouterr().out
+    unknown = np.isnan(READERS[form](folder / f"motion.{form}").positions).all(axis=(1, 2))
+    expected = [] if form in RIGGED else [*range(14), *range(34, 48)]
+    assert np.flatnonzero(unknown).tolist() == expected
+    save_motion(folder / "motion.npz", dataclasses.replace(walker, confidence=0.0 * confidence))
+    assert main(["export", str(folder), "--to", form]) == 0
+    assert "without the person" not in capsys.readouterr().out
+    assert np.isfinite(READERS[form](folder / f"motion.{form}").positions).all()
+
+
 def test_other_files_are_refused(folder, capsys):
     (folder / "text.npz").write_text("no archive")
     np.savez(folder / "other.npz", a=np.zeros(3))
@@ -79,7 +96,7 @@ def test_motions_without_content_are_refused(walker, folder, capsys, form):
         ({"joints": np.array(["pelvis"] * 15)}, "distinct"),
         ({"joints": np.array([f"joint {i}" for i in range(15)])}, "letters, digits"),
         ({"stamp_ns": np.zeros(48, np.int64)}, "strictly increasing"),
-        ({"stamp_ns": np.linspace(0, 1, 48)}, "integer nanoseconds"),
+        ({"stamp_ns": np.linspace(0, 1, 48)}, "int64 nanoseconds"),
         ({"stamp_ns": np.arange(47)}, "stamp_ns"),
         ({"joints3d": np.full((48, 15, 3), 1e30)}, "is the unit right"),
         ({"joints3d": np.full((48, 15, 3), np.inf)}, "infinity"),

@@ -11,6 +11,7 @@ from telemetry_logs import dji_subtitle, srt_text
 
 from drocap_ros.cli import main
 from drocap_ros.motion import load_motion, save_motion
+from drocap_ros.recording.mcap.writer import SessionWriter
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15, COCO_17, LIMB_JOINTS
 from drocap_ros.tracks import Tracks, load_tracks, save_tracks
@@ -223,6 +224,15 @@ def test_without_networks_one_line_names_the_ways_to_get_them(crowd, tmp_path, c
     monkeypatch.setattr("sys.stdin.readline", lambda: "\n")
     assert run("reconstruct", crowd, "--out", tmp_path / "out") == 2
     assert "Download rtmdet-nano and rtmpose-s" in capsys.readouterr().err
+
+
+def test_nothing_is_fetched_for_a_recording_without_images(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("DROCAP_MODELS", str(tmp_path / "models"))
+    monkeypatch.setattr("drocap_ros.perception.models.fetch.fetch", lambda *_, **__: pytest.fail("it downloads"))
+    SessionWriter(tmp_path / "session").close()
+    line = refused(capsys, "reconstruct", tmp_path / "session", "--fetch", "--out", tmp_path / "out")
+    assert "expected a topic of type sensor_msgs/msg/Image or" in line
+    assert "found no topics" in line
 
 
 def test_fetch_downloads_into_the_named_folder(crowd, tmp_path, monkeypatch):

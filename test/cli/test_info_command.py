@@ -3,8 +3,9 @@ import re
 
 import numpy as np
 import pytest
+from refusals import refused
 
-from drocap_ros.cli import info
+from drocap_ros.cli import info, main
 from drocap_ros.errors import InputError
 from drocap_ros.motion import Motion, save_motion
 from drocap_ros.skeleton import BODY_15
@@ -70,6 +71,30 @@ def test_info_of_tracks_and_motion_lists_arrays_and_rates(tmp_path, capture, cap
     assert "scale: assumed (assumed_height)" in out
     assert re.search(r"median flexion: knees \d+ and \d+, hips \d+ and \d+, elbows \d+ and \d+ degrees", out)
     assert "method: ba" in out
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"metric": np.array([True, False])}, "metric: expected one truth value"),
+        ({"metric": np.array("no")}, "metric: expected one truth value"),
+        ({"stamp_ns": np.array([-9, 9]) * 10**18}, "within a year"),
+        ({"stamp_ns": np.array([1, 2], np.uint64) + np.uint64(2**63)}, "expected int64"),
+        ({"stamp_ns": np.array([0.0, 1.0])}, "expected int64"),
+        ({"stamp_ns": np.array([5, 5])}, "strictly increasing"),
+    ],
+)
+def test_a_motion_of_impossible_values_is_refused(tmp_path, capsys, change, words):
+    arrays = {
+        "joints3d": np.zeros((2, 15, 3)), "joints": BODY_15.joints, "parents": BODY_15.parents, "frame": "camera",
+        "stamp_ns": np.arange(2), "metric": False, "scale_source": "", "camera_rotation": np.zeros((2, 3, 3)),
+        "confidence": np.ones((2, 15)), "keypoints": np.ones((2, 15, 2)), "reprojection_px": np.ones((2, 15)),
+        "meta": "{}",
+    }  # fmt: skip
+    np.savez(tmp_path / "motion.npz", **arrays)
+    assert main(["info", str(tmp_path / "motion.npz")]) == 0
+    np.savez(tmp_path / "motion.npz", **{**arrays, **change})
+    refused(["info", tmp_path / "motion.npz"], tmp_path, capsys, words)
 
 
 def test_files_of_unknown_kinds_are_refused_in_one_line(tmp_path):

@@ -1,12 +1,15 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rendered_person import rendered_images
 
 from drocap_ros.cli import main
 from drocap_ros.tracks import load_tracks
@@ -87,3 +90,21 @@ def test_fetch_without_a_network_ends_with_status_1(tmp_path):
     assert done.returncode == 1
     assert "check the network or proxy" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_terminated_command_leaves_nothing(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    (tmp_path / "images").mkdir()
+    images = rendered_images(8)
+    for number in range(200):
+        cv2.imwrite(str(tmp_path / "images" / f"{number:03}.jpg"), images[number % 8])
+    words = ["track", tmp_path / "images", "--models", "simulation", "--overlay", "--out", tmp_path / "out"]
+    process = subprocess.Popen([sys.executable, "-m", "drocap_ros.cli", *map(str, words)], stderr=subprocess.PIPE)
+    end = time.monotonic() + 60
+    while not list(tmp_path.glob(".out.*/overlay.mp4")) and time.monotonic() < end:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    said = process.communicate(timeout=60)[1].decode()
+    assert process.returncode == 130
+    assert said.endswith("drocap: interrupted\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["images"]

@@ -87,6 +87,17 @@ def test_truth_at_another_rate_is_interpolated():
     assert errors.error_mm < 1e-6
 
 
+def test_compare_says_that_times_do_not_overlap(tmp_path, caplog):
+    x = stick(30)
+    save_mocap(tmp_path / "truth.npz", x)
+    later = motion(x)
+    words = ["evaluate", "compare", str(tmp_path / "motion.npz"), str(tmp_path / "truth.npz")]
+    for shift_ns, said in ((0, 0), (10**18, 1)):
+        save_motion(tmp_path / "motion.npz", replace(later, stamp_ns=later.stamp_ns + shift_ns))
+        assert main(words) == 0
+        assert caplog.text.count("do not overlap") == said
+
+
 def test_compare_refuses_unusable_truth_or_motion(tmp_path):
     x = stick(10)
     with pytest.raises(InputError, match="finite"):

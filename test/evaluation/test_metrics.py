@@ -43,6 +43,9 @@ def test_world_error_aligns_on_the_first_two_frames(walk: Walk) -> None:
     np.testing.assert_allclose(metrics.w_mpjpe(truth @ turn.T + 77.0, truth), 0.0, atol=1e-8)
     drift = truth + np.arange(120.0)[:, None, None] * np.array([10.0, 0.0, 0.0])
     error = metrics.w_mpjpe(drift, truth)
+    other = truth.copy()
+    other[2:, BODY_15.index("head")] += 150.0 / np.sqrt(3)
+    np.testing.assert_allclose(metrics.w_mpjpe(other, truth)[2:100], 10.0)  # a joint of fifteen
     np.testing.assert_allclose(error[99], 985.0, atol=20.0)
     assert error[100] < 20.0  # every segment has its own alignment
 

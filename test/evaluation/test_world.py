@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +12,14 @@ from walking import Walk, make_walk, write_mocap
 
 from drocap_ros.cli import main
 from drocap_ros.evaluation import world_metrics
+from drocap_ros.evaluation.compare import compare
 from drocap_ros.evaluation.world import world_study
-from drocap_ros.evaluation.world_errors import world_errors
+from drocap_ros.evaluation.world_errors import WORLD_HEAD, world_cells, world_errors
 from drocap_ros.evaluation.world_protocol import FOCAL_PX, FPS, IMAGE_SIZE, TELEMETRY, world_view
 from drocap_ros.mocap import Sequence
+from drocap_ros.reconstruction.reconstruct import reconstruct
+from drocap_ros.simulation.simulated_person import simulate_person
+from drocap_ros.skeleton import BODY_15
 
 
 def in_world(walk: Walk) -> np.ndarray:
@@ -119,8 +123,26 @@ def test_command_prints_and_writes_every_measure(tmp_path: Path, capsys: pytest.
     assert 0 < float(line["w_mm"]) < 1500
     assert main([*words, "--every", "0"]) == 2
     assert main(["evaluate", "world", str(tmp_path / "absent")]) == 2
-    with pytest.raises(SystemExit):
-        main([*words, "--telemetry", "perfect"])
+    assert main([*words, "--telemetry", "perfect"]) == 2
+
+
+def test_acceleration_over_that_of_a_truth_that_does_not_move_is_unknown(walk: Walk) -> None:
+    moving = in_world(walk)
+    errors = world_errors(moving, np.repeat(moving[:1], len(moving), axis=0), FPS)
+    assert np.isnan(errors.acceleration_ratio)
+    assert world_cells(errors)[WORLD_HEAD.index("acceleration ratio")] == "-"
+
+
+def test_ellipsoids_about_the_pelvis_are_not_compared_with_places_in_the_world() -> None:
+    view = world_view(Sequence("walk", 1000.0 * simulate_person(np.arange(120) / FPS, "walk", 1, 1.75, BODY_15)))
+    time_s = np.arange(len(view.truth)) / FPS
+    for position, about in ((view.tracks.camera_position, "origin"), (None, "pelvis")):
+        motion = reconstruct(replace(view.tracks, camera_position=position))
+        assert motion.covariance is not None
+        assert motion.meta["covariance_about"] == about
+        errors = compare(motion, view.truth, time_s, "world").world
+        assert errors is not None
+        assert np.isnan(errors.coverage) == (about == "pelvis")
 
 
 def test_study_is_the_same_every_time(tmp_path: Path) -> None:

@@ -77,6 +77,16 @@ def test_locked_feet_keep_their_place_and_the_bones_their_lengths(walker):
     assert "mm" in out.notes[-1]
 
 
+def test_feet_are_locked_after_a_time_without_the_person_too(walker):
+    clip = clip_of(walker)
+    wander = np.cumsum(np.random.default_rng(4).normal(0, 0.004, (len(clip.positions), 1, 3)), axis=0)
+    whole = dataclasses.replace(clip, positions=clip.positions + wander)
+    positions = whole.positions.copy()
+    positions[:3] = np.nan
+    late = lock_feet(dataclasses.replace(whole, positions=positions)).positions
+    np.testing.assert_allclose(late[-20:], lock_feet(whole).positions[-20:], atol=1e-9)
+
+
 def test_knee_of_an_almost_straight_leg_does_not_jump(walker):
     """A leg bent by 5 degrees whose ankle wanders along it: a knee that followed fully would move ten times as far."""
     clip = clip_of(walker)

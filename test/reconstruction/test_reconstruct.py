@@ -17,6 +17,8 @@ from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.motion import Motion, load_motion, save_motion
 from drocap_ros.reconstruction.methods import METHODS
+from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput
+from drocap_ros.reconstruction.methods.run import run_method
 from drocap_ros.reconstruction.methods.windows import windows
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
@@ -71,6 +73,16 @@ def test_equal_input_gives_equal_bits(walk: Walk, paper: Motion, tmp_path: Path)
                 np.asarray(getattr(load_motion(tmp_path / "motion.npz"), field.name)),
                 np.asarray(getattr(paper, field.name)),
             )
+
+
+def test_method_without_a_finite_pose_is_an_error(walk: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lost(name: str, data: MethodInput) -> CameraPoses:
+        found = run_method(name, data)
+        return dataclasses.replace(found, joints_px=np.full_like(found.joints_px, np.nan))
+
+    monkeypatch.setattr("drocap_ros.reconstruction.reconstruct.run_method", lost)
+    with pytest.raises(InputError, match="none that give a finite pose"):
+        reconstruct(walk.tracks(), method="initial")
 
 
 def test_result_is_independent_of_the_joint_order(walk: Walk, paper: Motion) -> None:

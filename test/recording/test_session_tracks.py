@@ -1,10 +1,15 @@
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from angles import angle_between
 from recorded import NAMES, START_NS, record, write_poses
 
 from drocap_ros.errors import InputError
+from drocap_ros.reconstruction.live.camera_history import CameraHistory
 from drocap_ros.recording.open_session import open_session
+from drocap_ros.recording.pose_messages import add_calibration
 from drocap_ros.recording.session_tracks import read_pose2d
 from drocap_ros.simulation.vehicle.flight_path import SampledPath
 
@@ -76,6 +81,31 @@ def test_camera_pose_at_each_image(tmp_path, messages, capture):
     assert np.rad2deg(angle_between(tracks.camera_rotation, capture.camera_rotation))[:-1].max() < 0.01
     assert np.linalg.norm(tracks.camera_position - capture.camera_position, axis=1)[:-1].max() < 0.001
     assert np.array_equal(tracks.camera_matrix, capture.tracks.camera_matrix)
+
+
+def test_calibration_in_another_unit_is_refused(tmp_path, messages, capture):
+    entries = flight_entries(messages, capture)
+    (i,) = (i for i, entry in enumerate(entries) if entry[0] == "/drocap/camera_info")
+    topic, info, log, _ = entries[i]
+    info.k = info.k / np.array([*6 * [capture.tracks.image_size[0]], 1.0, 1.0, 1.0])
+    entries[i] = (topic, info, log, messages.cdr(info))
+    record(tmp_path / "s", entries)
+    with (
+        open_session(tmp_path / "s") as session,
+        pytest.raises(InputError, match="camera_matrix: expected focal lengths in px") as refused,
+    ):
+        read_pose2d(session)
+    assert str(tmp_path / "s") in str(refused.value)
+    with pytest.raises(InputError, match="expected focal lengths in px"):
+        add_calibration(CameraHistory(1.0), info)  # as the live graph does
+
+
+def test_warning_names_the_recording_and_no_folder(tmp_path, messages, capture):
+    record(tmp_path / "s", flight_entries(messages, capture, gimbal=False))
+    words = ["reconstruct", tmp_path / "s", "--out", tmp_path / "out", "--method", "initial", "--quiet"]
+    command = [sys.executable, "-m", "drocap_ros.cli", *map(str, words)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert done.stderr.startswith("drocap: s: camera telemetry incomplete: ")
 
 
 def test_rotation_is_unknown_without_a_gimbal(tmp_path, messages, capture):

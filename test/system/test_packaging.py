@@ -56,7 +56,15 @@ def copied_to(workspace):
             shutil.copytree(path, folder / name, ignore=shutil.ignore_patterns("__pycache__", ".*"))
         else:
             shutil.copy(path, folder)
+    git(folder, "init", "--quiet")
+    git(folder, "add", ".")
+    git(folder, "-c", "user.name=a", "-c", "user.email=a@b", "commit", "--quiet", "--message", "all")
     return folder
+
+
+def git(folder, *words):
+    done = subprocess.run(["git", "-C", folder, *words], check=True, capture_output=True, text=True)
+    return done.stdout.strip()
 
 
 def assert_colcon_installs(workspace, *option):
@@ -75,6 +83,9 @@ def assert_colcon_installs(workspace, *option):
     assert lines[0].startswith(install)
     assert lines[1].startswith(install)
     assert set(lines[2:]) == {"drocap", *NODES}
+    ask = ". install/setup.sh && python3 -c 'from drocap_ros.revision import git_revision as r; print(r())'"
+    revision = git(workspace / "src" / "drocap_ros", "rev-parse", "HEAD")
+    assert run("bash", "-c", ask, cwd=workspace, env=ros).strip() == revision
     assert (workspace / "install" / "drocap_ros" / "share" / "drocap_ros" / "launch" / "drocap.launch.py").exists()
     run(
         "bash", "-c", ". install/setup.sh && install/drocap_ros/lib/drocap_ros/drocap --version", cwd=workspace, env=ros
@@ -94,7 +105,10 @@ def test_wheel_contains_interfaces_libraries_and_data(workspace, tmp_path):
     )  # fmt: skip
     (wheel,) = (tmp_path / "wheels").glob("*.whl")
     assert "none-any" not in wheel.name
-    names = zipfile.ZipFile(wheel).namelist()
+    archive = zipfile.ZipFile(wheel)
+    revision = git(workspace / "src" / "drocap_ros", "rev-parse", "HEAD")
+    assert archive.read("drocap_ros/git_revision.txt").decode() == revision
+    names = archive.namelist()
     for wanted in (
         "drocap_ros/msg/_pose2_d.py",
         "drocap_ros/srv/_orbit_command.py",
@@ -113,6 +127,7 @@ def test_colcon_links_the_modules_of_the_sources(workspace):
 
 
 def test_package_without_ros_imports_all_but_nodes_and_messages(source, tmp_path):
+    (source / "setup.py").open("a").write("# a change that is not committed\n")
     base = Path(sys.base_prefix) / "bin" / "python3"
     run(base, "-m", "venv", "--without-pip", "bare", cwd=tmp_path, env=environment())
     site = str(PREFIX / "lib" / f"python{sys.version_info[0]}.{sys.version_info[1]}" / "site-packages")
@@ -135,7 +150,11 @@ for module in pkgutil.walk_packages(drocap_ros.__path__, "drocap_ros."):
     if not needs_ros and "__main__" not in module.name:
         importlib.import_module(module.name)
 print(drocap_ros.__file__)
+from drocap_ros.revision import git_revision
+print(git_revision())
 from drocap_ros.cli import main
 assert main(["live", "--config", "target/none.yaml"]) == 2
 """
-    assert "target" in run(python, "-c", check, cwd=tmp_path, env=bare)
+    where, revision = run(python, "-c", check, cwd=tmp_path, env=bare).splitlines()
+    assert "target" in where
+    assert revision == git(source, "rev-parse", "HEAD") + "+"

@@ -8,7 +8,9 @@ import fcntl
 import json
 import re
 import shutil
+import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -56,6 +58,9 @@ def run(args: argparse.Namespace) -> int:
     """Reconstruct what is not done yet; status 1 when a recording failed."""
     from drocap_ros.cli.atomic_output import check_output_folder
 
+    if threading.current_thread() is threading.main_thread():
+        # Recordings end with the batch; an interrupt would wait for them.
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if args.jobs < 1:
         raise InputError(f"--jobs: expected at least 1, got {args.jobs}; correct the number")
     check_output_folder(args.out)

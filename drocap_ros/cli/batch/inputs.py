@@ -8,8 +8,8 @@ import glob
 import shlex
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import NoReturn
 
+from drocap_ros.cli.options import LineParser
 from drocap_ros.errors import InputError
 
 #: Endings by which a folder's recordings are found; a recording that is named itself may end in anything.
@@ -56,7 +56,7 @@ def _read_list(path: Path, defaults: argparse.Namespace) -> list[argparse.Namesp
     """One recording per line, with options of ``reconstruct`` after its path; ``#`` begins a comment line."""
     from drocap_ros.cli.reconstruct import add_options
 
-    parser = _LineParser(add_help=False)
+    parser = LineParser("drocap reconstruct", add_help=False)
     parser.add_argument("input", type=Path)
     add_options(parser)
     try:
@@ -72,14 +72,9 @@ def _read_list(path: Path, defaults: argparse.Namespace) -> list[argparse.Namesp
             continue
         try:
             found.append(parser.parse_args(shlex.split(line), copy.copy(defaults)))
-        except ValueError as error:
+        except (ValueError, InputError) as error:
             raise InputError(f"{path}:{number}: expected a path and options of reconstruct; {error}") from None
     return found
-
-
-class _LineParser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise ValueError(message)
 
 
 def _in_folder(folder: Path) -> Iterator[Path]:

@@ -58,9 +58,9 @@ class Task:
 
 
 def version() -> str:
-    """Version of drocap_ros, with the revision of a checkout."""
+    """Version of drocap_ros, with its revision where known."""
     from drocap_ros import __version__
-    from drocap_ros.reconstruction.reconstruct import git_revision
+    from drocap_ros.revision import git_revision
 
     revision = git_revision()
     return f"{__version__}+{revision[:12]}" if revision else __version__

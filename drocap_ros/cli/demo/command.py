@@ -9,6 +9,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from drocap_ros.cli.options import add_seed_option
+
 if TYPE_CHECKING:
     from drocap_ros.cli.demo.operator import Operator
     from drocap_ros.cli.demo.verdict import FlightVerdict
@@ -33,7 +35,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("demo_out"), help="folder (default demo_out)")
     parser.add_argument("--seconds", metavar="S", type=float, default=30.0, help="length of the orbit (default 30)")
-    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of person, wind and scenery (default 0)")
+    add_seed_option(parser, "of person, wind and scenery", metavar="N")
     parser.add_argument(
         "--autopilot", choices=("ardupilot", "px4"), default="ardupilot", help="which one is simulated (default"
         " ardupilot)",

@@ -8,6 +8,7 @@ import math
 from typing import Any
 
 from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
+from drocap_ros.cli.options import ros_namespace
 from drocap_ros.errors import InputError
 
 #: Parameter of the orbit behind each option: its range is checked here, its limits by the bridge.
@@ -30,7 +31,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "--speed", metavar="DEG_S", type=float, default=math.nan, help="deg/s, positive = counter-clockwise from above"
     )
     parser.add_argument("--timeout", metavar="S", type=float, default=10.0, help="to wait for an answer (default 10)")
-    parser.add_argument("--namespace", default="/drocap", help="of all topics (default /drocap)")
+    parser.add_argument("--namespace", type=ros_namespace, default="/drocap", help="of all topics (default /drocap)")
     add_domain_option(parser)
     parser.set_defaults(run=run)
     return parser

@@ -59,5 +59,5 @@ def run(args: argparse.Namespace) -> int:
             print(f"publishing {args.session} in domain {domain_id}; Ctrl-C stops", flush=True)
         with stop_signals() as stop:
             while not stop.is_set() and "session_player" not in graph.finished:
-                graph.spin_for(0.2)
+                graph.spin_for(0.2, stop)
     return 0

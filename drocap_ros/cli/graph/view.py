@@ -17,6 +17,7 @@ from drocap_ros.cli.atomic_output import output_file
 from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
 from drocap_ros.cli.graph.live import import_bringup, interruptible, stop_signals
 from drocap_ros.cli.motion_input import read_motion
+from drocap_ros.cli.options import ros_namespace
 from drocap_ros.cli.progress import progress_bars
 from drocap_ros.errors import InputError
 
@@ -55,7 +56,11 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="address of --web; 0.0.0.0 shows it to the whole network (default 127.0.0.1)",
     )
     parser.add_argument("--video", metavar="VIDEO", type=Path, help="video or pictures that a motion was made from")
-    parser.add_argument("--namespace", help="of the topics (default: /drocap live, that of the keypoints otherwise)")
+    parser.add_argument(
+        "--namespace",
+        type=ros_namespace,
+        help="of the topics (default: /drocap live, that of the keypoints otherwise)",
+    )
     add_domain_option(parser)
     parser.add_argument("--seconds", type=float, metavar="S", help="end a --live view after so long")
     parser.add_argument(
@@ -173,7 +178,9 @@ def _shown(recording: rerun.RecordingStream, views: tuple[str, ...], args: argpa
 
     arranged = layout(views, follow=args.live)
     if args.save is not None:
-        with output_file(args.save) as file:
+        inside = args.input.glob("*") if args.input else ()
+        inputs = [args.input, args.video, *(path for path in inside if path.suffix != ".rrd")]
+        with output_file(args.save, inputs, "--save") as file:
             to_file(recording, file, arranged)
             try:
                 yield

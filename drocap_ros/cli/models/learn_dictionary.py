@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from drocap_ros.cli.options import add_seed_option
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,7 +28,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     )
     parser.add_argument("--include", metavar="GLOB", default="*", help="only files of this name, e.g. 'cmu_*'")
     parser.add_argument("--every", type=int, default=3, help="take every n-th frame (default 3)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the batches (default 0)")
+    add_seed_option(parser, "seed of the batches")
+    parser.add_argument("--quiet", action="store_true", help="no output, only errors")
     parser.set_defaults(run=run)
     return parser
 
@@ -40,6 +42,7 @@ def run(args: argparse.Namespace) -> int:
     InputError
         When an option or the folder is invalid.
     """
+    from drocap_ros.cli.atomic_output import output_file
     from drocap_ros.reconstruction.paper.dictionary import save_dictionary
 
     for name, low, high in (("atoms", 8, 4096), ("every", 1, 1000)):
@@ -49,21 +52,28 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--sparsity: expected more than 0 up to 10, got {args.sparsity:g}")
     if args.out.suffix != ".npz" or not args.out.absolute().parent.is_dir():
         raise InputError(f"--out: expected a .npz in a folder that exists, got {args.out}")
-    dictionary = learn_from_folder(args.folder, args.include, args.every, args.atoms, args.sparsity, args.seed)
-    save_dictionary(args.out, dictionary)
-    m = dictionary.metadata
-    print(f"{args.out}: {args.atoms} atoms from {m['poses']} poses of {m['files']} files")
-    print(f"reconstruction error {m['reconstruction_error_mm']:.1f} mm, {m['mean_active_atoms']:.1f} active atoms")
+    with output_file(args.out) as file:
+        dictionary = learn_from_folder(
+            args.folder, args.include, args.every, args.atoms, args.sparsity, args.seed, args.quiet
+        )
+        save_dictionary(file, dictionary)
+    if not args.quiet:
+        m = dictionary.metadata
+        print(f"{args.out}: {args.atoms} atoms from {m['poses']} poses of {m['files']} files")
+        print(f"reconstruction error {m['reconstruction_error_mm']:.1f} mm, {m['mean_active_atoms']:.1f} active atoms")
     return 0
 
 
-def learn_from_folder(folder: Path, include: str, every: int, atoms: int, sparsity: float, seed: int) -> Dictionary:
+def learn_from_folder(
+    folder: Path, include: str, every: int, atoms: int, sparsity: float, seed: int, quiet: bool = False
+) -> Dictionary:
     """Dictionary from every n-th frame of the files of a MoCap folder whose names match ``include``."""
     import numpy as np
 
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.mocap import load_mocap, mocap_files
     from drocap_ros.reconstruction.paper.dictionary import learn, normalize_poses
+    from drocap_ros.reconstruction.threads import blas_threads
     from drocap_ros.tracks import read_npz
 
     files = mocap_files(folder, include)
@@ -78,7 +88,7 @@ def learn_from_folder(folder: Path, include: str, every: int, atoms: int, sparsi
         "command": f"drocap learn-dictionary MOCAP_DIR --out NPZ --include '{include}' --every {every}"
         f" --atoms {atoms} --sparsity {sparsity:g} --seed {seed}",
     }
-    with progress_bars() as show:
+    with progress_bars(quiet) as show, blas_threads(1):
         return learn(
             poses, atoms=atoms, sparsity=sparsity, seed=seed, metadata=metadata,
             progress=lambda done: show("learning", done),

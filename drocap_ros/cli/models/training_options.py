@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Callable
 
+from drocap_ros.cli.options import add_seed_option
 from drocap_ros.errors import InputError
 
 
@@ -13,7 +14,7 @@ def add_training_options(parser: argparse.ArgumentParser, minutes: float) -> Non
     """Add ``--minutes``, ``--threads``, ``--seed`` and ``--quiet``."""
     parser.add_argument("--minutes", type=float, default=minutes, help=f"training time (default {minutes:g})")
     parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch (default 1)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of samples and initial weights (default 0)")
+    add_seed_option(parser, "seed of samples and initial weights")
     parser.add_argument("--quiet", action="store_true", help="no progress, only errors")
 
 

@@ -18,6 +18,8 @@ log = logging.getLogger(__name__)
 
 #: Missing frames at the end, against the container's count, from which the file counts as cut off.
 _TAIL_FRAMES = 2
+#: First bytes of Matroska and WebM, which state a duration and no count.
+_MATROSKA = b"\x1a\x45\xdf\xa3"
 
 
 def quiet_ffmpeg() -> None:
@@ -82,6 +84,8 @@ class VideoSource(ImageSource):
         self._origin_ns: int | None = None
         self._last_ns: int | None = None
         self._count = 0
+        with path.open("rb") as file:
+            self._counted = file.read(4) != _MATROSKA
         stated = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         # A container without an index states a negative or huge number.
         self.length = int(stated) if 0 < stated < 1e9 else None
@@ -134,12 +138,23 @@ class VideoSource(ImageSource):
         return rate if 0.1 < rate < 1000 else 30.0
 
     def _report_end(self) -> None:
-        if self._capture is not None and self.length is not None and self._count < self.length - _TAIL_FRAMES:
-            detail = f"cut off or damaged, {self._count} of {self.length} frames decoded"
-            event = SourceEvent(SourceEventKind.ENDED_EARLY, str(self.path), detail)
+        if self._capture is not None and (detail := self._missing_end()):
+            event = SourceEvent(SourceEventKind.ENDED_EARLY, str(self.path), f"cut off or damaged, {detail} decoded")
             log.warning(str(event))
             self._events.append(event)
         self.close()
+
+    def _missing_end(self) -> str:
+        """What is missing, or nothing."""
+        if self.length is None or self.duration_s is None or self._count >= self.length - _TAIL_FRAMES:
+            return ""
+        if self._counted:
+            return f"{self._count} of {self.length} frames"
+        # The count is the duration times a rate, which may be far from that of the frames.
+        end_s = ((self._last_ns or 0) - self._start_ns) * 1e-9
+        if end_s + _TAIL_FRAMES * end_s / max(self._count - 1, 1) >= self.duration_s:
+            return ""
+        return f"{end_s:.1f} of {self.duration_s:.1f} s"
 
     def close(self) -> None:
         """Close the file."""

@@ -83,7 +83,9 @@ class CameraHistory:
 
     def add_matrix(self, stamp_ns: int, matrix: np.ndarray) -> None:
         """Take the calibration (3, 3) px of the image of a stamp; an unusable one is left out."""
-        if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
+        if not (
+            np.isfinite(matrix).all() and min(matrix[0, 0], matrix[1, 1]) >= 1 and np.allclose(matrix[2], (0, 0, 1))
+        ):
             return
         if not self._matrices or not np.array_equal(self._matrices[-1][1], matrix):
             self._matrices = [*self._matrices[1 - _MOST_MATRICES :], (stamp_ns, matrix)]

@@ -5,6 +5,7 @@ A frame's information counts once: a window hands on its share of the frames tha
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -72,8 +73,10 @@ class WorldWindows:
         if self._moved and (reason := stopped(camera.rotation, camera.position, stamps)):
             self._before = None
             return replace(camera_result, telemetry=Telemetry.REFUSED, reason=reason)
+        # The size of the images is unknown here, and not used.
+        size = (math.ceil(camera.matrix[0, 0]), math.ceil(camera.matrix[1, 1]))
         tracks = Tracks(
-            keypoints.xy, BODY_17.joints, stamps, (1, 1), camera_rotation=camera.rotation,
+            keypoints.xy, BODY_17.joints, stamps, size, camera_rotation=camera.rotation,
             camera_position=camera.position, camera_matrix=camera.matrix,
         )  # fmt: skip
         poses = CameraPoses(*split(found.joints[use]), {}, 0, "", {}, sigma_px=found.sigma[use], still=found.still[use])

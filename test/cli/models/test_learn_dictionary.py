@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 from walking import write_mocap
 
 from drocap_ros.cli.models import learn_dictionary
 from drocap_ros.errors import InputError
-from drocap_ros.reconstruction.paper.dictionary import (
-    load_dictionary,
-)
+from drocap_ros.reconstruction.paper import dictionary
+from drocap_ros.reconstruction.paper.dictionary import load_dictionary
 
 
 def command(*words: str) -> argparse.Namespace:
@@ -57,3 +58,38 @@ def test_unusable_input_is_refused(
     with pytest.raises(InputError, match=match):
         args.run(args)
     assert not list(tmp_path.glob("d.npz"))
+
+
+def test_a_failure_keeps_the_old_dictionary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fill_disk(path: Path, _: object) -> None:
+        path.write_bytes(b"half")
+        raise OSError("no space left on device")
+
+    write_mocap(tmp_path, "one_1")
+    out = tmp_path / "d.npz"
+    out.write_bytes(b"old")
+    monkeypatch.setattr("drocap_ros.reconstruction.paper.dictionary.save_dictionary", fill_disk)
+    args = command(str(tmp_path), "--out", str(out), "--include", "one_*", "--atoms", "16", "--quiet")
+    with pytest.raises(OSError, match="no space"):
+        args.run(args)
+    assert out.read_bytes() == b"old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["d.npz", "one_1.npz"]
+
+
+def test_learning_uses_one_thread_whatever_the_environment_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    used: set[int] = set()
+
+    def spied(*args: Any, **options: Any) -> dictionary.Dictionary:
+        used.update(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
+        return learn(*args, **options)
+
+    learn = dictionary.learn
+    monkeypatch.setattr(dictionary, "learn", spied)
+    write_mocap(tmp_path, "one_1")
+    args = command(str(tmp_path), "--out", str(tmp_path / "d.npz"), "--include", "one_*", "--atoms", "16", "--quiet")
+    with threadpool_limits(2):
+        assert args.run(args) == 0
+    assert used == {1}
+    assert capsys.readouterr().out == ""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
+from drocap_ros.perception.calibration import load_calibration
 from drocap_ros.perception.sources import Frame, SourceEventKind, open_source
 from drocap_ros.perception.sources.image_files import read_image
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
@@ -98,6 +99,26 @@ def test_cut_off_file_gives_its_frames_and_an_event(tmp_path, caplog):
     assert 10 < len(frames) < 58
     assert [e.kind for e in events] == [SourceEventKind.ENDED_EARLY]
     assert f"{len(frames)} of 60" in caplog.text
+
+
+def test_matroska_file_with_a_wrong_rate_is_whole(tmp_path):
+    """Its header states a duration, and a rate from which the number of frames is guessed."""
+    path = tmp_path / "a.mkv"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        writer.write(rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    writer.release()
+    data = bytearray(path.read_bytes())
+    at = data.index(b"\x23\xe3\x83\x84") + 4  # DefaultDuration, four bytes
+    data[at : at + 4] = struct.pack(">I", 25_000_000)
+    for share, kinds in ((1.0, []), (0.8, [SourceEventKind.ENDED_EARLY])):
+        path.write_bytes(data[: int(share * len(data))])
+        with open_source(path) as source:
+            count = len(list(source))
+            assert [e.kind for e in source.events()] == kinds
+        assert source.length == 240
+        assert count == 60 if share == 1.0 else 40 < count < 50
 
 
 @pytest.mark.parametrize("content", [b"", b"this is no video\n" * 20, None], ids=["empty", "text", "without index"])
@@ -196,3 +217,19 @@ def test_prefetch_stops_when_the_reader_leaves():
         if frame.stamp_ns == 5:
             break
     assert len(made) < 20
+
+
+@pytest.mark.parametrize(
+    ("focal", "words"),
+    [("900.0", ""), ("0.7", "expected focal lengths in px, between 128 and 128000"), (".nan", "finite values")],
+)
+def test_calibration_in_another_unit_is_refused(tmp_path: Path, focal: str, words: str) -> None:
+    path = tmp_path / "camera.yaml"
+    matrix = f"[{focal}, 0.0, 640.0, 0.0, {focal}, 360.0, 0.0, 0.0, 1.0]"
+    path.write_text(f"image_width: 1280\nimage_height: 720\ncamera_matrix: {{rows: 3, cols: 3, data: {matrix}}}\n")
+    if not words:
+        assert load_calibration(path).matrix[0, 0] == float(focal)
+        return
+    with pytest.raises(InputError, match=words) as refused:
+        load_calibration(path)
+    assert str(path) in str(refused.value)

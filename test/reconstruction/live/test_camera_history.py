@@ -13,6 +13,10 @@ LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 MATRIX = np.array([[900.0, 0, 640.0], [0, 900.0, 360.0], [0, 0, 1.0]])
 
 
+def scaled(factor: float) -> np.ndarray:
+    return MATRIX * np.array([[factor], [factor], [1.0]])
+
+
 def at(*seconds: float) -> np.ndarray:
     return np.array([round(s * S) for s in seconds], np.int64)
 
@@ -47,7 +51,8 @@ def test_without_a_calibration_or_a_pose_there_is_no_camera() -> None:
     assert CameraHistory(12.0).along(at(1.0)) is None
     bare = CameraHistory(12.0)
     bare.add_pose(S, np.zeros(3), LEVEL)
-    bare.add_matrix(S, np.full((3, 3), np.nan))
+    for unusable in (np.full((3, 3), np.nan), MATRIX / 1280.0, MATRIX.T):
+        bare.add_matrix(S, unusable)
     assert bare.along(at(1.0)) is None
     blind = CameraHistory(12.0)
     blind.add_matrix(0, MATRIX)
@@ -77,7 +82,7 @@ def test_memory_is_bounded_and_a_window_stays_whole() -> None:
     for i in range(100_000):
         history.add_pose(i * S // 50, np.array([i / 50.0, 0.0, 0.0]), LEVEL)
         if i % 1000 == 0:
-            history.add_matrix(i * S // 50, MATRIX * (1.0 + i))
+            history.add_matrix(i * S // 50, scaled(1.0 + i))
     assert len(history._stamps) < 500
     assert len(history._matrices) <= 20
     end = 99_999 / 50
@@ -88,6 +93,6 @@ def test_memory_is_bounded_and_a_window_stays_whole() -> None:
 
 def test_the_calibration_is_that_of_the_image() -> None:
     history = filled(0.0, 1.0, 2.0)
-    history.add_matrix(round(1.5 * S), 2.0 * MATRIX)
+    history.add_matrix(round(1.5 * S), scaled(2.0))
     focal = [history.along(at(s)).focal_px for s in (0.0, 1.4, 1.6)]  # type: ignore[union-attr]
     assert focal == [900.0, 900.0, 1800.0]
