@@ -43,6 +43,7 @@ from drocap_ros.ros.polled_service import PolledService
 from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import RESULT_QOS, TFMessage
 from drocap_ros.srv import OrbitCommand
+from drocap_ros.tracks import check_camera_matrix
 
 _STATUS_PERIOD_S = 0.2
 _LINK_PERIOD_S = 0.01  # of a simulated link
@@ -225,8 +226,11 @@ class MavlinkBridgeNode(ComponentNode):
         self._rivals.take_status(stamp_from_ros(message.header.stamp), self.now_s())
 
     def _on_camera_info(self, message: CameraInfo) -> None:
-        self._controller.on_camera(np.array(message.k, dtype=float).reshape(3, 3))
-        self._calibrated_size = (message.width, message.height)
+        matrix, size = np.array(message.k, dtype=float).reshape(3, 3), (message.width, message.height)
+        if all(size):
+            check_camera_matrix(matrix, size)
+        self._controller.on_camera(matrix)
+        self._calibrated_size = size
 
     def _on_second(self) -> None:
         publishers = self.get_publishers_info_by_topic(self.resolve_topic_name("pose2d"))

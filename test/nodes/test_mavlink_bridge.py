@@ -39,6 +39,13 @@ def test_keypoints_of_images_of_another_size_are_refused(node):
         take((960, 540))
 
 
+def test_a_normalised_camera_matrix_is_refused(node):
+    camera = CameraModel(1280, 720, pinhole_matrix(1280, 720, 60.0) / 1280)
+    camera.matrix[2, 2] = 1.0
+    with pytest.raises(InputError, match="expected focal lengths in px"):
+        node._on_camera_info(camera_info_to_ros(header_at(1, "camera"), camera))
+
+
 def test_an_error_in_the_control_loop_holds_the_vehicle_at_once(node, monkeypatch):
     sent = []
     monkeypatch.setattr(node._watchdog, "_send", sent.append)
