@@ -104,6 +104,11 @@ def parse_config(data: Any, where: str) -> DrocapConfig:
         if not isinstance(values, Mapping):
             raise ParameterError(f"{where}: {key}: expected 'ros__parameters:' with values, found {body!r}")
         # A ROS parameter, not one of the component.
+        if values.get("use_sim_time"):
+            raise ParameterError(
+                f"{where}: {name}.use_sim_time: expected false, since drocap's commands use the machine's clock, got"
+                f" {values['use_sim_time']}; leave it out, and give it to nodes that are started one by one"
+            )
         ours = {str(k): v for k, v in values.items() if k != "use_sim_time"}
         sections[name] = types[name].from_mapping(ours, f"{where}: {name}")
     return DrocapConfig(**sections)  # type: ignore[arg-type]

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from std_msgs.msg import Header
 
+from drocap_ros.errors import InputError
 from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.live.adjuster import SOLVER_ERRORS, LiveAdjuster
@@ -131,6 +132,11 @@ class BundleAdjusterNode(ComponentNode):
             self.counters[Key.INITIAL_UNPAIRED] = self._join.dropped_second
             return
         observation, initial = pair
+        if initial.track_id != observation.track_id:
+            raise InputError(
+                f"track_id: expected {observation.track_id} in pose3d/initial, as in pose2d of the same stamp, got"
+                f" {initial.track_id}; its publisher has to copy it"
+            )
         joints, _ = pose3d_from_ros(initial)
         due = self._buffer.push(observation, joints)
         event = self._buffer.event

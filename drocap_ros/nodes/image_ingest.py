@@ -3,7 +3,8 @@
 Publishes ``image/compressed`` (sensor_msgs/CompressedImage) and, where the camera is known, ``camera_info``.
 Stamps are exposure times: those of the source; of a file, counted from the activation.
 With ``source = topic:NAME`` it subscribes to that topic: CompressedImage where the name ends in "compressed",
-else Image in one of the usual encodings; stamps are those of the messages.
+else Image in one of the usual encodings; stamps are those of the messages.  Where its publishers offer that, lost
+fragments of an image are sent again.
 """
 
 from __future__ import annotations
@@ -13,8 +14,12 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.expand_topic_name import expand_topic_name
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
+from rclpy.validate_full_topic_name import validate_full_topic_name
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
@@ -34,6 +39,8 @@ from drocap_ros.ros.topics import TOPIC_SOURCE
 
 #: An image of a file that is this late when it has been read is dropped.
 _LATE_S = 0.1
+#: Images of a topic that may wait.
+_DEPTH = 5
 
 
 class ImageIngestNode(ManagedComponent):
@@ -46,23 +53,26 @@ class ImageIngestNode(ManagedComponent):
         self._images = self.output("image/compressed")
         self._infos = self.output("camera_info")
         self._camera: CameraModel | None = None
+        self._size: tuple[int, int] | None = None
         self._last_ns: int | None = None
         self._arrived_s = time.monotonic()
         self._stop = threading.Event()
         self._source: ImageSource | None = None
-        self._topic: Any = None
+        self._topic = ""
+        self._subscription: Subscription | None = None
         self._thread: threading.Thread | None = None
         self.create_timer(0.5, self._watch)
         self.set_up()
 
     def acquire(self) -> None:
-        """Open the source, or subscribe to its topic."""
+        """Open the source, or wait for its topic."""
         self._stop.clear()
         if self.config.source.startswith(TOPIC_SOURCE):
-            self._topic = self._subscribe(self.config.source.removeprefix(TOPIC_SOURCE))
+            self._topic = self._valid_topic(self.config.source.removeprefix(TOPIC_SOURCE))
+            self.report(WARN, f"waiting for {self._kind().__name__} on {self._topic}")
         else:
             self._source = open_source(self.config.source, self.config)
-            self._camera = camera_model(self.config, self._source.size)
+            self._fit_camera(self._source.size)
 
     def begin(self) -> None:
         """Start or continue to read; a file has advanced meanwhile, as a camera would."""
@@ -83,9 +93,8 @@ class ImageIngestNode(ManagedComponent):
         if self._source is not None:
             self._source.close()
             self._source = None
-        if self._topic is not None:
-            self.destroy_subscription(self._topic)
-            self._topic = None
+        self._topic = ""
+        self._unsubscribe()
 
     def close(self) -> None:
         """Close the source."""
@@ -100,7 +109,10 @@ class ImageIngestNode(ManagedComponent):
                     return
                 if not self.active:
                     continue
-                self._publish(header_at(frame.stamp_ns, self.config.frame_id), frame)
+                try:
+                    self._publish(header_at(frame.stamp_ns, self.config.frame_id), frame)
+                except InputError as error:
+                    self.refuse(str(error))
             self.report(OK, "the source has ended")
         except DrocapError as error:
             self.report(ERROR, str(error))
@@ -148,10 +160,30 @@ class ImageIngestNode(ManagedComponent):
 
     # -- image topics ----------------------------------------------------------------------------------
 
-    def _subscribe(self, topic: str) -> Subscription:
-        if not topic:
-            raise InputError(f"source: expected {TOPIC_SOURCE}NAME of an image topic, got no name")
-        compressed = topic.endswith("compressed")
+    def _valid_topic(self, topic: str) -> str:
+        try:
+            validate_full_topic_name(expand_topic_name(topic, self.get_name(), self.get_namespace()))
+        except (InvalidTopicNameException, ValueError):
+            raise InputError(
+                f"source: expected {TOPIC_SOURCE}NAME with a name of ROS, as {TOPIC_SOURCE}/camera/image_raw, got"
+                f" {topic!r}; correct the name"
+            ) from None
+        return topic
+
+    def _kind(self) -> type:
+        return CompressedImage if self._topic.endswith("compressed") else Image
+
+    def _subscribe(self) -> None:
+        """Subscribe to the topic as reliably as its publishers offer, once there are some."""
+        offers = {info.qos_profile.reliability for info in self.get_publishers_info_by_topic(self._topic)}
+        if not offers:
+            return
+        all_reliable = offers == {ReliabilityPolicy.RELIABLE}
+        wanted = ReliabilityPolicy.RELIABLE if all_reliable else ReliabilityPolicy.BEST_EFFORT
+        if self._subscription is not None and self._subscription.qos_profile.reliability == wanted:
+            return
+        self._unsubscribe()
+        qos = QoSProfile(depth=_DEPTH, reliability=wanted)
         validator = StampValidator()
 
         def take(message: Any) -> None:
@@ -159,19 +191,25 @@ class ImageIngestNode(ManagedComponent):
                 return
             try:
                 validator.check(message.header.stamp.sec, message.header.stamp.nanosec)
-                self._take(message, compressed)
+                self._take(message)
             except InputError as error:
-                self.refuse(f"{topic}: {error}")
+                self.refuse(f"{self._topic}: {error}")
 
-        kind = CompressedImage if compressed else Image
-        self.report(WARN, f"waiting for {kind.__name__} on {topic}")
-        return self.create_subscription(kind, topic, take, qos_profile_sensor_data)
+        events = SubscriptionEventCallbacks(message_lost=self._on_lost)
+        self._subscription = self.create_subscription(self._kind(), self._topic, take, qos, event_callbacks=events)
 
-    def _take(self, message: Any, compressed: bool) -> None:
+    def _on_lost(self, event: Any) -> None:
+        self.count(of(Key.LOST, self._topic), event.total_count_change)
+
+    def _unsubscribe(self) -> None:
+        if self._subscription is not None:
+            self.destroy_subscription(self._subscription)
+            self._subscription = None
+
+    def _take(self, message: Any) -> None:
         stamp_ns = stamp_from_ros(message.header.stamp)
+        compressed = isinstance(message, CompressedImage)
         image = image_from_message(message, compressed)
-        if self._camera is None:
-            self._camera = camera_model(self.config, (image.shape[1], image.shape[0]))
         header = Header(stamp=message.header.stamp, frame_id=message.header.frame_id or self.config.frame_id)
         # A JPEG is passed on unchanged.
         jpeg = bytes(message.data) if compressed and "jp" in message.format.lower() else None
@@ -179,7 +217,14 @@ class ImageIngestNode(ManagedComponent):
 
     # -- out -------------------------------------------------------------------------------------------
 
+    def _fit_camera(self, size: tuple[int, int]) -> None:
+        """Choose the camera model of images of a size (width, height); an InputError when there is none."""
+        if size != self._size:
+            self._camera = camera_model(self.config, size)
+            self._size = size
+
     def _publish(self, header: Header, frame: Frame, jpeg: bytes | None = None) -> None:
+        self._fit_camera((frame.image.shape[1], frame.image.shape[0]))
         rate = self.config.max_rate_hz
         # A hundredth of slack: a source of exactly that rate keeps every image.
         if rate > 0 and self._last_ns is not None and 0 <= frame.stamp_ns - self._last_ns < 0.99e9 / rate:
@@ -197,7 +242,9 @@ class ImageIngestNode(ManagedComponent):
         self.report(OK, "running")
 
     def _watch(self) -> None:
-        """Report a camera, stream or topic without images within 2 s."""
+        """Look for the topic's publishers; report a camera, stream or topic without images within 2 s."""
+        if self._topic:
+            self._subscribe()
         for event in self._source.events() if self._source is not None else ():
             self.count(of(Key.SOURCE_EVENT, event.kind.value))
         is_live = self._source is None or self._source.live

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -230,10 +231,13 @@ class Graph:
             self._executor.spin_once(timeout_sec=0.05)
         self.check()
 
-    def spin_for(self, seconds: float) -> None:
-        """Run the script's own callbacks for some time; raises the error of a node."""
+    def spin_for(self, seconds: float, stop: threading.Event | None = None) -> None:
+        """Run the script's own callbacks for some time, or until ``stop`` is set; raises the error of a node.
+
+        The signal that sets ``stop`` may end the nodes too, which is no error then.
+        """
         end_s = time.monotonic() + seconds
-        while (left_s := end_s - time.monotonic()) > 0:
+        while (left_s := end_s - time.monotonic()) > 0 and not (stop and stop.is_set()):
             self.check()
             self._executor.spin_once(timeout_sec=min(left_s, 0.05))
 

@@ -13,7 +13,6 @@ from typing import Any, ClassVar
 
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
-from drocap_ros.errors import DrocapError
 from drocap_ros.parameters import Parameters
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
 from drocap_ros.ros.diagnostics import Key
@@ -46,7 +45,7 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
         LifecycleNodeMixin.__init__(self)
         self.active = False
         self._is_source = NODES[self.component].source
-        self._refusal: DrocapError | None = None
+        self._refusal: Exception | None = None
         self._ended = False
         self._autostart: bool = self.declare_parameter("autostart", True).value
         self._activates_itself = bool(self.declare_parameter("graph_running", False).value) or not self.peers
@@ -93,8 +92,8 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
 
         Raises
         ------
-        DrocapError
-            Raised by ``acquire``.
+        Exception
+            Raised by ``acquire``; a DrocapError when the resource is not available.
         """
         self._enter(UNCONFIGURED)
         if self._autostart:
@@ -123,7 +122,7 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
         self._refusal = None
         try:
             self.acquire()
-        except DrocapError as error:
+        except Exception as error:  # rclpy would swallow it
             self._refusal = error
             self.report(ERROR, str(error))
             return FAILURE

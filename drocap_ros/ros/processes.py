@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from multiprocessing import resource_tracker
 from multiprocessing.forkserver import ensure_running
 from pathlib import Path
 
@@ -19,7 +20,6 @@ from drocap_ros.errors import InputError, NodeError
 from drocap_ros.ros import fastdds
 from drocap_ros.ros.component import ComponentNode
 from drocap_ros.ros.spin import node_main
-from drocap_ros.ros.topics import TOPIC_SOURCE
 
 #: TF has its usual place in this namespace only; another graph has its own, ``NAMESPACE/tf``, since the frames of two
 #: drones have the same names.
@@ -55,7 +55,8 @@ class LaunchContext:
         solvers = ["scipy.linalg.lapack", "scipy.ndimage"] if "bundle_adjuster" in names else []
         _FORKSERVER.set_forkserver_preload([*(f"drocap_ros.nodes.{name}" for name in names), *solvers])
         path = os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))))
-        with environment({**_LEAN, **os.environ, "PYTHONPATH": path}):
+        resource_tracker.ensure_running()  # which unblocks the signal
+        with environment({**_LEAN, **os.environ, "PYTHONPATH": path}), _blocked(signal.SIGTERM):
             ensure_running()
 
     def parameter_file(self, name: str, config: DrocapConfig, restarted: bool) -> Path:
@@ -74,11 +75,10 @@ class NodeProcess:
         self.name = name
         self._log = context.folder / f"{name}.log"
         arguments = [*context.ros_arguments, "--params-file", str(context.parameter_file(name, config, restarted))]
-        # Raw images of a camera driver, 3 MB and more, need the shared memory that our profile excludes.
-        profile = {} if _reads_driver(name, config) else fastdds.environment()
+        variables = context.environment | fastdds.environment()
         # As a daemon it does not survive this process.
         self._process = _FORKSERVER.Process(
-            target=_run, name=name, args=(name, arguments, context.environment | profile, self._log), daemon=True
+            target=_run, name=name, args=(name, arguments, variables, self._log), daemon=True
         )
         self._process.start()
         assert self._process.pid is not None
@@ -94,7 +94,7 @@ class NodeProcess:
             With the last message of its log.
         """
         status = self._process.exitcode
-        if status is None or (self._stopping and status in (0, -signal.SIGINT)):
+        if status is None or (self._stopping and status in (0, -signal.SIGINT, -signal.SIGTERM)):
             return
         lines = self._log.read_text(errors="replace").splitlines() if self._log.exists() else []
         messages = [line for line in lines if line[:1].strip()]  # without the indented lines of a traceback
@@ -105,9 +105,9 @@ class NodeProcess:
 
     def stop(self) -> None:
         """Ask the node to stop and wait for it."""
+        self._stopping = True
         if self._process.exitcode is not None:
             return
-        self._stopping = True
         os.kill(self.pid, signal.SIGINT)
         self._process.join(STOP_TIMEOUT_S)
         if self._process.exitcode is None:
@@ -120,6 +120,7 @@ def _run(name: str, arguments: Sequence[str], environment: Mapping[str, str], lo
     # Out of reach of the terminal's Ctrl-C: the command stops its nodes in order.  The session stays the same, since
     # Linux shares processors out among sessions (autogroups) and niceness has no effect between them.
     os.setpgid(0, 0)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     os.environ.clear()
     os.environ.update(environment)
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
@@ -132,8 +133,17 @@ def _run(name: str, arguments: Sequence[str], environment: Mapping[str, str], lo
     raise SystemExit(node_main(node_class(name)))
 
 
-def _reads_driver(name: str, config: DrocapConfig) -> bool:
-    return name == "image_ingest" and config.image_ingest.source.startswith(TOPIC_SOURCE)
+@contextlib.contextmanager
+def _blocked(number: signal.Signals) -> Iterator[None]:
+    """Processes that start meanwhile ignore a signal.
+
+    A group that receives SIGTERM (``timeout``, systemd) would lose the server before the command has stopped its nodes.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {number})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def remaps(namespace: str) -> list[str]:

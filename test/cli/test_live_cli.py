@@ -11,10 +11,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from drocap_ros.bringup import free_domain
+from drocap_ros.bringup import free_domain, watch
 from drocap_ros.cli import main
 from drocap_ros.recording.open_session import session_info
+from drocap_ros.ros.topics import RESULT_QOS
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,7 +38,8 @@ def video(tmp_path_factory):
 def start(*arguments, log, **variables):
     command = [sys.executable, "-m", "drocap_ros.cli", *map(str, arguments)]
     env = {**os.environ, "PYTHONPATH": str(ROOT), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", **variables}
-    return subprocess.Popen(command, env=env, stdout=log.open("w"), stderr=subprocess.STDOUT)
+    # A session of its own: nodes, which are groups of their own, stay in it.
+    return subprocess.Popen(command, env=env, stdout=log.open("w"), stderr=subprocess.STDOUT, start_new_session=True)
 
 
 def wait_for_running(log):
@@ -84,11 +87,47 @@ def test_record_takes_what_another_graph_publishes_until_it_is_interrupted(video
     assert counts(tmp_path / "rec")[IMAGES] > 20
 
 
+def group_of(pid):
+    os.killpg(pid, signal.SIGTERM)
+
+
+def session_of(pid):
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            session = int(stat.read_text().rpartition(")")[2].split()[3])
+        except OSError:
+            continue
+        if session == pid:
+            os.kill(int(stat.parent.name), signal.SIGTERM)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize("end", [group_of, session_of], ids=["group, as timeout does", "all, as systemd does"])
+def test_sigterm_to_all_processes_ends_the_graph_in_order(video, tmp_path, end):
+    config = tmp_path / "loop.yaml"
+    config.write_text(f"/**/image_ingest: {{ros__parameters: {{source: {video}, loop: true}}}}")
+    with free_domain() as domain:
+        common = ("--config", config, "--session", tmp_path / "session", "--domain-id", domain)
+        live = start("live", *common, "--nodes", "image_ingest", "session_recorder", log=tmp_path / "log")
+        wait_for_running(tmp_path / "log")
+        time.sleep(1.5)
+        end(live.pid)
+        assert live.wait(30) == 0, (tmp_path / "log").read_text()
+    assert "restart" not in (tmp_path / "log").read_text()
+    assert f"session: {tmp_path / 'session'}\n" in (tmp_path / "log").read_text()
+    assert not session_info(tmp_path / "session").warnings
+    assert not (tmp_path / "session_2").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (("--config", "none.yaml"), "none.yaml"),
         (("--config", ROOT / "config" / "video_file.yaml", "--source", "none.mp4"), "none.mp4"),
+        (
+            ("--config", ROOT / "config" / "video_file.yaml", "--source", "topic:bad name/compressed"),
+            "got 'bad name/com",
+        ),
         (("--config", ROOT / "config" / "video_file.yaml", "--domain-id", "500"), "--domain-id: expected 0 to 101"),
     ],
 )
@@ -135,6 +174,24 @@ def test_top_shows_the_nodes_of_a_running_graph(video, tmp_path, monkeypatch):
         assert main(["top", "--once", "--domain-id", str(domain)]) == 1
 
 
+def test_top_waits_for_the_nodes_that_are_found_later(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with free_domain() as domain, watch("/drocap", domain) as graph:
+        publisher = graph.node.create_publisher(DiagnosticArray, "/diagnostics", RESULT_QOS)
+        top = start("top", "--once", "--domain-id", domain, log=tmp_path / "log")
+        graph.wait_until(publisher.get_subscription_count, 30, "the command to listen")
+        begin = time.monotonic()
+        while top.poll() is None:
+            names = [
+                name for name, after_s in (("a", 0.0), ("b", 1.2), ("c", 2.7)) if time.monotonic() > begin + after_s
+            ]
+            publisher.publish(DiagnosticArray(status=[DiagnosticStatus(name=f"drocap/{name}") for name in names]))
+            graph.spin_for(0.1)
+        assert top.wait() == 0
+    assert time.monotonic() - begin < 10.0
+    assert [name for name in "abc" if f"drocap/{name}" in (tmp_path / "log").read_text()] == ["a", "b", "c"]
+
+
 def test_every_command_joins_the_domain_of_the_environment(tmp_path):
     config = tmp_path / "quiet.yaml"
     config.write_text(f"mavlink_bridge:\n  url: udpin:127.0.0.1:{free_udp_port()}\n")
@@ -170,6 +227,17 @@ def test_every_command_joins_the_domain_of_the_environment(tmp_path):
         assert counts(tmp_path / "rec")["/drocap/orbit/status"] > 0
         status, text = run("replay", tmp_path / "rec", "--rate", "100")
         assert (status, f"in domain {domain};" in text) == (0, True), text
+
+
+@pytest.mark.parametrize("namespace", ["a-b", "a b", "/a/", "1a", "//"])
+@pytest.mark.parametrize(
+    "command",
+    ["record", "replay s", "top --once", "view --live", "orbit status", "preflight --config c", "live --config c"],
+)
+def test_a_namespace_that_ros_does_not_know_is_refused(command, namespace, capsys):
+    assert main([*command.split(), "--namespace", namespace]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"--namespace: expected names of letters, digits and _, as /drocap or /a/b, got '{namespace}'" in line
 
 
 @pytest.mark.parametrize("command", [("orbit", "status"), ("top", "--once"), ("record",), ("view", "--live")])

@@ -21,6 +21,7 @@ from drocap_ros.ros.conversions import (
     camera_info_to_ros,
     header_at,
     pose2d_to_ros,
+    pose3d_to_ros,
     stamp_from_ros,
     vehicle_state_to_ros,
 )
@@ -225,3 +226,48 @@ def test_the_recording_of_windows_in_map_repeats_them_bit_for_bit(orbited):
         assert set(motion.stamp_ns.tolist()) == placed
     else:
         assert (motion.frame, len(motion.stamp_ns)) == ("camera", 210)
+
+
+def initial_pose(observation, track_id, joints):
+    """An initial pose of 0, 15 or 17 joints."""
+    return pose3d_to_ros(
+        header_at(observation.stamp_ns, "camera"),
+        track_id=track_id,
+        stage=1,
+        skeleton=f"body{joints or 15}",
+        joints=np.random.default_rng(joints).normal(size=(joints, 3)),
+        covariance=np.zeros((joints, 6)),
+        confidence=np.ones(joints),
+        reprojection_rms_px=1.0,
+    )
+
+
+def test_initial_poses_of_another_subject_and_of_other_joints_do_not_end_the_node():
+    config = DrocapConfig().replace("bundle_adjuster", period_s=0.3, window_s=4.0, blend_s=1.0)
+    latest, reports = [], []
+    with bringup(config, ["bundle_adjuster"]) as graph:
+        publishers = {}
+        for topic in ("pose2d", "pose3d/initial"):
+            publishers[topic] = graph.node.create_publisher(TOPICS[topic].message, topic, TOPICS[topic].qos)
+        for topic, into in (("pose3d/latest", latest), ("/diagnostics", reports)):
+            graph.node.create_subscription(TOPICS[topic].message, topic, into.append, TOPICS[topic].qos)
+        graph.wait_until(lambda: all(p.get_subscription_count() for p in publishers.values()), 20, "the node to listen")
+
+        def publish(observation, *pose):
+            publishers["pose2d"].publish(pose2d_to_ros(observation, "camera"))
+            publishers["pose3d/initial"].publish(initial_pose(observation, *pose))
+            graph.spin_for(0.12)  # raises the error of the node
+
+        # Windows of fifteen and of seventeen joints in turn: a gap empties the window.
+        taken = [o for burst in range(4) for o in observed(1.0, begin_ns=BEGIN + 3 * S * burst)[::2]]
+        for i, observation in enumerate(taken):
+            publish(observation, 1, (15, 17)[i // 10 % 2])
+        for observation, pose in zip(observed(0.2, begin_ns=BEGIN + 14 * S), [(0, 0), (2, 15)], strict=False):
+            publish(observation, *pose)
+        graph.wait_until(lambda: len(latest) == len(taken), 10, "the latest poses")
+        count = len(reports)
+        graph.wait_until(lambda: len(reports) > count + 1, 10, "the counts on /diagnostics")
+    values = {v.key: v.value for v in reports[-1].status[0].values}
+    assert int(values[Key.ADJUSTMENTS]) >= 4
+    assert values[Key.MESSAGES_REFUSED] == "2"
+    assert "track_id: expected 1 in pose3d/initial" in values[Key.LAST_REFUSED]

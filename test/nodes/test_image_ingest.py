@@ -1,15 +1,19 @@
 """Every kind of source of ``image_ingest``."""
 
+import os
+import subprocess
+import sys
 from array import array
 
 import cv2
 import numpy as np
 import pytest
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import CompressedImage, Image
 
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
+from drocap_ros.errors import InputError
 from drocap_ros.ros.conversions import header_at, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import TOPICS
@@ -68,21 +72,23 @@ def test_max_rate_skips_images_and_counts_them(folder):
     assert int(values(reports)[Key.IMAGES_SKIPPED]) > 10
 
 
+def raw_image(stamp_ns, data, encoding="bgr8"):
+    height, width = data.shape[:2]
+    return Image(
+        header=header_at(stamp_ns, "nose_camera"),
+        height=height,
+        width=width,
+        encoding=encoding,
+        step=data.nbytes // height,
+        data=array("B", np.ascontiguousarray(data).tobytes()),
+    )
+
+
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8"])
 def test_image_topic_keeps_its_stamps_and_colours(encoding):
     image = picture()
     data = {"rgb8": image[..., ::-1], "bgr8": image, "mono8": image[..., 1]}[encoding]
-    messages = [
-        Image(
-            header=header_at(10**9 * (5 + i), "nose_camera"),
-            height=120,
-            width=160,
-            encoding=encoding,
-            step=data.nbytes // 120,
-            data=array("B", np.ascontiguousarray(data).tobytes()),
-        )
-        for i in range(3)
-    ]
+    messages = [raw_image(10**9 * (5 + i), data, encoding) for i in range(3)]
     config = {"source": "topic:/front/image_raw"}
     images, _, _ = run(config, lambda i, _n, _r: len(i) >= 3, messages, Image, "/front/image_raw")
     assert {m.header.frame_id for m in images} == {"nose_camera"}
@@ -111,3 +117,70 @@ def test_silent_topic_is_reported_within_two_seconds():
     config = {"source": "topic:/nobody/image_raw", "stall_timeout_s": 1.0}
     _, _, reports = run(config, lambda _i, _n, r: any("no image" in m.status[0].message for m in r))
     assert "check the camera" in reports[-1].status[0].message
+
+
+def test_camera_info_follows_the_size_of_the_images():
+    messages = [raw_image(10**9 * (5 + i), np.repeat(picture(), 1 + i, axis=1).repeat(1 + i, axis=0)) for i in range(2)]
+    config = {"source": "topic:/front/image_raw", "horizontal_fov_deg": 90.0}
+    _, infos, _ = run(config, lambda _i, n, _r: len({m.width for m in n}) == 2, messages, Image, "/front/image_raw")
+    assert {(m.width, m.height, round(m.k[0])) for m in infos} == {(160, 120, 80), (320, 240, 160)}
+
+
+@pytest.mark.parametrize("name", ["", "bad name/compressed", "/front//image_raw", "{lens}/image_raw", "front/"])
+def test_a_topic_that_ros_does_not_allow_is_refused_in_one_line(name):
+    config = DrocapConfig().replace("image_ingest", source=f"topic:{name}")
+    refusal = pytest.raises(InputError, match=r"^source: expected topic:NAME .*; correct the name$")
+    with refusal as caught, bringup(config, ["image_ingest"], timeout_s=5.0):
+        pass
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("qos", "reliable"), [(QoSProfile(depth=10), True), (qos_profile_sensor_data, False)])
+def test_the_subscription_is_as_reliable_as_the_driver(qos, reliable):
+    topic = "/front/image_raw"
+    with bringup(DrocapConfig().replace("image_ingest", source=f"topic:{topic}"), ["image_ingest"]) as graph:
+        other = graph.node.create_publisher(Image, topic, qos_profile_sensor_data if reliable else QoSProfile(depth=10))
+        graph.wait_until(other.get_subscription_count, 10, "the node to listen")
+        graph.node.destroy_publisher(other)
+        # Another driver takes its place.
+        publisher = graph.node.create_publisher(Image, topic, qos)
+
+        def offers():
+            return {info.qos_profile.reliability.name for info in graph.node.get_subscriptions_info_by_topic(topic)}
+
+        graph.wait_until(lambda: offers() == {"RELIABLE" if reliable else "BEST_EFFORT"}, 10, "the node to adapt")
+        graph.wait_until(publisher.get_subscription_count, 10, "the node to listen")
+
+
+DRIVER = """
+import sys, time, rclpy
+from sensor_msgs.msg import Image
+rclpy.init()
+node = rclpy.create_node("driver")
+publisher = node.create_publisher(Image, "/front/image_raw", 10)
+while not publisher.get_subscription_count():
+    time.sleep(0.05)
+time.sleep(0.5)
+image = Image(height=480, width=640, encoding="bgr8", step=1920, data=bytes(921600))
+for _ in range(30):
+    image.header.stamp = node.get_clock().now().to_msg()
+    publisher.publish(image)
+    time.sleep(1 / 15)
+time.sleep(1.0)
+"""
+
+
+def test_raw_images_of_a_driver_with_the_defaults_of_ros_arrive():
+    config = DrocapConfig().replace("image_ingest", source="topic:/front/image_raw", horizontal_fov_deg=60.0)
+    with bringup(config, ["image_ingest"], processes=True) as graph:
+        infos = []
+        entry = TOPICS["camera_info"]
+        graph.node.create_subscription(entry.message, "camera_info", infos.append, entry.qos)
+        driver = subprocess.Popen(
+            [sys.executable, "-c", DRIVER], env={**os.environ, "ROS_DOMAIN_ID": str(graph.domain_id)}
+        )
+        try:
+            graph.wait_until(lambda: driver.poll() is not None, 30, "the driver's end")
+        finally:
+            driver.kill()
+    assert len(infos) >= 28

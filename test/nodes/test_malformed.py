@@ -72,7 +72,8 @@ class Bench:
 @pytest.fixture(scope="module")
 def bench(shared, tmp_path_factory):
     session = tmp_path_factory.mktemp("malformed") / "session"
-    config = DrocapConfig().replace("image_ingest", source=f"topic:{CAMERA}", horizontal_fov_deg=60.0)
+    # Without a camera_info: the bridge would refuse pose2d of images of another size than those of the topic.
+    config = DrocapConfig().replace("image_ingest", source=f"topic:{CAMERA}")
     config = config.replace("pose_estimator", models_dir=str(shared / "models"), confirm_frames=1)
     config = config.replace("mavlink_bridge", url=f"udpin:127.0.0.1:{free_udp_port()}", commands_enabled=True)
     config = config.replace("session_recorder", session_dir=str(session))

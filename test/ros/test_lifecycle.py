@@ -11,6 +11,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
+from drocap_ros.nodes.image_ingest import ImageIngestNode
 from drocap_ros.recording.open_session import session_info
 from drocap_ros.ros.topics import TOPICS
 
@@ -119,6 +120,16 @@ def test_networks_are_released_and_loaded_again(video, shared):
         for transition in ("configure", "activate"):
             assert change(graph, "pose_estimator", transition)
         graph.wait_until(lambda: poses, 10, "keypoints again")
+
+
+def test_any_error_of_a_first_configuration_ends_the_start_at_once(video, monkeypatch):
+    def acquire(_):
+        raise RuntimeError("the driver is broken")
+
+    monkeypatch.setattr(ImageIngestNode, "acquire", acquire)
+    config = DrocapConfig().replace("image_ingest", source=str(video))
+    with pytest.raises(RuntimeError, match="driver is broken"), bringup(config, ["image_ingest"], timeout_s=5.0):
+        pass
 
 
 @pytest.mark.parametrize("processes", [False, True], ids=["one process", "a process each"])

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from drocap_ros.cli.graph.dashboard import Dashboard, dashboard_on_terminal
 from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
+from drocap_ros.cli.options import ros_namespace
 from drocap_ros.errors import InputError
 from drocap_ros.recording.mcap.metadata import METADATA_FILE
 from drocap_ros.recording.provenance import dated_name
@@ -49,7 +50,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def add_graph_options(parser: argparse.ArgumentParser) -> None:
     """Options of every command that starts nodes."""
-    parser.add_argument("--namespace", default="/drocap", help="of all topics (default /drocap)")
+    parser.add_argument("--namespace", type=ros_namespace, default="/drocap", help="of all topics (default /drocap)")
     add_domain_option(parser)
     parser.add_argument(
         "--one-process", action="store_true", help="all nodes in this process, a thread each: for tests"
@@ -102,7 +103,7 @@ def run_graph(config: DrocapConfig, nodes: list[str], args: argparse.Namespace) 
             sys.stdout.flush()
         with dashboard_of(graph, show=not args.quiet) as (_, draw), stop_signals() as stop:
             while not stop.is_set() and "image_ingest" not in graph.finished:
-                graph.spin_for(0.5)
+                graph.spin_for(0.5, stop)
                 draw()
                 while graph.events:
                     print(f"drocap: {graph.events.popleft()}", file=sys.stderr, flush=True)
@@ -131,10 +132,11 @@ def stop_signals() -> Iterator[threading.Event]:
 
 
 @contextlib.contextmanager
-def interruptible() -> Iterator[threading.Event]:
+def interruptible(*signals: signal.Signals) -> Iterator[threading.Event]:
     """SIGTERM interrupts the program as Ctrl-C does, so that no half-written file remains.
 
-    Both raise KeyboardInterrupt and set the event: an exception in a destructor, for one, is lost.
+    ``signals`` (default: SIGINT and SIGTERM) raise KeyboardInterrupt and set the event: an exception in a destructor,
+    for one, is lost.
     """
     interrupted = threading.Event()
 
@@ -142,7 +144,10 @@ def interruptible() -> Iterator[threading.Event]:
         interrupted.set()
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    taken = signals or (signal.SIGINT, signal.SIGTERM)
+    if threading.current_thread() is not threading.main_thread():
+        taken = ()  # Python permits handlers in the main thread only
+    before = {number: signal.signal(number, interrupt) for number in taken}
     try:
         yield interrupted
     finally:

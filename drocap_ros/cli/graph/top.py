@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from typing import Any
 
 from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
 from drocap_ros.cli.graph.live import dashboard_of, import_bringup, stop_signals
+from drocap_ros.cli.options import ros_namespace
 
-#: How long ``--once`` waits for a first status.
+#: How long ``--once`` waits for a first status, and then at most for further nodes.
 ONCE_TIMEOUT_S = 8.0
+#: All nodes have been heard when for so long none was new; each publishes its status once a second.
+_QUIET_S = 1.5
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -20,7 +24,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="dashboard of a running graph",
         description="Show state, rate, latency and counts of every node of a running graph until Ctrl-C.",
     )
-    parser.add_argument("--namespace", default="/drocap", help="of the graph (default /drocap)")
+    parser.add_argument("--namespace", type=ros_namespace, default="/drocap", help="of the graph (default /drocap)")
     add_domain_option(parser)
     parser.add_argument("--once", action="store_true", help="print the table once and end")
     parser.set_defaults(run=run)
@@ -38,16 +42,19 @@ def run(args: argparse.Namespace) -> int:
         stop_signals() as stop,
     ):
         if args.once:
-            # Discovery may take seconds; then every node publishes its status once a second.
-            for _ in range(int(ONCE_TIMEOUT_S)):
-                graph.spin_for(1.0)
-                if dashboard.heard(args.namespace):
-                    graph.spin_for(1.5)
-                    break
+            # Discovery may take seconds, for one node longer than for another.
+            end_s = time.monotonic() + ONCE_TIMEOUT_S
+            while not dashboard.heard(args.namespace) and time.monotonic() < end_s and not stop.is_set():
+                graph.spin_for(0.2, stop)
+            known: list[str] = []
+            end_s = time.monotonic() + ONCE_TIMEOUT_S
+            while dashboard.heard(args.namespace) != known and time.monotonic() < end_s and not stop.is_set():
+                known = dashboard.heard(args.namespace)
+                graph.spin_for(_QUIET_S, stop)
             # A pipe has no width: wide enough that no name is cut.
             Console(width=None if sys.stdout.isatty() else 180).print(dashboard.table(args.namespace))
             return 0 if dashboard.heard(args.namespace) else 1
         while not stop.is_set():
-            graph.spin_for(0.5)
+            graph.spin_for(0.5, stop)
             draw()
     return 0

@@ -44,10 +44,12 @@ class LatestPose:
         return self._to is not None
 
     def set_solution(self, lengths: np.ndarray, stamp_ns: int) -> None:
-        """Blend in a solution's bone lengths (16,) m from the image of ``stamp_ns`` on."""
+        """Blend in a solution's bone lengths (16,) m, or (14,) without toes, from the image of ``stamp_ns`` on."""
         if not np.isfinite(lengths).all():
             return
-        self._from = self._lengths(stamp_ns)
+        before = self._lengths(stamp_ns)
+        # Bones that only the new solution has are not blended, those that only the old one had are dropped.
+        self._from = None if before is None else np.concatenate([before, lengths[len(before) :]])[: len(lengths)]
         self._to, self._begin_ns = lengths, stamp_ns
 
     def pose(self, stamp_ns: int, joints: np.ndarray) -> np.ndarray:
@@ -74,10 +76,11 @@ class LatestPose:
 
 
 def _with_lengths(joints: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Joints (P, 3) whose bones keep their directions and have these lengths; pelvis at the origin."""
+    """Joints (P, 3) whose bones keep their directions and have these lengths, where given; pelvis at the origin."""
     bones = _BONES[: len(joints) - 1]
     way = joints[bones[:, 1]] - joints[bones[:, 0]]
-    way *= (lengths[: len(bones)] / np.maximum(np.linalg.norm(way, axis=-1), 1e-9))[:, None]
+    known = way[: len(lengths)]
+    known *= (lengths[: len(known)] / np.maximum(np.linalg.norm(known, axis=-1), 1e-9))[:, None]
     out = np.zeros_like(joints)
     for bone, (parent, child) in enumerate(bones):
         out[child] = out[parent] + way[bone]
