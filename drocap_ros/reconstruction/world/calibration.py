@@ -11,6 +11,8 @@ import numpy as np
 
 #: Number of unknowns.
 COUNT = 6
+#: Relative standard deviation of the scale below which it counts as measured.
+MEASURED = 0.03
 #: Time after which findings count a third: telemetry drifts, and errors of the poses do not average out.
 _MEMORY_S = 60.0
 

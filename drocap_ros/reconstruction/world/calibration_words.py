@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
+from drocap_ros.reconstruction.world.calibration import MEASURED
+
 #: Standard deviations from zero at which a correction is stated.
 _CLEAR = 2.0
+#: Standard deviations from the assumed stature at which a measured one is doubtful.
+_UNLIKELY = 3.0
 
 
 def telemetry_words(meta: Mapping[str, Any]) -> str:
-    """One to three sentences for the meta data of a motion; "" where no telemetry was adjusted."""
+    """A sentence for the meta data of a motion; "" where no telemetry was adjusted."""
     rejected = meta.get("telemetry_rejected")
     if isinstance(rejected, str):
         return f"Telemetry not used: {rejected}."
@@ -18,40 +23,55 @@ def telemetry_words(meta: Mapping[str, Any]) -> str:
     if not isinstance(windows, list) or not windows or not isinstance(windows[0], Mapping):
         return ""
     try:
-        return _calibration(windows[0])
-    except (KeyError, TypeError, ValueError, IndexError):
+        return _calibrations(windows, meta.get("assumed_height_m"))
+    except (KeyError, TypeError, ValueError, IndexError, ZeroDivisionError):
         return ""  # written by hand or by another version
 
 
-def _calibration(found: Mapping[str, Any]) -> str:
-    tilt, yaw, roll = (float(v) for v in found["misalignment_deg"])
-    spread = [float(v) for v in found["misalignment_std_deg"]]
+def _calibrations(windows: list[Mapping[str, Any]], height_m: float | None) -> str:
+    """The worst of each fact over the windows of a long recording."""
+    turned = [(w["misalignment_deg"], w["misalignment_std_deg"]) for w in windows]
     facts = [
-        _correction("gimbal pitch", tilt, spread[0], "deg"),
-        _correction("gimbal yaw", yaw, spread[1], "deg"),
-        _correction("gimbal roll", roll, spread[2], "deg"),
+        _correction(f"gimbal {name}", [(v[axis], std[axis]) for v, std in turned], "deg")
+        for axis, name in enumerate(("pitch", "yaw", "roll"))
+    ]
+    facts += [
         _correction(
-            "attitude's stamps", 1e3 * float(found["attitude_latency_s"]),
-            1e3 * float(found["attitude_latency_std_s"]), "ms",
-        ),
-        _correction(
-            "position's stamps", 1e3 * float(found["position_latency_s"]),
-            1e3 * float(found["position_latency_std_s"]), "ms",
-        ),
-    ]  # fmt: skip
+            f"{name}'s stamps",
+            [(1e3 * w[f"{name}_latency_s"], 1e3 * w[f"{name}_latency_std_s"]) for w in windows],
+            "ms",
+        )
+        for name in ("attitude", "position")
+    ]
     stated = [fact for fact in facts if fact]
-    scale = f"scale known to {100 * float(found['scale_std']):.1f} %"
-    feet = f"feet in contact for {100 * float(found['contact_share']):.0f} % of the time"
+    scale = f"scale known to {100 * max(w['scale_std'] for w in windows):.1f} %"
+    feet = f"feet in contact for {100 * min(w['contact_share'] for w in windows):.0f} % of the time"
     corrections = ", ".join(stated) if stated else "no error of the telemetry is clear"
-    still = (
-        ""
-        if found.get("camera_moves", True)
-        else "; the reported camera never moves: it is fixed, or its log is frozen"
-    )
-    return f"{corrections[0].upper()}{corrections[1:]}; {scale}, {feet}{still}."
+    still, stop_s = "", max(w.get("camera_stops_s", 0.0) for w in windows)
+    if not any(w.get("camera_moves", True) for w in windows):
+        still = "; the reported camera never moves: it is fixed, or its log is frozen"
+    elif stop_s > 0:
+        still = f"; the reported camera stands still for {stop_s:.1f} s: it hovers, or its log is frozen"
+    worst = f" (worst of {len(windows)} windows)" if len(windows) > 1 else ""
+    return f"{corrections[0].upper()}{corrections[1:]}; {scale}, {feet}{worst}{still}{_stature(windows, height_m)}."
 
 
-def _correction(name: str, value: float, std: float, unit: str) -> str:
+def _correction(name: str, found: list[tuple[float, float]], unit: str) -> str:
+    value, std = max(found, key=lambda v: abs(v[0]) / v[1])
     digits = 0 if unit == "ms" else 1
     clear = abs(value) > _CLEAR * std
     return f"{name} corrected by {value:.{digits}f} +- {std:.{digits}f} {unit}" if clear else ""
+
+
+def _stature(windows: list[Mapping[str, Any]], height_m: float | None) -> str:
+    """Whether a measured scale makes the person taller or shorter than people are expected to be."""
+    off = [math.log(w["scale"]) / w["stature_std"] for w in windows if w["scale_std"] < MEASURED and "stature_std" in w]
+    worst = max(off, key=abs, default=0.0)
+    if abs(worst) < _UNLIKELY:
+        return ""
+    size = max((w["scale"] for w in windows if w["scale_std"] < MEASURED), key=lambda v: abs(math.log(v)))
+    person = "the assumed one" if height_m is None else f"the assumed {height_m:.2f} m"
+    return (
+        f"; the person measures {size:.2f} times {person}, {abs(worst):.0f} standard deviations off: check the lens, "
+        "the log and assumed_height_m"
+    )

@@ -7,6 +7,8 @@ import numpy as np
 from drocap_ros.reconstruction.world.world_model import ANKLES, FEET, FEET_HEIGHT_M, FLOOR, WorldState
 
 _AVERAGE_FRAMES = 3
+#: Time for which a foot that is not seen keeps its contact.
+_HIDDEN_S = 0.25
 _HEIGHT_STD_M = 0.1
 #: Spread of the heights of resting feet on level ground, as the body's errors leave it, and on steps.
 _LEVEL_M, _STEPS_M = 0.025, 0.06
@@ -31,7 +33,7 @@ def contact_probability(
 ) -> np.ndarray:
     """(F - 1, 4) for each step between two frames of each of ``FEET``.
 
-    seen : (F, P) bool, of the joints; a toe that no network sees is the lifter's guess and holds no foot
+    seen : (F, P) bool, of the joints; a toe or an ankle that no network sees is the lifter's guess and holds no foot
     speed_std_m_s : of a foot in contact, as far as the present joints are accurate
     still : (F, 2) the network's probability that the right and the left foot rest, None = unknown
     parting : (F - 1, 2) m/s, of :func:`parting_speed`; None = unknown
@@ -52,9 +54,17 @@ def contact_probability(
     total = both + _MOVING * (right + left + _MOVING)
     probability = np.empty_like(resting)
     probability[:, ::2], probability[:, 1::2] = (both + _MOVING * right) / total, (both + _MOVING * left) / total
-    toes = FEET[len(ANKLES) :]
-    probability[:, len(ANKLES) :] *= seen[1:, toes] & seen[:-1, toes]
-    return probability
+    known = seen[:, FEET].copy()
+    known[:, : len(ANKLES)] = ankles_seen(seen, fps)
+    return probability * (known[1:] & known[:-1])
+
+
+def ankles_seen(seen: np.ndarray, fps: float) -> np.ndarray:
+    """(F, 2) whether a network saw the ankle, of joints (F, P), at the frame or shortly before or after it."""
+    from scipy.ndimage import maximum_filter1d
+
+    known: np.ndarray = maximum_filter1d(seen[:, ANKLES], 2 * round(_HIDDEN_S * fps) + 1, axis=0, mode="nearest")
+    return known
 
 
 def _resting_together(looks: np.ndarray, parting: np.ndarray) -> np.ndarray:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.methods.method_input import CameraPoses
 from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.placement import WorldPoses, place_in_world
-from drocap_ros.reconstruction.world.refine import Before, PlacedPoses, RefinedWorld, refine_in_world
+from drocap_ros.reconstruction.world.position_steps import without_steps
+from drocap_ros.reconstruction.world.refine import Before, PlacedPoses, RefinedWorld, refinable, refine_in_world
+from drocap_ros.reconstruction.world.telemetry_checks import upside_down
 from drocap_ros.reconstruction.world.world_model import WorldConfig
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
@@ -43,10 +47,16 @@ def in_world(
     -------
     WorldPoses, and as of :func:`~drocap_ros.reconstruction.world.refine.refine_in_world`
     """
+    rotation = tracks.camera_rotation
+    assert rotation is not None
     projected = poses.joints_px[..., :2] + poses.translation_px[:, None]
+    if tracks.camera_position is not None and poses.sigma_px is not None and refinable(tracks):
+        tracks = replace(tracks, camera_position=without_steps(tracks.camera_position, tracks.stamp_ns))
     placed = place_in_world(in_camera_axes(poses, per_px), projected, per_px, tracks)
     if poses.sigma_px is None:
         return placed, None
+    if reason := upside_down(placed.joints, rotation):
+        return placed, reason
     size = per_px[:, None]
     depth = (poses.joints_px[..., 2] - poses.joints_px[:, [_PELVIS], 2]) * size
     factor = placed.scale.factor if placed.metric and placed.scale is not None else 1.0

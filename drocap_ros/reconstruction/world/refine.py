@@ -13,9 +13,16 @@ from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.lifted.window_solver import difference_noise
 from drocap_ros.reconstruction.methods.windows import fade_weights, windows
-from drocap_ros.reconstruction.world.calibration import Calibration
+from drocap_ros.reconstruction.world.calibration import MEASURED, Calibration
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
-from drocap_ros.reconstruction.world.telemetry_checks import frozen, other_time, resting_feet_move
+from drocap_ros.reconstruction.world.contacts import ankles_seen
+from drocap_ros.reconstruction.world.telemetry_checks import (
+    frozen,
+    other_time,
+    resting_feet_move,
+    stops,
+    turned_at_once,
+)
 from drocap_ros.reconstruction.world.world_adjustment import WorldSolution, adjust_in_world
 from drocap_ros.reconstruction.world.world_model import (
     ANKLES,
@@ -41,11 +48,11 @@ _HELD = 2
 _LEAST_NOISE_PX = 0.5
 #: Weight of the lifter's image position of a joint that is not seen: its errors last for many frames.
 _GUESS_WEIGHT = 0.1
-#: Relative standard deviation of the scale below which it counts as measured.
-_MEASURED = 0.03
 #: Cost of the telemetry per frame that no camera's flight explains, and least share of contacts: jogging has 0.2,
 #: a yaw off by 40 degrees less than 0.01.
 _LARGEST_COST, _LEAST_CONTACT = 100.0, 0.03
+#: Share of the time in which an ankle has to be seen for the feet to tell wrong telemetry.
+_SEEN = 0.3
 #: Frames per second below which a step of a foot ends between two frames: contacts are not seen.
 _CONTACTS_FPS = 8.0
 
@@ -146,11 +153,17 @@ def refine_in_world(
     )
     turn = project_to_so3(_at_all_slots(rotation, slot))
     poses_at = body * poses.factor
-    if reason := frozen(turn, path, fps) or other_time(poses_at, turn, path, fps):
+    if reason := frozen(turn, path, fps) or turned_at_once(turn, fps):
         return reason
     still = None if poses.still is None else _at_all_slots(poses.still, slot)
-    if still is not None and (reason := resting_feet_move(poses_at, still, fps)):
-        return reason
+    ankles = ankles_seen(seen, fps)
+    # Windows whose feet can tell wrong telemetry.
+    of_feet = [rows for rows in windows(frames, _WINDOW, _OVERLAP) if config.feet and ankles[rows].mean() > _SEEN]
+    for rows in of_feet:
+        if reason := other_time(poses_at[rows], turn[rows], path[rows], fps):
+            return reason
+        if still is not None and (reason := resting_feet_move(poses_at[rows], still[rows], fps)):
+            return reason
     start, held = _start(tracks.stamp_ns, (poses.joints - origin) / poses.factor, origin, 1.0 / poses.factor, before)
     start = start._replace(joints=_at_all_slots(start.joints, slot), wander=_at_all_slots(start.wander, slot))
     joints: np.ndarray = np.zeros(body.shape)
@@ -158,7 +171,7 @@ def refine_in_world(
     wander: np.ndarray = np.zeros((frames, CAMERA))
     covariance: np.ndarray = np.zeros((*body.shape, 3))
     total, calibration = np.zeros(frames), []
-    measured, cost, contact = True, 0.0, 0.0
+    measured, cost, contact = True, 0.0, 1.0
     lengths = np.median(span_lengths(body), axis=0)
     for rows in windows(frames, _WINDOW, _OVERLAP):
         telemetry = CameraTelemetry(turn[rows], path[rows], fps)
@@ -174,14 +187,15 @@ def refine_in_world(
         wander[rows] += fade[:, None] * found.state.camera
         covariance[rows] += fade[:, None, None, None] * found.covariance
         total[rows] += fade
-        calibration.append(_calibration(found, poses.factor, path[rows]))
+        calibration.append(_calibration(found, config.stature_std, turn[rows], path[rows], fps))
         cost = max(cost, found.cost_terms["telemetry"] / len(found.joints))
-        contact = max(contact, float(found.contact[:, : len(ANKLES)].mean()))
-        measured &= bool(found.std[SCALE] < _MEASURED * found.state.globals[SCALE])
+        if rows in of_feet and fps >= _CONTACTS_FPS:
+            contact = min(contact, float(found.contact[:, : len(ANKLES)].mean() / ankles[rows].mean()))
+        measured &= bool(found.std[SCALE] < MEASURED * found.state.globals[SCALE])
     covariance = (covariance / total[:, None, None, None])[slot][..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     joints, camera = joints / total[:, None, None] + origin, camera / total[:, None]
     corrected, moved = exp_so3(camera[slot, 3:]) @ rotation, position + camera[slot, :3]
-    if reason := _rejection(cost, contact if config.feet and fps >= _CONTACTS_FPS else 1.0):
+    if reason := _rejection(cost, contact):
         return reason
     last = Before(tracks.stamp_ns, joints[slot], (wander / total[:, None])[slot], found.state.globals)
     return RefinedWorld(joints[slot], corrected, moved, measured, covariance, calibration, found.calibration, last)
@@ -224,7 +238,7 @@ def _rejection(cost: float, contact: float) -> str:
     if contact < _LEAST_CONTACT:
         return (
             "no foot of the body ever rests on its path in the world; check that the log belongs to the video, its "
-            "time offset and the gimbal's yaw"
+            "time offset and the gimbal's yaw (or the person glides)"
         )
     return ""
 
@@ -238,11 +252,15 @@ def _correction(found: WorldSolution, telemetry: CameraTelemetry) -> np.ndarray:
     return np.concatenate([position, turned], axis=1)
 
 
-def _calibration(found: WorldSolution, factor: float, camera_position: np.ndarray) -> dict[str, Any]:
+def _calibration(
+    found: WorldSolution, stature_std: float, rotation: np.ndarray, position: np.ndarray, fps: float
+) -> dict[str, Any]:
     shared, std = found.state.globals, found.std
+    still_s = [(stop.stop - stop.start) / fps for stop in stops(rotation, position, fps)]
     return {
         "scale": 1.0 / float(shared[SCALE]),
         "scale_std": float(std[SCALE] / shared[SCALE]),
+        "stature_std": stature_std,
         "misalignment_deg": np.degrees(found.turned).tolist(),
         "misalignment_std_deg": np.degrees(found.turned_std).tolist(),
         "attitude_latency_s": -float(shared[ATTITUDE_LATENCY]),
@@ -251,7 +269,8 @@ def _calibration(found: WorldSolution, factor: float, camera_position: np.ndarra
         "position_latency_std_s": float(std[POSITION_LATENCY]),
         "ground_spread_m": None if np.isnan(found.ground_spread) else found.ground_spread,
         "contact_share": float(found.contact[:, : len(ANKLES)].mean()),
-        "camera_moves": bool(np.ptp(camera_position, axis=0).max() > 0),
+        "camera_moves": bool(np.ptp(position, axis=0).max() > 0),
+        "camera_stops_s": max(still_s, default=0.0),
         "iterations": found.iterations,
         "stop_reason": found.stop_reason,
     }

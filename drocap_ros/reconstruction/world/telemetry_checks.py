@@ -5,10 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from drocap_ros.geometry.interpolation import true_runs
+from drocap_ros.geometry.rotations import log_so3
 from drocap_ros.reconstruction.world.world_model import ANKLES
+from drocap_ros.skeleton import BODY_15
 
 #: A moving camera whose pose stays the same for so long, to the rounding of its interpolation, has no new measurement.
 _FROZEN_S, _MOVING_M_S, _SAME = 1.0, 0.2, 1e-9
+#: A vehicle stops and starts more slowly than this.
+_STOP_M_S2 = 10.0
+#: Times within which no gimbal turns by so much and stands still, or turns evenly, before and after: 0 = one frame.
+_TURNS_S_DEG = ((0.0, 5.0), (0.12, 10.0))
+#: Change of the turn rate of a gimbal: what one frame of a low rate may hold.
+_TURN_DEG_S2 = 500.0
+#: Height (m per m) of the image's lower border above its centre, from which a camera is upside down.
+_UPSIDE_DOWN = 0.2
 _SHIFTS_S, _SHIFT_STEP_S = 3.0, 0.5
 _LAG_S, _SMOOTHING_S, _STILL_M = 0.4, 0.06, 0.06
 #: Share of still feet at another time over that at the reported time, and its least value.
@@ -19,16 +29,50 @@ _RESTING_M_S, _RESTING_RATIO = 0.55, 0.7
 _RESTING_SHARE, _RESTING_LAG_S, _RESTING_SMOOTHING_S = 0.05, 0.33, 0.08
 
 
-def frozen(rotation: np.ndarray, position: np.ndarray, fps: float) -> str:
-    """Whether the poses (F, 3, 3), (F, 3) m stop and the camera moves otherwise."""
+def stops(rotation: np.ndarray, position: np.ndarray, fps: float) -> list[slice]:
+    """Steps between poses (F, 3, 3), (F, 3) m that stay the same for a second, of a camera that moves otherwise."""
     same = unchanged(rotation, position)
     speed = np.linalg.norm(np.diff(position, axis=0), axis=-1) * fps
     if same.all() or not float(np.median(speed[~same])) > _MOVING_M_S:
+        return []
+    return [slice(begin, end) for begin, end in true_runs(same).tolist() if end - begin >= _FROZEN_S * fps]
+
+
+def frozen(rotation: np.ndarray, position: np.ndarray, fps: float) -> str:
+    """Whether the poses (F, 3, 3), (F, 3) m stop, or go on, at once: a vehicle that stops slows down before."""
+    from scipy.ndimage import maximum_filter1d
+
+    speed = np.linalg.norm(np.diff(position, axis=0), axis=-1) * fps
+    # The first step of a log between two images is a part of one.
+    beside = maximum_filter1d(speed, 5, mode="constant")
+    at_once = [
+        (stop.stop - stop.start) / fps
+        for stop in stops(rotation, position, fps)
+        if max(beside[stop.start], beside[stop.stop - 1]) > _STOP_M_S2 / fps
+    ]
+    if not at_once:
         return ""
-    longest = float(np.ptp(true_runs(same), axis=1).max(initial=0)) / fps
-    if longest < _FROZEN_S:
+    return f"the camera's reported pose stops at once, for {max(at_once):.1f} s; check the log for gaps"
+
+
+def turned_at_once(rotation: np.ndarray, fps: float) -> str:
+    """Whether rotations (F, 3, 3) jump: a turn that differs from those before and after as no gimbal's does."""
+    for within_s, least_deg in _TURNS_S_DEG:
+        lag = max(round(within_s * fps), 1)
+        turn = log_so3(rotation[lag:] @ np.swapaxes(rotation[:-lag], 1, 2))
+        differs = np.linalg.norm(turn[lag:] - turn[:-lag], axis=1)
+        jump = np.degrees(np.minimum(differs[:-lag], differs[lag:]).max(initial=0.0))
+        if jump > max(least_deg, _TURN_DEG_S2 * (lag / fps) ** 2):
+            return f"the camera's reported rotation jumps by {jump:.0f} deg; check the gimbal's yaw in the log"
+    return ""
+
+
+def upside_down(joints: np.ndarray, rotation: np.ndarray) -> str:
+    """Whether camera (F, 3, 3) and person (F, P, 3) m both stand on their heads: a log whose z points down."""
+    trunk = joints[:, BODY_15.index("neck"), 2] - joints[:, BODY_15.index("pelvis"), 2]
+    if not (np.median(rotation[:, 1, 2]) > _UPSIDE_DOWN and np.median(trunk) < 0.0):
         return ""
-    return f"the camera's reported pose stops for {longest:.1f} s between motions; check the log for gaps"
+    return "camera and person are upside down; check that the log's axes are east, north and up"
 
 
 def unchanged(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
@@ -54,7 +98,9 @@ def other_time(joints: np.ndarray, rotation: np.ndarray, position: np.ndarray, f
     best, own = int(share.argmax()), float(share[len(shifts) // 2])
     if share[best] < max(_CLEARLY_BETTER * own, _LEAST_SHARE):
         return ""
-    return f"the feet rest more with poses {shifts[best]:+.1f} s later; check the log's time offset"
+    return (
+        f"the feet rest more with poses {shifts[best]:+.1f} s later; check the log's time offset (or the person glides)"
+    )
 
 
 def resting_feet_move(joints: np.ndarray, still: np.ndarray, fps: float) -> str:
@@ -78,7 +124,7 @@ def resting_feet_move(joints: np.ndarray, still: np.ndarray, fps: float) -> str:
         return ""
     return (
         f"feet that look at rest move at {resting:.1f} m/s on their path; check that the log belongs to the video and "
-        "is not frozen"
+        "is not frozen (or the person glides: skates, lift)"
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from drocap_ros.flight.frames import camera_rotation, quaternion_multiply
 from drocap_ros.geometry.interpolation import interpolate, true_runs
+from drocap_ros.reconstruction.world.position_steps import without_steps
 from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack
 from drocap_ros.tracks import Tracks
 
@@ -56,7 +57,8 @@ def camera_poses(track: VehicleTrack, stamp_ns: np.ndarray, mount_pitch_deg: flo
     keep, reasons = slice(0, len(stamp_ns)), []
     rotation, keep, words = _series(track.stamp_ns, attitude, stamp_ns, keep, missing, spherical=True)
     reasons += words
-    position, keep, words = _series(track.stamp_ns, track.position, stamp_ns, keep, "position", spherical=False)
+    place = _without_steps(track, stamp_ns)
+    position, keep, words = _series(track.stamp_ns, place, stamp_ns, keep, "position", spherical=False)
     reasons += words
     return CameraPoses(
         None if rotation is None else camera_rotation(rotation[keep]),
@@ -82,6 +84,20 @@ def with_camera(
         arrays[name] = None if value is None else value[poses.keep]
     changed = dataclasses.replace(tracks, **arrays, camera_rotation=poses.rotation, camera_position=poses.position)
     return changed, poses.reason
+
+
+def _without_steps(track: VehicleTrack, stamp_ns: np.ndarray) -> np.ndarray:
+    """(N, 3) m: the track's positions about the time of the images, without the steps in which they are reported.
+
+    Interpolated at the images, steps would no longer stand alone.
+    """
+    place, reach_ns = track.position.copy(), round(REPORTED_GAP_S * 1e9)
+    if len(stamp_ns):
+        about = (track.stamp_ns >= stamp_ns[0] - reach_ns) & (track.stamp_ns <= stamp_ns[-1] + reach_ns)
+        about &= np.isfinite(place).all(axis=1)
+        if about.any():
+            place[about] = without_steps(place[about], track.stamp_ns[about])
+    return place
 
 
 def _series(
