@@ -14,7 +14,8 @@ _FROZEN_S, _MOVING_M_S, _SAME = 1.0, 0.2, 1e-9
 #: A vehicle stops and starts more slowly than this.
 _STOP_M_S2 = 10.0
 #: Times within which no gimbal turns by so much and stands still, or turns evenly, before and after: 0 = one frame.
-_TURNS_S_DEG = ((0.0, 5.0), (0.12, 10.0))
+#: Simulated orbits at 15 frames per second reach 5.3 degrees in both.
+_TURNS_S_DEG = ((0.0, 10.0), (0.12, 12.0))
 #: Change of the turn rate of a gimbal: what one frame of a low rate may hold.
 _TURN_DEG_S2 = 500.0
 #: Height (m per m) of the image's lower border above its centre, from which a camera is upside down.

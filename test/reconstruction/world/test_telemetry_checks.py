@@ -79,6 +79,7 @@ def test_a_yaw_that_jumps_is_noticed_and_quick_turns_are_not(fps: float) -> None
         "starts at once": np.maximum(time - 4.0, 0.0) * 60.0,
         "turns": 40.0 / (1.0 + np.exp(-(time - 4.0) / 0.15)),
         "shakes": 3.0 * np.sin(2 * np.pi * 1.5 * time),
+        "corrects": np.where(np.arange(frames) == frames // 2, 5.5, 0.0),  # simulated orbits reach 5.3
     }
     for values in yaw.values():
         assert not turned_at_once(turned(rotation, values), fps)
