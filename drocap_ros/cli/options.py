@@ -49,10 +49,10 @@ def add_seed_option(parser: argparse.ArgumentParser, help: str, **options: Any) 
 
 
 def ros_namespace(text: str) -> str:
-    """Type of ``--namespace``."""
+    """Type of ``--namespace``; the leading slash may be left out."""
     if not _NAMESPACE.fullmatch(text):
         raise argparse.ArgumentTypeError(f"expected names of letters, digits and _, as /drocap or /a/b, got {text!r}")
-    return text
+    return text if text.startswith("/") else f"/{text}"
 
 
 def _seed(text: str) -> int:

@@ -6,6 +6,7 @@ import sys
 import pytest
 
 from drocap_ros.cli import COMMANDS, main
+from drocap_ros.cli.options import ros_namespace
 
 HEAVY = ("numpy", "scipy", "cv2", "rclpy", "onnxruntime", "matplotlib", "torch")
 
@@ -67,3 +68,8 @@ def test_empty_word_is_no_path(words, after, tmp_path, monkeypatch, capsys):
 def test_name_with_a_line_break_gives_one_line(tmp_path, capsys):
     assert main(["info", str(tmp_path / "a\nb.npz")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(("text", "namespace"), [("/", "/"), ("drone2", "/drone2"), ("/a/b_1", "/a/b_1")])
+def test_a_namespace_has_its_leading_slash(text, namespace):
+    assert ros_namespace(text) == namespace
