@@ -16,38 +16,42 @@ _POLYNOMIAL = (3.4445, -4.7750, 2.0315)
 _ITERATIONS = 5
 
 
-def orthogonalised(matrix: torch.Tensor) -> torch.Tensor:
-    """The matrix (M, N) with all its singular values near one (0.7 to 1.2), by Newton-Schulz iterations.
+def orthogonalised(matrices: torch.Tensor) -> torch.Tensor:
+    """The matrices (..., M, N) with all their singular values near one (0.7 to 1.2), by Newton-Schulz iterations.
 
     K. Jordan et al., "Muon: an optimizer for hidden layers in neural networks", 2024.
     """
     a, b, c = _POLYNOMIAL
-    tall = matrix.shape[0] > matrix.shape[1]
-    x = matrix.T if tall else matrix
-    x = reduced(x / x.norm().clamp(min=1e-7))
+    tall = matrices.shape[-2] > matrices.shape[-1]
+    x = matrices.mT if tall else matrices
+    x = reduced(x / x.norm(dim=(-2, -1), keepdim=True).clamp(min=1e-7))
     for _ in range(_ITERATIONS):
-        gram = x @ x.T
+        gram = x @ x.mT
         x = a * x + (b * gram + c * (gram @ gram)) @ x
-    return (x.T if tall else x).float()
+    return (x.mT if tall else x).float()
 
 
 def muon(matrices: list[torch.nn.Parameter], weight_decay: float) -> Any:
-    """Optimiser of matrices (M, N) along the orthogonalised Nesterov momentum; the caller sets its rate."""
+    """Optimiser of matrices (M, N) along the orthogonalised Nesterov momentum; the caller sets its rate.
+
+    Matrices of one shape are stepped together.
+    """
     torch = pytorch()
     optimiser: Any = torch.optim.Optimizer
+    shapes = sorted({tuple(weight.shape) for weight in matrices})
 
     class Muon(optimiser):
         @torch.no_grad()
         def step(self) -> None:
             for group in self.param_groups:
-                for weight in group["params"]:
-                    state = self.state[weight]
-                    if not state:
-                        state["momentum"] = torch.zeros_like(weight)
-                    momentum = state["momentum"]
-                    momentum.lerp_(weight.grad, 1 - _MOMENTUM)
-                    update = orthogonalised(weight.grad.lerp(momentum, _MOMENTUM))
-                    rate = group["lr"] * math.sqrt(max(1.0, weight.shape[0] / weight.shape[1]))
-                    weight.mul_(1 - group["lr"] * weight_decay).add_(update, alpha=-rate)
+                weights = group["params"]
+                gradient = torch.stack([weight.grad for weight in weights])
+                momentum = self.state[weights[0]].setdefault("momentum", torch.zeros_like(gradient))
+                momentum.lerp_(gradient, 1 - _MOMENTUM)
+                update = orthogonalised(gradient.lerp(momentum, _MOMENTUM))
+                rate = group["lr"] * math.sqrt(max(1.0, gradient.shape[1] / gradient.shape[2]))
+                torch._foreach_mul_(weights, 1 - group["lr"] * weight_decay)
+                torch._foreach_add_(weights, list(update.unbind()), alpha=-rate)
 
-    return Muon(matrices, {"lr": 0.0})
+    groups = [{"params": [weight for weight in matrices if tuple(weight.shape) == shape]} for shape in shapes]
+    return Muon(groups, {"lr": 0.0})

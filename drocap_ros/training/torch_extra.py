@@ -35,15 +35,28 @@ def _has_bfloat16() -> bool:
     return bool(pytorch().cpu.get_capabilities().get("avx512_bf16", False))
 
 
-def mixed_precision() -> Any:
-    """Context of bfloat16 where the processor has it."""
+def best_device() -> Any:
+    """A GPU where PyTorch finds one that it can use, else the processor."""
     torch = pytorch()
-    return torch.autocast("cpu", dtype=torch.bfloat16, enabled=_has_bfloat16())
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def mixed_precision(device: Any = None) -> Any:
+    """Context of bfloat16 where the device (default: the processor) has it."""
+    torch = pytorch()
+    on_gpu = device is not None and device.type == "cuda"
+    # A recorded graph must not keep weights that were cast before it.
+    return torch.autocast(
+        "cuda" if on_gpu else "cpu",
+        dtype=torch.bfloat16,
+        enabled=on_gpu or _has_bfloat16(),
+        cache_enabled=not on_gpu,
+    )
 
 
 def reduced(tensor: torch.Tensor) -> torch.Tensor:
-    """The tensor in bfloat16 where the processor has it."""
-    return tensor.bfloat16() if _has_bfloat16() else tensor
+    """The tensor in bfloat16 where its device has it."""
+    return tensor.bfloat16() if tensor.is_cuda or _has_bfloat16() else tensor
 
 
 def set_threads(count: int) -> None:
@@ -62,20 +75,21 @@ def write_onnx(
     outputs: list[str],
     axes: dict[str, dict[int, str]],
     facts: dict[str, str],
+    bytes_per_weight: int = 2,
 ) -> None:
-    """Write a network as ONNX with weights in half precision (computed in single) and ``facts`` as metadata.
+    """Write a network as ONNX with weights in half precision or in eight bits, and ``facts`` as metadata.
 
-    ``axes`` names the variable dimensions per input and output.
+    It is computed in single precision.  ``axes`` names the variable dimensions per input and output.
     """
     torch = pytorch()
     try:
         import onnx
-        from onnx import TensorProto, helper, numpy_helper
+        from onnx import helper
     except ImportError:
         raise DrocapError("export needs the package onnx, which is not installed; pip install onnx") from None
     if path.suffix != ".onnx":
         raise InputError(f"--out: expected a file name ending in .onnx, got {path.name!r}")
-    network = copy.deepcopy(network).eval().float()
+    network = copy.deepcopy(network).cpu().eval().float()
     path.parent.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings():
         # The exporter warns of its deprecation and of unfolded slices.
@@ -91,19 +105,55 @@ def write_onnx(
             dynamo=False,
         )
     model = onnx.load(str(path))
-    kept, casts = [], []
-    for tensor in model.graph.initializer:
-        array = numpy_helper.to_array(tensor)
-        if array.dtype == np.float32 and array.size > 1024:
-            half = numpy_helper.from_array(array.astype(np.float16), tensor.name + "_half")
-            kept.append(half)
-            casts.append(helper.make_node("Cast", [half.name], [tensor.name], to=TensorProto.FLOAT))
-        else:
-            kept.append(tensor)
-    nodes = casts + list(model.graph.node)
-    del model.graph.initializer[:], model.graph.node[:]
-    model.graph.initializer.extend(kept)
-    model.graph.node.extend(nodes)
+    _store_small(model.graph, bytes_per_weight)
     helper.set_model_props(model, facts)
     onnx.checker.check_model(model)
     onnx.save(model, str(path))
+
+
+#: Most weights along a column of a matrix that share a scale in eight bits.
+_BLOCK = 64
+
+
+def _store_small(graph: Any, bytes_per_weight: int) -> None:
+    """Replace the large weights of an ONNX graph by smaller ones; the runtime unfolds them once, when it loads them."""
+    from onnx import TensorProto, helper, numpy_helper
+
+    kept, nodes = [], []
+    for tensor in graph.initializer:
+        array = numpy_helper.to_array(tensor)
+        block = _block(array) if bytes_per_weight == 1 else 0
+        if array.dtype != np.float32 or array.size <= 1024:
+            kept.append(tensor)
+        elif block:
+            # Of the columns (N, M), one per output: codes (N / block, block, M), scales (N / block, 1, M).
+            columns = array.reshape(-1, block, array.shape[1])
+            scale = np.maximum(np.abs(columns).max(axis=1, keepdims=True) / 127, 1e-6).astype(np.float16)
+            codes = np.clip(np.rint(columns / scale), -127, 127).astype(np.int8)
+            names = [f"{tensor.name}_{part}" for part in ("codes", "scale", "float", "blocks", "shape", "step")]
+            kept += [
+                numpy_helper.from_array(codes, names[0]),
+                numpy_helper.from_array(scale, names[1]),
+                numpy_helper.from_array(np.array(array.shape, np.int64), names[4]),
+            ]
+            nodes += [
+                helper.make_node("Cast", [names[0]], [names[2]], to=TensorProto.FLOAT),
+                helper.make_node("Cast", [names[1]], [names[5]], to=TensorProto.FLOAT),
+                helper.make_node("Mul", [names[2], names[5]], [names[3]]),
+                helper.make_node("Reshape", [names[3], names[4]], [tensor.name]),
+            ]
+        else:
+            half = numpy_helper.from_array(array.astype(np.float16), tensor.name + "_half")
+            kept.append(half)
+            nodes.append(helper.make_node("Cast", [half.name], [tensor.name], to=TensorProto.FLOAT))
+    nodes += list(graph.node)
+    del graph.initializer[:], graph.node[:]
+    graph.initializer.extend(kept)
+    graph.node.extend(nodes)
+
+
+def _block(array: np.ndarray) -> int:
+    """Largest number of weights that divides the columns evenly, at least 16; 0 where there is none."""
+    if array.ndim != 2:
+        return 0
+    return max((n for n in range(16, _BLOCK + 1) if array.shape[0] % n == 0), default=0)

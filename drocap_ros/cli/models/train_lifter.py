@@ -15,7 +15,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "train-lifter",
         help="train the temporal lifter on MoCap",
         description="Train the network that lifts 2D joints to 3D over time, on MoCap in virtual cameras. Needs the"
-        " extra 'train' (PyTorch, onnx). The learning rate follows the share of --minutes that has passed.",
+        " extra 'train' (PyTorch, onnx); uses a GPU where there is one. The learning rate follows the share of"
+        " --minutes, or of --steps, that has passed.",
     )
     parser.add_argument("folder", metavar="MOCAP_DIR", type=Path, help="folder of MoCap .npz files")
     parser.add_argument("--out", metavar="ONNX", type=Path, required=True, help="network file to write")
@@ -23,11 +24,15 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument(
         "--steps", type=int, default=0, help="batches instead of --minutes: the same seed gives the same weights"
     )
-    parser.add_argument("--initial", metavar="ONNX", type=Path, help="lifter whose weights begin the training")
+    parser.add_argument("--width", type=int, default=336, help="channels of the network (default 336)")
+    parser.add_argument("--frames-per-batch", type=int, default=4800, help="frames of a batch (default 4800)")
     parser.add_argument(
-        "--rate", type=float, default=1.0, help="share of the usual learning rates; less with --initial (default 1)"
+        "--steps-per-batch",
+        type=int,
+        default=1,
+        help="uses of each batch, where a GPU waits for samples (default 1)",
     )
-    parser.add_argument("--width", type=int, default=240, help="channels of the network (default 240)")
+    parser.add_argument("--workers", type=int, default=1, help="processes that draw samples (default 1)")
     add_training_options(parser, minutes=80.0)
     parser.set_defaults(run=run)
     return parser
@@ -49,14 +54,22 @@ def run(args: argparse.Namespace) -> int:
     if args.out.suffix != ".onnx" or not args.out.absolute().parent.is_dir():
         raise InputError(f"--out: expected an .onnx in a folder that exists, got {args.out}")
     use_threads(args.threads)
-    options = LifterTraining(minutes=args.minutes, steps=args.steps, width=args.width, rate=args.rate, seed=args.seed)
+    options = LifterTraining(
+        minutes=args.minutes,
+        steps=args.steps,
+        width=args.width,
+        frames_per_batch=args.frames_per_batch,
+        steps_per_batch=args.steps_per_batch,
+        workers=args.workers,
+        seed=args.seed,
+    )
     files = mocap_files(args.folder, args.include)
     bank = load_bank(files)
 
     def save(network: Any, facts: dict[str, Any]) -> None:
-        export_onnx(network, args.out, describe_training(files, args.include, options, facts, args.initial))
+        export_onnx(network, args.out, describe_training(files, args.include, options, facts))
 
-    network, facts = train(bank, options, progress_lines(args.quiet), save, initial=args.initial)
+    network, facts = train(bank, options, progress_lines(args.quiet), save)
     save(network, facts)
     print(f"{args.out}: {facts['steps']} steps, {facts['frames_seen']} frames seen, {len(files)} MoCap files")
     return 0
