@@ -18,12 +18,12 @@ class LiftedConfig(Parameters):
     noise_mm: float = param(2.0, "least standard deviation of a 2D joint", unit="mm", minimum=0.01, maximum=100.0)
     depth_weight: float = param(0.2, "weight of the lifter's depth", minimum=0.0, maximum=100.0)
     image_weight: float = param(1.0, "weight of the lifter's image position", minimum=0.0, maximum=100.0)
-    acceleration_std_m_s2: float = param(11.0, "ordinary acceleration", unit="m/s^2", minimum=0.01, maximum=1000.0)
+    acceleration_std_m_s2: float = param(16.0, "ordinary acceleration", unit="m/s^2", minimum=0.01, maximum=1000.0)
     smoothing_std_m_s2: float = param(
         10.0, "ordinary acceleration in the image for the outlier check", unit="m/s^2", minimum=0.01, maximum=1000.0
     )
     zoom_std_per_s: float = param(
-        0.01, "relative change of the person's size in the image per second", minimum=1e-6, maximum=1.0
+        0.006, "relative change of the person's size in the image per second", minimum=1e-6, maximum=1.0
     )
     sign_speed_m_s: float = param(
         1.44, "speed of a bone's end in depth that costs one sigma", unit="m/s", minimum=0.01, maximum=100.0

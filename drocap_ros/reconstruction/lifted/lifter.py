@@ -144,10 +144,9 @@ class Lifter:
         return self._lift_long(seen)
 
     def lift_last(self, seen: LifterInput, fps: float = LIFTER_FPS) -> LiftedMotion:
-        """The newest frame of a short sequence, in half the time: input as of :meth:`lift`, F = 1 in the result.
+        """The newest frame of a short sequence: input as of :meth:`lift`, F = 1 in the result.
 
-        Of the two ways of pairing frames it uses the one in which the last frame has no partner.  The pose is the end
-        of the straight line through the network's last five.
+        The pose is the end of the straight line through the network's last five.
         """
         seen = _checked(seen, fps)
         pace = fps / LIFTER_FPS
@@ -159,7 +158,7 @@ class Lifter:
         seen = seen[-_WINDOW:]
         if not np.isfinite(seen.keypoints).any():
             raise InputError("keypoints: expected a seen joint among the last frames, got none; check the detector")
-        lifted = self._lift_window(seen, shifts=(1 - len(seen) % 2,))
+        lifted = self._lift_window(seen, begin=1 - len(seen) % 2)
         joints = lifted.joints
         if len(joints) >= len(_LINE):
             joints = np.tensordot(_LINE, joints[-len(_LINE) :], axes=1)[None]
@@ -197,34 +196,32 @@ class Lifter:
         assert out is not None
         return out.map(lambda values: values / total.reshape(-1, *(1,) * (values.ndim - 1)))
 
-    def _lift_window(self, seen: LifterInput, shifts: tuple[int, ...] = (0, 1)) -> LiftedMotion:
-        """One window, averaged over its mirror image and over the ways of pairing frames."""
+    def _lift_window(self, seen: LifterInput, begin: int = 0) -> LiftedMotion:
+        """One window, averaged over its mirror image.
+
+        The network takes pairs of frames; with ``begin`` 1 the first frame has no partner, of an even number the last
+        one neither.
+        """
         confidence = np.ones(seen.keypoints.shape[:2]) if seen.confidence is None else seen.confidence
         features, centre, scale = normalise(
             seen.keypoints, confidence, seen.lengths, seen.covariance, seen.rotation, seen.focal
         )
-        frames = len(features)
-        length = frames + 2 - frames % 2
-        count = len(shifts)
-        variants = np.zeros((2 * count, length, FEATURES), np.float32)
-        mirror = mirrored(features)
-        for i, shift in enumerate(shifts):
-            variants[i, shift : shift + frames] = features
-            variants[count + i, shift : shift + frames] = mirror
-        joints, log_sigma, deeper, still = self._session.run(list(_OUTPUTS), {"features": variants})
-        joints[count:] = joints[count:, :, BODY_17.mirror] * np.array([-1, 1, 1], np.float32)
-        log_sigma[count:] = log_sigma[count:, :, BODY_17.mirror]
-        deeper[count:] = deeper[count:, :, BODY_17.mirror[1:] - 1]
-        still[count:] = still[count:, :, ::-1]
-        each = list(enumerate((*shifts, *shifts)))
-
-        def mean(values: np.ndarray) -> np.ndarray:
-            return np.stack([values[k, s : s + frames] for k, s in each]).mean(axis=0, dtype=np.float64)
-
-        place = mean(joints) * scale
+        frames = slice(begin, begin + len(features))
+        variants = np.zeros((2, frames.stop + frames.stop % 2, FEATURES), np.float32)
+        variants[0, frames] = features
+        variants[1, frames] = mirrored(features)
+        outputs = self._session.run(list(_OUTPUTS), {"features": variants})
+        joints, log_sigma, deeper, still = (values[:, frames].astype(np.float64) for values in outputs)
+        place = 0.5 * (joints[0] + joints[1][:, BODY_17.mirror] * np.array([-1, 1, 1])) * scale
         place[..., :2] += centre[:, None]
         place[..., 2] -= place[:, :1, 2]
-        return LiftedMotion(place, mean(np.exp(log_sigma)) * scale, _logistic(mean(deeper)), _logistic(mean(still)))
+        sigma = 0.5 * scale * (np.exp(log_sigma[0]) + np.exp(log_sigma[1][:, BODY_17.mirror]))
+        return LiftedMotion(
+            place,
+            sigma,
+            _logistic(0.5 * (deeper[0] + deeper[1][:, BODY_17.mirror[1:] - 1])),
+            _logistic(0.5 * (still[0] + still[1][:, ::-1])),
+        )
 
 
 def _logistic(logit: np.ndarray) -> np.ndarray:

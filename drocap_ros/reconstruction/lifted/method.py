@@ -34,10 +34,10 @@ from drocap_ros.reconstruction.lifted.window_solver import Cancelled, solve_sign
 
 #: Standard deviation of an adjusted pose over the lifter's expected errors, about the pelvis: across and along the
 #: ray (measured on the HDM05 sequences of mocap/train, which are not among the lifter's training data).
-ACROSS, ALONG = 1.2, 1.5
+ACROSS, ALONG = 1.3, 2.2
 #: The lifter expects no noise that lasts unless a covariance states it: share of it in the errors across the ray,
 #: measured on the same sequences.
-_LASTING = 1.5
+_LASTING = 1.2
 
 
 def prepare(config: LiftedConfig) -> None:
