@@ -181,6 +181,39 @@ def test_a_short_training_learns_and_its_network_runs(tmp_path):
     assert np.isfinite(lifted.joints).all()
 
 
+def test_repeated_batches_and_processes_that_draw_leave_the_weights_to_the_seed():
+    pytest.importorskip("torch", reason="the extra 'train' is not installed")
+    from drocap_ros.training.lifter import LifterTraining, train
+
+    def trained(seed: int, workers: int) -> list[np.ndarray]:
+        options = LifterTraining(steps=5, width=32, frames_per_batch=320, steps_per_batch=3, workers=workers, seed=seed)
+        return weights(train(bank(), options, lambda line: None, lambda n, f: None)[0])
+
+    first = trained(1, workers=0)
+    assert all(np.array_equal(a, b) for a, b in zip(first, trained(1, workers=2), strict=True))
+    assert not all(np.array_equal(a, b) for a, b in zip(first, trained(2, workers=0), strict=True))
+
+
+def test_weights_of_eight_bits_change_the_outputs_little(tmp_path):
+    torch = pytest.importorskip("torch", reason="the extra 'train' is not installed")
+    pytest.importorskip("onnx", reason="the extra 'train' is not installed")
+    import onnxruntime
+
+    from drocap_ros.training.lifter import export_onnx
+    from drocap_ros.training.lifter_network import build_network
+
+    network = build_network(96)
+    export_onnx(network, tmp_path / "a.onnx", {"command": "test"})
+    count = sum(weight.numel() for weight in network.parameters())
+    assert (tmp_path / "a.onnx").stat().st_size < 1.3 * count
+    features = sample_batch(bank(), np.random.default_rng(4), 4, 64).features
+    session = onnxruntime.InferenceSession(str(tmp_path / "a.onnx"), providers=["CPUExecutionProvider"])
+    outputs = session.run(None, {"features": features})
+    for exact, found in zip(network(torch.from_numpy(features)), outputs, strict=True):
+        exact = exact.detach().numpy()
+        assert np.abs(found - exact).mean() < 0.02 * np.abs(exact).mean()
+
+
 def test_muon_steps_along_an_orthogonal_matrix():
     torch = pytest.importorskip("torch", reason="the extra 'train' is not installed")
     from drocap_ros.training.muon import muon, orthogonalised
