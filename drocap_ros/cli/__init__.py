@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 from drocap_ros import __version__
 from drocap_ros.cli.options import LineParser
+from drocap_ros.cli.signals import interruptible
 from drocap_ros.errors import DrocapError
 
 #: Modules under ``drocap_ros.cli``, in the order of ``drocap --help``.
@@ -43,8 +44,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         args = build_parser().parse_args(words)
         args.command_line = shlex.join(["drocap", *words])
-        from drocap_ros.cli.graph.live import interruptible
-
         with interruptible(signal.SIGTERM):
             status: int = args.run(args)
         sys.stdout.flush()

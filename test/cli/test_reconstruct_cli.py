@@ -68,7 +68,11 @@ def test_outdoor_walk_gives_an_upright_motion_of_every_frame(shared, tmp_path):
     assert seen.any(axis=1).mean() >= 0.95
     # In the optical frame y points down.
     head, feet = (motion.joints3d[:, indices(motion.joints, names), 1] for names in (("head",), ("rankle", "lankle")))
-    assert (feet > head).all()
+    # He jumps off a roof backwards and turns over in the air: his head is below his feet in images 175 to 177.
+    upright = (feet > head).all(axis=1)
+    assert upright[:170].all()
+    assert not upright[175:178].any()
+    assert upright[182:].all()
     assert set(motion.meta["seconds"]) >= {"pose2d", "initial", "ba"}
     assert motion.meta["iterations"] > 0
     assert motion.meta["stop_reason"]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drocap_ros.cli.options import add_seed_option
+from drocap_ros.cli.signals import interruptible
 
 if TYPE_CHECKING:
     from drocap_ros.cli.demo.operator import Operator
@@ -62,7 +63,6 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.cli.demo.desk import check_flown
     from drocap_ros.cli.demo.operator import Operator
     from drocap_ros.cli.demo.verdict import judge_flight
-    from drocap_ros.cli.graph.live import interruptible
     from drocap_ros.cli.reconstruct import summary
     from drocap_ros.errors import InputError
     from drocap_ros.evaluation.compare import compare

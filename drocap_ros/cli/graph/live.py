@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
-import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from drocap_ros.cli.graph.dashboard import Dashboard, dashboard_on_terminal
 from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
 from drocap_ros.cli.options import ros_namespace
+from drocap_ros.cli.signals import stop_signals
 from drocap_ros.errors import InputError
 from drocap_ros.recording.mcap.metadata import METADATA_FILE
 from drocap_ros.recording.provenance import dated_name
@@ -117,42 +116,6 @@ def _session_folders(first: Path) -> set[Path]:
     """Finished sessions of a recorder: a restarted one takes the next free name."""
     folders = [first, *first.parent.glob(f"{first.name}_[0-9]*")]
     return {folder for folder in folders if (folder / METADATA_FILE).is_file()}
-
-
-@contextlib.contextmanager
-def stop_signals() -> Iterator[threading.Event]:
-    """An event that SIGINT and SIGTERM set instead of interrupting the program."""
-    stop = threading.Event()
-    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def interruptible(*signals: signal.Signals) -> Iterator[threading.Event]:
-    """SIGTERM interrupts the program as Ctrl-C does, so that no half-written file remains.
-
-    ``signals`` (default: SIGINT and SIGTERM) raise KeyboardInterrupt and set the event: an exception in a destructor,
-    for one, is lost.
-    """
-    interrupted = threading.Event()
-
-    def interrupt(*_: object) -> None:
-        interrupted.set()
-        raise KeyboardInterrupt
-
-    taken = signals or (signal.SIGINT, signal.SIGTERM)
-    if threading.current_thread() is not threading.main_thread():
-        taken = ()  # Python permits handlers in the main thread only
-    before = {number: signal.signal(number, interrupt) for number in taken}
-    try:
-        yield interrupted
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def import_bringup() -> ModuleType:

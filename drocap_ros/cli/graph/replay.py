@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from drocap_ros.cli.graph.domain import chosen_domain
-from drocap_ros.cli.graph.live import add_graph_options, import_bringup, stop_signals
+from drocap_ros.cli.graph.live import add_graph_options, import_bringup
+from drocap_ros.cli.signals import stop_signals
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:

@@ -8,8 +8,9 @@ import time
 from typing import Any
 
 from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
-from drocap_ros.cli.graph.live import dashboard_of, import_bringup, stop_signals
+from drocap_ros.cli.graph.live import dashboard_of, import_bringup
 from drocap_ros.cli.options import ros_namespace
+from drocap_ros.cli.signals import stop_signals
 
 #: How long ``--once`` waits for a first status, and then at most for further nodes.
 ONCE_TIMEOUT_S = 8.0
