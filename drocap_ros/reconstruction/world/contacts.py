@@ -13,7 +13,7 @@ _HEIGHT_STD_M = 0.1
 #: Spread of the heights of resting feet on level ground, as the body's errors leave it, and on steps.
 _LEVEL_M, _STEPS_M = 0.025, 0.06
 #: Likelihood of a foot that moves, against that of one that rests at the floor.
-_MOVING = 0.1
+_MOVING = 0.12
 #: Least and largest probability of the network: neither a foot in contact nor a moving one depends on it alone.
 _SURE = np.array([0.01, 0.99])
 #: Probability of the network from which both feet count as resting, and least standard deviation (m/s) of the speed at
