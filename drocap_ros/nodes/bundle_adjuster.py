@@ -41,7 +41,10 @@ from drocap_ros.ros.conversions import (
 )
 from drocap_ros.ros.diagnostics import Key, of
 from drocap_ros.ros.spin import node_main
+from drocap_ros.skeleton import BODY_15, BODY_17
 
+#: Joint sets of initial poses.
+_SKELETONS = (BODY_15.name, BODY_17.name)
 #: Words of the use of telemetry.
 _WORDS = {
     Telemetry.NONE: "",
@@ -136,6 +139,10 @@ class BundleAdjusterNode(ComponentNode):
             raise InputError(
                 f"track_id: expected {observation.track_id} in pose3d/initial, as in pose2d of the same stamp, got"
                 f" {initial.track_id}; its publisher has to copy it"
+            )
+        if initial.skeleton not in _SKELETONS:
+            raise InputError(
+                f"skeleton: expected {' or '.join(_SKELETONS)} in pose3d/initial, got {initial.skeleton!r}; map them"
             )
         joints, _ = pose3d_from_ros(initial)
         due = self._buffer.push(observation, joints)

@@ -228,13 +228,13 @@ def test_the_recording_of_windows_in_map_repeats_them_bit_for_bit(orbited):
         assert (motion.frame, len(motion.stamp_ns)) == ("camera", 210)
 
 
-def initial_pose(observation, track_id, joints):
+def initial_pose(observation, track_id, joints, skeleton=None):
     """An initial pose of 0, 15 or 17 joints."""
     return pose3d_to_ros(
         header_at(observation.stamp_ns, "camera"),
         track_id=track_id,
         stage=1,
-        skeleton=f"body{joints or 15}",
+        skeleton=skeleton or f"body{joints or 15}",
         joints=np.random.default_rng(joints).normal(size=(joints, 3)),
         covariance=np.zeros((joints, 6)),
         confidence=np.ones(joints),
@@ -262,12 +262,14 @@ def test_initial_poses_of_another_subject_and_of_other_joints_do_not_end_the_nod
         taken = [o for burst in range(4) for o in observed(1.0, begin_ns=BEGIN + 3 * S * burst)[::2]]
         for i, observation in enumerate(taken):
             publish(observation, 1, (15, 17)[i // 10 % 2])
-        for observation, pose in zip(observed(0.2, begin_ns=BEGIN + 14 * S), [(0, 0), (2, 15)], strict=False):
+        for observation, pose in zip(
+            observed(0.3, begin_ns=BEGIN + 14 * S), [(1, 17, "coco17"), (0, 0), (2, 15)], strict=False
+        ):
             publish(observation, *pose)
         graph.wait_until(lambda: len(latest) == len(taken), 10, "the latest poses")
         count = len(reports)
         graph.wait_until(lambda: len(reports) > count + 1, 10, "the counts on /diagnostics")
     values = {v.key: v.value for v in reports[-1].status[0].values}
     assert int(values[Key.ADJUSTMENTS]) >= 4
-    assert values[Key.MESSAGES_REFUSED] == "2"
+    assert values[Key.MESSAGES_REFUSED] == "3"
     assert "track_id: expected 1 in pose3d/initial" in values[Key.LAST_REFUSED]
