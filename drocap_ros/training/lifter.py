@@ -104,6 +104,7 @@ def _batches(bank: MocapBank, options: LifterTraining, device: Any) -> Iterator[
             batch = sample_batch(bank, rng, max(options.frames_per_batch // frames, 1), frames)
             return tuple(torch.from_numpy(part) for part in (batch.features, batch.target, batch.still))
 
+    # Without pinned memory: the thread that allocates it spoils the recording of a graph.
     loader = torch.utils.data.DataLoader(
         Samples(),
         batch_size=None,
@@ -114,10 +115,12 @@ def _batches(bank: MocapBank, options: LifterTraining, device: Any) -> Iterator[
     pool: list[Any] = []
     again = np.random.default_rng(options.seed)
     for batch in loader:
-        pool = [*pool[1 - _POOL :], tuple(part.to(device) for part in batch)]
-        yield pool[-1]
-        for _ in range(options.steps_per_batch - 1):
-            yield pool[again.integers(len(pool))]
+        newest = tuple(part.to(device) for part in batch)
+        yield newest
+        if options.steps_per_batch > 1:
+            pool = [*pool[1 - _POOL :], newest]
+            for _ in range(options.steps_per_batch - 1):
+                yield pool[again.integers(len(pool))]
 
 
 def _losses(network: torch.nn.Module, device: Any) -> Callable[..., Any]:
