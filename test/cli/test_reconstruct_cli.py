@@ -59,8 +59,14 @@ def changed(path, **arrays):
     return path.parent / "changed.npz"
 
 
-def test_outdoor_walk_gives_an_upright_motion_of_every_frame(shared, tmp_path):
-    motion = reconstructed(shared / "media" / "outdoor_walk.mp4", tmp_path, "--models", shared / "models")
+@pytest.fixture(scope="module")
+def outdoor_walk(shared, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("outdoor_walk")
+    return reconstructed(shared / "media" / "outdoor_walk.mp4", folder, "--models", shared / "models")
+
+
+def test_outdoor_walk_gives_an_upright_motion_of_every_frame(outdoor_walk):
+    motion = outdoor_walk
     assert motion.joints3d.shape == (230, 17, 3)
     assert motion.joints3d.dtype == np.float64
     assert motion.frame == "camera"
@@ -76,6 +82,23 @@ def test_outdoor_walk_gives_an_upright_motion_of_every_frame(shared, tmp_path):
     assert set(motion.meta["seconds"]) >= {"pose2d", "initial", "ba"}
     assert motion.meta["iterations"] > 0
     assert motion.meta["stop_reason"]
+
+
+@pytest.mark.parametrize("side", ["r", "l"])
+def test_the_knees_of_outdoor_walk_bend_as_the_legs_shorten_in_the_image(outdoor_walk, side):
+    leg = indices(outdoor_walk.joints, (f"{side}hip", f"{side}knee", f"{side}ankle"))
+    bones = np.diff(outdoor_walk.joints3d[:, leg], axis=1)
+    cosine = (bones[:, 0] * bones[:, 1]).sum(axis=1) / np.linalg.norm(bones, axis=2).prod(axis=1)
+    flexion = np.degrees(np.arccos(cosine))
+    # He does jumping jacks in the first 75 images, seen from the front: both bones of a leg lean alike.
+    length = np.linalg.norm(np.diff(outdoor_walk.keypoints[:75, leg], axis=1), axis=2).sum(axis=1)
+    expected = 2 * np.degrees(np.arccos(np.minimum(length / np.quantile(length, 0.95), 1)))
+    print(f"{side} knee, jumping: {np.median(flexion[:75]):.0f} degrees, by the leg's length {np.median(expected):.0f}")
+    print(f"{side} knee, walking: {np.median(flexion[100:140]):.0f} degrees")
+    assert np.corrcoef(flexion[:75], expected)[0, 1] > 0.75
+    assert abs(np.median(flexion[:75]) - np.median(expected)) < 15
+    # Then he turns to the side and walks on, upright.
+    assert np.median(flexion[100:140]) < 25
 
 
 def test_squats_agree_with_another_system(shared, tmp_path):
