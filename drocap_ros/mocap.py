@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -50,10 +51,13 @@ def load_mocap(
     x = x.astype(np.float64)
     if not np.isfinite(x).all():
         raise InputError(f"{path}: X, toes: expected finite millimetres, got NaN or infinity; fill the gaps in")
-    fps = float(a["fps"])
-    if not 1.0 <= fps <= 1000.0:
-        raise InputError(f"{path}: fps: expected 1 to 1000, got {fps:g}")
-    return in_body_order(x, names, required)[:, : len(joints)], fps
+    if a["fps"].size != 1 or a["fps"].dtype.kind not in "iuf" or not 1.0 <= float(a["fps"].item()) <= 1000.0:
+        raise InputError(f"{path}: fps: expected a number from 1 to 1000, got {a['fps']}")
+    try:
+        body = in_body_order(x, names, required)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return body[:, : len(joints)], float(a["fps"].item())
 
 
 def mocap_files(folder: str | Path, include: str = "*") -> list[Path]:
@@ -67,7 +71,7 @@ def mocap_files(folder: str | Path, include: str = "*") -> list[Path]:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of MoCap .npz files; no such folder")
-    files = sorted(folder.glob(f"{include}.npz"))
+    files = sorted(path for path in folder.glob("*.npz") if fnmatchcase(path.stem, include))
     if not files:
         raise InputError(f"{folder}: expected MoCap files {include}.npz, found none; check the folder and the pattern")
     return files

@@ -25,8 +25,10 @@ def test_resampling_keeps_the_motion() -> None:
     ("changes", "match"),
     [
         ({"X": np.zeros((4, 3, 3))}, r"X: expected \(T, 15, 3\)"),
-        ({"fps": np.array(0.0)}, "fps: expected 1 to 1000"),
-        ({"joints": np.array(["a"] * 15)}, "missing pelvis"),
+        ({"fps": np.array(0.0)}, "fps: expected a number from 1 to 1000"),
+        ({"fps": np.array("abc")}, "fps: expected a number from 1 to 1000"),
+        ({"fps": np.array([30.0, 30.0])}, "fps: expected a number from 1 to 1000"),
+        ({"joints": np.array(["a"] * 15)}, "bad.npz: .*missing pelvis"),
     ],
 )
 def test_bad_files_are_refused(tmp_path: Path, changes: dict[str, np.ndarray], match: str) -> None:

@@ -8,6 +8,7 @@ import os
 import shlex
 import signal
 import sys
+import threading
 from collections.abc import Sequence
 
 from drocap_ros import __version__
@@ -41,10 +42,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     logging.basicConfig(level=logging.WARNING, format="drocap: %(message)s")
     words = sys.argv[1:] if argv is None else list(argv)
+    interrupted = threading.Event()
     try:
         args = build_parser().parse_args(words)
         args.command_line = shlex.join(["drocap", *words])
-        with interruptible(signal.SIGTERM):
+        with interruptible(signal.SIGTERM) as interrupted:
             status: int = args.run(args)
         sys.stdout.flush()
         return status
@@ -52,18 +54,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"drocap: {_one_line(error)}", file=sys.stderr)
         return error.exit_status
     except KeyboardInterrupt:
-        print("drocap: interrupted", file=sys.stderr)
-        return 130
+        return _interrupted()
     except BrokenPipeError:
         # The reader closed the pipe (`drocap ... | head`): no failure.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
+        # A signal to the whole group ends worker processes, too, and a library may complain of that first.
+        if interrupted.is_set():
+            return _interrupted()
         if os.environ.get("DROCAP_DEBUG"):
             raise
         what = f"unexpected {type(error).__name__}: {_one_line(error)}"
         print(f"drocap: {what}; DROCAP_DEBUG=1 shows where", file=sys.stderr)
         return 1
+
+
+def _interrupted() -> int:
+    print("drocap: interrupted", file=sys.stderr)
+    return 130
 
 
 def _one_line(error: Exception) -> str:

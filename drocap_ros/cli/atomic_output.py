@@ -90,6 +90,22 @@ def output_folder(target: Path) -> Iterator[Path]:
         shutil.rmtree(work, ignore_errors=True)
 
 
+def check_output_file(target: Path, option: str = "--out") -> None:
+    """Validate an output file before the work starts.
+
+    Raises
+    ------
+    InputError
+        When it is no regular file, or its nearest existing folder is not writable.
+    """
+    with _system_errors(target, option):
+        if target.is_dir():
+            raise InputError(f"{option} {target}: expected a file, found a folder; name a file in it")
+        if target.exists() and not target.is_file():
+            raise InputError(f"{option} {target}: expected a file, found a pipe or device; name a file")
+    check_output_folder(Path(os.path.realpath(target)).parent)
+
+
 @contextlib.contextmanager
 def output_file(target: Path, inputs: Iterable[str | Path | None] = (), option: str = "--out") -> Iterator[Path]:
     """A temporary file, moved to ``target`` when the block succeeds.
@@ -103,14 +119,9 @@ def output_file(target: Path, inputs: Iterable[str | Path | None] = (), option: 
     DrocapError
         When the disk is full.
     """
-    with _system_errors(target, option):
-        if target.is_dir():
-            raise InputError(f"{option} {target}: expected a file, found a folder; name a file in it")
-        if target.exists() and not target.is_file():
-            raise InputError(f"{option} {target}: expected a file, found a pipe or device; name a file")
+    check_output_file(target, option)
     refuse_inputs([target], inputs, option)
     real = Path(os.path.realpath(target))
-    check_output_folder(real.parent)
     with _system_errors(target, option):
         real.parent.mkdir(parents=True, exist_ok=True)
         folder = tempfile.TemporaryDirectory(prefix=f".{real.name}.", dir=real.parent)

@@ -40,7 +40,9 @@ class LifterTraining(Parameters):
     minutes: float = param(80.0, "wall-clock time of the training", unit="min", minimum=0.01, maximum=10000.0)
     steps: int = param(0, "batches instead of minutes: the same seed gives the same weights", minimum=0)
     width: int = param(336, "channels of the network", minimum=8, maximum=2048)
-    frames_per_batch: int = param(4800, "frames of a batch, all windows together", minimum=64, maximum=1_000_000)
+    frames_per_batch: int = param(
+        4800, "frames of a batch, all windows together", minimum=max(_LENGTHS), maximum=1_000_000
+    )
     steps_per_batch: int = param(1, "uses of each batch, where steps are faster than samples", minimum=1, maximum=100)
     workers: int = param(1, "processes that draw samples; 0: the training itself does", minimum=0, maximum=256)
     learning_rate: float = param(2e-3, "peak of the schedule, AdamW", minimum=1e-6, maximum=1.0)
@@ -60,9 +62,7 @@ class LifterTraining(Parameters):
         )
 
 
-def describe_training(
-    files: list[Path], include: str, options: LifterTraining, facts: dict[str, Any]
-) -> dict[str, str]:
+def describe_training(files: list[Path], include: str, options: LifterTraining) -> dict[str, str]:
     """Metadata of the ONNX file: training data, licence and command."""
     arrays = [read_npz(path, ("X",)) for path in files]
     return {
@@ -71,7 +71,6 @@ def describe_training(
         "files": str(len(files)),
         "mocap_frames": str(sum(len(a["X"]) for a in arrays)),
         "command": options.command(include),
-        **{name: str(value) for name, value in facts.items()},
     }
 
 
@@ -102,20 +101,22 @@ def _batches(bank: MocapBank, options: LifterTraining, device: Any) -> Iterator[
             rng = np.random.default_rng((options.seed, k))
             frames = int(rng.choice(_LENGTHS, p=_SHARES))
             batch = sample_batch(bank, rng, max(options.frames_per_batch // frames, 1), frames)
-            return tuple(torch.from_numpy(part) for part in (batch.features, batch.target, batch.still))
+            return batch.features, batch.target, batch.still
 
-    # Without pinned memory: the thread that allocates it spoils the recording of a graph.
+    # Without pinned memory: the thread that allocates it spoils the recording of a graph.  Arrays pass through pipes:
+    # tensors would need shared memory, of which a container has 64 MB.
     loader = torch.utils.data.DataLoader(
         Samples(),
         batch_size=None,
         sampler=itertools.count(),
         num_workers=options.workers,
+        collate_fn=tuple,
         prefetch_factor=4 if options.workers else None,
     )
     pool: list[Any] = []
     again = np.random.default_rng(options.seed)
     for batch in loader:
-        newest = tuple(part.to(device) for part in batch)
+        newest = tuple(torch.from_numpy(part).to(device) for part in batch)
         yield newest
         if options.steps_per_batch > 1:
             pool = [*pool[1 - _POOL :], newest]
@@ -161,7 +162,13 @@ def train(
 ) -> tuple[torch.nn.Module, dict[str, Any]]:
     """Train on virtual views, on a GPU where PyTorch finds one; returns averaged weights and the counts of frames.
 
-    ``checkpoint(network, facts)`` is called every ``checkpoint_minutes`` with the averaged weights.
+    ``checkpoint(network, facts)`` is called every ``checkpoint_minutes`` with the averaged weights.  ``frames_seen``
+    counts a repeated batch each time.
+
+    Raises
+    ------
+    DrocapError
+        When the error is no longer finite.
     """
     torch = pytorch()
     torch.manual_seed(options.seed)
@@ -200,10 +207,15 @@ def train(
             report(f"{elapsed:6.1f} min  step {step}  frames {millions:.2f} M  error {float(smooth):.4f} of the size")
         if elapsed - saved > checkpoint_minutes:
             saved = elapsed
+            _check_finite(smooth)
             checkpoint(average, {"steps": step, "frames_seen": frames_seen})
-    if not math.isfinite(float(smooth)):
-        raise DrocapError("training diverged: the error is not finite; lower learning_rate")
+    _check_finite(smooth)
     return average, {"steps": step, "frames_seen": frames_seen, "device": device.type}
+
+
+def _check_finite(error: torch.Tensor) -> None:
+    if not math.isfinite(float(error)):
+        raise DrocapError("training diverged: expected a finite error; check the MoCap, or try another --seed")
 
 
 def export_onnx(network: torch.nn.Module, path: Path, facts: dict[str, str]) -> None:

@@ -36,7 +36,8 @@ STILL_M_S = 0.1
 class Batch:
     """features (B, T, 143); target (B, T, 17, 3) in the features' units, x and y in the image, NaN = unknown toe.
 
-    still : (B, T, 2) 1 where the right and the left foot are slower than 0.1 m/s, 0 where not, NaN = unknown
+    still : (B, T, 2) 1 where the right and the left foot of the recorded motion are slower than 0.1 m/s, 0 where not,
+        NaN = unknown; the window plays it at 0.7 to 1.4 of its pace
     """
 
     features: np.ndarray

@@ -18,6 +18,8 @@ _RIGHT_LEG = indices(BODY_17.joints, ("rhip", "rknee", "rankle"))
 #: Least flexion of the knees in a refitted sequence.
 _LEAST_FLEXION = np.radians([0.0, 10.0])
 _REFITTED = 0.7
+#: Thigh and shank of people.
+_LEG_MM = (300.0, 1500.0)
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ def load_bank(paths: list[Path]) -> MocapBank:
         x, fps = load_mocap(path, joints=BODY_17)
         if len(x) < 2:
             raise InputError(f"{path}: expected at least 2 frames, got {len(x)}; leave the file out")
+        _check_person(path, x)
         parts.append(x.astype(np.float32) / 1000)
         rates.append(fps)
         speeds.append(_foot_speed(parts[-1], fps))
@@ -66,6 +69,15 @@ def load_bank(paths: list[Path]) -> MocapBank:
         np.array([leg_reach(p) for p in parts]),
         np.array([_low(p) for p in parts]),
     )
+
+
+def _check_person(path: Path, x: np.ndarray) -> None:
+    thigh, shank = np.median(np.linalg.norm(np.diff(x[:, _RIGHT_LEG], axis=1), axis=-1), axis=0)
+    if not (_LEG_MM[0] <= thigh + shank <= _LEG_MM[1] and min(thigh, shank) > 0):
+        raise InputError(
+            f"{path}: X: expected a person in millimetres, whose leg is {_LEG_MM[0]:.0f} to {_LEG_MM[1]:.0f} long, got"
+            f" {thigh + shank:.4g}; change the unit, or leave the file out"
+        )
 
 
 def _foot_speed(joints: np.ndarray, fps: float) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import io
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,21 @@ def pytorch() -> Any:
     except ImportError:
         raise DrocapError("training needs PyTorch, which is not installed; pip install 'drocap_ros[train]'") from None
     return torch
+
+
+def onnx_package() -> Any:
+    """The package onnx.
+
+    Raises
+    ------
+    DrocapError
+        When it is not installed.
+    """
+    try:
+        import onnx
+    except ImportError:
+        raise DrocapError("training needs the package onnx, which is not installed; pip install onnx") from None
+    return onnx
 
 
 def _has_bfloat16() -> bool:
@@ -81,32 +97,28 @@ def write_onnx(
 
     It is computed in single precision.  ``axes`` names the variable dimensions per input and output.
     """
-    torch = pytorch()
-    try:
-        import onnx
-        from onnx import helper
-    except ImportError:
-        raise DrocapError("export needs the package onnx, which is not installed; pip install onnx") from None
+    torch, onnx = pytorch(), onnx_package()
     if path.suffix != ".onnx":
         raise InputError(f"--out: expected a file name ending in .onnx, got {path.name!r}")
     network = copy.deepcopy(network).cpu().eval().float()
     path.parent.mkdir(parents=True, exist_ok=True)
+    exported = io.BytesIO()
     with warnings.catch_warnings():
         # The exporter warns of its deprecation and of unfolded slices.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             network,
             (example,),
-            str(path),
+            exported,
             input_names=inputs,
             output_names=outputs,
             dynamic_axes=axes,
             opset_version=17,
             dynamo=False,
         )
-    model = onnx.load(str(path))
+    model = onnx.load_from_string(exported.getvalue())
     _store_small(model.graph, bytes_per_weight)
-    helper.set_model_props(model, facts)
+    onnx.helper.set_model_props(model, facts)
     onnx.checker.check_model(model)
     onnx.save(model, str(path))
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from drocap_ros.errors import InputError
+from drocap_ros.errors import DrocapError, InputError
 from drocap_ros.geometry.leg_lengths import refit_knees
 from drocap_ros.reconstruction.lifted.lifter_input import BONES, FEATURES, PARTS
 from drocap_ros.skeleton import BODY_17, indices
@@ -136,6 +138,25 @@ def test_unusable_files_are_refused(tmp_path):
     np.savez(tmp_path / "a.npz", X=np.full((5, 15, 3), np.nan), fps=30.0, joints=np.array(BODY_17.joints[:15]))
     with pytest.raises(InputError, match="finite"):
         load_bank([tmp_path / "a.npz"])
+    for size in (0.0, 0.001):
+        x = size * 1000 * bank().joints[:5, :15]
+        np.savez(tmp_path / "a.npz", X=x, fps=30.0, joints=np.array(BODY_17.joints[:15]))
+        with pytest.raises(InputError, match=r"a\.npz: X: expected a person in millimetres"):
+            load_bank([tmp_path / "a.npz"])
+
+
+def test_a_training_that_diverges_keeps_the_last_good_network():
+    pytest.importorskip("torch", reason="the extra 'train' is not installed")
+    from drocap_ros.training.lifter import LifterTraining, train
+
+    broken = replace(bank(), joints=bank().joints * np.float32(1e30))
+    kept = []
+    with pytest.raises(DrocapError, match="diverged"):
+        train(
+            broken, LifterTraining(steps=4, width=16, frames_per_batch=240), lambda line: None,
+            lambda network, facts: kept.append(facts), checkpoint_minutes=0.0,
+        )  # fmt: skip
+    assert not kept
 
 
 def test_low_postures_are_counted(tmp_path):

@@ -191,7 +191,7 @@ def test_invalid_training_options_are_refused(tmp_path, words):
 def test_short_training_writes_networks_that_run(tmp_path, capsys):
     pytest.importorskip("torch", reason="the extra 'train' is not installed")
     pytest.importorskip("onnx", reason="the extra 'train' is not installed")
-    assert run_command(tmp_path / "m", "--steps", "1", "--quiet") == 0
+    assert run_command(tmp_path / "m", "--steps", "1") == 0
     assert "1 batches of the detector, 2 of the pose network" in capsys.readouterr().out
     estimator = PoseEstimator(tmp_path / "m")
     assert estimator.limited_use
@@ -205,7 +205,7 @@ def test_short_training_writes_networks_that_run(tmp_path, capsys):
 def test_one_network_can_be_trained_alone(tmp_path, capsys):
     pytest.importorskip("torch", reason="the extra 'train' is not installed")
     pytest.importorskip("onnx", reason="the extra 'train' is not installed")
-    assert run_command(tmp_path / "m", "--steps", "1", "--only", "detector", "--quiet") == 0
+    assert run_command(tmp_path / "m", "--steps", "1", "--only", "detector") == 0
     assert "1 batches of the detector, 0 of the pose network" in capsys.readouterr().out
     assert [f.name for f in (tmp_path / "m").iterdir()] == ["person_detector.onnx"]
 

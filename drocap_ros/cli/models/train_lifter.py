@@ -22,7 +22,10 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("--out", metavar="ONNX", type=Path, required=True, help="network file to write")
     parser.add_argument("--include", metavar="GLOB", default="*", help="only files of this name, e.g. 'cmu_*'")
     parser.add_argument(
-        "--steps", type=int, default=0, help="batches instead of --minutes: the same seed gives the same weights"
+        "--steps",
+        type=int,
+        default=0,
+        help="batches instead of --minutes: the same seed and threads give the same weights",
     )
     parser.add_argument("--width", type=int, default=336, help="channels of the network (default 336)")
     parser.add_argument("--frames-per-batch", type=int, default=4800, help="frames of a batch (default 4800)")
@@ -46,14 +49,18 @@ def run(args: argparse.Namespace) -> int:
     InputError
         When an option or the folder is invalid.
     """
+    from drocap_ros.cli.atomic_output import check_output_file, output_file
     from drocap_ros.errors import InputError
     from drocap_ros.mocap import mocap_files
     from drocap_ros.training.lifter import LifterTraining, describe_training, export_onnx, train
     from drocap_ros.training.mocap_bank import load_bank
+    from drocap_ros.training.torch_extra import onnx_package
 
     if args.out.suffix != ".onnx" or not args.out.absolute().parent.is_dir():
         raise InputError(f"--out: expected an .onnx in a folder that exists, got {args.out}")
+    check_output_file(args.out)
     use_threads(args.threads)
+    onnx_package()
     options = LifterTraining(
         minutes=args.minutes,
         steps=args.steps,
@@ -65,11 +72,15 @@ def run(args: argparse.Namespace) -> int:
     )
     files = mocap_files(args.folder, args.include)
     bank = load_bank(files)
+    description = describe_training(files, args.include, options)
 
     def save(network: Any, facts: dict[str, Any]) -> None:
-        export_onnx(network, args.out, describe_training(files, args.include, options, facts))
+        counts = {name: str(value) for name, value in facts.items()}
+        with output_file(args.out) as file:
+            export_onnx(network, file, description | counts)
 
     network, facts = train(bank, options, progress_lines(args.quiet), save)
     save(network, facts)
-    print(f"{args.out}: {facts['steps']} steps, {facts['frames_seen']} frames seen, {len(files)} MoCap files")
+    if not args.quiet:
+        print(f"{args.out}: {facts['steps']} steps, {facts['frames_seen']} frames, {len(files)} MoCap files")
     return 0

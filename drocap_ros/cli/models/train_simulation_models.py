@@ -38,13 +38,17 @@ def run(args: argparse.Namespace) -> int:
     InputError
         When an option is invalid.
     """
+    from drocap_ros.cli.atomic_output import check_output_folder, output_folder
     from drocap_ros.errors import InputError
     from drocap_ros.training.simulation_models import SimulationTraining, export, train
+    from drocap_ros.training.torch_extra import onnx_package
 
     if not args.out.absolute().parent.is_dir() or args.out.is_file():
         raise InputError(f"--out: expected a folder, or a name in one that exists, got {args.out}")
     options = SimulationTraining(minutes=args.minutes, steps=args.steps, seed=args.seed, only=args.only)
+    check_output_folder(args.out)
     use_threads(args.threads)
+    onnx_package()
     length = f"--steps {args.steps}" if args.steps else f"--minutes {args.minutes:g}"
     chosen = "" if args.only == "both" else f" --only {args.only}"
 
@@ -56,9 +60,12 @@ def run(args: argparse.Namespace) -> int:
             "command": f"drocap train-simulation-models {length}{chosen} --seed {args.seed} --out DIR",
             **{name: str(value) for name, value in facts.items()},
         }
-        export(detector, pose, args.out, described)
+        with output_folder(args.out) as folder:
+            export(detector, pose, folder, described)
 
     detector, pose, facts = train(options, progress_lines(args.quiet), save)
     save(detector, pose, facts)
-    print(f"{args.out}: {facts['detector_steps']} batches of the detector, {facts['pose_steps']} of the pose network")
+    if not args.quiet:
+        batches = f"{facts['detector_steps']} batches of the detector, {facts['pose_steps']} of the pose network"
+        print(f"{args.out}: {batches}")
     return 0

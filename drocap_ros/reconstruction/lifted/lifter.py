@@ -18,7 +18,8 @@ from drocap_ros.skeleton import BODY_17
 SHIPPED = Path(__file__).parents[2] / "data" / "lifter_cmu.onnx"
 
 _JOINTS = len(BODY_17)
-_OUTPUTS = ("joints", "log_sigma", "deeper", "still")
+#: Names of the outputs, and their shapes behind (windows, frames).
+_OUTPUTS = {"joints": (_JOINTS, 3), "log_sigma": (_JOINTS, 2), "deeper": (len(BONES),), "still": (2,)}
 #: Frames of one window and overlap of neighbouring windows; about the length of the training windows.
 _WINDOW, _OVERLAP = 240, 80
 #: Frame rates, in units of LIFTER_FPS, of the network's training.
@@ -119,7 +120,10 @@ class Lifter:
         InputError
             When the file is no such network.
         """
-        return _load(str(path or SHIPPED))
+        file = Path(path or SHIPPED)
+        if not file.is_file():
+            raise InputError(f"{file}: no such file; expected an .onnx made by drocap train-lifter")
+        return _load(str(file.resolve()), file.stat().st_mtime_ns)
 
     @property
     def origin(self) -> dict[str, str]:
@@ -253,25 +257,27 @@ def _checked(seen: LifterInput, fps: float) -> LifterInput:
 
 
 @lru_cache(maxsize=4)
-def _load(path: str) -> Lifter:
+def _load(path: str, written_ns: int) -> Lifter:
+    """The file as it was written then."""
     import onnxruntime
 
-    if not Path(path).is_file():
-        raise InputError(f"{path}: no such file; expected an .onnx made by drocap train-lifter")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
     try:
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        inputs = [(i.name, i.shape[-1]) for i in session.get_inputs()]
+        outputs = {o.name: () for o in session.get_outputs()}
+        if inputs == [("features", FEATURES)] and list(outputs) == list(_OUTPUTS):
+            found = session.run(None, {"features": np.zeros((1, 2, FEATURES), np.float32)})
+            outputs = {name: values.shape[2:] for name, values in zip(outputs, found, strict=True)}
     except Exception as error:
         # onnxruntime documents no common exception class.
         raise InputError(f"{path}: expected an ONNX network; {str(error).splitlines()[0][:120]}") from None
-    inputs = [(i.name, i.shape[-1]) for i in session.get_inputs()]
-    outputs = [o.name for o in session.get_outputs()]
-    if inputs != [("features", FEATURES)] or outputs != list(_OUTPUTS):
+    if outputs != _OUTPUTS:
         raise InputError(
-            f"{path}: expected a lifter (features {FEATURES} -> {', '.join(_OUTPUTS)}), got {inputs} -> {outputs};"
+            f"{path}: expected a lifter (features {FEATURES} -> {_OUTPUTS}), got {inputs} -> {outputs};"
             " train one by drocap train-lifter"
         )
     return Lifter(session)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
@@ -147,6 +149,17 @@ def test_bad_input_is_refused_in_one_line(lifter, tmp_path):
         with pytest.raises(InputError) as caught:
             call()
         assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_was_written_again_is_loaded_again(tmp_path):
+    path = tmp_path / "lifter.onnx"
+    path.write_bytes(SHIPPED.read_bytes())
+    first = Lifter.load(path)
+    assert Lifter.load(path) is first
+    path.write_bytes(b"no network")
+    os.utime(path, ns=(1, 1))
+    with pytest.raises(InputError, match="expected an ONNX network"):
+        Lifter.load(path)
 
 
 def test_error_on_held_out_people_stays_low(lifter, shared):
