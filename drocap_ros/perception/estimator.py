@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from pathlib import Path
 
@@ -66,6 +67,8 @@ class PoseEstimator:
         self._joint_map = joint_map(self.pose_model.joints.name)
         self._flow = KeypointFlow()
         self._last_ns: int | None = None
+        #: The last image that certainly showed the subject, and the subject in it.
+        self._repeated: tuple[np.ndarray, PoseObservation] | None = None
         self._detected_ns = 0
         #: Score of the subject in the last detection, and mean confidence of its last keypoints; 0 = none.
         self._score = self._confidence = 0.0
@@ -99,19 +102,30 @@ class PoseEstimator:
             log.warning("stamps went back by %.3f s: the tracker restarts", (self._last_ns - stamp_ns) * 1e-9)
             self.tracker.reset()
             self._flow.start(None, None)
-            self._margins, self._rejected = None, []
+            self._margins, self._rejected, self._repeated = None, [], None
         self._last_ns = stamp_ns
         roi = _validated_roi(roi)
+        # A camera that repeats its picture shows nothing new: the bridge knows that by the same keypoints, bit for bit.
+        if self._repeated is not None and roi is None and np.array_equal(image, self._repeated[0]):
+            return dataclasses.replace(self._repeated[1], stamp_ns=stamp_ns)
+        observation, certain = self._observe(image, stamp_ns, roi, load_level)
+        self._repeated = (image.copy(), observation) if certain else None
+        return observation
+
+    def _observe(
+        self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None, load_level: int
+    ) -> tuple[PoseObservation, bool]:
+        """The subject in an image that differs from the last one, and whether it is certainly a person."""
         self.keypoints = None
         observation = self._flow.propagate(image, stamp_ns) if roi is None and self._flow.steps < load_level else None
         if observation is not None:
             self._failures = 0
-            return observation
+            return observation, True
         predicted = self._estimate_predicted(image, stamp_ns, load_level) if roi is None else None
         observation, certain = predicted or self._estimate_detected(image, stamp_ns, roi, load_level)
         # Doubtful persons are not propagated by optical flow; the detector runs again.
         self._flow.start(image if load_level and certain else None, observation)
-        return observation
+        return observation, certain
 
     @property
     def propagated(self) -> bool:

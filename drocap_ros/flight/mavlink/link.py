@@ -258,6 +258,8 @@ class MavlinkLink:
             self._requests.set_autopilot(kind)
             self.settings.set_autopilot(kind)
         self._requests.count(message.get_msgId(), now_ns)
+        if message.get_srcComponent() != self.estimator.component_id:
+            return state  # a gimbal, a camera or another companion of this vehicle: it answers for itself alone
         if name == "TIMESYNC":
             self._take_time_sync(message, now_ns)
         elif name == "PARAM_VALUE":

@@ -16,6 +16,7 @@ from drocap_ros.flight.safety_config import SafetyConfig
 _AT_REST_M_S, _AT_REST_S, _SETTLED_S = 0.35, 0.5, 0.3
 _DEAD_RECKONING_S = 0.6
 _FRESH_S = 0.25
+_UNSURE_S = 0.5  # without a place after a jump of the reported position: velocity zero
 _NEAR_M, _FAST_M_S, _STOPPING_S, _MAX_WAY_OUT_M = 5.0, 1.0, 1.2, 1.5
 _LEAD_S, _CLEAR_M, _MAX_LEAD_M = 1.5, 0.3, 3.0
 _HOLD_MODE_PATIENCE_S = 5.0
@@ -36,7 +37,7 @@ def begin_hold(
     """
     age_s = max(seen.position_age_s, seen.state_age_s)
     finite = bool(np.isfinite(seen.position).all() and np.isfinite(seen.velocity).all()) and math.isfinite(seen.yaw)
-    known = finite and seen.position_ok and seen.gps_fix_type >= 3 and age_s <= _DEAD_RECKONING_S
+    known = finite and seen.position_ok and seen.gps_fix_type >= 3 and age_s <= _DEAD_RECKONING_S and not seen.jumped
     fresh = known and max(seen.link_age_s, age_s) <= _FRESH_S
     behind_s = 0.0 if fresh else max(seen.position_age_s - seen.state_age_s, 0.0)
     place = seen.position + seen.velocity * behind_s if known else None
@@ -51,7 +52,8 @@ def begin_hold(
     return dataclasses.replace(
         state, state=State.HOLDING, since_s=now_s, condition=reason, blind=blind and not fresh,
         hold_mode_s=math.nan if seen.followed else now_s, hold_position=place, hold_yaw=seen.yaw,
-        retreats=retreats, retreated_s=-math.inf, slow_s=math.nan, resumable=reason.code in _HARMLESS,
+        retreats=retreats, retreated_s=-math.inf, slow_s=math.nan,
+        jumped_s=now_s if seen.jumped else -math.inf, resumable=reason.code in _HARMLESS,
         clear_s=math.nan,
     )  # fmt: skip
 
@@ -67,9 +69,10 @@ def update_hold(state: SafetyState, seen: Observed, now_s: float, blind: bool) -
     After a jump of the reported position (a glitch that comes back, a reset of the autopilot's estimator) the latched
     one names another place, and the vehicle would fly there.
     """
-    if seen.jumped and state.hold_position is not None:
-        state = dataclasses.replace(state, hold_position=seen.position.copy())
-    if state.blind and not blind:
+    if seen.jumped:  # no place is known, not even the new one: the reports may be two vehicles'
+        state = dataclasses.replace(state, hold_position=None, blind=True, since_s=now_s, jumped_s=now_s)
+    settled = now_s - state.jumped_s > _UNSURE_S
+    if state.blind and not blind and settled:
         state = dataclasses.replace(state, blind=False, since_s=now_s, hold_mode_s=math.nan)
         if state.hold_position is None:
             state = dataclasses.replace(state, hold_position=seen.position.copy(), hold_yaw=seen.yaw)

@@ -106,9 +106,8 @@ def position_jump_m(before: VehicleState | None, state: VehicleState) -> float:
     """Distance in m of the reported position from where the state before it led; 0 = near enough."""
     if before is None:
         return 0.0
-    dt = (state.stamp_ns - before.stamp_ns) / _NS
-    if not 0 < dt < _JUMP_PERIOD_S:
-        return 0.0
+    # Stamps may jump with the position, as where the autopilot restarts: the way since then is bounded all the same.
+    dt = min(max((state.stamp_ns - before.stamp_ns) / _NS, 0.0), _JUMP_PERIOD_S)
     mean = 0.5 * (before.velocity_enu_m_s + state.velocity_enu_m_s)
     jump = float(np.linalg.norm(state.position_enu_m - before.position_enu_m - mean * dt))
     return jump if jump > _POSITION_JUMP_M else 0.0  # NaN is no jump

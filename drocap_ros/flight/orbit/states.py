@@ -174,6 +174,7 @@ class SafetyState:
     hold_mode_s : when the hold mode was first requested; NaN = not yet
     blind : whether the hold began without a trustworthy vehicle state
     resumable : whether the orbit may resume by itself: a harmless cause alone began the hold
+    jumped_s : when the reported position has jumped last in this hold
     clear_s : since when all conditions hold again in such a hold; NaN = they do not
     lost_s : since when the vehicle is out of sight (no fresh telemetry); NaN = it is in sight
     seen_s : since when it is in sight without interruption; -infinity = it was never lost
@@ -194,6 +195,7 @@ class SafetyState:
     hold_mode_s: float = math.nan
     blind: bool = False
     resumable: bool = False
+    jumped_s: float = -math.inf
     clear_s: float = math.nan
     lost_s: float = math.nan
     seen_s: float = -math.inf

@@ -14,8 +14,9 @@ from drocap_ros.flight.orbit.states import Action, Command, OperatorCommand
 from drocap_ros.observation import PoseObservation
 from drocap_ros.simulation.closed_loop.fault_flight import FAULT_S, Injection
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, with_config
+from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.copter_reports import Readiness
-from drocap_ros.simulation.vehicle.loopback import is_setpoint
+from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport, is_setpoint
 
 
 def assign(owner: str = "", **values: Any) -> Injection:
@@ -70,6 +71,38 @@ def foreign_system(loop: OrbitLoop) -> None:
         packets = other.heartbeat_encode(2, 3, 1, 9, 4), other.local_position_ned_encode(i, 500, 0, 0, 0, 0, 0)
         for packet in packets:
             loop.down.write(packet.pack(other))
+
+
+def second_vehicle(loop: OrbitLoop) -> None:
+    """Another vehicle with the same system and component is heard: in control mode, 6 m beyond the person."""
+    sight = (loop.pelvis() - loop.copter.body.position)[:2]
+    place = np.append(loop.pelvis()[:2] + 6.0 * sight / np.hypot(*sight), loop.copter.body.position[2])
+    deaf = LoopbackTransport(Channel(lambda: loop.t), loop.down)
+    other = SimulatedCopter(deaf, place, 0.0, loop.settings.autopilot, seed=99, mode=loop.copter.mode)
+    other.armed, other._period_s = True, dict(loop.copter._period_s)
+    fly = loop.copter.fly
+
+    def both_fly(t_s: float) -> None:
+        fly(t_s)
+        other.fly(t_s)
+
+    loop.copter.fly = both_fly  # type: ignore[method-assign]
+
+
+def answer_time_sync(loop: OrbitLoop) -> None:
+    """A companion computer of the same vehicle answers TIMESYNC, too, by its own clock and without delay."""
+    companion = mavlink.MAVLink(None, srcSystem=1, srcComponent=mavlink.MAV_COMP_ID_ONBOARD_COMPUTER2)
+    parser = mavlink.MAVLink(None)
+
+    def heard(packet: bytes) -> bool:
+        for message in parser.parse_buffer(packet) or ():
+            if message.get_type() == "TIMESYNC" and message.tc1 == 0:
+                delay_s, loop.down.delay_s = loop.down.delay_s, 0.01
+                loop.down.write(companion.timesync_encode(loop.clock_ns(), message.ts1).pack(companion))
+                loop.down.delay_s = delay_s
+        return False
+
+    loop.up.drops = heard
 
 
 def begins(name: str) -> Injection:

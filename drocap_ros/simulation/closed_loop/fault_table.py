@@ -28,6 +28,7 @@ from drocap_ros.simulation.closed_loop.fault_causes import (
 )
 from drocap_ros.simulation.closed_loop.fault_flight import FAULT_S, Fault, Injection, start
 from drocap_ros.simulation.closed_loop.fault_injections import (
+    answer_time_sync,
     assign,
     begins,
     both,
@@ -55,6 +56,7 @@ from drocap_ros.simulation.closed_loop.fault_injections import (
     restart_clock,
     same_radius,
     scaled,
+    second_vehicle,
     shadow,
     shifted,
     shipped_timeouts,
@@ -170,6 +172,18 @@ _VEHICLE = (
         before=((4.0, start), (FAULT_S - 0.4, _STOP)), state=State.HOLDING,
     ),
     Fault(
+        "the autopilot's clock goes back and its position jumps during a hold", _STOP, LINK_S,
+        later=(0.3, both(restart_clock, reset_position(5.0))),
+    ),
+    Fault(
+        "another vehicle with the same ids is heard", second_vehicle, LINK_S, cause=TIMEOUT,
+        codes=(_C.POSITION_JUMPED, *_TAKEN),
+    ),
+    Fault(
+        "another vehicle with the same ids is heard during a hold", second_vehicle, LINK_S, cause=JUMPED,
+        before=((4.0, start), (FAULT_S - 0.4, _STOP)), state=State.HOLDING,
+    ),
+    Fault(
         "the autopilot's position jumps while the control loop hangs", assign(hung=True), cause=JUMPED,
         codes=(_STALLED, _C.POSITION_JUMPED), later=(0.6, both(reset_position(5.0), assign(hung=False))),
     ),
@@ -252,6 +266,10 @@ _REAL = (
     Fault(
         "downlink late, and the pilot takes RTL", both(assign("down", delay_s=1.0), pilot("RTL")), LINK_S, cause=MODE,
         later=(4.0, _RETURN), check=kept("RTL"),
+    ),
+    Fault(
+        "a companion answers TIMESYNC, the downlink is late, then the pilot takes RTL", assign("down", delay_s=1.0),
+        LINK_S, later=(3.4, pilot("RTL")), check=kept("RTL"), before=((0.0, answer_time_sync), (4.0, start)),
     ),
     Fault("pilot moves a stick that does not count", move_stick(1), harmless=True),
     _in_state(

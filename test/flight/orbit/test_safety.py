@@ -293,6 +293,10 @@ def test_a_hold_follows_a_jump_of_the_reported_position():
     jumped = condition(ConditionCode.POSITION_JUMPED, jump_m=5.0)
     seen = dataclasses.replace(GOOD, position=np.array([11.0, 0.0, 2.5]), disturbance=jumped)
     state, decision = reduce(state, seen, 10.1, None, LIMITS)
+    assert (state.hold_position, decision.action) == (None, Action.HALT)
+    seen = dataclasses.replace(seen, disturbance=None)
+    for step in range(12):
+        state, decision = reduce(state, seen, 10.15 + 0.05 * step, None, LIMITS)
     assert (state.hold_position.tolist(), decision.action) == ([11.0, 0.0, 2.5], Action.HOLD)
 
 
