@@ -19,6 +19,7 @@ from drocap_ros.perception.load_models import limited_use, load_detector, load_p
 from drocap_ros.perception.pose import NetworkKeypoints
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking import Subject, SubjectTracker
+from drocap_ros.perception.tracking.camera_motion import CameraMotion, moved_box
 from drocap_ros.perception.tracking.detection_windows import Window, uncut
 from drocap_ros.perception.tracking.pose_belief import CONFIRM_CONFIDENCE
 from drocap_ros.perception.tracking.rivals import wins
@@ -66,6 +67,7 @@ class PoseEstimator:
         self.tracker = SubjectTracker(self.config)
         self._joint_map = joint_map(self.pose_model.joints.name)
         self._flow = KeypointFlow()
+        self._camera = CameraMotion()
         self._last_ns: int | None = None
         #: The last image that certainly showed the subject, and the subject in it.
         self._repeated: tuple[np.ndarray, PoseObservation] | None = None
@@ -103,6 +105,7 @@ class PoseEstimator:
             self.tracker.reset()
             self._flow.start(None, None)
             self._margins, self._rejected, self._repeated = None, [], None
+            self._camera.reset()
         self._last_ns = stamp_ns
         roi = _validated_roi(roi)
         # A camera that repeats its picture shows nothing new: the bridge knows that by the same keypoints, bit for bit.
@@ -116,6 +119,10 @@ class PoseEstimator:
         self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None, load_level: int
     ) -> tuple[PoseObservation, bool]:
         """The subject in an image that differs from the last one, and whether it is certainly a person."""
+        motion = self._camera.update(image, self.tracker.boxes())
+        if motion is not None:
+            self.tracker.move_camera(motion)
+            self._rejected = [(moved_box(motion, box), at_ns) for box, at_ns in self._rejected]
         self.keypoints = None
         observation = self._flow.propagate(image, stamp_ns) if roi is None and self._flow.steps < load_level else None
         if observation is not None:

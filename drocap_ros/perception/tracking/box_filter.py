@@ -62,6 +62,12 @@ class BoxFilter:
         noise = np.array([[dt**4 / 4, dt**3 / 2], [dt**3 / 2, dt**2]])
         self.p = f @ self.p @ f.T + q[:, None, None] * noise
 
+    def move_camera(self, matrix: np.ndarray) -> None:
+        """Follow the image's motion (2, 3) by the camera's."""
+        self.x[:2] = matrix[:, :2] @ self.x[:2]
+        self.x[:2, 0] += matrix[:, 2]
+        self.x[2:, 0] += 0.5 * np.log(abs(np.linalg.det(matrix[:, :2])))
+
     def update(self, box: np.ndarray, noise: float = 1.0) -> None:
         """Update with a measured box; ``noise`` scales its standard deviation."""
         r = (noise * self._scaled(_MEASURED)) ** 2

@@ -6,6 +6,7 @@ import numpy as np
 
 from drocap_ros.perception.tracking.appearance import similarity
 from drocap_ros.perception.tracking.box_filter import BoxFilter
+from drocap_ros.perception.tracking.camera_motion import moved_box
 from drocap_ros.perception.tracking.pose_belief import PoseBelief
 
 #: Weight of a new descriptor in the mean appearance.
@@ -74,6 +75,13 @@ class Person:
         self.box = np.asarray(box, float)
         self.score = self.mean_score = score
         self.confirm(stamp_ns)
+
+    def move_camera(self, matrix: np.ndarray) -> None:
+        """Follow the image's motion (2, 3) by the camera's."""
+        self.filter.move_camera(matrix)
+        self.box = moved_box(matrix, self.box)
+        if self.pose.box is not None:
+            self.pose.box = moved_box(matrix, self.pose.box)
 
     def confirm(self, stamp_ns: int) -> None:
         """Confirm the detection at this time."""

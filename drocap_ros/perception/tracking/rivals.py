@@ -46,14 +46,20 @@ def rivals(
     for j, box in enumerate(np.asarray(boxes, float)):
         if _overlap(box, subject.box) > _SAME or not _in_reach(subject, box, confidence, stamp_ns):
             continue
-        owner = owner_of(box, persons, stamp_ns)
-        if owner is not None and owner is not subject and owner.pose.other:
+        if _on_other(subject, persons, box, stamp_ns):
             continue
         # A box around person and shadow has the colours of both: inside it they say nothing.
         inside = float(overlap_coefficient(box[None], subject.box[None])[0, 0]) > _INSIDE
         if inside or _looks_right(subject, describe(image, box), present):
             found.append(j)
     return found
+
+
+def _on_other(subject: Person, persons: list[Person], box: np.ndarray, stamp_ns: int) -> bool:
+    """Whether a box (4,) px lies on someone else who was detected in this image: it may be a second box around them."""
+    others = [p for p in persons if p is not subject and p.pose.other and p.plausible and p.detected_ns == stamp_ns]
+    boxes = np.array([p.box for p in others]).reshape(-1, 4)
+    return bool((overlap_coefficient(box[None], boxes) > _INSIDE).any())
 
 
 def _covered(subject: Person, persons: list[Person], stamp_ns: int) -> bool:

@@ -1,0 +1,130 @@
+"""Motion of the image by the camera's own, and persons who follow it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
+from drocap_ros.perception.tracking import SubjectTracker
+from drocap_ros.perception.tracking.box_filter import BoxFilter
+from drocap_ros.perception.tracking.camera_motion import CameraMotion, moved_box
+
+SIZE = (640, 360)
+STEP_NS = 50_000_000
+PERSON = np.array([[280.0, 120.0, 340.0, 270.0]])
+
+
+@pytest.fixture(scope="module")
+def ground():
+    """Grass and stones, several images wide."""
+    rng = np.random.default_rng(0)
+    picture = np.full((1400, 2400), 120, np.float32)
+    for size, contrast in ((8, 12), (24, 12), (96, 14)):
+        coarse = rng.normal(size=(1400 // size + 2, 2400 // size + 2)).astype(np.float32)
+        picture += contrast * cv2.resize(coarse, (2400, 1400), interpolation=cv2.INTER_CUBIC)
+    return np.repeat(np.clip(picture, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def view(ground, matrix, blur=0):
+    """Image of a camera whose pixels are (2, 3) ``matrix`` times those of the ground."""
+    image = cv2.warpAffine(ground, matrix, SIZE, borderMode=cv2.BORDER_REFLECT)
+    return cv2.blur(image, (blur, 1)) if blur else image
+
+
+def camera(x=-700.0, y=-500.0, degrees=0.0, zoom=1.0):
+    turn = zoom * np.array([[np.cos(a := np.radians(degrees)), -np.sin(a)], [np.sin(a), np.cos(a)]])
+    return np.column_stack([turn, [x, y]])
+
+
+def apart(found, first, second):
+    """Largest error (px) of a motion between two cameras, in the corners of the image."""
+    corners = np.array([[0, 0], [SIZE[0], 0], [0, SIZE[1]], SIZE], float)
+    on_ground = (corners - first[:, 2]) @ np.linalg.inv(first[:, :2]).T
+    expected = on_ground @ second[:, :2].T + second[:, 2]
+    return np.linalg.norm(corners @ found[:, :2].T + found[:, 2] - expected, axis=1).max()
+
+
+@pytest.mark.parametrize(
+    ("change", "blur"),
+    [
+        ({}, 0),
+        ({"x": -664.0, "y": -492.0}, 0),
+        ({"x": -630.0, "y": -510.0}, 25),
+        ({"x": -705.0, "degrees": 2.0, "zoom": 1.02}, 0),
+    ],
+    ids=["still", "pan", "fast pan, blurred", "turn and zoom"],
+)
+def test_the_motion_of_the_ground_is_found(ground, change, blur):
+    motion = CameraMotion()
+    first, second = camera(), camera(**change)
+    assert motion.update(view(ground, first, blur), PERSON) is None
+    found = motion.update(view(ground, second, blur), PERSON)
+    assert found is not None
+    assert apart(found, first, second) < 2.0
+
+
+def test_a_person_who_fills_half_the_image_is_not_the_ground(ground):
+    motion = CameraMotion()
+    box = np.array([[160.0, 0.0, 520.0, 360.0]])
+    for i in range(2):
+        image = view(ground, camera())
+        image[:, 160:520] = ground[300:660, 900 + 20 * i : 1260 + 20 * i]
+        found = motion.update(image, box)
+    assert found is not None
+    assert apart(found, camera(), camera()) < 1.0
+
+
+def test_what_does_not_show_the_motion_gives_none(ground):
+    motion = CameraMotion()
+    grey = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
+    assert [motion.update(grey, PERSON) for _ in range(2)] == [None, None]
+    assert motion.update(view(ground, camera()), PERSON) is None  # a cut
+    assert motion.update(view(ground, camera()), np.empty((0, 4))) is None
+    assert motion.update(view(ground, camera(x=-1500.0)), PERSON) is None  # nothing in common
+    motion.reset()
+    assert motion.update(view(ground, camera()), PERSON) is None
+    assert motion.update(view(ground, camera())[:180, :320].copy(), PERSON) is None  # another size
+
+
+def test_a_filter_follows_the_image():
+    matrix = camera(30.0, -10.0, 3.0, 1.1)
+    found = BoxFilter(PERSON[0], 0)
+    found.move_camera(matrix)
+    np.testing.assert_allclose(found.box(), moved_box(matrix, PERSON[0]), atol=1e-9)
+    found.predict(STEP_NS)
+    np.testing.assert_allclose(found.box(), moved_box(matrix, PERSON[0]), atol=1e-9)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_shaken_camera_keeps_its_subject_by_the_known_motion_alone(known):
+    tracker = SubjectTracker(PoseEstimatorConfig(on_loss="wait"))
+    rng, last, followed = np.random.default_rng(3), 0.0, []
+    for i in range(40):
+        shake = rng.uniform(-150, 150) if i >= 10 else 0.0
+        x = 320 + shake
+        image = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
+        image[100:240, int(x - 25) : int(x + 25)] = (40, 40, 200)
+        tracker.windows(SIZE, i * STEP_NS)
+        if known:
+            tracker.move_camera(camera(shake - last, 0.0))
+        last = shake
+        subject = tracker.update(image, i * STEP_NS, np.array([[x - 25, 100, x + 25, 240]]), np.array([0.8]))
+        followed.append(subject is not None and subject.score > 0 and abs(subject.box[[0, 2]].mean() - x) < 5)
+    assert all(followed) == known
+
+
+def test_a_second_box_around_a_known_other_person_is_no_rival():
+    tracker = SubjectTracker(PoseEstimatorConfig())
+    image = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
+    boxes = np.array([[280.0, 100, 340, 260], [370.0, 100, 430, 260]])
+    for i in range(20):
+        stamp = i * STEP_NS
+        subject = tracker.update(image, stamp, boxes, np.array([0.9, 0.8]))
+        tracker.judge(0.9, subject.box, stamp)
+        if (other := tracker.bystander_to_judge(stamp)) is not None:
+            tracker.judge_bystander(other, 0.9, stamp)
+    wider = np.array([[355.0, 60, 490, 290]])
+    assert tracker.rivals(image, stamp, wider, np.array([0.3]), 0.3) == []
+    assert tracker.rivals(image, stamp, wider - [200, 0, 200, 0], np.array([0.3]), 0.3) == [0]
