@@ -119,7 +119,7 @@ class PoseEstimator:
         self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None, load_level: int
     ) -> tuple[PoseObservation, bool]:
         """The subject in an image that differs from the last one, and whether it is certainly a person."""
-        motion = self._camera.update(image, self.tracker.boxes())
+        motion = self._camera.update(image, [person.box for person in self.tracker.persons])
         if motion is not None:
             self.tracker.move_camera(motion)
             self._rejected = [(moved_box(motion, box), at_ns) for box, at_ns in self._rejected]

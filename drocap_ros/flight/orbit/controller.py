@@ -85,7 +85,7 @@ class OrbitController:
         self._framing = Framing(config)
         self._guard = Guard(config, config, config.braking_m_s2)
         self._vehicle: VehicleState | None = None
-        self._placed: VehicleState | None = None  # the last one whose position was known
+        self._placed: VehicleState | None = None  # the last one whose position was known: it may jump from there
         self._commands: deque[OperatorCommand] = deque()
         self._answers: list[tuple[OperatorCommand, CommandAnswer]] = []
         self._queue = CommandQueue()
@@ -104,13 +104,11 @@ class OrbitController:
         self._unsafe: Condition | None = None  # why the last setpoint was not sent
 
     # -- inputs ----------------------------------------------------------------------------------------
-
     def on_state(self, state: VehicleState) -> None:
         """Take a state of the vehicle."""
         with self._lock:
-            if np.isfinite(state.position_enu_m).all():  # else the last known place is what it may jump from
-                self._jump_m = max(self._jump_m, position_jump_m(self._placed, state))
-                self._placed = state
+            if np.isfinite(state.position_enu_m).all():
+                self._jump_m, self._placed = max(self._jump_m, position_jump_m(self._placed, state)), state
             self._vehicle = state
             self._history.add(state)
             self._subject.height_wanders = state.autopilot == "px4"

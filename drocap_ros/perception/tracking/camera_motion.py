@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 #: Longer side (px) of the image in which it is measured, and points of the ground.
@@ -27,13 +29,13 @@ class CameraMotion:
         """Forget the last image."""
         self._last = None
 
-    def update(self, image: np.ndarray, persons: np.ndarray) -> np.ndarray | None:
+    def update(self, image: np.ndarray, persons: Sequence[np.ndarray]) -> np.ndarray | None:
         """Motion since the last image.
 
         Parameters
         ----------
         image : (H, W, 3) uint8 BGR
-        persons : (N, 4) px, boxes of the last image, whose points do not belong to the ground
+        persons : (4,) px each, boxes of the last image, whose points do not belong to the ground
 
         Returns
         -------
@@ -47,7 +49,7 @@ class CameraMotion:
         last, self._last = self._last, grey
         if last is None or last.shape != grey.shape or not len(persons):
             return None
-        points = cv2.goodFeaturesToTrack(last, _POINTS, _QUALITY, _APART_PX, mask=_ground(last.shape, scale * persons))
+        points = cv2.goodFeaturesToTrack(last, _POINTS, _QUALITY, _APART_PX, mask=_ground(last.shape, scale, persons))
         if points is None or len(points) < _LEAST:
             return None
         matrix, share = _consensus(last, grey, points, np.zeros(2))
@@ -65,9 +67,9 @@ class CameraMotion:
         return np.column_stack([matrix[:, :2], matrix[:, 2] / scale])
 
 
-def _ground(shape: tuple[int, ...], boxes: np.ndarray) -> np.ndarray:
+def _ground(shape: tuple[int, ...], scale: float, persons: Sequence[np.ndarray]) -> np.ndarray:
     mask = np.full(shape, 255, np.uint8)
-    for x_min, y_min, x_max, y_max in np.clip(boxes, 0, max(shape)).astype(int):
+    for x_min, y_min, x_max, y_max in np.clip(scale * np.array(persons), 0, max(shape)).astype(int):
         mask[y_min : y_max + 1, x_min : x_max + 1] = 0
     return mask
 

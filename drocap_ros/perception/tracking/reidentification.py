@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.perception.detection.nms import iou
+from drocap_ros.perception.detection.nms import iou, overlap_coefficient
 from drocap_ros.perception.tracking.person import Person
 from drocap_ros.perception.tracking.pose_belief import SURE_CONFIDENCE
 
@@ -27,6 +27,10 @@ _CLEAR_SCORE = 0.6
 _REIDENTIFY_SIMILARITY = 0.92
 #: The same for the only person who may be the subject, within this time.
 _ALONE_SIMILARITY, _ALONE_S = 0.85, 6.0
+#: Time for which someone new is looked at before the subject is given up for them.
+_KNOWN_S = 1.0
+#: Overlap coefficient above which two boxes are one person's.
+_DOUBLE = 0.75
 #: Longest gap of a person that the search without a subject centres on.
 _CANDIDATE_S = 0.3
 #: Growth of the search around the last place, lengths per second, and its farthest reach, lengths.
@@ -89,6 +93,26 @@ def same_person(lost: Person, person: Person, left_image: bool, alone: bool = Fa
     if alone and gap < _ALONE_S and person.pose.last >= SURE_CONFIDENCE:
         least = _ALONE_SIMILARITY
     return distance < 1.0 + 1.5 * gap and growth < 0.5 + 0.3 * gap and similarity >= least
+
+
+def found_again(
+    lost: Person, persons: list[Person], left_image: bool, confirm_frames: int, stamp_ns: int
+) -> Person | None:
+    """Whom of the persons detected in this image is the lost subject."""
+    seen = [p for p in persons if p is not lost and p.detected_ns == stamp_ns and could_be(lost, p)]
+    boxes = np.array([p.box for p in seen], float).reshape(-1, 4)
+    for person in seen:
+        early = person.hits < confirming_hits(person, confirm_frames)
+        # A second box around the same person is no other one.
+        alone = bool((overlap_coefficient(person.box[None], boxes) > _DOUBLE).all())
+        if not early and same_person(lost, person, left_image, alone):
+            return person
+    return None
+
+
+def certainly_others(lost: Person, persons: list[Person], stamp_ns: int) -> list[Person]:
+    """Persons without those who have just come into view: half hidden as yet, they may be the lost subject."""
+    return [p for p in persons if (stamp_ns - p.first_ns) * 1e-9 >= _KNOWN_S or not could_be(lost, p)]
 
 
 def confirming_hits(person: Person, confirm_frames: int) -> int:

@@ -18,10 +18,9 @@ from drocap_ros.perception.tracking.pose_belief import SURE_CONFIDENCE
 from drocap_ros.perception.tracking.reidentification import (
     FORGET_S,
     RELIABLE_SCORE,
-    confirming_hits,
-    could_be,
+    certainly_others,
+    found_again,
     leaving,
-    same_person,
     search_boxes,
 )
 from drocap_ros.perception.tracking.rivals import clutter_of, due_bystander, owner_of, rivals
@@ -37,8 +36,6 @@ _PART = 0.75
 _ISOLATED = 0.4
 #: For ``on_loss = next``: time beyond coasting after which a subject lost inside the image is given up.
 _GIVE_UP_S = 3.0
-#: Time for which someone new is looked at before the subject is given up for them.
-_KNOWN_S = 1.0
 #: Longest gap of a bystander, and the largest number of persons.
 _BYSTANDER_S, _MAX_PERSONS = 2.0, 30
 
@@ -84,10 +81,6 @@ class SubjectTracker:
         """Delete all tracks, for stamps that restarted; track ids continue."""
         self.persons, self._subject, self._any_detected, self._last_ns = [], None, False, None
         self._schedule.reset()
-
-    def boxes(self) -> np.ndarray:
-        """(N, 4) px, of all persons in the last image."""
-        return np.array([person.box for person in self.persons], float).reshape(-1, 4)
 
     def move_camera(self, matrix: np.ndarray) -> None:
         """Let all persons follow the image's motion (2, 3) by the camera's, those out of view as well."""
@@ -280,19 +273,10 @@ class SubjectTracker:
         lost = self._subject
         if lost is None or lost.unconfirmed_s(stamp_ns) <= 0:
             return
-        seen = [p for p in self.persons if p is not lost and p.detected_ns == stamp_ns and could_be(lost, p)]
-        boxes = np.array([p.box for p in seen], float).reshape(-1, 4)
-        for person in seen:
-            early = person.hits < confirming_hits(person, self._config.confirm_frames)
-            # A second box around the same person is no other one.
-            alone = bool((overlap_coefficient(person.box[None], boxes) > _PART).all())
-            if early or not same_person(lost, person, self._left_image, alone):
-                continue
+        if person := found_again(lost, self.persons, self._left_image, self._config.confirm_frames, stamp_ns):
             self.persons.remove(lost)
             person.appearance = lost.appearance if lost.appearance is not None else person.appearance
-            self._subject = person
-            self._left_image = False
-            return
+            self._subject, self._left_image = person, False
 
     def _apply_roi(self, roi: np.ndarray, stamp_ns: int) -> None:
         """A roi away from the subject is a choice; one on the subject replaces missing detections."""
@@ -329,8 +313,8 @@ class SubjectTracker:
             if config.on_loss == "wait" or self._subject.unconfirmed_s(stamp_ns) <= patience_s:
                 return
         persons, lost = self.persons, self._subject
-        if lost is not None and not self._left_image:  # whoever comes into view may be the lost one, half hidden as yet
-            persons = [p for p in persons if (stamp_ns - p.first_ns) * 1e-9 >= _KNOWN_S or not could_be(lost, p)]
+        if lost is not None and not self._left_image:
+            persons = certainly_others(lost, persons, stamp_ns)
         best = select(persons, lost, config, shape, stamp_ns, not self._track_id, not self._any_detected)
         if best is not None:
             self._follow(best)
