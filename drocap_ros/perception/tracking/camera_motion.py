@@ -15,12 +15,14 @@ _WINDOW_PX, _LEVELS = (15, 15), 4
 #: Points that agree on a motion: distance (px) up to which they do, least number and share of them, and the share that
 #: makes it certain.
 _AGREE_PX, _LEAST, _SHARE, _CERTAIN = 2.0, 15, 0.4, 0.7
+#: Share of the longer side that counts as motion: the tracks bear less, and each step costs a trace of accuracy.
+_SMALL = 0.01
 #: Largest change of the size between two images.
 _MOST_ZOOM = 1.5
 
 
 class CameraMotion:
-    """Similarity transform from the last image to the present one: optical flow of points, and their consensus."""
+    """Similarity transform between images: optical flow of points, and their consensus."""
 
     def __init__(self) -> None:
         self._last: np.ndarray | None = None
@@ -30,7 +32,7 @@ class CameraMotion:
         self._last = None
 
     def update(self, image: np.ndarray, persons: Sequence[np.ndarray]) -> np.ndarray | None:
-        """Motion since the last image.
+        """Motion since the last image, or since an earlier one, as long as it was small.
 
         Parameters
         ----------
@@ -39,32 +41,58 @@ class CameraMotion:
 
         Returns
         -------
-        (2, 3) transform of pixels; None for the first image, without persons, or where too few points agree.
+        (2, 3) transform of pixels; None for the first image, without persons, where too few points agree, or where the
+        motion is small.
         """
-        import cv2
-
         scale = min(1.0, _SIDE_PX / max(image.shape[:2]))
-        grey = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        grey = cv2.cvtColor(grey, cv2.COLOR_BGR2GRAY)
-        last, self._last = self._last, grey
+        grey, last = _small(image), self._last
         if last is None or last.shape != grey.shape or not len(persons):
+            self._last = grey
             return None
-        points = cv2.goodFeaturesToTrack(last, _POINTS, _QUALITY, _APART_PX, mask=_ground(last.shape, scale, persons))
-        if points is None or len(points) < _LEAST:
+        matrix = _motion(last, grey, _ground(last.shape, scale, persons))
+        if matrix is not None and _largest(matrix, grey.shape) < _SMALL * max(grey.shape):
             return None
-        matrix, share = _consensus(last, grey, points, np.zeros(2))
-        if share < _CERTAIN:
-            # A pan of a blurred image exceeds the reach of the flow: from the shift of the whole image once more.
-            window = cv2.createHanningWindow(grey.shape[::-1], cv2.CV_32F)
-            shift, _ = cv2.phaseCorrelate(last.astype(np.float32), grey.astype(np.float32), window)
-            again, share_again = _consensus(last, grey, points, np.array(shift))
-            if share_again > share:
-                matrix, share = again, share_again
-        if matrix is None or share < _SHARE or share * len(points) < _LEAST:
-            return None
-        if not _MOST_ZOOM**-2 < np.linalg.det(matrix[:, :2]) < _MOST_ZOOM**2:
-            return None
-        return np.column_stack([matrix[:, :2], matrix[:, 2] / scale])
+        self._last = grey
+        return None if matrix is None else np.column_stack([matrix[:, :2], matrix[:, 2] / scale])
+
+
+def _motion(last: np.ndarray, grey: np.ndarray, ground: np.ndarray) -> np.ndarray | None:
+    """Transform (2, 3) of one grey image to another, or None."""
+    import cv2
+
+    points = cv2.goodFeaturesToTrack(last, _POINTS, _QUALITY, _APART_PX, mask=ground)
+    if points is None or len(points) < _LEAST:
+        return None
+    matrix, share = _consensus(last, grey, points, np.zeros(2))
+    if share < _CERTAIN:
+        # A pan of a blurred image exceeds the reach of the flow: from the shift of the whole image once more.
+        window = cv2.createHanningWindow(grey.shape[::-1], cv2.CV_32F)
+        shift, _ = cv2.phaseCorrelate(last.astype(np.float32), grey.astype(np.float32), window)
+        again, share_again = _consensus(last, grey, points, np.array(shift))
+        if share_again > share:
+            matrix, share = again, share_again
+    if matrix is None or share < _SHARE or share * len(points) < _LEAST:
+        return None
+    zoom = np.sqrt(abs(np.linalg.det(matrix[:, :2])))
+    return matrix if 1 / _MOST_ZOOM < zoom < _MOST_ZOOM else None
+
+
+def _largest(matrix: np.ndarray, shape: tuple[int, ...]) -> float:
+    """Largest way (px) of the corners of an image."""
+    corners = np.array([[0, 0], [shape[1], 0], [0, shape[0]], [shape[1], shape[0]]], float)
+    return float(np.linalg.norm(corners @ matrix[:, :2].T + matrix[:, 2] - corners, axis=1).max())
+
+
+def _small(image: np.ndarray) -> np.ndarray:
+    import cv2
+
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    # Means of four pixels are fast, those of other numbers are not.
+    while max(grey.shape) >= 2 * _SIDE_PX:
+        grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    size = [round(side * min(1.0, _SIDE_PX / max(image.shape[:2]))) for side in image.shape[1::-1]]
+    small: np.ndarray = cv2.resize(grey, size, interpolation=cv2.INTER_LINEAR)
+    return small
 
 
 def _ground(shape: tuple[int, ...], scale: float, persons: Sequence[np.ndarray]) -> np.ndarray:
