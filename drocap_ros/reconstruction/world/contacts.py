@@ -12,8 +12,9 @@ _HIDDEN_S = 0.25
 _HEIGHT_STD_M = 0.1
 #: Spread of the heights of resting feet on level ground, as the body's errors leave it, and on steps.
 _LEVEL_M, _STEPS_M = 0.025, 0.06
-#: Likelihood of a foot that moves, against that of one that rests at the floor.
-_MOVING = 0.12
+#: Likelihood of a foot that moves, against that of one that rests at the floor: while scale and camera are found, which
+#: false contacts bend, and when feet are locked in their places.
+MOVING, MOVING_LOCKED = 0.5, 0.12
 #: Least and largest probability of the network: neither a foot in contact nor a moving one depends on it alone.
 _SURE = np.array([0.01, 0.99])
 #: Probability of the network from which both feet count as resting, and least standard deviation (m/s) of the speed at
@@ -30,6 +31,7 @@ def contact_probability(
     seen: np.ndarray,
     still: np.ndarray | None = None,
     parting: np.ndarray | None = None,
+    moving: float = MOVING,
 ) -> np.ndarray:
     """(F - 1, 4) for each step between two frames of each of ``FEET``.
 
@@ -37,6 +39,7 @@ def contact_probability(
     speed_std_m_s : of a foot in contact, as far as the present joints are accurate
     still : (F, 2) the network's probability that the right and the left foot rest, None = unknown
     parting : (F - 1, 2) m/s, of :func:`parting_speed`; None = unknown
+    moving : likelihood of a foot that moves, against that of one that rests
     """
     feet = state.joints[:, FEET]
     speed = _smooth(np.linalg.norm(np.diff(feet, axis=0), axis=-1) * fps)
@@ -51,9 +54,9 @@ def contact_probability(
     # Right and left of a pair: both rest, one does, or none.
     right, left = resting[:, ::2], resting[:, 1::2]
     both = right * left * likely
-    total = both + _MOVING * (right + left + _MOVING)
+    total = both + moving * (right + left + moving)
     probability = np.empty_like(resting)
-    probability[:, ::2], probability[:, 1::2] = (both + _MOVING * right) / total, (both + _MOVING * left) / total
+    probability[:, ::2], probability[:, 1::2] = (both + moving * right) / total, (both + moving * left) / total
     known = seen[:, FEET].copy()
     known[:, : len(ANKLES)] = ankles_seen(seen, fps)
     return probability * (known[1:] & known[:-1])

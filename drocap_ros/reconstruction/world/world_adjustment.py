@@ -17,6 +17,8 @@ from drocap_ros.reconstruction.line_search import search_line
 from drocap_ros.reconstruction.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
 from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.contacts import (
+    MOVING,
+    MOVING_LOCKED,
     contact_probability,
     floor_std,
     ground_spread,
@@ -106,7 +108,8 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
         stage = done + (len(_CONTACT_SPEEDS) if held else 0)
         speed = _CONTACT_SPEEDS[stage - 1] if stage <= len(_CONTACT_SPEEDS) else _LAST_CONTACT_SPEED
         if config.feet:
-            contact = contact_probability(state, data.fps, speed, seen, data.still, parting)
+            moving = MOVING_LOCKED if locking else MOVING
+            contact = contact_probability(state, data.fps, speed, seen, data.still, parting, moving)
         weight = config.locked_weight if locking else config.contact_weight
         if stage == len(_CONTACT_SPEEDS) + 1:
             ground = ground_spread(state, contact)
