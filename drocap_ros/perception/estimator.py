@@ -36,6 +36,8 @@ _RIVALS, _FEW_RIVALS = 2, 1
 _COMPARED_ROWS = 4
 #: Time for which a rival that lost is not looked at again, and the overlap from which a box is that rival's.
 _REJECTED_NS, _SAME_IOU = 300_000_000, 0.6
+#: Time without a detection and without a believable pose after which there are no keypoints: a blurred image is shorter.
+_UNSEEN_NS = 80_000_000
 #: Under load shedding, share of the detector's input for a window.
 _REDUCED_INPUT = 0.8
 #: Under load shedding, longest pause of the pose network, over the one after a first failure: 0.4 s at 30 Hz.
@@ -73,7 +75,8 @@ class PoseEstimator:
         self._last_ns: int | None = None
         #: Rows of the last image that certainly showed the subject, and the subject in it.
         self._repeated: tuple[np.ndarray, PoseObservation] | None = None
-        self._detected_ns = 0
+        #: Last run of the detector, and last image in which it or the pose showed the subject.
+        self._detected_ns = self._seen_ns = 0
         #: Score of the subject in the last detection, and mean confidence of its last keypoints; 0 = none.
         self._score = self._confidence = 0.0
         #: (4,) margins of the last box around the joints, over the joints' longer extent; None unless both were clear.
@@ -183,6 +186,10 @@ class PoseEstimator:
         elif extent is not None and subject.score >= _CLEAR_SCORE and self._confidence >= _CLEAR_CONFIDENCE:
             self._margins = (subject.box - extent) / (extent[2:] - extent[:2]).max()
         certain = is_person or subject.score >= self.config.detection_threshold
+        if is_person or subject.score > 0:
+            self._seen_ns = stamp_ns
+        elif stamp_ns - self._seen_ns > _UNSEEN_NS:
+            return self._without_keypoints(stamp_ns, size, subject), False
         return self._observation(stamp_ns, size, subject, pose), certain
 
     def _compete(

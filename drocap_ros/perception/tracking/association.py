@@ -103,7 +103,9 @@ def assign(
 
     predicted = np.array([p.filter.box() for p in persons])
     gap = np.array([p.undetected_s(stamp_ns) for p in persons])[:, None]
-    length = np.maximum((predicted[:, 2:] - predicted[:, :2]).max(axis=1), 1.0)[:, None]
+    # The box of a person who is half hidden is shorter than the person.
+    usual = np.array([p.pose.length for p in persons])
+    length = np.maximum((predicted[:, 2:] - predicted[:, :2]).max(axis=1), np.maximum(usual, 1.0))[:, None]
     offset = _centres(predicted)[:, None] - _centres(boxes)[None]
     distance = np.linalg.norm(offset, axis=2) / length
     growth = np.abs(np.log(_sizes(boxes)[None] / _sizes(predicted)[:, None]))
