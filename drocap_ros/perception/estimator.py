@@ -19,7 +19,7 @@ from drocap_ros.perception.load_models import limited_use, load_detector, load_p
 from drocap_ros.perception.pose import NetworkKeypoints
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking import Subject, SubjectTracker
-from drocap_ros.perception.tracking.camera_motion import CameraMotion, moved_box
+from drocap_ros.perception.tracking.camera_motion import CameraMotion, moved_box, sweeps
 from drocap_ros.perception.tracking.detection_windows import Window, uncut
 from drocap_ros.perception.tracking.pose_belief import CONFIRM_CONFIDENCE
 from drocap_ros.perception.tracking.rivals import wins
@@ -72,6 +72,7 @@ class PoseEstimator:
         self._joint_map = joint_map(self.pose_model.joints.name)
         self._flow = KeypointFlow()
         self._camera = CameraMotion()
+        self._motion: np.ndarray | None = None
         self._last_ns: int | None = None
         #: Rows of the last image that certainly showed the subject, and the subject in it.
         self._repeated: tuple[np.ndarray, PoseObservation] | None = None
@@ -125,7 +126,7 @@ class PoseEstimator:
         self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None, load_level: int
     ) -> tuple[PoseObservation, bool]:
         """The subject in an image that differs from the last one, and whether it is certainly a person."""
-        motion = self._camera.update(image, [person.box for person in self.tracker.persons])
+        self._motion = motion = self._camera.update(image, [person.box for person in self.tracker.persons])
         if motion is not None:
             self.tracker.move_camera(motion)
             self._rejected = [(moved_box(motion, box), at_ns) for box, at_ns in self._rejected]
@@ -233,7 +234,8 @@ class PoseEstimator:
         if person is not None:
             pose = self._calibrated(self.pose_model.estimate(image, person.box))
             same = subject is not None and pose.same_person(subject)
-            self.tracker.judge_bystander(person, _belief(pose, image, person.box), stamp_ns, same)
+            blurred = sweeps(self._motion, person.box)
+            self.tracker.judge_bystander(person, _belief(pose, image, person.box), stamp_ns, same, blurred)
 
     def _estimate_predicted(
         self, image: np.ndarray, stamp_ns: int, load_level: int

@@ -17,6 +17,8 @@ _WINDOW_PX, _LEVELS = (15, 15), 4
 _AGREE_PX, _LEAST, _SHARE, _CERTAIN = 2.0, 15, 0.4, 0.7
 #: Share of the longer side that counts as motion: the tracks bear less, and each step costs a trace of accuracy.
 _SMALL = 0.01
+#: Way between two images, lengths of the person, from which the blur takes joints from the pose.
+_BLUR = 0.1
 #: Largest change of the size between two images.
 _MOST_ZOOM = 1.5
 
@@ -119,6 +121,14 @@ def _consensus(
         points[ok], moved[ok], method=cv2.RANSAC, ransacReprojThreshold=_AGREE_PX
     )
     return matrix, 0.0 if matrix is None else float(agree.sum()) / len(points)
+
+
+def sweeps(matrix: np.ndarray | None, box: np.ndarray) -> bool:
+    """Whether the transform (2, 3) moves a box (4,) px so far that its image is blurred; None = no motion."""
+    if matrix is None:
+        return False
+    way = (moved_box(matrix, box) - box)[:2]
+    return float(np.linalg.norm(way)) > _BLUR * float((box[2:] - box[:2]).max())
 
 
 def moved_box(matrix: np.ndarray, box: np.ndarray) -> np.ndarray:

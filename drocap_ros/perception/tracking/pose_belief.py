@@ -39,9 +39,12 @@ class PoseBelief:
         self._usual = 0.0
         self._failing_ns: int | None = None
 
-    def judge(self, confidence: float, box: np.ndarray, stamp_ns: int) -> None:
-        """Add a pose by its mean confidence, found in a box (4,) px."""
-        first = self.judged_ns is None or (self.plausible_ns is None and confidence >= CONFIRM_CONFIDENCE)
+    def judge(self, confidence: float, box: np.ndarray, stamp_ns: int, blurred: bool = False) -> None:
+        """Add a pose by its mean confidence, found in a box (4,) px; a weak one in a blurred image says nothing."""
+        if blurred and confidence < CONFIRM_CONFIDENCE:
+            self.judged_ns = stamp_ns
+            return
+        first = np.isnan(self.value) or (self.plausible_ns is None and confidence >= CONFIRM_CONFIDENCE)
         self.value = confidence if first else self.value + _RATE * (confidence - self.value)
         self.last, self.judged_ns = confidence, stamp_ns
         if confidence >= max(CONFIRM_CONFIDENCE, _USUAL_SHARE * self._usual):

@@ -29,6 +29,8 @@ _REIDENTIFY_SIMILARITY = 0.92
 _ALONE_SIMILARITY, _ALONE_S = 0.85, 6.0
 #: Time for which someone new is looked at before the subject is given up for them.
 _KNOWN_S = 1.0
+#: Time of a search over the whole image after which someone whom it does not find is out of view.
+_GONE_S = 0.4
 #: Overlap coefficient above which two boxes are one person's.
 _DOUBLE = 0.75
 #: Longest gap of a person that the search without a subject centres on.
@@ -105,9 +107,30 @@ def found_again(
         early = person.hits < confirming_hits(person, confirm_frames)
         # A second box around the same person is no other one.
         alone = bool((overlap_coefficient(person.box[None], boxes) > _DOUBLE).all())
-        if not early and same_person(lost, person, left_image, alone):
+        if early or fits_other(lost, person, persons, stamp_ns):
+            continue
+        if same_person(lost, person, left_image, alone):
             return person
     return None
+
+
+def followed_on(lost: Person | None, persons: list[Person], coast_s: float, stamp_ns: int) -> list[Person]:
+    """Persons without the subject whose tracks take further detections.
+
+    Of those whom a search over the whole image did not find, one may come out of cover, or the lost subject in their
+    place: that is a new track.
+    """
+    others = [p for p in persons if p is not lost]
+    if lost is None or lost.unconfirmed_s(stamp_ns) <= coast_s + _GONE_S:
+        return others
+    return [p for p in others if p.undetected_s(stamp_ns) <= _GONE_S]
+
+
+def fits_other(lost: Person, person: Person, persons: list[Person], stamp_ns: int) -> bool:
+    """Whether a new track clearly looks more like someone else who went out of view."""
+    gone = [p for p in persons if p is not lost and p.plausible and p.undetected_s(stamp_ns) > _GONE_S]
+    own = person.similarity(lost.appearance)
+    return any(person.similarity(p.appearance) > own + _SIMILARITY_MARGIN for p in gone if p.appearance is not None)
 
 
 def certainly_others(lost: Person, persons: list[Person], stamp_ns: int) -> list[Person]:

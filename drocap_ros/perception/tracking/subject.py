@@ -19,6 +19,7 @@ from drocap_ros.perception.tracking.reidentification import (
     FORGET_S,
     RELIABLE_SCORE,
     certainly_others,
+    followed_on,
     found_again,
     leaving,
     search_boxes,
@@ -175,10 +176,12 @@ class SubjectTracker:
         """The person detected in this image whose pose should be looked at; see :func:`.rivals.due_bystander`."""
         return due_bystander(self._subject, self.persons, stamp_ns, shedding)
 
-    def judge_bystander(self, person: Person, confidence: float, stamp_ns: int, same: bool = False) -> None:
+    def judge_bystander(
+        self, person: Person, confidence: float, stamp_ns: int, same: bool = False, blurred: bool = False
+    ) -> None:
         """Add a bystander's pose: mean confidence, and whether its joints are the subject's; it may be a lost one."""
         subject = self._subject
-        person.pose.judge(confidence, person.box, stamp_ns)
+        person.pose.judge(confidence, person.box, stamp_ns, blurred)
         if subject is not None and subject.pose.believed_ns == stamp_ns and confidence >= SURE_CONFIDENCE:
             doubles.on_joints(person, subject, same)
         if self.current(stamp_ns) is None:
@@ -231,7 +234,7 @@ class SubjectTracker:
         subject = self._subject
         if subject is not None and subject.unconfirmed_s(stamp_ns) > self._coast_s:
             subject = None
-        others = [p for p in self.persons if p is not self._subject]
+        others = followed_on(self._subject, self.persons, self._coast_s, stamp_ns)
         assigned, replacements = assign_all(
             subject, others, boxes, scores, appearances, stamp_ns, self._config.detection_threshold
         )
