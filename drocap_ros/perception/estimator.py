@@ -21,7 +21,7 @@ from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking import Subject, SubjectTracker
 from drocap_ros.perception.tracking.camera_motion import CameraMotion, moved_box, sweeps
 from drocap_ros.perception.tracking.detection_windows import Window, uncut
-from drocap_ros.perception.tracking.pose_belief import CONFIRM_CONFIDENCE
+from drocap_ros.perception.tracking.pose_belief import CONFIRM_CONFIDENCE, EMPTY_CONFIDENCE
 from drocap_ros.perception.tracking.rivals import wins
 from drocap_ros.perception.tracking.shadow import without_shadow
 from drocap_ros.perception.uncertainty import calibrate
@@ -36,7 +36,7 @@ _RIVALS, _FEW_RIVALS = 2, 1
 _COMPARED_ROWS = 4
 #: Time for which a rival that lost is not looked at again, and the overlap from which a box is that rival's.
 _REJECTED_NS, _SAME_IOU = 300_000_000, 0.6
-#: Time without a detection and without a believable pose after which there are no keypoints: a blurred image is shorter.
+#: Time without a detection and a believable pose after which there are no keypoints; a single blurred image is shorter.
 _UNSEEN_NS = 80_000_000
 #: Under load shedding, share of the detector's input for a window.
 _REDUCED_INPUT = 0.8
@@ -187,7 +187,8 @@ class PoseEstimator:
         elif extent is not None and subject.score >= _CLEAR_SCORE and self._confidence >= _CLEAR_CONFIDENCE:
             self._margins = (subject.box - extent) / (extent[2:] - extent[:2]).max()
         certain = is_person or subject.score >= self.config.detection_threshold
-        if is_person or subject.score > 0:
+        blurred = sweeps(self._motion, subject.box)
+        if is_person or (subject.score > 0 and (blurred or self._confidence >= EMPTY_CONFIDENCE)):
             self._seen_ns = stamp_ns
         elif stamp_ns - self._seen_ns > _UNSEEN_NS:
             return self._without_keypoints(stamp_ns, size, subject), False

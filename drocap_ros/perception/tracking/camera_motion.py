@@ -18,7 +18,7 @@ _AGREE_PX, _LEAST, _SHARE, _CERTAIN = 2.0, 15, 0.4, 0.7
 #: Share of the longer side that counts as motion: the tracks bear less, and each step costs a trace of accuracy.
 _SMALL = 0.01
 #: Way between two images, lengths of the person, from which the blur takes joints from the pose.
-_BLUR = 0.1
+_BLUR = 0.25
 #: Largest change of the size between two images.
 _MOST_ZOOM = 1.5
 

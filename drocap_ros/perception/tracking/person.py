@@ -1,6 +1,8 @@
-"""Track of one person, the subject or a bystander."""
+"""Track of one person, the subject or a bystander, and the subject in one image."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,6 +17,22 @@ _APPEARANCE_RATE = 0.08
 _SETTLED = 10
 #: Weight of a new detection score in the mean score.
 _SCORE_RATE = 0.3
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The subject in one image.
+
+    track_id : 1, 2, ...
+    box : (4,) x_min y_min x_max y_max px, detected, or predicted while ``score`` is 0
+    score : the detector's score; 0 = predicted
+    hidden : predicted at another person's place; keypoints found there would be that person's
+    """
+
+    track_id: int
+    box: np.ndarray
+    score: float
+    hidden: bool
 
 
 class Person:

@@ -6,7 +6,7 @@ import numpy as np
 
 #: Mean confidence of the joints of a believable pose: on boxes without a person below 0.33, on shadows 0.2 to 0.6, on
 #: persons in bad light or from steeply above 0.5 to 0.9.
-CONFIRM_CONFIDENCE = 0.5
+EMPTY_CONFIDENCE, CONFIRM_CONFIDENCE = 0.33, 0.5
 #: Confidence from which a pose is certainly a person's.
 SURE_CONFIDENCE = 0.7
 #: A pose below this share of the track's usual confidence is not believed: persons of 0.9 do not stay at 0.6.

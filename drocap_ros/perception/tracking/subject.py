@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient
@@ -13,7 +11,7 @@ from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.association import assign_all
 from drocap_ros.perception.tracking.box_filter import BoxFilter
 from drocap_ros.perception.tracking.detection_windows import Window, WindowSchedule, tight_window, wide_window
-from drocap_ros.perception.tracking.person import Person
+from drocap_ros.perception.tracking.person import Person, Subject
 from drocap_ros.perception.tracking.pose_belief import SURE_CONFIDENCE
 from drocap_ros.perception.tracking.reidentification import (
     FORGET_S,
@@ -39,22 +37,6 @@ _ISOLATED = 0.4
 _GIVE_UP_S = 3.0
 #: Longest gap of a bystander, and the largest number of persons.
 _BYSTANDER_S, _MAX_PERSONS = 2.0, 30
-
-
-@dataclass(frozen=True)
-class Subject:
-    """The subject in one image.
-
-    track_id : 1, 2, ...
-    box : (4,) x_min y_min x_max y_max px, detected, or predicted while ``score`` is 0
-    score : the detector's score; 0 = predicted
-    hidden : predicted at another person's place; keypoints found there would be that person's
-    """
-
-    track_id: int
-    box: np.ndarray
-    score: float
-    hidden: bool
 
 
 class SubjectTracker:

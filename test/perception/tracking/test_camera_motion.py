@@ -9,7 +9,7 @@ import pytest
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking import SubjectTracker
 from drocap_ros.perception.tracking.box_filter import BoxFilter
-from drocap_ros.perception.tracking.camera_motion import CameraMotion, moved_box
+from drocap_ros.perception.tracking.camera_motion import CameraMotion, moved_box, sweeps
 
 SIZE = (640, 360)
 STEP_NS = 50_000_000
@@ -137,3 +137,10 @@ def test_a_second_box_around_a_known_other_person_is_no_rival():
     wider = np.array([[355.0, 60, 490, 290]])
     assert tracker.rivals(image, stamp, wider, np.array([0.3]), 0.3) == []
     assert tracker.rivals(image, stamp, wider - [200, 0, 200, 0], np.array([0.3]), 0.3) == [0]
+
+
+@pytest.mark.parametrize(("way", "blurred"), [((0.0, 0.0), False), ((30.0, 15.0), False), ((30.0, -30.0), True)])
+def test_way_of_a_quarter_of_the_person_blurs_it(way, blurred):
+    matrix = np.column_stack([np.eye(2), way])
+    assert sweeps(matrix, PERSON[0]) == blurred  # 150 px long
+    assert not sweeps(None, PERSON[0])

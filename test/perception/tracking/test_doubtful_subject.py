@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from test_subject_tracking import BLUE, GREEN, RED, SIZE, STEP, Scene, offset
 
+from drocap_ros.perception.tracking.person import Person
 from drocap_ros.perception.tracking.pose_belief import PoseBelief
+from drocap_ros.perception.tracking.reidentification import fits_other
 from drocap_ros.perception.tracking.shadow import shadow_share, without_shadow
 
 SECOND = 1_000_000_000
@@ -243,3 +245,69 @@ def test_person_before_leaves_that_were_found_to_be_none_starts_a_track():
         pytest.fail("the person was not found")
     assert scene.tracker.persons
     assert offset(scene.tracker.predict((scene.index - 1) * STEP) or scene.show([person]), 335) < 15
+
+
+def test_person_who_comes_into_view_in_blurred_images_is_found_by_its_appearance():
+    scene = lost_subject()
+    found = []
+    for t in range(8):  # the pan takes the joints from the pose, the colours stay
+        subject = scene.show([(300 + t, 180, 160, RED)])
+        stamp = (scene.index - 1) * STEP
+        person = scene.tracker.bystander_to_judge(stamp)
+        if subject is None and person is not None:
+            scene.tracker.judge_bystander(person, 0.32, stamp, blurred=True)
+        found.append(scene.tracker.current(stamp) is not None)
+    assert found[-1]
+    assert scene.show([(308, 180, 160, RED)]).track_id == 1
+
+
+def test_weak_pose_in_a_blurred_image_says_nothing_and_a_certain_one_counts():
+    belief = PoseBelief(0)
+    box = box_of(100, 100, 80)
+    belief.judge(0.3, box, SECOND, blurred=True)
+    assert belief.judged_ns == SECOND
+    assert belief.plausible_ns == 0
+    assert np.isnan(belief.last)
+    belief.judge(0.8, box, 2 * SECOND, blurred=True)
+    assert (belief.value, belief.believed_ns) == (0.8, 2 * SECOND)
+    sharp = PoseBelief(0)
+    sharp.judge(0.3, box, SECOND)
+    assert sharp.plausible_ns is None
+
+
+def seen_together(colours) -> Scene:
+    """Subject and someone else are in view, then both go out of view, the other one a second later."""
+    scene = Scene()
+    for _ in range(30):
+        judged(scene, 0.9, scene.show([(300, 180, 160, RED), (500, 180, 160, colours)]))
+        stamp = (scene.index - 1) * STEP
+        other = scene.tracker.bystander_to_judge(stamp)
+        if other is not None:
+            scene.tracker.judge_bystander(other, 0.9, stamp)
+    for _ in range(60):
+        scene.show([(500, 180, 160, colours)])
+    for _ in range(18):
+        scene.show([])
+    return scene
+
+
+def test_subject_that_comes_out_where_someone_else_went_in_is_found():
+    scene = seen_together(BLUE)
+    shown = [scene.show([(490 + 2 * t, 180, 160, RED)]) for t in range(8)]
+    assert shown[-1] is not None
+    assert shown[-1].track_id == 1
+    assert offset(shown[-1], 504) < 15
+
+
+def test_someone_else_who_comes_out_again_is_not_the_subject():
+    scene = seen_together(BLUE)
+    assert {scene.show([(490 + 2 * t, 180, 160, BLUE)]) for t in range(8)} == {None}
+
+
+def test_appearance_of_someone_who_went_out_of_view_fits_better():
+    mixed = np.sqrt(np.array([[0.9, 0.1, 0.0], [0.5, 0.5, 0.0], [0.45, 0.55, 0.0]], np.float32))
+    lost, gone, person = (Person(box_of(100, 100, 80), 0.8, 0, appearance) for appearance in mixed)
+    assert fits_other(lost, person, [lost, gone], SECOND)
+    assert not fits_other(lost, person, [lost, gone], SECOND // 10)  # in view
+    gone.pose.refute(0.1, 0)  # leaves
+    assert not fits_other(lost, person, [lost, gone], SECOND)

@@ -8,12 +8,14 @@ believable pose.
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 
 import cv2
 import numpy as np
 import pytest
 from field_scenes import FieldImage, FieldScene, field_images, on_subject
 
+from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import iou
 from drocap_ros.perception.estimator import PoseEstimator
@@ -29,6 +31,8 @@ class Script:
     """Detections of the image that is shown, and poses by the overlap with the truth."""
 
     joints = BODY_15
+    #: Least score of a joint, where there is no person.
+    least = 0.15
 
     def __init__(self, estimator: PoseEstimator) -> None:
         self.found: list[tuple[np.ndarray, float]] = []
@@ -54,7 +58,7 @@ class Script:
         if joints is None:  # something in the box
             rng = np.random.default_rng(round(box.sum()))
             joints = box[:2] + (box[2:] - box[:2]) * rng.random((15, 2))
-        score = float(np.clip(1.2 * max(overlap) - 0.05, 0.15, 0.95))
+        score = float(np.clip(1.2 * max(overlap) - 0.05, self.least, 0.95))
         count = len(joints)
         candidates = np.full((count, 2, 3), np.nan, np.float32)
         return NetworkKeypoints(
@@ -125,6 +129,48 @@ def test_subject_comes_back_from_under_a_canopy(seed):
     assert crown[0] > 15  # hidden for seconds
     assert right.count(False) <= 5  # of two times that the person comes out, in images at 10 Hz
     assert ids == {1}
+
+
+def under_cover(leaves) -> list[tuple[bool, PoseObservation]]:
+    """Whether the person is in view, and the observation; ``leaves`` gives the detections while it is not."""
+    config = PoseEstimatorConfig(subject="centre", on_loss="next", confirm_frames=1, detect_every_s=0.0)
+    estimator = PoseEstimator(models_folder(SIMULATION), config)
+    script, shown = Script(estimator), []
+    script.least = 0.02
+    for image in field_images(FieldScene("canopy", 21, 50.0, canopies=True)):
+        script.found = [(image.box, 0.7)] if image.in_view else leaves(image)
+        script.truth = [(image.box, image.joints)] if image.in_view else []
+        shown.append((image.in_view, estimator.process(image.image, image.stamp_ns)))
+    return shown
+
+
+@pytest.mark.parametrize("detected", [False, True])
+def test_hidden_subject_has_no_keypoints_on_leaves(detected):
+    def leaves(image: FieldImage):
+        return [(image.box + np.array([-10, -8, 10, 8]), 0.45)] if detected else []
+
+    shown = under_cover(leaves)
+    hidden = [o for before, (in_view, o) in pairwise(shown) if not (in_view or before[0])]
+    followed = [o for o in hidden if o.track_id]
+    assert len(followed) > 8
+    assert not any(np.isfinite(o.keypoints).any() for o in followed)
+    assert {float(o.detection_score) for o in followed} == {0.0}  # predicted: nothing was seen
+    assert all(np.isfinite(o.keypoints).any() for in_view, o in shown if in_view and o.track_id)
+
+
+def test_image_without_detection_keeps_its_keypoints():
+    config = PoseEstimatorConfig(subject="centre", on_loss="next", confirm_frames=1, detect_every_s=0.0)
+    estimator = PoseEstimator(models_folder(SIMULATION), config)
+    script = Script(estimator)
+    rng = np.random.default_rng(0)
+    box, joints = np.array([600.0, 300, 640, 400]), None
+    counts = []
+    for i in range(20):
+        image = rng.integers(100, 140, (720, 1280, 3), np.uint8)
+        blurred = i in (10, 15)
+        script.found, script.truth = ([], []) if blurred else ([(box, 0.7)], [(box, joints)])
+        counts.append(int(np.isfinite(estimator.process(image, i * 50_000_000).keypoints).all(axis=1).sum()))
+    assert min(counts) > 0
 
 
 @pytest.mark.parametrize("seed", [7])

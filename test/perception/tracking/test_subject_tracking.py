@@ -74,6 +74,31 @@ def test_subject_is_kept_through_a_crossing(front, speed):
     assert subject.score > 0
 
 
+def test_half_hidden_subject_takes_its_own_detection_when_the_cover_goes_away():
+    # Boxes of a real pair: the one in front left the other's head free, then went to the left.
+    scene = Scene()
+    subject_person = (330, 185, 120, RED)
+    for _ in range(30):
+        subject = scene.show([subject_person, (440, 195, 118, BLUE)])
+        scene.tracker.judge(0.9, subject.box, (scene.index - 1) * STEP)
+    for x in np.linspace(440, 336, 20):
+        scene.show([subject_person, (x, 195, 118, BLUE)], unseen=(0,) if x < 365 else ())
+    head, front = (310, 124, 350, 171), (309, 136, 357, 254)
+    for _ in range(3):
+        scene.show([subject_person, (333, 195, 118, BLUE)], detections=[(head, 0.25), (front, 0.75)])
+    for t in range(3):
+        scene.show([subject_person, (328 - 6 * t, 195, 118, BLUE)], unseen=(0,))
+    for t in range(10):
+        x = 298 - 7 * t
+        own = (330 - 1.5 * min(t, 6) + 7 if t < 3 else 308, 125, 354, 245)
+        other = (x - 24, 136, x + 24, 254)
+        subject = scene.show([subject_person, (x, 195, 118, BLUE)], detections=[(own, 0.7), (other, 0.75)])
+    assert subject is not None
+    assert subject.track_id == 1
+    assert subject.score > 0
+    assert offset(subject, 330, 185) < 15
+
+
 def test_second_box_of_the_subject_is_no_person_who_hides_it():
     scene = Scene()
     person = (340, 205, 250, RED)
