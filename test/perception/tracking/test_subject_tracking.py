@@ -8,7 +8,9 @@ import pytest
 from drocap_ros.errors import ParameterError
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking import SubjectTracker
+from drocap_ros.perception.tracking.association import assign
 from drocap_ros.perception.tracking.detection_windows import tiles, uncut, wide_window
+from drocap_ros.perception.tracking.person import Person
 
 SIZE = (640, 360)
 RED, BLUE, GREEN = ((40, 40, 200), (30, 30, 90)), ((200, 60, 30), (20, 20, 20)), ((60, 180, 60), (200, 200, 200))
@@ -75,28 +77,17 @@ def test_subject_is_kept_through_a_crossing(front, speed):
 
 
 def test_half_hidden_subject_takes_its_own_detection_when_the_cover_goes_away():
-    # Boxes of a real pair: the one in front left the other's head free, then went to the left.
-    scene = Scene()
-    subject_person = (330, 185, 120, RED)
-    for _ in range(30):
-        subject = scene.show([subject_person, (440, 195, 118, BLUE)])
-        scene.tracker.judge(0.9, subject.box, (scene.index - 1) * STEP)
-    for x in np.linspace(440, 336, 20):
-        scene.show([subject_person, (x, 195, 118, BLUE)], unseen=(0,) if x < 365 else ())
-    head, front = (310, 124, 350, 171), (309, 136, 357, 254)
-    for _ in range(3):
-        scene.show([subject_person, (333, 195, 118, BLUE)], detections=[(head, 0.25), (front, 0.75)])
-    for t in range(3):
-        scene.show([subject_person, (328 - 6 * t, 195, 118, BLUE)], unseen=(0,))
-    for t in range(10):
-        x = 298 - 7 * t
-        own = (330 - 1.5 * min(t, 6) + 7 if t < 3 else 308, 125, 354, 245)
-        other = (x - 24, 136, x + 24, 254)
-        subject = scene.show([subject_person, (x, 195, 118, BLUE)], detections=[(own, 0.7), (other, 0.75)])
-    assert subject is not None
-    assert subject.track_id == 1
-    assert subject.score > 0
-    assert offset(subject, 330, 185) < 15
+    # Boxes of real persons at 20 Hz: someone in front left only the subject's head free, and goes on to the left.
+    whole, head = np.array([709.0, 342, 749, 463]), np.array([703.0, 343, 743, 390])
+    subject, front = Person(head, 0.4, 0, None), Person(np.array([698.0, 355, 746, 471]), 0.7, 0, None)
+    for person, box in ((subject, whole), (front, front.box)):
+        person.pose.judge(0.9, box, 0)
+    front.update(front.box, 0.7, 50_000_000)
+    boxes = np.array([[720.0, 344, 749, 465], [691, 353, 740, 472]])
+    for person in (subject, front):
+        person.filter.predict(100_000_000)
+    pairs = assign([subject, front], boxes, np.array([0.6, 0.7]), [None, None], 100_000_000)
+    assert sorted(pairs) == [(0, 0), (1, 1)]
 
 
 def test_second_box_of_the_subject_is_no_person_who_hides_it():
