@@ -43,7 +43,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 def run(args: argparse.Namespace) -> int:
     """Export, and print the changes of the motion."""
     from drocap_ros.cli.atomic_output import output_file
-    from drocap_ros.export import export_motion
+    from drocap_ros.export import export
 
     path, motion = read_motion(args.motion)
     ending, *kind = args.to.split("-")
@@ -51,8 +51,8 @@ def run(args: argparse.Namespace) -> int:
     if out.suffix[1:] in {form.split("-")[0] for form in FORMATS} - {ending}:
         raise InputError(f"--out {out}: expected a name that ends in .{ending}, found {out.suffix}; change it or --to")
     with output_file(out, inputs=[path]) as file:
-        notes = export_motion(
-            motion, args.to, file, names=args.names, rest=args.rest, smooth_hz=args.smooth, lock_feet=args.lock_feet
+        notes = export(
+            motion, file, args.to, names=args.names, rest=args.rest, smooth_hz=args.smooth, lock_feet=args.lock_feet
         )
         if (model := file.with_suffix(".osim")).exists():  # of --to mot
             model.replace(out.with_suffix(".osim"))

@@ -29,21 +29,21 @@ RIGGED = ("bvh", "glb")
 MEASURED = ("c3d", "trc", "csv")
 
 
-def export_motion(
-    motion: Motion,
-    form: str,
+def export(
+    motion: Motion | str | Path,
     path: str | Path,
+    form: str | None = None,
     *,
     names: str | None = None,
     rest: str | None = None,
     smooth_hz: float | None = None,
     lock_feet: bool = False,
 ) -> tuple[str, ...]:
-    """Write a motion to a file of another format.
+    """Write a motion, or the motion of a file or folder, to a file of another format.
 
     Parameters
     ----------
-    form : one of :data:`FORMATS`
+    form : one of :data:`FORMATS`; None: the ending of ``path``
     names : joint names of BVH and glTF, one of :data:`drocap_ros.export.rig.NAMES`; None: "h36m"
     rest : rest pose of BVH and glTF, one of :data:`drocap_ros.export.rig.RESTS`; None: "t"
     smooth_hz : cut-off of :func:`drocap_ros.export.cleaning.smooth`; None: no filter
@@ -68,6 +68,7 @@ def export_motion(
     from drocap_ros.export.glb import write_glb
     from drocap_ros.export.mot import write_mot
     from drocap_ros.export.trc import write_trc
+    from drocap_ros.motion import Motion, load_motion
 
     writers: dict[str, Callable[..., tuple[str, ...]]] = {
         "bvh": write_bvh,
@@ -78,38 +79,19 @@ def export_motion(
         "glb": write_glb,
         "mot": write_mot,
     }
+    form = form or Path(path).suffix[1:]
     if form not in writers:
         raise InputError(f"format: expected one of {', '.join(FORMATS)}, got {form!r}")
     chosen = {name: value for name, value in (("names", names), ("rest", rest)) if value is not None}
     if chosen and form not in RIGGED:
         raise InputError(f"{', '.join(chosen)}: expected with format {' or '.join(RIGGED)}, got {form}; leave it out")
-    clip = clip_of(motion, measured=form in MEASURED)
+    whole = motion if isinstance(motion, Motion) else load_motion(motion)
+    clip = clip_of(whole, measured=form in MEASURED)
     if smooth_hz is not None:
         clip = cleaning.smooth(clip, smooth_hz)
     if lock_feet:
         clip = cleaning.lock_feet(clip)
     return writers[form](Path(path), clip, **chosen)
-
-
-def export(
-    motion: Motion | str | Path,
-    path: str | Path,
-    form: str | None = None,
-    *,
-    names: str | None = None,
-    rest: str | None = None,
-    smooth_hz: float | None = None,
-    lock_feet: bool = False,
-) -> tuple[str, ...]:
-    """Write a motion, or the motion of a file or folder; without ``form`` the ending of ``path`` names the format.
-
-    Parameters, results and errors of :func:`export_motion`.
-    """
-    from drocap_ros.motion import Motion, load_motion
-
-    whole = motion if isinstance(motion, Motion) else load_motion(motion)
-    form = form or Path(path).suffix[1:]
-    return export_motion(whole, form, path, names=names, rest=rest, smooth_hz=smooth_hz, lock_feet=lock_feet)
 
 
 class _CallableModule(ModuleType):

@@ -9,7 +9,7 @@ from refusals import refused
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
-from drocap_ros.export import RIGGED, export_motion
+from drocap_ros.export import RIGGED, export
 from drocap_ros.motion import load_motion, save_motion
 
 
@@ -176,7 +176,7 @@ def test_mutated_motions_are_exported_or_refused_in_one_line(walker, tmp_path):
             data = data[: rng.integers(1, len(data))]
         (tmp_path / "mutated.npz").write_bytes(data)
         try:
-            export_motion(load_motion(tmp_path / "mutated.npz"), "bvh", tmp_path / "out.bvh")
+            export(load_motion(tmp_path / "mutated.npz"), tmp_path / "out.bvh", "bvh")
         except InputError as error:
             refusals.append(str(error))
     assert len(refusals) > 75

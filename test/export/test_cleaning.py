@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
-from drocap_ros.export import export_motion
+from drocap_ros.export import export
 from drocap_ros.export.cleaning import lock_feet, smooth
 from drocap_ros.export.clip import clip_of
 from drocap_ros.motion import save_motion
@@ -123,7 +123,7 @@ def test_both_are_off_by_default_and_printed_when_chosen(walker, tmp_path, capsy
 
 def test_what_cannot_be_cleaned_is_refused(walker, in_camera, tmp_path):
     with pytest.raises(InputError, match="root that moves through the world"):
-        export_motion(in_camera, "csv", tmp_path / "a.csv", lock_feet=True)
+        export(in_camera, tmp_path / "a.csv", "csv", lock_feet=True)
     for cut_off in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(InputError, match="between 0 and"):
             smooth(clip_of(walker), cut_off)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from export_readers import READERS, gltf_array
 
-from drocap_ros.export import RIGGED, export_motion
+from drocap_ros.export import RIGGED, export
 from drocap_ros.skeleton import BODY_15
 
 TOLERANCE_M = {"bvh": 0.005, "c3d": 0.001, "trc": 0.001, "csv": 0.001, "glb": 0.001}
@@ -14,7 +14,7 @@ TOLERANCE_M = {"bvh": 0.005, "c3d": 0.001, "trc": 0.001, "csv": 0.001, "glb": 0.
 
 def written(motion, form, folder):
     path = folder / f"motion.{form}"
-    notes = export_motion(motion, form, path)
+    notes = export(motion, path, form)
     return READERS[form](path), notes
 
 
@@ -113,7 +113,7 @@ def test_long_gap_between_frames_stays_unknown(walker, tmp_path):
 def test_glb_has_a_person_bound_to_the_joints(walker, tmp_path):
     import pygltflib
 
-    export_motion(walker, "glb", tmp_path / "motion.glb")
+    export(walker, tmp_path / "motion.glb", "glb")
     document = pygltflib.GLTF2().load(str(tmp_path / "motion.glb"))
     assert document.asset.extras["up_axis"] == "Y"
     assert document.asset.extras["units"] == "m"
@@ -151,7 +151,7 @@ def test_glb_has_a_person_bound_to_the_joints(walker, tmp_path):
 @pytest.mark.parametrize("rest", ["t", "a"])
 @pytest.mark.parametrize("names", ["lafan1", "mixamo"])
 def test_rigs_have_the_names_of_other_programs(walker, tmp_path, form, names, rest):
-    export_motion(walker, form, tmp_path / f"rig.{form}", names=names, rest=rest)
+    export(walker, tmp_path / f"rig.{form}", form, names=names, rest=rest)
     back = READERS[form](tmp_path / f"rig.{form}")
     prefix, toe = ("", "Toe") if names == "lafan1" else ("mixamorig:", "ToeBase")
     expected = {"Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"} | {
@@ -178,7 +178,7 @@ def test_rigs_have_the_names_of_other_programs(walker, tmp_path, form, names, re
 def test_export_is_deterministic(walker, tmp_path, form):
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
-        export_motion(walker, form, tmp_path / folder / f"motion.{form}")
+        export(walker, tmp_path / folder / f"motion.{form}", form)
     assert (tmp_path / "a" / f"motion.{form}").read_bytes() == (tmp_path / "b" / f"motion.{form}").read_bytes()
 
 
@@ -195,5 +195,5 @@ def test_ten_minutes_are_exported_within_seconds(walker, tmp_path):
     long = dataclasses.replace(walker, **many, stamp_ns=stamps)
     begin = time.process_time()
     for form in ("bvh", "glb", "trc"):
-        export_motion(long, form, tmp_path / f"motion.{form}")
+        export(long, tmp_path / f"motion.{form}", form)
     assert time.process_time() - begin < 20
