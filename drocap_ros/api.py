@@ -51,7 +51,7 @@ def reconstruct(
     InputError
         When an input or option cannot be used, with one line that says what to do.
     """
-    settings = config if isinstance(config, DrocapConfig) else load_config(Path(config)) if config else DrocapConfig()
+    settings = config if isinstance(config, DrocapConfig) else load_config(config or None)
     clip = Clip(start_s, end_s)
     if isinstance(source, Tracks):
         return reconstruct_tracks(

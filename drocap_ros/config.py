@@ -67,8 +67,8 @@ def section_types() -> dict[str, type[Parameters]]:
     return dict(get_type_hints(DrocapConfig).items())
 
 
-def load_config(path: str | Path) -> DrocapConfig:
-    """Read a configuration file; missing sections and values keep their defaults.
+def load_config(path: str | Path | None) -> DrocapConfig:
+    """Read a configuration file; missing sections and values, and all of them without a file, keep their defaults.
 
     Raises
     ------
@@ -77,6 +77,8 @@ def load_config(path: str | Path) -> DrocapConfig:
     """
     import yaml
 
+    if path is None:
+        return DrocapConfig()
     path = Path(path)
     try:
         with path.open(encoding="utf-8") as stream:

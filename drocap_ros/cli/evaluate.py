@@ -176,14 +176,14 @@ def _live(args: argparse.Namespace) -> int:
     """Run the study of the live method, print the tables and write the files."""
     from drocap_ros.cli.atomic_output import check_output_folder, output_folder
     from drocap_ros.cli.progress import progress_bars
-    from drocap_ros.config import DrocapConfig, load_config
+    from drocap_ros.config import load_config
     from drocap_ros.evaluation.live_study import live_study
     from drocap_ros.evaluation.live_study_table import live_markdown
     from drocap_ros.evaluation.tables import save_csv
 
     if args.out is not None:
         check_output_folder(args.out)
-    config = DrocapConfig() if args.config is None else load_config(args.config)
+    config = load_config(args.config)
     with progress_bars(args.quiet) as progress:
         rows = live_study(
             args.folder,

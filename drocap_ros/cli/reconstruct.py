@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.cli.clip_options import clip_of
     from drocap_ros.cli.models.on_demand import ensure_networks
     from drocap_ros.cli.progress import progress_bars
-    from drocap_ros.config import DrocapConfig, load_config
+    from drocap_ros.config import load_config
     from drocap_ros.motion import save_motion
     from drocap_ros.perception.load_models import models_folder
     from drocap_ros.perception.pose_estimator_config import parse_subject
@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
     if clip_of(args).whole and is_same(out / "tracks.npz", args.input):
         names.remove("tracks.npz")  # they stay as they are
     refuse_inputs([out / name for name in names], [args.input])
-    config = load_config(args.config) if args.config else DrocapConfig()
+    config = load_config(args.config)
     if args.dictionary:
         config = config.replace("initializer", dictionary=str(args.dictionary))
     person, rule = parse_subject(args.subject)

@@ -134,9 +134,9 @@ def _track(
 
 
 def _configs(args: argparse.Namespace, rule: dict[str, Any]) -> tuple[PoseEstimatorConfig, Any]:
-    from drocap_ros.config import DrocapConfig, load_config
+    from drocap_ros.config import load_config
 
-    whole = load_config(args.config) if args.config else DrocapConfig()
+    whole = load_config(args.config)
     changes: dict[str, Any] = {"on_loss": "wait" if args.wait else "next", **rule}
     named = {"detector": args.detector, "pose_model": args.pose, "threads": args.threads}
     changes |= {key: value for key, value in named.items() if value is not None}

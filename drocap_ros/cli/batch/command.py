@@ -111,12 +111,12 @@ def _read_tasks(args: argparse.Namespace) -> list[Task]:
 
 def _resolved(arguments: argparse.Namespace) -> argparse.Namespace:
     """Copy with absolute paths, and with the folder of models that ``reconstruct`` would use."""
-    from drocap_ros.config import DrocapConfig, load_config
+    from drocap_ros.config import load_config
     from drocap_ros.perception.load_models import models_folder
     from drocap_ros.recording.telemetry.video_telemetry import NO_TELEMETRY
 
     values = dict(vars(arguments))
-    config = load_config(arguments.config) if arguments.config else DrocapConfig()
+    config = load_config(arguments.config)
     values["models"] = models_folder(arguments.models or config.pose_estimator.models_dir or None)
     relative = {k: v for k, v in values.items() if isinstance(v, Path) and v != NO_TELEMETRY}
     return argparse.Namespace(**values | {name: path.absolute() for name, path in relative.items()})

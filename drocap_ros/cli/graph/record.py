@@ -26,9 +26,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace) -> int:
     """Record until the user interrupts."""
-    from drocap_ros.config import DrocapConfig, load_config
+    from drocap_ros.config import load_config
 
-    config = load_config(args.config) if args.config else DrocapConfig()
+    config = load_config(args.config)
     if args.out is not None:
         config = config.replace("session_recorder", session_dir=str(args.out.absolute()))
     return run_graph(config, ["session_recorder"], args)
