@@ -206,9 +206,7 @@ def _row(sequence: Sequence, speed_deg_s: float, noisy: bool, view: OrbitView, r
     )
 
 
-def standardized_error(
-    joints_m: np.ndarray, std_m: np.ndarray, truth_mm: np.ndarray, axes: slice | int = slice(None)
-) -> float:
+def standardized_error(joints_m: np.ndarray, std_m: np.ndarray, truth_mm: np.ndarray) -> float:
     """RMS over frames, joints of ``BODY_15`` but the pelvis, and axes of the error over its standard deviation.
 
     joints_m, std_m : (F, 17, 3) camera axes, pelvis at the origin; truth_mm : (F, 17, 3).  The scale of a monocular
@@ -217,7 +215,7 @@ def standardized_error(
     scale = limb_lengths(truth_mm).mean() / limb_lengths(joints_m).mean()
     body = slice(1, len(BODY_15))
     gap = (joints_m[:, body] * scale - truth_mm[:, body]) / (std_m[:, body] * scale)
-    return float(np.sqrt(np.mean(np.square(gap[..., axes]))))
+    return float(np.sqrt(np.mean(np.square(gap))))
 
 
 def _std(covariance: np.ndarray) -> np.ndarray:

@@ -20,6 +20,8 @@ JOINT_GROUPS = {
     "knee": ("lknee", "rknee"),
     "ankle": ("lankle", "rankle"),
 }
+#: Frames of W-MPJPE's segments.
+SEGMENT = 100
 _LIMBS = indices(BODY_15.joints, LIMB_JOINTS)
 _TOES = indices(BODY_17.joints, ("rtoe", "ltoe"))
 _MIRROR = np.array([1.0, 1.0, -1.0])
@@ -30,26 +32,23 @@ def aligned_error(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.linalg.norm(apply_similarity(estimate, *similarity(estimate, truth)) - truth, axis=-1)
 
 
-def pa_mpjpe(estimate: np.ndarray, truth: np.ndarray, joints: tuple[str, ...] = BODY_15.joints) -> np.ndarray:
-    """The paper's reconstruction error (F,): :func:`aligned_error` averaged over the twelve limb joints.
-
-    ``joints`` names the joints of both poses (F, P, 3).
-    """
-    use = _LIMBS if joints == BODY_15.joints else indices(joints, LIMB_JOINTS)
-    return aligned_error(estimate[..., use, :], truth[..., use, :]).mean(-1)
+def pa_mpjpe(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """The paper's reconstruction error (F,): :func:`aligned_error` averaged over the twelve limb joints."""
+    return aligned_error(estimate[..., _LIMBS, :], truth[..., _LIMBS, :]).mean(-1)
 
 
-def w_mpjpe(estimate: np.ndarray, truth: np.ndarray, segment: int = 100) -> np.ndarray:
+def w_mpjpe(estimate: np.ndarray, truth: np.ndarray, aligned: int = 2) -> np.ndarray:
     """W-MPJPE (F,) of poses (F, P, 3) in world frames, over all given joints.
 
-    One rigid alignment per segment of 100 frames, on the segment's first two frames, without scale.
+    One rigid alignment per segment of 100 frames, on the segment's first ``aligned`` frames, without scale; on all of
+    them it is WA-MPJPE.
     """
     out = np.empty(len(truth))
-    for first in range(0, len(truth), segment):
-        est, tru = estimate[first : first + segment], truth[first : first + segment]
-        fit = similarity(est[:2].reshape(-1, 3), tru[:2].reshape(-1, 3), with_scale=False)
+    for first in range(0, len(truth), SEGMENT):
+        est, tru = estimate[first : first + SEGMENT], truth[first : first + SEGMENT]
+        fit = similarity(est[:aligned].reshape(-1, 3), tru[:aligned].reshape(-1, 3), with_scale=False)
         moved = apply_similarity(est.reshape(-1, 3), *fit).reshape(est.shape)
-        out[first : first + segment] = np.linalg.norm(moved - tru, axis=-1).mean(-1)
+        out[first : first + SEGMENT] = np.linalg.norm(moved - tru, axis=-1).mean(-1)
     return out
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.evaluation import world_metrics
-from drocap_ros.evaluation.metrics import horizon_error, pa_mpjpe, scale_error, w_mpjpe
+from drocap_ros.evaluation.metrics import SEGMENT, horizon_error, pa_mpjpe, scale_error, w_mpjpe
 from drocap_ros.skeleton import BODY_15
 
 WORLD_HEAD = [
@@ -64,7 +64,7 @@ def world_errors(
         pa_mm=1000 * float(pa_mpjpe(estimate, truth).mean()),
         mpjpe_mm=1000 * float(world_metrics.mpjpe(est, tru).mean()),
         w_mm=1000 * float(w_mpjpe(est, tru).mean()),
-        wa_mm=1000 * float(world_metrics.wa_mpjpe(est, tru).mean()),
+        wa_mm=1000 * float(w_mpjpe(est, tru, SEGMENT).mean()),
         absolute_mm=1000 * float(np.linalg.norm(est - tru, axis=-1).mean()),
         root_percent=100 * world_metrics.root_error(estimate, truth) if moving else nan,
         scale=scale_error(estimate, truth),

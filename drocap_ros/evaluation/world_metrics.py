@@ -27,18 +27,6 @@ def mpjpe(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.linalg.norm(relative, axis=-1).mean(-1)
 
 
-def wa_mpjpe(estimate: np.ndarray, truth: np.ndarray, segment: int = 100) -> np.ndarray:
-    """(F,) mean distance after one rigid alignment per segment of frames, on all its frames, without scale."""
-    out = np.empty(len(truth))
-    for first in range(0, len(truth), segment):
-        part = slice(first, first + segment)
-        est, tru = estimate[part], truth[part]
-        fit = similarity(est.reshape(-1, 3), tru.reshape(-1, 3), with_scale=False)
-        moved = apply_similarity(est.reshape(-1, 3), *fit).reshape(est.shape)
-        out[part] = np.linalg.norm(moved - tru, axis=-1).mean(-1)
-    return out
-
-
 def root_error(estimate: np.ndarray, truth: np.ndarray) -> float:
     """RTE: mean distance of the pelvis after one rigid alignment of its path, as a share of the true path's length."""
     est, tru = estimate[:, _PELVIS], truth[:, _PELVIS]

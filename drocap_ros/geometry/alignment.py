@@ -9,14 +9,13 @@ from drocap_ros.skeleton import BODY_15, JointSet
 
 
 def similarity(
-    source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None, *, with_scale: bool = True
+    source: np.ndarray, target: np.ndarray, *, with_scale: bool = True
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Best similarity transformation without reflection (Umeyama 1991), per leading index.
 
     Parameters
     ----------
     source, target : (..., P, 3)
-    weights : (..., P) non-negative, or None for equal ones
     with_scale : False for a rigid motion
 
     Returns
@@ -24,8 +23,9 @@ def similarity(
     scale (...), rotation (..., 3, 3), translation (..., 3)
         ``target ~ scale * source @ rotation^T + translation``.  A source of one point has scale 1.
     """
-    w = np.ones(source.shape[:-1]) if weights is None else weights
-    w = (w / np.maximum(w.sum(-1, keepdims=True), 1e-300))[..., None]
+    # An array, not a number: the products, and the order of the sums over them, then do not depend on the layout of
+    # the points in memory.
+    w = np.full((*source.shape[:-1], 1), 1.0 / source.shape[-2])
     mean_s, mean_t = np.sum(w * source, axis=-2, keepdims=True), np.sum(w * target, axis=-2, keepdims=True)
     s, t = source - mean_s, target - mean_t
     cross = np.swapaxes(t, -1, -2) @ (w * s)
@@ -74,17 +74,17 @@ def _unit(v: np.ndarray, fallback: np.ndarray) -> np.ndarray:
     return np.where(good, v / np.where(good, norm, 1.0), fallback)
 
 
-def to_torso_frame(s: np.ndarray, joints: JointSet = BODY_15) -> tuple[np.ndarray, np.ndarray]:
+def to_torso_frame(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split poses into body-fixed shapes and the rotation of the body.
 
     Parameters
     ----------
-    s : (..., P, 3), for example in the camera's frame
+    s : (..., P, 3) of BODY_15, for example in the camera's frame
 
     Returns
     -------
     shape (..., P, 3), rotation (..., 3, 3)
         ``s == shape @ rotation^T``.
     """
-    rotation = torso_frame(s, joints)
+    rotation = torso_frame(s)
     return s @ rotation, rotation

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 
 from drocap_ros.skeleton import BODY_15, BODY_17, RIGID_BONES, indices
@@ -11,6 +9,7 @@ from drocap_ros.skeleton import BODY_15, BODY_17, RIGID_BONES, indices
 #: Sum of the ten rigid limb lengths over stature: 1.876 over the head joint's standing height on the native CMU
 #: skeletons of the training set; that joint lies about 9 cm below the top of the head.
 LIMBS_PER_STATURE = 1.78
+_RIGID_ENDS = np.array([indices(BODY_15.joints, bone) for bone in RIGID_BONES])
 
 
 def pair_lengths(joints: np.ndarray, pairs: np.ndarray) -> np.ndarray:
@@ -23,11 +22,6 @@ def bone_lengths(joints: np.ndarray) -> np.ndarray:
     return pair_lengths(joints, BODY_17.bones[: joints.shape[-2] - 1])
 
 
-def limb_lengths(poses: np.ndarray, joints: tuple[str, ...] = BODY_15.joints) -> np.ndarray:
-    """Length (..., 10) of each of :data:`~drocap_ros.skeleton.RIGID_BONES` of poses (..., P, 3)."""
-    return pair_lengths(poses, _rigid_ends(joints))
-
-
-@lru_cache(maxsize=8)
-def _rigid_ends(joints: tuple[str, ...]) -> np.ndarray:
-    return np.array([indices(joints, bone) for bone in RIGID_BONES])
+def limb_lengths(poses: np.ndarray) -> np.ndarray:
+    """Length (..., 10) of each of :data:`~drocap_ros.skeleton.RIGID_BONES` of poses (..., P, 3), BODY_15 first."""
+    return pair_lengths(poses, _RIGID_ENDS)

@@ -112,9 +112,9 @@ def node_of(status: DiagnosticStatus) -> tuple[str, str]:
 class Latency:
     """Percentiles of the last measurements, and their rate; bounded memory."""
 
-    def __init__(self, size: int = 512) -> None:
-        self._seconds: deque[float] = deque(maxlen=size)
-        self._at_s: deque[float] = deque(maxlen=size)
+    def __init__(self) -> None:
+        self._seconds: deque[float] = deque(maxlen=512)
+        self._at_s: deque[float] = deque(maxlen=512)
 
     def add(self, seconds: float, now_s: float) -> None:
         """Take one measurement, made at ``now_s`` of a monotonic clock."""

@@ -22,10 +22,10 @@ _JOINTS = len(BODY_15)
 _SIGMA = tuple(math.sqrt(side / 8) for side in POSE_SIZE)
 
 
-def _conv(into: int, out: int, kernel: int = 3, stride: int = 1) -> Any:
+def _conv(into: int, out: int, stride: int = 1) -> Any:
     nn = pytorch().nn
     return nn.Sequential(
-        nn.Conv2d(into, out, kernel, stride, kernel // 2, bias=False), nn.BatchNorm2d(out), nn.ReLU(inplace=True)
+        nn.Conv2d(into, out, 3, stride, 1, bias=False), nn.BatchNorm2d(out), nn.ReLU(inplace=True)
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Convex relaxation of the single-view problem by ADMM (Zhou et al. 2015; 2016, section 3.3).
+"""Convex relaxation of the single-view problem by ADMM with mu = 1 (Zhou et al. 2015; 2016, section 3.3).
 
     min over M_k in R^(2 x 3) of  0.5 |W - sum_k M_k B_k|_F^2 + alpha sum_k |M_k|_2
 
@@ -22,8 +22,7 @@ def convex_relaxation(
     dictionary: Dictionary,
     *,
     alpha: float,
-    iterations: int = 100,
-    penalty: float = 1.0,
+    iterations: int,
 ) -> np.ndarray:
     """Matrices M (F, 1 + K, 2, 3); the first belongs to the mean pose.
 
@@ -32,7 +31,6 @@ def convex_relaxation(
     w : (F, P, 2) normalized; unseen joints are interpolated in time
     seen : (F, P) bool
     alpha : weight of the spectral norms
-    penalty : of the constraint that splits the two terms (mu of ADMM)
     """
     full = fill_joints(w, seen)
     full = full - full.mean(axis=1, keepdims=True)
@@ -41,15 +39,15 @@ def convex_relaxation(
     count = len(basis)
     b = np.swapaxes(basis, 1, 2).reshape(3 * count, p)
     target = np.swapaxes(full, 1, 2).reshape(2 * frames, p)
-    # (B B^T + mu I)^-1 by Woodbury: P is 15 where 3 K is hundreds.
-    small = np.linalg.inv(penalty * np.eye(p) + b.T @ b)
+    # (B B^T + I)^-1 by Woodbury: P is 15 where 3 K is hundreds.
+    small = np.linalg.inv(np.eye(p) + b.T @ b)
     moment = target @ b.T
     z = np.zeros((2 * frames, 3 * count))
     dual = np.zeros_like(z)
     for _ in range(iterations):
-        right = moment + penalty * (z - dual)
-        m = (right - (right @ b) @ small @ b.T) / penalty
-        z = _split(_shrink(_join(m + dual, count), alpha / penalty))
+        right = moment + (z - dual)
+        m = right - (right @ b) @ small @ b.T
+        z = _split(_shrink(_join(m + dual, count), alpha))
         dual += m - z
     out = _join(z, count)
     out[:, 0] /= np.linalg.norm(dictionary.mean)

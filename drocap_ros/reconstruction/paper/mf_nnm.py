@@ -21,6 +21,8 @@ from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 
 #: Candidates of K in the rank 3K of the factorization.
 BASIS_SHAPES = (2, 3)
+#: Proximal gradient steps of the metric upgrade, and Gauss-Newton steps of its refinement.
+_TRACE_STEPS, _REFINING_STEPS = 300, 30
 
 MIN_IMAGES = 3
 
@@ -103,7 +105,7 @@ def rotations_by_factorization(w: np.ndarray, basis_shapes: int) -> np.ndarray:
     return _continuous(rotation)
 
 
-def metric_upgrade(motion: np.ndarray, *, iterations: int = 300) -> np.ndarray:
+def metric_upgrade(motion: np.ndarray) -> np.ndarray:
     """Corrective matrix G (3K, 3): the rows of ``motion[t] @ G`` (F, 2, 3K) become orthogonal and of equal length.
 
     ``Q = G G^T`` is found by trace minimization over positive semidefinite matrices (Dai, Li and He 2012,
@@ -124,7 +126,7 @@ def metric_upgrade(motion: np.ndarray, *, iterations: int = 300) -> np.ndarray:
     step = 1.0 / np.linalg.norm(gram, 2)
     q = ahead = np.eye(rank) / rank
     t, trace_weight = 1.0, 1e-3
-    for _ in range(iterations):
+    for _ in range(_TRACE_STEPS):
         slope = (gram @ ahead.ravel() - moment).reshape(rank, rank)
         values, vectors = np.linalg.eigh(_symmetric(ahead - step * slope))
         new = (vectors * np.maximum(values - step * trace_weight, 0.0)) @ vectors.T
@@ -136,7 +138,7 @@ def metric_upgrade(motion: np.ndarray, *, iterations: int = 300) -> np.ndarray:
     return _refine_upgrade(g, a, b)
 
 
-def _refine_upgrade(g: np.ndarray, a: np.ndarray, b: np.ndarray, *, steps: int = 30) -> np.ndarray:
+def _refine_upgrade(g: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Gauss-Newton on ``|a G|^2 = |b G|^2``, ``a G G^T b = 0``, mean size 1; relative to each frame's size."""
 
     def residuals(g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -155,7 +157,7 @@ def _refine_upgrade(g: np.ndarray, a: np.ndarray, b: np.ndarray, *, steps: int =
 
     gap, jac = residuals(g)
     damping = 1e-2
-    for _ in range(steps):
+    for _ in range(_REFINING_STEPS):
         hessian = jac.T @ jac
         move = np.linalg.solve(
             hessian + damping * (np.trace(hessian) / len(hessian)) * np.eye(len(hessian)), jac.T @ gap

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
+#: Bound on the gain of a joint of vanishing variance.
+_LARGEST_GAIN = 4.0
 
-def information_from(
-    w: np.ndarray, weights: np.ndarray | None, covariance: np.ndarray | None, *, largest: float = 4.0
-) -> np.ndarray:
+
+def information_from(w: np.ndarray, weights: np.ndarray | None, covariance: np.ndarray | None) -> np.ndarray:
     """(F, P, 3) information xx, xy, yy per joint; 1, 0, 1 is an ordinary joint, 0 a missing one.
 
     Parameters
@@ -18,7 +19,6 @@ def information_from(
     w : (F, P, 2), NaN where not seen
     weights : (F, P) >= 0, or None
     covariance : (F, P, 3) xx, xy, yy in units of w squared; the median variance counts as ordinary
-    largest : bound on the gain of a joint of vanishing variance
     """
     seen = np.isfinite(w).all(-1)
     base = seen.astype(np.float64) if weights is None else np.where(seen, weights, 0.0)
@@ -28,7 +28,7 @@ def information_from(
     xx, xy, yy = (np.where(use, covariance[..., i], 1.0 - (i == 1)) for i in range(3))
     ordinary = float(np.median(0.5 * (xx + yy)[use])) if use.any() else 1.0
     # Adding a floor to both axes bounds the information and keeps it positive definite.
-    floor = ordinary / largest
+    floor = ordinary / _LARGEST_GAIN
     xx, yy = xx + floor, yy + floor
     scale = base * (ordinary + floor) / (xx * yy - xy * xy)
     return np.stack([scale * yy, -scale * xy, scale * xx], axis=-1)

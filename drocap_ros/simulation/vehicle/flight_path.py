@@ -65,11 +65,9 @@ class SampledPath:
         )
 
 
-def orbit_path(
-    seconds: float, radius_m: float = 6.0, height_m: float = 2.5, speed_deg_s: float = 25.0, rate_hz: float = 50.0
-) -> SampledPath:
+def orbit_path(seconds: float, radius_m: float = 6.0, height_m: float = 2.5, speed_deg_s: float = 25.0) -> SampledPath:
     """Orbit about a point 0.9 m above the origin."""
-    t = np.arange(0.0, seconds + 1.0 / rate_hz, 1.0 / rate_hz)
+    t = np.arange(0.0, seconds + 0.02, 0.02)
     centre = np.broadcast_to(np.array([0.0, 0.0, 0.9]), (len(t), 3))
     rotation, position = orbit_camera(t, centre, radius_m, height_m, speed_deg_s)
     return SampledPath(t, rotation, position)

@@ -63,7 +63,6 @@ class SimulatedVehicle:
         autopilot: str = "ardupilot",
         *,
         gimbal: bool = True,
-        system_id: int = 1,
         max_rate_hz: float = 400.0,
         boot_s: float = 30.0,
         transport: Transport | None = None,
@@ -80,7 +79,7 @@ class SimulatedVehicle:
         self.settings: dict[str, float] = (
             {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5} if autopilot == "px4" else {"GUID_TIMEOUT": 0.5}
         )
-        self._mav = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
+        self._mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
         if signing_key is not None:
             self.use_key(signing_key, time.time_ns())
         self._period_s: dict[int, float] = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}

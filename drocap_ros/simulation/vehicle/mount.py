@@ -88,10 +88,10 @@ class SimulatedMount:
         return min(max(self.pitch - lean, math.radians(_LIMITS_DEG[0])), math.radians(_LIMITS_DEG[1]))
 
 
-def level_camera(body_xyzw: np.ndarray, pitch: float, yaw_error: float = 0.0) -> np.ndarray:
+def level_camera(body_xyzw: np.ndarray, pitch: float) -> np.ndarray:
     """(4,) camera FLU -> ENU, level in the heading of a body (4,) FLU -> ENU, at a pitch in rad."""
     heading = float(yaw_of(orientation_to_aviation(body_xyzw)))
-    return orientation_to_ros(quaternion_from_euler(0.0, pitch, heading + yaw_error))
+    return orientation_to_ros(quaternion_from_euler(0.0, pitch, heading))
 
 
 def tilted_camera(body_xyzw: np.ndarray, pitch: float) -> np.ndarray:
