@@ -7,7 +7,6 @@ the same orbit.  For the tests.
 from __future__ import annotations
 
 import contextlib
-import threading
 import time
 from typing import Any
 
@@ -17,7 +16,7 @@ from sensor_msgs.msg import CameraInfo
 from drocap_ros.observation import PoseObservation
 from drocap_ros.ros.conversions import header_at, pose2d_to_ros
 from drocap_ros.ros.diagnostics import Key
-from drocap_ros.ros.lifecycle import ManagedComponent
+from drocap_ros.ros.lifecycle import ThreadedSource
 from drocap_ros.ros.spin import node_main
 from drocap_ros.simulation.capture import SimulatedCapture, simulate_capture
 from drocap_ros.simulation.vehicle.flight_path import SampledPath
@@ -29,7 +28,7 @@ HOVER_S = 3.0
 FRAME_ID = "camera_optical"
 
 
-class CaptureSimulatorNode(ManagedComponent):
+class CaptureSimulatorNode(ThreadedSource):
     """Plays a simulated capture in real time."""
 
     component = "capture_simulator"
@@ -41,29 +40,10 @@ class CaptureSimulatorNode(ManagedComponent):
         )
         self._pose2d = self.output("pose2d")
         self._infos = self.output("camera_info")
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
         self.set_up()
 
-    def begin(self) -> None:
-        """Take off; a flight under way has continued meanwhile."""
-        if self._thread is None:
-            self._stop.clear()
-            self._thread = threading.Thread(target=self._run, name="capture_simulator", daemon=True)
-            self._thread.start()
-
-    def release(self) -> None:
-        """End the flight."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=5.0)
-            self._thread = None
-
-    def close(self) -> None:
-        """End the flight."""
-        self.release()
-
-    def _run(self) -> None:
+    def play(self) -> None:
+        """Fly."""
         tracks = self._capture.tracks
         start_ns = self.get_clock().now().nanoseconds + int(HOVER_S * 1e9)
         begin = time.monotonic() + HOVER_S
@@ -73,11 +53,11 @@ class CaptureSimulatorNode(ManagedComponent):
                 vehicle = stack.enter_context(SimulatedVehicle(self.config.vehicle_url, path))
                 vehicle.start()
             for i, offset_ns in enumerate(tracks.stamp_ns):
-                if self._stop.wait(max(0.0, begin + offset_ns * 1e-9 - time.monotonic())):
+                if self.stopping.wait(max(0.0, begin + offset_ns * 1e-9 - time.monotonic())):
                     return
                 if self.active:
                     self._publish(tracks, i, start_ns + int(offset_ns))
-            self._stop.wait(0.5)  # the telemetry around the last image
+            self.stopping.wait(0.5)  # the telemetry around the last image
         self.end()
 
     def _publish(self, tracks: Tracks, i: int, stamp_ns: int) -> None:

@@ -9,7 +9,6 @@ fragments of an image are sent again.
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -32,9 +31,8 @@ from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.ros.component import ERROR, OK, WARN
 from drocap_ros.ros.conversions import camera_info_to_ros, compressed_image_to_ros, header_at, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key, of
-from drocap_ros.ros.lifecycle import ManagedComponent
+from drocap_ros.ros.lifecycle import ThreadedSource
 from drocap_ros.ros.spin import node_main
-from drocap_ros.ros.stamps import StampValidator
 from drocap_ros.ros.topics import TOPIC_SOURCE
 
 #: An image of a file that is this late when it has been read is dropped.
@@ -43,7 +41,7 @@ _LATE_S = 0.1
 _DEPTH = 5
 
 
-class ImageIngestNode(ManagedComponent):
+class ImageIngestNode(ThreadedSource):
     """Reads its source in a thread of its own, so that a slow source never blocks the node."""
 
     component = "image_ingest"
@@ -56,17 +54,14 @@ class ImageIngestNode(ManagedComponent):
         self._size: tuple[int, int] | None = None
         self._last_ns: int | None = None
         self._arrived_s = time.monotonic()
-        self._stop = threading.Event()
         self._source: ImageSource | None = None
         self._topic = ""
         self._subscription: Subscription | None = None
-        self._thread: threading.Thread | None = None
         self.create_timer(0.5, self._watch)
         self.set_up()
 
     def acquire(self) -> None:
         """Open the source, or wait for its topic."""
-        self._stop.clear()
         if self.config.source.startswith(TOPIC_SOURCE):
             self._topic = self._valid_topic(self.config.source.removeprefix(TOPIC_SOURCE))
             self.report(WARN, f"waiting for {self._kind().__name__} on {self._topic}")
@@ -77,35 +72,29 @@ class ImageIngestNode(ManagedComponent):
     def begin(self) -> None:
         """Start or continue to read; a file has advanced meanwhile, as a camera would."""
         self._arrived_s = time.monotonic()
-        if self._source is not None and self._thread is None:
-            self._thread = threading.Thread(target=self._run, name="image_ingest", daemon=True)
-            self._thread.start()
+        if self._source is not None:
+            super().begin()
 
     def release(self) -> None:
         """Stop reading and close the source."""
-        self._stop.set()
+        self.stopping.set()
         # A live source that waits for an image ends by being closed; a file must not be closed while it is read.
         if self._source is not None and self._source.live:
             self._source.close()
-        if self._thread is not None:
-            self._thread.join(timeout=5.0)
-            self._thread = None
+        super().release()
         if self._source is not None:
             self._source.close()
             self._source = None
         self._topic = ""
         self._unsubscribe()
 
-    def close(self) -> None:
-        """Close the source."""
-        self.release()
-
     # -- files, cameras, streams -----------------------------------------------------------------------
 
-    def _run(self) -> None:
+    def play(self) -> None:
+        """Publish the images of the source."""
         try:
             for frame in self._frames():
-                if self._stop.is_set():
+                if self.stopping.is_set():
                     return
                 if not self.active:
                     continue
@@ -116,7 +105,7 @@ class ImageIngestNode(ManagedComponent):
             self.report(OK, "the source has ended")
         except DrocapError as error:
             self.report(ERROR, str(error))
-        if not self._stop.is_set():
+        if not self.stopping.is_set():
             self.end()
 
     def _frames(self) -> Iterator[Frame]:
@@ -133,7 +122,7 @@ class ImageIngestNode(ManagedComponent):
                 stamp_ns = begin_ns + frame.stamp_ns
                 if self.config.realtime:
                     ahead_s = (stamp_ns - self.get_clock().now().nanoseconds) * 1e-9
-                    if self._stop.wait(max(0.0, ahead_s)):
+                    if self.stopping.wait(max(0.0, ahead_s)):
                         return
                     if ahead_s < -_LATE_S:
                         # As with a camera: images that the machine is too slow for are dropped, none is late.
@@ -152,7 +141,7 @@ class ImageIngestNode(ManagedComponent):
                 step_ns = frame.stamp_ns + offset_ns - last_ns or step_ns
                 last_ns = frame.stamp_ns + offset_ns
                 yield Frame(last_ns, frame.image)
-            if not self.config.loop or self._stop.is_set():
+            if not self.config.loop or self.stopping.is_set():
                 return
             offset_ns = last_ns + step_ns
             self._source.close()
@@ -184,17 +173,7 @@ class ImageIngestNode(ManagedComponent):
             return
         self._unsubscribe()
         qos = QoSProfile(depth=_DEPTH, reliability=wanted)
-        validator = StampValidator()
-
-        def take(message: Any) -> None:
-            if not self.active:
-                return
-            try:
-                validator.check(message.header.stamp.sec, message.header.stamp.nanosec)
-                self._take(message)
-            except InputError as error:
-                self.refuse(f"{self._topic}: {error}")
-
+        take = self.guarded(self._topic, self._take, stamps=True)
         events = SubscriptionEventCallbacks(message_lost=self._on_lost)
         self._subscription = self.create_subscription(self._kind(), self._topic, take, qos, event_callbacks=events)
 

@@ -7,7 +7,6 @@ recording's time).  Topics of the recorded namespace are published in the node's
 from __future__ import annotations
 
 import importlib
-import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -21,7 +20,7 @@ from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, RawMessage, Se
 from drocap_ros.ros.component import ERROR
 from drocap_ros.ros.conversions import stamp_to_ros
 from drocap_ros.ros.diagnostics import Key
-from drocap_ros.ros.lifecycle import ManagedComponent
+from drocap_ros.ros.lifecycle import ThreadedSource
 from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, RESULT_QOS, TOPICS
 
@@ -30,7 +29,7 @@ _OWN = ("/diagnostics", "/clock")
 _CLOCK_PERIOD_S = 0.01
 
 
-class SessionPlayerNode(ManagedComponent):
+class SessionPlayerNode(ThreadedSource):
     """Reads in a thread of its own; holds one chunk in memory."""
 
     component = "session_player"
@@ -50,27 +49,11 @@ class SessionPlayerNode(ManagedComponent):
             )
         self._clock_output = self.create_publisher(Clock, "/clock", 10) if self.config.clock else None
         self._clock_ns = 0
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
         self.set_up()
-
-    def begin(self) -> None:
-        """Start to publish; a session under way has continued meanwhile."""
-        if self._thread is None:
-            self._stop.clear()
-            self._thread = threading.Thread(target=self._run, name="session_player", daemon=True)
-            self._thread.start()
-
-    def release(self) -> None:
-        """Stop."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=5.0)
-            self._thread = None
 
     def close(self) -> None:
         """Stop and close the session."""
-        self.release()
+        super().close()
         self._session.close()
 
     def _publisher(self, topic: TopicInfo) -> Publisher:
@@ -83,18 +66,19 @@ class SessionPlayerNode(ManagedComponent):
         qos = IMAGE_RECORDING_QOS if topic.type_name in (IMAGE, COMPRESSED_IMAGE) else RESULT_QOS
         return self.create_publisher(message, topic.name, qos)
 
-    def _run(self) -> None:
+    def play(self) -> None:
+        """Publish the session, in a loop if configured."""
         try:
             while True:
                 self._play_once()
-                if not self.config.loop or self._stop.is_set():
+                if not self.config.loop or self.stopping.is_set():
                     break
                 self.count(Key.ROUNDS)
         except DrocapError as error:
             self.report(ERROR, str(error))
         for warning in self._session.warnings:
             self.get_logger().warning(warning)
-        if not self._stop.is_set():
+        if not self.stopping.is_set():
             self.flush()
             self.end()
 
@@ -106,7 +90,7 @@ class SessionPlayerNode(ManagedComponent):
         for raw in self._messages(origin_ns):
             due_s = begin_s + (raw.log_time_ns - origin_ns) * 1e-9 / self.config.rate
             self._wait_until(due_s, begin_s, origin_ns)
-            if self._stop.is_set():
+            if self.stopping.is_set():
                 return
             self._publish_clock(raw.log_time_ns)
             if self.active:
@@ -118,7 +102,7 @@ class SessionPlayerNode(ManagedComponent):
         return (raw for raw in self._session.raw_messages(wanted) if raw.log_time_ns >= origin_ns)
 
     def _wait_until(self, due_s: float, begin_s: float, origin_ns: int) -> None:
-        while (left_s := due_s - time.monotonic()) > 0 and not self._stop.wait(min(left_s, _CLOCK_PERIOD_S)):
+        while (left_s := due_s - time.monotonic()) > 0 and not self.stopping.wait(min(left_s, _CLOCK_PERIOD_S)):
             self._publish_clock(origin_ns + round((time.monotonic() - begin_s) * self.config.rate * 1e9))
 
     def _publish_clock(self, now_ns: int) -> None:

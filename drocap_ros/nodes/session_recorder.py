@@ -93,10 +93,6 @@ class SessionRecorderNode(ManagedComponent):
                 self._writer.discard()
             self._writer = None
 
-    def close(self) -> None:
-        """Finish the files."""
-        self.release()
-
     def _on_message(self, name: str, data: bytes, info: dict[str, Any]) -> None:
         """Write a message; log time is its arrival in this process, publish time the time at which it was sent."""
         log_ns = info["received_timestamp"]

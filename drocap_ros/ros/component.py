@@ -134,15 +134,11 @@ class ComponentNode(Node):
 
         with_info : the callback's second argument is rclpy's message info
         """
-        guarded = self.guarded(topic, callback)
-
-        def alone(message: Any) -> None:
-            guarded(message)
-
+        guarded = self.guarded(topic, callback, stamps=TOPICS[topic].one_clock)
         subscription = self.create_subscription(
             TOPICS[topic].message,
             topic,
-            _with_info(guarded) if with_info else alone,
+            _with_info(guarded) if with_info else guarded,
             qos or TOPICS[topic].qos,
             raw=raw,
             event_callbacks=events or SubscriptionEventCallbacks(use_default_callbacks=topic in FROM_OUTSIDE),
@@ -150,9 +146,9 @@ class ComponentNode(Node):
         self._inputs.append((topic, subscription))
         return subscription
 
-    def guarded(self, topic: str, callback: Callable[..., None], stamps: bool = True) -> Callable[..., None]:
-        """Wrap a callback: an InputError is counted and reported, not raised; stamps are validated first."""
-        validator = StampValidator() if stamps and topic in TOPICS and TOPICS[topic].one_clock else None
+    def guarded(self, topic: str, callback: Callable[..., None], *, stamps: bool) -> Callable[..., None]:
+        """Wrap a callback: an InputError is counted and reported, not raised; with ``stamps`` they are validated."""
+        validator = StampValidator() if stamps else None
 
         def run(*arguments: Any) -> None:
             self.callbacks_done += 1

@@ -9,6 +9,7 @@ shuts down: its state is then ``finalized``.
 
 from __future__ import annotations
 
+import threading
 from typing import Any, ClassVar
 
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
@@ -84,6 +85,10 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
 
     def release(self) -> None:
         """Release the resource; also called at the end, then perhaps a second time."""
+
+    def close(self) -> None:
+        """Release the resource."""
+        self.release()
 
     # -- transitions -----------------------------------------------------------------------------------
 
@@ -170,3 +175,30 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
         if state != FINALIZED or self._level != ERROR:
             self.report(OK, _WORDS[state])
         self.publish_diagnostics()
+
+
+class ThreadedSource(ManagedComponent):
+    """A source whose thread, from the first activation on, executes :meth:`play`."""
+
+    def __init__(self, config: Parameters | None = None, **node_kwargs: Any) -> None:
+        super().__init__(config, **node_kwargs)
+        self.stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def play(self) -> None:
+        """Publish while the node is active, until the end or until ``stopping`` is set."""
+        raise NotImplementedError
+
+    def begin(self) -> None:
+        """Start the thread; work under way has continued meanwhile."""
+        if self._thread is None:
+            self.stopping.clear()
+            self._thread = threading.Thread(target=self.play, name=self.component, daemon=True)
+            self._thread.start()
+
+    def release(self) -> None:
+        """End the thread."""
+        self.stopping.set()
+        if self._thread is not None:
+            self._thread.join(timeout=5.0)
+            self._thread = None
