@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         args = build_parser().parse_args(words)
         args.command_line = shlex.join(["drocap", *words])
-        with interruptible(signal.SIGTERM) as interrupted:
+        with interruptible(getattr(args, "interrupted_by", (signal.SIGTERM,))) as interrupted:
             status: int = args.run(args)
         sys.stdout.flush()
         return status

@@ -5,14 +5,16 @@ from __future__ import annotations
 import contextlib
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+
+BOTH = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextlib.contextmanager
 def stop_signals() -> Iterator[threading.Event]:
     """An event that SIGINT and SIGTERM set instead of interrupting the program."""
     stop = threading.Event()
-    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in BOTH}
     try:
         yield stop
     finally:
@@ -21,11 +23,10 @@ def stop_signals() -> Iterator[threading.Event]:
 
 
 @contextlib.contextmanager
-def interruptible(*signals: signal.Signals) -> Iterator[threading.Event]:
+def interruptible(signals: Sequence[signal.Signals] = BOTH) -> Iterator[threading.Event]:
     """SIGTERM interrupts the program as Ctrl-C does, so that no half-written file remains.
 
-    ``signals`` (default: SIGINT and SIGTERM) raise KeyboardInterrupt and set the event: an exception in a destructor,
-    for one, is lost.
+    ``signals`` raise KeyboardInterrupt and set the event: an exception in a destructor, for one, is lost.
     """
     interrupted = threading.Event()
 
@@ -33,10 +34,9 @@ def interruptible(*signals: signal.Signals) -> Iterator[threading.Event]:
         interrupted.set()
         raise KeyboardInterrupt
 
-    taken = signals or (signal.SIGINT, signal.SIGTERM)
     if threading.current_thread() is not threading.main_thread():
-        taken = ()  # Python permits handlers in the main thread only
-    before = {number: signal.signal(number, interrupt) for number in taken}
+        signals = ()  # Python permits handlers in the main thread only
+    before = {number: signal.signal(number, interrupt) for number in signals}
     try:
         yield interrupted
     finally:

@@ -8,9 +8,7 @@ import fcntl
 import json
 import re
 import shutil
-import signal
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -50,7 +48,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     where.add_argument("--cluster", metavar="ADDRESS", help="Dask scheduler, for example tcp://10.0.0.5:8786")
     add_options(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, only errors")
-    parser.set_defaults(run=run)
+    # SIGTERM ends the process and with it the recordings; an interrupt would wait for them.
+    parser.set_defaults(run=run, interrupted_by=())
     return parser
 
 
@@ -58,9 +57,6 @@ def run(args: argparse.Namespace) -> int:
     """Reconstruct what is not done yet; status 1 when a recording failed."""
     from drocap_ros.cli.atomic_output import check_output_folder
 
-    if threading.current_thread() is threading.main_thread():
-        # Recordings end with the batch; an interrupt would wait for them.
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if args.jobs < 1:
         raise InputError(f"--jobs: expected at least 1, got {args.jobs}; correct the number")
     check_output_folder(args.out)
