@@ -6,7 +6,12 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from drocap_ros.cli.models.training_options import add_training_options, progress_lines, use_threads
+from drocap_ros.cli.models.training_options import (
+    add_training_options,
+    progress_lines,
+    training_parameters,
+    use_threads,
+)
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -61,15 +66,7 @@ def run(args: argparse.Namespace) -> int:
     check_output_file(args.out)
     use_threads(args.threads)
     onnx_package()
-    options = LifterTraining(
-        minutes=args.minutes,
-        steps=args.steps,
-        width=args.width,
-        frames_per_batch=args.frames_per_batch,
-        steps_per_batch=args.steps_per_batch,
-        workers=args.workers,
-        seed=args.seed,
-    )
+    options = training_parameters(LifterTraining, args)
     files = mocap_files(args.folder, args.include)
     bank = load_bank(files)
     description = describe_training(files, args.include, options)

@@ -6,7 +6,12 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from drocap_ros.cli.models.training_options import add_training_options, progress_lines, use_threads
+from drocap_ros.cli.models.training_options import (
+    add_training_options,
+    progress_lines,
+    training_parameters,
+    use_threads,
+)
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -45,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
 
     if not args.out.absolute().parent.is_dir() or args.out.is_file():
         raise InputError(f"--out: expected a folder, or a name in one that exists, got {args.out}")
-    options = SimulationTraining(minutes=args.minutes, steps=args.steps, seed=args.seed, only=args.only)
+    options = training_parameters(SimulationTraining, args)
     check_output_folder(args.out)
     use_threads(args.threads)
     onnx_package()

@@ -5,9 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from dataclasses import fields
+from typing import TypeVar
 
 from drocap_ros.cli.options import add_seed_option
-from drocap_ros.errors import InputError
+from drocap_ros.errors import InputError, ParameterError
+from drocap_ros.parameters import Parameters
+
+P = TypeVar("P", bound=Parameters)
 
 
 def add_training_options(parser: argparse.ArgumentParser, minutes: float) -> None:
@@ -16,6 +21,21 @@ def add_training_options(parser: argparse.ArgumentParser, minutes: float) -> Non
     parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch (default 1)")
     add_seed_option(parser, "seed of samples and initial weights")
     parser.add_argument("--quiet", action="store_true", help="no progress, only errors")
+
+
+def training_parameters(kind: type[P], args: argparse.Namespace) -> P:
+    """Parameters by the options of the same names.
+
+    Raises
+    ------
+    InputError
+        When an option is out of range.
+    """
+    try:
+        return kind(**{field.name: getattr(args, field.name) for field in fields(kind) if hasattr(args, field.name)})
+    except ParameterError as error:
+        name, _, reason = str(error).removeprefix(f"{kind.__name__}.").partition(":")
+        raise InputError(f"--{name.replace('_', '-')}:{reason}") from None
 
 
 def use_threads(count: int) -> None:

@@ -58,7 +58,7 @@ def test_a_network_is_trained_and_states_its_origin(mocap: Path, capsys: pytest.
         (("--out", "x.npz"), "--out"),
         (("--out", "folder.onnx"), "found a folder"),
         (("--threads", "0"), "--threads"),
-        (("--frames-per-batch", "64"), "frames_per_batch"),
+        (("--frames-per-batch", "64"), "--frames-per-batch: expected 240"),
         (("--include", "/abs*"), "found none"),
         (("--include", "**/one"), "found none"),
     ],
