@@ -219,5 +219,5 @@ def export(detector: torch.nn.Module, pose: torch.nn.Module, folder: Path, facts
         )  # fmt: skip
         beside = folder / "person_pose.yaml"
         beside.write_text("skeleton: body15\n", encoding="utf-8")
-        scale = sigma_scale(folder / "person_pose.onnx")
-        beside.write_text(f"skeleton: body15\nsigma_scale: {scale:.2f}\n", encoding="utf-8")
+        with beside.open("a", encoding="utf-8") as file:
+            file.write(f"sigma_scale: {sigma_scale(folder / 'person_pose.onnx'):.2f}\n")
