@@ -130,20 +130,7 @@ def latest_pose_to_ros(
     initial: Pose3D, joints: np.ndarray, *, refined: bool, placed: PlacedPose | None = None
 ) -> Pose3D:
     """The initial pose's message with other joints (P, 3) m, or with those that are placed in ``map``."""
-    if placed is not None:
-        return pose3d_to_ros(
-            Header(stamp=initial.header.stamp, frame_id=MAP),
-            track_id=initial.track_id,
-            stage=Pose3D.REFINED if refined else Pose3D.INITIAL,
-            skeleton=initial.skeleton,
-            joints=placed.joints,
-            covariance=placed.covariance,
-            confidence=np.array(initial.confidence, np.float32),
-            reprojection_rms_px=initial.reprojection_rms,
-            camera_rotation=placed.rotation,
-            metric=True,
-        )
-    return Pose3D(
+    latest = Pose3D(
         header=initial.header,
         track_id=initial.track_id,
         stage=Pose3D.REFINED if refined else Pose3D.INITIAL,
@@ -155,6 +142,11 @@ def latest_pose_to_ros(
         metric=initial.metric,
         reprojection_rms=initial.reprojection_rms,
     )
+    if placed is not None:
+        latest.header = Header(stamp=initial.header.stamp, frame_id=MAP)
+        latest.joints, latest.covariance = floats(placed.joints), floats(placed.covariance)
+        latest.camera_orientation, latest.metric = _camera_orientation(placed.rotation), True
+    return latest
 
 
 def window_to_ros(
