@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 from drocap_ros.cli import reconstruct
 from drocap_ros.cli.motion_input import HELP, read_motion
 from drocap_ros.cli.options import add_seed_option
+from drocap_ros.cli.progress import Progress
 
 #: ``live`` needs a recording of the live graph.
 METHODS = tuple(method for method in reconstruct.METHODS if method != "live")
@@ -98,6 +100,34 @@ def _study_parser(
     return parser
 
 
+def _study(
+    args: argparse.Namespace,
+    name: str,
+    rows_of: Callable[[Progress], list[Any]],
+    record_of: Callable[[Any], Mapping[str, object]],
+    markdown: Callable[[list[Any]], str],
+    save_picture: Callable[[Path, list[Any]], None] | None = None,
+) -> int:
+    """Run a study, print its tables and write its files."""
+    from drocap_ros.cli.atomic_output import check_output_folder, output_folder
+    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.evaluation.tables import save_csv
+
+    if args.out is not None:
+        check_output_folder(args.out)
+    with progress_bars(args.quiet) as progress:
+        rows = rows_of(progress)
+    text = markdown(rows)
+    print(text, end="")
+    if args.out is not None:
+        with output_folder(args.out) as out:
+            save_csv(out / f"{name}.csv", [record_of(row) for row in rows])
+            (out / f"{name}.md").write_text(text, encoding="utf-8")
+            if save_picture is not None:
+                save_picture(out / f"{name}.png", rows)
+    return 0
+
+
 def _compare(args: argparse.Namespace) -> int:
     """Compare MOTION with TRUTH, print the table and write the files."""
     from drocap_ros.cli.atomic_output import check_output_folder, output_folder
@@ -120,86 +150,50 @@ def _compare(args: argparse.Namespace) -> int:
 
 
 def _rotation(args: argparse.Namespace) -> int:
-    """Run the camera-motion study, print the tables and write the files."""
-    from drocap_ros.cli.atomic_output import check_output_folder, output_folder
-    from drocap_ros.cli.progress import progress_bars
+    """The camera-motion study."""
     from drocap_ros.evaluation import tables
     from drocap_ros.evaluation.rotation import rotation_study
 
-    if args.out is not None:
-        check_output_folder(args.out)
-    with progress_bars(args.quiet) as progress:
-        rows = rotation_study(
-            args.folder,
-            speeds_deg_s=args.speeds,
-            methods=args.methods,
-            noisy=args.noisy,
-            seed=args.seed,
-            limit=args.limit,
-            processes=args.processes,
-            progress=progress,
-        )
-    text = tables.study_markdown(rows)
-    print(text, end="")
-    if args.out is not None:
-        with output_folder(args.out) as out:
-            tables.save_csv(out / "rotation.csv", [asdict(row) for row in rows])
-            (out / "rotation.md").write_text(text, encoding="utf-8")
-            tables.save_curves(out / "rotation.png", rows)
-    return 0
+    def rows_of(progress: Progress) -> list[Any]:
+        return rotation_study(
+            args.folder, speeds_deg_s=args.speeds, methods=args.methods, noisy=args.noisy, seed=args.seed,
+            limit=args.limit, processes=args.processes, progress=progress,
+        )  # fmt: skip
+
+    return _study(args, "rotation", rows_of, asdict, tables.study_markdown, tables.save_curves)
 
 
 def _world(args: argparse.Namespace) -> int:
-    """Run the study of the motion in the world, print the table and write the files."""
-    from drocap_ros.cli.atomic_output import check_output_folder, output_folder
-    from drocap_ros.cli.progress import progress_bars
-    from drocap_ros.evaluation.tables import save_csv
+    """The study of the motion in the world."""
     from drocap_ros.evaluation.world import world_markdown, world_study
 
-    if args.out is not None:
-        check_output_folder(args.out)
-    with progress_bars(args.quiet) as progress:
-        rows = world_study(
+    def rows_of(progress: Progress) -> list[Any]:
+        return world_study(
             args.folder, args.telemetry, still=args.still, seed=args.seed, method=args.method, every=args.every,
             limit=args.limit, progress=progress,
         )  # fmt: skip
-    text = world_markdown(rows, args.telemetry, args.still)
-    print(text, end="")
-    if args.out is not None:
-        with output_folder(args.out) as out:
-            save_csv(out / "world.csv", [{"sequence": row.sequence, **asdict(row.errors)} for row in rows])
-            (out / "world.md").write_text(text, encoding="utf-8")
-    return 0
+
+    return _study(
+        args,
+        "world",
+        rows_of,
+        lambda row: {"sequence": row.sequence, **asdict(row.errors)},
+        lambda rows: world_markdown(rows, args.telemetry, args.still),
+    )
 
 
 def _live(args: argparse.Namespace) -> int:
-    """Run the study of the live method, print the tables and write the files."""
-    from drocap_ros.cli.atomic_output import check_output_folder, output_folder
-    from drocap_ros.cli.progress import progress_bars
+    """The study of the live method."""
     from drocap_ros.config import load_config
     from drocap_ros.evaluation.live_study import live_study
     from drocap_ros.evaluation.live_study_table import live_markdown
-    from drocap_ros.evaluation.tables import save_csv
 
-    if args.out is not None:
-        check_output_folder(args.out)
     config = load_config(args.config)
-    with progress_bars(args.quiet) as progress:
-        rows = live_study(
-            args.folder,
-            speed_deg_s=args.speed,
-            noisy=args.noisy,
-            delay_s=args.delay,
-            seed=args.seed,
-            limit=args.limit,
-            initializer=config.initializer,
-            adjuster=config.bundle_adjuster,
-            progress=progress,
-        )
-    text = live_markdown(rows, args.delay)
-    print(text, end="")
-    if args.out is not None:
-        with output_folder(args.out) as out:
-            save_csv(out / "live.csv", [asdict(row) for row in rows])
-            (out / "live.md").write_text(text, encoding="utf-8")
-    return 0
+
+    def rows_of(progress: Progress) -> list[Any]:
+        return live_study(
+            args.folder, speed_deg_s=args.speed, noisy=args.noisy, delay_s=args.delay, seed=args.seed,
+            limit=args.limit, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress,
+        )  # fmt: skip
+
+    return _study(args, "live", rows_of, asdict, lambda rows: live_markdown(rows, args.delay))
