@@ -326,7 +326,7 @@ def cell_long(what: str, folder: str) -> dict[str, Any]:
 
     base_mib, begin = peak_mib(), time.process_time()
     if what == "read":
-        frames = len(read_input(Path(folder), DrocapConfig(), None))
+        frames = len(read_input(Path(folder), DrocapConfig(), None)[0])
     else:
         motion, _ = reconstruct_input(folder, method=what, config=DrocapConfig())
         frames = len(motion.joints3d)

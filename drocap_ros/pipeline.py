@@ -45,6 +45,9 @@ class Selection:
     redetect: bool = False
 
 
+_WHOLE = Selection()
+
+
 def reconstruct_input(
     path: str | Path,
     *,
@@ -54,7 +57,7 @@ def reconstruct_input(
     progress: Progress | None = None,
     telemetry: Telemetry | None = None,
     mount_pitch_deg: float | None = None,
-    selection: Selection | None = None,
+    selection: Selection = _WHOLE,
 ) -> tuple[Motion, Tracks]:
     """Motion of the subject in a video file, image folder, recording or tracks file.
 
@@ -74,15 +77,14 @@ def reconstruct_input(
     InputError
         When the input cannot be used.
     """
-    selection = selection or Selection()
     if method == "live":
-        if selection != Selection():
+        if selection != _WHOLE:
             raise InputError("--method live: expected a whole recording with its recorded poses; choose another method")
         return _reconstruct_live(Path(path), config, progress)
     begin = time.perf_counter()
     telemetry = telemetry or Telemetry()
     log = read_video_telemetry(Path(path), telemetry)
-    tracks, origin = _read(Path(path), config, models, progress, mount_pitch_deg, selection)
+    tracks, origin = read_input(Path(path), config, models, progress, mount_pitch_deg, selection)
     if log is not None:
         tracks, origin["telemetry"] = with_telemetry(Path(path), tracks, telemetry, log, config.image_ingest, progress)
     seconds = time.perf_counter() - begin
@@ -107,19 +109,7 @@ def _reconstruct_live(path: Path, config: DrocapConfig, progress: Progress | Non
     return dataclasses.replace(motion, meta={**motion.meta, "input": path.name}), tracks
 
 
-def read_input(
-    path: Path,
-    config: DrocapConfig,
-    models: Path | None,
-    progress: Progress | None = None,
-    mount_pitch_deg: float | None = None,
-    selection: Selection | None = None,
-) -> Tracks:
-    """2D tracks of the subject: from the input where it holds them, else estimated from its images."""
-    return _read(path, config, models, progress, mount_pitch_deg, selection or Selection())[0]
-
-
-def needs_networks(path: Path, redetect: bool = False) -> bool:
+def needs_networks(path: Path, redetect: bool) -> bool:
     """Whether the 2D poses of an input have to be estimated from its images.
 
     Raises
@@ -138,15 +128,18 @@ def needs_networks(path: Path, redetect: bool = False) -> bool:
         return not session.has_pose2d
 
 
-def _read(
+def read_input(
     path: Path,
     config: DrocapConfig,
     models: Path | None,
-    progress: Progress | None,
-    mount_pitch_deg: float | None,
-    selection: Selection,
+    progress: Progress | None = None,
+    mount_pitch_deg: float | None = None,
+    selection: Selection = _WHOLE,
 ) -> tuple[Tracks, dict[str, Any]]:
-    """Tracks, and what ``meta`` says of their origin."""
+    """2D tracks of the subject, from the input where it holds them, else estimated from its images; their origin.
+
+    The latter is for the motion's ``meta``.
+    """
     origin: dict[str, Any] = {} if selection.clip.whole else {"clip": selection.clip.meta}
     if needs_networks(path, selection.redetect):
         tracks, more = _track(path, config, models, progress, selection)

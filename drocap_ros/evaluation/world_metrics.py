@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from drocap_ros.geometry.alignment import apply_similarity, similarity
+from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.skeleton import BODY_15, indices
 
 FEET = indices(BODY_15.joints, ("rankle", "lankle"))
@@ -67,11 +68,10 @@ def ellipsoid_coverage(estimate: np.ndarray, truth: np.ndarray, covariance: np.n
 
     covariance : (F, P, 6) m^2: xx, xy, xz, yy, yz, zz; joints without a finite one are left out
     """
-    rows = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
     known = np.isfinite(covariance).all(-1)
     if not known.any():
         return float("nan")
-    matrix, gap = covariance[known][:, rows], (estimate - truth)[known]
+    matrix, gap = unpack_covariance(covariance[known]), (estimate - truth)[known]
     square = np.einsum("ni,ni->n", gap, np.linalg.solve(matrix + 1e-12 * np.eye(3), gap[..., None])[..., 0])
     return float((square < ELLIPSOID_90).mean())
 

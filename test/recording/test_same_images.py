@@ -54,7 +54,7 @@ def test_keypoints_do_not_depend_on_the_format_of_the_recording(tmp_path):
         pytest.skip("no models and media (../shared)")
     frames, messages = video_images(), Messages()
     tracks = [
-        read_input(write(tmp_path / name, kind, frames, messages), DrocapConfig(), SHARED / "models")
+        read_input(write(tmp_path / name, kind, frames, messages), DrocapConfig(), SHARED / "models")[0]
         for kind, name in (("bag", "x.bag"), ("sqlite3", "x"), ("mcap", "y"))
     ]
     assert len(tracks[0]) == COUNT

@@ -12,6 +12,8 @@ from drocap_ros.ros.diagnostics import Key, words
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from drocap_ros.bringup import Graph
+
 _COLOURS = {0: "green", 1: "yellow", 2: "red", 3: "magenta"}
 _LATENCY = (Key.LATENCY_P50, Key.LATENCY_P95, Key.LATENCY_P99)
 _SHOWN = (Key.SUBJECT, Key.LAST_REFUSED)
@@ -32,7 +34,7 @@ class Dashboard:
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
             self._rows[status.name] = (level, status.message, values)
 
-    def heard(self, namespace: str = "") -> list[str]:
+    def heard(self, namespace: str) -> list[str]:
         """Names of the nodes whose status has arrived, in a namespace."""
         inside = f"{namespace.strip('/')}/" if namespace else ""
         return sorted(name for name in self._rows if name.startswith(inside))
@@ -54,13 +56,16 @@ class Dashboard:
 
 
 @contextlib.contextmanager
-def dashboard_on_terminal(show: bool, namespace: str = "") -> Iterator[tuple[Dashboard, Callable[[], None]]]:
-    """A dashboard and the function that draws a namespace's nodes; it draws nothing in a pipe or without ``show``."""
-    dashboard = Dashboard()
+def dashboard_of(graph: Graph, show: bool) -> Iterator[tuple[Dashboard, Callable[[], None]]]:
+    """Dashboard of the graph's ``/diagnostics``, and the function that draws it: not in a pipe or without ``show``."""
+    from drocap_ros.ros.topics import TOPICS
+
+    dashboard, entry = Dashboard(), TOPICS["/diagnostics"]
+    graph.node.create_subscription(entry.message, "/diagnostics", dashboard.take, entry.qos)
     if not show or not sys.stdout.isatty():
         yield dashboard, lambda: None
         return
     from rich.live import Live
 
-    with Live(dashboard.table(namespace), auto_refresh=False) as live:
-        yield dashboard, lambda: live.update(dashboard.table(namespace), refresh=True)
+    with Live(dashboard.table(graph.namespace), auto_refresh=False) as live:
+        yield dashboard, lambda: live.update(dashboard.table(graph.namespace), refresh=True)

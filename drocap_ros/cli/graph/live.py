@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import importlib
 import sys
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from drocap_ros.cli.graph.dashboard import Dashboard, dashboard_on_terminal
+from drocap_ros.cli.graph.dashboard import dashboard_of
 from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
 from drocap_ros.cli.options import ros_namespace
 from drocap_ros.cli.signals import stop_signals
@@ -21,7 +19,6 @@ from drocap_ros.recording.mcap.metadata import METADATA_FILE
 from drocap_ros.recording.provenance import dated_name
 
 if TYPE_CHECKING:
-    from drocap_ros.bringup import Graph
     from drocap_ros.config import DrocapConfig
 
 
@@ -124,14 +121,3 @@ def import_bringup() -> ModuleType:
         return importlib.import_module("drocap_ros.bringup")
     except ImportError as error:
         raise InputError(f"expected ROS 2 with drocap_ros's messages, found none ({error}); run `make setup`") from None
-
-
-@contextlib.contextmanager
-def dashboard_of(graph: Graph, show: bool) -> Iterator[tuple[Dashboard, Callable[[], None]]]:
-    """Dashboard of the graph's ``/diagnostics``, and the function that draws it."""
-    from drocap_ros.ros.topics import TOPICS
-
-    with dashboard_on_terminal(show, graph.namespace) as (dashboard, draw):
-        entry = TOPICS["/diagnostics"]
-        graph.node.create_subscription(entry.message, "/diagnostics", dashboard.take, entry.qos)
-        yield dashboard, draw

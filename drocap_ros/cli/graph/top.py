@@ -7,8 +7,9 @@ import sys
 import time
 from typing import Any
 
+from drocap_ros.cli.graph.dashboard import dashboard_of
 from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
-from drocap_ros.cli.graph.live import dashboard_of, import_bringup
+from drocap_ros.cli.graph.live import import_bringup
 from drocap_ros.cli.options import ros_namespace
 from drocap_ros.cli.signals import stop_signals
 
