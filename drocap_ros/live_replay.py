@@ -16,6 +16,7 @@ from drocap_ros.motion import Motion
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.live.replay import LivePose, live_poses
 from drocap_ros.reconstruction.live.window import AdjustedWindow
+from drocap_ros.reconstruction.reconstruct import reprojection_px
 from drocap_ros.reconstruction.stop_reason import NO_WINDOW
 from drocap_ros.recording.pose_messages import read_observations
 from drocap_ros.recording.provenance import CONFIGURATION
@@ -164,11 +165,8 @@ def _arrays(session: Session, frames: dict[int, _Frame], matrix: np.ndarray | No
 def _motion_in_world(tracks: Tracks, joints3d: np.ndarray, config: DrocapConfig) -> Motion:
     assert tracks.camera_rotation is not None
     assert tracks.camera_position is not None
-    assert tracks.camera_matrix is not None
     motion = _motion(tracks, joints3d, config)
-    k = tracks.camera_matrix
-    seen = (joints3d - tracks.camera_position[:, None]) @ np.swapaxes(tracks.camera_rotation, 1, 2)
-    image = seen[..., :2] / np.maximum(seen[..., 2:], 1e-3) * np.diagonal(k)[:2] + k[:2, 2]
+    camera = tracks.camera_rotation, tracks.camera_position, tracks.camera_matrix
     return dataclasses.replace(
         motion,
         frame="world",
@@ -176,7 +174,7 @@ def _motion_in_world(tracks: Tracks, joints3d: np.ndarray, config: DrocapConfig)
         scale_source="telemetry",
         camera_rotation=tracks.camera_rotation,
         camera_position=tracks.camera_position,
-        reprojection_px=np.linalg.norm(image - motion.keypoints, axis=-1),
+        reprojection_px=reprojection_px(joints3d, *camera, motion.keypoints),
     )
 
 

@@ -195,7 +195,7 @@ def _to_motion(
             joints, rotation, position, metric = found.joints, found.rotation, found.position, found.metric
             scale_source = "telemetry" if metric else "assumed_height"
             covariance = found.covariance
-            reprojection = _reprojection(joints, rotation, position, tracks.camera_matrix, keypoints.xy)
+            reprojection = reprojection_px(joints, rotation, position, tracks.camera_matrix, keypoints.xy)
             meta["calibration"], meta["covariance_about"] = found.calibration, "origin"
     if covariance is None and result.sigma_px is not None:
         covariance = _covariance(result.sigma_px * per_px[:, None, None], rotation)
@@ -233,10 +233,10 @@ def _in_image(result: CameraPoses) -> np.ndarray:
     return joints
 
 
-def _reprojection(
+def reprojection_px(
     joints: np.ndarray, rotation: np.ndarray, position: np.ndarray, matrix: np.ndarray | None, keypoints: np.ndarray
 ) -> np.ndarray:
-    """(F, P) px, distance of the projected joints from their keypoints; NaN where not seen."""
+    """(F, P) px, distance of joints in the world, as a camera there projects them, from keypoints; NaN = not seen."""
     assert matrix is not None
     seen = (joints - position[:, None]) @ np.swapaxes(rotation, 1, 2)
     projected = seen[..., :2] / np.maximum(seen[..., 2:], 1e-3) * np.diagonal(matrix)[:2] + matrix[:2, 2]

@@ -70,6 +70,8 @@ class InMap(NamedTuple):
 class AdjustedWindow:
     """Poses of a window: joints3d (F, 17, 3) m and covariance (F, 17, 6) m^2.
 
+    By the paper's equations 15 joints from initial poses of 15 joints, as older recordings hold.
+
     They are in camera axes with the pelvis at the origin, or, where ``in_map`` is known, in ``map`` (ENU) and metric;
     then only the frames with a result there are in the window.
 
