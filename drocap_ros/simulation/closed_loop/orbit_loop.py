@@ -27,7 +27,7 @@ from drocap_ros.observation import PoseObservation
 from drocap_ros.simulation.keypoint_errors import detect_person
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
-from drocap_ros.simulation.vehicle.autopilot_modes import CONTROL_MODE
+from drocap_ros.simulation.vehicle.autopilot_modes import CONTROL_MODE, HANDED_OVER_MODE
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.copter_reports import Readiness
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
@@ -149,11 +149,10 @@ class OrbitLoop:
         bearing = math.radians(settings.bearing_deg)
         start = np.array([math.cos(bearing), math.sin(bearing), 0.0]) * settings.distance_m
         start += np.array([*joints[0, 0, :2], settings.height_m])
-        handed_over = "LOITER" if settings.autopilot == "px4" else CONTROL_MODE[settings.autopilot]
         self.copter = SimulatedCopter(
             LoopbackTransport(self.up, self.down), start, bearing + math.pi, settings.autopilot,
             wind=np.array(settings.wind_m_s), seed=settings.seed, guid_timeout_s=settings.guid_timeout_s,
-            offboard_loss_s=settings.offboard_loss_s, mode=settings.start_mode or handed_over,
+            offboard_loss_s=settings.offboard_loss_s, mode=settings.start_mode or HANDED_OVER_MODE[settings.autopilot],
             mount=SimulatedMount(settings.mount, settings.camera_pitch_deg), readiness=settings.readiness,
         )  # fmt: skip
         self.rows: list[Row] = []

@@ -9,15 +9,13 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.mavlink.transport import Transport
+from drocap_ros.simulation.vehicle.autopilot_modes import HANDED_OVER_MODE
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.flight_control import Manner, Target
 from drocap_ros.simulation.vehicle.mount import SimulatedMount
 
 #: The mode in which the sticks command velocities.
 STICK_MODE = {"ardupilot": "LOITER", "px4": "POSCTL"}
-#: ArduPilot waits for setpoints in GUIDED.  PX4 enters OFFBOARD only while setpoints stream, so the pilot leaves it
-#: holding and the operator's `engage` requests OFFBOARD.
-HANDED_OVER_MODE = {"ardupilot": "GUIDED", "px4": "LOITER"}
 _CLIMB_M_S, _BRAKING_M_S2, _LAG_S = 1.2, 1.45, 0.35
 _SKIDS_M = 0.1
 _READY_S, _HOVER_S = 1.0, 1.5

@@ -15,6 +15,9 @@ MODES = {
 }  # fmt: skip
 #: The mode in which setpoints steer.
 CONTROL_MODE = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}
+#: The mode in which the pilot hands over: ArduPilot waits for setpoints in GUIDED.  PX4 enters OFFBOARD only while
+#: setpoints stream, so the pilot leaves it holding and the operator's `engage` requests OFFBOARD.
+HANDED_OVER_MODE = {"ardupilot": "GUIDED", "px4": "LOITER"}
 #: m/s, up; of modes that change the height by themselves.
 CLIMB_M_S = {"RTL": 0.5, "LAND": -0.5}
 #: Mode that PX4 enters when the setpoints of OFFBOARD cease, by COM_OBL_RC_ACT; without sticks it lands for 0.
