@@ -131,15 +131,14 @@ def lockstep(
     nodes: Sequence[str],
     *,
     transports: Mapping[str, Transport] | None = None,
-    namespace: str = DEFAULT_NAMESPACE,
 ) -> Iterator[Lockstep]:
-    """Run the named nodes in this thread and in simulated time, while the context lasts.
+    """Run the named nodes in this thread, in simulated time and in the default namespace, while the context lasts.
 
     The caller adds its own endpoints to ``Lockstep.node`` and then calls ``Lockstep.start``.
 
     Parameters
     ----------
-    config, nodes, namespace : as of :func:`bringup`; the DDS domain is a free one
+    config, nodes : as of :func:`bringup`; the DDS domain is a free one
     transports : simulated ends of MAVLink links, by the nodes that own them
 
     Raises
@@ -158,17 +157,12 @@ def lockstep(
         context = Context()
         rclpy.init(args=["--ros-args", "--disable-stdout-logs"], context=context, domain_id=domain_id)
         stack.callback(context.try_shutdown)
-        place: dict[str, Any] = {"context": context, "namespace": namespace, "use_global_arguments": False}
+        place: dict[str, Any] = {"context": context, "namespace": DEFAULT_NAMESPACE, "use_global_arguments": False}
         components: list[ComponentNode] = []
         stack.callback(_close, components)
         for name in names:
             link = {"transport": transports[name]} if transports and name in transports else {}
-            arguments = ["--ros-args", *remaps(namespace)]
-            components.append(
-                node_class(name)(
-                    config.section(name), **link, **place, cli_args=arguments, parameter_overrides=overrides
-                )
-            )  # fmt: skip
+            components.append(node_class(name)(config.section(name), **link, **place, parameter_overrides=overrides))
         observer = Node("bringup", **place, parameter_overrides=overrides[:1])
         stack.callback(observer.destroy_node)
         graph = Lockstep(components, observer)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drocap_ros.evaluation.protocol import protocol_sequences
+from drocap_ros.evaluation.protocol import protocol_sequences, reported
 from drocap_ros.evaluation.tables import markdown_table
 from drocap_ros.evaluation.world_protocol import SHORTEST_S, TelemetryErrors, world_view
 from drocap_ros.reconstruction.reconstruct import reconstruct
@@ -54,19 +54,18 @@ class CalibrationRow:
 def calibration_study(
     folder: Path,
     *,
-    runs: int = 20,
-    seed: int = 0,
-    limit: int | None = None,
-    progress: Callable[[str, float], None] | None = None,
+    runs: int,
+    limit: int | None,
+    progress: Callable[[str, float], None],
 ) -> list[CalibrationRow]:
     """``runs`` flights over the folder's sequences in turn, each with a yaw error and noise of its own."""
     sequences = protocol_sequences(folder, shortest_s=SHORTEST_S, longest_s=SECONDS)[:limit]
     rows = []
-    for run in range(runs):
+    for run in reported(range(runs), runs, "calibration study", progress):
         sequence = sequences[run % len(sequences)]
-        rng = np.random.default_rng([seed, run])
+        rng = np.random.default_rng([0, run])
         yaw = float(rng.uniform(1.0, 3.0) * rng.choice([-1.0, 1.0]))
-        view = world_view(sequence, TelemetryErrors(yaw_deg=yaw, late_s=LATE_S), reverse=True, seed=seed + run)
+        view = world_view(sequence, TelemetryErrors(yaw_deg=yaw, late_s=LATE_S), reverse=True, seed=run)
         windows = reconstruct(view.tracks).meta.get("calibration")
         if windows:
             found = windows[0]
@@ -80,8 +79,6 @@ def calibration_study(
                     (float(found["attitude_latency_std_s"]), float(found["position_latency_std_s"])),
                 )
             )
-        if progress is not None:
-            progress("calibration study", (run + 1) / runs)
     return rows
 
 

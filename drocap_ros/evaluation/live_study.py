@@ -12,7 +12,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.evaluation.protocol import OrbitView, orbit_view, protocol_sequences
+from drocap_ros.evaluation.protocol import OrbitView, orbit_view, protocol_sequences, reported
 from drocap_ros.evaluation.world_protocol import WorldView
 from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.mocap import Sequence
@@ -90,12 +90,10 @@ def live_study(
         raise InputError(f"--limit: expected at least 1, got {limit}")
     sequences = protocol_sequences(folder, limit=limit)
     rows = []
-    for sequence in sequences:
+    for sequence in reported(sequences, len(sequences), "live study", progress):
         view = orbit_view(sequence.x, speed_deg_s, noisy=noisy, seed=seed)
         result = simulate_live(view, delay_s, initializer or InitializerConfig(), adjuster or BundleAdjusterConfig())
         rows.append(_row(sequence, speed_deg_s, noisy, view, result))
-        if progress is not None:
-            progress("live study", len(rows) / len(sequences))
     return rows
 
 

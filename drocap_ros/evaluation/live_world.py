@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.evaluation.live_study import REFINED_AFTER_S, observations
-from drocap_ros.evaluation.protocol import FPS, protocol_sequences
+from drocap_ros.evaluation.protocol import FPS, protocol_sequences, reported
 from drocap_ros.evaluation.tables import markdown_table
 from drocap_ros.evaluation.world_errors import WORLD_HEAD, WorldErrors, world_cells, world_errors
 from drocap_ros.evaluation.world_protocol import LONGEST_S, SHORTEST_S, WorldView, world_view
@@ -57,14 +57,11 @@ def live_world_study(
         When the folder has no such sequence.
     """
     sequences = protocol_sequences(folder, shortest_s=SHORTEST_S, longest_s=LONGEST_S)[::every][:limit]
-    rows = []
-    for index, sequence in enumerate(sequences):
-        row = _row(sequence.name, world_view(sequence, telemetry, seed=index), delay_s)
-        if row is not None:
-            rows.append(row)
-        if progress is not None:
-            progress("live world study", (index + 1) / len(sequences))
-    return rows
+    rows = [
+        _row(sequence.name, world_view(sequence, telemetry, seed=index), delay_s)
+        for index, sequence in enumerate(reported(sequences, len(sequences), "live world study", progress))
+    ]
+    return [row for row in rows if row is not None]
 
 
 def _row(name: str, view: WorldView, delay_s: float) -> LiveWorldRow | None:

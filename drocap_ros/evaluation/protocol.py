@@ -7,8 +7,10 @@ replaced with probability 0.05 by a point uniform within +-300 mm of its true pl
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,6 +18,8 @@ from drocap_ros.errors import InputError
 from drocap_ros.mocap import Sequence, load_mocap, mocap_files, resample
 from drocap_ros.skeleton import BODY_15, BODY_17
 from drocap_ros.tracks import Tracks
+
+T = TypeVar("T")
 
 FPS = 24.0
 ELEVATION_RAD = 0.3
@@ -107,3 +111,11 @@ def _with_noise(flat: np.ndarray, seed: int | list[int]) -> np.ndarray:
     gross = rng.random(flat.shape[:2]) < OUTLIER_PROBABILITY
     thrown = flat + rng.uniform(-OUTLIER_RANGE_MM, OUTLIER_RANGE_MM, flat.shape)
     return np.where(gross[..., None], thrown, noisy)
+
+
+def reported(items: Iterable[T], count: int, stage: str, progress: Callable[[str, float], None] | None) -> Iterator[T]:
+    """The items; reports the share of ``count`` that is done."""
+    for done, item in enumerate(items, 1):
+        yield item
+        if progress is not None:
+            progress(stage, done / count)

@@ -11,7 +11,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import JOINT_GROUPS, group_errors, is_mirrored, mirrored_frames, pa_mpjpe, toe_error
-from drocap_ros.evaluation.protocol import orbit_view, protocol_sequences
+from drocap_ros.evaluation.protocol import orbit_view, protocol_sequences, reported
 from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.mocap import Sequence
 from drocap_ros.reconstruction.methods import METHODS
@@ -106,12 +106,7 @@ def rotation_study(
             raise InputError(f"--{name}: expected at least 1, got {value}")
     sequences = protocol_sequences(folder, limit=limit)
     jobs = [(q, method, speed, noisy, seed) for method in methods for speed in speeds for q in sequences]
-    rows = []
-    for row in _results(jobs, processes):
-        rows.append(row)
-        if progress is not None:
-            progress("rotation study", len(rows) / len(jobs))
-    return rows
+    return list(reported(_results(jobs, processes), len(jobs), "rotation study", progress))
 
 
 def _results(jobs: list[tuple[Sequence, str, float, bool, int]], processes: int) -> Iterator[StudyRow]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.evaluation.protocol import FPS, protocol_sequences
+from drocap_ros.evaluation.protocol import FPS, protocol_sequences, reported
 from drocap_ros.evaluation.tables import markdown_table
 from drocap_ros.evaluation.world_errors import WORLD_HEAD, WorldErrors, world_cells, world_errors
 from drocap_ros.evaluation.world_protocol import LONGEST_S, SHORTEST_S, TELEMETRY, world_view
@@ -30,9 +30,7 @@ class WorldRow:
     errors: WorldErrors
 
 
-def measure_world(
-    sequence: Sequence, telemetry: str = "exact", *, still: bool = False, seed: int = 0, method: str = "ba"
-) -> WorldRow:
+def measure_world(sequence: Sequence, telemetry: str, *, still: bool, seed: int, method: str) -> WorldRow:
     """Reconstruct one view of one sequence and compare it with the truth."""
     view = world_view(sequence, telemetry, still=still, seed=seed)
     motion = reconstruct(view.tracks, method=method)
@@ -68,12 +66,10 @@ def world_study(
         if value is not None and value < 1:
             raise InputError(f"--{name}: expected at least 1, got {value}")
     sequences = protocol_sequences(folder, shortest_s=SHORTEST_S, longest_s=LONGEST_S)[::every][:limit]
-    rows = []
-    for index, sequence in enumerate(sequences):
-        rows.append(measure_world(sequence, telemetry, still=still, seed=seed + index, method=method))
-        if progress is not None:
-            progress("world study", len(rows) / len(sequences))
-    return rows
+    return [
+        measure_world(sequence, telemetry, still=still, seed=seed + index, method=method)
+        for index, sequence in enumerate(reported(sequences, len(sequences), "world study", progress))
+    ]
 
 
 def world_means(rows: list[WorldRow]) -> WorldErrors:

@@ -35,7 +35,7 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
     """A component with a life cycle.
 
     A subclass declares its endpoints in its constructor, which ends with :meth:`set_up`, and implements the
-    transitions in :meth:`acquire`, :meth:`begin`, :meth:`pause` and :meth:`release`.  Messages that arrive while it is
+    transitions in :meth:`acquire`, :meth:`begin` and :meth:`release`.  Messages that arrive while it is
     not active are dropped.
     """
 
@@ -79,9 +79,6 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
 
     def begin(self) -> None:
         """Start the output."""
-
-    def pause(self) -> None:
-        """Stop the output and keep the resource."""
 
     def release(self) -> None:
         """Release the resource; also called at the end, then perhaps a second time."""
@@ -142,9 +139,8 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
         return SUCCESS
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop the output."""
+        """Stop the output: messages are dropped, and a source's thread publishes nothing."""
         self.active = False
-        self.pause()
         self._enter(INACTIVE)
         return SUCCESS
 

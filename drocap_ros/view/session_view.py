@@ -12,8 +12,8 @@ from drocap_ros.view.message_view import MessageView
 def draw_session(
     view: MessageView,
     session: Session,
-    namespace: str | None = None,
-    progress: Callable[[str, float], None] | None = None,
+    namespace: str | None,
+    progress: Callable[[str, float], None],
 ) -> None:
     """Draw a recording's messages in the order of the recording.
 
@@ -31,8 +31,7 @@ def draw_session(
     start_ns, duration_ns = session.info.start_ns or 0, max(session.info.duration_s * 1e9, 1.0)
     for raw, message in session.messages(tuple(named)):
         view.take(named[raw.topic], message, raw.log_time_ns)
-        if progress is not None:
-            progress("messages", (raw.log_time_ns - start_ns) / duration_ns)
+        progress("messages", (raw.log_time_ns - start_ns) / duration_ns)
     view.finish()
 
 

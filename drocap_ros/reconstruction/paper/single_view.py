@@ -36,7 +36,7 @@ class SingleViewFit:
 
 
 def initialize(
-    w: np.ndarray, information: np.ndarray, dictionary: Dictionary, config: InitializerConfig | None = None
+    w: np.ndarray, information: np.ndarray, dictionary: Dictionary, config: InitializerConfig
 ) -> SingleViewFit:
     """Poses of all frames: viewpoint search, choice over time, sparse refinement within EM over the 2D joints.
 
@@ -45,7 +45,6 @@ def initialize(
     w : (F, P, 2) centred joints in units of their standard deviation, 0 where the information is 0
     information : (F, P, 3) of :func:`~drocap_ros.reconstruction.paper.reprojection.information_from`
     """
-    config = config or InitializerConfig()
     measured = information
     dense = search_viewpoints(w, information, dictionary, config)
     path = choose_path(dense.cost, dense.camera_shape, config.switch_cost)
