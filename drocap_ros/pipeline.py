@@ -165,7 +165,7 @@ def _track(
 ) -> tuple[Tracks, dict[str, Any]]:
     # Offline the most frequent subject of the whole recording is chosen at the end.
     settings, begin_ns = dataclasses.replace(config.pose_estimator, on_loss="next"), None
-    folder, clip = models_folder(models or settings.models_dir or None), selection.clip
+    folder, clip = models_folder(models or settings.models_dir), selection.clip
     try:
         if selection.person is not None:
             with open_images(path, config.image_ingest) as images:

@@ -101,7 +101,7 @@ def setup_of(config: DrocapConfig, models: Path | None = None) -> Setup:
             if ingest.calibration_file
             else f"{ingest.horizontal_fov_deg:g} deg wide as stated"
         )
-    folder = models_folder(models or config.pose_estimator.models_dir or None)
+    folder = models_folder(models or config.pose_estimator.models_dir)
     present = folder.is_dir() and any(folder.glob("*.onnx"))
     return Setup(
         camera_matrix=matrix, image_size=size, camera_words=words, calibrated=bool(ingest.calibration_file),

@@ -113,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
     config = config.replace("pose_estimator", **rule)
     telemetry, selection = _telemetry(args), Selection(clip_of(args), person, args.redetect)
     if needs_networks(args.input, args.redetect):
-        ensure_networks(models_folder(args.models or config.pose_estimator.models_dir or None), args.input, args)
+        ensure_networks(models_folder(args.models or config.pose_estimator.models_dir), args.input, args)
     with progress_bars(args.quiet) as progress:
         motion, tracks = reconstruct_input(
             args.input,

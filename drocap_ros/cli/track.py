@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     refuse_inputs([out / "persons.jpg"] if args.list else [out / "overlay.mp4"] * args.overlay, [args.video])
     clip, (person, rule) = clip_of(args), parse_subject(args.subject)
     config, ingest = _configs(args, rule)
-    folder = models_folder(args.models or config.models_dir or None)
+    folder = models_folder(args.models or config.models_dir)
     ensure_networks(folder, args.video, args)
     with output_folder(out) as target, progress_bars(args.quiet) as progress:
         begin_ns, persons = None, []

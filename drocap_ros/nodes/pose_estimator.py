@@ -45,7 +45,7 @@ class PoseEstimatorNode(ManagedComponent):
 
     def acquire(self) -> None:
         """Load the networks."""
-        self._estimator = PoseEstimator(models_folder(self.config.models_dir or None), self.config)
+        self._estimator = PoseEstimator(models_folder(self.config.models_dir), self.config)
         if self._estimator.limited_use:
             self.details[Key.NETWORKS] = self._estimator.limited_use
 

@@ -113,7 +113,7 @@ def _resolved(arguments: argparse.Namespace) -> argparse.Namespace:
 
     values = dict(vars(arguments))
     config = load_config(arguments.config)
-    values["models"] = models_folder(arguments.models or config.pose_estimator.models_dir or None)
+    values["models"] = models_folder(arguments.models or config.pose_estimator.models_dir)
     relative = {k: v for k, v in values.items() if isinstance(v, Path) and v != NO_TELEMETRY}
     return argparse.Namespace(**values | {name: path.absolute() for name, path in relative.items()})
 
