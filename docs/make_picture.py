@@ -37,7 +37,7 @@ SHOWN, EARLIER = 101, (5, 21, 37, 53, 69, 85)
 LEFT_PX, RIGHT_PX, TALL_PX = 440, 840, 560
 #: View of the right panel: turned from the side of the walked path, from above; half the ground's width.
 TURN_DEG, ELEVATION_DEG, GROUND_M = -8.0, 22.0, 12.0
-LEFT, RIGHT, MIDDLE = "#e4572e", "#2e86de", "#3fb56f"
+LEFT, RIGHT, MIDDLE = "#2e86de", "#e4572e", "#3fb56f"
 
 
 def capture() -> tuple[np.ndarray, Motion, np.ndarray]:

@@ -7,13 +7,14 @@ import numpy as np
 from drocap_ros.observation import PoseObservation
 from drocap_ros.skeleton import side_of
 
-_COLOURS = {"left": (60, 60, 255), "right": (255, 160, 40), "middle": (90, 220, 90)}
+#: BGR; the sides as in the markers and the viewer.
+_COLOURS = {"left": (255, 160, 40), "right": (60, 60, 255), "middle": (90, 220, 90)}
 #: Radius of the ellipses in standard deviations.
 _SIGMAS = 2.0
 
 
 def draw(image: np.ndarray, observation: PoseObservation) -> np.ndarray:
-    """Copy of the image (H, W, 3) uint8 BGR with box, bones and 2-sigma ellipses; left red, right blue.
+    """Copy of the image (H, W, 3) uint8 BGR with box, bones and 2-sigma ellipses; right red, left blue.
 
     A predicted box has a thin line.
     """
