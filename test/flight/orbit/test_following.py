@@ -18,9 +18,9 @@ from drocap_ros.flight.vehicle_state import VehicleState
 MAX_ECHO_AGE_S = 0.5
 
 
-def vehicle(autopilot, speed):
+def vehicle(autopilot, speed, north=0.0):
     return VehicleState(
-        stamp_ns=0, autopilot=autopilot, mode="GUIDED", armed=True, position_enu_m=np.zeros(3),
+        stamp_ns=0, autopilot=autopilot, mode="GUIDED", armed=True, position_enu_m=np.array([0.0, north, 0.0]),
         velocity_enu_m_s=np.array([0.0, speed, 0.1]), orientation_xyzw=np.array([0, 0, 0, 1.0]),
         angular_velocity_flu_rad_s=np.zeros(3), position_ok=True, gimbal_orientation_xyzw=np.full(4, np.nan),
         link_age_s=0.0,
@@ -31,8 +31,13 @@ def setpoint(x, vx):
     return SimpleNamespace(x=x, y=0.0, vx=vx, vy=0.0)
 
 
-def fly(echo_of, seconds=6.0, autopilot="ardupilot", commanded=2.0, flown=lambda t: 2.0, trip_s=math.nan):
-    """(time, evidence) of the first step that does not follow; ``echo_of(t, x)`` is the echo, where the path is x."""
+def fly(
+    echo_of, seconds=6.0, autopilot="ardupilot", commanded=2.0, flown=lambda t: 2.0, trip_s=math.nan, place=None
+):  # fmt: skip
+    """(time, evidence) of the first step that does not follow; ``echo_of(t, x)`` is the echo, where the path is x.
+
+    place : north (m) of the vehicle at a time; None = at the setpoint
+    """
     following, sent, echoed = Following(MAX_ECHO_AGE_S), [], None
     for i in range(1, round(seconds * 20)):
         t = i / 20
@@ -40,7 +45,8 @@ def fly(echo_of, seconds=6.0, autopilot="ardupilot", commanded=2.0, flown=lambda
         if i % 2 == 0 and (echo := echo_of(t - 0.1, x - 0.1 * commanded)) is not None:
             echoed = (t, echo)
         judged = None if echoed is None else (t - echoed[0], echoed[1])
-        if evidence := following.step(t, t, sent, judged, vehicle(autopilot, flown(t)), trip_s):
+        seen = vehicle(autopilot, flown(t), x - commanded / 20 if place is None else place(t))
+        if evidence := following.step(t, t, sent, judged, seen, trip_s):
             return t, evidence
         sent = [*sent[-79:], (t, setpoint(x, commanded))]
     return math.inf, ""
@@ -103,6 +109,16 @@ def test_a_slow_command_and_a_vehicle_in_wind_are_no_evidence():
     assert fly(lambda t, x: None, flown=lambda t: 0.9) == (math.inf, "")
 
 
+def test_a_vehicle_that_stands_or_springs_back_before_a_place_does_not_follow():
+    """The reference waits before a vehicle that stands: its speed falls, and the way to its place remains."""
+    t, evidence = fly(lambda t, x: None, commanded=0.1, flown=lambda t: 0.1, place=lambda t: -1.5)
+    assert 2.0 <= t <= 2.2
+    assert evidence == "it flies at 0.1 m/s where 1.1 m/s are commanded"
+    assert fly(lambda t, x: None, commanded=0.1, flown=lambda t: -1.0, place=lambda t: -1.2)[0] <= 2.2
+    assert fly(lambda t, x: None, commanded=0.1, flown=lambda t: 0.3, place=lambda t: -1.5) == (math.inf, "")
+    assert fly(lambda t, x: None, commanded=0.0, flown=lambda t: 0.0, place=lambda t: -0.5) == (math.inf, "")
+
+
 def test_each_orbit_is_judged_anew():
     following = Following(MAX_ECHO_AGE_S)
     sent = [(0.05 * i, setpoint(0.1 * i, 2.0)) for i in range(60)]
@@ -144,10 +160,14 @@ def test_no_recorded_flight_of_a_real_autopilot_counts_as_standing(shared):
         if "setpoint_time_s" not in flight or not path.name.startswith(("orbit", "px4_stand", "px4_walk")):
             continue
         following, time = Following(MAX_ECHO_AGE_S), flight["time_s"]
-        for at, (vn, ve) in zip(flight["setpoint_time_s"], flight["setpoint_velocity_m_s"][:, :2], strict=True):
-            flown = [np.interp(at - 0.1, time, flight["velocity_m_s"][:, i]) for i in range(3)]
-            state = dataclasses.replace(vehicle("px4", 0.0), velocity_enu_m_s=np.array(flown))
-            command = SimpleNamespace(x=0.0, y=0.0, vx=float(vn), vy=float(ve))
+        sent = np.hstack([flight["setpoint_position_m"][:, :2], flight["setpoint_velocity_m_s"][:, :2]])
+        for at, (east, north, ve, vn) in zip(flight["setpoint_time_s"], sent, strict=True):
+            flown, place = (
+                np.array([np.interp(at - 0.1, time, flight[name][:, i]) for i in range(3)])
+                for name in ("velocity_m_s", "position_m")
+            )
+            state = dataclasses.replace(vehicle("px4", 0.0), velocity_enu_m_s=flown, position_enu_m=place)
+            command = SimpleNamespace(x=float(north), y=float(east), vx=float(vn), vy=float(ve))
             assert following.step(at, at + 1.0, [(at, command)], None, state) == "", path.name
             judged += 1
     assert judged > 3000
