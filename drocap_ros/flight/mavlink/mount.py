@@ -25,6 +25,7 @@ SERVOS = 1
 
 _YAW_IN_VEHICLE_FRAME, _YAW_IN_EARTH_FRAME, _YAW_LOCK = 32, 64, 16
 _STALE_S = {"gimbal": 3.0, "servo": 0.5}  # the angles of servos follow the body's lean
+_UNKNOWN_S = 0.5  # without angles, from a mount that reports and does not know them
 _STEP_S = 0.25
 #: A servo follows its demanded angle this much later: a frame of its signal, and its turning.
 _SERVO_DELAY_S = 0.05
@@ -46,6 +47,7 @@ class Mount:
         self.type_number = math.nan
         self._latest: _Angles | None = None
         self._before: _Angles | None = None
+        self._knows = True  # whether its last message had angles
 
     @property
     def kind(self) -> str:
@@ -56,9 +58,15 @@ class Mount:
             return "servo"
         return "" if self._latest is None else "gimbal"
 
+    @property
+    def _stale_s(self) -> float:
+        """Greatest age of the angles in s: less where the mount still reports, and not its angles (NaN)."""
+        return min(_STALE_S.get(self.kind, math.inf), math.inf if self._knows else _UNKNOWN_S)
+
     def take(self, message: Any, now_ns: int) -> None:
         """Take a message of the mount."""
         angles = _READERS[message.get_type()](message)
+        self._knows = angles is not None
         if angles is not None:
             self._before, self._latest = self._latest, _Angles(now_ns, *angles)
 
@@ -78,7 +86,7 @@ class Mount:
             return condition(ConditionCode.CAMERA_UNKNOWN)
         if self._kind == "auto" and autopilot == "ardupilot" and math.isnan(self.type_number):
             return condition(ConditionCode.MOUNT_TYPE_UNKNOWN, name=TYPE_PARAMETER)
-        if self.age_s(now_ns) > _STALE_S.get(self.kind, math.inf):
+        if self.age_s(now_ns) > self._stale_s:
             return condition(ConditionCode.MOUNT_OUTDATED, age_s=self.age_s(now_ns))
         return None
 
@@ -91,7 +99,7 @@ class Mount:
         """
         if self.kind == "fixed":
             return orientation_to_ros(quaternion_multiply(body, self._fixed))
-        if self._latest is None or self.age_s(received_ns) > _STALE_S[self.kind]:
+        if self._latest is None or self.age_s(received_ns) > self._stale_s:
             return np.full(4, np.nan)
         latest, before = self._latest, self._before
         angles = latest.quaternion

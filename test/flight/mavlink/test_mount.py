@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from drocap_ros.config import load_config
 from drocap_ros.errors import ParameterError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.frames import orientation_to_aviation, orientation_to_ros, quaternion_from_euler
 from drocap_ros.flight.mavlink.mount import Mount
 
@@ -87,3 +88,16 @@ def test_an_old_configuration_is_refused_instead_of_flown_with_the_wrong_sign(tm
     with pytest.raises(ParameterError, match=r"camera_mount_pitch_deg .*camera_pitch_deg.* negative .*sign"):
         load_config(path)
     assert "camera_mount_pitch_deg" not in MavlinkBridgeConfig.__dataclass_fields__
+
+
+def test_a_mount_that_reports_no_angles_is_outdated_sooner_than_a_silent_one():
+    mount = Mount("gimbal")
+    mount.take(report(0, -20, 0), S)
+    unknown = mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, 0, FLAGS, [math.nan] * 4, 0, 0, 0, 0)
+    assert mount.problem("px4", round(2.9 * S)) is None
+    mount.take(unknown, round(1.1 * S))
+    assert mount.problem("px4", round(1.4 * S)) is None  # a few are lost
+    assert mount.problem("px4", round(1.6 * S)).code == ConditionCode.MOUNT_OUTDATED
+    assert np.isnan(mount.camera_at(NOSE_DOWN, round(1.6 * S))).all()
+    mount.take(report(0, -20, 0), round(1.7 * S))
+    assert mount.problem("px4", round(2.3 * S)) is None
