@@ -80,6 +80,8 @@ class ConditionCode(enum.IntEnum):
     MOUNT_TYPE_UNKNOWN = 123
     MOUNT_OUTDATED = 124
     PACKETS_LOST = 125
+    AUTOPILOT_EMERGENCY = 126
+    AUTOPILOT_CRITICAL = 127
     # Others in the graph
     OTHER_POSE_PUBLISHER = 130
     SECOND_BRIDGE = 131
@@ -181,6 +183,9 @@ _SENTENCES = {
     _C.MOUNT_OUTDATED: "the camera's attitude is outdated; last report of its mount: {ago}",
     _C.PACKETS_LOST: "{lost_percent:.0f} % of the autopilot's packets do not arrive: above {most_percent:.0f} % no "
     "mode is requested; let routers pass all of them, or mend the link",
+    _C.AUTOPILOT_EMERGENCY: "the autopilot reports {reported}: take over by hand",
+    _C.AUTOPILOT_CRITICAL: "the autopilot reports {reported}: one of its failsafes has triggered; the ground station "
+    "shows the cause",
     _C.OTHER_POSE_PUBLISHER: "pose2d has more than one publisher ({names}): stop the others, or give them another "
     "namespace",
     _C.SECOND_BRIDGE: "another bridge, or a replay of one, publishes in {namespace}: stop it, or give it another "

@@ -245,8 +245,8 @@ class MavlinkBridgeNode(ComponentNode):
             self.report(WARN, f"no autopilot on {self.config.url}: {silence}; {remedy}")
         elif safety.state in (State.HOLDING, State.TAKEN_OVER, State.FAULT):
             self.report(ERROR if safety.state == State.FAULT else WARN, f"{safety.state.name.lower()}: {safety.reason}")
-        elif status.refused:
-            self.report(WARN, f"the autopilot refuses to send {', '.join(sorted(status.refused))}")
+        elif warning := status.warning():
+            self.report(WARN, warning)
         elif self._link.settings.warning():
             self.report(WARN, self._link.settings.warning())
         else:

@@ -214,6 +214,7 @@ class MavlinkLink:
             bad_count=self._parser.bad_count,
             refused_count=self._parser.refused_count,
             unknown_count=self._parser.unknown_count,
+            critical=self.estimator.modes.system_status == mavlink.MAV_STATE_CRITICAL,
         )
 
     def _read(self, timeout_s: float) -> bytes:

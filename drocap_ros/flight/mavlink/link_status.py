@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 
@@ -16,6 +17,7 @@ class LinkStatus(NamedTuple):
     bad_count : pieces of data that were no message, or not signed correctly
     refused_count : of these, whole messages that were not signed with our key
     unknown_count : messages whose number we do not know
+    critical : whether the autopilot reports a critical state: one of its failsafes has triggered
     """
 
     connected: bool
@@ -26,3 +28,17 @@ class LinkStatus(NamedTuple):
     bad_count: int
     refused_count: int = 0
     unknown_count: int = 0
+    critical: bool = False
+
+    def warning(self) -> str:
+        """What a flight over this link lacks, in words; "" = nothing."""
+        if self.critical:
+            return "the autopilot reports a critical state: one of its failsafes has triggered; no orbit can begin"
+        if self.refused:
+            return f"the autopilot refuses to send {', '.join(sorted(self.refused))}"
+        if math.isnan(self.round_trip_s):
+            return (
+                "the autopilot has never answered time synchronization: a late link to it is not noticed, and pictures "
+                "are not matched to its clock; let the router pass TIMESYNC"
+            )
+        return ""

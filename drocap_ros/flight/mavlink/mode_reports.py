@@ -49,12 +49,13 @@ class ModeReports:
         present mode; "" = unknown.  PX4 keeps it where a failsafe enters another mode.
     vehicle_type : MAV_TYPE, by the last heartbeat
     armed : by the last heartbeat
+    system_status : MAV_STATE, by the last heartbeat; 0 = unknown
     received_ns : reception of the newest report that did not arrive late
     """
 
     def __init__(self) -> None:
         self.autopilot = self.mode = self.intended = ""
-        self.vehicle_type = 0
+        self.vehicle_type = self.system_status = 0
         self.armed = False
         self.received_ns: int | None = None
         self._heartbeat: Any = None
@@ -68,6 +69,7 @@ class ModeReports:
         self.autopilot, self.vehicle_type = _AUTOPILOTS.get(message.autopilot, "other"), int(message.type)
         if not late:
             self.armed = bool(message.base_mode & _MAV_MODE_FLAG_SAFETY_ARMED)
+            self.system_status = int(message.system_status)
         # The mode that is intended belongs to the mode with which it was reported.
         mode = _mode_name(message)
         self._take(mode, self.intended if mode == self.mode else "", message.get_seq(), late, now_ns)

@@ -24,7 +24,7 @@ from drocap_ros.flight.orbit.control_status import ControlStatus, widened_condit
 from drocap_ros.flight.orbit.degradation import slowed
 from drocap_ros.flight.orbit.following import Following, Keeping
 from drocap_ros.flight.orbit.last_setpoint import coast_speed, harmless, slowed_condition
-from drocap_ros.flight.orbit.observer import observe, position_jump_m
+from drocap_ros.flight.orbit.observer import PositionJumps, observe
 from drocap_ros.flight.orbit.planner import (
     OrbitGoal,
     OrbitState,
@@ -85,7 +85,6 @@ class OrbitController:
         self._framing = Framing(config)
         self._guard = Guard(config, config, config.braking_m_s2)
         self._vehicle: VehicleState | None = None
-        self._placed: VehicleState | None = None  # the last one whose position was known: it may jump from there
         self._commands: deque[OperatorCommand] = deque()
         self._answers: list[tuple[OperatorCommand, CommandAnswer]] = []
         self._queue = CommandQueue()
@@ -97,7 +96,7 @@ class OrbitController:
         self._shortfall = Shortfall()
         self._before: tuple[int, float] | None = None
         self._fallback: Setpoint | None = None  # what the watchdog holds if this loop hangs
-        self._jump_m = 0.0  # of the reported position, since the last step
+        self._jumps = PositionJumps()
         self._gimbal_s = -1e18
         #: Another one that commands or is followed, found in the graph; any thread may set it.
         self.intruder: Condition | None = None
@@ -107,8 +106,7 @@ class OrbitController:
     def on_state(self, state: VehicleState) -> None:
         """Take a state of the vehicle."""
         with self._lock:
-            if np.isfinite(state.position_enu_m).all():
-                self._jump_m, self._placed = max(self._jump_m, position_jump_m(self._placed, state)), state
+            self._jumps.take(state)
             self._vehicle = state
             self._history.add(state)
             self._subject.height_wanders = state.autopilot == "px4"
@@ -210,8 +208,7 @@ class OrbitController:
         jump_s = (now_ns - before[0]) / _NS - dt
         if abs(jump_s) > _CLOCK_JUMP_S:
             return condition(ConditionCode.CLOCK_JUMPED, jump_s=jump_s), dt, hung
-        jump_m, self._jump_m = self._jump_m, 0.0
-        if jump_m > 0:
+        if (jump_m := self._jumps.pop()) > 0:
             return condition(ConditionCode.POSITION_JUMPED, jump_m=jump_m), dt, hung
         if hung or dt > self._config.watchdog_s:
             return condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=dt), dt, hung

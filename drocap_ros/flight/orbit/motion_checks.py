@@ -23,6 +23,9 @@ _CARRIED_OFF, _CARRIED_OFF_S = 3.0, 1.0  # times that limit: beyond the 3.7 m be
 _LONGEST_AWAY_S = 20.0  # behind walking subjects in 8 m/s of wind: 10 s
 #: The clocks of image and step differ by a transmission at most.
 _FUTURE_S = 0.2
+_MAV_STATE_CRITICAL = 5
+#: MAV_STATE of a vehicle that nobody should command: PX4 reports the first for stopped motors.
+_EMERGENCIES = {6: "an emergency", 7: "that it is shutting down", 8: "that the flight is terminated"}
 _LANDED_STATES = {LANDED_ON_GROUND: "on the ground", LANDED_TAKEOFF: "taking off", LANDED_LANDING: "landing"}
 #: PX4's COM_OBL_RC_ACT but for hold (5), land (4) and return (3).
 _LOSS_ACTIONS = {
@@ -67,6 +70,8 @@ def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
     if seen.landed_state in _LANDED_STATES or (seen.autopilot == "px4" and seen.landed_state != LANDED_IN_AIR):
         landed = _LANDED_STATES.get(seen.landed_state, "not reported to be in the air (EXTENDED_SYS_STATE)")
         return condition(_C.NOT_FLYING, landed_state=landed)
+    if seen.system_status in _EMERGENCIES:
+        return condition(_C.AUTOPILOT_EMERGENCY, reported=_EMERGENCIES[seen.system_status])
     if seen.gps_fix_type < 3:
         return condition(_C.NO_SATELLITE_FIX, fix_type=seen.gps_fix_type)
     if not seen.position_ok:
@@ -75,6 +80,17 @@ def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
         return condition(_C.STATUS_OUTDATED, age_s=seen.status_age_s)
     battery = battery_condition(seen.battery_fraction, seen.battery_voltage_v, safety)
     return battery or seen.camera_problem or seen.intruder
+
+
+def start_condition(seen: Observed) -> Condition | None:
+    """Why no orbit may begin; one that is flown goes on.
+
+    ArduPilot reports a critical state while a failsafe has triggered that it was told to ignore in GUIDED: of the
+    battery, the radio, the ground station; PX4 while a failsafe acts.
+    """
+    if seen.system_status == _MAV_STATE_CRITICAL:
+        return condition(_C.AUTOPILOT_CRITICAL, reported="a critical state")
+    return None
 
 
 def battery_condition(charge: float, volts: float, safety: SafetyConfig) -> Condition | None:

@@ -18,6 +18,7 @@ from drocap_ros.geometry.rotations import matrix_from_quaternion
 _NS = 1_000_000_000
 _MAX_EXTRAPOLATION_S = 0.3
 _POSITION_JUMP_M, _JUMP_PERIOD_S = 1.0, 0.5
+_FADES_S = 4.0  # in recorded flights of both autopilots the steps added up to 0.2 m at most
 #: Modes that PX4 enters for the loss of setpoints, by COM_OBL_RC_ACT; without the setting any mode may be it.
 _LOSS_MODES = {3: "RTL", 4: "LAND", 5: "LOITER"}
 #: MAV_TYPE of the vehicles for which the control was made: multirotors, and a helicopter under the same autopilot.
@@ -80,7 +81,8 @@ def observe(
         mode=latest.mode, in_control=latest.mode == dialect.control_mode,
         in_hold=latest.mode == dialect.hold_mode, heard=heard | {latest.mode},
         left_by_itself=estimator.modes.intended == dialect.control_mode != latest.mode == loss_mode,
-        armed=latest.armed, landed_state=latest.landed_state, link_age_s=latest.link_age_s,
+        armed=latest.armed, system_status=estimator.modes.system_status, landed_state=latest.landed_state,
+        link_age_s=latest.link_age_s,
         heartbeat_age_s=estimator.modes.age_s(now_ns),
         state_age_s=abs(age_s),
         position_age_s=max(
@@ -102,15 +104,38 @@ def observe(
     )  # fmt: skip
 
 
-def position_jump_m(before: VehicleState | None, state: VehicleState) -> float:
-    """Distance in m of the reported position from where the state before it led; 0 = near enough."""
-    if before is None:
-        return 0.0
-    # Stamps may jump with the position, as where the autopilot restarts: the way since then is bounded all the same.
-    dt = min(max((state.stamp_ns - before.stamp_ns) / _NS, 0.0), _JUMP_PERIOD_S)
-    mean = 0.5 * (before.velocity_enu_m_s + state.velocity_enu_m_s)
-    jump = float(np.linalg.norm(state.position_enu_m - before.position_enu_m - mean * dt))
-    return jump if jump > _POSITION_JUMP_M else 0.0  # NaN is no jump
+class PositionJumps:
+    """Finds jumps of the reported position: one step, or small ones that add up, as of an estimator that is reset."""
+
+    def __init__(self) -> None:
+        self._before: VehicleState | None = None  # the last one whose position was known
+        self._drift = np.zeros(3)  # m, that velocity does not explain, and that fades
+        self._greatest_m = 0.0
+
+    def take(self, state: VehicleState) -> None:
+        """Take a state of the vehicle; one without a position is left out, and the next may jump from before it."""
+        if not np.isfinite(state.position_enu_m).all():
+            return
+        before, self._before = self._before, state
+        if before is None:
+            return
+        since_s = (state.stamp_ns - before.stamp_ns) / _NS
+        # Stamps may jump with the position, as where the autopilot restarts: the way since then is bounded anyway.
+        dt = min(max(since_s, 0.0), _JUMP_PERIOD_S)
+        mean = 0.5 * (before.velocity_enu_m_s + state.velocity_enu_m_s)
+        step = state.position_enu_m - before.position_enu_m - mean * dt
+        if not np.isfinite(step).all():
+            return
+        known = 0.0 <= since_s <= _JUMP_PERIOD_S
+        self._drift = math.exp(-dt / _FADES_S) * self._drift + (step if known else 0.0)
+        jump_m = max(float(np.linalg.norm(step)), float(np.linalg.norm(self._drift)))
+        if jump_m > _POSITION_JUMP_M:
+            self._greatest_m, self._drift = max(self._greatest_m, jump_m), np.zeros(3)
+
+    def pop(self) -> float:
+        """Greatest jump in m since the last call; 0 = none."""
+        greatest_m, self._greatest_m = self._greatest_m, 0.0
+        return greatest_m
 
 
 def _yaw(vehicle: VehicleState) -> float:

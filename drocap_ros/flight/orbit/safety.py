@@ -12,6 +12,7 @@ from drocap_ros.flight.orbit.hold import begin_hold, request_hold_mode, resumpti
 from drocap_ros.flight.orbit.motion_checks import (
     keeping_condition,
     limit_condition,
+    start_condition,
     subject_condition,
     vehicle_condition,
 )
@@ -53,7 +54,7 @@ def reduce(
     """
     vehicle = vehicle_condition(seen, limits)
     place = None if vehicle else limit_condition(seen, state.fence_centre, limits)
-    problem = vehicle or place or subject_condition(seen, limits)
+    problem = vehicle or place or subject_condition(seen, limits) or start_condition(seen)
     state = watch(state, seen, now_s, limits)
     lost_s, seen_s = state.lost_s, state.seen_s
     # However late it is heard: a mode of somebody else is a take-over.

@@ -14,7 +14,7 @@ from drocap_ros.flight.orbit.states import Limits, Observed, SafetyState, State
 #: heartbeats of PX4, and than packets that were late and arrive after newer ones.
 _STEADY_S = 1.3
 _DEFAULT_TIMEOUT_S = 0.5
-#: Out of sight for longer, the reported position may have jumped unseen (observer.position_jump_m).
+#: Out of sight for longer, the reported position may have jumped unseen (observer.PositionJumps).
 _UNSEEN_S = 0.25
 
 

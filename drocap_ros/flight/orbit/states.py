@@ -59,6 +59,7 @@ class Observed:
     in_control, in_hold : the mode is GUIDED or OFFBOARD; it is the autopilot's hold mode
     heard : all modes that were reported since the last step, late ones too; empty = the mode alone
     left_by_itself : whether the autopilot left the control mode as for the loss of setpoints, and nobody chose this
+    system_status : MAV_STATE of the autopilot; 0 = unknown
     heartbeat_age_s : since the newest report of the mode
     position_age_s : since the reported position last changed, so frozen telemetry ages too
     round_trip_s : since the sending of the message that was answered last; NaN = no answer yet
@@ -86,6 +87,7 @@ class Observed:
     heard: frozenset[str] = frozenset()
     left_by_itself: bool = False
     armed: bool = False
+    system_status: int = 0
     landed_state: int = 0
     link_age_s: float = math.inf
     heartbeat_age_s: float = math.inf

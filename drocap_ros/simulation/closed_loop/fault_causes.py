@@ -11,6 +11,7 @@ from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings
 
 FRAME_S = 0.17  # period of the images and their latency: the earliest sign of a fault of perception
 HEARTBEAT_S = 0.21  # mode and status arrive at 5 Hz
+HEARTBEAT_PX4_S = 1.05  # PX4 sends its heartbeat once a second, whatever is requested
 LINK_S = 0.05  # to the next setpoint or telemetry message
 ECHO_S = 0.65  # the simulated autopilot repeats its echo for 0.5 s at 10 Hz
 DELAY_S = 1.0  # of a delayed link

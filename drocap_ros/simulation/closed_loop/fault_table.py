@@ -17,6 +17,7 @@ from drocap_ros.simulation.closed_loop.fault_causes import (
     DELAYED,
     ECHO_S,
     FRAME_S,
+    HEARTBEAT_PX4_S,
     HEARTBEAT_S,
     JUMPED,
     LINK_S,
@@ -69,6 +70,17 @@ from drocap_ros.simulation.closed_loop.fault_injections import (
     wrong_ground,
 )
 from drocap_ros.simulation.closed_loop.orbit_loop import with_config
+from drocap_ros.simulation.closed_loop.report_injections import (
+    CRITICAL,
+    ECHO,
+    EMERGENCY,
+    TIME_SYNC,
+    at_least,
+    never_sends,
+    reports_state,
+    small_steps,
+    unknown_mount,
+)
 
 _C = ConditionCode
 _LOCATED = (_C.SUBJECT_OUTDATED, _C.NO_SUBJECT)
@@ -278,4 +290,33 @@ _REAL = (
     ),
 )  # fmt: skip
 
-FAULTS: tuple[Fault, ...] = (*_PERCEPTION, *_PROCESS, *_LINK, *_VEHICLE, *_PILOT, *_OPERATOR, *_SUBJECT, *_REAL)
+#: Reports that are wrong, missing or alarming.
+_REPORTS = (
+    Fault(
+        "setpoints alone are lost for 4 s, and no echo ever came", drop_setpoints, LINK_S, cause=TIMEOUT,
+        codes=_NOT_FOLLOWED, before=((0.0, never_sends(ECHO)), (4.0, start)),
+        later=(4.0, assign("up", drops=lambda packet: False)),
+    ),
+    Fault(
+        "the autopilot's position steps by 0.9 m again and again", small_steps(0.9), harmless=True,
+        codes=(_C.POSITION_JUMPED,), check=at_least(4.5),
+    ),
+    Fault(
+        "the autopilot reports an emergency", reports_state(EMERGENCY), HEARTBEAT_PX4_S,
+        codes=(_C.AUTOPILOT_EMERGENCY,),
+    ),
+    Fault("the autopilot reports a critical state", reports_state(CRITICAL), harmless=True),
+    Fault(
+        "the autopilot reports a critical state while idle", _ENGAGE, harmless=True, state=State.IDLE,
+        before=((2.0, reports_state(CRITICAL)),), codes=(_C.AUTOPILOT_CRITICAL,), check=no_orbit,
+    ),
+    Fault(
+        "TIMESYNC is never answered", lambda loop: None, harmless=True,
+        before=((0.0, never_sends(TIME_SYNC)), (4.0, start)),
+    ),
+    Fault("the mount reports no angles", unknown_mount, 0.5 + FRAME_S, codes=(_C.MOUNT_OUTDATED, *_LOCATED)),
+)  # fmt: skip
+
+FAULTS: tuple[Fault, ...] = (
+    *_PERCEPTION, *_PROCESS, *_LINK, *_VEHICLE, *_PILOT, *_OPERATOR, *_SUBJECT, *_REAL, *_REPORTS,
+)  # fmt: skip
