@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from drocap_ros.geometry.interpolation import MAX_GAP_S
 from drocap_ros.geometry.rotations import exp_so3, project_to_so3
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
@@ -153,12 +154,15 @@ def refine_in_world(
     )
     turn = project_to_so3(_at_all_slots(rotation, slot))
     poses_at = body * poses.factor
-    if reason := frozen(turn, path, fps) or turned_at_once(turn, fps):
-        return reason
+    parts = _parts(tracks.stamp_ns, slot)
+    for part in parts:
+        if reason := frozen(turn[part], path[part], fps) or turned_at_once(turn[part], fps):
+            return reason
     still = None if poses.still is None else _at_all_slots(poses.still, slot)
     ankles = ankles_seen(seen, fps)
     # Windows whose feet can tell wrong telemetry.
-    of_feet = [rows for rows in windows(frames, _WINDOW, _OVERLAP) if config.feet and ankles[rows].mean() > _SEEN]
+    all_windows = [faded for part in parts for faded in _windows(part)]
+    of_feet = [rows for rows, _ in all_windows if config.feet and ankles[rows].mean() > _SEEN]
     for rows in of_feet:
         if reason := other_time(poses_at[rows], turn[rows], path[rows], fps):
             return reason
@@ -173,15 +177,14 @@ def refine_in_world(
     total, calibration = np.zeros(frames), []
     measured, cost, contact = True, 0.0, 1.0
     lengths = np.median(span_lengths(body), axis=0)
-    for rows in windows(frames, _WINDOW, _OVERLAP):
+    for rows, fade in all_windows:
         telemetry = CameraTelemetry(turn[rows], path[rows], fps)
         data = WorldInput(
             points[rows], weight[rows], depth[rows], sigma[rows], lengths, telemetry, matrix, config, seen[rows], known,
             None if still is None else still[rows],
         )  # fmt: skip
         state = WorldState(start.joints[rows], start.wander[rows], start.shared)
-        found = adjust_in_world(data, state, held)
-        fade = fade_weights(rows, frames, _OVERLAP)
+        found = adjust_in_world(data, state, held if rows.start == 0 else 0)
         joints[rows] += fade[:, None, None] * found.joints
         camera[rows] += fade[:, None] * _correction(found, telemetry)
         wander[rows] += fade[:, None] * found.state.camera
@@ -192,6 +195,7 @@ def refine_in_world(
         if rows in of_feet and fps >= _CONTACTS_FPS:
             contact = min(contact, float(found.contact[:, : len(ANKLES)].mean() / ankles[rows].mean()))
         measured &= bool(found.std[SCALE] < MEASURED * found.state.globals[SCALE])
+    total = np.where(total > 0.0, total, 1.0)  # no window holds the slots of a pause
     covariance = (covariance / total[:, None, None, None])[slot][..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     joints, camera = joints / total[:, None, None] + origin, camera / total[:, None]
     corrected, moved = exp_so3(camera[slot, 3:]) @ rotation, position + camera[slot, :3]
@@ -199,6 +203,30 @@ def refine_in_world(
         return reason
     last = Before(tracks.stamp_ns, joints[slot], (wander / total[:, None])[slot], found.state.globals)
     return RefinedWorld(joints[slot], corrected, moved, measured, covariance, calibration, found.calibration, last)
+
+
+def _parts(stamp_ns: np.ndarray, slot: np.ndarray) -> list[slice]:
+    """Slots of the parts of a recording between its pauses, each of ``_LEAST_FRAMES`` images at least.
+
+    A pause is a time without images that exceeds the usual one by ``MAX_GAP_S``.  The even grid holds a second of it:
+    the camera would fly and turn through that second many times too fast.
+    """
+    step = np.diff(stamp_ns)
+    begins = [0]
+    for first in (np.flatnonzero(step > np.median(step) + MAX_GAP_S * 1e9) + 1).tolist():
+        if min(first - begins[-1], len(stamp_ns) - first) >= _LEAST_FRAMES:
+            begins.append(first)
+    ends = [*begins[1:], len(stamp_ns)]
+    return [slice(int(slot[begin]), int(slot[end - 1]) + 1) for begin, end in zip(begins, ends, strict=True)]
+
+
+def _windows(part: slice) -> list[tuple[slice, np.ndarray]]:
+    """Windows of a part, in slots of the recording, and the weights by which they fade into each other."""
+    frames = part.stop - part.start
+    return [
+        (slice(part.start + rows.start, part.start + rows.stop), fade_weights(rows, frames, _OVERLAP))
+        for rows in windows(frames, _WINDOW, _OVERLAP)
+    ]
 
 
 def _held_pelvis(before: Before, stamp_ns: int) -> np.ndarray:

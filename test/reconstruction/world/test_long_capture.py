@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from drocap_ros.evaluation.world_protocol import FPS, world_view
@@ -24,3 +26,18 @@ def test_windows_of_a_long_capture_join_without_a_step() -> None:
     step = np.linalg.norm(np.diff(body[:, 0], n=2, axis=0), axis=-1)
     seam = slice(frames // 2 - 40, frames // 2 + 40)
     assert step[seam].max() <= np.delete(step, np.r_[seam]).max()
+
+
+def test_ten_seconds_without_images_leave_the_telemetry_in_use() -> None:
+    frames = 720
+    person = simulate_person(np.arange(frames) / FPS, action="walk", seed=0)
+    view = world_view(Sequence("walk", 1000.0 * person), "exact")
+    seen = np.r_[0:240, 480:frames]
+    arrays = ("keypoints", "stamp_ns", "camera_rotation", "camera_position")
+    tracks = dataclasses.replace(view.tracks, **{name: getattr(view.tracks, name)[seen] for name in arrays})
+    motion = reconstruct(tracks)
+    assert motion.meta.get("telemetry_rejected") is None
+    assert len(motion.meta["calibration"]) == 2
+    error = np.linalg.norm(motion.joints3d[:, : len(BODY_15)] - view.truth[seen], axis=-1).mean(axis=1)
+    assert error.mean() < 0.2
+    assert error[215:265].max() < 0.4
