@@ -28,6 +28,10 @@ class CameraModel:
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
     distortion_model: str = "plumb_bob"
 
+    def has_aspect_of(self, size: tuple[int, int]) -> bool:
+        """Whether images of ``size`` (width, height) px have the calibration's aspect ratio, to 2 %."""
+        return abs(self.width * size[1] - self.height * size[0]) <= 0.02 * self.width * size[1]
+
     def resized(self, width: int, height: int) -> CameraModel:
         """The same lens at another image size."""
         scale = np.array([width / self.width, height / self.height, 1.0])
@@ -44,7 +48,7 @@ def camera_model(config: ImageIngestConfig, size: tuple[int, int]) -> CameraMode
     """
     if config.calibration_file:
         model = load_calibration(Path(config.calibration_file))
-        if abs(model.width * size[1] - model.height * size[0]) > 0.02 * model.width * size[1]:
+        if not model.has_aspect_of(size):
             raise InputError(
                 f"{config.calibration_file}: expected the aspect ratio of {size[0]}x{size[1]}, found"
                 f" {model.width}x{model.height}; calibrate with images of this camera mode"

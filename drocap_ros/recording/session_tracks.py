@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from typing import Any
 
 import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.rotations import unit_quaternions
+from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.recording.session import CAMERA_INFO, POSE2D, VEHICLE_STATE, Session, TopicInfo, header_stamp_ns
 from drocap_ros.recording.telemetry.camera_poses import with_camera
 from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack
 from drocap_ros.skeleton import joint_set
 from drocap_ros.tracks import MAX_FRAMES, Tracks
 
+#: Calibrations that differ by less are one: the scale of the motion errs by as much.
+_SAME_LENS = 0.01
+
 
 def read_pose2d(session: Session, mount_pitch_deg: float | None = None) -> Tracks:
-    """Tracks of the subject, keypoints exactly as in the recorded messages.
+    """Tracks of the subject in most images, keypoints exactly as in the recorded messages.
 
-    Images without a subject are frames of NaN.  The tracks contain the camera's poses where the recording does, see
+    Images without that subject are frames of NaN.  The tracks contain the camera's poses where the recording does, see
     :func:`drocap_ros.recording.telemetry.camera_poses.camera_poses`.  Missing parts are in ``session.warnings``.
 
     Parameters
@@ -48,9 +53,10 @@ def read_pose2d(session: Session, mount_pitch_deg: float | None = None) -> Track
     if not poses:
         raise InputError(f"{session.path}: expected poses on {chosen.name}, none could be decoded; record it again")
     ordered = [poses[stamp] for stamp in sorted(poses)]
+    track_id = _most_frequent(session, ordered)
     try:
         stamps = np.array(sorted(poses), dtype=np.int64)
-        tracks = Tracks(stamp_ns=stamps, **_pose_arrays(ordered))
+        tracks = Tracks(stamp_ns=stamps, **_pose_arrays(ordered, track_id))
         return with_recorded_camera(session, tracks, chosen.name, mount_pitch_deg)
     except InputError as error:
         raise InputError(f"{session.path}: {chosen.name}: {error}") from None
@@ -64,15 +70,19 @@ def with_recorded_camera(session: Session, tracks: Tracks, near: str, mount_pitc
     InputError
         When ``mount_pitch_deg`` contradicts the recording.
     """
-    tracks = dataclasses.replace(tracks, camera_matrix=_camera_matrix(session, near))
+    tracks = dataclasses.replace(tracks, camera_matrix=_camera_matrix(session, near, tracks.image_size))
     vehicle = read_vehicle_track(session, near)
     if vehicle is None:
         return tracks
-    if mount_pitch_deg is not None and np.isfinite(vehicle.gimbal).all(axis=1).any():
+    has_gimbal = bool(np.isfinite(vehicle.gimbal).all(axis=1).any())
+    if mount_pitch_deg is not None and has_gimbal:
         raise InputError("--mount-pitch: expected no recorded camera attitude, found one; leave the option out")
     tracks, reason = with_camera(tracks, vehicle, tracks.stamp_ns, mount_pitch_deg)
     if reason:
-        session.warn(f"camera telemetry incomplete: {reason}")
+        remedy = (
+            "" if has_gimbal or mount_pitch_deg is not None else "; for a camera fixed to the body: --mount-pitch DEG"
+        )
+        session.warn(f"camera telemetry incomplete: {reason}{remedy}")
     return tracks
 
 
@@ -96,9 +106,23 @@ def read_vehicle_track(session: Session, near: str = "") -> VehicleTrack | None:
     return VehicleTrack(stamp_ns, position, unit_quaternions(orientation), unit_quaternions(gimbal))
 
 
-def _pose_arrays(messages: list[Any]) -> dict[str, Any]:
-    """Arrays of a tracks object from Pose2D messages."""
-    seen = next((m for m in messages if m.track_id), messages[0])
+def _most_frequent(session: Session, messages: list[Any]) -> int:
+    """Track id of the subject in most images, the first of equals; 0 where no message has a subject."""
+    count = Counter(int(m.track_id) for m in messages if m.track_id)
+    if not count:
+        return 0
+    (track_id, most), *_ = count.most_common()
+    if others := count.total() - most:
+        session.warn(
+            f"poses of {len(count)} persons: the one in {most} images is used, {others} poses of others are left out"
+            " (--redetect --subject N chooses one)"
+        )
+    return track_id
+
+
+def _pose_arrays(messages: list[Any], track_id: int) -> dict[str, Any]:
+    """Arrays of a tracks object from Pose2D messages: those of one track, 0 = none."""
+    seen = next((m for m in messages if m.track_id == track_id), messages[0])
     joints = joint_set(seen.skeleton)
     size = (int(seen.image_width), int(seen.image_height))
     frames, count = len(messages), len(joints)
@@ -106,7 +130,7 @@ def _pose_arrays(messages: list[Any]) -> dict[str, Any]:
     covariance = np.full((frames, count, 3), np.nan)
     confidence = np.zeros((frames, count))
     for i, message in enumerate(messages):
-        if not message.track_id:
+        if not message.track_id or message.track_id != track_id:
             continue
         if message.skeleton != seen.skeleton:
             raise InputError(f"skeleton: expected {seen.skeleton} throughout, got {message.skeleton[:40]!r}")
@@ -134,18 +158,34 @@ def _fill(target: np.ndarray, values: Any, name: str) -> None:
     target[...] = array.reshape(target.shape)
 
 
-def _camera_matrix(session: Session, topic: str) -> np.ndarray | None:
-    """(3, 3) px of the first usable camera info, or None."""
+def _camera_matrix(session: Session, topic: str, size: tuple[int, int]) -> np.ndarray | None:
+    """(3, 3) px of the first usable camera info, for images of ``size`` (width, height) px; or None."""
     info = _nearest(session.topics_of(CAMERA_INFO), topic)
     if info is None:
         return None
+    camera: CameraModel | None = None
     for _, message in session.messages((info.name,)):
         # ROS 2 names it k, ROS 1 names it K.
         matrix = np.asarray(getattr(message, "k", getattr(message, "K", ())), dtype=np.float64)
-        if matrix.size == 9 and np.isfinite(matrix).all() and matrix[0] > 0 and matrix[4] > 0:
-            return matrix.reshape(3, 3)
-    session.warn(f"no usable calibration on {info.name}: its matrix is not set")
-    return None
+        if not (matrix.size == 9 and np.isfinite(matrix).all() and matrix[0] > 0 and matrix[4] > 0):
+            continue
+        matrix = matrix.reshape(3, 3)
+        if camera is None:
+            camera = CameraModel(message.width or size[0], message.height or size[1], matrix)
+        elif not np.allclose(matrix, camera.matrix, rtol=_SAME_LENS):
+            session.warn(f"the calibration on {info.name} changes: the first one is used; cut the recording there")
+            break
+    if camera is None:
+        session.warn(f"no usable calibration on {info.name}: its matrix is not set")
+        return None
+    if (camera.width, camera.height) == size:
+        return camera.matrix
+    found = f"the calibration on {info.name} is for {camera.width}x{camera.height} px, the images have"
+    if not camera.has_aspect_of(size):
+        session.warn(f"{found} {size[0]}x{size[1]}: not used; record the calibration of this camera mode")
+        return None
+    session.warn(f"{found} {size[0]}x{size[1]}: taken as the same picture, resized")
+    return camera.resized(*size).matrix
 
 
 def _nearest(topics: list[TopicInfo], near: str) -> TopicInfo | None:

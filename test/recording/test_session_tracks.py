@@ -115,6 +115,7 @@ def test_rotation_is_unknown_without_a_gimbal(tmp_path, messages, capture):
         assert tracks.camera_rotation is None
         assert tracks.camera_position is not None
         assert any("hold no gimbal" in warning for warning in session.warnings)
+        assert any("--mount-pitch DEG" in warning for warning in session.warnings)
 
 
 def test_short_gap_in_the_telemetry_is_interpolated_with_a_warning(tmp_path, messages, capture):
@@ -151,6 +152,61 @@ def test_images_before_the_telemetry_are_left_out_if_most_remain(tmp_path, messa
         tracks = read_pose2d(session)
     assert tracks.camera_rotation is None
     assert len(tracks) == len(capture.tracks)
+
+
+def test_only_the_person_in_most_images_is_read(tmp_path, messages, capture):
+    tracks = capture.tracks
+    other = range(40, 60)
+    entries = []
+    for i, stamp in enumerate(tracks.stamp_ns.tolist()):
+        pose = messages.pose2d(tracks, i, stamp, track_id=2 if i in other else 1)
+        entries.append(("/drocap/pose2d", pose, stamp, messages.cdr(pose)))
+    record(tmp_path / "s", entries)
+    with open_session(tmp_path / "s") as session:
+        read = read_pose2d(session)
+        (warning,) = session.warnings
+    assert "poses of 2 persons" in warning
+    assert "20 poses of others are left out" in warning
+    gone = np.isnan(read.keypoints).all(axis=(1, 2))
+    assert np.flatnonzero(gone).tolist() == list(other)
+
+
+def with_calibration(messages, capture, *calibrations):
+    """Entries of a flight with other calibrations (stamp ns, width, height, factor of the matrix's first two rows)."""
+    entries = [e for e in flight_entries(messages, capture) if e[0] != "/drocap/camera_info"]
+    for stamp, width, height, factor in calibrations:
+        k = capture.tracks.camera_matrix * np.array([[factor], [factor], [1.0]])
+        info = messages(INFO, header=messages.header(stamp), width=width, height=height, k=k.ravel())
+        entries.append(("/drocap/camera_info", info, stamp, messages.cdr(info)))
+    return entries
+
+
+def test_calibration_of_another_image_size_is_resized_or_left_out(tmp_path, messages, capture):
+    width, height = capture.tracks.image_size
+    record(tmp_path / "a", with_calibration(messages, capture, (START_NS, 2 * width, 2 * height, 2.0)))
+    with open_session(tmp_path / "a") as session:
+        tracks = read_pose2d(session)
+        assert any("the same picture, resized" in warning for warning in session.warnings)
+    assert np.allclose(tracks.camera_matrix, capture.tracks.camera_matrix)
+    record(tmp_path / "b", with_calibration(messages, capture, (START_NS, 2 * width, height, 2.0)))
+    with open_session(tmp_path / "b") as session:
+        tracks = read_pose2d(session)
+        assert any("not used; record the calibration" in warning for warning in session.warnings)
+    assert tracks.camera_matrix is None
+
+
+def test_change_of_the_calibration_is_reported(tmp_path, messages, capture):
+    size = capture.tracks.image_size
+    changes = (START_NS, *size, 1.0), (START_NS + 10**9, *size, 1.0), (START_NS + 2 * 10**9, *size, 1.5)
+    record(tmp_path / "s", with_calibration(messages, capture, *changes[:2]))
+    with open_session(tmp_path / "s") as session:
+        read_pose2d(session)
+        assert session.warnings == []
+    record(tmp_path / "t", with_calibration(messages, capture, *changes))
+    with open_session(tmp_path / "t") as session:
+        tracks = read_pose2d(session)
+        assert any("calibration on /drocap/camera_info changes" in warning for warning in session.warnings)
+    assert np.array_equal(tracks.camera_matrix, capture.tracks.camera_matrix)
 
 
 def test_poses_are_sorted_and_repeated_ones_left_out(tmp_path, messages, capture):

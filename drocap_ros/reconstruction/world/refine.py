@@ -195,7 +195,7 @@ def refine_in_world(
         if rows in of_feet and fps >= _CONTACTS_FPS:
             contact = min(contact, float(found.contact[:, : len(ANKLES)].mean() / ankles[rows].mean()))
         measured &= bool(found.std[SCALE] < MEASURED * found.state.globals[SCALE])
-    total = np.where(total > 0.0, total, 1.0)  # no window holds the slots of a pause
+    total[total == 0.0] = 1.0  # no window holds the slots of a pause
     covariance = (covariance / total[:, None, None, None])[slot][..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     joints, camera = joints / total[:, None, None] + origin, camera / total[:, None]
     corrected, moved = exp_so3(camera[slot, 3:]) @ rotation, position + camera[slot, :3]
