@@ -11,6 +11,7 @@ from drocap_ros.reconstruction.live.camera_history import CameraHistory
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.pose_messages import add_calibration
 from drocap_ros.recording.session_tracks import read_pose2d
+from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.vehicle.flight_path import SampledPath
 
 POSE2D, STATE, INFO = NAMES["pose2d"], NAMES["state"], NAMES["info"]
@@ -135,6 +136,20 @@ def test_camera_pose_is_unknown_after_a_long_gap(tmp_path, messages, capture):
         assert tracks.camera_rotation is None
         assert tracks.camera_position is None
         assert any("2.4 s from an attitude" in warning for warning in session.warnings)
+
+
+def test_images_in_a_long_gap_are_left_out_if_most_remain(tmp_path, messages):
+    capture = simulate_capture(10, 30, seed=2, start_ns=START_NS)
+    record(tmp_path / "s", flight_entries(messages, capture, skip_s=(3.005, 5.995)))
+    with open_session(tmp_path / "s") as session:
+        tracks = read_pose2d(session)
+        assert any("images in gaps of the attitude of up to 3.0 s: left out" in w for w in session.warnings)
+    t = (capture.tracks.stamp_ns - START_NS) * 1e-9
+    stays = (t < 3.001) | (t > 5.999)
+    assert np.array_equal(tracks.stamp_ns, capture.tracks.stamp_ns[stays])
+    expected = capture.tracks.keypoints[stays].astype(np.float32)
+    assert np.array_equal(tracks.keypoints, expected, equal_nan=True)
+    assert np.rad2deg(angle_between(tracks.camera_rotation, capture.camera_rotation[stays]))[:-1].max() < 0.01
 
 
 def test_images_before_the_telemetry_are_left_out_if_most_remain(tmp_path, messages, capture):

@@ -54,6 +54,8 @@ _GUESS_WEIGHT = 0.1
 _LARGEST_COST, _LEAST_CONTACT = 100.0, 0.03
 #: Share of the time in which an ankle has to be seen for the feet to tell wrong telemetry.
 _SEEN = 0.3
+#: A part of a recording that is shorter may hold no step: its feet tell nothing.
+_FEET_S = 4.0
 #: Frames per second below which a step of a foot ends between two frames: contacts are not seen.
 _CONTACTS_FPS = 8.0
 
@@ -162,7 +164,11 @@ def refine_in_world(
     ankles = ankles_seen(seen, fps)
     # Windows whose feet can tell wrong telemetry.
     all_windows = [faded for part in parts for faded in _windows(part)]
-    of_feet = [rows for rows, _ in all_windows if config.feet and ankles[rows].mean() > _SEEN]
+    of_feet = [
+        rows
+        for rows, _ in all_windows
+        if config.feet and ankles[rows].mean() > _SEEN and rows.stop - rows.start >= min(frames, _FEET_S * fps)
+    ]
     for rows in of_feet:
         if reason := other_time(poses_at[rows], turn[rows], path[rows], fps):
             return reason
@@ -176,15 +182,19 @@ def refine_in_world(
     covariance: np.ndarray = np.zeros((*body.shape, 3))
     total, calibration = np.zeros(frames), []
     measured, cost, contact = True, 0.0, 1.0
-    lengths = np.median(span_lengths(body), axis=0)
+    lengths, starts = np.median(span_lengths(body), axis=0), [part.start for part in parts]
+    prior = gathered = known  # the findings of one part are known in the next
     for rows, fade in all_windows:
+        if rows.start in starts:
+            prior = gathered
         telemetry = CameraTelemetry(turn[rows], path[rows], fps)
         data = WorldInput(
-            points[rows], weight[rows], depth[rows], sigma[rows], lengths, telemetry, matrix, config, seen[rows], known,
+            points[rows], weight[rows], depth[rows], sigma[rows], lengths, telemetry, matrix, config, seen[rows], prior,
             None if still is None else still[rows],
         )  # fmt: skip
         state = WorldState(start.joints[rows], start.wander[rows], start.shared)
         found = adjust_in_world(data, state, held if rows.start == 0 else 0)
+        gathered = (prior or Calibration.unknown()).later(found.calibration, 1.0, 0.0)
         joints[rows] += fade[:, None, None] * found.joints
         camera[rows] += fade[:, None] * _correction(found, telemetry)
         wander[rows] += fade[:, None] * found.state.camera

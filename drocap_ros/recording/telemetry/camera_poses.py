@@ -20,17 +20,17 @@ MIN_SHARE = 0.5
 
 
 class CameraPoses(NamedTuple):
-    """Camera poses of the images in ``keep``.
+    """Camera poses of the images that stay.
 
     rotation : (F, 3, 3) world ENU -> optical, or None
     position : (F, 3) m, or None
-    keep : images that stay; the others, at the start or end, have no telemetry
+    keep : index of the images that stay, one slice where they follow each other; the others have no telemetry
     reason : text, what is missing or was left out
     """
 
     rotation: np.ndarray | None
     position: np.ndarray | None
-    keep: slice
+    keep: slice | np.ndarray
     reason: str
 
 
@@ -49,21 +49,22 @@ def camera_attitude(track: VehicleTrack, mount_pitch_deg: float | None = None) -
 def camera_poses(track: VehicleTrack, stamp_ns: np.ndarray, mount_pitch_deg: float | None = None) -> CameraPoses:
     """Camera pose at the stamps (F,) of images: attitude on SO(3), position linearly, by :func:`interpolate`.
 
-    Images without a pose are left out where one stretch of at least half of the images has poses; else all images
-    stay, without telemetry.
+    Images without a pose are left out where at least half of the images have poses; else all images stay, without
+    telemetry.
     """
     attitude = camera_attitude(track, mount_pitch_deg)
     missing = "gimbal" if mount_pitch_deg is None else "attitude"
-    keep, reasons = slice(0, len(stamp_ns)), []
+    keep, reasons = np.ones(len(stamp_ns), bool), []
     rotation, keep, words = _series(track.stamp_ns, attitude, stamp_ns, keep, missing, spherical=True)
     reasons += words
     place = _without_steps(track, stamp_ns)
     position, keep, words = _series(track.stamp_ns, place, stamp_ns, keep, "position", spherical=False)
     reasons += words
+    runs = true_runs(keep)
     return CameraPoses(
         None if rotation is None else camera_rotation(rotation[keep]),
         None if position is None else position[keep],
-        keep,
+        slice(*runs[0].tolist()) if len(runs) == 1 else keep,
         "; ".join(reasons),
     )
 
@@ -101,28 +102,28 @@ def _without_steps(track: VehicleTrack, stamp_ns: np.ndarray) -> np.ndarray:
 
 
 def _series(
-    known_ns: np.ndarray, values: np.ndarray, stamp_ns: np.ndarray, keep: slice, name: str, *, spherical: bool
-) -> tuple[np.ndarray | None, slice, list[str]]:
+    known_ns: np.ndarray, values: np.ndarray, stamp_ns: np.ndarray, keep: np.ndarray, name: str, *, spherical: bool
+) -> tuple[np.ndarray | None, np.ndarray, list[str]]:
+    """Values at the images, those of the images ``keep`` (F,) that have one, and what is missing, in words."""
     if not np.isfinite(values).all(axis=1).any() or not len(stamp_ns):
         return None, keep, [f"the states of the vehicle hold no {name}"]
     word = "attitude" if spherical else name
     found, gap_s = interpolate(known_ns, values, stamp_ns, spherical=spherical)
-    known = np.isfinite(found).all(axis=1)
-    known[: keep.start] = known[keep.stop :] = False
-    run = _longest_run(known)
+    known = keep & np.isfinite(found).all(axis=1)
     article = "an" if word[0] in "aeiou" else "a"
-    worst_s = gap_s[keep].max()
-    if run.stop - run.start < MIN_SHARE * len(stamp_ns):
-        return None, keep, [f"images are up to {worst_s:.1f} s from {article} {word}"]
+    if known.sum() < MIN_SHARE * len(stamp_ns):
+        return None, keep, [f"images are up to {gap_s[keep].max():.1f} s from {article} {word}"]
     words = []
-    left_out = (keep.stop - keep.start) - (run.stop - run.start)
-    if left_out:
-        words.append(f"{left_out} images at the start or end are up to {worst_s:.1f} s from {article} {word}: left out")
-    elif worst_s > REPORTED_GAP_S:
-        words.append(f"the {word} was interpolated over gaps of up to {worst_s:.1f} s")
-    return found, run, words
-
-
-def _longest_run(flags: np.ndarray) -> slice:
-    runs = true_runs(flags)
-    return slice(*runs[np.ptp(runs, axis=1).argmax()].tolist()) if len(runs) else slice(0, 0)
+    first, last = np.flatnonzero(known)[[0, -1]]
+    lost = keep & ~known
+    in_gaps = lost.copy()
+    in_gaps[:first] = in_gaps[last:] = False
+    at_ends = lost & ~in_gaps
+    if at_ends.any():
+        far = f"up to {gap_s[at_ends].max():.1f} s from {article} {word}"
+        words.append(f"{at_ends.sum()} images at the start or end are {far}: left out")
+    if in_gaps.any():
+        words.append(f"{in_gaps.sum()} images in gaps of the {word} of up to {gap_s[in_gaps].max():.1f} s: left out")
+    if gap_s[known].max() > REPORTED_GAP_S:
+        words.append(f"the {word} was interpolated over gaps of up to {gap_s[known].max():.1f} s")
+    return found, known, words
