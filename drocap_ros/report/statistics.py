@@ -16,6 +16,10 @@ from drocap_ros.skeleton import RIGID_BONES, JointSet, indices
 _SMOOTH_S = 0.5
 #: A knee counts as bent from this angle on; below it the direction of the bend is noise.
 _BENT_DEG = 25.0
+#: Spread of the camera's bearings (mean square about the mean of unit vectors) of half a turn: 0.6; of a whole one: 1.
+_BEARINGS = 0.5
+#: Height of the neck above the ankles over their distance, from which a body is upright: one who lies leans anyhow.
+_UPRIGHT = 0.7
 _TORSO = ("pelvis", "neck", "lhip", "rhip", "lshoulder", "rshoulder")
 
 
@@ -36,6 +40,8 @@ class Statistics:
     view_speed_dps, view_span_deg : median speed and range of that
     elevation_deg : median elevation of the camera above the body: above the horizon where the vertical is known, else
         above the plane across the trunk
+    lean_deg : angle by which an upright body leans away from the camera, from whatever side it sees it; NaN where the
+        vertical is not known, the body is rarely upright, or the camera looks from less than about half a turn
     heading_rad : (F,) direction that the body faces, about the vertical
     knees_forward : share of bent knees that bend forward; NaN where none is bent
     bent_knees : number of bent knees
@@ -59,6 +65,7 @@ class Statistics:
     view_speed_dps: float
     view_span_deg: float
     elevation_deg: float
+    lean_deg: float
     heading_rad: np.ndarray
     knees_forward: float
     bent_knees: int
@@ -110,6 +117,7 @@ def motion_statistics(motion: Motion) -> Statistics:
         view_speed_dps=float(np.degrees(np.median(speed))),
         view_span_deg=float(np.degrees(np.ptp(view))),
         elevation_deg=_elevation(motion, torso, camera_axes(motion)[:, 2]),
+        lean_deg=_lean(motion),
         heading_rad=_heading(torso, times),
         knees_forward=forward,
         bent_knees=judged,
@@ -174,6 +182,26 @@ def _view_azimuth(torso: np.ndarray, forward: np.ndarray, times_s: np.ndarray) -
 def _elevation(motion: Motion, torso: np.ndarray, forward: np.ndarray) -> float:
     up = -forward[:, 2] if motion.frame == "world" else -np.einsum("fi,fi->f", torso[..., 2], forward)
     return float(np.degrees(np.arcsin(np.clip(np.median(up), -1.0, 1.0))))
+
+
+def _lean(motion: Motion) -> float:
+    """Lean from the ankles to the neck, of its part that turns with the camera's bearing."""
+    ends = ("neck", "lankle", "rankle")
+    if motion.frame != "world" or not set(ends) <= set(motion.joints):
+        return float("nan")
+    neck, left, right = (motion.joints3d[:, i] for i in indices(motion.joints, ends))
+    body, bearing = neck - 0.5 * (left + right), motion.camera_rotation[:, 2, :2]
+    length, flat = np.linalg.norm(body, axis=1), np.linalg.norm(bearing, axis=1)
+    upright = (body[:, 2] > _UPRIGHT * length) & (flat > 0)
+    if upright.sum() < 0.5 * len(body):
+        return float("nan")
+    lean, away = body[upright, :2] / length[upright, None], bearing[upright] / flat[upright, None]
+    lean, away = lean - lean.mean(axis=0), away - away.mean(axis=0)
+    spread = float(np.square(away).sum(axis=1).mean())
+    if spread < _BEARINGS:
+        return float("nan")
+    sine = float((lean * away).sum(axis=1).mean()) / spread
+    return float(np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0))))
 
 
 def _heading(torso: np.ndarray, times_s: np.ndarray) -> np.ndarray:

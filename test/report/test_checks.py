@@ -57,6 +57,29 @@ def test_view_and_heading_of_a_body_that_faces_north(person):
     np.testing.assert_allclose(m.view_deg, -90.0, atol=1e-6)
 
 
+def test_a_wrong_pitch_of_the_mount_is_a_body_that_leans_with_the_camera(person):
+    """The camera's pitch is reported 20 degrees too high, as by a wrong sign: body and camera turn by as much."""
+    capture = simulate_capture(16.0, 15.0, seed=3)
+    shape = capture.joints3d_world.shape[:2]
+    motion = dataclasses.replace(
+        person, joints3d=capture.joints3d_world, stamp_ns=capture.tracks.stamp_ns, confidence=np.ones(shape),
+        camera_rotation=capture.camera_rotation, keypoints=capture.tracks.keypoints, reprojection_px=np.ones(shape),
+    )  # fmt: skip
+    assert abs(motion_statistics(motion).lean_deg) < 4.0
+    assert Check.LEANING not in checks(motion)
+    half = np.deg2rad(20.0)
+    pitched = np.array([[1.0, 0, 0], [0, np.cos(half), np.sin(half)], [0, -np.sin(half), np.cos(half)]])
+    reported = pitched.T @ motion.camera_rotation
+    seen = (motion.joints3d - motion.joints3d[:, :1]) @ np.swapaxes(motion.camera_rotation, 1, 2)
+    wrong = dataclasses.replace(motion, joints3d=seen @ reported, camera_rotation=reported)
+    assert abs(motion_statistics(wrong).lean_deg) == pytest.approx(20.0, abs=4.0)
+    result = result_of(wrong, Check.LEANING)
+    assert result.level is Level.WARNING
+    assert "negative = down" in result.text
+    still = dataclasses.replace(wrong, camera_rotation=np.tile(reported[:1], (len(reported), 1, 1)))
+    assert np.isnan(motion_statistics(still).lean_deg)
+
+
 def test_a_still_camera_and_a_still_body_are_low_camera_motion(person):
     still = dataclasses.replace(
         person,
