@@ -65,7 +65,7 @@ def reconstruct(
         config=settings.replace("pose_estimator", **rule),
         models=None if models is None else Path(models),
         progress=progress,
-        telemetry=Telemetry(Path(telemetry)) if isinstance(telemetry, str | Path) else telemetry,
+        telemetry=Telemetry(Path(telemetry)) if isinstance(telemetry, str | Path) else telemetry or Telemetry(),
         selection=Selection(clip, person, redetect),
     )
     return motion

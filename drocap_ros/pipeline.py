@@ -26,7 +26,12 @@ from drocap_ros.recording.open_images import open_images, refuse_other_inputs
 from drocap_ros.recording.open_session import is_recording, open_session
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Session
 from drocap_ros.recording.session_tracks import read_pose2d, with_recorded_camera
-from drocap_ros.recording.telemetry.video_telemetry import Telemetry, read_video_telemetry, with_telemetry
+from drocap_ros.recording.telemetry.video_telemetry import (
+    NO_TELEMETRY,
+    Telemetry,
+    read_video_telemetry,
+    with_telemetry,
+)
 from drocap_ros.tracks import Tracks, load_tracks
 
 logger = logging.getLogger(__name__)
@@ -45,7 +50,7 @@ class Selection:
     redetect: bool = False
 
 
-_WHOLE = Selection()
+_WHOLE, _FOUND = Selection(), Telemetry()
 
 
 def reconstruct_input(
@@ -55,8 +60,7 @@ def reconstruct_input(
     config: DrocapConfig,
     models: Path | None = None,
     progress: Progress | None = None,
-    telemetry: Telemetry | None = None,
-    mount_pitch_deg: float | None = None,
+    telemetry: Telemetry = _FOUND,
     selection: Selection = _WHOLE,
 ) -> tuple[Motion, Tracks]:
     """Motion of the subject in a video file, image folder, recording or tracks file.
@@ -68,8 +72,9 @@ def reconstruct_input(
         graph on a recording with ``pose2d``, with the recorded parameters unless ``config`` differs from the defaults
     models : folder of ONNX files; None = ``DROCAP_MODELS`` or the user's own
     progress : called with a stage and its fraction done
-    telemetry : source of the camera's pose of a video; default: the DJI track inside it, where there is one
-    mount_pitch_deg : of a camera fixed to the body, negative down, for a recording without the camera's attitude
+    telemetry : source of the camera's pose of a video; default: the DJI track inside it, where there is one.  With
+        ``NO_TELEMETRY`` that of a recording or tracks file is not used either; its pitch of a mount is that of a
+        recording without the camera's attitude, too
     selection : part of the input; default: all images, the person in most of them
 
     Raises
@@ -80,11 +85,12 @@ def reconstruct_input(
     if method == "live":
         if selection != _WHOLE:
             raise InputError("--method live: expected a whole recording with its recorded poses; choose another method")
+        if telemetry != _FOUND:
+            raise InputError("--method live: expected the recorded telemetry, got other; leave the options out")
         return _reconstruct_live(Path(path), config, progress)
     begin = time.perf_counter()
-    telemetry = telemetry or Telemetry()
     log = read_video_telemetry(Path(path), telemetry)
-    tracks, origin = read_input(Path(path), config, models, progress, mount_pitch_deg, selection)
+    tracks, origin = read_input(Path(path), config, models, progress, telemetry, selection)
     if log is not None:
         tracks, origin["telemetry"] = with_telemetry(Path(path), tracks, telemetry, log, config.image_ingest, progress)
     seconds = time.perf_counter() - begin
@@ -133,13 +139,14 @@ def read_input(
     config: DrocapConfig,
     models: Path | None,
     progress: Progress | None = None,
-    mount_pitch_deg: float | None = None,
+    telemetry: Telemetry = _FOUND,
     selection: Selection = _WHOLE,
 ) -> tuple[Tracks, dict[str, Any]]:
     """2D tracks of the subject, from the input where it holds them, else estimated from its images; their origin.
 
     The latter is for the motion's ``meta``.
     """
+    pitch, in_use = telemetry.mount_pitch_deg, telemetry.path != NO_TELEMETRY
     origin: dict[str, Any] = {} if selection.clip.whole else {"clip": selection.clip.meta}
     if needs_networks(path, selection.redetect):
         tracks, more = _track(path, config, models, progress, selection)
@@ -147,15 +154,18 @@ def read_input(
             with open_session(path) as session:
                 near = session.choose_topic(IMAGE, COMPRESSED_IMAGE).name
                 session.warnings.clear()  # reported with the images
-                tracks = with_recorded_camera(session, tracks, near, mount_pitch_deg)
+                tracks = with_recorded_camera(session, tracks, near, pitch, telemetry=in_use)
                 _log_warnings(session)
         return tracks, origin | more
     if selection.person is not None:
         raise InputError(f"--subject {selection.person}: expected images, found 2D poses of one person; add --redetect")
     if path.suffix == ".npz":
-        return selection.clip.cut(load_tracks(path)), origin
+        tracks = load_tracks(path)
+        if not in_use:
+            tracks = dataclasses.replace(tracks, camera_rotation=None, camera_position=None)
+        return selection.clip.cut(tracks), origin
     with open_session(path) as session:
-        tracks = read_pose2d(session, mount_pitch_deg)
+        tracks = read_pose2d(session, pitch, telemetry=in_use)
         _log_warnings(session)
     return selection.clip.cut(tracks), {**origin, "pose2d": "recorded"}
 

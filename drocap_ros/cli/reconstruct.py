@@ -56,7 +56,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="LOG",
         type=Path,
         help="log beside a video: MAVLink .tlog, PX4 .ulg, ArduPilot .bin, DJI .srt, Airdata .csv (default: the DJI"
-        " track inside the video, where there is one); none: no telemetry",
+        " track inside the video, where there is one); none: no telemetry, nor that of a session or tracks file",
     )
     parser.add_argument(
         "--time-offset",
@@ -122,7 +122,6 @@ def run(args: argparse.Namespace) -> int:
             models=args.models,
             progress=progress,
             telemetry=telemetry,
-            mount_pitch_deg=args.mount_pitch,
             selection=selection,
         )
     motion = dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line})
@@ -151,12 +150,15 @@ def _telemetry(args: argparse.Namespace) -> Any:
     for name, value in (("--time-offset", args.time_offset), ("--mount-pitch", args.mount_pitch)):
         if value is None:
             continue
-        session = name == "--mount-pitch" and args.input.exists() and is_recording(args.input)
+        pitch = name == "--mount-pitch"
+        session = pitch and args.telemetry is None and args.input.exists() and is_recording(args.input)
         embedded = args.telemetry is None and has_djmd(args.input)
         if args.telemetry in (None, NO_TELEMETRY) and not session and not embedded:
             raise InputError(f"{name}: expected --telemetry LOG with it, found none; add the log")
         if not math.isfinite(value):
             raise InputError(f"{name}: expected a finite number, got {value}; correct the value")
+        if pitch and abs(value) > 90.0:
+            raise InputError(f"{name}: expected -90 to 90 deg, got {value}; choose a value in the range")
     return Telemetry(args.telemetry, args.time_offset, args.mount_pitch)
 
 

@@ -21,7 +21,7 @@ from drocap_ros.tracks import MAX_FRAMES, Tracks
 _SAME_LENS = 0.01
 
 
-def read_pose2d(session: Session, mount_pitch_deg: float | None = None) -> Tracks:
+def read_pose2d(session: Session, mount_pitch_deg: float | None = None, *, telemetry: bool = True) -> Tracks:
     """Tracks of the subject in most images, keypoints exactly as in the recorded messages.
 
     Images without that subject are frames of NaN.  The tracks contain the camera's poses where the recording does, see
@@ -30,6 +30,7 @@ def read_pose2d(session: Session, mount_pitch_deg: float | None = None) -> Track
     Parameters
     ----------
     mount_pitch_deg : of a camera fixed to the body, negative down, for recordings without the camera's attitude
+    telemetry : whether the states of the vehicle are used
 
     Raises
     ------
@@ -57,12 +58,14 @@ def read_pose2d(session: Session, mount_pitch_deg: float | None = None) -> Track
     try:
         stamps = np.array(sorted(poses), dtype=np.int64)
         tracks = Tracks(stamp_ns=stamps, **_pose_arrays(ordered, track_id))
-        return with_recorded_camera(session, tracks, chosen.name, mount_pitch_deg)
+        return with_recorded_camera(session, tracks, chosen.name, mount_pitch_deg, telemetry=telemetry)
     except InputError as error:
         raise InputError(f"{session.path}: {chosen.name}: {error}") from None
 
 
-def with_recorded_camera(session: Session, tracks: Tracks, near: str, mount_pitch_deg: float | None = None) -> Tracks:
+def with_recorded_camera(
+    session: Session, tracks: Tracks, near: str, mount_pitch_deg: float | None = None, *, telemetry: bool = True
+) -> Tracks:
     """Tracks with the camera's matrix and poses where the recording holds them, those nearest to a topic's name.
 
     Raises
@@ -71,7 +74,7 @@ def with_recorded_camera(session: Session, tracks: Tracks, near: str, mount_pitc
         When ``mount_pitch_deg`` contradicts the recording.
     """
     tracks = dataclasses.replace(tracks, camera_matrix=_camera_matrix(session, near, tracks.image_size))
-    vehicle = read_vehicle_track(session, near)
+    vehicle = read_vehicle_track(session, near) if telemetry else None
     if vehicle is None:
         return tracks
     has_gimbal = bool(np.isfinite(vehicle.gimbal).all(axis=1).any())

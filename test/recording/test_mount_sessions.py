@@ -14,10 +14,11 @@ from drocap_ros.errors import InputError
 from drocap_ros.evaluation.compare import compare
 from drocap_ros.flight.orbit.states import State
 from drocap_ros.motion import load_motion
-from drocap_ros.pipeline import reconstruct_input
+from drocap_ros.pipeline import Telemetry, reconstruct_input
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_pose2d
 from drocap_ros.simulation.closed_loop.orbit_loop import EPOCH_NS, LoopSettings, OrbitLoop, with_config
+from drocap_ros.tracks import load_tracks
 
 SECONDS = 18.0
 
@@ -137,3 +138,28 @@ def test_a_session_of_a_fixed_camera_without_its_attitude_needs_the_pitch(tmp_pa
     assert "leave the option out" in capsys.readouterr().err
     assert main(["reconstruct", str(tmp_path / "old"), *options]) == 0
     assert load_motion(tmp_path / "out" / "motion.npz").frame == "world"
+    assert main(["reconstruct", str(tmp_path / "old"), *options[:-1], "-120"]) == 2
+    assert "--mount-pitch: expected -90 to 90 deg, got -120" in capsys.readouterr().err
+    motion, _ = reconstruct_input(
+        tmp_path / "old", method="initial", config=DrocapConfig(), telemetry=Telemetry(mount_pitch_deg=pitch)
+    )
+    assert motion.frame == "world"
+
+
+def test_no_telemetry_is_that_of_a_session_and_of_its_tracks_neither(tmp_path, flight, capsys):
+    folder, _, _ = flight("gimbal")
+    options = ["--no-report", "--quiet", "--method", "initial"]
+    assert main(["reconstruct", str(folder), *options, "--out", str(tmp_path / "world")]) == 0
+    assert load_motion(tmp_path / "world").frame == "world"
+    for source in (folder, tmp_path / "world" / "tracks.npz"):
+        out = tmp_path / f"{source.name}_none"
+        assert main(["reconstruct", str(source), *options, "--out", str(out), "--telemetry", "none"]) == 0
+        assert load_motion(out).frame == "camera"
+        assert load_tracks(out / "tracks.npz").camera_position is None
+    command = ["reconstruct", str(folder), *options, "--telemetry", "none", "--mount-pitch", "-20"]
+    assert main([*command, "--out", str(tmp_path / "x")]) == 2
+    assert "--mount-pitch: expected --telemetry LOG with it" in capsys.readouterr().err
+    assert (
+        main(["reconstruct", str(folder), "--method", "live", "--telemetry", "none", "--out", str(tmp_path / "x")]) == 2
+    )
+    assert "--method live: expected the recorded telemetry" in capsys.readouterr().err
