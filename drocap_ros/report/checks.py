@@ -64,6 +64,7 @@ class Check(Enum):
     NO_VERTICAL = auto()
     ASSUMED_SCALE = auto()
     TELEMETRY_REJECTED = auto()
+    TELEMETRY_JUMPS = auto()
     CALIBRATION = auto()
 
 
@@ -156,6 +157,7 @@ _WORDS: dict[Check, tuple[str, str]] = {
         " path is not known. The player stands it on its lowest joint.",
     ),
     Check.TELEMETRY_REJECTED: ("Telemetry not used", "{words} The motion stays in the axes of the camera."),
+    Check.TELEMETRY_JUMPS: ("Reported position jumps", "{words}"),
     Check.CALIBRATION: ("Telemetry corrected", "{words}"),
     Check.ASSUMED_SCALE: ("Scale assumed", "Metres come from {source}{height}, not from a measurement."),
 }
@@ -319,8 +321,8 @@ def _telemetry(motion: Motion, s: Statistics) -> CheckResult | None:
     words = telemetry_words(motion.meta)
     if not words:
         return None
-    return (
-        _warn(Check.TELEMETRY_REJECTED, words=words)
-        if "telemetry_rejected" in motion.meta
-        else _note(Check.CALIBRATION, words=words)
-    )
+    if "telemetry_rejected" in motion.meta:
+        return _warn(Check.TELEMETRY_REJECTED, words=words)
+    if any(window.get("camera_jumps_m", 0.0) > 0 for window in motion.meta["calibration"]):
+        return _warn(Check.TELEMETRY_JUMPS, words=words)
+    return _note(Check.CALIBRATION, words=words)

@@ -52,6 +52,8 @@ def _calibrations(windows: list[Mapping[str, Any]], height_m: float | None) -> s
         still = "; the reported camera never moves: it is fixed, or its log is frozen"
     elif stop_s > 0:
         still = f"; the reported camera stands still for {stop_s:.1f} s: it hovers, or its log is frozen"
+    if jump := max(w.get("camera_jumps_m", 0.0) for w in windows):
+        still += f"; the reported position jumps by {jump:.1f} m: cut the recording there (--start, --end)"
     worst = f" (worst of {len(windows)} windows)" if len(windows) > 1 else ""
     return f"{corrections[0].upper()}{corrections[1:]}; {scale}, {feet}{worst}{still}{_stature(windows, height_m)}."
 

@@ -19,6 +19,7 @@ from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.contacts import ankles_seen
 from drocap_ros.reconstruction.world.telemetry_checks import (
     frozen,
+    jump_m,
     other_time,
     resting_feet_move,
     stops,
@@ -309,6 +310,7 @@ def _calibration(
         "contact_share": float(found.contact[:, : len(ANKLES)].mean()),
         "camera_moves": bool(np.ptp(position, axis=0).max() > 0),
         "camera_stops_s": max(still_s, default=0.0),
+        "camera_jumps_m": jump_m(position, fps),
         "iterations": found.iterations,
         "stop_reason": found.stop_reason,
     }

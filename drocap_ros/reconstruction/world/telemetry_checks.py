@@ -18,6 +18,8 @@ _STOP_M_S2 = 10.0
 _TURNS_S_DEG = ((0.0, 10.0), (0.12, 12.0))
 #: Change of the turn rate of a gimbal: what one frame of a low rate may hold.
 _TURN_DEG_S2 = 500.0
+#: A position that changes by more within this time, and moves evenly before and after, jumps.
+_JUMP_S, _JUMP_M = 0.12, 0.5
 #: Height (m per m) of the image's lower border above its centre, from which a camera is upside down.
 _UPSIDE_DOWN = 0.2
 _SHIFTS_S, _SHIFT_STEP_S = 3.0, 0.5
@@ -66,6 +68,15 @@ def turned_at_once(rotation: np.ndarray, fps: float) -> str:
         if jump > max(least_deg, _TURN_DEG_S2 * (lag / fps) ** 2):
             return f"the camera's reported rotation jumps by {jump:.0f} deg; check the gimbal's yaw in the log"
     return ""
+
+
+def jump_m(position: np.ndarray, fps: float) -> float:
+    """Jump of positions (F, 3) m that no vehicle flies, as when an estimate is set anew; 0 = none."""
+    lag = max(round(_JUMP_S * fps), 1)
+    move = position[lag:] - position[:-lag]
+    differs = np.linalg.norm(move[lag:] - move[:-lag], axis=1)
+    jump = float(np.minimum(differs[:-lag], differs[lag:]).max(initial=0.0))
+    return jump if jump > max(_JUMP_M, _STOP_M_S2 * (lag / fps) ** 2) else 0.0
 
 
 def upside_down(joints: np.ndarray, rotation: np.ndarray) -> str:

@@ -16,8 +16,10 @@ from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.reconstruction.world import refine
 from drocap_ros.reconstruction.world.calibration_words import telemetry_words
 from drocap_ros.reconstruction.world.contacts import contact_probability
-from drocap_ros.reconstruction.world.telemetry_checks import frozen, turned_at_once
+from drocap_ros.reconstruction.world.telemetry_checks import frozen, jump_m, turned_at_once
 from drocap_ros.reconstruction.world.world_model import CAMERA, GLOBALS, WorldState
+from drocap_ros.report.checks import Check, Level, run_checks
+from drocap_ros.report.statistics import motion_statistics
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
 
@@ -190,3 +192,26 @@ def test_heights_in_steps_do_not_inflate_the_person() -> None:
     rounded = replace(true, camera_position=np.column_stack([position[:, :2], np.round(position[:, 2], 1)]))
     sizes = [scale_error(reconstruct(seen).joints3d[:, :15], joints[:, :15]) for seen in (true, rounded)]
     assert abs(sizes[1] - sizes[0]) < 0.03
+
+
+def test_a_height_that_is_set_anew_is_said_and_a_doubt() -> None:
+    joints = walker(240)
+    seen = view(joints, RATE * np.arange(240) / FPS)
+    assert seen.camera_position is not None
+    step = np.clip((np.arange(240) - 120) / 2.0, 0.0, 1.0)[:, None]  # over two images: the next state comes later
+    jumped = replace(seen, camera_position=seen.camera_position + step * [0.0, 0.0, 1.0])
+    for given, said in ((seen, False), (jumped, True)):
+        motion = reconstruct(given)
+        assert motion.frame == "world"
+        assert ("reported position jumps by 1.0 m" in telemetry_words(motion.meta)) is said
+        warned = [r.check for r in run_checks(motion, motion_statistics(motion)) if r.level is Level.WARNING]
+        assert (Check.TELEMETRY_JUMPS in warned) is said
+
+
+def test_a_hard_start_of_a_vehicle_is_no_jump() -> None:
+    for fps in (5.0, 24.0, 120.0):
+        time = np.arange(0.0, 10.0, 1.0 / fps)
+        path = 0.5 * 5.0 * np.clip(time - 4.0, 0.0, 1.0) ** 2 + 5.0 * np.maximum(time - 5.0, 0.0)
+        position = np.stack([path, 0.0 * path, 0.0 * path], axis=1)
+        assert jump_m(position, fps) == 0.0
+        assert jump_m(position + 1.0 * (time > 7.0)[:, None], fps) == pytest.approx(np.sqrt(3.0), abs=0.2)
