@@ -11,7 +11,8 @@ FORMATS = {
     "GPS": (129, "QBIHLLf", "<QBIHiif", "TimeUS,Status,GMS,GWk,Lat,Lng,Alt"),
     "ATT": (130, "Qfff", "<Qfff", "TimeUS,Roll,Pitch,Yaw"),
     "POS": (131, "QLLf", "<Qiif", "TimeUS,Lat,Lng,Alt"),
-    "MNT": (132, "Qfff", "<Qfff", "TimeUS,Roll,Pitch,YawE"),
+    "MNT": (132, "Qffff", "<Qffff", "TimeUS,Roll,Pitch,YawB,YawE"),
+    "PARM": (133, "QNf", "<Q16sf", "TimeUS,Name,Value"),
 }
 GPS_EPOCH_S = 315_964_800
 LEAP_S = 18
@@ -23,12 +24,14 @@ def packed(name, *values):
     return HEAD + bytes([number]) + struct.pack(codes, *values)
 
 
-def write_dataflash(path, t, angles, geodetic=None, mount=None):
+def write_dataflash(path, t, angles, geodetic=None, mount=None, mount_type=None):
     """Power-up 10 s before the first of times t (N,) s; angles roll pitch yaw rad; latitude, longitude, altitude."""
     out = []
     for name, (number, form, codes, columns) in FORMATS.items():
         length = 3 + struct.calcsize(codes)
         out.append(packed("FMT", number, length, name.encode(), form.encode(), columns.encode()))
+    if mount_type is not None:
+        out.append(packed("PARM", 1, b"MNT1_TYPE", mount_type))
     for i, s in enumerate(t):
         us = round((10 + s) * 1e6)
         if geodetic is not None:
@@ -40,6 +43,9 @@ def write_dataflash(path, t, angles, geodetic=None, mount=None):
             out.append(packed("POS", us, lat, lon, geodetic[i, 2]))
         out.append(packed("ATT", us, *np.rad2deg(angles[i])))
         if mount is not None:
-            out.append(packed("MNT", us, *np.rad2deg(mount[i])))
+            roll, pitch, yaw = np.rad2deg(mount[i])
+            nose = np.rad2deg(angles[i, 2])
+            yaw_b, yaw_e = (yaw, yaw + nose) if mount_type == 1 else (yaw - nose, yaw)
+            out.append(packed("MNT", us, roll, pitch, yaw_b, yaw_e))
     path.write_bytes(b"".join(out))
     return path

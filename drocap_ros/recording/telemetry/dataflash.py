@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.frames import geodetic_to_enu, orientation_to_ros, quaternion_from_euler
+from drocap_ros.flight.frames import geodetic_to_enu, orientation_to_ros, quaternion_from_euler, quaternion_multiply
+from drocap_ros.flight.mavlink.mount import SERVOS, TYPE_PARAMETER
 from drocap_ros.recording.telemetry.log import Lack, LogLack, TelemetryLog, at_stamps, make_log
 
 _EARLIEST_UTC_S = 1e9
@@ -18,12 +19,15 @@ _EARLIEST_UTC_S = 1e9
 _FIELDS = {
     "ATT": ("Roll", "Pitch", "Yaw"),
     "POS": ("Lat", "Lng", "Alt"),
-    "MNT": ("Roll", "Pitch", "YawE"),
+    "MNT": ("Roll", "Pitch", "YawE", "YawB"),
 }
+_PARAMETER = "PARM"
 
 
 def read_dataflash(path: Path) -> TelemetryLog:
     """Attitude (ATT), position (POS) and mount (MNT) by time since power-up; UTC from the GPS.
+
+    The angles of servos (``MNT1_TYPE`` is 1) are against the body, those of other mounts against horizon and north.
 
     Raises
     ------
@@ -36,11 +40,15 @@ def read_dataflash(path: Path) -> TelemetryLog:
     rows: dict[str, list[tuple[float, ...]]] = {name: [] for name in _FIELDS}
     utc_us: list[float] = []
     lacks: list[LogLack] = []
+    servos = False
     try:
         # pymavlink prints remarks on damaged files.
         with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
             for message in _messages(path):
                 name = message.get_type()
+                if name == _PARAMETER:
+                    servos = message.Value == SERVOS if message.Name == TYPE_PARAMETER else servos
+                    continue
                 values = tuple(float(getattr(message, field, np.nan)) for field in _FIELDS[name])
                 rows[name].append((float(message.TimeUS), *values))
                 if name == "ATT" and message._timestamp > _EARLIEST_UTC_S:
@@ -53,6 +61,7 @@ def read_dataflash(path: Path) -> TelemetryLog:
     if not rows["ATT"]:
         raise InputError(f"{path}: expected ATT messages of an ArduPilot log, found none; is it a DataFlash .bin?")
     stamp_ns, angles = _series(rows["ATT"])
+    body = quaternion_from_euler(*np.deg2rad(angles).T).T
     position = gimbal = None
     if rows["POS"]:
         known_ns, geodetic = _series(rows["POS"])
@@ -63,16 +72,19 @@ def read_dataflash(path: Path) -> TelemetryLog:
             lacks.append(LogLack(Lack.LOCAL_POSITION, "POS"))
     if rows["MNT"]:
         known_ns, mount = _series(rows["MNT"])
-        camera = orientation_to_ros(quaternion_from_euler(*np.deg2rad(mount).T).T)
+        yaw = "YawB" if servos else "YawE"
+        used = [_FIELDS["MNT"].index(field) for field in ("Roll", "Pitch", yaw)]
+        camera = quaternion_from_euler(*np.deg2rad(mount[:, used]).T).T
         if np.isfinite(camera).all(axis=1).any():
-            gimbal = at_stamps(known_ns, camera, stamp_ns, spherical=True)
+            camera = at_stamps(known_ns, camera, stamp_ns, spherical=True)
+            gimbal = orientation_to_ros(quaternion_multiply(body, camera) if servos else camera)
         else:
-            lacks.append(LogLack(Lack.MOUNT_YAW, "MNT.YawE"))
+            lacks.append(LogLack(Lack.MOUNT_YAW, f"MNT.{yaw}"))
     return make_log(
         path,
         "ArduPilot DataFlash log",
         stamp_ns,
-        orientation=orientation_to_ros(quaternion_from_euler(*np.deg2rad(angles).T).T),
+        orientation=orientation_to_ros(body),
         position=position,
         gimbal=gimbal,
         utc_minus_stamp_ns=int(np.median(utc_us)) * 1000 if utc_us else None,
@@ -90,7 +102,7 @@ def _messages(path: Path) -> Any:
 
     log = Reader(str(path))
     try:
-        while (message := log.recv_match(type=list(_FIELDS))) is not None:
+        while (message := log.recv_match(type=[*_FIELDS, _PARAMETER])) is not None:
             yield message
     finally:
         log.close()

@@ -5,12 +5,14 @@ import random
 
 import numpy as np
 import pytest
+from angles import angle_between
 from dataflash import write_dataflash
 from telemetry_logs import angles_of, dji_subtitle, mutated, srt_text, wrapped
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import geodetic_to_enu, ned_to_enu, orientation_to_aviation, quaternion_from_euler, yaw_of
-from drocap_ros.recording.telemetry.camera_poses import camera_poses
+from drocap_ros.geometry.rotations import matrix_from_quaternion
+from drocap_ros.recording.telemetry.camera_poses import camera_attitude, camera_poses
 from drocap_ros.recording.telemetry.log import Lack, LogLack
 from drocap_ros.recording.telemetry.read import read_telemetry
 from drocap_ros.recording.telemetry.time_offset import find_offset
@@ -93,6 +95,16 @@ def test_dataflash_states_equal_the_flight_they_were_written_from(tmp_path, inve
     without = read_telemetry(write_dataflash(tmp_path / "y.bin", t, angles))
     assert without.lacks == (LogLack(Lack.CAMERA_ATTITUDE), LogLack(Lack.POSITION))
     assert without.utc_minus_stamp_ns is None
+
+
+def test_dataflash_angles_of_servos_are_against_the_body(tmp_path, invented_flight):
+    t, angles, geodetic, _ = invented_flight
+    demanded = np.tile([0.0, math.radians(-20.0), 0.0], (len(t), 1))
+    log = read_telemetry(write_dataflash(tmp_path / "s.bin", t, angles, geodetic, demanded, mount_type=1))
+    level = read_telemetry(write_dataflash(tmp_path / "l.bin", t, angles, geodetic, demanded, mount_type=4))
+    fixed = camera_attitude(log.track._replace(gimbal=np.full((len(t), 4), np.nan)), -20.0)
+    assert np.rad2deg(angle_between(*map(matrix_from_quaternion, (log.track.gimbal, fixed)))).max() < 0.01
+    assert wrapped(angles_of(level.track.gimbal) - demanded).max() < 1e-4
 
 
 def test_dji_subtitles_give_gimbal_and_position(tmp_path, invented_flight):
