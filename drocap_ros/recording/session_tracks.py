@@ -17,6 +17,8 @@ from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack
 from drocap_ros.skeleton import joint_set
 from drocap_ros.tracks import MAX_FRAMES, Tracks
 
+#: Where other systems record the poses of a vehicle or camera.
+_OTHER_POSES = ("tf2_msgs/msg/TFMessage", "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped")
 #: Calibrations that differ by less are one: the scale of the motion errs by as much.
 _SAME_LENS = 0.01
 
@@ -76,6 +78,8 @@ def with_recorded_camera(
     tracks = dataclasses.replace(tracks, camera_matrix=_camera_matrix(session, near, tracks.image_size))
     vehicle = read_vehicle_track(session, near) if telemetry else None
     if vehicle is None:
+        if telemetry and (others := [topic.name for topic in session.topics_of(*_OTHER_POSES)]):
+            session.warn(f"no camera telemetry: {', '.join(others)} is not read, {VEHICLE_STATE} is; add it to the bag")
         return tracks
     has_gimbal = bool(np.isfinite(vehicle.gimbal).all(axis=1).any())
     if mount_pitch_deg is not None and has_gimbal:

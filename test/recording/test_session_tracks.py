@@ -224,6 +224,17 @@ def test_change_of_the_calibration_is_reported(tmp_path, messages, capture):
     assert np.array_equal(tracks.camera_matrix, capture.tracks.camera_matrix)
 
 
+def test_poses_of_other_systems_are_said_not_to_be_read(tmp_path, messages, capture):
+    kind = "geometry_msgs/msg/PoseStamped"
+    entries = [e for e in flight_entries(messages, capture) if e[0] != "/drocap/vehicle/state"]
+    pose = messages(kind, header=messages.header(START_NS, "odom"))
+    record(tmp_path / "s", [*entries, ("/mavros/local_position/pose", pose, START_NS + 10**10, messages.cdr(pose))])
+    with open_session(tmp_path / "s") as session:
+        assert read_pose2d(session).camera_position is None
+        (warning,) = session.warnings
+    assert "/mavros/local_position/pose is not read, drocap_ros/msg/VehicleState is" in warning
+
+
 def test_poses_are_sorted_and_repeated_ones_left_out(tmp_path, messages, capture):
     tracks = capture.tracks
     order = [3, 1, 2, 0, 2]
