@@ -192,7 +192,7 @@ def _lean(motion: Motion) -> float:
     neck, left, right = (motion.joints3d[:, i] for i in indices(motion.joints, ends))
     body, bearing = neck - 0.5 * (left + right), motion.camera_rotation[:, 2, :2]
     length, flat = np.linalg.norm(body, axis=1), np.linalg.norm(bearing, axis=1)
-    upright = (body[:, 2] > _UPRIGHT * length) & (flat > 0)
+    upright = (body[:, 2] > _UPRIGHT * length) & (length > 0) & (flat > 0)
     if upright.sum() < 0.5 * len(body):
         return float("nan")
     lean, away = body[upright, :2] / length[upright, None], bearing[upright] / flat[upright, None]
