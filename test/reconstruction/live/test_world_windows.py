@@ -26,11 +26,15 @@ from drocap_ros.tracks import Tracks
 
 S = 10**9
 ADJUSTER = BundleAdjusterConfig()
+#: Half the windows, where the last one counts.
+SELDOM = BundleAdjusterConfig(period_s=2.0)
 CameraAt = Callable[[np.ndarray], WindowCamera | None]
 
 
-def run(observations: list[PoseObservation], camera_at: CameraAt) -> list[LivePose | LiveWindow]:
-    return list(live_poses(observations, InitializerConfig(), ADJUSTER, camera_at=camera_at))
+def run(
+    observations: list[PoseObservation], camera_at: CameraAt, adjuster: BundleAdjusterConfig = ADJUSTER
+) -> list[LivePose | LiveWindow]:
+    return list(live_poses(observations, InitializerConfig(), adjuster, camera_at=camera_at))
 
 
 def windows_of(results: list[LivePose | LiveWindow]) -> list[LiveWindow]:
@@ -50,7 +54,7 @@ def followed() -> list[LivePose | LiveWindow]:
 @lru_cache(maxsize=1)
 def without_telemetry() -> LiveWindow:
     """The last window of the same flight when no pose of the camera arrives."""
-    return windows_of(run(flown().observations, lambda stamp_ns: None))[-1]
+    return windows_of(run(flown().observations, lambda stamp_ns: None, SELDOM))[-1]
 
 
 def errors(poses: dict[int, np.ndarray], truth: Orbit) -> WorldErrors:
@@ -124,10 +128,10 @@ def test_findings_are_carried_from_window_to_window() -> None:
     stream = [
         replace(o, keypoints=p.astype(np.float32)) for o, p in zip(still.observations, image + noise, strict=True)
     ]
-    use = [w.window.telemetry for w in windows_of(run(stream, camera_at))]
+    use = [w.window.telemetry for w in windows_of(run(stream, camera_at, SELDOM))]
     assert use[-1] is Telemetry.USED
     # Without the orbit before, the same last seconds measure no scale.
-    alone = [w.window.telemetry for w in windows_of(run(stream[stop:], camera_at))]
+    alone = [w.window.telemetry for w in windows_of(run(stream[stop:], camera_at, SELDOM))]
     assert Telemetry.USED not in alone
     assert alone[-1] is Telemetry.UNSCALED
 
@@ -161,7 +165,7 @@ def test_wrong_telemetry_is_refused_and_bends_no_body(kind: str) -> None:
         rotation, position = np.roll(rotation, late, axis=0), np.roll(position, late, axis=0)
         rotation[:late], position[:late] = rotation[late], position[late]
     history = replace(true, rotation=rotation, position=position).history(keep_s=60.0)
-    windows = windows_of(run(true.observations, history.along))
+    windows = windows_of(run(true.observations, history.along, SELDOM))
     last = windows[-1].window
     assert last.telemetry is Telemetry.REFUSED
     assert last.in_map is None
@@ -190,8 +194,8 @@ def test_another_subject_starts_without_the_findings_of_the_first() -> None:
     history = flown().history(keep_s=100.0)
     for stamp, position, turn in zip(second.stamp_ns.tolist(), second.position, second.rotation, strict=True):
         history.add_pose(stamp, position, quaternion_from_matrix(turn.T))
-    both = windows_of(run([*flown().observations, *second.observations], history.along))
-    alone = windows_of(run(second.observations, history.along))
+    both = windows_of(run([*flown().observations, *second.observations], history.along, SELDOM))
+    alone = windows_of(run(second.observations, history.along, SELDOM))
     for a, b in zip(alone, both[-len(alone) :], strict=True):
         assert a.window.telemetry is b.window.telemetry
         np.testing.assert_array_equal(a.joints3d, b.joints3d)
