@@ -28,7 +28,9 @@ class ImageIngestConfig(Parameters):
     reconnect_max_s: float = param(
         10.0, "longest pause between attempts to reconnect to a live source", unit="s", minimum=0.1, maximum=600
     )
-    calibration_file: str = param("", "camera calibration YAML (camera_calibration format); empty: none")
+    calibration_file: str = param(
+        "", "camera calibration YAML (camera_calibration format), whose distortion is not removed; empty: none"
+    )
     horizontal_fov_deg: float = param(
         0.0, "horizontal field of view where there is no calibration; 0 = unknown", unit="deg", minimum=0, maximum=170
     )
