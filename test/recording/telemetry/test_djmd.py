@@ -200,7 +200,7 @@ def test_reconstruct_uses_the_track_by_itself(video, tmp_path, monkeypatch, capl
     # The networks are not what this tests.
     seen = simulate_capture(COUNT / 30, 30, seed=2, start_ns=0).tracks
     seen = Tracks(seen.keypoints[:10], seen.joints, IMAGE_NS[:10], (1280, 720))
-    monkeypatch.setattr("drocap_ros.pipeline._read", lambda *_, **__: (seen, {}))
+    monkeypatch.setattr("drocap_ros.pipeline.read_input", lambda *_, **__: (seen, {}))
     monkeypatch.setattr("drocap_ros.pipeline.needs_networks", lambda *_: False)
 
     def reconstructed(sample, *words):
