@@ -6,14 +6,13 @@ import importlib
 import logging
 import os
 import shlex
-import signal
 import sys
 import threading
 from collections.abc import Sequence
 
 from drocap_ros import __version__
 from drocap_ros.cli.options import LineParser
-from drocap_ros.cli.signals import interruptible
+from drocap_ros.cli.signals import BOTH, interruptible
 from drocap_ros.errors import DrocapError
 
 #: Modules under ``drocap_ros.cli``, in the order of ``drocap --help``.
@@ -46,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         args = build_parser().parse_args(words)
         args.command_line = shlex.join(["drocap", *words])
-        with interruptible(getattr(args, "interrupted_by", (signal.SIGTERM,))) as interrupted:
+        with interruptible(getattr(args, "interrupted_by", BOTH)) as interrupted:
             status: int = args.run(args)
         sys.stdout.flush()
         return status

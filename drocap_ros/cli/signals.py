@@ -6,6 +6,7 @@ import contextlib
 import signal
 import threading
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 BOTH = (signal.SIGINT, signal.SIGTERM)
 
@@ -26,17 +27,25 @@ def stop_signals() -> Iterator[threading.Event]:
 def interruptible(signals: Sequence[signal.Signals] = BOTH) -> Iterator[threading.Event]:
     """SIGTERM interrupts the program as Ctrl-C does, so that no half-written file remains.
 
-    ``signals`` raise KeyboardInterrupt and set the event: an exception in a destructor, for one, is lost.
+    ``signals`` raise KeyboardInterrupt and set the event, and that of an ``interruptible`` around it: an exception in a
+    destructor is lost, and one in a C++ library can become another one.
     """
     interrupted = threading.Event()
+    before: dict[signal.Signals, Any] = {}
 
-    def interrupt(*_: object) -> None:
+    def interrupt(number: int, frame: Any) -> None:
         interrupted.set()
+        around = before.get(signal.Signals(number))
+        if callable(around):
+            around(number, frame)
         raise KeyboardInterrupt
 
     if threading.current_thread() is not threading.main_thread():
         signals = ()  # Python permits handlers in the main thread only
-    before = {number: signal.signal(number, interrupt) for number in signals}
+    for number in signals:
+        # A shell's background job ignores Ctrl-C.
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            before[number] = signal.signal(number, interrupt)
     try:
         yield interrupted
     finally:

@@ -42,8 +42,7 @@ def test_interrupted_demo_leaves_no_process_and_no_file(tmp_path, options, proce
         demo.send_signal(signal.SIGINT)
         demo.stdout.read()
         error = demo.stderr.read()
-        assert demo.wait(60) == 130
-    assert error == "drocap: interrupted\n"
+        assert (demo.wait(60), error) == (130, "drocap: interrupted\n")
     assert _marked(mark) == []
     assert list(tmp_path.iterdir()) == []
 
@@ -65,6 +64,21 @@ def test_interruption_is_noticed_where_python_cannot_raise_it(number, monkeypatc
         assert interrupted.is_set()
     assert lost == [KeyboardInterrupt]
     assert signal.getsignal(number) is before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_that_a_library_turns_into_an_error_is_one_of_the_command(number, monkeypatch, capsys):
+    def library(args):
+        with interruptible():
+            try:
+                os.kill(os.getpid(), number)
+            except KeyboardInterrupt:
+                raise RuntimeError("Unable to convert call argument") from None
+
+    monkeypatch.setattr("drocap_ros.cli.demo.command.run", library)
+    assert main(["demo"]) == 130
+    assert capsys.readouterr().err == "drocap: interrupted\n"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def _marked(mark):
