@@ -104,11 +104,11 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
     parting = parting_speed(start.joints, data.fps)
     for done in range(1, config.iterations + config.locking_iterations + 1):
         locking = done > config.iterations
-        # A window that continues another one does not slide any more.
+        # A window that continues another one does not slide any more, and its scale and camera are known.
         stage = done + (len(_CONTACT_SPEEDS) if held else 0)
         speed = _CONTACT_SPEEDS[stage - 1] if stage <= len(_CONTACT_SPEEDS) else _LAST_CONTACT_SPEED
         if config.feet:
-            moving = MOVING_LOCKED if locking else MOVING
+            moving = MOVING_LOCKED if locking or held else MOVING
             contact = contact_probability(state, data.fps, speed, seen, data.still, parting, moving)
         weight = config.locked_weight if locking else config.contact_weight
         if stage == len(_CONTACT_SPEEDS) + 1:
