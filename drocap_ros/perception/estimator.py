@@ -76,7 +76,7 @@ class PoseEstimator:
         self._last_ns: int | None = None
         #: Rows of the last image that certainly showed the subject, and the subject in it.
         self._repeated: tuple[np.ndarray, PoseObservation] | None = None
-        #: Last run of the detector, and last image in which it or the pose showed the subject.
+        #: Last run of the detector, and last image in which it, the pose or the optical flow showed the subject.
         self._detected_ns = self._seen_ns = 0
         #: Score of the subject in the last detection, and mean confidence of its last keypoints; 0 = none.
         self._score = self._confidence = 0.0
@@ -110,7 +110,7 @@ class PoseEstimator:
             log.warning("stamps went back by %.3f s: the tracker restarts", (self._last_ns - stamp_ns) * 1e-9)
             self.tracker.reset()
             self._flow.start(None, None)
-            self._margins, self._rejected, self._repeated = None, [], None
+            self._margins, self._rejected, self._repeated, self._seen_ns = None, [], None, 0
             self._camera.reset()
         self._last_ns = stamp_ns
         roi = _validated_roi(roi)
@@ -133,9 +133,10 @@ class PoseEstimator:
         self.keypoints = None
         observation = self._flow.propagate(image, stamp_ns) if roi is None and self._flow.steps < load_level else None
         if observation is not None:
-            self._failures = 0
+            self._failures, self._seen_ns = 0, stamp_ns
             return observation, True
         predicted = self._estimate_predicted(image, stamp_ns, load_level) if roi is None else None
+        self._seen_ns = stamp_ns if predicted and predicted[1] else self._seen_ns
         observation, certain = predicted or self._estimate_detected(image, stamp_ns, roi, load_level)
         # Doubtful persons are not propagated by optical flow; the detector runs again.
         self._flow.start(image if load_level and certain else None, observation)

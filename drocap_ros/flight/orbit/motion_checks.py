@@ -85,8 +85,8 @@ def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
 def start_condition(seen: Observed) -> Condition | None:
     """Why no orbit may begin; one that is flown goes on.
 
-    ArduPilot reports a critical state while a failsafe has triggered that it was told to ignore in GUIDED: of the
-    battery, the radio, the ground station; PX4 while a failsafe acts.
+    ArduPilot reports a critical state after a failsafe of battery, radio or ground station has triggered, also one
+    whose action is switched off in GUIDED.  PX4 reports it while a failsafe acts.
     """
     if seen.system_status == _MAV_STATE_CRITICAL:
         return condition(_C.AUTOPILOT_CRITICAL, reported="a critical state")

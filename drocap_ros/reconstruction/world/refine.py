@@ -195,7 +195,7 @@ def refine_in_world(
         )  # fmt: skip
         state = WorldState(start.joints[rows], start.wander[rows], start.shared)
         found = adjust_in_world(data, state, held if rows.start == 0 else 0)
-        gathered = (prior or Calibration.unknown()).later(found.calibration, 1.0, 0.0)
+        gathered = (gathered or Calibration.unknown()).later(found.calibration, 1.0, 0.0)
         joints[rows] += fade[:, None, None] * found.joints
         camera[rows] += fade[:, None] * _correction(found, telemetry)
         wander[rows] += fade[:, None] * found.state.camera

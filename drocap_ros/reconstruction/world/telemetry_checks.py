@@ -71,7 +71,7 @@ def turned_at_once(rotation: np.ndarray, fps: float) -> str:
 
 
 def jump_m(position: np.ndarray, fps: float) -> float:
-    """Jump of positions (F, 3) m that no vehicle flies, as when an estimate is set anew; 0 = none."""
+    """Largest jump (m) of positions (F, 3) m, as by a reset of the estimate; 0 = none."""
     lag = max(round(_JUMP_S * fps), 1)
     move = position[lag:] - position[:-lag]
     differs = np.linalg.norm(move[lag:] - move[:-lag], axis=1)

@@ -158,8 +158,9 @@ def test_hidden_subject_has_no_keypoints_on_leaves(detected):
     assert all(np.isfinite(o.keypoints).any() for in_view, o in shown if in_view and o.track_id)
 
 
-def test_image_without_detection_keeps_its_keypoints():
-    config = PoseEstimatorConfig(subject="centre", on_loss="next", confirm_frames=1, detect_every_s=0.0)
+@pytest.mark.parametrize("detect_every_s", [0.0, 0.2])
+def test_image_without_detection_keeps_its_keypoints(detect_every_s):
+    config = PoseEstimatorConfig(subject="centre", on_loss="next", confirm_frames=1, detect_every_s=detect_every_s)
     estimator = PoseEstimator(models_folder(SIMULATION), config)
     script = Script(estimator)
     rng = np.random.default_rng(0)
