@@ -296,6 +296,9 @@ class PoseEstimator:
         tight = None if shedding else self.tracker.second_pass_window(size, stamp_ns, found.boxes, found.scores)
         if tight is not None:
             found = _merged(found, self._detect_in(image, tight))
+        sought = None if shedding else self.tracker.sought_window(size, stamp_ns, found.boxes)
+        if sought is not None:
+            found = _merged(found, self._detect_in(image, sought))
         return found
 
     def _detect_in(self, image: np.ndarray, window: Window | None, shedding: bool = False) -> Detections:

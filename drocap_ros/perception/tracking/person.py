@@ -15,6 +15,8 @@ from drocap_ros.perception.tracking.pose_belief import PoseBelief
 _APPEARANCE_RATE = 0.08
 #: Number of descriptors in a settled mean appearance.
 _SETTLED = 10
+#: Speed with which a person may deviate from the predicted motion, lengths/s: who falls gains 3 in half a second.
+_SPEED = 1.5
 #: Weight of a new detection score in the mean score.
 _SCORE_RATE = 0.3
 
@@ -77,6 +79,13 @@ class Person:
     def plausible(self) -> bool:
         """Whether its poses leave it to be a person."""
         return self.pose.plausible_ns is not None
+
+    def sought_box(self, stamp_ns: int) -> np.ndarray:
+        """(4,) px around the place where the whole person may be after a gap: the last box showed a part, curled up."""
+        box = self.filter.box_at(stamp_ns)
+        reach = max(self.filter.length, self.pose.length) * (0.5 + _SPEED * self.undetected_s(stamp_ns))
+        centre = (box[:2] + box[2:]) / 2
+        return np.concatenate([np.minimum(box[:2], centre - reach), np.maximum(box[2:], centre + reach)])
 
     def update(self, box: np.ndarray, score: float, stamp_ns: int) -> None:
         """Update with a detection, not yet confirmed."""

@@ -29,6 +29,8 @@ from drocap_ros.perception.tracking.selection import select
 _HIDDEN_IOU = 0.25
 #: Least overlap of a detection with the predicted box that needs no second pass.
 _CLEAR_IOU = 0.5
+#: Overlap with the predicted box from which a detection may be the subject.
+_AT_PLACE = 0.3
 #: Overlap coefficient above which an unassigned detection is a part of a tracked person, or that person and more.
 _PART = 0.75
 #: Free margin around an isolated subject, lengths.
@@ -102,6 +104,16 @@ class SubjectTracker:
         if clear.any() and iou(box[None], boxes[clear].astype(float)).max() > _CLEAR_IOU:
             return None
         return tight_window(box, image_size)
+
+    def sought_window(self, image_size: tuple[int, int], stamp_ns: int, boxes: np.ndarray) -> Window | None:
+        """Window in which a subject without detection may be, if it is in none of the boxes (N, 4) px; or None."""
+        subject = self._subject
+        if subject is None or self._chosen_box is not None or subject.unconfirmed_s(stamp_ns) > self._coast_s:
+            return None
+        seen = self._last_ns is None or subject.detected_ns == self._last_ns
+        if seen or (iou(subject.filter.box_at(stamp_ns)[None], boxes.astype(float)) > _AT_PLACE).any():
+            return None
+        return wide_window(subject.sought_box(stamp_ns), image_size)
 
     def predict(self, stamp_ns: int) -> Subject | None:
         """The predicted subject; None unless the last update confirmed it."""

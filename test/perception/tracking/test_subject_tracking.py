@@ -90,6 +90,31 @@ def test_half_hidden_subject_takes_its_own_detection_when_the_cover_goes_away():
     assert sorted(pairs) == [(0, 0), (1, 1)]
 
 
+def test_subject_that_fell_while_unseen_is_in_the_window_of_the_search():
+    size, tracker = (1768, 994), SubjectTracker(PoseEstimatorConfig())
+    image = np.full((size[1], size[0], 3), 128, np.uint8)
+    none = np.empty((0, 4))
+
+    def update(index, boxes):
+        tracker.update(image, index * STEP, boxes, np.full(len(boxes), 0.8))
+        for box in boxes:
+            tracker.judge(0.9, box, index * STEP)
+
+    # A man of 330 px; then he jumps, and is curled up in the last image that shows him.
+    for t in range(20):
+        update(t, np.array([[860.0, 100, 980, 430]]))
+    curled = np.array([[840.0, 165, 1030, 335]])
+    update(20, curled)
+    update(21, none)
+    assert tracker.sought_window(size, 22 * STEP, curled) is None  # the window near him shows him
+    update(22, none)
+    x0, y0, x1, y1 = tracker.sought_window(size, 23 * STEP, none)
+    # He stretches, and falls by his own length.
+    assert x0 < 880 and x1 > 1000 and y0 < 180 and y1 > 580
+    update(23, np.array([[880.0, 250, 1000, 570]]))
+    assert tracker.sought_window(size, 24 * STEP, none) is None
+
+
 def test_second_box_of_the_subject_is_no_person_who_hides_it():
     scene = Scene()
     person = (340, 205, 250, RED)
