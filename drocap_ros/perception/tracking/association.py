@@ -12,6 +12,10 @@ _IMPOSSIBLE = 1e6
 #: Weights of size, appearance and score against the distance: another person's appearance differs by 0.05 to 0.2, the
 #: own by 0.02; a whole person scores higher than a part.
 _SIZE_WEIGHT, _APPEARANCE_WEIGHT, _SCORE_WEIGHT = 0.4, 5.0, 2.0
+#: Distance from the prediction that a person may have, lengths: at once, more per second without detection, and the
+#: largest one of others than the subject.  Nobody looks for them at their places, but who is near the subject is rarely
+#: one of those from far away.
+_REACH, _REACH_PER_S, _OTHERS_REACH = 0.35, 2.0, 1.35
 #: Cost per second without detection: of two persons near one detection the one who was just seen takes it.
 _GAP_WEIGHT = 1.0
 #: Overlap with the last box from which a large change of size is possible: a person enters the image.
@@ -51,7 +55,8 @@ def assign_all(
     for owners, group in ((reliable, high), (unreliable, high), (reliable, ~high)):
         free = [p for p in owners if p.detected_ns < stamp_ns and id(p) not in refused]
         at = np.array([j for j in np.nonzero(group)[0] if j not in assigned], int)
-        pairs = assign(free, boxes[at], scores[at], [appearances[j] for j in at], stamp_ns, group is not high)
+        found = boxes[at], scores[at], [appearances[j] for j in at]
+        pairs = assign(free, *found, stamp_ns, group is not high, subject)
         for i, k in pairs:
             person, j = free[i], int(at[k])
             if person is subject:
@@ -86,6 +91,7 @@ def assign(
     appearances: list[np.ndarray | None],
     stamp_ns: int,
     low_score: bool = False,
+    subject: Person | None = None,
 ) -> list[tuple[int, int]]:
     """Pairs (person, detection) of least total cost within the gates of distance and size.
 
@@ -96,6 +102,7 @@ def assign(
     scores : (N,)
     appearances : N descriptors
     low_score : require a high overlap with the prediction, for detections that may be clutter
+    subject : the person among them for whom the detector looks in every image
     """
     if not persons or not len(boxes):
         return []
@@ -112,7 +119,8 @@ def assign(
     overlap = np.maximum(
         overlap_coefficient(predicted, boxes), overlap_coefficient(np.array([p.box for p in persons]), boxes)
     )
-    reach, scope = 0.35 + 2.0 * gap, 0.55 + 0.6 * gap
+    farthest = np.array([np.inf if p is subject else _OTHERS_REACH for p in persons])[:, None]
+    reach, scope = np.minimum(_REACH + _REACH_PER_S * gap, farthest), 0.55 + 0.6 * gap
     possible = (distance < reach) & (growth < scope) | (overlap > _SAME_PLACE) & (growth < _ENTRANCE_GROWTH)
     # What is no person stays in its place: a person who comes out from behind it is a new track.
     strict = np.array([low_score or not p.plausible for p in persons])[:, None]

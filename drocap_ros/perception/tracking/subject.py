@@ -77,7 +77,8 @@ class SubjectTracker:
     ) -> list[Window | None]:
         """Windows of the next image for the detector; None = the whole image.
 
-        ``single`` allows one window; ``close`` takes a smaller one around the subject.
+        ``single`` allows one window, a larger one where the last image did not show the subject; ``close`` takes a
+        smaller one around the subject.
         """
         if self._chosen_box is not None:
             near = wide_window(self._chosen_box, image_size)
@@ -85,6 +86,8 @@ class SubjectTracker:
         subject = self._subject
         if subject is not None and subject.unconfirmed_s(stamp_ns) <= self._coast_s:
             box = subject.filter.box_at(stamp_ns)
+            if single and self._last_ns is not None and subject.detected_ns < self._last_ns:
+                box, close = subject.sought_box(stamp_ns), False
             windows = self._schedule.near_subject(box, image_size, stamp_ns, single, close)
             if subject.pose.questioned and windows != [None]:  # whoever it is: the search goes on beside it
                 windows += [w for w in self._schedule.search([], image_size, stamp_ns, True) if w not in windows]
@@ -184,13 +187,18 @@ class SubjectTracker:
     def rivals(
         self, image: np.ndarray, stamp_ns: int, boxes: np.ndarray, scores: np.ndarray, confidence: float
     ) -> list[int]:
-        """Indices of the detections (N, 4), (N,) that could be the subject instead, by falling score.
+        """Indices of the detections (N, 4), (N,) that could be the subject instead, the nearest and best ones first.
 
         confidence : mean of the subject's pose in this image
         """
         subject = self._subject
-        found = [] if subject is None else rivals(subject, self.persons, image, boxes, confidence, stamp_ns)
-        return sorted(found, key=lambda j: -scores[j])
+        if subject is None:
+            return []
+        found = rivals(subject, self.persons, image, boxes, confidence, stamp_ns)
+        predicted = subject.filter.box()
+        offset = (predicted[:2] + predicted[2:] - boxes[:, :2] - boxes[:, 2:]) / 2
+        lengths = np.round(np.linalg.norm(offset, axis=1) / max(subject.filter.length, subject.pose.length))
+        return sorted(found, key=lambda j: (lengths[j], -scores[j]))
 
     def exchange(self, image: np.ndarray, stamp_ns: int, box: np.ndarray, score: float) -> Subject:
         """Continue the subject at a rival's box (4,) px; a track of what it was before remains."""

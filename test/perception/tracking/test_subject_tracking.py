@@ -110,9 +110,17 @@ def test_subject_that_fell_while_unseen_is_in_the_window_of_the_search():
     update(22, none)
     x0, y0, x1, y1 = tracker.sought_window(size, 23 * STEP, none)
     # He stretches, and falls by his own length.
-    assert x0 < 880 and x1 > 1000 and y0 < 180 and y1 > 580
+    assert max(x0 - 880, y0 - 180) < 0 < min(x1 - 1000, y1 - 580)
     update(23, np.array([[880.0, 250, 1000, 570]]))
     assert tracker.sought_window(size, 24 * STEP, none) is None
+
+
+def test_detection_near_the_subject_is_not_a_person_from_far_away():
+    # He somersaults; nobody has looked at her for 0.9 s.
+    subject, other = (Person(np.array(box), 0.8, 0, None) for box in ([848.0, 214, 1051, 361], [345.0, 516, 606, 945]))
+    found = np.array([[898.0, 182, 1177, 481]]), np.array([0.54]), [None]
+    assert assign([subject, other], *found, 867_000_000, subject=subject) == [(0, 0)]
+    assert assign([other], *found, 867_000_000, subject=subject) == []
 
 
 def test_second_box_of_the_subject_is_no_person_who_hides_it():
