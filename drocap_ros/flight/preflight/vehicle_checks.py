@@ -20,6 +20,8 @@ _GOOD_SATELLITES = 8
 _MOUNT = "GIMBAL_DEVICE_ATTITUDE_STATUS"
 _FIXES = {0: "no receiver", 1: "no fix", 2: "2D", 3: "3D", 4: "3D, differential", 5: "RTK float", 6: "RTK fixed"}
 _LANDED = {LANDED_ON_GROUND: "on the ground", LANDED_IN_AIR: "in the air"}
+#: Values of GF_ACTION that guard nobody: its 4 is flight termination, above a person.
+_PX4_FENCES: dict[float, str] = {0: "off", 1: "warns only", 4: "stops the motors"}
 _ACTIONS = {
     0: "drifts by the sticks", 1: "drifts in altitude mode", 2: "drifts in manual flight", 3: "returns", 4: "lands",
     5: "holds", 6: "ends the flight", 7: "stops the motors",
@@ -110,9 +112,11 @@ def _ardupilot_fence(config: MavlinkBridgeConfig, measured: Measured) -> Finding
             radius = radius if int(kinds) & 2 else 0.0
             height = height if int(kinds) & 1 else 0.0
     state = "off" if enabled == 0 else "" if enabled == 1 else "FENCE_ENABLE not reported"
+    if not state and measured.setting("FENCE_ACTION") == 0:
+        state = "reports only"
     return _fence(
         config, measured, state, radius, height, "FENCE_RADIUS", "FENCE_ALT_MAX",
-        "FENCE_ENABLE to 1 and FENCE_TYPE to 3 (height and circle)",
+        "FENCE_ENABLE to 1, FENCE_TYPE to 3 (height and circle), FENCE_ACTION to 4 (brake)",
     )  # fmt: skip
 
 
@@ -120,8 +124,7 @@ def _px4_fence(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
     action = measured.setting("GF_ACTION")
     radius, height = measured.setting("GF_MAX_HOR_DIST"), measured.setting("GF_MAX_VER_DIST")
     state = "GF_ACTION not reported" if math.isnan(action) else ""
-    if action in (0, 1):
-        state = "off" if action == 0 else "warns only"
+    state = _PX4_FENCES.get(action, state)
     return _fence(
         config, measured, state, radius, height, "GF_MAX_HOR_DIST", "GF_MAX_VER_DIST", "GF_ACTION to 2 (hold) or 3"
     )

@@ -116,10 +116,12 @@ def test_a_time_out_that_is_not_reported_is_missing():
     [
         ("ardupilot", {"FENCE_ENABLE": 0.0}, "off"),
         ("ardupilot", {"FENCE_RADIUS": 30.0}, "30 m wide, 50 m high"),
+        ("ardupilot", {"FENCE_ACTION": 0.0}, "reports only"),
         ("ardupilot", {"FENCE_TYPE": 1.0}, "unlimited wide, 50 m high"),
         ("ardupilot", {"FENCE_ALT_MAX": 15.0}, "60 m wide, 15 m high"),
         ("px4", {"GF_ACTION": 0}, "off"),
         ("px4", {"GF_ACTION": 1}, "warns only"),
+        ("px4", {"GF_ACTION": 4}, "stops the motors"),
         ("px4", {"GF_MAX_HOR_DIST": 0.0}, "unlimited wide, 50 m high"),
     ],
 )
