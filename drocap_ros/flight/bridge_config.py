@@ -10,6 +10,8 @@ from drocap_ros.flight.safety_config import SafetyConfig, height_condition
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.parameters import param
 
+FENCE_ROOM_M = 1.0
+
 
 @dataclass(frozen=True)
 class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
@@ -66,9 +68,9 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
         super().__post_init__()
         if (refusal := height_condition(self, self.height_m)) is not None:
             raise ParameterError(str(refusal))
-        if self.radius_m + 1.0 > self.fence_radius_m:
+        if self.radius_m + FENCE_ROOM_M > self.fence_radius_m:
             raise ParameterError(
-                f"fence_radius_m: expected at least radius_m and 1 m, {self.radius_m + 1.0:g}, "
+                f"fence_radius_m: expected at least radius_m and 1 m, {self.radius_m + FENCE_ROOM_M:g}, "
                 f"got {self.fence_radius_m:g}; widen the fence or come closer"
             )
         for name, least in (("attitude_hz", 5.0), ("position_hz", 5.0), ("status_hz", 2.0)):

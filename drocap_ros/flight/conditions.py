@@ -133,7 +133,7 @@ _SENTENCES = {
     _C.VALUE_NOT_FINITE: "{name}: expected a finite number or NaN (unchanged), got {value:g}",
     _C.RADIUS_TOO_SMALL: "radius_m: expected at least {limit:g} m (min_distance_m and 0.5 m of room), got {value:g}; "
     "choose a larger radius",
-    _C.RADIUS_TOO_LARGE: "radius_m: expected at most {limit:g} m (max_distance_m), got {value:g}; "
+    _C.RADIUS_TOO_LARGE: "radius_m: expected at most {limit:g} m ({limited_by}), got {value:g}; "
     "choose a smaller radius",
     _C.HEIGHT_OUT_OF_RANGE: "height_m: expected {low:g} to {high:g} m (inside min_height_m and max_height_m), "
     "got {value:g}; choose a height in the range",

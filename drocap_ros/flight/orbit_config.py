@@ -80,7 +80,9 @@ def orbit_condition(config: OrbitConfig, radius_m: float, angular_speed_deg_s: f
     if radius_m < least:
         return condition(ConditionCode.RADIUS_TOO_SMALL, value=radius_m, limit=least)
     if radius_m > config.max_distance_m:
-        return condition(ConditionCode.RADIUS_TOO_LARGE, value=radius_m, limit=config.max_distance_m)
+        return condition(
+            ConditionCode.RADIUS_TOO_LARGE, value=radius_m, limit=config.max_distance_m, limited_by="max_distance_m"
+        )  # fmt: skip
     omega = abs(math.radians(angular_speed_deg_s))
     if omega * radius_m > config.max_speed_m_s:
         return condition(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.bridge_config import FENCE_ROOM_M, MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.planner import OrbitGoal, goal_of
 from drocap_ros.flight.orbit.states import Command, OperatorCommand
@@ -40,4 +40,8 @@ def commanded_goal(
     goal = goal_of(config, command.radius_m, command.height_m, command.angular_speed_deg_s, present)
     speed = math.degrees(goal.angular_speed_rad_s)
     beyond = orbit_condition(config, goal.radius_m, speed) or height_condition(config, goal.height_m)
+    widest_m = config.fence_radius_m - FENCE_ROOM_M
+    if beyond is None and goal.radius_m > widest_m:
+        fence = "fence_radius_m less 1 m of room"
+        beyond = condition(ConditionCode.RADIUS_TOO_LARGE, value=goal.radius_m, limit=widest_m, limited_by=fence)
     return beyond or (framing.refusal(goal) if framing else None) or goal

@@ -54,6 +54,16 @@ def test_values_outside_the_limits_are_refused(values, code):
     assert next(iter(values)) in str(found)
 
 
+def test_radius_beyond_the_fence_is_refused():
+    config = MavlinkBridgeConfig(fence_radius_m=9.0)
+    present = OrbitGoal(6.0, 3.0, 0.2)
+    found = commanded_goal(config, OperatorCommand(int(Command.ADJUST), radius_m=8.1), present)
+    assert found.code == ConditionCode.RADIUS_TOO_LARGE
+    assert "fence_radius_m" in str(found)
+    allowed = commanded_goal(config, OperatorCommand(int(Command.ADJUST), radius_m=8.0), present)
+    assert allowed.radius_m == pytest.approx(8.0)
+
+
 def test_nan_keeps_the_present_or_the_configured_value():
     present = OrbitGoal(8.0, 3.0, 0.2)
     assert commanded_goal(CONFIG, OperatorCommand(int(Command.ADJUST)), present) == pytest.approx(present)
