@@ -151,7 +151,7 @@ class VehicleStateEstimator:
         )
 
     def _take_heartbeat(self, message: Any, now_ns: int) -> None:
-        if message.autopilot == _MAV_AUTOPILOT_INVALID or message.type == _MAV_TYPE_GCS:
+        if not is_autopilot(message):
             return
         system = message.get_srcSystem()
         if self.system_id not in (0, system):
@@ -271,6 +271,11 @@ class VehicleStateEstimator:
         if abs(gap_s) > _POSITION_STALE_S:
             return np.full(3, np.nan), np.full(3, np.nan)
         return position + velocity * min(max(gap_s, -_EXTRAPOLATE_S), _EXTRAPOLATE_S), velocity
+
+
+def is_autopilot(heartbeat: Any) -> bool:
+    """Whether a HEARTBEAT is an autopilot's: cameras, companions and ground stations send them too."""
+    return bool(heartbeat.autopilot != _MAV_AUTOPILOT_INVALID and heartbeat.type != _MAV_TYPE_GCS)
 
 
 def _estimator_ok(flags: int, bad: int) -> bool:

@@ -17,8 +17,9 @@ from drocap_ros.flight.conditions import Condition, ConditionCode
 from drocap_ros.flight.mavlink.autopilot_settings import AutopilotSettings
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.mount import TYPE_PARAMETER
+from drocap_ros.flight.mavlink.state_estimator import is_autopilot
 from drocap_ros.flight.mavlink.transport import Transport
-from drocap_ros.flight.orbit.motion_checks import vehicle_condition
+from drocap_ros.flight.orbit.motion_checks import start_condition, vehicle_condition
 from drocap_ros.flight.orbit.observer import observe
 from drocap_ros.flight.orbit.states import Limits
 from drocap_ros.flight.preflight.findings import Measured, Stream
@@ -72,7 +73,7 @@ class ListeningLink(MavlinkLink):
         if name == "TIMESYNC" and message.tc1 and message.ts1 in self._sync_sent:
             trip = now_ns - message.ts1
             self.exchanges.append((trip, message.ts1 + trip // 2 - message.tc1))
-        elif name == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID:
+        elif name == "HEARTBEAT" and is_autopilot(message):
             self.systems.add(message.get_srcSystem())
         elif name == "AUTOPILOT_VERSION":
             self.version = version_text(message.flight_sw_version)
@@ -85,7 +86,7 @@ class ListeningLink(MavlinkLink):
 
     def _send_due(self) -> None:
         super()._send_due()
-        wanted = self._autopilot is not None and not self.version and self._version_tries < _VERSION_TRIES
+        wanted = self._autopilot and not self.version and self._version_tries < _VERSION_TRIES
         if wanted and self._is_due("version", _VERSION_PERIOD_S):
             self._version_tries += 1
             number = mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
@@ -154,7 +155,7 @@ class Listening:
         seen = observe(self.link, self._config, self._vehicle, None, None, "", now_ns)
         seen = dataclasses.replace(seen, armed=True, landed_state=LANDED_IN_AIR)
         limits = Limits(self._config, self._config, max_control_timeout_s=self._config.max_control_timeout_s)
-        failed = vehicle_condition(seen, limits)
+        failed = vehicle_condition(seen, limits) or start_condition(seen)
         self._samples += 1
         if failed is not None:
             self._failed[failed.code] += 1

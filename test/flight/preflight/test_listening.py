@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
@@ -242,6 +243,30 @@ def test_every_condition_of_the_vehicle_that_fails_is_named():
     named = {code for finding in scene.findings.values() if finding.level > Level.OK for code in finding.conditions}
     assert ConditionCode.POSITION_FROZEN in named
     assert not is_ready(scene.findings.values())
+
+
+def test_a_critical_state_forbids_a_start():
+    def critical(scene):
+        beat = scene.copter._heartbeat()
+        beat.system_status = mavlink.MAV_STATE_CRITICAL
+        scene.copter._heartbeat = lambda: beat
+
+    scene = Scene("ardupilot", before=critical)
+    assert scene.missing() == {"condition_autopilot_critical"}
+
+
+def test_a_ground_station_that_poses_as_an_autopilot_is_no_second_vehicle():
+    def station(scene):
+        mav = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+        beat = mav.heartbeat_encode(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_GENERIC, 0, 0, 4)
+        scene.down.write(beat.pack(mav))
+
+    assert "vehicles" not in Scene("ardupilot", before=station).findings
+
+
+def test_tries_for_the_version_are_kept_for_an_autopilot_that_starts_late():
+    silent = Scene("ardupilot", before=lambda scene: setattr(scene.down, "cut", True), seconds=3.0)
+    assert "COMMAND_LONG" not in silent.copter.received
 
 
 def test_version_of_the_firmware():
