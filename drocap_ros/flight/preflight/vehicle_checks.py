@@ -194,6 +194,8 @@ def _mount(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
         )
     elif servo and kind == "gimbal":
         level, remedy = Level.WARNING, "set mount to servo or auto: the angles of servos are against the body"
+    elif kind == "servo" and not servo and not math.isnan(number):
+        level, remedy = Level.WARNING, "set mount to gimbal or auto: the angles of this mount are against the horizon"
     elif stream.real_hz < config.rate_shortfall * config.gimbal_hz:
         level, remedy = Level.WARNING, "lower gimbal_hz, or raise the rate of the link"
     problem = next((c for c, share in measured.conditions if c.code in _CAMERA and share > LASTING), None)

@@ -202,6 +202,7 @@ def test_a_battery_monitor_without_a_charge_is_named():
         (True, {}, {}, Level.OK, "gimbal, angles at 20."),
         (True, {}, {"MNT1_TYPE": 1.0}, Level.OK, "servo, angles at 20."),
         (True, {"mount": "gimbal"}, {"MNT1_TYPE": 1.0}, Level.WARNING, "MNT1_TYPE 1"),
+        (True, {"mount": "servo"}, {"MNT1_TYPE": 6.0}, Level.WARNING, "MNT1_TYPE 6"),
         (True, {"mount": "fixed"}, {}, Level.WARNING, "fixed"),
         (False, {}, {}, Level.MISSING, "no mount reports its angles"),
         (False, {"mount": "gimbal"}, {}, Level.MISSING, "no mount reports its angles"),
