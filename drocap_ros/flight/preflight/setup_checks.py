@@ -135,16 +135,22 @@ def _camera(config: MavlinkBridgeConfig, setup: Setup) -> Iterator[Finding]:
 
 def _latency(config: MavlinkBridgeConfig, setup: Setup) -> Finding:
     """Whether the stamps of the pictures are the driver's; how late they are cannot be seen from here."""
-    driver = setup.source.startswith(_DRIVER)
+    driver, stated_s = setup.source.startswith(_DRIVER), config.camera_latency_s
+    stamps = f"stamps are {'' if driver else 'not '}the driver's"
+    if stated_s > 0:
+        return Finding(
+            "camera_latency", "camera latency", Level.OK, f"{stated_s:g} s as stated; {stamps}", "measured or stated",
+            "", {"source": setup.source, "camera_latency_s": stated_s},
+        )  # fmt: skip
     aside_deg = abs(config.angular_speed_deg_s) * _STREAM_DELAY_S
     remedy = (
-        f"use a camera on {_DRIVER}N, or a topic with stamps of the exposure: {_STREAM_DELAY_S:g} s late, a picture "
-        f"has the person {aside_deg:.1f} deg aside"
+        f"use a camera on {_DRIVER}N, or a topic with stamps of the exposure, or measure the delay and set "
+        f"camera_latency_s: {_STREAM_DELAY_S:g} s late, a picture has the person {aside_deg:.1f} deg aside"
     )
     return Finding(
         "camera_latency", "camera latency", Level.OK if driver else Level.WARNING,
-        f"not measured; stamps are {'' if driver else 'not '}the driver's", "stamps of the exposure",
-        "" if driver else remedy, {"source": setup.source},
+        f"not stated; {stamps}", "stamps of the exposure", "" if driver else remedy,
+        {"source": setup.source, "camera_latency_s": stated_s},
     )  # fmt: skip
 
 

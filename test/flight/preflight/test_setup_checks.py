@@ -77,6 +77,13 @@ def test_what_is_missing_around_the_bridge(setup, code, level, words):
     assert words in finding.remedy
 
 
+def test_a_stated_latency_of_the_camera_is_the_remedy_of_late_stamps():
+    stream = SETUP._replace(source="rtsp://drone/video")
+    assert "camera_latency_s" in findings(setup=stream)["camera_latency"].remedy
+    stated = findings(dataclasses.replace(CONFIG, camera_latency_s=0.2), stream)["camera_latency"]
+    assert (stated.level, stated.found[:5]) == (Level.OK, "0.2 s")
+
+
 @pytest.mark.parametrize(
     ("values", "code", "level", "words"),
     [
