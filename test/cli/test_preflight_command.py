@@ -1,5 +1,6 @@
 """``drocap preflight`` as a process, against simulated vehicles as processes; two at a time."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -8,12 +9,18 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
 
+from drocap_ros.cli.graph.running_bridge import BridgeListener
 from drocap_ros.errors import InputError
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.transport import open_transport
+from drocap_ros.flight.preflight.checks import all_findings
+from drocap_ros.flight.preflight.findings import Level
+from drocap_ros.flight.preflight.setup_checks import Setup
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -191,6 +198,20 @@ def test_with_a_running_graph_it_reads_what_the_bridge_hears(tmp_path):
     assert checks["guid_timeout"]["found"] == "3 s"
     assert checks["rate_attitude_quaternion"]["values"]["real_hz"] > 25
     assert checks["battery"]["found"] == "87 %, 15.8 V"
+
+
+def test_what_the_running_bridge_refuses_is_missing_whatever_the_file_permits():
+    graph = SimpleNamespace(node=SimpleNamespace(create_subscription=lambda *_: None), namespace="/drocap")
+    listener = BridgeListener(graph)
+    for code, reason in ((115, "not armed"), (100, "commands are disabled"), (100, "commands are disabled")):
+        listener.statuses.append(SimpleNamespace(state=0, condition=code, reason=reason))
+    config = MavlinkBridgeConfig(commands_enabled=True)
+    measured = dataclasses.replace(listener.measured(config, "/drocap"), heard=True)
+    setup = Setup(None, (1280, 720), "", True, "/dev/video0", 1.7, "models")
+    found = {finding.code: finding for finding in all_findings(config, setup, measured)}
+    assert found["condition_commands_disabled"].level == Level.MISSING
+    assert found["condition_commands_disabled"].found == "commands are disabled (67% of the time)"
+    assert "condition_not_armed" not in found
 
 
 def test_a_link_that_another_program_holds_is_refused_in_one_line(tmp_path):

@@ -6,12 +6,15 @@ import contextlib
 import dataclasses
 import math
 import time
+from collections import Counter
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from drocap_ros.cli.progress import Progress
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.conditions import Condition, ConditionCode
 from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
 from drocap_ros.flight.orbit.states import State
 from drocap_ros.flight.preflight.findings import Measured, Stream
@@ -27,6 +30,21 @@ _STATE_FIELDS = (
     "autopilot", "mode", "armed", "landed_state", "gps_fix_type", "satellites", "position_ok", "battery_fraction",
     "battery_voltage_v",
 )  # fmt: skip
+
+
+#: Conditions that a vehicle on the ground fails, and those of place and subject, which follow a take-off.
+_BEFORE_TAKE_OFF = {ConditionCode.NOT_ARMED, ConditionCode.NOT_FLYING}
+_OF_VEHICLE = range(ConditionCode.COMMANDS_DISABLED, ConditionCode.TOO_FAST)
+
+
+@dataclass(frozen=True)
+class _Reported(Condition):
+    """A condition in the bridge's own words: its values are not on the topic."""
+
+    words: str = ""
+
+    def __str__(self) -> str:
+        return self.words
 
 
 class BridgeListener:
@@ -57,6 +75,16 @@ class BridgeListener:
             if status.name == f"{self._graph.namespace.strip('/')}/mavlink_bridge":
                 self.values.update({value.key: value.value for value in status.values})
 
+    def _failed(self) -> tuple[tuple[Condition, float], ...]:
+        """Conditions for motion that the bridge has reported, with their share of the time."""
+        idle = {status.condition: status.reason for status in self.statuses if status.state == State.IDLE}
+        times = Counter(status.condition for status in self.statuses)
+        return tuple(
+            (_Reported(ConditionCode(code), words=reason), times[code] / len(self.statuses))
+            for code, reason in sorted(idle.items())
+            if code in _OF_VEHICLE and code not in _BEFORE_TAKE_OFF
+        )
+
     def measured(self, config: MavlinkBridgeConfig, namespace: str) -> Measured:
         """What the bridge has reported; it reads fewer of the autopilot's parameters than a link of our own."""
         from drocap_ros.ros.diagnostics import Key, of
@@ -78,7 +106,7 @@ class BridgeListener:
         return Measured(
             vehicle=vehicle, heard=vehicle is not None, streams=streams,
             settings={name: float(text) for name, text in self.values.items() if name in known},
-            delays_s=np.array([age for age, _ in self.states]),
+            delays_s=np.array([age for age, _ in self.states]), conditions=self._failed(),
             bridge=f"by the running bridge in {namespace}, {state}: {status.reason}",
         )  # fmt: skip
 
