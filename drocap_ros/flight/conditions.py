@@ -82,6 +82,7 @@ class ConditionCode(enum.IntEnum):
     PACKETS_LOST = 125
     AUTOPILOT_EMERGENCY = 126
     AUTOPILOT_CRITICAL = 127
+    SEVERAL_VEHICLES = 128
     # Others in the graph
     OTHER_POSE_PUBLISHER = 130
     SECOND_BRIDGE = 131
@@ -186,6 +187,8 @@ _SENTENCES = {
     _C.AUTOPILOT_EMERGENCY: "the autopilot reports {reported}: take over by hand",
     _C.AUTOPILOT_CRITICAL: "the autopilot reports {reported}: one of its failsafes has triggered; the ground station "
     "shows the cause",
+    _C.SEVERAL_VEHICLES: "the link carries more than one vehicle, systems {systems}: set target_system_id to that of "
+    "the one with this camera",
     _C.OTHER_POSE_PUBLISHER: "pose2d has more than one publisher ({names}): stop the others, or give them another "
     "namespace",
     _C.SECOND_BRIDGE: "another bridge, or a replay of one, publishes in {namespace}: stop it, or give it another "

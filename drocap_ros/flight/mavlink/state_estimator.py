@@ -56,6 +56,8 @@ class VehicleStateEstimator:
         self.mount = camera_mount or mount.Mount()
         self.system_id = target_system_id
         self.component_id = 0
+        #: MAVLink systems of all autopilots that were heard.
+        self.systems: frozenset[int] = frozenset()
         self._heard_ns: int | None = None
         self._stamp_ns = -(10**18)
         self.modes = ModeReports()
@@ -151,9 +153,10 @@ class VehicleStateEstimator:
         )
 
     def _take_heartbeat(self, message: Any, now_ns: int) -> None:
-        if not is_autopilot(message):
+        if message.autopilot == _MAV_AUTOPILOT_INVALID or message.type == _MAV_TYPE_GCS:
             return
         system = message.get_srcSystem()
+        self.systems |= {system}
         if self.system_id not in (0, system):
             return
         if self.modes.autopilot and message.get_srcComponent() != self.component_id:
@@ -271,11 +274,6 @@ class VehicleStateEstimator:
         if abs(gap_s) > _POSITION_STALE_S:
             return np.full(3, np.nan), np.full(3, np.nan)
         return position + velocity * min(max(gap_s, -_EXTRAPOLATE_S), _EXTRAPOLATE_S), velocity
-
-
-def is_autopilot(heartbeat: Any) -> bool:
-    """Whether a HEARTBEAT is an autopilot's: cameras, companions and ground stations send them too."""
-    return bool(heartbeat.autopilot != _MAV_AUTOPILOT_INVALID and heartbeat.type != _MAV_TYPE_GCS)
 
 
 def _estimator_ok(flags: int, bad: int) -> bool:

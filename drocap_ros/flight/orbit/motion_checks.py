@@ -86,8 +86,11 @@ def start_condition(seen: Observed) -> Condition | None:
     """Why no orbit may begin; one that is flown goes on.
 
     ArduPilot reports a critical state after a failsafe of battery, radio or ground station has triggered, also one
-    whose action is switched off in GUIDED.  PX4 reports it while a failsafe acts.
+    whose action is switched off in GUIDED.  PX4 reports it while a failsafe acts.  Of several vehicles the first one
+    that was heard would fly, and need not be the one with the camera.
     """
+    if len(seen.vehicles) > 1:
+        return condition(_C.SEVERAL_VEHICLES, systems=", ".join(map(str, sorted(seen.vehicles))))
     if seen.system_status == _MAV_STATE_CRITICAL:
         return condition(_C.AUTOPILOT_CRITICAL, reported="a critical state")
     return None

@@ -82,6 +82,7 @@ def observe(
         in_hold=latest.mode == dialect.hold_mode, heard=heard | {latest.mode},
         left_by_itself=estimator.modes.intended == dialect.control_mode != latest.mode == loss_mode,
         armed=latest.armed, system_status=estimator.modes.system_status, landed_state=latest.landed_state,
+        vehicles=frozenset() if config.target_system_id else estimator.systems,
         link_age_s=latest.link_age_s,
         heartbeat_age_s=estimator.modes.age_s(now_ns),
         state_age_s=abs(age_s),

@@ -60,6 +60,7 @@ class Observed:
     heard : all modes that were reported since the last step, late ones too; empty = the mode alone
     left_by_itself : whether the autopilot left the control mode as for the loss of setpoints, and nobody chose this
     system_status : MAV_STATE of the autopilot; 0 = unknown
+    vehicles : MAVLink systems of the autopilots on the link, unless the operator has chosen one
     heartbeat_age_s : since the newest report of the mode
     position_age_s : since the reported position last changed, so frozen telemetry ages too
     round_trip_s : since the sending of the message that was answered last; NaN = no answer yet
@@ -89,6 +90,7 @@ class Observed:
     armed: bool = False
     system_status: int = 0
     landed_state: int = 0
+    vehicles: frozenset[int] = frozenset()
     link_age_s: float = math.inf
     heartbeat_age_s: float = math.inf
     state_age_s: float = math.inf

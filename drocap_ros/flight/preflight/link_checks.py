@@ -70,7 +70,7 @@ def _several(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
     return Finding(
         "vehicles", "vehicles on the link", Level.OK if chosen else Level.MISSING, f"systems {names}",
         "one, or a chosen one", "" if chosen else "set target_system_id to the system of your vehicle",
-        {"systems": names},
+        {"systems": names}, (_C.SEVERAL_VEHICLES,),
     )  # fmt: skip
 
 

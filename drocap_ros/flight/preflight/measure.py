@@ -17,7 +17,6 @@ from drocap_ros.flight.conditions import Condition, ConditionCode
 from drocap_ros.flight.mavlink.autopilot_settings import AutopilotSettings
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.mount import TYPE_PARAMETER
-from drocap_ros.flight.mavlink.state_estimator import is_autopilot
 from drocap_ros.flight.mavlink.transport import Transport
 from drocap_ros.flight.orbit.motion_checks import start_condition, vehicle_condition
 from drocap_ros.flight.orbit.observer import observe
@@ -55,7 +54,6 @@ class ListeningLink(MavlinkLink):
         self.version = ""
         self.arrivals: defaultdict[str, list[int]] = defaultdict(list)
         self.exchanges: list[tuple[int, int]] = []  # round trip, offset, ns
-        self.systems: set[int] = set()
         self._version_tries = 0
 
     def check_motion(self, message: Any) -> NoReturn:
@@ -73,8 +71,6 @@ class ListeningLink(MavlinkLink):
         if name == "TIMESYNC" and message.tc1 and message.ts1 in self._sync_sent:
             trip = now_ns - message.ts1
             self.exchanges.append((trip, message.ts1 + trip // 2 - message.tc1))
-        elif name == "HEARTBEAT" and is_autopilot(message):
-            self.systems.add(message.get_srcSystem())
         elif name == "AUTOPILOT_VERSION":
             self.version = version_text(message.flight_sw_version)
         elif name == "COMMAND_ACK" and message.command == mavlink.MAV_CMD_REQUEST_MESSAGE:
@@ -178,7 +174,7 @@ class Listening:
             delays_s=np.array([delay for at, delay in self._delays if at >= from_ns]),
             good_count=sum(map(len, link.arrivals.values())), bad_count=status.bad_count,
             unsigned_count=status.refused_count, packet_loss=link.estimator.packets.loss,
-            systems=frozenset(link.systems),
+            systems=link.estimator.systems,
             conditions=tuple(
                 (self._examples[code], self._failed[code] / self._samples) for code in sorted(self._failed)
             ),

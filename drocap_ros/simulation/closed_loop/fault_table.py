@@ -160,12 +160,16 @@ _LINK = (
     _link("uplink delayed by 1 s", "up", {"delay_s": DELAY_S}, cause=DELAYED, codes=(*_TELEMETRY, *_TAKEN)),
     Fault("30 % loss", assign("link", loss=0.3), harmless=True),
     _link("80 % loss", "link", {"loss": 0.8}, cause=LOSSY, codes=(*_TELEMETRY, *_LOCATED, *_TAKEN)),
+    Fault(
+        "another vehicle on the link, and none is chosen", _ENGAGE, harmless=True, state=State.IDLE,
+        before=((2.0, foreign_system),), codes=(_C.SEVERAL_VEHICLES,), check=no_orbit,
+    ),
     Fault("every packet twice", assign("link", duplicate=1.0), harmless=True),
     Fault("packets out of order", assign("link", jitter_s=0.08), harmless=True),
     Fault("a foreign system on the link", foreign_system, harmless=True),
     _link("telemetry frozen, clock continues", "copter", {"frozen": True}),
     _link("telemetry frozen with its clock", "copter", {"frozen": True, "frozen_clock": True}),
-)
+)  # fmt: skip
 _VEHICLE = (
     Fault("GPS lost", begins("gps_lost_s"), 0.4 + HEARTBEAT_S, codes=(_C.NO_SATELLITE_FIX,)),
     Fault("estimator fails", begins("ekf_failed_s"), HEARTBEAT_S, codes=(_C.ESTIMATOR_UNHEALTHY, *_TAKEN)),

@@ -39,6 +39,14 @@ def test_a_critical_state_forbids_a_start_and_ends_no_orbit():
     assert reduce(SafetyState(), dataclasses.replace(seen, system_status=4), 1.0, None, LIMITS)[0].state == State.READY
 
 
+def test_several_vehicles_forbid_a_start_and_end_no_orbit():
+    seen = dataclasses.replace(GOOD, vehicles=frozenset({1, 42}))
+    assert reduce(orbiting(), seen, 1.0, None, LIMITS)[0].state == State.ORBITING
+    answer = reduce(SafetyState(), seen, 1.0, Command.START, LIMITS)[1].answer
+    assert (answer.accepted, answer.condition.code) == (False, ConditionCode.SEVERAL_VEHICLES)
+    assert "systems 1, 42" in str(answer)
+
+
 def test_diagnostics_warn_of_what_a_link_lacks():
     good = LinkStatus(True, 0.0, 0.02, {}, {}, 0)
     assert good.warning() == ""
