@@ -113,8 +113,9 @@ _SENTENCES = {
     _C.ADJUSTED: "orbit adjusted",
     _C.STOPPED: "stopped by the operator",
     _C.ACKNOWLEDGED: "acknowledged by the operator",
-    _C.ALREADY_ORBITING: "already orbiting",
-    _C.ALREADY_REQUESTING_CONTROL: "already requesting control from the autopilot",
+    _C.ALREADY_ORBITING: "already orbiting, and its values stay; adjust changes them",
+    _C.ALREADY_REQUESTING_CONTROL: "already requesting control from the autopilot, for the orbit of the first "
+    "request; stop cancels it",
     _C.ALREADY_HOLDING: "already holding",
     _C.NOT_ORBITING: "not orbiting",
     _C.DISARMED: "the motors were disarmed",
@@ -131,7 +132,7 @@ _SENTENCES = {
     _C.COMMAND_OUTDATED: "the command is {age_s:.1f} s old, and {limit_s:g} s is the limit",
     _C.TOO_MANY_COMMANDS: "more than {limit} commands are waiting",
     _C.OVERRULED_BY_STOP: "a stop arrived together with this command",
-    _C.VALUE_NOT_FINITE: "{name}: expected a finite number or NaN (unchanged), got {value:g}",
+    _C.VALUE_NOT_FINITE: "{name}: expected a finite number or NaN (not given), got {value:g}",
     _C.RADIUS_TOO_SMALL: "radius_m: expected at least {limit:g} m (min_distance_m and 0.5 m of room), got {value:g}; "
     "choose a larger radius",
     _C.RADIUS_TOO_LARGE: "radius_m: expected at most {limit:g} m ({limited_by}), got {value:g}; "

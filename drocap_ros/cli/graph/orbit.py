@@ -22,7 +22,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="start, adjust or stop the orbit of a running graph, or print its status",
         description="Send a command to the mavlink_bridge of a running graph and print the answer. Exit status 1 when "
         "the command is refused. `start` needs the vehicle in GUIDED or OFFBOARD already; `engage` requests that mode "
-        "from the autopilot first.",
+        "from the autopilot first. Values that are not given stay with `adjust`; `start` and `engage` take the "
+        "configured ones, also after a hold.",
     )
     parser.add_argument("action", choices=("start", "engage", "adjust", "stop", "status"), help="command to send")
     parser.add_argument("--radius", metavar="M", type=float, default=math.nan, help="m, from the subject")

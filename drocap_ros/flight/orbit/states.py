@@ -225,7 +225,7 @@ class OperatorCommand:
     """A command as it was received, not validated.
 
     kind : number of a :class:`Command`
-    radius_m, height_m, angular_speed_deg_s : NaN = as at present or as configured
+    radius_m, height_m, angular_speed_deg_s : NaN = as at present (adjust) or as configured
     stamp_ns : when it was given; 0 = now
     """
 

@@ -1,12 +1,15 @@
+import dataclasses
 import math
 
 import pytest
+from orbit_observations import GOOD, LIMITS, orbiting
 
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode
 from drocap_ros.flight.orbit.command_checks import command_condition, commanded_goal
 from drocap_ros.flight.orbit.planner import OrbitGoal
-from drocap_ros.flight.orbit.states import Command, OperatorCommand
+from drocap_ros.flight.orbit.safety import reduce
+from drocap_ros.flight.orbit.states import Command, OperatorCommand, SafetyState
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop
 
 CONFIG = MavlinkBridgeConfig()
@@ -80,6 +83,16 @@ def answers_of(commands):
     for i in range(len(commands) + 1):
         found += loop.controller.step(loop.clock_ns() + i, loop.t + 0.001 * i).answers
     return found
+
+
+def test_a_second_start_names_the_command_that_changes_its_values():
+    seen = dataclasses.replace(GOOD, mode="LOITER", in_control=False)
+    allowed = LIMITS._replace(safety=dataclasses.replace(LIMITS.safety, mode_change_allowed=True))
+    requesting = reduce(SafetyState(), seen, 1.0, Command.ENGAGE, allowed)[0]
+    for state, now, word in ((orbiting(), GOOD, "adjust"), (requesting, seen, "stop")):
+        answer = reduce(state, now, 1.1, Command.ENGAGE, allowed)[1].answer
+        assert answer.accepted
+        assert word in str(answer)
 
 
 def test_every_command_gets_exactly_one_answer():
