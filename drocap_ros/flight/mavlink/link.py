@@ -255,6 +255,9 @@ class MavlinkLink:
         self._heard_s = self._monotonic_s()
         self._transport.accept_peer()
         if (kind := self.estimator.modes.autopilot) != self._autopilot:  # the first one, or another on the same link
+            if self._autopilot:  # nothing that the other one sent, refused or said of its mount is true of this one
+                self._requests = TelemetryRequests(self.config)
+                self.estimator.mount.take_type(math.nan)
             self._autopilot = kind
             self._requests.set_autopilot(kind)
             self.settings.set_autopilot(kind)

@@ -1,12 +1,16 @@
 """Which messages are requested from which autopilot, and which requests end."""
 
+import math
+
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.current_mode import CURRENT_MODE_ID
+from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
+from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 
 S = 1_000_000_000
 GIMBAL, BEAT = mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS, mavlink.MAVLINK_MSG_ID_HEARTBEAT
@@ -80,3 +84,19 @@ def test_a_message_that_we_do_not_know_is_no_bad_data():
     damaged[-1] ^= 1
     assert parser.feed(bytes(damaged) + bytes(300)) == []
     assert parser.bad_count > 0
+
+
+def test_another_autopilot_on_the_same_link_is_asked_for_its_own_messages():
+    down, up = Channel(lambda: 0.0), Channel(lambda: 0.0)
+    down.delay_s = 0.0
+    config = MavlinkBridgeConfig(commands_enabled=True)
+    link = MavlinkLink(config, monotonic_s=lambda: 0.0, transport=LoopbackTransport(down, up))
+    mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    link.estimator.mount.take_type(1.0)
+    for autopilot in (mavlink.MAV_AUTOPILOT_PX4, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA):
+        down.write(mav.heartbeat_encode(2, autopilot, 129, 4, 4).pack(mav))
+        link.spin_once()
+    wanted = link.status().rates_hz
+    assert {"HEARTBEAT", "EKF_STATUS_REPORT"} <= set(wanted)
+    assert not {"CURRENT_MODE", "ESTIMATOR_STATUS"} & set(wanted)
+    assert math.isnan(link.estimator.mount.type_number)
