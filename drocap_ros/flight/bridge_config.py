@@ -73,6 +73,12 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
                 f"fence_radius_m: expected at least radius_m and 1 m, {self.radius_m + FENCE_ROOM_M:g}, "
                 f"got {self.fence_radius_m:g}; widen the fence or come closer"
             )
+        # One period of the loop is no hang: with less, every step would count as one.
+        if self.watchdog_s < (periods_s := 2.0 / self.control_hz):
+            raise ParameterError(
+                f"watchdog_s: expected at least two periods of control_hz, {periods_s:.2g} s, got {self.watchdog_s:g}; "
+                "raise it or control_hz"
+            )
         for name, least in (("attitude_hz", 5.0), ("position_hz", 5.0), ("status_hz", 2.0)):
             if self.commands_enabled and getattr(self, name) < least:
                 raise ParameterError(

@@ -232,7 +232,9 @@ class open_transport_guard:  # noqa: N801
         self.transport.close()
 
 
-@pytest.mark.parametrize("change", [{"system_id": 255}, {"system_id": 0}, {"component_id": 0}, {"attitude_hz": -1.0}])
+@pytest.mark.parametrize(
+    "change", [{"system_id": 255}, {"system_id": 0}, {"component_id": 0}, {"attitude_hz": -1.0}, {"control_hz": 5.0}]
+)
 def test_bridge_parameters_out_of_range_are_refused(change):
     with pytest.raises(ParameterError):
         MavlinkBridgeConfig(**change)
