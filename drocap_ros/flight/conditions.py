@@ -129,7 +129,8 @@ _SENTENCES = {
     _C.WIDENED: "{cause}, {radius_m:.1f} m away instead of {wanted_m:.1f}: clear of min_distance_m, {limit_m:g} m, if "
     "the range is wrong; size_error, {size_error:g}, may be 0.04 where body_height_m is the subject's",
     _C.UNKNOWN_COMMAND: "no command has the number {number}",
-    _C.COMMAND_OUTDATED: "the command is {age_s:.1f} s old, and {limit_s:g} s is the limit",
+    _C.COMMAND_OUTDATED: "the command is {age_s:.1f} s old by the bridge's clock, and {limit_s:g} s is the limit; "
+    "synchronize the clocks of the two computers",
     _C.TOO_MANY_COMMANDS: "more than {limit} commands are waiting",
     _C.OVERRULED_BY_STOP: "a stop arrived together with this command",
     _C.VALUE_NOT_FINITE: "{name}: expected a finite number or NaN (not given), got {value:g}",
