@@ -130,7 +130,8 @@ def _time_sync(config: MavlinkBridgeConfig, measured: Measured) -> Iterator[Find
         yield Finding(
             "round_trip", "round trip", Level.MISSING, "no answer to time synchronization",
             f"below {config.max_round_trip_s:g} s",
-            "connect TX of this computer too, and let the router pass TIMESYNC", {}, (_C.ROUND_TRIP_TOO_LONG,),
+            "connect TX of this computer too, let the router pass TIMESYNC, and set signing_key_file if the autopilot "
+            "drops unsigned packets", {}, (_C.ROUND_TRIP_TOO_LONG,),
         )  # fmt: skip
         return
     typical, late = (float(v) for v in np.percentile(trips, (50, 99)))

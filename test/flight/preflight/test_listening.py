@@ -160,6 +160,7 @@ def test_a_link_that_only_receives_has_no_round_trip():
     scene = Scene("ardupilot", before=one_way)
     assert {"round_trip", "guid_timeout"} <= scene.missing()
     assert "TX" in scene.findings["round_trip"].remedy
+    assert "signing_key_file" in scene.findings["round_trip"].remedy
 
 
 def test_a_slow_uplink_is_a_long_round_trip():
