@@ -112,7 +112,7 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
     covariance = None
     if motion.covariance is not None and motion.meta.get("covariance_about") != "pelvis":
         covariance = in_body_order(motion.covariance, motion.joints, LIMB_JOINTS)[usable]
-    errors_in_world = world_errors(estimate, true, _rate(at[usable]), covariance) if world else None
+    errors_in_world = world_errors(estimate, true, 1 / np.diff(at[usable]), covariance) if world else None
     return MotionErrors(
         frames=len(estimate),
         error_mm=1000.0 * float(pa_mpjpe(estimate, true).mean()),
@@ -126,11 +126,6 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
         world=errors_in_world,
         toe_mm=1000.0 * toe_error(estimate, true),
     )
-
-
-def _rate(time_s: np.ndarray) -> float:
-    """Frames per second of increasing times; 1 for a single frame."""
-    return 1.0 / float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
 
 
 def _at_times(values: np.ndarray, time_s: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -127,7 +127,7 @@ def _history(view: WorldView) -> CameraHistory:
 
 def _errors(poses: dict[int, np.ndarray], truth: np.ndarray) -> WorldErrors:
     frames = sorted(poses)
-    return world_errors(np.array([poses[i] for i in frames]), truth[frames], FPS)
+    return world_errors(np.array([poses[i] for i in frames]), truth[frames], FPS / np.diff(frames))
 
 
 def live_world_markdown(rows: list[LiveWorldRow], telemetry: str) -> str:

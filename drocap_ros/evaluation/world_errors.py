@@ -46,18 +46,19 @@ class WorldErrors:
 
 
 def world_errors(
-    estimate: np.ndarray, truth: np.ndarray, fps: float, covariance: np.ndarray | None = None
+    estimate: np.ndarray, truth: np.ndarray, rate_hz: world_metrics.Rate, covariance: np.ndarray | None = None
 ) -> WorldErrors:
-    """Errors of joints (F, P, 3) m in the world against the truth, both z up at ``fps``; means are over ``BODY_15``.
+    """Errors of joints (F, P, 3) m in the world against the truth, both z up; means are over ``BODY_15``.
 
     Neck and head may be NaN: the means are then over the other joints.
 
+    rate_hz : frames per second, one number or (F - 1) of the steps
     covariance : (F, P, 6) m^2 of the estimate, or None
     """
     estimate, truth = estimate[:, : len(BODY_15)], truth[:, : len(BODY_15)]
     nan = float("nan")
     moving = len(truth) > 2
-    foot = world_metrics.still_foot_speed(estimate, truth, fps) if moving else nan
+    foot = world_metrics.still_foot_speed(estimate, truth, rate_hz) if moving else nan
     known = (np.isfinite(estimate) & np.isfinite(truth)).all(axis=(0, 2))
     est, tru = estimate[:, known], truth[:, known]
     return WorldErrors(
@@ -70,10 +71,10 @@ def world_errors(
         scale=scale_error(estimate, truth),
         horizon_deg=float(np.degrees(horizon_error(estimate, truth)).mean()),
         foot_m_s=foot,
-        foot_mm=1000 * foot / fps,
+        foot_mm=1000 * foot / float(np.median(rate_hz)) if moving else nan,
         penetration_mm=1000 * world_metrics.penetration(estimate, truth),
-        acceleration_ratio=world_metrics.acceleration_ratio(est, tru, fps) if moving else nan,
-        acceleration_error_m_s2=world_metrics.acceleration_error(est, tru, fps) if moving else nan,
+        acceleration_ratio=world_metrics.acceleration_ratio(est, tru, rate_hz) if moving else nan,
+        acceleration_error_m_s2=world_metrics.acceleration_error(est, tru, rate_hz) if moving else nan,
         coverage=nan
         if covariance is None
         else world_metrics.ellipsoid_coverage(est, tru, covariance[:, : len(BODY_15)][:, known]),

@@ -19,6 +19,8 @@ STILL_M_S = 0.1
 MOTIONLESS_M_S2 = 1e-3
 #: Squared radius of the ellipsoid that holds 90 % of a normal distribution in three dimensions (chi-squared).
 ELLIPSOID_90 = 6.2514
+#: Frames per second: one number, or (F - 1) of the steps between the frames, which images left out make longer.
+Rate = float | np.ndarray
 _PELVIS = BODY_15.index("pelvis")
 
 
@@ -36,10 +38,10 @@ def root_error(estimate: np.ndarray, truth: np.ndarray) -> float:
     return float(np.linalg.norm(moved - tru, axis=1).mean()) / max(path, 1e-9)
 
 
-def still_foot_speed(estimate: np.ndarray, truth: np.ndarray, fps: float) -> float:
+def still_foot_speed(estimate: np.ndarray, truth: np.ndarray, rate_hz: Rate) -> float:
     """Mean speed (m/s) of the estimated ankles where the true ones move slower than ``STILL_M_S``; NaN = never."""
-    still = _speed(truth[:, FEET], fps) < STILL_M_S
-    return float(_speed(estimate[:, FEET], fps)[still].mean()) if still.any() else float("nan")
+    still = _speed(truth[:, FEET], rate_hz) < STILL_M_S
+    return float(_speed(estimate[:, FEET], rate_hz)[still].mean()) if still.any() else float("nan")
 
 
 def penetration(estimate: np.ndarray, truth: np.ndarray) -> float:
@@ -47,20 +49,22 @@ def penetration(estimate: np.ndarray, truth: np.ndarray) -> float:
     return float(np.maximum(truth[:, FEET, 2].min() - estimate[:, FEET, 2], 0.0).mean())
 
 
-def accelerations(joints: np.ndarray, fps: float) -> np.ndarray:
+def accelerations(joints: np.ndarray, rate_hz: Rate) -> np.ndarray:
     """(F - 2, P, 3) m/s^2, second differences."""
-    return (joints[2:] - 2 * joints[1:-1] + joints[:-2]) * fps**2
+    rates = _of_steps(rate_hz, len(joints))
+    between = 2 / (1 / rates[1:] + 1 / rates[:-1])
+    return np.diff(np.diff(joints, axis=0) * rates, axis=0) * between
 
 
-def acceleration_ratio(estimate: np.ndarray, truth: np.ndarray, fps: float) -> float:
+def acceleration_ratio(estimate: np.ndarray, truth: np.ndarray, rate_hz: Rate) -> float:
     """Mean acceleration of the estimated joints over that of the true ones; NaN = the truth does not move."""
-    est, tru = (float(np.linalg.norm(accelerations(x, fps), axis=-1).mean()) for x in (estimate, truth))
+    est, tru = (float(np.linalg.norm(accelerations(x, rate_hz), axis=-1).mean()) for x in (estimate, truth))
     return est / tru if tru > MOTIONLESS_M_S2 else float("nan")
 
 
-def acceleration_error(estimate: np.ndarray, truth: np.ndarray, fps: float) -> float:
+def acceleration_error(estimate: np.ndarray, truth: np.ndarray, rate_hz: Rate) -> float:
     """Mean length (m/s^2) of the difference of the accelerations."""
-    return float(np.linalg.norm(accelerations(estimate, fps) - accelerations(truth, fps), axis=-1).mean())
+    return float(np.linalg.norm(accelerations(estimate, rate_hz) - accelerations(truth, rate_hz), axis=-1).mean())
 
 
 def ellipsoid_coverage(estimate: np.ndarray, truth: np.ndarray, covariance: np.ndarray) -> float:
@@ -76,5 +80,10 @@ def ellipsoid_coverage(estimate: np.ndarray, truth: np.ndarray, covariance: np.n
     return float((square < ELLIPSOID_90).mean())
 
 
-def _speed(points: np.ndarray, fps: float) -> np.ndarray:
-    return np.linalg.norm(np.diff(points, axis=0), axis=-1) * fps
+def _speed(points: np.ndarray, rate_hz: Rate) -> np.ndarray:
+    return np.linalg.norm(np.diff(points, axis=0) * _of_steps(rate_hz, len(points)), axis=-1)
+
+
+def _of_steps(rate_hz: Rate, frames: int) -> np.ndarray:
+    """Rates (F - 1, 1, 1) of the steps between the frames."""
+    return np.broadcast_to(np.asarray(rate_hz, float), frames - 1)[:, None, None]

@@ -80,6 +80,21 @@ def test_world_frames_give_world_error_and_horizon_error():
     assert errors.w_error_mm < 1e-3
 
 
+def test_images_left_out_change_neither_speed_nor_acceleration():
+    time_s = np.arange(121) / 24.0
+    truth, estimate = np.zeros((2, 121, 15, 3))
+    truth[..., 0] = 0.08 * time_s[:, None]  # still, at 0.08 m/s: a step over a gap is longer, not faster
+    estimate[..., 0] = 0.2 * time_s[:, None]
+    head = BODY_15.index("head")
+    truth[:, head, 2], estimate[:, head, 2] = 0.5 * time_s**2, 1.5 * time_s**2  # 1 and 3 m/s^2
+    kept = np.sort(np.random.default_rng(0).choice(121, 60, replace=False))
+    whole = motion(estimate, "world")
+    errors = compare(replace(motion(estimate[kept], "world"), stamp_ns=whole.stamp_ns[kept]), truth, time_s, "world")
+    assert errors.world.foot_m_s == pytest.approx(0.2)
+    assert errors.world.acceleration_ratio == pytest.approx(3.0, rel=1e-3)
+    assert errors.world.acceleration_error_m_s2 == pytest.approx(2.0 / 15.0, rel=1e-3)
+
+
 def test_truth_at_another_rate_is_interpolated():
     x = stick(61)
     errors = compare(motion(x[::2], fps=12.0), x, np.arange(61) / 24.0, "camera")
