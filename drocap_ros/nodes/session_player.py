@@ -68,6 +68,7 @@ class SessionPlayerNode(ThreadedSource):
 
     def play(self) -> None:
         """Publish the session, in a loop if configured."""
+        self.stopping.wait(self.config.delay_s)
         try:
             while True:
                 self._play_once()

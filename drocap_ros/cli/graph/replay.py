@@ -21,6 +21,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("session", metavar="SESSION", type=Path, help="session folder, .mcap, .bag or rosbag2 folder")
     parser.add_argument("--rate", type=float, default=1.0, help="times the speed of the recording (default 1)")
     parser.add_argument("--start", metavar="S", type=float, default=0.0, help="seconds into the recording (default 0)")
+    parser.add_argument(
+        "--delay",
+        metavar="S",
+        type=float,
+        default=3.0,
+        help="seconds before the first message, in which running subscribers find the player (default 3)",
+    )
     parser.add_argument("--loop", action="store_true", help="repeat until Ctrl-C")
     parser.add_argument(
         "--topics",
@@ -45,6 +52,7 @@ def run(args: argparse.Namespace) -> int:
         session=str(args.session.absolute()),
         rate=args.rate,
         start_s=args.start,
+        delay_s=args.delay,
         loop=args.loop,
         topics=" ".join(args.topics),
         clock=not args.no_clock,
