@@ -66,11 +66,9 @@ def upright_joints(motion: Motion) -> np.ndarray:
 
 
 def save_motion(path: str | Path, motion: Motion, **further: np.ndarray) -> None:
-    """Write ``motion.npz``; ``further`` arrays are added, and :func:`load_motion` ignores them."""
+    """Write ``motion.npz``, an unknown covariance as NaN; :func:`load_motion` ignores ``further`` arrays."""
     if motion.camera_position is not None:
         further = {"camera_position": motion.camera_position, **further}
-    if motion.covariance is not None:
-        further = {"covariance": motion.covariance, **further}
     np.savez_compressed(
         path,
         joints3d=motion.joints3d.astype(np.float64),
@@ -84,6 +82,7 @@ def save_motion(path: str | Path, motion: Motion, **further: np.ndarray) -> None
         confidence=motion.confidence,
         keypoints=motion.keypoints,
         reprojection_px=motion.reprojection_px,
+        covariance=np.full((*motion.joints3d.shape[:2], 6), np.nan) if motion.covariance is None else motion.covariance,
         meta=np.array(json.dumps(motion.meta, sort_keys=True)),
         **further,  # type: ignore[arg-type]
     )
@@ -150,12 +149,18 @@ def load_motion(path: str | Path) -> Motion:
             reprojection_px=a["reprojection_px"],
             meta=meta if isinstance(meta, dict) else {},
             camera_position=a.get("camera_position"),
-            covariance=a.get("covariance"),
+            covariance=_known(a.get("covariance")),
         )
         _check(motion)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return motion
+
+
+def _known(values: np.ndarray | None) -> np.ndarray | None:
+    """None where every value is NaN."""
+    nothing = values is None or (values.dtype.kind == "f" and np.isnan(values).all())
+    return None if nothing else values
 
 
 def _check(m: Motion) -> None:

@@ -75,6 +75,13 @@ def test_equal_input_gives_equal_bits(walk: Walk, paper: Motion, tmp_path: Path)
             )
 
 
+def test_file_of_a_motion_without_covariance_holds_unknown_ones(paper: Motion, tmp_path: Path) -> None:
+    save_motion(tmp_path / "motion.npz", paper)
+    with np.load(tmp_path / "motion.npz") as file:
+        np.testing.assert_array_equal(file["covariance"], np.full((120, 15, 6), np.nan))
+    assert load_motion(tmp_path / "motion.npz").covariance is None
+
+
 def test_method_without_a_finite_pose_is_an_error(walk: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
     def lost(name: str, data: MethodInput) -> CameraPoses:
         found = run_method(name, data)
