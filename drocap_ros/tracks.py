@@ -202,6 +202,8 @@ def read_npz(path: Path, required: tuple[str, ...]) -> dict[str, np.ndarray]:
         raise InputError(f"{path}: no such file; check the path") from None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, NotImplementedError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        if reason.startswith("Object arrays"):
+            reason = "found arrays of Python objects; save names as text: np.array(names, dtype=str)"
         raise InputError(f"{path}: expected a readable .npz archive; {reason}") from None
     missing = [name for name in required if name not in arrays]
     kind, wanted = kind_of(arrays), kind_of(required)

@@ -50,6 +50,7 @@ def test_file_round_trip(tmp_path):
         ({"stamp_ns": np.arange(4) * 0.04}, "expected int64"),
         ({"stamp_ns": np.arange(3)}, "expected shape"),
         ({"joints": np.array(["a"] * 15)}, "distinct"),
+        ({"joints": np.array(BODY_15.joints, object)}, r"save names as text: np\.array\(names, dtype=str\)"),
         ({"image_size": np.array([0, 480])}, "positive"),
         ({"image_size": np.array([640])}, "image_size"),
         ({"confidence": np.zeros((4, 3))}, "confidence: expected shape"),
