@@ -33,8 +33,8 @@ def joint_angles(body: RigidBody, rate_hz: float) -> dict[str, np.ndarray]:
     rate_hz : frames per second
     """
     pelvis, chest = body.pelvis @ _ISB, body.chest @ _ISB
-    rotation, list_, tilt = _euler(pelvis, "YXZ").T
-    flexion, bending, axial = _euler(np.swapaxes(pelvis, 1, 2) @ chest, "ZXY").T
+    rotation, list_, tilt = continuous_euler(pelvis, "YXZ").T
+    flexion, bending, axial = continuous_euler(np.swapaxes(pelvis, 1, 2) @ chest, "ZXY").T
     out = {"pelvis_rotation": rotation, "pelvis_obliquity": list_, "pelvis_tilt": -tilt}
     out |= {"trunk_flexion": -flexion, "trunk_bending": bending, "trunk_rotation": axial}
     head = _in(chest, body.at("head") - body.at("neck"))
@@ -49,7 +49,7 @@ def joint_angles(body: RigidBody, rate_hz: float) -> dict[str, np.ndarray]:
 def _leg(body: RigidBody, pelvis: np.ndarray, side: str, rate_hz: float) -> dict[str, np.ndarray]:
     hip, knee, ankle = (_in(pelvis, body.at(side + name), side) for name in ("hip", "knee", "ankle"))
     thigh, shank = _limb(knee - hip, ankle - knee, -1.0, rate_hz)
-    flexion, adduction, rotation = _euler(thigh, "ZXY").T
+    flexion, adduction, rotation = continuous_euler(thigh, "ZXY").T
     bend, aside = _angle(-shank[:, 0], -shank[:, 1]), np.degrees(np.arcsin(np.clip(-shank[:, 2], -1, 1)))
     out = {"hip_flexion": flexion, "hip_adduction": adduction, "hip_rotation": rotation}
     out |= {"knee_flexion": bend, "knee_adduction": aside}
@@ -64,7 +64,7 @@ def _leg(body: RigidBody, pelvis: np.ndarray, side: str, rate_hz: float) -> dict
 def _arm(body: RigidBody, chest: np.ndarray, side: str, rate_hz: float) -> dict[str, np.ndarray]:
     shoulder, elbow, wrist = (_in(chest, body.at(side + name), side) for name in ("shoulder", "elbow", "wrist"))
     upper, fore = _limb(elbow - shoulder, wrist - elbow, 1.0, rate_hz)
-    plane, elevation, rotation = _euler(upper, "YXY").T
+    plane, elevation, rotation = continuous_euler(upper, "YXY").T
     return {
         "shoulder_plane": plane,
         "shoulder_elevation": -elevation,
@@ -103,7 +103,7 @@ def _angle(y: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.degrees((np.arctan2(y, x) + 0.5 * np.pi) % (2.0 * np.pi) - 0.5 * np.pi)
 
 
-def _euler(rotations: np.ndarray, order: str) -> np.ndarray:
+def continuous_euler(rotations: np.ndarray, order: str) -> np.ndarray:
     """(F, 3) degrees about moving axes; of the two solutions per frame the one nearer to the previous frame's."""
     first = Rotation.from_matrix(rotations).as_euler(order)
     proper = order[0] == order[2]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drocap_ros.export.angles import continuous_euler
 from drocap_ros.export.clip import Clip, at_constant_rate, y_up
 from drocap_ros.export.rig import Rig, rig_of
 
@@ -51,7 +52,7 @@ def _joint(lines: list[str], columns: list[np.ndarray], rig: Rig, joint: int, de
         f"{inner}OFFSET {_numbers(offset)}",
         f"{inner}CHANNELS {channels}Zrotation Xrotation Yrotation",
     ]
-    columns.append(np.degrees(np.unwrap(rig.local(joint).as_euler("ZXY"), axis=0)))
+    columns.append(continuous_euler(rig.local(joint).as_matrix(), "ZXY"))
     for child in (c for c, above in enumerate(rig.parents) if above == joint):
         _joint(lines, columns, rig, child, depth + 1)
     if joint in rig.ends:

@@ -4,8 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from drocap_ros.errors import InputError
+from drocap_ros.export.bvh import write_bvh
 from drocap_ros.export.clip import clip_of, y_up
 from drocap_ros.export.rig import rig_of
 from drocap_ros.export.rigid_body import fit_rigid_body
@@ -123,6 +125,22 @@ def test_rotations_are_continuous_where_a_bone_passes_its_opposite_direction(wal
     rig, _ = rig_of(clip_with(walker, np.repeat(joints[-1:], 600, axis=0), rate_hz=60.0))
     still = rig.turned[rig.joints.index("lelbow")]
     np.testing.assert_allclose((still[:-1].inv() * still[1:]).magnitude(), 0.0, atol=1e-9)
+
+
+def test_bvh_channels_do_not_flip_in_a_squat(walker, tmp_path):
+    """A knee that bends past 90 degrees: in the order Z X Y every rotation has two solutions, half turns apart."""
+    joints = np.repeat(clip_of(walker).positions[:1], 15, axis=0)
+    hip, knee, ankle = (BODY_15.index(name) for name in ("lhip", "lknee", "lankle"))
+    aside = joints[0, hip] - joints[0, BODY_15.index("rhip")]
+    turn = np.radians(np.linspace(0, 130, 15))[:, None] * aside / np.linalg.norm(aside)
+    joints[:, ankle] = joints[:, knee] + Rotation.from_rotvec(turn).apply(joints[:, knee] - joints[:, hip])
+    write_bvh(
+        tmp_path / "squat.bvh", dataclasses.replace(clip_of(walker), positions=joints, times_s=np.arange(15) / 24)
+    )
+    rows = (tmp_path / "squat.bvh").read_text().split("Frame Time:")[1].splitlines()[1:]
+    channels = np.array([row.split() for row in rows], float)[:, 3:]
+    assert np.abs(np.diff(channels, axis=0)).max() < 45.0
+    assert channels.max() == pytest.approx(130.0, abs=0.5)
 
 
 def test_limbs_have_no_twist_of_their_own(walker):
