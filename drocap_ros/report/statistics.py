@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,9 @@ _TORSO = ("pelvis", "neck", "lhip", "rhip", "lshoulder", "rshoulder")
 class Statistics:
     """Statistics of one motion of F frames, P joints, B rigid bones; NaN where nothing is known.
 
+    Poses of frames without any keypoint are interpolated: none of these statistics counts them, except in a motion
+    without any keypoints.
+
     times_s : (F,) s since the first frame
     seen : (F,) bool, any keypoint found
     missing : (P,) share of frames without the joint's keypoint
@@ -36,13 +39,14 @@ class Statistics:
     body_px : median diagonal of the keypoints' bounding box, at least 1
     bones, bone_lengths_m : B names; (F, B) lengths
     bone_spread : (B,) standard deviation over mean of each bone's length
-    view_deg : (F,) azimuth of the camera from the body (0 in front, positive to its left), unwrapped
+    view_deg : (F,) azimuth of the camera from the body (0 in front, positive to its left), unwrapped; NaN where
+        interpolated
     view_speed_dps, view_span_deg : median speed and range of that
     elevation_deg : median elevation of the camera above the body: above the horizon where the vertical is known, else
         above the plane across the trunk
     lean_deg : angle by which an upright body leans away from the camera, from whatever side it sees it; NaN where the
         vertical is not known, the body is rarely upright, or the camera looks from less than about half a turn
-    heading_rad : (F,) direction that the body faces, about the vertical
+    heading_rad : (F,) direction that the body faces, about the vertical; in interpolated frames too
     knees_forward : share of bent knees that bend forward; NaN where none is bent
     bent_knees : number of bent knees
     foot_m_s : median speed of the lower ankle in the half of the frames in which it is lowest; of a person that stands
@@ -96,14 +100,20 @@ def motion_statistics(motion: Motion) -> Statistics:
     square = np.square(motion.reprojection_px)
     joints = upright_joints(motion)
     torso = _torso(joints, motion)
+    seen = found.any(axis=1)
+    counted = seen if seen.any() else np.ones_like(seen)
     view = _view_azimuth(torso, camera_axes(motion)[:, 2], times)
-    speed = np.abs(np.gradient(view, times)) if len(times) > 1 else np.zeros(1)
+    speed = (np.abs(np.gradient(view, times)) if len(times) > 1 else np.zeros(1))[counted]
+    elevation = _elevation(motion, torso[counted], camera_axes(motion)[counted, 2])
+    heading = _heading(torso, times)
+    motion = replace(motion, joints3d=np.where(counted[:, None, None], motion.joints3d, np.nan))
+    joints = upright_joints(motion)
     bones, lengths = _bones(joints, motion)
     forward, judged = _knees(joints, motion, torso[..., 0])
     foot, pelvis = _path_speeds(motion, times)
     return Statistics(
         times_s=times,
-        seen=found.any(axis=1),
+        seen=seen,
         missing=1.0 - found.mean(axis=0),
         error_px=np.sqrt(mean_known(square, 1)),
         joint_error_px=np.sqrt(mean_known(square, 0)),
@@ -113,12 +123,12 @@ def motion_statistics(motion: Motion) -> Statistics:
         bones=bones,
         bone_lengths_m=lengths,
         bone_spread=_spread(lengths),
-        view_deg=np.degrees(view),
+        view_deg=np.degrees(np.where(counted, view, np.nan)),
         view_speed_dps=float(np.degrees(np.median(speed))),
-        view_span_deg=float(np.degrees(np.ptp(view))),
-        elevation_deg=_elevation(motion, torso, camera_axes(motion)[:, 2]),
+        view_span_deg=float(np.degrees(np.ptp(view[counted]))),
+        elevation_deg=elevation,
         lean_deg=_lean(motion),
-        heading_rad=_heading(torso, times),
+        heading_rad=heading,
         knees_forward=forward,
         bent_knees=judged,
         foot_m_s=foot,
@@ -193,7 +203,7 @@ def _lean(motion: Motion) -> float:
     body, bearing = neck - 0.5 * (left + right), motion.camera_rotation[:, 2, :2]
     length, flat = np.linalg.norm(body, axis=1), np.linalg.norm(bearing, axis=1)
     upright = (body[:, 2] > _UPRIGHT * length) & (length > 0) & (flat > 0)
-    if upright.sum() < 0.5 * len(body):
+    if upright.sum() <= 0.5 * np.isfinite(length).sum():
         return float("nan")
     lean, away = body[upright, :2] / length[upright, None], bearing[upright] / flat[upright, None]
     lean, away = lean - lean.mean(axis=0), away - away.mean(axis=0)

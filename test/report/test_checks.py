@@ -120,6 +120,33 @@ def test_low_image_rate_is_named(person, rate_hz, level):
     assert level is None or f"{rate_hz:.1f} images per second" in found[0].text
 
 
+def test_interpolated_poses_before_the_person_comes_count_in_no_statistic(reported_in_camera):
+    """Two thirds of the frames repeat the first pose, with its knees bent backward and a longer shank."""
+    person, first = reported_in_camera, 2 * len(reported_in_camera.joints3d)
+    repeated = person.joints3d[:1].copy()
+    repeated[:, [BODY_15.index("lankle"), BODY_15.index("rankle")]] += (0.0, -0.2, 0.5)
+
+    def late(before, after):
+        return np.concatenate([np.repeat(before, first, axis=0), after])
+
+    motion = dataclasses.replace(
+        person,
+        joints3d=late(repeated, person.joints3d),
+        stamp_ns=np.arange(first // 2 * 3) * (person.stamp_ns[1] - person.stamp_ns[0]),
+        camera_rotation=late(person.camera_rotation[:1], person.camera_rotation),
+        confidence=late(0.0 * person.confidence[:1], person.confidence),
+        keypoints=late(np.full((1, 15, 2), np.nan), person.keypoints),
+        reprojection_px=late(np.full((1, 15), np.nan), person.reprojection_px),
+    )
+    whole, s = motion_statistics(person), motion_statistics(motion)
+    assert (s.knees_forward, s.bent_knees) == (whole.knees_forward, whole.bent_knees)
+    np.testing.assert_allclose(s.bone_spread, whole.bone_spread)
+    assert s.view_speed_dps == pytest.approx(whole.view_speed_dps, rel=0.3)  # smoothed over 0.5 s
+    assert s.elevation_deg == pytest.approx(whole.elevation_deg, abs=1e-6)
+    assert np.isnan(s.view_deg[:first]).all()
+    assert np.isfinite(s.view_deg[first:]).all()
+
+
 def test_a_body_that_turns_is_enough_camera_motion(reported_in_camera):
     """Only the motion of the camera relative to the body counts: the camera's frame shows the same."""
     assert Check.LOW_CAMERA_MOTION not in checks(reported_in_camera)
