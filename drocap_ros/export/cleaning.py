@@ -57,7 +57,7 @@ def lock_feet(clip: Clip) -> Clip:
     """Clip, z up, whose resting feet keep their place; knees follow by two-bone inverse kinematics.
 
     A foot rests while its ankle is slower than 0.4 m/s for at least 0.2 s; its place is the median over that time.
-    Hips stay, thigh and shank keep the frame's lengths, toes move with the ankle.
+    Hips stay, thigh and shank keep the frame's lengths, toes move with the ankle.  An uneven time line is resampled.
 
     Raises
     ------
@@ -70,6 +70,7 @@ def lock_feet(clip: Clip) -> Clip:
         raise InputError(
             "lock-feet: expected a root that moves through the world, it stands still; reconstruct with telemetry"
         )
+    clip = at_constant_rate(clip)
     out = clip.positions.copy()
     before, after, count = [], [], 0
     for side in "rl":

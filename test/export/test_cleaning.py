@@ -87,6 +87,17 @@ def test_feet_are_locked_after_a_time_without_the_person_too(walker):
     np.testing.assert_allclose(late[-20:], lock_feet(whole).positions[-20:], atol=1e-9)
 
 
+def test_feet_are_found_at_rest_where_images_were_dropped(walker):
+    """24 images per second, later every third of them: by the median step the feet would be three times as fast."""
+    clip = clip_of(walker)
+    wander = np.cumsum(np.random.default_rng(4).normal(0, 0.004, (len(clip.positions), 1, 3)), axis=0)
+    kept = np.r_[0:14, 14:48:3]
+    uneven = dataclasses.replace(clip, positions=(clip.positions + wander)[kept], times_s=clip.times_s[kept])
+    out = lock_feet(uneven)
+    assert "feet locked in 4 rests" in out.notes[-1]
+    np.testing.assert_allclose(out.times_s, np.arange(len(out.times_s)) / 24.0, atol=1e-6)
+
+
 def test_knee_of_an_almost_straight_leg_does_not_jump(walker):
     """A leg bent by 5 degrees whose ankle wanders along it: a knee that followed fully would move ten times as far."""
     clip = clip_of(walker)
