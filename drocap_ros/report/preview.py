@@ -16,14 +16,13 @@ _POSES = 7
 
 
 def save_preview(path: Path, motion: Motion) -> None:
-    """Draw 2D keypoints, front and side view of poses spread over the motion, and the reprojection error."""
+    """Draw 2D keypoints and two views of poses spread over the frames with the person, and the reprojection error."""
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    count = min(_POSES, len(motion.joints3d))
-    frames = np.unique(np.linspace(0, len(motion.joints3d) - 1, count).round().astype(int))
+    frames = shown_frames(motion)
     with mpl.rc_context({"font.size": 8}):
         layout = ConstrainedLayoutEngine(rect=(0.02, 0, 0.98, 1))
         figure = Figure(figsize=(1.9 * _POSES, 8.2), layout=layout)
@@ -40,6 +39,14 @@ def save_preview(path: Path, motion: Motion) -> None:
             figure.text(0.002, 0.86 - 0.265 * row, name, rotation=90, va="center", fontsize=9)
         _plot_error(figure.add_subplot(grid[3, :]), motion)
         figure.savefig(path, dpi=100)
+
+
+def shown_frames(motion: Motion) -> np.ndarray:
+    """Indices of the poses shown, spread over the frames with a keypoint; over all frames if there is none."""
+    seen = np.isfinite(motion.keypoints).all(axis=2).any(axis=1)
+    there = np.flatnonzero(seen if seen.any() else np.ones_like(seen))
+    places: np.ndarray = np.unique(np.linspace(0, len(there) - 1, _POSES).round().astype(int))
+    return there[places]
 
 
 def _upright_body(motion: Motion) -> tuple[np.ndarray, float]:
@@ -77,4 +84,4 @@ def _plot_error(axes: Any, motion: Motion) -> None:
     axes.set_xlabel("s")
     axes.set_ylabel("reprojection RMS, px")
     axes.set_ylim(bottom=0)
-    axes.margins(x=0)
+    axes.set_xlim(0, seconds[-1] or 1.0)
