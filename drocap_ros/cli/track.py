@@ -7,6 +7,8 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from drocap_ros.errors import DrocapError
+
 if TYPE_CHECKING:
     from drocap_ros.cli.progress import Progress
     from drocap_ros.clip import Clip
@@ -93,7 +95,8 @@ def _list(images: Images, persons: list[FoundPerson], target: Path) -> str:
     from drocap_ros.perception.persons import persons_picture
 
     picture, begin_ns = persons_picture(images.frames, persons)
-    cv2.imwrite(str(target / "persons.jpg"), picture)
+    # Unlike imwrite, this raises the system's error: a full disk.
+    (target / "persons.jpg").write_bytes(cv2.imencode(".jpg", picture)[1].tobytes())
     lines = [
         f"person {p.number}: {(p.first_ns - begin_ns) * 1e-9:.1f} to {(p.last_ns - begin_ns) * 1e-9:.1f} s"
         for p in persons
@@ -114,7 +117,7 @@ def _track(
     from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
     from drocap_ros.tracks import save_tracks
 
-    overlay = _OverlayWriter(target / "overlay.mp4") if with_overlay else None
+    overlay = _OverlayWriter(target / "overlay.mp4", images.rate_hz) if with_overlay else None
     meter = clip.meter(progress, "2D pose", images.duration_s)
 
     def on_frame(frame: Frame, observation: PoseObservation) -> None:
@@ -144,10 +147,10 @@ def _configs(args: argparse.Namespace, rule: dict[str, Any]) -> tuple[PoseEstima
 
 
 class _OverlayWriter:
-    """Writes the video with the subject drawn, at the rate of its first two frames."""
+    """Writes the video with the subject drawn, at the given rate; without one, at that of its first two frames."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, rate_hz: float | None) -> None:
+        self._path, self._rate_hz, self._count = path, rate_hz, 0
         self._first: tuple[int, Any] | None = None
         self._video: Any = None
 
@@ -164,27 +167,43 @@ class _OverlayWriter:
             self._first = frame.stamp_ns, image
             return
         if self._video is None:
-            self._open(1e9 / (frame.stamp_ns - self._first[0]))
-        self._video.write(image)
+            self._open(self._rate_hz or 1e9 / (frame.stamp_ns - self._first[0]))
+        self._write(image)
 
     def close(self) -> None:
         if self._video is None and self._first is not None:  # a single image
             self._open(1.0)
         if self._video is not None:
             self._video.release()
+            self._check()
+
+    def _write(self, image: Any) -> None:
+        self._video.write(image)
+        self._count += 1
+
+    def _check(self) -> None:
+        """The writer reports no error: a full disk leaves a file without its end."""
+        import cv2
+
+        video = cv2.VideoCapture(str(self._path))
+        found = video.get(cv2.CAP_PROP_FRAME_COUNT) if video.isOpened() else 0
+        video.release()
+        if found < self._count:
+            raise self._failed()
+
+    def _failed(self) -> DrocapError:
+        return DrocapError(f"{self._path.name}: the video could not be written; check the space on the disk")
 
     def _open(self, rate_hz: float) -> None:
         import cv2
-
-        from drocap_ros.errors import DrocapError
 
         assert self._first is not None
         rate_hz, image = min(max(rate_hz, 1.0), 120.0), self._first[1]
         size = (image.shape[1], image.shape[0])
         self._video = cv2.VideoWriter(str(self._path), cv2.VideoWriter.fourcc(*"mp4v"), rate_hz, size)
         if not self._video.isOpened():
-            raise DrocapError(f"{self._path}: the video could not be written; check the space on the disk")
-        self._video.write(self._first[1])
+            raise self._failed()
+        self._write(self._first[1])
 
 
 def _summary(found: list[tuple[int, int]], frames: int) -> str:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -12,6 +13,9 @@ import pytest
 from rendered_person import rendered_images
 
 from drocap_ros.cli import main
+from drocap_ros.cli.track import _OverlayWriter
+from drocap_ros.observation import PoseObservation
+from drocap_ros.perception.sources import Frame
 from drocap_ros.tracks import load_tracks
 
 
@@ -90,6 +94,35 @@ def test_fetch_without_a_network_ends_with_status_1(tmp_path):
     assert done.returncode == 1
     assert "check the network or proxy" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(("option", "limit"), [("--list", 4096), ("--overlay", 8192)])
+def test_a_full_disk_is_named_and_leaves_no_picture_or_video(tmp_path, option, limit):
+    cv2 = pytest.importorskip("cv2")
+    (tmp_path / "images").mkdir()
+    for number, image in enumerate(rendered_images(4)):
+        cv2.imwrite(str(tmp_path / "images" / f"{number}.jpg"), image)
+    words = ["track", tmp_path / "images", "--models", "simulation", option, "--out", tmp_path / "out"]
+    done = subprocess.run(
+        [sys.executable, "-B", "-m", "drocap_ros.cli", *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+    )
+    assert done.returncode == 1
+    assert "space" in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["images"]
+
+
+def test_overlay_has_the_rate_of_the_video_not_of_its_first_two_images(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    overlay = _OverlayWriter(tmp_path / "overlay.mp4", 20.0)
+    for stamp in (0, 100_000_000, 150_000_000):
+        overlay.add(Frame(stamp, np.zeros((48, 64, 3), np.uint8)), PoseObservation(stamp, 0, (64, 48)))
+    overlay.close()
+    assert cv2.VideoCapture(str(tmp_path / "overlay.mp4")).get(cv2.CAP_PROP_FPS) == pytest.approx(20.0)
 
 
 def test_terminated_command_leaves_nothing(tmp_path):
