@@ -136,13 +136,14 @@ def _onto_the_floor(body: RigidBody, root_moves: bool) -> tuple[np.ndarray, str]
     """(F,) heights to add, and a note.
 
     A moving root has one constant: the floor is a low percentile of the lower sole.  A root that stands still has no
-    known height: in each frame the lower sole stands on the floor.
+    known height: in each frame the lowest of soles and joints is on the floor, in a flip or on the back not a sole.
     """
     ends = TOES if set(TOES) <= set(body.joints) else ("rankle", "lankle")
     soles = [body.at(end)[:, 1] - (0.0 if end in TOES else _SOLE * body.lengths[end]) for end in ends]
     lower = np.min(soles, axis=0)
     if not root_moves:
-        return -lower, "no root motion known: the lower foot stands on the floor in each frame"
+        lowest = np.minimum(lower, body.positions[..., 1].min(axis=1))
+        return -lowest, "no root motion known: in each frame the lowest of soles and joints is on the floor"
     floor = float(np.percentile(lower, _FLOOR_PERCENTILE))
     way = "lowered" if floor > 0 else "raised"
     return np.full(len(lower), -floor), f"floor at 0: {way} by {abs(floor):.3f} m so that the feet stand on it"

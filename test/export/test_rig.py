@@ -193,6 +193,12 @@ def test_feet_stand_on_the_floor(walker, in_camera):
             assert any("floor at 0" in note for note in notes)
 
 
+def test_no_joint_is_below_the_floor_in_a_handstand(in_camera):
+    upside_down = dataclasses.replace(in_camera, joints3d=in_camera.joints3d * (-1.0, -1.0, 1.0))
+    rig, _ = rig_of(y_up(clip_of(upside_down)))
+    np.testing.assert_allclose(rig.positions()[..., 1].min(axis=1), 0.0, atol=1e-6)
+
+
 def test_missing_joints_and_unknown_options_are_refused(walker):
     clip = y_up(clip_of(walker))
     with pytest.raises(InputError, match="missing rwrist"):
