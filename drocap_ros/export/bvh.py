@@ -52,12 +52,20 @@ def _joint(lines: list[str], columns: list[np.ndarray], rig: Rig, joint: int, de
         f"{inner}OFFSET {_numbers(offset)}",
         f"{inner}CHANNELS {channels}Zrotation Xrotation Yrotation",
     ]
-    columns.append(continuous_euler(rig.local(joint).as_matrix(), "ZXY"))
+    columns.append(_channels(rig.local(joint).as_matrix()))
     for child in (c for c, above in enumerate(rig.parents) if above == joint):
         _joint(lines, columns, rig, child, depth + 1)
     if joint in rig.ends:
         lines += [f"{inner}End Site", f"{inner}{{", f"{inner}\tOFFSET {_numbers(rig.ends[joint])}", f"{inner}}}"]
     lines.append(outer + "}")
+
+
+def _channels(rotations: np.ndarray) -> np.ndarray:
+    """(F, 3) degrees about Z, X, Y, continuous; a motion that begins in a squat does not keep its half turns."""
+    angles = continuous_euler(rotations, "ZXY")
+    other = angles * (1.0, -1.0, 1.0) + 180.0
+    other -= 360.0 * np.round(other[0] / 360.0)
+    return min(angles, other, key=lambda solution: float(np.abs(solution[:, 1]).mean()))
 
 
 def _numbers(metres: np.ndarray) -> str:

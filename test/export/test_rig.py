@@ -127,12 +127,13 @@ def test_rotations_are_continuous_where_a_bone_passes_its_opposite_direction(wal
     np.testing.assert_allclose((still[:-1].inv() * still[1:]).magnitude(), 0.0, atol=1e-9)
 
 
-def test_bvh_channels_do_not_flip_in_a_squat(walker, tmp_path):
+@pytest.mark.parametrize(("first_deg", "last_deg"), [(0, 130), (130, -30)])
+def test_bvh_channels_do_not_flip_in_a_squat(walker, tmp_path, first_deg, last_deg):
     """A knee that bends past 90 degrees: in the order Z X Y every rotation has two solutions, half turns apart."""
     joints = np.repeat(clip_of(walker).positions[:1], 15, axis=0)
     hip, knee, ankle = (BODY_15.index(name) for name in ("lhip", "lknee", "lankle"))
     aside = joints[0, hip] - joints[0, BODY_15.index("rhip")]
-    turn = np.radians(np.linspace(0, 130, 15))[:, None] * aside / np.linalg.norm(aside)
+    turn = np.radians(np.linspace(first_deg, last_deg, 15))[:, None] * aside / np.linalg.norm(aside)
     joints[:, ankle] = joints[:, knee] + Rotation.from_rotvec(turn).apply(joints[:, knee] - joints[:, hip])
     write_bvh(
         tmp_path / "squat.bvh", dataclasses.replace(clip_of(walker), positions=joints, times_s=np.arange(15) / 24)
