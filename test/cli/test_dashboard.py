@@ -24,3 +24,16 @@ def test_the_table_shows_each_node_once_with_its_latest_words():
     assert "gone wrong" in text
     assert "running" not in text
     assert "warning" in text
+
+
+def test_words_with_brackets_are_shown_as_they_are():
+    from rich.console import Console
+
+    dashboard = Dashboard()
+    text = "skeleton: expected body15, got '[/b]'; recording to walk[take]"
+    dashboard.take(SimpleNamespace(status=[status("drocap/x", b"\x01", text, last_refused="[/i]")]))
+    console = Console(width=300, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(dashboard.table())
+    shown = console.export_text()
+    assert text in shown
+    assert "[/i]" in shown

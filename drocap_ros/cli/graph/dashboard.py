@@ -42,6 +42,7 @@ class Dashboard:
     def table(self, namespace: str = "") -> Table:
         """Table of the nodes whose status has arrived, in a namespace."""
         from rich.table import Table
+        from rich.text import Text
 
         table = Table("node", "state", "Hz", "latency, ms (p50 / p95 / p99)", "status", "counts", expand=True)
         for name in self.heard(namespace):
@@ -51,7 +52,8 @@ class Dashboard:
             )
             state = f"[{_COLOURS.get(level, 'white')}]{_LEVELS.get(level, str(level))}[/]"
             latency = " / ".join(f"{float(values[key]):.0f}" for key in _LATENCY if key in values)
-            table.add_row(name, state, values.get(Key.RATE, ""), latency, text, counts)
+            # Words of nodes, and of messages that they refused, may hold brackets, which are markup in a plain string.
+            table.add_row(Text(name), state, Text(values.get(Key.RATE, "")), latency, Text(text), Text(counts))
         return table
 
 
