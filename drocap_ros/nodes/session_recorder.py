@@ -19,6 +19,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
 
+from drocap_ros.errors import InputError
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.recording.mcap.schemas import schema_text
 from drocap_ros.recording.mcap.writer import SessionWriter
@@ -121,8 +122,8 @@ class SessionRecorderNode(ManagedComponent):
     def _on_camera_info(self, name: str, data: bytes, info: dict[str, Any]) -> None:
         self._on_message(name, data, info)
         if not self._calibrated:
+            camera = _decoded(data, CameraInfo)
             self._calibrated = True
-            camera = deserialize_message(data, CameraInfo)
             text = (
                 f"width: {camera.width}\nheight: {camera.height}\nk: {[float(v) for v in camera.k]}\n"
                 f"distortion_model: {camera.distortion_model}\nd: {[float(v) for v in camera.d]}\n"
@@ -132,7 +133,7 @@ class SessionRecorderNode(ManagedComponent):
     def _on_diagnostics(self, name: str, data: bytes, info: dict[str, Any]) -> None:
         """Record diagnostics, except those of another drone's graph."""
         ours = self.get_namespace().strip("/")
-        statuses = deserialize_message(data, DiagnosticArray).status
+        statuses = _decoded(data, DiagnosticArray).status
         for status in statuses:
             if node_of(status)[1] in self._sources and values_of(status).get(Key.LIFECYCLE) == ACTIVE:
                 self._source_active = True
@@ -189,6 +190,14 @@ def _free_mib(folder: Path) -> int | str:
         return shutil.disk_usage(folder).free >> 20
     except OSError:
         return "unknown"
+
+
+def _decoded(data: bytes, kind: type) -> Any:
+    """Message of its bytes, which nobody has decoded before; InputError where they are none."""
+    try:
+        return deserialize_message(data, kind)
+    except RuntimeError:  # RMWError
+        raise InputError(f"expected a whole {kind.__name__}, got {len(data)} bytes of none; check its sender") from None
 
 
 def _type_name(message: type) -> str:

@@ -89,3 +89,20 @@ def test_a_full_disk_is_an_error_of_the_recorder_alone(small_disk):
         graph.wait_until(lambda: any(Key.NOT_WRITTEN in v.key for v in errors()[-1].values), 20, "the drops")
     with open_session(small_disk / "s") as session:
         assert session.info.message_count > 10
+
+
+def test_message_that_is_none_is_refused_and_the_recording_continues(tmp_path):
+    config = DrocapConfig().replace("session_recorder", session_dir=str(tmp_path / "s"))
+    with bringup(config, ["session_recorder"]) as graph:
+        states = []
+        graph.node.create_subscription(TOPICS["/diagnostics"].message, "/diagnostics", states.append, 100)
+        for topic in ("/diagnostics", "camera_info"):
+            publisher = graph.node.create_publisher(TOPICS[topic].message, topic, TOPICS[topic].qos)
+            graph.wait_until(lambda p=publisher: p.get_subscription_count() >= 1, 20, "the recorder")
+            publisher.publish(b"\0\1\0\0\0\0")  # CDR that ends within the header
+
+        def refused():
+            values = [v for m in states for s in m.status for v in s.values]
+            return [v.value for v in values if v.key == Key.MESSAGES_REFUSED][-1:]
+
+        graph.wait_until(lambda: refused() == ["2"], 10, "two refusals")
