@@ -90,9 +90,9 @@ def _small(image: np.ndarray) -> np.ndarray:
 
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     # Means of four pixels are fast, those of other numbers are not.
-    while max(grey.shape) >= 2 * _SIDE_PX:
+    while max(grey.shape) >= 2 * _SIDE_PX and min(grey.shape) > 1:
         grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    size = [round(side * min(1.0, _SIDE_PX / max(image.shape[:2]))) for side in image.shape[1::-1]]
+    size = [max(1, round(side * min(1.0, _SIDE_PX / max(image.shape[:2])))) for side in image.shape[1::-1]]
     small: np.ndarray = cv2.resize(grey, size, interpolation=cv2.INTER_LINEAR)
     return small
 

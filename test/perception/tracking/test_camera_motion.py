@@ -144,3 +144,10 @@ def test_way_of_a_quarter_of_the_person_blurs_it(way, blurred):
     matrix = np.column_stack([np.eye(2), way])
     assert sweeps(matrix, PERSON[0]) == blurred  # 150 px long
     assert not sweeps(None, PERSON[0])
+
+
+@pytest.mark.parametrize("size", [(1, 5000), (5000, 2), (3, 961), (1, 1)])
+def test_image_of_a_few_rows_has_no_motion(size):
+    motion = CameraMotion()
+    for _ in range(2):
+        assert motion.update(np.zeros((*size, 3), np.uint8), PERSON) is None
