@@ -11,6 +11,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import optical_orientation
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.live.camera_history import CameraHistory
+from drocap_ros.reconstruction.live.stamps import StampValidator
 from drocap_ros.recording.session import header_stamp_ns
 from drocap_ros.skeleton import joint_set
 from drocap_ros.tracks import check_camera_matrix, check_keypoints
@@ -98,9 +99,10 @@ def float_array(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
 
 def read_observations(session: Session, topic: str) -> Iterator[PoseObservation]:
     """Observations of a topic in the order of the recording; messages that a live node refuses are skipped."""
-    refused = 0
+    refused, stamps = 0, StampValidator()
     for _, message in session.messages((topic,)):
         try:
+            stamps.check(message.header.stamp.sec, message.header.stamp.nanosec)
             observation = observation_from_message(message)
         except InputError:
             refused += 1

@@ -17,6 +17,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.reconstruction.live.camera_history import CameraHistory, WindowCamera
 from drocap_ros.reconstruction.live.effort import Effort
 from drocap_ros.reconstruction.live.replay import LiveWindow
+from drocap_ros.reconstruction.live.stamps import StampValidator
 from drocap_ros.recording.pose_messages import add_calibration, add_state
 from drocap_ros.recording.session import (
     CAMERA_INFO,
@@ -53,9 +54,9 @@ class RecordedCamera:
     def __init__(self, session: Session, near: str, keep_s: float) -> None:
         base = near.rsplit("/", 1)[0]
         self._history = CameraHistory(keep_s)
-        self._states = _messages(session, VEHICLE_STATE, f"{base}/vehicle/state")
+        self._states = _accepted(_messages(session, VEHICLE_STATE, f"{base}/vehicle/state"))
         self._next = next(self._states, None)
-        for message in _messages(session, CAMERA_INFO, f"{base}/camera_info"):
+        for message in _accepted(_messages(session, CAMERA_INFO, f"{base}/camera_info")):
             with contextlib.suppress(InputError):  # the live graph refused it too
                 add_calibration(self._history, message)
         self.matrix: np.ndarray | None = None
@@ -149,6 +150,17 @@ def _messages(session: Session, kind: str, name: str) -> Iterator[Any]:
     """Messages of a topic, none when the session lacks it."""
     if any(topic.name == name for topic in session.topics_of(kind)):
         yield from (message for _, message in session.messages((name,)))
+
+
+def _accepted(messages: Iterator[Any]) -> Iterator[Any]:
+    """Messages whose stamps the live graph did not refuse."""
+    stamps = StampValidator()
+    for message in messages:
+        try:
+            stamps.check(message.header.stamp.sec, message.header.stamp.nanosec)
+        except InputError:
+            continue
+        yield message
 
 
 def _fingerprint(*arrays: np.ndarray) -> bytes:

@@ -22,9 +22,9 @@ from rclpy.subscription import Subscription
 from drocap_ros.config import section_types
 from drocap_ros.errors import InputError
 from drocap_ros.parameters import Parameters
+from drocap_ros.reconstruction.live.stamps import StampValidator
 from drocap_ros.ros.diagnostics import ERROR, HARDWARE_ID, OK, WARN, Key, Latency, of
 from drocap_ros.ros.parameters import declare_parameters
-from drocap_ros.ros.stamps import StampValidator
 from drocap_ros.ros.topics import FROM_OUTSIDE, TOPICS, publishers_of, subscribers_of
 
 #: A node whose input has been silent for this long is idle.

@@ -9,7 +9,7 @@ from recorded import NAMES, START_NS, record, write_poses
 from drocap_ros.errors import InputError
 from drocap_ros.reconstruction.live.camera_history import CameraHistory
 from drocap_ros.recording.open_session import open_session
-from drocap_ros.recording.pose_messages import add_calibration
+from drocap_ros.recording.pose_messages import add_calibration, read_observations
 from drocap_ros.recording.session_tracks import read_pose2d
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.vehicle.flight_path import SampledPath
@@ -40,6 +40,19 @@ def test_images_without_a_subject_are_frames_of_nan(tmp_path, messages, capture)
     gone = np.isnan(tracks.keypoints).all(axis=(1, 2))
     assert np.flatnonzero(gone).tolist() == [0, 5, 6]
     assert (tracks.confidence[gone] == 0).all()
+
+
+def test_poses_of_a_stray_stamp_are_refused_as_in_the_live_graph(tmp_path, messages, capture):
+    entries = []
+    for i, stamp in enumerate(capture.tracks.stamp_ns.tolist()):
+        shown = 5 * 10**9 if i == 3 else stamp + 86_400 * 10**9 * (i >= 8)
+        entries.append(("/drocap/pose2d", messages.pose2d(capture.tracks, i, shown), stamp))
+    record(tmp_path / "s", [(topic, message, log, messages.cdr(message)) for topic, message, log in entries])
+    with open_session(tmp_path / "s") as session:
+        kept = [o.stamp_ns for o in read_observations(session, "/drocap/pose2d")]
+        assert len(session.warnings) == 1
+    expected = capture.tracks.stamp_ns + 86_400 * 10**9 * (np.arange(len(capture.tracks)) >= 8)
+    assert kept == np.delete(expected, [3, 8, 9, 10, 11]).tolist()
 
 
 def flight_entries(messages, capture, *, gimbal=True, rate_hz=50.0, skip_s=(9.0, 9.0), start_s=-0.5, lag_ns=0):

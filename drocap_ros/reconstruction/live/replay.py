@@ -18,6 +18,7 @@ from drocap_ros.reconstruction.live.camera_history import WindowCamera
 from drocap_ros.reconstruction.live.effort import Effort
 from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer
 from drocap_ros.reconstruction.live.initializer import InitialPose, LiveInitializer
+from drocap_ros.reconstruction.live.stamps import StampValidator
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 
@@ -58,6 +59,7 @@ def live_poses(
     camera_at : gives the reported camera at the stamps (F,) of a window that is adjusted; without it none is known
     """
     initial, buffer, solver = LiveInitializer(initializer), FrameBuffer(adjuster), LiveAdjuster(adjuster)
+    arrivals = StampValidator()  # of pose3d/initial at the adjuster's node
     for observation in observations:
         if not observation.has_subject:
             continue
@@ -69,6 +71,10 @@ def live_poses(
             continue
         joints = pose.joints3d.astype(np.float32)
         yield LivePose(observation, joints, pose, initial.event.restarted)
+        try:
+            arrivals.check(*divmod(observation.stamp_ns, 10**9))
+        except InputError:
+            continue
         due = buffer.push(observation, joints.astype(np.float64))
         effort = (Effort() if effort_at is None else effort_at(observation.stamp_ns)) if due else None
         if effort is None:

@@ -52,6 +52,14 @@ def test_a_second_round_and_another_subject_repeat_the_first_bit_for_bit() -> No
         assert all((w.window.stamp_ns >= second[0].stamp_ns).all() for w in both_windows[3:])
 
 
+def test_adjuster_takes_poses_of_another_day_when_its_node_does() -> None:
+    day = 86_400 * S
+    poses, windows = run([*observed(40), *observed(40, day)])
+    assert len(poses) == 79  # one image confirms the jump
+    # The node refuses four poses, until five agree.
+    assert min(w.window.stamp_ns[0] for w in windows if w.window.stamp_ns[-1] > day) == poses[44].observation.stamp_ns
+
+
 def test_a_gap_keeps_the_size_and_restarts_the_window() -> None:
     # The person is smaller in the image after the gap: the proportions stay, the size in the image is estimated again.
     before, after = observed(40), observed(30, 10 * S, size=0.5)

@@ -1,4 +1,4 @@
-"""Validation of a stream's stamps."""
+"""Validation of a stream's stamps, in the nodes and when their work is repeated offline."""
 
 from __future__ import annotations
 
