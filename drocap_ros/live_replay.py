@@ -22,6 +22,7 @@ from drocap_ros.recording.pose_messages import read_observations
 from drocap_ros.recording.provenance import CONFIGURATION
 from drocap_ros.recording.published_poses import Agreement, PublishedPoses, RecordedCamera
 from drocap_ros.recording.session import POSE2D, Session
+from drocap_ros.recording.session_tracks import most_frequent_subject
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
 
@@ -58,15 +59,15 @@ def reconstruct_live(
 ) -> tuple[Motion, Tracks, Agreement]:
     """Motion by the live method, from the session's ``pose2d``, ``vehicle/state`` and ``camera_info`` messages.
 
-    A frame's pose is that of the last window that holds it, one in ``map`` first, else its initial one.  Where at least
-    half of the frames are in ``map``, the motion has these, in frame "world"; else all, in frame "camera".  The windows
-    are those that the live graph adjusted where the session holds them, else all that are due.  Memory: the poses and
-    one window.
+    The motion is that of the subject in most images.  A frame's pose is that of the last window that holds it, one in
+    ``map`` first, else its initial one.  Where at least half of the frames are in ``map``, the motion has these, in
+    frame "world"; else all, in frame "camera".  The windows are those that the live graph adjusted where the session
+    holds them, else all that are due.  Memory: the poses and one window.
 
     Raises
     ------
     InputError
-        When the session holds no keypoints of a person.
+        When the session holds no keypoints of a person, or their joints or the size of their images change.
     """
     topic = session.choose_topic(POSE2D)
     published = PublishedPoses(session, topic.name)
@@ -96,6 +97,8 @@ def reconstruct_live(
             stop_reason, iterations = window.stop_reason, iterations + window.iterations
         if progress is not None and done % 50 == 0:
             progress("live", min(1.0, done / max(topic.count, 1)))
+    subject = most_frequent_subject(session, (frame.observation for frame in frames.values()))
+    frames = {stamp: frame for stamp, frame in frames.items() if frame.observation.track_id == subject}
     in_map = {stamp: frame for stamp, frame in frames.items() if frame.camera is not None}
     if in_map and 2 * len(in_map) >= len(frames):
         tracks, joints3d = _arrays(session, in_map, camera.matrix)
@@ -146,6 +149,12 @@ def _arrays(session: Session, frames: dict[int, _Frame], matrix: np.ndarray | No
     cameras = [frames[stamp].camera for stamp in stamps]
     known = [camera for camera in cameras if camera is not None]
     first = observations[0]
+    for other in observations:
+        if (other.joints, other.image_size) != (first.joints, first.image_size):
+            raise InputError(
+                f"{session.path}: expected {_format(first)} throughout, got {_format(other)}; cut the recording where"
+                " that changes"
+            )
     return (
         Tracks(
             keypoints=np.array([o.keypoints for o in observations], np.float64),
@@ -160,6 +169,11 @@ def _arrays(session: Session, frames: dict[int, _Frame], matrix: np.ndarray | No
         ),
         np.array([frames[stamp].joints for stamp in stamps], np.float64),
     )
+
+
+def _format(observation: PoseObservation) -> str:
+    width, height = observation.image_size
+    return f"{observation.joints.name} in images of {width}x{height} px"
 
 
 def _motion_in_world(tracks: Tracks, joints3d: np.ndarray, config: DrocapConfig) -> Motion:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,7 @@ def read_pose2d(session: Session, mount_pitch_deg: float | None = None, *, telem
     if not poses:
         raise InputError(f"{session.path}: expected poses on {chosen.name}, none could be decoded; record it again")
     ordered = [poses[stamp] for stamp in sorted(poses)]
-    track_id = _most_frequent(session, ordered)
+    track_id = most_frequent_subject(session, ordered)
     try:
         stamps = np.array(sorted(poses), dtype=np.int64)
         tracks = Tracks(stamp_ns=stamps, **_pose_arrays(ordered, track_id))
@@ -113,8 +114,8 @@ def read_vehicle_track(session: Session, near: str = "") -> VehicleTrack | None:
     return VehicleTrack(stamp_ns, position, unit_quaternions(orientation), unit_quaternions(gimbal))
 
 
-def _most_frequent(session: Session, messages: list[Any]) -> int:
-    """Track id of the subject in most images, the first of equals; 0 where no message has a subject."""
+def most_frequent_subject(session: Session, messages: Iterable[Any]) -> int:
+    """Track id of the subject in most of the messages or observations, the first of equals; 0 where none has one."""
     count = Counter(int(m.track_id) for m in messages if m.track_id)
     if not count:
         return 0
