@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.reconstruction.live.stamps import StampValidator
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Session, header_stamp_ns
 
 if TYPE_CHECKING:
@@ -56,7 +57,8 @@ def image_from_message(message: Any, compressed: bool) -> np.ndarray:
 def read_images(session: Session) -> Iterator[Frame]:
     """Images of a recording, one at a time, with strictly increasing stamps.
 
-    Images that do not decode, or with a stamp not later than the previous one, are left out with a warning.
+    Images that do not decode, or with a stamp not later than the previous one or far from it, are left out with a
+    warning.
 
     Raises
     ------
@@ -67,13 +69,14 @@ def read_images(session: Session) -> Iterator[Frame]:
 
     chosen = session.choose_topic(IMAGE, COMPRESSED_IMAGE)
     compressed = chosen.type_name == COMPRESSED_IMAGE
-    last_ns, unordered, problems = None, 0, Counter[str]()
+    last_ns, unordered, problems, stamps = None, 0, Counter[str](), StampValidator()
     for _, message in session.messages((chosen.name,)):
         stamp_ns = header_stamp_ns(message)
-        if last_ns is not None and stamp_ns <= last_ns:
-            unordered += 1
-            continue
         try:
+            stamps.check(message.header.stamp.sec, message.header.stamp.nanosec)
+            if last_ns is not None and stamp_ns <= last_ns:
+                unordered += 1
+                continue
             image = image_from_message(message, compressed)
         except InputError as error:
             problems[str(error)] += 1

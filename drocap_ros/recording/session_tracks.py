@@ -22,6 +22,8 @@ from drocap_ros.tracks import MAX_FRAMES, Tracks
 _OTHER_POSES = ("tf2_msgs/msg/TFMessage", "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped")
 #: Calibrations that differ by less are one: the scale of the motion errs by as much.
 _SAME_LENS = 0.01
+#: A stamp this far from most others is of another clock.
+_FAR_NS = 86_400 * 10**9
 
 
 def read_pose2d(session: Session, mount_pitch_deg: float | None = None, *, telemetry: bool = True) -> Tracks:
@@ -56,14 +58,24 @@ def read_pose2d(session: Session, mount_pitch_deg: float | None = None, *, telem
         session.warn(f"{repeated} repeated poses of the same images were left out")
     if not poses:
         raise InputError(f"{session.path}: expected poses on {chosen.name}, none could be decoded; record it again")
-    ordered = [poses[stamp] for stamp in sorted(poses)]
+    stamps = _of_one_clock(session, poses)
+    ordered = [poses[stamp] for stamp in stamps]
     track_id = most_frequent_subject(session, ordered)
     try:
-        stamps = np.array(sorted(poses), dtype=np.int64)
-        tracks = Tracks(stamp_ns=stamps, **_pose_arrays(ordered, track_id))
+        tracks = Tracks(stamp_ns=np.array(stamps, np.int64), **_pose_arrays(ordered, track_id))
         return with_recorded_camera(session, tracks, chosen.name, mount_pitch_deg, telemetry=telemetry)
     except InputError as error:
         raise InputError(f"{session.path}: {chosen.name}: {error}") from None
+
+
+def _of_one_clock(session: Session, stamps: Iterable[int]) -> list[int]:
+    """The stamps, sorted, without those far from most others: of a stray message, or from before a clock was set."""
+    ordered = sorted(stamps)
+    middle = ordered[len(ordered) // 2]
+    kept = [stamp for stamp in ordered if abs(stamp - middle) <= _FAR_NS]
+    if len(kept) < len(ordered):
+        session.warn(f"{len(ordered) - len(kept)} poses with a stamp more than a day from most others were left out")
+    return kept
 
 
 def with_recorded_camera(

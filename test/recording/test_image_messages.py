@@ -50,6 +50,18 @@ def test_yuv_images_are_grey_without_chroma(messages):
         assert abs(int(image.mean()) - 121) < 5
 
 
+def test_image_of_a_stray_stamp_costs_no_other(tmp_path, messages):
+    entries = []
+    for i in range(4):
+        stamp = START_NS + i + 10**17 * (i == 1)
+        message = image_message(messages, random_image(i), stamp, "bgr8", 0)
+        entries.append(("/camera", message, START_NS + i, messages.cdr(message)))
+    record(tmp_path / "s", entries)
+    with open_session(tmp_path / "s") as session:
+        assert [f.stamp_ns - START_NS for f in read_images(session)] == [0, 2, 3]
+        assert "1 images" in session.warnings[0]
+
+
 def test_damaged_compressed_images_are_left_out_with_a_warning(tmp_path, messages):
     import cv2
 

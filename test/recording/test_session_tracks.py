@@ -51,7 +51,10 @@ def test_poses_of_a_stray_stamp_are_refused_as_in_the_live_graph(tmp_path, messa
     with open_session(tmp_path / "s") as session:
         kept = [o.stamp_ns for o in read_observations(session, "/drocap/pose2d")]
         assert len(session.warnings) == 1
+        tracks = read_pose2d(session)  # has all images: those of most stamps
+        assert "8 poses with a stamp more than a day from most others" in session.warnings[-1]
     expected = capture.tracks.stamp_ns + 86_400 * 10**9 * (np.arange(len(capture.tracks)) >= 8)
+    assert np.array_equal(tracks.stamp_ns, expected[8:])
     assert kept == np.delete(expected, [3, 8, 9, 10, 11]).tolist()
 
 
