@@ -101,6 +101,8 @@ class SessionRecorderNode(ManagedComponent):
         # The middleware's times are not simulated ones.
         if self.simulated or not log_ns:
             log_ns = sent_ns = self.now_ns()
+            if not log_ns:  # the first /clock has not come: a session that begins in 1970 cannot be replayed
+                return
         self._received = self._received or name != "/diagnostics"
         self._recording = self._recording or name in self._subject
         if self._writer is not None:

@@ -92,7 +92,11 @@ class ComponentNode(Node):
         self._diagnostics = self.output("/diagnostics")
         self.create_timer(1.0, self.publish_diagnostics)
         # Before the simulated time begins the endpoints are matched already.
-        self._matching = self.create_timer(0.05, self.match, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._matching = self.create_timer(0.05, self.match, clock=steady)
+        self._clock_ns, self._clock_stands = -1, False
+        if self.simulated:
+            self.create_timer(1.0, self._watch_clock, clock=steady)
 
     # -- time ------------------------------------------------------------------------------------------
 
@@ -103,6 +107,13 @@ class ComponentNode(Node):
     def now_s(self) -> float:
         """Clock of periods and ages, s: monotonic, or the simulated time."""
         return self.now_ns() * 1e-9 if self.simulated else time.monotonic()
+
+    def _watch_clock(self) -> None:
+        """Publish the status while the simulated time stands still, and with it the timer that does so."""
+        last_ns, self._clock_ns = self._clock_ns, self.now_ns()
+        self._clock_stands = self._clock_ns == last_ns
+        if self._clock_stands:
+            self.publish_diagnostics()
 
     def _refuse_another_clock(self, parameters: list[Any]) -> SetParametersResult:
         changed = any(p.name == "use_sim_time" and p.value != self.simulated for p in parameters)
@@ -233,6 +244,8 @@ class ComponentNode(Node):
             return ""
         if not self.ready:
             return "waiting for the other nodes of the graph"
+        if self._clock_stands:
+            return "use_sim_time is set, and /clock " + ("stands still" if self._clock_ns else "has not come yet")
         now_s = self.now_s()
         for topic in self.needs:
             heard_s = self._heard_s.get(topic)

@@ -5,11 +5,18 @@ import os
 import signal
 
 import numpy as np
+import rclpy
 from captured_flight import FLIGHT, flight_config
+from rclpy.clock import ClockType
+from rclpy.context import Context
+from rclpy.parameter import Parameter
+from rclpy.time import Time
 from sensor_msgs.msg import CompressedImage
 
-from drocap_ros.bringup import bringup
+from drocap_ros.bringup import bringup, free_domain
 from drocap_ros.config import DrocapConfig
+from drocap_ros.nodes.session_recorder import SessionRecorderNode
+from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, TOPICS
@@ -106,3 +113,22 @@ def test_message_that_is_none_is_refused_and_the_recording_continues(tmp_path):
             return [v.value for v in values if v.key == Key.MESSAGES_REFUSED][-1:]
 
         graph.wait_until(lambda: refused() == ["2"], 10, "two refusals")
+
+
+def test_session_in_simulated_time_does_not_begin_before_the_clock(tmp_path):
+    config = SessionRecorderConfig(session_dir=str(tmp_path / "s"))
+    given = [Parameter("use_sim_time", value=True)]
+    with free_domain() as domain_id:
+        context = Context()
+        rclpy.init(args=[], context=context, domain_id=domain_id)
+        node = SessionRecorderNode(config, context=context, use_global_arguments=False, parameter_overrides=given)
+        try:
+            for now_ns in (0, 5 * 10**9):
+                node.get_clock().set_ros_time_override(Time(nanoseconds=now_ns, clock_type=ClockType.ROS_TIME))
+                node._on_message("/drocap/roi", bytes(24), {"received_timestamp": 1, "source_timestamp": 1})
+        finally:
+            node.close()
+            node.destroy_node()
+            context.try_shutdown()
+    with open_session(tmp_path / "s") as session:
+        assert [raw.log_time_ns for raw in session.raw_messages()] == [5 * 10**9]

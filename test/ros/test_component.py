@@ -43,6 +43,19 @@ def test_parameters_are_declared_from_the_dataclass_with_range_and_description(c
         assert "[m]" in node.describe_parameter("assumed_height_m").description
 
 
+def test_node_without_a_clock_reports_that(context):
+    with initializer(context, use_sim_time=True) as node:
+        states = []
+        node.create_subscription(TOPICS["/diagnostics"].message, "/diagnostics", states.append, RESULT_QOS)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        end_s = time.monotonic() + 10.0
+        while time.monotonic() < end_s and not any("/clock has not come yet" in m.status[0].message for m in states):
+            executor.spin_once(timeout_sec=0.1)
+        executor.shutdown()
+        assert "/clock has not come yet" in states[-1].status[0].message
+
+
 def test_override_takes_precedence_over_the_configuration(context):
     with initializer(context, InitializerConfig(search_azimuths=5), search_azimuths=3) as node:
         assert node.config.search_azimuths == 3
