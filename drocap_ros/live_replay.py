@@ -80,7 +80,9 @@ def reconstruct_live(
         config.initializer,
         config.bundle_adjuster,
         published.effort_at if published.has_windows else None,
-        lambda stamp_ns: camera.along(stamp_ns, published.telemetry_ns if published.has_windows else int(stamp_ns[-1])),
+        lambda stamp_ns, size: camera.along(
+            stamp_ns, size, published.telemetry_ns if published.has_windows else int(stamp_ns[-1])
+        ),
     )
     for done, result in enumerate(results):
         if isinstance(result, LivePose):

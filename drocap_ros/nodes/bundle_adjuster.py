@@ -94,6 +94,8 @@ class BundleAdjusterNode(ComponentNode):
         self._sequence = 0
         self._subject_in_view = True
         self._had_telemetry = False
+        #: Width and height px of the images, and those that the calibration is for if they differ.
+        self._sizes: tuple[tuple[int, int], tuple[int, int] | None] = (0, 0), None
         self._refined = self.output("pose3d/refined")
         self._latest = self.output("pose3d/latest")
         self.input("pose2d", self._on_pose2d)
@@ -166,14 +168,15 @@ class BundleAdjusterNode(ComponentNode):
         self._job_due_ns = observation.stamp_ns + round(self.config.max_solve_s * 1e9)
         work: Callable[..., Any] = self._solve if self.simulated else self._adjust
         window = self._buffer.window()
-        window = window._replace(camera=self._cameras.along(window.stamp_ns))
+        window = window._replace(camera=self._cameras.along(window.stamp_ns, observation.image_size))
         arguments = initial.header, observation.track_id, self._cameras.newest_ns, self._control.stride
         self._job = self._worker.submit(work, window, *arguments)
 
     def _publish_latest(self, observation: PoseObservation, initial: Pose3D, joints: np.ndarray) -> None:
         stamp_ns = observation.stamp_ns
         latest = self._latest_pose.pose(stamp_ns, joints)
-        camera = self._cameras.along(np.array([stamp_ns], np.int64))
+        camera = self._cameras.along(np.array([stamp_ns], np.int64), observation.image_size)
+        self._sizes = observation.image_size, self._cameras.other_size(observation.image_size)
         covariance = float_array(initial.covariance, (len(latest), 6), "covariance").astype(np.float64)
         keypoints = observation.body_keypoints().xy[: len(latest)]
         placed = self._latest_place.place(stamp_ns, (latest, covariance), keypoints, camera)
@@ -237,11 +240,15 @@ class BundleAdjusterNode(ComponentNode):
         return window
 
     def _report_telemetry(self, window: AdjustedWindow, done: str) -> None:
-        use = window.telemetry
+        use, reason = window.telemetry, window.reason
+        images, calibrated = self._sizes
+        if use is Telemetry.NONE and calibrated is not None:
+            use = Telemetry.REFUSED
+            reason = "camera_info is for images of {}x{} px, pose2d of {}x{}".format(*calibrated, *images)
         self.details[Key.TELEMETRY] = use.name.lower()
-        self.details[Key.TELEMETRY_REFUSED] = window.reason
+        self.details[Key.TELEMETRY_REFUSED] = reason
         self._had_telemetry |= use is Telemetry.USED
-        words = _WORDS[use].format(window.reason)
+        words = _WORDS[use].format(reason)
         refused = use is Telemetry.REFUSED or (self._had_telemetry and use in (Telemetry.NONE, Telemetry.LATE))
         self.report(WARN if refused else OK, f"{done}; {words}" if words else done)
 

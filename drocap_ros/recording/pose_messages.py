@@ -77,7 +77,7 @@ def add_calibration(history: CameraHistory, message: Any) -> None:
     if matrix.size == 9:
         if matrix[0] > 0 and min(message.width, message.height) > 0:
             check_camera_matrix(matrix.reshape(3, 3), (message.width, message.height))
-        history.add_matrix(header_stamp_ns(message), matrix.reshape(3, 3))
+        history.add_matrix(header_stamp_ns(message), matrix.reshape(3, 3), (message.width, message.height))
 
 
 def float_array(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:

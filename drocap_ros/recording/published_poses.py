@@ -61,15 +61,15 @@ class RecordedCamera:
                 add_calibration(self._history, message)
         self.matrix: np.ndarray | None = None
 
-    def along(self, stamp_ns: np.ndarray, newest_ns: int) -> WindowCamera | None:
-        """The camera at a window's images (F,), by the states up to that of the stamp ``newest_ns``."""
+    def along(self, stamp_ns: np.ndarray, size: tuple[int, int], newest_ns: int) -> WindowCamera | None:
+        """The camera at a window's images (F,) of a size, by the states up to that of the stamp ``newest_ns``."""
         history = self._history
         while self._next is not None and history.newest_ns != newest_ns:
             if history.newest_ns < newest_ns < header_stamp_ns(self._next):
                 break  # the recording lacks that state
             add_state(history, self._next)
             self._next = next(self._states, None)
-        camera = history.along(stamp_ns)
+        camera = history.along(stamp_ns, size)
         self.matrix = self.matrix if camera is None else camera.matrix
         return camera
 

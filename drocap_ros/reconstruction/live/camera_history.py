@@ -59,7 +59,7 @@ class CameraHistory:
         self._keep_ns = round(keep_s * 1e9) + _BEHIND_NS
         self._stamps: list[int] = []
         self._poses: list[np.ndarray] = []
-        self._matrices: list[tuple[int, np.ndarray]] = []
+        self._matrices: list[tuple[int, np.ndarray, tuple[int, int]]] = []
 
     @property
     def newest_ns(self) -> int:
@@ -81,21 +81,30 @@ class CameraHistory:
         old = max(bisect_left(self._stamps, stamp_ns - self._keep_ns), len(self._stamps) - _MOST_POSES)
         del self._stamps[:old], self._poses[:old]
 
-    def add_matrix(self, stamp_ns: int, matrix: np.ndarray) -> None:
-        """Take the calibration (3, 3) px of the image of a stamp; an unusable one is left out."""
+    def add_matrix(self, stamp_ns: int, matrix: np.ndarray, size: tuple[int, int] = (0, 0)) -> None:
+        """Take the calibration (3, 3) px of the image of a stamp; an unusable one is left out.
+
+        size : width and height px of the images that it is for; 0 = not stated
+        """
         if not (
             np.isfinite(matrix).all() and min(matrix[0, 0], matrix[1, 1]) >= 1 and np.allclose(matrix[2], (0, 0, 1))
         ):
             return
-        if not self._matrices or not np.array_equal(self._matrices[-1][1], matrix):
-            self._matrices = [*self._matrices[1 - _MOST_MATRICES :], (stamp_ns, matrix)]
+        last = self._matrices[-1] if self._matrices else None
+        if last is None or last[2] != size or not np.array_equal(last[1], matrix):
+            self._matrices = [*self._matrices[1 - _MOST_MATRICES :], (stamp_ns, matrix, size)]
 
-    def along(self, stamp_ns: np.ndarray) -> WindowCamera | None:
+    def other_size(self, size: tuple[int, int]) -> tuple[int, int] | None:
+        """Width and height px that the newest calibration is for, if there is none of images of ``size``."""
+        return self._matrices[-1][2] if self._matrices and self._matrix(0, size) is None else None
+
+    def along(self, stamp_ns: np.ndarray, size: tuple[int, int] = (0, 0)) -> WindowCamera | None:
         """The camera at images of increasing stamps (F,); None where no pose or no calibration is known.
 
+        Only a calibration of images of ``size`` (width, height) px counts; 0 = unknown.
         Between two poses up to 2 s apart values are interpolated; beyond the newest one they hold for 0.1 s.
         """
-        matrix = self._matrix(int(stamp_ns[-1]))
+        matrix = self._matrix(int(stamp_ns[-1]), size)
         if matrix is None or not self._stamps:
             return None
         begin = bisect_left(self._stamps, int(stamp_ns[0]) - _GAP_NS)
@@ -109,7 +118,8 @@ class CameraHistory:
         rotation = np.swapaxes(matrix_from_quaternion(orientation), 1, 2)
         return WindowCamera(rotation, position, matrix)
 
-    def _matrix(self, stamp_ns: int) -> np.ndarray | None:
+    def _matrix(self, stamp_ns: int, size: tuple[int, int]) -> np.ndarray | None:
         """Calibration of the last change up to a stamp; the first one before that."""
-        before = [matrix for since_ns, matrix in self._matrices if since_ns <= stamp_ns]
-        return before[-1] if before else self._matrices[0][1] if self._matrices else None
+        fitting = [(since, matrix) for since, matrix, of in self._matrices if 0 in (*of, *size) or of == size]
+        before = [matrix for since_ns, matrix in fitting if since_ns <= stamp_ns]
+        return before[-1] if before else fitting[0][1] if fitting else None

@@ -47,7 +47,7 @@ def live_poses(
     initializer: InitializerConfig,
     adjuster: BundleAdjusterConfig,
     effort_at: Callable[[int], Effort | None] | None = None,
-    camera_at: Callable[[np.ndarray], WindowCamera | None] | None = None,
+    camera_at: Callable[[np.ndarray, tuple[int, int]], WindowCamera | None] | None = None,
 ) -> Iterator[LivePose | LiveWindow]:
     """Poses and windows in the order of the live graph; memory is that of one window.
 
@@ -56,7 +56,8 @@ def live_poses(
     observations : in the order of their messages; those that the nodes drop are skipped
     effort_at : gives by the stamp of a window's newest image the effort of the live graph, None where it skipped the
         window (one is skipped while another is running); without it all windows that are due, with full effort
-    camera_at : gives the reported camera at the stamps (F,) of a window that is adjusted; without it none is known
+    camera_at : gives the reported camera at the stamps (F,) of a window that is adjusted and the size (width, height)
+        px of its newest image; without it none is known
     """
     initial, buffer, solver = LiveInitializer(initializer), FrameBuffer(adjuster), LiveAdjuster(adjuster)
     arrivals = StampValidator()  # of pose3d/initial at the adjuster's node
@@ -81,7 +82,7 @@ def live_poses(
             continue
         window = buffer.window()
         if camera_at is not None:
-            window = window._replace(camera=camera_at(window.stamp_ns))
+            window = window._replace(camera=camera_at(window.stamp_ns, observation.image_size))
         try:
             result = solver.adjust(window, effort)
         except SOLVER_ERRORS:

@@ -76,6 +76,21 @@ def test_a_late_report_is_left_out_and_a_loop_restarts() -> None:
     np.testing.assert_array_equal(camera.known, [True, False])
 
 
+def test_calibration_of_another_image_size_is_not_used() -> None:
+    history = filled(0.0, 1.0)
+    assert history.along(at(0.5), (1280, 720)) is not None  # its size is not stated
+    history = CameraHistory(12.0)
+    history.add_pose(S, np.zeros(3), LEVEL)
+    history.add_matrix(S, MATRIX, (640, 480))
+    assert history.along(at(1.0), (1280, 720)) is None
+    assert history.other_size((1280, 720)) == (640, 480)
+    history.add_matrix(2 * S, MATRIX, (1280, 720))
+    camera = history.along(at(1.0), (1280, 720))
+    assert camera is not None
+    assert camera.focal_px == MATRIX[0, 0]
+    assert history.other_size((1280, 720)) is None
+
+
 def test_memory_is_bounded_and_a_window_stays_whole() -> None:
     history = CameraHistory(2.0)
     history.add_matrix(0, MATRIX)

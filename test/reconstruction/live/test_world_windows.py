@@ -28,7 +28,7 @@ S = 10**9
 ADJUSTER = BundleAdjusterConfig()
 #: Half the windows, where the last one counts.
 SELDOM = BundleAdjusterConfig(period_s=2.0)
-CameraAt = Callable[[np.ndarray], WindowCamera | None]
+CameraAt = Callable[[np.ndarray, tuple[int, int]], WindowCamera | None]
 
 
 def run(
@@ -54,7 +54,7 @@ def followed() -> list[LivePose | LiveWindow]:
 @lru_cache(maxsize=1)
 def without_telemetry() -> LiveWindow:
     """The last window of the same flight when no pose of the camera arrives."""
-    return windows_of(run(flown().observations, lambda stamp_ns: None, SELDOM))[-1]
+    return windows_of(run(flown().observations, lambda *_: None, SELDOM))[-1]
 
 
 def errors(poses: dict[int, np.ndarray], truth: Orbit) -> WorldErrors:
