@@ -122,7 +122,8 @@ class Session(ABC):
         found = self.topics_of(*type_names)
         kinds = " or ".join(type_names)
         if not found:
-            there = ", ".join(f"{t.name} ({t.type_name})" for t in self.info.topics) or "no topics"
+            nothing = "no messages" if self.info.topics else "no topics"
+            there = ", ".join(f"{t.name} ({t.type_name})" for t in self.info.topics if t.count) or nothing
             raise InputError(f"{self.path}: expected a topic of type {kinds}, found {there}; record one")
         if len(found) > 1:
             self.warn(f"several topics of type {kinds}: {', '.join(t.name for t in found)}; took {found[0].name}")
