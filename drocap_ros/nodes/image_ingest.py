@@ -2,9 +2,9 @@
 
 Publishes ``image/compressed`` (sensor_msgs/CompressedImage) and, where the camera is known, ``camera_info``.
 Stamps are exposure times: those of the source; of a file, counted from the activation.
-With ``source = topic:NAME`` it subscribes to that topic: CompressedImage where the name ends in "compressed",
-else Image in one of the usual encodings; stamps are those of the messages.  Where its publishers offer that, lost
-fragments of an image are sent again.
+With ``source = topic:NAME`` it subscribes to that topic: CompressedImage, or Image in one of the usual encodings, as
+its publishers send it; stamps are those of the messages.  Where they offer that, lost fragments of an image are sent
+again.
 """
 
 from __future__ import annotations
@@ -39,6 +39,8 @@ from drocap_ros.ros.topics import TOPIC_SOURCE
 _LATE_S = 0.1
 #: Images of a topic that may wait.
 _DEPTH = 5
+#: Messages of images by the names of their types.
+_KINDS = {"sensor_msgs/msg/CompressedImage": CompressedImage, "sensor_msgs/msg/Image": Image}
 
 
 class ImageIngestNode(ThreadedSource):
@@ -56,6 +58,7 @@ class ImageIngestNode(ThreadedSource):
         self._arrived_s = time.monotonic()
         self._source: ImageSource | None = None
         self._topic = ""
+        self._foreign = ""  # types that are published there, if none is an image
         self._subscription: Subscription | None = None
         self.create_timer(0.5, self._watch)
         self.set_up()
@@ -64,7 +67,7 @@ class ImageIngestNode(ThreadedSource):
         """Open the source, or wait for its topic."""
         if self.config.source.startswith(TOPIC_SOURCE):
             self._topic = self._valid_topic(self.config.source.removeprefix(TOPIC_SOURCE))
-            self.report(WARN, f"waiting for {self._kind().__name__} on {self._topic}")
+            self.report(WARN, f"waiting for images on {self._topic}")
         else:
             self._source = open_source(self.config.source, self.config)
             self._fit_camera(self._source.size)
@@ -159,23 +162,25 @@ class ImageIngestNode(ThreadedSource):
             ) from None
         return topic
 
-    def _kind(self) -> type:
-        return CompressedImage if self._topic.endswith("compressed") else Image
-
     def _subscribe(self) -> None:
-        """Subscribe to the topic as reliably as its publishers offer, once there are some."""
-        offers = {info.qos_profile.reliability for info in self.get_publishers_info_by_topic(self._topic)}
-        if not offers:
+        """Subscribe to the topic with the type and as reliably as its publishers offer, once there are some."""
+        publishers = self.get_publishers_info_by_topic(self._topic)
+        types = {info.topic_type for info in publishers}
+        self._foreign = ", ".join(sorted(types)) if types.isdisjoint(_KINDS) else ""
+        kind = next((kind for name, kind in _KINDS.items() if name in types), None)
+        if kind is None:
             return
+        offers = {info.qos_profile.reliability for info in publishers if _KINDS.get(info.topic_type) is kind}
         all_reliable = offers == {ReliabilityPolicy.RELIABLE}
         wanted = ReliabilityPolicy.RELIABLE if all_reliable else ReliabilityPolicy.BEST_EFFORT
-        if self._subscription is not None and self._subscription.qos_profile.reliability == wanted:
+        last = self._subscription
+        if last is not None and (last.msg_type, last.qos_profile.reliability) == (kind, wanted):
             return
         self._unsubscribe()
         qos = QoSProfile(depth=_DEPTH, reliability=wanted)
         take = self.guarded(self._topic, self._take, stamps=True)
         events = SubscriptionEventCallbacks(message_lost=self._on_lost)
-        self._subscription = self.create_subscription(self._kind(), self._topic, take, qos, event_callbacks=events)
+        self._subscription = self.create_subscription(kind, self._topic, take, qos, event_callbacks=events)
 
     def _on_lost(self, event: Any) -> None:
         self.count(of(Key.LOST, self._topic), event.total_count_change)
@@ -229,9 +234,9 @@ class ImageIngestNode(ThreadedSource):
         is_live = self._source is None or self._source.live
         silence_s = time.monotonic() - self._arrived_s
         if self.active and is_live and silence_s > self.config.stall_timeout_s:
-            self.report(
-                WARN, f"no image from {self.config.source} for {silence_s:.1f} s; check the camera and its link"
-            )
+            remedy = f"{self._foreign} is published there: name an image topic" if self._foreign else ""
+            remedy = remedy or "check the camera and its link"
+            self.report(WARN, f"no image from {self.config.source} for {silence_s:.1f} s; {remedy}")
 
 
 def main() -> int:

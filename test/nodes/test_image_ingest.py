@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
-from sensor_msgs.msg import CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
@@ -150,6 +150,21 @@ def test_the_subscription_is_as_reliable_as_the_driver(qos, reliable):
 
         graph.wait_until(lambda: offers() == {"RELIABLE" if reliable else "BEST_EFFORT"}, 10, "the node to adapt")
         graph.wait_until(publisher.get_subscription_count, 10, "the node to listen")
+
+
+@pytest.mark.parametrize("kind", [CompressedImage, CameraInfo])
+def test_type_of_the_topic_is_that_of_its_publisher(kind):
+    topic, reports = "/front/jpeg", []
+    with bringup(DrocapConfig().replace("image_ingest", source=f"topic:{topic}"), ["image_ingest"]) as graph:
+        publisher = graph.node.create_publisher(kind, topic, 10)
+        entry = TOPICS["/diagnostics"]
+        graph.node.create_subscription(entry.message, "/diagnostics", reports.append, entry.qos)
+        words = "; sensor_msgs/msg/CameraInfo is published there: name an image topic"
+
+        def reported():
+            return any(m.status[0].message.endswith(words) for m in reports)
+
+        graph.wait_until(publisher.get_subscription_count if kind is CompressedImage else reported, 10, "the answer")
 
 
 DRIVER = """
