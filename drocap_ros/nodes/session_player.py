@@ -59,8 +59,9 @@ class SessionPlayerNode(ThreadedSource):
     def _publisher(self, topic: TopicInfo) -> Publisher:
         recorded = self._session.info.metadata.get("namespace", "/drocap").rstrip("/") + "/"
         name = topic.name.removeprefix(recorded)
-        if name in TOPICS:
-            return self.output(name)
+        for own in (name, f"/{name}"):  # TF of another namespace than the default one is recorded as NAMESPACE/tf
+            if own in TOPICS:
+                return self.output(own)
         package, _, kind = topic.type_name.split("/")
         message = getattr(importlib.import_module(f"{package}.msg"), kind)
         qos = IMAGE_RECORDING_QOS if topic.type_name in (IMAGE, COMPRESSED_IMAGE) else RESULT_QOS

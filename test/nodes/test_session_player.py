@@ -10,6 +10,8 @@ from rosgraph_msgs.msg import Clock
 from drocap_ros.bringup import bringup
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
+from drocap_ros.recording.mcap.schemas import schema_text
+from drocap_ros.recording.mcap.writer import SessionWriter
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_pose2d
 from drocap_ros.ros.conversions import stamp_from_ros
@@ -71,6 +73,18 @@ def test_impossible_replays_are_refused_in_one_line(captured, tmp_path):
         with pytest.raises(InputError, match=words) as error, bringup(config, ["session_player"]):
             pytest.fail("it came up")
         assert "\n" not in str(error.value)
+
+
+def test_tf_of_another_namespace_is_published_in_the_players_own(tmp_path):
+    kind = "tf2_msgs/msg/TFMessage"
+    pytest.importorskip("tf2_msgs")
+    with SessionWriter(tmp_path / "s", metadata={"namespace": "/drone2"}) as writer:
+        writer.register("/drone2/tf", kind, schema_text(kind))
+        writer.write("/drone2/tf", bytes([0, 1, 0, 0, 0, 0, 0, 0]), 10**9)
+    config = DrocapConfig().replace("session_player", session=str(tmp_path / "s"))
+    for namespace, topic in (("/drocap", "/tf"), ("/drone3", "/drone3/tf")):
+        with bringup(config, ["session_player"], namespace=namespace) as graph:
+            graph.wait_until(lambda g=graph, t=topic: g.node.count_publishers(t) == 1, 10, "TF in the namespace")
 
 
 def test_a_loop_repeats_until_it_is_stopped(captured):
