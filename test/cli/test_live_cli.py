@@ -154,7 +154,7 @@ def test_a_graph_that_cannot_begin_leaves_no_session(tmp_path, option):
     assert not (tmp_path / "flight").exists()
 
 
-def test_top_shows_the_nodes_of_a_running_graph(video, tmp_path, monkeypatch):
+def test_top_shows_the_nodes_of_a_running_graph(video, tmp_path, monkeypatch, capsys):
     config = ROOT / "config" / "video_file.yaml"
     with free_domain() as domain:
         nodes = ("--nodes", "session_recorder")
@@ -172,6 +172,7 @@ def test_top_shows_the_nodes_of_a_running_graph(video, tmp_path, monkeypatch):
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         monkeypatch.setattr("drocap_ros.cli.graph.top.ONCE_TIMEOUT_S", 3.0)
         assert main(["top", "--once", "--domain-id", str(domain)]) == 1
+        assert f"in /drocap, domain {domain}, found none" in capsys.readouterr().err
 
 
 def test_top_waits_for_the_nodes_that_are_found_later(tmp_path, monkeypatch):

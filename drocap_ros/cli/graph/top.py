@@ -53,9 +53,16 @@ def run(args: argparse.Namespace) -> int:
             while dashboard.heard(args.namespace) != known and time.monotonic() < end_s and not stop.is_set():
                 known = dashboard.heard(args.namespace)
                 graph.spin_for(_QUIET_S, stop)
+            if not known:
+                print(
+                    f"drocap: expected the status of a node in {args.namespace}, domain {domain_id}, found none; start"
+                    " the graph, or correct --namespace or --domain-id",
+                    file=sys.stderr,
+                )
+                return 1
             # A pipe has no width: wide enough that no name is cut.
             Console(width=None if sys.stdout.isatty() else 180).print(dashboard.table(args.namespace))
-            return 0 if dashboard.heard(args.namespace) else 1
+            return 0
         while not stop.is_set():
             graph.spin_for(0.5, stop)
             draw()
