@@ -27,6 +27,8 @@ from drocap_ros.ros.diagnostics import ERROR, HARDWARE_ID, OK, WARN, Key, Latenc
 from drocap_ros.ros.parameters import declare_parameters
 from drocap_ros.ros.topics import FROM_OUTSIDE, TOPICS, publishers_of, subscribers_of
 
+#: A simulated time that has not moved for this long, by the real clock, stands still: a busy simulator is faster.
+_CLOCK_STANDS_S = 5.0
 #: A node whose input has been silent for this long is idle.
 IDLE_S = 3.0
 
@@ -96,7 +98,7 @@ class ComponentNode(Node):
         self._matching = self.create_timer(0.05, self.match, clock=steady)
         self._clock_ns, self._clock_stands = -1, False
         if self.simulated:
-            self.create_timer(1.0, self._watch_clock, clock=steady)
+            self.create_timer(_CLOCK_STANDS_S, self._watch_clock, clock=steady)
 
     # -- time ------------------------------------------------------------------------------------------
 

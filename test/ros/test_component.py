@@ -43,7 +43,8 @@ def test_parameters_are_declared_from_the_dataclass_with_range_and_description(c
         assert "[m]" in node.describe_parameter("assumed_height_m").description
 
 
-def test_node_without_a_clock_reports_that(context):
+def test_node_without_a_clock_reports_that(context, monkeypatch):
+    monkeypatch.setattr("drocap_ros.ros.component._CLOCK_STANDS_S", 0.3)
     with initializer(context, use_sim_time=True) as node:
         states = []
         node.create_subscription(TOPICS["/diagnostics"].message, "/diagnostics", states.append, RESULT_QOS)
