@@ -293,12 +293,9 @@ class PoseEstimator:
         close = shedding and self._score >= _CLEAR_SCORE
         for window in self.tracker.windows(size, stamp_ns, single=shedding, close=close):
             found = _merged(found, self._detect_in(image, window, shedding))
-        tight = None if shedding else self.tracker.second_pass_window(size, stamp_ns, found.boxes, found.scores)
-        if tight is not None:
-            found = _merged(found, self._detect_in(image, tight))
-        sought = None if shedding else self.tracker.sought_window(size, stamp_ns, found.boxes)
-        if sought is not None:
-            found = _merged(found, self._detect_in(image, sought))
+        for further in () if shedding else (self.tracker.second_pass_window, self.tracker.sought_window):
+            if (window := further(size, stamp_ns, found.boxes, found.scores)) is not None:
+                found = _merged(found, self._detect_in(image, window))
         return found
 
     def _detect_in(self, image: np.ndarray, window: Window | None, shedding: bool = False) -> Detections:

@@ -32,9 +32,15 @@ def wins(rival: float, subject: float) -> bool:
 
 
 def rivals(
-    subject: Person, persons: list[Person], image: np.ndarray, boxes: np.ndarray, confidence: float, stamp_ns: int
+    subject: Person,
+    persons: list[Person],
+    image: np.ndarray,
+    boxes: np.ndarray,
+    scores: np.ndarray,
+    confidence: float,
+    stamp_ns: int,
 ) -> list[int]:
-    """Indices of the boxes (N, 4) px that could show the subject, in their order.
+    """Indices of the boxes (N, 4) px of scores (N,) that could show the subject, the nearest and best first.
 
     image : (H, W, 3) uint8 BGR
     confidence : of the subject's pose in this image
@@ -52,7 +58,10 @@ def rivals(
         inside = float(overlap_coefficient(box[None], subject.box[None])[0, 0]) > _INSIDE
         if inside or _looks_right(subject, describe(image, box), present):
             found.append(j)
-    return found
+    predicted = subject.filter.box()
+    offset = (predicted[:2] + predicted[2:] - boxes[:, :2] - boxes[:, 2:]) / 2
+    lengths = np.round(np.linalg.norm(offset, axis=1) / max(subject.filter.length, subject.pose.length))
+    return sorted(found, key=lambda j: (lengths[j], -scores[j]))
 
 
 def _on_other(subject: Person, persons: list[Person], box: np.ndarray, stamp_ns: int) -> bool:

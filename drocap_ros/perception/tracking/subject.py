@@ -86,7 +86,7 @@ class SubjectTracker:
         subject = self._subject
         if subject is not None and subject.unconfirmed_s(stamp_ns) <= self._coast_s:
             box = subject.filter.box_at(stamp_ns)
-            if single and self._last_ns is not None and subject.detected_ns < self._last_ns:
+            if single and subject.detected_ns < (self._last_ns or 0):
                 box, close = subject.sought_box(stamp_ns), False
             windows = self._schedule.near_subject(box, image_size, stamp_ns, single, close)
             if subject.pose.questioned and windows != [None]:  # whoever it is: the search goes on beside it
@@ -108,13 +108,15 @@ class SubjectTracker:
             return None
         return tight_window(box, image_size)
 
-    def sought_window(self, image_size: tuple[int, int], stamp_ns: int, boxes: np.ndarray) -> Window | None:
+    def sought_window(
+        self, image_size: tuple[int, int], stamp_ns: int, boxes: np.ndarray, _scores: np.ndarray
+    ) -> Window | None:
         """Window in which a subject without detection may be, if it is in none of the boxes (N, 4) px; or None."""
         subject = self._subject
-        if subject is None or self._chosen_box is not None or subject.unconfirmed_s(stamp_ns) > self._coast_s:
+        if subject is None or subject.unconfirmed_s(stamp_ns) > self._coast_s:
             return None
-        seen = self._last_ns is None or subject.detected_ns == self._last_ns
-        if seen or (iou(subject.filter.box_at(stamp_ns)[None], boxes.astype(float)) > _AT_PLACE).any():
+        near = iou(subject.filter.box_at(stamp_ns)[None], boxes.astype(float)) > _AT_PLACE
+        if near.any() or subject.detected_ns >= (self._last_ns or 0):
             return None
         return wide_window(subject.sought_box(stamp_ns), image_size)
 
@@ -192,13 +194,7 @@ class SubjectTracker:
         confidence : mean of the subject's pose in this image
         """
         subject = self._subject
-        if subject is None:
-            return []
-        found = rivals(subject, self.persons, image, boxes, confidence, stamp_ns)
-        predicted = subject.filter.box()
-        offset = (predicted[:2] + predicted[2:] - boxes[:, :2] - boxes[:, 2:]) / 2
-        lengths = np.round(np.linalg.norm(offset, axis=1) / max(subject.filter.length, subject.pose.length))
-        return sorted(found, key=lambda j: (lengths[j], -scores[j]))
+        return [] if subject is None else rivals(subject, self.persons, image, boxes, scores, confidence, stamp_ns)
 
     def exchange(self, image: np.ndarray, stamp_ns: int, box: np.ndarray, score: float) -> Subject:
         """Continue the subject at a rival's box (4,) px; a track of what it was before remains."""
@@ -326,8 +322,7 @@ class SubjectTracker:
 
     def _follow(self, person: Person) -> None:
         self._subject = person
-        self._track_id += 1
-        self._left_image = False
+        self._track_id, self._left_image = self._track_id + 1, False
         for bystander in self.persons:  # others than the last subject may be this one
             bystander.pose.other = False
 

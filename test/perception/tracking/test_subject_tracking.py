@@ -93,7 +93,7 @@ def test_half_hidden_subject_takes_its_own_detection_when_the_cover_goes_away():
 def test_subject_that_fell_while_unseen_is_in_the_window_of_the_search():
     size, tracker = (1768, 994), SubjectTracker(PoseEstimatorConfig())
     image = np.full((size[1], size[0], 3), 128, np.uint8)
-    none = np.empty((0, 4))
+    none, score = np.empty((0, 4)), np.ones(1)
 
     def update(index, boxes):
         tracker.update(image, index * STEP, boxes, np.full(len(boxes), 0.8))
@@ -106,13 +106,13 @@ def test_subject_that_fell_while_unseen_is_in_the_window_of_the_search():
     curled = np.array([[840.0, 165, 1030, 335]])
     update(20, curled)
     update(21, none)
-    assert tracker.sought_window(size, 22 * STEP, curled) is None  # the window near him shows him
+    assert tracker.sought_window(size, 22 * STEP, curled, score) is None  # the window near him shows him
     update(22, none)
-    x0, y0, x1, y1 = tracker.sought_window(size, 23 * STEP, none)
+    x0, y0, x1, y1 = tracker.sought_window(size, 23 * STEP, none, score[:0])
     # He stretches, and falls by his own length.
     assert max(x0 - 880, y0 - 180) < 0 < min(x1 - 1000, y1 - 580)
     update(23, np.array([[880.0, 250, 1000, 570]]))
-    assert tracker.sought_window(size, 24 * STEP, none) is None
+    assert tracker.sought_window(size, 24 * STEP, none, score[:0]) is None
 
 
 def test_detection_near_the_subject_is_not_a_person_from_far_away():
