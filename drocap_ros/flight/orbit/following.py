@@ -83,11 +83,13 @@ class Following:
                 return "the autopilot's target is none that was sent"
         setpoint, flown = sent[-1][1], vehicle.velocity_enu_m_s[:2]
         commanded = np.array([setpoint.vy, setpoint.vx], dtype=float)
-        stands = self._by_speed.judge(now_s, float(np.hypot(*commanded)), float(np.hypot(*flown)))
+        along_m_s = float(np.hypot(*commanded))
         # Before a vehicle that stands the reference waits: its speed falls, and the way to its place remains.
         way = np.array([setpoint.y, setpoint.x], dtype=float) - vehicle.position_enu_m[:2]
         commanded += way * min(1.0, _MOST_WAY_M / max(float(np.hypot(*way)), 1e-6)) * _POSITION_GAIN
         speed_m_s = float(np.hypot(*commanded))
+        # A vehicle stands where the way to its place and the velocity there cancel, as after an adjustment.
+        stands = self._by_speed.judge(now_s, min(along_m_s, speed_m_s), float(np.hypot(*flown)))
         # Along the command: after a stop ArduPilot springs back.
         return self._by_way.judge(now_s, speed_m_s, float(flown @ commanded) / max(speed_m_s, 1e-6)) or stands
 

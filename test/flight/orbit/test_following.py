@@ -119,6 +119,13 @@ def test_a_vehicle_that_stands_or_springs_back_before_a_place_does_not_follow():
     assert fly(lambda t, x: None, commanded=0.0, flown=lambda t: 0.0, place=lambda t: -0.5) == (math.inf, "")
 
 
+def test_a_vehicle_that_stands_where_velocity_and_way_back_cancel_follows():
+    """As after an adjustment between extremes: both autopilots add the way to the place to the velocity."""
+    ahead = fly(lambda t, x: None, commanded=1.0, flown=lambda t: 0.1, place=lambda t: t + 0.9)
+    assert ahead == (math.inf, "")
+    assert fly(lambda t, x: None, commanded=1.0, flown=lambda t: 0.1, place=lambda t: t + 0.2)[0] <= 1.2
+
+
 def test_each_orbit_is_judged_anew():
     following = Following(MAX_ECHO_AGE_S)
     sent = [(0.05 * i, setpoint(0.1 * i, 2.0)) for i in range(60)]
