@@ -13,7 +13,6 @@ from collections import deque
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.commands import CommandQueue, command_message
@@ -101,6 +100,7 @@ class OrbitController:
         #: Another one that commands or is followed, found in the graph; any thread may set it.
         self.intruder: Condition | None = None
         self._unsafe: Condition | None = None  # why the last setpoint was not sent
+        self._camera_changed: Condition | None = None  # since the last step
 
     # -- inputs ----------------------------------------------------------------------------------------
     def on_state(self, state: VehicleState) -> None:
@@ -112,18 +112,9 @@ class OrbitController:
             self._subject.height_wanders = state.autopilot == "px4"
 
     def on_camera(self, camera_matrix: np.ndarray) -> None:
-        """Take the camera matrix (3, 3) px.
-
-        Raises
-        ------
-        InputError
-            When a value is not finite or a focal length is not positive.
-        """
-        focal = np.diag(camera_matrix)[:2]
-        if not np.isfinite(camera_matrix).all() or np.any(focal <= 0):
-            raise InputError("camera_info: expected a camera matrix with positive focal lengths; calibrate the camera")
+        """Take the camera matrix (3, 3) px; raises as :meth:`Framing.calibrate`.  A change ends the motion."""
         with self._lock:
-            self._framing.matrix = np.asarray(camera_matrix, dtype=float)
+            self._camera_changed = self._framing.calibrate(camera_matrix) or self._camera_changed
 
     def on_pose2d(self, observation: PoseObservation) -> None:
         """Take the keypoints of one image."""
@@ -131,7 +122,7 @@ class OrbitController:
         observation = dataclasses.replace(observation, stamp_ns=observation.stamp_ns - late_ns)
         with self._lock:
             self._framing.size = observation.image_size
-            if (matrix := self._framing.matrix) is not None:
+            if (matrix := self._framing.matrix) is not None and self._camera_changed is None:
                 camera = self._history.at(observation.stamp_ns)
                 for estimator in (self._subject.update, self._guard.see):
                     estimator(observation, matrix, camera, locked=self.safety.bound)
@@ -189,6 +180,9 @@ class OrbitController:
             )
         if self.safety.state != before.state:
             self._on_change(seen, estimate)
+        if self._camera_changed is not None:  # the places so far were measured by another one
+            config, self._camera_changed = self._config, None
+            self._subject, self._guard = SubjectFilter(config), Guard(config, config, config.braking_m_s2)
         self._request_mode(decision.mode_request, seen, dialect, now_s)
         sent = self._send(decision.action, seen, estimate, dt)
         self._send_commands(seen, estimate, now_s)
@@ -212,7 +206,7 @@ class OrbitController:
             return condition(ConditionCode.POSITION_JUMPED, jump_m=jump_m), dt, hung
         if hung or dt > self._config.watchdog_s:
             return condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=dt), dt, hung
-        return self._unsafe, dt, hung
+        return self._camera_changed or self._unsafe, dt, hung
 
     def _next_command(self, now_ns: int) -> tuple[OperatorCommand | None, Command | None, OrbitGoal | None]:
         """The command to execute in this step, and the orbit that it asks for; an invalid one is refused here."""

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.planner import OrbitGoal
@@ -29,6 +30,7 @@ _LEAST_UP = 0.3  # of the body's axis; beyond it the vehicle tumbles
 _STILL_M_S, _SETTLED_S = 0.5, 1.0
 _LEARNING_S = 4.0  # of the lean against wind: a gust passes, the wind stays
 _STEADY_S = 0.7  # over which the margin now is averaged: a slower orbit cannot follow a gust
+_SAME_CAMERA = 0.03  # of the focal length, by which a camera matrix may change
 _COMFORT, _LEAST_PACE = 0.08, 0.3  # share of the picture's height below which the orbit slows down, and how far
 
 
@@ -97,7 +99,7 @@ def orbit_margin(view: View, goal: OrbitGoal, body_height_m: float, wind: float)
 class Framing:
     """Watches the picture of a fixed camera; without one it changes and refuses nothing.
 
-    matrix : (3, 3) px; None before the first calibration
+    matrix : (3, 3) px; None before the first calibration.  :meth:`calibrate` sets it
     size : width and height of the pictures, px; None before the first
     """
 
@@ -105,10 +107,30 @@ class Framing:
         self._config = config
         self.matrix: np.ndarray | None = None
         self.size: tuple[int, int] | None = None
+        self._judged_by: np.ndarray | None = None  # matrix of the distances so far
         self._wind = np.zeros(2)  # m/s^2 ENU, by which the vehicle leans without accelerating
         self._still_s = 0.0
         self._learned_s = 0.0
         self._margin = math.nan
+
+    def calibrate(self, matrix: np.ndarray) -> Condition | None:
+        """Take a camera matrix (3, 3) px; returns a condition where it is that of another camera or zoom.
+
+        Raises
+        ------
+        InputError
+            When a value is not finite or a focal length is not positive.
+        """
+        if not np.isfinite(matrix).all() or np.any(np.diag(matrix)[:2] <= 0):
+            raise InputError("camera_info: expected a camera matrix with positive focal lengths; calibrate the camera")
+        self.matrix, before = np.asarray(matrix, dtype=float), self._judged_by
+        # Against the first one, so that slow changes add up.
+        if before is not None and np.abs(self.matrix - before).max() <= _SAME_CAMERA * before[0, 0]:
+            return None
+        self._judged_by = self.matrix
+        if before is None:
+            return None
+        return condition(ConditionCode.CAMERA_CHANGED, before_px=before[0, 0], now_px=self.matrix[0, 0])
 
     def watch(self, vehicle: VehicleState | None, seen: Observed, dt: float) -> Observed:
         """The observation with the margin now; learns the lean against wind, ``dt`` s after the last one."""

@@ -80,6 +80,7 @@ from drocap_ros.simulation.closed_loop.report_injections import (
     reports_state,
     small_steps,
     unknown_mount,
+    zoomed,
 )
 
 _C = ConditionCode
@@ -318,6 +319,7 @@ _REPORTS = (
         "TIMESYNC is never answered", lambda loop: None, harmless=True,
         before=((0.0, never_sends(TIME_SYNC)), (4.0, start)),
     ),
+    Fault("camera_info changes as by a zoom", zoomed(42.0), LINK_S, codes=(_C.CAMERA_CHANGED,)),
     Fault("the mount reports no angles", unknown_mount, 0.5 + FRAME_S, codes=(_C.MOUNT_OUTDATED, *_LOCATED)),
 )  # fmt: skip
 

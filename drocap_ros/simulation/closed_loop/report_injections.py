@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.simulation.closed_loop.fault_flight import FAULT_S, Injection
 from drocap_ros.simulation.closed_loop.orbit_loop import OrbitLoop
+from drocap_ros.simulation.orbit_camera import pinhole_matrix
 
 
 def never_sends(number: int) -> Injection:
@@ -44,6 +45,16 @@ def unknown_mount(loop: OrbitLoop) -> None:
         return None if reported is None else reported._replace(quaternion_wxyz=np.full(4, np.nan))
 
     mount.report = unknown  # type: ignore[method-assign, assignment]
+
+
+def zoomed(field_deg: float) -> Injection:
+    """camera_info states another field of view in deg, as of a lens that zooms; the pictures stay."""
+
+    def inject(loop: OrbitLoop) -> None:
+        height, width = 2 * loop.matrix[1, 2], 2 * loop.matrix[0, 2]
+        loop.controller.on_camera(pinhole_matrix(round(width), round(height), field_deg))
+
+    return inject
 
 
 def small_steps(toward_m: float) -> Injection:

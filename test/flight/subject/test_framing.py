@@ -13,7 +13,7 @@ from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.orbit.degradation import allowed_pace
 from drocap_ros.flight.orbit.planner import goal_of
-from drocap_ros.flight.orbit.states import Limits, Observed, State
+from drocap_ros.flight.orbit.states import Command, Limits, Observed, State
 from drocap_ros.flight.subject.framing import Framing, View, framing_margin, orbit_margin
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop
@@ -107,6 +107,31 @@ def test_the_margin_now_follows_the_lean():
     coming = dataclasses.replace(FRESH, framing_margin=last.framing_margin, approach_m_s=0.8)
     assert allowed_pace(coming, limits).pace == 1.0
     assert orbit_margin(View(MATRIX, SIZE, math.radians(-11)), goal_of(CONFIG), 1.7, 0.0) > 0.1
+
+
+def test_a_slow_change_of_the_camera_counts_once_it_adds_up_to_more_than_three_percent():
+    framed = Framing(CONFIG)
+    steps = [framed.calibrate(MATRIX * np.array([[scale], [scale], [1.0]])) for scale in (1.0, 1.02, 1.04, 1.06, 1.0)]
+    changed = ConditionCode.CAMERA_CHANGED
+    assert [step and step.code for step in steps] == [None, None, changed, None, changed]
+    assert framed.calibrate(MATRIX + np.array([[0, 0, 60.0], [0, 0, 0], [0, 0, 0]])).code == changed
+
+
+def test_a_zoom_ends_the_orbit_and_a_new_start_flies_by_the_new_camera():
+    loop = OrbitLoop(LoopSettings(seed=1, seconds=18))
+    loop.start()
+    loop.run(8.0)
+    assert loop.controller.safety.state == State.ORBITING
+    loop.matrix = pinhole_matrix(*SIZE, 50.0)
+    loop.controller.on_camera(loop.matrix)
+    loop.run(8.1)
+    assert (loop.status.state, loop.status.condition.code) == (State.HOLDING, ConditionCode.CAMERA_CHANGED)
+    loop.run(12.0)
+    assert loop.status.state == State.HOLDING
+    loop.command(Command.ENGAGE)
+    loop.run(18.0)
+    assert loop.status.state == State.ORBITING
+    assert loop.rows[-1].distance_m == pytest.approx(loop.settings.config.radius_m, abs=1.0)
 
 
 def test_a_commanded_orbit_is_refused_in_flight():
