@@ -152,7 +152,7 @@ _SENTENCES = {
     _C.MODE_CHANGE_FORBIDDEN: "the mode is {mode} and mode_change_allowed is false; set it to true (PX4 enters "
     "OFFBOARD only while setpoints arrive), or switch to GUIDED by hand (ArduPilot)",
     _C.PERSON_LEAVES_PICTURE: "at {radius_m:g} m, {height_m:g} m high and {speed_deg_s:.0f} deg/s the person "
-    "leaves the picture of the fixed camera by {missing_percent:.0f} % of its height, as the body leans; {remedy}",
+    "leaves the picture of {camera} by {missing_percent:.0f} % of its height; {remedy}",
     _C.HOLD_MODE_PENDING: "the autopilot's hold mode has just been requested and is not reported yet; send engage when "
     "it is, or switch to GUIDED by hand (ArduPilot)",
     _C.COMMANDS_DISABLED: "no motion: commands are disabled; set commands_enabled to true to allow it",

@@ -32,7 +32,7 @@ def commanded_goal(
     """The goal that a command asks for, or why the limits forbid it.
 
     present : values that a NaN keeps; None = the configured ones
-    framing : of a fixed camera, which must keep the person in the picture
+    framing : of a camera that does not follow the person, who must stay in the picture
     """
     for name in ("radius_m", "height_m", "angular_speed_deg_s"):
         if math.isinf(value := getattr(command, name)):

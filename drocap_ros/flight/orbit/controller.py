@@ -292,7 +292,7 @@ class OrbitController:
         for command, result in self._link.take_answers():
             self._queue.acknowledge(command, result, now_s)
         if self._queue.failure(_GIMBAL):
-            self._gimbal_s = math.inf  # there is no mount: no further requests
+            self._gimbal_s, self._framing.follows = math.inf, False  # there is no mount: no further requests
         wanted = self._config.gimbal_control and self.safety.state == State.ORBITING and estimate is not None
         if wanted and estimate is not None and now_s - self._gimbal_s > _GIMBAL_PERIOD_S:
             drop = float(seen.position[2] - estimate.position[2])

@@ -1,4 +1,4 @@
-"""Whether the person stays in the picture of a camera that is fixed to the body.
+"""Whether the person stays in the picture of a camera that is fixed to the body, or on a mount that nothing points.
 
 A copter leans to accelerate: towards the centre of its orbit, and against the wind.  A gimbal takes that away; a fixed
 camera leans with the body, and the person moves in the picture by the same angle.  The lean needed against wind is
@@ -35,11 +35,15 @@ _COMFORT, _LEAST_PACE = 0.08, 0.3  # share of the picture's height below which t
 
 
 class View(NamedTuple):
-    """A fixed camera: matrix (3, 3) px, width and height px, pitch against the body in rad, negative = down."""
+    """A camera that does not follow the person: matrix (3, 3) px, width and height px, pitch in rad, negative = down.
+
+    level : whether a mount keeps the pitch against the horizon; else it is against the body
+    """
 
     matrix: np.ndarray
     size: tuple[int, int]
     pitch: float
+    level: bool = False
 
 
 def framing_margin(
@@ -88,6 +92,9 @@ def orbit_margin(view: View, goal: OrbitGoal, body_height_m: float, wind: float)
 
     Gusts, and what it takes to keep to the orbit, lean the body further.
     """
+    if view.level:
+        none = np.zeros(1)
+        return float(framing_margin(view, goal.radius_m, goal.height_m, body_height_m, none, none)[0])
     lean = _GUSTS * wind + _RESERVE
     around = np.linspace(0.0, 2 * math.pi, _DIRECTIONS, endpoint=False)
     inward = np.array([[0.0], [goal.angular_speed_rad_s**2 * goal.radius_m]])
@@ -97,16 +104,19 @@ def orbit_margin(view: View, goal: OrbitGoal, body_height_m: float, wind: float)
 
 
 class Framing:
-    """Watches the picture of a fixed camera; without one it changes and refuses nothing.
+    """Watches the picture of a camera that does not follow the person; with another one it refuses nothing.
 
     matrix : (3, 3) px; None before the first calibration.  :meth:`calibrate` sets it
     size : width and height of the pictures, px; None before the first
+    follows : whether the mount's pitch follows the person
     """
 
     def __init__(self, config: MavlinkBridgeConfig) -> None:
         self._config = config
         self.matrix: np.ndarray | None = None
         self.size: tuple[int, int] | None = None
+        self.follows = config.gimbal_control
+        self._mount_pitch = math.nan  # rad, against the horizon
         self._judged_by: np.ndarray | None = None  # matrix of the distances so far
         self._wind = np.zeros(2)  # m/s^2 ENU, by which the vehicle leans without accelerating
         self._still_s = 0.0
@@ -134,8 +144,10 @@ class Framing:
 
     def watch(self, vehicle: VehicleState | None, seen: Observed, dt: float) -> Observed:
         """The observation with the margin now; learns the lean against wind, ``dt`` s after the last one."""
+        if vehicle is not None:
+            self._mount_pitch = _pitch(vehicle.gimbal_orientation_xyzw)
         view = self._view()
-        if view is None or vehicle is None or not np.isfinite(vehicle.orientation_xyzw).all():
+        if view is None or view.level or vehicle is None or not np.isfinite(vehicle.orientation_xyzw).all():
             return seen
         forward, left, up = matrix_from_quaternion(vehicle.orientation_xyzw).T
         if up[2] < _LEAST_UP:
@@ -167,16 +179,30 @@ class Framing:
         margin = orbit_margin(view, goal, body, wind)
         if margin >= 0.0:
             return None
+        first = "set gimbal_control to true, or " if view.level and not config.gimbal_control else ""
         return condition(
             ConditionCode.PERSON_LEAVES_PICTURE, missing_percent=-100 * margin, radius_m=goal.radius_m,
             height_m=goal.height_m, speed_deg_s=math.degrees(abs(goal.angular_speed_rad_s)),
-            remedy=_remedy(view, goal, body, wind, config.max_distance_m),
+            camera=f"a mount that stays at {math.degrees(view.pitch):.0f} deg" if view.level else
+            "the fixed camera, as the body leans,",
+            remedy=first + _remedy(view, goal, body, wind, config.max_distance_m),
         )  # fmt: skip
 
     def _view(self) -> View | None:
-        if self._config.mount != "fixed" or self.matrix is None or self.size is None:
+        if self.matrix is None or self.size is None:
             return None
-        return View(self.matrix, self.size, math.radians(self._config.camera_pitch_deg))
+        if self._config.mount == "fixed":
+            return View(self.matrix, self.size, math.radians(self._config.camera_pitch_deg))
+        if self.follows or math.isnan(self._mount_pitch):
+            return None
+        return View(self.matrix, self.size, self._mount_pitch, level=True)
+
+
+def _pitch(camera_xyzw: np.ndarray) -> float:
+    """Pitch in rad of a camera (4,) FLU -> ENU against the horizon, negative = down; NaN = unknown."""
+    if not np.isfinite(camera_xyzw).all():
+        return math.nan
+    return math.asin(min(max(float(matrix_from_quaternion(camera_xyzw)[2, 0]), -1.0), 1.0))
 
 
 def _remedy(view: View, goal: OrbitGoal, body_height_m: float, wind: float, max_radius_m: float) -> str:
@@ -189,7 +215,8 @@ def _remedy(view: View, goal: OrbitGoal, body_height_m: float, wind: float, max_
     pitches = [math.radians(d) for d in range(-80, 31, 1)]
     best = max(pitches, key=lambda p: orbit_margin(view._replace(pitch=p), goal, body_height_m, wind))
     if keeps(view._replace(pitch=best), goal):
-        words.append(f"tilt the camera to {math.degrees(best):.0f} deg (camera_pitch_deg)")
+        how = "point the mount to {:.0f} deg" if view.level else "tilt the camera to {:.0f} deg (camera_pitch_deg)"
+        words.append(how.format(math.degrees(best)))
     speed = math.degrees(abs(goal.angular_speed_rad_s))
     slower = range(math.ceil(speed) - 1, 1, -1)
     kept = next((d for d in slower if keeps(view, goal._replace(angular_speed_rad_s=math.radians(d)))), None)

@@ -89,6 +89,39 @@ def test_only_a_fixed_camera_is_checked():
     assert blank.refusal(goal_of(CONFIG)) is None  # no calibration yet: another condition says so
 
 
+@pytest.mark.parametrize("commanded", [False, True])
+def test_a_mount_that_does_not_follow_is_checked_at_the_pitch_that_it_reports(commanded):
+    config = MavlinkBridgeConfig(gimbal_control=commanded)
+    mount, low, high = Framing(config), goal_of(config), goal_of(config, height_m=6.0)
+    mount.matrix, mount.size = MATRIX, SIZE
+    seen = Observed()
+    down = Rotation.from_euler("y", math.radians(14)).as_quat()
+    assert mount.watch(VehicleState(1, gimbal_orientation_xyzw=down), seen, 0.05) is seen  # it does not lean
+    assert (mount.refusal(high) is None) == commanded
+    mount.follows = False  # a refusal of the autopilot
+    assert mount.refusal(low) is None
+    refusal = mount.refusal(high)
+    assert refusal.code == ConditionCode.PERSON_LEAVES_PICTURE
+    assert ("set gimbal_control" in str(refusal)) != commanded
+    pitch = float(re.search(r"point the mount to (-?\d+) deg", str(refusal)).group(1))
+    aimed = Rotation.from_euler("y", math.radians(-pitch)).as_quat()
+    mount.watch(VehicleState(1, gimbal_orientation_xyzw=aimed), seen, 0.05)
+    assert mount.refusal(high) is None
+    mount.watch(VehicleState(1), seen, 0.05)  # another condition says that its pitch is unknown
+    assert mount.refusal(low) is None
+
+
+def test_an_adjustment_that_takes_the_person_out_of_a_still_mounts_picture_is_refused():
+    loop = OrbitLoop(LoopSettings(seconds=6, seed=1))
+    loop.start()
+    loop.run(4.5)
+    loop.command(Command.ADJUST, height_m=8.0)
+    loop.run(4.7)
+    _, answer = loop.answers[-1]
+    assert (answer.accepted, answer.condition.code) == (False, ConditionCode.PERSON_LEAVES_PICTURE)
+    assert loop.controller.safety.state == State.ORBITING
+
+
 def test_the_margin_now_follows_the_lean():
     watched = framing()
     seen = Observed(subject_distance_m=6.0, height_m=2.5, velocity=np.zeros(3))
