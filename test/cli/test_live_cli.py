@@ -241,6 +241,11 @@ def test_a_namespace_that_ros_does_not_know_is_refused(command, namespace, capsy
     assert f"--namespace: expected names of letters, digits and _, as /drocap or /a/b, got '{namespace}'" in line
 
 
+def test_an_adjustment_without_a_value_is_refused(capsys):
+    assert main(["orbit", "adjust", "--timeout", "0.1"]) == 2
+    assert "expected --radius, --height or --speed, got none" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("command", [("orbit", "status"), ("top", "--once"), ("record",), ("view", "--live")])
 def test_a_domain_of_the_environment_that_does_not_exist_is_refused(command, monkeypatch, capsys):
     monkeypatch.setenv("ROS_DOMAIN_ID", "400")

@@ -75,6 +75,8 @@ def run(args: argparse.Namespace) -> int:
 def _check_options(args: argparse.Namespace) -> None:
     if not 0 < args.timeout <= 600:
         raise InputError(f"--timeout: expected above 0 and at most 600 s, got {args.timeout:g}")
+    if args.action == "adjust" and all(map(math.isnan, (args.radius, args.height, args.speed))):
+        raise InputError("adjust: expected --radius, --height or --speed, got none; state what to change")
     for name, value in (("--radius", args.radius), ("--height", args.height), ("--speed", args.speed)):
         if math.isinf(value):
             raise InputError(f"{name}: expected a finite number, got {value:g}")
