@@ -79,6 +79,12 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
                 f"watchdog_s: expected at least two periods of control_hz, {periods_s:.2g} s, got {self.watchdog_s:g}; "
                 "raise it or control_hz"
             )
+        # The age of the last answer grows by a period before the next one: with less it would hold the vehicle.
+        if self.commands_enabled and self.time_sync_hz < (least_hz := 2.0 / self.max_round_trip_s):
+            raise ParameterError(
+                f"time_sync_hz: expected at least two answers within max_round_trip_s, {least_hz:.3g} Hz, to fly, "
+                f"got {self.time_sync_hz:g}; raise one of the two"
+            )
         for name, least in (("attitude_hz", 5.0), ("position_hz", 5.0), ("status_hz", 2.0)):
             if self.commands_enabled and getattr(self, name) < least:
                 raise ParameterError(

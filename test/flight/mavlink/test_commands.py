@@ -137,6 +137,7 @@ def test_link_sends_no_motion_without_permission():
         ({"fence_radius_m": 6.0}, "fence_radius_m"),
         ({"commands_enabled": True, "status_hz": 0.5}, "status_hz"),
         ({"commands_enabled": True, "attitude_hz": 2.0}, "attitude_hz"),
+        ({"commands_enabled": True, "time_sync_hz": 3.0}, "time_sync_hz.* max_round_trip_s"),
     ],
 )
 def test_contradicting_parameters_of_the_bridge_are_refused(values, word):
