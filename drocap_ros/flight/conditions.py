@@ -103,6 +103,9 @@ class ConditionCode(enum.IntEnum):
     SUBJECT_AT_BORDER = 205
 
 
+#: Factor of a limit that a command may reach: its values are float32, and limits are sums of decimal fractions.
+ROUNDING = 1.0 + 1e-6
+
 _C = ConditionCode
 _NEVER_S = 1e8
 _SENTENCES = {

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from drocap_ros.errors import ParameterError
-from drocap_ros.flight.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.conditions import ROUNDING, Condition, ConditionCode, condition
 from drocap_ros.parameters import Parameters, param
 
 _ROOM_M = 0.5
@@ -77,19 +77,19 @@ class OrbitConfig(Parameters):
 def orbit_condition(config: OrbitConfig, radius_m: float, angular_speed_deg_s: float) -> Condition | None:
     """Which limit of ``config`` forbids this orbit; None = none."""
     least = config.min_distance_m + _ROOM_M
-    if radius_m < least:
+    if radius_m * ROUNDING < least:
         return condition(ConditionCode.RADIUS_TOO_SMALL, value=radius_m, limit=least)
-    if radius_m > config.max_distance_m:
+    if radius_m > config.max_distance_m * ROUNDING:
         return condition(
             ConditionCode.RADIUS_TOO_LARGE, value=radius_m, limit=config.max_distance_m, limited_by="max_distance_m"
         )  # fmt: skip
     omega = abs(math.radians(angular_speed_deg_s))
-    if omega * radius_m > config.max_speed_m_s:
+    if omega * radius_m > config.max_speed_m_s * ROUNDING:
         return condition(
             ConditionCode.SPEED_ABOVE_LIMIT, value=angular_speed_deg_s, radius_m=radius_m,
             limit=math.degrees(config.max_speed_m_s / radius_m), max_speed_m_s=config.max_speed_m_s,
         )  # fmt: skip
-    if omega**2 * radius_m > config.max_acceleration_m_s2:
+    if omega**2 * radius_m > config.max_acceleration_m_s2 * ROUNDING:
         return condition(
             ConditionCode.ACCELERATION_ABOVE_LIMIT, value=angular_speed_deg_s, radius_m=radius_m,
             limit=math.degrees(math.sqrt(config.max_acceleration_m_s2 / radius_m)),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from drocap_ros.errors import ParameterError
-from drocap_ros.flight.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.conditions import ROUNDING, Condition, ConditionCode, condition
 from drocap_ros.parameters import Parameters, param
 
 
@@ -103,6 +103,6 @@ class SafetyConfig(Parameters):
 def height_condition(config: SafetyConfig, height_m: float) -> Condition | None:
     """Whether an orbit at this height leaves too little room to the limits; None = enough."""
     low, high = config.min_height_m + 0.3, config.max_height_m - 0.5
-    if low <= height_m <= high:
+    if low <= height_m * ROUNDING and height_m <= high * ROUNDING:
         return None
     return condition(ConditionCode.HEIGHT_OUT_OF_RANGE, value=height_m, low=low, high=high)

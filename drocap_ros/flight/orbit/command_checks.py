@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from drocap_ros.flight.bridge_config import FENCE_ROOM_M, MavlinkBridgeConfig
-from drocap_ros.flight.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.conditions import ROUNDING, Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.planner import OrbitGoal, goal_of
 from drocap_ros.flight.orbit.states import Command, OperatorCommand
 from drocap_ros.flight.orbit_config import orbit_condition
@@ -41,7 +41,7 @@ def commanded_goal(
     speed = math.degrees(goal.angular_speed_rad_s)
     beyond = orbit_condition(config, goal.radius_m, speed) or height_condition(config, goal.height_m)
     widest_m = config.fence_radius_m - FENCE_ROOM_M
-    if beyond is None and goal.radius_m > widest_m:
+    if beyond is None and goal.radius_m > widest_m * ROUNDING:
         fence = "fence_radius_m less 1 m of room"
         beyond = condition(ConditionCode.RADIUS_TOO_LARGE, value=goal.radius_m, limit=widest_m, limited_by=fence)
     return beyond or (framing.refusal(goal) if framing else None) or goal

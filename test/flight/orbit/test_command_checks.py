@@ -1,6 +1,7 @@
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 from orbit_observations import GOOD, LIMITS, orbiting
 
@@ -66,6 +67,24 @@ def test_radius_beyond_the_fence_is_refused():
     assert "fence_radius_m" in str(found)
     allowed = commanded_goal(config, OperatorCommand(int(Command.ADJUST), radius_m=8.0), present)
     assert allowed.radius_m == pytest.approx(8.0)
+
+
+@pytest.mark.parametrize("limits", [{}, {"min_distance_m": 3.1, "min_height_m": 1.1, "max_distance_m": 9.7}])
+def test_limits_are_allowed_as_float32_and_what_is_beyond_is_refused(limits):
+    config = dataclasses.replace(CONFIG, fence_radius_m=60.0, **limits)
+    least, low = round(config.min_distance_m + 0.5, 3), round(config.min_height_m + 0.3, 3)
+    high, widest = round(config.max_height_m - 0.5, 3), config.max_distance_m
+    fastest = math.degrees(min(config.max_speed_m_s / widest, math.sqrt(config.max_acceleration_m_s2 / widest)))
+    for name, value, step in (
+        ("radius_m", least, -1e-3), ("radius_m", widest, 1e-3), ("height_m", low, -1e-3), ("height_m", high, 1e-3),
+        ("angular_speed_deg_s", fastest, 1e-2),
+    ):  # fmt: skip
+        values = {"radius_m": widest, "angular_speed_deg_s": 5.0, name: value}
+        for rounded in (value, float(np.float32(value)), float(np.nextafter(np.float32(value), np.float32(99 * step)))):
+            command = OperatorCommand(START, **{**values, name: rounded})
+            assert isinstance(commanded_goal(config, command, None), OrbitGoal), (name, rounded)
+        beyond = commanded_goal(config, OperatorCommand(START, **{**values, name: value + step}), None)
+        assert isinstance(beyond, Condition)
 
 
 def test_nan_keeps_the_present_or_the_configured_value():
