@@ -31,6 +31,7 @@ _STILL_M_S, _SETTLED_S = 0.5, 1.0
 _LEARNING_S = 4.0  # of the lean against wind: a gust passes, the wind stays
 _STEADY_S = 0.7  # over which the margin now is averaged: a slower orbit cannot follow a gust
 _SAME_CAMERA = 0.03  # of the focal length, by which a camera matrix may change
+_CUT_OFF = 0.2  # share of the picture's height by which a mount may cut off feet or head: it does not lean further
 _COMFORT, _LEAST_PACE = 0.08, 0.3  # share of the picture's height below which the orbit slows down, and how far
 
 
@@ -177,7 +178,7 @@ class Framing:
         wind = float(np.hypot(*self._wind))
         body = config.body_height_m
         margin = orbit_margin(view, goal, body, wind)
-        if margin >= 0.0:
+        if margin >= (-_CUT_OFF if view.level else 0.0):
             return None
         first = "set gimbal_control to true, or " if view.level and not config.gimbal_control else ""
         return condition(
