@@ -71,7 +71,7 @@ def load_truth(truth: Motion | str | Path) -> tuple[np.ndarray, np.ndarray, str]
         names = read_npz(path, ())
         kind = kind_of(names)
         if kind == "MoCap":
-            x, fps = load_mocap(path, LIMB_JOINTS)
+            x, fps = load_mocap(path, LIMB_JOINTS, BODY_17)
             return x / 1000.0, np.arange(len(x)) / fps, "world"
         if kind != "motion":
             raise wrong_kind(path, names, "MoCap or a motion as the truth")

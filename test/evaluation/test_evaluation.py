@@ -15,7 +15,7 @@ from drocap_ros.evaluation.protocol import protocol_sequences
 from drocap_ros.evaluation.rotation import measure, rotation_study
 from drocap_ros.evaluation.tables import study_markdown
 from drocap_ros.motion import Motion, save_motion
-from drocap_ros.skeleton import BODY_15
+from drocap_ros.skeleton import BODY_15, BODY_17
 
 
 def stick(frames: int) -> np.ndarray:
@@ -61,6 +61,16 @@ def test_perfect_motion_has_no_error_in_any_frame_and_scale(tmp_path):
     assert not errors.mirrored
     assert np.isnan(errors.w_error_mm)
     assert max(errors.per_group_mm.values()) < 0.01
+
+
+def test_toes_of_mocap_are_compared(tmp_path):
+    x = np.concatenate([stick(40), stick(40)[:, [3, 6]] + (0.1, 0.0, 0.0)], axis=1)
+    save_mocap(tmp_path / "truth.npz", x[:, :15])
+    with np.load(tmp_path / "truth.npz") as file:
+        np.savez(tmp_path / "toes.npz", **file, toes=1000 * x[:, 15:], toe_joints=np.array(BODY_17.joints[15:]))
+    ours = replace(motion(x[:, :15]), joints3d=x, joints=BODY_17.joints, parents=BODY_17.parents)
+    assert compare(ours, *load_truth(tmp_path / "toes.npz")).toe_mm < 0.01
+    assert np.isnan(compare(ours, *load_truth(tmp_path / "truth.npz")).toe_mm)
 
 
 def test_mirrored_motion_is_reported():
