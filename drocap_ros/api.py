@@ -12,7 +12,7 @@ from drocap_ros.evaluation import compare as comparison
 from drocap_ros.evaluation.compare import MotionErrors
 from drocap_ros.motion import Motion, load_motion
 from drocap_ros.perception.pose_estimator_config import parse_subject
-from drocap_ros.pipeline import Selection, Telemetry, reconstruct_input
+from drocap_ros.pipeline import Selection, Telemetry, reconstruct_input, selected_tracks
 from drocap_ros.reconstruction.reconstruct import reconstruct as reconstruct_tracks
 from drocap_ros.tracks import Tracks
 
@@ -39,7 +39,8 @@ def reconstruct(
     method : "ba", "paper", "paper-no-articulation", "initial", "mf-nnm", or "live" for a recording of the live graph
     models : folder of ONNX files; None = ``DROCAP_MODELS`` or the user's own
     config : parameters, or their YAML file
-    telemetry : log beside a video, or "none"; default: the DJI track inside the video, where there is one
+    telemetry : log beside a video, or "none", also for tracks; default: the DJI track inside the video, where there is
+        one
     start_s, end_s : part of the source, seconds from its first image
     subject : number of a person as ``drocap track --list`` numbers them, "largest", "centre", or a box
         "x_min,y_min,x_max,y_max" px in the first image; empty = as configured
@@ -52,21 +53,22 @@ def reconstruct(
         When an input or option cannot be used, with one line that says what to do.
     """
     settings = config if isinstance(config, DrocapConfig) else load_config(config or None)
-    clip = Clip(start_s, end_s)
+    person, rule = parse_subject(str(subject))
+    log = Telemetry(Path(telemetry)) if isinstance(telemetry, str | Path) else telemetry or Telemetry()
+    selection = Selection(Clip(start_s, end_s), person, redetect)
     if isinstance(source, Tracks):
         return reconstruct_tracks(
-            clip.cut(source), method=method, initializer=settings.initializer, adjuster=settings.bundle_adjuster,
-            progress=progress,
+            selected_tracks(source, log, selection), method=method, initializer=settings.initializer,
+            adjuster=settings.bundle_adjuster, progress=progress,
         )  # fmt: skip
-    person, rule = parse_subject(str(subject))
     motion, _ = reconstruct_input(
         source,
         method=method,
         config=settings.replace("pose_estimator", **rule),
         models=None if models is None else Path(models),
         progress=progress,
-        telemetry=Telemetry(Path(telemetry)) if isinstance(telemetry, str | Path) else telemetry or Telemetry(),
-        selection=Selection(clip, person, redetect),
+        telemetry=log,
+        selection=selection,
     )
     return motion
 

@@ -157,17 +157,33 @@ def read_input(
                 tracks = with_recorded_camera(session, tracks, near, pitch, telemetry=in_use)
                 _log_warnings(session)
         return tracks, origin | more
+    if path.suffix == ".npz":
+        return selected_tracks(load_tracks(path), telemetry, selection), origin
     if selection.person is not None:
         raise InputError(f"--subject {selection.person}: expected images, found 2D poses of one person; add --redetect")
-    if path.suffix == ".npz":
-        tracks = load_tracks(path)
-        if not in_use:
-            tracks = dataclasses.replace(tracks, camera_rotation=None, camera_position=None)
-        return selection.clip.cut(tracks), origin
     with open_session(path) as session:
         tracks = read_pose2d(session, pitch, telemetry=in_use)
         _log_warnings(session)
     return selection.clip.cut(tracks), {**origin, "pose2d": "recorded"}
+
+
+def selected_tracks(tracks: Tracks, telemetry: Telemetry, selection: Selection) -> Tracks:
+    """The part of 2D tracks that is reconstructed, with ``NO_TELEMETRY`` without the camera's pose.
+
+    Raises
+    ------
+    InputError
+        When a log or a person is asked for, or no frame lies in the clip.
+    """
+    if selection.person is not None:
+        raise InputError(
+            f"--subject {selection.person}: expected images, found 2D tracks of one person; leave the option out"
+        )
+    if telemetry.path == NO_TELEMETRY:
+        tracks = dataclasses.replace(tracks, camera_rotation=None, camera_position=None)
+    elif telemetry.path is not None:
+        raise InputError("--telemetry: expected a video as input, found 2D tracks; they hold the camera's pose")
+    return selection.clip.cut(tracks)
 
 
 def _track(

@@ -70,6 +70,16 @@ def test_functions_do_as_the_commands(folder, tmp_path):
         drocap_ros.export(motion, tmp_path / "walk.xyz")
 
 
+def test_options_hold_for_tracks_as_for_their_file(folder):
+    for source in (folder / "tracks.npz", load_tracks(folder / "tracks.npz")):
+        assert drocap_ros.reconstruct(source, method="initial").frame == "world"
+        assert drocap_ros.reconstruct(source, method="initial", telemetry="none").frame == "camera"
+        with pytest.raises(InputError, match="--telemetry: expected a video"):
+            drocap_ros.reconstruct(source, method="initial", telemetry="flight.tlog")
+        with pytest.raises(InputError, match="--subject 2: expected images, found 2D tracks"):
+            drocap_ros.reconstruct(source, method="initial", subject=2)
+
+
 def test_import_of_the_package_loads_nothing_heavy(tmp_path, root):
     heavy = {"numpy", "cv2", "scipy", "onnxruntime", "drocap_ros.pipeline"}
     python(f"import sys, drocap_ros\nassert not {heavy!r} & set(sys.modules)\n", tmp_path, root)
