@@ -34,7 +34,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "session", metavar="SESSION", type=Path, help="recording, motion.npz or its folder, tracks .npz, video or log"
     )
     parser.add_argument(
-        "--metadata", action="store_true", help="print the session's configuration and other metadata in full"
+        "--metadata", action="store_true", help="print the parameters and other metadata of a session or motion in full"
     )
     parser.set_defaults(run=run)
     return parser
@@ -64,11 +64,15 @@ def summarize(path: Path) -> Summary:
     """
     if not path.exists():
         raise InputError(f"{path}: expected a recording, motion or tracks file, found no such file; check the path")
-    if path.is_dir() and (path / "motion.npz").is_file():
-        path = path / "motion.npz"
+    path = _motion_in(path)
     if path.suffix == ".npz":
         return _of_arrays(path)
     return Summary(*telemetry_summary(path)) if is_video_or_log(path) else _of_session(path)
+
+
+def _motion_in(path: Path) -> Path:
+    """The motion file of a motion's folder, else the path itself."""
+    return path / "motion.npz" if path.is_dir() and (path / "motion.npz").is_file() else path
 
 
 def _of_session(path: Path) -> Summary:
@@ -93,9 +97,17 @@ def _short(value: str) -> str:
 
 
 def _print_metadata(path: Path) -> int:
+    import json
+
+    from drocap_ros.motion import load_motion
     from drocap_ros.recording.open_session import session_info
 
-    for key, value in sorted(session_info(path).metadata.items()):
+    path = _motion_in(path)
+    if path.suffix == ".npz":
+        metadata = {key: json.dumps(value, indent=2) for key, value in load_motion(path).meta.items()}
+    else:
+        metadata = session_info(path).metadata
+    for key, value in sorted(metadata.items()):
         print(f"# {key}\n{value.rstrip()}\n")
     return 0
 
@@ -119,7 +131,7 @@ def _of_arrays(path: Path) -> Summary:
             ("scale", f"{scale} ({motion.scale_source})"),
             *((("median flexion", bent),) if (bent := flexion_words(motion.joints3d, motion.joints)) else ()),
             *((("telemetry", words),) if (words := telemetry_words(motion.meta)) else ()),
-            *((key, str(motion.meta[key])) for key in ("method", "input", "version") if key in motion.meta),
+            *((key, str(motion.meta[key])) for key in ("method", "input", "git_revision") if key in motion.meta),
         ]
     elif "keypoints" in arrays:
         tracks = load_tracks(path)

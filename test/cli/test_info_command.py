@@ -62,7 +62,7 @@ def test_info_of_tracks_and_motion_lists_arrays_and_rates(tmp_path, capture, cap
             joints3d=capture.joints3d_world, joints=BODY_15.joints, parents=BODY_15.parents, stamp_ns=tracks.stamp_ns,
             frame="world", metric=False, scale_source="assumed_height", camera_rotation=tracks.camera_rotation,
             confidence=tracks.confidence, keypoints=tracks.keypoints, reprojection_px=np.zeros((120, 15)),
-            meta={"method": "ba"},
+            meta={"method": "ba", "git_revision": "72e4e0d", "parameters": {"adjuster": {"gamma": 1.0}}},
         ),
     )  # fmt: skip
     assert run(tmp_path / "motion.npz") == 0
@@ -71,6 +71,9 @@ def test_info_of_tracks_and_motion_lists_arrays_and_rates(tmp_path, capture, cap
     assert "scale: assumed (assumed_height)" in out
     assert re.search(r"median flexion: knees \d+ and \d+, hips \d+ and \d+, elbows \d+ and \d+ degrees", out)
     assert "method: ba" in out
+    assert "git_revision: 72e4e0d" in out
+    assert main(["info", "--metadata", str(tmp_path)]) == 0
+    assert '"gamma": 1.0' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
