@@ -177,7 +177,7 @@ def _world(args: argparse.Namespace) -> int:
         args,
         "world",
         rows_of,
-        lambda row: {"sequence": row.sequence, **asdict(row.errors)},
+        lambda row: {key: value for key, value in asdict(row).items() if key != "errors"} | asdict(row.errors),
         lambda rows: world_markdown(rows, args.telemetry, args.still),
     )
 

@@ -20,7 +20,7 @@ from drocap_ros.reconstruction.reconstruct import reconstruct
 
 @dataclass(frozen=True)
 class WorldRow:
-    """One sequence of the study."""
+    """One sequence of the study; in frame "camera" it has no errors but PA-MPJPE and scale."""
 
     sequence: str
     frames: int
@@ -35,6 +35,9 @@ def measure_world(sequence: Sequence, telemetry: str, *, still: bool, seed: int,
     view = world_view(sequence, telemetry, still=still, seed=seed)
     motion = reconstruct(view.tracks, method=method)
     errors = world_errors(motion.joints3d, view.truth, FPS, motion.covariance)
+    if motion.frame != "world":  # its telemetry was refused: in the camera's axes only the body is comparable
+        unknown = dict.fromkeys((field.name for field in fields(WorldErrors)), float("nan"))
+        errors = WorldErrors(**unknown | {"pa_mm": errors.pa_mm, "scale": errors.scale})
     return WorldRow(
         sequence.name, len(view.truth), motion.frame, motion.metric, float(motion.meta["seconds"]["total"]), errors
     )

@@ -83,10 +83,14 @@ def world_errors(
 
 def world_cells(e: WorldErrors) -> list[str]:
     """Cells under :data:`WORLD_HEAD`; "-" where an error is not known."""
+    foot = "-" if np.isnan(e.foot_m_s) else f"{e.foot_m_s:.2f} ({e.foot_mm:.1f})"
     return [
-        f"{e.pa_mm:.1f}", f"{e.mpjpe_mm:.1f}", f"{e.w_mm:.0f}", f"{e.wa_mm:.0f}", f"{e.absolute_mm:.0f}",
-        f"{e.root_percent:.1f}", f"{100 * e.scale:+.1f}", f"{e.horizon_deg:.1f}",
-        "-" if np.isnan(e.foot_m_s) else f"{e.foot_m_s:.2f} ({e.foot_mm:.1f})", f"{e.penetration_mm:.0f}",
-        "-" if np.isnan(e.acceleration_ratio) else f"{e.acceleration_ratio:.2f}", f"{e.acceleration_error_m_s2:.1f}",
-        "-" if np.isnan(e.coverage) else f"{e.coverage:.0%}",
+        _cell(e.pa_mm, ".1f"), _cell(e.mpjpe_mm, ".1f"), _cell(e.w_mm, ".0f"), _cell(e.wa_mm, ".0f"),
+        _cell(e.absolute_mm, ".0f"), _cell(e.root_percent, ".1f"), _cell(100 * e.scale, "+.1f"),
+        _cell(e.horizon_deg, ".1f"), foot, _cell(e.penetration_mm, ".0f"), _cell(e.acceleration_ratio, ".2f"),
+        _cell(e.acceleration_error_m_s2, ".1f"), _cell(e.coverage, ".0%"),
     ]  # fmt: skip
+
+
+def _cell(value: float, form: str) -> str:
+    return "-" if np.isnan(value) else format(value, form)

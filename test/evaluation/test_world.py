@@ -13,7 +13,7 @@ from walking import Walk, make_walk, write_mocap
 from drocap_ros.cli import main
 from drocap_ros.evaluation import world_metrics
 from drocap_ros.evaluation.compare import compare
-from drocap_ros.evaluation.world import world_study
+from drocap_ros.evaluation.world import measure_world, world_means, world_study
 from drocap_ros.evaluation.world_errors import WORLD_HEAD, world_cells, world_errors
 from drocap_ros.evaluation.world_protocol import FOCAL_PX, FPS, IMAGE_SIZE, TELEMETRY, world_view
 from drocap_ros.mocap import Sequence
@@ -110,7 +110,7 @@ def test_telemetry_errs_as_stated(level: str) -> None:
 
 
 def test_command_prints_and_writes_every_measure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_mocap(tmp_path, "long", frames=300)
+    write_mocap(tmp_path, "long", X=_walker(300))
     write_mocap(tmp_path, "short", frames=150)
     out = tmp_path / "out"
     words = ["evaluate", "world", str(tmp_path), "--telemetry", "rtk", "--quiet"]
@@ -121,6 +121,7 @@ def test_command_prints_and_writes_every_measure(tmp_path: Path, capsys: pytest.
     with (out / "world.csv").open(encoding="utf-8") as file:
         (line,) = csv.DictReader(file)
     assert 0 < float(line["w_mm"]) < 1500
+    assert (line["frames"], line["frame"]) == ("240", "world")
     assert main([*words, "--every", "0"]) == 2
     assert main(["evaluate", "world", str(tmp_path / "absent")]) == 2
     assert main([*words, "--telemetry", "perfect"]) == 2
@@ -145,10 +146,29 @@ def test_ellipsoids_about_the_pelvis_are_not_compared_with_places_in_the_world()
         assert np.isnan(errors.coverage) == (about == "pelvis")
 
 
+def test_a_sequence_whose_telemetry_is_refused_has_no_errors_in_the_world() -> None:
+    time_s = np.arange(200) / FPS
+    skater = simulate_person(time_s, "walk", 1, 1.75, BODY_15)
+    skater[..., :2] -= skater[:, :1, :2]
+    skater[..., 0] += 1.5 * time_s[:, None]
+    row = measure_world(Sequence("skater", 1000.0 * skater), "exact", still=False, seed=0, method="ba")
+    assert row.frame == "camera"
+    assert [cell == "-" for cell in world_cells(row.errors)] == [
+        head not in {"PA-MPJPE mm", "scale %"} for head in WORLD_HEAD
+    ]
+    other = replace(row, frame="world", errors=replace(row.errors, w_mm=80.0))
+    assert world_means([row, other]).w_mm == 80.0
+
+
 def test_study_is_the_same_every_time(tmp_path: Path) -> None:
-    write_mocap(tmp_path, "a", frames=260)
+    write_mocap(tmp_path, "a", X=_walker(260))
     one, two = (astuple(world_study(tmp_path, "gps", seed=4)[0].errors) for _ in range(2))
     np.testing.assert_array_equal(one, two)
+
+
+def _walker(frames: int) -> np.ndarray:
+    """(F, 15, 3) mm at 30 fps: a person whose telemetry is accepted."""
+    return (1000.0 * simulate_person(np.arange(frames) / 30.0, "walk", 1, 1.75, BODY_15)).astype(np.float32)
 
 
 def _sequence() -> Sequence:
