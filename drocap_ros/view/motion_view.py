@@ -25,8 +25,8 @@ def draw_motion(
 ) -> None:
     """Every frame of a motion at its stamp, and its images: frame and (H, W, 3) uint8 BGR.
 
-    A motion holds no camera position: the camera is placed so that the body projects to its keypoints, with a nominal
-    field of view (:func:`drocap_ros.view.camera_placement.place_cameras`).
+    A camera whose position the motion does not hold is placed so that the body projects to its keypoints, with a
+    nominal field of view (:func:`drocap_ros.view.camera_placement.place_cameras`).
     """
     size, zoom = _image_size(motion), 1.0
     for index, image in images:
@@ -46,8 +46,7 @@ def _draw_frames(
     rotation = motion.camera_rotation
     if motion.frame == "camera":
         rotation = np.broadcast_to(LEVEL_CAMERA, rotation.shape)
-    matrix = nominal_camera_matrix(*size)
-    positions = place_cameras(joints, keypoints, rotation, matrix)
+    positions, matrix = _cameras(motion, joints, keypoints, rotation, size)
     error = motion.reprojection_px
     scene.at(int(motion.stamp_ns[0]))
     scene.calibration(matrix, size)
@@ -66,8 +65,35 @@ def _draw_frames(
         progress("frames", (i + 1) / len(motion.stamp_ns))
 
 
+def _cameras(
+    motion: Motion, joints: np.ndarray, keypoints: np.ndarray, rotation: np.ndarray, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (F, 3) m and matrix (3, 3) px of the cameras.
+
+    A motion holds no focal length: with its own positions that one which projects the body to its keypoints.
+    """
+    matrix = nominal_camera_matrix(*size)
+    if motion.camera_position is None or not np.nan_to_num(joints[:, 0]).any():  # the body has no place
+        return place_cameras(joints, keypoints, rotation, matrix), matrix
+    seen = (joints - motion.camera_position[:, None]) @ np.swapaxes(rotation, 1, 2)
+    rays = seen[..., :2] / np.where(seen[..., 2:] > 0.1, seen[..., 2:], np.nan)
+    known = np.isfinite(rays + keypoints).all(axis=2, keepdims=True)
+    count = np.maximum(known.sum(axis=1, keepdims=True), 1)
+    # About their means: an error of the camera's rotation moves all joints of an image alike.
+    rays, pixels = (
+        np.where(known, v - np.where(known, v, 0.0).sum(1, keepdims=True) / count, 0.0) for v in (rays, keypoints)
+    )
+    if (focal := float((rays * pixels).sum() / max(np.square(rays).sum(), 1e-12))) > 1.0:
+        matrix[[0, 1], [0, 1]] = focal
+    return motion.camera_position, matrix
+
+
 def _image_size(motion: Motion) -> tuple[int, int]:
-    """Width and height px that hold all keypoints: a motion holds no image size."""
+    """Width and height px of the images; where the motion does not state them, those that hold all keypoints."""
+    stated = motion.meta.get("images")
+    size = stated.get("size") if isinstance(stated, dict) else None
+    if isinstance(size, list) and len(size) == 2 and all(isinstance(n, int) and n > 0 for n in size):
+        return size[0], size[1]
     seen = motion.keypoints[np.isfinite(motion.keypoints).all(-1)]
     corner = seen.max(0) if len(seen) else np.array([640.0, 480.0])
     return max(16, math.ceil(float(corner[0]))), max(16, math.ceil(float(corner[1])))

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -25,6 +26,7 @@ from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.view.camera_placement import nominal_camera_matrix, place_cameras
 from drocap_ros.view.message_view import MessageView
+from drocap_ros.view.motion_view import draw_motion
 from drocap_ros.view.rerun_output import new_recording
 from drocap_ros.view.rerun_scene import Scene
 
@@ -116,6 +118,22 @@ def test_every_frame_of_a_motion_is_drawn_in_place(folder, tmp_path):
     jpeg = cv2.imdecode(np.asarray(images[stamps[5]], np.uint8).ravel(), cv2.IMREAD_COLOR)
     assert jpeg.shape == (540, 960, 3)
     assert abs(float(jpeg.mean()) - 100) < 4
+
+
+def test_camera_of_a_motion_in_the_world_is_drawn_in_its_place(folder, tmp_path):
+    capture = simulate_capture(1.0, 10.0, seed=3)
+    size = {"images": {"size": list(capture.tracks.image_size)}}
+    motion = replace(load_motion(folder / "motion.npz"), camera_position=capture.camera_position, meta=size)
+    recording, out = new_recording("test"), tmp_path / "motion.rrd"
+    recording.save(out)
+    draw_motion(Scene(recording), motion)
+    recording.disconnect()
+    drawn = Drawn(out)
+    places = drawn.values("/world/camera", "Transform3D:translation")
+    for stamp, place in zip(motion.stamp_ns.tolist(), motion.camera_position, strict=True):
+        np.testing.assert_allclose(places[stamp].ravel(), place, atol=1e-4)
+    (matrix,) = drawn.values("/world/camera/image", "Pinhole:image_from_camera").values()
+    np.testing.assert_allclose(matrix.reshape(3, 3).T, capture.tracks.camera_matrix, rtol=2e-3)
 
 
 def test_cameras_are_placed_near_their_true_positions():
