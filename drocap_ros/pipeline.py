@@ -177,7 +177,8 @@ def selected_tracks(tracks: Tracks, telemetry: Telemetry, selection: Selection) 
     """
     if selection.person is not None:
         raise InputError(
-            f"--subject {selection.person}: expected images, found 2D tracks of one person; leave the option out"
+            f"--subject {selection.person}: expected images, found 2D tracks of one person; leave the option out, or"
+            " name the video, or a recording with images and --redetect"
         )
     if telemetry.path == NO_TELEMETRY:
         tracks = dataclasses.replace(tracks, camera_rotation=None, camera_position=None)
