@@ -18,6 +18,8 @@ MAX_FRAMES = 1_080_000
 MAX_BYTES = 4 * 2**30
 #: Keypoints beyond it are no pixels, and their squares overflow in the solvers.
 _FARTHEST_PX = 1e9
+#: Keypoints that are all within it are shares of the image, not px.
+_NORMALISED = 2.0
 #: Focal lengths as shares of the image's width or height: a view of 157 degrees, and of 0.6.
 _FOCAL_SHARES = 0.1, 100.0
 #: Longest time from the first to the last frame, ns: a year. More is no recording, and overflows.
@@ -87,6 +89,13 @@ def _check(t: Tracks) -> None:
     check_keypoints(k, t.covariance)
     if min(t.image_size) < 1:
         raise InputError(f"image_size: expected positive width and height, got {t.image_size}")
+    seen = np.abs(k[np.isfinite(k)])
+    if seen.any() and seen.max() <= _NORMALISED and min(t.image_size) > 16 * _NORMALISED:
+        width, height = t.image_size
+        raise InputError(
+            f"keypoints: expected px of an image of {width}x{height}, got none above {seen.max():g}; multiply"
+            " normalised ones by the image's width and height"
+        )
     _check_telemetry(t)
 
 
@@ -232,7 +241,7 @@ def load_tracks(path: str | Path) -> Tracks:
             raise InputError(f"image_size: expected positive width and height, got {size.tolist()}")
         return Tracks(
             keypoints=_as_float(arrays["keypoints"], "keypoints"),
-            joints=tuple(str(name) for name in np.atleast_1d(arrays["joints"])),
+            joints=tuple(np.atleast_1d(arrays["joints"]).astype(str).tolist()),  # bytes, too
             stamp_ns=as_stamps(arrays["stamp_ns"]),
             image_size=(int(size[0]), int(size[1])),
             **{name: _as_float(arrays[name], name) for name in _OPTIONAL if name in arrays},

@@ -20,6 +20,11 @@ def arrays(frames=4, joints=BODY_15.joints):
     }
 
 
+def test_names_of_joints_may_be_bytes(tmp_path):
+    np.savez(tmp_path / "t.npz", **{**arrays(), "joints": np.array(BODY_15.joints).astype("S")})
+    assert load_tracks(tmp_path / "t.npz").joints == BODY_15.joints
+
+
 def test_file_round_trip(tmp_path):
     tracks = Tracks(
         keypoints=arrays()["keypoints"],
@@ -43,6 +48,7 @@ def test_file_round_trip(tmp_path):
     [
         ({"keypoints": np.zeros((4, 15))}, r"expected float \(F, P, 2\)"),
         ({"keypoints": np.zeros((4, 14, 2))}, "expected 14 names"),
+        ({"keypoints": arrays()["keypoints"] / 640.0}, "expected px of an image of 640x480, got none above 0.7"),
         ({"keypoints": np.zeros((0, 15, 2))}, "at least 1 frame"),
         ({"keypoints": np.full((4, 15, 2), np.inf)}, "got infinity"),
         ({"keypoints": np.array([["a"]])}, "expected numbers"),
