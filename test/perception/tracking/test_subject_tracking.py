@@ -139,6 +139,21 @@ def test_second_box_of_the_subject_is_no_person_who_hides_it():
     assert subject.track_id == 1
 
 
+def test_person_seen_once_a_second_takes_no_further_box_at_the_place_of_the_subject():
+    # Boxes of a man on a roof, whose window the detector searches, and of a woman who walks below.
+    scene = Scene()
+    man, man_and_roof = ((250, 27, 289, 159), 0.7), ((250, 27, 306, 190), 0.4)
+    walk = {1: (504, 181, 560, 333), 2: (497, 181, 553, 333), 30: (380, 180, 420, 332), 60: (252, 180, 339, 333)}
+    walk[90] = (136, 177, 216, 334)
+    for t in range(91):
+        further = [(walk[t], 0.8)] if t in walk else [man_and_roof] if 70 <= t < 75 else []
+        scene.show([], detections=[man, *further])
+        if t == 2:
+            woman = next(p for p in scene.tracker.persons if p.box[0] > 400)
+    assert woman in scene.tracker.persons
+    assert woman.box.tolist() == list(walk[90])
+
+
 def test_second_box_with_the_joints_of_the_subject_takes_nothing_from_it():
     # Boxes as in an orbit of rendered images in which the subject was lost for good.
     scene = Scene()
