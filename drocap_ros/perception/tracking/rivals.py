@@ -130,13 +130,13 @@ def due_bystander(
 ) -> Person | None:
     """The person detected in this image whose last pose is the oldest, beside a certain subject or without one.
 
-    shedding : only one who began at the subject's place and has shown no pose yet
+    shedding : only one who is not yet known to be someone else
     """
     if subject is not None and subject.detected_ns == stamp_ns and subject.pose.believed_ns != stamp_ns:
         return None
     seen = [p for p in persons if p is not subject and p.detected_ns == stamp_ns and p.hits > 1 and not p.double]
     if shedding:
-        seen = [p for p in seen if p.began_at_subject and p.pose.judged_ns is None]
+        seen = [p for p in seen if not p.pose.other]
     searching = subject is None or subject.detected_ns != stamp_ns
     due = [p for p in seen if p.pose.judged_ns is None or stamp_ns - p.pose.judged_ns >= _interval_ns(p, searching)]
     return min(due, key=lambda p: p.pose.judged_ns or 0, default=None)

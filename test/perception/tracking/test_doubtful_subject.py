@@ -99,6 +99,19 @@ def test_certain_bystander_is_no_rival():
     assert scene.tracker.rivals(drawn(persons), stamp, boxes, np.full(2, 0.8), 0.4) == []
 
 
+def test_bystander_is_judged_once_under_load_shedding_and_is_no_rival():
+    scene, persons, poses = Scene(), [(300, 180, 160, RED), (400, 180, 160, RED)], 0
+    for _ in range(40):
+        judged(scene, 0.9, scene.show(persons))
+        stamp = (scene.index - 1) * STEP
+        if (bystander := scene.tracker.bystander_to_judge(stamp, shedding=True)) is not None:
+            poses += 1
+            scene.tracker.judge_bystander(bystander, 0.9, stamp)
+    assert poses == 1
+    boxes = np.array([box_of(*p[:3]) for p in persons])
+    assert scene.tracker.rivals(drawn(persons), stamp, boxes, np.full(2, 0.8), 0.4) == []
+
+
 def test_rival_of_another_appearance_is_refused():
     scene = Scene()
     for _ in range(20):
