@@ -254,7 +254,7 @@ class PoseEstimator:
         age_s, every_s = (stamp_ns - self._detected_ns) * 1e-9, self.config.detect_every_s
         shedding = load_level > 0 and self._confidence >= _CLEAR_CONFIDENCE
         shedding = shedding and not age_s > load_level * every_s - _SLACK_S
-        margins = None if age_s > every_s - _SLACK_S else self._margins
+        margins = self._margins if shedding or not age_s > every_s - _SLACK_S else None
         if margins is not None and not self.tracker.isolated(predicted, size, stamp_ns):
             margins = None
         if margins is None and not shedding:

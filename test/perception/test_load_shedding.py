@@ -93,6 +93,16 @@ def test_isolated_subject_is_propagated_by_the_pose_network_without_load_sheddin
     assert len(detections) < 20
 
 
+def test_subject_is_updated_between_the_rarer_detections_of_load_shedding(estimator, images, monkeypatch):
+    updates = counted(monkeypatch, estimator.tracker, "propagate")
+    ages_s = []
+    for i, image in enumerate(images[:30]):
+        before = len(updates)
+        estimator.process(image, i * STEP_NS, load_level=3)
+        ages_s += [(i * STEP_NS - estimator._detected_ns) * 1e-9] * (len(updates) - before)
+    assert max(ages_s, default=0.0) > 0.2  # at a stale place the tracker would extrapolate the last speed
+
+
 @pytest.mark.parametrize(
     ("load_level", "expected"),
     [(1, [0, 1, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), (3, [0] * 3 + [1] + [0] * 6 + [1] + [0] * 12 + [1])],
