@@ -124,10 +124,11 @@ def assign(
     possible = (distance < reach) & (growth < scope) | (overlap > _SAME_PLACE) & (growth < _ENTRANCE_GROWTH)
     # What is no person stays in its place: a person who comes out from behind it is a new track.
     strict = np.array([low_score or not p.plausible for p in persons])[:, None]
+    possible &= ~strict | (iou(predicted, boxes) > _LOW_SCORE_IOU)
     if subject is not None:  # a further box at the subject's place is its limb or shadow, nobody's from elsewhere
         further = overlap_coefficient(subject.filter.box()[None], boxes) > _SAME_PLACE
-        strict = strict | further & np.array([p is not subject for p in persons])[:, None]
-    possible &= ~strict | (iou(predicted, boxes) > _LOW_SCORE_IOU)
+        elsewhere = np.array([p is not subject for p in persons])[:, None] & (overlap <= MIXED_IOU)
+        possible &= ~(further & elsewhere)
     cost = np.full(possible.shape, _IMPOSSIBLE)
     for i, j in zip(*np.nonzero(possible), strict=True):
         difference = 1.0 - persons[i].similarity(appearances[j])
