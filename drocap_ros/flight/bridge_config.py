@@ -10,6 +10,7 @@ from drocap_ros.flight.safety_config import SafetyConfig, height_condition
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.parameters import param
 
+#: Least distance of an orbit from the fence.
 FENCE_ROOM_M = 1.0
 
 
