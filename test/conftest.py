@@ -14,15 +14,15 @@ pytest_plugins = ["fixtures_export", "fixtures_recording", "fixtures_reconstruct
 #: Where nodes run, ports are listened to or time is measured, and what of it only computes.
 CLOCKED = (
     "nodes", "ros", "system", "view", "cli/test_live_cli.py", "cli/test_preflight_command.py",
-    "flight/mavlink/test_link.py", "flight/mavlink/test_signing.py", "flight/mavlink/test_gimbal.py",
-    "perception/sources/test_live_sources.py",
+    "cli/models/test_train_lifter.py", "flight/mavlink/test_link.py", "flight/mavlink/test_signing.py",
+    "flight/mavlink/test_gimbal.py", "perception/sources/test_live_sources.py",
     "perception/models/test_fetch.py", "recording/mcap/test_bounded_queue.py",
     "recording/mcap/test_recover.py", "recording/mcap/test_session_writer.py",
     "recording/telemetry/test_flight_to_tracks.py",
 )  # fmt: skip
 COMPUTING = ("system/test_packaging.py", "system/test_simulated_demo.py")
-#: Those of them that count messages or frames while the graph is busy: beside another test they fail now and then.
-ALONE = (
+#: Those of them that count messages or frames while the graph is busy: many tests beside them disturb them.
+COUNTING = (
     "nodes/test_bundle_adjuster.py", "nodes/test_live_replay.py", "system/test_bringup.py",
     "system/test_live_faults.py", "system/test_orbit", "view",
 )  # fmt: skip
@@ -32,18 +32,36 @@ LONG = (
     "reconstruction/live/test_world_windows.py", "cli/batch/test_batch_command.py", "system/test_demo.py",
     "cli/test_preflight_command.py", "cli/test_live_cli.py",
 )  # fmt: skip
+#: Marker expressions of `make test`, and the group of files that each runs.
+PARTS = {"not clock and not counting": "", "clock": "clock", "counting": "counting"}
+
+
+def file_of(path: Path) -> str:
+    """Path inside this folder."""
+    return path.relative_to(ROOT / "test").as_posix()
+
+
+def group(file: str) -> str:
+    """Marker of a file's tests; "" for those that only compute."""
+    if not file.startswith(CLOCKED) or file in COMPUTING:
+        return ""
+    return "counting" if file.startswith(COUNTING) else "clock"
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Import no file of another part: each worker would take ten seconds for them."""
+    part = PARTS.get(config.getoption("markexpr"))
+    if part is None or collection_path.suffix != ".py":
+        return None
+    return group(file_of(collection_path)) != part or None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what waits for clocks and what has to run alone; long files first."""
-
-    def file(item: pytest.Item) -> str:
-        return item.path.relative_to(ROOT / "test").as_posix()
-
+    """Mark what waits for clocks and what counts messages; long files first."""
     for item in items:
-        if file(item).startswith(CLOCKED) and file(item) not in COMPUTING:
-            item.add_marker("alone" if file(item).startswith(ALONE) else "clock")
-    items.sort(key=lambda item: file(item) not in LONG)
+        if part := group(file_of(item.path)):
+            item.add_marker(part)
+    items.sort(key=lambda item: file_of(item.path) not in LONG)
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -14,6 +14,7 @@ import numpy as np
 
 from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
 
+_ENU_OF_NED, _SIGNS = np.array([1, 0, 2]), np.array([1.0, 1.0, -1.0])
 _HALF = np.sqrt(0.5)
 #: Rotation NED -> ENU (and ENU -> NED), x y z w: half a turn about north-east.
 _NED_ENU = np.array([_HALF, _HALF, 0.0, 0.0])
@@ -29,7 +30,7 @@ _ECCENTRICITY2 = 6.694379990141316e-3
 
 def ned_to_enu(vector: np.ndarray) -> np.ndarray:
     """(..., 3) NED -> ENU."""
-    return np.stack([vector[..., 1], vector[..., 0], -vector[..., 2]], axis=-1)
+    return vector[..., _ENU_OF_NED] * _SIGNS
 
 
 def enu_to_ned(vector: np.ndarray) -> np.ndarray:
@@ -49,9 +50,18 @@ def flu_to_frd(vector: np.ndarray) -> np.ndarray:
 
 def quaternion_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Product (..., 4) x y z w: first ``b``, then ``a``."""
-    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
-    vector = aw * bv + bw * av + np.cross(av, bv)
-    return np.concatenate([vector, aw * bw - np.sum(av * bv, axis=-1, keepdims=True)], axis=-1)
+    # By components: np.cross takes ten times as long for one quaternion.
+    ax, ay, az, aw = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
+    bx, by, bz, bw = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
+    return np.stack(
+        [
+            aw * bx + bw * ax + (ay * bz - az * by),
+            aw * by + bw * ay + (az * bx - ax * bz),
+            aw * bz + bw * az + (ax * by - ay * bx),
+            aw * bw - (ax * bx + ay * by + az * bz),
+        ],
+        axis=-1,
+    )
 
 
 def _as_matrix(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -95,7 +105,7 @@ def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> 
 
 def yaw_of(frd_to_ned: np.ndarray) -> np.ndarray:
     """(...) rad, heading from north towards east, of rotations (..., 4) x y z w body FRD -> NED."""
-    x, y, z, w = np.moveaxis(np.asarray(frd_to_ned), -1, 0)
+    x, y, z, w = (frd_to_ned[..., i] for i in range(4))
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 

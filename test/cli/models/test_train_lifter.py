@@ -74,7 +74,6 @@ def test_an_unusable_option_is_refused_before_the_training(
     assert not (mocap.parent / "l.onnx").exists()
 
 
-@pytest.mark.clock
 def test_a_terminated_group_leaves_the_file_that_was_there(mocap: Path) -> None:
     out = mocap.parent / "l.onnx"
     out.write_bytes(b"before")
