@@ -90,9 +90,9 @@ def reconstruct(
     )
     with blas_threads(adjuster.threads):
         result = run_method(method, data)
-    if not np.isfinite(result.joints_px).all(axis=(1, 2)).any():
-        raise InputError("keypoints: expected those of a person, got none that give a finite pose; check the values")
-    motion = _to_motion(tracks, joints, keypoints, result, initializer, world_config(adjuster))
+        if not np.isfinite(result.joints_px).all(axis=(1, 2)).any():
+            raise InputError("keypoints: expected those of a person, got none that give a finite pose; check the values")
+        motion = _to_motion(tracks, joints, keypoints, result, initializer, world_config(adjuster))
     if isinstance(motion, str):
         # The lifter saw the camera's rotation: without it the poses differ too.
         without = dataclasses.replace(tracks, camera_rotation=None, camera_position=None)

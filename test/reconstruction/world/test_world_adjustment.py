@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from drocap_ros.evaluation.metrics import scale_error
 from drocap_ros.evaluation.world_metrics import ellipsoid_coverage, still_foot_speed
@@ -14,6 +16,7 @@ from drocap_ros.geometry.rotations import exp_so3, left_jacobian, log_so3
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.world import refine
 from drocap_ros.reconstruction.world.calibration_words import telemetry_words
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.contacts import contact_probability
@@ -254,6 +257,22 @@ def test_result_does_not_depend_on_where_the_origin_and_north_lie() -> None:
     one, two = reconstruct(view), reconstruct(moved)
     np.testing.assert_allclose(two.joints3d, one.joints3d @ turn.T + shift, atol=5e-3)
     assert one.scale_source == two.scale_source
+
+
+def test_body_and_camera_are_adjusted_in_one_thread_whatever_the_environment_says(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A second thread waits for its core beside another process: a factor of a hundred, and other last bits."""
+    used: set[int] = set()
+
+    def spied(*args: Any, **options: Any) -> Any:
+        used.update(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
+        return adjust_in_world(*args, **options)
+
+    monkeypatch.setattr(refine, "adjust_in_world", spied)
+    with threadpool_limits(2):
+        reconstruct(tracks(walker(30), noise_px=2.0))
+    assert used == {1}
 
 
 def test_feet_in_contact_keep_their_place() -> None:
