@@ -105,13 +105,13 @@ _WORDS: dict[Check, tuple[str, str]] = {
     Check.STEEP_VIEW: (
         "Steep view",
         "The camera looks at the body from {elevation:.0f}° above (median). Limbs are foreshortened and hide each"
-        " other: in studies the error of the joints grew from 20 mm to 25 mm at 52° and 38 mm at 69°. Fly lower or"
-        " farther away; below {limit:.0f}° the view does not limit the result.",
+        " other, so the joints err more. Fly lower or farther away; below {limit:.0f}° the view does not limit the"
+        " result.",
     ),
     Check.LOW_RATE: (
         "Low image rate",
-        "{rate:.1f} images per second. Fast motions fall between the images: in studies the error of the joints was"
-        " 27 mm at 24 images per second, 40 mm at 10 and 84 mm at 5. Record at {limit:.0f} or more.",
+        "{rate:.1f} images per second. Fast motions fall between the images, so the joints err more. Record at"
+        " {limit:.0f} or more.",
     ),
     Check.HIGH_ERROR: (
         "High reprojection error",

@@ -178,6 +178,7 @@ def test_space_belongs_to_the_player_after_a_click_and_to_a_button_reached_by_ke
 
 def test_two_fingers_zoom(browser, pages):
     browser.open(pages / "plain.html", 400, 900)
+    browser.run('byId("main").scrollIntoView()')
     x, y = browser.run(
         '(({x, y, width, height}) => [x + width / 2, y + height / 2])(byId("main").getBoundingClientRect())'
     )
