@@ -271,8 +271,9 @@ def test_body_and_camera_are_adjusted_in_one_thread_whatever_the_environment_say
 
     monkeypatch.setattr(refine, "adjust_in_world", spied)
     with threadpool_limits(2):
-        reconstruct(tracks(walker(30), noise_px=2.0))
+        motion = reconstruct(tracks(walker(30), noise_px=2.0))
     assert used == {1}
+    assert motion.meta["seconds"]["world"] > 0.0
 
 
 def test_feet_in_contact_keep_their_place() -> None:
