@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.evaluation.live_study import REFINED_AFTER_S, observations
-from drocap_ros.evaluation.protocol import FPS, protocol_sequences, reported
+from drocap_ros.evaluation.protocol import FPS, reported
 from drocap_ros.evaluation.tables import markdown_table
 from drocap_ros.evaluation.world_errors import WORLD_HEAD, WorldErrors, world_cells, world_errors
-from drocap_ros.evaluation.world_protocol import LONGEST_S, SHORTEST_S, WorldView, world_view
+from drocap_ros.evaluation.world_protocol import LONGEST_S, WorldView, world_sequences, world_view
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.reconstruction.live.camera_history import CameraHistory
 from drocap_ros.reconstruction.live.latest_place import LatestPlace
@@ -56,10 +56,10 @@ def live_world_study(
     InputError
         When the folder has no such sequence.
     """
-    sequences = protocol_sequences(folder, shortest_s=SHORTEST_S, longest_s=LONGEST_S)[::every][:limit]
+    sequences = world_sequences(folder, every, limit)
     rows = [
-        _row(sequence.name, world_view(sequence, telemetry, seed=index), delay_s)
-        for index, sequence in enumerate(reported(sequences, len(sequences), "live world study", progress))
+        _row(sequence.name, world_view(sequence, telemetry, seed=seed), delay_s)
+        for seed, sequence in reported(sequences, len(sequences), "live world study", progress)
     ]
     return [row for row in rows if row is not None]
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.evaluation.protocol import FPS, protocol_sequences, reported
+from drocap_ros.evaluation.protocol import FPS, reported
 from drocap_ros.evaluation.tables import markdown_table
 from drocap_ros.evaluation.world_errors import WORLD_HEAD, WorldErrors, world_cells, world_errors
-from drocap_ros.evaluation.world_protocol import LONGEST_S, SHORTEST_S, TELEMETRY, world_view
+from drocap_ros.evaluation.world_protocol import TELEMETRY, world_sequences, world_view
 from drocap_ros.mocap import Sequence
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.reconstruct import reconstruct
@@ -54,7 +54,7 @@ def world_study(
     limit: int | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> list[WorldRow]:
-    """Every ``every``-th sequence of at least 8 s of a MoCap folder, by name; each has a seed of its own.
+    """Every ``every``-th sequence of at least 8 s of a MoCap folder, by name; the choice does not change their seeds.
 
     Raises
     ------
@@ -68,10 +68,10 @@ def world_study(
     for name, value in (("every", every), ("limit", limit)):
         if value is not None and value < 1:
             raise InputError(f"--{name}: expected at least 1, got {value}")
-    sequences = protocol_sequences(folder, shortest_s=SHORTEST_S, longest_s=LONGEST_S)[::every][:limit]
+    sequences = world_sequences(folder, every, limit)
     return [
-        measure_world(sequence, telemetry, still=still, seed=seed + index, method=method)
-        for index, sequence in enumerate(reported(sequences, len(sequences), "world study", progress))
+        measure_world(sequence, telemetry, still=still, seed=seed + own, method=method)
+        for own, sequence in reported(sequences, len(sequences), "world study", progress)
     ]
 
 

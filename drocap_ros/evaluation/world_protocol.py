@@ -8,11 +8,12 @@ Sequences of at least 8 s, their first 20 s at 24 fps.  A perspective camera (12
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.evaluation.protocol import FPS
+from drocap_ros.evaluation.protocol import FPS, protocol_sequences
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.mocap import Sequence
 from drocap_ros.skeleton import BODY_15, BODY_17, indices
@@ -64,6 +65,19 @@ class WorldView:
     tracks: Tracks
     truth: np.ndarray
     camera_rotation: np.ndarray
+
+
+def world_sequences(folder: Path, every: int = 1, limit: int | None = None) -> list[tuple[int, Sequence]]:
+    """Every ``every``-th sequence of a MoCap folder, by name, each with its seed: the same for any ``every``.
+
+    Raises
+    ------
+    InputError
+        When the folder has no usable sequence.
+    """
+    found = enumerate(protocol_sequences(folder, shortest_s=SHORTEST_S, longest_s=LONGEST_S))
+    # The published figures are of every third sequence, with the seeds 0, 1, 2 and so on.
+    return [(index // 3 + 1000 * (index % 3), sequence) for index, sequence in found][::every][:limit]
 
 
 def world_view(

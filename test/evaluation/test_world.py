@@ -15,7 +15,7 @@ from drocap_ros.evaluation import world_metrics
 from drocap_ros.evaluation.compare import compare
 from drocap_ros.evaluation.world import measure_world, world_means, world_study
 from drocap_ros.evaluation.world_errors import WORLD_HEAD, world_cells, world_errors
-from drocap_ros.evaluation.world_protocol import FOCAL_PX, FPS, IMAGE_SIZE, TELEMETRY, world_view
+from drocap_ros.evaluation.world_protocol import FOCAL_PX, FPS, IMAGE_SIZE, TELEMETRY, world_sequences, world_view
 from drocap_ros.mocap import Sequence
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.simulation.simulated_person import simulate_person
@@ -158,6 +158,16 @@ def test_a_sequence_whose_telemetry_is_refused_has_no_errors_in_the_world() -> N
     ]
     other = replace(row, frame="world", errors=replace(row.errors, w_mm=80.0))
     assert world_means([row, other]).w_mm == 80.0
+
+
+def test_a_sequence_has_the_same_seed_with_every_choice(tmp_path: Path) -> None:
+    for name in "abcdefg":
+        write_mocap(tmp_path, name, frames=250)
+    seeds = {sequence.name: seed for seed, sequence in world_sequences(tmp_path)}
+    assert len(set(seeds.values())) == 7
+    assert [seeds[name] for name in "adg"] == [0, 1, 2]  # of the published figures
+    for every in (2, 3):
+        assert {sequence.name: seed for seed, sequence in world_sequences(tmp_path, every)}.items() <= seeds.items()
 
 
 def test_study_is_the_same_every_time(tmp_path: Path) -> None:
