@@ -20,7 +20,7 @@ class FrameBuffer:
     """The last ``window_s`` of keypoints and initial poses of one subject; an adjustment is due every ``period_s``.
 
     Time is that of the stamps.  ``event`` is the last frame's: duplicate and late frames are dropped; another
-    subject, a jump of time and a gap longer than ``gap_s`` empty the buffer.
+    subject or image size, a jump of time and a gap longer than ``gap_s`` empty the buffer.
     """
 
     def __init__(self, config: BundleAdjusterConfig) -> None:
@@ -37,7 +37,7 @@ class FrameBuffer:
 
         initial_joints : (17, 3) m, camera axes; (15, 3) from older recordings
         """
-        self.event = self._order.classify(observation.stamp_ns, observation.track_id)
+        self.event = self._order.classify(observation.stamp_ns, observation.track_id, observation.image_size)
         if self.event.dropped:
             return False
         if self.event.restarted:

@@ -36,7 +36,7 @@ class LiveInitializer:
     """Lifts each image of a stream with the last ``past_s`` of keypoints (:mod:`stream_lifter`).
 
     ``event`` is the last image's (:mod:`stream_order`): duplicates, late images and stray stamps are dropped; another
-    subject or a jump of time restarts; a gap keeps only the person's proportions.
+    subject, another image size or a jump of time restarts; a gap keeps only the person's proportions.
     """
 
     def __init__(self, config: InitializerConfig | None = None) -> None:
@@ -55,7 +55,7 @@ class LiveInitializer:
             When an array has a wrong shape or an impossible value.
         """
         keypoints = _keypoints(observation)
-        self.event = self._order.classify(observation.stamp_ns, observation.track_id)
+        self.event = self._order.classify(observation.stamp_ns, observation.track_id, observation.image_size)
         if self.event.dropped:
             return None
         if self.event.restarted:

@@ -26,7 +26,7 @@ from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 class LivePose(NamedTuple):
     """An image's initial pose as published: joints (17, 3) float32 m in camera axes.
 
-    restarted : the subject or the pass of time differs from the image before
+    restarted : the subject, the image size or the pass of time differs from the image before
     """
 
     observation: PoseObservation

@@ -55,7 +55,7 @@ class StreamLifter:
         self._since_estimate = 0
 
     def forget_person(self) -> None:
-        """Another person, or another pass of time."""
+        """Another person, other pixels, or another pass of time."""
         self.forget_motion()
         self._proportions.clear()
 

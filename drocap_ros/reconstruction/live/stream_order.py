@@ -18,6 +18,7 @@ class StreamEvent(Enum):
     CONTINUED = auto()
     GAP = auto()
     NEW_SUBJECT = auto()
+    RESIZED = auto()
     TIME_JUMP = auto()
     DUPLICATE = auto()
     LATE = auto()
@@ -33,8 +34,8 @@ class StreamEvent(Enum):
 
     @property
     def restarted(self) -> bool:
-        """Earlier state is void: another person, or another pass of time."""
-        return self in (StreamEvent.FIRST, StreamEvent.NEW_SUBJECT, StreamEvent.TIME_JUMP)
+        """Earlier state is void: another person, other pixels, or another pass of time."""
+        return self in (StreamEvent.FIRST, StreamEvent.NEW_SUBJECT, StreamEvent.RESIZED, StreamEvent.TIME_JUMP)
 
 
 _WORDS = {
@@ -42,6 +43,7 @@ _WORDS = {
     StreamEvent.CONTINUED: "continued",
     StreamEvent.GAP: "continued after a gap",
     StreamEvent.NEW_SUBJECT: "restarted: another subject",
+    StreamEvent.RESIZED: "restarted: images of another size",
     StreamEvent.TIME_JUMP: "restarted: time jumped",
     StreamEvent.DUPLICATE: "dropped: duplicate stamp",
     StreamEvent.LATE: "dropped: late stamp",
@@ -50,14 +52,14 @@ _WORDS = {
 
 
 class StreamOrder:
-    """Classifies each image by its stamp and its subject.
+    """Classifies each image by its stamp, its subject and its size.
 
     - The same stamp again: a duplicate, dropped.
     - Up to ``late_s`` before the last stamp: late, dropped; after :data:`LATE_RUN` in a row the clock was set back.
     - Further back, or more than :data:`LEAP_S` ahead: a stray, dropped, unless it follows a stray; then time has
       jumped (a looped bag, a clock that was set) and the stream restarts.  A single stamp of 1970 or 2100 does no
       harm, and a whole stream in 1970 or 2100 works.
-    - Another ``track_id``: the stream restarts.  More than ``gap_s`` later: a gap.
+    - Another ``track_id`` or image size: the stream restarts.  More than ``gap_s`` later: a gap.
 
     Parameters
     ----------
@@ -67,22 +69,22 @@ class StreamOrder:
     def __init__(self, late_s: float, gap_s: float, *, confirm: bool = True) -> None:
         self._late_ns, self._gap_ns, self._leap_ns = (round(s * 1e9) for s in (late_s, gap_s, LEAP_S))
         self._confirm = confirm
-        self._last: tuple[int, int] | None = None
+        self._last: tuple[int, int, tuple[int, int]] | None = None
         self._stray_ns: int | None = None
         self._late = 0
 
-    def classify(self, stamp_ns: int, track_id: int) -> StreamEvent:
-        """Event of the next image; a dropped image does not change the order of the others."""
-        event = self._event(stamp_ns, track_id)
+    def classify(self, stamp_ns: int, track_id: int, size: tuple[int, int] = (0, 0)) -> StreamEvent:
+        """Event of the next image, ``size`` px; a dropped image does not change the order of the others."""
+        event = self._event(stamp_ns, track_id, size)
         if event.dropped:
             self._late += event is StreamEvent.LATE
             if event is StreamEvent.STRAY:
                 self._stray_ns = stamp_ns
         else:
-            self._last, self._stray_ns, self._late = (stamp_ns, track_id), None, 0
+            self._last, self._stray_ns, self._late = (stamp_ns, track_id, size), None, 0
         return event
 
-    def _event(self, stamp_ns: int, track_id: int) -> StreamEvent:
+    def _event(self, stamp_ns: int, track_id: int, size: tuple[int, int]) -> StreamEvent:
         if self._last is None:
             return StreamEvent.FIRST
         step = stamp_ns - self._last[0]
@@ -95,4 +97,6 @@ class StreamOrder:
             return StreamEvent.TIME_JUMP if follows or not self._confirm else StreamEvent.STRAY
         if track_id != self._last[1]:
             return StreamEvent.NEW_SUBJECT
+        if size != self._last[2]:
+            return StreamEvent.RESIZED
         return StreamEvent.GAP if step > self._gap_ns else StreamEvent.CONTINUED

@@ -52,6 +52,15 @@ def test_a_second_round_and_another_subject_repeat_the_first_bit_for_bit() -> No
         assert all((w.window.stamp_ns >= second[0].stamp_ns).all() for w in both_windows[3:])
 
 
+def test_images_of_another_size_share_no_pose_and_no_window_with_those_before() -> None:
+    small = [replace(o, image_size=(640, 512)) for o in observed(40, 2 * S, size=0.5)]
+    poses, windows = run([*observed(40), *small])
+    alone, alone_windows = run(small)
+    assert [p.restarted for p in poses] == [i in (0, 40) for i in range(80)]
+    assert same(poses[40:], alone)
+    assert same(windows[3:], alone_windows)
+
+
 def test_adjuster_takes_poses_of_another_day_when_its_node_does() -> None:
     day = 86_400 * S
     poses, windows = run([*observed(40), *observed(40, day)])

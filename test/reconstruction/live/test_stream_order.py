@@ -45,6 +45,13 @@ def test_another_subject_restarts_and_a_gap_is_an_event() -> None:
     assert [a.restarted for a in found] == [True, True, False, False, True]
 
 
+def test_another_image_size_restarts() -> None:
+    order = StreamOrder(1.0, 1.0)
+    found = [order.classify(NOW + i, 1, size) for i, size in enumerate([(1280, 720)] * 2 + [(640, 360)] * 2)]
+    assert found == [StreamEvent.FIRST, StreamEvent.CONTINUED, StreamEvent.RESIZED, StreamEvent.CONTINUED]
+    assert StreamEvent.RESIZED.restarted
+
+
 @pytest.mark.parametrize("stray_ns", [Y1970, Y2100], ids=["1970", "2100"])
 def test_a_single_stray_stamp_is_dropped(stray_ns: int) -> None:
     order = StreamOrder(1.0, 1.0)
