@@ -5,6 +5,7 @@ Programs compare keys and values of this module; sentences are made here, for pe
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -101,6 +102,14 @@ def words(key: str) -> str:
 def values_of(status: DiagnosticStatus) -> dict[str, str]:
     """Keys and values of a status."""
     return {value.key: value.value for value in status.values}
+
+
+def number(text: str) -> float:
+    """Number of a value that anyone may publish; NaN where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def node_of(status: DiagnosticStatus) -> tuple[str, str]:

@@ -26,6 +26,14 @@ def test_the_table_shows_each_node_once_with_its_latest_words():
     assert "warning" in text
 
 
+def test_a_latency_that_is_no_number_is_shown_as_unknown():
+    dashboard = Dashboard()
+    values = {"latency_p50_ms": "12.4", "latency_p95_ms": "slow", "latency_p99_ms": ""}
+    dashboard.take(SimpleNamespace(status=[status("drocap/x", b"\x00", "running", **values)]))
+    (cell,) = dashboard.table().columns[3].cells
+    assert cell == "12 / nan / nan"
+
+
 def test_words_with_brackets_are_shown_as_they_are():
     from rich.console import Console
 

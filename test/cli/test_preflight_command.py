@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import yaml
 
@@ -212,6 +213,15 @@ def test_what_the_running_bridge_refuses_is_missing_whatever_the_file_permits():
     assert found["condition_commands_disabled"].level == Level.MISSING
     assert found["condition_commands_disabled"].found == "commands are disabled (67% of the time)"
     assert "condition_not_armed" not in found
+
+
+def test_values_of_the_bridge_that_are_no_numbers_are_unknown():
+    graph = SimpleNamespace(node=SimpleNamespace(create_subscription=lambda *_: None), namespace="/drocap")
+    listener = BridgeListener(graph)
+    listener.statuses.append(SimpleNamespace(state=0, condition=0, reason=""))
+    listener.values = {"stream_rate_hz/SYS_STATUS": "often", "GUID_TIMEOUT": "short"}
+    measured = listener.measured(MavlinkBridgeConfig(), "/drocap")
+    assert np.isnan([measured.streams["SYS_STATUS"].real_hz, measured.settings["GUID_TIMEOUT"]]).all()
 
 
 def test_a_link_that_another_program_holds_is_refused_in_one_line(tmp_path):

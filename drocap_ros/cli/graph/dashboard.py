@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from drocap_ros.ros.diagnostics import Key, words
+from drocap_ros.ros.diagnostics import Key, number, words
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -51,7 +51,7 @@ class Dashboard:
                 f"{words(key)} {value}" for key, value in values.items() if value.isdigit() or key in _SHOWN
             )
             state = f"[{_COLOURS.get(level, 'white')}]{_LEVELS.get(level, str(level))}[/]"
-            latency = " / ".join(f"{float(values[key]):.0f}" for key in _LATENCY if key in values)
+            latency = " / ".join(f"{number(values[key]):.0f}" for key in _LATENCY if key in values)
             # Words of nodes, and of messages that they refused, may hold brackets, which are markup in a plain string.
             table.add_row(Text(name), state, Text(values.get(Key.RATE, "")), latency, Text(text), Text(counts))
         return table

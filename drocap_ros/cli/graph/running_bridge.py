@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -87,7 +86,7 @@ class BridgeListener:
 
     def measured(self, config: MavlinkBridgeConfig, namespace: str) -> Measured:
         """What the bridge has reported; it reads fewer of the autopilot's parameters than a link of our own."""
-        from drocap_ros.ros.diagnostics import Key, of
+        from drocap_ros.ros.diagnostics import Key, number, of
 
         status = self.statuses[-1]
         state = State(status.state).name.lower().replace("_", " ")
@@ -99,13 +98,13 @@ class BridgeListener:
             requests.set_autopilot(vehicle.autopilot)
         known = {name for names in MORE_SETTINGS.values() for name in names} | {"GUID_TIMEOUT", "COM_OF_LOSS_T"}
         streams = {
-            name: Stream(float(self.values.get(of(Key.STREAM_RATE, name), math.nan)), wanted)
+            name: Stream(number(self.values[of(Key.STREAM_RATE, name)]), wanted)
             for name, (_, wanted) in requests.rates_hz(0).items()
             if of(Key.STREAM_RATE, name) in self.values
         }
         return Measured(
             vehicle=vehicle, heard=vehicle is not None, streams=streams,
-            settings={name: float(text) for name, text in self.values.items() if name in known},
+            settings={name: number(text) for name, text in self.values.items() if name in known},
             delays_s=np.array([age for age, _ in self.states]), conditions=self._failed(),
             bridge=f"by the running bridge in {namespace}, {state}: {status.reason}",
         )  # fmt: skip
