@@ -75,7 +75,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_fetch_option(parser)
     parser.add_argument("--dictionary", metavar="NPZ", type=Path, help="pose dictionary instead of the shipped one")
     parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
-    parser.add_argument("--no-report", action="store_true", help="do not write report.html")
+    parser.add_argument("--no-report", action="store_true", help="do not write report.html; that of an older run goes")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
             selection=selection,
         )
     motion = dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line})
-    with output_folder(out) as folder:
+    with output_folder(out, stale=["report.html"]) as folder:
         save_motion(folder / "motion.npz", motion)
         if "tracks.npz" in names:
             save_tracks(folder / "tracks.npz", tracks)

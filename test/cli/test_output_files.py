@@ -56,6 +56,32 @@ def test_reconstruct_beside_its_tracks_leaves_them_as_they_are(tmp_path, capsys)
     assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
 
 
+def test_no_report_of_an_older_run_stays_beside_a_new_motion(tmp_path):
+    save_tracks(tmp_path / "a.npz", simulate_capture(1.0, 15.0, seed=1).tracks)
+    (tmp_path / "out").mkdir()
+    for name in ("report.html", "walk.bvh"):
+        (tmp_path / "out" / name).write_text("old")
+    words = ["reconstruct", str(tmp_path / "a.npz"), "--out", str(tmp_path / "out"), "--method", "initial", "--quiet"]
+    assert main([*words, "--no-report"]) == 0
+    found = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert found == ["motion.npz", "preview.png", "tracks.npz", "walk.bvh"]
+
+
+def test_files_of_an_older_run_go_with_its_others_but_not_the_input(tmp_path):
+    for name in ("overlay.mp4", "tracks.npz", "tracks_person_2.npz", "tracks_person_3.npz", "other.npz"):
+        (tmp_path / name).write_text("old")
+    stale = ["overlay.mp4", "tracks_person_[0-9]*.npz"]
+    with pytest.raises(KeyError), output_folder(tmp_path, stale):
+        raise KeyError
+    assert len(list(tmp_path.iterdir())) == 5
+    with output_folder(tmp_path, stale, tmp_path / "overlay.mp4") as work:
+        for name in ("tracks.npz", "tracks_person_3.npz"):
+            (work / name).write_text("new")
+    found = {path.name: path.read_text() for path in tmp_path.iterdir()}
+    old, new = ("overlay.mp4", "other.npz"), ("tracks.npz", "tracks_person_3.npz")
+    assert found == {**dict.fromkeys(old, "old"), **dict.fromkeys(new, "new")}
+
+
 def test_default_folder_has_the_whole_name_of_the_input(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     save_tracks("walk.take1.npz", simulate_capture(1.0, 15.0, seed=1).tracks)
