@@ -56,6 +56,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 def run(args: argparse.Namespace) -> int:
     """Reconstruct what is not done yet; status 1 when a recording failed."""
     from drocap_ros.cli.atomic_output import check_output_folder
+    from drocap_ros.cli.batch.recording import RECORD_FILE
 
     if args.jobs < 1:
         raise InputError(f"--jobs: expected at least 1, got {args.jobs}; correct the number")
@@ -66,7 +67,8 @@ def run(args: argparse.Namespace) -> int:
     with _locked(args.out):
         _remove_left_overs(args.out)
         records, todo = _split(tasks, args.out)
-        earlier = len(records)
+        # A recording that was moved is found to be done by its bytes only.
+        before = {path.parent.name for path in args.out.glob(f"*/{RECORD_FILE}")}
         _reconstruct(args, records, todo)
         _remove_left_overs(args.out)
     failures = [record for record in records if record["status"] != "done"]
@@ -76,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         print(
             f"{len(tasks)} recording{'s' * (len(tasks) != 1)}: {len(records) - len(failures)} done,"
-            f" {earlier} of them earlier,"
+            f" {sum(record.get('folder') in before for record in records)} of them earlier,"
             f" {len(failures)} failed; {time.monotonic() - begin:.1f} s\n"
             f"written: {args.out}/{LOG_FILE}, {PAGE_FILE}"
         )
