@@ -9,6 +9,12 @@ if TYPE_CHECKING:
     from drocap_ros.recording.telemetry.log import TelemetryLog
 
 _VIDEOS = (".mp4", ".mov", ".lrf")
+#: Codes of ISO/IEC 14496-12 and its registry in words.
+_KINDS = {"vide": "video", "soun": "sound", "meta": "data", "tmcd": "time code", "text": "text", "sbtl": "subtitles"}
+_FORMATS = {
+    "avc1": "H.264", "hvc1": "H.265", "hev1": "H.265", "vp09": "VP9", "av01": "AV1", "mp4v": "MPEG-4", "jpeg": "JPEG",
+    "mp4a": "AAC", "djmd": "DJI telemetry", "dbgi": "DJI debugging data", "mebx": "metadata", "tmcd": "time code",
+}  # fmt: skip
 
 #: Facts by name, names of the columns, rows, warnings.
 Parts = tuple[list[tuple[str, str]], tuple[str, ...], list[tuple[str, ...]], list[str]]
@@ -57,7 +63,8 @@ def _video_facts(path: Path) -> list[tuple[str, str]]:
     facts = []
     with path.open("rb") as file:
         for track in read_tracks(file):
-            words = track.sample_format
+            code = _printable(track.sample_format)
+            words = f"{_FORMATS[code]} ({code})" if code in _FORMATS else code
             if track.handler == "vide":
                 words += f", {track.size[0]}x{track.size[1]} px"
             try:
@@ -66,10 +73,15 @@ def _video_facts(path: Path) -> list[tuple[str, str]]:
                 words += f", {len(stamp_ns)} samples" + (f", {(len(stamp_ns) - 1) / span:.2f}/s" if span > 0 else "")
             except InputError as error:
                 words += f", damaged: {error}"
-            facts.append((f"track {track.handler}", words))
+            facts.append((f"{_KINDS.get(track.handler) or _printable(track.handler)} track", words))
     if not facts:
         raise InputError(f"{path}: expected a video file (MP4, MOV) with its index, found none; copy it again")
     return facts
+
+
+def _printable(code: str) -> str:
+    """A damaged file may hold codes that steer a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in code)
 
 
 def _log_facts(log: TelemetryLog) -> list[tuple[str, str]]:

@@ -228,9 +228,12 @@ def test_info_shows_model_rates_and_what_is_missing(video, tmp_path, capsys):
     assert main(["info", str(clip(video, tmp_path / "c.mp4", "dvtm_AVATA2", avata_sample))]) == 0
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert "source: DJI djmd track (Avata 2)" in lines
-    assert "track vide: mp4v, 320x180 px, 45 samples, 30.00/s" in lines
+    assert "video track: MPEG-4 (mp4v), 320x180 px, 45 samples, 30.00/s" in lines
     assert "missing: no gimbal or camera attitude in the log" in lines
     assert "aircraft attitude 45 100.0% 30.00/s" in lines
     (tmp_path / "v.mp4").write_bytes(video)
     assert main(["info", str(tmp_path / "v.mp4")]) == 0
     assert capsys.readouterr().out.endswith("telemetry: none in the file\n")
+    (tmp_path / "v.mp4").write_bytes(video.replace(b"vide", b"\x1b[2J"))
+    assert main(["info", str(tmp_path / "v.mp4")]) == 0
+    assert "?[2J track: MPEG-4 (mp4v)" in capsys.readouterr().out
