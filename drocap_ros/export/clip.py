@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.interpolation import true_runs
+from drocap_ros.geometry.interpolation import true_runs, usual_step
 from drocap_ros.motion import Motion, upright_joints
 from drocap_ros.tracks import MAX_FRAMES
 
@@ -31,7 +31,7 @@ class Clip:
     positions : (F, P, 3) float64, m, NaN where unknown
     joints, parents : P names; P parent indices, -1 at the root
     times_s : (F,) s, 0 at the first frame
-    rate_hz : frames per second; of an uneven time line the inverse of its median step
+    rate_hz : frames per second; of an uneven time line the inverse of its usual step
     notes : sentences on changes
     """
 
@@ -65,7 +65,7 @@ def clip_of(motion: Motion, *, measured: bool = False) -> Clip:
         if not _NAME.fullmatch(name):
             raise InputError(f"joints: expected names of letters, digits, _ . -, got {name[:60]!r}; rename the joint")
     times = (motion.stamp_ns - motion.stamp_ns[0]) * 1e-9
-    step = float(np.median(np.diff(times)))
+    step = usual_step(times)
     notes = []
     if motion.frame == "camera":
         notes.append("upright as the camera saw it: its vertical is the camera's, not gravity's")
@@ -103,7 +103,7 @@ def y_up(clip: Clip) -> Clip:
 def at_constant_rate(clip: Clip) -> Clip:
     """Clip on an even time line, for formats with a frame rate instead of stamps.
 
-    An uneven time line is resampled, linearly, at the inverse of its median step; within gaps longer than
+    An uneven time line is resampled, linearly, at the inverse of its usual step; within gaps longer than
     ``LONGEST_BRIDGE_S`` the result is NaN.
 
     Raises

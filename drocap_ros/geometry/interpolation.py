@@ -15,6 +15,15 @@ MAX_GAP_S = 2.0
 HOLD_S = 0.1
 
 
+def usual_step(times: np.ndarray) -> float:
+    """Mean of the usual steps between times (F,), F >= 2, in their unit; pauses and lost frames do not count.
+
+    Not the median: stamps in whole milliseconds of a camera with 120 Hz have steps of 8 and 9 ms.
+    """
+    steps = np.sort(np.diff(times))
+    return float(steps[np.abs(steps / steps[len(steps) // 2] - 1.0) <= 0.5].mean())
+
+
 def fill_frames(stamp_ns: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """Poses (F, P, 3) whose frames of NaN are interpolated in time from their neighbours.
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.geometry.interpolation import usual_step
 from drocap_ros.motion import Motion
 from drocap_ros.perception.sources import Frame
 from drocap_ros.recording.open_images import Images, open_images
@@ -120,7 +121,7 @@ def _check_times(path: Path, images: Images, motion: Motion) -> None:
             raise _other(path, f"{expected:.4g} {words}", f"{got:.4g}")
     if stated.get("length") or images.rate_hz is None or images.duration_s is None or len(motion.stamp_ns) < 2:
         return
-    step_s = float(np.median(np.diff(motion.stamp_ns))) * 1e-9
+    step_s = usual_step(motion.stamp_ns) * 1e-9
     ratio = step_s * images.rate_hz  # images per frame of the motion
     if ratio < 0.5 or abs(ratio - round(ratio)) > _RATE_SHARE * ratio:
         raise _other(path, f"{1 / step_s:.4g} images per second or a multiple", f"{images.rate_hz:.4g}")

@@ -9,6 +9,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.alignment import torso_frame
+from drocap_ros.geometry.interpolation import usual_step
 from drocap_ros.motion import Motion, upright_joints
 from drocap_ros.skeleton import RIGID_BONES, JointSet, indices
 
@@ -78,8 +79,8 @@ class Statistics:
 
     @property
     def rate_hz(self) -> float:
-        """Frames per second, by the median step; 0 for a single frame."""
-        return float(1.0 / np.median(np.diff(self.times_s))) if len(self.times_s) > 1 else 0.0
+        """Frames per second, by the usual step; 0 for a single frame."""
+        return 1.0 / usual_step(self.times_s) if len(self.times_s) > 1 else 0.0
 
 
 def motion_statistics(motion: Motion) -> Statistics:
