@@ -246,6 +246,12 @@ def test_an_adjustment_without_a_value_is_refused(capsys):
     assert "expected --radius, --height or --speed, got none" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("action", ["start", "adjust"])
+def test_a_value_that_is_no_number_is_not_taken_for_one_left_out(action, capsys):
+    assert main(["orbit", action, "--radius", "nan", "--speed", "5", "--timeout", "0.1"]) == 2
+    assert "--radius: expected a finite number, got nan" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("command", [("orbit", "status"), ("top", "--once"), ("record",), ("view", "--live")])
 def test_a_domain_of_the_environment_that_does_not_exist_is_refused(command, monkeypatch, capsys):
     monkeypatch.setenv("ROS_DOMAIN_ID", "400")

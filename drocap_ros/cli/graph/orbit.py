@@ -26,11 +26,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "configured ones, also after a hold.",
     )
     parser.add_argument("action", choices=("start", "engage", "adjust", "stop", "status"), help="command to send")
-    parser.add_argument("--radius", metavar="M", type=float, default=math.nan, help="m, from the subject")
-    parser.add_argument("--height", metavar="M", type=float, default=math.nan, help="m, above the subject's ground")
-    parser.add_argument(
-        "--speed", metavar="DEG_S", type=float, default=math.nan, help="deg/s, positive = counter-clockwise from above"
-    )
+    parser.add_argument("--radius", metavar="M", type=float, help="m, from the subject")
+    parser.add_argument("--height", metavar="M", type=float, help="m, above the subject's ground")
+    parser.add_argument("--speed", metavar="DEG_S", type=float, help="deg/s, positive = counter-clockwise from above")
     parser.add_argument("--timeout", metavar="S", type=float, default=10.0, help="to wait for an answer (default 10)")
     parser.add_argument("--namespace", type=ros_namespace, default="/drocap", help="of all topics (default /drocap)")
     add_domain_option(parser)
@@ -61,7 +59,8 @@ def run(args: argparse.Namespace) -> int:
             return 0
         if not wait(lambda: client.is_ready):
             raise no_graph
-        answer = client.send(int(Command[args.action.upper()]), args.radius, args.height, args.speed)
+        values = (math.nan if value is None else value for value in (args.radius, args.height, args.speed))
+        answer = client.send(int(Command[args.action.upper()]), *values)
         if not wait(answer.done):
             raise InputError(
                 f"orbit: expected an answer to {args.action} within {args.timeout:g} s, found none; "
@@ -75,12 +74,15 @@ def run(args: argparse.Namespace) -> int:
 def _check_options(args: argparse.Namespace) -> None:
     if not 0 < args.timeout <= 600:
         raise InputError(f"--timeout: expected above 0 and at most 600 s, got {args.timeout:g}")
-    if args.action == "adjust" and all(map(math.isnan, (args.radius, args.height, args.speed))):
+    values = {"--radius": args.radius, "--height": args.height, "--speed": args.speed}
+    given = {name: value for name, value in values.items() if value is not None}
+    if args.action == "adjust" and not given:
         raise InputError("adjust: expected --radius, --height or --speed, got none; state what to change")
-    for name, value in (("--radius", args.radius), ("--height", args.height), ("--speed", args.speed)):
-        if math.isinf(value):
-            raise InputError(f"{name}: expected a finite number, got {value:g}")
-        if args.action in ("stop", "status") and not math.isnan(value):
+    for name, value in given.items():
+        # To the bridge NaN means the configured value: a failed computation must not start another orbit.
+        if not math.isfinite(value):
+            raise InputError(f"{name}: expected a finite number, got {value:g}; correct the value or leave it out")
+        if args.action in ("stop", "status"):
             raise InputError(f"{name}: {args.action} takes no values; leave it out")
         _check_range(name, value)
 
