@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drocap_ros.cli.atomic_output import output_file
+from drocap_ros.cli.atomic_output import check_output_file, output_file
 from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
 from drocap_ros.cli.options import ros_namespace
 from drocap_ros.cli.progress import progress_bars
@@ -62,6 +62,8 @@ def run(args: argparse.Namespace) -> int:
     if not 2 <= args.seconds <= 300:
         raise InputError(f"--seconds: expected 2 to 300, got {args.seconds:g}; choose another")
     config = load_config(args.config)
+    if args.json:
+        check_output_file(args.json, "--json")
     setup = setup_of(config, args.models)
     measured = _measure(config, args)
     found = all_findings(config.mavlink_bridge, setup, measured)
@@ -161,5 +163,5 @@ def _print(found: Sequence[Finding], quiet: bool) -> None:
 
 def _write(path: Path, status: str, exit_status: int, found: Sequence[Finding]) -> None:
     content = {"status": status, "exit_status": exit_status, "checks": [finding.as_dict() for finding in found]}
-    with output_file(path) as file:
+    with output_file(path, option="--json") as file:
         file.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

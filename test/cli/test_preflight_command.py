@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 
+from drocap_ros.cli import main
 from drocap_ros.cli.graph.running_bridge import BridgeListener
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
@@ -155,6 +156,13 @@ def test_an_option_out_of_range_is_refused(tmp_path, option):
     process = start("drocap_ros.cli", "preflight", "--config", config, *option, log=tmp_path / "out")
     assert process.wait(60) == 2
     assert f"{option[0]}: expected" in (tmp_path / "out.err").read_text()
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_listening(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("drocap_ros.cli.preflight._measure", None)
+    config = write_config(tmp_path / "c.yaml", "udpin:127.0.0.1:1", "simulation")
+    assert main(["preflight", "--config", str(config), "--json", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith(f"drocap: --json {tmp_path}: expected a file, found a folder")
 
 
 def test_ctrl_c_ends_it_at_once_and_leaves_no_file(tmp_path):
