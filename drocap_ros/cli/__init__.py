@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import logging
 import os
@@ -41,6 +42,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     logging.basicConfig(level=logging.WARNING, format="drocap: %(message)s")
     words = sys.argv[1:] if argv is None else list(argv)
+    # Closed by the shell (>&-): Python has no stream then, and the next file opened would take its number.
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     interrupted = threading.Event()
     try:
         args = build_parser().parse_args(words)
@@ -64,6 +69,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _interrupted()
         if os.environ.get("DROCAP_DEBUG"):
             raise
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            print(f"drocap: expected space on the disk, found none: {_one_line(error)}; free some", file=sys.stderr)
+            return 1
         what = f"unexpected {type(error).__name__}: {_one_line(error)}"
         print(f"drocap: {what}; DROCAP_DEBUG=1 shows where", file=sys.stderr)
         return 1

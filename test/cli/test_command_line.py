@@ -1,13 +1,19 @@
 """The parser of the whole command line."""
 
+import os
+import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from drocap_ros.cli import COMMANDS, main
 from drocap_ros.cli.options import ros_namespace
+from drocap_ros.simulation.capture import simulate_capture
+from drocap_ros.tracks import save_tracks
 
+ROOT = Path(__file__).resolve().parents[2]
 HEAVY = ("numpy", "scipy", "cv2", "rclpy", "onnxruntime", "matplotlib", "torch")
 
 
@@ -73,3 +79,16 @@ def test_name_with_a_line_break_gives_one_line(tmp_path, capsys):
 @pytest.mark.parametrize(("text", "namespace"), [("/", "/"), ("drone2", "/drone2"), ("/a/b_1", "/a/b_1")])
 def test_a_namespace_has_its_leading_slash(text, namespace):
     assert ros_namespace(text) == namespace
+
+
+@pytest.mark.parametrize(
+    ("redirection", "status", "words"),
+    [(">/dev/full", 1, "drocap: expected space on the disk, found none"), (">&-", 0, ""), ("2>&-", 0, "")],
+)
+def test_a_full_or_closed_output_is_no_unexpected_error(tmp_path, redirection, status, words):
+    save_tracks(tmp_path / "t.npz", simulate_capture(1.0, 15.0, seed=1).tracks)
+    command = f"{shlex.quote(sys.executable)} -m drocap_ros.cli info t.npz {redirection}"
+    done = subprocess.run(
+        command, shell=True, cwd=tmp_path, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)}
+    )
+    assert (done.returncode, done.stderr[: len(words)], done.stderr.count("\n")) == (status, words, len(words) > 0)
