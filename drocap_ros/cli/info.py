@@ -62,8 +62,9 @@ def summarize(path: Path) -> Summary:
     InputError
         When it is missing, unreadable, or of an unknown kind.
     """
-    if not path.exists():
-        raise InputError(f"{path}: expected a recording, motion or tracks file, found no such file; check the path")
+    if not (path.is_file() or path.is_dir()):  # a named pipe would be waited for
+        found = "a pipe or device" if path.exists() else "no such file"
+        raise InputError(f"{path}: expected a recording, motion or tracks file, found {found}; check the path")
     path = _motion_in(path)
     if path.suffix == ".npz":
         return _of_arrays(path)

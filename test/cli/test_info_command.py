@@ -1,4 +1,5 @@
 import argparse
+import os
 import re
 
 import numpy as np
@@ -104,7 +105,8 @@ def test_files_of_unknown_kinds_are_refused_in_one_line(tmp_path):
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     (tmp_path / "text.npz").write_text("no archive")
     (tmp_path / "x.mp4").write_bytes(b"0000")
-    for name in ("missing", "other.npz", "text.npz", "x.mp4"):
+    os.mkfifo(tmp_path / "pipe.npz")
+    for name in ("missing", "other.npz", "text.npz", "x.mp4", "pipe.npz"):
         with pytest.raises(InputError, match="expected") as error:
             run(tmp_path / name)
         assert "\n" not in str(error.value)
