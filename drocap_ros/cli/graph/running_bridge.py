@@ -94,7 +94,11 @@ class BridgeListener:
         vehicle = None
         if self.states:
             message = self.states[-1][1]
-            vehicle = VehicleState(0, **{name: getattr(message, name) for name in _STATE_FIELDS})
+            q = message.gimbal_orientation
+            vehicle = VehicleState(
+                0, **{name: getattr(message, name) for name in _STATE_FIELDS},
+                gimbal_orientation_xyzw=np.array([q.x, q.y, q.z, q.w]),
+            )  # fmt: skip
             requests.set_autopilot(vehicle.autopilot)
         known = {name for names in MORE_SETTINGS.values() for name in names} | {"GUID_TIMEOUT", "COM_OF_LOSS_T"}
         streams = {

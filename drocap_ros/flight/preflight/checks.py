@@ -18,7 +18,7 @@ def all_findings(config: MavlinkBridgeConfig, setup: Setup, measured: Measured) 
     A condition for motion that fails and that no check explains is a finding of its own, so that no condition of the
     bridge can be forgotten here.
     """
-    found = [*setup_findings(config, setup)]
+    found = [*setup_findings(config, setup, measured.vehicle)]
     if not measured.heard:
         return [*found, _silence(config, measured)]
     found += link_findings(config, measured)

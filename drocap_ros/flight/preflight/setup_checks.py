@@ -11,8 +11,10 @@ import numpy as np
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.planner import goal_of
+from drocap_ros.flight.orbit.states import Observed
 from drocap_ros.flight.preflight.findings import Finding, Level
 from drocap_ros.flight.subject.framing import Framing, View, orbit_margin
+from drocap_ros.flight.vehicle_state import VehicleState
 
 _C = ConditionCode
 _EDGE = 0.04
@@ -56,12 +58,12 @@ class Fit(NamedTuple):
     height_px: float
 
 
-def setup_findings(config: MavlinkBridgeConfig, setup: Setup) -> Iterator[Finding]:
-    """Everything that can be checked without a vehicle."""
+def setup_findings(config: MavlinkBridgeConfig, setup: Setup, vehicle: VehicleState | None = None) -> Iterator[Finding]:
+    """Everything that can be checked without a vehicle, and with one the picture of a mount that nothing points."""
     yield _permission(config)
     yield from _limits(config)
     yield _source(setup)
-    yield from _camera(config, setup)
+    yield from _camera(config, setup, vehicle)
     yield _latency(config, setup)
     yield from _body(config, setup)
 
@@ -117,7 +119,7 @@ def _source(setup: Setup) -> Finding:
     )  # fmt: skip
 
 
-def _camera(config: MavlinkBridgeConfig, setup: Setup) -> Iterator[Finding]:
+def _camera(config: MavlinkBridgeConfig, setup: Setup, vehicle: VehicleState | None) -> Iterator[Finding]:
     if setup.camera_matrix is None:
         yield Finding(
             "camera", "camera", Level.MISSING, setup.camera_words, "a calibration, or a field of view",
@@ -130,7 +132,7 @@ def _camera(config: MavlinkBridgeConfig, setup: Setup) -> Iterator[Finding]:
         "" if setup.calibrated else "calibrate and set image_ingest.calibration_file: an error of the field of view is "
         "one of the range", {"fov_deg": _fov_deg(setup.camera_matrix, setup.image_size[0])},
     )  # fmt: skip
-    yield _picture(config, setup, setup.camera_matrix)
+    yield _picture(config, setup, setup.camera_matrix, vehicle)
 
 
 def _latency(config: MavlinkBridgeConfig, setup: Setup) -> Finding:
@@ -154,40 +156,49 @@ def _latency(config: MavlinkBridgeConfig, setup: Setup) -> Finding:
     )  # fmt: skip
 
 
-def _picture(config: MavlinkBridgeConfig, setup: Setup, matrix: np.ndarray) -> Finding:
+def _picture(config: MavlinkBridgeConfig, setup: Setup, matrix: np.ndarray, vehicle: VehicleState | None) -> Finding:
     """Whether the person fits into the picture, and how high it is there."""
-    fixed = config.mount == "fixed"
-    rows = setup.image_size[1]
-    fit = person_in_picture(config, matrix, -config.camera_pitch_deg if fixed else best_pitch_deg(config))
+    rows, aimed_deg = setup.image_size[1], -best_pitch_deg(config)
+    framing = Framing(config)
+    framing.matrix, framing.size = matrix, setup.image_size
+    if config.mount != "fixed":
+        framing.watch(vehicle, Observed(), 0.0)
+    view = framing.view()
+    pitch_deg = aimed_deg if view is None else math.degrees(view.pitch)
+    fit = person_in_picture(config, matrix, -pitch_deg)
     level: Level = Level.OK
     remedies: list[str] = []
-    if fixed:
-        level, remedies = _fixed_camera(config, setup, matrix)
+    if view is not None:
+        level, remedies = _unaimed_camera(config, framing, view, _inside(fit, rows))
     elif not _inside(fit, rows):
         level = Level.MISSING
         remedies.append(f"fly at least {_least_radius_m(config, matrix, rows):.0f} m away, or use a wider lens")
     if fit.height_px < _GOOD_PX:
         level = max(level, Level.MISSING if fit.height_px < _LEAST_PX else Level.WARNING)
         remedies.append("fly closer, or raise width_px and height_px")
-    how = f"camera fixed at {config.camera_pitch_deg:g} deg" if fixed else "mount aims at the person"
+    how = "mount aims at the person"
+    if view is not None:
+        how = f"mount at {pitch_deg:.0f} deg" if view.level else f"camera fixed at {pitch_deg:g} deg"
     return Finding(
         "picture", "person in the picture", level,
         f"{fit.height_px:.0f} px high, rows {fit.head_px:.0f} to {fit.feet_px:.0f} of {rows} ({how})",
         f"inside the picture, {_GOOD_PX:.0f} px high", "; ".join(remedies),
-        {"height_px": fit.height_px, "head_px": fit.head_px, "feet_px": fit.feet_px, "rows": rows},
+        {"height_px": fit.height_px, "head_px": fit.head_px, "feet_px": fit.feet_px, "rows": rows,
+         "pitch_deg": pitch_deg},
         (_C.PERSON_LEAVES_PICTURE,),
     )  # fmt: skip
 
 
-def _fixed_camera(config: MavlinkBridgeConfig, setup: Setup, matrix: np.ndarray) -> tuple[Level, list[str]]:
-    """As the bridge judges an orbit by a camera that leans with the body, calm and in wind."""
-    framing = Framing(config)
-    framing.matrix, framing.size = matrix, setup.image_size
+def _unaimed_camera(config: MavlinkBridgeConfig, framing: Framing, view: View, inside: bool) -> tuple[Level, list[str]]:
+    """As the bridge judges an orbit by a camera that nothing points: it leans with the body, or a mount keeps it."""
     goal = goal_of(config)
     refusal = framing.refusal(goal)
     if refusal is not None:
         return Level.MISSING, [str(refusal.values["remedy"])]
-    view = View(matrix, setup.image_size, math.radians(config.camera_pitch_deg))
+    if view.level:
+        # Flown, with a part of the person cut off.
+        remedy = f"set gimbal_control to true, or point the mount to {-best_pitch_deg(config):.0f} deg before the start"
+        return (Level.OK, []) if inside else (Level.WARNING, [remedy])
     if orbit_margin(view, goal, config.body_height_m, _WIND_LEAN_M_S2) < 0:
         return Level.WARNING, ["a wind of 8 m/s would lean the person out of it: use a gimbal, or fly farther away"]
     return Level.OK, []

@@ -147,7 +147,7 @@ class Framing:
         """The observation with the margin now; learns the lean against wind, ``dt`` s after the last one."""
         if vehicle is not None:
             self._mount_pitch = _pitch(vehicle.gimbal_orientation_xyzw)
-        view = self._view()
+        view = self.view()
         if view is None or view.level or vehicle is None or not np.isfinite(vehicle.orientation_xyzw).all():
             return seen
         forward, left, up = matrix_from_quaternion(vehicle.orientation_xyzw).T
@@ -172,7 +172,7 @@ class Framing:
 
     def refusal(self, goal: OrbitGoal) -> Condition | None:
         """Why an orbit loses the person, with what would keep them; None = it does not, or nothing is known."""
-        view, config = self._view(), self._config
+        view, config = self.view(), self._config
         if view is None:
             return None
         wind = float(np.hypot(*self._wind))
@@ -189,7 +189,8 @@ class Framing:
             remedy=first + _remedy(view, goal, body, wind, config.max_distance_m),
         )  # fmt: skip
 
-    def _view(self) -> View | None:
+    def view(self) -> View | None:
+        """The camera that does not follow the person; None = it follows, or nothing is known of it."""
         if self.matrix is None or self.size is None:
             return None
         if self._config.mount == "fixed":

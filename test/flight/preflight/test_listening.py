@@ -219,6 +219,25 @@ def test_the_mount_is_compared_with_what_is_configured(gimbal, values, settings,
     assert words in mount.found
 
 
+@pytest.mark.parametrize(
+    ("pitch_deg", "gimbal_control", "level", "remedy"),
+    [
+        (-14.0, False, Level.OK, ""),
+        (0.0, False, Level.WARNING, "set gimbal_control to true, or point the mount to -15 deg"),
+        (-60.0, False, Level.MISSING, "set gimbal_control to true, or point the mount to -15 deg"),
+        (-60.0, True, Level.OK, ""),
+    ],
+)
+def test_the_pitch_of_a_mount_that_the_bridge_does_not_turn_is_compared_with_the_orbit(
+    pitch_deg, gimbal_control, level, remedy
+):
+    config = dataclasses.replace(CONFIG, gimbal_control=gimbal_control)
+    picture = Scene("ardupilot", config, before=lambda scene: scene.copter.mount.command(pitch_deg)).findings["picture"]
+    assert picture.level == level
+    assert picture.remedy.startswith(remedy)
+    assert ("mount aims at the person" if gimbal_control else f"mount at {pitch_deg:.0f} deg") in picture.found
+
+
 def test_px4_needs_the_permission_to_change_the_mode():
     config = dataclasses.replace(CONFIG, mode_change_allowed=False)
     assert Scene("px4", config).missing() == {"engage"}
