@@ -207,8 +207,7 @@ _SENTENCES = {
     _C.AT_FENCE: "{distance_m:.1f} m from where the orbit began: at the fence of {limit_m:g} m",
     _C.COAST_UNSAFE: "if the bridge failed now, the vehicle would {reach} before it stands",
     _C.ORBIT_NOT_KEPT: "the vehicle has been more than {limit_m:.1f} m from its place on the orbit for {for_s:.0f} s, "
-    "{away_m:.1f} m now: it cannot keep the orbit in this wind, or follow this subject; land, or "
-    "take over by hand",
+    "{away_m:.1f} m now: {verdict}",
     _C.NO_SUBJECT: "no subject is tracked",
     _C.SUBJECT_OUTDATED: "the subject was last located {ago}",
     _C.SUBJECT_UNCERTAIN: "the subject's position is uncertain by {sd_m:.1f} m",

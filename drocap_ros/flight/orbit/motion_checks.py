@@ -153,11 +153,16 @@ def keeping_condition(seen: Observed, limits: Limits, longest_s: float = _LONGES
     Sooner at three times the distance: the vehicle is carried off.
     """
     limit_m = away_limit_m(limits.orbit)
-    if seen.away_m > _CARRIED_OFF * limit_m:
+    carried_off = seen.away_m > _CARRIED_OFF * limit_m
+    if carried_off:
         longest_s = min(longest_s, _CARRIED_OFF_S)
     if seen.away_s <= longest_s:
         return None
-    return condition(_C.ORBIT_NOT_KEPT, away_m=seen.away_m, for_s=seen.away_s, limit_m=limit_m)
+    # A reversed orbit, a gust and a subject who turns leave a healthy vehicle behind for some seconds.
+    verdict = f"the orbit waits for it, and ends after {_LONGEST_AWAY_S:g} s"
+    if carried_off or seen.away_s > _LONGEST_AWAY_S:
+        verdict = "it cannot keep the orbit in this wind, or follow this subject; land, or take over by hand"
+    return condition(_C.ORBIT_NOT_KEPT, away_m=seen.away_m, for_s=seen.away_s, limit_m=limit_m, verdict=verdict)
 
 
 def away_limit_m(orbit: OrbitConfig) -> float:

@@ -145,6 +145,9 @@ def test_vehicle_that_does_not_reach_its_place_on_the_orbit_slows_down_and_then_
         blown = dataclasses.replace(GOOD, position=GOOD.position + np.array([0.0, blown_m, 0.0]))
         state, _ = reduce(state, keeping.watch(place, blown, t), t, None, LIMITS)
         codes.append((round(t, 2), state.condition.values.get("cause", state.condition).code, state.state))
+        # "take over by hand" is no word for a vehicle that is on its way back.
+        away = codes[-1][1] == ConditionCode.ORBIT_NOT_KEPT
+        assert ("take over by hand" in str(state.condition)) == (away and state.state == State.HOLDING)
     kept = [(t, now) for t, code, now in codes if code == ConditionCode.ORBIT_NOT_KEPT]
     assert 5.0 <= kept[0][0] <= 5.1
     assert kept[0][1] == State.ORBITING
