@@ -195,8 +195,8 @@ _SENTENCES = {
     "shows the cause",
     _C.SEVERAL_VEHICLES: "the link carries more than one vehicle, systems {systems}: set target_system_id to that of "
     "the one with this camera",
-    _C.CAMERA_CHANGED: "camera_info changed (focal length {before_px:.0f} px, now {now_px:.0f}), and every distance "
-    "with it; switch off what zooms or crops, then start again",
+    _C.CAMERA_CHANGED: "camera_info changed (focal length {before_px:.0f} px, now {now_px:.0f}): another zoom, crop or "
+    "image size; keep all three as they are in flight, then start again",
     _C.OTHER_POSE_PUBLISHER: "pose2d has more than one publisher ({names}): stop the others, or give them another "
     "namespace",
     _C.SECOND_BRIDGE: "another bridge, or a replay of one, publishes in {namespace}: stop it, or give it another "
