@@ -9,37 +9,28 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.joint_maps import joint_map
 from drocap_ros.observation import PoseObservation
-from drocap_ros.perception.body_pose import BodyPose
+from drocap_ros.perception.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
 from drocap_ros.perception.detection.detector import Detections
-from drocap_ros.perception.detection.nms import iou, suppress, without_parts
+from drocap_ros.perception.detection.nms import without_parts
 from drocap_ros.perception.flow import KeypointFlow
 from drocap_ros.perception.load_models import limited_use, load_detector, load_pose_model
+from drocap_ros.perception.other_poses import OtherPoses
 from drocap_ros.perception.pose import NetworkKeypoints
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking import Subject, SubjectTracker
-from drocap_ros.perception.tracking.camera_motion import CameraMotion, moved_box, sweeps
-from drocap_ros.perception.tracking.detection_windows import Window, uncut
+from drocap_ros.perception.tracking.camera_motion import CameraMotion, sweeps
 from drocap_ros.perception.tracking.pose_belief import CONFIRM_CONFIDENCE, EMPTY_CONFIDENCE
-from drocap_ros.perception.tracking.rivals import wins
-from drocap_ros.perception.tracking.shadow import without_shadow
-from drocap_ros.perception.uncertainty import calibrate
+from drocap_ros.perception.tracking.search import SubjectSearch
 
-#: Detection score and mean confidence from which the next images need no detection.
-_CLEAR_SCORE, _CLEAR_CONFIDENCE = 0.6, 0.8
+#: Detection score from which the next images need no detection, if the pose is clear.
+_CLEAR_SCORE = 0.6
 #: Tolerance of the detection interval against jitter of the stamps.
 _SLACK_S = 0.005
-#: Largest number of rivals of a doubtful subject whose poses one image looks at, and the same under load shedding.
-_RIVALS, _FEW_RIVALS = 2, 1
 #: Every so many rows tell whether an image is the last one again.
 _COMPARED_ROWS = 4
-#: Time for which a rival that lost is not looked at again, and the overlap from which a box is that rival's.
-_REJECTED_NS, _SAME_IOU = 300_000_000, 0.6
 #: Time without a detection and a believable pose after which there are no keypoints; a single blurred image is shorter.
 _UNSEEN_NS = 80_000_000
-#: Under load shedding, share of the detector's input for a window.
-_REDUCED_INPUT = 0.8
 #: Under load shedding, longest pause of the pose network, over the one after a first failure: 0.4 s at 30 Hz.
 _LONGEST_PAUSE = 4
 
@@ -69,7 +60,9 @@ class PoseEstimator:
         if self.limited_use:
             log.warning("networks in use: %s", self.limited_use)
         self.tracker = SubjectTracker(self.config)
-        self._joint_map = joint_map(self.pose_model.joints.name)
+        self._search = SubjectSearch(self.detector, self.tracker, self.config)
+        self._body = BodyPoseModel(self.pose_model)
+        self._others = OtherPoses(self.tracker, self._body)
         self._flow = KeypointFlow()
         self._camera = CameraMotion()
         self._motion: np.ndarray | None = None
@@ -86,8 +79,6 @@ class PoseEstimator:
         self._failures = self._paused = 0
         #: Keypoints of the pose network in the last image; None where it did not run.
         self.keypoints: NetworkKeypoints | None = None
-        #: Boxes (4,) px and stamps of the rivals that lost lately.
-        self._rejected: list[tuple[np.ndarray, int]] = []
 
     def process(
         self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None = None, load_level: int = 0
@@ -110,8 +101,9 @@ class PoseEstimator:
             log.warning("stamps went back by %.3f s: the tracker restarts", (self._last_ns - stamp_ns) * 1e-9)
             self.tracker.reset()
             self._flow.start(None, None)
-            self._margins, self._rejected, self._repeated, self._seen_ns = None, [], None, 0
+            self._others.reset()
             self._camera.reset()
+            self._margins, self._repeated, self._seen_ns = None, None, 0
         self._last_ns = stamp_ns
         roi = _validated_roi(roi)
         # A camera that repeats its picture shows nothing new: the bridge knows that by the same keypoints, bit for bit.
@@ -129,7 +121,7 @@ class PoseEstimator:
         self._motion = motion = self._camera.update(image, [person.box for person in self.tracker.persons])
         if motion is not None:
             self.tracker.move_camera(motion)
-            self._rejected = [(moved_box(motion, box), at_ns) for box, at_ns in self._rejected]
+            self._others.move_camera(motion)
         self.keypoints = None
         observation = self._flow.propagate(image, stamp_ns) if roi is None and self._flow.steps < load_level else None
         if observation is not None:
@@ -151,93 +143,45 @@ class PoseEstimator:
         self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None, load_level: int
     ) -> tuple[PoseObservation, bool]:
         """The subject by detection, and whether it is certainly a person."""
-        size = (image.shape[1], image.shape[0])
-        everything = self._detect(image, stamp_ns, load_level > 0)
+        shedding = load_level > 0
+        everything = self._search.detect(image, stamp_ns, shedding, close=shedding and self._score >= _CLEAR_SCORE)
         kept = without_parts(everything.boxes, everything.scores)
         found = Detections(everything.boxes[kept], everything.scores[kept])
         subject = self.tracker.update(image, stamp_ns, found.boxes, found.scores, roi)
         if subject is None:
             self._failures = 0
-            self._judge_bystander(image, stamp_ns)
+            self._others.judge_bystander(image, stamp_ns, None, self._motion, shedding=False)
             subject = self.tracker.current(stamp_ns)
         self._detected_ns, self._score, self._confidence = stamp_ns, 0.0 if subject is None else subject.score, 0.0
         if subject is None:
-            return PoseObservation(stamp_ns, 0, size), False
+            return PoseObservation(stamp_ns, 0, _size(image)), False
         if subject.hidden:
-            return self._without_keypoints(stamp_ns, size, subject), False
+            return self._observation(image, stamp_ns, subject), False
         pause = load_level * min(2 ** (self._failures - 1), _LONGEST_PAUSE) if self._failures else 0
         if subject.score < _CLEAR_SCORE and self._paused < pause:
             self._paused += 1
-            return self._without_keypoints(stamp_ns, size, subject), False
-        self.keypoints = self.pose_model.estimate(image, subject.box)
-        pose = self._calibrated(self.keypoints)
-        self._confidence = pose.mean_confidence
-        belief = _belief(pose, image, subject.box)
-        if belief < _CLEAR_CONFIDENCE:
-            subject, pose = self._compete(image, stamp_ns, subject, pose, belief, everything, load_level)
+            return self._observation(image, stamp_ns, subject), False
+        pose = self._body.estimate(image, subject.box)
+        subject, pose = self._others.compete(image, stamp_ns, subject, pose, everything, shedding)
+        self.keypoints, self._score, self._confidence = pose.network, subject.score, pose.mean_confidence
         self.tracker.judge(self._confidence, subject.box, stamp_ns)
-        self._judge_bystander(image, stamp_ns, pose, load_level > 0)
+        self._others.judge_bystander(image, stamp_ns, pose, self._motion, shedding)
         is_person = self._confidence >= CONFIRM_CONFIDENCE
         self._failures, self._paused = 0 if is_person else self._failures + 1, 0
         self._margins = None
         extent = pose.extent()
         if subject.score < self.config.detection_threshold:
-            if extent is not None and is_person:
-                margin = 0.06 * (extent[2:] - extent[:2]).max()
-                self.tracker.confirm(extent + margin * np.array([-1, -1, 1, 1]), stamp_ns)
-        elif extent is not None and subject.score >= _CLEAR_SCORE and self._confidence >= _CLEAR_CONFIDENCE:
+            if is_person and (box := pose.box()) is not None:
+                self.tracker.confirm(box, stamp_ns)
+        elif extent is not None and subject.score >= _CLEAR_SCORE and self._confidence >= CLEAR_CONFIDENCE:
             self._margins = (subject.box - extent) / (extent[2:] - extent[:2]).max()
         certain = is_person or subject.score >= self.config.detection_threshold
         blurred = sweeps(self._motion, subject.box)
         if is_person or (subject.score > 0 and (blurred or self._confidence >= EMPTY_CONFIDENCE)):
             self._seen_ns = stamp_ns
         elif stamp_ns - self._seen_ns > _UNSEEN_NS:
-            return self._without_keypoints(stamp_ns, size, subject), False
-        return self._observation(stamp_ns, size, subject, pose), certain
-
-    def _compete(
-        self,
-        image: np.ndarray,
-        stamp_ns: int,
-        subject: Subject,
-        pose: BodyPose,
-        belief: float,
-        found: Detections,
-        load_level: int,
-    ) -> tuple[Subject, BodyPose]:
-        """Subject and pose, or those of a detection in whose pose the belief is clearly greater: it was a shadow."""
-        boxes = found.boxes.astype(float)
-        joints = pose.extent(CONFIRM_CONFIDENCE, 0.4) if subject.score > 0 else None
-        if joints is not None:  # a box around person and shadow: its clear joints are the person's
-            margin = 0.06 * (joints[2:] - joints[:2]).max()
-            boxes = np.concatenate([boxes, [joints + margin * np.array([-1, -1, 1, 1])]])
-        scores = np.append(found.scores, subject.score)[: len(boxes)]
-        self._rejected = [(box, ns) for box, ns in self._rejected if stamp_ns - ns < _REJECTED_NS]
-        known = np.array([box for box, _ in self._rejected]).reshape(-1, 4)
-        rivals = self.tracker.rivals(image, stamp_ns, boxes, scores, belief)
-        rivals = [j for j in rivals if not (iou(boxes[j][None], known) > _SAME_IOU).any()]
-        for j in rivals[: _FEW_RIVALS if load_level else _RIVALS]:
-            keypoints = self.pose_model.estimate(image, boxes[j])
-            rival = self._calibrated(keypoints)
-            rivals_belief = _belief(rival, image, boxes[j])
-            if not wins(rivals_belief, belief):
-                self._rejected.append((boxes[j], stamp_ns))
-                continue
-            subject = self.tracker.exchange(image, stamp_ns, boxes[j], float(scores[j]))
-            self.keypoints, pose, belief = keypoints, rival, rivals_belief
-            self._score, self._confidence = subject.score, pose.mean_confidence
-        return subject, pose
-
-    def _judge_bystander(
-        self, image: np.ndarray, stamp_ns: int, subject: BodyPose | None = None, shedding: bool = False
-    ) -> None:
-        """Let the tracker know the pose of at most one other person: whether it is one, and not the subject again."""
-        person = self.tracker.bystander_to_judge(stamp_ns, shedding)
-        if person is not None:
-            pose = self._calibrated(self.pose_model.estimate(image, person.box))
-            same = subject is not None and pose.same_person(subject)
-            blurred = sweeps(self._motion, person.box)
-            self.tracker.judge_bystander(person, _belief(pose, image, person.box), stamp_ns, same, blurred)
+            return self._observation(image, stamp_ns, subject), False
+        return self._observation(image, stamp_ns, subject, pose), certain
 
     def _estimate_predicted(
         self, image: np.ndarray, stamp_ns: int, load_level: int
@@ -250,20 +194,18 @@ class PoseEstimator:
         predicted = self.tracker.predict(stamp_ns)
         if predicted is None:
             return None
-        size = (image.shape[1], image.shape[0])
+        size = _size(image)
         age_s, every_s = (stamp_ns - self._detected_ns) * 1e-9, self.config.detect_every_s
-        shedding = load_level > 0 and self._confidence >= _CLEAR_CONFIDENCE
+        shedding = load_level > 0 and self._confidence >= CLEAR_CONFIDENCE
         shedding = shedding and not age_s > load_level * every_s - _SLACK_S
         margins = self._margins if shedding or not age_s > every_s - _SLACK_S else None
-        if margins is not None and not self.tracker.isolated(predicted, size, stamp_ns):
+        if margins is not None and not self._search.isolated(predicted.box, size, stamp_ns):
             margins = None
         if margins is None and not shedding:
             return None
-        keypoints = self.pose_model.estimate(image, predicted.box)
-        pose = self._calibrated(keypoints)
-        confidence = pose.mean_confidence
-        extent = pose.extent()
-        if margins is not None and extent is not None and confidence >= _CLEAR_CONFIDENCE:
+        pose = self._body.estimate(image, predicted.box)
+        confidence, extent = pose.mean_confidence, pose.extent()
+        if margins is not None and extent is not None and confidence >= CLEAR_CONFIDENCE:
             box = extent + margins * (extent[2:] - extent[:2]).max()
             box = np.clip(box, 0, np.array([*size, *size], float))
             self.tracker.propagate(box, stamp_ns)
@@ -271,68 +213,33 @@ class PoseEstimator:
             predicted = Subject(predicted.track_id, box, predicted.score, False)
         elif not shedding:
             return None
-        self.keypoints, self._confidence = keypoints, confidence
-        return self._observation(stamp_ns, size, predicted, pose), confidence >= CONFIRM_CONFIDENCE
+        self.keypoints, self._confidence = pose.network, confidence
+        return self._observation(image, stamp_ns, predicted, pose), confidence >= CONFIRM_CONFIDENCE
 
-    def _observation(self, stamp_ns: int, size: tuple[int, int], subject: Subject, pose: BodyPose) -> PoseObservation:
-        xy, covariance, confidence = pose
-        # Networks extrapolate beyond the image; nothing there was seen.
-        outside = ~((xy >= 0) & (xy < np.array(size))).all(axis=1)
-        confidence = np.where(outside, 0.0, confidence)
-        unseen = outside | (confidence < self.config.keypoint_threshold)
-        xy[unseen], covariance[unseen] = np.nan, np.nan
+    def _observation(
+        self, image: np.ndarray, stamp_ns: int, subject: Subject, pose: BodyPose | None = None
+    ) -> PoseObservation:
+        """The subject in the image; without a pose, its predicted box without keypoints."""
+        joints, size = self._body.joint_map.joints, _size(image)
+        if pose is None:
+            confidence: np.ndarray = np.zeros(len(joints))
+            xy, covariance = (np.full((len(joints), n), np.nan) for n in (2, 3))
+        else:
+            xy, covariance = pose.xy, pose.covariance
+            # Networks extrapolate beyond the image; nothing there was seen.
+            outside = ~((xy >= 0) & (xy < np.array(size))).all(axis=1)
+            confidence = np.where(outside, 0.0, pose.confidence)
+            unseen = outside | (confidence < self.config.keypoint_threshold)
+            xy[unseen], covariance[unseen] = np.nan, np.nan
         return PoseObservation(
-            stamp_ns, subject.track_id, size, self._joint_map.joints, subject.box.astype(np.float32), subject.score,
+            stamp_ns, subject.track_id, size, joints, subject.box.astype(np.float32),
+            0.0 if pose is None else subject.score,
             xy.astype(np.float32), covariance.astype(np.float32), confidence.astype(np.float32),
         )  # fmt: skip
 
-    def _detect(self, image: np.ndarray, stamp_ns: int, shedding: bool) -> Detections:
-        """Detections of all windows together, parts of persons among them."""
-        size = (image.shape[1], image.shape[0])
-        found = Detections(np.empty((0, 4), np.float32), np.empty(0, np.float32))
-        close = shedding and self._score >= _CLEAR_SCORE
-        for window in self.tracker.windows(size, stamp_ns, single=shedding, close=close):
-            found = _merged(found, self._detect_in(image, window, shedding))
-        for further in () if shedding else (self.tracker.second_pass_window, self.tracker.sought_window):
-            if (window := further(size, stamp_ns, found.boxes, found.scores)) is not None:
-                found = _merged(found, self._detect_in(image, window))
-        return found
 
-    def _detect_in(self, image: np.ndarray, window: Window | None, shedding: bool = False) -> Detections:
-        """Detections in a window, without those that its edge cuts."""
-        reduced = None if not shedding else 1.0 if window is None else _REDUCED_INPUT
-        found = self.detector.detect(image, window, self.config.low_threshold, reduced)
-        kept = uncut(found.boxes, window, (image.shape[1], image.shape[0]))
-        return Detections(found.boxes[kept], found.scores[kept])
-
-    def _calibrated(self, keypoints: NetworkKeypoints) -> BodyPose:
-        """The network's keypoints as joints of the body, with covariance and confidence."""
-        spec = self.pose_model.spec
-        covariance, confidence = calibrate(keypoints, spec.layout, spec.sigma_scale)
-        return BodyPose(*self._joint_map.apply(keypoints.xy.astype(float), covariance, confidence, keypoints.box_size))
-
-    def _without_keypoints(self, stamp_ns: int, size: tuple[int, int], subject: Subject) -> PoseObservation:
-        """The subject at its predicted box, without keypoints."""
-        joints = self._joint_map.joints
-        points, spread = (np.full((len(joints), n), np.nan, np.float32) for n in (2, 3))
-        return PoseObservation(
-            stamp_ns, subject.track_id, size, joints, subject.box.astype(np.float32), 0.0,
-            points, spread, np.zeros(len(joints), np.float32),
-        )  # fmt: skip
-
-
-def _merged(a: Detections, b: Detections) -> Detections:
-    if not len(a) or not len(b):
-        return b if len(b) else a
-    boxes, scores = np.concatenate([a.boxes, b.boxes]), np.concatenate([a.scores, b.scores])
-    kept = suppress(boxes, scores)
-    return Detections(boxes[kept], scores[kept])
-
-
-def _belief(pose: BodyPose, image: np.ndarray, box: np.ndarray) -> float:
-    """Confidence in a person of a pose found in a box (4,) px."""
-    confidence = pose.mean_confidence
-    return confidence if confidence >= _CLEAR_CONFIDENCE else without_shadow(confidence, image, box)
+def _size(image: np.ndarray) -> tuple[int, int]:
+    return image.shape[1], image.shape[0]
 
 
 def _check_image(image: np.ndarray) -> None:

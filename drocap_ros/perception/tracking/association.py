@@ -6,7 +6,7 @@ import numpy as np
 
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient
 from drocap_ros.perception.tracking.person import Person
-from drocap_ros.perception.tracking.reidentification import MIXED_IOU, RELIABLE_SCORE, known_other, replaced
+from drocap_ros.perception.tracking.reidentification import MIXED_IOU, known_other, replaced
 
 _IMPOSSIBLE = 1e6
 #: Weights of size, appearance and score against the distance: another person's appearance differs by 0.05 to 0.2, the
@@ -46,7 +46,7 @@ def assign_all(
     Indices of the assigned detections, and new persons who stand at once in the subject's place.
     """
     persons = others if subject is None else [subject, *others]
-    reliable = [p for p in persons if p is subject or (p.mean_score >= RELIABLE_SCORE and p.plausible and not p.double)]
+    reliable = [p for p in persons if p is subject or (p.reliable and not p.double)]
     unreliable = [p for p in persons if not any(p is q for q in reliable)]
     high = scores >= threshold
     assigned: set[int] = set()

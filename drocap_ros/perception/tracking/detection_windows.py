@@ -25,10 +25,6 @@ class WindowSchedule:
         self._alternate = False
         self._turn = 0
 
-    def reset(self) -> None:
-        """Forget the time of the last detection over the whole image."""
-        self._full_ns = None
-
     def full_image_due(self, stamp_ns: int) -> bool:
         """Whether the interval since the last detection over the whole image has passed."""
         return self._full_ns is None or stamp_ns - self._full_ns >= _FULL_EVERY_NS
@@ -41,7 +37,7 @@ class WindowSchedule:
         ``single`` allows one window; ``close`` takes a smaller one around the subject.
         """
         near = close_window(box, image_size) if close else wide_window(box, image_size)
-        if near is None or self.full_image_due(stamp_ns) or stamp_ns < (self._full_ns or 0):
+        if near is None or self.full_image_due(stamp_ns):
             self._full_ns = stamp_ns
             return [None] if single else list({near: None, None: None})
         return [near]

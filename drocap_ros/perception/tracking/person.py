@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,8 @@ _SETTLED = 10
 _SPEED = 1.5
 #: Weight of a new detection score in the mean score.
 _SCORE_RATE = 0.3
+#: Least mean score of a reliable track; body parts and clutter score below.
+_RELIABLE_SCORE = 0.4
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,7 @@ class Person:
     hits : number of detections
     began_at_subject, double : whether its first box lay on the subject's, and whether it is a second box around the
         subject; see ``doubles.py``
+    left_image : whether it was out of view last, at an edge of the image; of the subject alone
     pose : what its poses say about it
     """
 
@@ -57,7 +61,7 @@ class Person:
         self.score = score
         self.mean_score = score
         self.hits = 1
-        self.began_at_subject = self.double = False
+        self.began_at_subject = self.double = self.left_image = False
         self.pose = PoseBelief(stamp_ns)
         self.appearance = appearance
         self._descriptors = 1 if appearance is not None else 0
@@ -79,6 +83,11 @@ class Person:
     def plausible(self) -> bool:
         """Whether its poses leave it to be a person."""
         return self.pose.plausible_ns is not None
+
+    @property
+    def reliable(self) -> bool:
+        """Whether the scores and the poses of a bystander let it be compared with the subject."""
+        return self.plausible and self.mean_score >= _RELIABLE_SCORE
 
     def sought_box(self, stamp_ns: int) -> np.ndarray:
         """(4,) px around the place where the whole person may be after a gap: the last box showed a part, curled up."""
@@ -134,3 +143,8 @@ class Person:
     def similarity(self, appearance: np.ndarray | None) -> float:
         """Similarity to a descriptor in [0, 1]."""
         return similarity(self.appearance, appearance)
+
+
+def boxes_of(persons: Iterable[Person]) -> np.ndarray:
+    """(N, 4) px, last boxes."""
+    return np.array([p.box for p in persons]).reshape(-1, 4)

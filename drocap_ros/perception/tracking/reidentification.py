@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient
-from drocap_ros.perception.tracking.person import Person
+from drocap_ros.perception.tracking.person import Person, boxes_of
 from drocap_ros.perception.tracking.pose_belief import SURE_CONFIDENCE
 
-#: Least mean score of a bystander in comparisons with the subject; body parts and clutter score below.
-RELIABLE_SCORE = 0.4
 #: Overlap above which two persons' appearances mix.
 MIXED_IOU = 0.1
 #: Time after which a lost subject is not re-identified.
@@ -58,7 +56,7 @@ def known_other(subject: Person, persons: list[Person], box: np.ndarray, appeara
     own = subject.similarity(appearance)
     if own >= _OWN_SIMILARITY:
         return False
-    others = [p for p in persons if p is not subject and p.plausible and p.mean_score >= RELIABLE_SCORE]
+    others = [p for p in persons if p is not subject and p.reliable]
     predicted = np.array([p.filter.box() for p in others]).reshape(-1, 4)
     near = iou(box[None].astype(float), predicted)[0] > MIXED_IOU
     return any(p.similarity(appearance) > own + _SIMILARITY_MARGIN for p, at in zip(others, near, strict=True) if at)
@@ -73,7 +71,7 @@ def could_be(lost: Person, person: Person) -> bool:
     return since_ns is not None and max(since_ns, person.first_ns) > lost.certain_ns and not person.pose.other
 
 
-def same_person(lost: Person, person: Person, left_image: bool, alone: bool = False) -> bool:
+def same_person(lost: Person, person: Person, alone: bool) -> bool:
     """Whether a track fits the lost subject's appearance, and its distance and size the elapsed time.
 
     alone : no one else in view may be the subject; then a certain pose makes up for some change of the light
@@ -89,7 +87,7 @@ def same_person(lost: Person, person: Person, left_image: bool, alone: bool = Fa
     if lost.pose.box is not None:
         growth = lost.pose.growth(end)
     similarity = person.similarity(lost.appearance)
-    if left_image:  # re-entry at the place of leaving, at half the usual difference of appearance
+    if lost.left_image:  # re-entry at the place of leaving, at half the usual difference of appearance
         return distance < 1.5 and similarity >= 0.5 * (1 + _REIDENTIFY_SIMILARITY)
     least = _REIDENTIFY_SIMILARITY
     if alone and gap < _ALONE_S and person.pose.last >= SURE_CONFIDENCE:
@@ -97,19 +95,17 @@ def same_person(lost: Person, person: Person, left_image: bool, alone: bool = Fa
     return distance < 1.0 + 1.5 * gap and growth < 0.5 + 0.3 * gap and similarity >= least
 
 
-def found_again(
-    lost: Person, persons: list[Person], left_image: bool, confirm_frames: int, stamp_ns: int
-) -> Person | None:
+def found_again(lost: Person, persons: list[Person], confirm_frames: int, stamp_ns: int) -> Person | None:
     """Whom of the persons detected in this image is the lost subject."""
     seen = [p for p in persons if p is not lost and p.detected_ns == stamp_ns and could_be(lost, p)]
-    boxes = np.array([p.box for p in seen], float).reshape(-1, 4)
+    boxes = boxes_of(seen)
     for person in seen:
         early = person.hits < confirming_hits(person, confirm_frames)
         # A second box around the same person is no other one.
         alone = bool((overlap_coefficient(person.box[None], boxes) > _DOUBLE).all())
         if early or fits_other(lost, person, persons, stamp_ns):
             continue
-        if same_person(lost, person, left_image, alone):
+        if same_person(lost, person, alone):
             return person
     return None
 
@@ -143,14 +139,10 @@ def confirming_hits(person: Person, confirm_frames: int) -> int:
     return min(2, confirm_frames) if person.pose.last >= SURE_CONFIDENCE else confirm_frames
 
 
-def search_boxes(
-    lost: Person | None, persons: list[Person], left_image: bool, confirm_frames: int, stamp_ns: int
-) -> list[np.ndarray]:
+def search_boxes(lost: Person | None, persons: list[Person], confirm_frames: int, stamp_ns: int) -> list[np.ndarray]:
     """(4,) px each, where to look closely without a subject: a possible new one, and around the last place.
 
     A small person needs a window around it to be confirmed.
-
-    lost : the last subject; left_image : whether it left the image
     """
     recent = [p for p in persons if p is not lost and p.plausible and p.undetected_s(stamp_ns) <= _CANDIDATE_S]
     if lost is not None:  # persons in view together with the subject cannot be the subject
@@ -159,7 +151,7 @@ def search_boxes(
     if recent:
         best = max(recent, key=lambda p: (p.hits < confirm_frames, p.mean_score))
         boxes.append(best.filter.box_at(stamp_ns))
-    if lost is not None and not left_image and lost.unconfirmed_s(stamp_ns) <= FORGET_S:
+    if lost is not None and not lost.left_image and lost.unconfirmed_s(stamp_ns) <= FORGET_S:
         reach = min(_WIDER_PER_S * lost.unconfirmed_s(stamp_ns), _WIDEST) * lost.filter.length
         boxes.append(lost.box + reach * np.array([-1, -1, 1, 1]))
     return boxes

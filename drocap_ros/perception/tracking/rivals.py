@@ -6,7 +6,7 @@ import numpy as np
 
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient
 from drocap_ros.perception.tracking.appearance import describe
-from drocap_ros.perception.tracking.person import Person
+from drocap_ros.perception.tracking.person import Person, boxes_of
 from drocap_ros.perception.tracking.pose_belief import CONFIRM_CONFIDENCE, SURE_CONFIDENCE
 from drocap_ros.perception.tracking.reidentification import MIXED_IOU
 
@@ -67,8 +67,7 @@ def rivals(
 def _on_other(subject: Person, persons: list[Person], box: np.ndarray, stamp_ns: int) -> bool:
     """Whether a box (4,) px lies on someone else who was detected in this image: it may be a second box around them."""
     others = [p for p in persons if p is not subject and p.pose.other and p.plausible and p.detected_ns == stamp_ns]
-    boxes = np.array([p.box for p in others]).reshape(-1, 4)
-    return bool((overlap_coefficient(box[None], boxes) > _INSIDE).any())
+    return bool((overlap_coefficient(box[None], boxes_of(others)) > _INSIDE).any())
 
 
 def _covered(subject: Person, persons: list[Person], stamp_ns: int) -> bool:
@@ -76,8 +75,7 @@ def _covered(subject: Person, persons: list[Person], stamp_ns: int) -> bool:
     if subject.detected_ns == stamp_ns:
         return False
     others = [p for p in persons if p is not subject and p.plausible and not p.double and p.detected_ns == stamp_ns]
-    boxes = np.array([p.box for p in others]).reshape(-1, 4)
-    return bool((overlap_coefficient(subject.filter.box()[None], boxes) > MIXED_IOU).any())
+    return bool((overlap_coefficient(subject.filter.box()[None], boxes_of(others)) > MIXED_IOU).any())
 
 
 def _in_reach(subject: Person, box: np.ndarray, confidence: float, stamp_ns: int) -> bool:

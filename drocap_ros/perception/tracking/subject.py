@@ -5,38 +5,27 @@ from __future__ import annotations
 import numpy as np
 
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig, parse_box
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking import doubles
 from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.association import assign_all
 from drocap_ros.perception.tracking.box_filter import BoxFilter
-from drocap_ros.perception.tracking.detection_windows import Window, WindowSchedule, tight_window, wide_window
-from drocap_ros.perception.tracking.person import Person, Subject
+from drocap_ros.perception.tracking.person import Person, Subject, boxes_of
 from drocap_ros.perception.tracking.pose_belief import SURE_CONFIDENCE
 from drocap_ros.perception.tracking.reidentification import (
     FORGET_S,
-    RELIABLE_SCORE,
-    certainly_others,
     followed_on,
     found_again,
     leaving,
     search_boxes,
 )
 from drocap_ros.perception.tracking.rivals import clutter_of, due_bystander, owner_of, rivals
-from drocap_ros.perception.tracking.selection import select
+from drocap_ros.perception.tracking.selection import SubjectChoice
 
 #: Overlap with another person from which a predicted box counts as hidden.
 _HIDDEN_IOU = 0.25
-#: Least overlap of a detection with the predicted box that needs no second pass.
-_CLEAR_IOU = 0.5
-#: Overlap with the predicted box from which a detection may be the subject.
-_AT_PLACE = 0.3
 #: Overlap coefficient above which an unassigned detection is a part of a tracked person, or that person and more.
 _PART = 0.75
-#: Free margin around an isolated subject, lengths.
-_ISOLATED = 0.4
-#: For ``on_loss = next``: time beyond coasting after which a subject lost inside the image is given up.
-_GIVE_UP_S = 3.0
 #: Longest gap of a bystander, and the largest number of persons.
 _BYSTANDER_S, _MAX_PERSONS = 2.0, 30
 
@@ -53,95 +42,46 @@ class SubjectTracker:
         self._config = config
         #: All persons in view or lately in view, the subject among them.
         self.persons: list[Person] = []
-        self._subject: Person | None = None
+        #: The last subject, lost or not.
+        self.subject: Person | None = None
         self._track_id = 0
-        self._left_image = False
-        self._chosen_box: np.ndarray | None = parse_box(config.subject_box) if config.subject == "box" else None
-        self._schedule = WindowSchedule()
-        self._any_detected = False
+        self.choice = SubjectChoice(config)
         self._coast_s = config.coast_s
         self._last_ns: int | None = None
 
     def reset(self) -> None:
         """Delete all tracks, for stamps that restarted; track ids continue."""
-        self.persons, self._subject, self._any_detected, self._last_ns = [], None, False, None
-        self._schedule.reset()
+        self.persons, self.subject, self.choice.nothing_yet, self._last_ns = [], None, True, None
 
     def move_camera(self, matrix: np.ndarray) -> None:
         """Let all persons follow the image's motion (2, 3) by the camera's, those out of view as well."""
         for person in self.persons:
             person.move_camera(matrix)
 
-    def windows(
-        self, image_size: tuple[int, int], stamp_ns: int, single: bool = False, close: bool = False
-    ) -> list[Window | None]:
-        """Windows of the next image for the detector; None = the whole image.
+    def followed(self, stamp_ns: int) -> Person | None:
+        """The subject while it is in view or predicted; None while it is lost."""
+        subject = self.subject
+        return None if subject is None or subject.unconfirmed_s(stamp_ns) > self._coast_s else subject
 
-        ``single`` allows one window, a larger one where the last image did not show the subject; ``close`` takes a
-        smaller one around the subject.
-        """
-        if self._chosen_box is not None:
-            near = wide_window(self._chosen_box, image_size)
-            return [near] if single else list({near: None, None: None})
-        subject = self._subject
-        if subject is not None and subject.unconfirmed_s(stamp_ns) <= self._coast_s:
-            box = subject.filter.box_at(stamp_ns)
-            if single and subject.detected_ns < (self._last_ns or 0):
-                box, close = subject.sought_box(stamp_ns), False
-            windows = self._schedule.near_subject(box, image_size, stamp_ns, single, close)
-            if subject.pose.questioned and windows != [None]:  # whoever it is: the search goes on beside it
-                windows += [w for w in self._schedule.search([], image_size, stamp_ns, True) if w not in windows]
-            return windows[-1:] if single else windows
-        boxes = search_boxes(subject, self.persons, self._left_image, self._config.confirm_frames, stamp_ns)
-        return self._schedule.search(boxes, image_size, stamp_ns, single)
+    @property
+    def missed(self) -> bool:
+        """Whether the last image did not show the subject."""
+        return self.subject is not None and self.subject.detected_ns < (self._last_ns or 0)
 
-    def second_pass_window(
-        self, image_size: tuple[int, int], stamp_ns: int, boxes: np.ndarray, scores: np.ndarray
-    ) -> Window | None:
-        """Tight window around a subject that the detections (N, 4), (N,) do not show clearly, or None."""
-        subject = self._subject
-        if subject is None or self._chosen_box is not None or subject.unconfirmed_s(stamp_ns) > self._coast_s:
-            return None
-        box = subject.filter.box_at(stamp_ns)
-        clear = scores >= self._config.detection_threshold
-        if clear.any() and iou(box[None], boxes[clear].astype(float)).max() > _CLEAR_IOU:
-            return None
-        return tight_window(box, image_size)
-
-    def sought_window(
-        self, image_size: tuple[int, int], stamp_ns: int, boxes: np.ndarray, _scores: np.ndarray
-    ) -> Window | None:
-        """Window in which a subject without detection may be, if it is in none of the boxes (N, 4) px; or None."""
-        subject = self._subject
-        if subject is None or subject.unconfirmed_s(stamp_ns) > self._coast_s:
-            return None
-        near = iou(subject.filter.box_at(stamp_ns)[None], boxes.astype(float)) > _AT_PLACE
-        if near.any() or subject.detected_ns >= (self._last_ns or 0):
-            return None
-        return wide_window(subject.sought_box(stamp_ns), image_size)
+    def search_boxes(self, stamp_ns: int) -> list[np.ndarray]:
+        """(4,) px each, where to look closely while there is no subject; see :func:`.reidentification.search_boxes`."""
+        return search_boxes(self.subject, self.persons, self._config.confirm_frames, stamp_ns)
 
     def predict(self, stamp_ns: int) -> Subject | None:
         """The predicted subject; None unless the last update confirmed it."""
-        subject = self._subject
-        if subject is None or self._chosen_box is not None or subject.confirmed_ns != self._last_ns:
+        subject = self.subject
+        if subject is None or subject.confirmed_ns != self._last_ns:
             return None
         return Subject(self._track_id, subject.filter.box_at(stamp_ns), subject.score, False)
 
-    def isolated(self, predicted: Subject, image_size: tuple[int, int], stamp_ns: int) -> bool:
-        """Whether the predicted subject is away from others and from the image's edges, and no full image is due."""
-        subject, box = self._subject, predicted.box
-        if subject is None or self._schedule.full_image_due(stamp_ns):
-            return False
-        around = box + _ISOLATED * subject.filter.length * np.array([-1, -1, 1, 1])
-        others = [p for p in self.persons if p is not subject and p.plausible and p.mean_score >= RELIABLE_SCORE]
-        boxes = np.array([p.filter.box_at(stamp_ns) for p in others]).reshape(-1, 4)
-        edge = 0.01 * max(image_size)
-        at_edge = (box[:2] < edge).any() or (box[2:] > np.array(image_size) - edge).any()
-        return not ((overlap_coefficient(around[None], boxes) > 0).any() or at_edge)
-
     def propagate(self, box: np.ndarray, stamp_ns: int) -> None:
         """Update the subject with the pose network's box (4,) px, in an image without detection."""
-        subject = self._subject
+        subject = self.subject
         if subject is None:
             return
         for person in self.persons:
@@ -153,16 +93,16 @@ class SubjectTracker:
 
     def confirm(self, box: np.ndarray, stamp_ns: int) -> None:
         """Confirm a predicted or low-score subject by the pose network's box (4,) px."""
-        if self._subject is not None:
-            self._subject.filter.update(box, noise=2.0)
-            self._subject.confirm(stamp_ns)
+        if self.subject is not None:
+            self.subject.filter.update(box, noise=2.0)
+            self.subject.confirm(stamp_ns)
 
     def judge(self, confidence: float, box: np.ndarray, stamp_ns: int) -> None:
         """Add the mean confidence of the subject's pose, found in a box (4,) px.
 
         A subject that has shown no person for seconds is lost from its last certain time on.
         """
-        subject = self._subject
+        subject = self.subject
         if subject is None:
             return
         subject.pose.judge(confidence, box, stamp_ns)
@@ -173,13 +113,13 @@ class SubjectTracker:
 
     def bystander_to_judge(self, stamp_ns: int, shedding: bool = False) -> Person | None:
         """The person detected in this image whose pose should be looked at; see :func:`.rivals.due_bystander`."""
-        return due_bystander(self._subject, self.persons, stamp_ns, shedding)
+        return due_bystander(self.subject, self.persons, stamp_ns, shedding)
 
     def judge_bystander(
         self, person: Person, confidence: float, stamp_ns: int, same: bool = False, blurred: bool = False
     ) -> None:
         """Add a bystander's pose: mean confidence, and whether its joints are the subject's; it may be a lost one."""
-        subject = self._subject
+        subject = self.subject
         person.pose.judge(confidence, person.box, stamp_ns, blurred)
         if subject is not None and subject.pose.believed_ns == stamp_ns and confidence >= SURE_CONFIDENCE:
             doubles.on_joints(person, subject, same)
@@ -193,12 +133,12 @@ class SubjectTracker:
 
         confidence : mean of the subject's pose in this image
         """
-        subject = self._subject
+        subject = self.subject
         return [] if subject is None else rivals(subject, self.persons, image, boxes, scores, confidence, stamp_ns)
 
     def exchange(self, image: np.ndarray, stamp_ns: int, box: np.ndarray, score: float) -> Subject:
         """Continue the subject at a rival's box (4,) px; a track of what it was before remains."""
-        subject = self._subject
+        subject = self.subject
         assert subject is not None
         owner = owner_of(box, self.persons, stamp_ns)
         clutter = clutter_of(subject, stamp_ns)
@@ -229,10 +169,8 @@ class SubjectTracker:
         for person in self.persons:
             person.filter.predict(stamp_ns)
         appearances = [describe(image, box) for box in boxes]
-        subject = self._subject
-        if subject is not None and subject.unconfirmed_s(stamp_ns) > self._coast_s:
-            subject = None
-        others = followed_on(self._subject, self.persons, self._coast_s, stamp_ns)
+        subject = self.followed(stamp_ns)
+        others = followed_on(self.subject, self.persons, self._coast_s, stamp_ns)
         assigned, replacements = assign_all(
             subject, others, boxes, scores, appearances, stamp_ns, self._config.detection_threshold
         )
@@ -240,10 +178,9 @@ class SubjectTracker:
         doubles.on_detections(self.persons, subject, stamp_ns)
         self._spawn(boxes, scores, appearances, assigned, stamp_ns)
         self._reidentify(stamp_ns)
-        self._apply_choice(stamp_ns)
-        self._select(image.shape, stamp_ns)
+        self._choose(image.shape, stamp_ns)
         self._prune(image.shape, stamp_ns)
-        self._any_detected |= bool(len(boxes))
+        self.choice.nothing_yet &= not len(boxes)
         return self.current(stamp_ns)
 
     def _spawn(
@@ -255,10 +192,10 @@ class SubjectTracker:
         stamp_ns: int,
     ) -> None:
         """Start tracks from unassigned detections, except parts of tracked persons."""
-        subject = self._subject
+        subject = self.subject
         # Leaves and signs that were found to be no person may cover one.
-        known = np.array([p.box for p in self.persons if p.detected_ns == stamp_ns and p.plausible]).reshape(-1, 4)
-        if subject is not None and not self._left_image and 0.0 < subject.unconfirmed_s(stamp_ns) <= self._coast_s:
+        known = boxes_of(p for p in self.persons if p.detected_ns == stamp_ns and p.plausible)
+        if subject is not None and not subject.left_image and 0.0 < subject.unconfirmed_s(stamp_ns) <= self._coast_s:
             known = np.concatenate([known, subject.filter.box()[None]])
         for j in range(len(boxes)):
             if j in assigned or scores[j] < self._config.detection_threshold:
@@ -271,66 +208,47 @@ class SubjectTracker:
 
     def _reidentify(self, stamp_ns: int) -> None:
         """Re-identify a lost subject in a new track."""
-        lost = self._subject
+        lost = self.subject
         if lost is None or lost.unconfirmed_s(stamp_ns) <= 0:
             return
-        if person := found_again(lost, self.persons, self._left_image, self._config.confirm_frames, stamp_ns):
+        if person := found_again(lost, self.persons, self._config.confirm_frames, stamp_ns):
             self.persons.remove(lost)
             person.appearance = lost.appearance if lost.appearance is not None else person.appearance
-            self._subject, self._left_image = person, False
+            self.subject, person.left_image = person, False
 
     def _apply_roi(self, roi: np.ndarray, stamp_ns: int) -> None:
         """A roi away from the subject is a choice; one on the subject replaces missing detections."""
-        subject = self._subject
+        subject = self.subject
         if subject is None or iou(roi[None], subject.filter.box()[None])[0, 0] < 0.1:
-            self._chosen_box = roi
+            self.choice.box = roi
         elif self._config.subject == "roi" and subject.unconfirmed_s(stamp_ns) > 0.5 * self._coast_s:
             subject.update(roi, 0.0, stamp_ns)
             subject.confirm(stamp_ns)
 
-    def _apply_choice(self, stamp_ns: int) -> None:
-        """Make the person in the chosen box the subject."""
-        if self._chosen_box is None:
-            return
-        chosen_box, self._chosen_box = self._chosen_box, None
-        detected = [p for p in self.persons if p.detected_ns == stamp_ns]
-        overlap = iou(chosen_box[None], np.array([p.box for p in detected]).reshape(-1, 4))[0]
-        if len(overlap) and overlap.max() >= 0.2:
-            chosen = detected[int(overlap.argmax())]
-        else:
-            chosen = Person(chosen_box, 0.0, stamp_ns, None)
-            self.persons.append(chosen)
-        if chosen is not self._subject:
-            chosen.pose.choose(chosen.box, stamp_ns)
-            self._follow(chosen)
-
-    def _select(self, shape: tuple[int, ...], stamp_ns: int) -> None:
-        """Choose a subject by the configured rule when there is none to wait for."""
-        config = self._config
-        if config.subject in ("box", "roi") and (not self._track_id or config.on_loss == "wait"):
-            return
-        if self._subject is not None:
-            patience_s = 0.0 if self._left_image else self._coast_s + _GIVE_UP_S
-            if config.on_loss == "wait" or self._subject.unconfirmed_s(stamp_ns) <= patience_s:
-                return
-        persons, lost = self.persons, self._subject
-        if lost is not None and not self._left_image:
-            persons = certainly_others(lost, persons, stamp_ns)
-        best = select(persons, lost, config, shape, stamp_ns, not self._track_id, not self._any_detected)
+    def _choose(self, shape: tuple[int, ...], stamp_ns: int) -> None:
+        """Make a person the subject: the one in a given box, then one by the rule."""
+        given = self.choice.given(self.persons, stamp_ns)
+        if given is not None and given not in self.persons:
+            self.persons.append(given)
+        if given is not None and given is not self.subject:
+            given.pose.choose(given.box, stamp_ns)
+            self._follow(given)
+        first = not self._track_id
+        best = self.choice.by_rule(self.persons, self.subject, shape, stamp_ns, self._coast_s, first)
         if best is not None:
             self._follow(best)
 
     def _follow(self, person: Person) -> None:
-        self._subject = person
-        self._track_id, self._left_image = self._track_id + 1, False
+        self.subject = person
+        self._track_id, person.left_image = self._track_id + 1, False
         for bystander in self.persons:  # others than the last subject may be this one
             bystander.pose.other = False
 
     def _prune(self, shape: tuple[int, ...], stamp_ns: int) -> None:
         """Delete the tracks of bystanders out of view."""
-        subject = self._subject
+        subject = self.subject
         if subject is not None:
-            self._left_image = subject.undetected_s(stamp_ns) > 0 and (self._left_image or leaving(subject, shape))
+            subject.left_image = subject.undetected_s(stamp_ns) > 0 and (subject.left_image or leaving(subject, shape))
         kept = [p for p in self.persons if p is subject or p.undetected_s(stamp_ns) <= _BYSTANDER_S]
         if len(kept) > _MAX_PERSONS:
             kept.sort(key=lambda p: (p is not subject, -p.detected_ns))
@@ -338,13 +256,13 @@ class SubjectTracker:
 
     def current(self, stamp_ns: int) -> Subject | None:
         """The subject in the image of the last update."""
-        subject = self._subject
-        if subject is None or subject.unconfirmed_s(stamp_ns) > (0.0 if self._left_image else self._coast_s):
+        subject = self.subject
+        if subject is None or subject.unconfirmed_s(stamp_ns) > (0.0 if subject.left_image else self._coast_s):
             return None
         if subject.detected_ns == stamp_ns:
             return Subject(self._track_id, subject.box, subject.score, False)
         box = subject.filter.box()
         persons = [p for p in self.persons if p is not subject and p.plausible and not p.double]
-        others = np.array([p.box for p in persons if p.confirmed_ns == stamp_ns]).reshape(-1, 4)
+        others = boxes_of(p for p in persons if p.confirmed_ns == stamp_ns)
         hidden = bool((iou(box[None], others) > _HIDDEN_IOU).any())
         return Subject(self._track_id, box, 0.0, hidden)

@@ -115,7 +115,6 @@ def test_a_shaken_camera_keeps_its_subject_by_the_known_motion_alone(known):
         x = 320 + shake
         image = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
         image[100:240, int(x - 25) : int(x + 25)] = (40, 40, 200)
-        tracker.windows(SIZE, i * STEP_NS)
         if known:
             tracker.move_camera(camera(shake - last, 0.0))
         last = shake

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from test_subject_tracking import BLUE, GREEN, RED, SIZE, STEP, Scene, offset
 
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking.person import Person
 from drocap_ros.perception.tracking.pose_belief import PoseBelief
 from drocap_ros.perception.tracking.reidentification import fits_other
+from drocap_ros.perception.tracking.search import SubjectSearch
 from drocap_ros.perception.tracking.shadow import shadow_share, without_shadow
 
 SECOND = 1_000_000_000
@@ -124,13 +126,11 @@ def test_rival_of_another_appearance_is_refused():
 
 def test_doubted_subject_is_searched_over_the_whole_picture_after_a_second():
     scene = Scene()
-    windows_of, seen = scene.tracker.windows, []
-    scene.tracker.windows = lambda _, stamp: seen.append(windows_of((1920, 1080), stamp))
-    for _ in range(20):
-        judged(scene, 0.9, scene.show([(300, 180, 160, RED)]))
-    seen.clear()
-    for _ in range(60):
-        judged(scene, 0.2, scene.show([(300, 180, 160, RED)]))
+    search, seen = SubjectSearch(None, scene.tracker, PoseEstimatorConfig()), []
+    for confidence in [0.9] * 20 + [0.2] * 60:
+        seen.append(search.windows((1920, 1080), scene.index * STEP, single=False, close=False))
+        judged(scene, confidence, scene.show([(300, 180, 160, RED)]))
+    del seen[:20]
     assert all(len(windows) <= 2 for windows in seen)  # bounded in every image
     early, late = seen[:25], seen[35:60]
     assert sum(len(windows) > 1 for windows in early) <= 2  # the usual interval

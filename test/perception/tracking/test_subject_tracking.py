@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import ParameterError
+from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking import SubjectTracker
 from drocap_ros.perception.tracking.association import assign
 from drocap_ros.perception.tracking.detection_windows import tiles, uncut, wide_window
 from drocap_ros.perception.tracking.person import Person
+from drocap_ros.perception.tracking.search import SubjectSearch
 
 SIZE = (640, 360)
 RED, BLUE, GREEN = ((40, 40, 200), (30, 30, 90)), ((200, 60, 30), (20, 20, 20)), ((60, 180, 60), (200, 200, 200))
@@ -47,7 +49,6 @@ class Scene:
             boxes, score = np.array([box for box, _ in detections], float), np.array([s for _, s in detections])
         stamp = self.index * STEP
         self.index += 1
-        self.tracker.windows(SIZE, stamp)
         return self.tracker.update(image, stamp, boxes, score, roi)
 
 
@@ -92,13 +93,18 @@ def test_half_hidden_subject_takes_its_own_detection_when_the_cover_goes_away():
 
 def test_subject_that_fell_while_unseen_is_in_the_window_of_the_search():
     size, tracker = (1768, 994), SubjectTracker(PoseEstimatorConfig())
+    search = SubjectSearch(None, tracker, PoseEstimatorConfig())
     image = np.full((size[1], size[0], 3), 128, np.uint8)
-    none, score = np.empty((0, 4)), np.ones(1)
+    none = np.empty((0, 4))
 
     def update(index, boxes):
         tracker.update(image, index * STEP, boxes, np.full(len(boxes), 0.8))
         for box in boxes:
             tracker.judge(0.9, box, index * STEP)
+
+    def window(index, boxes):
+        stamp_ns = index * STEP
+        return search.sought_window(tracker.followed(stamp_ns), Detections(boxes, np.ones(len(boxes))), size, stamp_ns)
 
     # A man of 330 px; then he jumps, and is curled up in the last image that shows him.
     for t in range(20):
@@ -106,13 +112,13 @@ def test_subject_that_fell_while_unseen_is_in_the_window_of_the_search():
     curled = np.array([[840.0, 165, 1030, 335]])
     update(20, curled)
     update(21, none)
-    assert tracker.sought_window(size, 22 * STEP, curled, score) is None  # the window near him shows him
+    assert window(22, curled) is None  # the window near him shows him
     update(22, none)
-    x0, y0, x1, y1 = tracker.sought_window(size, 23 * STEP, none, score[:0])
+    x0, y0, x1, y1 = window(23, none)
     # He stretches, and falls by his own length.
     assert max(x0 - 880, y0 - 180) < 0 < min(x1 - 1000, y1 - 580)
     update(23, np.array([[880.0, 250, 1000, 570]]))
-    assert tracker.sought_window(size, 24 * STEP, none, score[:0]) is None
+    assert window(24, none) is None
 
 
 def test_detection_near_the_subject_is_not_a_person_from_far_away():
