@@ -19,7 +19,6 @@ class KnownModel:
     licence : of the weights, as their publisher states it
     training_data : data sets of the training; their terms may restrict commercial use
     home : publisher
-    layout : ModelSpec layout
     url : the file or a ZIP archive with it; empty = no ONNX download
     member : end of the file's path in the archive; empty = the download is the file itself
     sha256 : of the ONNX file; empty = unknown
@@ -32,7 +31,6 @@ class KnownModel:
     licence: str
     training_data: str
     home: str
-    layout: str
     url: str = ""
     member: str = ""
     sha256: str = ""
@@ -43,45 +41,44 @@ class KnownModel:
 KNOWN_MODELS: tuple[KnownModel, ...] = (
     KnownModel(
         "rtmdet-nano", "detector", "rtmdet-nano-person.onnx", 4.0, "Apache-2.0", "COCO, Objects365 (persons)",
-        "OpenMMLab", "boxes-nms", f"{_MMPOSE}/rtmpose/rtmpose-cpu.zip", "rtmdet-nano/end2end.onnx",
+        "OpenMMLab", f"{_MMPOSE}/rtmpose/rtmpose-cpu.zip", "rtmdet-nano/end2end.onnx",
         "b8585adb6d1352796f6e86337e09c3459b830645a7e7192d9381670bea2facbd",
     ),
     KnownModel(
-        "yolox-nano", "detector", "yolox_nano.onnx", 3.7, "Apache-2.0", "COCO", "Megvii", "yolox-grid",
+        "yolox-nano", "detector", "yolox_nano.onnx", 3.7, "Apache-2.0", "COCO", "Megvii",
         "https://github.com/Megvii-BaseDetection/YOLOX/releases/download/0.1.1rc0/yolox_nano.onnx", "",
         "c789161ed43c8269fcd4e67c67eeeb4e80c622da2eb296a20bc6007bd18a0b7d",
     ),
     KnownModel(
         "yolox-tiny", "detector", "yolox-tiny-humanart.onnx", 20.0, "Apache-2.0", "COCO, HumanArt", "OpenMMLab",
-        "boxes-nms", f"{_SDK}/yolox_tiny_8xb8-300e_humanart-6f3252f9.zip", "end2end.onnx",
+        f"{_SDK}/yolox_tiny_8xb8-300e_humanart-6f3252f9.zip", "end2end.onnx",
         "ceb11c07298f95c50d7c5abeb906d03340c85f23aa79e3e66966e7fb6c307250",
     ),
     KnownModel(
         "yolox-m", "detector", "yolox-m-humanart.onnx", 97.0, "Apache-2.0", "COCO, HumanArt", "OpenMMLab",
-        "boxes-nms", f"{_SDK}/yolox_m_8xb8-300e_humanart-c2c7a14a.zip", "end2end.onnx",
+        f"{_SDK}/yolox_m_8xb8-300e_humanart-c2c7a14a.zip", "end2end.onnx",
         "3dea6513388889f0fff4b77bf7a26013600321b9eb9ceb0e9a400a82572f5f23",
     ),
     KnownModel(
         "rtmpose-t", "pose", "rtmpose-t-body7.onnx", 13.0, "Apache-2.0", "seven public sets (body7)", "OpenMMLab",
-        "simcc", f"{_SDK}/rtmpose-t_simcc-body7_pt-body7_420e-256x192-026a1439_20230504.zip", "end2end.onnx",
+        f"{_SDK}/rtmpose-t_simcc-body7_pt-body7_420e-256x192-026a1439_20230504.zip", "end2end.onnx",
     ),
     KnownModel(
         "rtmpose-s", "pose", "rtmpose-s-body7.onnx", 21.0, "Apache-2.0", "seven public sets (body7)", "OpenMMLab",
-        "simcc", f"{_SDK}/rtmpose-s_simcc-body7_pt-body7_420e-256x192-acd4a1ef_20230504.zip", "end2end.onnx",
+        f"{_SDK}/rtmpose-s_simcc-body7_pt-body7_420e-256x192-acd4a1ef_20230504.zip", "end2end.onnx",
         "9aeb635b83f86aea45cf45d85798f7eba1a162de8e0d721c44e54fe5eebaf47d",
     ),
     KnownModel(
         "rtmpose-m", "pose", "rtmpose-m-body7.onnx", 52.0, "Apache-2.0", "seven public sets (body7)", "OpenMMLab",
-        "simcc", f"{_SDK}/rtmpose-m_simcc-body7_pt-body7_420e-256x192-e48f03d0_20230504.zip", "end2end.onnx",
+        f"{_SDK}/rtmpose-m_simcc-body7_pt-body7_420e-256x192-e48f03d0_20230504.zip", "end2end.onnx",
         "5c0a4bf67953e6d2ac43ce15e77dc9d5d354ae18430a47d2c5963a7bc5683e3c",
     ),
     KnownModel(
-        "tinypose", "pose", "tinypose_256x192.onnx", 2.8, "Apache-2.0", "COCO, AI Challenger",
-        "PaddleDetection", "heatmap",
+        "tinypose", "pose", "tinypose_256x192.onnx", 2.8, "Apache-2.0", "COCO, AI Challenger", "PaddleDetection",
     ),
     KnownModel(
         "movenet-lightning", "pose", "movenet_lightning_int8.onnx", 2.9, "Apache-2.0", "COCO, Active (Google)",
-        "Google", "movenet",
+        "Google",
     ),
 )  # fmt: skip
 

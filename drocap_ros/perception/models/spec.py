@@ -16,12 +16,17 @@ from drocap_ros.perception.models.runtime import OnnxModel
 DETECTOR_LAYOUTS = ("rtmdet-maps", "yolox-grid", "boxes-nms", "yolo-nms", "yolo", "yolo-pose", "yolo-pose-nms", "rtmo")
 POSE_LAYOUTS = ("heatmap", "simcc", "movenet", "yolo-pose", "yolo-pose-nms", "rtmo")
 
-_PLAIN = {"mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
-_RAW_BGR: dict[str, Any] = {**_PLAIN, "colour": "bgr"}
-_RAW_RGB: dict[str, Any] = {**_PLAIN, "colour": "rgb"}
-_UNIT_RGB: dict[str, Any] = {**_PLAIN, "std": (255.0, 255.0, 255.0), "colour": "rgb", "letterbox": "centre"}
-_IMAGENET: dict[str, Any] = {"mean": (123.675, 116.28, 103.53), "std": (58.395, 57.12, 57.375), "colour": "rgb"}
+_LAYOUTS = tuple(dict.fromkeys(DETECTOR_LAYOUTS + POSE_LAYOUTS))
+
+_RAW_BGR: dict[str, Any] = {"colour": "bgr"}
+_UNIT_RGB: dict[str, Any] = {"std": (255.0, 255.0, 255.0), "letterbox": "centre"}
+_IMAGENET: dict[str, Any] = {"mean": (123.675, 116.28, 103.53), "std": (58.395, 57.12, 57.375)}
 _MMDET: dict[str, Any] = {"mean": (103.53, 116.28, 123.675), "std": (57.375, 57.12, 58.395), "colour": "bgr"}
+#: Input of each layout that does not take plain RGB.
+_INPUTS = {
+    "rtmdet-maps": _MMDET, "yolox-grid": _RAW_BGR, "rtmo": _RAW_BGR, "heatmap": _IMAGENET, "simcc": _IMAGENET,
+    "yolo": _UNIT_RGB, "yolo-nms": _UNIT_RGB, "yolo-pose": _UNIT_RGB, "yolo-pose-nms": _UNIT_RGB,
+}  # fmt: skip
 
 #: Joint sets by their number of joints.
 JOINTS_BY_COUNT = {17: "coco17", 133: "wholebody133", 26: "halpe26", 16: "mpii16"}
@@ -79,7 +84,7 @@ def read_spec(model: OnnxModel) -> ModelSpec:
         found = ", ".join(f"{t.name} {list(o.shape)}" for t, o in zip(model.outputs, outputs, strict=True))
         raise InputError(
             f"{model.path}: expected the outputs of a known detector or 2D pose model, found {found}; write its layout"
-            f" (one of {', '.join(dict.fromkeys(DETECTOR_LAYOUTS + POSE_LAYOUTS))}) into {model.path.stem}.yaml"
+            f" (one of {', '.join(_LAYOUTS)}) into {model.path.stem}.yaml"
         )
     fields.update(_defaults(layout, outputs, model.path.stem.lower(), size, overrides))
     fields.update(overrides)
@@ -174,10 +179,10 @@ def _defaults(
     detects, poses = layout in DETECTOR_LAYOUTS, layout in POSE_LAYOUTS
     task = "both" if detects and poses else "pose" if poses else "detector"
     fields: dict[str, Any] = {"layout": layout, "task": task}
-    if layout == "rtmdet-maps":
-        fields |= _MMDET
-    elif layout == "yolox-grid":
-        fields |= _RAW_BGR | {"decoded": is_decoded_grid(outputs[0], size)}
+    if detects or poses:
+        fields |= _INPUTS.get(layout, {})
+    if layout == "yolox-grid":
+        fields["decoded"] = is_decoded_grid(outputs[0], size)
     elif layout == "boxes-nms":
         # RTMDet and YOLOX with NMS have equal outputs but different inputs; only the name distinguishes them.
         if "yolox" in stem:
@@ -189,15 +194,7 @@ def _defaults(
                 f"{stem}.onnx: expected rtmdet or yolox in the name, since their outputs (boxes, labels) are alike;"
                 f" rename it or write colour, mean and std into {stem}.yaml"
             )
-    elif layout == "rtmo":
-        fields |= _RAW_BGR
-    elif layout in ("yolo", "yolo-nms", "yolo-pose", "yolo-pose-nms"):
-        fields |= _UNIT_RGB
-    elif layout == "movenet":
-        fields |= _RAW_RGB
-    else:
-        fields |= _IMAGENET
-    if fields["task"] != "detector":
+    if task != "detector":
         fields["skeleton"] = _skeleton(layout, outputs, stem, overrides)
     return fields
 
@@ -275,10 +272,9 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 def _checked(spec: ModelSpec, path: Path) -> ModelSpec:
     from drocap_ros.skeleton import JOINT_SETS
 
-    layouts = tuple(dict.fromkeys(DETECTOR_LAYOUTS + POSE_LAYOUTS))
     size_fine = len(spec.input_size) == 2 and all(8 <= v <= 8192 for v in spec.input_size)
     problems = [
-        (spec.layout in layouts, "layout", ", ".join(layouts), spec.layout),
+        (spec.layout in _LAYOUTS, "layout", ", ".join(_LAYOUTS), spec.layout),
         (spec.task in ("detector", "pose", "both"), "task", "detector, pose, both", spec.task),
         (size_fine, "input_size", "[width, height] px", spec.input_size),
         (spec.colour in ("rgb", "bgr"), "colour", "rgb, bgr", spec.colour),

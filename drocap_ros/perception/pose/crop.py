@@ -33,30 +33,23 @@ def cut(image: np.ndarray, crop: Crop) -> np.ndarray:
     """(H, W, 3) uint8 -> crop (size[1], size[0], 3), black outside the image."""
     import cv2
 
-    cx, cy = crop.centre
-    scale = crop.scale
+    (cx, cy), scale, (width, height) = crop.centre, crop.scale, crop.size
+    left, top, exact = 0, 0, np.array([1.0, 1.0])
     if scale < 0.5:
         # Bilinear sampling would skip pixels: average first, over the visible part.
-        half_w, half_h = crop.size[0] / scale / 2, crop.size[1] / scale / 2
+        half_w, half_h = width / scale / 2, height / scale / 2
         x0, y0 = max(0, int(cx - half_w)), max(0, int(cy - half_h))
         x1, y1 = min(image.shape[1], int(cx + half_w) + 2), min(image.shape[0], int(cy + half_h) + 2)
         factor = int(1 / scale)
         view = image[y0:y1, x0:x1]
         small = (max(1, view.shape[1] // factor), max(1, view.shape[0] // factor))
         if view.size:
-            exact = np.array([view.shape[1] / small[0], view.shape[0] / small[1]])
+            left, top, exact = x0, y0, np.array([view.shape[1] / small[0], view.shape[0] / small[1]])
             image = cv2.resize(view, small, interpolation=cv2.INTER_AREA)
-            matrix = np.array(
-                [
-                    [scale * exact[0], 0, (x0 + 0.5 * exact[0] - cx) * scale + crop.size[0] / 2 - 0.5],
-                    [0, scale * exact[1], (y0 + 0.5 * exact[1] - cy) * scale + crop.size[1] / 2 - 0.5],
-                ]
-            )
-            return cv2.warpAffine(image, matrix, crop.size, flags=cv2.INTER_LINEAR)
     matrix = np.array(
         [
-            [scale, 0, (0.5 - cx) * scale + crop.size[0] / 2 - 0.5],
-            [0, scale, (0.5 - cy) * scale + crop.size[1] / 2 - 0.5],
+            [scale * exact[0], 0, (left + 0.5 * exact[0] - cx) * scale + width / 2 - 0.5],
+            [0, scale * exact[1], (top + 0.5 * exact[1] - cy) * scale + height / 2 - 0.5],
         ]
     )
     return cv2.warpAffine(image, matrix, crop.size, flags=cv2.INTER_LINEAR)

@@ -9,20 +9,20 @@ from drocap_ros.errors import InputError
 from drocap_ros.perception.sources.base import ImageSource
 from drocap_ros.perception.sources.image_files import SUFFIXES, ImageFileSource
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+from drocap_ros.perception.sources.live_source import open_camera, open_stream
 from drocap_ros.perception.sources.video import VideoSource
 
 _STREAM = re.compile(r"^(rtsps?|udp|rtp|rtmp|srt|tcp|https?)://", re.IGNORECASE)
 _CAMERA = re.compile(r"^/dev/video(\d+)$")
 
 
-def open_source(uri: str | Path, config: ImageIngestConfig | None = None, start_ns: int = 0) -> ImageSource:
+def open_source(uri: str | Path, config: ImageIngestConfig | None = None) -> ImageSource:
     """Source for a video file, an image, a folder of images, ``/dev/videoN``, or a stream's URL.
 
     Parameters
     ----------
     uri : path or URL; ``file://`` is allowed
     config : rates, camera mode and time-outs; ``config.source`` is ignored
-    start_ns : stamp of a video file's first frame; live sources use the system clock
 
     Raises
     ------
@@ -32,12 +32,8 @@ def open_source(uri: str | Path, config: ImageIngestConfig | None = None, start_
     config = config or ImageIngestConfig()
     text = str(uri)
     if camera := _CAMERA.match(text):
-        from drocap_ros.perception.sources.live_source import open_camera
-
         return open_camera(int(camera[1]), config)
     if _STREAM.match(text):
-        from drocap_ros.perception.sources.live_source import open_stream
-
         return open_stream(text, config)
     path = Path(text.removeprefix("file://"))
     if not text or not path.exists():
@@ -46,9 +42,7 @@ def open_source(uri: str | Path, config: ImageIngestConfig | None = None, start_
             " file; check the path"
         )
     if path.is_fifo() or path.suffix.lower() == ".sdp":
-        from drocap_ros.perception.sources.live_source import open_stream
-
         return open_stream(str(path), config)
     if path.is_dir() or path.suffix.lower() in SUFFIXES:
         return ImageFileSource(path, config.folder_rate_hz)
-    return VideoSource(path, start_ns)
+    return VideoSource(path)

@@ -52,8 +52,8 @@ def ffmpeg_options(options: str | None) -> Iterator[None]:
 class VideoSource(ImageSource):
     """Frames of a video file.
 
-    A stamp is the frame's presentation time in its container, from 0 at the first, plus ``start_ns``; variable frame
-    rates keep their times.  Rotation metadata is applied.  A file that is cut off gives its frames up to the cut and an
+    A stamp is the frame's presentation time in its container, from 0 at the first; variable frame rates keep
+    their times.  Rotation metadata is applied.  A file that is cut off gives its frames up to the cut and an
     ``ENDED_EARLY`` event.
 
     Raises
@@ -62,7 +62,7 @@ class VideoSource(ImageSource):
         When the file is missing or empty, or its index or first frame cannot be decoded.
     """
 
-    def __init__(self, path: Path, start_ns: int = 0) -> None:
+    def __init__(self, path: Path) -> None:
         super().__init__()
         import cv2
 
@@ -80,7 +80,6 @@ class VideoSource(ImageSource):
                 f"{path}: expected a video that FFmpeg can open, found {size} bytes without a readable header or index"
                 " (not a video, or cut off); copy or record it again"
             )
-        self._start_ns = start_ns
         self._origin_ns: int | None = None
         self._last_ns: int | None = None
         self._count = 0
@@ -120,12 +119,12 @@ class VideoSource(ImageSource):
         now = round(position_ms * 1e6)
         if self._origin_ns is None:
             self._origin_ns = now
-        now += self._start_ns - self._origin_ns
+        now -= self._origin_ns
         if self._last_ns is not None and now <= self._last_ns:
             # FFmpeg gives 0 for each frame of a stream without times (raw H.264).
             step = round(1e9 / self._nominal_rate())
             kind = SourceEventKind.NO_TIMES
-            if not any(e.kind is kind for e in self._events) and now == self._start_ns:
+            if not any(e.kind is kind for e in self._events) and now == 0:
                 self._events.append(SourceEvent(kind, str(self.path), "the nominal rate is used"))
             now = self._last_ns + step
         self._last_ns = now
@@ -151,7 +150,7 @@ class VideoSource(ImageSource):
         if self._counted:
             return f"{self._count} of {self.length} frames"
         # The count is the duration times a rate, which may be far from that of the frames.
-        end_s = ((self._last_ns or 0) - self._start_ns) * 1e-9
+        end_s = (self._last_ns or 0) * 1e-9
         if end_s + _TAIL_FRAMES * end_s / max(self._count - 1, 1) >= self.duration_s:
             return ""
         return f"{end_s:.1f} of {self.duration_s:.1f} s"

@@ -64,7 +64,7 @@ def server():
 
 
 def model(url: str, **changes) -> KnownModel:
-    plain = KnownModel("tiny", "pose", "tiny.onnx", 1.0, "Apache-2.0", "none", "here", "heatmap", url, "", SHA)
+    plain = KnownModel("tiny", "pose", "tiny.onnx", 1.0, "Apache-2.0", "none", "here", url, "", SHA)
     return replace(plain, **changes)
 
 
