@@ -50,7 +50,7 @@ class BodyPose(NamedTuple):
         return None if joints is None else joints + _MARGIN * (joints[2:] - joints[:2]).max() * _OUTWARD
 
     def belief(self, image: np.ndarray, box: np.ndarray) -> float:
-        """Confidence that a person is in the box (4,) px of this pose, a shadow less than its joints say."""
+        """Confidence that the box (4,) px of this pose shows a person; shadow in the box reduces it."""
         confidence = self.mean_confidence
         return confidence if confidence >= CLEAR_CONFIDENCE else without_shadow(confidence, image, box)
 

@@ -101,7 +101,7 @@ class PoseEstimator:
             log.warning("stamps went back by %.3f s: the tracker restarts", (self._last_ns - stamp_ns) * 1e-9)
             self.tracker.reset()
             self._flow.start(None, None)
-            self._others.reset()
+            self._others = OtherPoses(self.tracker, self._body)
             self._camera.reset()
             self._margins, self._repeated, self._seen_ns = None, None, 0
         self._last_ns = stamp_ns

@@ -19,16 +19,12 @@ _REJECTED_NS, _SAME_IOU = 300_000_000, 0.6
 
 
 class OtherPoses:
-    """Estimates poses of few others per image, and gives the tracker what they say."""
+    """Estimates the poses of few others per image; the tracker judges persons by them."""
 
     def __init__(self, tracker: SubjectTracker, model: BodyPoseModel) -> None:
         self._tracker, self._model = tracker, model
         #: Boxes (4,) px and stamps of the rivals that lost lately.
         self._rejected: list[tuple[np.ndarray, int]] = []
-
-    def reset(self) -> None:
-        """Forget the rivals that lost."""
-        self._rejected = []
 
     def move_camera(self, matrix: np.ndarray) -> None:
         """Follow the image's motion (2, 3) by the camera's."""

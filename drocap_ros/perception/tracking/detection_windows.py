@@ -7,9 +7,9 @@ import numpy as np
 Window = tuple[int, int, int, int]
 
 #: Side of a window over the subject's longer side, and its least side in px.  In bad light, detectors of 320-416 px
-#: input give a person over most of the window two to three times the score of one over a third of it; a wider window
-#: also covers the persons nearby.
-_WIDE, _CLOSE, _TIGHT = (1.8, 416), (1.45, 208), (1.3, 160)
+#: input give a person over most of the window two to three times the score of one over a third of it.  WIDE also covers
+#: the persons nearby; in CLOSE a person is as large at 256 px of input as in WIDE at 320 px; TIGHT is for a low score.
+WIDE, CLOSE, TIGHT = (1.8, 416), (1.45, 208), (1.3, 160)
 #: Images longer than this are also searched in tiles of this side, one per image.
 _TILE = 800
 #: Interval of detection over the whole image while the subject is in view.
@@ -17,30 +17,18 @@ _FULL_EVERY_NS = 1_000_000_000
 
 
 class WindowSchedule:
-    """Order of the windows: near the subject, at intervals the whole image, without a subject also tiles."""
+    """Order of the windows over the whole image: at intervals all of it, without a subject parts of it in turn."""
 
     def __init__(self) -> None:
-        self._full_ns: int | None = None
+        #: Last detection over the whole image.
+        self.full_ns: int | None = None
         self._tile = 0
         self._alternate = False
         self._turn = 0
 
     def full_image_due(self, stamp_ns: int) -> bool:
         """Whether the interval since the last detection over the whole image has passed."""
-        return self._full_ns is None or stamp_ns - self._full_ns >= _FULL_EVERY_NS
-
-    def near_subject(
-        self, box: np.ndarray, image_size: tuple[int, int], stamp_ns: int, single: bool, close: bool
-    ) -> list[Window | None]:
-        """Windows while the subject is in view at a predicted ``box`` (4,) px; None = the whole image.
-
-        ``single`` allows one window; ``close`` takes a smaller one around the subject.
-        """
-        near = close_window(box, image_size) if close else wide_window(box, image_size)
-        if near is None or self.full_image_due(stamp_ns):
-            self._full_ns = stamp_ns
-            return [None] if single else list({near: None, None: None})
-        return [near]
+        return self.full_ns is None or stamp_ns - self.full_ns >= _FULL_EVERY_NS
 
     def search(
         self, candidates: list[np.ndarray], image_size: tuple[int, int], stamp_ns: int, single: bool
@@ -49,12 +37,12 @@ class WindowSchedule:
 
         With ``single`` whole image and others alternate.
         """
-        self._full_ns = stamp_ns
+        self.full_ns = stamp_ns
         self._alternate = not self._alternate
         if single and not self._alternate:
             return [None]
         self._turn += 1
-        near, tiled = [wide_window(box, image_size) for box in candidates], tiles(image_size)
+        near, tiled = [window_around(box, image_size, WIDE) for box in candidates], tiles(image_size)
         at = self._turn % (len(near) + bool(tiled)) if near or tiled else 0
         window = near[at] if at < len(near) else None
         if window is None and tiled:
@@ -65,22 +53,9 @@ class WindowSchedule:
         return [window] if single else [None, window]
 
 
-def wide_window(box: np.ndarray, image_size: tuple[int, int]) -> Window | None:
-    """Window around a box (4,) px that also covers the persons nearby; None when it would be the whole image."""
-    return _window(box, image_size, *_WIDE)
-
-
-def close_window(box: np.ndarray, image_size: tuple[int, int]) -> Window | None:
-    """Smaller window, in which a person is as large at 256 px of input as in the wide one at 320 px."""
-    return _window(box, image_size, *_CLOSE)
-
-
-def tight_window(box: np.ndarray, image_size: tuple[int, int]) -> Window | None:
-    """Window of the second pass, for a subject with a low score."""
-    return _window(box, image_size, *_TIGHT)
-
-
-def _window(box: np.ndarray, image_size: tuple[int, int], factor: float, least: int) -> Window | None:
+def window_around(box: np.ndarray, image_size: tuple[int, int], extent: tuple[float, int]) -> Window | None:
+    """Window of WIDE, CLOSE or TIGHT extent around a box (4,) px; None when it would be the whole image."""
+    factor, least = extent
     width, height = image_size
     side = max(factor * float(max(box[2] - box[0], box[3] - box[1])), least)
     if side >= max(width, height):

@@ -48,7 +48,7 @@ class Person:
     hits : number of detections
     began_at_subject, double : whether its first box lay on the subject's, and whether it is a second box around the
         subject; see ``doubles.py``
-    left_image : whether it was out of view last, at an edge of the image; of the subject alone
+    left_image : whether it left at an edge of the image; set for the subject only
     pose : what its poses say about it
     """
 

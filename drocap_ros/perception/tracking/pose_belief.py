@@ -64,11 +64,14 @@ class PoseBelief:
         length = float((self.box[2:] - self.box[:2]).max())
         self.length = length if not self.length else self.length + _LENGTH_RATE * (length - self.length)
 
-    def growth(self, box: np.ndarray) -> float:
-        """Absolute logarithm of the size of a box (4,) px over the last or the usual one, whichever is nearer."""
-        length = max(float((box[2:] - box[:2]).max()), 1.0)
-        known = [self.length] if self.box is None else [self.length, float((self.box[2:] - self.box[:2]).max())]
-        return min(abs(float(np.log(length / max(value, 1.0)))) for value in known)
+    def growth(self, box: np.ndarray, length: float) -> float:
+        """Absolute logarithm of the size of a box (4,) px over the last or the usual one, whichever is nearer.
+
+        length : px, of the person before there is a believable box
+        """
+        size = max(float((box[2:] - box[:2]).max()), 1.0)
+        known = [length] if self.box is None else [self.length, float((self.box[2:] - self.box[:2]).max())]
+        return min(abs(float(np.log(size / max(value, 1.0)))) for value in known)
 
     def refute(self, confidence: float, stamp_ns: int) -> None:
         """Mark the track as no person, by a pose that lost against another one."""

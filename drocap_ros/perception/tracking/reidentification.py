@@ -83,9 +83,7 @@ def same_person(lost: Person, person: Person, alone: bool) -> bool:
     start, end = lost.box if lost.pose.box is None else lost.pose.box, person.box
     length = max(lost.filter.length, lost.pose.length, 1.0)
     distance = float(np.linalg.norm((start[:2] + start[2:] - end[:2] - end[2:]) / 2)) / length
-    growth = abs(float(np.log(max(end[3] - end[1], end[2] - end[0], 1.0) / length)))
-    if lost.pose.box is not None:
-        growth = lost.pose.growth(end)
+    growth = lost.pose.growth(end, length)
     similarity = person.similarity(lost.appearance)
     if lost.left_image:  # re-entry at the place of leaving, at half the usual difference of appearance
         return distance < 1.5 and similarity >= 0.5 * (1 + _REIDENTIFY_SIMILARITY)

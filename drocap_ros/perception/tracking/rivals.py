@@ -91,10 +91,7 @@ def _in_reach(subject: Person, box: np.ndarray, confidence: float, stamp_ns: int
     gap = min((stamp_ns - since_ns) * 1e-9, _LONGEST_S)
     length = max(float((last[2:] - last[:2]).max()), subject.pose.length, 1.0)
     distance = float(np.linalg.norm((last[:2] + last[2:] - box[:2] - box[2:]) / 2)) / length
-    if subject.pose.box is not None:
-        growth = subject.pose.growth(box)
-    else:
-        growth = abs(float(np.log(max((box[2:] - box[:2]).max(), 1.0) / length)))
+    growth = subject.pose.growth(box, length)
     return distance < _REACH + _REACH_PER_S * gap and growth < _GROWTH + _GROWTH_PER_S * gap
 
 

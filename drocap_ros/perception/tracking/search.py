@@ -9,8 +9,17 @@ import numpy as np
 from drocap_ros.perception.detection.detector import Detections, Detector
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient, suppress
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
-from drocap_ros.perception.tracking.detection_windows import Window, WindowSchedule, tight_window, uncut, wide_window
+from drocap_ros.perception.tracking.detection_windows import (
+    CLOSE,
+    TIGHT,
+    WIDE,
+    Window,
+    WindowSchedule,
+    uncut,
+    window_around,
+)
 from drocap_ros.perception.tracking.person import Person
+from drocap_ros.perception.tracking.reidentification import search_boxes
 from drocap_ros.perception.tracking.subject import SubjectTracker
 
 #: Least overlap of a detection with the predicted box that needs no second pass.
@@ -33,8 +42,8 @@ class SubjectSearch:
     def detect(self, image: np.ndarray, stamp_ns: int, shedding: bool, close: bool) -> Detections:
         """Detections of all windows together, parts of persons among them.
 
-        ``shedding`` allows one window, a larger one where the last image did not show the subject; ``close`` takes a
-        smaller one around the subject.
+        shedding : one window, a larger one where the last image did not show the subject
+        close : a smaller window around the subject
         """
         size = (image.shape[1], image.shape[0])
         windows = self.windows(size, stamp_ns, shedding, close)
@@ -61,15 +70,20 @@ class SubjectSearch:
         """Windows of the next image, with ``single`` one; None = the whole image; ``close`` as for :meth:`detect`."""
         tracker = self._tracker
         if tracker.choice.box is not None:
-            near = wide_window(tracker.choice.box, image_size)
+            near = window_around(tracker.choice.box, image_size, WIDE)
             return [near] if single else list({near: None, None: None})
         subject = tracker.followed(stamp_ns)
         if subject is None:
-            return self._schedule.search(tracker.search_boxes(stamp_ns), image_size, stamp_ns, single)
+            boxes = search_boxes(tracker.subject, tracker.persons, self._config.confirm_frames, stamp_ns)
+            return self._schedule.search(boxes, image_size, stamp_ns, single)
         box = subject.filter.box_at(stamp_ns)
         if single and tracker.missed:
             box, close = subject.sought_box(stamp_ns), False
-        windows = self._schedule.near_subject(box, image_size, stamp_ns, single, close)
+        near = window_around(box, image_size, CLOSE if close else WIDE)
+        windows = [near]
+        if near is None or self._schedule.full_image_due(stamp_ns):
+            self._schedule.full_ns = stamp_ns
+            windows = [None] if single else list({near: None, None: None})
         if subject.pose.questioned and windows != [None]:  # whoever it is: the search goes on beside it
             windows += [w for w in self._schedule.search([], image_size, stamp_ns, True) if w not in windows]
         return windows[-1:] if single else windows
@@ -80,7 +94,7 @@ class SubjectSearch:
         """Tight window around a subject that the detections do not show clearly, or None."""
         box = subject.filter.box_at(stamp_ns)
         clear = found.boxes[found.scores >= self._config.detection_threshold]
-        return None if _overlaps(box, clear, _CLEAR_IOU) else tight_window(box, image_size)
+        return None if _overlaps(box, clear, _CLEAR_IOU) else window_around(box, image_size, TIGHT)
 
     def sought_window(
         self, subject: Person, found: Detections, image_size: tuple[int, int], stamp_ns: int
@@ -89,7 +103,7 @@ class SubjectSearch:
         at_place = _overlaps(subject.filter.box_at(stamp_ns), found.boxes, _AT_PLACE)
         if at_place or not self._tracker.missed:
             return None
-        return wide_window(subject.sought_box(stamp_ns), image_size)
+        return window_around(subject.sought_box(stamp_ns), image_size, WIDE)
 
     def _detect_in(self, image: np.ndarray, window: Window | None, shedding: bool) -> Detections:
         """Detections in a window, without those that its edge cuts."""

@@ -49,11 +49,7 @@ class SubjectChoice:
     ) -> Person | None:
         """The person detected in this image who becomes the subject; None while there is one to wait for.
 
-        Parameters
-        ----------
-        last : the last subject
-        shape : of the image
-        coast_s : time over which the last subject is predicted
+        last : the last subject, predicted over ``coast_s``; shape : of the image
         first : whether there was no subject yet; then a person whose poses are not believable can be chosen
         """
         config = self._config

@@ -17,7 +17,6 @@ from drocap_ros.perception.tracking.reidentification import (
     followed_on,
     found_again,
     leaving,
-    search_boxes,
 )
 from drocap_ros.perception.tracking.rivals import clutter_of, due_bystander, owner_of, rivals
 from drocap_ros.perception.tracking.selection import SubjectChoice
@@ -67,10 +66,6 @@ class SubjectTracker:
     def missed(self) -> bool:
         """Whether the last image did not show the subject."""
         return self.subject is not None and self.subject.detected_ns < (self._last_ns or 0)
-
-    def search_boxes(self, stamp_ns: int) -> list[np.ndarray]:
-        """(4,) px each, where to look closely while there is no subject; see :func:`.reidentification.search_boxes`."""
-        return search_boxes(self.subject, self.persons, self._config.confirm_frames, stamp_ns)
 
     def predict(self, stamp_ns: int) -> Subject | None:
         """The predicted subject; None unless the last update confirmed it."""

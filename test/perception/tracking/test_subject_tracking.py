@@ -10,7 +10,7 @@ from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking import SubjectTracker
 from drocap_ros.perception.tracking.association import assign
-from drocap_ros.perception.tracking.detection_windows import tiles, uncut, wide_window
+from drocap_ros.perception.tracking.detection_windows import WIDE, tiles, uncut, window_around
 from drocap_ros.perception.tracking.person import Person
 from drocap_ros.perception.tracking.search import SubjectSearch
 
@@ -317,7 +317,7 @@ def test_invalid_subject_box_is_refused(text):
 def test_windows_lie_in_the_image_and_tiles_cover_it():
     size = (1920, 1080)
     for box in ([0, 0, 50, 120], [1880, 1000, 1920, 1080], [900, 500, 950, 620]):
-        x0, y0, x1, y1 = wide_window(np.array(box, float), size)
+        x0, y0, x1, y1 = window_around(np.array(box, float), size, WIDE)
         assert 0 <= x0 < x1 <= 1920
         assert 0 <= y0 < y1 <= 1080
         assert x0 <= box[0]
