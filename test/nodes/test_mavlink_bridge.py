@@ -4,6 +4,8 @@ import time
 
 import pytest
 import rclpy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
@@ -44,6 +46,20 @@ def test_a_normalised_camera_matrix_is_refused(node):
     camera.matrix[2, 2] = 1.0
     with pytest.raises(InputError, match="expected focal lengths in px"):
         node._on_camera_info(camera_info_to_ros(header_at(1, "camera"), camera))
+
+
+@pytest.mark.parametrize("reliability", ["BEST_EFFORT", "RELIABLE"])
+def test_a_drivers_camera_info_is_heard_whatever_it_offers(node, reliability):
+    driver = rclpy.create_node("driver")
+    qos = QoSProfile(depth=1, reliability=ReliabilityPolicy[reliability], durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    publisher = driver.create_publisher(CameraInfo, "/drocap/camera_info", qos)
+    camera = CameraModel(1280, 720, pinhole_matrix(1280, 720, 60.0))
+    end = time.monotonic() + 5.0
+    while node._controller._framing.matrix is None and time.monotonic() < end:
+        publisher.publish(camera_info_to_ros(header_at(time.time_ns(), "camera"), camera))
+        rclpy.spin_once(node, timeout_sec=0.05)
+    driver.destroy_node()
+    assert node._controller._framing.matrix is not None
 
 
 def test_an_error_in_the_control_loop_holds_the_vehicle_at_once(node, monkeypatch):
