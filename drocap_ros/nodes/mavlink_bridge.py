@@ -257,6 +257,7 @@ class MavlinkBridgeNode(ComponentNode):
         for name, (real, _) in status.rates_hz.items():
             self.details[of(Key.STREAM_RATE, name)] = f"{real:.1f}"
         self.details[Key.MAVLINK_BAD] = str(status.bad_count)
+        self.details[Key.ROUND_TRIP] = f"{status.round_trip_s:.3f}"
         if self.config.signing_key_file:
             self.details[Key.MAVLINK_UNSIGNED] = str(status.refused_count)
         for name, value in self._link.settings.reported().items():

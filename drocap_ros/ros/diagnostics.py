@@ -57,6 +57,7 @@ class Key:
     ORBIT_COMMANDS, ORBIT_COMMANDS_REFUSED = "orbit_commands", "orbit_commands_refused"
     STREAM_RATE = "stream_rate_hz"
     MAVLINK_BAD, MAVLINK_UNSIGNED = "mavlink_bad", "mavlink_unsigned"
+    ROUND_TRIP = "round_trip_s"  # "nan" while time synchronization has never been answered
     RESTARTS = "restarts"
 
 

@@ -22,7 +22,9 @@ from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.preflight.checks import all_findings
 from drocap_ros.flight.preflight.findings import Level
+from drocap_ros.flight.preflight.link_checks import link_findings
 from drocap_ros.flight.preflight.setup_checks import Setup
+from drocap_ros.ros.diagnostics import Key
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -230,6 +232,18 @@ def test_values_of_the_bridge_that_are_no_numbers_are_unknown():
     listener.values = {"stream_rate_hz/SYS_STATUS": "often", "GUID_TIMEOUT": "short"}
     measured = listener.measured(MavlinkBridgeConfig(), "/drocap")
     assert np.isnan([measured.streams["SYS_STATUS"].real_hz, measured.settings["GUID_TIMEOUT"]]).all()
+
+
+@pytest.mark.parametrize(("round_trip", "missing"), [("nan", True), ("0.021", False)])
+def test_a_running_bridge_whose_time_synchronization_is_never_answered_is_not_ready(round_trip, missing):
+    listener = BridgeListener(
+        SimpleNamespace(node=SimpleNamespace(create_subscription=lambda *_: None), namespace="/drocap")
+    )
+    listener.statuses.append(SimpleNamespace(state=0, condition=115, reason="not armed"))
+    listener.values[Key.ROUND_TRIP] = round_trip
+    config = MavlinkBridgeConfig(commands_enabled=True)
+    found = {finding.code for finding in link_findings(config, listener.measured(config, "/drocap"))}
+    assert ("round_trip" in found) == missing
 
 
 def test_a_link_that_another_program_holds_is_refused_in_one_line(tmp_path):

@@ -106,8 +106,9 @@ class BridgeListener:
             for name, (_, wanted) in requests.rates_hz(0).items()
             if of(Key.STREAM_RATE, name) in self.values
         }
+        trips_s = np.array([number(self.values.get(Key.ROUND_TRIP, ""))])
         return Measured(
-            vehicle=vehicle, heard=vehicle is not None, streams=streams,
+            vehicle=vehicle, heard=vehicle is not None, streams=streams, round_trips_s=trips_s[np.isfinite(trips_s)],
             settings={name: number(text) for name, text in self.values.items() if name in known},
             delays_s=np.array([age for age, _ in self.states]), conditions=self._failed(),
             bridge=f"by the running bridge in {namespace}, {state}: {status.reason}",

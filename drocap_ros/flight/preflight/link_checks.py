@@ -36,7 +36,8 @@ def link_findings(config: MavlinkBridgeConfig, measured: Measured) -> Iterator[F
             yield _rate(config, measured, name, stream)
     if len(measured.delays_s):
         yield _delay(config, measured)
-    if not measured.bridge:  # whose own conditions watch the round trip
+    # A bridge's own conditions watch how long an answer takes, and not whether there has ever been one.
+    if not (measured.bridge and len(measured.round_trips_s)):
         yield from _time_sync(config, measured)
 
 
