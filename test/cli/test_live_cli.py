@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,6 +16,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from drocap_ros.bringup import free_domain, watch
 from drocap_ros.cli import main
+from drocap_ros.cli.graph import orbit
+from drocap_ros.flight.conditions import ConditionCode
+from drocap_ros.flight.orbit.states import State
 from drocap_ros.recording.open_session import session_info
 from drocap_ros.ros.topics import RESULT_QOS
 from drocap_ros.simulation.vehicle.ports import free_udp_port
@@ -257,3 +261,9 @@ def test_a_domain_of_the_environment_that_does_not_exist_is_refused(command, mon
     monkeypatch.setenv("ROS_DOMAIN_ID", "400")
     assert main(list(command)) == 2
     assert capsys.readouterr().err == "drocap: ROS_DOMAIN_ID: expected 0 to 101, got 400; choose another domain\n"
+
+
+@pytest.mark.parametrize(("condition", "stays"), [(ConditionCode.STOPPED, True), (ConditionCode.SUBJECT_NEAR, False)])
+def test_the_status_of_a_hold_says_that_the_vehicle_gives_way_to_nobody(condition, stays):
+    status = SimpleNamespace(state=State.HOLDING, condition=condition, reason="held", radius_m=4.0, height_m=2.5)
+    assert ("stays there, also where somebody walks up to it" in orbit._sentence(status)) == stays

@@ -99,12 +99,15 @@ def _check_range(name: str, value: float) -> None:
 
 
 def _sentence(status: Any) -> str:
+    from drocap_ros.flight.conditions import ConditionCode
     from drocap_ros.flight.orbit.states import State
 
     state = State(status.state)
     text = f"{state.name.lower().replace('_', ' ')}: {status.reason}"
     if not math.isnan(status.radius_m):
         text += f"; {status.radius_m:.1f} m from the subject, {status.height_m:.1f} m high"
+    if state == State.HOLDING and status.condition != ConditionCode.SUBJECT_NEAR:
+        text += "; it stays there, also where somebody walks up to it"
     if state == State.ORBITING:
         text += f", {status.angular_speed_deg_s:.0f} deg/s, yaw error {status.yaw_error_deg:+.1f} deg"
     return text
