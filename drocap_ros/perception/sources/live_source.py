@@ -148,7 +148,7 @@ class LiveSource(ImageSource):
             if not ok or image is None:
                 break
             position_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-            stamp = clock.stamp(position_ns, time.time_ns())
+            stamp = clock.stamp(position_ns, time.time_ns(), time.monotonic_ns())
             images += 1
             self._last_arrival = time.monotonic()
             if self._stalled:

@@ -149,3 +149,14 @@ def test_stream_clock_removes_the_network_jitter():
     assert (np.diff(stamps) > 0).all()
     error = stamps - (1_000_000_000_000 + exposure)
     assert np.abs(error[100:] - 5_000_000).max() < 5_000_000  # steady to 5 ms though arrivals scatter by 30
+
+
+@pytest.mark.parametrize("set_s", [2.0, -2.0, 86400.0])
+def test_stamps_follow_a_system_clock_that_is_set(set_s):
+    """Else the pictures would be 2 s old for hours, and a day old where NTP comes after the start."""
+    clock, set_ns = StreamClock(), round(set_s * 1e9)
+    for i in range(100):
+        exposure = 40_000_000 * i
+        steady = exposure + 5_000_000
+        now = 1_000_000_000_000 + steady + (set_ns if i >= 50 else 0)
+        assert abs(clock.stamp(exposure, now, steady) - now) < 1_000_000
