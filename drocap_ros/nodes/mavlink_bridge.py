@@ -196,7 +196,7 @@ class MavlinkBridgeNode(ComponentNode):
         """Publish every change at once, except while idle, and else five times a second."""
         now_s, reported = self.now_s(), (status.state, status.reason)
         changed = reported != self._reported and status.state != State.IDLE
-        if not status.answers and (changed or now_s - self._reported_s >= _STATUS_PERIOD_S):
+        if not status.answers and (changed or abs(now_s - self._reported_s) >= _STATUS_PERIOD_S):
             self._reported, self._reported_s = reported, now_s
             self._publish_status(status)
 

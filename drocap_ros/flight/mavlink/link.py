@@ -316,7 +316,7 @@ class MavlinkLink:
 
     def _is_due(self, what: str, period_s: float) -> bool:
         now = self._monotonic_s()
-        if now < self._due.get(what, 0.0):
+        if 0.0 < self._due.get(what, 0.0) - now < 2.0 * period_s:  # more: a simulated time went back
             return False
         self._due[what] = now + period_s
         return True

@@ -322,3 +322,13 @@ def test_requests_are_sent_one_at_a_time_until_the_rate_is_measured():
     assert q not in later
     assert len(later) == 7  # all others never came
     assert requests.rate_hz(q, 3 * S) == pytest.approx(50, rel=0.05)
+
+
+def test_heartbeats_go_on_where_the_simulated_time_goes_back(port):
+    """A looped recording, a simulator that is reset."""
+    now_s, sent = [600.0], []
+    with MavlinkLink(MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{port}"), monotonic_s=lambda: now_s[0]) as link:
+        link._transmit = sent.append
+        for now_s[0] in (600.0, 600.5, 10.0, 10.5, 11.1):
+            link.spin_once()
+    assert len(sent) == 3
