@@ -59,11 +59,8 @@ def check_output_folder(target: Path) -> None:
 
 
 @contextlib.contextmanager
-def output_folder(target: Path, stale: Iterable[str] = (), source: str | Path = "") -> Iterator[Path]:
+def output_folder(target: Path) -> Iterator[Path]:
     """A temporary folder; its files are moved to ``target`` together when the block succeeds.
-
-    Files of the patterns ``stale`` are an older run's: those that the block does not write anew are removed then, but
-    not the command's input ``source``.
 
     Raises
     ------
@@ -85,9 +82,6 @@ def output_folder(target: Path, stale: Iterable[str] = (), source: str | Path = 
             yield work
         with _system_errors(target):
             if real.exists():
-                for path in (path for pattern in stale for path in real.glob(pattern)):
-                    if path.is_file() and not is_same(path, source):
-                        path.unlink()
                 for path in work.iterdir():
                     _replace(path, real / path.name)
             else:

@@ -125,13 +125,15 @@ def run(args: argparse.Namespace) -> int:
             selection=selection,
         )
     motion = dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line})
-    with output_folder(out, stale=["report.html"]) as folder:
+    with output_folder(out) as folder:
         save_motion(folder / "motion.npz", motion)
         if "tracks.npz" in names:
             save_tracks(folder / "tracks.npz", tracks)
         save_preview(folder / "preview.png", motion)
         if "report.html" in names:
             save_report(folder / "report.html", motion, video=args.input if has_images(args.input) else None)
+    if args.no_report:
+        (out / "report.html").unlink(missing_ok=True)  # of an older motion
     if not args.quiet:
         print(summary(motion, args.method))
         print(f"written: {out}/{', '.join(names)}")

@@ -69,8 +69,7 @@ def run(args: argparse.Namespace) -> int:
     config, ingest = _configs(args, rule)
     folder = models_folder(args.models or config.models_dir)
     ensure_networks(folder, args.video, args)
-    stale = [] if args.list else ["overlay.mp4", "tracks_person_[0-9]*.npz"]
-    with output_folder(out, stale, args.video) as target, progress_bars(args.quiet) as progress:
+    with output_folder(out) as target, progress_bars(args.quiet) as progress:
         begin_ns, persons = None, []
         if args.list or person is not None:
             with open_images(args.video, ingest) as images:

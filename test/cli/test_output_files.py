@@ -67,21 +67,6 @@ def test_no_report_of_an_older_run_stays_beside_a_new_motion(tmp_path):
     assert found == ["motion.npz", "preview.png", "tracks.npz", "walk.bvh"]
 
 
-def test_files_of_an_older_run_go_with_its_others_but_not_the_input(tmp_path):
-    for name in ("overlay.mp4", "tracks.npz", "tracks_person_2.npz", "tracks_person_3.npz", "other.npz"):
-        (tmp_path / name).write_text("old")
-    stale = ["overlay.mp4", "tracks_person_[0-9]*.npz"]
-    with pytest.raises(KeyError), output_folder(tmp_path, stale):
-        raise KeyError
-    assert len(list(tmp_path.iterdir())) == 5
-    with output_folder(tmp_path, stale, tmp_path / "overlay.mp4") as work:
-        for name in ("tracks.npz", "tracks_person_3.npz"):
-            (work / name).write_text("new")
-    found = {path.name: path.read_text() for path in tmp_path.iterdir()}
-    old, new = ("overlay.mp4", "other.npz"), ("tracks.npz", "tracks_person_3.npz")
-    assert found == {**dict.fromkeys(old, "old"), **dict.fromkeys(new, "new")}
-
-
 def test_default_folder_has_the_whole_name_of_the_input(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     save_tracks("walk.take1.npz", simulate_capture(1.0, 15.0, seed=1).tracks)
