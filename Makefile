@@ -6,7 +6,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Libraries of a ROS environment around this process must not leak into ours.  Bytecode is kept, whatever the shell says:
 # pip compiles none here, and each process that a test or a graph starts would compile ROS, NumPy and SciPy again.
-CLEAN := env -u PYTHONDONTWRITEBYTECODE -u _ROS_WHEELS_BOOTSTRAP_COMPLETE -u LD_LIBRARY_PATH -u PYTHONPATH -u AMENT_PREFIX_PATH -u CMAKE_PREFIX_PATH
+# Ninja would look for the job server of `make -j`, which recipes do not reach.
+CLEAN := env -u MAKEFLAGS -u PYTHONDONTWRITEBYTECODE -u _ROS_WHEELS_BOOTSTRAP_COMPLETE -u LD_LIBRARY_PATH -u PYTHONPATH -u AMENT_PREFIX_PATH -u CMAKE_PREFIX_PATH
 TEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
 BENCHMARK = $(CLEAN) $(BIN)/python benchmarks
 SOURCES := $(shell find drocap_ros msg srv config resource -type f -not -path '*/__pycache__/*') setup.py CMakeLists.txt package.xml
@@ -29,7 +30,7 @@ $(VENV)/.requirements: requirements.lock
 .SECONDEXPANSION:
 $(VENV)/.tf2_msgs $(VENV)/.hri_msgs: $(VENV)/.%: $(VENV)/.requirements resource/cmake/ros_wheels.cmake $$(wildcard resource/$$*/*) $$(wildcard resource/$$*/msg/*)
 	@PATH="$(CURDIR)/$(BIN):$$PATH" AMENT_PREFIX_PATH=$(CURDIR)/$(VENV) CMAKE_PREFIX_PATH=$(CURDIR)/$(VENV) $(BIN)/cmake -S resource/$* -B build/$* -G Ninja -DCMAKE_INSTALL_PREFIX=$(CURDIR)/$(VENV) -DPython3_EXECUTABLE=$(CURDIR)/$(BIN)/python -DBUILD_TESTING=OFF > build/$*.log
-	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/cmake --build build/$* --target install >> build/$*.log
+	@env -u MAKEFLAGS PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/cmake --build build/$* --target install >> build/$*.log
 	@touch $@
 
 $(VENV)/.package: $(VENV)/.requirements $(VENV)/.tf2_msgs $(VENV)/.hri_msgs $(SOURCES)
@@ -47,7 +48,7 @@ test: setup  ## the whole test suite: computing, then clocks and nodes, then tho
 	$(CLEAN) $(TEST) -m clock -n 3 --reruns 2 -r sR
 	$(CLEAN) $(TEST) -m counting -n 2 --reruns 2 -r sR
 
-lint: setup  ## ruff and mypy
+lint: $(VENV)/.requirements  ## ruff and mypy
 	$(CLEAN) $(BIN)/ruff check .
 	$(CLEAN) $(BIN)/ruff format --check .
 	$(CLEAN) $(BIN)/mypy
