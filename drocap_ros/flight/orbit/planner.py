@@ -167,6 +167,8 @@ def advance(
     # The ramp is too slow for a vehicle that suddenly falls behind: the phase itself waits.
     creep = min(max((1.3 * config.max_lead_m - lead) / (0.3 * config.max_lead_m), 0.0), 1.0)
     phase = state.phase + 0.5 * (state.omega.value + omega.value) * dt * creep
+    if math.hypot(*centre_velocity) > WALKING_M_S:
+        phase = _yielding(phase, vehicle[:2] - centre, config.max_lead_m / radius.value)
     trim = state.trim
     if creep == 1.0:
         error = radius.value - float(np.hypot(*(vehicle[:2] - subject[:2])))
@@ -214,13 +216,42 @@ def setpoint_of(
     )
     velocity = _limited(np.array([*flat_velocity, state.height.rate]), config.max_speed_m_s)
     acceleration = _limited(np.array([*flat_acceleration, state.height.acceleration]), config.max_acceleration_m_s2)
-    position = vehicle + _limited(reference_position(state) - vehicle, config.max_lead_m)
+    position = vehicle + _way(state, vehicle, config.max_lead_m)
     sight = subject[:2] - vehicle[:2]
     distance2 = max(float(sight @ sight), 0.25)
     # The subject moves as estimated, the vehicle as commanded.
     drift = subject_velocity[:2] - velocity[:2]
     yaw_rate = float(sight[0] * drift[1] - sight[1] * drift[0]) / distance2
     return Setpoint(position, velocity, acceleration, math.atan2(sight[1], sight[0]), yaw_rate)
+
+
+def _yielding(phase: float, offset: np.ndarray, most: float) -> float:
+    """Phase about a walking subject: where the vehicle cannot keep both, the angle yields, and the radius stays.
+
+    A phase that stands is no waiting for the vehicle: the subject takes the reference with him, and its lead grows.
+
+    offset : (2,) m, of the vehicle from the centre
+    most : rad, from the vehicle's phase
+    """
+    bearing = math.atan2(offset[1], offset[0])
+    return bearing + min(max(math.remainder(phase - bearing, 2 * math.pi), -most), most)
+
+
+def _way(state: OrbitState, vehicle: np.ndarray, longest_m: float) -> np.ndarray:
+    """(3,) m towards the reference: radius and height first, with what is left along the circle.
+
+    The straight way would lead a vehicle that lags behind inside the circle, and its lag would take from the way that
+    the radius has.
+    """
+    offset = vehicle[:2] - state.centre
+    distance, bearing = math.hypot(*offset), math.atan2(offset[1], offset[0])
+    outward = np.array([math.cos(bearing), math.sin(bearing), 0.0])
+    along = np.array([-outward[1], outward[0], 0.0])
+    radius = state.radius.value + state.trim
+    first = _limited((radius - distance) * outward + [0.0, 0.0, state.height.value - vehicle[2]], longest_m)
+    left = math.sqrt(max(longest_m**2 - float(first @ first), 0.0))
+    arc = radius * math.remainder(state.phase - bearing, 2 * math.pi)
+    return first + min(max(arc, -left), left) * along
 
 
 def _approach_speed(state: OrbitState, config: OrbitConfig) -> float:

@@ -138,6 +138,27 @@ def test_reference_waits_for_a_vehicle_that_stands_still():
     assert np.linalg.norm(sent.position - vehicle) <= config.max_lead_m + 1e-9
 
 
+def test_a_lag_along_the_orbit_takes_nothing_from_the_way_to_the_radius():
+    state = begin_orbit(np.array([6.0, 0.0, 2.5]), np.zeros(3), np.zeros(3), OrbitConfig())
+    for behind in (0.0, 0.3, 0.6):  # rad; the vehicle is 1 m too near
+        vehicle = np.array([5.0 * math.cos(behind), -5.0 * math.sin(behind), 2.5])
+        sent = setpoint_of(state, vehicle, np.zeros(3), np.zeros(3), OrbitConfig())
+        outward = np.array([math.cos(behind), -math.sin(behind), 0.0])
+        assert (sent.position - vehicle) @ outward == pytest.approx(1.0)
+        assert np.linalg.norm(sent.position - vehicle) <= OrbitConfig().max_lead_m + 1e-9
+
+
+def test_the_angle_yields_where_a_vehicle_falls_behind_a_walking_subject():
+    config = OrbitConfig()
+    state = begin_orbit(np.array([6.0, 0.0, 2.5]), np.zeros(3), np.zeros(3), config)
+    speed = np.array([0.0, 1.4, 0.0])
+    for i in range(400):
+        subject, angle = speed * i * DT, -math.radians(9.0) * i * DT
+        vehicle = subject + np.array([6.0 * math.cos(angle), 6.0 * math.sin(angle), 2.5])
+        state = advance(state, goal_of(config), vehicle, subject, speed, 0.0, DT, config)
+    assert np.linalg.norm(reference_position(state) - vehicle) <= config.max_lead_m + 0.1
+
+
 def test_larger_radius_reduces_angular_speed_to_the_acceleration_limit():
     config = OrbitConfig(radius_m=4.0, angular_speed_deg_s=40.0)
     _, state, _ = fly(30, config=config, start=(15.0, 0, 2.5))[20]
