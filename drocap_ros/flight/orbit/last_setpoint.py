@@ -25,6 +25,8 @@ _ACROSS = (
     (1.0, 1.0, 1.0), (0.75, 1.0, 1.0), (0.5, 1.0, 1.0), (0.25, 1.0, 1.0), (0.0, 1.0, 1.0), (0.0, 0.8, 0.5),
     (0.0, 0.6, 0.0), (0.0, 0.4, 0.0),
 )  # fmt: skip
+#: Then a share along it is refined where PX4 retreats: it is hardly faster than one who walks up to it.
+_HALVINGS = 3
 _WALKED = 0.96  # of its longest coast, about one who walks: the vehicle follows him meanwhile
 
 
@@ -91,27 +93,49 @@ def harmless(
     tries = [(share, share) for share in _SHARES]
     if seen.subject is not None and (seen.autopilot == "px4" or walking > WALKING_M_S):
         tries = [(_SHARES[0], share) for share in _ACROSS] + [(share, min(share, _ACROSS[-1])) for share in _SHARES[1:]]
-    for along, across in tries:
+
+    def judged(shares: np.ndarray) -> tuple[Setpoint, Condition | None, bool]:
+        """Part of the setpoint by (2, 3) shares, its danger, and whether its coast is too long."""
         way, velocity, acceleration = (
-            _shared(vector, seen, *shares) for vector, *shares in zip(
-                (setpoint.position - seen.position, setpoint.velocity, setpoint.acceleration), along, across,
-                strict=True,
+            _shared(vector, seen, *part) for vector, *part in zip(
+                (setpoint.position - seen.position, setpoint.velocity, setpoint.acceleration), *shares, strict=True
             )
         )  # fmt: skip
         part = setpoint._replace(position=seen.position + way, velocity=velocity, acceleration=acceleration)
         coast = coast_of(part, seen.position, seen.velocity, seen.autopilot, _timeout_s(seen))
-        problem = _danger(coast, seen, complex(*subject_velocity[:2]), fence_centre, limits)
-        long = coast.length_m > longest or _pulled(part, seen) > fastest
+        long = coast.length_m > longest or math.hypot(*_commanded(part, seen)) > fastest
         long |= _creeps_nearer(coast, seen, complex(*subject_velocity[:2])) > _CREEPS_NEARER_M
+        return part, _danger(coast, seen, complex(*subject_velocity[:2]), fence_centre, limits), long
+
+    above = tries[0]
+    for shares in tries:
+        part, problem, long = judged(np.array(shares))
         # A coast that is only long is not shorter after a hold: the slowest setpoint is sent.
-        if problem is None and (not long or along == _SHARES[-1]):
-            return part, None
-    return hold_setpoint(seen.position, seen.yaw), problem
+        if problem is None and (not long or shares[0] == _SHARES[-1]):
+            break
+        above = shares
+    else:
+        return hold_setpoint(seen.position, seen.yaw), problem
+    if seen.autopilot == "px4" and not long and shares[0] != above[0] and _retreats(setpoint, seen):
+        least, greatest = np.array(shares), np.array(above)
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (least + greatest)
+            more, danger, long = judged(middle)
+            if danger is None and not long:
+                part, least = more, middle
+            else:
+                greatest = middle
+    return part, None
 
 
-def _pulled(setpoint: Setpoint, seen: Observed) -> float:
-    """Speed (m/s) that PX4 commands: of the setpoint, and of the way to its place."""
-    return float(np.hypot(*(setpoint.velocity + PX4_POSITION_GAIN * (setpoint.position - seen.position))[:2]))
+def _commanded(setpoint: Setpoint, seen: Observed) -> np.ndarray:
+    """(2,) m/s that PX4 commands: of the setpoint, and of the way to its place."""
+    return (setpoint.velocity + PX4_POSITION_GAIN * (setpoint.position - seen.position))[:2]
+
+
+def _retreats(setpoint: Setpoint, seen: Observed) -> bool:
+    """Whether PX4 flies away from the subject."""
+    return seen.subject is not None and float(_commanded(setpoint, seen) @ (seen.subject - seen.position)[:2]) < 0.0
 
 
 def _shared(vector: np.ndarray, seen: Observed, along: float, across: float) -> np.ndarray:

@@ -92,6 +92,20 @@ def test_px4_creeps_on_after_its_stop_so_it_comes_nearer_more_slowly():
     assert follows.velocity[0] == pytest.approx(-0.6), "he recedes as fast"
 
 
+def test_px4_that_lacks_more_of_its_distance_retreats_no_more_slowly():
+    """Steps of the share left nothing of a way of 1.5 m, but half of one of 1 m: walkers caught up."""
+    now = seen(position=(4.6, 0.0, 2.5), velocity=(1.1, 0.0, 0.0), by="px4")
+    comes, ways = np.array([1.4, 0.0, 0.0]), []
+    for way in (0.6, 1.0, 1.5):
+        wanted = flight(now, comes, (0.5, 0.0, 0.0))._replace(position=now.position + np.array([way, 0.0, 0.0]))
+        sent = sent_of(wanted, now, comes, CENTRE, LIMITS)
+        assert isinstance(sent, Setpoint)
+        assert coast_of(sent, now.position, now.velocity, "px4", 0.5).length_m <= 0.82 * LIMITS.safety.max_coast_m
+        ways.append((sent.position - now.position)[0])
+    assert min(ways) > 0.5
+    assert np.all(np.diff(ways) > -0.05)
+
+
 @pytest.mark.parametrize("speed", [1.0, 2.0])
 def test_no_setpoint_leads_past_the_minimum_distance(speed):
     now = seen(position=(3.4, 0.0, 2.5), velocity=(-speed, 0.0, 0.0))
