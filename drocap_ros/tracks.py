@@ -196,6 +196,8 @@ def read_npz(path: Path, required: tuple[str, ...]) -> dict[str, np.ndarray]:
     InputError
         When the file is missing, is no ``.npz``, or lacks a required array.
     """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(f"{path}: expected a readable .npz archive, found a pipe or device; name a file")
     if path.is_file() and not zipfile.is_zipfile(path):
         raise InputError(f"{path}: expected a readable .npz archive, found another or a damaged file; check the path")
     try:

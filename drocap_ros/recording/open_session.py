@@ -32,6 +32,8 @@ def open_session(path: str | Path) -> Session:
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: expected {FORMS}, found no such file; check the path")
+    if not (path.is_file() or path.is_dir()):
+        raise InputError(f"{path}: expected {FORMS}, found a pipe or device; name a file or folder")
     if not is_recording(path):
         raise InputError(f"{path}: expected {FORMS}, found something else; check the path")
     try:

@@ -110,3 +110,14 @@ def test_files_of_unknown_kinds_are_refused_in_one_line(tmp_path):
         with pytest.raises(InputError, match="expected") as error:
             run(tmp_path / name)
         assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "words", ["replay x.mcap", "replay x.bag", "view x.npz --save y.rrd", "reconstruct x.npz --out y", "recover x.mcap"]
+)
+def test_a_named_pipe_is_refused_and_not_waited_for(tmp_path, monkeypatch, capsys, words):
+    monkeypatch.chdir(tmp_path)
+    command, name, *more = words.split()
+    os.mkfifo(name)
+    assert main([command, name, *more]) == 2
+    assert re.search("found (a pipe or device|another kind of file)", capsys.readouterr().err)

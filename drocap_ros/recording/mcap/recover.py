@@ -95,8 +95,8 @@ def recover_session(path: str | Path, progress: Progress | None = None) -> list[
 def _files(path: Path) -> tuple[list[Path], dict[str, str]]:
     if not path.exists():
         raise InputError(f"{path}: expected a session folder or .mcap, found no such file; check the path")
-    if path.is_file():
-        if path.suffix != ".mcap":
+    if not path.is_dir():
+        if not path.is_file() or path.suffix != ".mcap":
             raise InputError(f"{path}: expected a session folder or .mcap, found another kind of file; check the path")
         return [path], {}
     description, _ = read_metadata(path)
