@@ -25,7 +25,7 @@ from drocap_ros.parameters import Parameters
 from drocap_ros.reconstruction.live.stamps import StampValidator
 from drocap_ros.ros.diagnostics import ERROR, HARDWARE_ID, OK, WARN, Key, Latency, of
 from drocap_ros.ros.parameters import declare_parameters
-from drocap_ros.ros.topics import CAMERA_INFO_QOS, FROM_OUTSIDE, TOPICS, publishers_of, subscribers_of
+from drocap_ros.ros.topics import FROM_OUTSIDE, RESULT_QOS, TOPICS, publishers_of, subscribers_of
 
 #: A simulated time that has not moved for this long, by the real clock, stands still: a busy simulator is faster.
 _CLOCK_STANDS_S = 5.0
@@ -149,8 +149,7 @@ class ComponentNode(Node):
         """
         guarded = self.guarded(topic, callback, stamps=TOPICS[topic].one_clock)
         if qos is None:  # in simulated time no driver publishes, and every message counts
-            from_driver = topic == "camera_info" and not self.simulated
-            qos = CAMERA_INFO_QOS if from_driver else TOPICS[topic].qos
+            qos = RESULT_QOS if topic == "camera_info" and self.simulated else TOPICS[topic].qos
         subscription = self.create_subscription(
             TOPICS[topic].message,
             topic,

@@ -10,8 +10,9 @@ from captured_flight import FLIGHT, flight_config
 from rclpy.clock import ClockType
 from rclpy.context import Context
 from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data
 from rclpy.time import Time
-from sensor_msgs.msg import CompressedImage
+from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from drocap_ros.bringup import bringup, free_domain
 from drocap_ros.config import DrocapConfig
@@ -113,6 +114,17 @@ def test_message_that_is_none_is_refused_and_the_recording_continues(tmp_path):
             return [v.value for v in values if v.key == Key.MESSAGES_REFUSED][-1:]
 
         graph.wait_until(lambda: refused() == ["2"], 10, "two refusals")
+
+
+def test_a_drivers_camera_info_of_best_effort_is_recorded(tmp_path):
+    config = DrocapConfig().replace("session_recorder", session_dir=str(tmp_path / "s"))
+    with bringup(config, ["session_recorder"]) as graph:
+        driver = graph.node.create_publisher(CameraInfo, "camera_info", qos_profile_sensor_data)
+        graph.wait_until(lambda: driver.get_subscription_count() == 1, 10, "the recorder")
+        driver.publish(CameraInfo(width=640))
+        graph.spin_for(0.2)
+    with open_session(tmp_path / "s") as session:
+        assert "width: 640" in session.info.metadata["calibration"]
 
 
 def test_session_in_simulated_time_does_not_begin_before_the_clock(tmp_path):
