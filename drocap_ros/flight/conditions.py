@@ -101,6 +101,7 @@ class ConditionCode(enum.IntEnum):
     SUBJECT_NEAR = 203
     SUBJECT_FAR = 204
     SUBJECT_AT_BORDER = 205
+    NO_CAMERA_INFO = 206
 
 
 #: Factor of a limit that a command may reach: its values are float32, and limits are sums of decimal fractions.
@@ -209,6 +210,8 @@ _SENTENCES = {
     _C.ORBIT_NOT_KEPT: "the vehicle has been more than {limit_m:.1f} m from its place on the orbit for {for_s:.0f} s, "
     "{away_m:.1f} m now: {verdict}",
     _C.NO_SUBJECT: "no subject is tracked",
+    _C.NO_CAMERA_INFO: "no camera_info has arrived, and without it no subject is located: set "
+    "image_ingest.calibration_file or horizontal_fov_deg, or let the camera's driver publish it",
     _C.SUBJECT_OUTDATED: "the subject was last located {ago}",
     _C.SUBJECT_UNCERTAIN: "the subject's position is uncertain by {sd_m:.1f} m",
     _C.SUBJECT_NEAR: "the subject is {distance_m:.1f} m away, give or take {sd_m:.1f} m: at the limit of {limit_m:g} m",

@@ -63,10 +63,10 @@ class SessionRecorderNode(ManagedComponent):
         special = {
             _IMAGES: self._on_image, "camera_info": self._on_camera_info, "/diagnostics": self._on_diagnostics
         }  # fmt: skip
-        for topic, entry in TOPICS.items():
+        for topic in TOPICS:
             name = self.resolve_topic_name(topic)
             take = special.get(topic, self._on_message)
-            qos = IMAGE_RECORDING_QOS if topic == _IMAGES else entry.qos
+            qos = IMAGE_RECORDING_QOS if topic == _IMAGES else None
             events = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, name), use_default_callbacks=False)
             self.input(topic, partial(take, name), raw=True, qos=qos, events=events, with_info=True)
         self.create_timer(1.0, self._on_second)

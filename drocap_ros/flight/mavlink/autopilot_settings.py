@@ -70,7 +70,7 @@ class AutopilotSettings:
         names = []
         for name, setting in self._settings.items():
             patient = setting.tries >= _TRIES or not math.isnan(setting.value)
-            if now_s - setting.requested_s >= (_AGAIN_S if patient else _RETRY_S):
+            if abs(now_s - setting.requested_s) >= (_AGAIN_S if patient else _RETRY_S):
                 setting.requested_s, setting.tries = now_s, setting.tries + 1
                 names.append(name)
         return names

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 
 _NS = 1_000_000_000
+#: Two clocks drift apart by a few ms within the window; the answering of a packet is stamped as exactly.
+_TOLERANCE_NS = 20_000_000
+
+logger = logging.getLogger(__name__)
 
 
 class ClockOffset:
@@ -12,7 +17,10 @@ class ClockOffset:
 
     Answers to TIMESYNC give it from both directions; the exchange with the shortest round trip of the last minute is
     used.  Before the first answer, the fastest message of the last ten seconds gives it from one direction, late by the
-    shortest transmission time.  A restart of the autopilot or a jump of either clock resets it.
+    shortest transmission time.  A restart of the autopilot or a step of either clock resets it.
+
+    An exchange bounds the offset: the answer was given after our sending and before our reception.  However late or
+    uneven a link is, these bounds contain the offset, so two exchanges that exclude each other prove a step.
     """
 
     def __init__(self, window_s: float = 60.0, one_way_window_s: float = 10.0, jump_s: float = 1.0) -> None:
@@ -42,7 +50,9 @@ class ClockOffset:
         if not 0 <= trip <= 2 * _NS:
             return
         offset = sent_ns + trip // 2 - remote_ns
-        if self._best is not None and abs(offset - self._best[2]) > self._jump_ns + trip:
+        if self._best is not None and abs(offset - self._best[2]) > (trip + self._best[1]) // 2 + _TOLERANCE_NS:
+            step_s = (offset - self._best[2]) / _NS
+            logger.warning("our clock and the autopilot's stepped apart by %+.2f s; synchronized again", step_s)
             self.reset()
         self._exchanges.append((received_ns, trip, offset))
         while self._exchanges and received_ns - self._exchanges[0][0] > self._window_ns:

@@ -95,7 +95,7 @@ class TelemetryRequests:
             window_ns = min(window_ns, max(now_ns - self._since_ns, 1))
         arrivals = self._wanted[message_id].arrivals
         # Called at every turn of the link: each outdated arrival is visited once.
-        while arrivals and now_ns - arrivals[0] > window_ns:
+        while arrivals and not 0 <= now_ns - arrivals[0] <= window_ns:  # below 0: the clock went back
             arrivals.popleft()
         return len(arrivals) * _NS / window_ns
 
@@ -116,14 +116,15 @@ class TelemetryRequests:
 
     def due(self, now_ns: int) -> list[tuple[int, int]]:
         """(message id, interval us) to request now: at most one, so that its answer is unambiguous."""
-        if self._since_ns is None:
+        if self._since_ns is None or now_ns < self._since_ns:
             self._since_ns = now_ns
         settle_ns = int(self._config.rate_window_s * _NS)
         for number, wanted in self._wanted.items():
             wait_s = self._config.request_retry_s * (1 if wanted.result in (None, 0) else 10)
-            if (now_ns - wanted.requested_ns) / _NS < wait_s or self._no_mount(number):
+            since_request_ns = abs(now_ns - wanted.requested_ns)  # a clock that went back must not wait for itself
+            if since_request_ns / _NS < wait_s or self._no_mount(number):
                 continue
-            measured = now_ns - self._since_ns >= settle_ns and now_ns - wanted.requested_ns >= settle_ns
+            measured = now_ns - self._since_ns >= settle_ns and since_request_ns >= settle_ns
             short = measured and self.rate_hz(number, now_ns) < self._config.rate_shortfall * wanted.rate_hz
             if wanted.request_count == 0 or short:
                 wanted.requested_ns, wanted.result = now_ns, None

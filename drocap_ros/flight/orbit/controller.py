@@ -163,7 +163,10 @@ class OrbitController:
         not_followed = self._following.step(now_s, orbiting_s, setpoints, echo, self._vehicle, trip_s)
         seen = observe(self._link, self._config, self._vehicle, estimate, disturbance, not_followed, now_ns)
         seen = self._keeping.watch(self._orbit, self._framing.watch(self._vehicle, seen, dt), now_s)
-        seen = dataclasses.replace(self._guard.doubt(seen, self._history.offset, now_ns), intruder=self.intruder)
+        seen = dataclasses.replace(
+            self._guard.doubt(seen, self._history.offset, now_ns), intruder=self.intruder,
+            calibrated=self._framing.matrix is not None,
+        )  # fmt: skip
         command, kind, goal = self._next_command(now_ns)
         dialect = DIALECTS.get(seen.autopilot, ARDUPILOT)
         before = self.safety

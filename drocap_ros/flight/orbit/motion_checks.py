@@ -178,7 +178,7 @@ def subject_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
     """
     safety = limits.safety
     if seen.subject is None:
-        return condition(_C.NO_SUBJECT)
+        return condition(_C.NO_SUBJECT if seen.calibrated else _C.NO_CAMERA_INFO)
     oldest_s = oldest_subject_s(seen, safety)
     if patient and not seen.subject_contradicted:
         oldest_s = max(oldest_s, safety.max_subject_gap_s)

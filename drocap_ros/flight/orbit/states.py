@@ -77,6 +77,7 @@ class Observed:
     followed : whether the autopilot follows our setpoints; if not, only a mode can stop it
     loss_settings : the autopilot's settings for the loss of setpoints
     camera_problem : why the camera's attitude is unknown
+    calibrated : whether the camera's matrix is known, without which no subject is located
     away_m, away_s : from the vehicle to its place on the orbit, and for how long this has been too far
     framing_margin : between the person and the border of a fixed camera's picture, as a share of its height
     """
@@ -120,6 +121,7 @@ class Observed:
     followed: bool = True
     loss_settings: LossSettings | None = None
     camera_problem: Condition | None = None
+    calibrated: bool = True
     away_m: float = 0.0
     away_s: float = 0.0
     framing_margin: float = math.inf

@@ -22,6 +22,7 @@ from drocap_ros.flight.orbit.motion_checks import start_condition, vehicle_condi
 from drocap_ros.flight.orbit.observer import observe
 from drocap_ros.flight.orbit.states import Limits
 from drocap_ros.flight.preflight.findings import Measured, Stream
+from drocap_ros.flight.preflight.setting_checks import SETTINGS
 from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, VehicleState
 
 _NS = 1_000_000_000
@@ -30,8 +31,11 @@ _CONDITIONS_PERIOD_S, _VERSION_PERIOD_S, _VERSION_TRIES = 0.1, 1.0, 4
 MORE_SETTINGS = {
     "ardupilot": (
         "FENCE_ENABLE", "FENCE_TYPE", "FENCE_RADIUS", "FENCE_ALT_MAX", "FENCE_ACTION", TYPE_PARAMETER, "BATT_MONITOR",
+        *SETTINGS["ardupilot"],
     ),
-    "px4": ("GF_ACTION", "GF_MAX_HOR_DIST", "GF_MAX_VER_DIST", "COM_RC_OVERRIDE", "COM_OBL_RC_ACT"),
+    "px4": (
+        "GF_ACTION", "GF_MAX_HOR_DIST", "GF_MAX_VER_DIST", "COM_RC_OVERRIDE", "COM_OBL_RC_ACT", *SETTINGS["px4"],
+    ),
 }  # fmt: skip
 
 

@@ -124,7 +124,7 @@ def _camera(config: MavlinkBridgeConfig, setup: Setup, vehicle: VehicleState | N
         yield Finding(
             "camera", "camera", Level.MISSING, setup.camera_words, "a calibration, or a field of view",
             "set image_ingest.calibration_file (ROS camera_calibration), or at least horizontal_fov_deg", {},
-            (_C.NO_SUBJECT,),
+            (_C.NO_CAMERA_INFO,),
         )  # fmt: skip
         return
     yield Finding(

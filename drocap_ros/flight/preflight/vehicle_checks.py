@@ -12,6 +12,7 @@ from drocap_ros.flight.mavlink.dialects import PX4
 from drocap_ros.flight.mavlink.mount import SERVOS, TYPE_PARAMETER
 from drocap_ros.flight.orbit.motion_checks import battery_condition, loss_condition
 from drocap_ros.flight.preflight.findings import LASTING, Finding, Level, Measured, Stream
+from drocap_ros.flight.preflight.setting_checks import setting_findings
 from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, LANDED_ON_GROUND, SATELLITES_UNKNOWN, VehicleState
 
 _C = ConditionCode
@@ -32,6 +33,7 @@ def vehicle_findings(config: MavlinkBridgeConfig, measured: Measured, vehicle: V
     """Everything about the vehicle, whose state is known."""
     yield _autopilot(measured, vehicle)
     yield from _loss(config, measured, vehicle)
+    yield from setting_findings(config, measured, vehicle.autopilot)
     if vehicle.autopilot == "px4":
         yield from _px4_settings(config, measured, vehicle)
         yield _px4_fence(config, measured)

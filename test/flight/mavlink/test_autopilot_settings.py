@@ -87,3 +87,10 @@ def test_orbit_is_refused_when_the_autopilot_flies_on_without_setpoints(autopilo
     allowed.start()
     allowed.run(7.0)
     assert allowed.controller.safety.state == State.ORBITING
+
+
+def test_settings_are_read_again_where_the_clock_goes_back():
+    known = settings("ardupilot", GUID_TIMEOUT=0.5)
+    assert known.due(1000.0) == ["GUID_TIMEOUT"]
+    assert known.due(1000.1) == []
+    assert known.due(5.0) == ["GUID_TIMEOUT"]

@@ -1,4 +1,7 @@
 import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from drocap_ros.flight.mavlink.clock_offset import ClockOffset
 
@@ -49,6 +52,31 @@ def test_jump_of_our_clock_is_followed():
         clock.exchange(100 * S + i * S, i * S, 100 * S + i * S)
     clock.exchange(5000 * S, 10 * S, 5000 * S + 1000)
     assert clock.offset_ns == 4990 * S + 500
+
+
+@pytest.mark.parametrize("step_s", [-0.8, -0.3, 0.1, 0.3, 0.8])
+def test_a_step_of_either_clock_is_followed_by_the_next_exchange_and_reported(step_s, caplog):
+    clock, step = ClockOffset(), int(step_s * S)
+    for i in range(100):
+        sent = 100 * S + i * S // 10
+        clock.exchange(sent, i * S // 10 + S // 200, sent + S // 100)
+    assert not caplog.records
+    sent += S // 10 + step
+    clock.exchange(sent, 10 * S + S // 200, sent + S // 20)
+    assert abs(clock.offset_ns - 100 * S - step) <= S // 40
+    assert len(caplog.records) == 1
+    assert caplog.records[0].args[0] == pytest.approx(step_s, abs=0.025)
+
+
+@given(st.lists(st.tuples(*[st.integers(0, 2 * S)] * 2), min_size=1, max_size=50))
+def test_no_delay_of_a_link_counts_as_a_step_of_a_clock(delays):
+    """Else a late link would be synchronized anew, and its telemetry would seem fresh."""
+    clock, true = ClockOffset(), 7 * S
+    clock.exchange(true, S // 100, true + S // 50)
+    for i, (there, back) in enumerate(delays):
+        sent = true + i * S // 10
+        clock.exchange(sent, sent + there - true, sent + there + back)
+        assert abs(clock.offset_ns - true) <= clock.round_trip_ns // 2 + 1 <= S // 100 + 1
 
 
 def test_stamp_is_never_later_than_its_reception():

@@ -100,3 +100,14 @@ def test_another_autopilot_on_the_same_link_is_asked_for_its_own_messages():
     assert {"HEARTBEAT", "EKF_STATUS_REPORT"} <= set(wanted)
     assert not {"CURRENT_MODE", "ESTIMATOR_STATUS"} & set(wanted)
     assert math.isnan(link.estimator.mount.type_number)
+
+
+def test_requests_continue_where_the_clock_goes_back():
+    """As a clock that NTP sets, or a simulation that starts again."""
+    requests = TelemetryRequests(MavlinkBridgeConfig())
+    asked(requests, 20, start_s=1000)
+    assert {number for _, number, _ in asked(requests, 20)} == set(requests._wanted)
+    streams = set(requests._wanted)
+    asked(requests, 20, arriving=streams, start_s=1000)
+    asked(requests, 1, arriving=streams)
+    assert max(real for real, _ in requests.rates_hz(S).values()) == pytest.approx(50, rel=0.1)

@@ -11,6 +11,7 @@ from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.preflight.checks import all_findings, is_ready
 from drocap_ros.flight.preflight.findings import Level
 from drocap_ros.flight.preflight.measure import Listening, version_text
+from drocap_ros.flight.preflight.setting_checks import SETTINGS
 from drocap_ros.flight.preflight.setup_checks import Setup
 from drocap_ros.simulation.orbit_camera import pinhole_matrix
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
@@ -63,6 +64,7 @@ def test_a_vehicle_with_everything_set_is_ready_on_the_ground(autopilot):
     assert is_ready(scene.findings.values()), scene.missing()
     warnings = {code for code, finding in scene.findings.items() if finding.level == Level.WARNING}
     assert warnings <= {"rate_heartbeat"}
+    assert not {name.lower() for name in SETTINGS[autopilot]} & scene.findings.keys()  # it has none of them
     assert scene.findings["rate_attitude_quaternion"].values["real_hz"] == pytest.approx(50, rel=0.05)
     assert scene.findings["round_trip"].values["median_s"] == pytest.approx(0.02, abs=0.01)
     assert scene.findings["clock_offset"].values["spread_s"] < 0.01
@@ -103,6 +105,36 @@ def test_a_setting_that_forbids_motion_is_missing_with_its_value(autopilot, sett
     finding = scene.findings[code]
     assert finding.remedy.startswith(words)
     assert finding.found.split()[0] == f"{next(iter(settings.values())):g}"
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "settings", "level"),
+    [
+        ("ardupilot", {"GUID_OPTIONS": 77.0}, Level.OK),
+        ("ardupilot", {"GUID_OPTIONS": 16.0}, Level.MISSING),
+        ("ardupilot", {"GUID_OPTIONS": 32.0}, Level.MISSING),
+        ("ardupilot", {"GUID_OPTIONS": 128.0}, Level.WARNING),
+        ("ardupilot", {"WPNAV_ACCEL": 250.0}, Level.OK),
+        ("ardupilot", {"WPNAV_ACCEL": 100.0}, Level.WARNING),
+        ("ardupilot", {"WP_ACC": 1.0}, Level.WARNING),
+        ("ardupilot", {"FS_THR_ENABLE": 0.0}, Level.WARNING),
+        ("ardupilot", {"FS_OPTIONS": 16.0}, Level.OK),
+        ("ardupilot", {"FS_OPTIONS": 20.0}, Level.WARNING),
+        ("px4", {"MPC_XY_VEL_MAX": 12.0}, Level.OK),
+        ("px4", {"MPC_XY_VEL_MAX": 4.0}, Level.WARNING),
+        ("px4", {"MPC_XY_VEL_MAX": 1.5}, Level.MISSING),
+        ("px4", {"COM_RCL_EXCEPT": 3}, Level.OK),
+        ("px4", {"COM_RCL_EXCEPT": 4}, Level.WARNING),
+        ("px4", {"NAV_RCL_ACT": 2}, Level.OK),
+        ("px4", {"NAV_RCL_ACT": 6}, Level.WARNING),
+    ],
+)
+def test_a_setting_that_changes_how_setpoints_are_flown_or_a_pilot_is_lost_is_named(autopilot, settings, level):
+    scene = Scene(autopilot, seconds=2.0, **settings)
+    ((name, value),) = settings.items()
+    finding = scene.findings[name.lower()]
+    assert (finding.level, finding.values["value"]) == (level, value)
+    assert (name in finding.remedy) == (level > Level.OK)
 
 
 def test_a_time_out_that_is_not_reported_is_missing():

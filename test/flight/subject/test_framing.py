@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.frames import camera_rotation
+from drocap_ros.flight.orbit.controller import OrbitController
 from drocap_ros.flight.orbit.degradation import allowed_pace
 from drocap_ros.flight.orbit.planner import goal_of
 from drocap_ros.flight.orbit.states import Command, Limits, Observed, State
@@ -165,6 +166,19 @@ def test_a_zoom_ends_the_orbit_and_a_new_start_flies_by_the_new_camera():
     loop.run(18.0)
     assert loop.status.state == State.ORBITING
     assert loop.rows[-1].distance_m == pytest.approx(loop.settings.config.radius_m, abs=1.0)
+
+
+def test_a_missing_camera_info_is_named_until_it_arrives():
+    loop = OrbitLoop(LoopSettings(seed=1))
+    loop.controller = OrbitController(loop.link, loop.settings.config, loop.watchdog)
+    loop.start()
+    loop.run(4.5)
+    _, answer = loop.answers[-1]
+    assert not answer.accepted
+    assert loop.status.condition.code == answer.condition.code == ConditionCode.NO_CAMERA_INFO
+    loop.controller.on_camera(loop.matrix)
+    loop.run(7.0)
+    assert loop.status.condition.code == ConditionCode.ALL_CLEAR
 
 
 def test_a_commanded_orbit_is_refused_in_flight():
