@@ -70,7 +70,7 @@ def test_a_step_of_either_clock_is_followed_by_the_next_exchange_and_reported(st
 
 @given(st.lists(st.tuples(*[st.integers(0, 2 * S)] * 2), min_size=1, max_size=50))
 def test_no_delay_of_a_link_counts_as_a_step_of_a_clock(delays):
-    """Else a late link would be synchronized anew, and its telemetry would seem fresh."""
+    """A delay counts as no step: telemetry of a late link would seem fresh."""
     clock, true = ClockOffset(), 7 * S
     clock.exchange(true, S // 100, true + S // 50)
     for i, (there, back) in enumerate(delays):
