@@ -12,7 +12,7 @@ TEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
 BENCHMARK = $(CLEAN) $(BIN)/python benchmarks
 SOURCES := $(shell find drocap_ros msg srv config resource -type f -not -path '*/__pycache__/*') setup.py CMakeLists.txt package.xml
 
-.PHONY: help setup demo test lint bench bench-quick bench-flight clean
+.PHONY: help setup demo test test-nodes test-computing lint bench bench-quick bench-flight clean
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
 
@@ -42,11 +42,18 @@ demo: setup  ## a whole simulated capture, reconstructed and compared with its t
 	@$(CLEAN) $(BIN)/drocap demo --out demo_out
 
 # All parts run in workers, which end with the run: an interpreter that held nodes may hang at its exit.
-# Tests of nodes wait more than they compute: three at a time, where two compute.
-test: setup  ## the whole test suite: computing, then clocks and nodes, then those that count messages (up to three times)
-	$(CLEAN) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(TEST) -m "not clock and not counting" -n 2
+# Tests of nodes wait more than they compute: three at a time, then two.  Those that only compute take what is left of
+# the processors beside them.  Their outcome is printed when they end.
+test: setup  ## the whole test suite: nodes and clocks (up to three times), and beside them what only computes
+	@$(MAKE) --no-print-directory -j2 test-nodes test-computing
+
+test-nodes: setup
 	$(CLEAN) $(TEST) -m clock -n 3 --reruns 2 -r sR
 	$(CLEAN) $(TEST) -m counting -n 2 --reruns 2 -r sR
+
+test-computing: setup
+	@$(CLEAN) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 19 $(TEST) -m "not clock and not counting" -n 2 > build/test-computing.log 2>&1; \
+	status=$$?; cat build/test-computing.log; exit $$status
 
 lint: $(VENV)/.requirements  ## ruff and mypy
 	$(CLEAN) $(BIN)/ruff check .
