@@ -7,6 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -25,10 +26,12 @@ from drocap_ros.parameters import Parameters
 from drocap_ros.reconstruction.live.stamps import StampValidator
 from drocap_ros.ros.diagnostics import ERROR, HARDWARE_ID, OK, WARN, Key, Latency, of
 from drocap_ros.ros.parameters import declare_parameters
-from drocap_ros.ros.topics import FROM_OUTSIDE, RESULT_QOS, TOPICS, publishers_of, subscribers_of
+from drocap_ros.ros.topics import FROM_OUTSIDE, KEPT_QOS, RESULT_QOS, TOPICS, publishers_of, subscribers_of
 
 #: A simulated time that has not moved for this long, by the real clock, stands still: a busy simulator is faster.
 _CLOCK_STANDS_S = 5.0
+#: Between looks for a publisher that keeps its last message.
+_KEPT_PERIOD_S = 0.5
 #: A node whose input has been silent for this long is idle.
 IDLE_S = 3.0
 
@@ -91,6 +94,7 @@ class ComponentNode(Node):
         #: Publishers by the names of their topics.
         self.outputs: list[tuple[str, Publisher]] = []
         self._inputs: list[tuple[str, Subscription]] = []
+        self._kept: Subscription | None = None  # of what was published before this node
         self._diagnostics = self.output("/diagnostics")
         self.create_timer(1.0, self.publish_diagnostics)
         # Before the simulated time begins the endpoints are matched already.
@@ -150,16 +154,30 @@ class ComponentNode(Node):
         guarded = self.guarded(topic, callback, stamps=TOPICS[topic].one_clock)
         if qos is None:  # in simulated time no driver publishes, and every message counts
             qos = RESULT_QOS if topic == "camera_info" and self.simulated else TOPICS[topic].qos
-        subscription = self.create_subscription(
-            TOPICS[topic].message,
-            topic,
-            _with_info(guarded) if with_info else guarded,
-            qos,
+        subscribe = partial(
+            self.create_subscription, TOPICS[topic].message, topic, _with_info(guarded) if with_info else guarded,
             raw=raw,
-            event_callbacks=events or SubscriptionEventCallbacks(use_default_callbacks=topic in FROM_OUTSIDE),
-        )
+        )  # fmt: skip
+        events = events or SubscriptionEventCallbacks(use_default_callbacks=topic in FROM_OUTSIDE)
+        subscription: Subscription = subscribe(qos, event_callbacks=events)
         self._inputs.append((topic, subscription))
+        if topic == "camera_info" and not self.simulated:
+            self.create_timer(_KEPT_PERIOD_S, partial(self._hear_kept, topic, subscribe))
         return subscription
+
+    def _hear_kept(self, topic: str, subscribe: Callable[..., Subscription]) -> None:
+        """Subscribe a second time, until a message comes, where a publisher keeps its last one for late subscribers."""
+        if not self.active:
+            self._heard_s.pop(topic, None)  # what was heard meanwhile was not taken
+        elif topic not in self._heard_s:
+            offered = [p.qos_profile for p in self.get_publishers_info_by_topic(self.resolve_topic_name(topic))]
+            if self._kept is None and any(qos.durability == KEPT_QOS.durability for qos in offered):
+                silent = SubscriptionEventCallbacks(use_default_callbacks=False)
+                self._kept = subscribe(KEPT_QOS, event_callbacks=silent)
+            return
+        if self._kept is not None:
+            self.destroy_subscription(self._kept)
+            self._kept = None
 
     def guarded(self, topic: str, callback: Callable[..., None], *, stamps: bool) -> Callable[..., None]:
         """Wrap a callback: an InputError is counted and reported, not raised; with ``stamps`` they are validated."""

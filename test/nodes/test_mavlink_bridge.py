@@ -14,6 +14,7 @@ from drocap_ros.nodes.mavlink_bridge import MavlinkBridgeNode
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.ros.conversions import camera_info_to_ros, header_at, pose2d_to_ros
+from drocap_ros.ros.topics import KEPT_QOS
 from drocap_ros.simulation.orbit_camera import pinhole_matrix
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 
@@ -60,6 +61,26 @@ def test_a_drivers_camera_info_is_heard_whatever_it_offers(node, reliability):
         rclpy.spin_once(node, timeout_sec=0.05)
     driver.destroy_node()
     assert node._controller._framing.matrix is not None
+
+
+def test_a_camera_info_that_was_published_once_before_the_bridge_is_heard():
+    rclpy.init()
+    driver = rclpy.create_node("driver")
+    camera = CameraModel(1280, 720, pinhole_matrix(1280, 720, 60.0))
+    driver.create_publisher(CameraInfo, "/drocap/camera_info", KEPT_QOS).publish(
+        camera_info_to_ros(header_at(time.time_ns(), "camera"), camera)
+    )
+    node = MavlinkBridgeNode(MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{free_udp_port()}"))
+    try:
+        end = time.monotonic() + 5.0
+        while node._controller._framing.matrix is None and time.monotonic() < end:
+            rclpy.spin_once(node, timeout_sec=0.05)
+        assert node._controller._framing.matrix is not None
+    finally:
+        node.close()
+        node.destroy_node()
+        driver.destroy_node()
+        rclpy.try_shutdown()
 
 
 def test_an_error_in_the_control_loop_holds_the_vehicle_at_once(node, monkeypatch):

@@ -3,12 +3,14 @@
 import json
 import os
 import signal
+import time
 
 import numpy as np
 import rclpy
 from captured_flight import FLIGHT, flight_config
 from rclpy.clock import ClockType
 from rclpy.context import Context
+from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.time import Time
@@ -20,7 +22,7 @@ from drocap_ros.nodes.session_recorder import SessionRecorderNode
 from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.ros.diagnostics import Key
-from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, TOPICS
+from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, KEPT_QOS, TOPICS
 
 
 def test_a_session_holds_its_provenance(tmp_path):
@@ -125,6 +127,40 @@ def test_a_drivers_camera_info_of_best_effort_is_recorded(tmp_path):
         graph.spin_for(0.2)
     with open_session(tmp_path / "s") as session:
         assert "width: 640" in session.info.metadata["calibration"]
+
+
+def test_a_camera_info_that_was_published_once_before_is_recorded_once(tmp_path):
+    with free_domain() as domain_id:
+        context = Context()
+        rclpy.init(args=[], context=context, domain_id=domain_id)
+        driver = rclpy.create_node("driver", context=context, use_global_arguments=False)
+        publisher = driver.create_publisher(CameraInfo, "/drocap/camera_info", KEPT_QOS)
+        publisher.publish(CameraInfo(width=640))
+        config = SessionRecorderConfig(session_dir=str(tmp_path / "s"))
+        node = SessionRecorderNode(config, context=context, use_global_arguments=False)
+        executor = EventsExecutor(context=context)
+        executor.add_node(node)
+        try:
+            wait_for(executor, lambda: node._calibrated and publisher.get_subscription_count() == 1)
+            first_s = node._heard_s["camera_info"]
+            publisher.publish(CameraInfo(width=641))
+            wait_for(executor, lambda: node._heard_s["camera_info"] > first_s)
+        finally:
+            executor.shutdown()
+            node.close()
+            for closed in (node, driver):
+                closed.destroy_node()
+            context.try_shutdown()
+    with open_session(tmp_path / "s") as session:
+        assert "width: 640" in session.info.metadata["calibration"]
+        assert next(t.count for t in session.info.topics if t.name.endswith("camera_info")) == 2
+
+
+def wait_for(executor, condition):
+    end = time.monotonic() + 10.0
+    while not condition() and time.monotonic() < end:
+        executor.spin_once(timeout_sec=0.05)
+    assert condition()
 
 
 def test_session_in_simulated_time_does_not_begin_before_the_clock(tmp_path):
