@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,12 @@ def group(file: str) -> str:
     if not file.startswith(CLOCKED) or file in COMPUTING:
         return ""
     return "counting" if file.startswith(COUNTING) else "clock"
+
+
+def pytest_configure() -> None:
+    """Let tests interrupt processes in a shell's background job, too: it ignores SIGINT, and so would they."""
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
