@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drocap_ros.flight.orbit.states import Action, Command, OperatorCommand
+from drocap_ros.flight.orbit.states import Action, Command, OperatorCommand, State
 from drocap_ros.observation import PoseObservation
 from drocap_ros.simulation.closed_loop.fault_flight import FAULT_S, Injection
 from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, with_config
@@ -224,6 +224,15 @@ def no_orbit(loop: OrbitLoop) -> str:
     return "the orbit was commanded after the fault" if orbiting else ""
 
 
+def orbits_again(loop: OrbitLoop) -> str:
+    """Where the orbit has stopped, the operator starts it again, and it is flown within 3 s."""
+    if loop.controller.safety.state != State.ORBITING:
+        loop.command(Command.START if loop.copter.mode in ("GUIDED", "OFFBOARD") else Command.ENGAGE)
+        loop.run(loop.t + 3.0)
+    safety = loop.controller.safety
+    return "" if safety.state == State.ORBITING else f"no orbit can be started: {safety.condition}"
+
+
 def scaled(factor: float) -> Injection:
     """The person appears larger by this factor: nearer, or taller than configured."""
 
@@ -293,6 +302,11 @@ def kept(mode: str) -> Callable[[OrbitLoop], str]:
         return "" if loop.copter.mode == mode else f"the pilot's {mode} became {loop.copter.mode}"
 
     return check
+
+
+def longer(settings: LoopSettings) -> LoopSettings:
+    """By the time that :func:`orbits_again` flies on."""
+    return dataclasses.replace(settings, seconds=settings.seconds + 3.0)
 
 
 def in_wind(settings: LoopSettings) -> LoopSettings:

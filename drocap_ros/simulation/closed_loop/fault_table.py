@@ -45,10 +45,12 @@ from drocap_ros.simulation.closed_loop.fault_injections import (
     jump,
     kept,
     late_stamps,
+    longer,
     lose_half,
     move_stick,
     no_orbit,
     old_commands,
+    orbits_again,
     perceived,
     pilot,
     ready_late,
@@ -150,7 +152,14 @@ _PROCESS = (
     Fault("control loop hangs for 1 s", assign(hung=True), later=(1.0, assign(hung=False)), codes=(_STALLED,)),
     Fault("clock jumps 3 s ahead", assign(clock_jump_s=3.0), LINK_S, codes=(_C.CLOCK_JUMPED,)),
     Fault("clock jumps 3 s back", assign(clock_jump_s=-3.0), LINK_S, codes=(_C.CLOCK_JUMPED,)),
-)
+    *(
+        Fault(
+            f"clock steps {abs(step):g} s {'ahead' if step > 0 else 'back'}, then the operator starts again",
+            assign(clock_jump_s=step), harmless=True, change=longer, watch_s=4.0,
+            check=orbits_again,
+        ) for step in (0.3, -0.3, 0.8, -0.8)
+    ),
+)  # fmt: skip
 _LINK = (
     _link("link lost", "link", {"cut": True}, cause=TIMEOUT),
     _link("link lost for 2 s", "link", {"cut": True}, cause=TIMEOUT, later=(2.0, assign("link", cut=False)), codes=()),

@@ -15,6 +15,7 @@ SUBSET = {
     ("process killed (SIGKILL)", "px4"),
     ("process restarts after 1 s", "ardupilot"),
     ("control loop hangs for 1 s", "ardupilot"),
+    ("clock steps 0.8 s ahead, then the operator starts again", "px4"),
     ("uplink delayed by 1 s", "ardupilot"),
     ("pilot takes over and gives back", "ardupilot"),
     ("pilot takes position while engaging", "px4"),
