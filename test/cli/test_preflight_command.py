@@ -209,6 +209,7 @@ def test_with_a_running_graph_it_reads_what_the_bridge_hears(tmp_path):
     assert checks["guid_timeout"]["found"] == "3 s"
     assert checks["rate_attitude_quaternion"]["values"]["real_hz"] > 25
     assert checks["battery"]["found"] == "87 %, 15.8 V"
+    assert (checks["settings"]["level"], checks["settings"]["found"]) == ("warning", "not read")
 
 
 def test_what_the_running_bridge_refuses_is_missing_whatever_the_file_permits():

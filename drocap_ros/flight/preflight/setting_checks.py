@@ -85,6 +85,13 @@ SETTINGS = {autopilot: tuple(check.name for check in checks) for autopilot, chec
 
 def setting_findings(config: MavlinkBridgeConfig, measured: Measured, autopilot: str) -> Iterator[Finding]:
     """A finding for each parameter that was reported: no version of an autopilot has all of them."""
+    names = SETTINGS.get(autopilot, ())
+    if names and not any(name in measured.settings for name in names):
+        yield Finding(
+            "settings", "autopilot's settings", Level.WARNING, "not read", f"good values of {', '.join(names)}",
+            "stop the running bridge and run this again to read them",
+        )  # fmt: skip
+        return
     for name, wanted, remedy, level_of in _CHECKS.get(autopilot, ()):
         value = measured.setting(name)
         if math.isnan(value):
