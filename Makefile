@@ -52,7 +52,7 @@ test-nodes: setup
 	$(CLEAN) $(TEST) -m counting -n 2 --reruns 2 -r sR
 
 test-computing: setup
-	@$(CLEAN) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 19 $(TEST) -m "not clock and not counting" -n 2 > build/test-computing.log 2>&1; \
+	@$(CLEAN) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 19 $(TEST) -m "not clock and not counting" -n 2 --timeout 1200 > build/test-computing.log 2>&1; \
 	status=$$?; cat build/test-computing.log; exit $$status
 
 lint: $(VENV)/.requirements  ## ruff and mypy

@@ -23,7 +23,7 @@ from drocap_ros.tracks import load_tracks, save_tracks
 def python(text, cwd, root):
     (cwd / "example.py").write_text(text)
     env = {**os.environ, "PYTHONPATH": str(root), "DROCAP_MODELS": "simulation"}
-    done = subprocess.run([sys.executable, "example.py"], cwd=cwd, env=env, capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "example.py"], cwd=cwd, env=env, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -113,7 +113,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(folder):
         command,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096)),  # the nearest to a full disk
     )
     assert done.returncode == 1

@@ -27,7 +27,7 @@ def drocap(*arguments, cwd, **env):
     clean = {k: v for k, v in os.environ.items() if k not in ("DROCAP_MODELS", "DROCAP_DEBUG")}
     clean["PYTHONPATH"] = str(ROOT)
     command = [sys.executable, "-m", "drocap_ros.cli", *map(str, arguments)]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=280, env={**clean, **env})
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=900, env={**clean, **env})
 
 
 def reconstructed(path, cwd, *options):
