@@ -148,8 +148,10 @@ def _range_from_size(
     """Horizontal range from the third longest bone relative to its own length, and the bending.
 
     The bones are measured in the upright plane across the line of sight, at distance 1, so a camera that looks down
-    does not shorten them.  A wrong joint lengthens two bones at most; the shortest bones are foreshortened.  Where the
-    picture cuts the shanks off, the third of three bones is the shortest: then the second longest counts.
+    does not shorten them.  A wrong joint lengthens two bones at most; the shortest bones are foreshortened.  Without
+    shanks the third of three bones is the shortest: then the second longest counts, or the trunk if it is longer.
+    Thighs bend towards the camera, and a network that misses shanks of the ground's colour puts the knees too high:
+    both would put the subject much too far away.
     """
     depth = rays[:, :2] @ ahead
     usable = seen & (depth > 0.05)
@@ -161,6 +163,8 @@ def _range_from_size(
     lengths = np.linalg.norm(across[_ENDS_A] - across[_ENDS_B], axis=1)[bones] / (_SHARES[bones] * config.body_height_m)
     order = np.sort(lengths)[::-1]
     length = float(order[2 if len(order) > 4 else 1])
+    if len(order) == 3 and bones[0]:
+        length = max(length, float(lengths[0]))
     if length < 1e-6:
         return float("nan"), float("nan")
     return _THIRD_LONGEST / length, float(np.log(order[1] / max(order[min(3, len(order) - 1)], 1e-6)))

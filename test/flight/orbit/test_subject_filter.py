@@ -109,6 +109,22 @@ def test_range_ignores_a_foot_at_the_horizon():
     assert kicked.range_ground_m == pytest.approx(truth, rel=0.1)
 
 
+@pytest.mark.parametrize("up", [0.0, 0.4, 0.7])
+def test_missed_shanks_and_knees_too_high_put_nobody_farther(up):
+    # A network that does not see shanks of the ground's colour puts the knees on the thighs.
+    capture = flight("stand", noise_scale=0.0, outlier_fraction=0.0, missed_fraction=0.0, attitude_error_deg=0.0)
+    for i, pose, seen in observations(capture):
+        keypoints, confidence = seen.keypoints.copy(), seen.confidence.copy()
+        for side in "rl":
+            hip, knee, ankle = (seen.joints.index(side + name) for name in ("hip", "knee", "ankle"))
+            keypoints[knee] += up * (keypoints[hip] - keypoints[knee])
+            confidence[ankle] = 0.1
+        seen = dataclasses.replace(seen, keypoints=keypoints, confidence=confidence)
+        found = locate_subject(seen, capture.tracks.camera_matrix, pose, SubjectConfig())
+        truth = np.linalg.norm(capture.joints3d_world[i, 0, :2] - pose.position[:2])
+        assert 0.9 * truth < found.range_size_m < 1.1 * truth
+
+
 def test_velocity_of_a_standing_person_is_small_while_the_position_wanders():
     capture = flight("stand")
     rng = np.random.default_rng(0)
