@@ -90,7 +90,7 @@ def test_models_commands_refuse_unknown_folders_and_names(tmp_path, capsys):
 def test_fetch_without_a_network_ends_with_status_1(tmp_path):
     env = {**os.environ, "https_proxy": "http://127.0.0.1:9", "no_proxy": ""}
     command = [sys.executable, "-m", "drocap_ros.cli", "models", "fetch", "yolox-nano", "--models", str(tmp_path)]
-    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 1
     assert "check the network or proxy" in done.stderr
     assert done.stderr.count("\n") == 1

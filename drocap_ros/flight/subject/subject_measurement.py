@@ -163,7 +163,7 @@ def _range_from_size(
     lengths = np.linalg.norm(across[_ENDS_A] - across[_ENDS_B], axis=1)[bones] / (_SHARES[bones] * config.body_height_m)
     order = np.sort(lengths)[::-1]
     length = float(order[2 if len(order) > 4 else 1])
-    if len(order) == 3 and bones[0]:
+    if len(order) == 3 and bones[0]:  # the trunk
         length = max(length, float(lengths[0]))
     if length < 1e-6:
         return float("nan"), float("nan")

@@ -155,8 +155,7 @@ _PROCESS = (
     *(
         Fault(
             f"clock steps {abs(step):g} s {'ahead' if step > 0 else 'back'}, then the operator starts again",
-            assign(clock_jump_s=step), harmless=True, change=longer, watch_s=4.0,
-            check=orbits_again,
+            assign(clock_jump_s=step), harmless=True, change=longer, watch_s=4.0, check=orbits_again,
         ) for step in (0.3, -0.3, 0.8, -0.8)
     ),
 )  # fmt: skip
