@@ -131,8 +131,7 @@ _SENTENCES = {
     _C.DEGRADED: "the orbit is slowed down: {cause}",
     _C.SLOWED: "{cause}, at {speed_deg_s:.1f} deg/s instead of {wanted_deg_s:.1f}: without setpoints the autopilot "
     "flies on for {timeout_s:g} s, and the vehicle must stop within max_coast_m, {limit_m:g} m",
-    _C.WIDENED: "{cause}, {radius_m:.1f} m away instead of {wanted_m:.1f}: clear of min_distance_m, {limit_m:g} m, if "
-    "the range is wrong; size_error, {size_error:g}, may be 0.04 where body_height_m is the subject's",
+    _C.WIDENED: "{cause}, {radius_m:.1f} m away instead of {wanted_m:.1f}: {why}",
     _C.UNKNOWN_COMMAND: "no command has the number {number}",
     _C.COMMAND_OUTDATED: "the command is {age_s:.1f} s old by the bridge's clock, and {limit_s:g} s is the limit; "
     "synchronize the clocks of the two computers",

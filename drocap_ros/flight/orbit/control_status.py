@@ -12,6 +12,14 @@ from drocap_ros.flight.orbit.planner import OrbitGoal, OrbitState
 from drocap_ros.flight.orbit.states import Action, CommandAnswer, OperatorCommand, State
 
 _WIDER = 1.05
+_CLEAR = (
+    "clear of min_distance_m, {:g} m, if the range is wrong; size_error, {:g}, may be 0.04 where body_height_m is the"
+    " subject's"
+)
+_FRAMED = (
+    "there the fixed camera keeps one in the picture who walks up to the vehicle; a wider lens or a gimbal keeps him"
+    " nearer"
+)
 
 
 class ControlStatus(NamedTuple):
@@ -39,13 +47,16 @@ class ControlStatus(NamedTuple):
 
 
 def widened_condition(
-    present: Condition, goal: OrbitGoal, orbit: OrbitState, config: MavlinkBridgeConfig
+    present: Condition, goal: OrbitGoal, orbit: OrbitState, framed_radius_m: float, config: MavlinkBridgeConfig
 ) -> tuple[Condition, OrbitGoal]:
-    """The condition of a flown orbit, with its radius if that is wider than the goal's, and the goal that is flown."""
+    """The condition of a flown orbit, with its radius if that is wider than the goal's, and the goal that is flown.
+
+    framed_radius_m : least radius at which one who walks stays in the picture
+    """
     if present.code != ConditionCode.ORBITING or orbit.goal_radius <= _WIDER * goal.radius_m:
         return present, goal
+    why = _FRAMED if orbit.goal_radius <= framed_radius_m else _CLEAR.format(config.min_distance_m, config.size_error)
     widened = condition(
-        ConditionCode.WIDENED, cause=present, radius_m=orbit.goal_radius, wanted_m=goal.radius_m,
-        limit_m=config.min_distance_m, size_error=config.size_error,
-    )  # fmt: skip
+        ConditionCode.WIDENED, cause=present, radius_m=orbit.goal_radius, wanted_m=goal.radius_m, why=why
+    )
     return widened, goal._replace(radius_m=orbit.goal_radius)

@@ -93,6 +93,7 @@ class OrbitController:
         self._goal: OrbitGoal = goal_of(config)
         self._orbit: OrbitState | None = None
         self._shortfall = Shortfall()
+        self._framed_radius_m = 0.0
         self._before: tuple[int, float] | None = None
         self._fallback: Setpoint | None = None  # what the watchdog holds if this loop hangs
         self._jumps = PositionJumps()
@@ -271,9 +272,10 @@ class OrbitController:
                 config, estimate.position_sd_m, speed, config.braking_m_s2, config.size_error,
                 estimate.nearer * seen.subject_distance_m,
             )  # fmt: skip
+            self._framed_radius_m = self._framing.least_radius(self._goal, speed, seen.autopilot)
             self._orbit = advance(
                 self._orbit, self._goal, seen.position, estimate.position, estimate.velocity, config.ground_height_m,
-                dt * pace.value, config, least, coast_speed(seen, self._limits),
+                dt * pace.value, config, max(least, self._framed_radius_m), coast_speed(seen, self._limits),
             )  # fmt: skip
             setpoint = setpoint_of(self._orbit, seen.position, estimate.position, estimate.velocity, config)
             setpoint = self._shortfall.added(setpoint, seen, estimate.position, self._orbit.centre_velocity)
@@ -333,7 +335,8 @@ class OrbitController:
             yaw_error = math.degrees(math.remainder(seen.yaw - bearing, 2 * math.pi)) if sight.any() else math.nan
         orbiting, present = self.safety.state == State.ORBITING, self.safety.condition
         if orbiting and self._orbit is not None:
-            present, flown = widened_condition(present, self._goal, self._orbit, self._config)
+            framed_m = self._framed_radius_m
+            present, flown = widened_condition(present, self._goal, self._orbit, framed_m, self._config)
             present = slowed_condition(present, flown, seen, self._limits)
         answers, self._answers = self._answers, []
         return ControlStatus(

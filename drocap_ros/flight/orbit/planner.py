@@ -16,7 +16,7 @@ import numpy as np
 from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.setpoint import Setpoint
 
-WALKING_M_S = 0.5  # speed of one who walks
+WALKING_M_S, STANDING_M_S = 0.5, 0.3  # speed of one who walks; what the estimate of one who stands has
 #: 1/s, about one who stands and one who walks: his turns are no lasting error; m.
 _TRIM_RATE, _WALKING_TRIM_RATE, _MAX_TRIM_M = 0.15, 0.03, 0.5
 _FREE_LEAD = 0.6  # share of the greatest lead, below which the reference does not wait
@@ -26,7 +26,7 @@ _FORWARD_S = 0.5  # s; filter of the centre's acceleration
 #: 1/s, m/s^2: so much of it is passed on, by the centre's speed beyond that of one who stands: noise.
 _FORWARD_RATE, _MAX_FORWARD = 0.5, 0.5
 _MAX_HASTE = 0.12  # m/s^2 along the path that the setpoint passes on: the reference waits for a vehicle that lags
-_STANDING_M_S, _SURPRISE_S, _FLIGHT_ERROR_M = 0.3, 0.5, 0.5  # of the least radius
+_SURPRISE_S, _FLIGHT_ERROR_M = 0.5, 0.5  # of the least radius
 _CALIBRATION_S = 15.0  # against the wanted direction, with calibrate_telemetry
 _WORST_RANGE = 5.0  # of size_error: 40 % where the body is not measured, as by a wrong lens or a child
 
@@ -98,7 +98,7 @@ def least_radius(
     size_error : standard deviation of the range by body size, a share
     nearer_m : by so much the nearer of body size and ground puts the subject nearer
     """
-    speed = min(max(subject_speed_m_s - _STANDING_M_S, 0.0), config.max_subject_speed_m_s)
+    speed = min(max(subject_speed_m_s - STANDING_M_S, 0.0), config.max_subject_speed_m_s)
     surprise = max(_SURPRISE_S * speed, speed**2 / (2 * braking_m_s2))
     worst = _WORST_RANGE * size_error * config.min_distance_m
     nearer = max(2 * subject_sd_m, nearer_m + subject_sd_m, worst)
@@ -207,7 +207,7 @@ def setpoint_of(
     c, s = math.cos(state.phase), math.sin(state.phase)
     outward, along = np.array([c, s]), np.array([-s, c])
     r, omega = state.radius, state.omega
-    walking = max(float(np.hypot(*state.centre_velocity)) - _STANDING_M_S, 0.0)
+    walking = max(float(np.hypot(*state.centre_velocity)) - STANDING_M_S, 0.0)
     flat_velocity = state.centre_velocity + r.rate * outward + r.value * omega.value * along
     flat_acceleration = (
         _limited(state.centre_acceleration, min(_FORWARD_RATE * walking, _MAX_FORWARD))

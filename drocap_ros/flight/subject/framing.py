@@ -16,7 +16,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.orbit.planner import OrbitGoal
+from drocap_ros.flight.orbit.planner import STANDING_M_S, OrbitGoal
 from drocap_ros.flight.orbit.states import Observed
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
@@ -33,6 +33,9 @@ _STEADY_S = 0.7  # over which the margin now is averaged: a slower orbit cannot 
 _SAME_CAMERA = 0.03  # of the focal length, by which a camera matrix may change
 _CUT_OFF = 0.2  # share of the picture's height by which a mount may cut off feet or head: it does not lean further
 _COMFORT, _LEAST_PACE = 0.08, 0.3  # share of the picture's height below which the orbit slows down, and how far
+#: s of his way, by which one who walks up to the vehicle comes nearer than the orbit before it gives way as fast: it
+#: leans, and PX4 is slower by its coast.
+_GIVES_WAY_S = {"ardupilot": 1.2, "px4": 2.4}
 
 
 class View(NamedTuple):
@@ -102,6 +105,17 @@ def orbit_margin(view: View, goal: OrbitGoal, body_height_m: float, wind: float)
     ahead = np.arctan2(inward + lean * np.cos(around), _GRAVITY).ravel()
     left = np.arctan2(np.tile(lean * np.sin(around), 2), _GRAVITY)
     return float(framing_margin(view, goal.radius_m, goal.height_m, body_height_m, ahead, left).min())
+
+
+def nearest_framed(view: View, height_m: float, body_height_m: float) -> float:
+    """Least horizontal distance (m) at which the whole person is in the picture of a level body; inf = at none."""
+    focal, middle = view.matrix[1, 1], view.matrix[1, 2]
+    below = math.atan((view.size[1] - middle) / focal) - view.pitch
+    above = math.atan(middle / focal) + view.pitch
+    sides = ((height_m, below), (body_height_m + _HEADROOM_M - height_m, above))
+    if any(reach > 0.0 >= angle for reach, angle in sides):
+        return math.inf
+    return max(reach / math.tan(angle) for reach, angle in sides if reach > 0.0)
 
 
 class Framing:
@@ -188,6 +202,17 @@ class Framing:
             "the fixed camera, as the body leans,",
             remedy=first + _remedy(view, goal, body, wind, config.max_distance_m),
         )  # fmt: skip
+
+    def least_radius(self, goal: OrbitGoal, subject_speed_m_s: float, autopilot: str) -> float:
+        """Radius (m) at which one who walks up to the vehicle stays in a fixed camera's picture; 0 = any, or he stands.
+
+        subject_speed_m_s : horizontal
+        """
+        view, walking = self.view(), subject_speed_m_s - STANDING_M_S
+        if view is None or view.level or walking <= 0.0:
+            return 0.0
+        comes_m = _GIVES_WAY_S.get(autopilot, max(_GIVES_WAY_S.values())) * walking
+        return nearest_framed(view, goal.height_m, self._config.body_height_m) + comes_m
 
     def view(self) -> View | None:
         """The camera that does not follow the person; None = it follows, or nothing is known of it."""

@@ -15,9 +15,9 @@ from drocap_ros.flight.orbit.controller import OrbitController
 from drocap_ros.flight.orbit.degradation import allowed_pace
 from drocap_ros.flight.orbit.planner import goal_of
 from drocap_ros.flight.orbit.states import Command, Limits, Observed, State
-from drocap_ros.flight.subject.framing import Framing, View, framing_margin, orbit_margin
+from drocap_ros.flight.subject.framing import Framing, View, framing_margin, nearest_framed, orbit_margin
 from drocap_ros.flight.vehicle_state import VehicleState
-from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop
+from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, with_config
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
 from drocap_ros.simulation.vehicle.mount import tilted_camera
 
@@ -52,6 +52,37 @@ def test_margin_equals_the_projection_of_the_person(ahead, left, pitch):
 def test_a_person_behind_the_camera_is_outside():
     behind = framing_margin(View(MATRIX, SIZE, 1.5), 1.0, 2.5, 1.7, np.array([0.0]), np.array([0.0]))
     assert behind[0] == -1.0
+
+
+@pytest.mark.parametrize(("pitch", "height_m"), [(-0.2, 2.5), (0.1, 1.2), (-0.5, 5.0)])
+def test_at_the_nearest_framed_distance_the_person_touches_the_border(pitch, height_m):
+    view, level = View(MATRIX, SIZE, pitch), np.zeros(1)
+    nearest = nearest_framed(view, height_m, 1.7)
+    assert framing_margin(view, nearest, height_m, 1.7, level, level)[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_camera_that_looks_above_the_ground_frames_nobody():
+    assert nearest_framed(View(MATRIX, SIZE, 0.6), 2.5, 1.7) == math.inf
+
+
+def test_the_radius_grows_with_the_speed_of_one_who_walks_and_for_a_fixed_camera_only():
+    watched = framing()
+    slow, fast = (watched.least_radius(goal_of(CONFIG), speed, "px4") for speed in (0.6, 1.4))
+    assert watched.least_radius(goal_of(CONFIG), 0.2, "px4") == 0.0
+    assert slow < 6.0 < fast
+    assert watched.least_radius(goal_of(CONFIG), 1.4, "ardupilot") < fast
+    assert Framing(MavlinkBridgeConfig()).least_radius(goal_of(CONFIG), 1.4, "px4") == 0.0
+
+
+def test_px4_keeps_one_who_walks_in_the_picture_of_a_fixed_camera_and_says_how_far_away():
+    """He came nearer at 6 m until feet and knees were cut off, was lost, and the orbit ended after 15 s."""
+    settings = LoopSettings(autopilot="px4", mount="fixed", action="walk", seed=2, seconds=27)
+    loop = OrbitLoop(with_config(settings, body_height_m=settings.stature_m, size_error=0.04))
+    loop.start()
+    said = []
+    loop.run(26.0, lambda flown: said.append(flown.status.condition) if flown.status else None)
+    assert loop.controller.safety.state == State.ORBITING
+    assert any("instead of 6.0: there the fixed camera keeps" in str(condition) for condition in said)
 
 
 def test_the_orbit_is_refused_that_loses_the_person_and_the_remedies_keep_them():
