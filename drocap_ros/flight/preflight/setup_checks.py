@@ -169,7 +169,9 @@ def _picture(config: MavlinkBridgeConfig, setup: Setup, matrix: np.ndarray, vehi
     level: Level = Level.OK
     remedies: list[str] = []
     if view is not None:
-        level, remedies = _unaimed_camera(config, framing, view, _inside(fit, rows))
+        level, remedies = _unaimed_camera(
+            config, framing, view, _inside(fit, rows), vehicle.autopilot if vehicle else ""
+        )
     elif not _inside(fit, rows):
         level = Level.MISSING
         remedies.append(f"fly at least {_least_radius_m(config, matrix, rows):.0f} m away, or use a wider lens")
@@ -189,7 +191,9 @@ def _picture(config: MavlinkBridgeConfig, setup: Setup, matrix: np.ndarray, vehi
     )  # fmt: skip
 
 
-def _unaimed_camera(config: MavlinkBridgeConfig, framing: Framing, view: View, inside: bool) -> tuple[Level, list[str]]:
+def _unaimed_camera(
+    config: MavlinkBridgeConfig, framing: Framing, view: View, inside: bool, autopilot: str
+) -> tuple[Level, list[str]]:
     """As the bridge judges an orbit by a camera that nothing points: it leans with the body, or a mount keeps it."""
     goal = goal_of(config)
     refusal = framing.refusal(goal)
@@ -199,9 +203,16 @@ def _unaimed_camera(config: MavlinkBridgeConfig, framing: Framing, view: View, i
         # Flown, with a part of the person cut off.
         remedy = f"set gimbal_control to true, or point the mount to {-best_pitch_deg(config):.0f} deg before the start"
         return (Level.OK, []) if inside else (Level.WARNING, [remedy])
+    problems = []
     if orbit_margin(view, goal, config.body_height_m, _WIND_LEAN_M_S2) < 0:
-        return Level.WARNING, ["a wind of 8 m/s would lean the person out of it: use a gimbal, or fly farther away"]
-    return Level.OK, []
+        problems.append("a wind of 8 m/s would lean the person out of it: use a gimbal, or fly farther away")
+    walker_m = framing.least_radius(goal, _WALK_M_S, autopilot)
+    if walker_m > goal.radius_m:
+        problems.append(
+            f"about one who walks at {_WALK_M_S:g} m/s the orbit is flown at {walker_m:.1f} m, so that he stays in"
+            " it: use a gimbal or a wider lens to fly nearer"
+        )
+    return (Level.WARNING if problems else Level.OK), problems
 
 
 def person_in_picture(

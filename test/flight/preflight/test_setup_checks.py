@@ -9,6 +9,7 @@ import pytest
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.preflight.findings import Level
 from drocap_ros.flight.preflight.setup_checks import Setup, best_pitch_deg, person_in_picture, setup_findings
+from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.simulation.orbit_camera import look_at, pinhole_matrix, project
 
 MATRIX = pinhole_matrix(1280, 720, 60.0)
@@ -47,6 +48,14 @@ def test_a_level_fixed_camera_loses_the_feet_and_the_remedy_is_its_tilt():
     assert findings(tilted, narrow)["picture"].level == Level.WARNING  # of wind
     assert "wind" in findings(tilted, narrow)["picture"].remedy
     assert findings(tilted, SETUP._replace(camera_matrix=pinhole_matrix(1280, 720, 80.0)))["picture"].level == Level.OK
+
+
+@pytest.mark.parametrize(("autopilot", "said"), [("ardupilot", False), ("px4", True)])
+def test_a_fixed_camera_states_the_radius_about_one_who_walks(autopilot, said):
+    aimed = dataclasses.replace(FIXED, camera_pitch_deg=-best_pitch_deg(FIXED))
+    vehicle = VehicleState(1, autopilot=autopilot)
+    remedy = next(f.remedy for f in setup_findings(aimed, SETUP, vehicle) if f.code == "picture")
+    assert ("about one who walks at 1.4 m/s the orbit is flown at 6.5 m" in remedy) == said
 
 
 def test_a_person_too_large_or_too_small_for_the_picture():
