@@ -94,8 +94,7 @@ class BundleAdjusterNode(ComponentNode):
         self._sequence = 0
         self._subject_in_view = True
         self._had_telemetry = False
-        #: Width and height px of the images, and those that the calibration is for if they differ.
-        self._sizes: tuple[tuple[int, int], tuple[int, int] | None] = (0, 0), None
+        self._uncalibrated = ""  # why the images have no calibration
         self._refined = self.output("pose3d/refined")
         self._latest = self.output("pose3d/latest")
         self.input("pose2d", self._on_pose2d)
@@ -176,7 +175,7 @@ class BundleAdjusterNode(ComponentNode):
         stamp_ns = observation.stamp_ns
         latest = self._latest_pose.pose(stamp_ns, joints)
         camera = self._cameras.along(np.array([stamp_ns], np.int64), observation.image_size)
-        self._sizes = observation.image_size, self._cameras.other_size(observation.image_size)
+        self._uncalibrated = self._cameras.uncalibrated(observation.image_size)
         covariance = float_array(initial.covariance, (len(latest), 6), "covariance").astype(np.float64)
         keypoints = observation.body_keypoints().xy[: len(latest)]
         placed = self._latest_place.place(stamp_ns, (latest, covariance), keypoints, camera)
@@ -241,10 +240,8 @@ class BundleAdjusterNode(ComponentNode):
 
     def _report_telemetry(self, window: AdjustedWindow, done: str) -> None:
         use, reason = window.telemetry, window.reason
-        images, calibrated = self._sizes
-        if use is Telemetry.NONE and calibrated is not None:
-            use = Telemetry.REFUSED
-            reason = "camera_info is for images of {}x{} px, pose2d of {}x{}".format(*calibrated, *images)
+        if use is Telemetry.NONE and self._uncalibrated:
+            use, reason = Telemetry.REFUSED, self._uncalibrated
         self.details[Key.TELEMETRY] = use.name.lower()
         self.details[Key.TELEMETRY_REFUSED] = reason
         self._had_telemetry |= use is Telemetry.USED

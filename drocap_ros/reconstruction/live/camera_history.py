@@ -94,9 +94,13 @@ class CameraHistory:
         if last is None or last[2] != size or not np.array_equal(last[1], matrix):
             self._matrices = [*self._matrices[1 - _MOST_MATRICES :], (stamp_ns, matrix, size)]
 
-    def other_size(self, size: tuple[int, int]) -> tuple[int, int] | None:
-        """Width and height px that the newest calibration is for, if there is none of images of ``size``."""
-        return self._matrices[-1][2] if self._matrices and self._matrix(0, size) is None else None
+    def uncalibrated(self, size: tuple[int, int]) -> str:
+        """Why images of ``size``, width and height px, have no calibration, as words; "" = they have, or no poses."""
+        if self._matrix(0, size) is not None or not (self._matrices or self._stamps):
+            return ""
+        if not self._matrices:
+            return "no usable camera_info has arrived; calibrate the camera, or set image_ingest.horizontal_fov_deg"
+        return "camera_info is for images of {}x{} px, pose2d of {}x{}".format(*self._matrices[-1][2], *size)
 
     def along(self, stamp_ns: np.ndarray, size: tuple[int, int] = (0, 0)) -> WindowCamera | None:
         """The camera at images of increasing stamps (F,); None where no pose or no calibration is known.

@@ -83,12 +83,20 @@ def test_calibration_of_another_image_size_is_not_used() -> None:
     history.add_pose(S, np.zeros(3), LEVEL)
     history.add_matrix(S, MATRIX, (640, 480))
     assert history.along(at(1.0), (1280, 720)) is None
-    assert history.other_size((1280, 720)) == (640, 480)
+    assert history.uncalibrated((1280, 720)) == "camera_info is for images of 640x480 px, pose2d of 1280x720"
     history.add_matrix(2 * S, MATRIX, (1280, 720))
     camera = history.along(at(1.0), (1280, 720))
     assert camera is not None
     assert camera.focal_px == MATRIX[0, 0]
-    assert history.other_size((1280, 720)) is None
+    assert history.uncalibrated((1280, 720)) == ""
+
+
+def test_poses_without_a_calibration_are_named() -> None:
+    history = CameraHistory(2.0)
+    assert history.uncalibrated((1280, 720)) == ""  # no telemetry either
+    history.add_pose(S, np.zeros(3), LEVEL)
+    history.add_matrix(S, np.full((3, 3), np.nan))
+    assert history.uncalibrated((1280, 720)).startswith("no usable camera_info has arrived")
 
 
 def test_memory_is_bounded_and_a_window_stays_whole() -> None:
