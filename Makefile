@@ -48,8 +48,8 @@ test: setup  ## the whole test suite: nodes and clocks (up to three times), and 
 	@$(MAKE) --no-print-directory -j2 test-nodes test-computing
 
 test-nodes: setup
-	$(CLEAN) $(TEST) -m clock -n 3 --reruns 2 -r sR
-	$(CLEAN) $(TEST) -m counting -n 2 --reruns 2 -r sR
+	$(CLEAN) $(TEST) -m clock -n 3 --reruns 2 --rerun-show-tracebacks -r sR
+	$(CLEAN) $(TEST) -m counting -n 2 --reruns 2 --rerun-show-tracebacks -r sR
 
 test-computing: setup
 	@$(CLEAN) OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 19 $(TEST) -m "not clock and not counting" -n 2 --timeout 1200 > build/test-computing.log 2>&1; \
