@@ -111,11 +111,14 @@ class SimulatedVehicle:
         """Fly in real time until :meth:`close`, or for some seconds."""
         start = clock_s()
         while not self._stop.is_set() and clock_s() - start < seconds:
-            self.step(clock_s() - start, wait_s=0.004)
+            data = self._transport.read(0.004)
+            # The time is taken after it: an answer to TIMESYNC must not be stamped before the question came.
+            self.step(clock_s() - start, data)
 
-    def step(self, t_s: float, wait_s: float = 0.0) -> None:
-        """Answer the received messages (waiting at most ``wait_s``) and send those due at path time ``t_s``."""
-        data = self._transport.read(wait_s)
+    def step(self, t_s: float, data: bytes | None = None) -> None:
+        """Answer the messages received (None = what waits now) and send those due at path time ``t_s``."""
+        if data is None:
+            data = self._transport.read(0.0)
         if data:
             for message in self._parser.feed(data):
                 self._transport.accept_peer()

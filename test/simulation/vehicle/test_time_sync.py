@@ -1,0 +1,44 @@
+"""The simulated vehicle answers TIMESYNC as a real one does: with a time at which it had the question."""
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from drocap_ros.flight.mavlink.parser import MavlinkParser
+from drocap_ros.simulation.vehicle.flight_path import orbit_path
+from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle
+
+ARRIVES_S = 1.3
+QUESTION = mavlink.MAVLink(None, srcSystem=255).timesync_encode(0, 7)
+
+
+class BusyMachine:
+    """A transport on which a read takes until the question comes, much longer than it may wait."""
+
+    def __init__(self):
+        self.now_s, self.sent = 0.0, b""
+
+    def read(self, timeout_s):
+        if self.now_s >= ARRIVES_S:
+            self.now_s += 0.01
+            return b""
+        self.now_s = ARRIVES_S
+        return QUESTION.pack(mavlink.MAVLink(None, srcSystem=255))
+
+    def write(self, data):
+        self.sent += data
+        return True
+
+    def accept_peer(self):
+        pass
+
+    def close(self):
+        pass
+
+
+def test_an_answer_is_not_stamped_before_its_question_arrived():
+    """On a busy machine it was, by 0.02 s, and counted as a step of the clock."""
+    machine = BusyMachine()
+    with SimulatedVehicle("", orbit_path(60), transport=machine, boot_s=30.0) as vehicle:
+        vehicle.run(lambda: machine.now_s, seconds=1.5)
+    answers = [m for m in MavlinkParser().feed(machine.sent) if m.get_type() == "TIMESYNC"]
+    assert [m.ts1 for m in answers] == [7]
+    assert answers[0].tc1 >= (30.0 + ARRIVES_S) * 1e9
