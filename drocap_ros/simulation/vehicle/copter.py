@@ -79,7 +79,9 @@ class SimulatedCopter(ReportingCopter):
         return self.control.target
 
     def fly(self, t_s: float) -> None:
-        """Fly up to path time ``t_s``, then send and receive."""
+        """Fly up to path time ``t_s``, then answer what had arrived before, and send."""
+        # An answer to TIMESYNC must not be stamped before its question came: a busy machine takes its time to fly.
+        data = self._transport.read(0.0)
         while self._t < t_s - 1e-9 and not self.crashed:
             dt = min(_STEP_S, t_s - self._t)
             self._t += dt
@@ -88,7 +90,7 @@ class SimulatedCopter(ReportingCopter):
             self.mount.step(self.body.orientation_xyzw(), dt)
             self.error.step(self._t > self.gps_lost_s, dt)
         if not self.crashed:
-            self.step(t_s)
+            self.step(t_s, data)
             while self._answers and self._answers[0][0] <= t_s:
                 self._send(self._answers.pop(0)[1])
 
