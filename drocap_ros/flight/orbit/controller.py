@@ -93,7 +93,7 @@ class OrbitController:
         self._goal: OrbitGoal = goal_of(config)
         self._orbit: OrbitState | None = None
         self._shortfall = Shortfall()
-        self._framed_radius_m = 0.0
+        self._framed_radius_m = 0.0  # of the last orbit step, for the status
         self._before: tuple[int, float] | None = None
         self._fallback: Setpoint | None = None  # what the watchdog holds if this loop hangs
         self._jumps = PositionJumps()

@@ -206,13 +206,16 @@ class Framing:
     def least_radius(self, goal: OrbitGoal, subject_speed_m_s: float, autopilot: str) -> float:
         """Radius (m) at which one who walks up to the vehicle stays in a fixed camera's picture; 0 = any, or he stands.
 
+        At most ``max_distance_m``.
+
         subject_speed_m_s : horizontal
         """
         view, walking = self.view(), subject_speed_m_s - STANDING_M_S
         if view is None or view.level or walking <= 0.0:
             return 0.0
         comes_m = _GIVES_WAY_S.get(autopilot, max(_GIVES_WAY_S.values())) * walking
-        return nearest_framed(view, goal.height_m, self._config.body_height_m) + comes_m
+        radius = nearest_framed(view, goal.height_m, self._config.body_height_m) + comes_m
+        return min(radius, self._config.max_distance_m)
 
     def view(self) -> View | None:
         """The camera that does not follow the person; None = it follows, or nothing is known of it."""

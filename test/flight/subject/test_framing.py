@@ -71,6 +71,7 @@ def test_the_radius_grows_with_the_speed_of_one_who_walks_and_for_a_fixed_camera
     assert watched.least_radius(goal_of(CONFIG), 0.2, "px4") == 0.0
     assert slow < 6.0 < fast
     assert watched.least_radius(goal_of(CONFIG), 1.4, "ardupilot") < fast
+    assert watched.least_radius(goal_of(CONFIG), 50.0, "px4") == CONFIG.max_distance_m
     assert Framing(MavlinkBridgeConfig()).least_radius(goal_of(CONFIG), 1.4, "px4") == 0.0
 
 
