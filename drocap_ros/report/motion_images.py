@@ -101,14 +101,14 @@ def _no_images(path: Path) -> InputError:
 
 
 @contextlib.contextmanager
-def _opened(path: Path, motion: Motion) -> Iterator[Iterable[Frame]]:
+def _opened(path: Path, motion: Motion) -> Iterator[Images]:
     """Images of a path; refused when they cannot be those of the motion."""
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
     with open_images(path) as images:
         if not is_recording(path):  # a recording may hold more images than poses, with the same clock
             _check_times(path, images, motion)
-        yield _checked_sizes(path, images.frames, motion)
+        yield images._replace(frames=_checked_sizes(path, images.frames, motion))
 
 
 def _check_times(path: Path, images: Images, motion: Motion) -> None:
@@ -125,9 +125,9 @@ def _check_times(path: Path, images: Images, motion: Motion) -> None:
     ratio = step_s * images.rate_hz  # images per frame of the motion
     if ratio < 0.5 or abs(ratio - round(ratio)) > _RATE_SHARE * ratio:
         raise _other(path, f"{1 / step_s:.4g} images per second or a multiple", f"{images.rate_hz:.4g}")
-    last_s = float(motion.stamp_ns[-1] - motion.stamp_ns[0]) * 1e-9
-    if last_s > images.duration_s + max(0.5, _LENGTH_SHARE * last_s):
-        raise _other(path, f"at least {last_s:.1f} s", f"{images.duration_s:.1f} s")
+    length_ns = int(motion.stamp_ns[-1] - motion.stamp_ns[0])
+    if length_ns > 1e9 * images.duration_s + _slack_ns(length_ns):
+        raise _other(path, f"at least {length_ns * 1e-9:.1f} s", f"{images.duration_s:.1f} s")
 
 
 def _checked_sizes(path: Path, frames: Iterable[Frame], motion: Motion) -> Iterator[Frame]:
@@ -159,11 +159,9 @@ def _other(path: Path, expected: str, found: str) -> InputError:
     return InputError(f"{path}: expected the images of this motion with {expected}, found {found}; name its own video")
 
 
-def _matched(source: Iterable[Frame], motion: Motion, wanted: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+def _matched(images: Images, motion: Motion, wanted: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
     """Images of the wanted frames: the nearest to each stamp within half a frame."""
     stamp_ns = motion.stamp_ns
-    start_s = _stated(motion, "clip").get("start_s")
-    start_ns = round(1e9 * start_s) if isinstance(start_s, int | float) else 0
     half = int(np.median(np.diff(stamp_ns)) / 2) if len(stamp_ns) > 1 else 50_000_000
     waiting = [int(index) for index in wanted]
     offset: int | None = None
@@ -176,11 +174,9 @@ def _matched(source: Iterable[Frame], motion: Motion, wanted: np.ndarray) -> Ite
         if near:
             yield index, min(near, key=lambda c: abs(c[0] - target))[1]
 
-    for frame in source:
+    for frame in images.frames:
         if offset is None:
-            begin_ns = frame.stamp_ns + start_ns
-            elsewhere = not stamp_ns[0] - half <= begin_ns <= stamp_ns[-1] + half
-            offset = int(stamp_ns[0]) - begin_ns if elsewhere else 0
+            offset = _clock_offset_ns(motion, frame.stamp_ns, images.duration_s, half)
         now = (frame.stamp_ns + offset, frame.image)
         while waiting and now[0] >= int(stamp_ns[waiting[0]]):
             yield from nearest([before, now])
@@ -189,6 +185,28 @@ def _matched(source: Iterable[Frame], motion: Motion, wanted: np.ndarray) -> Ite
         before = now
     if waiting:
         yield from nearest([before])
+
+
+def _clock_offset_ns(motion: Motion, first_ns: int, duration_s: float | None, half_ns: int) -> int:
+    """Time from the images' clock to the motion's, ns: 0 where the motion lies within the images' time.
+
+    A motion begins after its first image where the first poses were left out: without a subject or telemetry.
+    With a foreign clock it begins with the first image of the clip that it states.
+
+    first_ns, duration_s : stamp of the first image, time to the last one if known
+    half_ns : half the time between two poses
+    """
+    begin_ns, end_ns = int(motion.stamp_ns[0]), int(motion.stamp_ns[-1])
+    length_ns = end_ns - begin_ns if duration_s is None else round(1e9 * duration_s)
+    if first_ns - half_ns <= begin_ns and end_ns <= first_ns + length_ns + _slack_ns(end_ns - begin_ns):
+        return 0
+    start_s = _stated(motion, "clip").get("start_s")
+    return begin_ns - first_ns - (round(1e9 * start_s) if isinstance(start_s, int | float) else 0)
+
+
+def _slack_ns(length_ns: int) -> int:
+    """Greatest excess of a motion's length over the stated one of its images: rates in containers are rounded."""
+    return max(500_000_000, round(_LENGTH_SHARE * length_ns))
 
 
 class _Encoder:

@@ -11,6 +11,9 @@ from drocap_ros.report import motion_images
 from drocap_ros.report.motion_images import has_images, read_motion_images
 from drocap_ros.report.page_data import page_data
 from drocap_ros.report.statistics import motion_statistics
+from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
+from drocap_ros.simulation.render.renderer import Renderer
+from drocap_ros.simulation.simulated_person import simulate_person
 
 cv2 = pytest.importorskip("cv2")
 
@@ -52,6 +55,34 @@ def test_a_motion_with_another_clock_starts_with_the_first_image(person, folder)
     stamps = np.round(np.arange(0, 40, 4) / 30.0 * 1e9) + 1_700_000_000_000_000_000
     found = read_motion_images(folder, seen_at(person, stamps))
     assert [level(j) for j in found.jpegs] == pytest.approx([5 * n + 20 for n in range(0, 40, 4)], abs=1)
+
+
+@pytest.mark.parametrize("left_out", [0, 2, 7])
+def test_keypoints_lie_on_the_rendered_person_when_the_first_poses_were_left_out(person, tmp_path, left_out):
+    count, matrix = 14, pinhole_matrix(320, 240, 60)
+    t = 0.7 + np.arange(count) / 30.0
+    joints = simulate_person(t, "mixed", 0)
+    ahead = np.tile([0, 0, 0.9], (count, 1))
+    rotation, position = orbit_camera(t, ahead + joints[:, 0] * [1, 1, 0], 4.0, 2.0, 60.0, 0.0)
+    rotation = np.repeat(rotation[:1], count, axis=0)  # a tripod: the person moves in the picture
+    position = np.repeat(position[:1], count, axis=0)
+    places = project(joints, rotation, position, matrix)[:, :15]
+    rendered = [Renderer(matrix, 320, 240).render(*view) for view in zip(joints, rotation, position, strict=True)]
+    for number, image in enumerate(rendered):
+        cv2.imwrite(str(tmp_path / f"{number:04d}.png"), image)
+    motion = seen_at(person, np.round(np.arange(left_out, count) / 30.0 * 1e9))
+    motion = dataclasses.replace(motion, keypoints=places[left_out:])
+    images = read_motion_images(tmp_path, motion)
+    data = page_data(motion, motion_statistics(motion), images)
+    drawn = np.array(data["keypoints"]).reshape(-1, 15, 2) / 10.0
+    assert len(images.jpegs) == count - left_out
+    x0, y0, x1, y1 = data["image"]["box"]
+    for place, jpeg in zip(data["image"]["places"], images.jpegs, strict=True):
+        shown = decoded(jpeg).astype(float)
+        assert shown.shape[:2] == (y1 - y0, x1 - x0)
+        differences = [np.abs(shown - image[y0:y1, x0:x1]).mean() for image in rendered]
+        off = np.linalg.norm(drawn[place] - places[int(np.argmin(differences))], axis=1)
+        assert off.max() < 3.0
 
 
 def test_the_crop_holds_the_keypoints(person, folder):
