@@ -1,7 +1,7 @@
 """Accuracy studies over MoCap and simulation: `python benchmarks/accuracy.py`, or some of its parts by name.
 
 rotation     every method at four orbit speeds, clean and noisy 2D (`drocap evaluate rotation`): page accuracy
-live         the live method beside the offline one, clean and noisy 2D (`drocap evaluate live`): page accuracy_live
+live         the live method beside the offline one, clean and noisy 2D: page accuracy_live
 live-world   the live method in the world beside the offline one, every third sequence: page accuracy_live_world
 perspective  the default method with a camera 6 m and 10 m away, lens known and unknown: page accuracy_perspective
 world        placement and scale from telemetry, on simulated captures: page accuracy_world
@@ -24,10 +24,6 @@ import numpy as np
 from figures import ROOT, table, write_figures
 
 from drocap_ros.cli.progress import progress_bars
-from drocap_ros.evaluation.calibration import calibration_markdown, calibration_study
-from drocap_ros.evaluation.live_study import live_study
-from drocap_ros.evaluation.live_study_table import live_markdown
-from drocap_ros.evaluation.live_world import live_world_markdown, live_world_study
 from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error, w_mpjpe
 from drocap_ros.evaluation.protocol import (
     FPS,
@@ -46,6 +42,10 @@ from drocap_ros.simulation.capture_config import SimulationConfig
 from drocap_ros.simulation.orbit_camera import project, to_camera
 from drocap_ros.skeleton import BODY_15, BODY_17, indices
 from drocap_ros.tracks import Tracks
+from lab.studies.calibration import calibration_markdown, calibration_study
+from lab.studies.live_study import live_study
+from lab.studies.live_study_table import live_markdown
+from lab.studies.live_world import live_world_markdown, live_world_study
 
 SPEED_DEG_S = 25.0
 SOLUTION_DELAY_S = 0.5

@@ -10,7 +10,7 @@ import argparse
 
 from figures import table, write_figures
 
-from drocap_ros.simulation.closed_loop.fault_flight import (
+from lab.flights.fault_flight import (
     EXCURSION_M,
     MOTION_S,
     Fault,
@@ -19,7 +19,7 @@ from drocap_ros.simulation.closed_loop.fault_flight import (
     fly_fault,
     within_protocol,
 )
-from drocap_ros.simulation.closed_loop.fault_table import FAULTS
+from lab.flights.fault_table import FAULTS
 
 HEAD = [
     "", "dialect", "fault", "motion, s", "bound, s", "away, m", "bound, m", "speed, m/s", "state", "cause or condition",

@@ -18,9 +18,9 @@ from figures import table, write_figures
 from flight_field_defects import DEFECTS
 
 from drocap_ros.flight.orbit.states import Command, State
-from drocap_ros.simulation.closed_loop.branches import over_processes
-from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
 from drocap_ros.simulation.vehicle.loopback import is_setpoint
+from lab.flights.branches import over_processes
+from lab.flights.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
 
 FAULT_S, WATCH_S = 14.0, 7.0
 MOVING_M_S = 0.05

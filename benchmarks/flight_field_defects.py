@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drocap_ros.flight.orbit.states import Action, Command, State
-from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, with_config
 from drocap_ros.simulation.vehicle.loopback import is_setpoint
+from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 
 NEEDED_M_S2 = math.radians(19.0) ** 2 * 6.0  # of an orbit of 6 m at 19 deg/s
 

@@ -17,7 +17,7 @@ from figures import write_figures
 
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.states import Action, OperatorCommand, State
-from drocap_ros.simulation.closed_loop.orbit_loop import EPOCH_NS, LoopSettings, OrbitLoop, with_config
+from lab.flights.orbit_loop import EPOCH_NS, LoopSettings, OrbitLoop, with_config
 
 _ODD = [float("nan"), float("inf"), -float("inf"), 0.0, -0.0, -1e30, 1e30, 5.0, 1e-300, 3.4e38]
 _BAD_RADIUS = [0.0, -5.0, 1e30, float("inf"), -float("inf"), 3.49, 100.1]

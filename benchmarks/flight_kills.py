@@ -20,8 +20,8 @@ import numpy as np
 from figures import table, write_figures
 
 from drocap_ros.flight.orbit.states import Action, State
-from drocap_ros.simulation.closed_loop.branches import branch, over_processes
-from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, with_config
+from lab.flights.branches import branch, over_processes
+from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 
 AUTOPILOTS = ("ardupilot", "px4")
 RADII_M, WINDS_M_S, ACTIONS = (4.0, 6.0, 10.0), (0.0, 8.0), ("stand", "walk")

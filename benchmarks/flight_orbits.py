@@ -30,8 +30,8 @@ from perception_errors import PerceptionErrors
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.orbit.states import Command, State
-from drocap_ros.simulation.closed_loop.branches import over_processes
-from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
+from lab.flights.branches import over_processes
+from lab.flights.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
 
 SECONDS = 24.0
 SETTLE_S = 4.0

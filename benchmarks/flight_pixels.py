@@ -17,8 +17,8 @@ from drocap_ros.flight.orbit.states import State
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
-from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
-from drocap_ros.simulation.closed_loop.pixel_loop import PixelOrbitLoop
+from lab.flights.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
+from lab.flights.pixel_loop import PixelOrbitLoop
 
 _RADIUS_M, _SETTLED_S = 6.0, 13.0
 

@@ -31,14 +31,14 @@ from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.orbit.states import Command, State
 from drocap_ros.observation import PoseObservation
-from drocap_ros.simulation.closed_loop.fault_causes import TIMEOUT
-from drocap_ros.simulation.closed_loop.fault_flight import EXCURSION_M, MOTION_S, Bounds
-from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings
 from drocap_ros.simulation.keypoint_errors import noisy_keypoints
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.ports import free_udp_port
+from lab.flights.fault_causes import TIMEOUT
+from lab.flights.fault_flight import EXCURSION_M, MOTION_S, Bounds
+from lab.flights.orbit_loop import LoopSettings
 
 RATE_HZ, WIDTH, HEIGHT, FIELD_DEG = 15.0, 1280, 720, 60.0
 CONTROL = {"ardupilot": "GUIDED", "px4": "OFFBOARD"}

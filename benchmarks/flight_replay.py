@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from figures import ROOT, table, write_figures
 
-from drocap_ros.simulation.vehicle.replay import WIND_M_S, Case, RecordedFlight, load_recorded, recorded_cases, replay
+from lab.flights.replay import WIND_M_S, Case, RecordedFlight, load_recorded, recorded_cases, replay
 
 HEAD = ["recording", "autopilot", "from, s", "off after 1, 2, 3 s, m", "most, m", "went, simulated, m", "recorded, m"]
 BOUND_M = 0.3

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.observation import PoseObservation
-from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, with_config
+from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 
 #: Half of the orbits have errors; in the others perception errs as a detector does.
 KINDS = ("none", "range", "swing", "another person", "shadow", "ground", "frozen", "late stamps")

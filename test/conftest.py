@@ -15,7 +15,7 @@ pytest_plugins = ["fixtures_export", "fixtures_recording", "fixtures_reconstruct
 #: Where nodes run, ports are listened to or time is measured, and what of it only computes.
 CLOCKED = (
     "nodes", "ros", "system", "view", "cli/test_live_cli.py", "cli/test_preflight_command.py",
-    "cli/models/test_train_lifter.py", "flight/mavlink/test_link.py", "flight/mavlink/test_signing.py",
+    "lab/commands/test_train_lifter.py", "flight/mavlink/test_link.py", "flight/mavlink/test_signing.py",
     "flight/mavlink/test_gimbal.py", "perception/sources/test_live_sources.py",
     "perception/models/test_fetch.py", "recording/mcap/test_bounded_queue.py",
     "recording/mcap/test_recover.py", "recording/mcap/test_session_writer.py",
@@ -29,7 +29,7 @@ COUNTING = (
 )  # fmt: skip
 #: Files that take longest begin, so that none of them ends alone.
 LONG = (
-    "system/test_simulated_demo.py", "system/test_packaging.py", "simulation/closed_loop/test_pilot_wins.py",
+    "system/test_simulated_demo.py", "system/test_packaging.py", "lab/flights/test_pilot_wins.py",
     "reconstruction/live/test_world_windows.py", "cli/batch/test_batch_command.py", "system/test_demo.py",
     "cli/test_preflight_command.py", "cli/test_live_cli.py",
 )  # fmt: skip

@@ -1,8 +1,9 @@
-"""The rooms of the package: sizes, layers, imports of ROS.  ARCHITECTURE.md describes them."""
+"""The rooms of product and laboratory: budgets, layers, circles, imports of ROS.  ARCHITECTURE.md describes them."""
 
 from __future__ import annotations
 
 import ast
+import re
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -13,22 +14,41 @@ LAYERS = (
     ("errors", "revision", "parameters", "skeleton", "joint_maps", "leg_sides", "geometry", "keypoints", "observation",
      "tracks", "motion", "mocap", "clip"),
     ("perception", "flight", "reconstruction", "recording", "simulation"),
-    ("api", "config", "pipeline", "live_replay", "training", "evaluation", "export", "report", "view"),
+    ("api", "config", "pipeline", "live_replay", "evaluation", "export", "report", "view"),
     ("ros",),
     ("nodes", "bringup"),
     ("cli",),
 )  # fmt: skip
 ROS_ROOMS = {"ros", "nodes", "bringup"}
 ROS_PACKAGES = ("rclpy", "drocap_ros.msg", "drocap_ros.srv")
-MAX_MODULES = 17
 MAX_LINES = 350
+#: Most lines of Python per room, in thousands.  A feature pays for its lines by what it makes needless; who raises a
+#: budget writes the reason beside the number.
+BUDGETS = {
+    ("errors", "revision", "parameters", "skeleton", "joint_maps", "leg_sides", "geometry", "keypoints", "observation",
+     "tracks", "motion", "mocap", "clip", "api", "config", "pipeline", "live_replay"): 3.0,
+    ("perception",): 5.2,
+    ("reconstruction",): 7.6,
+    ("flight",): 7.7,
+    ("recording",): 4.9,
+    ("simulation",): 3.6,
+    ("evaluation",): 1.7,
+    ("export", "report", "view"): 4.2,
+    ("ros", "nodes", "bringup"): 4.6,
+    ("cli",): 4.5,
+    ("lab", "benchmarks"): 11.0,
+}  # fmt: skip
+#: Names of autopilots and of their settings; `ardupilotmega` is a dialect of MAVLink.
+AUTOPILOT_WORD = re.compile(
+    r"(?i:px4|ardupilot(?!mega)|arducopter)|\b(?:COM|EK3|EKF2|FS|GF|GUID|LOIT|MPC|PSC|SYSID|WPNAV|SR\d)_[A-Z0-9_]+"
+)
 
 
 class Package:
-    """Modules of `root/drocap_ros` by dotted name, and what each imports, inside functions included."""
+    """Modules of `root/NAME` by dotted name, and what each imports, inside functions included."""
 
-    def __init__(self, root: Path) -> None:
-        self.root = root / "drocap_ros"
+    def __init__(self, root: Path, name: str = "drocap_ros") -> None:
+        self.root = root / name
         self.files: dict[str, Path] = {}
         for path in sorted(self.root.rglob("*.py")):
             parts = path.relative_to(root).with_suffix("").parts
@@ -46,6 +66,11 @@ class Package:
                 found |= {name if name in self.files or node.module == "drocap_ros" else node.module for name in names}
         return found
 
+    def folder(self, module: str) -> str:
+        """Folder of a module, dotted; a module of the top folder stands for itself."""
+        parent = self.files[module].parent
+        return module if parent == self.root else ".".join(parent.relative_to(self.root.parent).parts)
+
     def edges(self) -> dict[str, set[str]]:
         """Module -> modules of the package that it imports."""
         return {name: {to for to in found if to in self.files and to != name} for name, found in self.imports.items()}
@@ -61,12 +86,6 @@ def large_files(package: Package) -> list[str]:
     return [f"{path.relative_to(package.root)}: {n} lines" for path, n in lines.items() if n > MAX_LINES]
 
 
-def large_folders(package: Package) -> list[str]:
-    folders = [package.root, *(path for path in package.root.rglob("*") if path.is_dir())]
-    sizes = {folder: sum(p.name != "__init__.py" for p in folder.glob("*.py")) for folder in folders}
-    return [f"{folder.name}: {n} modules" for folder, n in sizes.items() if n > MAX_MODULES]
-
-
 def rooms_without_docstring(package: Package) -> list[str]:
     inits = [path for path in package.files.values() if path.name == "__init__.py"]
     missing = [path for path in inits if not ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))]
@@ -75,12 +94,18 @@ def rooms_without_docstring(package: Package) -> list[str]:
 
 
 def circles(package: Package) -> list[str]:
-    """An import circle between files, and one between top rooms."""
+    """Import circles between files, between folders at every depth, and between rooms.
+
+    A folder is its own modules, without its subfolders; each module of the top folder is a room of its own.
+    """
     files = package.edges()
-    rooms: dict[str, set[str]] = {}
-    for name, targets in files.items():
-        rooms.setdefault(room(name), set()).update(room(to) for to in targets if room(to) != room(name))
-    return [found for graph in (files, rooms) if (found := _circle(graph))]
+    graphs = [files]
+    for place in (package.folder, room):
+        graph: dict[str, set[str]] = {}
+        for name, targets in files.items():
+            graph.setdefault(place(name), set()).update(place(to) for to in targets if place(to) != place(name))
+        graphs.append(graph)
+    return [found for graph in graphs if (found := _circle(graph))]
 
 
 def _circle(graph: dict[str, set[str]]) -> str:
@@ -107,7 +132,29 @@ def ros_outside_its_rooms(package: Package) -> list[str]:
     ]  # fmt: skip
 
 
-RULES = [large_files, large_folders, rooms_without_docstring, circles, arrows_upwards, ros_outside_its_rooms]
+def laboratory_in_the_product(package: Package) -> list[str]:
+    return [
+        f"{name}: {target}" for name, targets in package.imports.items() for target in targets
+        if target.split(".")[0] in ("lab", "benchmarks")
+    ]  # fmt: skip
+
+
+def autopilots_outside_their_room(package: Package) -> list[str]:
+    """Words of an autopilot in the flight room, comments included: what differs is a field of its object."""
+    found = []
+    for name, path in package.files.items():
+        if room(name) == "flight" and "autopilot" not in name.split(".")[2:3]:
+            words = set(AUTOPILOT_WORD.findall(path.read_text(encoding="utf-8")))
+            found += [f"{name}: {', '.join(sorted(words))}"] if words else []
+    return found
+
+
+RULES = [
+    large_files, rooms_without_docstring, circles, arrows_upwards, ros_outside_its_rooms, laboratory_in_the_product,
+    autopilots_outside_their_room,
+]  # fmt: skip
+#: What the tree does not keep yet.
+OPEN = {circles, autopilots_outside_their_room}
 
 
 @pytest.fixture(scope="module")
@@ -116,16 +163,38 @@ def package(root):
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_package_keeps_rule(package, rule):
+def test_package_keeps_rule(package, rule, request):
+    if rule in OPEN:
+        request.applymarker(pytest.mark.xfail(reason="open"))
     found = rule(package)
     assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("rule", [large_files, rooms_without_docstring])
+def test_laboratory_keeps_rule(root, rule):
+    found = rule(Package(root, "lab"))
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("rooms", BUDGETS, ids=lambda rooms: rooms[0])
+def test_room_keeps_its_budget(root, rooms):
+    """Its lines are at most those of the table; where they fall far below, the table follows."""
+    lines = 0
+    for name in rooms:
+        top = root / ("" if name in ("lab", "benchmarks") else "drocap_ros")
+        paths = [top / f"{name}.py", *(top / name).rglob("*.py")]
+        lines += sum(len(path.read_text(encoding="utf-8").splitlines()) for path in paths if path.is_file())
+    assert lines <= 1000 * BUDGETS[rooms]
+
+
+def test_every_room_has_a_budget():
+    assert {name for rooms in BUDGETS for name in rooms} >= {name for names in LAYERS for name in names}
 
 
 @pytest.mark.parametrize(
     ("rule", "files"),
     [
         (large_files, {"errors.py": "x = 1\n" * (MAX_LINES + 1)}),
-        (large_folders, {f"flight/m{i}.py": "" for i in range(MAX_MODULES + 1)}),
         (rooms_without_docstring, {"flight/__init__.py": "import math\n"}),
         (rooms_without_docstring, {"flight/orbit/safety.py": ""}),
         (circles, {"tracks.py": "import drocap_ros.motion\n", "motion.py": "from drocap_ros.tracks import Tracks\n"}),
@@ -133,6 +202,13 @@ def test_package_keeps_rule(package, rule):
             "flight/a.py": "from drocap_ros.simulation import b\n", "simulation/b.py": "",
             "simulation/c.py": "def f():\n    from drocap_ros.flight.d import g\n", "flight/d.py": "",
         }),
+        (circles, {
+            "flight/__init__.py": "", "flight/orbit/a.py": "from drocap_ros.flight import b\n", "flight/b.py": "",
+            "flight/c.py": "from drocap_ros.flight.orbit.d import e\n", "flight/orbit/d.py": "",
+        }),
+        (laboratory_in_the_product, {"cli/train.py": "def run():\n    from lab.training import lifter\n"}),
+        (autopilots_outside_their_room, {"flight/orbit/a.py": "# PX4 grants it\n"}),
+        (autopilots_outside_their_room, {"flight/link.py": 'NAME = "GUID_TIMEOUT"\n', "flight/autopilot/a.py": ""}),
         (arrows_upwards, {"flight/a.py": "from drocap_ros import pipeline\n", "pipeline.py": ""}),
         (arrows_upwards, {"attic.py": ""}),
         (ros_outside_its_rooms, {"cli/orbit.py": "def run():\n    from drocap_ros.msg import OrbitStatus\n"}),
@@ -149,5 +225,8 @@ def test_rule_finds_violation(tmp_path, rule, files):
 
 def test_test_folders_mirror_the_rooms(root):
     folders = {p.parent.relative_to(root / "test") for p in (root / "test").rglob("test_*.py")}
-    extra = {str(f) for f in folders if f.parts and f.parts[0] != "system" and not (root / "drocap_ros" / f).is_dir()}
+    extra = {
+        str(f) for f in folders
+        if f.parts and f.parts[0] != "system" and not (root / "drocap_ros" / f).is_dir() and not (root / f).is_dir()
+    }  # fmt: skip
     assert extra == set()

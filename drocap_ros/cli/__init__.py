@@ -20,7 +20,7 @@ from drocap_ros.errors import DrocapError
 COMMANDS = (
     "demo.command", "graph.live", "preflight", "graph.view", "graph.orbit", "graph.record", "graph.replay", "track",
     "reconstruct", "batch.command", "models.learn_dictionary", "export", "report", "info", "recover", "graph.top",
-    "models.command", "evaluate", "models.train_lifter", "models.train_simulation_models",
+    "models.command", "evaluate",
 )  # fmt: skip
 
 
@@ -38,8 +38,8 @@ def build_parser() -> LineParser:
     return parser
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
+def main(argv: Sequence[str] | None = None, parser: LineParser | None = None) -> int:
+    """Run the command line, or another one by its parser; returns the exit status."""
     logging.basicConfig(level=logging.WARNING, format="drocap: %(message)s")
     words = sys.argv[1:] if argv is None else list(argv)
     # Closed by the shell (>&-): Python has no stream then, and the next file opened would take its number.
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     interrupted = threading.Event()
     try:
-        args = build_parser().parse_args(words)
+        args = (parser or build_parser()).parse_args(words)
         args.command_line = shlex.join(["drocap", *words])
         with interruptible(getattr(args, "interrupted_by", BOTH)) as interrupted:
             status: int = args.run(args)

@@ -1,4 +1,4 @@
-"""``drocap evaluate``: a motion against its truth, the camera-motion study, the study of the live method."""
+"""``drocap evaluate``: a motion against its truth, the camera-motion study, the motion in the world."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "evaluate",
         help="errors of a motion; accuracy studies over MoCap",
-        description="Measure accuracy: of one motion against its truth, of every method over MoCap, of the live graph.",
+        description="Measure accuracy: of one motion against its truth, of every method over MoCap.",
     )
     kinds = parser.add_subparsers(metavar="KIND", required=True)
     comparison = kinds.add_parser(
@@ -70,18 +70,6 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     world.add_argument("--method", choices=METHODS, default="ba", help="default: ba")
     world.add_argument("--every", metavar="N", type=int, default=1, help="only every N-th sequence")
     world.set_defaults(run=_world)
-    live = _study_parser(
-        kinds,
-        "live",
-        help="error of the live graph's poses at their publication, beside the offline result",
-        description="The sequences of `evaluate rotation`, image by image through the live method: errors of the"
-        " initial and the latest pose at publication, and of the refined pose 2 s after its image.",
-        files="live.csv and live.md",
-    )
-    live.add_argument("--speed", metavar="DEG_S", type=float, default=25.0, help="orbit speed (default 25)")
-    live.add_argument("--delay", metavar="S", type=float, default=0.5, help="duration of an adjustment (default 0.5 s)")
-    live.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
-    live.set_defaults(run=_live)
     return parser
 
 
@@ -180,20 +168,3 @@ def _world(args: argparse.Namespace) -> int:
         lambda row: {key: value for key, value in asdict(row).items() if key != "errors"} | asdict(row.errors),
         lambda rows: world_markdown(rows, args.telemetry, args.still),
     )
-
-
-def _live(args: argparse.Namespace) -> int:
-    """The study of the live method."""
-    from drocap_ros.config import load_config
-    from drocap_ros.evaluation.live_study import live_study
-    from drocap_ros.evaluation.live_study_table import live_markdown
-
-    config = load_config(args.config)
-
-    def rows_of(progress: Progress) -> list[Any]:
-        return live_study(
-            args.folder, speed_deg_s=args.speed, noisy=args.noisy, delay_s=args.delay, seed=args.seed,
-            limit=args.limit, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress,
-        )  # fmt: skip
-
-    return _study(args, "live", rows_of, asdict, lambda rows: live_markdown(rows, args.delay))

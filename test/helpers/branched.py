@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from drocap_ros.simulation.closed_loop.branches import branch
+from lab.flights.branches import branch
 
 
 def branched(test: Callable[..., None]) -> Callable[..., None]:

@@ -17,8 +17,8 @@ from drocap_ros.motion import load_motion
 from drocap_ros.pipeline import Telemetry, reconstruct_input
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_pose2d
-from drocap_ros.simulation.closed_loop.orbit_loop import EPOCH_NS, LoopSettings, OrbitLoop, with_config
 from drocap_ros.tracks import load_tracks
+from lab.flights.orbit_loop import EPOCH_NS, LoopSettings, OrbitLoop, with_config
 
 SECONDS = 18.0
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.states import State
-from drocap_ros.simulation.closed_loop.fault_causes import TIMEOUT
-from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings
+from lab.flights.fault_causes import TIMEOUT
+from lab.flights.orbit_loop import LoopSettings
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 

@@ -113,7 +113,7 @@ class Lifter:
 
     @staticmethod
     def load(path: str | Path | None = None) -> Lifter:
-        """Open an ONNX file made by ``drocap train-lifter`` (default: the shipped one).
+        """Open an ONNX file made by ``python -m lab train-lifter`` (default: the shipped one).
 
         Raises
         ------
@@ -122,7 +122,7 @@ class Lifter:
         """
         file = Path(path or SHIPPED)
         if not file.is_file():
-            raise InputError(f"{file}: no such file; expected an .onnx made by drocap train-lifter")
+            raise InputError(f"{file}: no such file; expected an .onnx made by python -m lab train-lifter")
         return _load(str(file.resolve()), file.stat().st_mtime_ns)
 
     @property
@@ -278,6 +278,6 @@ def _load(path: str, written_ns: int) -> Lifter:
     if outputs != _OUTPUTS:
         raise InputError(
             f"{path}: expected a lifter (features {FEATURES} -> {_OUTPUTS}), got {inputs} -> {outputs};"
-            " train one by drocap train-lifter"
+            " train one by python -m lab train-lifter"
         )
     return Lifter(session)

@@ -7,7 +7,7 @@ from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.mavlink.autopilot_settings import AutopilotSettings
 from drocap_ros.flight.orbit.motion_checks import loss_condition
 from drocap_ros.flight.orbit.states import Action, State
-from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, with_config
+from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 
 MAV = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
 REAL, INTEGER = mavlink.MAV_PARAM_TYPE_REAL32, mavlink.MAV_PARAM_TYPE_INT32

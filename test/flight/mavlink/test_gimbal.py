@@ -7,7 +7,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.orbit.states import Command, State
-from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, with_config
+from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 
 PITCH = mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW
 

@@ -11,7 +11,7 @@ from drocap_ros.flight.orbit.command_checks import command_condition, commanded_
 from drocap_ros.flight.orbit.planner import OrbitGoal
 from drocap_ros.flight.orbit.safety import reduce
 from drocap_ros.flight.orbit.states import Command, OperatorCommand, SafetyState
-from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop
+from lab.flights.orbit_loop import LoopSettings, OrbitLoop
 
 CONFIG = MavlinkBridgeConfig()
 NOW_NS = 1_700_000_000_000_000_000

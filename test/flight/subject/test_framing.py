@@ -17,9 +17,9 @@ from drocap_ros.flight.orbit.planner import goal_of
 from drocap_ros.flight.orbit.states import Command, Limits, Observed, State
 from drocap_ros.flight.subject.framing import Framing, View, framing_margin, nearest_framed, orbit_margin
 from drocap_ros.flight.vehicle_state import VehicleState
-from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, with_config
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
 from drocap_ros.simulation.vehicle.mount import tilted_camera
+from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 
 SIZE = (1280, 720)
 MATRIX = pinhole_matrix(*SIZE, 60.0)

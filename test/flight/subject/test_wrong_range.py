@@ -13,7 +13,7 @@ from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.observation import PoseObservation
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.capture_config import SimulationConfig
-from drocap_ros.simulation.closed_loop.orbit_loop import LoopSettings, OrbitLoop, with_config
+from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 
 S = 1_000_000_000
 

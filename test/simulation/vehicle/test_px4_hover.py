@@ -7,7 +7,7 @@ from drocap_ros.simulation.vehicle.dynamics import AIRFRAMES, Body
 from drocap_ros.simulation.vehicle.estimate_error import EstimateError
 from drocap_ros.simulation.vehicle.flight_control import Manner, Target
 from drocap_ros.simulation.vehicle.px4_control import Px4Control
-from drocap_ros.simulation.vehicle.replay import Case, load_recorded, replay
+from lab.flights.replay import Case, load_recorded, replay
 
 
 def change_m(path, seconds=4.0):

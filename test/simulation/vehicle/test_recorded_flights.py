@@ -8,7 +8,7 @@ import pytest
 from drocap_ros.simulation.vehicle.arducopter_control import ArduCopterControl
 from drocap_ros.simulation.vehicle.dynamics import AIRFRAMES, Body
 from drocap_ros.simulation.vehicle.flight_control import Manner, Target
-from drocap_ros.simulation.vehicle.replay import WIND_M_S, Case, RecordedFlight, load_recorded, recorded_cases, replay
+from lab.flights.replay import WIND_M_S, Case, RecordedFlight, load_recorded, recorded_cases, replay
 
 #: Flights whose every input is recorded: nothing but ArduPilot's control moves the vehicle.
 KILLS = [f"bridge_killed_timeout_{timeout}s_{i}" for timeout, count in ((0.3, 3), (0.5, 4)) for i in range(count)]

@@ -1,0 +1,1 @@
+"""Studies behind the figure pages: calibration of the telemetry, the live method's poses at their publication."""

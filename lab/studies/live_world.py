@@ -1,0 +1,152 @@
+"""Study of the live motion in the world: the world protocol through the live method, beside the offline result."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.evaluation.protocol import FPS, reported
+from drocap_ros.evaluation.tables import markdown_table
+from drocap_ros.evaluation.world_errors import WORLD_HEAD, WorldErrors, world_cells, world_errors
+from drocap_ros.evaluation.world_protocol import LONGEST_S, WorldView, world_sequences, world_view
+from drocap_ros.geometry.rotations import quaternion_from_matrix
+from drocap_ros.reconstruction.live.camera_history import CameraHistory
+from drocap_ros.reconstruction.live.latest_place import LatestPlace
+from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
+from drocap_ros.reconstruction.live.replay import LivePose, live_poses
+from drocap_ros.reconstruction.live.window import AdjustedWindow
+from drocap_ros.reconstruction.reconstruct import reconstruct
+from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
+from lab.studies.live_study import REFINED_AFTER_S, observations
+
+
+class LiveWorldRow(NamedTuple):
+    """One sequence: errors of ``pose3d/latest`` and ``refined`` in ``map``, and offline over the latter's frames.
+
+    first_s : time until the first pose in ``map``; share : of all later images with such a pose
+    """
+
+    sequence: str
+    first_s: float
+    share: float
+    latest: WorldErrors
+    refined: WorldErrors
+    offline: WorldErrors
+
+
+def live_world_study(
+    folder: Path,
+    telemetry: str = "exact",
+    *,
+    every: int = 1,
+    delay_s: float = 0.5,
+    limit: int | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> list[LiveWorldRow]:
+    """Every ``every``-th sequence of the world protocol; solutions arrive ``delay_s`` after their newest image.
+
+    Sequences without a pose in ``map`` are left out.
+
+    Raises
+    ------
+    InputError
+        When the folder has no such sequence.
+    """
+    sequences = world_sequences(folder, every, limit)
+    rows = [
+        _row(sequence.name, world_view(sequence, telemetry, seed=seed), delay_s)
+        for seed, sequence in reported(sequences, len(sequences), "live world study", progress)
+    ]
+    return [row for row in rows if row is not None]
+
+
+def _row(name: str, view: WorldView, delay_s: float) -> LiveWorldRow | None:
+    latest, refined = _live(view, delay_s)
+    if len(latest) < 10 or len(refined) < 10:
+        return None
+    stamps = view.tracks.stamp_ns
+    motion = reconstruct(view.tracks)
+    offline = {i: motion.joints3d[i] for i in refined}
+    first = min(latest)
+    return LiveWorldRow(
+        name,
+        float((stamps[first] - stamps[0]) * 1e-9),
+        len(latest) / (len(stamps) - first),
+        *(_errors(poses, view.truth) for poses in (latest, refined, offline)),
+    )
+
+
+def _live(view: WorldView, delay_s: float) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
+    """Frame -> joints (17, 3) m in ``map``: as ``pose3d/latest`` is published, and refined 2 s later."""
+    tracks, adjuster = view.tracks, BundleAdjusterConfig()
+    stamps, history = tracks.stamp_ns, _history(view)
+    place = {int(stamp): i for i, stamp in enumerate(stamps)}
+    latest, refined = dict[int, np.ndarray](), dict[int, np.ndarray]()
+    lengths, placing = LatestPose(adjuster.blend_s), LatestPlace(adjuster.blend_s)
+    pending = deque[AdjustedWindow]()
+    for result in live_poses(observations(view), InitializerConfig(), adjuster, camera_at=history.along):
+        if isinstance(result, LivePose):
+            now, o = result.observation.stamp_ns, result.observation
+            while pending and pending[0].stamp_ns[-1] + delay_s * 1e9 <= now:
+                window = pending.popleft()
+                lengths.set_solution(median_bone_lengths(window.joints3d), now)
+                placing.set_solution(window, now)
+            rigid = lengths.pose(now, result.joints3d.astype(float))
+            camera = history.along(np.array([now], np.int64))
+            keypoints = o.body_keypoints().xy
+            placed = placing.place(now, (rigid, result.pose.covariance), keypoints, camera)
+            if placed is not None:
+                latest[place[now]] = placed.joints
+            continue
+        window = result.window
+        pending.append(window)
+        age_s = (window.stamp_ns[-1] - window.stamp_ns) * 1e-9
+        if window.in_map is not None:
+            for i in np.flatnonzero(age_s + delay_s <= REFINED_AFTER_S):
+                refined[place[int(window.stamp_ns[i])]] = result.joints3d[i].astype(float)
+    last = int(stamps[-1] - REFINED_AFTER_S * 1e9)
+    return latest, {i: joints for i, joints in refined.items() if stamps[i] <= last}
+
+
+def _history(view: WorldView) -> CameraHistory:
+    tracks = view.tracks
+    assert tracks.camera_rotation is not None
+    assert tracks.camera_position is not None
+    assert tracks.camera_matrix is not None
+    history = CameraHistory(2.0 * LONGEST_S)
+    history.add_matrix(int(tracks.stamp_ns[0]), tracks.camera_matrix)
+    turns = quaternion_from_matrix(np.swapaxes(tracks.camera_rotation, 1, 2))
+    for stamp, position, turn in zip(tracks.stamp_ns.tolist(), tracks.camera_position, turns, strict=True):
+        history.add_pose(stamp, position, turn)
+    return history
+
+
+def _errors(poses: dict[int, np.ndarray], truth: np.ndarray) -> WorldErrors:
+    frames = sorted(poses)
+    return world_errors(np.array([poses[i] for i in frames]), truth[frames], FPS / np.diff(frames))
+
+
+def live_world_markdown(rows: list[LiveWorldRow], telemetry: str) -> str:
+    """Errors of every sequence as Markdown: latest, refined, offline."""
+    head = f"Live in `map`, {len(rows)} sequences, {telemetry} telemetry, orbit."
+    cells = [
+        [f"{row.sequence}, {kind}", *world_cells(errors)]
+        for row in rows
+        for kind, errors in (("latest", row.latest), ("refined", row.refined), ("offline", row.offline))
+    ]
+    first = float(np.median([row.first_s for row in rows])) if rows else float("nan")
+    share = 100 * float(np.mean([row.share for row in rows])) if rows else float("nan")
+    return "\n".join(
+        [
+            head,
+            "",
+            *markdown_table(["sequence", *WORLD_HEAD], cells),
+            "",
+            f"First pose in `map` after {first:.1f} s in the median; {share:.0f} % of the later images have one.",
+            "",
+        ]
+    )

@@ -1,0 +1,78 @@
+"""Part of the table of faults; ``benchmarks/flight_faults.py`` flies all of it."""
+
+from functools import partial
+
+import pytest
+
+from drocap_ros.flight.orbit.states import State
+from lab.flights.branches import branch
+from lab.flights.fault_flight import failures, inject_fault, lead_to_fault, within_protocol
+from lab.flights.fault_table import FAULTS
+
+SUBSET = {
+    ("perception stops", "ardupilot"),
+    ("image frozen, stamps continue", "px4"),
+    ("process killed (SIGKILL)", "px4"),
+    ("process restarts after 1 s", "ardupilot"),
+    ("control loop hangs for 1 s", "ardupilot"),
+    ("clock steps 0.8 s ahead, then the operator starts again", "px4"),
+    ("uplink delayed by 1 s", "ardupilot"),
+    ("pilot takes over and gives back", "ardupilot"),
+    ("pilot takes position while engaging", "px4"),
+    ("the autopilot's position jumps by 15 m", "px4"),
+    ("the autopilot's position jumps by 15 m", "ardupilot"),
+    ("hold mode denied", "ardupilot"),
+    ("telemetry frozen with its clock", "ardupilot"),
+    ("setpoints ignored", "px4"),
+    ("a foreign system on the link", "px4"),
+    ("the person appears 40 % larger", "ardupilot"),
+    ("setpoints alone are lost", "ardupilot"),
+    ("process stopped for 3 s, pilot takes RTL meanwhile", "px4"),
+    ("downlink lost, then the pilot takes RTL", "px4"),
+    ("downlink lost, then the pilot takes LAND", "ardupilot"),
+    ("estimator fails", "px4"),
+    ("the ground is 2 m lower than configured", "ardupilot"),
+    ("the ground is 2 m higher than configured", "px4"),
+}
+
+
+_LED = {}
+
+
+def fly_fault(fault, autopilot):
+    """Result of the case.  The same flight leads to many cases: it is flown once, and each case is a branch of it."""
+    flight = fault.settings(autopilot), fault.before, fault.state
+    if flight not in _LED:
+        _LED[flight] = lead_to_fault(fault, autopilot)
+    return branch(partial(inject_fault, fault, _LED[flight]))
+
+
+def fault_named(name):
+    return next(fault for fault in FAULTS if fault.name == name)
+
+
+@pytest.mark.parametrize(("name", "autopilot"), sorted(SUBSET))
+def test_case_keeps_its_bounds(name, autopilot):
+    fault = fault_named(name)
+    result = fly_fault(fault, autopilot)
+    assert failures(fault, autopilot, result) == [], result
+    if not fault.harmless and fault.cause is None:
+        assert within_protocol(result)
+    if fault.harmless:
+        assert result.state == State.ORBITING
+
+
+def test_table_has_seventy_five_faults_with_distinct_names():
+    assert len(FAULTS) >= 75
+    assert len({fault.name for fault in FAULTS}) == len(FAULTS)
+
+
+def test_each_violated_requirement_is_reported():
+    fault = fault_named("process killed (SIGKILL)")
+    result = fly_fault(fault, "ardupilot")
+    worse = result._replace(motion_s=0.6, excursion_m=9.0, resumed=True, evident=False, least_distance_m=2.0)
+    report = " ".join(failures(fault, "ardupilot", worse))
+    for words in ("motion for 0.60 s", "excursion of 9.00 m", "without the operator", "no evidence", "2.00 m"):
+        assert words in report
+    other = fault_named("perception stops")
+    assert "the condition is not SUBJECT_OUTDATED" in failures(other, "px4", result)[0]

@@ -1,0 +1,144 @@
+"""Setpoints that are lost on the way, a bridge that stood still: nothing follows until the operator commands."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from branched import branched
+
+from drocap_ros.flight.conditions import ConditionCode
+from drocap_ros.flight.orbit.states import Action, Command, State
+from lab.flights.orbit_loop import LoopSettings, OrbitLoop
+
+BOTH = pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+_SET_POSITION_TARGET = 84
+
+
+def orbit(autopilot):
+    loop = OrbitLoop(LoopSettings(autopilot=autopilot, seed=3, seconds=30, perception_hz=10.0))
+    loop.start(2.0)
+    loop.run(7.0)
+    assert loop.controller.safety.state == State.ORBITING
+    return loop
+
+
+begun = lru_cache(orbit)
+
+
+@pytest.fixture
+def loop(autopilot):
+    """An orbit that has begun, flown once of each autopilot."""
+    return begun(autopilot)
+
+
+def drop_setpoints(loop):
+    """Returns a function that ends it."""
+    write = loop.up.write
+    loop.up.write = lambda data: None if data[7] == _SET_POSITION_TARGET and data[8] == 0 else write(data)
+
+    def end():
+        loop.up.write = write
+
+    return end
+
+
+def speed_at(loop, t_s):
+    return next(float((row.velocity**2).sum() ** 0.5) for row in loop.rows if row.t_s >= t_s)
+
+
+@BOTH
+@branched
+def test_setpoints_alone_are_dropped_on_the_way(loop):
+    end = drop_setpoints(loop)
+    loop.run(12.0)
+    noticed = [(t, cause) for t, state, cause in loop.reasons if state == "HOLDING"]
+    assert noticed[0][0] <= 8.0  # the time-out of 0.5 s, and half a second
+    assert noticed[0][1].code == ConditionCode.SETPOINTS_NOT_FOLLOWED
+    end()
+    loop.run(15.0)
+    assert State.ORBITING not in {row.state for row in loop.rows if row.t_s > 8.0}
+    assert all(speed_at(loop, 13.0 + 0.1 * i) < 0.5 for i in range(15))  # ArduPilot's spring back has ended
+    loop.command(Command.ENGAGE)
+    loop.run(18.0)
+    assert loop.controller.safety.state == State.ORBITING
+
+
+@BOTH
+@branched
+def test_a_bridge_that_was_stopped_and_continues_sends_nothing_until_it_is_engaged(loop, autopilot):
+    loop.stopped = True
+    loop.run(10.0)
+    loop.stopped = False
+    loop.run(14.0)
+    assert {row.action for row in loop.rows if row.t_s > 7.05} == {Action.NOTHING}
+    assert loop.controller.safety.condition.code == ConditionCode.CONTROL_LOOP_STALLED
+    assert loop.copter.mode == ("LOITER" if autopilot == "px4" else "GUIDED")
+    loop.command(Command.ENGAGE)
+    loop.run(17.0)
+    assert loop.controller.safety.state == State.ORBITING
+
+
+@BOTH
+@branched
+def test_a_step_that_was_interrupted_sends_no_old_setpoint_and_says_that_it_stood_still(loop, autopilot):
+    sent = loop.link.sent_setpoints()
+    estimate = loop.controller._subject.estimate
+
+    def stopped(now_ns):
+        loop.t += 3.0  # between the beginning of the step and its observation
+        return estimate(now_ns)
+
+    loop.controller._subject.estimate = stopped
+    loop.controller.step(loop.clock_ns(), loop.t)
+    assert loop.link.sent_setpoints() == sent
+    assert loop.copter.mode == ("OFFBOARD" if autopilot == "px4" else "GUIDED")
+    assert loop.controller.safety.state == State.HOLDING
+    assert loop.controller.safety.condition.code == ConditionCode.CONTROL_LOOP_STALLED
+
+
+@pytest.mark.parametrize("autopilot", ["px4"])
+@branched
+def test_with_the_downlink_lost_px4_ends_in_its_own_hold_and_offboard_does_not_return(loop):
+    loop.down.cut = True
+    loop.run(13.0)
+    loop.down.cut = False
+    loop.run(16.0)
+    (t, mode, by) = loop.copter.mode_log[-1]
+    assert (mode, by) == ("LOITER", "failsafe: offboard lost")
+    assert t <= 7.0 + 0.25 + loop.settings.config.blind_hold_s + 0.7
+    assert loop.copter.mode == "LOITER"
+    assert {row.action for row in loop.rows if row.t_s > t} == {Action.NOTHING}
+    assert loop.controller.safety.state == State.HOLDING
+    assert loop.controller.safety.condition.code == ConditionCode.SETPOINTS_NOT_FOLLOWED
+
+
+@BOTH
+@branched
+def test_the_pilots_mode_is_noticed_within_a_fifth_of_a_second(loop, autopilot):
+    late = []
+    for i in range(3):
+        loop.run(loop.t + 0.047 * i)
+        assert loop.controller.safety.state == State.ORBITING
+        chosen = loop.t
+        loop.copter.set_mode("POSCTL" if autopilot == "px4" else "LOITER", "pilot")
+        loop.run(loop.t + 0.4)
+        late.append(next((t for t, state, _ in loop.reasons if t > chosen and state == "TAKEN_OVER"), 9e9) - chosen)
+        loop.command(Command.STOP)
+        loop.run(loop.t + 0.1)
+        loop.command(Command.ENGAGE)
+        loop.run(loop.t + 2.5)
+    assert max(late) <= (0.2 if autopilot == "px4" else 0.3), late
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot"])
+@branched
+def test_wind_that_is_stronger_than_the_vehicle_ends_the_orbit(loop):
+    loop.copter.body.wind = np.array([0.0, 12.0, 0.0])
+    loop.run(20.0)
+    assert loop.controller.safety.state == State.HOLDING
+    assert loop.controller.safety.condition.code == ConditionCode.ORBIT_NOT_KEPT
+    assert "wind" in loop.controller.safety.reason
+    flown = [row for row in loop.rows if row.action == Action.ORBIT]
+    assert max(row.distance_m for row in flown) < 14.0
+    degraded = [reason.values["cause"].code for _, _, reason in loop.reasons if reason.code == ConditionCode.DEGRADED]
+    assert ConditionCode.ORBIT_NOT_KEPT in degraded
