@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-
 import numpy as np
 import pytest
 
-from drocap_ros.cli import main
+from drocap_ros.errors import InputError
 from drocap_ros.evaluation.protocol import orbit_view
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15, BODY_17
 from lab.studies.live_study import live_study, simulate_live, standardized_error
+from lab.studies.live_study_table import live_markdown
 from lab.studies.live_world import live_world_markdown, live_world_study
 
 
@@ -27,17 +26,14 @@ def mocap(tmp_path_factory):
     return folder
 
 
-def test_the_command_prints_its_tables_and_writes_them(mocap, tmp_path, capsys):
-    assert main(["evaluate", "live", str(mocap), "--quiet", "--out", str(tmp_path / "out")]) == 0
-    printed = capsys.readouterr().out
-    assert "refined over offline" in printed
-    assert (tmp_path / "out" / "live.md").read_text() == printed
-    (row,) = csv.DictReader((tmp_path / "out" / "live.csv").open())
-    assert row["sequence"] == "walk"
-    assert float(row["refined_mm"]) < float(row["latest_mm"]) < 80.0
-    for option, value in (("--delay", "-1"), ("--speed", "1000"), ("--limit", "0")):
-        assert main(["evaluate", "live", str(mocap), option, value]) == 2
-        assert f"{option}: expected" in capsys.readouterr().err
+def test_the_study_has_a_row_per_sequence_and_refuses_what_it_cannot_use(mocap):
+    (row,) = rows = live_study(mocap)
+    assert row.sequence == "walk"
+    assert float(row.refined_mm) < float(row.latest_mm) < 80.0
+    assert "refined over offline" in live_markdown(rows, 0.5)
+    for wrong in ({"delay_s": -1.0}, {"speed_deg_s": 1000.0}, {"limit": 0}):
+        with pytest.raises(InputError, match="expected"):
+            live_study(mocap, **wrong)
 
 
 def test_a_solution_counts_from_its_arrival():
