@@ -40,7 +40,7 @@ def test_links_between_pages_lead_to_files(root):
 
 
 def test_files_that_the_pages_name_exist(root):
-    folders = ("drocap_ros", "test", "benchmarks", "docs", "launch")
+    folders = ("drocap_ros", "lab", "test", "benchmarks", "docs", "launch")
     known = [path for folder in folders for path in (root / folder).rglob("*.py")] + list(root.glob("*.py"))
     ends = {"/".join(path.parts[-n:]) for path in known for n in range(1, len(path.parts))}
     for page in pages(root):
