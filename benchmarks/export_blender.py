@@ -1,7 +1,7 @@
 """A motion in Blender: `PYTHONPATH=. python benchmarks/export_blender.py MOTION --out PNG`.
 
 Exports the motion to BVH and glTF, imports both by Blender's own importers, prints how far their joints are from the
-motion's, and renders a still of the glTF person.  Without a screen and without a GPU.  Needs Python 3.11 with bpy 5.0
+motion's, and renders a still of the glTF skeleton.  Without a screen and without a GPU.  Needs Python 3.11 with bpy 5.0
 (Blender as a module), scipy, pyyaml and onnxruntime: bpy accepts no numpy 2, which the project's own environment has.
 """
 

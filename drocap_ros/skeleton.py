@@ -151,10 +151,19 @@ def joint_set(name: str) -> JointSet:
         raise InputError(f"skeleton: expected one of {', '.join(JOINT_SETS)}, got {name!r}") from None
 
 
+#: Colour of a body side in markers and in the viewer, RGB 0 to 255; the report's page has its own light and dark theme.
+SIDE_COLOURS = {"left": (36, 112, 163), "right": (191, 56, 43), "middle": (90, 90, 90)}
+
+
 def side_of(joint: str, joints: tuple[str, ...]) -> str:
     """Body side of a joint by its name, "left", "right" or "middle"; both sides must be among ``joints``."""
-    for letter, other, side in (("l", "r", "left"), ("r", "l", "right")):
-        if joint.startswith(letter) and other + joint[1:] in joints:
+    for own, other, side in (
+        ("l", "r", "left"),
+        ("r", "l", "right"),
+        ("left_", "right_", "left"),
+        ("right_", "left_", "right"),
+    ):
+        if joint.startswith(own) and other + joint[len(own) :] in joints:
             return side
     return "middle"
 

@@ -48,7 +48,11 @@ def main(argv: Sequence[str] | None = None, parser: LineParser | None = None) ->
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     interrupted = threading.Event()
     try:
-        args = (parser or build_parser()).parse_args(words)
+        parser = parser or build_parser()
+        if not words:
+            parser.print_help()
+            return 0
+        args = parser.parse_args(words)
         args.command_line = shlex.join(["drocap", *words])
         with interruptible(getattr(args, "interrupted_by", BOTH)) as interrupted:
             status: int = args.run(args)

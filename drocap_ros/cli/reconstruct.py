@@ -18,8 +18,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "reconstruct",
         help="3D motion from a video, recording or tracks file",
-        description="Recover the 3D motion of the person in INPUT and write motion.npz, tracks.npz, preview.png and"
-        " report.html.",
+        description="Recover the 3D motion of the person in INPUT and write motion.npz, tracks.npz and report.html.",
     )
     parser.add_argument(
         "input",
@@ -90,6 +89,7 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.cli.clip_options import clip_of
     from drocap_ros.cli.models.on_demand import ensure_networks
     from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.cli.report import open_words
     from drocap_ros.config import load_config
     from drocap_ros.motion import save_motion
     from drocap_ros.perception.load_models import models_folder
@@ -97,12 +97,11 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.pipeline import Selection, needs_networks, reconstruct_input
     from drocap_ros.report.motion_images import has_images
     from drocap_ros.report.page import save_report
-    from drocap_ros.report.preview import save_preview
     from drocap_ros.tracks import save_tracks
 
     out = args.out or default_folder(args.input, "motion")
     check_output_folder(out)
-    names = ["motion.npz", "tracks.npz", "preview.png", *([] if args.no_report else ["report.html"])]
+    names = ["motion.npz", "tracks.npz", *([] if args.no_report else ["report.html"])]
     if clip_of(args).whole and is_same(out / "tracks.npz", args.input):
         names.remove("tracks.npz")  # they stay as they are
     refuse_inputs([out / name for name in names], [args.input])
@@ -129,7 +128,6 @@ def run(args: argparse.Namespace) -> int:
         save_motion(folder / "motion.npz", motion)
         if "tracks.npz" in names:
             save_tracks(folder / "tracks.npz", tracks)
-        save_preview(folder / "preview.png", motion)
         if "report.html" in names:
             save_report(folder / "report.html", motion, video=args.input if has_images(args.input) else None)
     if args.no_report:
@@ -137,6 +135,8 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         print(summary(motion, args.method))
         print(f"written: {out}/{', '.join(names)}")
+        if "report.html" in names:
+            print(open_words(out / "report.html"))
     return 0
 
 

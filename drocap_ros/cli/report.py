@@ -36,5 +36,10 @@ def run(args: argparse.Namespace) -> int:
     with output_file(out, inputs=[path, args.video]) as file:
         save_report(file, motion, video=args.video, command=args.command_line)
     if not args.quiet:
-        print(f"written: {out} ({out.stat().st_size / 1e6:.1f} MB)")
+        print(f"written: {out} ({out.stat().st_size / 1e6:.1f} MB)\n{open_words(out)}")
     return 0
+
+
+def open_words(report: Path) -> str:
+    """What a person does with a report: the last line of each command that writes one."""
+    return f"open {report} in a browser"

@@ -1,7 +1,7 @@
-"""Binary glTF 2.0: an animated skeleton with constant bones and a plain skinned body; metres, y up, own times.
+"""Binary glTF 2.0: an animated skeleton with constant bones; metres, y up, own times.
 
 Each joint of :mod:`drocap_ros.export.rig` is a node of the skin's hierarchy with animated rotation; the root's
-translation is animated too.
+translation is animated too.  The skin needs a mesh: each bone is an octahedron that follows its joint.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.export.body_mesh import COLOURS, MeshPart, body_mesh
 from drocap_ros.export.clip import Clip, y_up
 from drocap_ros.export.rig import Rig, rig_of
 from drocap_ros.export.rigid_body import BODY
@@ -22,6 +21,8 @@ from drocap_ros.export.rigid_body import BODY
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _COMPONENTS = {"float32": 5126, "uint8": 5121, "uint16": 5123}
+#: Half width of a drawn bone, and its distance from the joint, as shares of the bone's length; a matter of taste.
+_GIRTH = 0.1
 #: A GLB stores its length in 32 bits.
 _MAX_BYTES = 2**32 - 2**20
 
@@ -80,16 +81,15 @@ def _document(rig: Rig, times_s: np.ndarray, facts: dict[str, Any]) -> tuple[dic
     inverse_bind = np.tile(np.eye(4, dtype=np.float32), (len(rig.rest), 1, 1))
     inverse_bind[:, :3, 3] = -rig.rest
     skin = buffer.add(np.ascontiguousarray(inverse_bind.transpose(0, 2, 1)).reshape(-1, 16))
-    primitives = [_primitive(buffer, part) for part in body_mesh(rig)]
+    bones = _bones(buffer, rig)
     animation = _animation(buffer, rig, times_s)
     body = len(rig.names)
     document = {
         "asset": {"version": "2.0", "generator": "drocap_ros", "extras": facts},
         "scene": 0,
         "scenes": [{"name": "motion", "nodes": [0, body]}],
-        "nodes": [*_joint_nodes(rig), {"name": "body", "mesh": 0, "skin": 0}],
-        "meshes": [{"name": "body", "primitives": primitives}],
-        "materials": [_material(name, colour) for name, colour in COLOURS.items()],
+        "nodes": [*_joint_nodes(rig), {"name": "bones", "mesh": 0, "skin": 0}],
+        "meshes": [{"name": "bones", "primitives": [bones]}],
         "skins": [{"name": "skeleton", "joints": list(range(body)), "inverseBindMatrices": skin, "skeleton": 0}],
         "animations": [animation],
         "accessors": buffer.accessors,
@@ -109,20 +109,28 @@ def _joint_nodes(rig: Rig) -> list[dict[str, Any]]:
     return nodes
 
 
-def _primitive(buffer: _Buffer, part: MeshPart) -> dict[str, Any]:
+def _bones(buffer: _Buffer, rig: Rig) -> dict[str, Any]:
+    """Octahedra from each joint to its children or its bone's end; without normals viewers shade them flat."""
+    tips = [(parent, rig.rest[child]) for child, parent in enumerate(rig.parents) if parent >= 0]
+    tips += [(joint, rig.rest[joint] + end) for joint, end in rig.ends.items()]
+    owner = np.array([joint for joint, _ in tips])
+    along = np.array([tip for _, tip in tips]) - rig.rest[owner]
+    _, _, axes = np.linalg.svd(along[:, None])
+    aside = _GIRTH * np.linalg.norm(along, axis=1)[:, None, None] * axes[:, 1:]
+    # Right-handed with the bone, so that the corners below turn counter-clockwise from outside.
+    aside[:, 1] *= np.sign(np.linalg.det(np.stack([along, aside[:, 0], aside[:, 1]], axis=1)))[:, None]
+    ring = _GIRTH * along[:, None] + np.stack([aside[:, 0], aside[:, 1], -aside[:, 0], -aside[:, 1]], axis=1)
+    corners = np.concatenate([np.zeros_like(ring[:, :1]), ring, along[:, None]], axis=1) + rig.rest[owner][:, None]
+    faces = np.array([face for i in range(4) for face in ((0, 1 + (i + 1) % 4, 1 + i), (5, 1 + i, 1 + (i + 1) % 4))])
+    joints = np.zeros((len(tips) * 6, 4), np.uint8)
+    joints[:, 0] = np.repeat(owner, 6)
     attributes = {
-        "POSITION": buffer.add(part.vertices, bounds=True, target=_ARRAY_BUFFER),
-        "NORMAL": buffer.add(part.normals, target=_ARRAY_BUFFER),
-        "JOINTS_0": buffer.add(part.joints, target=_ARRAY_BUFFER),
-        "WEIGHTS_0": buffer.add(part.weights, target=_ARRAY_BUFFER),
+        "POSITION": buffer.add(corners.reshape(-1, 3).astype(np.float32), bounds=True, target=_ARRAY_BUFFER),
+        "JOINTS_0": buffer.add(joints, target=_ARRAY_BUFFER),
+        "WEIGHTS_0": buffer.add(np.tile(np.eye(4, dtype=np.float32)[0], (len(joints), 1)), target=_ARRAY_BUFFER),
     }
-    corners = buffer.add(part.triangles.reshape(-1), target=_ELEMENT_BUFFER)
-    return {"attributes": attributes, "indices": corners, "material": list(COLOURS).index(part.material)}
-
-
-def _material(name: str, colour: tuple[float, float, float]) -> dict[str, Any]:
-    surface = {"baseColorFactor": [*colour, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.8}
-    return {"name": name, "pbrMetallicRoughness": surface}
+    triangles = (6 * np.arange(len(tips))[:, None, None] + faces).astype(np.uint16)
+    return {"attributes": attributes, "indices": buffer.add(triangles.reshape(-1), target=_ELEMENT_BUFFER)}
 
 
 def _animation(buffer: _Buffer, rig: Rig, times_s: np.ndarray) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""Reports, previews and contact sheets of a reconstructed motion."""
+"""The report of a reconstructed motion: statistics, checks, one HTML page."""

@@ -11,9 +11,8 @@ from visualization_msgs.msg import ImageMarker, Marker, MarkerArray
 from drocap_ros.geometry.ellipsoids import ellipsoids, unpack_covariance
 from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_from_ros, quaternion_to_ros
-from drocap_ros.skeleton import JointSet, joint_set
+from drocap_ros.skeleton import SIDE_COLOURS, JointSet, joint_set, side_of
 
-_RIGHT, _LEFT, _MIDDLE = ((0.75, 0.22, 0.17), (0.14, 0.44, 0.64), (0.35, 0.35, 0.35))
 _UNCERTAIN = (0.95, 0.75, 0.1, 0.25)
 _PATH = (0.2, 0.7, 0.3, 0.9)
 #: Ellipsoids show two standard deviations.
@@ -96,7 +95,7 @@ def keypoint_marker(message: Pose2D) -> ImageMarker:
     known = np.isfinite(points).all(axis=1)
     size = max(2.0, 0.004 * max(observation.image_size))
     marker.scale = float(max(1.0, 0.4 * size))
-    marker.outline_color = _colour(*_MIDDLE, 1.0)
+    marker.outline_color = _colour_of("middle")
     for bone in joints_of.bones:
         if known[bone].all():
             _line(marker, points[bone[0]], points[bone[1]], _side_colour(joints_of, int(bone[1])))
@@ -129,15 +128,17 @@ def body_transforms(message: Pose3D, frame_prefix: str = "") -> list[TransformSt
 def _marker(header: Header, namespace: str, kind: int, number: int = 0) -> Marker:
     marker = Marker(header=header, ns=namespace, id=number, type=kind, action=Marker.ADD)
     marker.pose.orientation = Quaternion(w=1.0)
-    marker.color = _colour(*_MIDDLE, 1.0)
+    marker.color = _colour_of("middle")
     return marker
 
 
 def _side_colour(joints: JointSet, joint: int) -> ColorRGBA:
-    if joints.mirror[joint] == joint:
-        return _colour(*_MIDDLE, 1.0)
-    right = joints.joints[joint].startswith("r")
-    return _colour(*(_RIGHT if right else _LEFT), 1.0)
+    return _colour_of(side_of(joints.joints[joint], joints.joints))
+
+
+def _colour_of(side: str) -> ColorRGBA:
+    red, green, blue = (part / 255.0 for part in SIDE_COLOURS[side])
+    return _colour(red, green, blue, 1.0)
 
 
 def _colour(red: float, green: float, blue: float, alpha: float) -> ColorRGBA:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drocap_ros.geometry.ellipsoids import ellipsoids, unpack_covariance
-from drocap_ros.skeleton import JointSet, side_of
+from drocap_ros.skeleton import SIDE_COLOURS, JointSet, side_of
 
 if TYPE_CHECKING:
     import rerun
@@ -19,7 +19,6 @@ CAMERA = "world/camera"
 IMAGE = "world/camera/image"
 CAMERA_PATH = "world/camera_path"
 
-_COLOURS = {"left": (36, 112, 163), "right": (191, 56, 43), "middle": (90, 90, 90)}
 #: The stages of a pose differ in opacity and width.
 _OPACITY = {"initial": 90, "latest": 255, "refined": 200}
 _WIDTH_M = {"initial": 0.008, "latest": 0.018, "refined": 0.012}
@@ -147,12 +146,5 @@ class Scene:
 
 
 def _joint_colours(joints_of: JointSet, opacity: int) -> np.ndarray:
-    rows = [(*_COLOURS[_side(joint, joints_of)], opacity) for joint in joints_of.joints]
+    rows = [(*SIDE_COLOURS[side_of(joint, joints_of.joints)], opacity) for joint in joints_of.joints]
     return np.array(rows, np.uint8)
-
-
-def _side(joint: str, joints_of: JointSet) -> str:
-    for side in ("left", "right"):
-        if joint.startswith(f"{side}_"):
-            return side
-    return side_of(joint, joints_of.joints)

@@ -30,6 +30,11 @@ def test_help_lists_every_command(capsys):
     assert len([line for line in capsys.readouterr().out.splitlines() if line.startswith("    ")]) >= len(COMMANDS)
 
 
+def test_no_word_prints_the_help(capsys):
+    assert main([]) == 0
+    assert "reconstruct" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [

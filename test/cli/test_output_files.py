@@ -50,7 +50,7 @@ def test_reconstruct_beside_its_tracks_leaves_them_as_they_are(tmp_path, capsys)
     words = ["reconstruct", tmp_path / "tracks.npz", "--out", tmp_path, "--method", "initial", "--no-report"]
     refused([*words, "--end", "0.5"], tmp_path, capsys, OWN_INPUT)
     assert main([str(word) for word in words]) == 0
-    assert capsys.readouterr().out.endswith(f"written: {tmp_path}/motion.npz, preview.png\n")
+    assert capsys.readouterr().out.endswith(f"written: {tmp_path}/motion.npz\n")
     assert len(load_motion(tmp_path).stamp_ns) == 15
     after = (tmp_path / "tracks.npz").stat()
     assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
@@ -64,7 +64,7 @@ def test_no_report_of_an_older_run_stays_beside_a_new_motion(tmp_path):
     words = ["reconstruct", str(tmp_path / "a.npz"), "--out", str(tmp_path / "out"), "--method", "initial", "--quiet"]
     assert main([*words, "--no-report"]) == 0
     found = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert found == ["motion.npz", "preview.png", "tracks.npz", "walk.bvh"]
+    assert found == ["motion.npz", "tracks.npz", "walk.bvh"]
 
 
 def test_default_folder_has_the_whole_name_of_the_input(tmp_path, monkeypatch):

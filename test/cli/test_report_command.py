@@ -20,7 +20,7 @@ def folder(person, tmp_path):
 
 def test_the_folder_of_a_motion_is_enough(folder, capsys):
     assert main(["report", str(folder)]) == 0
-    assert "report.html" in capsys.readouterr().out
+    assert capsys.readouterr().out.endswith(f"\nopen {folder}/report.html in a browser\n")
     assert f"drocap report {folder}" in (folder / "report.html").read_text()
 
 

@@ -25,7 +25,7 @@ def test_demo_flies_by_its_images_and_reconstructs_a_motion_near_the_truth(tmp_p
     # A person who holds every joint right but the depth of one arm is 60 mm off; depth = 0 would give 125.
     assert float(re.search(r"truth: ([\d.]+) mm", printed)[1]) < 90
     assert {path.name for path in out.iterdir()} == {
-        "motion.npz", "truth.npz", "pictures.jpg", "preview.png", "report.html", "session",
+        "motion.npz", "truth.npz", "report.html", "session",
     }  # fmt: skip
     truth, motion = load_flight_truth(out / "truth.npz"), load_motion(out / "motion.npz")
     assert motion.frame == "world"

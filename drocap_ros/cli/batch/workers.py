@@ -15,8 +15,8 @@ from drocap_ros.errors import DrocapError, InputError
 
 #: A process of a recording begins as a fork of a server with these modules.
 _PRELOAD = (
-    "drocap_ros.cli.reconstruct", "drocap_ros.pipeline", "drocap_ros.report.page", "drocap_ros.report.preview",
-    "scipy.linalg.lapack", "scipy.ndimage", "cv2", "matplotlib.pyplot",
+    "drocap_ros.cli.reconstruct", "drocap_ros.pipeline", "drocap_ros.report.page",
+    "scipy.linalg.lapack", "scipy.ndimage", "cv2",
 )  # fmt: skip
 #: Attempts after an unexpected error, such as one of the file system.
 _RETRIES = 2

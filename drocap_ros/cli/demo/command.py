@@ -64,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.cli.demo.operator import Operator
     from drocap_ros.cli.demo.verdict import judge_flight
     from drocap_ros.cli.reconstruct import summary
+    from drocap_ros.cli.report import open_words
     from drocap_ros.errors import InputError
     from drocap_ros.evaluation.compare import compare
     from drocap_ros.recording.open_session import open_session
@@ -95,7 +96,8 @@ def run(args: argparse.Namespace) -> int:
         f" {errors.frames} frames){world}; scale error {100 * errors.scale_error:+.1f} % ({motion.scale_source}),"
         f" frame {motion.frame}"
     )
-    print(f"files in {args.out}: motion.npz, truth.npz, pictures.jpg, preview.png, report.html, session/")
+    print(f"files in {args.out}: motion.npz, truth.npz, report.html, session/")
+    print(open_words(args.out / "report.html"))
     return 0
 
 
@@ -154,17 +156,11 @@ def _reconstruct(folder: Path, config: DrocapConfig, args: argparse.Namespace) -
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.motion import save_motion
     from drocap_ros.pipeline import reconstruct_input
-    from drocap_ros.recording.open_session import open_session
-    from drocap_ros.report.contact_sheet import save_contact_sheet
     from drocap_ros.report.page import save_report
-    from drocap_ros.report.preview import save_preview
 
     with progress_bars(args.quiet) as progress:
         motion, _ = reconstruct_input(folder / "session", method="ba", config=config, progress=progress)
     save_motion(folder / "motion.npz", motion)
-    save_preview(folder / "preview.png", motion)
-    with open_session(folder / "session") as session:
-        save_contact_sheet(folder / "pictures.jpg", session)
     save_report(folder / "report.html", motion, video=folder / "session", command=args.command_line)
     return motion
 
