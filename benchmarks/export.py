@@ -99,13 +99,13 @@ def same_length(ours: dict[str, np.ndarray], opensim: dict[str, np.ndarray], nam
 
 
 def moved_joints(motions: list[Path]) -> str:
-    from drocap_ros.export.clip import clip_of, without_gaps, y_up
     from drocap_ros.export.rigid_body import fit_rigid_body
+    from drocap_ros.export.take import take_of, without_gaps, y_up
     from drocap_ros.motion import load_motion
 
     rows = []
     for path in motions:
-        clip = y_up(clip_of(load_motion(path)))
+        clip = y_up(take_of(load_motion(path)))
         known = np.isfinite(clip.positions).all(axis=2)
         body = fit_rigid_body(without_gaps(clip).positions, clip.joints, known)
         names = [name for name in clip.joints if name in body.joints]
@@ -121,12 +121,12 @@ def moved_joints(motions: list[Path]) -> str:
 def locked_feet(motions: list[Path]) -> str:
     from drocap_ros.errors import InputError
     from drocap_ros.export.cleaning import lock_feet
-    from drocap_ros.export.clip import at_constant_rate, clip_of
+    from drocap_ros.export.take import at_constant_rate, take_of
     from drocap_ros.motion import load_motion
 
     rows = []
     for path in motions:
-        clip = at_constant_rate(clip_of(load_motion(path)))
+        clip = at_constant_rate(take_of(load_motion(path)))
         try:
             locked = lock_feet(clip)
         except InputError:

@@ -61,13 +61,12 @@ def export(
         needs.
     """
     from drocap_ros.export import cleaning
+    from drocap_ros.export.angles import write_csv_angles
     from drocap_ros.export.bvh import write_bvh
-    from drocap_ros.export.c3d_file import write_c3d
-    from drocap_ros.export.clip import clip_of
-    from drocap_ros.export.csv_table import write_csv, write_csv_angles
     from drocap_ros.export.glb import write_glb
+    from drocap_ros.export.measured import write_c3d, write_csv, write_trc
     from drocap_ros.export.mot import write_mot
-    from drocap_ros.export.trc import write_trc
+    from drocap_ros.export.take import take_of
     from drocap_ros.motion import Motion, load_motion
 
     writers: dict[str, Callable[..., tuple[str, ...]]] = {
@@ -86,12 +85,12 @@ def export(
     if chosen and form not in RIGGED:
         raise InputError(f"{', '.join(chosen)}: expected with format {' or '.join(RIGGED)}, got {form}; leave it out")
     whole = motion if isinstance(motion, Motion) else load_motion(motion)
-    clip = clip_of(whole, measured=form in MEASURED)
+    take = take_of(whole, measured=form in MEASURED)
     if smooth_hz is not None:
-        clip = cleaning.smooth(clip, smooth_hz)
+        take = cleaning.smooth(take, smooth_hz)
     if lock_feet:
-        clip = cleaning.lock_feet(clip)
-    return writers[form](Path(path), clip, **chosen)
+        take = cleaning.lock_feet(take)
+    return writers[form](Path(path), take, **chosen)
 
 
 class _CallableModule(ModuleType):

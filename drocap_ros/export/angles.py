@@ -8,12 +8,16 @@ follows the trunk), nor pronation, nor the rotation of the shank.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from drocap_ros.export.rig import least_rotation
+from drocap_ros.export.measured import write_table
+from drocap_ros.export.rig import body_of, least_rotation
 from drocap_ros.export.rigid_body import RigidBody
+from drocap_ros.export.take import Take, y_up
 from drocap_ros.skeleton import TOES
 
 #: Columns: ISB axes X, Y, Z in the axes of the rigid body (x left, y up, z forwards).
@@ -23,6 +27,21 @@ _MIRROR = np.diag([1.0, 1.0, -1.0])
 _AXIAL_S = 0.2
 #: Flexion at which the plane of knee or elbow counts as much as no axial rotation, degrees.
 _CLEAR_DEG = 15.0
+
+
+def write_csv_angles(path: Path, take: Take) -> tuple[str, ...]:
+    """Write a table with the columns ``time_s``, ``frame`` (from 0), and ``NAME_deg`` per joint angle; returns notes.
+
+    Raises
+    ------
+    InputError
+        When a joint of ``BODY_15`` is missing or never known.
+    """
+    take = y_up(take)
+    body, notes = body_of(take)
+    angles = joint_angles(body, take.rate_hz)
+    write_table(path, take.times_s, [f"{name}_deg" for name in angles], np.stack(list(angles.values()), axis=1))
+    return notes
 
 
 def joint_angles(body: RigidBody, rate_hz: float) -> dict[str, np.ndarray]:

@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.export.angles import continuous_euler
-from drocap_ros.export.clip import Clip, at_constant_rate, y_up
 from drocap_ros.export.rig import Rig, rig_of
+from drocap_ros.export.take import Take, at_constant_rate, y_up
 
 _CM = 100.0
 _FORMAT = "%.5f"
 
 
-def write_bvh(path: Path, clip: Clip, *, names: str = "h36m", rest: str = "t") -> tuple[str, ...]:
+def write_bvh(path: Path, take: Take, *, names: str = "h36m", rest: str = "t") -> tuple[str, ...]:
     """Write a BVH file; returns notes on changes.
 
     Parameters
     ----------
-    clip : z-up; it is resampled to a constant rate, and its gaps are interpolated
+    take : z-up; it is resampled to a constant rate, and its gaps are interpolated
     names, rest : as of :func:`~drocap_ros.export.rig.rig_of`
 
     Raises
@@ -27,8 +27,8 @@ def write_bvh(path: Path, clip: Clip, *, names: str = "h36m", rest: str = "t") -
     InputError
         When an option is unknown, a joint of ``BODY_15`` is missing, or a joint is never known.
     """
-    clip = y_up(at_constant_rate(clip))
-    rig, notes = rig_of(clip, names=names, rest=rest)
+    take = y_up(at_constant_rate(take))
+    rig, notes = rig_of(take, names=names, rest=rest)
     lines: list[str] = ["HIERARCHY"]
     # The root rests where its channels put it, so that a viewer without channels shows a standing person.
     columns = [_CM * rig.root]
@@ -36,7 +36,7 @@ def write_bvh(path: Path, clip: Clip, *, names: str = "h36m", rest: str = "t") -
     values = np.concatenate(columns, axis=1)
     with path.open("w", encoding="ascii", newline="\n") as out:
         out.write("\n".join(lines))
-        out.write(f"\nMOTION\nFrames: {len(values)}\nFrame Time: {1.0 / clip.rate_hz:.9f}\n")
+        out.write(f"\nMOTION\nFrames: {len(values)}\nFrame Time: {1.0 / take.rate_hz:.9f}\n")
         np.savetxt(out, values, fmt=_FORMAT)
     return notes
 

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 from scipy.signal import butter, filtfilt
 
 from drocap_ros.errors import InputError
-from drocap_ros.export.clip import Clip, at_constant_rate, interpolated
+from drocap_ros.export.take import Take, at_constant_rate, interpolated
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.skeleton import indices
 
@@ -27,8 +27,8 @@ _CLEAR_M = 0.02
 _ROOT_MOVES_M = 0.05
 
 
-def smooth(clip: Clip, cut_off_hz: float) -> Clip:
-    """Clip filtered by a zero-phase Butterworth filter of order 4: order 2, both ways (Winter 2009, 3.4.4).
+def smooth(take: Take, cut_off_hz: float) -> Take:
+    """Take filtered by a zero-phase Butterworth filter of order 4: order 2, both ways (Winter 2009, 3.4.4).
 
     Unknown joints stay unknown; the filter passes over them by linear interpolation.  An uneven time line is resampled.
 
@@ -37,24 +37,24 @@ def smooth(clip: Clip, cut_off_hz: float) -> Clip:
     InputError
         When the cut-off is not between 0 and half the frame rate, or there are too few frames.
     """
-    clip = at_constant_rate(clip)
+    take = at_constant_rate(take)
     corrected = cut_off_hz / _TWICE
-    if not 0.0 < corrected < 0.5 * clip.rate_hz:
-        most = 0.5 * clip.rate_hz * _TWICE
+    if not 0.0 < corrected < 0.5 * take.rate_hz:
+        most = 0.5 * take.rate_hz * _TWICE
         raise InputError(f"smooth: expected a cut-off between 0 and {most:.3g}, got {cut_off_hz:g} Hz; choose another")
-    b, a = butter(2, corrected, fs=clip.rate_hz)
-    out = clip.positions
+    b, a = butter(2, corrected, fs=take.rate_hz)
+    out = take.positions
     if len(out) <= 3 * max(len(a), len(b)):
         raise InputError(f"smooth: expected more than 9 frames to filter, got {len(out)}; leave it out")
     known = np.isfinite(out).all(axis=2)
-    out = filtfilt(b, a, interpolated(clip.times_s, out, known), axis=0)
-    out = np.where(known[..., None], out, clip.positions)
-    note = f"smoothed (Butterworth, zero phase, order 4, {cut_off_hz:g} Hz): {_moved(clip.positions, out)}"
-    return replace(clip, positions=out, notes=(*clip.notes, note))
+    out = filtfilt(b, a, interpolated(take.times_s, out, known), axis=0)
+    out = np.where(known[..., None], out, take.positions)
+    note = f"smoothed (Butterworth, zero phase, order 4, {cut_off_hz:g} Hz): {_moved(take.positions, out)}"
+    return replace(take, positions=out, notes=(*take.notes, note))
 
 
-def lock_feet(clip: Clip) -> Clip:
-    """Clip, z up, whose resting feet keep their place; knees follow by two-bone inverse kinematics.
+def lock_feet(take: Take) -> Take:
+    """Take, z up, whose resting feet keep their place; knees follow by two-bone inverse kinematics.
 
     A foot rests while its ankle is slower than 0.4 m/s for at least 0.2 s; its place is the median over that time.
     Hips stay, thigh and shank keep the frame's lengths, toes move with the ankle.  An uneven time line is resampled.
@@ -64,35 +64,35 @@ def lock_feet(clip: Clip) -> Clip:
     InputError
         When the root does not move through the world, or a joint of the legs is missing.
     """
-    pelvis = clip.positions[:, indices(clip.joints, ("pelvis",))[0]]
+    pelvis = take.positions[:, indices(take.joints, ("pelvis",))[0]]
     pelvis = pelvis[np.isfinite(pelvis).all(axis=1)]
     if not len(pelvis) or np.ptp(pelvis, axis=0).max() < _ROOT_MOVES_M:
         raise InputError(
             "lock-feet: expected a root that moves through the world, it stands still; reconstruct with telemetry"
         )
-    clip = at_constant_rate(clip)
-    out = clip.positions.copy()
+    take = at_constant_rate(take)
+    out = take.positions.copy()
     before, after, count = [], [], 0
     for side in "rl":
-        hip, knee, ankle = indices(clip.joints, tuple(side + name for name in ("hip", "knee", "ankle")))
-        rests = _rests(clip.positions[:, ankle], clip.rate_hz)
-        moved = clip.positions[:, ankle] + _offsets(clip.positions[:, ankle], rests, clip.rate_hz)
-        out[:, knee], out[:, ankle] = _two_bones(clip.positions[:, [hip, knee, ankle]], moved, clip.rate_hz)
-        if side + "toe" in clip.joints:
-            toe = clip.joints.index(side + "toe")
-            out[:, toe] += out[:, ankle] - clip.positions[:, ankle]
+        hip, knee, ankle = indices(take.joints, tuple(side + name for name in ("hip", "knee", "ankle")))
+        rests = _rests(take.positions[:, ankle], take.rate_hz)
+        moved = take.positions[:, ankle] + _offsets(take.positions[:, ankle], rests, take.rate_hz)
+        out[:, knee], out[:, ankle] = _two_bones(take.positions[:, [hip, knee, ankle]], moved, take.rate_hz)
+        if side + "toe" in take.joints:
+            toe = take.joints.index(side + "toe")
+            out[:, toe] += out[:, ankle] - take.positions[:, ankle]
         for first, last in rests:
-            speeds = [np.diff(x[first:last, ankle], axis=0) * clip.rate_hz for x in (clip.positions, out)]
+            speeds = [np.diff(x[first:last, ankle], axis=0) * take.rate_hz for x in (take.positions, out)]
             before.append(np.linalg.norm(speeds[0], axis=1))
             after.append(np.linalg.norm(speeds[1], axis=1))
         count += len(rests)
     if not count:
-        return replace(clip, notes=(*clip.notes, "feet not locked: none rests"))
+        return replace(take, notes=(*take.notes, "feet not locked: none rests"))
     note = (
         f"feet locked in {count} rests, their speed {np.nanmean(np.concatenate(before)):.2f} ->"
-        f" {np.nanmean(np.concatenate(after)):.2f} m/s: {_moved(clip.positions, out)}"
+        f" {np.nanmean(np.concatenate(after)):.2f} m/s: {_moved(take.positions, out)}"
     )
-    return replace(clip, positions=out, notes=(*clip.notes, note))
+    return replace(take, positions=out, notes=(*take.notes, note))
 
 
 def _moved(before: np.ndarray, after: np.ndarray) -> str:

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.export.clip import Clip, y_up
 from drocap_ros.export.rig import Rig, rig_of
 from drocap_ros.export.rigid_body import BODY
+from drocap_ros.export.take import Take, y_up
 
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
@@ -27,8 +27,8 @@ _GIRTH = 0.1
 _MAX_BYTES = 2**32 - 2**20
 
 
-def write_glb(path: Path, clip: Clip, *, names: str = "h36m", rest: str = "t") -> tuple[str, ...]:
-    """Write a GLB file of a z-up clip; returns notes on changes.
+def write_glb(path: Path, take: Take, *, names: str = "h36m", rest: str = "t") -> tuple[str, ...]:
+    """Write a GLB file of a z-up take; returns notes on changes.
 
     Parameters
     ----------
@@ -39,11 +39,11 @@ def write_glb(path: Path, clip: Clip, *, names: str = "h36m", rest: str = "t") -
     InputError
         When an option is unknown, a joint of ``BODY_15`` is missing or never known, or the file would exceed 4 GiB.
     """
-    if len(clip.positions) * len(BODY) * 16 > _MAX_BYTES:
-        raise InputError(f"motion: expected less than 4 GiB of glTF, got {len(clip.positions)} frames; cut it")
-    rig, notes = rig_of(y_up(clip), names=names, rest=rest)
-    facts = {"units": "m", "up_axis": "Y", "frame_rate_hz": round(clip.rate_hz, 6), "notes": list(notes)}
-    path.write_bytes(_container(*_document(rig, clip.times_s, facts)))
+    if len(take.positions) * len(BODY) * 16 > _MAX_BYTES:
+        raise InputError(f"motion: expected less than 4 GiB of glTF, got {len(take.positions)} frames; cut it")
+    rig, notes = rig_of(y_up(take), names=names, rest=rest)
+    facts = {"units": "m", "up_axis": "Y", "frame_rate_hz": round(take.rate_hz, 6), "notes": list(notes)}
+    path.write_bytes(_container(*_document(rig, take.times_s, facts)))
     return notes
 
 

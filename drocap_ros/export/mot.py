@@ -11,14 +11,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from drocap_ros.errors import InputError
-from drocap_ros.export.clip import Clip, at_constant_rate, without_gaps, y_up
+from drocap_ros.export.measured import write_trc
 from drocap_ros.export.opensim_model import WEIGHTS, model_xml
 from drocap_ros.export.rig import body_of
-from drocap_ros.export.trc import write_trc
+from drocap_ros.export.take import Take, at_constant_rate, without_gaps, y_up
 
 
-def write_mot(path: Path, clip: Clip) -> tuple[str, ...]:
-    """Write the coordinates of a z-up clip, and beside them the model as ``.osim``; returns notes on changes.
+def write_mot(path: Path, take: Take) -> tuple[str, ...]:
+    """Write the coordinates of a z-up take, and beside them the model as ``.osim``; returns notes on changes.
 
     Raises
     ------
@@ -32,15 +32,15 @@ def write_mot(path: Path, clip: Clip) -> tuple[str, ...]:
         raise InputError(f"opensim: expected the Python package, found none; run {install}")
     import opensim
 
-    clip = at_constant_rate(clip)
-    body, notes = body_of(y_up(clip))
+    take = at_constant_rate(take)
+    body, notes = body_of(y_up(take))
     opensim.Logger.removeFileSink()  # opensim.log in the current folder
     opensim.Logger.setLevelString("Off")
     # The tool writes further files into the working folder of its model.
     with tempfile.TemporaryDirectory(prefix="drocap_ik_") as folder:
         markers = Path(folder) / "markers.trc"
         # OpenSim stops at a frame without any marker.
-        write_trc(markers, without_gaps(clip))
+        write_trc(markers, without_gaps(take))
         path.with_suffix(".osim").write_text(model_xml(body), encoding="utf-8")
         model = opensim.Model(str(path.with_suffix(".osim")))
         tool = opensim.InverseKinematicsTool()
@@ -50,7 +50,7 @@ def write_mot(path: Path, clip: Clip) -> tuple[str, ...]:
         tool.setResultsDir(folder)
         # By default the tool stops after two seconds.
         tool.setStartTime(0.0)
-        tool.setEndTime(len(body.positions) / clip.rate_hz)
+        tool.setEndTime(len(body.positions) / take.rate_hz)
         tool.set_report_errors(False)
         tasks = tool.upd_IKTaskSet()
         for name in (marker.getName() for marker in model.getMarkerSet()):

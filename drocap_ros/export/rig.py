@@ -13,8 +13,8 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from drocap_ros.errors import InputError
-from drocap_ros.export.clip import Clip, without_gaps
 from drocap_ros.export.rigid_body import BODY, PARENTS, RigidBody, fit_rigid_body
+from drocap_ros.export.take import Take, without_gaps
 from drocap_ros.geometry.rotations import exp_so3, log_so3
 from drocap_ros.skeleton import BODY_15, TOES
 
@@ -80,12 +80,12 @@ class Rig:
         return self.turned[joint] if parent < 0 else self.turned[parent].inv() * self.turned[joint]
 
 
-def rig_of(clip: Clip, *, names: str = "h36m", rest: str = "t") -> tuple[Rig, tuple[str, ...]]:
-    """Rig of a clip, and notes on the changes.
+def rig_of(take: Take, *, names: str = "h36m", rest: str = "t") -> tuple[Rig, tuple[str, ...]]:
+    """Rig of a take, and notes on the changes.
 
     Parameters
     ----------
-    clip : y up; gaps are interpolated
+    take : y up; gaps are interpolated
     names : one of :data:`NAMES`
     rest : one of :data:`RESTS`
 
@@ -97,37 +97,37 @@ def rig_of(clip: Clip, *, names: str = "h36m", rest: str = "t") -> tuple[Rig, tu
     for option, value, table in (("names", names, NAMES), ("rest", rest, RESTS)):
         if value not in table:
             raise InputError(f"{option}: expected one of {', '.join(table)}, got {value!r}")
-    body, notes = body_of(clip)
-    pelvis = clip.positions[:, clip.joints.index("pelvis")]
+    body, notes = body_of(take)
+    pelvis = take.positions[:, take.joints.index("pelvis")]
     path = np.nanmax(pelvis, axis=0) - np.nanmin(pelvis, axis=0)
     lift, floor_note = _onto_the_floor(body, bool(path.max() > _STILL_M))
-    rig = _rig(body, clip.rate_hz, lift, NAMES[names], rest)
+    rig = _rig(body, take.rate_hz, lift, NAMES[names], rest)
     feet = (
         () if set(TOES) <= set(body.joints) else ("no toes in the motion: each foot is assumed, square to its shank",)
     )
     return rig, (*notes, floor_note, *feet)
 
 
-def body_of(clip: Clip) -> tuple[RigidBody, tuple[str, ...]]:
-    """Rigid body of a clip, y up, with its gaps interpolated, and notes on the changes.
+def body_of(take: Take) -> tuple[RigidBody, tuple[str, ...]]:
+    """Rigid body of a take, y up, with its gaps interpolated, and notes on the changes.
 
     Raises
     ------
     InputError
         When a joint of ``BODY_15`` is missing, or a joint is never known.
     """
-    known = np.isfinite(clip.positions).all(axis=2)
-    clip = without_gaps(clip)
-    body = fit_rigid_body(clip.positions, clip.joints, known)
-    common = [name for name in clip.joints if name in (*BODY_15.joints, *TOES) and name in body.joints]
+    known = np.isfinite(take.positions).all(axis=2)
+    take = without_gaps(take)
+    body = fit_rigid_body(take.positions, take.joints, known)
+    common = [name for name in take.joints if name in (*BODY_15.joints, *TOES) and name in body.joints]
     off = np.stack([body.at(name) for name in common], axis=1)
-    off -= clip.positions[:, [clip.joints.index(name) for name in common]]
+    off -= take.positions[:, [take.joints.index(name) for name in common]]
     moved = 1000.0 * np.linalg.norm(off, axis=2)
     notes = [
-        *clip.notes,
+        *take.notes,
         f"bones made constant: joints moved by {moved.mean():.1f} mm on average, at most {moved.max():.1f} mm",
     ]
-    if left := [name for name in clip.joints if name not in common]:
+    if left := [name for name in take.joints if name not in common]:
         notes.append(f"left out, not in the rigid body: {', '.join(left)}")
     return body, tuple(notes)
 

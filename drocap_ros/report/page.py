@@ -13,7 +13,7 @@ import numpy as np
 
 from drocap_ros.motion import Motion
 from drocap_ros.report import plots
-from drocap_ros.report.checks import CheckResult, Level, run_checks
+from drocap_ros.report.checks import Finding, Severity, run_checks
 from drocap_ros.report.motion_images import MotionImages, read_motion_images
 from drocap_ros.report.page_data import page_data, script_json
 from drocap_ros.report.statistics import Statistics, mean_known, motion_statistics, stage_seconds
@@ -85,9 +85,9 @@ def _number(value: float, form: str) -> str:
     return format(value, form) if np.isfinite(value) else "-"
 
 
-def _checks(results: list[CheckResult]) -> str:
-    items = [(result.level.value, result.title, result.text) for result in results]
-    if not any(result.level is Level.WARNING for result in results):
+def _checks(results: list[Finding]) -> str:
+    items = [(result.severity.value, result.title, result.text) for result in results]
+    if not any(result.severity is Severity.WARNING for result in results):
         items.insert(0, ("good", "No warnings", "No automatic check doubts this motion."))
     return "".join(f'<li class="{kind}"><b>{escape(title)}</b> {escape(text)}</li>' for kind, title, text in items)
 

@@ -10,7 +10,7 @@ from drocap_ros.cli import main
 from drocap_ros.errors import InputError
 from drocap_ros.export import export
 from drocap_ros.export.cleaning import lock_feet, smooth
-from drocap_ros.export.clip import clip_of
+from drocap_ros.export.take import take_of
 from drocap_ros.motion import save_motion
 from drocap_ros.skeleton import BODY_15
 
@@ -22,7 +22,7 @@ def swinging(walker, hz, rate_hz=120.0, frames=240):
     times = np.arange(frames) / rate_hz
     positions = np.zeros((frames, 15, 3))
     positions[..., 0] = 0.01 * np.sin(2.0 * np.pi * hz * times)[:, None]
-    return dataclasses.replace(clip_of(walker), positions=positions, times_s=times, rate_hz=rate_hz)
+    return dataclasses.replace(take_of(walker), positions=positions, times_s=times, rate_hz=rate_hz)
 
 
 @pytest.mark.parametrize(("hz", "gain", "within"), [(1.0, 1.0, 0.01), (6.0, np.sqrt(0.5), 0.01), (24.0, 0.0, 0.01)])
@@ -36,7 +36,7 @@ def test_filter_has_the_stated_cut_off_and_no_phase(walker, hz, gain, within):
 
 
 def test_filter_keeps_gaps_and_states_the_change(with_gaps):
-    clip = clip_of(with_gaps)
+    clip = take_of(with_gaps)
     out = smooth(clip, 5.0)
     np.testing.assert_array_equal(np.isnan(out.positions), np.isnan(clip.positions))
     moved = 1000.0 * np.linalg.norm(out.positions - clip.positions, axis=2)
@@ -46,7 +46,7 @@ def test_filter_keeps_gaps_and_states_the_change(with_gaps):
 
 def test_locked_feet_keep_their_place_and_the_bones_their_lengths(walker):
     rng = np.random.default_rng(4)
-    clip = clip_of(walker)
+    clip = take_of(walker)
     truth = clip.positions
     wander = np.cumsum(rng.normal(0, 0.004, (len(truth), 1, 3)), axis=0)
     noisy = dataclasses.replace(clip, positions=truth + wander)
@@ -78,7 +78,7 @@ def test_locked_feet_keep_their_place_and_the_bones_their_lengths(walker):
 
 
 def test_feet_are_locked_after_a_time_without_the_person_too(walker):
-    clip = clip_of(walker)
+    clip = take_of(walker)
     wander = np.cumsum(np.random.default_rng(4).normal(0, 0.004, (len(clip.positions), 1, 3)), axis=0)
     whole = dataclasses.replace(clip, positions=clip.positions + wander)
     positions = whole.positions.copy()
@@ -89,7 +89,7 @@ def test_feet_are_locked_after_a_time_without_the_person_too(walker):
 
 def test_feet_are_found_at_rest_where_images_were_dropped(walker):
     """24 images per second, later every third of them: by the median step the feet would be three times as fast."""
-    clip = clip_of(walker)
+    clip = take_of(walker)
     wander = np.cumsum(np.random.default_rng(4).normal(0, 0.004, (len(clip.positions), 1, 3)), axis=0)
     kept = np.r_[0:14, 14:48:3]
     uneven = dataclasses.replace(clip, positions=(clip.positions + wander)[kept], times_s=clip.times_s[kept])
@@ -100,7 +100,7 @@ def test_feet_are_found_at_rest_where_images_were_dropped(walker):
 
 def test_knee_of_an_almost_straight_leg_does_not_jump(walker):
     """A leg bent by 5 degrees whose ankle wanders along it: a knee that followed fully would move ten times as far."""
-    clip = clip_of(walker)
+    clip = take_of(walker)
     positions = clip.positions.copy()
     wander = gaussian_filter1d(np.random.default_rng(5).normal(0, 0.02, len(positions)), 2.0)
     for side in "rl":
@@ -137,7 +137,7 @@ def test_what_cannot_be_cleaned_is_refused(walker, in_camera, tmp_path):
         export(in_camera, tmp_path / "a.csv", "csv", lock_feet=True)
     for cut_off in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(InputError, match="between 0 and"):
-            smooth(clip_of(walker), cut_off)
+            smooth(take_of(walker), cut_off)
     few = swinging(walker, 1.0, frames=6)
     with pytest.raises(InputError, match="more than 9 frames"):
         smooth(few, 6.0)

@@ -8,15 +8,15 @@ from scipy.spatial.transform import Rotation
 
 from drocap_ros.errors import InputError
 from drocap_ros.export.bvh import write_bvh
-from drocap_ros.export.clip import clip_of, y_up
 from drocap_ros.export.rig import rig_of
 from drocap_ros.export.rigid_body import fit_rigid_body
+from drocap_ros.export.take import take_of, y_up
 from drocap_ros.skeleton import BODY_15, H36M_17
 
 
 def clip_with(walker, joints, names=BODY_15.joints, parents=BODY_15.parents, rate_hz=24.0):
     return dataclasses.replace(
-        y_up(clip_of(walker)),
+        y_up(take_of(walker)),
         positions=joints,
         joints=names,
         parents=parents,
@@ -33,7 +33,7 @@ def off(rig, joints, names=BODY_15.joints):
 
 
 def test_forward_kinematics_reproduces_joints_with_constant_bones(walker):
-    joints = y_up(clip_of(walker)).positions
+    joints = y_up(take_of(walker)).positions
     rig, _ = rig_of(clip_with(walker, joints))
     assert off(rig, joints).max() < 1e-3
     assert off(rig, joints).mean() < 1e-4
@@ -42,7 +42,7 @@ def test_forward_kinematics_reproduces_joints_with_constant_bones(walker):
 def test_changing_bones_become_constant_with_small_moves(walker):
     """Errors of 10 mm of each coordinate change the bones; the fit moves a joint by less than that error."""
     noise = np.random.default_rng(1).normal(0, 0.010, walker.joints3d.shape)
-    truth = y_up(clip_of(walker)).positions
+    truth = y_up(take_of(walker)).positions
     rig, notes = rig_of(clip_with(walker, truth + noise))
     posed = rig.positions()
     bones = np.linalg.norm(posed[:, 1:] - posed[:, rig.parents[1:]], axis=2)
@@ -56,7 +56,7 @@ def test_changing_bones_become_constant_with_small_moves(walker):
 def test_fit_is_at_a_minimum(walker):
     """No small turn of a limb, the pelvis or the root brings the joints nearer."""
     noise = np.random.default_rng(2).normal(0, 0.02, walker.joints3d.shape)
-    joints = y_up(clip_of(walker)).positions + noise
+    joints = y_up(take_of(walker)).positions + noise
     body = fit_rigid_body(joints, BODY_15.joints, np.ones(joints.shape[:2], bool), far_m=np.inf)
     posed = np.stack([body.at(name) for name in BODY_15.joints], axis=1)
     residual = posed - joints
@@ -69,7 +69,7 @@ def test_fit_is_at_a_minimum(walker):
 
 def test_no_joint_bears_the_whole_misfit_of_a_frame(walker):
     """A trunk that is 75 mm too short in a third of the frames: least squares would leave the shoulders far off."""
-    joints = y_up(clip_of(walker)).positions.copy()
+    joints = y_up(take_of(walker)).positions.copy()
     below = [BODY_15.index(name) for name in ("pelvis", "lhip", "rhip", "lknee", "rknee", "lankle", "rankle")]
     joints[::3, below] += (0.0, 0.075, 0.0)
     known = np.ones(joints.shape[:2], bool)
@@ -107,7 +107,7 @@ def test_rest_pose_has_identity_rotations(walker, rest):
 
 def test_rotations_are_continuous_where_a_bone_passes_its_opposite_direction(walker):
     """A forearm that swings past the direction opposite to its rest: the smallest rotation alone would jump by pi."""
-    joints = np.repeat(y_up(clip_of(walker)).positions[:1], 240, axis=0)
+    joints = np.repeat(y_up(take_of(walker)).positions[:1], 240, axis=0)
     elbow, wrist = BODY_15.index("lelbow"), BODY_15.index("lwrist")
     rig, _ = rig_of(clip_with(walker, joints, rate_hz=60.0))
     rest = rig.turned[rig.joints.index("lshoulder")][0].apply([1.0, 0.0, 0.0])
@@ -130,13 +130,13 @@ def test_rotations_are_continuous_where_a_bone_passes_its_opposite_direction(wal
 @pytest.mark.parametrize(("first_deg", "last_deg"), [(0, 130), (130, -30)])
 def test_bvh_channels_do_not_flip_in_a_squat(walker, tmp_path, first_deg, last_deg):
     """A knee that bends past 90 degrees: in the order Z X Y every rotation has two solutions, half turns apart."""
-    joints = np.repeat(clip_of(walker).positions[:1], 15, axis=0)
+    joints = np.repeat(take_of(walker).positions[:1], 15, axis=0)
     hip, knee, ankle = (BODY_15.index(name) for name in ("lhip", "lknee", "lankle"))
     aside = joints[0, hip] - joints[0, BODY_15.index("rhip")]
     turn = np.radians(np.linspace(first_deg, last_deg, 15))[:, None] * aside / np.linalg.norm(aside)
     joints[:, ankle] = joints[:, knee] + Rotation.from_rotvec(turn).apply(joints[:, knee] - joints[:, hip])
     write_bvh(
-        tmp_path / "squat.bvh", dataclasses.replace(clip_of(walker), positions=joints, times_s=np.arange(15) / 24)
+        tmp_path / "squat.bvh", dataclasses.replace(take_of(walker), positions=joints, times_s=np.arange(15) / 24)
     )
     rows = (tmp_path / "squat.bvh").read_text().split("Frame Time:")[1].splitlines()[1:]
     channels = np.array([row.split() for row in rows], float)[:, 3:]
@@ -146,7 +146,7 @@ def test_bvh_channels_do_not_flip_in_a_squat(walker, tmp_path, first_deg, last_d
 
 def test_limbs_have_no_twist_of_their_own(walker):
     """The rotation of a forearm or thigh relative to its parent is about an axis across the bone."""
-    rig, _ = rig_of(clip_with(walker, y_up(clip_of(walker)).positions))
+    rig, _ = rig_of(clip_with(walker, y_up(take_of(walker)).positions))
     for joint, along in (("lelbow", (1, 0, 0)), ("relbow", (1, 0, 0)), ("lhip", (0, 1, 0)), ("rhip", (0, 1, 0))):
         turn = rig.local(rig.joints.index(joint)).as_rotvec()
         assert np.degrees(np.abs(turn @ along)).max() < 0.5
@@ -155,7 +155,7 @@ def test_limbs_have_no_twist_of_their_own(walker):
 
 def test_measured_toes_make_the_feet_and_other_joints_are_left_out(walker):
     """Human3.6M's tree with spine and thorax, and toes."""
-    body = y_up(clip_of(walker)).positions
+    body = y_up(take_of(walker)).positions
     at = {name: body[:, BODY_15.index(name)] for name in BODY_15.joints}
     at["spine"] = 0.5 * at["pelvis"] + 0.5 * at["neck"]
     at["thorax"] = 0.2 * at["pelvis"] + 0.8 * at["neck"]
@@ -179,7 +179,7 @@ def test_measured_toes_make_the_feet_and_other_joints_are_left_out(walker):
 def test_feet_stand_on_the_floor(walker, in_camera):
     """Known root motion: one height for all frames.  Unknown: the lower foot stands in every frame."""
     for motion in (walker, in_camera):
-        rig, notes = rig_of(y_up(clip_of(motion)))
+        rig, notes = rig_of(y_up(take_of(motion)))
         ankles = rig.positions()[:, [rig.joints.index(name) for name in ("lankle", "rankle")], 1]
         height = rig.rest[rig.joints.index("lankle"), 1]
         assert 0.05 < height < 0.1
@@ -189,19 +189,19 @@ def test_feet_stand_on_the_floor(walker, in_camera):
             np.testing.assert_allclose(lower, 0.0, atol=0.003)
             assert any("no root motion" in note for note in notes)
         else:
-            moved = rig.root - y_up(clip_of(motion)).positions[:, 0]
+            moved = rig.root - y_up(take_of(motion)).positions[:, 0]
             assert np.ptp(moved, axis=0).max() < 2e-3
             assert any("floor at 0" in note for note in notes)
 
 
 def test_no_joint_is_below_the_floor_in_a_handstand(in_camera):
     upside_down = dataclasses.replace(in_camera, joints3d=in_camera.joints3d * (-1.0, -1.0, 1.0))
-    rig, _ = rig_of(y_up(clip_of(upside_down)))
+    rig, _ = rig_of(y_up(take_of(upside_down)))
     np.testing.assert_allclose(rig.positions()[..., 1].min(axis=1), 0.0, atol=1e-6)
 
 
 def test_missing_joints_and_unknown_options_are_refused(walker):
-    clip = y_up(clip_of(walker))
+    clip = y_up(take_of(walker))
     with pytest.raises(InputError, match="missing rwrist"):
         rig_of(clip_with(walker, clip.positions[:, :14], BODY_15.joints[:14], BODY_15.parents[:14]))
     with pytest.raises(InputError, match="names: expected one of h36m, lafan1, mixamo, got 'vicon'"):

@@ -12,7 +12,7 @@ from drocap_ros.cli import main
 from drocap_ros.geometry.alignment import apply_similarity, similarity
 from drocap_ros.motion import load_motion, save_motion
 from drocap_ros.reconstruction.reconstruct import body_keypoints
-from drocap_ros.report.checks import Check, run_checks
+from drocap_ros.report.checks import MotionCheck, run_checks
 from drocap_ros.report.statistics import motion_statistics
 from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
@@ -103,8 +103,8 @@ def test_without_toes_in_the_image_they_are_an_estimate(tmp_path, seen):
     assert (motion.confidence[:, 15:] == 0.0).all()
     assert np.isnan(motion.reprojection_px[:, 15:]).all()
     results = {result.check: result for result in run_checks(motion, motion_statistics(motion))}
-    assert Check.ESTIMATED_FEET in results
-    assert Check.MISSING_JOINTS not in results
+    assert MotionCheck.ESTIMATED_FEET in results
+    assert MotionCheck.MISSING_JOINTS not in results
     assert foot_errors(motion).mean() > foot_errors(seen).mean()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.motion import upright_joints
-from drocap_ros.report.checks import _WORDS, Check, Level, run_checks
+from drocap_ros.report.checks import MotionCheck, Severity, run_checks
 from drocap_ros.report.statistics import motion_statistics, smooth
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.orbit_camera import look_at
@@ -19,7 +19,7 @@ def results(motion):
 
 
 def checks(motion, level=None):
-    return [r.check for r in results(motion) if level in (None, r.level)]
+    return [r.check for r in results(motion) if level in (None, r.severity)]
 
 
 def result_of(motion, check):
@@ -28,8 +28,8 @@ def result_of(motion, check):
 
 
 def test_a_good_motion_has_no_warning(person):
-    assert checks(person, Level.WARNING) == []
-    assert Check.ASSUMED_SCALE in checks(person)
+    assert checks(person, Severity.WARNING) == []
+    assert MotionCheck.ASSUMED_SCALE in checks(person)
 
 
 def test_the_view_span_is_that_of_the_orbit(person):
@@ -66,15 +66,15 @@ def test_a_wrong_pitch_of_the_mount_is_a_body_that_leans_with_the_camera(person)
         camera_rotation=capture.camera_rotation, keypoints=capture.tracks.keypoints, reprojection_px=np.ones(shape),
     )  # fmt: skip
     assert abs(motion_statistics(motion).lean_deg) < 4.0
-    assert Check.LEANING not in checks(motion)
+    assert MotionCheck.LEANING not in checks(motion)
     half = np.deg2rad(20.0)
     pitched = np.array([[1.0, 0, 0], [0, np.cos(half), np.sin(half)], [0, -np.sin(half), np.cos(half)]])
     reported = pitched.T @ motion.camera_rotation
     seen = (motion.joints3d - motion.joints3d[:, :1]) @ np.swapaxes(motion.camera_rotation, 1, 2)
     wrong = dataclasses.replace(motion, joints3d=seen @ reported, camera_rotation=reported)
     assert abs(motion_statistics(wrong).lean_deg) == pytest.approx(20.0, abs=4.0)
-    result = result_of(wrong, Check.LEANING)
-    assert result.level is Level.WARNING
+    result = result_of(wrong, MotionCheck.LEANING)
+    assert result.severity is Severity.WARNING
     assert "negative = down" in result.text
     still = dataclasses.replace(wrong, camera_rotation=np.tile(reported[:1], (len(reported), 1, 1)))
     assert np.isnan(motion_statistics(still).lean_deg)
@@ -86,11 +86,11 @@ def test_a_still_camera_and_a_still_body_are_low_camera_motion(person):
         joints3d=np.repeat(person.joints3d[:1], len(person.joints3d), axis=0),
         camera_rotation=np.repeat(person.camera_rotation[:1], len(person.joints3d), axis=0),
     )
-    assert Check.LOW_CAMERA_MOTION in checks(still, Level.WARNING)
+    assert MotionCheck.LOW_CAMERA_MOTION in checks(still, Severity.WARNING)
     assert motion_statistics(still).view_span_deg == pytest.approx(0.0, abs=1e-6)
 
 
-@pytest.mark.parametrize(("elevation", "level"), [(30.0, None), (52.0, Level.NOTE), (69.0, Level.WARNING)])
+@pytest.mark.parametrize(("elevation", "level"), [(30.0, None), (52.0, Severity.NOTE), (69.0, Severity.WARNING)])
 @pytest.mark.parametrize("frame", ["world", "camera"])
 def test_steep_view_is_named_with_its_elevation(person, frame, elevation, level):
     """A camera that orbits a standing body at an elevation."""
@@ -107,16 +107,18 @@ def test_steep_view_is_named_with_its_elevation(person, frame, elevation, level)
         person, joints3d=body, camera_rotation=rotation, frame=frame, camera_position=None, covariance=None
     )
     assert motion_statistics(motion).elevation_deg == pytest.approx(elevation, abs=6.0)
-    found = [r for r in results(motion) if r.check is Check.STEEP_VIEW]
-    assert [r.level for r in found] == ([] if level is None else [level])
+    found = [r for r in results(motion) if r.check is MotionCheck.STEEP_VIEW]
+    assert [r.severity for r in found] == ([] if level is None else [level])
     assert level is None or f"{motion_statistics(motion).elevation_deg:.0f}° above" in found[0].text
 
 
-@pytest.mark.parametrize(("rate_hz", "level"), [(24, None), (15, Level.NOTE), (10, Level.WARNING), (5, Level.WARNING)])
+@pytest.mark.parametrize(
+    ("rate_hz", "level"), [(24, None), (15, Severity.NOTE), (10, Severity.WARNING), (5, Severity.WARNING)]
+)
 def test_low_image_rate_is_named(person, rate_hz, level):
     stamps = np.arange(len(person.stamp_ns), dtype=np.int64) * round(1e9 / rate_hz)
-    found = [r for r in results(dataclasses.replace(person, stamp_ns=stamps)) if r.check is Check.LOW_RATE]
-    assert [r.level for r in found] == ([] if level is None else [level])
+    found = [r for r in results(dataclasses.replace(person, stamp_ns=stamps)) if r.check is MotionCheck.LOW_RATE]
+    assert [r.severity for r in found] == ([] if level is None else [level])
     assert level is None or f"{rate_hz:.1f} images per second" in found[0].text
 
 
@@ -149,8 +151,8 @@ def test_interpolated_poses_before_the_person_comes_count_in_no_statistic(report
 
 def test_a_body_that_turns_is_enough_camera_motion(reported_in_camera):
     """Only the motion of the camera relative to the body counts: the camera's frame shows the same."""
-    assert Check.LOW_CAMERA_MOTION not in checks(reported_in_camera)
-    assert Check.NO_VERTICAL in checks(reported_in_camera, Level.NOTE)
+    assert MotionCheck.LOW_CAMERA_MOTION not in checks(reported_in_camera)
+    assert MotionCheck.NO_VERTICAL in checks(reported_in_camera, Severity.NOTE)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -168,15 +170,15 @@ def test_a_body_mirrored_in_depth_is_a_warning(person, seed):
         keypoints=capture.tracks.keypoints,
         reprojection_px=np.zeros((frames, 15)),
     )
-    assert Check.MIRRORED not in checks(motion)
+    assert MotionCheck.MIRRORED not in checks(motion)
     mirrored = dataclasses.replace(motion, joints3d=joints * np.array([1.0, 1.0, -1.0]))
-    assert Check.MIRRORED in checks(mirrored, Level.WARNING)
+    assert MotionCheck.MIRRORED in checks(mirrored, Severity.WARNING)
 
 
 def test_missing_joints_are_named_with_their_share(person):
     keypoints = person.keypoints.copy()
     keypoints[::2, BODY_15.index("lwrist")] = np.nan
-    text = result_of(dataclasses.replace(person, keypoints=keypoints), Check.MISSING_JOINTS).text
+    text = result_of(dataclasses.replace(person, keypoints=keypoints), MotionCheck.MISSING_JOINTS).text
     share = np.isnan(keypoints[:, BODY_15.index("lwrist")]).any(axis=1).mean()
     assert f"lwrist {share:.0%}" in text
 
@@ -185,21 +187,21 @@ def test_a_few_outliers_are_no_high_error(person):
     size = motion_statistics(person).body_px
     few = np.zeros_like(person.reprojection_px)
     few[::20] = 0.5 * size
-    assert checks(dataclasses.replace(person, reprojection_px=few), Level.WARNING) == []
-    assert Check.OUTLIERS in checks(dataclasses.replace(person, reprojection_px=few))
+    assert checks(dataclasses.replace(person, reprojection_px=few), Severity.WARNING) == []
+    assert MotionCheck.OUTLIERS in checks(dataclasses.replace(person, reprojection_px=few))
     many = few.copy()
     many[::5] = 0.5 * size
-    assert Check.OUTLIERS in checks(dataclasses.replace(person, reprojection_px=many), Level.WARNING)
+    assert MotionCheck.OUTLIERS in checks(dataclasses.replace(person, reprojection_px=many), Severity.WARNING)
     all_over = np.full_like(few, 0.03 * size)
-    assert Check.HIGH_ERROR in checks(dataclasses.replace(person, reprojection_px=all_over), Level.WARNING)
+    assert MotionCheck.HIGH_ERROR in checks(dataclasses.replace(person, reprojection_px=all_over), Severity.WARNING)
 
 
 def test_short_sequences_are_warned_of_and_stretching_bones_noted(person, one_frame):
-    assert Check.SHORT in checks(one_frame, Level.WARNING)
+    assert MotionCheck.SHORT in checks(one_frame, Severity.WARNING)
     stretched = person.joints3d.copy()
     knee, ankle = BODY_15.index("rknee"), BODY_15.index("rankle")
     stretched[::2, ankle] = stretched[::2, knee] + 1.5 * (stretched[::2, ankle] - stretched[::2, knee])
-    result = result_of(dataclasses.replace(person, joints3d=stretched), Check.BONE_LENGTHS)
+    result = result_of(dataclasses.replace(person, joints3d=stretched), MotionCheck.BONE_LENGTHS)
     assert result.values["bone"] == "rknee - rankle"
     assert result.values["worst"] == pytest.approx(0.2, abs=0.005)  # half of the frames 1, half 1.5: 0.25 / 1.25
     assert "rknee - rankle varies by 20%" in result.text
@@ -208,7 +210,7 @@ def test_short_sequences_are_warned_of_and_stretching_bones_noted(person, one_fr
 def test_frames_without_a_pose_are_counted(person):
     joints = person.joints3d.copy()
     joints[5:9] = np.nan
-    result = result_of(dataclasses.replace(person, joints3d=joints), Check.MISSING_POSES)
+    result = result_of(dataclasses.replace(person, joints3d=joints), MotionCheck.MISSING_POSES)
     assert result.values == {"missing": 4, "frames": 60}
     assert result.text.startswith("4 of 60 frames")
 
@@ -225,7 +227,3 @@ def test_smoothing_keeps_constants_and_means():
     np.testing.assert_allclose(smooth(np.full((40, 2), 3.0), times), 3.0)
     ramp = smooth(times, times)
     np.testing.assert_allclose(ramp[5:-5], times[5:-5])
-
-
-def test_every_check_has_words():
-    assert {check: bool(title and text) for check, (title, text) in _WORDS.items()} == dict.fromkeys(Check, True)

@@ -147,7 +147,7 @@ def quality(motion: Motion) -> Record:
     ``seen`` share of frames with a subject; ``error_body`` median reprojection error over the body's size in the
     image; ``bone_spread`` mean relative standard deviation of bone lengths; ``view_span_deg`` range of the azimuth.
     """
-    from drocap_ros.report.checks import Level, run_checks
+    from drocap_ros.report.checks import Severity, run_checks
     from drocap_ros.report.statistics import mean_known, motion_statistics
 
     s = motion_statistics(motion)
@@ -160,7 +160,7 @@ def quality(motion: Motion) -> Record:
         "view_span_deg": s.view_span_deg,
     }
     return {
-        "doubts": [check.title for check in run_checks(motion, s) if check.level is Level.WARNING],
+        "doubts": [check.title for check in run_checks(motion, s) if check.severity is Severity.WARNING],
         "frames": len(s.times_s),
         **{name: round(value, 4) if math.isfinite(value) else None for name, value in values.items()},
         "frame": motion.frame,

@@ -18,7 +18,7 @@ from drocap_ros.reconstruction.world.calibration_words import telemetry_words
 from drocap_ros.reconstruction.world.contacts import contact_probability
 from drocap_ros.reconstruction.world.telemetry_checks import frozen, jump_m, turned_at_once
 from drocap_ros.reconstruction.world.world_model import CAMERA, GLOBALS, WorldState
-from drocap_ros.report.checks import Check, Level, run_checks
+from drocap_ros.report.checks import MotionCheck, Severity, run_checks
 from drocap_ros.report.statistics import motion_statistics
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
@@ -204,8 +204,8 @@ def test_a_height_that_is_set_anew_is_said_and_a_doubt() -> None:
         motion = reconstruct(given)
         assert motion.frame == "world"
         assert ("reported position jumps by 1.0 m" in telemetry_words(motion.meta)) is said
-        warned = [r.check for r in run_checks(motion, motion_statistics(motion)) if r.level is Level.WARNING]
-        assert (Check.TELEMETRY_JUMPS in warned) is said
+        warned = [r.check for r in run_checks(motion, motion_statistics(motion)) if r.severity is Severity.WARNING]
+        assert (MotionCheck.TELEMETRY_JUMPS in warned) is said
 
 
 def test_a_hard_start_of_a_vehicle_is_no_jump() -> None:

@@ -25,7 +25,7 @@ LONGEST_BRIDGE_S = 0.5
 
 
 @dataclass(frozen=True)
-class Clip:
+class Take:
     """Joints over time in the axes of an export.
 
     positions : (F, P, 3) float64, m, NaN where unknown
@@ -43,8 +43,8 @@ class Clip:
     notes: tuple[str, ...] = ()
 
 
-def clip_of(motion: Motion, *, measured: bool = False) -> Clip:
-    """Z-up clip of a motion; with ``measured`` the positions of :func:`unseen_frames` are unknown.
+def take_of(motion: Motion, *, measured: bool = False) -> Take:
+    """Z-up take of a motion; with ``measured`` the positions of :func:`unseen_frames` are unknown.
 
     Frame "world" keeps its axes (x east, y north, z up).  Frame "camera" (x right, y down, z forward) becomes
     x right, y away from the camera, z up: its vertical is the camera's, not gravity's.
@@ -77,7 +77,7 @@ def clip_of(motion: Motion, *, measured: bool = False) -> Clip:
         notes.append(f"{np.count_nonzero(unseen)} frames without the person: their poses are {poses}")
     if measured:
         positions = np.where(unseen[:, None, None], np.nan, positions)
-    return Clip(positions, motion.joints, motion.parents, times, 1.0 / step, notes=tuple(notes))
+    return Take(positions, motion.joints, motion.parents, times, 1.0 / step, notes=tuple(notes))
 
 
 def unseen_frames(motion: Motion) -> np.ndarray:
@@ -94,14 +94,14 @@ def unseen_frames(motion: Motion) -> np.ndarray:
     return unseen
 
 
-def y_up(clip: Clip) -> Clip:
-    """The same clip with y up: (x, y, z) becomes (x, z, -y)."""
-    turned = clip.positions[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
-    return replace(clip, positions=turned)
+def y_up(take: Take) -> Take:
+    """The same take with y up: (x, y, z) becomes (x, z, -y)."""
+    turned = take.positions[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
+    return replace(take, positions=turned)
 
 
-def at_constant_rate(clip: Clip) -> Clip:
-    """Clip on an even time line, for formats with a frame rate instead of stamps.
+def at_constant_rate(take: Take) -> Take:
+    """Take on an even time line, for formats with a frame rate instead of stamps.
 
     An uneven time line is resampled, linearly, at the inverse of its usual step; within gaps longer than
     ``LONGEST_BRIDGE_S`` the result is NaN.
@@ -111,47 +111,47 @@ def at_constant_rate(clip: Clip) -> Clip:
     InputError
         When the even time line would need too many frames.
     """
-    times, last = clip.times_s, float(clip.times_s[-1])
+    times, last = take.times_s, float(take.times_s[-1])
     even_step = last / (len(times) - 1)
     if np.abs(times - np.arange(len(times)) * even_step).max() <= EVEN_TOLERANCE * even_step:
-        return replace(clip, rate_hz=1.0 / even_step)
-    count = int(np.floor(last * clip.rate_hz + 1e-6)) + 1
+        return replace(take, rate_hz=1.0 / even_step)
+    count = int(np.floor(last * take.rate_hz + 1e-6)) + 1
     if count > MAX_FRAMES:
         raise InputError(
             f"motion: expected at most {MAX_FRAMES} frames at a constant rate, its stamps span {last:.0f} s at"
-            f" {clip.rate_hz:.6g} Hz; export to csv or glb, or cut the recording"
+            f" {take.rate_hz:.6g} Hz; export to csv or glb, or cut the recording"
         )
-    even = np.arange(count) / clip.rate_hz
+    even = np.arange(count) / take.rate_hz
     right = np.clip(np.searchsorted(times, even, side="left"), 1, len(times) - 1)
     left, span = right - 1, times[right] - times[right - 1]
     share = np.clip((even - times[left]) / span, 0.0, 1.0)
     # A sample on a frame equals that frame, even where its neighbour is unknown or far.
-    on_left, on_right = (np.abs(even - times[i]) * clip.rate_hz < _SAME_FRAME for i in (left, right))
+    on_left, on_right = (np.abs(even - times[i]) * take.rate_hz < _SAME_FRAME for i in (left, right))
     share = np.where(on_left, 0.0, np.where(on_right, 1.0, share))[:, None, None]
-    a, b = clip.positions[left], clip.positions[right]
+    a, b = take.positions[left], take.positions[right]
     mixed = np.where(share <= 0, a, np.where(share >= 1, b, (1 - share) * a + share * b))
     mixed[(span > LONGEST_BRIDGE_S) & ~on_left & ~on_right] = np.nan
-    note = f"uneven stamps resampled, linearly, to {clip.rate_hz:.6g} Hz"
-    return replace(clip, positions=mixed, times_s=even, notes=(*clip.notes, note))
+    note = f"uneven stamps resampled, linearly, to {take.rate_hz:.6g} Hz"
+    return replace(take, positions=mixed, times_s=even, notes=(*take.notes, note))
 
 
-def without_gaps(clip: Clip) -> Clip:
-    """Clip with unknown joints interpolated over time, constant before the first and after the last known one.
+def without_gaps(take: Take) -> Take:
+    """Take with unknown joints interpolated over time, constant before the first and after the last known one.
 
     Raises
     ------
     InputError
         When a joint is never known.
     """
-    known = np.isfinite(clip.positions).all(axis=2)
-    never = [name for name, seen in zip(clip.joints, known.any(axis=0), strict=True) if not seen]
+    known = np.isfinite(take.positions).all(axis=2)
+    never = [name for name, seen in zip(take.joints, known.any(axis=0), strict=True) if not seen]
     if never:
         raise InputError(f"motion: expected every joint in at least one frame, never known: {', '.join(never)}")
     if known.all():
-        return clip
-    filled = interpolated(clip.times_s, clip.positions, known)
+        return take
+    filled = interpolated(take.times_s, take.positions, known)
     note = f"{np.count_nonzero(~known.all(axis=1))} frames with unknown joints interpolated over time"
-    return replace(clip, positions=filled, notes=(*clip.notes, note))
+    return replace(take, positions=filled, notes=(*take.notes, note))
 
 
 def interpolated(times_s: np.ndarray, positions: np.ndarray, known: np.ndarray) -> np.ndarray:
