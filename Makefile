@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 CLEAN := env -u MAKEFLAGS -u PYTHONDONTWRITEBYTECODE -u _ROS_WHEELS_BOOTSTRAP_COMPLETE -u LD_LIBRARY_PATH -u PYTHONPATH -u AMENT_PREFIX_PATH -u CMAKE_PREFIX_PATH
 TEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
 BENCHMARK = $(CLEAN) $(BIN)/python benchmarks
-SOURCES := $(shell find drocap_ros msg srv config resource -type f -not -path '*/__pycache__/*') setup.py CMakeLists.txt package.xml
+SOURCES := $(shell find drocap_ros msg srv config resource -type f -not -path '*/__pycache__/*') setup.py pyproject.toml CMakeLists.txt package.xml
 
 .PHONY: help setup demo test test-nodes test-computing lint bench bench-quick bench-flight clean
 help:  ## this list

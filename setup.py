@@ -14,7 +14,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from setuptools import Distribution, find_packages, setup
+from setuptools import Distribution, setup
 from setuptools.command.build_py import build_py
 
 ROOT = Path(__file__).resolve().parent
@@ -98,54 +98,5 @@ class BinaryWhereRos(Distribution):
         return bool(ros_prefixes())
 
 
-setup(
-    name="drocap_ros",
-    version="0.1.0",
-    description="Human motion capture with one drone, as a ROS 2 package",
-    long_description=(ROOT / "README.md").read_text() if (ROOT / "README.md").exists() else "",
-    long_description_content_type="text/markdown",
-    license="Apache-2.0",
-    python_requires=">=3.10",
-    packages=find_packages(include=["drocap_ros", "drocap_ros.*"]),
-    package_data={
-        "drocap_ros": ["py.typed", "*.pyi", "data/*", "data/*/*", "report/page/*", "config/*.yaml", "definitions/*.msg"]
-    },
-    install_requires=[
-        "numpy>=1.26",
-        "scipy>=1.11",
-        "onnxruntime>=1.17",
-        "opencv-python-headless>=4.8",
-        "pymavlink>=2.4.40",
-        "pyserial>=3.5",
-        "mcap>=1.6",
-        "rosbags>=0.10",
-        "pyulog>=1.0",
-        "threadpoolctl>=3.1",
-        "PyYAML>=6",
-        "rich>=13",
-        "matplotlib>=3.8",
-        "c3d>=0.6",
-    ],
-    extras_require={
-        "live": ["onnx>=1.16"],  # lets a detector take smaller inputs where time is short
-        "opensim": ["opensim>=4.6,<5"],  # drocap export --to mot; wheels from Python 3.11 on
-        "view": ["rerun-sdk>=0.39,<0.40"],
-        "cluster": ["distributed>=2024.8", "bokeh>=3.1"],  # bokeh draws the scheduler's dashboard
-        "train": ["torch>=2.13", "onnx>=1.16"],
-        "test": [
-            "pytest",
-            "pytest-timeout",
-            "pytest-xdist",
-            "hypothesis",
-            "mcap-ros2-support",
-            "bvhio",
-            "ezc3d",
-            "pygltflib",
-            "trc-data-reader",
-        ],
-    },
-    entry_points={"console_scripts": ["drocap = drocap_ros.cli:main"]},
-    cmdclass={"build_py": BuildPy},
-    distclass=BinaryWhereRos,
-    zip_safe=False,
-)
+# pyproject.toml has all that is constant.
+setup(cmdclass={"build_py": BuildPy}, distclass=BinaryWhereRos)

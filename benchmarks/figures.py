@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
 #: What a figure depends on: changes there that are not committed are mentioned beside the revision.
-SOURCES = ("drocap_ros", "lab", "benchmarks", "msg", "srv", "setup.py", "requirements.lock")
+SOURCES = ("drocap_ros", "lab", "benchmarks", "msg", "srv", "setup.py", "pyproject.toml", "requirements.lock")
 
 
 def write_figures(name: str, title: str, markdown: str) -> Path:

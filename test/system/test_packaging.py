@@ -6,8 +6,11 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
+
+import drocap_ros
 
 ROOT = Path(__file__).resolve().parents[2]
 PREFIX = Path(sys.prefix)
@@ -32,6 +35,11 @@ def run(*command, cwd, env):
     done = subprocess.run(list(map(str, command)), cwd=cwd, env=env, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     return done.stdout
+
+
+def test_the_manifest_of_ros_has_the_version_of_the_package():
+    manifest = ElementTree.parse(ROOT / "package.xml")
+    assert manifest.findtext("version") == drocap_ros.__version__
 
 
 @pytest.fixture
