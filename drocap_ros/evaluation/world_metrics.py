@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from drocap_ros.contacts import TRUE_REST_M_S, step_speed
 from drocap_ros.geometry.alignment import apply_similarity, similarity
 from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.skeleton import BODY_15, indices
 
 FEET = indices(BODY_15.joints, ("rankle", "lankle"))
-#: Speed (m/s) below which a true foot counts as still.
-STILL_M_S = 0.1
 #: Mean acceleration (m/s^2) below which a truth is motionless: a person who stands has tenths.
 MOTIONLESS_M_S2 = 1e-3
 #: Squared radius of the ellipsoid that holds 90 % of a normal distribution in three dimensions (chi-squared).
@@ -39,9 +38,9 @@ def root_error(estimate: np.ndarray, truth: np.ndarray) -> float:
 
 
 def still_foot_speed(estimate: np.ndarray, truth: np.ndarray, rate_hz: Rate) -> float:
-    """Mean speed (m/s) of the estimated ankles where the true ones move slower than ``STILL_M_S``; NaN = never."""
-    still = _speed(truth[:, FEET], rate_hz) < STILL_M_S
-    return float(_speed(estimate[:, FEET], rate_hz)[still].mean()) if still.any() else float("nan")
+    """Mean speed (m/s) of the estimated ankles where the true ones move slower than ``TRUE_REST_M_S``; NaN = never."""
+    still = step_speed(truth[:, FEET], rate_hz) < TRUE_REST_M_S
+    return float(step_speed(estimate[:, FEET], rate_hz)[still].mean()) if still.any() else float("nan")
 
 
 def penetration(estimate: np.ndarray, truth: np.ndarray) -> float:
@@ -78,10 +77,6 @@ def ellipsoid_coverage(estimate: np.ndarray, truth: np.ndarray, covariance: np.n
     matrix, gap = unpack_covariance(covariance[known]), (estimate - truth)[known]
     square = np.einsum("ni,ni->n", gap, np.linalg.solve(matrix + 1e-12 * np.eye(3), gap[..., None])[..., 0])
     return float((square < ELLIPSOID_90).mean())
-
-
-def _speed(points: np.ndarray, rate_hz: Rate) -> np.ndarray:
-    return np.linalg.norm(np.diff(points, axis=0) * _of_steps(rate_hz, len(points)), axis=-1)
 
 
 def _of_steps(rate_hz: Rate, frames: int) -> np.ndarray:

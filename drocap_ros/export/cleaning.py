@@ -5,18 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, uniform_filter1d
+from scipy.ndimage import gaussian_filter1d
 from scipy.signal import butter, filtfilt
 
+from drocap_ros.contacts import rest_spans
 from drocap_ros.errors import InputError
 from drocap_ros.export.take import Take, at_constant_rate, interpolated
-from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.skeleton import indices
 
 #: A filter of order 2 applied twice has its -3 dB at this share of its cut-off.
 _TWICE = (np.sqrt(2.0) - 1.0) ** 0.25
-#: A foot rests while its ankle, averaged over a time, is slower than this, for at least a time.
-_STILL_M_S, _AVERAGE_S, _SHORTEST_S = 0.4, 0.15, 0.2
+#: Time (s) over which the direction of a knee is averaged: as that of a foot's velocity (contacts.py).
+_AVERAGE_S = 0.15
 #: Time in which a foot leaves or reaches its place; farther than this from its median place it is not at rest, m.
 _FADE_S, _FARTHEST_M = 0.2, 0.08
 #: Change of a leg's half length per turn of its knee at which half of the turn is made; 0.07 is that of 8 degrees.
@@ -75,7 +75,7 @@ def lock_feet(take: Take) -> Take:
     before, after, count = [], [], 0
     for side in "rl":
         hip, knee, ankle = indices(take.joints, tuple(side + name for name in ("hip", "knee", "ankle")))
-        rests = _rests(take.positions[:, ankle], take.rate_hz)
+        rests = rest_spans(take.positions[:, ankle], take.rate_hz)
         moved = take.positions[:, ankle] + _offsets(take.positions[:, ankle], rests, take.rate_hz)
         out[:, knee], out[:, ankle] = _two_bones(take.positions[:, [hip, knee, ankle]], moved, take.rate_hz)
         if side + "toe" in take.joints:
@@ -98,18 +98,6 @@ def lock_feet(take: Take) -> Take:
 def _moved(before: np.ndarray, after: np.ndarray) -> str:
     off = 1000.0 * np.linalg.norm(after - before, axis=2)
     return f"joints moved by {np.nanmean(off):.1f} mm on average, at most {np.nanmax(off):.1f} mm"
-
-
-def _rests(ankle: np.ndarray, rate_hz: float) -> list[tuple[int, int]]:
-    """First and end frame of each time in which an ankle (F, 3) rests."""
-    velocity = np.gradient(ankle, axis=0) * rate_hz
-    width = min(max(round(_AVERAGE_S * rate_hz), 1), len(ankle))
-    known = np.isfinite(velocity).all(axis=1)
-    # The running average would carry NaN on to the end.
-    average = uniform_filter1d(np.where(known[:, None], velocity, 0.0), width, axis=0, mode="nearest")
-    whole = uniform_filter1d(known.astype(np.float64), width, mode="nearest") > 1.0 - 1e-6
-    still = whole & (np.linalg.norm(average, axis=1) < _STILL_M_S)
-    return [(int(a), int(b)) for a, b in true_runs(still) if b - a >= max(_SHORTEST_S * rate_hz, 2)]
 
 
 def _offsets(ankle: np.ndarray, rests: list[tuple[int, int]], rate_hz: float) -> np.ndarray:

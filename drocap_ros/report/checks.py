@@ -8,6 +8,7 @@ from enum import Enum
 
 import numpy as np
 
+from drocap_ros.contacts import MOTION_REST_M_S
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.world.calibration_words import telemetry_words
 from drocap_ros.report.statistics import Statistics, mean_known
@@ -40,9 +41,8 @@ _MANY_OUTLIERS = 0.1
 #: Share of forward knees at which a body is no likelier right than mirrored, and the least number of bent knees.
 _MIRRORED_SHARE = 0.5
 _MIRRORED_COUNT = 10
-#: Speed of the lower foot, m/s, and its share of the pelvis's speed: no take of 523 with real walks, runs, jumps and
-#: squats exceeds the larger of the two.
-_SLIDING_M_S = 0.4
+#: Share of the pelvis's speed: the lower foot of no take of 523 with real walks, runs, jumps and squats exceeds the
+#: larger of it and of ``MOTION_REST_M_S``.
 _SLIDING_SHARE = 0.3
 #: Lean with the camera: 64 true takes, seen from an orbit, reach 3.6 degrees; a mount's pitch off by 10 gives 10.
 _LEANING_DEG = 8.0
@@ -230,7 +230,7 @@ def _of_keypoints(motion: Motion, s: Statistics) -> Iterator[Finding]:
 
 
 def _of_path(s: Statistics) -> Iterator[Finding]:
-    if s.foot_m_s > max(_SLIDING_M_S, _SLIDING_SHARE * s.pelvis_m_s):
+    if s.foot_m_s > max(MOTION_REST_M_S, _SLIDING_SHARE * s.pelvis_m_s):
         yield _warn(MotionCheck.SLIDING_FEET, speed=s.foot_m_s)
     if abs(s.lean_deg) > _LEANING_DEG:
         where = "away from" if s.lean_deg > 0 else "towards"

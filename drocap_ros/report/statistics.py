@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from drocap_ros.contacts import speed_of_lowest
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.alignment import torso_frame
 from drocap_ros.geometry.interpolation import usual_step
@@ -279,13 +280,9 @@ def _path_speeds(motion: Motion, times_s: np.ndarray) -> tuple[float, float]:
     # Without the camera's position the pelvis stays at the origin.
     if len(at) < 2 or not np.ptp(at[:, 0], axis=0).any():
         return float("nan"), float("nan")
-    step = np.diff(at, axis=0) / np.diff(times_s)[:, None, None]
-    height = 0.5 * (at[1:, 1:, 2] + at[:-1, 1:, 2])
-    lower = height.argmin(axis=1)[:, None]
-    speed = np.take_along_axis(np.linalg.norm(step[:, 1:], axis=2), lower, axis=1)[:, 0]
-    height = np.take_along_axis(height, lower, axis=1)[:, 0]
-    resting = speed[height <= np.median(height)]
-    return float(np.median(resting)), float(np.median(np.linalg.norm(step[:, 0, :2], axis=1)))
+    step_s = np.diff(times_s)
+    pelvis = np.linalg.norm(np.diff(at[:, 0, :2], axis=0) / step_s[:, None], axis=1)
+    return speed_of_lowest(at[:, 1:], step_s), float(np.median(pelvis))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

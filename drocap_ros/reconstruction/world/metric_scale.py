@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drocap_ros.contacts import rest_likelihood
+
 #: Time lags between two positions of a foot.
 LAGS_S = (0.15, 0.25, 0.4)
 
@@ -60,10 +62,10 @@ def estimate_scale(feet: np.ndarray, camera_position: np.ndarray, stamp_ns: np.n
     a, b, c = (np.sum(x * y, axis=1) for x, y in ((gap, gap), (gap, base), (base, base)))
     factors = np.geomspace(LOWEST, HIGHEST, 200)
     square = np.maximum(a[:, None] * factors**2 + 2.0 * b[:, None] * factors + c[:, None], 0.0)
-    score = np.exp(-0.5 * square / STILL_M**2).sum(0)
+    score = rest_likelihood(square, STILL_M).sum(0)
     factor = float(factors[np.argmax(score)])
     for _ in range(10):
-        weight = np.exp(-0.5 * np.maximum(a * factor**2 + 2.0 * b * factor + c, 0.0) / STILL_M**2)
+        weight = rest_likelihood(np.maximum(a * factor**2 + 2.0 * b * factor + c, 0.0), STILL_M)
         if weight.sum() < 1e-9:
             return None
         factor = float(np.clip(-np.sum(weight * b) / np.sum(weight * a), LOWEST, HIGHEST))

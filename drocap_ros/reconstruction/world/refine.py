@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from drocap_ros.contacts import ANKLES, ankles_seen
 from drocap_ros.geometry.interpolation import MAX_GAP_S
 from drocap_ros.geometry.rotations import exp_so3, project_to_so3
 from drocap_ros.keypoints import Keypoints2D
@@ -16,7 +17,6 @@ from drocap_ros.reconstruction.lifted.window_solver import difference_noise
 from drocap_ros.reconstruction.methods.windows import fade_weights, windows
 from drocap_ros.reconstruction.world.calibration import MEASURED, Calibration
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
-from drocap_ros.reconstruction.world.contacts import ankles_seen
 from drocap_ros.reconstruction.world.telemetry_checks import (
     frozen,
     jump_m,
@@ -27,7 +27,6 @@ from drocap_ros.reconstruction.world.telemetry_checks import (
 )
 from drocap_ros.reconstruction.world.world_adjustment import WorldSolution, adjust_in_world
 from drocap_ros.reconstruction.world.world_model import (
-    ANKLES,
     ATTITUDE_LATENCY,
     CALIBRATED,
     CAMERA,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from drocap_ros.contacts import ANKLES, LOOKS_AT_REST, PLACED_REST_M_S, rest_likelihood
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.geometry.rotations import log_so3
-from drocap_ros.reconstruction.world.world_model import ANKLES
 from drocap_ros.skeleton import BODY_15
 
 #: A moving camera whose pose stays the same for so long, to the rounding of its interpolation, has no new measurement.
@@ -26,8 +26,8 @@ _SHIFTS_S, _SHIFT_STEP_S = 3.0, 0.5
 _LAG_S, _SMOOTHING_S, _STILL_M = 0.4, 0.06, 0.06
 #: Share of still feet at another time over that at the reported time, and its least value.
 _CLEARLY_BETTER, _LEAST_SHARE = 1.8, 0.06
-#: Feet at rest on a true path move at 0.5 m/s at most and slower than the others: the placement jitters.
-_RESTING_M_S, _RESTING_RATIO = 0.55, 0.7
+#: Feet at rest on a true path are slower than the others by this factor.
+_RESTING_RATIO = 0.7
 #: Share of the time in which a foot has to look at rest, and the times between which its speed is taken.
 _RESTING_SHARE, _RESTING_LAG_S, _RESTING_SMOOTHING_S = 0.05, 0.33, 0.08
 
@@ -128,11 +128,11 @@ def resting_feet_move(joints: np.ndarray, still: np.ndarray, fps: float) -> str:
     feet = gaussian_filter1d(joints[:, ANKLES], _RESTING_SMOOTHING_S * fps, axis=0, mode="nearest")
     speed = np.linalg.norm(feet[lag:] - feet[:-lag], axis=-1) * fps / lag
     rests = still[lag // 2 :][: len(speed)]
-    weight = np.where(rests > 0.5, rests, 0.0)
+    weight = np.where(rests > LOOKS_AT_REST, rests, 0.0)
     if weight.mean() < _RESTING_SHARE:
         return ""
-    resting, moving = _median(speed, weight), _median(speed, np.where(rests > 0.5, 0.0, 1.0 - rests))
-    if not (resting > _RESTING_M_S and resting > _RESTING_RATIO * moving):
+    resting, moving = _median(speed, weight), _median(speed, np.where(rests > LOOKS_AT_REST, 0.0, 1.0 - rests))
+    if not (resting > PLACED_REST_M_S and resting > _RESTING_RATIO * moving):
         return ""
     return (
         f"feet that look at rest move at {resting:.1f} m/s on their path; check that the log belongs to the video and "
@@ -159,4 +159,4 @@ def _still_share(seen: np.ndarray, rotation: np.ndarray, position: np.ndarray, l
     placed = seen[of : of + frames] @ rotation[at : at + frames] + position[at : at + frames, None]
     feet = gaussian_filter1d(placed, _SMOOTHING_S * fps, axis=0, mode="nearest")
     square = np.square(feet[lag:] - feet[:-lag]).sum(-1)
-    return float(np.exp(-0.5 * square / _STILL_M**2).mean())
+    return float(rest_likelihood(square, _STILL_M).mean())

@@ -7,48 +7,47 @@ contact are locked in their places while the unknowns of the whole recording sta
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.contacts import ANKLES, FEET, HEIGHT_STD_M, MOVING, MOVING_LOCKED, RestingFeet, step_height
 from drocap_ros.reconstruction.banded import backward, band_factor, forward
 from drocap_ros.reconstruction.line_search import search_line
 from drocap_ros.reconstruction.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
 from drocap_ros.reconstruction.world.calibration import Calibration
-from drocap_ros.reconstruction.world.contacts import (
-    MOVING,
-    MOVING_LOCKED,
-    contact_probability,
-    floor_std,
-    ground_spread,
-    parting_speed,
-)
 from drocap_ros.reconstruction.world.posterior import posterior
 from drocap_ros.reconstruction.world.world_equations import normal_matrix
 from drocap_ros.reconstruction.world.world_model import (
-    ANKLES,
     CALIBRATED,
-    FEET,
     FLOOR,
     FRAME,
     GLOBALS,
     LENGTHS,
     MISALIGNMENT,
     SCALE,
+    WorldConfig,
     WorldInput,
     WorldState,
 )
-from drocap_ros.reconstruction.world.world_residuals import FLOOR_STD_M, Residuals, gradient, weights_of
+from drocap_ros.reconstruction.world.world_residuals import WorldResiduals, gradient, weights_of
 
+#: Relative decrease of the cost below which the adjustment has converged.
 _CONVERGED = 1e-4
-#: Standard deviation (m/s) of the speed of feet in contact in the first steps, when the body still slides.
-_CONTACT_SPEEDS = (0.6, 0.4, 0.3, 0.2)
-_LAST_CONTACT_SPEED = 0.15
+#: Standard deviation (m/s) of the speed of feet in contact in the first steps, when the body still slides, and later.
+_FIRST_CONTACT_SPEEDS_M_S = (0.6, 0.4, 0.3, 0.2)
+_CONTACT_SPEED_M_S = 0.15
+#: Spread (m) of the heights of resting feet on level ground, as the body's errors leave it, and on steps.
+_LEVEL_M = 0.025
+_STEPS_M = 0.06
+#: Scale below which a step of the adjustment goes astray: no person measures five times the assumed stature.
 _LEAST_SCALE = 0.2
 #: Weight of a held unknown, per m^2 or rad^2: a hundred thousand times that of a clear keypoint.
 _HOLD = 1e10
-#: Errors of the shared unknowns over their formal standard deviations: contacts are chosen by the same data.
+#: Errors of the shared unknowns over their formal standard deviations, from the scale errors of 36 runs: contacts are
+#: chosen by the same data.
 _STD_FACTOR = 1.25
 
 
@@ -87,6 +86,38 @@ def initial_state(data: WorldInput, start: WorldState) -> WorldState:
     return WorldState(start.joints, start.camera, shared)
 
 
+class _Stage(NamedTuple):
+    """One step of the adjustment.
+
+    locking : feet in contact are locked, the shared unknowns stay
+    speed_std_m_s : of feet in contact
+    moving : likelihood of a foot that moves
+    weight : of feet in contact
+    finds_floor : the body does not slide any more: feet in contact tell how level the ground is
+    """
+
+    locking: bool
+    speed_std_m_s: float
+    moving: float
+    weight: float
+    finds_floor: bool
+
+
+def _stages(config: WorldConfig, held: int) -> Iterator[_Stage]:
+    """The steps in order; a window that continues another one does not slide, and its scale and camera are known."""
+    first = len(_FIRST_CONTACT_SPEEDS_M_S)
+    for number in range(config.iterations + config.locking_iterations):
+        locking = number >= config.iterations
+        stage = number + (first if held else 0)
+        yield _Stage(
+            locking=locking,
+            speed_std_m_s=_FIRST_CONTACT_SPEEDS_M_S[stage] if stage < first else _CONTACT_SPEED_M_S,
+            moving=MOVING_LOCKED if locking or held else MOVING,
+            weight=config.locked_weight if locking else config.contact_weight,
+            finds_floor=stage == first,
+        )
+
+
 def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> WorldSolution:
     """Adjust from a point.
 
@@ -97,46 +128,56 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
     """
     config, weights = data.config, weights_of(data)
     state = initial_state(data, start)
-    stop, done, ground, floor = ITERATIONS, 0, float("nan"), FLOOR_STD_M
+    stop, done, ground, floor_std = ITERATIONS, 0, float("nan"), HEIGHT_STD_M
     contact: np.ndarray = np.zeros((len(start.joints) - 1, len(FEET)))
-    outlier = Residuals(data, weights, state, contact, 0.0).usual_outlier()
+    outlier = WorldResiduals(data, weights, state, contact, 0.0).usual_outlier()
     seen = data.weight > 0 if data.seen is None else data.seen
-    parting = parting_speed(start.joints, data.fps)
-    for done in range(1, config.iterations + config.locking_iterations + 1):
-        locking = done > config.iterations
-        # A window that continues another one does not slide any more, and its scale and camera are known.
-        stage = done + (len(_CONTACT_SPEEDS) if held else 0)
-        speed = _CONTACT_SPEEDS[stage - 1] if stage <= len(_CONTACT_SPEEDS) else _LAST_CONTACT_SPEED
+    feet = RestingFeet(seen, data.fps, data.still, start.joints)
+    for stage in _stages(config, held):
+        done += 1
         if config.feet:
-            moving = MOVING_LOCKED if locking or held else MOVING
-            contact = contact_probability(state, data.fps, speed, seen, data.still, parting, moving)
-        weight = config.locked_weight if locking else config.contact_weight
-        if stage == len(_CONTACT_SPEEDS) + 1:
-            ground = ground_spread(state, contact)
-            floor = floor_std(ground, FLOOR_STD_M)
-        here = Residuals(data, weights, state, contact, weight, outlier, floor)
-        frames, shared = gradient(here)
-        matrix = normal_matrix(here)
-        matrix[0][: held * FRAME, 0] += _HOLD
-        step = _solve(matrix, frames, shared, locking)
-        if step is None:
-            stop = NO_DESCENT
-            break
-        slope = float((frames * step[0]).sum() + shared @ step[1])
-        there = search_line(here.cost, slope, partial(_moved, here, step))
+            contact = feet.probability(state.joints, float(state.globals[FLOOR]), stage.speed_std_m_s, stage.moving)
+        if stage.finds_floor:
+            ground = _ground_spread(state, contact)
+            floor_std = _floor_std(ground)
+        here = WorldResiduals(data, weights, state, contact, stage.weight, outlier, floor_std)
+        there = _improved(here, held, stage.locking)
         if there is None:
             stop = NO_DESCENT
             break
         state, outlier = there.state, there.usual_outlier()
-        if locking and here.cost - there.cost <= _CONVERGED * here.cost:
+        if stage.locking and here.cost - there.cost <= _CONVERGED * here.cost:
             stop = CONVERGED
             break
-    final = Residuals(data, weights, state, contact, config.contact_weight, floor_std=floor)
+    final = WorldResiduals(data, weights, state, contact, config.contact_weight, floor_std=floor_std)
+    return _solution(final, ground, done, stop)
+
+
+def _improved(here: WorldResiduals, held: int, locking: bool) -> WorldResiduals | None:
+    """The point after one step of Gauss-Newton, shortened until the cost falls; None = there is none."""
+    frames, shared = gradient(here)
+    matrix = normal_matrix(here)
+    matrix[0][: held * FRAME, 0] += _HOLD
+    step = _solve(matrix, frames, shared, locking)
+    if step is None:
+        return None
+    slope = float((frames * step[0]).sum() + shared @ step[1])
+
+    def moved(share: float) -> WorldResiduals | None:
+        there = here.moved(share * step[0], share * step[1])
+        return there if there.state.globals[SCALE] > _LEAST_SCALE else None
+
+    return search_line(here.cost, slope, moved)
+
+
+def _solution(final: WorldResiduals, ground: float, iterations: int, stop_reason: str) -> WorldSolution:
+    """The solution with its errors, by the posterior covariance where the normal equations have one."""
+    data, weights, state = final.data, final.weights, final.state
     found = posterior(normal_matrix(final), state)
-    fact = config.frames_per_fact
-    std: np.ndarray = np.full(GLOBALS, np.nan)
-    axes, turned_std = data.telemetry.gimbal_axes(), np.full(3, np.nan)
-    covariance: np.ndarray = np.full((*state.joints.shape, 3), np.nan)
+    fact = data.config.frames_per_fact
+    axes = data.telemetry.gimbal_axes()
+    std, turned_std = np.full(GLOBALS, np.nan), np.full(3, np.nan)
+    covariance = np.full((*state.joints.shape, 3), np.nan)
     calibration = Calibration.unknown()
     if found is not None:
         prior = np.sqrt(fact * np.diag(np.linalg.inv(weights.shared)))
@@ -149,7 +190,7 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
     return WorldSolution(
         joints=state.joints / state.globals[SCALE],
         state=state,
-        contact=contact,
+        contact=final.contact,
         std=std,
         turned=axes @ state.globals[MISALIGNMENT],
         turned_std=turned_std,
@@ -157,9 +198,23 @@ def adjust_in_world(data: WorldInput, start: WorldState, held: int = 0) -> World
         ground_spread=ground,
         calibration=calibration,
         cost_terms=final.terms,
-        iterations=done,
-        stop_reason=stop,
+        iterations=iterations,
+        stop_reason=stop_reason,
     )
+
+
+def _ground_spread(state: WorldState, contact: np.ndarray) -> float:
+    """Standard deviation (m) of the heights of feet in contact (F - 1, 4) above the floor; NaN = no contact."""
+    height = step_height(state.joints[:, FEET], float(state.globals[FLOOR]))
+    total = float(contact.sum())
+    return float(np.sqrt((contact * np.square(height)).sum() / total)) if total > 1.0 else float("nan")
+
+
+def _floor_std(spread: float) -> float:
+    """Standard deviation (m) of the floor's term: tight on level ground, loose on steps or a slope."""
+    if not np.isfinite(spread):
+        return HEIGHT_STD_M
+    return max(_LEVEL_M, HEIGHT_STD_M * (spread / _STEPS_M) ** 2)
 
 
 def _findings(covariance: np.ndarray, prior: np.ndarray, expected: np.ndarray, at: np.ndarray) -> Calibration:
@@ -174,11 +229,6 @@ def _findings(covariance: np.ndarray, prior: np.ndarray, expected: np.ndarray, a
         (after - before) / _STD_FACTOR**2,
         (after @ point[CALIBRATED] - before @ expected[CALIBRATED]) / _STD_FACTOR**2,
     )
-
-
-def _moved(here: Residuals, step: tuple[np.ndarray, np.ndarray], share: float) -> Residuals | None:
-    there = here.moved(share * step[0], share * step[1])
-    return there if there.state.globals[SCALE] > _LEAST_SCALE else None
 
 
 def _solve(

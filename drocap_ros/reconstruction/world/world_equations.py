@@ -8,11 +8,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
+from drocap_ros.contacts import FEET
 from drocap_ros.reconstruction.lifted.adjustment import SPANS
 from drocap_ros.reconstruction.world.world_model import (
     BONES,
     CAMERA,
-    FEET,
     FLOOR,
     FRAME,
     GLOBALS,
@@ -21,7 +21,7 @@ from drocap_ros.reconstruction.world.world_model import (
     SCALE,
     SPAN_STD_M,
 )
-from drocap_ros.reconstruction.world.world_residuals import CAMERA_COLUMNS, GAUGE_M, OF_CAMERA, Residuals
+from drocap_ros.reconstruction.world.world_residuals import CAMERA_COLUMNS, GAUGE_M, OF_CAMERA, WorldResiduals
 
 _BODY = 3 * JOINTS
 #: (17, 18) whether a joint is an end of a span.
@@ -30,7 +30,7 @@ _ENDS = np.array([[float(joint in span) for span in SPANS] for joint in range(JO
 WIDTH = 2 * FRAME + 1
 
 
-def normal_matrix(r: Residuals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def normal_matrix(r: WorldResiduals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Band (F * FRAME, WIDTH), border (F * FRAME, GLOBALS) and corner (GLOBALS, GLOBALS).
 
     Element [i, d] of the band couples unknowns i and i + d.  It needs double precision: the small weight that holds
@@ -55,7 +55,7 @@ def normal_matrix(r: Residuals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return band.reshape(frames * FRAME, WIDTH), border.reshape(frames * FRAME, GLOBALS), corner
 
 
-def _set_image_part(r: Residuals, blocks: np.ndarray, border: np.ndarray, corner: np.ndarray) -> None:
+def _set_image_part(r: WorldResiduals, blocks: np.ndarray, border: np.ndarray, corner: np.ndarray) -> None:
     """Set the part of the reprojection, and that of the depths that the camera has, of blocks, border and corner."""
     _, by_joint, camera = r.image_derivatives
     frames = len(by_joint)
@@ -79,7 +79,7 @@ def _set_image_part(r: Residuals, blocks: np.ndarray, border: np.ndarray, corner
     border[:, CAMERA:, OF_CAMERA] = coupling[..., CAMERA_COLUMNS]
 
 
-def _add_body(r: Residuals, blocks: np.ndarray, border: np.ndarray, corner: np.ndarray) -> None:
+def _add_body(r: WorldResiduals, blocks: np.ndarray, border: np.ndarray, corner: np.ndarray) -> None:
     """Add the terms within a frame, in upper triangles: depths, bones, feet and floor."""
     frames = len(blocks)
     own = np.zeros((frames, JOINTS, 3, 3))
@@ -113,7 +113,7 @@ def _add_body(r: Residuals, blocks: np.ndarray, border: np.ndarray, corner: np.n
     corner[FLOOR, FLOOR] += float(r.height_weight.sum())
 
 
-def _add_time(r: Residuals, band: np.ndarray) -> None:
+def _add_time(r: WorldResiduals, band: np.ndarray) -> None:
     """Add the couplings between frames: accelerations, contacts, wander of the camera's errors."""
     for rows, weight in (
         (slice(CAMERA, None), r.weights.acceleration), (slice(0, 3), r.weights.camera_acceleration),

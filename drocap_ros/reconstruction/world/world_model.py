@@ -15,13 +15,9 @@ from drocap_ros.reconstruction.lifted.adjustment import SPAN_STD_MM, SPANS
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.camera_telemetry import CameraPath, CameraTelemetry
-from drocap_ros.skeleton import BODY_15, BODY_17, indices
+from drocap_ros.skeleton import BODY_15, BODY_17
 
 JOINTS = len(BODY_17)
-#: Points of the feet that rest on the ground, ankles first, and their height over that of a standing ankle.
-FEET = np.array(indices(BODY_17.joints, ("rankle", "lankle", "rtoe", "ltoe")))
-FEET_HEIGHT_M = np.array([0.0, 0.0, -0.06, -0.06])
-ANKLES = FEET[:2]
 #: Bones whose total length is the unit: those without the feet.
 BONES = len(BODY_15.bones)
 SPAN_STD_M = SPAN_STD_MM / 1000.0

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.contacts import FEET, HEIGHT_STD_M, step_height
 from drocap_ros.geometry.rotations import exp_so3, left_jacobian
 from drocap_ros.reconstruction.lifted.adjustment import SPANS
 from drocap_ros.reconstruction.world.world_model import (
@@ -23,8 +24,6 @@ from drocap_ros.reconstruction.world.world_model import (
     BONES,
     CALIBRATED,
     CAMERA,
-    FEET,
-    FEET_HEIGHT_M,
     FLOOR,
     FRAME,
     GLOBALS,
@@ -37,16 +36,19 @@ from drocap_ros.reconstruction.world.world_model import (
     WorldState,
 )
 
-#: Squared image residual, in standard deviations, at which a joint has half its weight.
+#: Squared image residual, in standard deviations, at which a joint has half its weight: three of them, as usual.
 OUTLIER_SQUARE = 9.0
+#: The same over the median square, while all residuals are large: two standard deviations of the usual joint.
 _OVER_MEDIAN = 4.0
+#: Error (m) of a depth below which its term is quadratic: that of the default method's adjustment.
 _DEPTH_ROUNDING_M = 0.015
+#: Least depth (m) of a joint before the camera: no drone is nearer.
 _NEAREST_M = 0.3
-#: Spread (m) of the heights of feet in contact, as long as the ground is not known.
-FLOOR_STD_M = 0.1
-#: Spread of the floor's height where no foot is in contact.
+#: Square (m^2) below which a bone has no direction: a hundredth of a millimetre.
+_LEAST_SQUARE_M2 = 1e-10
+#: Standard deviation (m) of the floor's height where no foot is in contact: any height.
 _ANY_FLOOR_M = 1000.0
-#: Standard deviation (m) of the body's total bone length, which sets the unit.
+#: Standard deviation (m) of the body's total bone length, which sets the unit: less than any other term feels.
 GAUGE_M = 0.0005
 #: The shared unknowns of the camera, and their columns in its derivatives: a misalignment turns every frame.
 OF_CAMERA = np.r_[SCALE, MISALIGNMENT, ATTITUDE_LATENCY, POSITION_LATENCY]
@@ -57,7 +59,7 @@ WANDER_S = np.repeat([60.0, 10.0], 3)
 _OWN_LATENCY = 0.2
 
 
-class Weights(NamedTuple):
+class WorldWeights(NamedTuple):
     """Weights of one adjustment that do not depend on the unknowns; the names are those of the terms.
 
     wander, first : (6,) of the change of the camera's errors between frames, and of the first ones
@@ -74,7 +76,7 @@ class Weights(NamedTuple):
     expected: np.ndarray
 
 
-def weights_of(data: WorldInput) -> Weights:
+def weights_of(data: WorldInput) -> WorldWeights:
     """Weights from the parameters and from the telemetry's roughness."""
     config, fps = data.config, data.fps
     rough = data.telemetry.roughness() / np.sqrt(2.0 / (WANDER_S[0] * fps))
@@ -96,7 +98,7 @@ def weights_of(data: WorldInput) -> Weights:
         shared[CALIBRATED, CALIBRATED] += data.known.precision
         expected[CALIBRATED] = np.linalg.solve(shared[CALIBRATED, CALIBRATED], data.known.vector)
     fact = config.frames_per_fact
-    return Weights(
+    return WorldWeights(
         acceleration=(config.acceleration_m_s2 / fps**2) ** -2,
         camera_acceleration=(config.camera_acceleration_m_s2 / fps**2) ** -2,
         depth=config.depth_weight / np.maximum(data.depth_sigma, 0.01),
@@ -107,7 +109,7 @@ def weights_of(data: WorldInput) -> Weights:
     )
 
 
-class Residuals:
+class WorldResiduals:
     """Residuals at one point.
 
     contact : (F - 1, 4) probability that a point of ``FEET`` keeps its place between two frames
@@ -119,72 +121,104 @@ class Residuals:
     def __init__(
         self,
         data: WorldInput,
-        weights: Weights,
+        weights: WorldWeights,
         state: WorldState,
         contact: np.ndarray,
         contact_weight: float,
         outlier: float = OUTLIER_SQUARE,
-        floor_std: float = FLOOR_STD_M,
+        floor_std: float = HEIGHT_STD_M,
     ) -> None:
-        config, shared = data.config, state.globals
         self.data, self.weights, self.state = data, weights, state
         self.contact, self.contact_weight, self.outlier, self.floor_std = contact, contact_weight, outlier, floor_std
-        path = state.path(data.telemetry)
-        self.turn = shared[MISALIGNMENT] + state.camera[:, 3:]
+        self._see()
+        self._compare_image()
+        self._compare_body()
+        self._compare_feet()
+        self._compare_camera()
+        self._compare_shared()
+        self.terms = self._terms()
+        self.cost = sum(self.terms.values())
+
+    def _see(self) -> None:
+        """The camera's corrected path, and the joints in its axes."""
+        shared, camera, path = self.state.globals, self.state.camera, self.state.path(self.data.telemetry)
+        self.turn = shared[MISALIGNMENT] + camera[:, 3:]
         correction = exp_so3(self.turn)
         self.rotation = correction @ path.rotation
-        self.position = path.position + state.camera[:, :3]
+        self.position = path.position + camera[:, :3]
         self.velocity = path.velocity
         self.turn_rate = np.einsum("fij,fj->fi", correction, path.turn_rate)
-        joints = state.joints
-        self.seen = (joints - shared[SCALE] * self.position[:, None]) @ np.swapaxes(self.rotation, 1, 2)
+        offset = self.state.joints - shared[SCALE] * self.position[:, None]
+        self.seen = offset @ np.swapaxes(self.rotation, 1, 2)
+        # Along the reported view, a lifter whose bodies lean would turn the camera.
+        self.view = self.rotation[:, 2]
+
+    def _compare_image(self) -> None:
+        """Projected joints with the keypoints, and depths behind the pelvis with the lifter's."""
+        data = self.data
         self.depth = np.maximum(self.seen[..., 2], _NEAREST_M)
         focal, centre = np.diagonal(data.camera_matrix)[:2], data.camera_matrix[:2, 2]
         pixels = focal * self.seen[..., :2] / self.depth[..., None] + centre
         self.image = np.where(data.weight[..., None] > 0, pixels - data.keypoints, 0.0)
-        square = np.square(self.image).sum(-1) * data.weight
-        self.square, self.robust = square, 1.0 / (1.0 + square / outlier)
-        # Along the reported view, a lifter whose bodies lean would turn the camera.
-        self.view = self.rotation[:, 2]
+        self.square = np.square(self.image).sum(-1) * data.weight
+        self.robust = 1.0 / (1.0 + self.square / self.outlier)
         self.relief = self.seen[..., 2] - self.seen[:, :1, 2] - data.depth
         self.rounded = np.sqrt(np.square(self.relief) + _DEPTH_ROUNDING_M**2)
+
+    def _compare_body(self) -> None:
+        """Bones with their lengths, and joints with a steady motion."""
+        joints, lengths = self.state.joints, self.state.globals[LENGTHS]
         span = joints[:, SPANS[:, 1]] - joints[:, SPANS[:, 0]]
-        length = np.sqrt(np.square(span).sum(-1) + 1e-10)
+        length = np.sqrt(np.square(span).sum(-1) + _LEAST_SQUARE_M2)
         self.direction = span / length[..., None]
-        self.stretch = (length - shared[LENGTHS]) / SPAN_STD_M
-        self.excess = 1.0 - shared[LENGTHS] / length
+        self.stretch = (length - lengths) / SPAN_STD_M
+        self.excess = 1.0 - lengths / length
         self.swing = joints[2:] - 2 * joints[1:-1] + joints[:-2]
-        flown = data.telemetry.position + state.camera[:, :3]
-        self.camera_swing = flown[2:] - 2 * flown[1:-1] + flown[:-2]
-        feet = joints[:, FEET]
+
+    def _compare_feet(self) -> None:
+        """Feet in contact with their place one frame before, and with the floor."""
+        feet, config = self.state.joints[:, FEET], self.data.config
         self.step = feet[1:] - feet[:-1]
-        self.step_weight = contact_weight * contact / (config.contact_speed_m_s / data.fps) ** 2
-        self.height = 0.5 * (feet[1:, :, 2] + feet[:-1, :, 2]) - shared[FLOOR] - FEET_HEIGHT_M
-        self.height_weight = contact / floor_std**2
-        self.drift = np.diff(state.camera, axis=0)
-        self.gauge = (shared[:BONES].sum() - data.lengths[:BONES].sum()) / GAUGE_M
+        self.step_weight = self.contact_weight * self.contact / (config.contact_speed_m_s / self.data.fps) ** 2
+        self.height = step_height(feet, self.state.globals[FLOOR])
+        self.height_weight = self.contact / self.floor_std**2
+
+    def _compare_camera(self) -> None:
+        """The camera's errors with those one frame before, and its path with a steady flight."""
+        camera = self.state.camera
+        flown = self.data.telemetry.position + camera[:, :3]
+        self.camera_swing = flown[2:] - 2 * flown[1:-1] + flown[:-2]
+        self.drift = np.diff(camera, axis=0)
+
+    def _compare_shared(self) -> None:
+        """Lengths, scale, misalignment and latencies with their priors."""
+        shared, lengths = self.state.globals, self.data.lengths
+        self.gauge = (shared[:BONES].sum() - lengths[:BONES].sum()) / GAUGE_M
         self.prior = shared.copy()
-        self.prior[LENGTHS] -= data.lengths
+        self.prior[LENGTHS] -= lengths
         self.prior[SCALE] = np.log(shared[SCALE])
-        self.prior -= weights.expected
-        self.terms = {
-            "reprojection": 0.5 * float((square * self.robust).sum()),
+        self.prior -= self.weights.expected
+
+    def _terms(self) -> dict[str, float]:
+        """The cost, term by term."""
+        weights = self.weights
+        return {
+            "reprojection": 0.5 * float((self.square * self.robust).sum()),
             "lifter_depth": float((weights.depth * (self.rounded - _DEPTH_ROUNDING_M)).sum()),
             "articulation": 0.5 * float(np.square(self.stretch).sum()),
             "acceleration": 0.5 * weights.acceleration * float(np.square(self.swing).sum()),
             "contact": 0.5 * float((self.step_weight[..., None] * np.square(self.step)).sum()),
             "floor": 0.5 * float((self.height_weight * np.square(self.height)).sum()),
             "telemetry": 0.5 * float((weights.wander * np.square(self.drift)).sum())
-            + 0.5 * float((weights.first * np.square(state.camera[0])).sum())
+            + 0.5 * float((weights.first * np.square(self.state.camera[0])).sum())
             + 0.5 * weights.camera_acceleration * float(np.square(self.camera_swing).sum()),
             "priors": 0.5 * float(self.prior @ weights.shared @ self.prior) + 0.5 * self.gauge**2,
         }
-        self.cost = sum(self.terms.values())
 
-    def moved(self, frames: np.ndarray, shared: np.ndarray) -> Residuals:
+    def moved(self, frames: np.ndarray, shared: np.ndarray) -> WorldResiduals:
         """Residuals of the same cost after a step."""
         state = self.state.moved(frames, shared)
-        return Residuals(
+        return WorldResiduals(
             self.data, self.weights, state, self.contact, self.contact_weight, self.outlier, self.floor_std
         )
 
@@ -233,7 +267,7 @@ class Residuals:
         return out
 
 
-def gradient(r: Residuals) -> tuple[np.ndarray, np.ndarray]:
+def gradient(r: WorldResiduals) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives of the cost by the unknowns of every frame (F, FRAME) and by the shared ones (GLOBALS,)."""
     weights, state = r.weights, r.state
     frames = np.zeros((len(state.joints), FRAME))

@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 from test_world_adjustment import FPS, MATRIX, followed, orbit, project, tracks, walker
 
+from drocap_ros.contacts import RestingFeet
 from drocap_ros.evaluation.metrics import scale_error
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.reconstruction.world import refine
 from drocap_ros.reconstruction.world.calibration_words import telemetry_words
-from drocap_ros.reconstruction.world.contacts import contact_probability
 from drocap_ros.reconstruction.world.telemetry_checks import frozen, jump_m, turned_at_once
-from drocap_ros.reconstruction.world.world_model import CAMERA, GLOBALS, WorldState
 from drocap_ros.report.checks import MotionCheck, Severity, run_checks
 from drocap_ros.report.statistics import motion_statistics
 from drocap_ros.skeleton import BODY_17
@@ -160,12 +159,11 @@ def test_words_are_those_of_the_worst_window() -> None:
 
 
 def test_ankles_that_nobody_sees_hold_no_contact() -> None:
-    joints, shared = np.repeat(walker(1), 48, axis=0), np.zeros(GLOBALS)
-    state, seen = WorldState(joints, np.zeros((48, CAMERA)), shared), np.ones((48, 17), bool)
+    joints, seen = np.repeat(walker(1), 48, axis=0), np.ones((48, 17), bool)
     right, left = BODY_17.index("rankle"), BODY_17.index("lankle")
     seen[:, right], seen[20:24, left] = False, False
-    found = contact_probability(state, FPS, 0.15, seen)
-    everywhere = contact_probability(state, FPS, 0.15, np.ones((48, 17), bool))
+    found = RestingFeet(seen, FPS).probability(joints, 0.0, 0.15)
+    everywhere = RestingFeet(np.ones((48, 17), bool), FPS).probability(joints, 0.0, 0.15)
     assert not found[:, 0].any()
     np.testing.assert_array_equal(found[:, 1], everywhere[:, 1])  # hidden for a moment
 

@@ -10,6 +10,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from drocap_ros.contacts import ANKLES, RestingFeet
 from drocap_ros.evaluation.metrics import scale_error
 from drocap_ros.evaluation.world_metrics import ellipsoid_coverage, still_foot_speed
 from drocap_ros.geometry.rotations import exp_so3, left_jacobian, log_so3
@@ -19,12 +20,10 @@ from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.reconstruction.world import refine
 from drocap_ros.reconstruction.world.calibration_words import telemetry_words
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
-from drocap_ros.reconstruction.world.contacts import contact_probability
 from drocap_ros.reconstruction.world.posterior import posterior
 from drocap_ros.reconstruction.world.world_adjustment import adjust_in_world
 from drocap_ros.reconstruction.world.world_equations import normal_matrix
 from drocap_ros.reconstruction.world.world_model import (
-    ANKLES,
     ATTITUDE_LATENCY,
     CAMERA,
     FLOOR,
@@ -38,7 +37,7 @@ from drocap_ros.reconstruction.world.world_model import (
     WorldInput,
     WorldState,
 )
-from drocap_ros.reconstruction.world.world_residuals import Residuals, gradient, weights_of
+from drocap_ros.reconstruction.world.world_residuals import WorldResiduals, gradient, weights_of
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
@@ -91,7 +90,7 @@ def exact_input(
     )  # fmt: skip
 
 
-def random_point() -> tuple[Residuals, WorldInput, WorldState, np.ndarray]:
+def random_point() -> tuple[WorldResiduals, WorldInput, WorldState, np.ndarray]:
     rng = np.random.default_rng(0)
     joints = rng.normal(0.0, 0.4, (7, 17, 3)) + np.array([0.0, 0.0, 1.0])
     rotation, position = orbit(0.1 * np.arange(7), np.zeros((7, 2)))
@@ -102,7 +101,7 @@ def random_point() -> tuple[Residuals, WorldInput, WorldState, np.ndarray]:
     shared[MISALIGNMENT], shared[[ATTITUDE_LATENCY, POSITION_LATENCY]] = [0.03, -0.05, 0.02], [0.03, 0.02]
     state = WorldState(joints, rng.normal(0, 0.01, (7, 6)), shared)
     contact = rng.random((6, 4))
-    return Residuals(data, weights_of(data), state, contact, 0.2), data, state, contact
+    return WorldResiduals(data, weights_of(data), state, contact, 0.2), data, state, contact
 
 
 def test_normal_matrix_holds_body_and_camera_together_by_the_first_frame_of_the_telemetry_alone() -> None:
@@ -115,7 +114,7 @@ def test_normal_matrix_holds_body_and_camera_together_by_the_first_frame_of_the_
     shared = np.zeros(GLOBALS)
     shared[LENGTHS], shared[SCALE] = data.lengths, 1.0
     weights, state = weights_of(data), WorldState(joints, np.zeros((frames, CAMERA)), shared)
-    here = Residuals(data, weights, state, np.ones((frames - 1, 4)), 0.2)
+    here = WorldResiduals(data, weights, state, np.ones((frames - 1, 4)), 0.2)
     band, _, _ = normal_matrix(here)
     for axis in (0, 1):
         along = np.zeros((frames, FRAME))
@@ -131,7 +130,7 @@ def test_derivatives_are_those_of_the_cost() -> None:
     rng, step = np.random.default_rng(1), 1e-6
 
     def cost(frames: np.ndarray, shared: np.ndarray) -> float:
-        return Residuals(data, here.weights, state.moved(frames, shared), contact, 0.2).cost
+        return WorldResiduals(data, here.weights, state.moved(frames, shared), contact, 0.2).cost
 
     for _ in range(60):
         way = rng.normal(size=by_frame.shape)
@@ -159,13 +158,13 @@ def test_normal_matrix_is_the_curvature_of_the_quadratic_terms() -> None:
     rng = np.random.default_rng(2)
     camera = np.zeros((7, FRAME))
     camera[:, 2] = rng.normal(size=7)  # the position's error
-    moved = Residuals(replace(data, weight=0 * data.weight), here.weights, state, contact, 0.2)
+    moved = WorldResiduals(replace(data, weight=0 * data.weight), here.weights, state, contact, 0.2)
     flat, _, _ = normal_matrix(moved)
     matrix = np.zeros((size, size))
     for offset in range(flat.shape[1]):
         at = np.arange(size - offset)
         matrix[at, at + offset] = matrix[at + offset, at] = flat[: size - offset, offset]
-    there = Residuals(
+    there = WorldResiduals(
         replace(data, weight=0 * data.weight), here.weights, state.moved(camera, np.zeros(GLOBALS)), contact, 0.2
     )
     change = gradient(there)[0] - gradient(moved)[0]
@@ -235,16 +234,17 @@ def test_a_lifter_whose_bodies_lean_does_not_turn_the_camera() -> None:
 
 def test_a_foot_that_looks_moving_is_not_in_contact() -> None:
     joints = walker(48)
-    shared = np.zeros(GLOBALS)
-    shared[FLOOR] = np.percentile(joints[:, ANKLES, 2], 2)
-    state, seen = WorldState(joints, np.zeros((48, CAMERA)), shared), np.ones((48, 17), bool)
-    unknown = contact_probability(state, FPS, 0.15, seen)
+    floor, seen = float(np.percentile(joints[:, ANKLES, 2], 2)), np.ones((48, 17), bool)
+
+    def contact(looks: np.ndarray | None) -> np.ndarray:
+        return RestingFeet(seen, FPS, looks).probability(joints, floor, 0.15)
+
+    unknown = contact(None)
     right, left = np.array([0.98, 0.02])
-    looks = contact_probability(state, FPS, 0.15, seen, np.tile([right, left], (48, 1)))
+    looks = contact(np.tile([right, left], (48, 1)))
     np.testing.assert_array_less(unknown[:, [0, 2]].mean(axis=0), looks[:, [0, 2]].mean(axis=0))
     np.testing.assert_array_less(looks[:, [1, 3]].mean(axis=0), 0.3 * unknown[:, [1, 3]].mean(axis=0))
-    even = contact_probability(state, FPS, 0.15, seen, np.full((48, 2), 0.5))
-    np.testing.assert_allclose(even, unknown)
+    np.testing.assert_allclose(contact(np.full((48, 2), 0.5)), unknown)
 
 
 def test_result_does_not_depend_on_where_the_origin_and_north_lie() -> None:
