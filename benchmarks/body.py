@@ -16,6 +16,7 @@ import numpy as np
 from figures import ROOT, table, write_figures
 from scipy.signal import lfilter
 
+from drocap_ros.contacts import TRUE_REST_M_S
 from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.evaluation.protocol import (
     FPS,
@@ -46,7 +47,6 @@ _SIGNED_MM = 50.0
 #: Square of the radius of the ellipsoid that holds 90 % of a normal distribution in three dimensions.
 _NINETY = 6.251
 _FLOOR = ("lie", "floor")
-_STILL_M_S = 0.1
 
 
 class Row(NamedTuple):
@@ -241,7 +241,7 @@ def summary(name: str, scores: list[Score]) -> list[str]:
     true_speed = np.concatenate([s.speed.ravel() for s in scores])
     shown = np.concatenate([s.still.ravel() for s in scores])
     known = np.isfinite(true_speed)
-    roc = area_under_roc(true_speed[known] < _STILL_M_S, shown[known]) if known.any() else np.nan
+    roc = area_under_roc(true_speed[known] < TRUE_REST_M_S, shown[known]) if known.any() else np.nan
     return [
         name,
         f"{mean:.1f}",

@@ -12,7 +12,7 @@ import pytest
 #: Bottom to top; a room imports rooms of its own layer or below.
 LAYERS = (
     ("errors", "revision", "parameters", "skeleton", "joint_maps", "leg_sides", "geometry", "keypoints", "observation",
-     "tracks", "motion", "mocap", "clip"),
+     "tracks", "motion", "mocap", "clip", "contacts"),
     ("perception", "flight", "reconstruction", "recording", "simulation"),
     ("api", "config", "pipeline", "live_replay", "evaluation", "export", "report", "view"),
     ("ros",),
@@ -26,7 +26,7 @@ MAX_LINES = 350
 #: budget writes the reason beside the number.
 BUDGETS = {
     ("errors", "revision", "parameters", "skeleton", "joint_maps", "leg_sides", "geometry", "keypoints", "observation",
-     "tracks", "motion", "mocap", "clip", "api", "config", "pipeline", "live_replay"): 3.0,
+     "tracks", "motion", "mocap", "clip", "contacts", "api", "config", "pipeline", "live_replay"): 3.0,
     ("perception",): 5.2,
     ("reconstruction",): 7.6,
     ("flight",): 7.7,

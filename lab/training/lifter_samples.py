@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drocap_ros.contacts import TRUE_REST_M_S
 from drocap_ros.geometry.bones import pair_lengths
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.lifted.lifter_input import BONES, LIFTER_FPS, normalise
@@ -28,8 +29,6 @@ _SIDES = ((_J["rhip"], _J["lhip"]), (_J["rknee"], _J["lknee"]), (_J["rankle"], _
           (_J["rtoe"], _J["ltoe"]))  # fmt: skip
 #: Share of the people who go from posture to posture.
 _POSED = 0.45
-#: Speed below which a foot counts as still.
-STILL_M_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ def _draw_motion(bank: MocapBank, rng: np.random.Generator, windows: int, frames
     part = (time - low).astype(np.float32)[..., None, None]
     at = bank.start[pick][:, None] + low
     motion = bank.joints[at] * (1 - part) + bank.joints[at + 1] * part
-    still = (bank.foot_speed[at] < STILL_M_S).astype(np.float32)
+    still = (bank.foot_speed[at] < TRUE_REST_M_S).astype(np.float32)
     motion = straighten_legs(motion, bank.reach[pick], rng)
     flip = rng.random(windows) < 0.5
     flipped = motion[flip][:, :, BODY_17.mirror]
