@@ -241,7 +241,7 @@ def whole_file(kind: str, folder: Path) -> bytes:
     from recorded import START_NS, Messages, write_poses
     from telemetry_logs import dji_subtitle, srt_text
 
-    from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
+    from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
     from drocap_ros.simulation.capture import simulate_capture
     from drocap_ros.tracks import save_tracks
 

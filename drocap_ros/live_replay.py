@@ -14,6 +14,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
 from drocap_ros.observation import PoseObservation
+from drocap_ros.reconstruction.live.effort import Effort
 from drocap_ros.reconstruction.live.replay import LivePose, live_poses
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.reconstruction.reconstruct import reprojection_px
@@ -75,11 +76,16 @@ def reconstruct_live(
     frames: dict[int, _Frame] = {}
     camera = RecordedCamera(session, topic.name, config.bundle_adjuster.window_s)
     stop_reason, iterations = NO_WINDOW, 0
+
+    def effort_at(stamp_ns: int) -> Effort | None:
+        window = published.next_window(stamp_ns)
+        return None if window is None else Effort(window.stride, window.steps)
+
     results = live_poses(
         read_observations(session, topic.name),
         config.initializer,
         config.bundle_adjuster,
-        published.effort_at if published.has_windows else None,
+        effort_at if published.has_windows else None,
         lambda stamp_ns, size: camera.along(
             stamp_ns, size, published.telemetry_ns if published.has_windows else int(stamp_ns[-1])
         ),
@@ -90,8 +96,8 @@ def reconstruct_live(
             published.compare_initial(stamp_ns, result.joints3d)
             frames[stamp_ns] = _Frame(result.observation, result.joints3d)
         else:
-            published.compare_window(result)
             window = result.window
+            published.compare_window(window.stamp_ns, result.joints3d)
             for i, stamp_ns in enumerate(window.stamp_ns.tolist()):
                 # A pose in map stays: a window after the end of the telemetry holds older frames too.
                 if window.in_map is not None or frames[stamp_ns].camera is None:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.tracks import MAX_FRAMES, as_stamps, check_stamps, read_npz
+from drocap_ros.stamps import as_stamps, check_stamps
+from drocap_ros.tracks import MAX_FRAMES, read_npz
 
 #: Name of a motion in its folder.
 FILE = "motion.npz"

@@ -26,7 +26,7 @@ from drocap_ros.recording.open_images import open_images, refuse_other_inputs
 from drocap_ros.recording.open_session import is_recording, open_session
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Session
 from drocap_ros.recording.session_tracks import read_pose2d, with_recorded_camera
-from drocap_ros.recording.telemetry.video_telemetry import (
+from drocap_ros.recording.video_telemetry import (
     NO_TELEMETRY,
     Telemetry,
     read_video_telemetry,

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.stamps import as_stamps, check_stamps
 
 #: Longest accepted sequence (10 h at 30 fps); longer ones are refused before memory runs out.
 MAX_FRAMES = 1_080_000
@@ -22,8 +23,6 @@ _FARTHEST_PX = 1e9
 _NORMALISED = 2.0
 #: Focal lengths as shares of the image's width or height: a view of 157 degrees, and of 0.6.
 _FOCAL_SHARES = 0.1, 100.0
-#: Longest time from the first to the last frame, ns: a year. More is no recording, and overflows.
-_LONGEST_NS = 365 * 86_400 * 10**9
 
 
 @dataclass(frozen=True)
@@ -109,21 +108,6 @@ def _check_telemetry(t: Tracks) -> None:
         raise InputError("camera_position: expected finite metres, got NaN or infinity; fill the gaps in")
     if t.camera_matrix is not None:
         check_camera_matrix(t.camera_matrix, t.image_size)
-
-
-def check_stamps(stamp_ns: np.ndarray) -> None:
-    """Refuse stamps (F,) that do not increase, or last longer than a year.
-
-    Raises
-    ------
-    InputError
-        When they do.
-    """
-    first, last = int(stamp_ns[0]), int(stamp_ns[-1])
-    if last - first > _LONGEST_NS:
-        raise InputError(f"stamp_ns: expected nanoseconds within a year, got {first} to {last}; is the unit right?")
-    if np.any(stamp_ns[1:] <= stamp_ns[:-1]):
-        raise InputError("stamp_ns: expected strictly increasing times, got a repeated or earlier one; sort the frames")
 
 
 def check_keypoints(keypoints: np.ndarray, covariance: np.ndarray | None) -> None:
@@ -250,21 +234,6 @@ def load_tracks(path: str | Path) -> Tracks:
         )
     except (InputError, ValueError) as error:
         raise InputError(f"{path}: {error}") from None
-
-
-def as_stamps(array: np.ndarray) -> np.ndarray:
-    """int64 stamps of a file's array.
-
-    Raises
-    ------
-    InputError
-        When it holds no integers, or larger ones.
-    """
-    if array.dtype.kind not in "iu":
-        raise InputError(f"stamp_ns: expected int64 nanoseconds, got {array.dtype}")
-    if array.size and array.max() > np.iinfo(np.int64).max:
-        raise InputError(f"stamp_ns: expected int64 nanoseconds, got {array.max()}; is the unit right?")
-    return array.astype(np.int64)
 
 
 def _as_float(array: np.ndarray, name: str) -> np.ndarray:

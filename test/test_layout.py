@@ -12,7 +12,7 @@ import pytest
 #: Bottom to top; a room imports rooms of its own layer or below.
 LAYERS = (
     ("errors", "revision", "parameters", "skeleton", "joint_maps", "leg_sides", "geometry", "keypoints", "observation",
-     "tracks", "motion", "mocap", "clip", "contacts"),
+     "stamps", "tracks", "motion", "mocap", "clip", "contacts"),
     ("perception", "flight", "reconstruction", "recording", "simulation"),
     ("api", "config", "pipeline", "live_replay", "evaluation", "export", "report", "view"),
     ("ros",),

@@ -146,8 +146,8 @@ def _telemetry(args: argparse.Namespace) -> Any:
     from drocap_ros.errors import InputError
     from drocap_ros.pipeline import Telemetry
     from drocap_ros.recording.open_session import is_recording
-    from drocap_ros.recording.telemetry.djmd.reader import has_djmd
-    from drocap_ros.recording.telemetry.video_telemetry import NO_TELEMETRY
+    from drocap_ros.recording.telemetry.djmd import has_djmd
+    from drocap_ros.recording.video_telemetry import NO_TELEMETRY
 
     for name, value in (("--time-offset", args.time_offset), ("--mount-pitch", args.mount_pitch)):
         if value is None:

@@ -44,7 +44,7 @@ def telemetry_summary(path: Path) -> Parts:
     if path.suffix.lower() not in _VIDEOS:
         log = read_telemetry(path)
     else:
-        from drocap_ros.recording.telemetry.djmd.reader import has_djmd, read_djmd
+        from drocap_ros.recording.telemetry.djmd import has_djmd, read_djmd
 
         facts += _video_facts(path)
         try:

@@ -13,6 +13,8 @@ _NS = 1e-9
 MAX_GAP_S = 2.0
 #: Time beyond the first and last state for which these still hold; at 25 deg/s it is 2.5 deg.
 HOLD_S = 0.1
+#: Frames by which values are continued at both ends before smoothing; the smoothing's tail is cut there.
+_CONTINUED = 12
 
 
 def usual_step(times: np.ndarray) -> float:
@@ -84,3 +86,19 @@ def interpolate(
         found = values[before] + part[:, None] * (values[after] - values[before])
     unknown = (gap_s > max_gap_s) | (outside_s > HOLD_S)
     return np.where(unknown[:, None], np.nan, found), np.maximum(gap_s, outside_s)
+
+
+def smoothed(values: np.ndarray, sigma: float) -> np.ndarray:
+    """Values (F, C) through a Gaussian of ``sigma`` frames that keeps their slope at both ends.
+
+    The values are continued there in straight lines.
+    """
+    from scipy.ndimage import gaussian_filter1d
+
+    reach = min(_CONTINUED, len(values) - 1)
+    steps = np.arange(1, _CONTINUED + 1)[:, None]
+    before = values[0] - (values[reach] - values[0]) / max(reach, 1) * steps[::-1]
+    after = values[-1] + (values[-1] - values[-1 - reach]) / max(reach, 1) * steps
+    extended = np.concatenate([before, values, after])
+    out: np.ndarray = gaussian_filter1d(extended, sigma, axis=0, mode="nearest")[_CONTINUED:-_CONTINUED]
+    return out

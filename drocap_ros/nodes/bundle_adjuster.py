@@ -19,10 +19,10 @@ import numpy as np
 from std_msgs.msg import Header
 
 from drocap_ros.errors import InputError
+from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.live.adjuster import SOLVER_ERRORS, LiveAdjuster
-from drocap_ros.reconstruction.live.camera_history import CameraHistory
 from drocap_ros.reconstruction.live.effort import Effort, EffortControl
 from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer
 from drocap_ros.reconstruction.live.latest_place import LatestPlace

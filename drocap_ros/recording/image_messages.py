@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.reconstruction.live.stamps import StampValidator
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Session, header_stamp_ns
+from drocap_ros.stamps import StampValidator
 
 if TYPE_CHECKING:
     from drocap_ros.perception.sources.base import Frame

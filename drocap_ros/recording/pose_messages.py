@@ -9,11 +9,11 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import optical_orientation
+from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.observation import PoseObservation
-from drocap_ros.reconstruction.live.camera_history import CameraHistory
-from drocap_ros.reconstruction.live.stamps import StampValidator
-from drocap_ros.recording.session import header_stamp_ns
+from drocap_ros.recording.session import calibration_of, header_stamp_ns
 from drocap_ros.skeleton import joint_set
+from drocap_ros.stamps import StampValidator
 from drocap_ros.tracks import check_camera_matrix, check_keypoints
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def observation_from_message(message: Any) -> PoseObservation:
     """
     joints = joint_set(message.skeleton)
     count = len(joints) if message.track_id else 0
-    stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+    stamp_ns = header_stamp_ns(message)
     if stamp_ns < 0:
         raise InputError(f"stamp: expected a time after 1970, got {stamp_ns} ns; set the sender's clock")
     if message.image_width < 1 or message.image_height < 1:
@@ -72,12 +72,12 @@ def add_calibration(history: CameraHistory, message: Any) -> None:
     InputError
         When the calibration is not one in px.
     """
-    # ROS 2 names the matrix k, ROS 1 names it K.
-    matrix = np.asarray(getattr(message, "k", getattr(message, "K", ())), np.float64)
-    if matrix.size == 9:
-        if matrix[0] > 0 and min(message.width, message.height) > 0:
-            check_camera_matrix(matrix.reshape(3, 3), (message.width, message.height))
-        history.add_matrix(header_stamp_ns(message), matrix.reshape(3, 3), (message.width, message.height))
+    matrix = calibration_of(message)
+    if matrix is not None:
+        size = (message.width, message.height)
+        if matrix[0, 0] > 0 and min(size) > 0:
+            check_camera_matrix(matrix, size)
+        history.add_matrix(header_stamp_ns(message), matrix, size)
 
 
 def float_array(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import re
 from collections import defaultdict, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -14,10 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.reconstruction.live.camera_history import CameraHistory, WindowCamera
-from drocap_ros.reconstruction.live.effort import Effort
-from drocap_ros.reconstruction.live.replay import LiveWindow
-from drocap_ros.reconstruction.live.stamps import StampValidator
+from drocap_ros.geometry.camera_history import CameraHistory, WindowCamera
 from drocap_ros.recording.pose_messages import add_calibration, add_state
 from drocap_ros.recording.session import (
     CAMERA_INFO,
@@ -26,7 +22,9 @@ from drocap_ros.recording.session import (
     VEHICLE_STATE,
     Session,
     header_stamp_ns,
+    stamp_of,
 )
+from drocap_ros.stamps import StampValidator
 
 _INITIAL = 1  # Pose3D.INITIAL
 
@@ -46,6 +44,22 @@ class Agreement:
             f"equal to the live graph bit for bit: {self.initial[1]} of {self.initial[0]} initial poses,"
             f" {self.windows[1]} of {self.windows[0]} windows"
         )
+
+
+class PublishedWindow(NamedTuple):
+    """A window of the live graph.
+
+    stamp_ns : of its last image
+    fingerprint : of its stamps and joints
+    stride, steps : the effort of its adjustment: of the images, and of its two solutions where they were limited
+    telemetry_ns : stamp of the newest state of the vehicle that it knew, 0 = none
+    """
+
+    stamp_ns: int
+    fingerprint: bytes
+    stride: int
+    steps: tuple[int, int] | None
+    telemetry_ns: int
 
 
 class RecordedCamera:
@@ -81,8 +95,8 @@ class PublishedPoses:
         base = near.rsplit("/", 1)[0]
         # Fingerprints save memory: the windows of half an hour overlap twelvefold.
         self._initial: defaultdict[int, deque[bytes]] = defaultdict(deque)
-        self._windows: deque[_PublishedWindow] = deque()
-        self._current: _PublishedWindow | None = None
+        self._windows: deque[PublishedWindow] = deque()
+        self._current: PublishedWindow | None = None
         self.agreement = Agreement()
         for m in _messages(session, POSE3D, f"{base}/pose3d/initial"):
             if m.stage == _INITIAL:
@@ -90,24 +104,25 @@ class PublishedPoses:
         for m in _messages(session, POSE3D_WINDOW, f"{base}/pose3d/refined"):
             stamps = np.array([header_stamp_ns(pose) for pose in m.poses], np.int64)
             joints = np.array([_joints(pose) for pose in m.poses])
+            steps = (int(m.steps[0]), int(m.steps[1])) if len(m.steps) else None
+            known_ns = stamp_of(m.telemetry_stamp)
             self._windows.append(
-                _PublishedWindow(header_stamp_ns(m), _fingerprint(stamps, joints), _effort(m), _telemetry_ns(m))
+                PublishedWindow(header_stamp_ns(m), _fingerprint(stamps, joints), int(m.stride), steps, known_ns)
             )
         self.has_windows = bool(self._windows)
 
-    def effort_at(self, stamp_ns: int) -> Effort | None:
-        """Effort of the window that ends here, the next in order; None when the graph adjusted none."""
+    def next_window(self, stamp_ns: int) -> PublishedWindow | None:
+        """The window that ends here, the next in order; None when the graph adjusted none."""
         ahead = next((i for i, w in enumerate(self._windows) if w.stamp_ns == stamp_ns), None)
         if ahead is None or any(w.stamp_ns > stamp_ns for w in islice(self._windows, ahead)):
             return None
         for _ in range(ahead + 1):
             self._current = self._windows.popleft()
-        assert self._current is not None
-        return self._current.effort
+        return self._current
 
     @property
     def telemetry_ns(self) -> int:
-        """Of the window that :meth:`effort_at` returned last: stamp of the newest state that it knew, 0 = none."""
+        """Of the window that :meth:`next_window` returned last: stamp of the newest state that it knew, 0 = none."""
         return 0 if self._current is None else self._current.telemetry_ns
 
     def compare_initial(self, stamp_ns: int, joints: np.ndarray) -> None:
@@ -116,34 +131,12 @@ class PublishedPoses:
         if theirs:
             _count(self.agreement.initial, theirs.popleft() == _fingerprint(joints))
 
-    def compare_window(self, result: LiveWindow) -> None:
-        """Compare with the window that :meth:`effort_at` returned last."""
+    def compare_window(self, stamp_ns: np.ndarray, joints: np.ndarray) -> None:
+        """Compare the joints (F, P, 3) at the stamps (F,) with the window that :meth:`next_window` returned last."""
         theirs, self._current = self._current, None
         if theirs is not None:
-            equal = theirs.fingerprint == _fingerprint(result.window.stamp_ns, result.joints3d)
+            equal = theirs.fingerprint == _fingerprint(stamp_ns, joints)
             _count(self.agreement.windows, equal)
-
-
-class _PublishedWindow(NamedTuple):
-    stamp_ns: int
-    fingerprint: bytes
-    effort: Effort
-    telemetry_ns: int
-
-
-def _telemetry_ns(window: Any) -> int:
-    """Stamp of the newest vehicle state that a Pose3DWindow knew; recordings older than the field used none."""
-    stamp = getattr(window, "telemetry_stamp", None)
-    return 0 if stamp is None else int(stamp.sec) * 10**9 + int(stamp.nanosec)
-
-
-def _effort(window: Any) -> Effort:
-    """Effort of a Pose3DWindow; recordings older than its field ``stride`` hold it in the stop reason."""
-    if hasattr(window, "stride"):
-        return Effort(int(window.stride), (int(window.steps[0]), int(window.steps[1])) if len(window.steps) else None)
-    stride = re.search(r"every (\d+)\. image", window.stop_reason)
-    steps = re.search(r"(\d+) \+ (\d+) steps", window.stop_reason)
-    return Effort(int(stride[1]) if stride else 1, (int(steps[1]), int(steps[2])) if steps else None)
 
 
 def _messages(session: Session, kind: str, name: str) -> Iterator[Any]:

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from drocap_ros.errors import InputError
 
 POSE2D = "drocap_ros/msg/Pose2D"
@@ -165,5 +167,16 @@ class Session(ABC):
 
 def header_stamp_ns(message: Any) -> int:
     """Stamp of a message's header, ns."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+    return stamp_of(message.header.stamp)
+
+
+def calibration_of(message: Any) -> np.ndarray | None:
+    """(3, 3) px of a ``CameraInfo``; None where it holds no matrix."""
+    # ROS 2 names the matrix k, ROS 1 names it K.
+    matrix = np.asarray(getattr(message, "k", getattr(message, "K", ())), dtype=np.float64)
+    return matrix.reshape(3, 3) if matrix.size == 9 else None
+
+
+def stamp_of(time: Any) -> int:
+    """A ``builtin_interfaces/Time`` in ns."""
+    return int(time.sec) * 10**9 + int(time.nanosec)

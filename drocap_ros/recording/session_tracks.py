@@ -12,17 +12,25 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.rotations import unit_quaternions
 from drocap_ros.perception.calibration import CameraModel
-from drocap_ros.recording.session import CAMERA_INFO, POSE2D, VEHICLE_STATE, Session, TopicInfo, header_stamp_ns
+from drocap_ros.recording.session import (
+    CAMERA_INFO,
+    POSE2D,
+    VEHICLE_STATE,
+    Session,
+    TopicInfo,
+    calibration_of,
+    header_stamp_ns,
+)
 from drocap_ros.recording.telemetry.camera_poses import with_camera
-from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack
+from drocap_ros.recording.telemetry.log import VehicleTrack
 from drocap_ros.skeleton import joint_set
 from drocap_ros.tracks import MAX_FRAMES, Tracks
 
 #: Where other systems record the poses of a vehicle or camera.
 _OTHER_POSES = ("tf2_msgs/msg/TFMessage", "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped")
-#: Calibrations that differ by less are one: the scale of the motion errs by as much.
+#: Calibrations that differ by a smaller share are one: the scale of the motion errs by as much.
 _SAME_LENS = 0.01
-#: A stamp this far from most others is of another clock.
+#: A stamp farther from most others, in ns, is of another clock: a day, the longest flight and more.
 _FAR_NS = 86_400 * 10**9
 
 
@@ -99,9 +107,8 @@ def with_recorded_camera(
         raise InputError("--mount-pitch: expected no recorded camera attitude, found one; leave the option out")
     tracks, reason = with_camera(tracks, vehicle, tracks.stamp_ns, mount_pitch_deg)
     if reason:
-        remedy = (
-            "" if has_gimbal or mount_pitch_deg is not None else "; for a camera fixed to the body: --mount-pitch DEG"
-        )
+        fixed = not has_gimbal and mount_pitch_deg is None
+        remedy = "; for a camera fixed to the body: --mount-pitch DEG" if fixed else ""
         session.warn(f"camera telemetry incomplete: {reason}{remedy}")
     return tracks
 
@@ -178,23 +185,12 @@ def _fill(target: np.ndarray, values: Any, name: str) -> None:
     target[...] = array.reshape(target.shape)
 
 
-def _camera_matrix(session: Session, topic: str, size: tuple[int, int]) -> np.ndarray | None:
+def _camera_matrix(session: Session, near: str, size: tuple[int, int]) -> np.ndarray | None:
     """(3, 3) px of the first usable camera info, for images of ``size`` (width, height) px; or None."""
-    info = _nearest(session.topics_of(CAMERA_INFO), topic)
+    info = _nearest(session.topics_of(CAMERA_INFO), near)
     if info is None:
         return None
-    camera: CameraModel | None = None
-    for _, message in session.messages((info.name,)):
-        # ROS 2 names it k, ROS 1 names it K.
-        matrix = np.asarray(getattr(message, "k", getattr(message, "K", ())), dtype=np.float64)
-        if not (matrix.size == 9 and np.isfinite(matrix).all() and matrix[0] > 0 and matrix[4] > 0):
-            continue
-        matrix = matrix.reshape(3, 3)
-        if camera is None:
-            camera = CameraModel(message.width or size[0], message.height or size[1], matrix)
-        elif not np.allclose(matrix, camera.matrix, rtol=_SAME_LENS):
-            session.warn(f"the calibration on {info.name} changes: the first one is used; cut the recording there")
-            break
+    camera = _first_calibration(session, info.name, size)
     if camera is None:
         session.warn(f"no usable calibration on {info.name}: its matrix is not set")
         return None
@@ -206,6 +202,21 @@ def _camera_matrix(session: Session, topic: str, size: tuple[int, int]) -> np.nd
         return None
     session.warn(f"{found} {size[0]}x{size[1]}: taken as the same picture, resized")
     return camera.resized(*size).matrix
+
+
+def _first_calibration(session: Session, topic: str, size: tuple[int, int]) -> CameraModel | None:
+    """The first usable calibration, of images of ``size`` where it states none; warns where it changes."""
+    camera: CameraModel | None = None
+    for _, message in session.messages((topic,)):
+        matrix = calibration_of(message)
+        if matrix is None or not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
+            continue
+        if camera is None:
+            camera = CameraModel(message.width or size[0], message.height or size[1], matrix)
+        elif not np.allclose(matrix, camera.matrix, rtol=_SAME_LENS):
+            session.warn(f"the calibration on {topic} changes: the first one is used; cut the recording there")
+            break
+    return camera
 
 
 def _nearest(topics: list[TopicInfo], near: str) -> TopicInfo | None:

@@ -23,10 +23,10 @@ from rclpy.subscription import Subscription
 from drocap_ros.config import section_types
 from drocap_ros.errors import InputError
 from drocap_ros.parameters import Parameters
-from drocap_ros.reconstruction.live.stamps import StampValidator
 from drocap_ros.ros.diagnostics import ERROR, HARDWARE_ID, OK, WARN, Key, Latency, of
 from drocap_ros.ros.parameters import declare_parameters
 from drocap_ros.ros.topics import FROM_OUTSIDE, KEPT_QOS, RESULT_QOS, TOPICS, publishers_of, subscribers_of
+from drocap_ros.stamps import StampValidator
 
 #: A simulated time that has not moved for this long, by the real clock, stands still: a busy simulator is faster.
 _CLOCK_STANDS_S = 5.0

@@ -13,8 +13,8 @@ from drocap_ros.evaluation.protocol import FPS, reported
 from drocap_ros.evaluation.tables import markdown_table
 from drocap_ros.evaluation.world_errors import WORLD_HEAD, WorldErrors, world_cells, world_errors
 from drocap_ros.evaluation.world_protocol import LONGEST_S, WorldView, world_sequences, world_view
+from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.geometry.rotations import quaternion_from_matrix
-from drocap_ros.reconstruction.live.camera_history import CameraHistory
 from drocap_ros.reconstruction.live.latest_place import LatestPlace
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.replay import LivePose, live_poses

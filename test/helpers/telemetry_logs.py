@@ -7,8 +7,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from drocap_ros.flight.frames import orientation_to_aviation
-from drocap_ros.recording.telemetry.log import TelemetryLog
-from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack
+from drocap_ros.recording.telemetry.log import TelemetryLog, VehicleTrack
 
 
 def angles_of(orientation):

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.observation import PoseObservation
-from drocap_ros.reconstruction.live.camera_history import CameraHistory
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.capture_config import SimulationConfig
 from drocap_ros.skeleton import BODY_17

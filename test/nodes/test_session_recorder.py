@@ -19,7 +19,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from drocap_ros.bringup import bringup, free_domain
 from drocap_ros.config import DrocapConfig
 from drocap_ros.nodes.session_recorder import SessionRecorderNode
-from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
+from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, KEPT_QOS, TOPICS

@@ -7,7 +7,7 @@ from angles import angle_between
 from recorded import NAMES, START_NS, record, write_poses
 
 from drocap_ros.errors import InputError
-from drocap_ros.reconstruction.live.camera_history import CameraHistory
+from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.pose_messages import add_calibration, read_observations
 from drocap_ros.recording.session_tracks import read_pose2d

@@ -89,7 +89,7 @@ def _read_tasks(args: argparse.Namespace) -> list[Task]:
     """A task for each recording that the arguments name, each once."""
     from drocap_ros.cli.batch.inputs import read_inputs
     from drocap_ros.cli.batch.recording import Task, content_digest, fingerprint, stat_digest, version
-    from drocap_ros.recording.telemetry.video_telemetry import NO_TELEMETRY
+    from drocap_ros.recording.video_telemetry import NO_TELEMETRY
 
     options = argparse.ArgumentParser()
     add_options(options)
@@ -111,7 +111,7 @@ def _resolved(arguments: argparse.Namespace) -> argparse.Namespace:
     """Copy with absolute paths, and with the folder of models that ``reconstruct`` would use."""
     from drocap_ros.config import load_config
     from drocap_ros.perception.load_models import models_folder
-    from drocap_ros.recording.telemetry.video_telemetry import NO_TELEMETRY
+    from drocap_ros.recording.video_telemetry import NO_TELEMETRY
 
     values = dict(vars(arguments))
     config = load_config(arguments.config)

@@ -8,13 +8,13 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.bones import limb_lengths
+from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
 from drocap_ros.reconstruction.lifted.body_size import BodySize, magnification
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig, lifted_config
 from drocap_ros.reconstruction.lifted.method import ACROSS, ALONG, WindowSolution, prepare, solve_window
 from drocap_ros.reconstruction.lifted.window_solver import Cancelled
-from drocap_ros.reconstruction.live.camera_history import WindowCamera
 from drocap_ros.reconstruction.live.effort import Effort
 from drocap_ros.reconstruction.live.paper_adjustment import adjust_by_equations
 from drocap_ros.reconstruction.live.stream_lifter import person_size

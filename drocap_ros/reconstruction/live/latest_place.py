@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.geometry.rotations import exp_so3
-from drocap_ros.reconstruction.live.camera_history import WindowCamera
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 
 #: Images of the last half second, and at most so many, have a say.

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.live.camera_history import WindowCamera
 from drocap_ros.reconstruction.live.effort import Effort
 
 

@@ -6,11 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.geometry.interpolation import smoothed
 from drocap_ros.geometry.rotations import exp_so3, log_so3
 
 _SMOOTHING_S = 0.25
-#: Frames by which :func:`extended` continues values at each end.
-MARGIN = 12
 
 
 class CameraPath(NamedTuple):
@@ -46,7 +45,7 @@ class CameraTelemetry:
             turn = np.concatenate([step[:1], 0.5 * (step[1:] + step[:-1]), step[-1:]])
         smoothing = _SMOOTHING_S * fps
         self._turn_rate = gaussian_filter1d(turn, smoothing, axis=0, mode="nearest")
-        self._smooth = gaussian_filter1d(extended(position), smoothing, axis=0, mode="nearest")[MARGIN:-MARGIN]
+        self._smooth = smoothed(position, smoothing)
         self._velocity = np.gradient(self._smooth, axis=0) * fps if self.frames > 1 else np.zeros((self.frames, 3))
 
     def gimbal_axes(self) -> np.ndarray:
@@ -79,12 +78,3 @@ class CameraTelemetry:
         path = np.stack([np.interp(inside, at, self._smooth[:, axis]) for axis in range(3)], axis=1)
         ends = np.where((frame < inside)[:, None], self._velocity[0], self._velocity[-1])
         return path + ends * ((frame - inside) / self.fps)[:, None]
-
-
-def extended(values: np.ndarray) -> np.ndarray:
-    """(F + 2 MARGIN, C) values (F, C) continued in straight lines: a smoothing then keeps their slope at both ends."""
-    reach = min(MARGIN, len(values) - 1)
-    steps = np.arange(1, MARGIN + 1)[:, None]
-    before = values[0] - (values[reach] - values[0]) / max(reach, 1) * steps[::-1]
-    after = values[-1] + (values[-1] - values[-1 - reach]) / max(reach, 1) * steps
-    return np.concatenate([before, values, after])

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.mcap.damage import Damage, DamageKind
 from drocap_ros.recording.mcap.file import McapFile
 from drocap_ros.recording.mcap.metadata import (
     METADATA_FILE,
@@ -32,7 +31,7 @@ from drocap_ros.recording.mcap.metadata import (
     write_atomically,
 )
 from drocap_ros.recording.mcap.schemas import type_hash
-from drocap_ros.recording.mcap.stream import MAGIC, McapChannel, McapStream, counted_channels
+from drocap_ros.recording.mcap.stream import MAGIC, Damage, DamageKind, McapChannel, McapStream, counted_channels
 
 _BESIDE = ".recovering"
 

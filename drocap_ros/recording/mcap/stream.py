@@ -11,11 +11,11 @@ import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.mcap.damage import Damage, DamageKind
 
 logger = logging.getLogger(__name__)
 
@@ -28,6 +28,41 @@ _CHUNK_OPCODE = 6
 #: opcode, length, start and end time, unpacked size, checksum, length of the compression's name
 _CHUNK_HEAD = struct.Struct("<BQQQQII")
 _COMPRESSION = re.compile(rb"\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4")
+
+
+class DamageKind(Enum):
+    """Kind of a damage; the value is its text with the fields of :class:`Damage`."""
+
+    CUT_OFF = "cut off or damaged at byte {offset} of {amount}"
+    SKIPPED_BYTES = "{amount} bytes skipped at byte {offset}"
+    DAMAGED_CHUNKS = "{amount} damaged chunks"
+    UNKNOWN_CHANNELS = "{amount} messages of unknown channels"
+    NO_SUMMARY = "no summary at the end"
+    NO_MESSAGE = "no message in it"
+
+
+#: Damages behind or in which other tools may find more data.
+_RECOVERABLE = frozenset({DamageKind.SKIPPED_BYTES, DamageKind.DAMAGED_CHUNKS, DamageKind.UNKNOWN_CHANNELS})
+
+
+class Damage(NamedTuple):
+    """One damage of a file.
+
+    offset : byte at which it starts, where known
+    amount : bytes, chunks or messages, by kind; CUT_OFF: size of the file
+    """
+
+    kind: DamageKind
+    offset: int = 0
+    amount: int = 0
+
+    @property
+    def keeps_data(self) -> bool:
+        """Whether the damaged file may hold more data than was read."""
+        return self.kind in _RECOVERABLE
+
+    def __str__(self) -> str:
+        return self.kind.value.format(offset=self.offset, amount=self.amount)
 
 
 class McapChannel(NamedTuple):

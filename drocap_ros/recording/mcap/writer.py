@@ -25,8 +25,8 @@ from drocap_ros.recording.mcap.metadata import (
     sync_folder,
     write_atomically,
 )
-from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
 from drocap_ros.recording.mcap.schemas import type_hash
+from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
 
 _MIB = 1 << 20
 

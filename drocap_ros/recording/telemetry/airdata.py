@@ -11,15 +11,15 @@ from typing import IO
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.frames import geodetic_to_enu
 from drocap_ros.geometry.interpolation import true_runs
-from drocap_ros.recording.telemetry.lens import assumed_lens
-from drocap_ros.recording.telemetry.log import TelemetryLog, dji_attitude, make_log
+from drocap_ros.recording.telemetry.log import Lens, LogFormat, TelemetryLog, dji_attitude, from_first_fix, make_log
 from drocap_ros.recording.telemetry.plausibility import Series, plausible
 
 TIME = "time(millisecond)"
+#: Characters of a line, beyond which the file is no table: Airdata's lines have about a thousand.
 _LINE = 16384
-_MAX_ROWS = 200_000  # five hours
+#: Rows: five hours at Airdata's ten a second.
+_MAX_ROWS = 200_000
 _UNITS_M = {"(feet)": 0.3048, "(meters)": 1.0}
 _HEIGHT = "height_above_takeoff"
 _GIMBAL = ("gimbal_pitch(degrees)", "gimbal_roll(degrees)", "gimbal_heading(degrees)")
@@ -39,69 +39,70 @@ def read_airdata(path: Path) -> TelemetryLog:
     """
     try:
         with path.open("r", encoding="utf-8-sig", errors="replace", newline="") as file:
-            head, rows = _table(path, file)
-            table: np.ndarray = np.array(rows, dtype=np.float64).reshape(-1, len(head))
+            table = _Table(path, file)
     except OSError as error:
         raise InputError(f"{path}: expected a readable file; {error.strerror}") from None
     except csv.Error as error:
         raise InputError(f"{path}: expected a CSV file of Airdata; {error}") from None
-    place = {name: i for i, name in enumerate(head)}
-    time_ms = table[:, place[TIME]]
-    table = table[(time_ms >= 0) & (time_ms < 1e9)]
-    table = table[np.unique(table[:, place[TIME]], return_index=True)[1]]
-    if not len(table):
-        raise InputError(f"{path}: expected rows with {TIME}, found none; export the flight from Airdata again")
-    stamp_ns = np.round(table[:, place[TIME]] * 1e6).astype(np.int64)
-
-    def columns(names: tuple[str, ...], missing: float = np.nan) -> np.ndarray:
-        return np.stack([table[:, place[n]] if n in place else np.full(len(table), missing) for n in names], axis=1)
-
-    gimbal, aircraft = columns(_GIMBAL), columns(_AIRCRAFT)
-    if _GIMBAL[1] not in place:
+    stamp_ns = np.round(table.columns(TIME)[:, 0] * 1e6).astype(np.int64)
+    gimbal = table.columns(*_GIMBAL)
+    if not table.has(_GIMBAL[1]):
         gimbal[:, 1] = 0.0  # older exports have no roll
-    height = next((table[:, place[_HEIGHT + u]] * f for u, f in _UNITS_M.items() if _HEIGHT + u in place), None)
-    geodetic = np.column_stack([columns(_PLACE), np.full(len(table), np.nan) if height is None else height])
-    found, lacks = plausible(path, Series(stamp_ns, gimbal, aircraft, geodetic))
-    fixed = np.isfinite(found.geodetic).all(axis=1)
-    position = None
-    if fixed.any():
-        position = geodetic_to_enu(found.geodetic, np.array([*found.geodetic[fixed][0, :2], 0.0]))
-    utc_s = columns((_UTC,))[:, 0] - stamp_ns * 1e-9
+    geodetic = np.column_stack([table.columns(*_PLACE), table.height_m()])
+    found, lacks = plausible(path, Series(stamp_ns, gimbal, table.columns(*_AIRCRAFT), geodetic))
+    utc_s = table.columns(_UTC)[:, 0] - stamp_ns * 1e-9
+    video = true_runs(table.columns(_VIDEO)[:, 0] == 1)
     return make_log(
         path,
         "Airdata CSV",
         stamp_ns,
+        lacks,
         orientation=dji_attitude(found.aircraft),
-        position=position,
+        position=from_first_fix(found.geodetic, above_takeoff=True),
         gimbal=dji_attitude(found.gimbal),
+    )._replace(
         # The column has whole seconds.
         utc_minus_stamp_ns=round((float(np.nanmedian(utc_s)) + 0.5) * 1e9) if np.isfinite(utc_s).any() else None,
-        lacks=tuple(lacks),
-        video_parts=_parts(stamp_ns, columns((_VIDEO,), 0.0)[:, 0] == 1),
-        lens=assumed_lens(),
+        video_parts=tuple((int(stamp_ns[a]), int(stamp_ns[b - 1])) for a, b in video),
+        lens=Lens(),
     )
 
 
-def _parts(stamp_ns: np.ndarray, video: np.ndarray) -> tuple[tuple[int, int], ...]:
-    return tuple((int(stamp_ns[a]), int(stamp_ns[b - 1])) for a, b in true_runs(video))
+class _Table:
+    """Rows of a file at times that increase; a column that is not there is NaN."""
 
+    def __init__(self, path: Path, file: IO[str]) -> None:
+        reader = csv.reader(iter(lambda: file.readline(_LINE), ""))
+        head = [name.strip().lower() for name in next(reader, [])]
+        if TIME not in head:
+            raise InputError(f"{path}: expected a flight log of Airdata with the column {TIME}, found another")
+        if not any(_HEIGHT + unit in head for unit in _UNITS_M) and any(name.startswith(_HEIGHT) for name in head):
+            raise InputError(f"{path}: expected {_HEIGHT} in (feet) or (meters), found another unit; export it again")
+        self._names = [name for name in _USED if name in head]
+        read = [(head.index(name), _utc_s if name == _UTC else _number) for name in self._names]
+        rows: list[list[float]] = []
+        for row in reader:
+            if len(rows) >= _MAX_ROWS:
+                raise InputError(f"{path}: expected at most {_MAX_ROWS} rows, found more; cut the file")
+            rows.append([number(row[i]) if i < len(row) else math.nan for i, number in read])
+        table = np.array(rows, dtype=np.float64).reshape(-1, len(read))
+        time_ms = table[:, self._names.index(TIME)]
+        table = table[(time_ms >= 0) & (time_ms < 1e9)]
+        self._rows = table[np.unique(table[:, self._names.index(TIME)], return_index=True)[1]]
+        if not len(self._rows):
+            raise InputError(f"{path}: expected rows with {TIME}, found none; export the flight from Airdata again")
 
-def _table(path: Path, file: IO[str]) -> tuple[list[str], list[list[float]]]:
-    """Names of the columns that are used, and their numbers row by row, NaN where there is none."""
-    reader = csv.reader(iter(lambda: file.readline(_LINE), ""))
-    head = [name.strip().lower() for name in next(reader, [])]
-    if TIME not in head:
-        raise InputError(f"{path}: expected a flight log of Airdata with the column {TIME}, found another; check it")
-    if not any(_HEIGHT + unit in head for unit in _UNITS_M) and any(name.startswith(_HEIGHT) for name in head):
-        raise InputError(f"{path}: expected {_HEIGHT} in (feet) or (meters), found another unit; export it again")
-    used = [name for name in _USED if name in head]
-    read = [(head.index(name), _utc_s if name == _UTC else _number) for name in used]
-    rows: list[list[float]] = []
-    for row in reader:
-        if len(rows) >= _MAX_ROWS:
-            raise InputError(f"{path}: expected at most {_MAX_ROWS} rows, found more; cut the file")
-        rows.append([number(row[i]) if i < len(row) else math.nan for i, number in read])
-    return used, rows
+    def has(self, name: str) -> bool:
+        return name in self._names
+
+    def columns(self, *names: str) -> np.ndarray:
+        unknown = np.full(len(self._rows), np.nan)
+        return np.stack([self._rows[:, self._names.index(n)] if self.has(n) else unknown for n in names], axis=1)
+
+    def height_m(self) -> np.ndarray:
+        """(N, 1) above take-off, in the unit that the file has."""
+        unit = next((unit for unit in _UNITS_M if self.has(_HEIGHT + unit)), "(meters)")
+        return self.columns(_HEIGHT + unit) * _UNITS_M[unit]
 
 
 def _number(text: str) -> float:
@@ -117,3 +118,6 @@ def _utc_s(text: str) -> float:
         return datetime.strptime(text.strip(), "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc).timestamp()
     except (ValueError, OverflowError):
         return math.nan
+
+
+FORMAT = LogFormat(".csv", read_airdata)

@@ -9,8 +9,8 @@ import numpy as np
 
 from drocap_ros.flight.frames import camera_rotation, quaternion_multiply
 from drocap_ros.geometry.interpolation import interpolate, true_runs
-from drocap_ros.reconstruction.world.position_steps import without_steps
-from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack
+from drocap_ros.geometry.position_steps import without_steps
+from drocap_ros.recording.telemetry.log import VehicleTrack
 from drocap_ros.tracks import Tracks
 
 #: Interpolation over longer gaps than this is reported.

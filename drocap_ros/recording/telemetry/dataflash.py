@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,9 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import geodetic_to_enu, orientation_to_ros, quaternion_from_euler, quaternion_multiply
-from drocap_ros.flight.mavlink.mount import SERVOS, TYPE_PARAMETER
-from drocap_ros.recording.telemetry.log import Lack, LogLack, TelemetryLog, at_stamps, make_log
+from drocap_ros.recording.telemetry.log import Lack, LogFormat, LogLack, TelemetryLog, at_stamps, first_line, make_log
 
+#: UTC in s from which a time is one of a GPS (2001); before its first fix the reader counts from 1970.
 _EARLIEST_UTC_S = 1e9
 #: message -> fields used
 _FIELDS = {
@@ -22,6 +23,9 @@ _FIELDS = {
     "MNT": ("Roll", "Pitch", "YawE", "YawB"),
 }
 _PARAMETER = "PARM"
+#: ArduPilot's parameter for the kind of its first mount; 1 = servos.
+_MOUNT_TYPE = "MNT1_TYPE"
+_SERVOS = 1
 
 
 def read_dataflash(path: Path) -> TelemetryLog:
@@ -35,64 +39,88 @@ def read_dataflash(path: Path) -> TelemetryLog:
         When the file cannot be read, is no DataFlash log, or holds no attitude.
     """
     with path.open("rb") as file:
-        if file.read(2) != b"\xa3\x95":
+        if file.read(2) != FORMAT.magic[:2]:
             raise InputError(f"{path}: expected an ArduPilot DataFlash log, found other content at its start")
-    rows: dict[str, list[tuple[float, ...]]] = {name: [] for name in _FIELDS}
-    utc_us: list[float] = []
-    lacks: list[LogLack] = []
-    servos = False
+    content, lacks = _Content(), []
     try:
         # pymavlink prints remarks on damaged files.
         with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
             for message in _messages(path):
-                name = message.get_type()
-                if name == _PARAMETER:
-                    servos = message.Value == SERVOS if message.Name == TYPE_PARAMETER else servos
-                    continue
-                values = tuple(float(getattr(message, field, np.nan)) for field in _FIELDS[name])
-                rows[name].append((float(message.TimeUS), *values))
-                if name == "ATT" and message._timestamp > _EARLIEST_UTC_S:
-                    utc_us.append(message._timestamp * 1e6 - message.TimeUS)
+                content.take(message)
     except Exception as error:  # pymavlink passes on any error of its parser
-        if not rows["ATT"]:
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
+        if not content.rows["ATT"]:
+            reason = first_line(error)
             raise InputError(f"{path}: expected an ArduPilot DataFlash log that can be read; {reason}") from None
         lacks.append(LogLack(Lack.DAMAGED))
-    if not rows["ATT"]:
+    if not content.rows["ATT"]:
         raise InputError(f"{path}: expected ATT messages of an ArduPilot log, found none; is it a DataFlash .bin?")
-    stamp_ns, angles = _series(rows["ATT"])
+    stamp_ns, angles = content.series("ATT")
     body = quaternion_from_euler(*np.deg2rad(angles).T).T
-    position = gimbal = None
-    if rows["POS"]:
-        known_ns, geodetic = _series(rows["POS"])
-        fixed = (geodetic[:, 0] != 0) | (geodetic[:, 1] != 0)
-        if fixed.any():
-            enu = geodetic_to_enu(geodetic, geodetic[fixed][0])
-            position = at_stamps(known_ns[fixed], enu[fixed], stamp_ns, spherical=False)
-            lacks.append(LogLack(Lack.LOCAL_POSITION, "POS"))
-    if rows["MNT"]:
-        known_ns, mount = _series(rows["MNT"])
-        yaw = "YawB" if servos else "YawE"
-        used = [_FIELDS["MNT"].index(field) for field in ("Roll", "Pitch", yaw)]
-        camera = quaternion_from_euler(*np.deg2rad(mount[:, used]).T).T
-        if np.isfinite(camera).all(axis=1).any():
-            camera = at_stamps(known_ns, camera, stamp_ns, spherical=True)
-            gimbal = orientation_to_ros(quaternion_multiply(body, camera) if servos else camera)
-        else:
-            lacks.append(LogLack(Lack.MOUNT_YAW, f"MNT.{yaw}"))
+    position, position_lacks = _position(content, stamp_ns)
+    gimbal, gimbal_lacks = _gimbal(content, stamp_ns, body)
+    utc_us = content.utc_us
     return make_log(
         path,
         "ArduPilot DataFlash log",
         stamp_ns,
+        lacks + position_lacks + gimbal_lacks,
         orientation=orientation_to_ros(body),
         position=position,
         gimbal=gimbal,
-        utc_minus_stamp_ns=int(np.median(utc_us)) * 1000 if utc_us else None,
-        lacks=tuple(lacks),
-    )
+    )._replace(utc_minus_stamp_ns=int(np.median(utc_us)) * 1000 if utc_us else None)
 
 
-def _messages(path: Path) -> Any:
+class _Content:
+    """Rows of the messages by name, each time us and the fields; differences of UTC and time since power-up, us."""
+
+    def __init__(self) -> None:
+        self.rows: dict[str, list[tuple[float, ...]]] = {name: [] for name in _FIELDS}
+        self.utc_us: list[float] = []
+        self.servos = False
+
+    def take(self, message: Any) -> None:
+        name = message.get_type()
+        if name == _PARAMETER:
+            if message.Name == _MOUNT_TYPE:
+                self.servos = message.Value == _SERVOS
+            return
+        values = (float(getattr(message, field, np.nan)) for field in _FIELDS[name])
+        self.rows[name].append((float(message.TimeUS), *values))
+        if name == "ATT" and message._timestamp > _EARLIEST_UTC_S:
+            self.utc_us.append(message._timestamp * 1e6 - message.TimeUS)
+
+    def series(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Stamps (N,) ns and fields (N, C) of a message."""
+        table = np.array(self.rows[name], dtype=np.float64)
+        table = table[(table[:, 0] >= 0) & (table[:, 0] < 2**52)]
+        return np.round(table[:, 0] * 1000).astype(np.int64), table[:, 1:]
+
+
+def _position(content: _Content, stamp_ns: np.ndarray) -> tuple[np.ndarray | None, list[LogLack]]:
+    if not content.rows["POS"]:
+        return None, []
+    known_ns, geodetic = content.series("POS")
+    fixed = (geodetic[:, 0] != 0) | (geodetic[:, 1] != 0)
+    if not fixed.any():
+        return None, []
+    enu = geodetic_to_enu(geodetic, geodetic[fixed][0])
+    return at_stamps(known_ns[fixed], enu[fixed], stamp_ns, spherical=False), [LogLack(Lack.LOCAL_POSITION, "POS")]
+
+
+def _gimbal(content: _Content, stamp_ns: np.ndarray, body: np.ndarray) -> tuple[np.ndarray | None, list[LogLack]]:
+    if not content.rows["MNT"]:
+        return None, []
+    known_ns, mount = content.series("MNT")
+    yaw = "YawB" if content.servos else "YawE"
+    used = [_FIELDS["MNT"].index(field) for field in ("Roll", "Pitch", yaw)]
+    camera = quaternion_from_euler(*np.deg2rad(mount[:, used]).T).T
+    if not np.isfinite(camera).all(axis=1).any():
+        return None, [LogLack(Lack.MOUNT_YAW, f"MNT.{yaw}")]
+    camera = at_stamps(known_ns, camera, stamp_ns, spherical=True)
+    return orientation_to_ros(quaternion_multiply(body, camera) if content.servos else camera), []
+
+
+def _messages(path: Path) -> Iterator[Any]:
     from pymavlink.DFReader import DFReader_binary
 
     class Reader(DFReader_binary):
@@ -108,7 +136,4 @@ def _messages(path: Path) -> Any:
         log.close()
 
 
-def _series(rows: list[tuple[float, ...]]) -> tuple[np.ndarray, np.ndarray]:
-    table = np.array(rows, dtype=np.float64)
-    table = table[(table[:, 0] >= 0) & (table[:, 0] < 2**52)]
-    return np.round(table[:, 0] * 1000).astype(np.int64), table[:, 1:]
+FORMAT = LogFormat(".bin", read_dataflash, magic=b"\xa3\x95\x80")

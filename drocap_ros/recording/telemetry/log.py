@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
@@ -9,13 +11,52 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.frames import orientation_to_ros, quaternion_from_euler
+from drocap_ros.flight.frames import geodetic_to_enu, orientation_to_ros, quaternion_from_euler
 from drocap_ros.geometry.interpolation import interpolate
 from drocap_ros.geometry.rotations import unit_quaternions
-from drocap_ros.recording.telemetry.lens import Lens
-from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack
 
+#: Longest gap of one series of a log over which it is interpolated: ten periods of the slowest usual rate, 10 Hz.
 _SERIES_GAP_S = 1.0
+#: Width in mm of a 4:3 sensor with the diagonal of 35 mm film, to which equivalent focal lengths refer.
+_EQUIVALENT_WIDTH_MM = 0.8 * math.hypot(36.0, 24.0)
+#: 35 mm equivalent of the main camera of most DJI drones, in mm; see the models of ``djmd_layouts.py``.
+_USUAL_MM = 24.0
+
+
+class VehicleTrack(NamedTuple):
+    """States of a vehicle at N times.
+
+    stamp_ns : (N,) int64, strictly increasing
+    position : (N, 3) m ENU, NaN unknown
+    orientation : (N, 4) x y z w body FLU -> ENU, NaN unknown
+    gimbal : (N, 4) x y z w camera FLU -> ENU, NaN without a mount
+    """
+
+    stamp_ns: np.ndarray
+    position: np.ndarray
+    orientation: np.ndarray
+    gimbal: np.ndarray
+
+
+class Lens(NamedTuple):
+    """A lens as a file describes it; by default that of an unknown model, the usual main camera.
+
+    focal_35mm_mm : focal length, 35 mm equivalent (of the sensor's diagonal)
+    origin : text, where it comes from and what is assumed
+    zoom : digital zoom
+    """
+
+    focal_35mm_mm: float = _USUAL_MM
+    origin: str = f"{_USUAL_MM:g} mm equivalent assumed, as of most DJI main cameras"
+    zoom: float = 1.0
+
+    def __str__(self) -> str:
+        return self.origin if self.zoom == 1.0 else f"{self.origin}, digital zoom {self.zoom:g}"
+
+    def horizontal_fov_deg(self, size: tuple[int, int]) -> float:
+        """Field of view across images of ``size`` (width, height) that use the longer side of a 4:3 sensor in full."""
+        focal_px = max(size) * self.focal_35mm_mm / _EQUIVALENT_WIDTH_MM * self.zoom
+        return math.degrees(2 * math.atan(0.5 * size[0] / focal_px))
 
 
 class Lack(Enum):
@@ -58,7 +99,7 @@ class TelemetryLog(NamedTuple):
 
     kind: str
     track: VehicleTrack
-    utc_minus_stamp_ns: int | None
+    utc_minus_stamp_ns: int | None = None
     lacks: tuple[LogLack, ...] = ()
     video_clock: bool = False
     video_parts: tuple[tuple[int, int], ...] = ()
@@ -70,19 +111,33 @@ class TelemetryLog(NamedTuple):
         return float(self.track.stamp_ns[-1] - self.track.stamp_ns[0]) * 1e-9
 
 
+class LogFormat(NamedTuple):
+    """A format of telemetry; each reader's module registers its own in ``read.py``.
+
+    suffix : of the name of a log beside a video; empty = the telemetry is inside the video
+    magic, at : bytes by which the content is known, and their place within the first sixteen; empty = the name alone
+    read : reader of a file of this format
+    """
+
+    suffix: str
+    read: Callable[[Path], TelemetryLog]
+    magic: bytes = b""
+    at: int = 0
+
+    def begins(self, head: bytes) -> bool:
+        """Whether the first bytes of a file are of this format."""
+        return bool(self.magic) and head[self.at :].startswith(self.magic)
+
+
 def make_log(
     path: Path,
     kind: str,
     stamp_ns: np.ndarray,
+    lacks: list[LogLack],
     *,
     orientation: np.ndarray | None = None,
     position: np.ndarray | None = None,
     gimbal: np.ndarray | None = None,
-    utc_minus_stamp_ns: int | None = None,
-    lacks: tuple[LogLack, ...] = (),
-    video_clock: bool = False,
-    video_parts: tuple[tuple[int, int], ...] = (),
-    lens: Lens | None = None,
 ) -> TelemetryLog:
     """Log from its series (N, ...) at ``stamp_ns``; states are sorted, missing series are NaN and listed as lacks.
 
@@ -114,13 +169,27 @@ def make_log(
     missing = [LogLack(lack) for lack, values in found.items() if not np.isfinite(values).all(axis=1).any()]
     if len(missing) == len(found):
         raise InputError(f"{path}: expected attitude or position in the {kind}, found neither; check the log")
-    return TelemetryLog(kind, track, utc_minus_stamp_ns, (*missing, *lacks), video_clock, video_parts, lens)
+    return TelemetryLog(kind, track, lacks=(*missing, *lacks))
 
 
 def dji_attitude(pitch_roll_yaw_deg: np.ndarray) -> np.ndarray:
     """(N, 4) x y z w FLU -> ENU of DJI's angles (N, 3): pitch positive up, yaw clockwise from north."""
     pitch, roll, yaw = np.deg2rad(pitch_roll_yaw_deg).T
     return orientation_to_ros(quaternion_from_euler(roll, pitch, yaw).T)
+
+
+def from_first_fix(geodetic: np.ndarray, *, above_takeoff: bool = False) -> np.ndarray | None:
+    """(N, 3) m ENU of latitude deg, longitude deg and height m from the first state that has all; None without one.
+
+    Heights above take-off stay as they are.
+    """
+    fixed = np.isfinite(geodetic).all(axis=1)
+    if not fixed.any():
+        return None
+    origin = geodetic[fixed][0].copy()
+    if above_takeoff:
+        origin[2] = 0.0
+    return geodetic_to_enu(geodetic, origin)
 
 
 def at_stamps(known_ns: np.ndarray, values: np.ndarray, stamp_ns: np.ndarray, *, spherical: bool) -> np.ndarray:
@@ -130,3 +199,8 @@ def at_stamps(known_ns: np.ndarray, values: np.ndarray, stamp_ns: np.ndarray, *,
     fresh = np.concatenate([[True], np.diff(known_ns) > 0])
     found, _ = interpolate(known_ns[fresh], values[fresh], stamp_ns, spherical=spherical, max_gap_s=_SERIES_GAP_S)
     return found
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of an error's text, else its type."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -9,17 +9,26 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.frames import geodetic_to_enu
-from drocap_ros.recording.telemetry.lens import Lens, assumed_lens
-from drocap_ros.recording.telemetry.log import Lack, LogLack, TelemetryLog, dji_attitude, make_log
+from drocap_ros.recording.telemetry.log import (
+    Lack,
+    Lens,
+    LogFormat,
+    LogLack,
+    TelemetryLog,
+    dji_attitude,
+    from_first_fix,
+    make_log,
+)
 from drocap_ros.tracks import MAX_FRAMES
 
+#: Characters of a line, and of a subtitle; more are cut off.  DJI's have some hundreds.
 _LINE = 8192
 #: Sources of a height, the preferred one first.
 _HEIGHTS = ("rel_alt", "barometer", "abs_alt", "altitude")
@@ -69,32 +78,37 @@ def read_srt(path: Path) -> TelemetryLog:
     impossible = (np.abs(geodetic[:, 0]) > 90) | (np.abs(geodetic[:, 1]) > 180)
     nowhere = (geodetic[:, 0] == 0) & (geodetic[:, 1] == 0)
     geodetic[impossible | nowhere] = np.nan
-    fixed = np.isfinite(geodetic).all(axis=1)
-    position = None
-    lacks: list[LogLack] = []
-    if fixed.any():
-        origin = geodetic[fixed][0].copy()
-        if heights == "rel_alt":
-            origin[2] = 0.0  # rel_alt is the height above take-off
-        else:
-            lacks.append(LogLack(Lack.HEIGHT, heights))
-        position = geodetic_to_enu(geodetic, origin)
+    # rel_alt is the height above take-off.
+    position = from_first_fix(geodetic, above_takeoff=heights == "rel_alt")
+    lacks = [LogLack(Lack.HEIGHT, heights)] if position is not None and heights != "rel_alt" else []
     return make_log(
         path,
         "DJI subtitles",
         stamps,
-        video_clock=True,
+        lacks,
         orientation=dji_attitude(np.array([e.body for e in entries])),
         position=position,
         gimbal=dji_attitude(np.array([e.gimbal for e in entries])),
-        lacks=tuple(lacks),
-        lens=_lens(np.array([e.lens for e in entries])),
-    )
+    )._replace(video_clock=True, lens=_lens(np.array([e.lens for e in entries])))
 
 
 def _entries(path: Path) -> tuple[list[_Entry], str]:
+    """Subtitles with telemetry, and the source of their heights."""
     entries: list[_Entry] = []
     kinds: set[str] = set()
+    for stamp_ns, text in _subtitles(path):
+        found = _entry(stamp_ns, text)
+        if found is not None:
+            entry, kind = found
+            entries.append(entry)
+            kinds.add(kind)
+        if len(entries) > MAX_FRAMES:
+            raise InputError(f"{path}: expected at most {MAX_FRAMES} subtitles; cut the file")
+    return entries, next((kind for kind in _HEIGHTS if kind in kinds), "height")
+
+
+def _subtitles(path: Path) -> Iterator[tuple[int, str]]:
+    """Time ns in the video and text of each subtitle."""
     stamp_ns, text = None, ""
     try:
         with path.open("r", encoding="utf-8", errors="replace") as file:
@@ -103,43 +117,35 @@ def _entries(path: Path) -> tuple[list[_Entry], str]:
                 if match is None:
                     text = (text + line)[:_LINE]
                     continue
-                _add(entries, kinds, stamp_ns, text)
+                if stamp_ns is not None:
+                    yield stamp_ns, text
                 hours, minutes, seconds = (int(match[i]) for i in (1, 2, 3))
                 stamp_ns = ((hours * 60 + minutes) * 60 + seconds) * 10**9 + int(match[4].ljust(3, "0")) * 10**6
                 text = ""
-                if len(entries) > MAX_FRAMES:
-                    raise InputError(f"{path}: expected at most {MAX_FRAMES} subtitles; cut the file")
     except OSError as error:
         raise InputError(f"{path}: expected a readable file; {error.strerror}") from None
-    _add(entries, kinds, stamp_ns, text)
-    return entries, next((kind for kind in _HEIGHTS if kind in kinds), "height")
+    if stamp_ns is not None:
+        yield stamp_ns, text
 
 
-def _add(entries: list[_Entry], kinds: set[str], stamp_ns: int | None, text: str) -> None:
-    if stamp_ns is None:
-        return
+def _entry(stamp_ns: int, text: str) -> tuple[_Entry, str] | None:
+    """One subtitle and the source of its height, "" = none; None without telemetry."""
     values = {name.lower(): float(number) for name, number in _VALUE.findall(text)}
     angles = {kind: (float(p), float(r), float(y)) for kind, p, r, y in _PRY.findall(text)}
-    latitude = values.get("latitude", math.nan)
-    longitude = values.get("longitude", values.get("longtitude", math.nan))
-    heights = {name: values[name] for name in ("rel_alt", "abs_alt", "altitude") if name in values}
-    gps = _GPS.search(text)
-    if gps is not None and math.isnan(latitude):
-        longitude, latitude = float(gps[1]), float(gps[2])
-        heights["altitude"] = float(gps[3])
-    barometer = _BAROMETER.search(text)
-    if barometer is not None:
-        heights["barometer"] = float(barometer[1] or barometer[2])
-    kind = next((name for name in _HEIGHTS if name in heights), None)
+    if "latitude" not in values and (gps := _GPS.search(text)):
+        values |= {"longitude": float(gps[1]), "latitude": float(gps[2]), "altitude": float(gps[3])}
+    if barometer := _BAROMETER.search(text):
+        values["barometer"] = float(barometer[1] or barometer[2])
     gimbal = angles.get("G", _UNKNOWN)
     if "gb_yaw" in values and "gb_pitch" in values:
         gimbal = (values["gb_pitch"], values.get("gb_roll", 0.0), values["gb_yaw"])
-    if kind is None and not angles and math.isnan(gimbal[0]):
-        return  # a subtitle without telemetry
-    if kind is not None:
-        kinds.add(kind)
-    height = heights[kind] if kind is not None else math.nan
-    entries.append(_Entry(stamp_ns, latitude, longitude, height, gimbal, angles.get("F", _UNKNOWN), _focal(text)))
+    kind = next((name for name in _HEIGHTS if name in values), "")
+    if not kind and not angles and math.isnan(gimbal[0]):
+        return None
+    latitude = values.get("latitude", math.nan)
+    longitude = values.get("longitude", values.get("longtitude", math.nan))
+    height = values.get(kind, math.nan)
+    return _Entry(stamp_ns, latitude, longitude, height, gimbal, angles.get("F", _UNKNOWN), _focal(text)), kind
 
 
 def _focal(text: str) -> tuple[float, float]:
@@ -157,8 +163,11 @@ def _lens(values: np.ndarray) -> Lens | None:
     """The lens of all subtitles (N, 2); the usual one where they state none; None where it changes."""
     stated = values[(values[:, 0] >= 5) & (values[:, 0] <= 1000) & (values[:, 1] >= 1) & (values[:, 1] <= 100)]
     if not len(stated):
-        return assumed_lens()
+        return Lens()
     focal, zoom = np.median(stated, axis=0)
     if (np.ptp(stated, axis=0) > 0.01 * np.array([focal, zoom])).any():
         return None
     return Lens(float(focal), f"{focal:g} mm equivalent of the subtitles, full sensor width assumed", float(zoom))
+
+
+FORMAT = LogFormat(".srt", read_srt)

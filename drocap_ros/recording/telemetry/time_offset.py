@@ -21,9 +21,8 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.geometry.interpolation import interpolate
 from drocap_ros.recording.telemetry.camera_poses import camera_attitude
-from drocap_ros.recording.telemetry.log import TelemetryLog
+from drocap_ros.recording.telemetry.log import TelemetryLog, VehicleTrack
 from drocap_ros.recording.telemetry.mp4 import creation_time_ns, duration_s
-from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack
 
 #: Sampling rate of the correlation.
 RATE_HZ = 10.0

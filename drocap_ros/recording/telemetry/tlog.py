@@ -5,16 +5,21 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.telemetry.log import TelemetryLog, make_log
+from drocap_ros.recording.telemetry.log import LogFormat, TelemetryLog, make_log
 
+#: UTC in ns from which a time is one of a clock that was set (2001); a ground station without one starts at 1970.
 _MIN_UTC_NS = 1_000_000_000 * 10**9
-_EARLIEST_US, _LATEST_US = 0, 4_102_444_800_000_000  # to the year 2100
-_MAGIC_V1, _MAGIC_V2 = 0xFE, 0xFD
+#: Latest time of a packet, us: the year 2100; a later one is damage.
+_LATEST_US = 4_102_444_800_000_000
+#: First bytes of a packet of MAVLink 1 and 2, https://mavlink.io/en/guide/serialization.html.
+_MAGIC_V1 = 0xFE
+_MAGIC_V2 = 0xFD
+#: Bytes read at once.
 _CHUNK = 1 << 20
 
 
@@ -43,12 +48,11 @@ def read_tlog(path: Path) -> TelemetryLog:
         path,
         "MAVLink tlog",
         stamps,
+        [],
         orientation=orientation,
         position=position,
         gimbal=gimbal,
-        # A ground station without a clock starts at 1970.
-        utc_minus_stamp_ns=0 if stamps[0] > _MIN_UTC_NS else None,
-    )
+    )._replace(utc_minus_stamp_ns=0 if stamps[0] > _MIN_UTC_NS else None)
 
 
 def tlog_messages(path: str | Path) -> Iterator[tuple[Any, int]]:
@@ -77,7 +81,7 @@ def tlog_messages(path: str | Path) -> Iterator[tuple[Any, int]]:
         raise InputError(f"{path}: expected a MAVLink telemetry log, found no message in it; is it a .tlog?")
 
 
-def _packets(file: Any) -> Iterator[tuple[int, bytes]]:
+def _packets(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
     """(time us, packet); in the file each packet follows its time, a big-endian 64-bit number."""
     data = b""
     while True:
@@ -104,7 +108,10 @@ def _packet_length(data: bytes, place: int) -> int | None:
         return None
     stamp_us = struct.unpack_from(">Q", data, place)[0]
     magic, payload, flags = data[place + 8], data[place + 9], data[place + 10]
-    if not _EARLIEST_US < stamp_us < _LATEST_US or magic not in (_MAGIC_V1, _MAGIC_V2):
+    if not 0 < stamp_us < _LATEST_US or magic not in (_MAGIC_V1, _MAGIC_V2):
         return 0
     length = payload + (8 if magic == _MAGIC_V1 else 12 + (13 if flags & 1 else 0))
     return length if len(data) >= place + 8 + length else None
+
+
+FORMAT = LogFormat(".tlog", read_tlog)

@@ -11,16 +11,37 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.frames import geodetic_to_enu, ned_to_enu, orientation_to_ros, quaternion_multiply, yaw_of
-from drocap_ros.recording.telemetry.log import Lack, LogLack, TelemetryLog, at_stamps, make_log
+from drocap_ros.flight.frames import ned_to_enu, orientation_to_ros, quaternion_multiply, yaw_of
+from drocap_ros.recording.telemetry.log import (
+    Lack,
+    LogFormat,
+    LogLack,
+    TelemetryLog,
+    at_stamps,
+    first_line,
+    from_first_fix,
+    make_log,
+)
+
+#: Fields of a topic by name, each (N,).
+_Data = dict[str, np.ndarray]
 
 _TOPICS = (
-    "vehicle_attitude", "vehicle_local_position", "vehicle_global_position", "gimbal_device_attitude_status",
-    "vehicle_gps_position", "sensor_gps",
-)  # fmt: skip
+    "vehicle_attitude",
+    "vehicle_local_position",
+    "vehicle_global_position",
+    "gimbal_device_attitude_status",
+    "vehicle_gps_position",
+    "sensor_gps",
+)
+#: UTC in us from which a time is one of a GPS (2001).
 _EARLIEST_UTC_US = 1_000_000_000_000_000
+#: PX4's ``fix_type`` of a fix in three dimensions; more are better ones.
 _FIX_3D = 3
-_YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
+#: MAVLink's GIMBAL_DEVICE_FLAGS_YAW_LOCK, _YAW_IN_VEHICLE_FRAME and _YAW_IN_EARTH_FRAME.
+_YAW_LOCK = 16
+_YAW_IN_VEHICLE = 32
+_YAW_IN_EARTH = 64
 
 
 def read_ulog(path: Path) -> TelemetryLog:
@@ -39,8 +60,7 @@ def read_ulog(path: Path) -> TelemetryLog:
             warnings.simplefilter("ignore")
             log = ULog(str(path), list(_TOPICS), disable_str_exceptions=True)
     except Exception as error:  # pyulog passes on any error of its parser
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path}: expected a PX4 ULog that can be read; {reason}") from None
+        raise InputError(f"{path}: expected a PX4 ULog that can be read; {first_line(error)}") from None
     try:
         return _to_log(path, log)
     except (KeyError, IndexError, ValueError) as error:  # a damaged definition: fields are missing or of other types
@@ -48,7 +68,7 @@ def read_ulog(path: Path) -> TelemetryLog:
 
 
 def _to_log(path: Path, log: Any) -> TelemetryLog:
-    series: dict[str, dict[str, np.ndarray]] = {}
+    series: dict[str, _Data] = {}
     for data in log.data_list:
         if "timestamp" in data.data and (data.multi_id == 0 or data.name not in series):
             series[data.name] = data.data
@@ -63,15 +83,14 @@ def _to_log(path: Path, log: Any) -> TelemetryLog:
         path,
         "PX4 ULog",
         stamp_ns,
+        lacks + position_lacks,
         orientation=orientation_to_ros(frd_to_ned),
         position=position,
         gimbal=_gimbal(series, stamp_ns, frd_to_ned),
-        utc_minus_stamp_ns=_utc(series),
-        lacks=(*lacks, *position_lacks),
-    )
+    )._replace(utc_minus_stamp_ns=_utc(series))
 
 
-def _position(series: dict[str, Any], stamp_ns: np.ndarray) -> tuple[np.ndarray | None, list[LogLack]]:
+def _position(series: dict[str, _Data], stamp_ns: np.ndarray) -> tuple[np.ndarray | None, list[LogLack]]:
     """(N, 3) m ENU: the estimator's local position where valid, else its global one, else the GPS's."""
     local = series.get("vehicle_local_position")
     if local is not None and len(local["timestamp"]):
@@ -82,22 +101,19 @@ def _position(series: dict[str, Any], stamp_ns: np.ndarray) -> tuple[np.ndarray 
         if np.isfinite(ned).all(axis=1).any():
             return at_stamps(_stamps(local), ned_to_enu(ned), stamp_ns, spherical=False), []
     for name, read in (("vehicle_global_position", _global), ("vehicle_gps_position", _gps), ("sensor_gps", _gps)):
-        data = series.get(name)
-        geodetic = None if data is None else read(data)
-        if data is None or geodetic is None:
-            continue
-        known = np.isfinite(geodetic).all(axis=1)
-        if known.any():
-            enu = geodetic_to_enu(geodetic, geodetic[known][0])
-            return at_stamps(_stamps(data), enu, stamp_ns, spherical=False), [LogLack(Lack.LOCAL_POSITION, name)]
+        geodetic = read(series[name]) if name in series else None
+        enu = None if geodetic is None else from_first_fix(geodetic)
+        if enu is not None:
+            position = at_stamps(_stamps(series[name]), enu, stamp_ns, spherical=False)
+            return position, [LogLack(Lack.LOCAL_POSITION, name)]
     return None, []
 
 
-def _global(data: dict[str, np.ndarray]) -> np.ndarray | None:
+def _global(data: _Data) -> np.ndarray | None:
     return np.stack([data[name] for name in ("lat", "lon", "alt")], axis=1).astype(np.float64)
 
 
-def _gps(data: dict[str, np.ndarray]) -> np.ndarray | None:
+def _gps(data: _Data) -> np.ndarray | None:
     if "lat" in data:
         geodetic = np.stack([data["lat"] * 1e-7, data["lon"] * 1e-7, data["alt"] * 1e-3], axis=1).astype(np.float64)
     elif "latitude_deg" in data:
@@ -109,7 +125,7 @@ def _gps(data: dict[str, np.ndarray]) -> np.ndarray | None:
     return geodetic
 
 
-def _gimbal(series: dict[str, Any], stamp_ns: np.ndarray, frd_to_ned: np.ndarray) -> np.ndarray | None:
+def _gimbal(series: dict[str, _Data], stamp_ns: np.ndarray, frd_to_ned: np.ndarray) -> np.ndarray | None:
     """(N, 4) camera FLU -> ENU; the yaw of a gimbal that follows the vehicle is relative to its nose."""
     status = series.get("gimbal_device_attitude_status")
     if status is None or not len(status["timestamp"]):
@@ -125,7 +141,7 @@ def _gimbal(series: dict[str, Any], stamp_ns: np.ndarray, frd_to_ned: np.ndarray
     return orientation_to_ros(np.where(earth[:, None], camera, quaternion_multiply(turn, camera)))
 
 
-def _utc(series: dict[str, Any]) -> int | None:
+def _utc(series: dict[str, _Data]) -> int | None:
     for name in ("vehicle_gps_position", "sensor_gps"):
         gps = series.get(name)
         if gps is None or "time_utc_usec" not in gps:
@@ -137,10 +153,13 @@ def _utc(series: dict[str, Any]) -> int | None:
     return None
 
 
-def _stamps(data: dict[str, np.ndarray]) -> np.ndarray:
+def _stamps(data: _Data) -> np.ndarray:
     return np.asarray(data["timestamp"], dtype=np.int64) * 1000
 
 
-def _quaternion(data: dict[str, np.ndarray], name: str) -> np.ndarray:
+def _quaternion(data: _Data, name: str) -> np.ndarray:
     """(N, 4) x y z w of PX4's w x y z."""
     return np.stack([np.asarray(data[f"{name}[{i}]"], np.float64) for i in (1, 2, 3, 0)], axis=1)
+
+
+FORMAT = LogFormat(".ulg", read_ulog, magic=b"ULog\x01\x12\x35")

@@ -13,9 +13,9 @@ from telemetry_stream import FPS, Orbit, orbit
 
 from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.evaluation.world_errors import WorldErrors, world_errors
+from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.geometry.rotations import exp_so3, quaternion_from_matrix
 from drocap_ros.observation import PoseObservation
-from drocap_ros.reconstruction.live.camera_history import WindowCamera
 from drocap_ros.reconstruction.live.latest_place import LatestPlace
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from recorded import write_poses
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
+from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_pose2d
 

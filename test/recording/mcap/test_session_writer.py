@@ -9,9 +9,9 @@ from killed_recording import killed_session
 from recorded import NAMES, START_NS, write_poses
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.mcap.committed_file import CommittedFile
-from drocap_ros.recording.mcap.recorder_config import SessionRecorderConfig
+from drocap_ros.recording.mcap.file import CommittedFile
 from drocap_ros.recording.mcap.schemas import schema_text
+from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
 from drocap_ros.recording.mcap.writer import SessionWriter
 from drocap_ros.recording.open_session import open_session, session_info
 from drocap_ros.recording.session_tracks import read_pose2d

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from telemetry_stream import orbit
 
-from drocap_ros.reconstruction.live.camera_history import CameraHistory
+from drocap_ros.geometry.camera_history import CameraHistory
 
 S = 10**9
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])

@@ -57,7 +57,7 @@ def read_video_telemetry(video: Path, telemetry: Telemetry) -> TelemetryLog | No
                 f"--telemetry: expected a video file as input, found {video}; recordings hold their telemetry"
             )
         return read_telemetry(telemetry.path)
-    from drocap_ros.recording.telemetry.djmd.reader import has_djmd, read_djmd
+    from drocap_ros.recording.telemetry.djmd import has_djmd, read_djmd
 
     if not video.is_file() or not has_djmd(video):
         return None

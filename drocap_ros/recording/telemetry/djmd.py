@@ -11,9 +11,9 @@ from typing import IO
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.frames import geodetic_to_enu, orientation_to_ros
+from drocap_ros.flight.frames import orientation_to_ros
 from drocap_ros.geometry.rotations import unit_quaternions
-from drocap_ros.recording.telemetry.djmd.layouts import (
+from drocap_ros.recording.telemetry.djmd_layouts import (
     LATITUDE,
     LONGITUDE,
     MODELS,
@@ -22,38 +22,54 @@ from drocap_ros.recording.telemetry.djmd.layouts import (
     Layout,
     Model,
     find_layout,
-    lens_of,
 )
-from drocap_ros.recording.telemetry.djmd.protobuf import Message, Value
-from drocap_ros.recording.telemetry.log import Lack, LogLack, TelemetryLog, dji_attitude, make_log
+from drocap_ros.recording.telemetry.log import (
+    Lack,
+    Lens,
+    LogFormat,
+    LogLack,
+    TelemetryLog,
+    dji_attitude,
+    from_first_fix,
+    make_log,
+)
 from drocap_ros.recording.telemetry.mp4 import Samples, Track, read_samples, read_tracks
 from drocap_ros.recording.telemetry.plausibility import Series, plausible
+from drocap_ros.recording.telemetry.protobuf import Message, Value
 
-FORMAT = "djmd"
-#: A message has some kilobytes.
-_MAX_MESSAGE, _MIN_MESSAGE = 1 << 18, 4
+#: Format of the track's samples.
+_SAMPLES = "djmd"
+#: Bytes of a message; known ones have some kilobytes.
+_MAX_MESSAGE = 1 << 18
+_MIN_MESSAGE = 4
 #: Messages from which the layout is found.
 _PROBED = 32
-_TENTH_DEG, _MM = 0.1, 1e-3
-#: Largest angle between the gimbal's quaternion and its angles, which are rounded to 0.1 deg.
+#: Units of the file: angles in tenths of a degree, heights in mm; ExifTool's DJI tags.
+_TENTH_DEG = 0.1
+_MM = 1e-3
+#: Largest angle between the gimbal's quaternion and its angles, deg: five times their rounding to 0.1 deg.
 _AGREEMENT_DEG = 0.5
+#: Digital zooms; others are another value at that place.
 _ZOOM_RANGE = (1.0, 60.0)
-#: Of an unknown schema: largest median roll of a gimbal, and turn of the gimbal from the nose.
-_ROLL_DEG, _TURN_DEG = 45.0, 90.0
-#: Numbers of one message: gimbal 3, aircraft 3, quaternion 4, latitude, longitude, unit, two heights, zoom.
+#: Of an unknown schema: largest median roll of a gimbal, deg, which keeps the camera level.
+_ROLL_DEG = 45.0
+#: Of an unknown schema: largest median turn of the gimbal from the nose, deg, whose yaw follows the aircraft's.
+_TURN_DEG = 90.0
+#: Ends of the columns of one message's numbers: gimbal 3, aircraft 3, quaternion 4, latitude, longitude, unit, two
+#: heights, zoom.
 _COLUMNS = (3, 6, 10, 13, 15, 16)
 
 
-def find_track(file: IO[bytes]) -> Track | None:
+def _find_track(file: IO[bytes]) -> Track | None:
     """The telemetry track of an open video file, None where there is none."""
-    return next((track for track in read_tracks(file) if track.sample_format == FORMAT), None)
+    return next((track for track in read_tracks(file) if track.sample_format == _SAMPLES), None)
 
 
 def has_djmd(path: Path) -> bool:
     """Whether a file is a video with such a track."""
     try:
         with path.open("rb") as file:
-            return find_track(file) is not None
+            return _find_track(file) is not None
     except OSError:
         return False
 
@@ -68,7 +84,7 @@ def read_djmd(path: Path) -> TelemetryLog:
     """
     try:
         with path.open("rb") as file:
-            track = find_track(file)
+            track = _find_track(file)
             if track is None:
                 raise InputError(f"{path}: expected a DJI djmd track in the video, found none; give a log beside it")
             try:
@@ -169,32 +185,25 @@ def _from_rows(
     lacks += more
     if model is None:
         _check_unknown(path, found)
-    fixed = np.isfinite(found.geodetic).all(axis=1)
-    position = None
-    if fixed.any():
-        origin = found.geodetic[fixed][0].copy()
-        if above_takeoff:
-            origin[2] = 0.0
-        else:
-            lacks.append(LogLack(Lack.HEIGHT, "absolute altitude"))
-        position = geodetic_to_enu(found.geodetic, origin)
+    position = from_first_fix(found.geodetic, above_takeoff=bool(above_takeoff))
+    if position is not None and not above_takeoff:
+        lacks.append(LogLack(Lack.HEIGHT, "absolute altitude"))
     attitude, agrees = _with_quaternion(dji_attitude(found.gimbal), quaternion)
     if not agrees:
         lacks.append(LogLack(Lack.QUATERNION))
     factor, steady = _zoom(zoom[:, 0])
     if not steady:
         lacks.append(LogLack(Lack.ZOOM, f"{np.nanmin(zoom):.1f} to {np.nanmax(zoom):.1f}"))
+    lens = model.lens() if model else Lens()
     return make_log(
         path,
         kind,
         stamp_ns,
-        video_clock=True,
+        lacks,
         orientation=dji_attitude(found.aircraft),
         position=position,
         gimbal=attitude,
-        lacks=tuple(lacks),
-        lens=lens_of(model, factor) if steady else None,
-    )
+    )._replace(video_clock=True, lens=lens._replace(zoom=factor) if steady else None)
 
 
 def _check_unknown(path: Path, series: Series) -> None:
@@ -243,3 +252,6 @@ def _zoom(zoom: np.ndarray) -> tuple[float, bool]:
     if not len(known):
         return 1.0, True
     return float(np.median(known)), bool(np.ptp(known) < 0.01 * np.median(known))
+
+
+FORMAT = LogFormat("", read_djmd, magic=b"ftyp", at=4)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drocap_ros.reconstruction.world.position_steps import without_steps
+from drocap_ros.geometry.position_steps import without_steps
 from drocap_ros.recording.telemetry.camera_poses import camera_poses
-from drocap_ros.recording.telemetry.vehicle_track import VehicleTrack
+from drocap_ros.recording.telemetry.log import VehicleTrack
 
 FPS = 30.0
 STAMPS = np.round(np.arange(360) * 1e9 / FPS).astype(np.int64)

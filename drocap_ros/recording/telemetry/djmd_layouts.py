@@ -9,16 +9,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from drocap_ros.recording.telemetry.djmd.protobuf import Message
-from drocap_ros.recording.telemetry.lens import Lens, assumed_lens
+from drocap_ros.recording.telemetry.log import Lens
+from drocap_ros.recording.telemetry.protobuf import Message
 
 Path = tuple[int, ...]
 
 #: In the first message: the schema's name.
 SCHEMA: Path = (1, 1, 1)
 #: Fields of a position: unit (1 = degrees), latitude, longitude.
-UNIT, LATITUDE, LONGITUDE = 1, 2, 3
-#: Highest field number at which a position is searched.
+UNIT = 1
+LATITUDE = 2
+LONGITUDE = 3
+#: Highest field number at which a position is searched; the known ones are below 6.
 _SEARCHED = 12
 
 
@@ -57,11 +59,11 @@ class Model(NamedTuple):
     degrees: bool = False
     zoom: Path | None = None
 
-    def lens(self, zoom: float = 1.0) -> Lens:
+    def lens(self) -> Lens:
         """The main camera's lens."""
         focal = self.focal_35mm_mm[0]
         which = "only camera" if len(self.focal_35mm_mm) == 1 else "main camera, which is assumed"
-        return Lens(focal, f"{focal:g} mm equivalent of the {self.name}'s {which}, full sensor width assumed", zoom)
+        return Lens(focal, f"{focal:g} mm equivalent of the {self.name}'s {which}, full sensor width assumed")
 
 
 #: Schema name -> model.
@@ -80,11 +82,6 @@ MODELS = {
 }
 
 
-def lens_of(model: Model | None, zoom: float = 1.0) -> Lens:
-    """The main camera's lens; of an unknown model the usual one."""
-    return model.lens(zoom) if model else assumed_lens(zoom)
-
-
 def find_layout(messages: list[Message], model: Model | None) -> Layout | None:
     """The layout of a clip from some of its messages, of an unknown model by what is there; None = none fits.
 
@@ -94,15 +91,16 @@ def find_layout(messages: list[Message], model: Model | None) -> Layout | None:
     if layout is None and any(m.holds(WITH_GIMBAL.aircraft) for m in messages):
         layout = WITH_GIMBAL
     position = next((place for m in messages for place in _positions(m, layout)), None)
-    if layout is None and position:
+    if position is None:
+        return layout
+    if layout is None:
         layout = WITHOUT_GIMBAL if position[:2] == WITHOUT_GIMBAL.position[:2] else WITH_GIMBAL
-    return layout._replace(position=position) if layout and position else layout
+    return layout._replace(position=position)
 
 
 def _positions(message: Message, layout: Layout | None) -> Iterator[Path]:
     """Places of two doubles at the fields of a latitude and a longitude, the known places first."""
-    known = (layout,) if layout else (WITH_GIMBAL, WITHOUT_GIMBAL)
-    places = [one.position for one in known]
+    places = [one.position for one in ((layout,) if layout else (WITH_GIMBAL, WITHOUT_GIMBAL))]
     for parent in ((3, 3, 4), (3, 4)):
         places.append(parent)
         for child in range(1, _SEARCHED + 1):

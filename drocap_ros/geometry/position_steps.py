@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.reconstruction.world.camera_telemetry import MARGIN, extended
+from drocap_ros.geometry.interpolation import smoothed
 
 _SMOOTHING_S = 0.25
 #: A coordinate that changes by less rests; steps are larger, and so many of them stand alone between frames at rest.
@@ -22,8 +22,6 @@ def without_steps(position: np.ndarray, stamp_ns: np.ndarray) -> np.ndarray:
     report was true when it came, so the middles are late by half the time between two.  Coordinates without steps stay
     as they are, bit for bit, and so do those with a jump.
     """
-    from scipy.ndimage import gaussian_filter1d
-
     change = np.diff(position, axis=0)
     moves = np.abs(change) > _REST_M
     out = position.copy()
@@ -39,7 +37,7 @@ def without_steps(position: np.ndarray, stamp_ns: np.ndarray) -> np.ndarray:
         passed = 0.5 * (time[at] + time[at + 1]) - late_s
         path = _through(time, passed, position[at, axis] + 0.5 * step, 1.0 if late_s else 0.5)
         smoothing = min(_SMOOTHING_S / float(np.median(np.diff(time))), len(time))
-        out[:, axis] = gaussian_filter1d(extended(path[:, None]), smoothing, axis=0, mode="nearest")[MARGIN:-MARGIN, 0]
+        out[:, axis] = smoothed(path[:, None], smoothing)[:, 0]
     return out
 
 

@@ -1,4 +1,4 @@
-"""Parameters of the session recorder."""
+"""Parameters of the recorder and of the player of sessions."""
 
 from __future__ import annotations
 
@@ -31,3 +31,22 @@ class SessionRecorderConfig(Parameters):
     )
     split_s: float = param(600.0, "time after which a new file starts; 0 = never", unit="s", minimum=0, maximum=86_400)
     sync: bool = param(True, "force each chunk to the disk, so that a power cut loses at most the last one")
+
+
+@dataclass(frozen=True)
+class SessionPlayerConfig(Parameters):
+    """Session, topics and speed of a replay."""
+
+    session: str = param("", "session folder, .mcap, .bag or rosbag2 folder")
+    rate: float = param(1.0, "times the speed of the recording", minimum=0.01, maximum=100)
+    start_s: float = param(0.0, "time in the recording at which the replay starts", unit="s", minimum=0)
+    delay_s: float = param(
+        0.0,
+        "before the first message: subscribers that run already find the player meanwhile",
+        unit="s",
+        minimum=0,
+        maximum=3600,
+    )
+    loop: bool = param(False, "start again at the end, until stopped")
+    topics: str = param("", "names, or their ends, separated by spaces; empty = all but /diagnostics and /clock")
+    clock: bool = param(True, "publish the recording's time on /clock")

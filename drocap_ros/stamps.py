@@ -1,9 +1,13 @@
-"""Validation of a stream's stamps, in the nodes and when their work is repeated offline."""
+"""Stamps of images in ns: checks of those of a file, and of a stream in the nodes and when it is repeated offline."""
 
 from __future__ import annotations
 
+import numpy as np
+
 from drocap_ros.errors import InputError
 
+#: Longest time from the first to the last frame, ns: a year. More is no recording, and overflows.
+_LONGEST_NS = 365 * 86_400 * 10**9
 #: A stamp this far from the previous one belongs to another time.
 JUMP_S = 3600.0
 #: Successive stamps of another time after which the stream has moved there: a replay began, a clock was set.
@@ -47,3 +51,33 @@ class StampValidator:
 
 def _far(a_ns: int, b_ns: int) -> bool:
     return abs(a_ns - b_ns) > JUMP_S * 1e9
+
+
+def check_stamps(stamp_ns: np.ndarray) -> None:
+    """Refuse stamps (F,) that do not increase, or last longer than a year.
+
+    Raises
+    ------
+    InputError
+        When they do.
+    """
+    first, last = int(stamp_ns[0]), int(stamp_ns[-1])
+    if last - first > _LONGEST_NS:
+        raise InputError(f"stamp_ns: expected nanoseconds within a year, got {first} to {last}; is the unit right?")
+    if np.any(stamp_ns[1:] <= stamp_ns[:-1]):
+        raise InputError("stamp_ns: expected strictly increasing times, got a repeated or earlier one; sort the frames")
+
+
+def as_stamps(array: np.ndarray) -> np.ndarray:
+    """int64 stamps of a file's array.
+
+    Raises
+    ------
+    InputError
+        When it holds no integers, or larger ones.
+    """
+    if array.dtype.kind not in "iu":
+        raise InputError(f"stamp_ns: expected int64 nanoseconds, got {array.dtype}")
+    if array.size and array.max() > np.iinfo(np.int64).max:
+        raise InputError(f"stamp_ns: expected int64 nanoseconds, got {array.max()}; is the unit right?")
+    return array.astype(np.int64)

@@ -1,1 +1,0 @@
-"""The timed-metadata track ``djmd`` inside the video files of DJI drones."""
