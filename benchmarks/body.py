@@ -29,12 +29,12 @@ from drocap_ros.evaluation.protocol import (
 )  # fmt: skip
 from drocap_ros.geometry.alignment import apply_similarity, similarity
 from drocap_ros.geometry.ellipsoids import unpack_covariance
-from drocap_ros.geometry.leg_lengths import leg_reach, refit_knees, shortening
 from drocap_ros.mocap import load_mocap, mocap_files, resample
 from drocap_ros.reconstruction.lifted.lifter import Lifter, LifterInput
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.skeleton import BODY_15, BODY_17, LIMB_JOINTS, indices
 from drocap_ros.tracks import Tracks
+from lab.training.leg_lengths import leg_reach, refit_knees, shortening
 
 SPEED_DEG_S = 25.0
 _LIMBS = indices(BODY_17.joints, LIMB_JOINTS)

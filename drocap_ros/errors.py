@@ -24,3 +24,8 @@ class ParameterError(InputError):
 
 class NodeError(DrocapError):
     """A node of the running graph failed."""
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of an error's text, else its type."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -11,7 +11,7 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 from drocap_ros.errors import ParameterError
 
@@ -48,9 +48,6 @@ class Parameters:
         At construction, when a value has the wrong type or lies outside its range.
     """
 
-    #: Names that earlier versions had, with what to write instead.
-    RETIRED: ClassVar[Mapping[str, str]] = {}
-
     def __post_init__(self) -> None:
         types = _types(type(self))  # type: ignore[arg-type]  # a class is hashable
         for spec in dataclasses.fields(self):
@@ -63,8 +60,6 @@ class Parameters:
         known = {spec.name for spec in dataclasses.fields(cls)}
         unknown = sorted(set(values) - known)
         if unknown:
-            if unknown[0] in cls.RETIRED:
-                raise ParameterError(f"{where or cls.__name__}: {unknown[0]} is no more; {cls.RETIRED[unknown[0]]}")
             raise ParameterError(
                 f"{where or cls.__name__}: unknown parameter {unknown[0]!r}; expected one of {', '.join(sorted(known))}"
             )

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 from drocap_ros.flight.mavlink.mount import KINDS
 from drocap_ros.parameters import Parameters, param
@@ -13,11 +11,6 @@ from drocap_ros.parameters import Parameters, param
 @dataclass(frozen=True)
 class SubjectConfig(Parameters):
     """Assumptions about body, ground and sensors that locate the subject."""
-
-    RETIRED: ClassVar[Mapping[str, str]] = {
-        "camera_mount_pitch_deg": "write mount: fixed and camera_pitch_deg, which is negative where the camera looks "
-        "down: the sign has changed"
-    }
 
     body_height_m: float = param(1.7, "assumed height of the subject", unit="m", minimum=0.5, maximum=2.5)
     ground_height_m: float = param(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
@@ -35,8 +36,7 @@ class McapSession(Session):
         for stream in self._streams:
             stream.damage.clear()
             count = 0
-            for message in stream.messages():
-                count += 1
+            for count, message in enumerate(stream.messages(), 1):
                 channel = message.channel
                 if not topics or channel.topic in topics:
                     yield RawMessage(channel.topic, channel.type_name, message.log_time_ns, message.data, channel)
@@ -53,12 +53,14 @@ class McapSession(Session):
         return store.deserialize_cdr(raw.data, channel.type_name)
 
     def _read_info(self) -> SessionInfo:
-        counts: dict[tuple[str, str], int] = {}
+        counts = Counter[tuple[str, str]]()
         times: list[int] = []
         metadata = dict(self._metadata)
         for stream in self._streams:
-            if not _count_by_summary(stream, counts, times):
-                self._count_by_messages(stream, counts, times)
+            of_file, span = self._content(stream)
+            for key, count in of_file.items():
+                counts[key] += count
+            times += span
             metadata = stream.metadata().get(METADATA_RECORD, {}) | metadata
         return SessionInfo(
             path=self.path,
@@ -69,40 +71,29 @@ class McapSession(Session):
             metadata=metadata,
         )
 
-    def _count_by_messages(self, stream: McapStream, counts: dict[tuple[str, str], int], times: list[int]) -> None:
+    def _content(self, stream: McapStream) -> tuple[Counter[tuple[str, str]], list[int]]:
+        """Messages by (topic, type) and log times of the first and last one, by the summary or else by reading all."""
+        counts = Counter[tuple[str, str]]()
+        summary = stream.summary()
+        statistics = None if summary is None else summary.statistics
+        if statistics is not None and len(summary.channels) == statistics.channel_count:
+            for channel, count in counted_channels(summary):
+                counts[channel.topic, channel.type_name] += count
+            return counts, [statistics.message_start_time, statistics.message_end_time] if counts.total() else []
         stream.damage.clear()
         record = FileRecord(stream.path.name)
         for message in stream.messages():
-            key = (message.channel.topic, message.channel.type_name)
-            counts[key] = counts.get(key, 0) + 1
+            counts[message.channel.topic, message.channel.type_name] += 1
             record.count(message.log_time_ns)
-        if record.start_ns is not None:
-            times += [record.start_ns, record.end_ns]
-        if stream.damage:
-            self._warn_of_damage(stream, record.messages)
-        else:
+        self._warn_of_damage(stream, record.messages)
+        if not stream.damage:
             self.warn(f"{stream.path.name}: no usable summary at its end; counted its {record.messages} messages")
+        return counts, [] if record.start_ns is None else [record.start_ns, record.end_ns]
 
     def _warn_of_damage(self, stream: McapStream, count: int) -> None:
         if stream.damage:
             damage = "; ".join(map(str, stream.damage))
             self.warn(f"{stream.path.name}: {damage}; read the {count} messages that are whole")
-
-
-def _count_by_summary(stream: McapStream, counts: dict[tuple[str, str], int], times: list[int]) -> bool:
-    """Add counts and times of a file; False without a usable summary."""
-    summary = stream.summary()
-    if summary is None or summary.statistics is None:
-        return False
-    statistics = summary.statistics
-    if len(summary.channels) != statistics.channel_count:
-        return False
-    for channel, count in counted_channels(summary):
-        key = (channel.topic, channel.type_name)
-        counts[key] = counts.get(key, 0) + count
-    if statistics.message_count:
-        times += [statistics.message_start_time, statistics.message_end_time]
-    return True
 
 
 def _typestore(channel: McapChannel) -> Any:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
-from drocap_ros.errors import InputError
+from drocap_ros.errors import InputError, first_line
 from drocap_ros.recording.mcap.schemas import standard_types
 from drocap_ros.recording.session import FORMS, RawMessage, Session, SessionInfo, TopicInfo
 
@@ -21,8 +22,8 @@ class RosbagsSession(Session):
         try:
             self._reader = AnyReader([path], default_typestore=standard_types())
             self._reader.open()
-        except Exception as error:  # rosbags passes on any error of its storages
-            raise InputError(f"{path}: expected {FORMS} that can be read; {_first_line(error)}") from None
+        except Exception as error:  # noqa: BLE001  # rosbags passes on any error of its storages
+            raise InputError(f"{path}: expected {FORMS} that can be read; {first_line(error)}") from None
 
     def raw_messages(self, topics: Collection[str] = ()) -> Iterator[RawMessage]:
         """Messages of some topics (default: all) in the order of their log times."""
@@ -35,8 +36,8 @@ class RosbagsSession(Session):
                 connection, log_time_ns, data = next(messages)
             except StopIteration:
                 return
-            except Exception as error:  # a damaged file: the messages before it are whole
-                self.warn(f"cut off or damaged: {_first_line(error)}; read the messages before it")
+            except Exception as error:  # noqa: BLE001  # a damaged file: the messages before it are whole
+                self.warn(f"cut off or damaged: {first_line(error)}; read the messages before it")
                 return
             yield RawMessage(connection.topic, connection.msgtype, log_time_ns, bytes(data), connection)
 
@@ -45,11 +46,10 @@ class RosbagsSession(Session):
         return self._reader.deserialize(raw.data, raw.type_name)
 
     def _read_info(self) -> SessionInfo:
-        counts: dict[tuple[str, str], int] = {}
+        counts = Counter[tuple[str, str]]()
         for connection in self._reader.connections:
-            key = (connection.topic, connection.msgtype)
-            counts[key] = counts.get(key, 0) + connection.msgcount
-        any_message = sum(counts.values()) > 0
+            counts[connection.topic, connection.msgtype] += connection.msgcount
+        any_message = counts.total() > 0
         return SessionInfo(
             path=self.path,
             kind="rosbag2 folder" if self.path.is_dir() else f"rosbag ({self.path.suffix})",
@@ -63,8 +63,3 @@ class RosbagsSession(Session):
         """Release the files."""
         if self._reader.stack is not None:
             self._reader.close()
-
-
-def _first_line(error: BaseException) -> str:
-    text = str(error).strip()
-    return text.splitlines()[0] if text else type(error).__name__

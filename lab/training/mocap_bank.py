@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.geometry.leg_lengths import leg_reach, refit_knees, shortening
 from drocap_ros.mocap import load_mocap
 from drocap_ros.skeleton import BODY_17, indices
+from lab.training.leg_lengths import leg_reach, refit_knees, shortening
 
 _FEET = np.stack([indices(BODY_17.joints, (s + "ankle", s + "toe")) for s in "rl"])
 _PELVIS, _NECK = indices(BODY_17.joints, ("pelvis", "neck"))

@@ -85,5 +85,5 @@ def type_hash(type_name: str, schema: str) -> str:
     try:
         store.register(get_types_from_msg(schema, type_name))
         return store.hash_rihs01(type_name)
-    except Exception:  # readers do without a hash
+    except Exception:  # noqa: BLE001  # readers do without a hash
         return ""

@@ -160,7 +160,7 @@ class McapStream:
                     return None
                 file.seek(0)
                 return SeekingReader(bounded, record_size_limit=bounded.size).get_summary()
-        except Exception:  # a damaged summary fails in many ways; the stream does without
+        except Exception:  # noqa: BLE001  # a damaged summary fails in many ways; the stream does without
             return None
 
     def metadata(self) -> dict[str, dict[str, str]]:
@@ -175,7 +175,7 @@ class McapStream:
                 bounded: Any = _BoundedFile(file)
                 for record in SeekingReader(bounded, record_size_limit=bounded.size).iter_metadata():
                     found.setdefault(record.name, {}).update(record.metadata)
-        except Exception:  # messages can be read without metadata
+        except Exception:  # noqa: BLE001  # messages can be read without metadata
             logger.debug("%s: metadata cannot be read", self.path)
         return found
 
@@ -201,7 +201,7 @@ class McapStream:
                     continue
                 try:
                     records = breakup_chunk(_unpacked(record), validate_crc=True)
-                except Exception:  # decompression, checksum, lengths: a damaged chunk fails in many ways
+                except Exception:  # noqa: BLE001  # decompression, checksum, lengths: a damaged chunk fails in many ways
                     bad_chunks += 1
                     continue
                 yield from records
@@ -235,7 +235,7 @@ class McapStream:
                 record = next(records)
             except StopIteration:
                 return
-            except Exception:  # mcap raises many kinds on cut or damaged records
+            except Exception:  # noqa: BLE001  # mcap raises many kinds on cut or damaged records
                 if not ended:
                     self.damage.append(Damage(DamageKind.CUT_OFF, place, size))
                 return

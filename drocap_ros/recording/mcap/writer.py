@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from drocap_ros.errors import InputError
+from drocap_ros.errors import InputError, first_line
 from drocap_ros.recording.mcap.bounded_queue import BoundedQueue, QueuedMessage
 from drocap_ros.recording.mcap.file import McapFile
 from drocap_ros.recording.mcap.metadata import (
@@ -206,7 +206,7 @@ class SessionWriter:
                     if message is not None:
                         self._add(message)
                     self._save_if_due(ended=message is None and self._queue.closed)
-            except Exception as error:  # the graph continues; diagnostics report the reason
+            except Exception as error:  # noqa: BLE001  # the graph continues; diagnostics report the reason
                 self._fail(error)
             if self.error is not None:
                 self._queue.drop_all()
@@ -299,7 +299,7 @@ class SessionWriter:
     def _fail(self, error: Exception) -> None:
         if self.error is not None:
             return
-        reason = getattr(error, "strerror", None) or (str(error).splitlines() or [type(error).__name__])[0]
+        reason = getattr(error, "strerror", None) or first_line(error)
         for topic, count in self._file.abandon().items():
             self._queue.dropped[topic] += count
         if self._file.record.name:

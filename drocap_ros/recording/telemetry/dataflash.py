@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from drocap_ros.errors import InputError
+from drocap_ros.errors import InputError, first_line
 from drocap_ros.flight.frames import geodetic_to_enu, orientation_to_ros, quaternion_from_euler, quaternion_multiply
-from drocap_ros.recording.telemetry.log import Lack, LogFormat, LogLack, TelemetryLog, at_stamps, first_line, make_log
+from drocap_ros.recording.telemetry.log import Lack, LogFormat, LogLack, TelemetryLog, at_stamps, make_log
 
 #: UTC in s from which a time is one of a GPS (2001); before its first fix the reader counts from 1970.
 _EARLIEST_UTC_S = 1e9
@@ -47,7 +47,7 @@ def read_dataflash(path: Path) -> TelemetryLog:
         with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
             for message in _messages(path):
                 content.take(message)
-    except Exception as error:  # pymavlink passes on any error of its parser
+    except Exception as error:  # noqa: BLE001  # pymavlink passes on any error of its parser
         if not content.rows["ATT"]:
             reason = first_line(error)
             raise InputError(f"{path}: expected an ArduPilot DataFlash log that can be read; {reason}") from None

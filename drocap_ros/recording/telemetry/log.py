@@ -199,8 +199,3 @@ def at_stamps(known_ns: np.ndarray, values: np.ndarray, stamp_ns: np.ndarray, *,
     fresh = np.concatenate([[True], np.diff(known_ns) > 0])
     found, _ = interpolate(known_ns[fresh], values[fresh], stamp_ns, spherical=spherical, max_gap_s=_SERIES_GAP_S)
     return found
-
-
-def first_line(error: BaseException) -> str:
-    """The first line of an error's text, else its type."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

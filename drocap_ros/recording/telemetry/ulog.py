@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from drocap_ros.errors import InputError
+from drocap_ros.errors import InputError, first_line
 from drocap_ros.flight.frames import ned_to_enu, orientation_to_ros, quaternion_multiply, yaw_of
 from drocap_ros.recording.telemetry.log import (
     Lack,
@@ -18,7 +18,6 @@ from drocap_ros.recording.telemetry.log import (
     LogLack,
     TelemetryLog,
     at_stamps,
-    first_line,
     from_first_fix,
     make_log,
 )
@@ -59,7 +58,7 @@ def read_ulog(path: Path) -> TelemetryLog:
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             log = ULog(str(path), list(_TOPICS), disable_str_exceptions=True)
-    except Exception as error:  # pyulog passes on any error of its parser
+    except Exception as error:  # noqa: BLE001  # pyulog passes on any error of its parser
         raise InputError(f"{path}: expected a PX4 ULog that can be read; {first_line(error)}") from None
     try:
         return _to_log(path, log)

@@ -7,9 +7,6 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from scipy.spatial.transform import Rotation
 
-from drocap_ros.config import load_config
-from drocap_ros.errors import ParameterError
-from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.frames import orientation_to_aviation, orientation_to_ros, quaternion_from_euler
 from drocap_ros.flight.mavlink.mount import Mount
@@ -80,14 +77,6 @@ def test_yaw_from_the_nose_turns_with_the_nose():
         camera = mount.camera_at(quaternion_from_euler(0.0, 0.0, math.radians(heading)), S + S // 50)
         ahead = Rotation.from_quat(camera).apply([1, 0, 0])
         assert math.degrees(math.atan2(ahead[0], ahead[1])) == pytest.approx(heading + 10)
-
-
-def test_an_old_configuration_is_refused_instead_of_flown_with_the_wrong_sign(tmp_path):
-    path = tmp_path / "old.yaml"
-    path.write_text("/**/mavlink_bridge:\n  ros__parameters:\n    camera_mount_pitch_deg: 15.0\n")
-    with pytest.raises(ParameterError, match=r"camera_mount_pitch_deg .*camera_pitch_deg.* negative .*sign"):
-        load_config(path)
-    assert "camera_mount_pitch_deg" not in MavlinkBridgeConfig.__dataclass_fields__
 
 
 def test_a_mount_that_reports_no_angles_is_outdated_sooner_than_a_silent_one():

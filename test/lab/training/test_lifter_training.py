@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import DrocapError, InputError
-from drocap_ros.geometry.leg_lengths import refit_knees
 from drocap_ros.reconstruction.lifted.lifter_input import BONES, FEATURES, PARTS
 from drocap_ros.skeleton import BODY_17, indices
 from lab.training.keypoint_errors import detect
+from lab.training.leg_lengths import refit_knees
 from lab.training.lifter_samples import camera_rotation, sample_batch
 from lab.training.mocap_bank import MocapBank, load_bank, straighten_legs
 
