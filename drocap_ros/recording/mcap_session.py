@@ -36,7 +36,8 @@ class McapSession(Session):
         for stream in self._streams:
             stream.damage.clear()
             count = 0
-            for count, message in enumerate(stream.messages(), 1):
+            for message in stream.messages():
+                count += 1
                 channel = message.channel
                 if not topics or channel.topic in topics:
                     yield RawMessage(channel.topic, channel.type_name, message.log_time_ns, message.data, channel)

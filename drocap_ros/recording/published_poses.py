@@ -14,16 +14,9 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.camera_history import CameraHistory, WindowCamera
+from drocap_ros.recording import session as recorded
 from drocap_ros.recording.pose_messages import add_calibration, add_state
-from drocap_ros.recording.session import (
-    CAMERA_INFO,
-    POSE3D,
-    POSE3D_WINDOW,
-    VEHICLE_STATE,
-    Session,
-    header_stamp_ns,
-    stamp_of,
-)
+from drocap_ros.recording.session import Session, header_stamp_ns, stamp_of
 from drocap_ros.stamps import StampValidator
 
 _INITIAL = 1  # Pose3D.INITIAL
@@ -68,9 +61,9 @@ class RecordedCamera:
     def __init__(self, session: Session, near: str, keep_s: float) -> None:
         base = near.rsplit("/", 1)[0]
         self._history = CameraHistory(keep_s)
-        self._states = _accepted(_messages(session, VEHICLE_STATE, f"{base}/vehicle/state"))
+        self._states = _accepted(_messages(session, recorded.VEHICLE_STATE, f"{base}/vehicle/state"))
         self._next = next(self._states, None)
-        for message in _accepted(_messages(session, CAMERA_INFO, f"{base}/camera_info")):
+        for message in _accepted(_messages(session, recorded.CAMERA_INFO, f"{base}/camera_info")):
             with contextlib.suppress(InputError):  # the live graph refused it too
                 add_calibration(self._history, message)
         self.matrix: np.ndarray | None = None
@@ -98,10 +91,10 @@ class PublishedPoses:
         self._windows: deque[PublishedWindow] = deque()
         self._current: PublishedWindow | None = None
         self.agreement = Agreement()
-        for m in _messages(session, POSE3D, f"{base}/pose3d/initial"):
+        for m in _messages(session, recorded.POSE3D, f"{base}/pose3d/initial"):
             if m.stage == _INITIAL:
                 self._initial[header_stamp_ns(m)].append(_fingerprint(_joints(m)))
-        for m in _messages(session, POSE3D_WINDOW, f"{base}/pose3d/refined"):
+        for m in _messages(session, recorded.POSE3D_WINDOW, f"{base}/pose3d/refined"):
             stamps = np.array([header_stamp_ns(pose) for pose in m.poses], np.int64)
             joints = np.array([_joints(pose) for pose in m.poses])
             steps = (int(m.steps[0]), int(m.steps[1])) if len(m.steps) else None

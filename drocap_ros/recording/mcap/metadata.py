@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from dataclasses import dataclass
@@ -11,7 +12,9 @@ from typing import Any
 METADATA_FILE = "metadata.yaml"
 #: Name of the metadata records that this package writes into MCAP files.
 METADATA_RECORD = "drocap_ros"
+#: Version of the file that ROS 2 Jazzy writes.
 _VERSION = 9
+#: rosbag2's duration without an end: the most nanoseconds of an int64.
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 
 
@@ -62,15 +65,11 @@ def qos_profile(*, reliable: bool = True, depth: int = 1000) -> list[dict[str, A
     ]
 
 
-def dump_yaml(value: Any) -> str:
-    """YAML text without anchors."""
+def dump_yaml(value: object) -> str:
+    """YAML text without anchors: in the copy no object stands twice."""
     import yaml
 
-    class Plain(yaml.SafeDumper):
-        def ignore_aliases(self, data: Any) -> bool:
-            return True
-
-    return str(yaml.dump(value, Dumper=Plain, sort_keys=False, default_flow_style=False))
+    return str(yaml.safe_dump(json.loads(json.dumps(value)), sort_keys=False, default_flow_style=False))
 
 
 def bag_metadata(files: list[FileRecord], topics: list[TopicRecord], custom: dict[str, str]) -> dict[str, Any]:
@@ -140,12 +139,11 @@ def storage_files(folder: Path, description: dict[str, Any]) -> list[Path]:
     """Files of a folder in their order, with MCAP files that a crash left out of the description."""
     there = sorted((p for p in folder.iterdir() if p.suffix == ".mcap"), key=_by_number)
     named = description.get("relative_file_paths")
-    if isinstance(named, list) and named:
-        files = [folder / Path(str(name)).name for name in named]
-        if all(file.is_file() for file in files):
-            beside = [p for p in there if p not in files] if all(f.suffix == ".mcap" for f in files) else []
-            return files + beside
-    return there
+    files = [folder / Path(str(name)).name for name in named] if isinstance(named, list) else []
+    if not files or not all(file.is_file() for file in files):
+        return there
+    is_mcap = all(file.suffix == ".mcap" for file in files)
+    return files + [p for p in there if is_mcap and p not in files]
 
 
 def _by_number(path: Path) -> tuple[Any, ...]:

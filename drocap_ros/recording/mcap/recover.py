@@ -15,21 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from drocap_ros.errors import InputError
+from drocap_ros.recording.mcap import metadata as bag
 from drocap_ros.recording.mcap.file import McapFile
-from drocap_ros.recording.mcap.metadata import (
-    METADATA_FILE,
-    METADATA_RECORD,
-    FileRecord,
-    TopicRecord,
-    bag_metadata,
-    custom_metadata,
-    dump_yaml,
-    qos_profile,
-    read_metadata,
-    storage_files,
-    sync_folder,
-    write_atomically,
-)
+from drocap_ros.recording.mcap.metadata import FileRecord, TopicRecord
 from drocap_ros.recording.mcap.schemas import type_hash
 from drocap_ros.recording.mcap.stream import MAGIC, Damage, DamageKind, McapChannel, McapStream, counted_channels
 
@@ -75,10 +63,10 @@ def recover_session(path: str | Path, progress: Progress | None = None) -> list[
                 progress("files", number / len(files))
             done.append(_recover_file(file, len(files) > 1))
             records.append(_describe(file, topics))
-            custom = McapStream(file).metadata().get(METADATA_RECORD, {}) | custom
+            custom = McapStream(file).metadata().get(bag.METADATA_RECORD, {}) | custom
         if path.is_dir():
             ordered = [topics[name] for name in sorted(topics)]
-            write_atomically(path / METADATA_FILE, dump_yaml(bag_metadata(records, ordered, custom)))
+            bag.write_atomically(path / bag.METADATA_FILE, bag.dump_yaml(bag.bag_metadata(records, ordered, custom)))
             for left in path.glob("*.tmp"):
                 left.unlink()
     except OSError as error:
@@ -98,11 +86,11 @@ def _files(path: Path) -> tuple[list[Path], dict[str, str]]:
         if not path.is_file() or path.suffix != ".mcap":
             raise InputError(f"{path}: expected a session folder or .mcap, found another kind of file; check the path")
         return [path], {}
-    description, _ = read_metadata(path)
-    files = storage_files(path, description)
+    description, _ = bag.read_metadata(path)
+    files = bag.storage_files(path, description)
     if not files or any(file.suffix != ".mcap" for file in files):
         raise InputError(f"{path}: expected a session of MCAP files, found none or others; check the path")
-    return files, custom_metadata(description)
+    return files, bag.custom_metadata(description)
 
 
 def _recover_file(path: Path, one_of_several: bool) -> RecoveredFile:
@@ -151,7 +139,7 @@ def _replace(stream: McapStream, beside: Path, count: int, damage: tuple[Damage,
             if not kept.exists():
                 os.link(path, kept)
         os.replace(beside, path)
-        sync_folder(path.parent)
+        bag.sync_folder(path.parent)
     finally:
         beside.unlink(missing_ok=True)
     return RecoveredFile(path, True, count, damage, kept)
@@ -209,4 +197,4 @@ def _qos(metadata: dict[str, str]) -> list[dict[str, Any]]:
         profiles = yaml.safe_load(metadata.get("offered_qos_profiles", ""))
     except yaml.YAMLError:
         profiles = None
-    return profiles if isinstance(profiles, list) and profiles else qos_profile()
+    return profiles if isinstance(profiles, list) and profiles else bag.qos_profile()

@@ -62,7 +62,7 @@ def schema_text(type_name: str) -> str:
     """
     try:
         text, _ = standard_types().generate_msgdef(type_name, ros_version=2)
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001  # rosbags passes on any error of its types
         raise InputError(
             f"message type: expected one of drocap_ros or of ROS 2 Jazzy, got {type_name!r} ({error}); "
             "register it with its schema text"

@@ -83,23 +83,19 @@ def tlog_messages(path: str | Path) -> Iterator[tuple[Any, int]]:
 
 def _packets(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
     """(time us, packet); in the file each packet follows its time, a big-endian 64-bit number."""
-    data = b""
+    data, place = b"", 0
     while True:
-        more = file.read(_CHUNK)
-        data += more
-        place = 0
-        while True:
-            length = _packet_length(data, place)
-            if length is None:
-                break
-            if length == 0:
-                place += 1
-                continue
+        length = _packet_length(data, place)
+        if length is None:
+            more = file.read(_CHUNK)
+            if not more:
+                return
+            data, place = data[place:] + more, 0
+        elif length == 0:
+            place += 1
+        else:
             yield struct.unpack_from(">Q", data, place)[0], data[place + 8 : place + 8 + length]
             place += 8 + length
-        data = data[place:]
-        if not more:
-            return
 
 
 def _packet_length(data: bytes, place: int) -> int | None:
