@@ -27,11 +27,11 @@ from drocap_ros.perception.load_models import load_detector, load_pose_model
 from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.perception.models.spec import read_spec
 from drocap_ros.perception.pose import NetworkKeypoints, PoseModel
+from drocap_ros.perception.pose.uncertainty import CALIBRATIONS, Calibration, calibrate
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.sources import open_source
 from drocap_ros.perception.sources.image_files import read_image
 from drocap_ros.perception.track_video import observe, subjects
-from drocap_ros.perception.uncertainty import CALIBRATIONS, Calibration, calibrate
 from drocap_ros.skeleton import COCO_17
 
 SHARED = ROOT.parent / "shared"
@@ -301,7 +301,7 @@ def fit(cases: list[Case], degraded: list[Case], spread_share: float) -> Calibra
         error = np.concatenate([c.errors for c in these])
         score = np.concatenate([c.keypoints.score[LIMBS] for c in these])
         spread = np.concatenate([c.keypoints.spread[LIMBS] / c.keypoints.box_size**2 for c in these])
-        second_peak = np.nan_to_num(np.concatenate([c.keypoints.candidates[LIMBS, 1, 2] for c in these]))
+        second_peak = np.concatenate([c.keypoints.second[LIMBS] for c in these])
         return error, score, spread, second_peak, np.repeat([weight(c) for c in these], 12)
 
     parts = [columns(cases, lambda c: weights[c.source]), columns(degraded, lambda c: 0.15)]

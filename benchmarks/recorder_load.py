@@ -18,7 +18,7 @@ def make_sources(node: Any) -> list[tuple[Any, Any, float, str]]:
 
     from drocap_ros.msg import VehicleState
     from drocap_ros.nodes.capture_simulator import observation_of
-    from drocap_ros.perception.jpeg import encode_jpeg
+    from drocap_ros.perception.sources.image_files import encode_jpeg
     from drocap_ros.ros.conversions import header_at, pose2d_to_ros
     from drocap_ros.ros.topics import TOPICS
     from drocap_ros.simulation.capture import simulate_capture

@@ -20,7 +20,7 @@ from typing import Any
 
 from drocap_ros.flight.mavlink.transport import Transport, open_transport
 from drocap_ros.perception.calibration import CameraModel
-from drocap_ros.perception.jpeg import encode_jpeg
+from drocap_ros.perception.sources.image_files import encode_jpeg
 from drocap_ros.ros.component import OK, WARN
 from drocap_ros.ros.conversions import camera_info_to_ros, compressed_image_to_ros, header_at
 from drocap_ros.ros.diagnostics import PILOT_FLIES, PILOT_HANDS_OFF, Key

@@ -8,8 +8,8 @@ import numpy as np
 
 from drocap_ros.joint_maps import joint_map
 from drocap_ros.perception.pose import NetworkKeypoints, PoseModel
+from drocap_ros.perception.pose.uncertainty import calibrate
 from drocap_ros.perception.tracking.shadow import without_shadow
-from drocap_ros.perception.uncertainty import calibrate
 from drocap_ros.skeleton import BODY_15
 
 #: Mean confidence of a clear pose.

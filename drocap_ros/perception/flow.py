@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.observation import PoseObservation
-from drocap_ros.perception.detection.letterbox import shrink
+from drocap_ros.perception.models.network_input import shrink
 
 #: Longer side of the box in the flow's image, px; smaller boxes are not enlarged.
 _SIDE_PX = 192

@@ -13,8 +13,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
-from drocap_ros.perception.sources.base import Frame
-from drocap_ros.perception.sources.prefetch import prefetch
+from drocap_ros.perception.sources.base import Frame, prefetch
 from drocap_ros.perception.tracking.person import Person
 
 #: Interval of the detections.

@@ -12,8 +12,7 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
-from drocap_ros.perception.sources.base import Frame
-from drocap_ros.perception.sources.prefetch import prefetch
+from drocap_ros.perception.sources.base import Frame, prefetch
 from drocap_ros.tracks import Tracks
 
 

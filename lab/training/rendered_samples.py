@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.perception.detection.letterbox import letterbox
-from drocap_ros.perception.pose.crop import crop_around, cut
+from drocap_ros.perception.models.network_input import crop_around, cut, letterbox
 from drocap_ros.simulation.orbit_camera import look_at, project
 from drocap_ros.simulation.render.background import draw_background
 from drocap_ros.simulation.render.body import dress

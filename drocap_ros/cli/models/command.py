@@ -31,7 +31,6 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
             " $DROCAP_MODELS)",
         )
     fetching.add_argument("names", nargs="*", metavar="NAME", help="models by name (default: rtmdet-nano rtmpose-s)")
-    fetching.add_argument("--unverified", action="store_true", help="allow models without a known checksum")
     fetching.add_argument("--quiet", action="store_true", help="no progress, only errors")
     checking.add_argument("image", nargs="?", type=Path, metavar="IMAGE", help="image of a person")
     checking.add_argument("--detector", metavar="NAME", default="auto", help="detector (default: the preferred one)")
@@ -109,7 +108,7 @@ def run_fetch(args: argparse.Namespace) -> int:
                 f"{name}: expected one of {', '.join(m.name for m in KNOWN_MODELS)}; see `drocap models list`"
             )
         chosen.append(model)
-    errors = fetch_models(chosen, models_folder(args.models), unverified=args.unverified, quiet=args.quiet)
+    errors = fetch_models(chosen, models_folder(args.models), quiet=args.quiet)
     for error in errors:
         print(f"drocap: {error}", file=sys.stderr)
     return 1 if errors else 0

@@ -52,9 +52,7 @@ def ensure_networks(folder: Path, source: str | Path, args: argparse.Namespace) 
         raise DrocapError("; ".join(errors))
 
 
-def fetch_models(
-    models: Sequence[KnownModel], folder: Path, *, unverified: bool = False, quiet: bool = False
-) -> list[str]:
+def fetch_models(models: Sequence[KnownModel], folder: Path, *, quiet: bool = False) -> list[str]:
     """Download models and print one line for each; returns the failures of network or server."""
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.perception.models.fetch import FetchError, fetch
@@ -66,13 +64,11 @@ def fetch_models(
                 path = fetch(
                     model,
                     folder,
-                    unverified=unverified,
                     progress=lambda have, total, name=model.name: progress(name, have / total if total else -1.0),  # type: ignore[misc]
                 )
             except FetchError as error:
                 errors.append(str(error))
                 continue
             if not quiet:
-                verified = "SHA-256 verified" if model.sha256 else "checksum recorded, not verified"
-                print(f"{model.name}: {path} ({verified})")
+                print(f"{model.name}: {path} (SHA-256 verified)")
     return errors

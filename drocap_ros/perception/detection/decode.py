@@ -34,6 +34,11 @@ def _flat(output: np.ndarray) -> np.ndarray:
     return output.reshape(output.shape[-2:])
 
 
+def _points(rows: np.ndarray, spec: ModelSpec) -> np.ndarray | None:
+    """(N, 3 P) -> (N, P, 3) keypoints; None for a model without joints."""
+    return rows.reshape(len(rows), -1, 3) if spec.skeleton else None
+
+
 def rtmdet_maps(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
     """RTMDet's raw maps: class logits and distances l t r b (px) from each cell's corner.
 
@@ -47,18 +52,12 @@ def rtmdet_maps(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) ->
         by_stride.setdefault(grid[0], []).append(output[0] if grid[2] else np.moveaxis(output[0], 0, 2))
     boxes, scores = [], []
     for stride in sorted(by_stride):
-        maps = by_stride[stride]
-        if len(maps) == 1:
-            logits, distances = maps[0][..., spec.person_class], maps[0][..., -4:]
-        else:
-            # Exports put the distance map second; a first map of four channels is the distance map.
-            first, second = maps
-            swapped = first.shape[-1] == 4 and second.shape[-1] != 4
-            logits, distances = (second if swapped else first)[..., spec.person_class], first if swapped else second
-        score = _sigmoid(logits)
+        # The export's class map comes before its distance map.
+        joined = np.concatenate(by_stride[stride], axis=2)
+        score = _sigmoid(joined[..., spec.person_class])
         rows, columns = np.nonzero(score >= threshold)
         corner = np.stack([columns, rows], 1).astype(np.float32) * stride
-        d = distances[rows, columns]
+        d = joined[rows, columns, -4:]
         boxes.append(np.concatenate([corner - d[:, :2], corner + d[:, 2:]], axis=1))
         scores.append(score[rows, columns])
     return RawDetections(np.concatenate(boxes), np.concatenate(scores))
@@ -79,47 +78,27 @@ def yolox_grid(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> 
 
 
 def boxes_nms(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
-    """Model with suppression: x_min y_min x_max y_max score; a second output holds class labels."""
+    """Model with suppression: x_min y_min x_max y_max score; a second output holds class labels or keypoints."""
     rows = _flat(outputs[0])
     keep = rows[:, 4] >= threshold
-    if len(outputs) > 1:
+    if len(outputs) > 1 and not spec.skeleton:
         keep &= outputs[1].reshape(-1) == spec.person_class
-    return RawDetections(rows[keep, :4], rows[keep, 4])
+    keypoints = _points(outputs[1].reshape(len(rows), -1)[keep], spec) if spec.skeleton else None
+    return RawDetections(rows[keep, :4], rows[keep, 4], keypoints)
 
 
 def yolo_nms(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
     """Model with suppression, one output: x_min y_min x_max y_max score class (and keypoints x y score)."""
     rows = _flat(outputs[0])
     rows = rows[(rows[:, 4] >= threshold) & (np.round(rows[:, 5]) == spec.person_class)]
-    keypoints = rows[:, 6:].reshape(len(rows), -1, 3) if rows.shape[1] > 6 else None
-    return RawDetections(rows[:, :4], rows[:, 4], keypoints)
+    return RawDetections(rows[:, :4], rows[:, 4], _points(rows[:, 6:], spec))
 
 
 def yolo(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
-    """YOLO without objectness, channels first: cx cy w h, classes."""
+    """YOLO without objectness, channels first: cx cy w h, classes; or one class and keypoints x y score."""
     rows = _flat(outputs[0]).T
-    score = rows[:, 4 + spec.person_class]
-    rows, score = rows[score >= threshold], score[score >= threshold]
-    return RawDetections(_corners(rows[:, :4]), score)
-
-
-def yolo_pose(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
-    """YOLO-pose before suppression: cx cy w h, score (or objectness and class), keypoints x y score."""
-    rows = _flat(outputs[0])
-    if rows.shape[0] < rows.shape[1]:  # channels first
-        rows = rows.T
-    first = 5 if (rows.shape[1] - 5) % 3 == 0 else 6
-    score = rows[:, 4] if first == 5 else rows[:, 4] * rows[:, 5]
-    keep = score >= threshold
-    rows = rows[keep]
-    return RawDetections(_corners(rows[:, :4]), score[keep], rows[:, first:].reshape(len(rows), -1, 3))
-
-
-def rtmo(outputs: list[np.ndarray], spec: ModelSpec, threshold: float) -> RawDetections:
-    """RTMO with suppression: boxes with score, keypoints x y score."""
-    rows, keypoints = _flat(outputs[0]), outputs[1].reshape(-1, *outputs[1].shape[-2:])
-    keep = rows[:, 4] >= threshold
-    return RawDetections(rows[keep, :4], rows[keep, 4], keypoints[keep])
+    rows = rows[rows[:, 4 + spec.person_class] >= threshold]
+    return RawDetections(_corners(rows[:, :4]), rows[:, 4 + spec.person_class], _points(rows[:, 5:], spec))
 
 
 DECODERS: dict[str, Callable[[list[np.ndarray], ModelSpec, float], RawDetections]] = {
@@ -128,7 +107,7 @@ DECODERS: dict[str, Callable[[list[np.ndarray], ModelSpec, float], RawDetections
     "boxes-nms": boxes_nms,
     "yolo-nms": yolo_nms,
     "yolo": yolo,
-    "yolo-pose": yolo_pose,
+    "yolo-pose": yolo,
     "yolo-pose-nms": yolo_nms,
-    "rtmo": rtmo,
+    "rtmo": boxes_nms,
 }

@@ -9,9 +9,8 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.detection.decode import DECODERS
-from drocap_ros.perception.detection.letterbox import letterbox
 from drocap_ros.perception.detection.nms import suppress
-from drocap_ros.perception.models.preprocess import Normalizer
+from drocap_ros.perception.models.network_input import Normalizer, letterbox
 from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.perception.models.spec import ModelSpec, map_grid
 
@@ -68,7 +67,7 @@ class Detector:
             spec = dataclasses.replace(spec, input_size=_reduced_size(window, reduced * min(spec.input_size)))
         canvas, place = letterbox(image, window, spec.input_size, spec.letterbox == "centre")
         raw = self._decode(self.model(self._normalize(canvas)), spec, threshold)
-        boxes = place.boxes_to_image(raw.boxes.astype(np.float32))
+        boxes = place.to_image(raw.boxes.astype(np.float32).reshape(-1, 2, 2)).reshape(-1, 4)
         boxes = np.clip(boxes, 0, np.array([width, height, width, height], np.float32))
         not_empty = (boxes[:, 2:] - boxes[:, :2]).min(axis=1, initial=np.inf) >= 1.0
         kept = np.nonzero(not_empty)[0]

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-#: Most boxes that :func:`suppress` keeps.
+#: Most boxes that :func:`suppress` keeps: more persons than a tracker follows.
 _MAX_BOXES = 100
-#: A box is a part of a better-scored one when this share of it lies inside and its area is below that share.
-_PART_INSIDE, _PART_AREA = 0.8, 0.65
+#: A box is a part of a better-scored one when this share of it lies inside.
+_PART_INSIDE = 0.8
+#: And when its area is below this share of the other's: legs or a trunk, of a person seen from the side.
+_PART_AREA = 0.65
 
 
 def iou(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -14,7 +14,9 @@ from pathlib import Path
 from drocap_ros.errors import DrocapError, InputError
 from drocap_ros.perception.models.registry import KnownModel
 
+#: Bytes per read: progress a few times a second on a slow line.
 _CHUNK = 1 << 18
+#: Seconds without an answer of the server, twice the time of pip, after which the download fails.
 _TIMEOUT_S = 30.0
 #: Larger than any model of the registry; a longer download is refused.
 _MAX_BYTES = 2_000_000_000
@@ -36,37 +38,31 @@ def sha256_of(path: Path) -> str:
     return digest.hexdigest()
 
 
-def fetch(model: KnownModel, folder: Path, *, unverified: bool = False, progress: Progress | None = None) -> Path:
+def fetch(model: KnownModel, folder: Path, *, progress: Progress | None = None) -> Path:
     """The model's file in ``folder``, downloaded unless it is present.
 
     A ``.part`` file holds the download, and the next attempt resumes it; the model gets its name after its checksum
-    matched.  A model without a known checksum needs ``unverified``; the checksum found is stored beside it and
-    expected by later fetches.
+    matched.
 
     Raises
     ------
     InputError
-        When the model has no download, or no checksum and ``unverified`` is not set.
+        When the model has no download.
     FetchError
         When the network, the server or the checksum fails.
     """
     target = folder / model.file
-    expected = model.sha256 or _recorded(target)
-    if target.is_file() and expected and sha256_of(target) == expected:
+    if target.is_file() and sha256_of(target) == model.sha256:
         return target
     if not model.url:
         raise InputError(
             f"{model.name}: expected a model that its publisher offers as ONNX, {model.home} does not; export it"
             f" yourself to {target}, or fetch another"
         )
-    if not expected and not unverified:
-        raise InputError(
-            f"{model.name}: no checksum is known for it; fetch another, or add --unverified to trust {model.url}"
-        )
     folder.mkdir(parents=True, exist_ok=True)
     part = folder / f"{Path(model.url).name}.part"
     download(model.url, part, progress)
-    _install(model, part, target, expected)
+    _install(model, part, target)
     return target
 
 
@@ -112,7 +108,7 @@ def download(url: str, part: Path, progress: Progress | None = None) -> None:
         raise FetchError(f"{url}: cut off after {have} of {total} bytes; run the command again to continue")
 
 
-def _install(model: KnownModel, part: Path, target: Path, expected: str) -> None:
+def _install(model: KnownModel, part: Path, target: Path) -> None:
     fresh = target.with_suffix(".new")
     try:
         if model.member:
@@ -120,13 +116,11 @@ def _install(model: KnownModel, part: Path, target: Path, expected: str) -> None
         else:
             shutil.copyfile(part, fresh)
         found = sha256_of(fresh)
-        if expected and found != expected:
+        if found != model.sha256:
             raise FetchError(
-                f"{model.name}: expected SHA-256 {expected}, got {found}; the download was damaged or changed at its"
-                " home: nothing was kept, try again"
+                f"{model.name}: expected SHA-256 {model.sha256}, got {found}; the download was damaged or changed at"
+                " its home: nothing was kept, try again"
             )
-        if not model.sha256:
-            _record_path(target).write_text(f"{found}  {target.name}\n", encoding="ascii")
         os.replace(fresh, target)
     finally:
         fresh.unlink(missing_ok=True)
@@ -147,13 +141,3 @@ def _extract(archive: Path, member: str, target: Path) -> None:
                 shutil.copyfileobj(source, sink, _CHUNK)
     except zipfile.BadZipFile as error:
         raise FetchError(f"{archive.name}: expected a ZIP archive; {error}; nothing was kept, try again") from None
-
-
-def _record_path(target: Path) -> Path:
-    return target.with_suffix(".onnx.sha256")
-
-
-def _recorded(target: Path) -> str:
-    """Checksum stored by the first unverified fetch, or an empty string."""
-    path = _record_path(target)
-    return path.read_text(encoding="ascii").split()[0] if path.is_file() and path.stat().st_size else ""

@@ -21,7 +21,7 @@ class KnownModel:
     home : publisher
     url : the file or a ZIP archive with it; empty = no ONNX download
     member : end of the file's path in the archive; empty = the download is the file itself
-    sha256 : of the ONNX file; empty = unknown
+    sha256 : of the ONNX file; empty = no ONNX download
     """
 
     name: str
@@ -37,7 +37,7 @@ class KnownModel:
 
 
 #: Publishers state no checksums for these files.  These SHA-256 sums are pinned by independent projects for the same
-#: official downloads (one project for rtmdet-nano, several for the others); a model without one needs ``--unverified``.
+#: official downloads (one project for rtmdet-nano, several for the others).
 KNOWN_MODELS: tuple[KnownModel, ...] = (
     KnownModel(
         "rtmdet-nano", "detector", "rtmdet-nano-person.onnx", 4.0, "Apache-2.0", "COCO, Objects365 (persons)",
@@ -58,10 +58,6 @@ KNOWN_MODELS: tuple[KnownModel, ...] = (
         "yolox-m", "detector", "yolox-m-humanart.onnx", 97.0, "Apache-2.0", "COCO, HumanArt", "OpenMMLab",
         f"{_SDK}/yolox_m_8xb8-300e_humanart-c2c7a14a.zip", "end2end.onnx",
         "3dea6513388889f0fff4b77bf7a26013600321b9eb9ceb0e9a400a82572f5f23",
-    ),
-    KnownModel(
-        "rtmpose-t", "pose", "rtmpose-t-body7.onnx", 13.0, "Apache-2.0", "seven public sets (body7)", "OpenMMLab",
-        f"{_SDK}/rtmpose-t_simcc-body7_pt-body7_420e-256x192-026a1439_20230504.zip", "end2end.onnx",
     ),
     KnownModel(
         "rtmpose-s", "pose", "rtmpose-s-body7.onnx", 21.0, "Apache-2.0", "seven public sets (body7)", "OpenMMLab",

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.models.dynamic_size import with_dynamic_size
 
 _PROVIDERS = {
     "cpu": "CPUExecutionProvider",
@@ -59,7 +58,7 @@ class OnnxModel:
         self._open = lambda source: ort.InferenceSession(source, options, providers=providers)
         try:
             self._session: Any = self._open(str(self.path))
-        except Exception as error:  # onnxruntime raises its own unrelated classes
+        except Exception as error:
             raise InputError(
                 f"{self.path}: expected an ONNX model that onnxruntime {ort.__version__} can run; {_first_line(error)};"
                 " export or fetch it again"
@@ -85,7 +84,7 @@ class OnnxModel:
             return False
         try:
             self._session = self._open(source)
-        except Exception:  # onnxruntime's own
+        except Exception:
             return False
         return True
 
@@ -112,6 +111,32 @@ class OnnxModel:
                     f"{self.path}: output {info.name}: expected finite numbers, got NaN or infinity; replace the model"
                 )
         return list(outputs)
+
+
+def with_dynamic_size(path: Path) -> bytes | None:
+    """The model with dynamic height and width of its one image input (N, 3, H, W); None where that is impossible.
+
+    Exports fix both, although a convolutional network accepts any multiple of its stride.  The caller has to test the
+    model: constants in the graph may depend on the size.
+    """
+    try:
+        import onnx
+
+        model = onnx.load(path)
+    except Exception:
+        return None
+    inputs = model.graph.input
+    if len(inputs) != 1 or len(inputs[0].type.tensor_type.shape.dim) != 4:
+        return None
+    for axis, name in ((2, "height"), (3, "width")):
+        inputs[0].type.tensor_type.shape.dim[axis].dim_param = name
+    # Inferred shapes hold the fixed size.
+    del model.graph.value_info[:]
+    for output in model.graph.output:
+        for axis, dimension in enumerate(output.type.tensor_type.shape.dim):
+            if axis:
+                dimension.dim_param = f"{output.name}_{axis}"
+    return bytes(model.SerializeToString())
 
 
 def choose_providers(wanted: str, offered: list[str]) -> list[str]:

@@ -1,6 +1,5 @@
-"""2D pose: crop of a person, decoding of each layout."""
+"""2D pose: decoding of each layout, and the calibrated uncertainty of keypoints."""
 
-from drocap_ros.perception.pose.network_keypoints import NetworkKeypoints
-from drocap_ros.perception.pose.pose_model import PoseModel
+from drocap_ros.perception.pose.pose_model import NetworkKeypoints, PoseModel
 
 __all__ = ["NetworkKeypoints", "PoseModel"]

@@ -2,17 +2,36 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from drocap_ros.perception.models.preprocess import Normalizer
+from drocap_ros.perception.detection.decode import DECODERS
+from drocap_ros.perception.detection.nms import iou
+from drocap_ros.perception.models.network_input import Normalizer, crop_around, cut
 from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.perception.models.spec import ModelSpec
-from drocap_ros.perception.pose.crop import crop_around, cut
-from drocap_ros.perception.pose.heatmap import decode_heatmaps
-from drocap_ros.perception.pose.network_keypoints import NetworkKeypoints, Peaks
-from drocap_ros.perception.pose.regression import decode_movenet, decode_one_stage
-from drocap_ros.perception.pose.simcc import decode_simcc
+from drocap_ros.perception.pose.peaks import Peaks, certain_peaks, decode_heatmaps, decode_movenet, decode_simcc
 from drocap_ros.skeleton import JointSet, joint_set
+
+#: Least score of a person of a one-stage model, and least overlap with the box of the crop.
+_LEAST_SCORE = 0.05
+_LEAST_OVERLAP = 0.1
+
+
+class NetworkKeypoints(NamedTuple):
+    """Keypoints of one person in image px, before calibration; other fields as in :class:`.peaks.Peaks`.
+
+    skeleton : name of the joint set
+    box_size : px, longer side of the person's box, the unit of the calibration
+    """
+
+    skeleton: str
+    xy: np.ndarray
+    score: np.ndarray
+    spread: np.ndarray
+    second: np.ndarray
+    box_size: float
 
 
 class PoseModel:
@@ -37,13 +56,9 @@ class PoseModel:
         corners = np.asarray(box, np.float32).reshape(2, 2)
         in_crop = (corners - np.array(crop.centre, np.float32)) * crop.scale + np.array(crop.size) / 2
         peaks = self._decode(outputs, in_crop.reshape(4))
-        inverse = np.float32(1 / crop.scale)
-        candidates = peaks.candidates.copy()
-        candidates[..., :2] = crop.to_image(candidates[..., :2])
-        return NetworkKeypoints(
-            self.joints.name, crop.to_image(peaks.xy), peaks.score, peaks.spread * inverse**2, candidates,
-            float(max(box[2] - box[0], box[3] - box[1])),
-        )  # fmt: skip
+        spread = peaks.spread * np.float32(1 / crop.scale) ** 2
+        size = float(max(box[2] - box[0], box[3] - box[1]))
+        return NetworkKeypoints(self.joints.name, crop.to_image(peaks.xy), peaks.score, spread, peaks.second, size)
 
     def _decode(self, outputs: list[np.ndarray], box: np.ndarray) -> Peaks:
         size = self.spec.input_size
@@ -54,4 +69,13 @@ class PoseModel:
             return decode_simcc(outputs[0][0], outputs[1][0], size)
         if self.spec.layout == "movenet":
             return decode_movenet(outputs[0], size)
-        return decode_one_stage(outputs, self.spec, box, len(self.joints))
+        return self._one_stage(outputs, box)
+
+    def _one_stage(self, outputs: list[np.ndarray], box: np.ndarray) -> Peaks:
+        """The person in a one-stage model's output that overlaps ``box`` (4,) input px most; scores 0 without one."""
+        raw = DECODERS[self.spec.layout](outputs, self.spec, _LEAST_SCORE)
+        overlap = iou(raw.boxes.astype(np.float32), box[None].astype(np.float32))[:, 0]
+        worth = np.where(overlap >= _LEAST_OVERLAP, overlap * raw.scores, 0.0)
+        if raw.keypoints is None or not worth.any():
+            return certain_peaks(np.zeros((len(self.joints), 3), np.float32))
+        return certain_peaks(raw.keypoints[int(np.argmax(worth))])

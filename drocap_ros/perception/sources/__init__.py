@@ -1,6 +1,50 @@
 """Image sources: video files, image folders, cameras and network streams, behind one iterator."""
 
-from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
-from drocap_ros.perception.sources.open import open_source
+from __future__ import annotations
 
-__all__ = ["Frame", "ImageSource", "SourceEvent", "SourceEventKind", "open_source"]
+import re
+from pathlib import Path
+
+from drocap_ros.errors import InputError
+from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind, prefetch
+from drocap_ros.perception.sources.image_files import SUFFIXES, ImageFileSource
+from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+from drocap_ros.perception.sources.live_source import open_camera, open_stream
+from drocap_ros.perception.sources.video import VideoSource
+
+__all__ = ["Frame", "ImageSource", "SourceEvent", "SourceEventKind", "open_source", "prefetch"]
+
+_STREAM = re.compile(r"^(rtsps?|udp|rtp|rtmp|srt|tcp|https?)://", re.IGNORECASE)
+_CAMERA = re.compile(r"^/dev/video(\d+)$")
+
+
+def open_source(uri: str | Path, config: ImageIngestConfig | None = None) -> ImageSource:
+    """Source for a video file, an image, a folder of images, ``/dev/videoN``, or a stream's URL.
+
+    Parameters
+    ----------
+    uri : path or URL; ``file://`` is allowed
+    config : rates, camera mode and time-outs; ``config.source`` is ignored
+
+    Raises
+    ------
+    InputError
+        When the source cannot be opened.
+    """
+    config = config or ImageIngestConfig()
+    text = str(uri)
+    if camera := _CAMERA.match(text):
+        return open_camera(int(camera[1]), config)
+    if _STREAM.match(text):
+        return open_stream(text, config)
+    path = Path(text.removeprefix("file://"))
+    if not text or not path.exists():
+        raise InputError(
+            f"{text or 'source'}: expected a video file, image folder, /dev/videoN, rtsp:// or udp://; found no such"
+            " file; check the path"
+        )
+    if path.is_fifo() or path.suffix.lower() == ".sdp":
+        return open_stream(str(path), config)
+    if path.is_dir() or path.suffix.lower() in SUFFIXES:
+        return ImageFileSource(path, config.folder_rate_hz)
+    return VideoSource(path)

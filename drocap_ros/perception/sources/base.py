@@ -1,9 +1,11 @@
-"""Interface of all image sources."""
+"""Interface of all image sources, and their prefetching."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import Enum
@@ -83,3 +85,20 @@ class ImageSource(AbstractContextManager["ImageSource"]):
     def __exit__(self, *_: object) -> None:
         """Close on leaving the context."""
         self.close()
+
+
+def prefetch(frames: Iterable[Frame], ahead: int = 4) -> Generator[Frame, None, None]:
+    """The same frames in the same order, up to ``ahead`` of them decoded in advance.
+
+    An error of the source is raised in place of its frame.  Closing the generator stops the thread.
+    """
+    iterator = iter(frames)
+    pool = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
+    try:
+        pending = deque(pool.submit(next, iterator, None) for _ in range(ahead))
+        while (frame := pending.popleft().result()) is not None:
+            pending.append(pool.submit(next, iterator, None))
+            yield frame
+    finally:
+        # A file must not be closed during a read; the read of a live source ends only by its closing.
+        pool.shutdown(wait=not getattr(frames, "live", False), cancel_futures=True)

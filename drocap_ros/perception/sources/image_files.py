@@ -1,4 +1,4 @@
-"""Image files: one file, or a folder in the order of the names."""
+"""Image files: one file, or a folder in the order of the names; encoding as JPEG."""
 
 from __future__ import annotations
 
@@ -53,6 +53,16 @@ def read_image(path: Path) -> np.ndarray:
             f"{path}: expected an image (JPEG, PNG, TIFF, ...), found {data.size} bytes that do not decode; replace it"
         )
     return to_bgr(image)
+
+
+def encode_jpeg(image: np.ndarray, quality: int = 90) -> bytes:
+    """JPEG bytes of an image (H, W, 3) uint8 BGR; quality 1 to 100."""
+    import cv2
+
+    done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise InputError(f"image: expected (H, W, 3) uint8, got {image.dtype} {image.shape}")
+    return data.tobytes()
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

@@ -27,7 +27,10 @@ def quiet_ffmpeg() -> None:
     import cv2
 
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    if hasattr(cv2, "setLogLevel"):  # to OpenCV 4.6 (Ubuntu 24.04)
+        cv2.setLogLevel(0)
+    elif hasattr(cv2.utils, "logging"):
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
 #: OpenCV passes options to FFmpeg through one environment variable of the process.

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from tiny_models import write_model
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.detection.letterbox import letterbox
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient, suppress, without_parts
 from drocap_ros.perception.load_models import load_detector
+from drocap_ros.perception.models.network_input import letterbox
 from drocap_ros.perception.models.spec import grid_centres
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 
@@ -83,13 +83,16 @@ def rtmo() -> dict[str, np.ndarray]:
     return {"dets": np.array([[[*BOX, 0.85], [0, 0, 5, 5, 0.0]]], np.float32), "keypoints": points}
 
 
+#: Those in the second table need a YAML, which names the layout.
 LAYOUTS = {
     "rtmdet raw, one map a stride": ("a.onnx", rtmdet_maps(False), "rtmdet-maps"),
     "rtmdet raw, two maps a stride": ("a.onnx", rtmdet_maps(True), "rtmdet-maps"),
     "rtmdet with NMS": ("rtmdet-s.onnx", end_to_end(), "boxes-nms"),
     "yolox raw": ("a.onnx", yolox(False), "yolox-grid"),
-    "yolox decoded": ("a.onnx", yolox(True), "yolox-grid"),
     "yolox with NMS": ("my_yolox.onnx", end_to_end(), "boxes-nms"),
+}
+NAMED = {
+    "yolox decoded": ("a.onnx", yolox(True), "yolox-grid"),
     "yolo": ("a.onnx", yolov8(), "yolo"),
     "yolo with NMS": ("a.onnx", {"o": np.array([[[*BOX, 0.85, 0], [1, 1, 50, 50, 0.9, 3]]], np.float32)}, "yolo-nms"),
     "yolo-pose": ("a.onnx", yolo_pose(False), "yolo-pose"),
@@ -98,9 +101,11 @@ LAYOUTS = {
 }
 
 
-@pytest.mark.parametrize(("file", "outputs", "layout"), LAYOUTS.values(), ids=LAYOUTS)
-def test_layout_is_inferred_and_decoded(tmp_path, file, outputs, layout):
+@pytest.mark.parametrize(("file", "outputs", "layout"), (LAYOUTS | NAMED).values(), ids=LAYOUTS | NAMED)
+def test_layout_is_inferred_or_named_and_decoded(tmp_path, file, outputs, layout):
     write_model(tmp_path / file, (1, 3, SIZE[1], SIZE[0]), outputs)
+    if any(outputs is named for _, named, _ in NAMED.values()):
+        (tmp_path / file).with_suffix(".yaml").write_text(f"layout: {layout}\ndecoded: true\n")
     detector = load_detector(tmp_path, PoseEstimatorConfig())
     assert detector.spec.layout == layout
     found = detector.detect(IMAGE, None, 0.3)

@@ -8,9 +8,8 @@ from tiny_models import TensorProto, heatmaps, write_model
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.load_models import load_pose_model
-from drocap_ros.perception.pose.crop import crop_around, cut
-from drocap_ros.perception.pose.heatmap import decode_heatmaps
-from drocap_ros.perception.pose.simcc import decode_simcc
+from drocap_ros.perception.models.network_input import crop_around, cut
+from drocap_ros.perception.pose.peaks import decode_heatmaps, decode_simcc
 from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 
 IMAGE = np.zeros((400, 300, 3), np.uint8)
@@ -47,11 +46,12 @@ def test_spread_follows_width_and_direction():
     assert decode_heatmaps(tilted, (192, 256)).spread[0, 1] > 5
 
 
-def test_further_peaks_are_candidates():
+def test_second_peak_is_the_highest_other_one():
     two = heatmaps(1, 64, 48, np.array([[12.0, 20.0]]), 0.8)[0] + heatmaps(1, 64, 48, np.array([[36.0, 50.0]]), 0.5)[0]
-    candidates = decode_heatmaps(two, (192, 256)).candidates[0]
-    np.testing.assert_allclose(candidates[:2], [[48, 80, 0.8], [144, 200, 0.5]], atol=0.5)
-    assert np.isnan(candidates[2]).all()
+    peaks = decode_heatmaps(two, (192, 256))
+    np.testing.assert_allclose(peaks.xy[0], [48, 80], atol=0.5)
+    np.testing.assert_allclose([peaks.score[0], peaks.second[0]], [0.8, 0.5], atol=0.01)
+    assert decode_heatmaps(heatmaps(1, 64, 48, np.array([[12.0, 20.0]]))[0], (192, 256)).second[0] == 0
 
 
 def test_udp_cells_span_the_outer_pixels():
@@ -105,10 +105,8 @@ def test_last_of_stacked_heatmaps_is_used(tmp_path):
     np.testing.assert_allclose(model.estimate(IMAGE, BOX).xy, expected, atol=0.1)
 
 
-def test_h36m_joint_set_comes_from_name_or_yaml(tmp_path):
+def test_other_joint_set_of_17_comes_from_the_yaml(tmp_path):
     outputs, _ = heatmap_outputs(17)
-    write_model(tmp_path / "hrnet_h36m.onnx", (1, 3, 256, 192), outputs)
-    assert load(tmp_path).joints.name == "h36m17"
     write_model(tmp_path / "b.onnx", (1, 3, 256, 192), outputs)
     (tmp_path / "b.yaml").write_text("skeleton: h36m17\nudp: true\nsigma_scale: 0.8\n")
     model = load(tmp_path, pose_model="b")
@@ -144,6 +142,7 @@ def test_one_stage_model_gives_the_person_in_the_box(tmp_path):
     rows[0, 0] = [0, 0, 20, 20, 0.99, 0, *np.tile([5, 5, 0.9], 17)]  # another person
     rows[0, 1] = [*inside, 0.6, 0, *np.tile([100, 120, 0.8], 17)]
     write_model(tmp_path / "yolo11-pose.onnx", (1, 3, 256, 192), {"out": rows})
+    (tmp_path / "yolo11-pose.yaml").write_text("layout: yolo-pose-nms\n")
     keypoints = load(tmp_path).estimate(IMAGE, BOX)
     np.testing.assert_allclose(keypoints.xy, in_image(np.tile([100.0, 120.0], (17, 1))), atol=0.01)
     np.testing.assert_allclose(keypoints.score, 0.8, atol=1e-6)
@@ -177,7 +176,7 @@ def test_crop_samples_the_image_at_its_mapping(scale):
 
 def test_unknown_outputs_are_refused_with_the_layouts(tmp_path):
     write_model(tmp_path / "odd.onnx", (1, 3, 256, 192), {"embedding": np.zeros((1, 512), np.float32)})
-    with pytest.raises(InputError, match=r"found no layout|embedding \[1, 512\].*odd\.yaml"):
+    with pytest.raises(InputError, match=r"embedding \[1, 512\]; write its layout \(layout: one of .*odd\.yaml"):
         load(tmp_path, pose_model="odd")
 
 

@@ -9,9 +9,9 @@ import pytest
 from drocap_ros.errors import InputError
 from drocap_ros.perception.calibration import load_calibration
 from drocap_ros.perception.sources import Frame, SourceEventKind, open_source
+from drocap_ros.perception.sources.base import prefetch
 from drocap_ros.perception.sources.image_files import read_image
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
-from drocap_ros.perception.sources.prefetch import prefetch
 
 cv2 = pytest.importorskip("cv2")
 
@@ -45,6 +45,18 @@ def test_stamps_are_the_presentation_times(tmp_path):
     np.testing.assert_allclose([f.stamp_ns for f in frames], 1e8 * np.arange(12), atol=1000)
     assert frames[3].image.dtype == np.uint8
     assert frames[3].image.shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize("older", [True, False])
+def test_video_opens_with_each_way_of_opencv_to_be_silent(tmp_path, monkeypatch, older):
+    """To OpenCV 4.6 there is ``cv2.setLogLevel``, later ``cv2.utils.logging``, and perhaps neither one day."""
+    path, levels = write_video(tmp_path / "a.mp4"), []
+    monkeypatch.delattr(cv2.utils, "logging", raising=False)
+    if older:
+        monkeypatch.setattr(cv2, "setLogLevel", levels.append, raising=False)
+    with open_source(path) as source:
+        assert len(list(source)) == 12
+    assert levels == [0] * older
 
 
 def test_nominal_rate_does_not_replace_the_times(tmp_path):

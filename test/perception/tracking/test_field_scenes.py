@@ -60,10 +60,9 @@ class Script:
             joints = box[:2] + (box[2:] - box[:2]) * rng.random((15, 2))
         score = float(np.clip(1.2 * max(overlap) - 0.05, self.least, 0.95))
         count = len(joints)
-        candidates = np.full((count, 2, 3), np.nan, np.float32)
         return NetworkKeypoints(
             BODY_15.name, joints.astype(np.float32), np.full(count, score, np.float32),
-            np.zeros((count, 3), np.float32), candidates, float((box[2:] - box[:2]).max()),
+            np.zeros((count, 3), np.float32), np.zeros(count, np.float32), float((box[2:] - box[:2]).max()),
         )  # fmt: skip
 
     def apply(self, xy, covariance, confidence, box_size):

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drocap_ros.perception.pose.network_keypoints import NetworkKeypoints
+from drocap_ros.perception.pose.pose_model import NetworkKeypoints
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def calibrate(keypoints: NetworkKeypoints, layout: str, sigma_scale: float = 1.0
     variance = (np.interp(score, c.scores, c.sigmas) * keypoints.box_size) ** 2
     covariance = sigma_scale**2 * (c.spread_share * spread + variance[:, None] * np.array([1.0, 0.0, 1.0]))
     covariance += _FLOOR_PX**2 * np.array([1.0, 0.0, 1.0])
-    second_peak = np.clip(np.nan_to_num(keypoints.candidates[:, 1, 2].astype(float)), 0.0, None)
+    second_peak = keypoints.second.astype(float)
     width = np.sqrt((spread[:, 0] + spread[:, 2]) / 2) / max(keypoints.box_size, 1.0)
     logit = c.intercept + c.per_score * score + c.per_second_peak * second_peak + c.per_spread * 10.0 * width
     return covariance, 1.0 / (1.0 + np.exp(-np.clip(logit, -30, 30)))

@@ -3,17 +3,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drocap_ros.perception.pose.network_keypoints import NetworkKeypoints
-from drocap_ros.perception.uncertainty import CALIBRATIONS, calibrate
+from drocap_ros.perception.pose import NetworkKeypoints
+from drocap_ros.perception.pose.uncertainty import CALIBRATIONS, calibrate
 
 
 def keypoints(score, spread=0.0, second_peak=0.0, box=200.0) -> NetworkKeypoints:
     score = np.atleast_1d(np.asarray(score, np.float32))
     n = len(score)
-    candidates = np.full((n, 3, 3), np.nan, np.float32)
-    candidates[:, 1, 2] = second_peak
+    second = np.full(n, second_peak, np.float32)
     spreads = np.tile(np.float32([spread, 0, spread]), (n, 1))
-    return NetworkKeypoints("coco17", np.zeros((n, 2), np.float32), score, spreads, candidates, box)
+    return NetworkKeypoints("coco17", np.zeros((n, 2), np.float32), score, spreads, second, box)
 
 
 @pytest.mark.parametrize("layout", [*CALIBRATIONS, "yolo-pose"])
