@@ -163,6 +163,8 @@ def lockstep(
         for name in names:
             link = {"transport": transports[name]} if transports and name in transports else {}
             components.append(node_class(name)(config.section(name), **link, **place, parameter_overrides=overrides))
+        for component in components:
+            component.beside.update((other.component, other) for other in components)
         observer = Node("bringup", **place, parameter_overrides=overrides[:1])
         stack.callback(observer.destroy_node)
         graph = Lockstep(components, observer)

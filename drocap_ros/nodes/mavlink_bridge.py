@@ -39,7 +39,7 @@ from drocap_ros.ros.conversions import (
     vehicle_state_to_ros,
 )
 from drocap_ros.ros.diagnostics import Key, of
-from drocap_ros.ros.polled_service import PolledService
+from drocap_ros.ros.rclpy_internals import PolledService
 from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import RESULT_QOS, TFMessage
 from drocap_ros.srv import OrbitCommand

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import threading
 import time
 from collections import Counter
@@ -25,6 +24,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.parameters import Parameters
 from drocap_ros.ros.diagnostics import ERROR, HARDWARE_ID, OK, WARN, Key, Latency, of
 from drocap_ros.ros.parameters import declare_parameters
+from drocap_ros.ros.rclpy_internals import taking_info
 from drocap_ros.ros.topics import FROM_OUTSIDE, KEPT_QOS, RESULT_QOS, TOPICS, publishers_of, subscribers_of
 from drocap_ros.stamps import StampValidator
 
@@ -76,6 +76,8 @@ class ComponentNode(Node):
         peers = self.declare_parameter("graph_nodes", "").value
         #: All nodes of the graph; empty without a bringup.
         self.peers: list[str] = [name for name in peers.split(",") if name]
+        #: Nodes of the graph that one thread runs, by name: they read each other's parameters without a service.
+        self.beside: dict[str, ComponentNode] = {self.component: self}
         self.config: Any = declare_parameters(self, config or section_types()[self.component]())
         self.counters: Counter[str] = Counter()
         self._counting = threading.Lock()
@@ -155,7 +157,7 @@ class ComponentNode(Node):
         if qos is None:  # in simulated time no driver publishes, and every message counts
             qos = RESULT_QOS if topic == "camera_info" and self.simulated else TOPICS[topic].qos
         subscribe = partial(
-            self.create_subscription, TOPICS[topic].message, topic, _with_info(guarded) if with_info else guarded,
+            self.create_subscription, TOPICS[topic].message, topic, taking_info(guarded) if with_info else guarded,
             raw=raw,
         )  # fmt: skip
         events = events or SubscriptionEventCallbacks(use_default_callbacks=topic in FROM_OUTSIDE)
@@ -226,8 +228,11 @@ class ComponentNode(Node):
 
     def match(self) -> None:
         """Become ready if every peer is matched."""
-        if self.peers and not self._matched():
-            return
+        if not self.peers or self._matched():
+            self.become_ready()
+
+    def become_ready(self) -> None:
+        """Begin to work."""
         self._matching.cancel()
         self.ready, self._begin_s = True, self.now_s()
         self.details[Key.READY] = "true"
@@ -301,20 +306,6 @@ class ComponentNode(Node):
             )
         ]
         self._diagnostics.publish(message)
-
-
-def _with_info(callback: Callable[..., None]) -> Callable[..., None]:
-    """Callback of message and info for either executor: rclpy 7.1's EventsExecutor passes both as one tuple."""
-
-    def take(message: Any, info: Any = None) -> None:
-        callback(*(message if info is None else (message, info)))
-
-    # rclpy chooses the kind of callback by the number of its parameters.
-    kind = inspect.Parameter.POSITIONAL_ONLY
-    take.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [inspect.Parameter(name, kind) for name in ("message", "info")]
-    )
-    return take
 
 
 def _publishers(topic: str, nodes: list[str]) -> int:

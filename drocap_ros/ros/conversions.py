@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion
+from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_msgs.msg import Header
 
@@ -19,6 +21,7 @@ from drocap_ros.reconstruction.live.latest_place import PlacedPose
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.recording.pose_messages import float_array, observation_from_message
 from drocap_ros.skeleton import BODY_15, BODY_17, joint_set
+from drocap_ros.srv import OrbitCommand
 
 #: The world's frame: ENU, z up.
 MAP = "map"
@@ -203,6 +206,19 @@ def pose3d_from_ros(message: Pose3D) -> tuple[np.ndarray, np.ndarray]:
     count = len(joint_set(message.skeleton)) if message.track_id else 0
     joints = float_array(message.joints, (count, 3), "joints").astype(np.float64)
     return joints, float_array(message.confidence, (count,), "confidence").astype(np.float64)
+
+
+def orbit_request(
+    node: Node, command: int, radius_m: float = math.nan, height_m: float = math.nan, speed_deg_s: float = math.nan
+) -> OrbitCommand.Request:
+    """A command for ``mavlink_bridge``, stamped by the node's clock; NaN = the configured or present value."""
+    return OrbitCommand.Request(
+        stamp=node.get_clock().now().to_msg(),
+        command=command,
+        radius_m=radius_m,
+        height_m=height_m,
+        angular_speed_deg_s=speed_deg_s,
+    )
 
 
 def vehicle_state_to_ros(state: VehicleStateData) -> VehicleState:

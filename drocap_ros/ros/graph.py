@@ -215,6 +215,15 @@ class Graph:
         """Wait until the named sources have published everything."""
         self.wait_until(lambda: self.finished >= set(names), timeout_s, f"the end of {', '.join(names)}")
 
+    def wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Run the script's own callbacks until ``condition()`` holds; returns whether it does."""
+        end_s = time.monotonic() + timeout_s
+        while not (holds := condition()) and time.monotonic() <= end_s:
+            self.check()
+            self._executor.spin_once(timeout_sec=0.05)
+        self.check()
+        return holds
+
     def wait_until(self, condition: Callable[[], bool], timeout_s: float, what: str = "the condition") -> None:
         """Run the script's own callbacks until ``condition()`` holds.
 
@@ -223,13 +232,8 @@ class Graph:
         NodeError
             When that takes longer than ``timeout_s``, or a node failed meanwhile.
         """
-        end_s = time.monotonic() + timeout_s
-        while not condition():
-            self.check()
-            if time.monotonic() > end_s:
-                raise NodeError(f"waited {timeout_s:g} s for {what}; it did not come")
-            self._executor.spin_once(timeout_sec=0.05)
-        self.check()
+        if not self.wait(condition, timeout_s):
+            raise NodeError(f"waited {timeout_s:g} s for {what}; it did not come")
 
     def spin_for(self, seconds: float, stop: threading.Event | None = None) -> None:
         """Run the script's own callbacks for some time, or until ``stop`` is set; raises the error of a node.

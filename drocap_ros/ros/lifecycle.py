@@ -10,6 +10,7 @@ shuts down: its state is then ``finalized``.
 from __future__ import annotations
 
 import threading
+from functools import partial
 from typing import Any, ClassVar
 
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
@@ -17,6 +18,7 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 from drocap_ros.parameters import Parameters
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
 from drocap_ros.ros.diagnostics import Key
+from drocap_ros.ros.rclpy_internals import answer_impossible_transitions
 from drocap_ros.ros.topics import NODES
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -52,19 +54,7 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
         self._activates_itself = bool(self.declare_parameter("graph_running", False).value) or not self.peers
         if self._is_source:
             self.create_timer(0.1, self._shut_down_when_ended)
-        service = self._service_change_state
-        change = service.callback
-
-        def guarded(request: Any, response: Any) -> Any:
-            # A transition that the state does not allow is an error of the client, not of this node.
-            try:
-                return change(request, response)
-            except Exception as error:
-                self.report(WARN, f"transition {request.transition.label or request.transition.id}: {error}")
-                response.success = False
-                return response
-
-        service.callback = guarded
+        answer_impossible_transitions(self, partial(self.report, WARN))
 
     # -- what a subclass implements --------------------------------------------------------------------
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import gc
-import time
+import inspect
+import itertools
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
-from rclpy.clock import ClockType
+from rclpy.clock import ClockType, ROSClock
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
 from rclpy.time import Time
+from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
 from drocap_ros.errors import NodeError
@@ -23,18 +26,16 @@ from drocap_ros.ros.topics import NODES
 
 #: First instant of every simulated time, 2026-01-01.
 EPOCH_NS = 1_767_225_600 * 10**9
+#: Of the clock: half the period of the fastest timer of a node.
 STEP_S = 0.01
-#: Longest wait for bytes that the middleware carries within this process.
-_ARRIVAL_S = 20.0
-_SERVE_EVERY = 10  # steps
 
 
 class Lockstep:
     """Steps the clock of all nodes; each step ends when every timer that was due and every message is done.
 
-    Timers run in the order of the nodes; messages pass the middleware and are delivered in the order of their
-    publication, to their subscribers in the order of the nodes.  Neither order depends on the time that a callback
-    takes, so runs are equal.  ``/clock`` is published for viewers.
+    Timers run in the order of the nodes; messages are serialized and delivered in the order of their publication, to
+    their subscribers in the order of the nodes.  Neither order depends on the time that a callback takes, so runs are
+    equal.  The middleware carries the messages too, and ``/clock``, for viewers.
 
     Parameters
     ----------
@@ -46,10 +47,13 @@ class Lockstep:
         self.components, self.node = list(components), observer
         self.steps = 0
         self._nodes: list[Node] = [*components, observer]
-        self._published: deque[str] = deque()
-        self._subscribers: dict[str, list[Subscription]] = {}
+        self._published: deque[tuple[str, bytes, int]] = deque()  # topic, message, number of the message
+        self._subscriptions: dict[str, list[tuple[Subscription, bool]]] = {}  # and whether it takes the info
+        self._due_ns: dict[Timer, int] = {}
         self._clock = observer.create_publisher(Clock, "/clock", 10)
         self._set_clocks()
+        for timer in self._timers():
+            self._due_ns[timer] = EPOCH_NS
 
     @property
     def now_ns(self) -> int:
@@ -61,28 +65,18 @@ class Lockstep:
         """Simulated time since the start."""
         return self.steps * STEP_S
 
-    def start(self, timeout_s: float = 60.0) -> None:
-        """Match all endpoints, then activate the sources.
-
-        Raises
-        ------
-        NodeError
-            When the endpoints are not matched in time.
-        """
-        self.wait_for(self._all_ready, timeout_s, "the endpoints to be matched")
+    def start(self) -> None:
+        """Make all nodes ready, then activate the sources; messages count from then on."""
+        for component in self.components:
+            component.become_ready()
         for node in self._nodes:
             for subscription in node.subscriptions:
-                self._subscribers.setdefault(subscription.topic_name, []).append(subscription)
-        # What the nodes published before the start depends on the machine: nobody receives it.
+                entry = subscription, _takes_info(subscription.callback)
+                self._subscriptions.setdefault(subscription.topic_name, []).append(entry)
         for component in self.components:
-            component.flush()
-        for subscription in [s for found in self._subscribers.values() for s in found]:
-            while _taken(subscription) is not None:
-                pass
-        for component in self.components:
-            for name, publisher in component.outputs:
-                topic = component.resolve_topic_name(name)
-                publisher.publish = partial(self._publish, topic, publisher.publish)  # type: ignore[method-assign]
+            for _, publisher in component.outputs:
+                publish = partial(self._publish, publisher.topic_name, publisher.publish, itertools.count(1))
+                publisher.publish = publish  # type: ignore[method-assign]
         # Without this, the garbage collector visits all modules again and again.
         gc.collect()
         gc.freeze()
@@ -93,17 +87,15 @@ class Lockstep:
 
     def step(self) -> None:
         """Advance the clock by ``STEP_S``, and do all that is then to be done."""
+        for timer in self._timers():
+            self._due_ns.setdefault(timer, self.now_ns + timer.timer_period_ns)
         self.steps += 1
         self._set_clocks()
         self._clock.publish(Clock(clock=stamp_to_ros(self.now_ns)))
-        for node in self._nodes:
-            for timer in list(node.timers):
-                if timer.clock.clock_type == ClockType.ROS_TIME and timer.is_ready():
-                    timer.handle.call_timer()
-                    timer.callback()
-                    self._deliver()
-        if self.steps % _SERVE_EVERY == 0:
-            self.serve()
+        for timer in self._timers():
+            if self._is_due(timer):
+                timer.callback()
+                self._deliver()
 
     def run_until(self, condition: Callable[[], bool], limit_s: float, what: str) -> None:
         """Step until ``condition()`` holds.
@@ -130,64 +122,43 @@ class Lockstep:
             component.on_stop()
             self._deliver()
 
-    def serve(self) -> None:
-        """Answer the requests to services, such as for parameters, and take the answers that have arrived."""
-        services: list[Any] = [service for node in self._nodes for service in node.services]
-        for service in services:
-            request, header = service.handle.service_take_request(service.srv_type.Request)
-            if header is not None:
-                service.send_response(service.callback(request, service.srv_type.Response()), header)
-        clients: list[Any] = [client for node in self._nodes for client in node.clients]
-        for client in clients:
-            header, response = client.handle.take_response(client.srv_type.Response)
-            if header is not None:
-                client.get_pending_request(header.request_id.sequence_number).set_result(response)
+    def _timers(self) -> Iterator[Timer]:
+        """Timers of the simulated time, in the order of the nodes."""
+        for node in self._nodes:
+            yield from [timer for timer in node.timers if timer.clock.clock_type == ClockType.ROS_TIME]
 
-    def wait_for(self, arrived: Callable[[], bool], timeout_s: float = _ARRIVAL_S, what: str = "a message") -> None:
-        """Wait for the middleware; the simulated time stands still.
-
-        Raises
-        ------
-        NodeError
-            When that takes too long.
-        """
-        end_s = time.monotonic() + timeout_s
-        while not arrived():
-            if time.monotonic() > end_s:
-                raise NodeError(f"waited {timeout_s:g} s for {what}; it did not come")
-            time.sleep(0.0005)
-
-    def _all_ready(self) -> bool:
-        for component in self.components:
-            if not component.ready:
-                component.match()
-        return all(component.ready for component in self.components)
+    def _is_due(self, timer: Timer) -> bool:
+        """Whether a timer has to run now; instants that it missed are left out."""
+        now_ns, period_ns = self.now_ns, timer.timer_period_ns
+        due_ns = self._due_ns.setdefault(timer, now_ns + period_ns)
+        if due_ns > now_ns or timer.is_canceled():
+            return False
+        self._due_ns[timer] = due_ns + period_ns * max(1, -(-(now_ns - due_ns) // period_ns))
+        return True
 
     def _set_clocks(self) -> None:
         now = Time(nanoseconds=self.now_ns, clock_type=ClockType.ROS_TIME)
         for node in self._nodes:
-            node.get_clock().set_ros_time_override(now)  # type: ignore[attr-defined]
+            cast(ROSClock, node.get_clock()).set_ros_time_override(now)
 
-    def _publish(self, topic: str, publish: Callable[[Any], None], message: Any) -> None:
+    def _publish(self, topic: str, publish: Callable[[Any], None], numbers: Iterator[int], message: Any) -> None:
         publish(message)
-        self._published.append(topic)
+        self._published.append((topic, serialize_message(message), next(numbers)))
 
     def _deliver(self) -> None:
         while self._published:
-            topic = self._published.popleft()
-            for subscription in self._subscribers.get(topic, ()):
-                taken: list[Any] = []
-
-                def arrived(subscription: Subscription = subscription, taken: list[Any] = taken) -> bool:
-                    taken[:] = [_taken(subscription)]
-                    return taken[0] is not None
-
-                self.wait_for(arrived, what=f"a message on {topic}")
-                alone = subscription._callback_type is Subscription.CallbackType.MessageOnly
-                subscription.callback(*(taken[0][:1] if alone else taken[0]))
+            topic, data, number = self._published.popleft()
+            now_ns = self.now_ns
+            info = {"publication_sequence_number": number, "source_timestamp": now_ns, "received_timestamp": now_ns}
+            for subscription, takes_info in self._subscriptions.get(topic, ()):
+                message = data if subscription.raw else deserialize_message(data, subscription.msg_type)
+                subscription.callback(*((message, info) if takes_info else (message,)))
 
 
-def _taken(subscription: Subscription) -> tuple[Any, Any] | None:
-    """The next message with its info, or None."""
-    found: tuple[Any, Any] | None = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-    return found
+def _takes_info(callback: Callable[..., None]) -> bool:
+    """Whether a callback takes the message's info too, by rclpy's rule: its number of parameters."""
+    try:
+        inspect.signature(callback).bind(None)
+    except TypeError:
+        return True
+    return False

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -17,6 +17,10 @@ from rclpy.task import Future
 from drocap_ros.config import section_types
 from drocap_ros.errors import ParameterError
 from drocap_ros.parameters import Parameters
+from drocap_ros.ros.rclpy_internals import overridden_parameters
+
+if TYPE_CHECKING:
+    from drocap_ros.ros.component import ComponentNode
 
 P = TypeVar("P", bound=Parameters)
 
@@ -33,7 +37,7 @@ def declare_parameters(node: Node, defaults: P) -> P:
         When an override is unknown, has the wrong type or lies outside its range.
     """
     known = {*_DECLARED_LATER, *(spec.name for spec in dataclasses.fields(defaults))}
-    for name in sorted(node._parameter_overrides.keys() - known):  # ROS ignores unknown ones
+    for name in sorted(set(overridden_parameters(node)) - known):  # ROS ignores unknown ones
         if not node.has_parameter(name) and not name.startswith("qos_overrides."):
             type(defaults).from_mapping({name: None}, node.get_name())
     values = {}
@@ -82,10 +86,11 @@ def _descriptor(spec: dataclasses.Field, default: object) -> ParameterDescriptor
 class ParameterSurvey:
     """Requests the parameters of every component of the graph in the background.
 
+    node : the node that asks; those ``beside`` it are read without a service
     done : called with all parameters so far, by node, whenever a node has answered
     """
 
-    def __init__(self, node: Node, done: Callable[[dict[str, dict[str, Any]]], None]) -> None:
+    def __init__(self, node: ComponentNode, done: Callable[[dict[str, dict[str, Any]]], None]) -> None:
         self._node = node
         self._done = done
         self._types = section_types()
@@ -95,15 +100,15 @@ class ParameterSurvey:
 
     def ask_new_nodes(self) -> None:
         """Ask the nodes that appeared since the last call; returns at once."""
+        for name, near in self._node.beside.items():
+            if name not in self._asked:
+                self._asked.add(name)
+                self._take(name, {key: near.get_parameter(key).value for key in self._names(name)})
         for name, namespace in self._node.get_node_names_and_namespaces():
             if namespace == self._node.get_namespace() and name in self._types and name not in self._asked:
                 self._ask(name, f"{namespace.rstrip('/')}/{name}")
 
     def _ask(self, name: str, full_name: str) -> None:
-        if name == self._node.get_name():
-            self._asked.add(name)
-            self._take(name, {p: self._node.get_parameter(p).value for p in self._names(name)})
-            return
         client = self._clients.setdefault(name, AsyncParameterClient(self._node, full_name))
         if not client.services_are_ready():
             return

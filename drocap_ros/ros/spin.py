@@ -16,13 +16,13 @@ from functools import partial
 
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException
-from rclpy.experimental import EventsExecutor
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from drocap_ros.errors import DrocapError, InputError
 from drocap_ros.ros.component import ComponentNode
 from drocap_ros.ros.parameters import parameter_help
+from drocap_ros.ros.rclpy_internals import node_executor
 from drocap_ros.ros.topics import NODES
 
 #: After the order to stop, messages that have arrived are still processed, for this long at most.
@@ -110,7 +110,7 @@ def node_main(node_class: type[ComponentNode]) -> int:
     stop = threading.Event()
     _stop_on_signal(stop)
     rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
-    executor = EventsExecutor()
+    executor = node_executor()
     # Again: the executor has replaced the handlers by its own, which shut the context down before the node has stopped.
     _stop_on_signal(stop)
     try:

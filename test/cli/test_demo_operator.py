@@ -2,7 +2,7 @@
 
 import pytest
 
-from drocap_ros.cli.demo.desk import check_flown
+from drocap_ros.cli.demo.flight import check_flown
 from drocap_ros.cli.demo.operator import READY_TIMEOUT_S, Operator, Phase
 from drocap_ros.errors import NodeError
 from drocap_ros.flight.conditions import ConditionCode, condition

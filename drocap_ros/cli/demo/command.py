@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import threading
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,7 +58,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 def run(args: argparse.Namespace) -> int:
     """Fly, record, reconstruct, compare."""
     from drocap_ros.cli.atomic_output import check_output_folder, output_folder
-    from drocap_ros.cli.demo.desk import check_flown
+    from drocap_ros.cli.demo.flight import check_flown, fly_in_real_time, fly_in_simulated_time
     from drocap_ros.cli.demo.operator import Operator
     from drocap_ros.cli.demo.verdict import judge_flight
     from drocap_ros.cli.reconstruct import summary
@@ -76,9 +74,10 @@ def run(args: argparse.Namespace) -> int:
     operator = Operator(args.seconds, requests_control=args.autopilot == "px4")
     with interruptible() as interrupted, output_folder(args.out) as folder:
         config = demo_config(folder, args.seed, args.autopilot, args.models, args.mount)
+        fly = fly_in_simulated_time
         if args.real_time:
-            config = with_link(config)
-        how = _fly(config, operator, args, interrupted)
+            config, fly = with_link(config), fly_in_real_time
+        how = fly(config, operator, _silent if args.quiet else _say, interrupted)
         check_flown(operator)
         truth = load_flight_truth(folder / "truth.npz")
         with open_session(folder / "session") as session:
@@ -101,23 +100,12 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _fly(config: DrocapConfig, operator: Operator, args: argparse.Namespace, interrupted: threading.Event) -> str:
-    """Fly; returns a sentence about the machine."""
-    begin = time.monotonic()
+def _say(seconds: float, text: str) -> None:
+    print(f"{seconds:6.1f} s  {text}", flush=True)
 
-    def say(seconds: float, text: str) -> None:
-        if not args.quiet:
-            print(f"{seconds:6.1f} s  {text}", flush=True)
 
-    if args.real_time:
-        from drocap_ros.cli.demo.real_time import fly_in_real_time
-
-        load = fly_in_real_time(config, operator, lambda text: say(time.monotonic() - begin, text), interrupted)
-        return "processor: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in load.items())
-    from drocap_ros.cli.demo.simulated_time import fly_in_simulated_time
-
-    flown_s = fly_in_simulated_time(config, operator, say, interrupted)
-    return f"simulated time: {flown_s:.1f} s in {time.monotonic() - begin:.1f} s on this machine"
+def _silent(_seconds: float, _text: str) -> None:
+    pass
 
 
 def demo_config(folder: Path, seed: int, autopilot: str, models: str, mount: str = "gimbal") -> DrocapConfig:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
+import time
 from typing import Any
 
 from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
+from drocap_ros.cli.graph.live import import_bringup
 from drocap_ros.cli.options import ros_namespace
 from drocap_ros.errors import InputError
 
@@ -40,28 +42,32 @@ def run(args: argparse.Namespace) -> int:
     """Send the command and print the answer."""
     domain_id = chosen_domain(args)
     _check_options(args)
-    try:
-        from drocap_ros.ros.orbit_client import orbit_client
-    except ImportError as error:
-        raise InputError(f"expected ROS 2 with drocap_ros's messages, found none ({error}); run `make setup`") from None
+    bringup = import_bringup()
     from drocap_ros.flight.orbit.states import Command
+    from drocap_ros.msg import OrbitStatus
+    from drocap_ros.ros.conversions import orbit_request
+    from drocap_ros.ros.topics import RESULT_QOS
+    from drocap_ros.srv import OrbitCommand
 
     no_graph = InputError(
         f"orbit: expected a running graph with mavlink_bridge in {args.namespace}, domain {domain_id}, "
         f"found none within {args.timeout:g} s; start `drocap live` first"
     )
-    with orbit_client(args.namespace, domain_id, args.timeout) as (client, wait):
+    end_s = time.monotonic() + args.timeout
+    with bringup.watch(args.namespace, domain_id) as graph:
         if args.action == "status":
-            client.subscribe()
-            if not wait(lambda: bool(client.statuses)):
+            statuses: list[Any] = []
+            graph.node.create_subscription(OrbitStatus, "orbit/status", statuses.append, RESULT_QOS)
+            if not graph.wait(lambda: bool(statuses), end_s - time.monotonic()):
                 raise no_graph
-            print(_sentence(client.statuses[-1]))
+            print(_sentence(statuses[-1]))
             return 0
-        if not wait(lambda: client.is_ready):
+        client = graph.node.create_client(OrbitCommand, "orbit/command", qos_profile=RESULT_QOS)
+        if not graph.wait(client.service_is_ready, end_s - time.monotonic()):
             raise no_graph
         values = (math.nan if value is None else value for value in (args.radius, args.height, args.speed))
-        answer = client.send(int(Command[args.action.upper()]), *values)
-        if not wait(answer.done):
+        answer = client.call_async(orbit_request(graph.node, int(Command[args.action.upper()]), *values))
+        if not graph.wait(answer.done, end_s - time.monotonic()):
             raise InputError(
                 f"orbit: expected an answer to {args.action} within {args.timeout:g} s, found none; "
                 "check by `drocap orbit status` whether it was executed"

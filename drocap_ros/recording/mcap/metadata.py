@@ -1,4 +1,4 @@
-"""``metadata.yaml`` of a rosbag2 folder: reading, and writing of version 9 (ROS 2 Jazzy)."""
+"""``metadata.yaml`` of a rosbag2 folder: reading, and writing of version 9 (since ROS 2 Jazzy)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from drocap_ros.recording.mcap.schemas import ROS_DISTRIBUTION
 
 METADATA_FILE = "metadata.yaml"
 #: Name of the metadata records that this package writes into MCAP files.
@@ -100,7 +102,7 @@ def bag_metadata(files: list[FileRecord], topics: list[TopicRecord], custom: dic
             "relative_file_paths": [f.name for f in files],
             "files": [{"path": f.name, **_time(f.start_ns, f.end_ns), "message_count": f.messages} for f in files],
             "custom_data": custom or None,
-            "ros_distro": "jazzy",
+            "ros_distro": ROS_DISTRIBUTION,
         }
     }
 

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 PACKAGE = "drocap_ros"
+#: The ROS distribution whose message definitions a session holds; its packages are those of ``requirements.in``.
+ROS_DISTRIBUTION = "jazzy"
 _SEPARATOR = "=" * 80 + "\n"
 
 
@@ -40,10 +42,10 @@ def own_definitions() -> dict[str, str]:
 
 @lru_cache(maxsize=1)
 def standard_types() -> Typestore:
-    """ROS 2 Jazzy's message types and this package's."""
+    """Message types of the ROS distribution and this package's."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    store = get_typestore(Stores.ROS2_JAZZY)
+    store = get_typestore(Stores[f"ROS2_{ROS_DISTRIBUTION.upper()}"])
     types = {}
     for name, text in own_definitions().items():
         types.update(get_types_from_msg(text, name))
@@ -64,8 +66,8 @@ def schema_text(type_name: str) -> str:
         text, _ = standard_types().generate_msgdef(type_name, ros_version=2)
     except Exception as error:  # noqa: BLE001  # rosbags passes on any error of its types
         raise InputError(
-            f"message type: expected one of drocap_ros or of ROS 2 Jazzy, got {type_name!r} ({error}); "
-            "register it with its schema text"
+            f"message type: expected one of drocap_ros or of ROS 2 {ROS_DISTRIBUTION.capitalize()}, got {type_name!r}"
+            f" ({error}); register it with its schema text"
         ) from None
     # The generated text has no comments, which give the units; the package's own files replace it.
     own = own_definitions()
