@@ -1,4 +1,4 @@
-"""The graph in two tables: topics with types and quality of service, nodes with topics and priorities."""
+"""The graph in tables: topics with types and quality of service, services, nodes with topics and priorities."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, RegionOfInterest
 from visualization_msgs.msg import ImageMarker, MarkerArray
 
 from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleState
+from drocap_ros.srv import OrbitCommand
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -69,6 +70,8 @@ TOPICS: dict[str, Topic] = {
 FROM_OUTSIDE = frozenset({"image/compressed", "camera_info", "roi", "vehicle/state"})
 if TFMessage is not None:
     TOPICS["/tf"] = Topic(TFMessage, RESULT_QOS)
+
+SERVICES: dict[str, type] = {"orbit/command": OrbitCommand}
 
 _TF = ("/tf",) if TFMessage is not None else ()
 

@@ -65,11 +65,10 @@ def fly_in_real_time(config: DrocapConfig, operator: Operator, say: Say, interru
 
     Arguments, result and errors are those of :func:`fly_in_simulated_time`.
     """
-    from drocap_ros.ros.topics import RESULT_QOS
-    from drocap_ros.srv import OrbitCommand
+    from drocap_ros.ros.topics import RESULT_QOS, SERVICES
 
     with import_bringup().bringup(config, NODES, processes=True) as graph:
-        client = graph.node.create_client(OrbitCommand, "orbit/command", qos_profile=RESULT_QOS)
+        client = graph.node.create_client(SERVICES["orbit/command"], "orbit/command", qos_profile=RESULT_QOS)
         begin_s = time.monotonic()
         _Desk(graph.node, operator, client.call_async, say, lambda: time.monotonic() - begin_s)
         before = {name: _processor_s(graph.pid(name)) for name in NODES}

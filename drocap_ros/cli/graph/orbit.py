@@ -44,10 +44,8 @@ def run(args: argparse.Namespace) -> int:
     _check_options(args)
     bringup = import_bringup()
     from drocap_ros.flight.orbit.states import Command
-    from drocap_ros.msg import OrbitStatus
     from drocap_ros.ros.conversions import orbit_request
-    from drocap_ros.ros.topics import RESULT_QOS
-    from drocap_ros.srv import OrbitCommand
+    from drocap_ros.ros.topics import RESULT_QOS, SERVICES, TOPICS
 
     no_graph = InputError(
         f"orbit: expected a running graph with mavlink_bridge in {args.namespace}, domain {domain_id}, "
@@ -57,12 +55,12 @@ def run(args: argparse.Namespace) -> int:
     with bringup.watch(args.namespace, domain_id) as graph:
         if args.action == "status":
             statuses: list[Any] = []
-            graph.node.create_subscription(OrbitStatus, "orbit/status", statuses.append, RESULT_QOS)
+            graph.node.create_subscription(TOPICS["orbit/status"].message, "orbit/status", statuses.append, RESULT_QOS)
             if not graph.wait(lambda: bool(statuses), end_s - time.monotonic()):
                 raise no_graph
             print(_sentence(statuses[-1]))
             return 0
-        client = graph.node.create_client(OrbitCommand, "orbit/command", qos_profile=RESULT_QOS)
+        client = graph.node.create_client(SERVICES["orbit/command"], "orbit/command", qos_profile=RESULT_QOS)
         if not graph.wait(client.service_is_ready, end_s - time.monotonic()):
             raise no_graph
         values = (math.nan if value is None else value for value in (args.radius, args.height, args.speed))
