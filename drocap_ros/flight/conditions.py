@@ -169,7 +169,7 @@ _SENTENCES = {
     "{limit_s:g} on the autopilot, or change max_control_timeout_s",
     _C.TIMEOUT_TOO_LONG: "the autopilot flies on for {value_s:g} s without setpoints; set {name} to {limit_s:g} on the "
     "autopilot, or change max_control_timeout_s",
-    _C.LOSS_ACTION_FATAL: "without setpoints {consequence} ({name} is {value:g}); set {name} to 5, hold, on the "
+    _C.LOSS_ACTION_FATAL: "without setpoints {consequence} ({name} is {value:g}); set {name} to {hold:g}, hold, on the "
     "autopilot",
     _C.MODE_OUTDATED: "the flight mode is outdated; last report: {ago}",
     _C.ATTITUDE_OUTDATED: "the vehicle's attitude is outdated; last one: {ago}",

@@ -19,7 +19,7 @@ class VehicleState:
     """State of the vehicle as its autopilot reports it; the fields of ``msg/VehicleState.msg``.
 
     stamp_ns : our clock's time of the attitude
-    autopilot : "ardupilot", "px4" or "other"
+    autopilot : name of an :class:`Autopilot`, or "other"
     mode : flight mode by the autopilot's own name
     landed_state : MAV_LANDED_STATE
     position_enu_m, velocity_enu_m_s : (3,) at ``stamp_ns``; origin = that of the autopilot's local frame

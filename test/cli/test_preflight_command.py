@@ -19,9 +19,9 @@ from drocap_ros.cli import main
 from drocap_ros.cli.graph.running_bridge import BridgeListener
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.findings import Level
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.preflight.checks import all_findings
-from drocap_ros.flight.preflight.findings import Level
 from drocap_ros.flight.preflight.link_checks import link_findings
 from drocap_ros.flight.preflight.setup_checks import Setup
 from drocap_ros.ros.diagnostics import Key

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drocap_ros.cli.progress import Progress
+from drocap_ros.flight.autopilot import AUTOPILOTS, autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode
 from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
 from drocap_ros.flight.orbit.states import State
-from drocap_ros.flight.preflight.findings import Measured, Stream
-from drocap_ros.flight.preflight.measure import MORE_SETTINGS
+from drocap_ros.flight.preflight.measured import Measured, Stream
 from drocap_ros.flight.vehicle_state import VehicleState
 
 if TYPE_CHECKING:
@@ -99,8 +99,8 @@ class BridgeListener:
                 0, **{name: getattr(message, name) for name in _STATE_FIELDS},
                 gimbal_orientation_xyzw=np.array([q.x, q.y, q.z, q.w]),
             )  # fmt: skip
-            requests.set_autopilot(vehicle.autopilot)
-        known = {name for names in MORE_SETTINGS.values() for name in names} | {"GUID_TIMEOUT", "COM_OF_LOSS_T"}
+            requests.set_autopilot(autopilot_of(vehicle.autopilot))
+        known = {name for autopilot in AUTOPILOTS.values() for name in autopilot.preflight_names}
         streams = {
             name: Stream(number(self.values[of(Key.STREAM_RATE, name)]), wanted)
             for name, (_, wanted) in requests.rates_hz(0).items()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -70,7 +69,7 @@ class CommandQueue:
     def acknowledge(self, command: int, result: int, now_s: float) -> None:
         """Take an acknowledgement.
 
-        PX4 answers DO_SET_MODE twice: accepted at once, and then in earnest.  A refusal that follows counts.
+        Some autopilots answer DO_SET_MODE twice: accepted at once, and then in earnest.  A refusal that follows counts.
         """
         pending = self._pending.get(command)
         if pending is None or pending.tries == 0:
@@ -108,10 +107,3 @@ class CommandQueue:
             return ""
         words = _RESULTS.get(pending.result, f"answered with result {pending.result}")
         return f"{pending.label}: {words}"
-
-
-def command_message(
-    mav: Any, target: tuple[int, int], command: int, confirmation: int, parameters: tuple[float, ...]
-) -> Any:
-    """COMMAND_LONG of a command."""
-    return mav.command_long_encode(*target, command, confirmation, *parameters)

@@ -1,8 +1,8 @@
 """CURRENT_MODE (message 436), which pymavlink 2.4.50 does not have: the present and the intended mode.
 
-PX4 refuses an interval for HEARTBEAT and grants one for this message, which it sends twice a second and after every
-change: a mode of the pilot is seen after one interval, not after the second between two heartbeats.  Registered with
-pymavlink, it is decoded like any other message: checksum, truncated zeros and signature included.
+An autopilot that refuses an interval for HEARTBEAT may grant one for this message, which it sends twice a second and
+after every change: a mode of the pilot is seen after one interval, not after the second between two heartbeats.
+Registered with pymavlink, it is decoded like any other message: checksum, truncated zeros and signature included.
 Source: MAVLink's common.xml, https://mavlink.io/en/messages/common.html#CURRENT_MODE.
 """
 

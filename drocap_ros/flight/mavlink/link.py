@@ -1,7 +1,7 @@
 """The one owner of the connection to the autopilot.
 
 It reads and requests telemetry, sends a heartbeat and synchronizes the clocks.  Only messages of the allow-list
-(``allowed_messages.py``) leave the port.
+(``messages.py``) leave the port.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import InputError
+from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
-from drocap_ros.flight.mavlink.allowed_messages import TELEMETRY_COMMANDS, is_motion, is_telemetry
-from drocap_ros.flight.mavlink.autopilot_settings import AutopilotSettings
 from drocap_ros.flight.mavlink.link_status import LinkStatus
+from drocap_ros.flight.mavlink.messages import TELEMETRY_COMMANDS, is_motion, is_telemetry
 from drocap_ros.flight.mavlink.mount import Mount
 from drocap_ros.flight.mavlink.parser import MavlinkParser
+from drocap_ros.flight.mavlink.settings import AutopilotSettings
 from drocap_ros.flight.mavlink.signing import read_signing_key, sign_with, signing_time
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
 from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
@@ -78,7 +79,7 @@ class MavlinkLink:
         if key is not None:
             sign_with(self._mav, key, clock_ns())
             sign_with(self._watchdog_mav, key, clock_ns(), link_id=1)
-        self._autopilot = ""  # "" = none is heard yet
+        self._autopilot: Autopilot | None = None  # None = none is heard yet
         self._heard_s: float | None = None  # monotonic
         self._due: dict[str, float] = {}
         self._sync_sent: dict[int, float] = {}  # monotonic s by our stamp, ns
@@ -254,10 +255,11 @@ class MavlinkLink:
             return state
         self._heard_s = self._monotonic_s()
         self._transport.accept_peer()
-        if (kind := self.estimator.modes.autopilot) != self._autopilot:  # the first one, or another on the same link
+        kind = self.estimator.modes.autopilot
+        if kind is not None and kind is not self._autopilot:  # the first one, or another on the same link
             if self._autopilot:  # nothing that the other one sent, refused or said of its mount is true of this one
                 self._requests = TelemetryRequests(self.config)
-                self.estimator.mount.take_type(math.nan)
+                self.estimator.mount.servos = None
             self._autopilot = kind
             self._requests.set_autopilot(kind)
             self.settings.set_autopilot(kind)
@@ -291,7 +293,7 @@ class MavlinkLink:
                     mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE
                 )
             )
-        if not self._autopilot:
+        if self._autopilot is None:
             return
         now_ns = self._clock_ns()
         if self._is_due("time_sync", 1.0 / config.time_sync_hz):

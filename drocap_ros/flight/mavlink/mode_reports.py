@@ -6,8 +6,9 @@ import math
 from collections import deque
 from typing import Any
 
+from drocap_ros.flight.autopilot import Autopilot, autopilot_by_heartbeat
+
 _NS = 1_000_000_000
-_AUTOPILOTS = {3: "ardupilot", 12: "px4"}
 _MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, _MAV_MODE_FLAG_SAFETY_ARMED = 1, 128
 #: Packets; farther back a sequence number counts as the beginning of a new sequence.
 _MAX_LATE = 32
@@ -43,10 +44,10 @@ class PacketOrder:
 class ModeReports:
     """The mode of one vehicle.
 
-    autopilot : "ardupilot", "px4" or "other"; "" before the first heartbeat
+    autopilot : None before the first heartbeat
     mode : by the newest report, the autopilot's own name; "" before the first
     intended : the mode that the pilot or a command has chosen last, as CURRENT_MODE reported it together with the
-        present mode; "" = unknown.  PX4 keeps it where a failsafe enters another mode.
+        present mode; "" = unknown.  An autopilot may keep it where a failsafe enters another mode.
     vehicle_type : MAV_TYPE, by the last heartbeat
     armed : by the last heartbeat
     system_status : MAV_STATE, by the last heartbeat; 0 = unknown
@@ -54,7 +55,8 @@ class ModeReports:
     """
 
     def __init__(self) -> None:
-        self.autopilot = self.mode = self.intended = ""
+        self.autopilot: Autopilot | None = None
+        self.mode = self.intended = ""
         self.vehicle_type = self.system_status = 0
         self.armed = False
         self.received_ns: int | None = None
@@ -66,7 +68,7 @@ class ModeReports:
     def take_heartbeat(self, message: Any, late: bool, now_ns: int) -> None:
         """Take a HEARTBEAT; ``late``: it was sent before a packet that has already arrived."""
         self._heartbeat = message
-        self.autopilot, self.vehicle_type = _AUTOPILOTS.get(message.autopilot, "other"), int(message.type)
+        self.autopilot, self.vehicle_type = autopilot_by_heartbeat(message.autopilot), int(message.type)
         if not late:
             self.armed = bool(message.base_mode & _MAV_MODE_FLAG_SAFETY_ARMED)
             self.system_status = int(message.system_status)
@@ -124,7 +126,8 @@ class _Numbered:
 
 
 def _mode_name(heartbeat: Any) -> str:
-    """Flight mode by the autopilot's own name, or its number where pymavlink knows none."""
+    """Flight mode by the autopilot's own name, or its number where neither its table nor pymavlink knows one."""
     from pymavlink import mavutil
 
-    return str(mavutil.mode_string_v10(heartbeat))
+    name = autopilot_by_heartbeat(heartbeat.autopilot).mode_name(heartbeat.custom_mode)
+    return name or str(mavutil.mode_string_v10(heartbeat))

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.frames import orientation_to_ros, quaternion_from_euler, quaternion_multiply, yaw_of
 from drocap_ros.geometry.rotations import slerp, unit_quaternions
@@ -18,10 +19,6 @@ _NS = 1_000_000_000
 #: Kinds of mount: "auto" = as the autopilot describes it; "gimbal" = stabilized, its angles are against the horizon;
 #: "servo" = its angles are against the body; "fixed" = no mount, the camera has one pitch against the body.
 KINDS = ("auto", "gimbal", "servo", "fixed")
-#: ArduPilot's parameter for the kind of its first mount; 1 reports the commands of its servos, against the body, under
-#: the flags of angles against the horizon.
-TYPE_PARAMETER = "MNT1_TYPE"
-SERVOS = 1
 
 _YAW_IN_VEHICLE_FRAME, _YAW_IN_EARTH_FRAME, _YAW_LOCK = 32, 64, 16
 _STALE_S = {"gimbal": 3.0, "servo": 0.5}  # the angles of servos follow the body's lean
@@ -43,8 +40,9 @@ class Mount:
     def __init__(self, kind: str = "auto", pitch_deg: float = 0.0) -> None:
         self._kind = kind
         self._fixed = quaternion_from_euler(0.0, math.radians(pitch_deg), 0.0)
-        #: ``MNT1_TYPE`` of the autopilot; NaN = not reported.
-        self.type_number = math.nan
+        #: Whether it is servos by the autopilot's parameter; None = not reported.  Servos report their commands,
+        #: against the body, under the flags of angles against the horizon.
+        self.servos: bool | None = None
         self._latest: _Angles | None = None
         self._before: _Angles | None = None
         self._knows = True  # whether its last message had angles
@@ -54,7 +52,7 @@ class Mount:
         """One of "gimbal", "servo" and "fixed"; "" = no mount has reported its angles."""
         if self._kind != "auto":
             return self._kind
-        if self.type_number == SERVOS:
+        if self.servos:
             return "servo"
         return "" if self._latest is None else "gimbal"
 
@@ -70,22 +68,18 @@ class Mount:
         if angles is not None:
             self._before, self._latest = self._latest, _Angles(now_ns, *angles)
 
-    def take_type(self, number: float) -> None:
-        """Take the value of ``MNT1_TYPE``."""
-        self.type_number = number
-
     def age_s(self, now_ns: int) -> float:
         """Time in s since the mount's last message, infinity before the first; 0 for a fixed camera."""
         if self.kind == "fixed":
             return 0.0
         return math.inf if self._latest is None else (now_ns - self._latest.received_ns) / _NS
 
-    def problem(self, autopilot: str, now_ns: int) -> Condition | None:
+    def problem(self, autopilot: Autopilot, now_ns: int) -> Condition | None:
         """Why the camera's attitude must not be relied on; None = it may be."""
         if self.kind == "":
             return condition(ConditionCode.CAMERA_UNKNOWN)
-        if self._kind == "auto" and autopilot == "ardupilot" and math.isnan(self.type_number):
-            return condition(ConditionCode.MOUNT_TYPE_UNKNOWN, name=TYPE_PARAMETER)
+        if self._kind == "auto" and autopilot.mount_type_setting and self.servos is None:
+            return condition(ConditionCode.MOUNT_TYPE_UNKNOWN, name=autopilot.mount_type_setting)
         if self.age_s(now_ns) > self._stale_s:
             return condition(ConditionCode.MOUNT_OUTDATED, age_s=self.age_s(now_ns))
         return None

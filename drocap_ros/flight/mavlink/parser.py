@@ -11,8 +11,8 @@ from drocap_ros.flight.mavlink.signing import SigningMavlink, sign_with
 class MavlinkParser:
     """Decodes a stream of bytes; counts what cannot be decoded.
 
-    ArduPilot's dialect holds the common one of its time, so PX4's messages decode too.  Messages that it does not have
-    are no damage: a healthy PX4 sends two a second.
+    Pymavlink's largest dialect holds the common one of its time.  Messages that it does not have are no damage: a
+    healthy autopilot sends two a second.
 
     Parameters
     ----------

@@ -28,10 +28,6 @@ _MAV_TYPE_GCS = 6
 #: All of attitude, horizontal and vertical velocity and vertical position; either horizontal position.
 _ESTIMATOR_NEEDED = 1 | 2 | 4 | 32
 _ESTIMATOR_POSITION = 8 | 16
-_ESTIMATOR_CONSTANT_POSITION = 128
-_EKF_UNINITIALIZED = 1024  # EKF_STATUS_REPORT only; in ESTIMATOR_STATUS the bit is the GPS glitch
-_EKF_GPS_GLITCH = 32768
-_ESTIMATOR_GLITCH = 1024 | 2048  # GPS, accelerometer
 
 _POSITION_STALE_S = 3.0
 _ESTIMATOR_STALE_S = 5.0
@@ -86,7 +82,7 @@ class VehicleStateEstimator:
         if name == "HEARTBEAT":
             self._take_heartbeat(message, receive_time_ns)
             return None
-        if not self.modes.autopilot or message.get_srcSystem() != self.system_id:
+        if self.modes.autopilot is None or message.get_srcSystem() != self.system_id:
             return None
         from_autopilot = message.get_srcComponent() == self.component_id
         if from_autopilot:
@@ -129,7 +125,8 @@ class VehicleStateEstimator:
 
     def snapshot(self, now_ns: int) -> VehicleState | None:
         """The state at ``now_ns``; None before the first heartbeat and attitude."""
-        if not self.modes.autopilot or self._attitude is None or self._heard_ns is None:
+        autopilot = self.modes.autopilot
+        if autopilot is None or self._attitude is None or self._heard_ns is None:
             return None
         boot_ns, orientation, rates = self._attitude
         position, velocity = self._position_at(boot_ns)
@@ -139,7 +136,7 @@ class VehicleStateEstimator:
             estimator_ok = self._estimator[1] and age_s < _ESTIMATOR_STALE_S
         return VehicleState(
             stamp_ns=self.clock.to_local_ns(boot_ns, self._heard_ns),
-            autopilot=self.modes.autopilot,
+            autopilot=autopilot.name,
             mode=self.modes.mode,
             armed=self.modes.armed,
             position_enu_m=position,
@@ -159,7 +156,7 @@ class VehicleStateEstimator:
         self.systems |= {system}
         if self.system_id not in (0, system):
             return
-        if self.modes.autopilot and message.get_srcComponent() != self.component_id:
+        if self.modes.autopilot is not None and message.get_srcComponent() != self.component_id:
             return
         self.system_id, self.component_id = system, message.get_srcComponent()
         self._heard_ns = now_ns
@@ -234,14 +231,11 @@ class VehicleStateEstimator:
         self._values["battery_fraction"] = percent * 1e-2 if 0 <= percent <= 100 else math.nan
         return False
 
-    def _take_ekf(self, message: Any, now_ns: int) -> bool:
-        bad = _ESTIMATOR_CONSTANT_POSITION | _EKF_UNINITIALIZED | _EKF_GPS_GLITCH
-        self._estimator = (now_ns, _estimator_ok(message.flags, bad))
-        return False
-
     def _take_estimator(self, message: Any, now_ns: int) -> bool:
-        bad = _ESTIMATOR_CONSTANT_POSITION | _ESTIMATOR_GLITCH
-        self._estimator = (now_ns, _estimator_ok(message.flags, bad))
+        autopilot, flags = self.modes.autopilot, message.flags
+        if autopilot is not None and message.get_type() == autopilot.estimator_message:
+            known = flags & _ESTIMATOR_NEEDED == _ESTIMATOR_NEEDED and bool(flags & _ESTIMATOR_POSITION)
+            self._estimator = (now_ns, known and not flags & autopilot.estimator_bad)
         return False
 
     def _take_echo(self, message: Any, now_ns: int) -> bool:
@@ -257,8 +251,10 @@ class VehicleStateEstimator:
         return False
 
     def _take_parameter(self, message: Any, _now_ns: int) -> bool:
-        if str(message.param_id).rstrip("\0") == mount.TYPE_PARAMETER:
-            self.mount.take_type(float(message.param_value))
+        autopilot = self.modes.autopilot
+        if autopilot is not None and str(message.param_id).rstrip("\0") == autopilot.mount_type_setting:
+            value = float(message.param_value)
+            self.mount.servos = None if math.isnan(value) else value == autopilot.servo_mount
         return False
 
     def _take_system_time(self, message: Any, now_ns: int) -> bool:
@@ -276,10 +272,6 @@ class VehicleStateEstimator:
         return position + velocity * min(max(gap_s, -_EXTRAPOLATE_S), _EXTRAPOLATE_S), velocity
 
 
-def _estimator_ok(flags: int, bad: int) -> bool:
-    return flags & _ESTIMATOR_NEEDED == _ESTIMATOR_NEEDED and bool(flags & _ESTIMATOR_POSITION) and not flags & bad
-
-
 _HANDLERS = {
     "ATTITUDE": VehicleStateEstimator._take_attitude,
     "ATTITUDE_QUATERNION": VehicleStateEstimator._take_attitude_quaternion,
@@ -287,7 +279,7 @@ _HANDLERS = {
     "GLOBAL_POSITION_INT": VehicleStateEstimator._take_global_position,
     "GPS_RAW_INT": VehicleStateEstimator._take_gps,
     "SYS_STATUS": VehicleStateEstimator._take_sys_status,
-    "EKF_STATUS_REPORT": VehicleStateEstimator._take_ekf,
+    "EKF_STATUS_REPORT": VehicleStateEstimator._take_estimator,
     "ESTIMATOR_STATUS": VehicleStateEstimator._take_estimator,
     "EXTENDED_SYS_STATE": VehicleStateEstimator._take_extended_state,
     "POSITION_TARGET_LOCAL_NED": VehicleStateEstimator._take_echo,

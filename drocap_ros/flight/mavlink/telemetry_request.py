@@ -8,12 +8,13 @@ from dataclasses import dataclass, field
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.current_mode import CURRENT_MODE_ID
 
 _NS = 1_000_000_000
 _FAST_HEARTBEAT_HZ = 5.0
-#: PX4 sends CURRENT_MODE twice a second while nothing changes, and a change after one interval.
+#: CURRENT_MODE is sent twice a second while nothing changes, and a change after one interval.
 _CURRENT_MODE_HZ, _CURRENT_MODE_INTERVAL_HZ = 2.0, 20.0
 _ECHO_HZ = 10.0
 _GIMBAL = mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS
@@ -59,13 +60,13 @@ class TelemetryRequests:
         self._wanted = {number: _Wanted(rate) for number, rate in rates.items() if rate > 0}
         self._since_ns: int | None = None
 
-    def set_autopilot(self, autopilot: str) -> None:
+    def set_autopilot(self, autopilot: Autopilot) -> None:
         """Add the messages by which this autopilot reports its estimator's health and, soon, a change of its mode."""
-        px4 = autopilot == "px4"
-        number = mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS if px4 else mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT
-        self._wanted.setdefault(number, _Wanted(self._config.status_hz))
-        if px4 and self._wanted.pop(mavlink.MAVLINK_MSG_ID_HEARTBEAT, None) is not None:
-            # It grants no interval for its heartbeat: 1 Hz.
+        if autopilot.estimator_message:
+            number = getattr(mavlink, f"MAVLINK_MSG_ID_{autopilot.estimator_message}")
+            self._wanted.setdefault(number, _Wanted(self._config.status_hz))
+        fixed = not autopilot.heartbeat_on_request
+        if fixed and self._wanted.pop(mavlink.MAVLINK_MSG_ID_HEARTBEAT, None) is not None:
             self._wanted[CURRENT_MODE_ID] = _Wanted(_CURRENT_MODE_HZ, _CURRENT_MODE_INTERVAL_HZ)
 
     def count(self, message_id: int, now_ns: int) -> None:

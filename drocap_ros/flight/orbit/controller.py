@@ -11,13 +11,19 @@ import threading
 from collections import deque
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from drocap_ros.flight.autopilot import Autopilot, autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.mavlink.commands import CommandQueue, command_message
-from drocap_ros.flight.mavlink.dialects import ARDUPILOT, DIALECTS, Dialect, halt_message, setpoint_message
+from drocap_ros.flight.mavlink.commands import CommandQueue
 from drocap_ros.flight.mavlink.link import MavlinkLink
+from drocap_ros.flight.mavlink.messages import (
+    GIMBAL_PITCH,
+    SET_MODE,
+    command_message,
+    halt_message,
+    setpoint_message,
+)
 from drocap_ros.flight.orbit.command_checks import command_condition, commanded_goal
 from drocap_ros.flight.orbit.control_status import ControlStatus, widened_condition
 from drocap_ros.flight.orbit.degradation import slowed
@@ -59,8 +65,6 @@ _NS = 1_000_000_000
 _CLOCK_JUMP_S = 0.25
 _GIMBAL_PERIOD_S = 0.5
 _MODE_AGE_STEPS = 1.5  # a report of the mode is seen in the step that follows it
-_SET_MODE = mavlink.MAV_CMD_DO_SET_MODE
-_GIMBAL = mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW
 _MAX_WAITING_COMMANDS = 16
 
 
@@ -110,7 +114,7 @@ class OrbitController:
             self._jumps.take(state)
             self._vehicle = state
             self._history.add(state)
-            self._subject.height_wanders = state.autopilot == "px4"
+            self._subject.height_wanders = autopilot_of(state.autopilot).height_wanders
 
     def on_camera(self, camera_matrix: np.ndarray) -> None:
         """Take the camera matrix (3, 3) px; raises as :meth:`Framing.calibrate`.  A change ends the motion."""
@@ -169,9 +173,9 @@ class OrbitController:
             calibrated=self._framing.matrix is not None,
         )  # fmt: skip
         command, kind, goal = self._next_command(now_ns)
-        dialect = DIALECTS.get(seen.autopilot, ARDUPILOT)
+        autopilot = autopilot_of(seen.autopilot)
         before = self.safety
-        limits = self._limits._replace(warm_up_s=dialect.warm_up_s)
+        limits = self._limits._replace(warm_up_s=autopilot.warm_up_s)
         self.safety, decision = reduce(before, seen, now_s, kind, limits)
         if command is not None and decision.answer is not None:
             self._answers.append((command, decision.answer))
@@ -187,10 +191,10 @@ class OrbitController:
         if self._camera_changed is not None:  # the places so far were measured by another one
             config, self._camera_changed = self._config, None
             self._subject, self._guard = SubjectFilter(config), Guard(config, config, config.braking_m_s2)
-        self._request_mode(decision.mode_request, seen, dialect, now_s)
+        self._request_mode(decision.mode_request, seen, autopilot, now_s)
         sent = self._send(decision.action, seen, estimate, dt)
         self._send_commands(seen, estimate, now_s)
-        self._leave_fallback(seen, dialect, now_s)
+        self._leave_fallback(seen, autopilot, now_s)
         return self._status(seen, estimate, sent)
 
     def _disturbance(self, now_ns: int, now_s: float) -> tuple[Condition | None, float, bool]:
@@ -198,8 +202,8 @@ class OrbitController:
         before, self._before = self._before, (now_ns, now_s)
         hung, requested = self._watchdog.take_fired() if self._watchdog else (False, False)
         if requested and self.safety.modes and self._vehicle is not None:
-            dialect = DIALECTS.get(self._vehicle.autopilot, ARDUPILOT)
-            self.safety = permit_mode(self.safety, dialect.hold_mode)
+            autopilot = autopilot_of(self._vehicle.autopilot)
+            self.safety = permit_mode(self.safety, autopilot.hold_mode)
         if before is None:
             return None, 0.0, hung
         dt = now_s - before[1]
@@ -250,17 +254,16 @@ class OrbitController:
         if self.safety.state in (State.TAKEN_OVER, State.IDLE):
             self._queue.cancel_all()
 
-    def _request_mode(self, request: ModeRequest, seen: Observed, dialect: Dialect, now_s: float) -> None:
-        if request == ModeRequest.NONE:
+    def _request_mode(self, request: ModeRequest, seen: Observed, autopilot: Autopilot, now_s: float) -> None:
+        if request == ModeRequest.NONE or not autopilot.supported:
             # A request that waits for a visible mode is not sent, but it is not forgotten either: a mode that was
             # granted must not be requested again.
             waiting = self.safety.requesting or self.safety.state in (State.HOLDING, State.FAULT)
-            (self._queue.pause if waiting and not seen.in_hold else self._queue.cancel)(_SET_MODE)
+            (self._queue.pause if waiting and not seen.in_hold else self._queue.cancel)(SET_MODE)
             return
-        hold = request == ModeRequest.HOLD
-        mode = dialect.hold_mode if hold else dialect.control_mode
+        mode = autopilot.hold_mode if request == ModeRequest.HOLD else autopilot.control_mode
         self.safety = permit_mode(self.safety, mode)
-        self._queue.request(_SET_MODE, dialect.mode_parameters(hold), f"mode {mode}", now_s)
+        self._queue.request(SET_MODE, autopilot.mode_parameters(mode), f"mode {mode}", now_s)
 
     def _send(self, action: Action, seen: Observed, estimate: SubjectEstimate | None, dt: float) -> Action:
         mav, target = self._link.mav, self._link.target
@@ -296,20 +299,20 @@ class OrbitController:
     def _send_commands(self, seen: Observed, estimate: SubjectEstimate | None, now_s: float) -> None:
         for command, result in self._link.take_answers():
             self._queue.acknowledge(command, result, now_s)
-        if self._queue.failure(_GIMBAL):
+        if self._queue.failure(GIMBAL_PITCH):
             self._gimbal_s, self._framing.follows = math.inf, False  # there is no mount: no further requests
         wanted = self._config.gimbal_control and self.safety.state == State.ORBITING and estimate is not None
         if wanted and estimate is not None and now_s - self._gimbal_s > _GIMBAL_PERIOD_S:
             drop = float(seen.position[2] - estimate.position[2])
             pitch = -math.degrees(math.atan2(drop, max(seen.subject_distance_m, 0.1)))
             nan = math.nan
-            self._queue.request(_GIMBAL, (round(pitch, 1), 0.0, nan, nan, 0.0, 0.0, 0.0), "gimbal pitch", now_s)
+            self._queue.request(GIMBAL_PITCH, (round(pitch, 1), 0.0, nan, nan, 0.0, 0.0, 0.0), "gimbal pitch", now_s)
             self._gimbal_s = now_s
         for command, confirmation, parameters in self._queue.due(now_s):
             message = command_message(self._link.mav, self._link.target, command, confirmation, parameters)
             self._link.send_motion(message)
 
-    def _leave_fallback(self, seen: Observed, dialect: Dialect, now_s: float) -> None:
+    def _leave_fallback(self, seen: Observed, autopilot: Autopilot, now_s: float) -> None:
         if self._watchdog is None:
             return
         commands = None
@@ -317,10 +320,10 @@ class OrbitController:
             mav, target = self._link.mav, self._link.target
             self._fallback = hold_setpoint(seen.position, seen.yaw)
             hold = setpoint_message(mav, target, self._fallback)
-            mode = command_message(mav, target, _SET_MODE, 0, dialect.mode_parameters(True))
+            mode = command_message(mav, target, SET_MODE, 0, autopilot.mode_parameters(autopilot.hold_mode))
             commands = FallbackCommands(
                 self._link.check_motion(hold), self._link.check_motion(mode),
-                lambda: self._link.fresh_mode(self._limits.max_mode_age_s) == dialect.control_mode,
+                lambda: self._link.fresh_mode(self._limits.max_mode_age_s) == autopilot.control_mode,
             )  # fmt: skip
         self._watchdog.kick(now_s, commands)
 
@@ -340,7 +343,7 @@ class OrbitController:
             present = slowed_condition(present, flown, seen, self._limits)
         answers, self._answers = self._answers, []
         return ControlStatus(
-            state=self.safety.state, condition=present, mode_failure=self._queue.failure(_SET_MODE),
+            state=self.safety.state, condition=present, mode_failure=self._queue.failure(SET_MODE),
             answers=answers, radius_m=seen.subject_distance_m, height_m=seen.height_m, angular_speed_deg_s=omega,
             radius_error_m=seen.subject_distance_m - self._goal.radius_m if orbiting else math.nan,
             yaw_error_deg=yaw_error, subject_position=subject, action=sent,

@@ -1,8 +1,9 @@
 """Whether the vehicle follows the setpoints, by the autopilot's echo and the vehicle's motion, and keeps the orbit.
 
-ArduPilot streams POSITION_TARGET_LOCAL_NED throughout GUIDED and PX4 in every mode, whether or not setpoints arrive:
-its age shows nothing but the loss of the stream.  It contains the target that is followed.  ArduPilot integrates the
-last setpoint until GUID_TIMEOUT, and then sets its velocity to zero; PX4 adds the correction of the position to it.
+Autopilots stream POSITION_TARGET_LOCAL_NED throughout the control mode or in every mode, whether or not setpoints
+arrive: its age shows nothing but the loss of the stream.  It contains the target that is followed: the setpoint,
+continued until the time-out, which sets its velocity to zero, or the place as it came, with the correction of the
+position in the velocity.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from drocap_ros.flight.autopilot import autopilot_of
+from drocap_ros.flight.autopilot.autopilot import Echo
 from drocap_ros.flight.orbit.motion_checks import away_limit_m
 from drocap_ros.flight.orbit.planner import OrbitState, reference_position
 from drocap_ros.flight.orbit.states import Observed
@@ -23,9 +26,7 @@ from drocap_ros.flight.vehicle_state import VehicleState
 
 _SENT_S = 0.7  # a setpoint may be echoed for so long at most: two transmissions and the period of the echo
 _ECHOED_S = 0.25  # beyond the age of the echo and two transmissions: two periods of it, and a step
-_AHEAD_S = 0.5  # along its velocity: ArduPilot's integration
-_PLACE_M, _VELOCITY_M_S = 0.5, 0.75  # ArduPilot's target is integrated
-_PX4_PLACE_M = 0.2  # PX4 echoes the place as it came
+_AHEAD_S = 0.5  # along its velocity, by which the echoed place may be ahead
 _MISMATCH_S = 0.25  # longer than two echoes
 #: Window in s, least commanded speed in m/s, and share of the commanded speed below which the vehicle stands for all
 #: of the window.  In every recorded flight of the orbit it reached 0.46, and along the command, with the way, 0.27.
@@ -77,7 +78,7 @@ class Following:
                 return f"no echo of a target for {age_s:.1f} s"
             oldest_s = min(_SENT_S, age_s + trip_s + _ECHOED_S) if math.isfinite(trip_s) else _SENT_S
             recent = [message for at_s, message in sent if now_s - at_s <= oldest_s]
-            if _agrees(target, recent, vehicle.autopilot):
+            if _agrees(target, recent, autopilot_of(vehicle.autopilot).echo):
                 self._matched_s = now_s
             elif now_s - self._matched_s > _MISMATCH_S:  # NaN: its content has not agreed yet, and is not judged
                 return "the autopilot's target is none that was sent"
@@ -90,7 +91,7 @@ class Following:
         speed_m_s = float(np.hypot(*commanded))
         # A vehicle stands where the way to its place and the velocity there cancel, as after an adjustment.
         stands = self._by_speed.judge(now_s, min(along_m_s, speed_m_s), float(np.hypot(*flown)))
-        # Along the command: after a stop ArduPilot springs back.
+        # Along the command: after a stop a vehicle may spring back.
         return self._by_way.judge(now_s, speed_m_s, float(flown @ commanded) / max(speed_m_s, 1e-6)) or stands
 
 
@@ -141,7 +142,7 @@ class Keeping:
         return dataclasses.replace(seen, away_m=away_m, away_s=now_s - self._near_s)
 
 
-def _agrees(echo: Any, sent: list[Any], autopilot: str) -> bool:
+def _agrees(echo: Any, sent: list[Any], most: Echo) -> bool:
     """Whether the echoed target lies on the way of a setpoint, and has its velocity."""
     place = np.array([echo.x, echo.y], dtype=float)
     if not sent or not np.isfinite(place).all():
@@ -151,7 +152,7 @@ def _agrees(echo: Any, sent: list[Any], autopilot: str) -> bool:
     way = _AHEAD_S * velocity
     part = ((place - begin) * way).sum(axis=1) / np.maximum((way * way).sum(axis=1), 1e-9)
     nearest = begin + np.clip(part, 0.0, 1.0)[:, None] * way
-    near = np.hypot(*(place - nearest).T) <= (_PX4_PLACE_M if autopilot == "px4" else _PLACE_M)
-    if autopilot != "px4":
-        near &= np.hypot(*(np.array([echo.vx, echo.vy], dtype=float) - velocity).T) <= _VELOCITY_M_S
+    near = np.hypot(*(place - nearest).T) <= most.place_m
+    if math.isfinite(most.velocity_m_s):
+        near &= np.hypot(*(np.array([echo.vx, echo.vy], dtype=float) - velocity).T) <= most.velocity_m_s
     return bool(near.any())

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.flight.autopilot import autopilot_of
+from drocap_ros.flight.autopilot.autopilot import greatest_speed
+from drocap_ros.flight.autopilot.coasting import Coast
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.orbit.coast import PX4_POSITION_GAIN, Coast, coast_of, greatest_speed
 from drocap_ros.flight.orbit.planner import WALKING_M_S, OrbitGoal
 from drocap_ros.flight.orbit.states import Limits, Observed
 from drocap_ros.flight.setpoint import Setpoint, hold_setpoint
@@ -19,40 +20,32 @@ _SHARES = (
     (1.0, 1.0, 1.0), (0.5, 1.0, 1.0), (0.0, 1.0, 1.0), (0.0, 0.8, 0.5), (0.0, 0.6, 0.0), (0.0, 0.4, 0.0),
     (0.0, 0.2, 0.0),
 )  # fmt: skip
-#: Shares across the line of sight that PX4 tries first, and ArduPilot about one who walks: a vehicle that falls behind
-#: along the orbit keeps its radius.  About one who stands ArduPilot would come near too fast as the radius shrinks.
+#: Shares across the line of sight that are tried first where setpoints are held, and about one who walks: a vehicle
+#: that falls behind along the orbit keeps its radius.  Where setpoints are continued, it would come near one who stands
+#: too fast as the radius shrinks.
 _ACROSS = (
     (1.0, 1.0, 1.0), (0.75, 1.0, 1.0), (0.5, 1.0, 1.0), (0.25, 1.0, 1.0), (0.0, 1.0, 1.0), (0.0, 0.8, 0.5),
     (0.0, 0.6, 0.0), (0.0, 0.4, 0.0),
 )  # fmt: skip
-#: Then a share along it is refined where PX4 retreats: it is hardly faster than one who walks up to it.
+#: Then a share along it is refined where such a vehicle retreats: it is hardly faster than one who walks up to it.
 _HALVINGS = 3
 _WALKED = 0.96  # of its longest coast, about one who walks: the vehicle follows him meanwhile
 
 
-class _Use(NamedTuple):
-    """Shares of max_coast_m: of a steady flight, to which gusts, turns and the way add, and of any setpoint."""
-
-    steady: float
-    greatest: float
-
-
-#: PX4's estimate wanders while the vehicle stops, and the vehicle follows it.  With less than this it
-#: falls behind subjects who walk at 1.4 m/s, and loses them.
-_USES, _USE = {"px4": _Use(0.63, 0.82)}, _Use(0.75, 0.935)
-#: A far place lets PX4 fly faster than predicted: a vehicle that caught up with a walking subject went on for 3.1 m.
+#: A far place that is held lets the vehicle fly faster than predicted: one that caught up with a walker went on
+#: for 3.1 m.
 #: Greatest speed of setpoint and way together beyond a steady flight's, m/s, and share of the subject's speed added.
 _PULLED_M_S, _PULLED_BEHIND = 0.3, 0.25
 #: Way nearer to the subject that forbids a setpoint, and that with the creep from which it is slowed down, m.
 _NEARER_M, _CREEPS_NEARER_M = 1.0, 0.9
 _SLACK_M, _SLACK_M_S = 0.2, 0.1  # what the vehicle has already is no effect of the setpoint
-_SHIPPED_S = {"ardupilot": 3.0, "px4": 1.0}  # time-outs, where they are not reported
 _SLOWED = 0.95
 
 
 def coast_speed(seen: Observed, limits: Limits) -> float:
     """Speed in m/s of a steady flight whose coast leaves room to ``max_coast_m``."""
-    return greatest_speed(seen.autopilot, _timeout_s(seen), _use(seen).steady * limits.safety.max_coast_m)
+    autopilot = autopilot_of(seen.autopilot)
+    return greatest_speed(autopilot, _timeout_s(seen), autopilot.coast.steady * limits.safety.max_coast_m)
 
 
 def slowed_condition(present: Condition, goal: OrbitGoal, seen: Observed, limits: Limits) -> Condition:
@@ -76,7 +69,7 @@ def harmless(
 
     The coast must be short, and stay inside the fence and the greatest speed.  It must stay clear of the minimum
     distance from a subject that stands and from one that moves as estimated, and come at most 1 m nearer to that one;
-    with the creep of PX4 after its stop, what would come 0.9 m nearer is slowed down.
+    with the creep after its stop, what would come 0.9 m nearer is slowed down.
 
     Parameters
     ----------
@@ -84,14 +77,15 @@ def harmless(
     fence_centre : (2,) m; None = there is no fence
     """
     problem: Condition | None = None
-    longest, fastest = _use(seen).greatest * limits.safety.max_coast_m, math.inf
+    autopilot = autopilot_of(seen.autopilot)
+    longest, fastest = autopilot.coast.greatest * limits.safety.max_coast_m, math.inf
     walking = float(np.hypot(*subject_velocity[:2]))
-    if seen.autopilot == "px4":
+    if not autopilot.continues_setpoints:
         fastest = coast_speed(seen, limits) + _PULLED_M_S + _PULLED_BEHIND * walking
     elif walking > WALKING_M_S:
         longest *= _WALKED
     tries = [(share, share) for share in _SHARES]
-    if seen.subject is not None and (seen.autopilot == "px4" or walking > WALKING_M_S):
+    if seen.subject is not None and (not autopilot.continues_setpoints or walking > WALKING_M_S):
         tries = [(_SHARES[0], share) for share in _ACROSS] + [(share, min(share, _ACROSS[-1])) for share in _SHARES[1:]]
 
     def judged(shares: np.ndarray) -> tuple[Setpoint, Condition | None, bool]:
@@ -102,7 +96,7 @@ def harmless(
             )
         )  # fmt: skip
         part = setpoint._replace(position=seen.position + way, velocity=velocity, acceleration=acceleration)
-        coast = coast_of(part, seen.position, seen.velocity, seen.autopilot, _timeout_s(seen))
+        coast = autopilot.coast_of(part, seen.position, seen.velocity, _timeout_s(seen))
         long = coast.length_m > longest or math.hypot(*_commanded(part, seen)) > fastest
         long |= _creeps_nearer(coast, seen, complex(*subject_velocity[:2])) > _CREEPS_NEARER_M
         return part, _danger(coast, seen, complex(*subject_velocity[:2]), fence_centre, limits), long
@@ -116,7 +110,7 @@ def harmless(
         above = shares
     else:
         return hold_setpoint(seen.position, seen.yaw), problem
-    if seen.autopilot == "px4" and not long and shares[0] != above[0] and _retreats(setpoint, seen):
+    if not autopilot.continues_setpoints and not long and shares[0] != above[0] and _retreats(setpoint, seen):
         least, greatest = np.array(shares), np.array(above)
         for _ in range(_HALVINGS):
             middle = 0.5 * (least + greatest)
@@ -129,12 +123,14 @@ def harmless(
 
 
 def _commanded(setpoint: Setpoint, seen: Observed) -> np.ndarray:
-    """(2,) m/s that PX4 commands: of the setpoint, and of the way to its place."""
-    return (setpoint.velocity + PX4_POSITION_GAIN * (setpoint.position - seen.position))[:2]
+    """(2,) m/s that the autopilot commands: of the setpoint, and of the way to its place."""
+    return (setpoint.velocity + autopilot_of(seen.autopilot).position_gain_per_s * (setpoint.position - seen.position))[
+        :2
+    ]
 
 
 def _retreats(setpoint: Setpoint, seen: Observed) -> bool:
-    """Whether PX4 flies away from the subject."""
+    """Whether the vehicle is to fly away from the subject."""
     return seen.subject is not None and float(_commanded(setpoint, seen) @ (seen.subject - seen.position)[:2]) < 0.0
 
 
@@ -183,10 +179,5 @@ def _creeps_nearer(coast: Coast, seen: Observed, subject_velocity: complex) -> f
     return alone - abs(coast.place[-1] - then) + coast.creep_towards(then)
 
 
-def _use(seen: Observed) -> _Use:
-    return _USES.get(seen.autopilot, _USE)
-
-
 def _timeout_s(seen: Observed) -> float:
-    reported = math.nan if seen.loss_settings is None else seen.loss_settings.timeout_s
-    return _SHIPPED_S.get(seen.autopilot, 3.0) if math.isnan(reported) else reported
+    return autopilot_of(seen.autopilot).timeout_s(seen.loss_settings)

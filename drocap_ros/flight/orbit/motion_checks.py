@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
+from drocap_ros.flight.autopilot import autopilot_of
+from drocap_ros.flight.autopilot.autopilot import LossAction, LossSettings
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
 from drocap_ros.flight.orbit.states import Limits, Observed
 from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.safety_config import SafetyConfig
@@ -24,17 +25,9 @@ _LONGEST_AWAY_S = 20.0  # behind walking subjects in 8 m/s of wind: 10 s
 #: The clocks of image and step differ by a transmission at most.
 _FUTURE_S = 0.2
 _MAV_STATE_CRITICAL = 5
-#: MAV_STATE of a vehicle that nobody should command: PX4 reports the first for stopped motors.
+#: MAV_STATE of a vehicle that nobody should command; the first may stand for stopped motors.
 _EMERGENCIES = {6: "an emergency", 7: "that it is shutting down", 8: "that the flight is terminated"}
 _LANDED_STATES = {LANDED_ON_GROUND: "on the ground", LANDED_TAKEOFF: "taking off", LANDED_LANDING: "landing"}
-#: PX4's COM_OBL_RC_ACT but for hold (5), land (4) and return (3).
-_LOSS_ACTIONS = {
-    0: "the vehicle waits for sticks in position mode, and lands without a remote control",
-    1: "the vehicle drifts in altitude mode",
-    2: "the vehicle flies by its sticks alone",
-    6: "flight is terminated",
-    7: "the motors are stopped",
-}
 
 
 def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) -> Condition | None:
@@ -50,9 +43,12 @@ def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
         return seen.disturbance
     if seen.link_age_s > oldest_s:
         return condition(_C.LINK_SILENT, age_s=seen.link_age_s)
-    if seen.autopilot not in ("ardupilot", "px4"):
+    autopilot = autopilot_of(seen.autopilot)
+    if not autopilot.supported:
         return condition(_C.AUTOPILOT_UNSUPPORTED, autopilot=seen.autopilot)
-    if (settings := loss_condition(seen.loss_settings, limits.max_control_timeout_s)) is not None:
+    if (
+        settings := loss_condition(seen.loss_settings, autopilot.loss_action, limits.max_control_timeout_s)
+    ) is not None:
         return settings
     if seen.heartbeat_age_s > safety.max_heartbeat_age_s:
         return condition(_C.MODE_OUTDATED, age_s=seen.heartbeat_age_s)
@@ -66,8 +62,7 @@ def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
         return condition(_C.VEHICLE_STATE_UNKNOWN)
     if not seen.armed:
         return condition(_C.NOT_ARMED)
-    # Where nothing is reported: a setpoint starts PX4 from the ground; ArduPilot in GUIDED waits for a take-off.
-    if seen.landed_state in _LANDED_STATES or (seen.autopilot == "px4" and seen.landed_state != LANDED_IN_AIR):
+    if seen.landed_state in _LANDED_STATES or (autopilot.starts_from_ground and seen.landed_state != LANDED_IN_AIR):
         landed = _LANDED_STATES.get(seen.landed_state, "not reported to be in the air (EXTENDED_SYS_STATE)")
         return condition(_C.NOT_FLYING, landed_state=landed)
     if seen.system_status in _EMERGENCIES:
@@ -85,9 +80,8 @@ def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
 def start_condition(seen: Observed) -> Condition | None:
     """Why no orbit may begin; one that is flown goes on.
 
-    ArduPilot reports a critical state after a failsafe of battery, radio or ground station has triggered, also one
-    whose action is switched off in GUIDED.  PX4 reports it while a failsafe acts.  Of several vehicles the first one
-    that was heard would fly, and need not be the one with the camera.
+    A critical state is reported after a failsafe of battery, radio or ground station has triggered, or while one acts.
+    Of several vehicles the first one that was heard would fly, and need not be the one with the camera.
     """
     if len(seen.vehicles) > 1:
         return condition(_C.SEVERAL_VEHICLES, systems=", ".join(map(str, sorted(seen.vehicles))))
@@ -108,20 +102,27 @@ def battery_condition(charge: float, volts: float, safety: SafetyConfig) -> Cond
     return None
 
 
-def loss_condition(settings: LossSettings | None, longest_s: float) -> Condition | None:
-    """Why the autopilot's reaction to the loss of setpoints forbids motion; ``longest_s`` 0 = not checked."""
+def loss_condition(settings: LossSettings | None, meaning: LossAction | None, longest_s: float) -> Condition | None:
+    """Why the autopilot's reaction to the loss of setpoints forbids motion; ``longest_s`` 0 = not checked.
+
+    meaning : of the action's number; None = the autopilot has no such setting
+    """
     if settings is None or longest_s == 0:
         return None
     if math.isnan(settings.timeout_s):
         return condition(_C.TIMEOUT_UNKNOWN, name=settings.timeout_name, limit_s=longest_s)
     if settings.timeout_s > longest_s + _TIMEOUT_ROUNDING_S:
         return condition(_C.TIMEOUT_TOO_LONG, name=settings.timeout_name, value_s=settings.timeout_s, limit_s=longest_s)
-    if not settings.action_name:
+    if meaning is None:
         return None
     unknown = "the vehicle reacts in an unknown way" if math.isnan(settings.action) else ""
-    if consequence := unknown or _LOSS_ACTIONS.get(int(settings.action), ""):
+    if consequence := unknown or meaning.fatal.get(int(settings.action), ""):
         return condition(
-            _C.LOSS_ACTION_FATAL, name=settings.action_name, value=settings.action, consequence=consequence
+            _C.LOSS_ACTION_FATAL,
+            name=meaning.setting,
+            value=settings.action,
+            consequence=consequence,
+            hold=meaning.hold,
         )
     return None
 

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
+from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.mavlink.dialects import ARDUPILOT, DIALECTS
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.orbit.states import Observed
 from drocap_ros.flight.subject.subject_filter import SubjectEstimate
@@ -19,8 +19,6 @@ _NS = 1_000_000_000
 _MAX_EXTRAPOLATION_S = 0.3
 _POSITION_JUMP_M, _JUMP_PERIOD_S = 1.0, 0.5
 _FADES_S = 4.0  # in recorded flights of both autopilots the steps added up to 0.2 m at most
-#: Modes that PX4 enters for the loss of setpoints, by COM_OBL_RC_ACT; without the setting any mode may be it.
-_LOSS_MODES = {3: "RTL", 4: "LAND", 5: "LOITER"}
 #: MAV_TYPE of the vehicles for which the control was made: multirotors, and a helicopter under the same autopilot.
 _MULTIROTORS = frozenset({2, 3, 4, 13, 14, 15, 29, 35})
 _STATUS_MESSAGES = (("GPS_RAW_INT",), ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"), ("SYS_STATUS",))
@@ -54,7 +52,7 @@ def observe(
         max(age_s, 0.0), _MAX_EXTRAPOLATION_S
     )
     latest = estimator.snapshot(now_ns) or vehicle  # mode and health are newer than the attitude
-    dialect = DIALECTS.get(latest.autopilot, ARDUPILOT)
+    autopilot = autopilot_of(latest.autopilot)
     status_age = max(estimator.age_s(names, now_ns) for names in _STATUS_MESSAGES)
     distance, closing, approach, approach_sd = math.nan, 0.0, 0.0, 0.0
     if estimate is not None:
@@ -65,11 +63,11 @@ def observe(
         approach_sd = math.sqrt(max(float(offset @ estimate.covariance[3:5, 3:5] @ offset), 0.0)) / max(distance, 1e-3)
     if not_followed and disturbance is None:
         disturbance = condition(ConditionCode.SETPOINTS_NOT_FOLLOWED, evidence=not_followed)
-    # PX4 needs another mode; ArduPilot's GUID_TIMEOUT has ended the motion by now, and BRAKE would take longer.
-    followed = not not_followed or latest.autopilot != "px4"
+    followed = not not_followed or not autopilot.needs_mode_to_stop
     loss = link.settings.loss_settings()
     action = math.nan if loss is None else loss.action
-    loss_mode = _LOSS_MODES.get(int(action) if math.isfinite(action) else -1, latest.mode)
+    loss_modes = {} if autopilot.loss_action is None else autopilot.loss_action.modes
+    loss_mode = loss_modes.get(int(action) if math.isfinite(action) else -1, latest.mode)
     flies = estimator.modes.vehicle_type in _MULTIROTORS
     trip_s, gap_s = link.answer_age_s(), link.stream_gap_s()
     jumped = disturbance is not None and disturbance.code == ConditionCode.POSITION_JUMPED
@@ -78,9 +76,9 @@ def observe(
         disturbance = condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=stood_s)
     return Observed(
         autopilot=latest.autopilot if flies else f"{latest.autopilot}, vehicle type {estimator.modes.vehicle_type}",
-        mode=latest.mode, in_control=latest.mode == dialect.control_mode,
-        in_hold=latest.mode == dialect.hold_mode, heard=heard | {latest.mode},
-        left_by_itself=estimator.modes.intended == dialect.control_mode != latest.mode == loss_mode,
+        mode=latest.mode, in_control=latest.mode == autopilot.control_mode,
+        in_hold=latest.mode == autopilot.hold_mode, heard=heard | {latest.mode},
+        left_by_itself=estimator.modes.intended == autopilot.control_mode != latest.mode == loss_mode,
         armed=latest.armed, system_status=estimator.modes.system_status, landed_state=latest.landed_state,
         vehicles=frozenset() if config.target_system_id else estimator.systems,
         link_age_s=latest.link_age_s,
@@ -101,7 +99,7 @@ def observe(
         subject_sd_m=math.inf if estimate is None else estimate.position_sd_m,
         subject_distance_m=distance, closing_m_s=closing, approach_m_s=approach, approach_sd_m_s=approach_sd,
         disturbance=disturbance, followed=followed, loss_settings=loss,
-        camera_problem=estimator.mount.problem(latest.autopilot, now_ns),
+        camera_problem=estimator.mount.problem(autopilot, now_ns),
     )  # fmt: skip
 
 

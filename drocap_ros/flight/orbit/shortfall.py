@@ -1,8 +1,8 @@
 """Acceleration that a vehicle behind a walking subject lacks: wind and friction slow it down.
 
-The integral of an autopilot's velocity loop adapts within several seconds, a walking subject turns sooner.  PX4 passes
-the acceleration of a setpoint on to the thrust and ends it with the setpoints.  ArduPilot continues its path by it,
-also after the last setpoint, so it gets none.
+The integral of an autopilot's velocity loop adapts within several seconds, a walking subject turns sooner.  Where the
+acceleration of a setpoint is passed on to the thrust, it ends with the setpoints.  An autopilot that continues its path
+by it does so after the last setpoint too, and gets none.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from drocap_ros.flight.orbit.coast import PX4_POSITION_GAIN
+from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.orbit.states import Observed
 from drocap_ros.flight.setpoint import Setpoint
 
@@ -30,7 +30,7 @@ class Shortfall:
 
         subject : (3,) m;  subject_velocity : (2,) m/s or more, horizontal first; ENU, estimated
         """
-        if seen.autopilot != "px4":
+        if autopilot_of(seen.autopilot).continues_setpoints:
             return setpoint
         sight = subject[:2] - seen.position[:2]
         toward = sight / max(float(np.hypot(*sight)), 0.5)
@@ -41,7 +41,7 @@ class Shortfall:
 
     def learn(self, sent: Setpoint, seen: Observed, dt: float) -> None:
         """Take the setpoint that was sent, ``dt`` s after the one before."""
-        wanted = sent.velocity + PX4_POSITION_GAIN * (sent.position - seen.position)
+        wanted = sent.velocity + autopilot_of(seen.autopilot).position_gain_per_s * (sent.position - seen.position)
         missing = (wanted - seen.velocity)[:2]
         dt = min(max(dt, 0.0), 0.2)
         self._integral = self._integral + (_RATE * missing - _FORGETTING * self._integral) * dt

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.flight.autopilot.autopilot import LossSettings
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
 from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.safety_config import SafetyConfig
 
@@ -56,7 +56,7 @@ class ModeRequest(enum.Enum):
 class Observed:
     """Vehicle, link and subject at one instant; ages in s, infinite = never.
 
-    in_control, in_hold : the mode is GUIDED or OFFBOARD; it is the autopilot's hold mode
+    in_control, in_hold : the mode is the autopilot's for setpoints; it is its hold mode
     heard : all modes that were reported since the last step, late ones too; empty = the mode alone
     left_by_itself : whether the autopilot left the control mode as for the loss of setpoints, and nobody chose this
     system_status : MAV_STATE of the autopilot; 0 = unknown

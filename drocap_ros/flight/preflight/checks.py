@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition
-from drocap_ros.flight.preflight.findings import LASTING, Finding, Level, Measured
+from drocap_ros.flight.findings import Finding, Level
 from drocap_ros.flight.preflight.link_checks import link_findings
+from drocap_ros.flight.preflight.measured import LASTING, Measured
 from drocap_ros.flight.preflight.setup_checks import Setup, setup_findings
 from drocap_ros.flight.preflight.vehicle_checks import vehicle_findings
 
@@ -52,7 +53,7 @@ def _silence(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
         remedy = "give the autopilot the same key, or remove signing_key_file"
     elif measured.bad_count:
         data = f"{measured.bad_count} pieces of data that are no MAVLink"
-        remedy = "check the baud rate, and that the port's protocol is MAVLink 2 (ArduPilot: SERIALn_PROTOCOL 2)"
+        remedy = "check the baud rate, and that the port's protocol is MAVLink 2"
     elif config.target_system_id:
         remedy += f", and target_system_id {config.target_system_id}"
     place = measured.bridge or f"on {config.url}"

@@ -7,21 +7,18 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from drocap_ros.flight.autopilot import UNKNOWN, Autopilot, autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.mavlink.dialects import ARDUPILOT, DIALECTS
+from drocap_ros.flight.findings import Finding, Level
 from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
-from drocap_ros.flight.preflight.findings import Finding, Level, Measured, Stream
+from drocap_ros.flight.preflight.measured import Measured, Stream
 
 _C = ConditionCode
 _ENOUGH = 0.8
 _MOST_SPREAD_S = 0.02
 _MOST_BAD = 0.02
 _MOUNT, _ECHO, _HEARTBEAT = "GIMBAL_DEVICE_ATTITUDE_STATUS", "POSITION_TARGET_LOCAL_NED", "HEARTBEAT"
-_OWN_PORT = (
-    "give the bridge a telemetry port of its own at 921600 baud (ArduPilot: SERIALn_BAUD 921, PX4: MAV_n_MODE "
-    "Onboard); a radio or a router thins the stream"
-)
 
 
 def link_findings(config: MavlinkBridgeConfig, measured: Measured) -> Iterator[Finding]:
@@ -76,24 +73,24 @@ def _several(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
 
 
 def _rate(config: MavlinkBridgeConfig, measured: Measured, name: str, stream: Stream) -> Finding:
-    limit_s, code = _limit(config, name)
+    (limit_s, code), own_port = _limit(config, name), _own_port(measured)
     real, wanted, gap_s = stream
     found = f"{real:.1f} Hz" + (f", longest gap {gap_s:.2f} s" if real > 0 and math.isfinite(gap_s) else "")
     needed = f"{wanted:g} Hz, gaps below {limit_s:g} s" if limit_s else f"{wanted:g} Hz"
     level, remedy = Level.OK, ""
     if limit_s and real >= _ENOUGH * wanted and gap_s > limit_s:
-        level, remedy = Level.WARNING, f"a gap above {limit_s:g} s ends an orbit by a hold; {_OWN_PORT}"
+        level, remedy = Level.WARNING, f"a gap above {limit_s:g} s ends an orbit by a hold; {own_port}"
     elif not real >= _ENOUGH * wanted:
         short = not real >= config.rate_shortfall * wanted or real * limit_s < 1.0
-        level, remedy = Level.MISSING if short and code else Level.WARNING, _OWN_PORT
+        level, remedy = Level.MISSING if short and code else Level.WARNING, own_port
     if name == _ECHO and level != Level.OK and not _in_control_mode(measured):
         level, remedy = Level.OK, ""
-        found += ", as ArduPilot does outside GUIDED"
+        found += ", as outside the control mode"
     elif name == _HEARTBEAT and level == Level.MISSING and real * limit_s >= 1.0:
-        level, remedy = Level.WARNING, f"the pilot's change of mode is seen up to {1 / real:.1f} s late; {_OWN_PORT}"
+        level, remedy = Level.WARNING, f"the pilot's change of mode is seen up to {1 / real:.1f} s late; {own_port}"
     if level != Level.OK and name in measured.refused:
         found += f", refused with result {measured.refused[name]}"
-        remedy = remedy.replace(_OWN_PORT, "this autopilot grants no other rate")
+        remedy = remedy.replace(own_port, "this autopilot grants no other rate")
     return Finding(
         f"rate_{name.lower()}", f"rate of {name}", level, found, needed, remedy,
         {"real_hz": real, "wanted_hz": wanted, "longest_gap_s": gap_s}, code,
@@ -120,7 +117,7 @@ def _delay(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
     return Finding(
         "telemetry_delay", "delay of telemetry", level, f"{_ms(typical)} typical, {_ms(late)} in 99 %",
         f"below {_ms(0.5 * limit)} (max_state_age_s {limit:g})",
-        "" if level == Level.OK else f"stop what loads this computer, or: {_OWN_PORT}",
+        "" if level == Level.OK else f"stop what loads this computer, or: {_own_port(measured)}",
         {"median_s": typical, "p99_s": late}, (_C.ATTITUDE_OUTDATED,),
     )  # fmt: skip
 
@@ -143,7 +140,8 @@ def _time_sync(config: MavlinkBridgeConfig, measured: Measured) -> Iterator[Find
     yield Finding(
         "round_trip", "round trip", level, f"{_ms(typical)} typical, {_ms(late)} in 99 %",
         f"with the period of {1 / config.time_sync_hz:g} s below {limit:g} s (max_round_trip_s)",
-        "" if level == Level.OK else _OWN_PORT, {"median_s": typical, "p99_s": late}, (_C.ROUND_TRIP_TOO_LONG,),
+        "" if level == Level.OK else _own_port(measured), {"median_s": typical, "p99_s": late},
+        (_C.ROUND_TRIP_TOO_LONG,),
     )  # fmt: skip
     if len(measured.offsets_s) < 2:
         return
@@ -162,8 +160,16 @@ def _time_sync(config: MavlinkBridgeConfig, measured: Measured) -> Iterator[Find
 
 
 def _in_control_mode(measured: Measured) -> bool:
-    vehicle = measured.vehicle
-    return vehicle is not None and vehicle.mode == DIALECTS.get(vehicle.autopilot, ARDUPILOT).control_mode
+    return measured.vehicle is not None and measured.vehicle.mode == _autopilot(measured).control_mode
+
+
+def _own_port(measured: Measured) -> str:
+    port = _autopilot(measured).hints.port
+    return f"give the bridge a telemetry port of its own at 921600 baud{port}; a radio or a router thins the stream"
+
+
+def _autopilot(measured: Measured) -> Autopilot:
+    return UNKNOWN if measured.vehicle is None else autopilot_of(measured.vehicle.autopilot)
 
 
 def _ms(seconds: float) -> str:

@@ -14,35 +14,17 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode
-from drocap_ros.flight.mavlink.autopilot_settings import AutopilotSettings
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.mavlink.mount import TYPE_PARAMETER
+from drocap_ros.flight.mavlink.settings import AutopilotSettings
 from drocap_ros.flight.mavlink.transport import Transport
 from drocap_ros.flight.orbit.motion_checks import start_condition, vehicle_condition
 from drocap_ros.flight.orbit.observer import observe
 from drocap_ros.flight.orbit.states import Limits
-from drocap_ros.flight.preflight.findings import Measured, Stream
-from drocap_ros.flight.preflight.setting_checks import SETTINGS
+from drocap_ros.flight.preflight.measured import Measured, Stream
 from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, VehicleState
 
 _NS = 1_000_000_000
 _CONDITIONS_PERIOD_S, _VERSION_PERIOD_S, _VERSION_TRIES = 0.1, 1.0, 4
-#: Read beside the parameters that decide about motion.
-MORE_SETTINGS = {
-    "ardupilot": (
-        "FENCE_ENABLE", "FENCE_TYPE", "FENCE_RADIUS", "FENCE_ALT_MAX", "FENCE_ACTION", TYPE_PARAMETER, "BATT_MONITOR",
-        *SETTINGS["ardupilot"],
-    ),
-    "px4": (
-        "GF_ACTION", "GF_MAX_HOR_DIST", "GF_MAX_VER_DIST", "COM_RC_OVERRIDE", "COM_OBL_RC_ACT", *SETTINGS["px4"],
-    ),
-}  # fmt: skip
-
-
-class _Settings(AutopilotSettings):
-    def set_autopilot(self, autopilot: str) -> None:
-        super().set_autopilot(autopilot)
-        self.add(MORE_SETTINGS.get(autopilot, ()))
 
 
 class ListeningLink(MavlinkLink):
@@ -54,7 +36,7 @@ class ListeningLink(MavlinkLink):
     def __init__(self, config: MavlinkBridgeConfig, **keywords: Any) -> None:
         # With motion enabled the link asks for the rates and parameters of a flight.
         super().__init__(dataclasses.replace(config, commands_enabled=True), **keywords)
-        self.settings = _Settings()
+        self.settings = AutopilotSettings(preflight=True)
         self.version = ""
         self.arrivals: defaultdict[str, list[int]] = defaultdict(list)
         self.exchanges: list[tuple[int, int]] = []  # round trip, offset, ns

@@ -10,9 +10,9 @@ import numpy as np
 
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
+from drocap_ros.flight.findings import Finding, Level
 from drocap_ros.flight.orbit.planner import goal_of
 from drocap_ros.flight.orbit.states import Observed
-from drocap_ros.flight.preflight.findings import Finding, Level
 from drocap_ros.flight.subject.framing import Framing, View, orbit_margin
 from drocap_ros.flight.vehicle_state import VehicleState
 

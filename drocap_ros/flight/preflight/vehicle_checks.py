@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
+from drocap_ros.flight.autopilot import Autopilot, autopilot_of, supported_titles
+from drocap_ros.flight.autopilot.autopilot import FenceSettings, FlownSpeeds, LossAction
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.mavlink.autopilot_settings import LossSettings, loss_settings_of
-from drocap_ros.flight.mavlink.dialects import PX4
-from drocap_ros.flight.mavlink.mount import SERVOS, TYPE_PARAMETER
+from drocap_ros.flight.findings import Finding, Level
 from drocap_ros.flight.orbit.motion_checks import battery_condition, loss_condition
-from drocap_ros.flight.preflight.findings import LASTING, Finding, Level, Measured, Stream
-from drocap_ros.flight.preflight.setting_checks import setting_findings
+from drocap_ros.flight.preflight.measured import LASTING, Measured, Stream
 from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, LANDED_ON_GROUND, SATELLITES_UNKNOWN, VehicleState
 
 _C = ConditionCode
@@ -21,48 +20,41 @@ _GOOD_SATELLITES = 8
 _MOUNT = "GIMBAL_DEVICE_ATTITUDE_STATUS"
 _FIXES = {0: "no receiver", 1: "no fix", 2: "2D", 3: "3D", 4: "3D, differential", 5: "RTK float", 6: "RTK fixed"}
 _LANDED = {LANDED_ON_GROUND: "on the ground", LANDED_IN_AIR: "in the air"}
-#: Values of GF_ACTION that guard nobody: its 4 is flight termination, above a person.
-_PX4_FENCES: dict[float, str] = {0: "off", 1: "warns only", 4: "stops the motors"}
-_ACTIONS = {
-    0: "drifts by the sticks", 1: "drifts in altitude mode", 2: "drifts in manual flight", 3: "returns", 4: "lands",
-    5: "holds", 6: "ends the flight", 7: "stops the motors",
-}  # fmt: skip
 
 
 def vehicle_findings(config: MavlinkBridgeConfig, measured: Measured, vehicle: VehicleState) -> Iterator[Finding]:
     """Everything about the vehicle, whose state is known."""
-    yield _autopilot(measured, vehicle)
-    yield from _loss(config, measured, vehicle)
-    yield from setting_findings(config, measured, vehicle.autopilot)
-    if vehicle.autopilot == "px4":
-        yield from _px4_settings(config, measured, vehicle)
-        yield _px4_fence(config, measured)
-    else:
-        yield _ardupilot_fence(config, measured)
-    yield _mount(config, measured)
+    autopilot = autopilot_of(vehicle.autopilot)
+    yield _identity(measured, vehicle, autopilot)
+    yield from _loss(config, measured, autopilot)
+    yield from _settings(config, measured, autopilot)
+    yield from _way_into_control(config, vehicle, autopilot)
+    if autopilot.fence is not None:
+        yield _fence(config, measured, autopilot.fence)
+    yield _mount(config, measured, autopilot)
     yield _satellites(vehicle)
     yield _estimator(vehicle)
-    yield _battery(config, vehicle)
+    yield _battery(config, vehicle, autopilot)
     yield _phase(vehicle)
 
 
-def _autopilot(measured: Measured, vehicle: VehicleState) -> Finding:
-    known = vehicle.autopilot in ("ardupilot", "px4")
+def _identity(measured: Measured, vehicle: VehicleState, autopilot: Autopilot) -> Finding:
+    known = autopilot.supported
     version = measured.version or "version not reported"
     return Finding(
         "autopilot", "autopilot", Level.OK if known else Level.MISSING, f"{vehicle.autopilot}, {version}",
-        "ArduPilot Copter or PX4", "" if known else "the bridge flies no other autopilot",
+        supported_titles(), "" if known else "the bridge flies no other autopilot",
         {"autopilot": vehicle.autopilot, "version": measured.version}, (_C.AUTOPILOT_UNSUPPORTED,),
     )  # fmt: skip
 
 
-def _loss(config: MavlinkBridgeConfig, measured: Measured, vehicle: VehicleState) -> Iterator[Finding]:
-    settings = loss_settings_of(vehicle.autopilot, measured.settings)
+def _loss(config: MavlinkBridgeConfig, measured: Measured, autopilot: Autopilot) -> Iterator[Finding]:
+    settings, meaning = autopilot.loss_settings(measured.settings), autopilot.loss_action
     if settings is None:
         return
     limit = config.max_control_timeout_s
     name = settings.timeout_name
-    refusal = loss_condition(settings, limit)
+    refusal = loss_condition(settings, meaning, limit)
     wrong = refusal is not None and refusal.code in (_C.TIMEOUT_UNKNOWN, _C.TIMEOUT_TOO_LONG)
     level = Level.MISSING if wrong else Level.OK if limit else Level.WARNING
     yield Finding(
@@ -71,81 +63,65 @@ def _loss(config: MavlinkBridgeConfig, measured: Measured, vehicle: VehicleState
         else "" if limit else "set max_control_timeout_s to 0.5: 0 switches the check off",
         {"value": settings.timeout_s, "limit": limit}, (_C.TIMEOUT_UNKNOWN, _C.TIMEOUT_TOO_LONG),
     )  # fmt: skip
-    if vehicle.autopilot == "px4":
-        yield _loss_action(settings, refused=refusal is not None and not wrong)
+    if meaning is not None:
+        yield _loss_action(settings.action, meaning, refused=refusal is not None and not wrong)
 
 
-def _loss_action(settings: LossSettings, refused: bool) -> Finding:
-    holds = settings.action == 5
+def _loss_action(action: float, meaning: LossAction, refused: bool) -> Finding:
+    holds = action == meaning.hold
+    wanted, remedy = f"{meaning.hold} ({meaning.words[meaning.hold]})", ""
+    if not holds:
+        remedy = f"set {meaning.setting} to {meaning.hold} on the autopilot: what it does after the bridge's death"
     return Finding(
-        settings.action_name.lower(), settings.action_name,
+        meaning.setting.lower(), meaning.setting,
         Level.OK if holds else Level.MISSING if refused else Level.WARNING,
-        _value(settings.action) + _words(_ACTIONS, settings.action), "5 (holds)",
-        "" if holds else f"set {settings.action_name} to 5 on the autopilot: what it does after the bridge's death",
-        {"value": settings.action}, (_C.LOSS_ACTION_FATAL,),
+        _value(action) + _words(meaning.words, action), wanted, remedy, {"value": action}, (_C.LOSS_ACTION_FATAL,),
     )  # fmt: skip
 
 
-def _px4_settings(config: MavlinkBridgeConfig, measured: Measured, vehicle: VehicleState) -> Iterator[Finding]:
-    if "COM_RC_OVERRIDE" in measured.settings:
-        value = measured.setting("COM_RC_OVERRIDE")
-        obeys = not math.isnan(value) and int(value) & 2 == 2
+def _settings(config: MavlinkBridgeConfig, measured: Measured, autopilot: Autopilot) -> Iterator[Finding]:
+    """A finding for each parameter that was reported: no version of an autopilot has all of them."""
+    names = [check.name for check in autopilot.checks]
+    if names and not any(name in measured.settings for name in names):
         yield Finding(
-            "com_rc_override", "COM_RC_OVERRIDE", Level.OK if obeys else Level.WARNING, _value(value),
-            "3 (the sticks take over in OFFBOARD)",
-            "" if obeys else "set COM_RC_OVERRIDE to 3 on the autopilot, or take over by the mode switch only",
-            {"value": value},
+            "settings", "autopilot's settings", Level.WARNING, "not read", f"good values of {', '.join(names)}",
+            "stop the running bridge and run this again to read them",
         )  # fmt: skip
-    if not config.mode_change_allowed and vehicle.mode != PX4.control_mode:
+        return
+    speeds = FlownSpeeds(abs(math.radians(config.angular_speed_deg_s)) * config.radius_m, config.max_speed_m_s)
+    for check in autopilot.checks:
+        value = measured.setting(check.name)
+        if math.isnan(value) and not (check.always and check.name in measured.settings):
+            continue
+        level = check.judge(value, speeds)
+        remedy = "" if level == Level.OK else check.remedy.format(speeds=speeds)
+        wanted = check.wanted.format(speeds=speeds)
+        yield Finding(check.name.lower(), check.name, level, _value(value), wanted, remedy, {"value": value})
+
+
+def _way_into_control(config: MavlinkBridgeConfig, vehicle: VehicleState, autopilot: Autopilot) -> Iterator[Finding]:
+    """Where the pilot cannot enter the control mode by hand, the bridge must be allowed to request it."""
+    mode, hints = autopilot.control_mode, autopilot.hints
+    if autopilot.supported and not hints.by_hand and not config.mode_change_allowed and vehicle.mode != mode:
         yield Finding(
-            "engage", "way into OFFBOARD", Level.MISSING, "mode_change_allowed is false", "true",
-            "set mode_change_allowed to true and start by `drocap orbit engage`: PX4 grants OFFBOARD only while "
-            "setpoints arrive", {}, (_C.MODE_CHANGE_FORBIDDEN, _C.NOT_IN_CONTROL_MODE),
+            "engage", f"way into {mode}", Level.MISSING, "mode_change_allowed is false", "true",
+            f"set mode_change_allowed to true and start by `drocap orbit engage`: {hints.engaged}", {},
+            (_C.MODE_CHANGE_FORBIDDEN, _C.NOT_IN_CONTROL_MODE),
         )  # fmt: skip
 
 
-def _ardupilot_fence(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
-    enabled = measured.setting("FENCE_ENABLE")
-    kinds = measured.setting("FENCE_TYPE")
-    radius = height = math.nan
-    if enabled == 1:
-        radius, height = measured.setting("FENCE_RADIUS"), measured.setting("FENCE_ALT_MAX")
-        if not math.isnan(kinds):
-            radius = radius if int(kinds) & 2 else 0.0
-            height = height if int(kinds) & 1 else 0.0
-    state = "off" if enabled == 0 else "" if enabled == 1 else "FENCE_ENABLE not reported"
-    if not state and measured.setting("FENCE_ACTION") == 0:
-        state = "reports only"
-    return _fence(
-        config, measured, state, radius, height, "FENCE_RADIUS", "FENCE_ALT_MAX",
-        "FENCE_ENABLE to 1, FENCE_TYPE to 3 (height and circle), FENCE_ACTION to 4 (brake)",
-    )  # fmt: skip
-
-
-def _px4_fence(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
-    action = measured.setting("GF_ACTION")
-    radius, height = measured.setting("GF_MAX_HOR_DIST"), measured.setting("GF_MAX_VER_DIST")
-    state = "GF_ACTION not reported" if math.isnan(action) else ""
-    state = _PX4_FENCES.get(action, state)
-    return _fence(
-        config, measured, state, radius, height, "GF_MAX_HOR_DIST", "GF_MAX_VER_DIST", "GF_ACTION to 2 (hold) or 3"
-    )
-
-
-def _fence(
-    config: MavlinkBridgeConfig, measured: Measured, state: str, radius_m: float, height_m: float, radius_name: str,
-    height_name: str, how: str,
-) -> Finding:  # fmt: skip
-    """The autopilot's own fence against ours; 0 = that side has none."""
-    names = (radius_name, height_name)
-    if not any(name in measured.settings for name in names):
+def _fence(config: MavlinkBridgeConfig, measured: Measured, settings: FenceSettings) -> Finding:
+    """The autopilot's own fence against ours."""
+    problem, radius_m, height_m = settings.read(measured.setting)
+    radius_name, height_name = settings.radius, settings.height
+    if radius_name not in measured.settings and height_name not in measured.settings:
         found, remedy = "not read", "stop the running bridge and run this again to read it"
         level = Level.WARNING
-    elif state:
-        found, level = state, Level.WARNING
+    elif problem:
+        found, level = problem, Level.WARNING
         remedy = (
-            f"set {how}, {radius_name} above {config.fence_radius_m:g} and {height_name} above {config.max_height_m:g} "
-            "on the autopilot: the last guard that needs no companion computer"
+            f"set {settings.how}, {radius_name} above {config.fence_radius_m:g} and {height_name} above "
+            f"{config.max_height_m:g} on the autopilot: the last guard that needs no companion computer"
         )
     else:
         found = f"{_side(radius_m)} wide, {_side(height_m)} high"
@@ -169,15 +145,14 @@ def _side(metres: float) -> str:
     return "unlimited" if metres == 0 else _value(metres, " m")
 
 
-def _mount(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
+def _mount(config: MavlinkBridgeConfig, measured: Measured, autopilot: Autopilot) -> Finding:
     stream = measured.streams.get(_MOUNT, Stream(0.0, config.gimbal_hz))
-    number = measured.setting(TYPE_PARAMETER)
-    servo = number == SERVOS
+    setting = autopilot.mount_type_setting
+    number = measured.setting(setting)
+    servo = number == autopilot.servo_mount
     kind = config.mount if config.mount != "auto" else "servo" if servo else "gimbal"
     reported = stream.real_hz > 0
-    found = f"{kind}, angles at {stream.real_hz:.1f} Hz" + (
-        "" if math.isnan(number) else f", {TYPE_PARAMETER} {number:g}"
-    )
+    found = f"{kind}, angles at {stream.real_hz:.1f} Hz" + ("" if math.isnan(number) else f", {setting} {number:g}")
     wanted, level, remedy = f"{config.gimbal_hz:g} Hz", Level.OK, ""
     if kind == "fixed":
         found, wanted = f"fixed, {config.camera_pitch_deg:g} deg against the body", "as built"
@@ -191,7 +166,7 @@ def _mount(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
     elif not reported:
         found, level = "no mount reports its angles", Level.MISSING
         remedy = (
-            "connect the mount and set its type on the autopilot (ArduPilot: MNT1_TYPE); without one set mount: fixed "
+            f"connect the mount and set its type on the autopilot{autopilot.hints.mount}; without one set mount: fixed "
             "and camera_pitch_deg"
         )
     elif servo and kind == "gimbal":
@@ -205,7 +180,7 @@ def _mount(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
         level, remedy = Level.MISSING, str(problem)
     return Finding(
         "mount", "mount", level, found, wanted, remedy,
-        {"kind": kind, "real_hz": stream.real_hz, "mnt1_type": number}, _CAMERA,
+        {"kind": kind, "real_hz": stream.real_hz, "type": number}, _CAMERA,
     )  # fmt: skip
 
 
@@ -230,7 +205,7 @@ def _estimator(vehicle: VehicleState) -> Finding:
     )  # fmt: skip
 
 
-def _battery(config: MavlinkBridgeConfig, vehicle: VehicleState) -> Finding:
+def _battery(config: MavlinkBridgeConfig, vehicle: VehicleState, autopilot: Autopilot) -> Finding:
     charge, volts = vehicle.battery_fraction, vehicle.battery_voltage_v
     level, remedy = Level.OK, ""
     found = _value(volts, " V") if math.isnan(charge) else f"{100 * charge:.0f} %, {_value(volts, ' V')}"
@@ -242,8 +217,8 @@ def _battery(config: MavlinkBridgeConfig, vehicle: VehicleState) -> Finding:
         level = Level.MISSING
         found += ", no charge" if not math.isnan(volts) else ": no battery monitor"
         remedy = (
-            "set up a battery monitor with a current sensor (ArduPilot: BATT_MONITOR 4 and BATT_CAPACITY; PX4: "
-            "BAT1_CAPACITY), or min_battery_voltage_v to fly by the voltage alone"
+            f"set up a battery monitor with a current sensor{autopilot.hints.battery}, or min_battery_voltage_v to fly "
+            "by the voltage alone"
         )
     elif problem is not None:
         level, remedy = Level.MISSING, "charge the battery, or correct its capacity on the autopilot"
@@ -266,5 +241,5 @@ def _value(value: float, unit: str = "") -> str:
     return "not reported" if math.isnan(value) else f"{value:.6g}{unit}"
 
 
-def _words(names: dict[int, str], value: float) -> str:
+def _words(names: Mapping[int, str], value: float) -> str:
     return f" ({names[int(value)]})" if value in names else ""

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.planner import STANDING_M_S, OrbitGoal
@@ -33,9 +34,6 @@ _STEADY_S = 0.7  # over which the margin now is averaged: a slower orbit cannot 
 _SAME_CAMERA = 0.03  # of the focal length, by which a camera matrix may change
 _CUT_OFF = 0.2  # share of the picture's height by which a mount may cut off feet or head: it does not lean further
 _COMFORT, _LEAST_PACE = 0.08, 0.3  # share of the picture's height below which the orbit slows down, and how far
-#: s of his way, by which one who walks up to the vehicle comes nearer than the orbit before it gives way as fast: it
-#: leans, and PX4 is slower by its coast.
-_GIVES_WAY_S = {"ardupilot": 1.2, "px4": 2.4}
 
 
 class View(NamedTuple):
@@ -213,7 +211,7 @@ class Framing:
         view, walking = self.view(), subject_speed_m_s - STANDING_M_S
         if view is None or view.level or walking <= 0.0:
             return 0.0
-        comes_m = _GIVES_WAY_S.get(autopilot, max(_GIVES_WAY_S.values())) * walking
+        comes_m = autopilot_of(autopilot).gives_way_s * walking
         radius = nearest_framed(view, goal.height_m, self._config.body_height_m) + comes_m
         return min(radius, self._config.max_distance_m)
 

@@ -16,6 +16,7 @@ import math
 
 import numpy as np
 
+from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.orbit.pose_history import CameraPose
 from drocap_ros.flight.orbit.states import Observed
 from drocap_ros.flight.orbit_config import OrbitConfig
@@ -39,11 +40,13 @@ _SURELY_M_S = 0.1  # so much faster than by the estimated place he may recede by
 #: m, and m/s that his receding must exceed at the second distance: an error of the size is an error of the speed in
 #: proportion to the distance, and from 12 m one who stands recedes at up to 0.4 m/s for a second.
 _NEAR_M, _FAR_M, _FAR_ERROR_M_S = 8.0, 12.0, 0.3
-_POSITION_GAIN = 1.0  # 1/s, of both autopilots' position loops: 1.0 (PSC_POSXY_P) and 0.95 (MPC_XY_P)
+_POSITION_GAIN = 1.0  # 1/s, the greatest of the autopilots' position loops
 _REACTION_S = 0.5
-#: Most that a setpoint adds to ArduPilot's present closing speed towards one who stands: it overshoots a larger step.
+#: Most that a setpoint adds to the present closing speed towards one who stands, where setpoints are continued: the
+#: vehicle overshoots a larger step.
 _STEP_M_S = 0.4
-#: Share of the speed at which ArduPilot follows a walker, by which it closes up more slowly: a stop is seen 0.4 s late.
+#: Share of the speed at which such a vehicle follows a walker, by which it closes up more slowly: a stop is seen 0.4 s
+#: late.
 _STOPS = 0.3
 
 
@@ -121,7 +124,7 @@ class Guard:
         receding = min(receding, max(receding - _farness(distance) * _FAR_ERROR_M_S, 0.0))
         closing_up = _OVERSHOOT * self._orbit.max_closing_m_s
         allowed = min(max(closing_up + receding, 0.0), room)
-        if seen.autopilot == "ardupilot":
+        if autopilot_of(seen.autopilot).continues_setpoints:
             closing = float(seen.velocity[:2] @ inward)
             allowed -= _STOPS * min(max(receding, 0.0), closing_up)
             # Its path, limited in jerk, overshoots a reversal: from 1.8 m/s away it closed up at 1.3 m/s without this.

@@ -71,7 +71,7 @@ class SubjectFilter:
 
     def __init__(self, config: SubjectConfig) -> None:
         self._config = config
-        #: Whether the vehicle's height wanders within seconds, as PX4's does.
+        #: Whether the vehicle's height wanders within seconds.
         self.height_wanders = False
         self._state: np.ndarray | None = None
         self._covariance = np.eye(6)

@@ -7,11 +7,14 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import ParameterError
+from drocap_ros.flight.autopilot import AUTOPILOTS
+from drocap_ros.flight.autopilot.ardupilot import ARDUPILOT
+from drocap_ros.flight.autopilot.px4 import PX4
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.frames import ned_to_enu
 from drocap_ros.flight.mavlink.commands import CommandQueue
-from drocap_ros.flight.mavlink.dialects import ARDUPILOT, DIALECTS, PX4, halt_message, setpoint_message
 from drocap_ros.flight.mavlink.link import MavlinkLink
+from drocap_ros.flight.mavlink.messages import halt_message, setpoint_message
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.transport import LinkError
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
@@ -55,16 +58,16 @@ def test_halt_is_velocity_zero_alone():
 
 def test_command_is_sent_until_answered_and_a_failure_is_reported():
     queue = CommandQueue()
-    queue.request(SET_MODE, ARDUPILOT.mode_parameters(False), "mode GUIDED", 0.0)
+    queue.request(SET_MODE, ARDUPILOT.mode_parameters("GUIDED"), "mode GUIDED", 0.0)
     assert queue.due(0.0) == [(SET_MODE, 0, (1.0, 4.0, 0.0, 0.0, 0.0, 0.0, 0.0))]
     assert queue.due(0.1) == []
     assert queue.due(0.5)[0][1] == 1
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_DENIED, 0.6)
     assert queue.due(5.0) == []
     assert queue.failure(SET_MODE) == "mode GUIDED: denied"
-    queue.request(SET_MODE, ARDUPILOT.mode_parameters(False), "mode GUIDED", 1.0)  # too soon
+    queue.request(SET_MODE, ARDUPILOT.mode_parameters("GUIDED"), "mode GUIDED", 1.0)  # too soon
     assert queue.due(5.0) == []
-    queue.request(SET_MODE, ARDUPILOT.mode_parameters(False), "mode GUIDED", 6.0)
+    queue.request(SET_MODE, ARDUPILOT.mode_parameters("GUIDED"), "mode GUIDED", 6.0)
     assert len(queue.due(6.0)) == 1
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_ACCEPTED, 6.1)
     assert queue.failure(SET_MODE) == ""
@@ -72,7 +75,7 @@ def test_command_is_sent_until_answered_and_a_failure_is_reported():
 
 def test_command_without_an_answer_is_given_up():
     queue = CommandQueue()
-    queue.request(SET_MODE, PX4.mode_parameters(True), "mode LOITER", 0.0)
+    queue.request(SET_MODE, PX4.mode_parameters("LOITER"), "mode LOITER", 0.0)
     sent = sum(len(queue.due(0.5 * i)) for i in range(40))
     assert sent == 5
     assert "not answered after 5 tries" in queue.failure(SET_MODE)
@@ -80,7 +83,7 @@ def test_command_without_an_answer_is_given_up():
 
 def test_temporary_rejection_is_retried_and_progress_awaited():
     queue = CommandQueue()
-    queue.request(SET_MODE, PX4.mode_parameters(False), "mode OFFBOARD", 0.0)
+    queue.request(SET_MODE, PX4.mode_parameters("OFFBOARD"), "mode OFFBOARD", 0.0)
     queue.due(0.0)
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, 0.1)
     assert len(queue.due(0.6)) == 1
@@ -97,12 +100,12 @@ def link(**values):
     return MavlinkLink(config, lambda: 10**10, monotonic_s=lambda: 0.0, transport=LoopbackTransport(up, up))
 
 
-def test_link_sends_only_setpoints_and_the_modes_of_the_dialects():
+def test_link_sends_only_setpoints_and_the_modes_of_the_autopilots():
     sender = link()
     sender.send_motion(halt_message(sender.mav, (1, 1)))
-    for dialect in DIALECTS.values():
-        for hold in (True, False):
-            message = sender.mav.command_long_encode(1, 1, SET_MODE, 0, *dialect.mode_parameters(hold))
+    for autopilot in AUTOPILOTS.values():
+        for mode in (autopilot.control_mode, autopilot.hold_mode):
+            message = sender.mav.command_long_encode(1, 1, SET_MODE, 0, *autopilot.mode_parameters(mode))
             sender.send_motion(message)
     for command, values in (
         (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (1, 0, 0, 0, 0, 0, 0)),
@@ -186,7 +189,7 @@ def test_watchdog_that_stood_still_with_its_loop_sends_no_outdated_position():
 
 def test_both_acknowledgements_of_a_mode_count():
     queue = CommandQueue()
-    queue.request(SET_MODE, PX4.mode_parameters(False), "mode OFFBOARD", 0.0)
+    queue.request(SET_MODE, PX4.mode_parameters("OFFBOARD"), "mode OFFBOARD", 0.0)
     queue.due(0.0)
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_ACCEPTED, 0.05)
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_DENIED, 0.07)
@@ -194,7 +197,7 @@ def test_both_acknowledgements_of_a_mode_count():
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_ACCEPTED, 0.1)  # a refusal stays
     assert queue.failure(SET_MODE) == "mode OFFBOARD: denied"
     queue.cancel_all()
-    queue.request(SET_MODE, PX4.mode_parameters(False), "mode OFFBOARD", 3.0)
+    queue.request(SET_MODE, PX4.mode_parameters("OFFBOARD"), "mode OFFBOARD", 3.0)
     queue.due(3.0)
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_ACCEPTED, 3.05)
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, 3.07)

@@ -12,10 +12,11 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import InputError, ParameterError
+from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.frames import camera_rotation
-from drocap_ros.flight.mavlink.allowed_messages import TELEMETRY
 from drocap_ros.flight.mavlink.link import MavlinkLink
+from drocap_ros.flight.mavlink.messages import TELEMETRY
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
 from drocap_ros.flight.mavlink.transport import open_transport
@@ -308,7 +309,7 @@ def test_link_refuses_to_send_motion(port):
 def test_requests_are_sent_one_at_a_time_until_the_rate_is_measured():
     config = MavlinkBridgeConfig(rate_window_s=1.0, request_retry_s=0.5)
     requests = TelemetryRequests(config)
-    requests.set_autopilot("px4")
+    requests.set_autopilot(autopilot_of("px4"))
     asked = []
     for i in range(20):
         asked += [number for number, _ in requests.due(i * S // 100)]

@@ -7,8 +7,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
-from drocap_ros.flight.mavlink.dialects import halt_message
 from drocap_ros.flight.mavlink.link import MavlinkLink
+from drocap_ros.flight.mavlink.messages import halt_message
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.signing import read_signing_key, sign_with, signing_time
 from drocap_ros.simulation.vehicle.flight_path import orbit_path

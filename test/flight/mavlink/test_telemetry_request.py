@@ -1,10 +1,9 @@
 """Which messages are requested from which autopilot, and which requests end."""
 
-import math
-
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.current_mode import CURRENT_MODE_ID
 from drocap_ros.flight.mavlink.link import MavlinkLink
@@ -31,7 +30,7 @@ def asked(requests, seconds, results=None, arriving=frozenset(), start_s=0):
 
 def test_px4_is_asked_for_current_mode_and_not_for_a_faster_heartbeat(caplog):
     requests = TelemetryRequests(MavlinkBridgeConfig(commands_enabled=True))
-    requests.set_autopilot("px4")
+    requests.set_autopilot(autopilot_of("px4"))
     first = {number: interval for _, number, interval in asked(requests, 1)}
     assert BEAT not in first
     assert first[CURRENT_MODE_ID] == 50_000
@@ -46,7 +45,7 @@ def test_px4_is_asked_for_current_mode_and_not_for_a_faster_heartbeat(caplog):
 
 def test_an_autopilot_that_refuses_current_mode_is_named_once(caplog):
     requests = TelemetryRequests(MavlinkBridgeConfig(commands_enabled=True))
-    requests.set_autopilot("px4")
+    requests.set_autopilot(autopilot_of("px4"))
     times = asked(requests, 60, {CURRENT_MODE_ID: mavlink.MAV_RESULT_DENIED})
     assert [number for _, number, _ in times].count(CURRENT_MODE_ID) == 1
     assert requests.refused() == {}
@@ -55,7 +54,7 @@ def test_an_autopilot_that_refuses_current_mode_is_named_once(caplog):
 
 def test_ardupilot_is_asked_for_a_fast_heartbeat():
     requests = TelemetryRequests(MavlinkBridgeConfig(commands_enabled=True))
-    requests.set_autopilot("ardupilot")
+    requests.set_autopilot(autopilot_of("ardupilot"))
     assert {n: i for _, n, i in asked(requests, 1)}[BEAT] == 200_000
     assert CURRENT_MODE_ID not in {n for _, n, _ in asked(requests, 5, start_s=1)}
 
@@ -92,14 +91,14 @@ def test_another_autopilot_on_the_same_link_is_asked_for_its_own_messages():
     config = MavlinkBridgeConfig(commands_enabled=True)
     link = MavlinkLink(config, monotonic_s=lambda: 0.0, transport=LoopbackTransport(down, up))
     mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-    link.estimator.mount.take_type(1.0)
+    link.estimator.mount.servos = True
     for autopilot in (mavlink.MAV_AUTOPILOT_PX4, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA):
         down.write(mav.heartbeat_encode(2, autopilot, 129, 4, 4).pack(mav))
         link.spin_once()
     wanted = link.status().rates_hz
     assert {"HEARTBEAT", "EKF_STATUS_REPORT"} <= set(wanted)
     assert not {"CURRENT_MODE", "ESTIMATOR_STATUS"} & set(wanted)
-    assert math.isnan(link.estimator.mount.type_number)
+    assert link.estimator.mount.servos is None
 
 
 def test_requests_continue_where_the_clock_goes_back():

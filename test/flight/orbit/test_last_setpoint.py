@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 
+from drocap_ros.flight.autopilot.autopilot import LossSettings
+from drocap_ros.flight.autopilot.px4 import PX4
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
-from drocap_ros.flight.orbit.coast import PX4_POSITION_GAIN, coast_of
 from drocap_ros.flight.orbit.last_setpoint import coast_speed, harmless, slowed_condition
 from drocap_ros.flight.orbit.planner import OrbitGoal
 from drocap_ros.flight.orbit.states import Limits, Observed
@@ -62,7 +62,7 @@ def test_px4_falls_behind_along_the_orbit_before_it_yields_the_radius():
     assert (sent.position - now.position)[0] == pytest.approx(-0.3)
     assert sent.velocity[0] == pytest.approx(-0.9)
     assert (sent.position - now.position)[1] < 1.2
-    coast = coast_of(sent, now.position, now.velocity, "px4", 0.5)
+    coast = PX4.coast_of(sent, now.position, now.velocity, 0.5)
     assert coast.length_m <= 0.82 * LIMITS.safety.max_coast_m
 
 
@@ -72,7 +72,7 @@ def test_px4_is_not_pulled_to_a_far_place_faster_than_it_may_fly():
         wanted = flight(now, acceleration=ZERO)._replace(position=now.position + np.array([0.0, way, 0.0]))
         sent = sent_of(wanted, now, np.array([0.0, walking, 0.0]), CENTRE, LIMITS)
         assert isinstance(sent, Setpoint)
-        commanded = sent.velocity[1] + PX4_POSITION_GAIN * (sent.position - now.position)[1]
+        commanded = sent.velocity[1] + PX4.position_gain_per_s * (sent.position - now.position)[1]
         assert commanded <= coast_speed(now, LIMITS) + 0.3 + 0.25 * walking
         assert sent.velocity[1] == pytest.approx(0.9)
     assert sent.position[1] == pytest.approx(now.position[1] + 0.2)
@@ -83,7 +83,7 @@ def test_px4_creeps_on_after_its_stop_so_it_comes_nearer_more_slowly():
     wanted = flight(now, velocity=(-0.6, 0.0, 0.0), acceleration=ZERO)
     sent = sent_of(wanted, now, ZERO, CENTRE, LIMITS)
     assert isinstance(sent, Setpoint)
-    coast = coast_of(sent, now.position, now.velocity, "px4", 0.5)
+    coast = PX4.coast_of(sent, now.position, now.velocity, 0.5)
     assert coast.creep_towards(0j) > 0.4
     assert float(coast.place[0].real - coast.place[-1].real) + coast.creep_towards(0j) <= 0.9
     assert -0.5 < sent.velocity[0] < 0.0
@@ -100,7 +100,7 @@ def test_px4_that_lacks_more_of_its_distance_retreats_no_more_slowly():
         wanted = flight(now, comes, (0.5, 0.0, 0.0))._replace(position=now.position + np.array([way, 0.0, 0.0]))
         sent = sent_of(wanted, now, comes, CENTRE, LIMITS)
         assert isinstance(sent, Setpoint)
-        assert coast_of(sent, now.position, now.velocity, "px4", 0.5).length_m <= 0.82 * LIMITS.safety.max_coast_m
+        assert PX4.coast_of(sent, now.position, now.velocity, 0.5).length_m <= 0.82 * LIMITS.safety.max_coast_m
         ways.append((sent.position - now.position)[0])
     assert min(ways) > 0.5
     assert np.all(np.diff(ways) > -0.05)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from orbit_observations import BRAKE, GOOD, LIMITS, LOITER, orbiting
 
 from drocap_ros.errors import ParameterError
+from drocap_ros.flight.autopilot.autopilot import LossSettings
 from drocap_ros.flight.conditions import ConditionCode, condition
-from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
 from drocap_ros.flight.orbit.motion_checks import battery_condition
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
 from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, SafetyState, State

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from orbit_observations import GOOD, LIMITS, orbiting
 
+from drocap_ros.flight.autopilot.autopilot import LossSettings
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.mavlink.autopilot_settings import LossSettings
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
 from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, SafetyState, State
 

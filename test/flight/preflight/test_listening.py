@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
+from drocap_ros.flight.findings import Level
 from drocap_ros.flight.preflight.checks import all_findings, is_ready
-from drocap_ros.flight.preflight.findings import Level
 from drocap_ros.flight.preflight.measure import Listening, version_text
-from drocap_ros.flight.preflight.setting_checks import SETTINGS
 from drocap_ros.flight.preflight.setup_checks import Setup
 from drocap_ros.simulation.orbit_camera import pinhole_matrix
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
@@ -64,7 +64,8 @@ def test_a_vehicle_with_everything_set_is_ready_on_the_ground(autopilot):
     assert is_ready(scene.findings.values()), scene.missing()
     warnings = {code for code, finding in scene.findings.items() if finding.level == Level.WARNING}
     assert warnings <= {"rate_heartbeat"}
-    assert not {name.lower() for name in SETTINGS[autopilot]} & scene.findings.keys()  # it has none of them
+    lacking = {check.name.lower() for check in autopilot_of(autopilot).checks if not check.always}
+    assert not lacking & scene.findings.keys()
     assert scene.findings["rate_attitude_quaternion"].values["real_hz"] == pytest.approx(50, rel=0.05)
     assert scene.findings["round_trip"].values["median_s"] == pytest.approx(0.02, abs=0.01)
     assert scene.findings["clock_offset"].values["spread_s"] < 0.01

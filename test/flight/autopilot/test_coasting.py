@@ -6,7 +6,8 @@ import time
 import numpy as np
 import pytest
 
-from drocap_ros.flight.orbit.coast import coast_of, greatest_speed
+from drocap_ros.flight.autopilot import autopilot_of
+from drocap_ros.flight.autopilot.autopilot import greatest_speed
 from drocap_ros.flight.setpoint import Setpoint
 
 ARDUPILOT = [f"bridge_killed_timeout_{timeout}s_{i}" for timeout, n in (("0.3", 3), ("0.5", 5)) for i in range(n)]
@@ -24,9 +25,8 @@ def recorded(shared_files, name):
     parts = ("position_m", "velocity_m_s", "acceleration_m_s2")
     last = Setpoint(*(flight[f"setpoint_{part}"][-1] for part in parts), 0.0, 0.0)
     px4, timeout_s = name.startswith("px4"), 0.3 if "timeout_0.3" in name else 0.5
-    coast = coast_of(
-        last, flight["position_m"][after][0], flight["velocity_m_s"][after][0], "px4" if px4 else "ardupilot", timeout_s
-    )
+    first = (flight[name][after][0] for name in ("position_m", "velocity_m_s"))
+    coast = autopilot_of("px4" if px4 else "ardupilot").coast_of(last, *first, timeout_s)
     farthest = float(np.linalg.norm(places - places[0], axis=1).max())
     return coast, places[:stands], times[:stands], farthest
 
@@ -45,7 +45,7 @@ def test_prediction_agrees_with_the_recorded_flight(shared, name):
 def steady(speed, autopilot="ardupilot", acceleration=0.0):
     velocity, zero = np.array([speed, 0.0, 0.0]), np.zeros(3)
     last = Setpoint(zero, velocity, np.array([0.0, acceleration, 0.0]), 0.0, 0.0)
-    return coast_of(last, zero, velocity, autopilot, 0.5)
+    return autopilot_of(autopilot).coast_of(last, zero, velocity, 0.5)
 
 
 def test_noise_of_the_acceleration_lengthens_the_coast():
@@ -54,10 +54,10 @@ def test_noise_of_the_acceleration_lengthens_the_coast():
 
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
 def test_greatest_speed_stops_within_the_distance(autopilot):
-    speed = greatest_speed(autopilot, 0.5, 2.5)
+    speed = greatest_speed(autopilot_of(autopilot), 0.5, 2.5)
     assert 1.5 < speed < 2.5  # PX4 creeps on after its stop
     assert steady(speed, autopilot).length_m == pytest.approx(2.5, abs=0.05)
-    assert greatest_speed(autopilot, 0.3, 2.5) > speed > greatest_speed(autopilot, 1.0, 2.5)
+    assert greatest_speed(autopilot_of(autopilot), 0.3, 2.5) > speed > greatest_speed(autopilot_of(autopilot), 1.0, 2.5)
 
 
 def test_prediction_is_fast_enough_for_every_setpoint():
@@ -76,12 +76,12 @@ def test_a_vehicle_at_rest_stays(autopilot):
 def test_acceleration_lengthens_the_coast_of_px4():
     velocity, zero = np.array([1.2, 0.0, 0.0]), np.zeros(3)
     plain, pushed = (Setpoint(zero, velocity, np.array([a, 0.0, 0.0]), 0.0, 0.0) for a in (0.0, 0.8))
-    lengths = [coast_of(last, zero, velocity, "px4", 0.5).length_m for last in (plain, pushed)]
+    lengths = [autopilot_of("px4").coast_of(last, zero, velocity, 0.5).length_m for last in (plain, pushed)]
     assert lengths[1] > lengths[0] + 0.1
 
 
 def test_a_place_far_ahead_lengthens_the_coast_of_px4():
     velocity, zero = np.array([1.2, 0.0, 0.0]), np.zeros(3)
     near, far = (Setpoint(np.array([way, 0.0, 0.0]), velocity, zero, 0.0, 0.0) for way in (0.4, 1.4))
-    lengths = [coast_of(last, zero, velocity, "px4", 0.5).length_m for last in (near, far)]
+    lengths = [autopilot_of("px4").coast_of(last, zero, velocity, 0.5).length_m for last in (near, far)]
     assert lengths[1] > lengths[0] + 0.5

@@ -1,8 +1,7 @@
-"""Types of the check before a flight: what was measured, and what a check finds in it."""
+"""What was heard of an autopilot before a flight."""
 
 from __future__ import annotations
 
-import enum
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,48 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.conditions import Condition, ConditionCode
+from drocap_ros.flight.conditions import Condition
 from drocap_ros.flight.vehicle_state import VehicleState
 
 #: Share of the time above which a failing condition is no mere gap.
 LASTING = 0.5
-
-
-class Level(enum.IntEnum):
-    """How much a finding matters."""
-
-    OK = 0
-    WARNING = 1  # it flies; the setting or the link should change
-    MISSING = 2  # the bridge refuses motion, or soon ends it
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One check.
-
-    code : of programs
-    name : of people
-    found, wanted, remedy : sentences; "" where there is nothing to write
-    values : measured values by names with their units; NaN = unknown
-    conditions : that this finding explains
-    """
-
-    code: str
-    name: str
-    level: Level
-    found: str
-    wanted: str = ""
-    remedy: str = ""
-    values: Mapping[str, float | str | bool] = field(default_factory=dict)
-    conditions: tuple[ConditionCode, ...] = ()
-
-    def as_dict(self) -> dict[str, object]:
-        """The finding for JSON, which has no NaN."""
-        values = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in self.values.items()}
-        return {
-            "code": self.code, "level": self.level.name.lower(), "name": self.name, "found": self.found,
-            "wanted": self.wanted, "remedy": self.remedy, "values": values,
-        }  # fmt: skip
 
 
 class Stream(NamedTuple):

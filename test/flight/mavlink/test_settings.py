@@ -3,8 +3,9 @@ import math
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.mavlink.autopilot_settings import AutopilotSettings
+from drocap_ros.flight.mavlink.settings import AutopilotSettings
 from drocap_ros.flight.orbit.motion_checks import loss_condition
 from drocap_ros.flight.orbit.states import Action, State
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
@@ -15,7 +16,7 @@ REAL, INTEGER = mavlink.MAV_PARAM_TYPE_REAL32, mavlink.MAV_PARAM_TYPE_INT32
 
 def settings(autopilot, **values):
     known = AutopilotSettings()
-    known.set_autopilot(autopilot)
+    known.set_autopilot(autopilot_of(autopilot))
     for name, value in values.items():
         kind = INTEGER if isinstance(value, int) else REAL
         raw = value * 2.0**-149 if isinstance(value, int) else value  # the integer's bytes, read as a float
@@ -49,9 +50,10 @@ def settings(autopilot, **values):
 )
 def test_settings_that_forbid_motion(autopilot, values, code):
     known = settings(autopilot, **values).loss_settings()
-    found = loss_condition(known, 0.5)
+    meaning = autopilot_of(autopilot).loss_action
+    found = loss_condition(known, meaning, 0.5)
     assert (found and found.code) == code
-    assert loss_condition(known, 0.0) is None
+    assert loss_condition(known, meaning, 0.0) is None
     if code == ConditionCode.LOSS_ACTION_FATAL:
         assert "set COM_OBL_RC_ACT to 5, hold" in str(found)
     if code == ConditionCode.TIMEOUT_TOO_LONG:

@@ -1,0 +1,290 @@
+"""Everything that the rest asks of an autopilot.
+
+An instance in a file of its own (``ardupilot.py``, ``px4.py``) is all that an autopilot needs; the registry is
+``__init__.py``.  An autopilot without an instance is :data:`UNKNOWN`: it has no control mode, so nothing flies it, and
+the conditions for motion refuse it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.flight.autopilot.coasting import Coast, Coasting, HeldCoasting, coast_of
+from drocap_ros.flight.findings import Level
+from drocap_ros.flight.setpoint import Setpoint
+
+_MAV_MODE_FLAG_CUSTOM_MODE_ENABLED = 1  # MAV_MODE_FLAG of MAVLink's common.xml
+
+
+class LossSettings(NamedTuple):
+    """Reaction to the loss of setpoints: time-out in s and number of the action, with their parameters' names.
+
+    NaN = not reported; action_name "" = the autopilot has no such setting.
+    """
+
+    timeout_name: str
+    timeout_s: float
+    action_name: str = ""
+    action: float = math.nan
+
+
+class LossAction(NamedTuple):
+    """What an autopilot's action on the loss of setpoints means, by the action's number.
+
+    setting : name of the parameter
+    hold : number of the action that holds the position
+    words : what the vehicle does, for tables
+    fatal : consequence that forbids motion, as a sentence
+    leaves : consequence that should change, as a verb
+    modes : mode that the autopilot enters by itself; without an entry any mode may be it
+    """
+
+    setting: str
+    hold: int
+    words: Mapping[int, str]
+    fatal: Mapping[int, str]
+    leaves: Mapping[int, str]
+    modes: Mapping[int, str]
+
+
+class FlownSpeeds(NamedTuple):
+    """Speeds in m/s that the configuration asks for: of the orbit, and ``max_speed_m_s``."""
+
+    orbit_m_s: float
+    greatest_m_s: float
+
+
+class SettingCheck(NamedTuple):
+    """A parameter that the check before a flight judges.
+
+    wanted, remedy : sentences, in which ``speeds`` is a :class:`FlownSpeeds`
+    judge : level of a value
+    always : whether a row appears where the value was asked for and not reported; else the version lacks it
+    """
+
+    name: str
+    wanted: str
+    remedy: str
+    judge: Callable[[float, FlownSpeeds], Level]
+    always: bool = False
+
+
+def warn_if(wrong: Callable[[float], bool]) -> Callable[[float, FlownSpeeds], Level]:
+    """A judge that warns."""
+    return lambda value, _: Level.WARNING if wrong(value) else Level.OK
+
+
+class Fence(NamedTuple):
+    """The autopilot's own fence as it is set: metres, 0 = unlimited, NaN = not reported.
+
+    problem : why it guards nothing; "" = it does
+    """
+
+    problem: str
+    radius_m: float
+    height_m: float
+
+
+class FenceSettings(NamedTuple):
+    """Parameters of the autopilot's own fence.
+
+    others : beside the two sizes
+    how : settings that switch it on, for the remedy
+    read : the fence by the parameters; a missing one is NaN
+    """
+
+    radius: str
+    height: str
+    others: tuple[str, ...]
+    how: str
+    read: Callable[[Callable[[str], float]], Fence]
+
+
+class Hints(NamedTuple):
+    """The autopilot's part of remedies, in words; "" = none.
+
+    port : settings of a telemetry port that the bridge has for itself
+    mount : where the kind of the mount is set
+    battery : settings of a battery monitor with a current sensor
+    by_hand : how the pilot enters the control mode; "" = the pilot cannot
+    engaged : why the operator has to engage instead
+    """
+
+    port: str = ""
+    mount: str = ""
+    battery: str = ""
+    by_hand: str = ""
+    engaged: str = ""
+
+
+class CoastLimits(NamedTuple):
+    """Shares of ``max_coast_m``: of a steady flight, to which gusts, turns and the way add, and of any setpoint."""
+
+    steady: float
+    greatest: float
+
+
+class Echo(NamedTuple):
+    """How far the echoed target may be from a setpoint that was sent: m, and m/s (infinite = another velocity)."""
+
+    place_m: float
+    velocity_m_s: float
+
+
+# Of an unknown autopilot: nothing flies it.
+_NO_COASTING, _NO_COAST = HeldCoasting(0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.5), CoastLimits(0.5, 0.5)
+_NO_ECHO, _NO_HINTS = Echo(0.0, 0.0), Hints()
+
+
+@dataclass(frozen=True, eq=False)
+class Autopilot:
+    """One autopilot.  Instances are compared by identity.
+
+    Identity and modes
+
+    name : as in ``VehicleState``;  title : of people
+    mav_autopilot : MAV_AUTOPILOT of its heartbeat; None = of no heartbeat
+    modes : custom modes by their names; other numbers get pymavlink's names
+    submodes : whether a custom mode is a main and a sub mode, in its third and fourth byte
+    control_mode, hold_mode : names; "" = it has none
+    handed_over_mode : the mode in which the pilot hands over to the bridge
+    warm_up_s : how long setpoints must be sent before the control mode is granted
+    answers_twice : whether it acknowledges a mode at once, and then in earnest
+
+    Telemetry
+
+    estimator_message : by which it reports the health of its estimator;  estimator_bad : flags that deny it
+    heartbeat_on_request : whether it grants a rate for its heartbeat; else CURRENT_MODE shows a change of the mode
+    integers_in_bytes : whether an integer parameter has its bytes in the field of the float
+    height_wanders : whether the reported height wanders by decimetres within seconds
+
+    Flight by setpoints, and without them
+
+    position_gain_per_s : of its position loop
+    continues_setpoints : whether it continues a setpoint by its velocity and acceleration along a path that is limited
+        in jerk and overshoots; else it holds a setpoint as it came, and passes its acceleration on to the thrust
+    needs_mode_to_stop : whether only another mode stops a vehicle that follows no setpoints; else its time-out has
+    starts_from_ground : whether a setpoint may start a vehicle that stands on the ground
+    timeout_setting : parameter of the time-out without setpoints, s; "" = none
+    shipped_timeout_s : its value where it is not reported
+    loss_action : what follows it; None = it holds its position in the control mode
+    coasting : motion after the last setpoint;  coast : shares of the longest coast
+    gives_way_s : of the way of one who walks up to the vehicle, by which he comes nearer before it flies as fast
+    echo : distance of the echoed target from what was sent
+
+    Its settings before a flight
+
+    mount_type_setting : parameter of the mount's kind, whose value ``servo_mount`` means servos without a sensor
+    checks, fence, hints
+    """
+
+    name: str
+    title: str = ""
+    mav_autopilot: int | None = None
+    modes: Mapping[str, int] = field(default_factory=dict)
+    submodes: bool = False
+    control_mode: str = ""
+    hold_mode: str = ""
+    handed_over_mode: str = ""
+    warm_up_s: float = 0.0
+    answers_twice: bool = False
+
+    estimator_message: str = ""
+    estimator_bad: int = 0
+    heartbeat_on_request: bool = True
+    integers_in_bytes: bool = False
+    height_wanders: bool = False
+
+    position_gain_per_s: float = 1.0
+    continues_setpoints: bool = False
+    needs_mode_to_stop: bool = True
+    starts_from_ground: bool = True
+    timeout_setting: str = ""
+    shipped_timeout_s: float = math.inf
+    loss_action: LossAction | None = None
+    coasting: Coasting = _NO_COASTING
+    coast: CoastLimits = _NO_COAST
+    gives_way_s: float = 2.4  # of the slowest one
+    echo: Echo = _NO_ECHO
+
+    mount_type_setting: str = ""
+    servo_mount: float = math.nan
+    checks: tuple[SettingCheck, ...] = ()
+    fence: FenceSettings | None = None
+    hints: Hints = _NO_HINTS
+
+    @property
+    def supported(self) -> bool:
+        """Whether the bridge flies it."""
+        return bool(self.control_mode)
+
+    def mode_name(self, custom_mode: int) -> str:
+        """Name of a mode; "" = not in the table."""
+        return next((name for name, number in self.modes.items() if number == custom_mode), "")
+
+    def mode_numbers(self, mode: str) -> tuple[int, int]:
+        """Main and sub mode of MAV_CMD_DO_SET_MODE."""
+        number = self.modes[mode]
+        return (number >> 16 & 0xFF, number >> 24) if self.submodes else (number, 0)
+
+    def mode_parameters(self, mode: str) -> tuple[float, ...]:
+        """The seven parameters of MAV_CMD_DO_SET_MODE."""
+        main, sub = self.mode_numbers(mode)
+        return (float(_MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), float(main), float(sub), 0.0, 0.0, 0.0, 0.0)
+
+    @property
+    def loss_names(self) -> tuple[str, ...]:
+        """Parameters that decide its flight without setpoints."""
+        action = () if self.loss_action is None else (self.loss_action.setting,)
+        return (self.timeout_setting, *action) if self.timeout_setting else action
+
+    def loss_settings(self, values: Mapping[str, float]) -> LossSettings | None:
+        """Reaction to the loss of setpoints by its parameters; None = it has no such settings."""
+        if not self.timeout_setting:
+            return None
+        timeout_s = values.get(self.timeout_setting, math.nan)
+        if self.loss_action is None:
+            return LossSettings(self.timeout_setting, timeout_s)
+        setting = self.loss_action.setting
+        return LossSettings(self.timeout_setting, timeout_s, setting, values.get(setting, math.nan))
+
+    def timeout_s(self, settings: LossSettings | None) -> float:
+        """For how long it flies on without setpoints: as reported, else as it ships."""
+        reported = math.nan if settings is None else settings.timeout_s
+        return self.shipped_timeout_s if math.isnan(reported) else reported
+
+    @property
+    def preflight_names(self) -> tuple[str, ...]:
+        """Parameters that the check before a flight reads."""
+        fence = () if self.fence is None else (self.fence.radius, self.fence.height, *self.fence.others)
+        mount = (self.mount_type_setting,) if self.mount_type_setting else ()
+        return (*self.loss_names, *fence, *mount, *(check.name for check in self.checks))
+
+    def coast_of(self, setpoint: Setpoint, position: np.ndarray, velocity: np.ndarray, timeout_s: float) -> Coast:
+        """Horizontal motion until the vehicle stands, if this setpoint is the last one; see :func:`coast_of`."""
+        return coast_of(setpoint, position, velocity, self.coasting, timeout_s)
+
+
+@lru_cache(maxsize=64)
+def greatest_speed(autopilot: Autopilot, timeout_s: float, longest_m: float) -> float:
+    """Greatest speed in m/s at which a level flight straight ahead stops within ``longest_m``."""
+    low, high = 0.0, 20.0
+    while high - low > 0.01:
+        speed = 0.5 * (low + high)
+        velocity, zero = np.array([speed, 0.0, 0.0]), np.zeros(3)
+        last = Setpoint(zero, velocity, zero, 0.0, 0.0)
+        if autopilot.coast_of(last, zero, velocity, timeout_s).length_m > longest_m:
+            high = speed
+        else:
+            low = speed
+    return low
+
+
+#: An autopilot without an instance of its own.
+UNKNOWN = Autopilot("other", "an unknown autopilot")
