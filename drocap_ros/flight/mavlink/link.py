@@ -199,24 +199,20 @@ class MavlinkLink:
 
     def status(self) -> LinkStatus:
         """State of the link now."""
+        silence_s = math.inf if self._heard_s is None else self._monotonic_s() - self._heard_s
         with self._lock:
-            return self._status()
-
-    def _status(self) -> LinkStatus:
-        silence = float("inf") if self._heard_s is None else self._monotonic_s() - self._heard_s
-        trip = self.estimator.clock.round_trip_ns
-        now_ns = self._clock_ns()
-        return LinkStatus(
-            connected=silence < self.config.link_timeout_s,
-            silence_s=silence,
-            round_trip_s=float("nan") if trip is None else trip / _NS,
-            rates_hz=self._requests.rates_hz(now_ns),
-            refused=self._requests.refused(),
-            bad_count=self._parser.bad_count,
-            refused_count=self._parser.refused_count,
-            unknown_count=self._parser.unknown_count,
-            critical=self.estimator.modes.system_status == mavlink.MAV_STATE_CRITICAL,
-        )
+            trip_ns = self.estimator.clock.round_trip_ns
+            return LinkStatus(
+                connected=silence_s < self.config.link_timeout_s,
+                silence_s=silence_s,
+                round_trip_s=math.nan if trip_ns is None else trip_ns / _NS,
+                rates_hz=self._requests.rates_hz(self._clock_ns()),
+                refused=self._requests.refused(),
+                bad_count=self._parser.bad_count,
+                refused_count=self._parser.refused_count,
+                unknown_count=self._parser.unknown_count,
+                critical=self.estimator.modes.system_status == mavlink.MAV_STATE_CRITICAL,
+            )
 
     def _read(self, timeout_s: float) -> bytes:
         if self._broken_s is not None and not self._reopened(timeout_s):
