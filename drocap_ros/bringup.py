@@ -29,7 +29,7 @@ from rclpy.parameter import Parameter
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import DrocapError, InputError, NodeError
 from drocap_ros.flight.mavlink.transport import Transport
-from drocap_ros.reconstruction.threads import blas_threads
+from drocap_ros.reconstruction.common.threads import blas_threads
 from drocap_ros.ros import fastdds
 from drocap_ros.ros.component import ComponentNode
 from drocap_ros.ros.graph import Graph, Runner

@@ -20,7 +20,7 @@ from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.persons import find_persons, following, in_view
 from drocap_ros.perception.sources import Frame
 from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
-from drocap_ros.reconstruction.methods.method_input import Progress
+from drocap_ros.reconstruction.common.poses import Progress
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording.open_images import open_images, refuse_other_inputs
 from drocap_ros.recording.open_session import is_recording, open_session

@@ -13,16 +13,16 @@ from drocap_ros.errors import InputError
 from drocap_ros.joint_maps import TABLES, joint_map, joint_set_of
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.common.poses import CameraPoses, MethodInput, Progress
+from drocap_ros.reconstruction.common.threads import blas_threads
 from drocap_ros.reconstruction.heels import with_heels
 from drocap_ros.reconstruction.lifted.lifted_config import lifted_config
 from drocap_ros.reconstruction.lifted.lifter import Lifter
 from drocap_ros.reconstruction.lifted.method import ACROSS, ALONG
 from drocap_ros.reconstruction.methods import METHODS
-from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput, Progress
 from drocap_ros.reconstruction.methods.run import run_method
 from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.threads import blas_threads
 from drocap_ros.reconstruction.world.in_world import in_camera_axes, in_world
 from drocap_ros.reconstruction.world.placement import metres_per_px
 from drocap_ros.reconstruction.world.refine import refinable

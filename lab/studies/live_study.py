@@ -17,11 +17,11 @@ from drocap_ros.evaluation.world_protocol import WorldView
 from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.mocap import Sequence
 from drocap_ros.observation import PoseObservation
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.skeleton import BODY_15, BODY_17
 
 #: Age at which the error of a refined pose counts.

@@ -15,12 +15,12 @@ from drocap_ros.evaluation.world_errors import WORLD_HEAD, WorldErrors, world_ce
 from drocap_ros.evaluation.world_protocol import LONGEST_S, WorldView, world_sequences, world_view
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.geometry.rotations import quaternion_from_matrix
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.latest_place import LatestPlace
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.replay import LivePose, live_poses
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 from lab.studies.live_study import REFINED_AFTER_S, observations
 
 

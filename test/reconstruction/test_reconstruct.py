@@ -16,12 +16,12 @@ from drocap_ros.evaluation.metrics import horizon_error, is_mirrored, pa_mpjpe
 from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.motion import Motion, load_motion, save_motion
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.common.poses import CameraPoses, MethodInput
+from drocap_ros.reconstruction.common.windows import windows
 from drocap_ros.reconstruction.methods import METHODS
-from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput
 from drocap_ros.reconstruction.methods.run import run_method
-from drocap_ros.reconstruction.methods.windows import windows
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
 

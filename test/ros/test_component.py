@@ -16,7 +16,7 @@ from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import ParameterError
 from drocap_ros.nodes.initializer import InitializerNode
 from drocap_ros.observation import PoseObservation
-from drocap_ros.reconstruction.reconstruction_config import InitializerConfig
+from drocap_ros.reconstruction.common.config import InitializerConfig
 from drocap_ros.ros.conversions import pose2d_to_ros
 from drocap_ros.ros.diagnostics import Key, values_of
 from drocap_ros.ros.topics import RESULT_QOS, TOPICS

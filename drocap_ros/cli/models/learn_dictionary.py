@@ -72,8 +72,8 @@ def learn_from_folder(
 
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.mocap import load_mocap, mocap_files
+    from drocap_ros.reconstruction.common.threads import blas_threads
     from drocap_ros.reconstruction.paper.dictionary import learn, normalize_poses
-    from drocap_ros.reconstruction.threads import blas_threads
     from drocap_ros.tracks import read_npz
 
     files = mocap_files(folder, include)

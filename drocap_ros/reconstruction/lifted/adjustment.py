@@ -21,9 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.geometry.bones import pair_lengths
-from drocap_ros.reconstruction.banded import backward, band_factor, forward
-from drocap_ros.reconstruction.line_search import search_line
-from drocap_ros.reconstruction.stop_reason import CONVERGED, DEADLINE, ITERATIONS, NO_DESCENT
+from drocap_ros.reconstruction.common.banded import backward, band_factor, forward
+from drocap_ros.reconstruction.common.line_search import search_line
+from drocap_ros.reconstruction.common.stop_reason import CONVERGED, DEADLINE, ITERATIONS, NO_DESCENT
 from drocap_ros.skeleton import BODY_17, RIGID_BONES, indices
 
 _CHAIN = BODY_17.bones

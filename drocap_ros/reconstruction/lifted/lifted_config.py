@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from drocap_ros.parameters import Parameters, param
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 
 
 @dataclass(frozen=True)

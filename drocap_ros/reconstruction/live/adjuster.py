@@ -11,6 +11,9 @@ from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
+from drocap_ros.reconstruction.common.stop_reason import DEADLINE
+from drocap_ros.reconstruction.common.threads import blas_threads
 from drocap_ros.reconstruction.lifted.body_size import BodySize, magnification
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig, lifted_config
 from drocap_ros.reconstruction.lifted.method import ACROSS, ALONG, WindowSolution, prepare, solve_window
@@ -22,9 +25,6 @@ from drocap_ros.reconstruction.live.window import AdjustedWindow, Window
 from drocap_ros.reconstruction.live.world_windows import WorldWindows
 from drocap_ros.reconstruction.paper.bundle_adjustment import MIN_WINDOW
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
-from drocap_ros.reconstruction.stop_reason import DEADLINE
-from drocap_ros.reconstruction.threads import blas_threads
 from drocap_ros.skeleton import BODY_15
 
 #: Errors that an adjustment raises on arrays that it cannot solve.

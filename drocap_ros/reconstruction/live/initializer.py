@@ -9,11 +9,11 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.observation import PoseObservation
+from drocap_ros.reconstruction.common.config import InitializerConfig
 from drocap_ros.reconstruction.lifted.lifter import Lifter
 from drocap_ros.reconstruction.live.stream_lifter import StreamLifter
 from drocap_ros.reconstruction.live.stream_order import StreamEvent, StreamOrder
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS, check_uncertainty
-from drocap_ros.reconstruction.reconstruction_config import InitializerConfig
 from drocap_ros.skeleton import BODY_17
 
 

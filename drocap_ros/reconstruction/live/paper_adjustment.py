@@ -9,13 +9,13 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.geometry.interpolation import fill_frames
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
+from drocap_ros.reconstruction.common.stop_reason import TOO_SHORT
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Window
 from drocap_ros.reconstruction.paper.bundle_adjustment import MIN_WINDOW, bundle_adjust
 from drocap_ros.reconstruction.paper.expectation import expected_information
 from drocap_ros.reconstruction.paper.normalize import normalize_tracks
 from drocap_ros.reconstruction.paper.reprojection import Projection, frames_first, frames_last
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
-from drocap_ros.reconstruction.stop_reason import TOO_SHORT
 from drocap_ros.skeleton import BODY_15, BODY_17, indices
 
 #: Least standard deviations of an adjusted pose, in units of the 2D joints: across the image, along the ray.

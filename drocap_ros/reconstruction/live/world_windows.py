@@ -13,11 +13,11 @@ import numpy as np
 from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.geometry.rotations import log_so3
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
+from drocap_ros.reconstruction.common.poses import CameraPoses
+from drocap_ros.reconstruction.common.windows import split
 from drocap_ros.reconstruction.lifted.method import WindowSolution
 from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, Telemetry, Window
-from drocap_ros.reconstruction.methods.method_input import CameraPoses
-from drocap_ros.reconstruction.methods.windows import split
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.in_world import in_world
 from drocap_ros.reconstruction.world.placement import metres_per_px

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from drocap_ros.reconstruction.common.poses import CameraPoses, MethodInput
 from drocap_ros.reconstruction.methods import ba, initial, mf_nnm, paper
-from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput
 from drocap_ros.skeleton import BODY_15, BODY_17, JointSet
 
 

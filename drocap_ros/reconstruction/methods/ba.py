@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.common.poses import CameraPoses, MethodInput
+from drocap_ros.reconstruction.common.windows import WindowResult, over_windows
 from drocap_ros.reconstruction.lifted.lifted_config import lifted_config
 from drocap_ros.reconstruction.lifted.method import solve_window
-from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput
-from drocap_ros.reconstruction.methods.windows import WindowResult, over_windows
 from drocap_ros.reconstruction.paper.normalize import NormalizedTracks
 
 

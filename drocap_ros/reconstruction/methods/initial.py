@@ -6,11 +6,11 @@ import time
 
 import numpy as np
 
-from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput
-from drocap_ros.reconstruction.methods.windows import normalized_windows, placed, split
+from drocap_ros.reconstruction.common.poses import CameraPoses, MethodInput
+from drocap_ros.reconstruction.common.stop_reason import NO_ADJUSTMENT
+from drocap_ros.reconstruction.common.windows import normalized_windows, placed, split
 from drocap_ros.reconstruction.paper.reprojection import information_from
 from drocap_ros.reconstruction.paper.single_view import initialize
-from drocap_ros.reconstruction.stop_reason import NO_ADJUSTMENT
 
 
 def run(data: MethodInput) -> CameraPoses:

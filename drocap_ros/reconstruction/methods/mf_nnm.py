@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 
-from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput
-from drocap_ros.reconstruction.methods.windows import WindowResult, over_windows, placed
+from drocap_ros.reconstruction.common.poses import CameraPoses, MethodInput
+from drocap_ros.reconstruction.common.windows import WindowResult, over_windows, placed
 from drocap_ros.reconstruction.paper.mf_nnm import factorize
 from drocap_ros.reconstruction.paper.normalize import NormalizedTracks
 

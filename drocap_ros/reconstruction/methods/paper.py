@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from drocap_ros.reconstruction.common.poses import CameraPoses, MethodInput
+from drocap_ros.reconstruction.common.stop_reason import TOO_SHORT
+from drocap_ros.reconstruction.common.windows import WindowResult, over_windows, placed
 from drocap_ros.reconstruction.methods.initial import initial_poses
-from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput
-from drocap_ros.reconstruction.methods.windows import WindowResult, over_windows, placed
 from drocap_ros.reconstruction.paper.bundle_adjustment import MIN_WINDOW, bundle_adjust
 from drocap_ros.reconstruction.paper.normalize import NormalizedTracks
-from drocap_ros.reconstruction.stop_reason import TOO_SHORT
 
 
 def run(data: MethodInput) -> CameraPoses:

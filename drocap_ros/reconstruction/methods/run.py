@@ -8,8 +8,8 @@ import numpy as np
 
 from drocap_ros.geometry.interpolation import fill_frames
 from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.common.poses import CameraPoses, MethodInput
 from drocap_ros.reconstruction.methods import METHODS
-from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS, normalize_tracks
 
 

@@ -16,6 +16,8 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.alignment import torso_frame
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
+from drocap_ros.reconstruction.common.stop_reason import CONVERGED, ITERATIONS
 from drocap_ros.reconstruction.paper.articulation import articulation_term, articulation_value
 from drocap_ros.reconstruction.paper.nuclear_norm import nuclear_norm, singular_value_threshold
 from drocap_ros.reconstruction.paper.reprojection import (
@@ -26,8 +28,6 @@ from drocap_ros.reconstruction.paper.reprojection import (
     rotate,
 )
 from drocap_ros.reconstruction.paper.rotations import update_rotations
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
-from drocap_ros.reconstruction.stop_reason import CONVERGED, ITERATIONS
 
 #: Window length for which alpha is given: the protocol's 10 s at 24 fps.
 REFERENCE_FRAMES = 240

@@ -14,10 +14,10 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.alignment import to_torso_frame
 from drocap_ros.geometry.rotations import complete_rotation
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.paper.bundle_adjustment import Objective, minimize
 from drocap_ros.reconstruction.paper.dictionary import Dictionary, normalize_poses
 from drocap_ros.reconstruction.paper.reprojection import Projection, frames_first, frames_last
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 
 #: Candidates of K in the rank 3K of the factorization.
 BASIS_SHAPES = (2, 3)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drocap_ros.reconstruction.common.config import InitializerConfig
 from drocap_ros.reconstruction.paper.convex_relaxation import convex_relaxation, rotation_and_coefficients
 from drocap_ros.reconstruction.paper.dictionary import Dictionary, sparse_code
 from drocap_ros.reconstruction.paper.expectation import expected_information
@@ -13,7 +14,6 @@ from drocap_ros.reconstruction.paper.reprojection import Projection, frames_firs
 from drocap_ros.reconstruction.paper.sparse_fit import SparseFit, fit_sparse
 from drocap_ros.reconstruction.paper.viewpoint_search import DenseFit, fit_dense, image_scale, initial_viewpoints
 from drocap_ros.reconstruction.paper.viterbi import choose_path
-from drocap_ros.reconstruction.reconstruction_config import InitializerConfig
 
 
 @dataclass(frozen=True)

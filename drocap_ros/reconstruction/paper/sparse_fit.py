@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drocap_ros.reconstruction.common.config import InitializerConfig
 from drocap_ros.reconstruction.paper.dictionary import Dictionary, soft_threshold
 from drocap_ros.reconstruction.paper.reprojection import Projection, frames_first
 from drocap_ros.reconstruction.paper.rotations import update_rotations
-from drocap_ros.reconstruction.reconstruction_config import InitializerConfig
 
 
 @dataclass(frozen=True)

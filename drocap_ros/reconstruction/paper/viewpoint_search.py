@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.reconstruction.common.config import InitializerConfig
 from drocap_ros.reconstruction.paper.dictionary import Dictionary
-from drocap_ros.reconstruction.reconstruction_config import InitializerConfig
 from drocap_ros.skeleton import BODY_15
 
 #: Poses fitted in one batch: their Jacobians fit the processor's cache.

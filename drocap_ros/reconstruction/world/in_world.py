@@ -8,7 +8,7 @@ import numpy as np
 
 from drocap_ros.geometry.position_steps import without_steps
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.methods.method_input import CameraPoses
+from drocap_ros.reconstruction.common.poses import CameraPoses
 from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.placement import WorldPoses, place_in_world
 from drocap_ros.reconstruction.world.refine import Before, PlacedPoses, RefinedWorld, refinable, refine_in_world

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.reconstruction.banded import backward, band_factor, forward
+from drocap_ros.reconstruction.common.banded import backward, band_factor, forward
 from drocap_ros.reconstruction.world.world_equations import WIDTH
 from drocap_ros.reconstruction.world.world_model import CAMERA, FRAME, GLOBALS, JOINTS, SCALE, WorldState
 

@@ -11,10 +11,10 @@ from drocap_ros.contacts import ANKLES, ankles_seen
 from drocap_ros.geometry.interpolation import MAX_GAP_S
 from drocap_ros.geometry.rotations import exp_so3, project_to_so3
 from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.common.windows import fade_weights, windows
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.lifted.window_solver import difference_noise
-from drocap_ros.reconstruction.methods.windows import fade_weights, windows
 from drocap_ros.reconstruction.world.calibration import MEASURED, Calibration
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.telemetry_checks import (

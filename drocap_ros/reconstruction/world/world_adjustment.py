@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.contacts import ANKLES, FEET, HEIGHT_STD_M, MOVING, MOVING_LOCKED, RestingFeet, step_height
-from drocap_ros.reconstruction.banded import backward, band_factor, forward
-from drocap_ros.reconstruction.line_search import search_line
-from drocap_ros.reconstruction.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
+from drocap_ros.reconstruction.common.banded import backward, band_factor, forward
+from drocap_ros.reconstruction.common.line_search import search_line
+from drocap_ros.reconstruction.common.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
 from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.posterior import posterior
 from drocap_ros.reconstruction.world.world_equations import normal_matrix

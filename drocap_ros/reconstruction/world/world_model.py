@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drocap_ros.parameters import Parameters, param
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.lifted.adjustment import SPAN_STD_MM, SPANS
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.camera_telemetry import CameraPath, CameraTelemetry
 from drocap_ros.skeleton import BODY_15, BODY_17

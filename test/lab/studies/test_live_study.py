@@ -7,7 +7,7 @@ import pytest
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.protocol import orbit_view
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_15, BODY_17
 from lab.studies.live_study import live_study, simulate_live, standardized_error

@@ -13,11 +13,11 @@ from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.live.adjuster import LiveAdjuster
 from drocap_ros.reconstruction.live.effort import Effort, EffortControl
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Window
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.skeleton import BODY_17, indices
 
 FRAMES = 120

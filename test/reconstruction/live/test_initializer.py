@@ -13,9 +13,9 @@ from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import is_mirrored, pa_mpjpe
 from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.observation import PoseObservation
+from drocap_ros.reconstruction.common.config import InitializerConfig
 from drocap_ros.reconstruction.live.initializer import InitialPose, LiveInitializer
 from drocap_ros.reconstruction.live.stream_order import StreamEvent
-from drocap_ros.reconstruction.reconstruction_config import InitializerConfig
 
 FRAMES = 72
 S = 10**9

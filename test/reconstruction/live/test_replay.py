@@ -12,8 +12,8 @@ from walking import make_walk, stamps
 
 from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.observation import PoseObservation
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 
 ADJUSTER = BundleAdjusterConfig(period_s=0.5, window_s=2.0)
 S = 10**9

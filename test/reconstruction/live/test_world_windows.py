@@ -16,12 +16,12 @@ from drocap_ros.evaluation.world_errors import WorldErrors, world_errors
 from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.geometry.rotations import exp_so3, quaternion_from_matrix
 from drocap_ros.observation import PoseObservation
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.latest_place import LatestPlace
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
 from drocap_ros.reconstruction.live.window import Telemetry
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.tracks import Tracks
 
 S = 10**9

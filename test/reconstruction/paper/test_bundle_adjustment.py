@@ -10,9 +10,9 @@ from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.paper.bundle_adjustment import AdjustmentResult, bundle_adjust
 from drocap_ros.reconstruction.paper.reprojection import information_from
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 
 
 def units(walk: Walk) -> tuple[np.ndarray, float]:

@@ -11,6 +11,7 @@ from walking import make_walk
 
 from drocap_ros.evaluation.metrics import is_mirrored, pa_mpjpe
 from drocap_ros.evaluation.protocol import orbit_rotations
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.paper.dictionary import Dictionary
 from drocap_ros.reconstruction.paper.mf_nnm import (
     factorize,
@@ -19,7 +20,6 @@ from drocap_ros.reconstruction.paper.mf_nnm import (
     rotations_by_factorization,
 )
 from drocap_ros.reconstruction.paper.reprojection import information_from
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 
 FRAMES = 150
 

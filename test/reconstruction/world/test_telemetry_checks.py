@@ -12,8 +12,8 @@ from test_world_adjustment import FPS, MATRIX, followed, orbit, project, tracks,
 from drocap_ros.contacts import RestingFeet
 from drocap_ros.evaluation.metrics import scale_error
 from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.reconstruction.world import refine
 from drocap_ros.reconstruction.world.calibration_words import telemetry_words
 from drocap_ros.reconstruction.world.telemetry_checks import frozen, jump_m, turned_at_once

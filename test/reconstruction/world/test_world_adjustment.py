@@ -14,9 +14,9 @@ from drocap_ros.contacts import ANKLES, RestingFeet
 from drocap_ros.evaluation.metrics import scale_error
 from drocap_ros.evaluation.world_metrics import ellipsoid_coverage, still_foot_speed
 from drocap_ros.geometry.rotations import exp_so3, left_jacobian, log_so3
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.world import refine
 from drocap_ros.reconstruction.world.calibration_words import telemetry_words
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.methods.method_input import CameraPoses, MethodInput
+from drocap_ros.reconstruction.common.poses import CameraPoses, MethodInput
 from drocap_ros.reconstruction.paper.normalize import NormalizedTracks, normalize_tracks
 from drocap_ros.reconstruction.paper.reprojection import Projection, frames_last
 

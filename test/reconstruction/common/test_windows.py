@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from drocap_ros.reconstruction.methods.windows import windows
+from drocap_ros.reconstruction.common.windows import windows
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.paper.dictionary import Dictionary
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig, InitializerConfig
 
 Progress = Callable[[str, float], None]
 
