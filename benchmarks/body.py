@@ -30,7 +30,8 @@ from drocap_ros.evaluation.protocol import (
 from drocap_ros.geometry.alignment import apply_similarity, similarity
 from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.mocap import load_mocap, mocap_files, resample
-from drocap_ros.reconstruction.lifted.lifter import Lifter, LifterInput
+from drocap_ros.reconstruction.lifted.lifter import Lifter
+from drocap_ros.reconstruction.lifted.network import LifterInput
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.skeleton import BODY_15, BODY_17, LIMB_JOINTS, indices
 from drocap_ros.tracks import Tracks

@@ -22,7 +22,8 @@ from figures import table, write_figures
 from drocap_ros.mocap import mocap_files
 from drocap_ros.reconstruction.lifted import adjustment, body_size, window_solver
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig, lifted_config
-from drocap_ros.reconstruction.lifted.lifter import LiftedMotion, Lifter, LifterInput
+from drocap_ros.reconstruction.lifted.lifter import Lifter
+from drocap_ros.reconstruction.lifted.network import LiftedMotion, LifterInput
 from drocap_ros.reconstruction.methods import ba
 
 MEASURED = ("clean", "clean, camera's rotation known", "noisy", "correlated noise, covariance given")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import platform
 import time
 from typing import Any
 
@@ -14,25 +15,52 @@ from drocap_ros.joint_maps import TABLES, joint_map, joint_set_of
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.common.poses import CameraPoses, MethodInput, Progress
+from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput, Progress
+from drocap_ros.reconstruction.common.refusal import Refusal
 from drocap_ros.reconstruction.common.threads import blas_threads
 from drocap_ros.reconstruction.heels import with_heels
-from drocap_ros.reconstruction.lifted.lifted_config import lifted_config
-from drocap_ros.reconstruction.lifted.lifter import Lifter
-from drocap_ros.reconstruction.lifted.method import ACROSS, ALONG
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.methods.run import run_method
-from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M, Dictionary, load_dictionary
+from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M
 from drocap_ros.reconstruction.world.in_world import in_camera_axes, in_world
-from drocap_ros.reconstruction.world.placement import metres_per_px
-from drocap_ros.reconstruction.world.refine import refinable
-from drocap_ros.reconstruction.world.world_model import WorldConfig, world_config
+from drocap_ros.reconstruction.world.placement import WorldPoses, metres_per_px
+from drocap_ros.reconstruction.world.refine import RefinedWorld, refinable
+from drocap_ros.reconstruction.world.world_model import world_config
 from drocap_ros.revision import git_revision
 from drocap_ros.skeleton import BODY_15, BODY_17, BODY_19, JointSet, body_set
 from drocap_ros.tracks import Tracks
 
 #: Steps of each of the body's adjustments where the one in the world goes on from them: more change nothing there.
 _STEPS_BEFORE_WORLD = 2
+#: Fewer known joints, of the 15 of a body, determine no pose.
+_LEAST_JOINTS = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class _Settings:
+    method: str
+    initializer: InitializerConfig
+    adjuster: BundleAdjusterConfig
+    progress: Progress
+
+    @property
+    def body(self) -> JointSet:
+        return METHODS[self.method].joints
+
+
+@dataclasses.dataclass(frozen=True)
+class _Body:
+    """Poses in m, with the camera: the fields of :class:`Motion` of the same names."""
+
+    joints3d: np.ndarray
+    frame: str
+    metric: bool
+    scale_source: str
+    camera_rotation: np.ndarray
+    camera_position: np.ndarray | None
+    reprojection_px: np.ndarray
+    covariance: np.ndarray | None
+    meta: dict[str, Any]
 
 
 def reconstruct(
@@ -41,7 +69,6 @@ def reconstruct(
     method: str = "ba",
     initializer: InitializerConfig | None = None,
     adjuster: BundleAdjusterConfig | None = None,
-    dictionary: Dictionary | None = None,
     progress: Progress | None = None,
 ) -> Motion:
     """3D motion of the subject of ``tracks``.
@@ -66,68 +93,82 @@ def reconstruct(
     """
     if method not in METHODS:
         raise InputError(f"method: expected one of {', '.join(METHODS)}, got {method!r}; choose one of them")
-    initializer = initializer or InitializerConfig()
-    adjuster = adjuster or BundleAdjusterConfig()
-    dictionary = dictionary or load_dictionary(initializer.dictionary or None)
-    started = time.perf_counter()
-    joints = METHODS[method].joints
-    seen = body_keypoints(tracks, BODY_19)
-    keypoints = seen.with_joints(len(joints))
-    k = tracks.camera_matrix
-    body = adjuster
+    settings = _Settings(
+        method, initializer or InitializerConfig(), adjuster or BundleAdjusterConfig(), progress or (lambda *_: None)
+    )
+    clock = time.perf_counter()
+    every_joint = body_keypoints(tracks, BODY_19)
+    keypoints = every_joint.with_joints(len(settings.body))
+    with blas_threads(settings.adjuster.threads):
+        poses = _solve(tracks, keypoints, settings)
+        solved = time.perf_counter()
+        body = _in_metres(tracks, keypoints, poses, settings)
+        if not isinstance(body, _Body):
+            # The lifter saw the camera's rotation: without it the poses differ too.
+            refusal, tracks = body, dataclasses.replace(tracks, camera_rotation=None, camera_position=None)
+            poses = _solve(tracks, keypoints, settings)
+            solved = time.perf_counter()
+            body = _in_metres(tracks, keypoints, poses, settings)
+            assert isinstance(body, _Body)
+            body.meta["telemetry_rejected"] = str(refusal)
+    motion = Motion(
+        joints=settings.body.joints,
+        parents=settings.body.parents,
+        stamp_ns=tracks.stamp_ns,
+        confidence=keypoints.weights,
+        keypoints=keypoints.xy,
+        **{field.name: getattr(body, field.name) for field in dataclasses.fields(body)},
+    )
+    if settings.body is BODY_17:
+        motion = with_heels(motion, every_joint.without_joints(len(BODY_17)), poses.in_image)
+    seconds = dict(poses.report.seconds)
+    if motion.frame == "world":
+        seconds["world"] = time.perf_counter() - solved
+    total = time.perf_counter() - clock
+    motion.meta.update(
+        _meta(poses, settings), seconds={**seconds, "other": total - sum(seconds.values()), "total": total}
+    )
+    return motion
+
+
+def _solve(tracks: Tracks, keypoints: Keypoints2D, settings: _Settings) -> ImagePoses:
+    """Poses in px by the method."""
+    k, adjuster = tracks.camera_matrix, settings.adjuster
     if refinable(tracks):
         first, final = (min(n, _STEPS_BEFORE_WORLD) for n in (adjuster.limb_iterations_first, adjuster.limb_iterations))
-        body = dataclasses.replace(adjuster, limb_iterations_first=first, limb_iterations=final)
+        adjuster = dataclasses.replace(adjuster, limb_iterations_first=first, limb_iterations=final)
     data = MethodInput(
         stamp_ns=tracks.stamp_ns,
         keypoints=keypoints,
         focal_px=None if k is None else 0.5 * float(k[0, 0] + k[1, 1]),
-        initializer=initializer,
-        adjuster=body,
-        dictionary=dictionary,
-        progress=progress or (lambda stage, fraction: None),
+        initializer=settings.initializer,
+        adjuster=adjuster,
+        progress=settings.progress,
         rotation=tracks.camera_rotation,
     )
-    with blas_threads(adjuster.threads):
-        result = run_method(method, data)
-        if not np.isfinite(result.joints_px).all(axis=(1, 2)).any():
-            raise InputError(
-                "keypoints: expected those of a person, got none that give a finite pose; check the values"
-            )
-        solved = time.perf_counter()
-        motion = _to_motion(tracks, joints, keypoints, result, initializer, world_config(adjuster))
-    if isinstance(motion, str):
-        # The lifter saw the camera's rotation: without it the poses differ too.
-        without = dataclasses.replace(tracks, camera_rotation=None, camera_position=None)
-        again = reconstruct(
-            without, method=method, initializer=initializer, adjuster=adjuster, dictionary=dictionary, progress=progress
-        )
-        again.meta["telemetry_rejected"] = motion
-        return again
-    if joints is BODY_17:
-        motion = with_heels(motion, seen.without_joints(len(joints)), _in_image(result))
-    seconds = dict(result.seconds)
-    if motion.frame == "world":
-        seconds["world"] = time.perf_counter() - solved
-    total = time.perf_counter() - started
-    motion.meta.update(
-        method=method,
-        versions=_versions(),
-        git_revision=git_revision(),
-        parameters={"initializer": dataclasses.asdict(initializer), "adjuster": dataclasses.asdict(adjuster)},
-        dictionary=dictionary.metadata,
-        seconds={**seconds, "other": total - sum(seconds.values()), "total": total},
-        iterations=result.iterations,
-        stop_reason=result.stop_reason,
-        cost_terms=result.cost_terms,
-        frames=len(tracks),
-    )
-    if method == "ba":
-        own = lifted_config(adjuster)
-        motion.meta["parameters"]["default_method"] = dataclasses.asdict(own)
-        motion.meta["parameters"]["world"] = dataclasses.asdict(world_config(adjuster))
-        motion.meta["lifter"] = Lifter.load(own.lifter or None).origin
-    return motion
+    poses = run_method(settings.method, data)
+    if not np.isfinite(poses.joints_px).all(axis=(1, 2)).any():
+        raise InputError("keypoints: expected those of a person, got none that give a finite pose; check the values")
+    return poses
+
+
+def _meta(poses: ImagePoses, settings: _Settings) -> dict[str, Any]:
+    """What made the motion."""
+    report, origin = poses.report, dict(poses.report.origin)
+    parameters = {"initializer": settings.initializer, "adjuster": settings.adjuster, **origin.pop("parameters", {})}
+    if poses.sigma_px is not None:  # of what the adjustment in the world starts from
+        parameters["world"] = world_config(settings.adjuster)
+    return {
+        "method": settings.method,
+        "versions": {"drocap_ros": __version__, "numpy": np.__version__, "python": platform.python_version()},
+        "git_revision": git_revision(),
+        "parameters": {name: dataclasses.asdict(values) for name, values in parameters.items()},
+        "iterations": report.iterations,
+        "stop_reason": report.stop_reason,
+        "cost_terms": report.cost_terms,
+        "frames": len(poses.joints_px),
+        **origin,
+    }
 
 
 def body_keypoints(tracks: Tracks, joints: JointSet = BODY_17) -> Keypoints2D:
@@ -144,10 +185,10 @@ def body_keypoints(tracks: Tracks, joints: JointSet = BODY_17) -> Keypoints2D:
     have = place >= 0
     names = tuple(np.array(source.joints)[have])
     given = sum(set(parts) <= set(names) for parts in TABLES[source.name].values())
-    if given < 4:
+    if given < _LEAST_JOINTS:
         raise InputError(
-            f"joints: expected at least 4 of {', '.join(BODY_15.joints)}, or names of {', '.join(list(TABLES)[3:])},"
-            f" got {given} of them; rename the joints"
+            f"joints: expected at least {_LEAST_JOINTS} of {', '.join(BODY_15.joints)}, or names of"
+            f" {', '.join(list(TABLES)[3:])}, got {given} of them; rename the joints"
         )
     shape = (len(tracks), len(source))
     keypoints, confidence, covariance = np.full((*shape, 2), np.nan), np.zeros(shape), np.full((*shape, 3), np.nan)
@@ -167,76 +208,76 @@ def body_keypoints(tracks: Tracks, joints: JointSet = BODY_17) -> Keypoints2D:
     return found.with_joints(len(joints))
 
 
-def _to_motion(
-    tracks: Tracks,
-    body: JointSet,
-    keypoints: Keypoints2D,
-    result: CameraPoses,
-    config: InitializerConfig,
-    world_config: WorldConfig,
-) -> Motion | str:
-    """The motion, or in words why the telemetry cannot be true."""
-    projected = result.joints_px[..., :2] + result.translation_px[:, None]
-    reprojection = np.linalg.norm(projected - keypoints.xy, axis=-1)
-    per_px = metres_per_px(result.joints_px, tracks.stamp_ns, config.assumed_height_m)
-    joints = in_camera_axes(result, per_px)
-    metric, scale_source = False, "assumed_height"
-    meta: dict[str, Any] = {"assumed_height_m": config.assumed_height_m, "reference_stature_m": REFERENCE_STATURE_M}
-    position = covariance = None
-    rotation, frame = np.broadcast_to(np.eye(3), (len(tracks), 3, 3)).copy(), "camera"
-    if tracks.camera_rotation is None and tracks.camera_matrix is not None:
-        # Undo the perspective, as place_in_world: it moves joints behind the pelvis towards the axis.
-        range_m = 0.5 * (tracks.camera_matrix[0, 0] + tracks.camera_matrix[1, 1]) * per_px
-        joints[..., :2] *= np.maximum(1.0 + joints[..., 2] / range_m[:, None], 0.1)[..., None]
-    if tracks.camera_rotation is not None:
-        rotation, frame = tracks.camera_rotation, "world"
-        world, found = in_world(tracks, keypoints, result, per_px, world_config)
-        joints, metric, scale_source = world.joints, world.metric, world.scale_source
-        if world.scale is not None:
-            meta["scale"] = dataclasses.asdict(world.scale)
-        position = tracks.camera_position
-        if isinstance(found, str):
-            return found
-        if found is not None:
-            joints, rotation, position, metric = found.joints, found.rotation, found.position, found.metric
-            scale_source = "telemetry" if metric else "assumed_height"
-            covariance = found.covariance
-            reprojection = reprojection_px(joints, rotation, position, tracks.camera_matrix, keypoints.xy)
-            meta["calibration"], meta["covariance_about"] = found.calibration, "origin"
-    if covariance is None and result.sigma_px is not None:
-        covariance = _covariance(result.sigma_px * per_px[:, None, None], rotation)
-        meta["covariance_about"] = "pelvis"
-    return Motion(
-        joints3d=np.ascontiguousarray(joints),
-        joints=body.joints,
-        parents=body.parents,
-        stamp_ns=tracks.stamp_ns,
+def _in_metres(tracks: Tracks, keypoints: Keypoints2D, poses: ImagePoses, settings: _Settings) -> _Body | Refusal | str:
+    """The one step from px to m: in the world where the camera's rotation is known, else in the camera's axes.
+
+    In the world the poses are placed by the reported camera and, with its position and matrix, adjusted with it.  The
+    answer is a refusal where its telemetry cannot be true.
+    """
+    height_m = settings.initializer.assumed_height_m
+    per_px = metres_per_px(poses.joints_px, tracks.stamp_ns, height_m)
+    meta: dict[str, Any] = {"assumed_height_m": height_m, "reference_stature_m": REFERENCE_STATURE_M}
+    rotation, refined = tracks.camera_rotation, None
+    if rotation is None:
+        rotation, frame = np.broadcast_to(np.eye(3), (len(tracks), 3, 3)).copy(), "camera"
+        placed = WorldPoses(_without_perspective(tracks, poses, per_px), False, "assumed_height", None)
+    else:
+        frame = "world"
+        placed, refined = in_world(tracks, keypoints, poses, per_px, world_config(settings.adjuster))
+        if refined is not None and not isinstance(refined, RefinedWorld):
+            return refined
+    if placed.scale is not None:
+        meta["scale"] = dataclasses.asdict(placed.scale)
+    body = _Body(
+        joints3d=np.ascontiguousarray(placed.joints),
         frame=frame,
-        metric=metric,
-        scale_source=scale_source,
+        metric=placed.metric,
+        scale_source=placed.scale_source,
         camera_rotation=rotation,
-        confidence=keypoints.weights,
-        keypoints=keypoints.xy,
-        reprojection_px=reprojection,
+        camera_position=tracks.camera_position if frame == "world" else None,
+        reprojection_px=np.linalg.norm(poses.in_image[..., :2] - keypoints.xy, axis=-1),
+        covariance=_covariance(poses, per_px, rotation),
         meta=meta,
-        camera_position=position,
-        covariance=covariance,
+    )
+    if refined is None:
+        if body.covariance is not None:
+            meta["covariance_about"] = "pelvis"
+        return body
+    meta["calibration"], meta["covariance_about"] = refined.calibration, "origin"
+    camera = refined.rotation, refined.position
+    return dataclasses.replace(
+        body,
+        joints3d=np.ascontiguousarray(refined.joints),
+        metric=refined.metric,
+        scale_source="telemetry" if refined.metric else "assumed_height",
+        camera_rotation=refined.rotation,
+        camera_position=refined.position,
+        reprojection_px=reprojection_px(refined.joints, *camera, tracks.camera_matrix, keypoints.xy),
+        covariance=refined.covariance,
     )
 
 
-def _covariance(sigma: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """(F, P, 6) m^2 about the pelvis of expected errors (F, P, 2) m across and along the ray; world -> camera."""
-    variance = np.square(sigma * np.array([ACROSS, ALONG]))[..., [0, 0, 1]]
+def _without_perspective(tracks: Tracks, poses: ImagePoses, per_px: np.ndarray) -> np.ndarray:
+    """(F, P, 3) m in camera axes; where the lens is known, without what its perspective does to the pose.
+
+    As in ``place_in_world``, it moves joints behind the pelvis towards the axis.
+    """
+    joints = in_camera_axes(poses, per_px)
+    if tracks.camera_matrix is not None:
+        range_m = 0.5 * (tracks.camera_matrix[0, 0] + tracks.camera_matrix[1, 1]) * per_px
+        joints[..., :2] *= np.maximum(1.0 + joints[..., 2] / range_m[:, None], 0.1)[..., None]
+    return joints
+
+
+def _covariance(poses: ImagePoses, per_px: np.ndarray, rotation: np.ndarray) -> np.ndarray | None:
+    """(F, P, 6) m^2 about the pelvis of the expected errors across and along the ray; rotation is world -> camera."""
+    if poses.sigma_px is None:
+        return None
+    std = poses.sigma_px * per_px[:, None, None] * np.array(poses.std_over_sigma)
+    variance = np.square(std)[..., [0, 0, 1]]
     full = np.einsum("fki,fpk,fkj->fpij", rotation, variance, rotation)
     packed: np.ndarray = full[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     return packed
-
-
-def _in_image(result: CameraPoses) -> np.ndarray:
-    """(F, P, 3) px, the method's joints, x and y in the image."""
-    joints = result.joints_px.copy()
-    joints[..., :2] += result.translation_px[:, None]
-    return joints
 
 
 def reprojection_px(
@@ -248,9 +289,3 @@ def reprojection_px(
     projected = seen[..., :2] / np.maximum(seen[..., 2:], 1e-3) * np.diagonal(matrix)[:2] + matrix[:2, 2]
     distance: np.ndarray = np.linalg.norm(projected - keypoints, axis=-1)
     return distance
-
-
-def _versions() -> dict[str, str]:
-    import platform
-
-    return {"drocap_ros": __version__, "numpy": np.__version__, "python": platform.python_version()}

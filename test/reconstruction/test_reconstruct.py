@@ -17,7 +17,7 @@ from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.motion import Motion, load_motion, save_motion
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.common.poses import CameraPoses, MethodInput
+from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput
 from drocap_ros.reconstruction.common.windows import windows
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.methods.run import run_method
@@ -83,7 +83,7 @@ def test_file_of_a_motion_without_covariance_holds_unknown_ones(paper: Motion, t
 
 
 def test_method_without_a_finite_pose_is_an_error(walk: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
-    def lost(name: str, data: MethodInput) -> CameraPoses:
+    def lost(name: str, data: MethodInput) -> ImagePoses:
         found = run_method(name, data)
         return dataclasses.replace(found, joints_px=np.full_like(found.joints_px, np.nan))
 

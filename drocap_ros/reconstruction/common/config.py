@@ -15,10 +15,6 @@ class InitializerConfig(Parameters):
     search_azimuths: int = param(4, "viewpoints around the body in the viewpoint search", minimum=1, maximum=64)
     search_elevation_deg: float = param(15.0, "camera elevation of these viewpoints", unit="deg", minimum=-89.0,
                                         maximum=89.0)  # fmt: skip
-    convex_relaxation: bool = param(False, "add the viewpoint of the convex relaxation (spectral norm, ADMM)")
-    convex_alpha: float = param(0.1, "weight of the spectral norms in the convex relaxation", unit="2D std",
-                                minimum=0.0)  # fmt: skip
-    convex_iterations: int = param(100, "ADMM steps of the convex relaxation", minimum=1, maximum=10000)
     search_components: int = param(20, "principal components in the viewpoint search", minimum=1, maximum=45)
     search_iterations: int = param(14, "damped Gauss-Newton steps per viewpoint", minimum=1, maximum=200)
     keypoint_std: float = param(0.1, "standard deviation of an ordinary 2D joint", unit="2D std", minimum=0.001)

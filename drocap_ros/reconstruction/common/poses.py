@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.paper.dictionary import Dictionary
+from drocap_ros.reconstruction.common.stop_reason import NO_ADJUSTMENT
 
 Progress = Callable[[str, float], None]
 
@@ -30,32 +31,63 @@ class MethodInput:
     focal_px: float | None
     initializer: InitializerConfig
     adjuster: BundleAdjusterConfig
-    dictionary: Dictionary
     progress: Progress
     rotation: np.ndarray | None = None
 
-    def frames(self, use: np.ndarray) -> MethodInput:
-        """The input of the frames ``use`` (F,) bool."""
+    def frames(self, use: np.ndarray | slice) -> MethodInput:
+        """The input of some of the frames."""
         rotation = None if self.rotation is None else self.rotation[use]
         return replace(self, stamp_ns=self.stamp_ns[use], keypoints=self.keypoints[use], rotation=rotation)
 
 
 @dataclass(frozen=True)
-class CameraPoses:
-    """Poses in camera axes, in px, and the solver's report.
+class Report:
+    """What a solver did.
 
-    joints_px : (F, P, 3), centred; ``keypoints ~ joints_px[..., :2] + translation_px``
+    iterations : accepted steps; cost_terms : cost at the end per term
+    seconds : wall-clock per stage, "initial" and "ba"
+    origin : for the motion's ``meta``: metadata of learned files, further parameters
+    """
+
+    iterations: int = 0
+    stop_reason: str = NO_ADJUSTMENT
+    cost_terms: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    origin: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ImagePoses:
+    """Poses in px as the images show them: the result of every method, and of each window of one.
+
+    joints_px : (F, P, 3) camera axes; ``keypoints ~ joints_px[..., :2] + translation_px[:, None]``
     translation_px : (F, 2)
-    seconds : wall-clock per stage
-    sigma_px : (F, P, 2) expected error of x, y (each) and of depth, None = the method has none
-    still : (F, 2) probability that the right and the left foot rest in the world, None = the method has none
+    sigma_px : (F, P, 2) expected absolute error of x, y (each) and of depth; None = the method has none
+    still : (F, 2) probability that the right and the left foot rest in the world; None = the method has none
+    std_over_sigma : (2,) standard deviation of a pose about its pelvis over ``sigma_px``, across and along the ray
     """
 
     joints_px: np.ndarray
     translation_px: np.ndarray
-    seconds: dict[str, float]
-    iterations: int
-    stop_reason: str
-    cost_terms: dict[str, float]
     sigma_px: np.ndarray | None = None
     still: np.ndarray | None = None
+    std_over_sigma: tuple[float, float] = (1.0, 1.0)
+    report: Report = field(default_factory=Report)
+
+    @staticmethod
+    def uncentred(in_image: np.ndarray, **more: Any) -> ImagePoses:
+        """Poses (F, P, 3) px whose x and y stand in the image, as they are."""
+        return ImagePoses(in_image, np.zeros((len(in_image), 2)), **more)
+
+    @staticmethod
+    def centred(in_image: np.ndarray, **more: Any) -> ImagePoses:
+        """Poses (F, P, 3) px whose x and y stand in the image, centred about their mean."""
+        middle = in_image.mean(axis=1, keepdims=True)
+        return ImagePoses(in_image - middle, middle[:, 0, :2], **more)
+
+    @property
+    def in_image(self) -> np.ndarray:
+        """(F, P, 3) px, x and y in the image."""
+        joints = self.joints_px.copy()
+        joints[..., :2] += self.translation_px[:, None]
+        return joints

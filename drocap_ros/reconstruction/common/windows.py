@@ -2,75 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable
 
 import numpy as np
 
-from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.common.poses import CameraPoses, MethodInput
-from drocap_ros.reconstruction.paper.normalize import NormalizedTracks, normalize_tracks
-from drocap_ros.reconstruction.paper.reprojection import Projection, frames_last
+from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput, Report
 
 
-class WindowResult(NamedTuple):
-    """Poses (F, P, 3) in camera axes, x and y in the window's normalized image; the solver's report.
-
-    sigma : (F, P, 2) expected error of x, y (each) and of depth, in the same unit; None = the method has none
-    still : (F, 2) probability that the right and the left foot rest, None = the method has none
-    """
-
-    poses: np.ndarray
-    cost_terms: dict[str, float]
-    iterations: int
-    stop_reason: str
-    sigma: np.ndarray | None = None
-    still: np.ndarray | None = None
-
-
-def over_windows(data: MethodInput, solve: Callable[[slice, NormalizedTracks], WindowResult]) -> CameraPoses:
-    """Solve window by window and cross-fade the poses where windows overlap."""
-    keypoints, overlap = data.keypoints, data.adjuster.overlap_frames
-    sigma: np.ndarray | None = None
-    still: np.ndarray | None = None
-    out, weight = np.zeros((*keypoints.xy.shape[:2], 3)), np.zeros(len(keypoints))
-    iterations, terms, stops = 0, dict[str, float](), set[str]()
-    for rows, n in normalized_windows(keypoints, data.adjuster.window_frames, overlap):
-        found = solve(rows, n)
-        fade = fade_weights(rows, len(keypoints), overlap)
-        in_image = found.poses * n.scale_px
-        in_image[..., :2] += n.centre_px[:, None]
-        out[rows] += fade[:, None, None] * in_image
+def over_windows(data: MethodInput, solve: Callable[[slice], ImagePoses]) -> ImagePoses:
+    """Solve window by window and cross-fade the results where windows overlap."""
+    frames, overlap = len(data.keypoints), data.adjuster.overlap_frames
+    rows_of = windows(frames, data.adjuster.window_frames, overlap)
+    faded: dict[str, np.ndarray] = {}
+    weight = np.zeros(frames)
+    reports = []
+    for rows in rows_of:
+        found = solve(rows)
+        fade = fade_weights(rows, frames, overlap)
         weight[rows] += fade
-        if found.sigma is not None:
-            sigma = np.zeros(keypoints.xy.shape) if sigma is None else sigma
-            sigma[rows] += fade[:, None, None] * found.sigma * n.scale_px
-        if found.still is not None:
-            still = np.zeros((len(keypoints), 2)) if still is None else still
-            still[rows] += fade[:, None] * found.still
-        iterations += found.iterations
-        stops.add(found.stop_reason)
-        for name, value in found.cost_terms.items():
-            terms[name] = terms.get(name, 0.0) + value
-        data.progress("ba", rows.stop / len(keypoints))
-    sigma = None if sigma is None else sigma / weight[:, None, None]
-    still = None if still is None else still / weight[:, None]
-    return CameraPoses(
-        *split(out / weight[:, None, None]), {}, iterations, ", ".join(sorted(stops)), terms, sigma, still
+        for name, values in (("in_image", found.in_image), ("sigma_px", found.sigma_px), ("still", found.still)):
+            if values is not None:
+                total = faded.setdefault(name, np.zeros((frames, *values.shape[1:])))
+                total[rows] += _along(fade, values) * values
+        reports.append(found.report)
+        data.progress("ba", rows.stop / frames)
+    mean = {name: total / _along(weight, total) for name, total in faded.items()}
+    return ImagePoses.centred(
+        mean.pop("in_image"), **mean, report=_together(reports), std_over_sigma=found.std_over_sigma
     )
 
 
-def placed(poses: np.ndarray, w: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """Poses (F, P, 3) translated in the image to fit the joints ``w`` (F, P, 2) best."""
-    moved = poses.copy()
-    moved[..., :2] += Projection(w, information).translation(frames_last(poses[..., :2])).T[:, None]
-    return moved
+def _along(per_frame: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """(F,) with as many axes as the values (F, ...)."""
+    return per_frame.reshape(-1, *(1,) * (values.ndim - 1))
 
 
-def split(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centred poses (F, P, 3), and their centres in the image (F, 2)."""
-    middle = poses.mean(axis=1, keepdims=True)
-    return poses - middle, middle[:, 0, :2]
+def _together(reports: list[Report]) -> Report:
+    """Sums over the windows; the stop reasons of all."""
+    terms: dict[str, float] = {}
+    seconds: dict[str, float] = {}
+    for report in reports:
+        for total, values in ((terms, report.cost_terms), (seconds, report.seconds)):
+            for name, value in values.items():
+                total[name] = total.get(name, 0.0) + value
+    stops = ", ".join(sorted({report.stop_reason for report in reports}))
+    return Report(sum(report.iterations for report in reports), stops, terms, seconds, reports[0].origin)
 
 
 def windows(frames: int, length: int, overlap: int) -> list[slice]:
@@ -83,12 +59,6 @@ def windows(frames: int, length: int, overlap: int) -> list[slice]:
     length = int(np.ceil((frames + (count - 1) * overlap) / count))
     begins = np.round(np.linspace(0, frames - length, count)).astype(int)
     return [slice(int(begin), int(begin) + length) for begin in begins]
-
-
-def normalized_windows(keypoints: Keypoints2D, length: int, overlap: int) -> Iterator[tuple[slice, NormalizedTracks]]:
-    """Normalized tracks, window by window."""
-    for rows in windows(len(keypoints), length, overlap):
-        yield rows, normalize_tracks(keypoints[rows])
 
 
 def fade_weights(rows: slice, frames: int, overlap: int) -> np.ndarray:

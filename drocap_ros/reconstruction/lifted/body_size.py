@@ -14,7 +14,8 @@ from drocap_ros.geometry.bones import bone_lengths
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
-from drocap_ros.reconstruction.lifted.lifter import LiftedMotion, Lifter, LifterInput
+from drocap_ros.reconstruction.lifted.lifter import Lifter
+from drocap_ros.reconstruction.lifted.network import LiftedMotion, LifterInput
 from drocap_ros.reconstruction.lifted.window_solver import (
     Cancelled,
     WindowModel,
@@ -88,7 +89,7 @@ def measure_size(view: EvenView, config: LiftedConfig, lifter: Lifter, cancelled
     lifted = lifter.lift(seen, fps)
     clock = time.perf_counter()
     mm = YARDSTICK_MM / max(float(np.median(bone_lengths(lifted.joints), axis=0)[YARDSTICK].sum()), 1e-12)
-    model = window_model(keypoints, lifted.joints[..., :2], mm, fps, config)
+    model = window_model(keypoints, lifted.joints[..., :2], mm, fps, config, lifter.interleaved(fps))
     centre = np.median(lifted.joints[..., :2], axis=1)
     zoom = _zoom_of(lifted.joints, fps)
     prior = lifted.joints.copy()
@@ -121,7 +122,7 @@ def apply_size(known: BodySize, view: EvenView, config: LiftedConfig, lifter: Li
     joints[..., :2] -= middle[:, None]
     flat = _orthographic(keypoints.xy, joints[..., 2], centre, zoom, mm, focal)
     place = lifted.joints[..., :2] * (zoom / mm)[:, None, None]
-    model = window_model(keypoints, place, mm, fps, config)
+    model = window_model(keypoints, place, mm, fps, config, lifter.interleaved(fps))
     lifted = replace(lifted, joints=joints)
     return SizedWindow(model, flat, lifted, known.lengths_mm, centre, zoom, mm, seconds=0.0, iterations=0)
 

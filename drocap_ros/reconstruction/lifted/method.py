@@ -32,13 +32,6 @@ from drocap_ros.reconstruction.lifted.lifter import Lifter
 from drocap_ros.reconstruction.lifted.lifter_input import LIFTER_FPS
 from drocap_ros.reconstruction.lifted.window_solver import Cancelled, solve_signs_and_adjust
 
-#: Standard deviation of an adjusted pose over the lifter's expected errors, about the pelvis: across and along the
-#: ray (measured on the HDM05 sequences of mocap/train, which are not among the lifter's training data).
-ACROSS, ALONG = 1.3, 2.2
-#: The lifter expects no noise that lasts unless a covariance states it: share of it in the errors across the ray,
-#: measured on the same sequences.
-_LASTING = 1.2
-
 
 def prepare(config: LiftedConfig) -> None:
     """Load libraries and network before the first window.
@@ -66,6 +59,7 @@ class WindowSolution:
         pelvis
     sigma : (F, 17, 2) expected absolute error of x, y (each) and of depth, in the same unit: the lifter's and, for
         keypoints without a covariance, their noise that lasts for some frames
+    std_over_sigma : standard deviation of a pose about its pelvis over sigma, across and along the ray
     still : (F, 2) the lifter's probability that the right and the left foot rest in the world
     body : the size for the next window
     steps : of the first and of the final adjustment
@@ -74,6 +68,7 @@ class WindowSolution:
 
     joints: np.ndarray
     sigma: np.ndarray
+    std_over_sigma: tuple[float, float]
     still: np.ndarray
     body: BodySize
     cost_terms: dict[str, float]
@@ -151,11 +146,12 @@ def solve_even_window(
     adjusting = sized.seconds + end - clock
     sigma = sized.lifted.sigma * size
     if keypoints.covariance is None:
-        sigma[..., 0] = np.hypot(sigma[..., 0], _LASTING * sized.model.lasting_noise_mm * size[..., 0])
+        sigma[..., 0] = np.hypot(sigma[..., 0], lifter.errors.lasting * sized.model.lasting_noise_mm * size[..., 0])
     yardstick = YARDSTICK_MM / max(float(found.lengths[YARDSTICK].sum()), 1e-12)
     return WindowSolution(
         joints=joints,
         sigma=sigma,
+        std_over_sigma=lifter.errors.adjusted,
         still=sized.lifted.still,
         body=BodySize(found.lengths * yardstick, zoom * found.zoom / (mm * yardstick)),
         cost_terms=found.cost_terms,

@@ -21,8 +21,8 @@ from drocap_ros.reconstruction.lifted.adjustment import (
 )
 from drocap_ros.reconstruction.lifted.depth_signs import depth_signs
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
-from drocap_ros.reconstruction.lifted.lifter import LiftedMotion
-from drocap_ros.reconstruction.lifted.lifter_input import LIFTER_FPS, nanmedian_small
+from drocap_ros.reconstruction.lifted.lifter_input import nanmedian_small
+from drocap_ros.reconstruction.lifted.network import LiftedMotion
 from drocap_ros.skeleton import BODY_17
 
 #: Returns True when an adjustment should end.
@@ -65,15 +65,17 @@ class WindowModel:
     zoom_precision: np.ndarray
 
 
-def window_model(keypoints: Keypoints2D, place: np.ndarray, mm: float, fps: float, config: LiftedConfig) -> WindowModel:
+def window_model(
+    keypoints: Keypoints2D, place: np.ndarray, mm: float, fps: float, config: LiftedConfig, interleaved: int = 1
+) -> WindowModel:
     """Model of a window whose keypoints have ``mm`` per unit.
 
     Without a covariance the noise comes from the change between two frames of the keypoints' distance from the lifter's
-    places (F, 17, 2), in their unit: the body's motion does not enter.
+    places (F, 17, 2), in their unit: the body's motion does not enter.  ``interleaved`` : of the lifter.
     """
     points_mm, confidence = keypoints.xy * mm, keypoints.confidence
     seen = np.isfinite(points_mm[..., 0])
-    fresh, whole = _gap_noise(points_mm - place * mm, max(round(fps / LIFTER_FPS), 1))
+    fresh, whole = _gap_noise(points_mm - place * mm, interleaved)
     share = (fresh / whole) ** 2 if whole > 0 else 0.0
     noise = max(config.noise_mm, min(whole, _LASTING_FACTOR * fresh))
     covariance = np.broadcast_to(noise**2 * np.array([1.0, 0.0, 1.0]), (*seen.shape, 3))

@@ -16,7 +16,7 @@ from drocap_ros.reconstruction.common.stop_reason import DEADLINE
 from drocap_ros.reconstruction.common.threads import blas_threads
 from drocap_ros.reconstruction.lifted.body_size import BodySize, magnification
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig, lifted_config
-from drocap_ros.reconstruction.lifted.method import ACROSS, ALONG, WindowSolution, prepare, solve_window
+from drocap_ros.reconstruction.lifted.method import WindowSolution, prepare, solve_window
 from drocap_ros.reconstruction.lifted.window_solver import Cancelled
 from drocap_ros.reconstruction.live.effort import Effort
 from drocap_ros.reconstruction.live.paper_adjustment import adjust_by_equations
@@ -144,7 +144,7 @@ def _adjusted(w: Window, found: WindowSolution, focal: float | None, effort: Eff
         raise InputError("initial_joints: expected a pose in at least one frame, got NaN in all; check the 2D joints")
     # The scale of a monocular result is that of the initial poses: keep the mean limb length.
     metres = float(limb_lengths(w.initial_joints[known]).mean() / limb_lengths(joints).mean())
-    std = found.sigma / found.body.unit_per_mm[:, None, None] * np.array([ACROSS, ALONG]) * metres
+    std = found.sigma / found.body.unit_per_mm[:, None, None] * np.array(found.std_over_sigma) * metres
     covariance = np.zeros((*joints.shape[:2], 6))
     covariance[..., [0, 3, 5]] = std[..., [0, 0, 1]] ** 2
     return AdjustedWindow(

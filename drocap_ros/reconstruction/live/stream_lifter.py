@@ -12,7 +12,8 @@ from drocap_ros.geometry.bones import LIMBS_PER_STATURE, bone_lengths, limb_leng
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
-from drocap_ros.reconstruction.lifted.lifter import Lifter, LifterInput
+from drocap_ros.reconstruction.lifted.lifter import Lifter
+from drocap_ros.reconstruction.lifted.network import LifterInput
 
 #: Images before the first estimate of the proportions, images between two estimates, and estimates kept.
 FIRST_ESTIMATE, ESTIMATE_EVERY, ESTIMATES = 12, 24, 40
@@ -22,10 +23,6 @@ SIZE_IMAGES = 30
 
 #: Most images of the past at any frame rate.
 MAX_IMAGES = 400
-
-#: Standard deviation of the pose's errors, about the pelvis, over the lifter's expected errors: across and along the
-#: ray (measured on the HDM05 sequences of mocap/train, which are not among the lifter's training data).
-ACROSS, ALONG = 1.45, 2.2
 
 
 class LiftedImage(NamedTuple):
@@ -77,7 +74,7 @@ class StreamLifter:
         joints = lifted.joints[0]
         self._limbs_px.append(max(float(limb_lengths(joints).sum()), 1e-9))
         metres = self._limbs_m / median(self._limbs_px)
-        return LiftedImage(joints, lifted.sigma[0] * np.array([ACROSS, ALONG]), metres)
+        return LiftedImage(joints, lifted.sigma[0] * np.array(self._lifter.errors.newest), metres)
 
     def _with_own_legs(self, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints and confidences of the past; legs that the network exchanged are exchanged back."""

@@ -14,8 +14,7 @@ from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.geometry.rotations import log_so3
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.common.poses import CameraPoses
-from drocap_ros.reconstruction.common.windows import split
+from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.lifted.method import WindowSolution
 from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, Telemetry, Window
 from drocap_ros.reconstruction.world.calibration import Calibration
@@ -79,7 +78,7 @@ class WorldWindows:
             keypoints.xy, BODY_17.joints, stamps, size, camera_rotation=camera.rotation,
             camera_position=camera.position, camera_matrix=camera.matrix,
         )  # fmt: skip
-        poses = CameraPoses(*split(found.joints[use]), {}, 0, "", {}, sigma_px=found.sigma[use], still=found.still[use])
+        poses = ImagePoses.centred(found.joints[use], sigma_px=found.sigma[use], still=found.still[use])
         per_px = metres_per_px(poses.joints_px, stamps, _assumed_height(w.initial_joints))
         known = self._prior(stamps)
         before = None if self._before is None or stamps[0] > self._before[0].stamp_ns[-1] else self._before[0]

@@ -1,6 +1,7 @@
-"""The methods of ``drocap reconstruct``: ``--method NAME`` runs ``METHODS[NAME].run``.
+"""The methods of ``drocap reconstruct``: ``--method NAME`` runs ``METHODS[NAME]``.
 
-``live`` is no entry: it needs a recording of the live graph and runs in :mod:`drocap_ros.live_replay`.
+A new method is one file here and its entry.  ``live`` is no entry: it needs a recording of the live graph and runs in
+:mod:`drocap_ros.live_replay`.
 """
 
 from __future__ import annotations
@@ -8,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drocap_ros.reconstruction.common.poses import CameraPoses, MethodInput
-from drocap_ros.reconstruction.methods import ba, initial, mf_nnm, paper
+from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput
+from drocap_ros.reconstruction.methods import ba, paper
 from drocap_ros.skeleton import BODY_15, BODY_17, JointSet
 
 
@@ -17,7 +18,7 @@ from drocap_ros.skeleton import BODY_15, BODY_17, JointSet
 class Method:
     """A method of reconstruction, its help text and its joints: those of the paper are fifteen."""
 
-    run: Callable[[MethodInput], CameraPoses]
+    run: Callable[[MethodInput], ImagePoses]
     summary: str
     joints: JointSet = BODY_15
 
@@ -26,6 +27,6 @@ METHODS = {
     "ba": Method(ba.run, "the default: learned lifter, depth signs, adjustment with constant bone lengths", BODY_17),
     "paper": Method(paper.run, "single-view initializer and equations (2) to (4) of the paper"),
     "paper-no-articulation": Method(paper.run_without_articulation, "paper with gamma = 0"),
-    "initial": Method(initial.run, "the paper's single-view initializer alone"),
-    "mf-nnm": Method(mf_nnm.run, "baseline: matrix factorization and nuclear norm minimization"),
+    "initial": Method(paper.run_initializer, "the paper's single-view initializer alone"),
+    "mf-nnm": Method(paper.run_factorization, "baseline: matrix factorization and nuclear norm minimization"),
 }

@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.common.poses import CameraPoses, MethodInput
-from drocap_ros.reconstruction.common.windows import WindowResult, over_windows
+from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput, Report
+from drocap_ros.reconstruction.common.windows import over_windows
 from drocap_ros.reconstruction.lifted.lifted_config import lifted_config
+from drocap_ros.reconstruction.lifted.lifter import Lifter
 from drocap_ros.reconstruction.lifted.method import solve_window
-from drocap_ros.reconstruction.paper.normalize import NormalizedTracks
 
 
-def run(data: MethodInput) -> CameraPoses:
+def run(data: MethodInput) -> ImagePoses:
     """Poses by the default method."""
     config = lifted_config(data.adjuster)
-    seconds = {"initial": 0.0, "ba": 0.0}
+    origin = {"parameters": {"default_method": config}, "lifter": Lifter.load(config.lifter or None).origin}
 
-    def solve(rows: slice, n: NormalizedTracks) -> WindowResult:
-        covariance = data.keypoints.covariance
-        covariance = None if covariance is None else covariance[rows] / n.scale_px**2
-        rotation = None if data.rotation is None else data.rotation[rows]
-        points = np.where((n.weights > 0.0)[..., None], n.w, np.nan)
-        focal = None if data.focal_px is None else data.focal_px / n.scale_px
-        seen = Keypoints2D(points, n.weights, covariance)
-        found = solve_window(data.stamp_ns[rows], seen, focal, config, rotation=rotation)
-        for stage, value in found.seconds.items():
-            seconds[stage] += value
-        return WindowResult(found.joints, found.cost_terms, found.steps[1], found.stop_reason, found.sigma, found.still)
+    def solve(rows: slice) -> ImagePoses:
+        window = data.frames(rows)
+        weights = window.keypoints.weights
+        points = np.where((weights > 0.0)[..., None], window.keypoints.xy, np.nan)
+        # The way of the body through the image is no noise of the keypoints.
+        middle = np.nanmean(points, axis=1)
+        seen = Keypoints2D(points - middle[:, None], weights, window.keypoints.covariance)
+        found = solve_window(window.stamp_ns, seen, data.focal_px, config, rotation=window.rotation)
+        joints = found.joints.copy()
+        joints[..., :2] += middle[:, None]
+        report = Report(found.steps[1], found.stop_reason, found.cost_terms, found.seconds, origin)
+        return ImagePoses.uncentred(
+            joints, sigma_px=found.sigma, still=found.still, std_over_sigma=found.std_over_sigma, report=report
+        )
 
-    return replace(over_windows(data, solve), seconds=seconds)
+    return over_windows(data, solve)

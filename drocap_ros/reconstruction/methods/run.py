@@ -8,12 +8,12 @@ import numpy as np
 
 from drocap_ros.geometry.interpolation import fill_frames
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.common.poses import CameraPoses, MethodInput
+from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS, normalize_tracks
 
 
-def run_method(name: str, data: MethodInput) -> CameraPoses:
+def run_method(name: str, data: MethodInput) -> ImagePoses:
     """Poses of all frames by one of :data:`~drocap_ros.reconstruction.methods.METHODS`.
 
     Raises
@@ -38,18 +38,24 @@ def usable_frames(keypoints: Keypoints2D) -> np.ndarray:
     return np.asarray((np.sum(seen, axis=1) >= MIN_JOINTS) & apart)
 
 
-def _spread(found: CameraPoses, use: np.ndarray, stamp_ns: np.ndarray) -> CameraPoses:
+def _spread(found: ImagePoses, use: np.ndarray, stamp_ns: np.ndarray) -> ImagePoses:
     """Poses of the frames in use, interpolated over all frames."""
+    t = (stamp_ns - stamp_ns[0]).astype(np.float64)
+
+    def over_time(values: np.ndarray | None) -> np.ndarray | None:
+        if values is None:
+            return None
+        columns = values.reshape(len(values), -1).T
+        return np.stack([np.interp(t, t[use], column) for column in columns], axis=-1).reshape(-1, *values.shape[1:])
+
     joints = np.full((len(use), *found.joints_px.shape[1:]), np.nan)
     joints[use] = found.joints_px
-    t = (stamp_ns - stamp_ns[0]).astype(np.float64)
-    translation = np.stack([np.interp(t, t[use], found.translation_px[:, i]) for i in range(2)], axis=-1)
-    sigma = found.sigma_px
-    if sigma is not None:
-        flat = sigma.reshape(len(sigma), -1).T
-        sigma = np.stack([np.interp(t, t[use], column) for column in flat], axis=-1).reshape(-1, *sigma.shape[1:])
-    still = found.still
-    if still is not None:
-        still = np.stack([np.interp(t, t[use], column) for column in still.T], axis=-1)
-    joints = fill_frames(stamp_ns, joints)
-    return replace(found, joints_px=joints, translation_px=translation, sigma_px=sigma, still=still)
+    translation = over_time(found.translation_px)
+    assert translation is not None
+    return replace(
+        found,
+        joints_px=fill_frames(stamp_ns, joints),
+        translation_px=translation,
+        sigma_px=over_time(found.sigma_px),
+        still=over_time(found.still),
+    )

@@ -31,6 +31,12 @@ class NormalizedTracks:
     centre_px: np.ndarray
     scale_px: float
 
+    def in_px(self, poses: np.ndarray) -> np.ndarray:
+        """Poses (F, P, 3) of the solvers' units in px, x and y in the image."""
+        joints = poses * self.scale_px
+        joints[..., :2] += self.centre_px[:, None]
+        return joints
+
 
 def normalize_tracks(keypoints: Keypoints2D) -> NormalizedTracks:
     """Centre each image's seen joints and scale the sequence to unit standard deviation.

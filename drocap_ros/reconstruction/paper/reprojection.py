@@ -106,6 +106,12 @@ class Projection:
         x, y = self.inform(gap).sum(1)
         return np.stack([self._inverse[0] * x + self._inverse[1] * y, self._inverse[1] * x + self._inverse[2] * y])
 
+    def placed(self, poses: np.ndarray) -> np.ndarray:
+        """Poses (F, P, 3) translated in the image to fit the joints best."""
+        moved = poses.copy()
+        moved[..., :2] += self.translation(frames_last(poses[..., :2])).T[:, None]
+        return moved
+
     def residual(self, s: np.ndarray, r: np.ndarray) -> np.ndarray:
         """``R S + T - W`` (2, P, F)."""
         projected = rotate(r, s, 2)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.reconstruction.common.config import InitializerConfig
-from drocap_ros.reconstruction.paper.convex_relaxation import convex_relaxation, rotation_and_coefficients
 from drocap_ros.reconstruction.paper.dictionary import Dictionary, sparse_code
 from drocap_ros.reconstruction.paper.expectation import expected_information
 from drocap_ros.reconstruction.paper.reprojection import Projection, frames_first, frames_last
@@ -74,11 +73,6 @@ def search_viewpoints(
     """Fits from every initial viewpoint, with a leading axis of viewpoints: (A, F, ...)."""
     views = initial_viewpoints(w, information, config.search_azimuths, np.deg2rad(config.search_elevation_deg))
     size = min(config.search_components, len(dictionary.components))
-    if config.convex_relaxation:
-        relaxed = convex_relaxation(
-            w, information[..., 0] > 0.0, dictionary, alpha=config.convex_alpha, iterations=config.convex_iterations
-        )
-        views = np.concatenate([rotation_and_coefficients(relaxed)[0][None], views])
     count, frames = views.shape[:2]
     tiled_w, tiled_i = np.tile(w, (count, 1, 1)), np.tile(information, (count, 1, 1))
     rotation = views.reshape(-1, 3, 3)

@@ -8,7 +8,7 @@ import numpy as np
 
 from drocap_ros.geometry.position_steps import without_steps
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.common.poses import CameraPoses
+from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.placement import WorldPoses, place_in_world
 from drocap_ros.reconstruction.world.refine import Before, PlacedPoses, RefinedWorld, refinable, refine_in_world
@@ -20,7 +20,7 @@ from drocap_ros.tracks import Tracks
 _PELVIS = BODY_15.index("pelvis")
 
 
-def in_camera_axes(poses: CameraPoses, per_px: np.ndarray) -> np.ndarray:
+def in_camera_axes(poses: ImagePoses, per_px: np.ndarray) -> np.ndarray:
     """(F, P, 3) m in the camera's axes, pelvis at the origin, at (F,) metres per px."""
     joints: np.ndarray = (poses.joints_px - poses.joints_px[:, _PELVIS][:, None]) * per_px[:, None, None]
     return joints
@@ -29,7 +29,7 @@ def in_camera_axes(poses: CameraPoses, per_px: np.ndarray) -> np.ndarray:
 def in_world(
     tracks: Tracks,
     keypoints: Keypoints2D,
-    poses: CameraPoses,
+    poses: ImagePoses,
     per_px: np.ndarray,
     config: WorldConfig,
     known: Calibration | None = None,

@@ -176,7 +176,8 @@ def test_low_postures_are_counted(tmp_path):
 def test_a_short_training_learns_and_its_network_runs(tmp_path):
     pytest.importorskip("torch", reason="the extra 'train' is not installed")
     pytest.importorskip("onnx", reason="the extra 'train' is not installed")
-    from drocap_ros.reconstruction.lifted.lifter import Lifter, LifterInput
+    from drocap_ros.reconstruction.lifted.lifter import Lifter
+    from drocap_ros.reconstruction.lifted.network import LifterInput
     from lab.training.lifter import LifterTraining, export_onnx, train
     from lab.training.lifter_network import build_network
 

@@ -12,7 +12,8 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.lifted import body_size
 from drocap_ros.reconstruction.lifted.body_size import EvenView, measure_size
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
-from drocap_ros.reconstruction.lifted.lifter import LiftedMotion, Lifter, LifterInput
+from drocap_ros.reconstruction.lifted.lifter import Lifter
+from drocap_ros.reconstruction.lifted.network import LiftedMotion, LifterInput
 from drocap_ros.reconstruction.lifted.window_solver import WindowModel, solve_signs_and_adjust, window_model
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.skeleton import BODY_17
@@ -103,7 +104,7 @@ class Watched(Lifter):
     """The shipped lifter; keeps what it was shown."""
 
     def __init__(self) -> None:
-        super().__init__(Lifter.load()._session)
+        super().__init__(Lifter.load()._network)
         self.shown: list[np.ndarray] = []
 
     def lift(self, seen: LifterInput, fps: float = FPS):  # type: ignore[no-untyped-def]

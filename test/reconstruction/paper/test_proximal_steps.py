@@ -9,7 +9,6 @@ import pytest
 
 from drocap_ros.reconstruction.paper.dictionary import soft_threshold
 from drocap_ros.reconstruction.paper.nuclear_norm import nuclear_norm, singular_value_threshold
-from drocap_ros.reconstruction.paper.spectral_norm import shrink_spectral_norm
 
 Step = Callable[[np.ndarray, float], np.ndarray]
 
@@ -28,23 +27,10 @@ def project_on_box(x: np.ndarray, tau: float) -> np.ndarray:
     return np.clip(x, -tau, tau)
 
 
-def project_on_nuclear_ball(x: np.ndarray, tau: float) -> np.ndarray:
-    """Projection of matrices (..., 2, 3) on nuclear norm <= tau, the dual ball of the spectral norm, by bisection."""
-    u, s, vt = np.linalg.svd(x, full_matrices=False)
-    low, high = np.zeros(s.shape[:-1]), s.max(-1)
-    for _ in range(200):
-        middle = 0.5 * (low + high)
-        over = np.maximum(s - middle[..., None], 0.0).sum(-1) > tau
-        low, high = np.where(over, middle, low), np.where(over, high, middle)
-    level = np.where(s.sum(-1) <= tau, 0.0, high)
-    return (u * np.maximum(s - level[..., None], 0.0)[..., None, :]) @ vt
-
-
 CASES: list[tuple[Step, Step, tuple[int, ...]]] = [
     (soft_threshold, project_on_box, (30, 20)),
     (low_rank, project_on_nuclear_dual, (45, 80)),
     (low_rank, project_on_nuclear_dual, (45, 12)),
-    (shrink_spectral_norm, project_on_nuclear_ball, (40, 2, 3)),
 ]
 
 

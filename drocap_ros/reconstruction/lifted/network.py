@@ -1,0 +1,133 @@
+"""What a lifting network is to the rest of the package: the interface of :class:`Network`, its input and its result.
+
+Another network is one file with a class of this interface and an entry in ``NETWORKS`` (:mod:`lifter`).  Features,
+outputs and frame pairs are private to the class; :mod:`feature_network` is the shipped one's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Protocol
+
+import numpy as np
+
+from drocap_ros.geometry.rotations import exp_so3, log_so3
+
+
+@dataclass(frozen=True)
+class LiftedMotion:
+    """Result of the lifter.
+
+    joints : (F, 17, 3) in the camera frame (x right, y down, z forward) and the unit of the keypoints; x and y
+        in the image, outliers and gaps corrected; depth relative to the pelvis
+    sigma : (F, 17, 2) expected absolute error of x, y (each) and of depth, in the same unit
+    deeper : (F, 16) probability that the child of bone j - 1 (joint j) lies behind its parent
+    still : (F, 2) probability that the right and the left foot move slower than 0.1 m/s in the world
+    """
+
+    joints: np.ndarray
+    sigma: np.ndarray
+    deeper: np.ndarray
+    still: np.ndarray
+
+    def map(self, change: Callable[[np.ndarray], np.ndarray]) -> LiftedMotion:
+        """The result with the same change of every array."""
+        return LiftedMotion(*(change(getattr(self, field.name)) for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class LifterInput:
+    """Evenly spaced frames as the lifter takes them.
+
+    keypoints : (F, 17, 2) of ``BODY_17``, any unit, y down; NaN where not seen
+    confidence : (F, 17) in [0, 1]; None = all seen joints alike
+    lengths : (16,) of the bones (joint j to its parent at j - 1) in the keypoints' unit, where known
+    covariance : (F, 17, 3) xx, xy, yy of the keypoints in their unit squared, where known
+    rotation : (F, 3, 3) world (z up) -> camera (x right, y down, z forward), where known
+    focal : focal length in the keypoints' unit, infinite for a distant camera; None = unknown
+    """
+
+    keypoints: np.ndarray
+    confidence: np.ndarray | None = None
+    lengths: np.ndarray | None = None
+    covariance: np.ndarray | None = None
+    rotation: np.ndarray | None = None
+    focal: float | None = None
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+    def __getitem__(self, frames: slice) -> LifterInput:
+        """Some of the frames."""
+        return self._over_time(lambda values: values[frames])
+
+    def _over_time(self, change: Callable[[np.ndarray], np.ndarray]) -> LifterInput:
+        def maybe(values: np.ndarray | None) -> np.ndarray | None:
+            return None if values is None else change(values)
+
+        return replace(
+            self,
+            keypoints=change(self.keypoints),
+            confidence=maybe(self.confidence),
+            covariance=maybe(self.covariance),
+            rotation=maybe(self.rotation),
+        )
+
+    def spread(self, factor: int) -> LifterInput:
+        """``factor - 1`` frames without a seen joint after each frame but the last; the camera turns evenly."""
+
+        def apart(values: np.ndarray) -> np.ndarray:
+            out = np.full(((len(values) - 1) * factor + 1, *values.shape[1:]), np.nan)
+            out[::factor] = values
+            return out
+
+        out = self._over_time(apart)
+        if self.rotation is None:
+            return out
+        before, after = self.rotation[:-1], self.rotation[1:]
+        turn = log_so3(after @ np.swapaxes(before, -1, -2))
+        share = np.arange(factor).reshape(1, -1, 1) / factor
+        dense = exp_so3(share * turn[:, None]) @ before[:, None]
+        return replace(out, rotation=np.concatenate([dense.reshape(-1, 3, 3), self.rotation[-1:]]))
+
+
+@dataclass(frozen=True)
+class Errors:
+    """True errors of a network's poses, measured on sequences that it was not trained on.
+
+    adjusted, newest : standard deviation of a pose about its pelvis over the expected absolute error, across and along
+        the ray: after the adjustment of a window, and of the newest image of a stream as lifted
+    lasting : share of the keypoints' lasting noise in the errors across the ray, for keypoints without a covariance
+    """
+
+    adjusted: tuple[float, float]
+    newest: tuple[float, float]
+    lasting: float
+
+
+class Network(Protocol):
+    """Lifts one window at the network's own frame rate.
+
+    fps : frame rate of the training; slowest, fastest : other rates, in units of it, that are taken as they are
+    window, overlap : most frames of one call, about those of a training window, and what neighbouring windows share
+    """
+
+    fps: float
+    slowest: float
+    fastest: float
+    window: int
+    overlap: int
+    errors: Errors
+
+    @property
+    def origin(self) -> dict[str, str]:
+        """Metadata: data, command, samples seen."""
+        ...
+
+    def lift(self, seen: LifterInput, *, newest: bool = False) -> LiftedMotion:
+        """Joints of a window with confidences; with ``newest`` only the last frames have to be at their best.
+
+        Some of the first frames may then be left out.
+        """
+        ...
