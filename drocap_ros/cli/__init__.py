@@ -19,8 +19,8 @@ from drocap_ros.errors import DrocapError
 #: Modules under ``drocap_ros.cli``, in the order of ``drocap --help``.
 COMMANDS = (
     "demo.command", "graph.live", "preflight", "graph.view", "graph.orbit", "graph.record", "graph.replay", "track",
-    "reconstruct", "batch.command", "models.learn_dictionary", "export", "report", "info", "recover", "graph.top",
-    "models.command", "evaluate",
+    "reconstruct", "batch.command", "learn_dictionary", "export", "report", "info", "recover", "graph.top",
+    "models", "evaluate",
 )  # fmt: skip
 
 
@@ -42,10 +42,7 @@ def main(argv: Sequence[str] | None = None, parser: LineParser | None = None) ->
     """Run the command line, or another one by its parser; returns the exit status."""
     logging.basicConfig(level=logging.WARNING, format="drocap: %(message)s")
     words = sys.argv[1:] if argv is None else list(argv)
-    # Closed by the shell (>&-): Python has no stream then, and the next file opened would take its number.
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+    _open_closed_streams()
     interrupted = threading.Event()
     try:
         parser = parser or build_parser()
@@ -73,12 +70,23 @@ def main(argv: Sequence[str] | None = None, parser: LineParser | None = None) ->
             return _interrupted()
         if os.environ.get("DROCAP_DEBUG"):
             raise
-        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-            print(f"drocap: expected space on the disk, found none: {_one_line(error)}; free some", file=sys.stderr)
-            return 1
+        return _unexpected(error)
+
+
+def _open_closed_streams() -> None:
+    """Streams that the shell closed (>&-) lead nowhere; else the next file opened would take their number."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 - it stays open as long as the program
+
+
+def _unexpected(error: Exception) -> int:
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        print(f"drocap: expected space on the disk, found none: {_one_line(error)}; free some", file=sys.stderr)
+    else:
         what = f"unexpected {type(error).__name__}: {_one_line(error)}"
         print(f"drocap: {what}; DROCAP_DEBUG=1 shows where", file=sys.stderr)
-        return 1
+    return 1
 
 
 def _interrupted() -> int:

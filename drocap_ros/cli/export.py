@@ -6,20 +6,22 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from drocap_ros.cli.motion_input import HELP, read_motion
+from drocap_ros.cli.options import add_command, add_motion_argument, add_quiet_option, read_motion
 from drocap_ros.errors import InputError
 from drocap_ros.export import FORMATS
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+def add_parser(subparsers: Any) -> None:
     """Add the command's options; ``run`` is its action."""
     units = "; ".join(f"{form}: {facts}" for form, facts in FORMATS.items())
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "export",
+        run,
         help="write a motion as BVH, C3D, TRC, CSV or glTF, or its joint angles",
         description=f"Write a motion in the format of another tool. {units}. Conventions: docs/export.md.",
     )
-    parser.add_argument("motion", metavar="MOTION", type=Path, help=HELP)
+    add_motion_argument(parser)
     parser.add_argument("--to", metavar="FORMAT", choices=tuple(FORMATS), required=True, help=", ".join(FORMATS))
     parser.add_argument("--out", metavar="FILE", type=Path, help="file to write (default: beside MOTION)")
     parser.add_argument(
@@ -35,9 +37,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="low-pass filter, cut-off in Hz (6 without a number)",
     )
     parser.add_argument("--lock-feet", action="store_true", help="resting feet keep their place")
-    parser.add_argument("--quiet", action="store_true", help="no output, only errors")
-    parser.set_defaults(run=run)
-    return parser
+    add_quiet_option(parser, "no output, only errors")
 
 
 def run(args: argparse.Namespace) -> int:

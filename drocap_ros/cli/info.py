@@ -7,10 +7,15 @@ import sys
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from drocap_ros.cli.options import add_command, table_lines
 from drocap_ros.cli.telemetry_summary import is_video_or_log, telemetry_summary
 from drocap_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from drocap_ros.motion import Motion
+    from drocap_ros.tracks import Tracks
 
 
 class Summary(NamedTuple):
@@ -22,10 +27,12 @@ class Summary(NamedTuple):
     warnings: Sequence[str]
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+def add_parser(subparsers: Any) -> None:
     """Add the command's options; ``run`` is its action."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "info",
+        run,
         help="print the content of a recording, motion or tracks file",
         description="Print topics, types, counts and duration of a recording (session folder, .mcap, .bag, rosbag2 "
         "folder), arrays and shapes of a motion.npz or tracks .npz, or the telemetry of a video file or log.",
@@ -36,19 +43,17 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument(
         "--metadata", action="store_true", help="print the parameters and other metadata of a session or motion in full"
     )
-    parser.set_defaults(run=run)
-    return parser
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the summary: tables on a terminal, plain lines in a pipe."""
+    """Print facts, a table and, on stderr, warnings."""
     if args.metadata:
         return _print_metadata(args.session)
     summary = summarize(args.session)
-    if sys.stdout.isatty():
-        _print_table(summary)
-    else:
-        _print_plain(summary)
+    for name, value in summary.facts:
+        print(f"{name}: {_one_line(value)}")
+    if summary.columns:
+        print("\n".join(table_lines([summary.columns, *([_one_line(cell) for cell in row] for row in summary.rows)])))
     for warning in summary.warnings:
         print(f"drocap: warning: {warning}", file=sys.stderr)
     return 0
@@ -114,40 +119,49 @@ def _print_metadata(path: Path) -> int:
 
 
 def _of_arrays(path: Path) -> Summary:
-    from drocap_ros.geometry.flexion import flexion_words
     from drocap_ros.motion import load_motion
-    from drocap_ros.reconstruction.world.calibration_words import telemetry_words
     from drocap_ros.tracks import load_tracks, read_npz, wrong_kind
 
     arrays = read_npz(path, ())
-    facts = [("path", str(path))]
     if "joints3d" in arrays:
-        motion = load_motion(path)
-        scale = "metric" if motion.metric else "assumed"
-        facts += [
-            ("kind", "motion"),
-            *_times(motion.stamp_ns),
-            ("joints", ", ".join(motion.joints)),
-            ("frame", motion.frame),
-            ("scale", f"{scale} ({motion.scale_source})"),
-            *((("median flexion", bent),) if (bent := flexion_words(motion.joints3d, motion.joints)) else ()),
-            *((("telemetry", words),) if (words := telemetry_words(motion.meta)) else ()),
-            *((key, str(motion.meta[key])) for key in ("method", "input", "git_revision") if key in motion.meta),
-        ]
+        facts = _motion_facts(load_motion(path))
     elif "keypoints" in arrays:
-        tracks = load_tracks(path)
-        seen = (tracks.keypoints == tracks.keypoints).all(axis=2)
-        facts += [
-            ("kind", "tracks"),
-            *_times(tracks.stamp_ns),
-            ("joints", ", ".join(tracks.joints)),
-            ("image", f"{tracks.image_size[0]}x{tracks.image_size[1]} px"),
-            ("seen", f"{seen.any(axis=1).sum()} of {len(tracks)} frames, {100 * seen.mean():.1f} % of the keypoints"),
-        ]
+        facts = _tracks_facts(load_tracks(path))
     else:
         raise wrong_kind(path, arrays, "a motion or 2D tracks")
     rows = [(name, str(a.dtype), " x ".join(map(str, a.shape)) or "scalar") for name, a in sorted(arrays.items())]
-    return Summary(facts, ("array", "type", "shape"), rows, ())
+    return Summary([("path", str(path)), *facts], ("array", "type", "shape"), rows, ())
+
+
+def _motion_facts(motion: Motion) -> list[tuple[str, str]]:
+    from drocap_ros.geometry.flexion import flexion_words
+    from drocap_ros.reconstruction.world.calibration_words import telemetry_words
+    from drocap_ros.report.statistics import scale_words
+
+    found = [
+        ("median flexion", flexion_words(motion.joints3d, motion.joints)),
+        ("telemetry", telemetry_words(motion.meta)),
+        *((key, str(motion.meta.get(key, ""))) for key in ("method", "input", "git_revision")),
+    ]
+    return [
+        ("kind", "motion"),
+        *_times(motion.stamp_ns),
+        ("joints", ", ".join(motion.joints)),
+        ("frame", motion.frame),
+        ("scale", scale_words(motion)),
+        *((name, words) for name, words in found if words),
+    ]
+
+
+def _tracks_facts(tracks: Tracks) -> list[tuple[str, str]]:
+    seen = (tracks.keypoints == tracks.keypoints).all(axis=2)
+    return [
+        ("kind", "tracks"),
+        *_times(tracks.stamp_ns),
+        ("joints", ", ".join(tracks.joints)),
+        ("image", f"{tracks.image_size[0]}x{tracks.image_size[1]} px"),
+        ("seen", f"{seen.any(axis=1).sum()} of {len(tracks)} frames, {100 * seen.mean():.1f} % of the keypoints"),
+    ]
 
 
 def _times(stamp_ns: Any) -> list[tuple[str, str]]:
@@ -169,34 +183,6 @@ def _time_text(stamp_ns: int | None) -> str:
 
 def _rate_text(count: int, seconds: float) -> str:
     return f"{(count - 1) / seconds:.2f} Hz" if seconds > 0 and count > 1 else "-"
-
-
-def _print_table(summary: Summary) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    console = Console()
-    facts = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    for name, value in summary.facts:
-        facts.add_row(Text(name, style="bold"), Text(value))
-    table = Table(*summary.columns)
-    for row in summary.rows:
-        table.add_row(*(Text(cell) for cell in row))
-    console.print(facts)
-    if summary.columns:
-        console.print(table)
-
-
-def _print_plain(summary: Summary) -> None:
-    for name, value in summary.facts:
-        print(f"{name}: {_one_line(value)}")
-    if not summary.columns:
-        return
-    table = [summary.columns, *summary.rows]
-    widths = [max(len(row[i]) for row in table) for i in range(len(summary.columns))]
-    for row in table:
-        print("  ".join(_one_line(cell).ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
 def _one_line(text: str) -> str:

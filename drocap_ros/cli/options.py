@@ -1,14 +1,20 @@
-"""The parser of commands and of batch lists, and the types of options that several commands have."""
+"""The parser of commands and of batch lists, and what several commands share: options, MOTION, tables."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import sys
-from collections.abc import Sequence
-from typing import Any, NoReturn
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from drocap_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from drocap_ros.clip import Clip
+    from drocap_ros.motion import Motion
 
 #: Names of ROS: letters, digits and underscores, none begins with a digit.
 _NAMESPACE = re.compile(r"/|/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
@@ -43,6 +49,33 @@ class LineParser(argparse.ArgumentParser):
         raise InputError(f"{message}; see {self.prog} --help")
 
 
+def add_command(
+    subparsers: Any, name: str, run: Callable[[argparse.Namespace], int], *, help: str, description: str
+) -> argparse.ArgumentParser:
+    """Parser of a command with its action."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(name, help=help, description=description)
+    parser.set_defaults(run=run)
+    return parser
+
+
+def add_quiet_option(parser: argparse.ArgumentParser, help: str = "no progress, only errors") -> None:
+    """Add ``--quiet``."""
+    parser.add_argument("--quiet", action="store_true", help=help)
+
+
+def add_config_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--config``."""
+    parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
+
+
+def add_network_options(parser: argparse.ArgumentParser) -> None:
+    """Add ``--models`` and ``--fetch``."""
+    parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
+    parser.add_argument(
+        "--fetch", action="store_true", help="download the default networks first where the folder of models has none"
+    )
+
+
 def add_seed_option(parser: argparse.ArgumentParser, help: str, **options: Any) -> None:
     """Add ``--seed``."""
     parser.add_argument("--seed", type=_seed, default=0, help=f"{help} (default 0)", **options)
@@ -59,3 +92,50 @@ def _seed(text: str) -> int:
     if not text.isdecimal() or int(text) > _LARGEST_SEED:
         raise argparse.ArgumentTypeError(f"expected an integer from 0 to {_LARGEST_SEED}, got {text}")
     return int(text)
+
+
+def add_clip_options(parser: argparse.ArgumentParser) -> None:
+    """Add ``--start``, ``--end`` and ``--subject``."""
+    first = "seconds from the first image (default 0)"
+    parser.add_argument("--start", metavar="S", type=float, default=0.0, help=first)
+    parser.add_argument("--end", metavar="S", type=float, default=math.inf, help="likewise (default: the last image)")
+    parser.add_argument(
+        "--subject",
+        metavar="N|RULE",
+        default="",
+        help="number of a person in the picture of `drocap track --list`; or largest (default), centre, or a box"
+        " x_min,y_min,x_max,y_max px in the first image",
+    )
+
+
+def clip_of(args: argparse.Namespace) -> Clip:
+    """Clip of ``--start`` and ``--end``."""
+    from drocap_ros.clip import Clip
+
+    return Clip(args.start, args.end)
+
+
+def add_motion_argument(parser: argparse.ArgumentParser) -> None:
+    """Add MOTION: a motion file, or its folder."""
+    parser.add_argument("motion", metavar="MOTION", type=Path, help="motion.npz, or its folder")
+
+
+def read_motion(argument: Path) -> tuple[Path, Motion]:
+    """Path and content of the motion file of MOTION.
+
+    Raises
+    ------
+    InputError
+        When it is not a motion.
+    """
+    from drocap_ros.motion import load_motion, motion_file
+
+    path = motion_file(argument)
+    return path, load_motion(path)
+
+
+def table_lines(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Lines of a table whose first row is its head, columns aligned."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()

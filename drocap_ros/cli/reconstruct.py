@@ -4,19 +4,34 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from drocap_ros.cli.options import (
+    add_clip_options,
+    add_command,
+    add_config_option,
+    add_network_options,
+    add_quiet_option,
+    clip_of,
+)
+from drocap_ros.errors import InputError
+
 if TYPE_CHECKING:
     from drocap_ros.motion import Motion
+    from drocap_ros.pipeline import Telemetry
+    from drocap_ros.tracks import Tracks
 
 METHODS = ("ba", "paper", "paper-no-articulation", "initial", "mf-nnm", "live")
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+def add_parser(subparsers: Any) -> None:
     """Add the command's options; ``run`` is its action."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "reconstruct",
+        run,
         help="3D motion from a video, recording or tracks file",
         description="Recover the 3D motion of the person in INPUT and write motion.npz, tracks.npz and report.html.",
     )
@@ -28,16 +43,11 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     )
     parser.add_argument("--out", metavar="DIR", type=Path, help="output folder (default: INPUT's name + _motion)")
     add_options(parser)
-    parser.add_argument("--quiet", action="store_true", help="no progress, only errors")
-    parser.set_defaults(run=run)
-    return parser
+    add_quiet_option(parser)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of one reconstruction; ``drocap batch`` has them too."""
-    from drocap_ros.cli.clip_options import add_clip_options
-    from drocap_ros.cli.models.on_demand import add_fetch_option
-
     parser.add_argument(
         "--method",
         choices=METHODS,
@@ -70,39 +80,27 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="pitch of a camera fixed to a vehicle without a gimbal, negative looks down; for telemetry, or a session,"
         " without the camera's attitude",
     )
-    parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
-    add_fetch_option(parser)
+    add_network_options(parser)
     parser.add_argument("--dictionary", metavar="NPZ", type=Path, help="pose dictionary instead of the shipped one")
-    parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
+    add_config_option(parser)
     parser.add_argument("--no-report", action="store_true", help="do not write report.html; that of an older run goes")
 
 
 def run(args: argparse.Namespace) -> int:
     """Reconstruct and write the output folder."""
-    from drocap_ros.cli.atomic_output import (
-        check_output_folder,
-        default_folder,
-        is_same,
-        output_folder,
-        refuse_inputs,
-    )
-    from drocap_ros.cli.clip_options import clip_of
-    from drocap_ros.cli.models.on_demand import ensure_networks
+    from drocap_ros.cli.atomic_output import check_output_folder, default_folder, is_same, refuse_inputs
+    from drocap_ros.cli.models import ensure_networks
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.cli.report import open_words
     from drocap_ros.config import load_config
-    from drocap_ros.motion import save_motion
     from drocap_ros.perception.load_models import models_folder
     from drocap_ros.perception.pose_estimator_config import parse_subject
     from drocap_ros.pipeline import Selection, needs_networks, reconstruct_input
-    from drocap_ros.report.motion_images import has_images
-    from drocap_ros.report.page import save_report
-    from drocap_ros.tracks import save_tracks
 
-    out = args.out or default_folder(args.input, "motion")
+    out, clip = args.out or default_folder(args.input, "motion"), clip_of(args)
     check_output_folder(out)
     names = ["motion.npz", "tracks.npz", *([] if args.no_report else ["report.html"])]
-    if clip_of(args).whole and is_same(out / "tracks.npz", args.input):
+    if clip.whole and is_same(out / "tracks.npz", args.input):
         names.remove("tracks.npz")  # they stay as they are
     refuse_inputs([out / name for name in names], [args.input])
     config = load_config(args.config)
@@ -110,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
         config = config.replace("initializer", dictionary=str(args.dictionary))
     person, rule = parse_subject(args.subject)
     config = config.replace("pose_estimator", **rule)
-    telemetry, selection = _telemetry(args), Selection(clip_of(args), person, args.redetect)
+    telemetry = _telemetry(args)
     if needs_networks(args.input, args.redetect):
         ensure_networks(models_folder(args.models or config.pose_estimator.models_dir), args.input, args)
     with progress_bars(args.quiet) as progress:
@@ -121,53 +119,62 @@ def run(args: argparse.Namespace) -> int:
             models=args.models,
             progress=progress,
             telemetry=telemetry,
-            selection=selection,
+            selection=Selection(clip, person, args.redetect),
         )
     motion = dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line})
+    _write(out, names, args.input, motion, tracks)
+    if not args.quiet:
+        opened = f"\n{open_words(out / 'report.html')}" if "report.html" in names else ""
+        print(f"{summary(motion, args.method)}\nwritten: {out}/{', '.join(names)}{opened}")
+    return 0
+
+
+def _write(out: Path, names: list[str], source: Path, motion: Motion, tracks: Tracks) -> None:
+    from drocap_ros.cli.atomic_output import output_folder
+    from drocap_ros.motion import save_motion
+    from drocap_ros.report.motion_images import has_images
+    from drocap_ros.report.page import save_report
+    from drocap_ros.tracks import save_tracks
+
     with output_folder(out) as folder:
         save_motion(folder / "motion.npz", motion)
         if "tracks.npz" in names:
             save_tracks(folder / "tracks.npz", tracks)
         if "report.html" in names:
-            save_report(folder / "report.html", motion, video=args.input if has_images(args.input) else None)
-    if args.no_report:
+            save_report(folder / "report.html", motion, video=source if has_images(source) else None)
+    if "report.html" not in names:
         (out / "report.html").unlink(missing_ok=True)  # of an older motion
-    if not args.quiet:
-        print(summary(motion, args.method))
-        print(f"written: {out}/{', '.join(names)}")
-        if "report.html" in names:
-            print(open_words(out / "report.html"))
-    return 0
 
 
-def _telemetry(args: argparse.Namespace) -> Any:
-    import math
-
-    from drocap_ros.errors import InputError
+def _telemetry(args: argparse.Namespace) -> Telemetry:
     from drocap_ros.pipeline import Telemetry
+
+    if args.time_offset is not None:
+        _check_offset("--time-offset", args.time_offset, args, mount=False)
+    if args.mount_pitch is not None:
+        _check_offset("--mount-pitch", args.mount_pitch, args, mount=True)
+        if abs(args.mount_pitch) > 90.0:
+            raise InputError(f"--mount-pitch: expected -90 to 90 deg, got {args.mount_pitch}; choose another")
+    return Telemetry(args.telemetry, args.time_offset, args.mount_pitch)
+
+
+def _check_offset(name: str, value: float, args: argparse.Namespace, *, mount: bool) -> None:
+    """Refuse an offset that is no number, or without telemetry: a log, a video's own, of a mount a recording's."""
     from drocap_ros.recording.open_session import is_recording
     from drocap_ros.recording.telemetry.djmd import has_djmd
     from drocap_ros.recording.video_telemetry import NO_TELEMETRY
 
-    for name, value in (("--time-offset", args.time_offset), ("--mount-pitch", args.mount_pitch)):
-        if value is None:
-            continue
-        pitch = name == "--mount-pitch"
-        session = pitch and args.telemetry is None and args.input.exists() and is_recording(args.input)
-        embedded = args.telemetry is None and has_djmd(args.input)
-        if args.telemetry in (None, NO_TELEMETRY) and not session and not embedded:
-            raise InputError(f"{name}: expected --telemetry LOG with it, found none; add the log")
-        if not math.isfinite(value):
-            raise InputError(f"{name}: expected a finite number, got {value}; correct the value")
-        if pitch and abs(value) > 90.0:
-            raise InputError(f"{name}: expected -90 to 90 deg, got {value}; choose a value in the range")
-    return Telemetry(args.telemetry, args.time_offset, args.mount_pitch)
+    own = has_djmd(args.input) or (mount and args.input.exists() and is_recording(args.input))
+    if args.telemetry == NO_TELEMETRY or (args.telemetry is None and not own):
+        raise InputError(f"{name}: expected --telemetry LOG with it, found none; add the log")
+    if not math.isfinite(value):
+        raise InputError(f"{name}: expected a finite number, got {value}; correct the value")
 
 
 def summary(motion: Motion, method: str) -> str:
     """Four lines: frames, method, frame and scale; reprojection error as in the report; seconds; quality."""
     from drocap_ros.report.checks import quality_sentence, run_checks
-    from drocap_ros.report.statistics import motion_statistics, stage_seconds
+    from drocap_ros.report.statistics import motion_statistics, scale_words, stage_seconds
 
     s = motion_statistics(motion)
     stages = stage_seconds(motion.meta)
@@ -175,7 +182,7 @@ def summary(motion: Motion, method: str) -> str:
     poses = "; 2D poses as recorded (--redetect estimates them from the images)"
     return (
         f"{len(motion.joints3d)} frames, a subject in {s.seen.mean():.1%}; method {method}, frame {motion.frame},"
-        f" scale from {motion.scale_source}{poses if motion.meta.get('pose2d') == 'recorded' else ''}\n"
+        f" scale {scale_words(motion)}{poses if motion.meta.get('pose2d') == 'recorded' else ''}\n"
         f"median reprojection error {s.median_px:.1f} px, {s.median_px / s.body_px:.1%} of the body\n"
         f"{total:.2f} s: {', '.join(f'{name} {value:.2f} s' for name, value in stages.items())}\n"
         f"{quality_sentence(run_checks(motion, s))}"

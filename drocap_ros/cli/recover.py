@@ -6,19 +6,21 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from drocap_ros.cli.options import add_command, add_quiet_option
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+
+def add_parser(subparsers: Any) -> None:
     """Add the command's options; ``run`` is its action."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "recover",
+        run,
         help="repair a session after a crash or power cut",
         description="Repair a session in place for every reader of MCAP and rosbag2. A damaged file is replaced only"
         " after all of its readable messages were read back from the repaired copy.",
     )
     parser.add_argument("session", metavar="SESSION", type=Path, help="session folder or .mcap")
-    parser.add_argument("--quiet", action="store_true", help="print only warnings")
-    parser.set_defaults(run=run)
-    return parser
+    add_quiet_option(parser, "print only warnings")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -6,24 +6,24 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from drocap_ros.cli.motion_input import HELP, read_motion
+from drocap_ros.cli.options import add_command, add_motion_argument, add_quiet_option, read_motion
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+def add_parser(subparsers: Any) -> None:
     """Add the command's options; ``run`` is its action."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "report",
+        run,
         help="a motion as one HTML page that works offline",
         description="Write one self-contained HTML file: 3D player, 2D keypoints, plots, warnings, provenance.",
     )
-    parser.add_argument("motion", metavar="MOTION", type=Path, help=HELP)
+    add_motion_argument(parser)
     parser.add_argument("--out", metavar="FILE", type=Path, help="file to write (default: report.html beside MOTION)")
     parser.add_argument(
         "--video", metavar="VIDEO", type=Path, help="video, image folder or recording of MOTION, for its images"
     )
-    parser.add_argument("--quiet", action="store_true", help="no output, only errors")
-    parser.set_defaults(run=run)
-    return parser
+    add_quiet_option(parser, "no output, only errors")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -7,6 +7,14 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from drocap_ros.cli.options import (
+    add_clip_options,
+    add_command,
+    add_config_option,
+    add_network_options,
+    add_quiet_option,
+    clip_of,
+)
 from drocap_ros.errors import DrocapError
 
 if TYPE_CHECKING:
@@ -15,18 +23,16 @@ if TYPE_CHECKING:
     from drocap_ros.observation import PoseObservation
     from drocap_ros.perception.estimator import PoseEstimator
     from drocap_ros.perception.persons import FoundPerson
-    from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
     from drocap_ros.perception.sources import Frame
     from drocap_ros.recording.open_images import Images
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+def add_parser(subparsers: Any) -> None:
     """Add the command's options; ``run`` is its action."""
-    from drocap_ros.cli.clip_options import add_clip_options
-    from drocap_ros.cli.models.on_demand import add_fetch_option
-
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "track",
+        run,
         help="2D tracks of the subject of a video",
         description="Track the subject of VIDEO and write tracks.npz: keypoints, covariance and confidence of each"
         " image. Each later subject is written to tracks_person_N.npz.",
@@ -37,25 +43,18 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "--list", action="store_true", help="only find the persons, and write persons.jpg with their numbers"
     )
     add_clip_options(parser)
-    parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
-    add_fetch_option(parser)
-    parser.add_argument("--detector", metavar="NAME", help="detector in that folder (default: the preferred one)")
-    parser.add_argument("--pose", metavar="NAME", help="2D pose model in that folder (default: the preferred one)")
-    parser.add_argument("--wait", action="store_true", help="track no other person after the subject is lost")
-    parser.add_argument("--threads", metavar="N", type=int, help="threads of one model run (default: 1)")
+    add_network_options(parser)
     parser.add_argument("--overlay", action="store_true", help="also write overlay.mp4 with the subject drawn")
-    parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
-    parser.add_argument("--quiet", action="store_true", help="no progress, only errors")
-    parser.set_defaults(run=run)
-    return parser
+    add_config_option(parser)
+    add_quiet_option(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Track, or find all persons, and write the output folder."""
     from drocap_ros.cli.atomic_output import check_output_folder, default_folder, output_folder, refuse_inputs
-    from drocap_ros.cli.clip_options import clip_of
-    from drocap_ros.cli.models.on_demand import ensure_networks
+    from drocap_ros.cli.models import ensure_networks
     from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.config import load_config
     from drocap_ros.perception.estimator import PoseEstimator
     from drocap_ros.perception.load_models import models_folder
     from drocap_ros.perception.persons import find_persons, following
@@ -66,7 +65,8 @@ def run(args: argparse.Namespace) -> int:
     check_output_folder(out)
     refuse_inputs([out / "persons.jpg"] if args.list else [out / "overlay.mp4"] * args.overlay, [args.video])
     clip, (person, rule) = clip_of(args), parse_subject(args.subject)
-    config, ingest = _configs(args, rule)
+    whole = load_config(args.config)
+    config, ingest = dataclasses.replace(whole.pose_estimator, on_loss="next", **rule), whole.image_ingest
     folder = models_folder(args.models or config.models_dir)
     ensure_networks(folder, args.video, args)
     with output_folder(out) as target, progress_bars(args.quiet) as progress:
@@ -134,16 +134,6 @@ def _track(
         name = "tracks.npz" if rank == 0 else f"tracks_person_{track_id}.npz"
         save_tracks(target / name, tracks_from_observations(observations, track_id))
     return _summary(found, len(observations))
-
-
-def _configs(args: argparse.Namespace, rule: dict[str, Any]) -> tuple[PoseEstimatorConfig, Any]:
-    from drocap_ros.config import load_config
-
-    whole = load_config(args.config)
-    changes: dict[str, Any] = {"on_loss": "wait" if args.wait else "next", **rule}
-    named = {"detector": args.detector, "pose_model": args.pose, "threads": args.threads}
-    changes |= {key: value for key, value in named.items() if value is not None}
-    return dataclasses.replace(whole.pose_estimator, **changes), whole.image_ingest
 
 
 class _OverlayWriter:

@@ -16,7 +16,7 @@ from drocap_ros.report import plots
 from drocap_ros.report.checks import Finding, Severity, run_checks
 from drocap_ros.report.motion_images import MotionImages, read_motion_images
 from drocap_ros.report.page_data import page_data, script_json
-from drocap_ros.report.statistics import Statistics, mean_known, motion_statistics, stage_seconds
+from drocap_ros.report.statistics import Statistics, mean_known, motion_statistics, scale_words, stage_seconds
 from drocap_ros.skeleton import side_of
 
 _SCRIPTS = ("data.js", "scene.js", "image.js", "player.js")
@@ -71,13 +71,14 @@ def _tile(value: str, unit: str, label: str) -> str:
 
 def _tiles(motion: Motion, s: Statistics) -> list[tuple[str, str, str]]:
     share = s.median_px / s.body_px
+    scale, source = scale_words(motion).split(", ")
     return [
         (f"{s.times_s[-1]:.1f}", "s", f"{len(s.times_s)} frames at {s.rate_hz:.3g} Hz"),
         (f"{100 * s.seen.mean():.0f}", "%", "of frames with a subject"),
         (_number(s.median_px, ".1f"), "px", f"median reprojection error, {_number(100 * share, '.1f')} % of the body"),
         (_number(100 * float(mean_known(s.bone_spread, None)), ".1f"), "%", "spread of bone lengths"),
         (f"{s.view_speed_dps:.0f}", "°/s", f"view of the body, {s.view_span_deg:.0f}° in all"),
-        ("measured" if motion.metric else "assumed", "", f"scale, from {motion.scale_source.replace('_', ' ')}"),
+        (scale, "", f"scale, {source}"),
     ]
 
 
@@ -149,7 +150,7 @@ def _provenance(motion: Motion, command: str) -> str:
             for name, version in sorted(versions.items() if isinstance(versions, dict) else ())
         ),
         ("solver", _solver(meta)),
-        ("scale", motion.scale_source.replace("_", " ")),
+        ("scale", scale_words(motion)),
     ]
     return "".join(
         f"<tr><th>{escape(name)}</th><td><code>{escape(str(value))}</code></td></tr>" for name, value in rows if value

@@ -138,6 +138,11 @@ def motion_statistics(motion: Motion) -> Statistics:
     )
 
 
+def scale_words(motion: Motion) -> str:
+    """Whether metres are measured, and by what."""
+    return f"{'measured' if motion.metric else 'assumed'}, from {motion.scale_source.replace('_', ' ')}"
+
+
 def stage_seconds(meta: dict[str, Any]) -> dict[str, float]:
     """Seconds per stage of a motion's ``meta`` in the order of the stages, the total last; others are left out."""
     seconds = meta.get("seconds")

@@ -40,14 +40,6 @@ def test_truncated_session_warns_on_stderr(pose_session, capsys):
     assert err.startswith("drocap: warning: session_0.mcap: cut off")
 
 
-def test_info_prints_a_table_on_a_terminal(pose_session, capsys, monkeypatch):
-    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
-    info._print_table(info.summarize(pose_session))
-    out = capsys.readouterr().out
-    assert "/drocap/pose2d" in out
-    assert "┃" in out
-
-
 def test_info_of_tracks_and_motion_lists_arrays_and_rates(tmp_path, capture, capsys):
     save_tracks(tmp_path / "tracks.npz", capture.tracks)
     assert run(tmp_path / "tracks.npz") == 0
@@ -69,7 +61,7 @@ def test_info_of_tracks_and_motion_lists_arrays_and_rates(tmp_path, capture, cap
     assert run(tmp_path / "motion.npz") == 0
     out = capsys.readouterr().out
     assert "kind: motion" in out
-    assert "scale: assumed (assumed_height)" in out
+    assert "scale: assumed, from assumed height" in out
     assert re.search(r"median flexion: knees \d+ and \d+, hips \d+ and \d+, elbows \d+ and \d+ degrees", out)
     assert "method: ba" in out
     assert "git_revision: 72e4e0d" in out

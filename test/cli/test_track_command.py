@@ -56,12 +56,12 @@ def test_recording_without_a_person_ends_with_status_2(models, tmp_path, capsys)
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    "option", [["--subject", "tallest"], ["--pose", "nothing"], ["--detector", "tinypose_256x192"]]
-)
-def test_unusable_option_ends_with_status_2(models, shared, tmp_path, capsys, option):
+@pytest.mark.parametrize("parameter", ["subject: tallest", "pose_model: nothing", "detector: tinypose_256x192"])
+def test_unusable_networks_end_with_status_2(models, shared, tmp_path, capsys, parameter):
     image = str(shared / "media" / "skier.jpg")
-    assert main(["track", image, "--out", str(tmp_path / "out"), "--models", models, *option]) == 2
+    (tmp_path / "config.yaml").write_text(f"pose_estimator:\n  {parameter}\n")
+    words = ["track", image, "--out", str(tmp_path / "out"), "--models", models]
+    assert main([*words, "--config", str(tmp_path / "config.yaml")]) == 2
     assert "expected" in capsys.readouterr().err
 
 

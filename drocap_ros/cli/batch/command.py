@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from drocap_ros.cli.options import add_command, add_quiet_option
 from drocap_ros.cli.reconstruct import add_options
 from drocap_ros.errors import InputError
 
@@ -27,10 +28,12 @@ _FAILURES_PRINTED = 10
 _LEFT_OVER = re.compile(r"\.+[\w-]*-[0-9a-f]{16}\.\w+(\.\w+)?")
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+def add_parser(subparsers: Any) -> None:
     """Add the command's options; ``run`` is its action."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "batch",
+        run,
         help="many recordings, resumable, on one machine or a Dask cluster",
         description="Reconstruct each recording of INPUTS into a folder of its own in DIR. What is done is skipped, so"
         " that an interrupted batch goes on. DIR/batch.jsonl gets one line per recording, DIR/summary.html a table.",
@@ -47,10 +50,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     where.add_argument("--jobs", metavar="N", type=int, default=1, help="recordings at a time (default: 1)")
     where.add_argument("--cluster", metavar="ADDRESS", help="Dask scheduler, for example tcp://10.0.0.5:8786")
     add_options(parser)
-    parser.add_argument("--quiet", action="store_true", help="no progress, only errors")
+    add_quiet_option(parser)
     # SIGTERM ends the process and with it the recordings; an interrupt would wait for them.
-    parser.set_defaults(run=run, interrupted_by=())
-    return parser
+    parser.set_defaults(interrupted_by=())
 
 
 def run(args: argparse.Namespace) -> int:

@@ -43,7 +43,7 @@ def _run_in_process(task: Task, context: multiprocessing.context.ForkServerConte
             return pool.submit(reconstruct_recording, task).result()
     except BrokenProcessPool:
         return failure(task, "process ended: out of memory, or a crash in a library; see the system's log")
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - what fails in one recording ends no other one
         return failure(task, f"unexpected {type(error).__name__}: {error}")
 
 

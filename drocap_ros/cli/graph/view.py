@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any
 from drocap_ros.cli.atomic_output import output_file
 from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
 from drocap_ros.cli.graph.live import import_bringup
-from drocap_ros.cli.motion_input import read_motion
-from drocap_ros.cli.options import ros_namespace
+from drocap_ros.cli.options import read_motion, ros_namespace
 from drocap_ros.cli.progress import progress_bars
 from drocap_ros.cli.signals import interruptible, stop_signals
 from drocap_ros.errors import InputError

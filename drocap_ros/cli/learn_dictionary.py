@@ -6,17 +6,19 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drocap_ros.cli.options import add_seed_option
+from drocap_ros.cli.options import add_command, add_quiet_option, add_seed_option
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
     from drocap_ros.reconstruction.paper.dictionary import Dictionary
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+def add_parser(subparsers: Any) -> None:
     """Add the command's options; ``run`` is its action."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "learn-dictionary",
+        run,
         help="learn a pose dictionary from MoCap",
         description="Learn a sparse pose dictionary from the MoCap .npz files of a folder.",
     )
@@ -29,9 +31,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("--include", metavar="GLOB", default="*", help="only files of this name, e.g. 'cmu_*'")
     parser.add_argument("--every", type=int, default=3, help="take every n-th frame (default 3)")
     add_seed_option(parser, "seed of the batches")
-    parser.add_argument("--quiet", action="store_true", help="no output, only errors")
-    parser.set_defaults(run=run)
-    return parser
+    add_quiet_option(parser, "no output, only errors")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -53,9 +53,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out.suffix != ".npz" or not args.out.absolute().parent.is_dir():
         raise InputError(f"--out: expected a .npz in a folder that exists, got {args.out}")
     with output_file(args.out) as file:
-        dictionary = learn_from_folder(
-            args.folder, args.include, args.every, args.atoms, args.sparsity, args.seed, args.quiet
-        )
+        dictionary = learn_from_folder(args)
         save_dictionary(file, dictionary)
     if not args.quiet:
         m = dictionary.metadata
@@ -64,10 +62,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def learn_from_folder(
-    folder: Path, include: str, every: int, atoms: int, sparsity: float, seed: int, quiet: bool = False
-) -> Dictionary:
-    """Dictionary from every n-th frame of the files of a MoCap folder whose names match ``include``."""
+def learn_from_folder(args: argparse.Namespace) -> Dictionary:
+    """Dictionary from every n-th frame of the files of a MoCap folder whose names match ``--include``."""
     import numpy as np
 
     from drocap_ros.cli.progress import progress_bars
@@ -76,20 +72,29 @@ def learn_from_folder(
     from drocap_ros.reconstruction.paper.dictionary import learn, normalize_poses
     from drocap_ros.tracks import read_npz
 
-    files = mocap_files(folder, include)
-    poses = np.concatenate([normalize_poses(load_mocap(path)[0][::every]) for path in files])
+    files = mocap_files(args.folder, args.include)
+    poses, frames, stated = [], 0, []
+    for path in files:
+        take, arrays = load_mocap(path)[0], read_npz(path, ())
+        poses.append(normalize_poses(take[:: args.every]))
+        frames += len(take)
+        stated.append({name: str(arrays[name]) for name in ("licence", "source") if name in arrays})
     metadata = {
         "files": len(files),
-        "frames": sum(len(load_mocap(path)[0]) for path in files),
-        "include": include,
-        "every": every,
-        "licence": sorted({str(a["licence"]) for path in files if "licence" in (a := read_npz(path, ()))}),
-        "origin": sorted({str(a["source"]) for path in files if "source" in (a := read_npz(path, ()))}),
-        "command": f"drocap learn-dictionary MOCAP_DIR --out NPZ --include '{include}' --every {every}"
-        f" --atoms {atoms} --sparsity {sparsity:g} --seed {seed}",
+        "frames": frames,
+        "include": args.include,
+        "every": args.every,
+        "licence": sorted({facts["licence"] for facts in stated if "licence" in facts}),
+        "origin": sorted({facts["source"] for facts in stated if "source" in facts}),
+        "command": f"drocap learn-dictionary MOCAP_DIR --out NPZ --include '{args.include}' --every {args.every}"
+        f" --atoms {args.atoms} --sparsity {args.sparsity:g} --seed {args.seed}",
     }
-    with progress_bars(quiet) as show, blas_threads(1):
+    with progress_bars(args.quiet) as show, blas_threads(1):
         return learn(
-            poses, atoms=atoms, sparsity=sparsity, seed=seed, metadata=metadata,
+            np.concatenate(poses),
+            atoms=args.atoms,
+            sparsity=args.sparsity,
+            seed=args.seed,
+            metadata=metadata,
             progress=lambda done: show("learning", done),
-        )  # fmt: skip
+        )

@@ -11,7 +11,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 from walking import write_mocap
 
-from drocap_ros.cli.models import learn_dictionary
+from drocap_ros.cli import learn_dictionary
 from drocap_ros.errors import InputError
 from drocap_ros.reconstruction.paper import dictionary
 from drocap_ros.reconstruction.paper.dictionary import load_dictionary

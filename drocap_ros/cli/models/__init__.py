@@ -1,1 +1,0 @@
-"""Commands around networks and dictionaries."""
