@@ -26,7 +26,7 @@ from figures import ROOT, table, write_figures
 
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import NodeError
-from drocap_ros.flight.conditions import ConditionCode
+from drocap_ros.flight.conditions import PICTURE_CODES, ConditionCode
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.orbit.states import Command, State
@@ -309,7 +309,7 @@ class Case(NamedTuple):
 
 _ANY: frozenset[State | ConditionCode] = frozenset()
 _STOOD = frozenset({ConditionCode.CONTROL_LOOP_STALLED, ConditionCode.PILOT_TOOK_OVER})
-_LOST = frozenset({ConditionCode.SUBJECT_OUTDATED, ConditionCode.NO_SUBJECT})
+_LOST = PICTURE_CODES | {ConditionCode.NO_SUBJECT}
 CASES = (
     Case("bridge killed (SIGKILL)", _kill_bridge, LINK_S, True, _ANY, 0.2),
     Case("bridge stopped for 3 s (SIGSTOP)", _stop_bridge, LINK_S, True, _STOOD),

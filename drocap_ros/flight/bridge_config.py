@@ -60,7 +60,7 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
     )  # fmt: skip
     max_control_timeout_s: float = param(
         0.5, "longest time-out after which the autopilot may stop by itself when our setpoints stay away "
-        "(GUID_TIMEOUT, COM_OF_LOSS_T, read from it): a longer or unknown one forbids motion; 0 = not checked",
+        "(read from its parameters): a longer or unknown one forbids motion; 0 = not checked",
         unit="s", minimum=0, maximum=10,
     )  # fmt: skip
     gimbal_control: bool = param(False, "whether the mount's pitch follows the subject")

@@ -102,7 +102,22 @@ class ConditionCode(enum.IntEnum):
     SUBJECT_FAR = 204
     SUBJECT_AT_BORDER = 205
     NO_CAMERA_INFO = 206
+    PICTURES_LOST = 207
+    PICTURES_LATE = 208
+    PICTURES_FROZEN = 209
+    OTHER_SUBJECT = 210
 
+
+#: The subject's position is outdated: by a fault of the pictures, or he is not found in them.
+PICTURE_CODES = frozenset(
+    {
+        ConditionCode.SUBJECT_OUTDATED,
+        ConditionCode.PICTURES_LOST,
+        ConditionCode.PICTURES_LATE,
+        ConditionCode.PICTURES_FROZEN,
+        ConditionCode.OTHER_SUBJECT,
+    }
+)
 
 #: Factor of a limit that a command may reach: its values are float32, and limits are sums of decimal fractions.
 ROUNDING = 1.0 + 1e-6
@@ -151,20 +166,19 @@ _SENTENCES = {
     _C.NO_ORBIT_TO_ADJUST: "adjust needs a running orbit, the state is {state}",
     _C.PILOT_IN_COMMAND: "the pilot has taken over; send stop to acknowledge it, then start",
     _C.FAULT_NOT_ACKNOWLEDGED: "{cause}; send stop to acknowledge it, then start",
-    _C.NOT_IN_CONTROL_MODE: "the mode is {mode}; send engage, or switch to GUIDED by hand (ArduPilot)",
-    _C.MODE_CHANGE_FORBIDDEN: "the mode is {mode} and mode_change_allowed is false; set it to true (PX4 enters "
-    "OFFBOARD only while setpoints arrive), or switch to GUIDED by hand (ArduPilot)",
+    _C.NOT_IN_CONTROL_MODE: "the mode is {mode}; send engage{by_hand}",
+    _C.MODE_CHANGE_FORBIDDEN: "the mode is {mode} and mode_change_allowed is false; set it to true{engaged}{by_hand}",
     _C.PERSON_LEAVES_PICTURE: "at {radius_m:g} m, {height_m:g} m high and {speed_deg_s:.0f} deg/s the person "
     "leaves the picture of {camera} by {missing_percent:.0f} % of its height; {remedy}",
     _C.HOLD_MODE_PENDING: "the autopilot's hold mode has just been requested and is not reported yet; send engage when "
-    "it is, or switch to GUIDED by hand (ArduPilot)",
+    "it is{by_hand}",
     _C.COMMANDS_DISABLED: "no motion: commands are disabled; set commands_enabled to true to allow it",
     _C.CLOCK_JUMPED: "our clock jumped by {jump_s:.1f} s",
     _C.POSITION_JUMPED: "the reported position jumped by {jump_m:.1f} m",
     _C.CONTROL_LOOP_STALLED: "the control loop stood still for {gap_s:.1f} s",
     _C.SETPOINTS_NOT_FOLLOWED: "the vehicle does not follow the setpoints: {evidence}",
     _C.LINK_SILENT: "nothing heard from the autopilot; last message: {ago}",
-    _C.AUTOPILOT_UNSUPPORTED: "the autopilot is {autopilot!r}: expected ArduPilot or PX4 of a multirotor or helicopter",
+    _C.AUTOPILOT_UNSUPPORTED: "the autopilot is {autopilot!r}: expected {supported} of a multirotor or helicopter",
     _C.TIMEOUT_UNKNOWN: "the autopilot has not reported {name}, how long it flies on without setpoints; set {name} to "
     "{limit_s:g} on the autopilot, or change max_control_timeout_s",
     _C.TIMEOUT_TOO_LONG: "the autopilot flies on for {value_s:g} s without setpoints; set {name} to {limit_s:g} on the "
@@ -212,6 +226,14 @@ _SENTENCES = {
     _C.NO_CAMERA_INFO: "no camera_info has arrived, and without it no subject is located: set "
     "image_ingest.calibration_file or horizontal_fov_deg, or let the camera's driver publish it",
     _C.SUBJECT_OUTDATED: "the subject was last located {ago}",
+    _C.PICTURES_LOST: "no keypoints of a picture (pose2d) have arrived for {silent_s:.1f} s; the subject was last "
+    "located {ago}; look after the camera, its stream and pose_estimator",
+    _C.PICTURES_LATE: "pictures arrive {late_s:.1f} s after their exposure; the subject was last located {ago}; look "
+    "after the load of the computer, the stream's buffer and the clocks",
+    _C.PICTURES_FROZEN: "the picture stands still: its keypoints repeat bit for bit; the subject was last located "
+    "{ago}; look after the camera and its stream",
+    _C.OTHER_SUBJECT: "the pictures show somebody else, or a person where the subject cannot be; he was last located "
+    "{ago}",
     _C.SUBJECT_UNCERTAIN: "the subject's position is uncertain by {sd_m:.1f} m",
     _C.SUBJECT_NEAR: "the subject is {distance_m:.1f} m away, give or take {sd_m:.1f} m: at the limit of {limit_m:g} m",
     _C.SUBJECT_AT_BORDER: "the body leans, and the person is {margin_percent:.0f} % of the picture's height from the "

@@ -68,7 +68,7 @@ class SafetyConfig(Parameters):
     )  # fmt: skip
     max_coast_m: float = param(
         3.0, "distance that the vehicle may fly on if setpoints end, the autopilot's time-out included: it limits the "
-        "speed, to 1.8 m/s with GUID_TIMEOUT 0.5, 2.1 m/s with 0.3, 1.3 m/s with COM_OF_LOSS_T 0.5", unit="m",
+        "speed, to 1.3 to 1.8 m/s by the autopilot with a time-out of 0.5 s, up to 2.1 m/s with 0.3 s", unit="m",
         minimum=0.5, maximum=50,
     )  # fmt: skip
     speed_margin: float = param(
@@ -80,7 +80,7 @@ class SafetyConfig(Parameters):
     )  # fmt: skip
     blind_hold_s: float = param(
         3.5, "time for which setpoints hold the position after the vehicle is lost from sight (telemetry silent or "
-        "late), before nothing more is sent and the autopilot's time-out (GUID_TIMEOUT, COM_OF_LOSS_T) ends the "
+        "late), before nothing more is sent and the autopilot's time-out ends the "
         "control: braking from 4.5 m/s at 1.3 m/s^2 takes 3.5 s", unit="s", minimum=0.5, maximum=30,
     )  # fmt: skip
     resume_after_hold_s: float = param(

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drocap_ros.flight.mavlink.mount import KINDS
 from drocap_ros.parameters import Parameters, param
+
+#: Kinds of mount: "auto" = as the autopilot describes it; "gimbal" = stabilized, its angles are against the horizon;
+#: "servo" = its angles are against the body; "fixed" = no mount, the camera has one pitch against the body.
+MOUNT_KINDS = ("auto", "gimbal", "servo", "fixed")
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ class SubjectConfig(Parameters):
         maximum=1,
     )
     height_error_m: float = param(
-        0.5, "standard deviation of the camera's height above the subject's ground: PX4's height wanders by as much",
+        0.5, "standard deviation of the camera's height above the subject's ground, as much as reports of it wander",
         unit="m", minimum=0, maximum=20,
     )  # fmt: skip
     attitude_error_deg: float = param(
@@ -44,8 +47,9 @@ class SubjectConfig(Parameters):
     )
     mount: str = param(
         "auto", "what holds the camera: gimbal = its angles are reported against the horizon; servo = reported against "
-        "the body; fixed = camera_pitch_deg against the body; auto = gimbal, or servo where ArduPilot's MNT1_TYPE is 1",
-        choices=KINDS,
+        "the body; fixed = camera_pitch_deg against the body; auto = gimbal, or servo where the autopilot names "
+        "servos",
+        choices=MOUNT_KINDS,
     )  # fmt: skip
     camera_pitch_deg: float = param(
         0.0, "pitch of a fixed camera against the body, as in MAVLink: negative = it looks down", unit="deg",

@@ -77,7 +77,7 @@ class MavlinkBridgeNode(ComponentNode):
         self._stepped = transport is not None
         self._link = MavlinkLink(self.config, self.now_ns, monotonic_s=self.now_s, transport=transport)
         self._watchdog = Watchdog(self._link.send_unlocked, self.config.watchdog_s)
-        self._controller = OrbitController(self._link, self.config, self._watchdog)
+        self.controller = OrbitController(self._link, self.config, self._watchdog)
         self._states = self.output("vehicle/state")
         self._statuses = self.output("orbit/status")
         self._tf = self.output("/tf") if TFMessage is not None else None
@@ -110,9 +110,9 @@ class MavlinkBridgeNode(ComponentNode):
 
     def on_stop(self) -> None:
         """End a running orbit by a hold at once, before the shutdown waits for other nodes."""
-        if self._controller.safety.state != State.ORBITING:
+        if self.controller.safety.state != State.ORBITING:
             return
-        self._controller.command(OperatorCommand(int(Command.STOP)))
+        self.controller.command(OperatorCommand(int(Command.STOP)))
         if self._stepped:
             self._control_step()
         elif self._threads[1].is_alive():
@@ -152,8 +152,8 @@ class MavlinkBridgeNode(ComponentNode):
 
     def _control_step(self) -> None:
         self._take_commands()
-        self._controller.intruder = self._rivals.condition(self.now_s())
-        status = self._controller.step(self.now_ns(), self.now_s())
+        self.controller.intruder = self._rivals.condition(self.now_s())
+        status = self.controller.step(self.now_ns(), self.now_s())
         self._answer_commands(status)
         self._report_status(status)
 
@@ -174,7 +174,7 @@ class MavlinkBridgeNode(ComponentNode):
                 float(request.angular_speed_deg_s), stamp_from_ros(request.stamp),
             )  # fmt: skip
             self._unanswered.append((command, request, header))
-            self._controller.command(command)
+            self.controller.command(command)
 
     def _answer_commands(self, status: ControlStatus) -> None:
         for command, answer in status.answers:
@@ -201,7 +201,7 @@ class MavlinkBridgeNode(ComponentNode):
             self._publish_status(status)
 
     def _on_state(self, state: VehicleState) -> None:
-        self._controller.on_state(state)
+        self.controller.on_state(state)
         self._states.publish(vehicle_state_to_ros(state))
         self.count(Key.VEHICLE_STATES)
         if self._tf is not None:
@@ -218,7 +218,7 @@ class MavlinkBridgeNode(ComponentNode):
                 f"pose2d: expected images of {expected} as in camera_info, got {got}: every distance would be wrong; "
                 "publish the camera_info of these images"
             )
-        self._controller.on_pose2d(observation)
+        self.controller.on_pose2d(observation)
         if observation.has_subject:
             self.count(Key.SUBJECT_SEEN)
 
@@ -229,14 +229,14 @@ class MavlinkBridgeNode(ComponentNode):
         matrix, size = np.array(message.k, dtype=float).reshape(3, 3), (message.width, message.height)
         if all(size):
             check_camera_matrix(matrix, size)
-        self._controller.on_camera(matrix)
+        self.controller.on_camera(matrix)
         self._calibrated_size = size
 
     def _on_second(self) -> None:
         publishers = self.get_publishers_info_by_topic(self.resolve_topic_name("pose2d"))
         self._rivals.set_names(f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers)
         status = self._link.status()
-        safety = self._controller.safety
+        safety = self.controller.safety
         if not status.connected:
             silence = "never heard" if np.isinf(status.silence_s) else f"silent for {status.silence_s:.0f} s"
             remedy = "check the link and its URL"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drocap_ros.flight.conditions import ConditionCode
+from drocap_ros.flight.conditions import PICTURE_CODES, ConditionCode
 from drocap_ros.flight.orbit.states import Command, State
 from lab.flights.fault_causes import (
     DELAY_S,
@@ -86,7 +86,7 @@ from lab.flights.report_injections import (
 )
 
 _C = ConditionCode
-_LOCATED = (_C.SUBJECT_OUTDATED, _C.NO_SUBJECT)
+_LOCATED = tuple(PICTURE_CODES)
 _TELEMETRY = (
     _C.POSITION_FROZEN, _C.ATTITUDE_OUTDATED, _C.LINK_SILENT, _C.ROUND_TRIP_TOO_LONG, _C.SETPOINTS_NOT_FOLLOWED,
 )  # fmt: skip
@@ -104,8 +104,8 @@ _TO_CONTROL, _TO_POSITION = pilot("GUIDED", "OFFBOARD"), pilot("LOITER", "POSCTL
 _STOP, _ENGAGE = command(Command.STOP), command(Command.ENGAGE)
 
 
-def _perception(name: str, inject: Injection) -> Fault:
-    return Fault(name, inject, FRAME_S, codes=_LOCATED)
+def _perception(name: str, inject: Injection, code: ConditionCode = _C.SUBJECT_OUTDATED) -> Fault:
+    return Fault(name, inject, FRAME_S, codes=(code,))
 
 
 def _process(name: str, **values: Any) -> Fault:
@@ -128,16 +128,24 @@ def _in_state(name: str, inject: Injection, state: State, *before: tuple[float, 
 
 
 _PERCEPTION = (
-    _perception("perception stops", _LOSE_SUBJECT),
+    _perception("perception stops", _LOSE_SUBJECT, _C.PICTURES_LOST),
     _perception("perception finds no subject", perceived(lambda seen: {"track_id": 0})),
-    _perception("keypoints jump by 400 px", perceived(lambda seen: {"keypoints": shifted(seen, 400)})),
-    _perception("keypoints are NaN", perceived(lambda seen: {"keypoints": seen.keypoints * np.float32(np.nan)})),
-    _perception("image frozen, stamps continue", freeze),
     _perception(
-        "another person, by its track", perceived(lambda seen: {"keypoints": shifted(seen, 150), "track_id": 2})
+        "keypoints jump by 400 px", perceived(lambda seen: {"keypoints": shifted(seen, 400)}), _C.OTHER_SUBJECT
     ),
-    _perception("another person 2 m aside, same track", perceived(lambda seen: {"keypoints": shifted(seen, 370)})),
-    _perception("perception 1 s late", perceived(lambda seen: {"stamp_ns": seen.stamp_ns - 10**9})),
+    _perception("keypoints are NaN", perceived(lambda seen: {"keypoints": seen.keypoints * np.float32(np.nan)})),
+    _perception("image frozen, stamps continue", freeze, _C.PICTURES_FROZEN),
+    _perception(
+        "another person, by its track",
+        perceived(lambda seen: {"keypoints": shifted(seen, 150), "track_id": 2}),
+        _C.OTHER_SUBJECT,
+    ),
+    _perception(
+        "another person 2 m aside, same track",
+        perceived(lambda seen: {"keypoints": shifted(seen, 370)}),
+        _C.OTHER_SUBJECT,
+    ),
+    _perception("perception 1 s late", perceived(lambda seen: {"stamp_ns": seen.stamp_ns - 10**9}), _C.PICTURES_LATE),
     _perception("stamps 5 s in the future", perceived(lambda seen: {"stamp_ns": seen.stamp_ns + 5 * 10**9})),
     Fault("every other image lost", lose_half, harmless=True),
 )

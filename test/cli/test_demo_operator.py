@@ -79,7 +79,7 @@ def test_nothing_is_started_before_the_pilot_has_handed_over():
 def test_refused_start_is_repeated_after_a_pause():
     desk = Desk(Operator(5.0))
     desk.show(State.READY, CLEAR, 1.2)
-    desk.answer(False, condition(ConditionCode.NOT_IN_CONTROL_MODE, mode="LOITER"))
+    desk.answer(False, condition(ConditionCode.NOT_IN_CONTROL_MODE, mode="LOITER", by_hand=""))
     desk.show(State.READY, CLEAR, 6.0)
     times = [t for t, command in desk.commands if command == Command.START]
     assert len(times) == 2

@@ -56,11 +56,11 @@ def test_a_drivers_camera_info_is_heard_whatever_it_offers(node, reliability):
     publisher = driver.create_publisher(CameraInfo, "/drocap/camera_info", qos)
     camera = CameraModel(1280, 720, pinhole_matrix(1280, 720, 60.0))
     end = time.monotonic() + 5.0
-    while node._controller._framing.matrix is None and time.monotonic() < end:
+    while not node.controller.calibrated and time.monotonic() < end:
         publisher.publish(camera_info_to_ros(header_at(time.time_ns(), "camera"), camera))
         rclpy.spin_once(node, timeout_sec=0.05)
     driver.destroy_node()
-    assert node._controller._framing.matrix is not None
+    assert node.controller.calibrated
 
 
 def test_a_camera_info_that_was_published_once_before_the_bridge_is_heard():
@@ -73,9 +73,9 @@ def test_a_camera_info_that_was_published_once_before_the_bridge_is_heard():
     node = MavlinkBridgeNode(MavlinkBridgeConfig(url=f"udpin:127.0.0.1:{free_udp_port()}"))
     try:
         end = time.monotonic() + 5.0
-        while node._controller._framing.matrix is None and time.monotonic() < end:
+        while not node.controller.calibrated and time.monotonic() < end:
             rclpy.spin_once(node, timeout_sec=0.05)
-        assert node._controller._framing.matrix is not None
+        assert node.controller.calibrated
     finally:
         node.close()
         node.destroy_node()
@@ -87,7 +87,7 @@ def test_an_error_in_the_control_loop_holds_the_vehicle_at_once(node, monkeypatc
     sent = []
     monkeypatch.setattr(node._watchdog, "_send", sent.append)
     node._watchdog.kick(time.monotonic(), FallbackCommands("hold", "hold mode", lambda: True))
-    monkeypatch.setattr(node._controller, "step", lambda now_ns, now_s: 1 / 0)
+    monkeypatch.setattr(node.controller, "step", lambda now_ns, now_s: 1 / 0)
     node._control()
     assert sent == ["hold"]
     assert isinstance(node.failure, ZeroDivisionError)

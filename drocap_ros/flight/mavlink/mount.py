@@ -16,10 +16,6 @@ from drocap_ros.flight.frames import orientation_to_ros, quaternion_from_euler, 
 from drocap_ros.geometry.rotations import slerp, unit_quaternions
 
 _NS = 1_000_000_000
-#: Kinds of mount: "auto" = as the autopilot describes it; "gimbal" = stabilized, its angles are against the horizon;
-#: "servo" = its angles are against the body; "fixed" = no mount, the camera has one pitch against the body.
-KINDS = ("auto", "gimbal", "servo", "fixed")
-
 _YAW_IN_VEHICLE_FRAME, _YAW_IN_EARTH_FRAME, _YAW_LOCK = 32, 64, 16
 _STALE_S = {"gimbal": 3.0, "servo": 0.5}  # the angles of servos follow the body's lean
 _UNKNOWN_S = 0.5  # without angles, from a mount that reports and does not know them
@@ -33,7 +29,7 @@ class Mount:
 
     Parameters
     ----------
-    kind : one of ``KINDS``
+    kind : one of ``subject_config.MOUNT_KINDS``
     pitch_deg : of a fixed camera against the body, negative = down
     """
 

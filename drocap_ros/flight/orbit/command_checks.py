@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections import deque
+from typing import NamedTuple
 
 from drocap_ros.flight.bridge_config import FENCE_ROOM_M, MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ROUNDING, Condition, ConditionCode, condition
-from drocap_ros.flight.orbit.planner import OrbitGoal, goal_of
-from drocap_ros.flight.orbit.states import Command, OperatorCommand
+from drocap_ros.flight.orbit.states import Command, CommandAnswer, OperatorCommand, SafetyState, State
 from drocap_ros.flight.orbit_config import orbit_condition
+from drocap_ros.flight.orbit_goal import OrbitGoal, goal_of
 from drocap_ros.flight.safety_config import height_condition
 from drocap_ros.flight.subject.framing import Framing
 
 _NS = 1_000_000_000
-_COMMAND_AGE_S = 2.0
+_COMMAND_AGE_S = 2.0  # as srv/OrbitCommand.srv states
+_MAX_WAITING = 16  # commands: one a step is answered, so the last one waits for 0.8 s at 20 Hz
 
 
 def command_condition(command: OperatorCommand, now_ns: int) -> Condition | None:
@@ -45,3 +48,64 @@ def commanded_goal(
         fence = "fence_radius_m less 1 m of room"
         beyond = condition(ConditionCode.RADIUS_TOO_LARGE, value=goal.radius_m, limit=widest_m, limited_by=fence)
     return beyond or (framing.refusal(goal) if framing else None) or goal
+
+
+class Order(NamedTuple):
+    """A command to execute in this step, and the orbit that it asks for; None = the present one stays."""
+
+    command: OperatorCommand
+    kind: Command
+    goal: OrbitGoal | None = None
+
+
+class CommandDesk:
+    """The operator's commands that wait, and the answers to them."""
+
+    def __init__(self, config: MavlinkBridgeConfig) -> None:
+        self._config = config
+        self._waiting: deque[OperatorCommand] = deque()
+        self._answers: list[tuple[OperatorCommand, CommandAnswer]] = []
+
+    def take(self, command: OperatorCommand) -> None:
+        """Take a command.  Of too many the oldest that is no stop is dropped: never a stop for another command."""
+        self._waiting.append(command)
+        if len(self._waiting) > _MAX_WAITING:
+            index = next((i for i, c in enumerate(self._waiting) if c.kind != Command.STOP), 0)
+            dropped = self._waiting[index]
+            del self._waiting[index]
+            self.answer(dropped, CommandAnswer(False, condition(ConditionCode.TOO_MANY_COMMANDS, limit=_MAX_WAITING)))
+
+    def next(self, now_ns: int, state: SafetyState, goal: OrbitGoal, framing: Framing) -> Order | None:
+        """The command to execute in this step, a stop before all others; an invalid one is refused here."""
+        stop = next((c for c in self._waiting if c.kind == Command.STOP), None)
+        if stop is not None:
+            overruled = condition(ConditionCode.OVERRULED_BY_STOP)
+            for other in self._waiting:
+                if other is not stop:
+                    self.answer(other, CommandAnswer(other.kind == Command.STOP, overruled))
+            self._waiting.clear()
+            return Order(stop, Command.STOP)
+        if not self._waiting:
+            return None
+        command = self._waiting.popleft()
+        if (refusal := command_condition(command, now_ns)) is not None:
+            self.answer(command, CommandAnswer(False, refusal))
+            return None
+        kind = Command(command.kind)
+        running = state.state == State.ORBITING
+        if (kind == Command.ADJUST and not running) or (kind != Command.ADJUST and (running or state.requesting)):
+            return Order(command, kind)  # the state decides, and the goal stays
+        wanted = commanded_goal(self._config, command, goal if kind == Command.ADJUST else None, framing)
+        if isinstance(wanted, Condition):
+            self.answer(command, CommandAnswer(False, wanted))
+            return None
+        return Order(command, kind, wanted)
+
+    def answer(self, command: OperatorCommand, answer: CommandAnswer) -> None:
+        """Note the answer to a command."""
+        self._answers.append((command, answer))
+
+    def take_answers(self) -> list[tuple[OperatorCommand, CommandAnswer]]:
+        """The answers since the last call."""
+        answers, self._answers = self._answers, []
+        return answers

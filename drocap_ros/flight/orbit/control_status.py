@@ -8,8 +8,9 @@ import numpy as np
 
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.orbit.planner import OrbitGoal, OrbitState
+from drocap_ros.flight.orbit.planner import OrbitState
 from drocap_ros.flight.orbit.states import Action, CommandAnswer, OperatorCommand, State
+from drocap_ros.flight.orbit_goal import OrbitGoal
 
 _WIDER = 1.05
 _CLEAR = (

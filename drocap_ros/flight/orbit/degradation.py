@@ -12,8 +12,14 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.orbit.motion_checks import keeping_condition, oldest_state_s, oldest_subject_s
-from drocap_ros.flight.orbit.states import Limits, Observed, Pace
+from drocap_ros.flight.observed import Observed
+from drocap_ros.flight.orbit.motion_checks import (
+    keeping_condition,
+    oldest_state_s,
+    oldest_subject_s,
+    outdated_condition,
+)
+from drocap_ros.flight.orbit.states import Limits, Pace
 from drocap_ros.flight.setpoint import Setpoint
 from drocap_ros.flight.subject.framing import framed_pace
 
@@ -39,27 +45,35 @@ def allowed_pace(seen: Observed, limits: Limits) -> Allowed:
     usual_s = safety.max_state_age_s
     halt_s = 0.5 * (usual_s + oldest_state_s(safety, patient=True))
     subject_s = min(oldest_subject_s(seen, safety), _STANDING_AGE * safety.max_subject_age_s)
-    ages = (
-        (seen.subject_age_s, min(_USUAL_SUBJECT_AGE_S, 0.8 * subject_s), subject_s, _C.SUBJECT_OUTDATED),
-        (seen.link_age_s, usual_s, halt_s, _C.LINK_SILENT),
-        (seen.state_age_s, usual_s, halt_s, _C.ATTITUDE_OUTDATED),
-        (seen.position_age_s, usual_s, halt_s, _C.POSITION_FROZEN),
-    )
+    usual_subject_s = min(_USUAL_SUBJECT_AGE_S, 0.8 * subject_s)
     allowed = Allowed(1.0, None)
-    if seen.subject_contradicted:  # at once: most of what is flown after a jump is flown before the hold
-        allowed = Allowed(_CONTRADICTED_PACE, condition(_C.SUBJECT_OUTDATED, age_s=seen.subject_age_s))
-    for age_s, full_s, none_s, code in ages:
-        if age_s > full_s:
-            pace = max(none_s - age_s, 0.0) / (none_s - full_s) if none_s > full_s else 0.0
-            if pace < allowed.pace:
-                allowed = Allowed(pace, condition(code, age_s=age_s))
+    if seen.subject.contradicted:  # at once: most of what is flown after a jump is flown before the hold
+        allowed = Allowed(_CONTRADICTED_PACE, condition(_C.OTHER_SUBJECT, age_s=seen.subject.age_s))
+    pace = _share(seen.subject.age_s, usual_subject_s, subject_s)
+    if pace < allowed.pace:
+        allowed = Allowed(pace, outdated_condition(seen, usual_subject_s))
+    for age_s, code in (
+        (seen.link.age_s, _C.LINK_SILENT),
+        (seen.vehicle.age_s, _C.ATTITUDE_OUTDATED),
+        (seen.vehicle.position_age_s, _C.POSITION_FROZEN),
+    ):
+        pace = _share(age_s, usual_s, halt_s)
+        if pace < allowed.pace:
+            allowed = Allowed(pace, condition(code, age_s=age_s))
     if allowed.cause is None:  # the reference waits by itself
         allowed = allowed._replace(cause=keeping_condition(seen, limits, _AWAY_S))
     # A slower orbit gives way more slowly: a subject who comes nearer leaves the picture, and is near.
-    framed = min(max(framed_pace(seen.framing_margin), seen.approach_m_s / _COMES_M_S), 1.0)
+    framed = min(max(framed_pace(seen.pictures.framing_margin), seen.subject.approach_m_s / _COMES_M_S), 1.0)
     if framed < allowed.pace:
-        allowed = Allowed(framed, condition(_C.SUBJECT_AT_BORDER, margin_percent=100 * seen.framing_margin))
+        allowed = Allowed(framed, condition(_C.SUBJECT_AT_BORDER, margin_percent=100 * seen.pictures.framing_margin))
     return allowed
+
+
+def _share(age_s: float, full_s: float, none_s: float) -> float:
+    """1 up to the one age, 0 from the other one on."""
+    if age_s <= full_s:
+        return 1.0
+    return max(none_s - age_s, 0.0) / (none_s - full_s) if none_s > full_s else 0.0
 
 
 def next_pace(

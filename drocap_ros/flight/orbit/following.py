@@ -8,19 +8,16 @@ position in the velocity.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.autopilot.autopilot import Echo
 from drocap_ros.flight.orbit.motion_checks import away_limit_m
-from drocap_ros.flight.orbit.planner import OrbitState, reference_position
-from drocap_ros.flight.orbit.states import Observed
 from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.vehicle_state import VehicleState
 
@@ -33,6 +30,19 @@ _MISMATCH_S = 0.25  # longer than two echoes
 _BY_SPEED, _BY_WAY = (1.0, 0.6, 0.25), (2.0, 0.6, 0.15)
 _POSITION_GAIN = 1.0  # 1/s, of both autopilots' position loops, as in the guard
 _MOST_WAY_M = 1.0  # a walking subject in wind keeps the vehicle at a distance from its place, and it flies
+
+
+class Echoes(NamedTuple):
+    """What the link knows of the setpoints.
+
+    sent : (monotonic s, SET_POSITION_TARGET_LOCAL_NED) in order of time
+    echo : (age in s, POSITION_TARGET_LOCAL_NED), or None before the first
+    trip_s : since the sending of the message that was answered last: two transmissions at least; NaN = unknown
+    """
+
+    sent: Sequence[tuple[float, Any]]
+    echo: tuple[float, Any] | None = None
+    trip_s: float = math.nan
 
 
 class Following:
@@ -48,25 +58,15 @@ class Following:
         self._matched_s = math.nan  # when an echo last agreed in this orbit
         self._by_speed, self._by_way = _Standing(*_BY_SPEED), _Standing(*_BY_WAY)
 
-    def step(
-        self,
-        now_s: float,
-        orbiting_s: float,
-        sent: Sequence[tuple[float, Any]],
-        echo: tuple[float, Any] | None,
-        vehicle: VehicleState | None,
-        trip_s: float = math.nan,
-    ) -> str:
+    def step(self, now_s: float, orbiting_s: float, echoes: Echoes, vehicle: VehicleState | None) -> str:
         """Why the setpoints count as not followed, in words; "" = they are followed, or it is not known.
 
         Parameters
         ----------
         now_s : monotonic
         orbiting_s : how long the orbit has been flown; 0 = it is not
-        sent : (monotonic s, SET_POSITION_TARGET_LOCAL_NED) in order of time
-        echo : (age in s, POSITION_TARGET_LOCAL_NED), or None before the first
-        trip_s : since the sending of the message that was answered last: two transmissions at least; NaN = unknown
         """
+        sent, echo, trip_s = echoes
         if orbiting_s == 0.0 or not sent or vehicle is None:
             self._matched_s = math.nan
             self._by_speed.clear()
@@ -134,12 +134,12 @@ class Keeping:
         self._limit_m = away_limit_m(config)
         self._near_s = 0.0
 
-    def watch(self, orbit: OrbitState | None, seen: Observed, now_s: float) -> Observed:
-        """The observation with the distance from the place on the orbit, and for how long it has been too far."""
-        away_m = 0.0 if orbit is None else float(np.hypot(*(reference_position(orbit) - seen.position)[:2]))
+    def watch(self, reference: np.ndarray | None, position: np.ndarray, now_s: float) -> tuple[float, float]:
+        """Distance in m from the place on the orbit (3,), and for how long it has been too far; None = no orbit."""
+        away_m = 0.0 if reference is None else float(np.hypot(*(reference - position)[:2]))
         if not away_m > self._limit_m:  # NaN: other conditions decide
             self._near_s = now_s
-        return dataclasses.replace(seen, away_m=away_m, away_s=now_s - self._near_s)
+        return away_m, now_s - self._near_s
 
 
 def _agrees(echo: Any, sent: list[Any], most: Echo) -> bool:

@@ -7,10 +7,11 @@ import math
 
 import numpy as np
 
-from drocap_ros.flight.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.conditions import PICTURE_CODES, Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
+from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.motion_checks import braking_distance, subject_located
-from drocap_ros.flight.orbit.states import Limits, Observed, SafetyState, State
+from drocap_ros.flight.orbit.states import Limits, SafetyState, State
 from drocap_ros.flight.safety_config import SafetyConfig
 
 _AT_REST_M_S, _AT_REST_S, _SETTLED_S = 0.35, 0.5, 0.3
@@ -21,7 +22,7 @@ _NEAR_M, _FAST_M_S, _STOPPING_S, _MAX_WAY_OUT_M = 5.0, 1.0, 1.2, 1.5
 _LEAD_S, _CLEAR_M, _MAX_LEAD_M = 1.5, 0.3, 3.0
 _HOLD_MODE_PATIENCE_S = 5.0
 #: Causes that pass by themselves.  A silent link is none of them: motion does not resume because a link returns.
-_HARMLESS = frozenset({ConditionCode.SUBJECT_OUTDATED, ConditionCode.ATTITUDE_OUTDATED, ConditionCode.POSITION_FROZEN})
+_HARMLESS = PICTURE_CODES | {ConditionCode.ATTITUDE_OUTDATED, ConditionCode.POSITION_FROZEN}
 
 
 def begin_hold(
@@ -35,23 +36,31 @@ def begin_hold(
     blind : whether the vehicle's state is not to be trusted
     retreats : see :class:`SafetyState`
     """
-    age_s = max(seen.position_age_s, seen.state_age_s)
-    finite = bool(np.isfinite(seen.position).all() and np.isfinite(seen.velocity).all()) and math.isfinite(seen.yaw)
-    known = finite and seen.position_ok and seen.gps_fix_type >= 3 and age_s <= _DEAD_RECKONING_S and not seen.jumped
-    fresh = known and max(seen.link_age_s, age_s) <= _FRESH_S
-    behind_s = 0.0 if fresh else max(seen.position_age_s - seen.state_age_s, 0.0)
-    place = seen.position + seen.velocity * behind_s if known else None
+    age_s = max(seen.vehicle.position_age_s, seen.vehicle.age_s)
+    finite = bool(
+        np.isfinite(seen.vehicle.position).all() and np.isfinite(seen.vehicle.velocity).all()
+    ) and math.isfinite(seen.vehicle.yaw)
+    known = (
+        finite
+        and seen.health.position_ok
+        and seen.health.gps_fix_type >= 3
+        and age_s <= _DEAD_RECKONING_S
+        and not seen.jumped
+    )
+    fresh = known and max(seen.link.age_s, age_s) <= _FRESH_S
+    behind_s = 0.0 if fresh else max(seen.vehicle.position_age_s - seen.vehicle.age_s, 0.0)
+    place = seen.vehicle.position + seen.vehicle.velocity * behind_s if known else None
     if place is not None and state.pace.value == 0.0 and reason.code in _HARMLESS:
         place = state.pace.place  # the setpoint has stood there
-    elif place is not None and seen.subject is not None and _moves_away(seen):
+    elif place is not None and seen.subject.position is not None and _moves_away(seen):
         # It does not return to where it was: the subject may follow, and it would come back fast.
-        outward = (seen.position - seen.subject)[:2] / max(seen.subject_distance_m, 1e-3)
-        way = min((max(seen.approach_m_s, 0.0) - seen.closing_m_s) * _STOPPING_S, _MAX_WAY_OUT_M)
-        aside = seen.velocity[:2] - (seen.velocity[:2] @ outward) * outward
+        outward = (seen.vehicle.position - seen.subject.position)[:2] / max(seen.subject.distance_m, 1e-3)
+        way = min((max(seen.subject.approach_m_s, 0.0) - seen.subject.closing_m_s) * _STOPPING_S, _MAX_WAY_OUT_M)
+        aside = seen.vehicle.velocity[:2] - (seen.vehicle.velocity[:2] @ outward) * outward
         place = place + np.append(way * outward + 0.5 * _STOPPING_S * aside, 0.0)
     return dataclasses.replace(
         state, state=State.HOLDING, since_s=now_s, condition=reason, blind=blind and not fresh,
-        hold_mode_s=math.nan if seen.followed else now_s, hold_position=place, hold_yaw=seen.yaw,
+        hold_mode_s=math.nan if seen.course.followed else now_s, hold_position=place, hold_yaw=seen.vehicle.yaw,
         retreats=retreats, retreated_s=-math.inf, slow_s=math.nan,
         jumped_s=now_s if seen.jumped else -math.inf, resumable=reason.code in _HARMLESS,
         clear_s=math.nan,
@@ -60,7 +69,7 @@ def begin_hold(
 
 def _moves_away(seen: Observed) -> bool:
     """Whether the vehicle moves away from a near subject, or fast."""
-    return seen.closing_m_s < (0.0 if seen.subject_distance_m < _NEAR_M else -_FAST_M_S)
+    return seen.subject.closing_m_s < (0.0 if seen.subject.distance_m < _NEAR_M else -_FAST_M_S)
 
 
 def update_hold(state: SafetyState, seen: Observed, now_s: float, blind: bool) -> SafetyState:
@@ -75,9 +84,9 @@ def update_hold(state: SafetyState, seen: Observed, now_s: float, blind: bool) -
     if state.blind and not blind and settled:
         state = dataclasses.replace(state, blind=False, since_s=now_s, hold_mode_s=math.nan)
         if state.hold_position is None:
-            state = dataclasses.replace(state, hold_position=seen.position.copy(), hold_yaw=seen.yaw)
+            state = dataclasses.replace(state, hold_position=seen.vehicle.position.copy(), hold_yaw=seen.vehicle.yaw)
     late = not math.isnan(state.hold_mode_s) and now_s - state.hold_mode_s > _HOLD_MODE_PATIENCE_S
-    if state.state == State.HOLDING and late and not seen.in_hold and math.isnan(state.lost_s):
+    if state.state == State.HOLDING and late and not seen.mode.in_hold and math.isnan(state.lost_s):
         reason = condition(ConditionCode.HOLD_MODE_MISSING, cause=state.condition)
         return dataclasses.replace(state, state=State.FAULT, since_s=now_s, condition=reason)
     return state
@@ -89,7 +98,7 @@ def resumption(
     """Note since when all is clear in a hold that may end by itself; any other cause takes this permission away."""
     if not state.resumable:
         return state
-    over = now_s - state.since_s > config.resume_after_hold_s or seen.in_hold or not seen.in_control
+    over = now_s - state.since_s > config.resume_after_hold_s or seen.mode.in_hold or not seen.mode.in_control
     if over or (problem is not None and problem.code not in _HARMLESS):
         return dataclasses.replace(state, resumable=False, clear_s=math.nan)
     if problem is not None:
@@ -102,19 +111,19 @@ def retreat(state: SafetyState, seen: Observed, now_s: float, limits: Limits) ->
 
     Only a subject that is located counts, and only until the autopilot's hold mode has been requested.
     """
-    place, subject, safety = state.hold_position, seen.subject, limits.safety
-    settled = state.blind or not math.isnan(state.hold_mode_s) or seen.in_hold
+    place, subject, safety = state.hold_position, seen.subject.position, limits.safety
+    settled = state.blind or not math.isnan(state.hold_mode_s) or seen.mode.in_hold
     if settled or not state.retreats or place is None or subject is None or state.fence_centre is None:
         return state
     if not subject_located(seen, safety):
         return state
-    wanted = limits.orbit.min_distance_m + seen.subject_sd_m + _LEAD_S * max(seen.approach_m_s, 0.0) + _CLEAR_M
-    if not seen.subject_distance_m < wanted or np.hypot(*(place - subject)[:2]) >= wanted:
+    wanted = limits.orbit.min_distance_m + seen.subject.sd_m + _LEAD_S * max(seen.subject.approach_m_s, 0.0) + _CLEAR_M
+    if not seen.subject.distance_m < wanted or np.hypot(*(place - subject)[:2]) >= wanted:
         return state
-    outward = (seen.position - subject)[:2] / max(seen.subject_distance_m, 1e-3)
+    outward = (seen.vehicle.position - subject)[:2] / max(seen.subject.distance_m, 1e-3)
     target = subject[:2] + wanted * outward
-    step = target - seen.position[:2]
-    target = seen.position[:2] + step * min(1.0, _MAX_LEAD_M / max(float(np.hypot(*step)), 1e-6))
+    step = target - seen.vehicle.position[:2]
+    target = seen.vehicle.position[:2] + step * min(1.0, _MAX_LEAD_M / max(float(np.hypot(*step)), 1e-6))
     offset = target - state.fence_centre
     room = safety.fence_radius_m - braking_distance(limits.orbit.max_speed_m_s, safety)
     target = state.fence_centre + offset * min(1.0, room / max(float(np.hypot(*offset)), 1e-6))
@@ -125,10 +134,10 @@ def request_hold_mode(state: SafetyState, seen: Observed, now_s: float, config: 
     """Allow the request of the hold mode once the vehicle is at rest, or after ``hold_s``; not on a lossy link."""
     if state.state != State.HOLDING or not math.isnan(state.hold_mode_s) or state.blind or not math.isnan(state.lost_s):
         return state
-    if seen.packet_loss > MAX_LOSS or (state.resumable and now_s - state.since_s <= config.resume_after_hold_s):
+    if seen.link.packet_loss > MAX_LOSS or (state.resumable and now_s - state.since_s <= config.resume_after_hold_s):
         return state
     held_s = now_s - max(state.since_s, state.retreated_s)
-    if not np.linalg.norm(seen.velocity) < _AT_REST_M_S:
+    if not np.linalg.norm(seen.vehicle.velocity) < _AT_REST_M_S:
         state = dataclasses.replace(state, slow_s=math.nan)
     elif math.isnan(state.slow_s):
         state = dataclasses.replace(state, slow_s=now_s)

@@ -6,13 +6,14 @@ import math
 
 import numpy as np
 
-from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.autopilot.autopilot import greatest_speed
 from drocap_ros.flight.autopilot.coasting import Coast
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.orbit.planner import WALKING_M_S, OrbitGoal
-from drocap_ros.flight.orbit.states import Limits, Observed
+from drocap_ros.flight.observed import Observed
+from drocap_ros.flight.orbit.states import Limits
+from drocap_ros.flight.orbit_goal import OrbitGoal
 from drocap_ros.flight.setpoint import Setpoint, hold_setpoint
+from drocap_ros.flight.subject.subject_filter import WALKING_M_S
 
 #: Shares that are tried, one after the other: of the way to the reference, of velocity and of acceleration.  The way
 #: comes first: with less velocity the vehicle would fall behind the reference, and the way to it would grow.
@@ -44,7 +45,7 @@ _SLOWED = 0.95
 
 def coast_speed(seen: Observed, limits: Limits) -> float:
     """Speed in m/s of a steady flight whose coast leaves room to ``max_coast_m``."""
-    autopilot = autopilot_of(seen.autopilot)
+    autopilot = seen.autopilot
     return greatest_speed(autopilot, _timeout_s(seen), autopilot.coast.steady * limits.safety.max_coast_m)
 
 
@@ -61,7 +62,7 @@ def slowed_condition(present: Condition, goal: OrbitGoal, seen: Observed, limits
 
 
 def harmless(
-    setpoint: Setpoint, seen: Observed, subject_velocity: np.ndarray, fence_centre: np.ndarray | None, limits: Limits
+    setpoint: Setpoint, seen: Observed, fence_centre: np.ndarray | None, limits: Limits
 ) -> tuple[Setpoint, Condition | None]:
     """The setpoint as it is sent, slowed down where its coast would break a limit.
 
@@ -73,11 +74,10 @@ def harmless(
 
     Parameters
     ----------
-    subject_velocity : (3,) m/s, estimated
     fence_centre : (2,) m; None = there is no fence
     """
     problem: Condition | None = None
-    autopilot = autopilot_of(seen.autopilot)
+    autopilot, subject_velocity = seen.autopilot, seen.subject.velocity
     longest, fastest = autopilot.coast.greatest * limits.safety.max_coast_m, math.inf
     walking = float(np.hypot(*subject_velocity[:2]))
     if not autopilot.continues_setpoints:
@@ -85,18 +85,17 @@ def harmless(
     elif walking > WALKING_M_S:
         longest *= _WALKED
     tries = [(share, share) for share in _SHARES]
-    if seen.subject is not None and (not autopilot.continues_setpoints or walking > WALKING_M_S):
+    if seen.subject.position is not None and (not autopilot.continues_setpoints or walking > WALKING_M_S):
         tries = [(_SHARES[0], share) for share in _ACROSS] + [(share, min(share, _ACROSS[-1])) for share in _SHARES[1:]]
 
     def judged(shares: np.ndarray) -> tuple[Setpoint, Condition | None, bool]:
         """Part of the setpoint by (2, 3) shares, its danger, and whether its coast is too long."""
+        vectors = (setpoint.position - seen.vehicle.position, setpoint.velocity, setpoint.acceleration)
         way, velocity, acceleration = (
-            _shared(vector, seen, *part) for vector, *part in zip(
-                (setpoint.position - seen.position, setpoint.velocity, setpoint.acceleration), *shares, strict=True
-            )
-        )  # fmt: skip
-        part = setpoint._replace(position=seen.position + way, velocity=velocity, acceleration=acceleration)
-        coast = autopilot.coast_of(part, seen.position, seen.velocity, _timeout_s(seen))
+            _shared(vector, seen, *part) for vector, *part in zip(vectors, *shares, strict=True)
+        )
+        part = setpoint._replace(position=seen.vehicle.position + way, velocity=velocity, acceleration=acceleration)
+        coast = autopilot.coast_of(part, seen.vehicle.position, seen.vehicle.velocity, _timeout_s(seen))
         long = coast.length_m > longest or math.hypot(*_commanded(part, seen)) > fastest
         long |= _creeps_nearer(coast, seen, complex(*subject_velocity[:2])) > _CREEPS_NEARER_M
         return part, _danger(coast, seen, complex(*subject_velocity[:2]), fence_centre, limits), long
@@ -109,7 +108,7 @@ def harmless(
             break
         above = shares
     else:
-        return hold_setpoint(seen.position, seen.yaw), problem
+        return hold_setpoint(seen.vehicle.position, seen.vehicle.yaw), problem
     if not autopilot.continues_setpoints and not long and shares[0] != above[0] and _retreats(setpoint, seen):
         least, greatest = np.array(shares), np.array(above)
         for _ in range(_HALVINGS):
@@ -124,21 +123,22 @@ def harmless(
 
 def _commanded(setpoint: Setpoint, seen: Observed) -> np.ndarray:
     """(2,) m/s that the autopilot commands: of the setpoint, and of the way to its place."""
-    return (setpoint.velocity + autopilot_of(seen.autopilot).position_gain_per_s * (setpoint.position - seen.position))[
-        :2
-    ]
+    way = setpoint.position - seen.vehicle.position
+    return (setpoint.velocity + seen.autopilot.position_gain_per_s * way)[:2]
 
 
 def _retreats(setpoint: Setpoint, seen: Observed) -> bool:
     """Whether the vehicle is to fly away from the subject."""
-    return seen.subject is not None and float(_commanded(setpoint, seen) @ (seen.subject - seen.position)[:2]) < 0.0
+    if seen.subject.position is None:
+        return False
+    return float(_commanded(setpoint, seen) @ (seen.subject.position - seen.vehicle.position)[:2]) < 0.0
 
 
 def _shared(vector: np.ndarray, seen: Observed, along: float, across: float) -> np.ndarray:
     """Shares of a vector along the horizontal line of sight, and of the rest of it."""
-    if seen.subject is None or along == across:
+    if seen.subject.position is None or along == across:
         return along * vector
-    sight = np.append((seen.subject - seen.position)[:2], 0.0)
+    sight = np.append((seen.subject.position - seen.vehicle.position)[:2], 0.0)
     part = (vector @ sight) / max(float(sight @ sight), 0.01) * sight
     return across * vector + (along - across) * part
 
@@ -154,9 +154,9 @@ def _danger(
         if away.max() > max(limits.safety.fence_radius_m, float(away[0]) + _SLACK_M):
             fence_m = limits.safety.fence_radius_m
             return condition(ConditionCode.AT_FENCE, distance_m=float(away[0]), limit_m=fence_m)
-    if seen.subject is None:
+    if seen.subject.position is None:
         return None
-    subject, least = complex(*seen.subject[:2]), limits.orbit.min_distance_m
+    subject, least = complex(*seen.subject.position[:2]), limits.orbit.min_distance_m
     stands = np.abs(coast.place - subject)
     walks = np.abs(coast.place - subject - subject_velocity * coast.time_s)
     alone = np.abs(coast.place[0] - subject - subject_velocity * coast.time_s)  # distances of a vehicle that stands
@@ -171,13 +171,13 @@ def _danger(
 
 def _creeps_nearer(coast: Coast, seen: Observed, subject_velocity: complex) -> float:
     """Way (m) nearer, creep included, to a subject who moves as estimated; his own approach does not count."""
-    if seen.subject is None:
+    if seen.subject.position is None:
         return 0.0
-    now = complex(*seen.subject[:2])
+    now = complex(*seen.subject.position[:2])
     then = now + subject_velocity * float(coast.time_s[-1])
     alone = min(abs(coast.place[0] - now), abs(coast.place[0] - then))
     return alone - abs(coast.place[-1] - then) + coast.creep_towards(then)
 
 
 def _timeout_s(seen: Observed) -> float:
-    return autopilot_of(seen.autopilot).timeout_s(seen.loss_settings)
+    return seen.autopilot.timeout_s(seen.loss_settings)

@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 
-from drocap_ros.flight.autopilot import autopilot_of
+from drocap_ros.flight.autopilot import supported_titles
 from drocap_ros.flight.autopilot.autopilot import LossAction, LossSettings
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.orbit.states import Limits, Observed
+from drocap_ros.flight.observed import Observed
+from drocap_ros.flight.orbit.states import Limits
 from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.safety_config import SafetyConfig
 from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, LANDED_LANDING, LANDED_ON_GROUND, LANDED_TAKEOFF
@@ -41,40 +42,46 @@ def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
         return condition(_C.COMMANDS_DISABLED)
     if seen.disturbance is not None:
         return seen.disturbance
-    if seen.link_age_s > oldest_s:
-        return condition(_C.LINK_SILENT, age_s=seen.link_age_s)
-    autopilot = autopilot_of(seen.autopilot)
+    if seen.link.age_s > oldest_s:
+        return condition(_C.LINK_SILENT, age_s=seen.link.age_s)
+    autopilot = seen.autopilot
     if not autopilot.supported:
-        return condition(_C.AUTOPILOT_UNSUPPORTED, autopilot=seen.autopilot)
+        return condition(_C.AUTOPILOT_UNSUPPORTED, autopilot=seen.autopilot_name, supported=supported_titles())
     if (
         settings := loss_condition(seen.loss_settings, autopilot.loss_action, limits.max_control_timeout_s)
     ) is not None:
         return settings
-    if seen.heartbeat_age_s > safety.max_heartbeat_age_s:
-        return condition(_C.MODE_OUTDATED, age_s=seen.heartbeat_age_s)
-    if seen.state_age_s > oldest_s:
-        return condition(_C.ATTITUDE_OUTDATED, age_s=seen.state_age_s)
-    if seen.position_age_s > oldest_s:
-        return condition(_C.POSITION_FROZEN, age_s=seen.position_age_s)
-    if seen.round_trip_s > safety.max_round_trip_s:
-        return condition(_C.ROUND_TRIP_TOO_LONG, age_s=seen.round_trip_s)
-    if not (np.isfinite(seen.position).all() and np.isfinite(seen.velocity).all() and math.isfinite(seen.yaw)):
+    if seen.link.heartbeat_age_s > safety.max_heartbeat_age_s:
+        return condition(_C.MODE_OUTDATED, age_s=seen.link.heartbeat_age_s)
+    if seen.vehicle.age_s > oldest_s:
+        return condition(_C.ATTITUDE_OUTDATED, age_s=seen.vehicle.age_s)
+    if seen.vehicle.position_age_s > oldest_s:
+        return condition(_C.POSITION_FROZEN, age_s=seen.vehicle.position_age_s)
+    if seen.link.round_trip_s > safety.max_round_trip_s:
+        return condition(_C.ROUND_TRIP_TOO_LONG, age_s=seen.link.round_trip_s)
+    if not (
+        np.isfinite(seen.vehicle.position).all()
+        and np.isfinite(seen.vehicle.velocity).all()
+        and math.isfinite(seen.vehicle.yaw)
+    ):
         return condition(_C.VEHICLE_STATE_UNKNOWN)
-    if not seen.armed:
+    if not seen.health.armed:
         return condition(_C.NOT_ARMED)
-    if seen.landed_state in _LANDED_STATES or (autopilot.starts_from_ground and seen.landed_state != LANDED_IN_AIR):
-        landed = _LANDED_STATES.get(seen.landed_state, "not reported to be in the air (EXTENDED_SYS_STATE)")
+    if seen.health.landed_state in _LANDED_STATES or (
+        autopilot.starts_from_ground and seen.health.landed_state != LANDED_IN_AIR
+    ):
+        landed = _LANDED_STATES.get(seen.health.landed_state, "not reported to be in the air (EXTENDED_SYS_STATE)")
         return condition(_C.NOT_FLYING, landed_state=landed)
-    if seen.system_status in _EMERGENCIES:
-        return condition(_C.AUTOPILOT_EMERGENCY, reported=_EMERGENCIES[seen.system_status])
-    if seen.gps_fix_type < 3:
-        return condition(_C.NO_SATELLITE_FIX, fix_type=seen.gps_fix_type)
-    if not seen.position_ok:
+    if seen.health.system_status in _EMERGENCIES:
+        return condition(_C.AUTOPILOT_EMERGENCY, reported=_EMERGENCIES[seen.health.system_status])
+    if seen.health.gps_fix_type < 3:
+        return condition(_C.NO_SATELLITE_FIX, fix_type=seen.health.gps_fix_type)
+    if not seen.health.position_ok:
         return condition(_C.ESTIMATOR_UNHEALTHY)
-    if seen.status_age_s > safety.max_status_age_s:
-        return condition(_C.STATUS_OUTDATED, age_s=seen.status_age_s)
-    battery = battery_condition(seen.battery_fraction, seen.battery_voltage_v, safety)
-    return battery or seen.camera_problem or seen.intruder
+    if seen.health.age_s > safety.max_status_age_s:
+        return condition(_C.STATUS_OUTDATED, age_s=seen.health.age_s)
+    battery = battery_condition(seen.health.battery_fraction, seen.health.battery_voltage_v, safety)
+    return battery or seen.pictures.camera_problem or seen.intruder
 
 
 def start_condition(seen: Observed) -> Condition | None:
@@ -83,9 +90,9 @@ def start_condition(seen: Observed) -> Condition | None:
     A critical state is reported after a failsafe of battery, radio or ground station has triggered, or while one acts.
     Of several vehicles the first one that was heard would fly, and need not be the one with the camera.
     """
-    if len(seen.vehicles) > 1:
-        return condition(_C.SEVERAL_VEHICLES, systems=", ".join(map(str, sorted(seen.vehicles))))
-    if seen.system_status == _MAV_STATE_CRITICAL:
+    if len(seen.link.vehicles) > 1:
+        return condition(_C.SEVERAL_VEHICLES, systems=", ".join(map(str, sorted(seen.link.vehicles))))
+    if seen.health.system_status == _MAV_STATE_CRITICAL:
         return condition(_C.AUTOPILOT_CRITICAL, reported="a critical state")
     return None
 
@@ -130,19 +137,19 @@ def loss_condition(settings: LossSettings | None, meaning: LossAction | None, lo
 def limit_condition(seen: Observed, fence_centre: np.ndarray | None, limits: Limits) -> Condition | None:
     """Which limit of place or speed is reached, the braking distance included; the vehicle's state must be known."""
     safety = limits.safety
-    speed = float(np.linalg.norm(seen.velocity))
+    speed = float(np.linalg.norm(seen.vehicle.velocity))
     if speed > safety.speed_margin * limits.orbit.max_speed_m_s:
         return condition(_C.TOO_FAST, speed_m_s=speed)
-    climb = float(seen.velocity[2])
+    climb = float(seen.vehicle.velocity[2])
     margin = braking_distance(climb, safety)
-    if seen.height_m + (margin if climb > 0 else 0.0) > safety.max_height_m:
-        return condition(_C.TOO_HIGH, height_m=seen.height_m, limit_m=safety.max_height_m)
-    if seen.height_m - (margin if climb < 0 else 0.0) < safety.min_height_m:
-        return condition(_C.TOO_LOW, height_m=seen.height_m, limit_m=safety.min_height_m)
+    if seen.vehicle.height_m + (margin if climb > 0 else 0.0) > safety.max_height_m:
+        return condition(_C.TOO_HIGH, height_m=seen.vehicle.height_m, limit_m=safety.max_height_m)
+    if seen.vehicle.height_m - (margin if climb < 0 else 0.0) < safety.min_height_m:
+        return condition(_C.TOO_LOW, height_m=seen.vehicle.height_m, limit_m=safety.min_height_m)
     if fence_centre is not None:
-        offset = seen.position[:2] - fence_centre
+        offset = seen.vehicle.position[:2] - fence_centre
         distance = float(np.hypot(*offset))
-        outward = max(float(offset @ seen.velocity[:2]) / max(distance, 1e-6), 0.0)
+        outward = max(float(offset @ seen.vehicle.velocity[:2]) / max(distance, 1e-6), 0.0)
         if distance + braking_distance(outward, safety) > safety.fence_radius_m:
             return condition(_C.AT_FENCE, distance_m=distance, limit_m=safety.fence_radius_m)
     return None
@@ -154,16 +161,18 @@ def keeping_condition(seen: Observed, limits: Limits, longest_s: float = _LONGES
     Sooner at three times the distance: the vehicle is carried off.
     """
     limit_m = away_limit_m(limits.orbit)
-    carried_off = seen.away_m > _CARRIED_OFF * limit_m
+    carried_off = seen.course.away_m > _CARRIED_OFF * limit_m
     if carried_off:
         longest_s = min(longest_s, _CARRIED_OFF_S)
-    if seen.away_s <= longest_s:
+    if seen.course.away_s <= longest_s:
         return None
     # A reversed orbit, a gust and a subject who turns leave a healthy vehicle behind for some seconds.
     verdict = f"the orbit waits for it, and ends after {_LONGEST_AWAY_S:g} s"
-    if carried_off or seen.away_s > _LONGEST_AWAY_S:
+    if carried_off or seen.course.away_s > _LONGEST_AWAY_S:
         verdict = "it cannot keep the orbit in this wind, or follow this subject; land, or take over by hand"
-    return condition(_C.ORBIT_NOT_KEPT, away_m=seen.away_m, for_s=seen.away_s, limit_m=limit_m, verdict=verdict)
+    return condition(
+        _C.ORBIT_NOT_KEPT, away_m=seen.course.away_m, for_s=seen.course.away_s, limit_m=limit_m, verdict=verdict
+    )
 
 
 def away_limit_m(orbit: OrbitConfig) -> float:
@@ -178,27 +187,46 @@ def subject_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
         something else end it as before
     """
     safety = limits.safety
-    if seen.subject is None:
-        return condition(_C.NO_SUBJECT if seen.calibrated else _C.NO_CAMERA_INFO)
+    if seen.subject.position is None:
+        return condition(_C.NO_SUBJECT if seen.pictures.calibrated else _C.NO_CAMERA_INFO)
     oldest_s = oldest_subject_s(seen, safety)
-    if patient and not seen.subject_contradicted:
+    if patient and not seen.subject.contradicted:
         oldest_s = max(oldest_s, safety.max_subject_gap_s)
-    if not -_FUTURE_S < seen.subject_age_s <= oldest_s:
-        return condition(_C.SUBJECT_OUTDATED, age_s=seen.subject_age_s)
-    if not seen.subject_sd_m <= safety.max_subject_sd_m:
-        return condition(_C.SUBJECT_UNCERTAIN, sd_m=seen.subject_sd_m)
+    if not -_FUTURE_S < seen.subject.age_s <= oldest_s:
+        return outdated_condition(seen, oldest_s)
+    if not seen.subject.sd_m <= safety.max_subject_sd_m:
+        return condition(_C.SUBJECT_UNCERTAIN, sd_m=seen.subject.sd_m)
     if _too_near(seen, limits):
         return condition(
-            _C.SUBJECT_NEAR, distance_m=seen.subject_distance_m, sd_m=seen.subject_sd_m,
+            _C.SUBJECT_NEAR,
+            distance_m=seen.subject.distance_m,
+            sd_m=seen.subject.sd_m,
             limit_m=limits.orbit.min_distance_m,
-        )  # fmt: skip
-    if seen.subject_distance_m > limits.orbit.max_distance_m:
-        return condition(_C.SUBJECT_FAR, distance_m=seen.subject_distance_m, limit_m=limits.orbit.max_distance_m)
+        )
+    if seen.subject.distance_m > limits.orbit.max_distance_m:
+        return condition(_C.SUBJECT_FAR, distance_m=seen.subject.distance_m, limit_m=limits.orbit.max_distance_m)
     return None
 
 
+def outdated_condition(seen: Observed, oldest_s: float) -> Condition:
+    """What is wrong with the pictures where the subject's position is older than ``oldest_s``.
+
+    Where the newest picture itself is too old, the greater part of its age says why: it came late, or none came since.
+    A newer one repeats the one before, shows something else in the subject's place, or does not show him.
+    """
+    pictures, age_s = seen.pictures, seen.subject.age_s
+    if pictures.age_s > oldest_s:
+        late_s = pictures.age_s - pictures.silent_s
+        if pictures.silent_s > late_s or math.isinf(pictures.silent_s):
+            return condition(_C.PICTURES_LOST, age_s=age_s, silent_s=pictures.silent_s)
+        return condition(_C.PICTURES_LATE, age_s=age_s, late_s=late_s)
+    if pictures.frozen:
+        return condition(_C.PICTURES_FROZEN, age_s=age_s)
+    return condition(_C.OTHER_SUBJECT if seen.subject.contradicted else _C.SUBJECT_OUTDATED, age_s=age_s)
+
+
 def _too_near(seen: Observed, limits: Limits) -> bool:
-    return not seen.subject_distance_m - stopping_room(seen, limits.safety) >= limits.orbit.min_distance_m
+    return not seen.subject.distance_m - stopping_room(seen, limits.safety) >= limits.orbit.min_distance_m
 
 
 def stopping_room(seen: Observed, safety: SafetyConfig) -> float:
@@ -209,10 +237,16 @@ def stopping_room(seen: Observed, safety: SafetyConfig) -> float:
     the way that it flies away from him until it reacts.  A standard deviation of his position, and of his speed until
     the vehicle reacts, is added.
     """
-    toward = max(seen.closing_m_s, -seen.approach_m_s, 0.0) + _OWN_SPEED_SD_M_S  # own speed and chase together
-    gaining = seen.approach_m_s + min(seen.closing_m_s, 0.0)  # on a vehicle that flies away
-    steps = max(gaining, 0.0) * _REACTION_S + max(seen.approach_m_s, 0.0) * toward / safety.braking_m_s2
-    return braking_distance(toward, safety) + steps + math.hypot(seen.subject_sd_m, _REACTION_S * seen.approach_sd_m_s)
+    toward = (
+        max(seen.subject.closing_m_s, -seen.subject.approach_m_s, 0.0) + _OWN_SPEED_SD_M_S
+    )  # own speed and chase together
+    gaining = seen.subject.approach_m_s + min(seen.subject.closing_m_s, 0.0)  # on a vehicle that flies away
+    steps = max(gaining, 0.0) * _REACTION_S + max(seen.subject.approach_m_s, 0.0) * toward / safety.braking_m_s2
+    return (
+        braking_distance(toward, safety)
+        + steps
+        + math.hypot(seen.subject.sd_m, _REACTION_S * seen.subject.approach_sd_m_s)
+    )
 
 
 def oldest_state_s(safety: SafetyConfig, *, patient: bool = False) -> float:
@@ -222,14 +256,14 @@ def oldest_state_s(safety: SafetyConfig, *, patient: bool = False) -> float:
 
 def oldest_subject_s(seen: Observed, safety: SafetyConfig) -> float:
     """Greatest age in s of the subject at which the vehicle is moved: less at speed."""
-    speed = float(np.linalg.norm(np.nan_to_num(seen.velocity)))
+    speed = float(np.linalg.norm(np.nan_to_num(seen.vehicle.velocity)))
     return min(safety.max_subject_age_s, max(safety.max_blind_m / max(speed, 1e-3), _LEAST_SUBJECT_AGE_S))
 
 
 def subject_located(seen: Observed, safety: SafetyConfig) -> bool:
     """Whether a subject is known recently and certainly enough to retreat from it."""
-    recent = -_FUTURE_S < seen.subject_age_s <= safety.max_subject_age_s
-    return seen.subject is not None and recent and seen.subject_sd_m <= safety.max_subject_sd_m
+    recent = -_FUTURE_S < seen.subject.age_s <= safety.max_subject_age_s
+    return seen.subject.position is not None and recent and seen.subject.sd_m <= safety.max_subject_sd_m
 
 
 def braking_distance(speed_m_s: float, config: SafetyConfig) -> float:

@@ -1,21 +1,30 @@
-"""Gathers what the safety machine decides by: vehicle, link and subject at the instant of one step."""
+"""What is observed of vehicle, link, subject and pictures: everything that arrives, and the one value of each step."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from drocap_ros.flight.autopilot import autopilot_of
+from drocap_ros.flight.autopilot.autopilot import UNKNOWN
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.orbit.states import Observed
-from drocap_ros.flight.subject.subject_filter import SubjectEstimate
+from drocap_ros.flight.observed import Course, Health, Link, Mode, Motion, Observed, Pictures, SizeSight, Subject
+from drocap_ros.flight.orbit.following import Echoes, Following, Keeping
+from drocap_ros.flight.pose_history import PoseHistory
+from drocap_ros.flight.subject.framing import Framing
+from drocap_ros.flight.subject.guard import Guard
+from drocap_ros.flight.subject.subject_filter import SubjectEstimate, SubjectFilter
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
+from drocap_ros.observation import PoseObservation
 
 _NS = 1_000_000_000
+_CLOCK_JUMP_S = 0.25
 _MAX_EXTRAPOLATION_S = 0.3
 _POSITION_JUMP_M, _JUMP_PERIOD_S = 1.0, 0.5
 _FADES_S = 4.0  # in recorded flights of both autopilots the steps added up to 0.2 m at most
@@ -24,83 +33,241 @@ _MULTIROTORS = frozenset({2, 3, 4, 13, 14, 15, 29, 35})
 _STATUS_MESSAGES = (("GPS_RAW_INT",), ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"), ("SYS_STATUS",))
 
 
-def observe(
-    link: MavlinkLink,
-    config: MavlinkBridgeConfig,
-    vehicle: VehicleState | None,
-    estimate: SubjectEstimate | None,
-    disturbance: Condition | None,
-    not_followed: str,
-    now_ns: int,
-) -> Observed:
-    """The observation of one step.
+class OwnFlight(NamedTuple):
+    """What the controller itself adds to the observation.
 
-    Parameters
-    ----------
-    vehicle : latest state
-    estimate : of the subject, in the frame of the reported position
-    disturbance : of our own time or of the reported position
-    not_followed : why the setpoints count as not followed, in words; "" = they are
+    orbiting_s : how long the orbit has been flown; 0 = it is not
+    reference : (3,) m, the place on the orbit; None = there is none
+    hung : whether the watchdog has acted since the last step
+    unsafe : why the setpoint of the last step was not sent
+    intruder : another one that commands or is followed, found in the graph
     """
-    if vehicle is None:
-        return Observed(disturbance=disturbance)
+
+    orbiting_s: float = 0.0
+    reference: np.ndarray | None = None
+    hung: bool = False
+    unsafe: Condition | None = None
+    intruder: Condition | None = None
+
+
+class Observer:
+    """Takes what arrives between the steps, and builds the observation of a step.  It reads no clock.
+
+    vehicle : latest state
+    framing : of the present camera
+    """
+
+    def __init__(self, config: MavlinkBridgeConfig) -> None:
+        self._config = config
+        self.vehicle: VehicleState | None = None
+        self.framing = Framing(config)
+        self._history, self._jumps, self._pictures = PoseHistory(), PositionJumps(), PictureWatch()
+        self._subject, self._guard = SubjectFilter(config), Guard(config)
+        self._following, self._keeping = Following(config.max_echo_age_s), Keeping(config)
+        self._before: tuple[int, float] | None = None  # stamp and monotonic time of the last step
+        self._camera_changed: Condition | None = None  # since the last step
+
+    def on_state(self, state: VehicleState) -> None:
+        """Take a state of the vehicle."""
+        self._jumps.take(state)
+        self.vehicle = state
+        self._history.add(state)
+        self._subject.height_wanders = autopilot_of(state.autopilot).height_wanders
+
+    def on_camera(self, camera_matrix: np.ndarray) -> None:
+        """Take the camera matrix (3, 3) px; raises as :meth:`Framing.calibrate`.  A change ends the motion."""
+        self._camera_changed = self.framing.calibrate(camera_matrix) or self._camera_changed
+
+    def on_pose2d(self, observation: PoseObservation, *, locked: bool) -> None:
+        """Take the keypoints of one image; ``locked``: the vehicle flies by the present subject."""
+        stamp_ns = observation.stamp_ns - round(self._config.camera_latency_s * _NS)
+        observation = dataclasses.replace(observation, stamp_ns=stamp_ns)
+        self.framing.size = observation.image_size
+        fresh = self._pictures.take(observation)
+        if (matrix := self.framing.matrix) is not None and self._camera_changed is None and fresh:
+            camera = self._history.at(stamp_ns)
+            self._subject.update(observation, matrix, camera, locked=locked)
+            self._guard.see(observation, matrix, camera, locked=locked)
+
+    def observe(self, link: MavlinkLink, now_ns: int, now_s: float, own: OwnFlight) -> tuple[Observed, float]:
+        """The observation of a step, and the time in s since the last one.
+
+        Parameters
+        ----------
+        now_ns : clock of the stamps
+        now_s : monotonic
+        """
+        vehicle, config = self.vehicle, self._config
+        before, self._before = self._before, (now_ns, now_s)
+        dt = 0.0 if before is None else now_s - before[1]
+        disturbance = self._own_disturbance(before, now_ns, dt, hung=own.hung) or self._camera_changed or own.unsafe
+        estimate = self._subject.estimate(now_ns)
+        echoes = Echoes(link.sent_setpoints(), link.echo(), link.answer_age_s())
+        not_followed = self._following.step(now_s, own.orbiting_s, echoes, vehicle)
+        pictures = self._pictures.observed(now_ns, calibrated=self.framing.matrix is not None)
+        if vehicle is None:
+            return Observed(pictures=pictures, intruder=own.intruder, disturbance=disturbance), dt
+        seen = observe_vehicle(link, config, vehicle, now_ns)
+        motion = seen.vehicle
+        by_size = self._guard.sight(motion.position, self._history.offset, now_ns)
+        subject = Subject() if estimate is None else _subject(estimate, self._history.offset, motion, by_size)
+        away_m, away_s = self._keeping.watch(own.reference, motion.position, now_s)
+        distance_m = math.nan if estimate is None else _distance(motion, estimate.position + self._history.offset)
+        margin = self.framing.watch(vehicle, motion, distance_m, dt)
+        followed = not not_followed or not seen.autopilot.needs_mode_to_stop
+        if not_followed and disturbance is None:
+            disturbance = condition(ConditionCode.SETPOINTS_NOT_FOLLOWED, evidence=not_followed)
+        jumped = disturbance is not None and disturbance.code == ConditionCode.POSITION_JUMPED
+        if not jumped and (stood_s := link.decision_age_s()) > config.watchdog_s:
+            # The process stood still within this step: what was read above belongs to different instants.
+            disturbance = condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=stood_s)
+        observed = dataclasses.replace(
+            seen,
+            subject=subject,
+            pictures=dataclasses.replace(pictures, camera_problem=seen.pictures.camera_problem, framing_margin=margin),
+            course=Course(followed, away_m, away_s),
+            intruder=own.intruder,
+            disturbance=disturbance,
+        )
+        return observed, dt
+
+    def forget_changed_camera(self) -> None:
+        """Begin anew with the subject after a change of the camera: the places so far were measured by another one."""
+        if self._camera_changed is not None:
+            self._camera_changed = None
+            self._subject, self._guard = SubjectFilter(self._config), Guard(self._config)
+
+    def _own_disturbance(
+        self, before: tuple[int, float] | None, now_ns: int, dt: float, *, hung: bool
+    ) -> Condition | None:
+        """Disturbance of our own time, or of the reported position, since the last step."""
+        if before is None:
+            return None
+        jump_s = (now_ns - before[0]) / _NS - dt
+        if abs(jump_s) > _CLOCK_JUMP_S:
+            return condition(ConditionCode.CLOCK_JUMPED, jump_s=jump_s)
+        if (jump_m := self._jumps.pop()) > 0:
+            return condition(ConditionCode.POSITION_JUMPED, jump_m=jump_m)
+        if hung or dt > self._config.watchdog_s:
+            return condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=dt)
+        return None
+
+
+def observe_vehicle(link: MavlinkLink, config: MavlinkBridgeConfig, vehicle: VehicleState, now_ns: int) -> Observed:
+    """The observation of vehicle and link alone; ``vehicle``: latest state."""
     estimator = link.estimator
     heard = estimator.modes.take_heard()
     age_s = (now_ns - vehicle.stamp_ns) / _NS
-    # The state is at the attitude's stamp; a moment later the vehicle is a little farther.
-    position = vehicle.position_enu_m + np.nan_to_num(vehicle.velocity_enu_m_s) * min(
-        max(age_s, 0.0), _MAX_EXTRAPOLATION_S
-    )
     latest = estimator.snapshot(now_ns) or vehicle  # mode and health are newer than the attitude
     autopilot = autopilot_of(latest.autopilot)
-    status_age = max(estimator.age_s(names, now_ns) for names in _STATUS_MESSAGES)
-    distance, closing, approach, approach_sd = math.nan, 0.0, 0.0, 0.0
-    if estimate is not None:
-        offset = position[:2] - estimate.position[:2]
-        distance = float(np.hypot(*offset))
-        closing = -float(offset @ vehicle.velocity_enu_m_s[:2]) / max(distance, 1e-3)
-        approach = float(offset @ estimate.velocity[:2]) / max(distance, 1e-3)
-        approach_sd = math.sqrt(max(float(offset @ estimate.covariance[3:5, 3:5] @ offset), 0.0)) / max(distance, 1e-3)
-    if not_followed and disturbance is None:
-        disturbance = condition(ConditionCode.SETPOINTS_NOT_FOLLOWED, evidence=not_followed)
-    followed = not not_followed or not autopilot.needs_mode_to_stop
     loss = link.settings.loss_settings()
     action = math.nan if loss is None else loss.action
     loss_modes = {} if autopilot.loss_action is None else autopilot.loss_action.modes
     loss_mode = loss_modes.get(int(action) if math.isfinite(action) else -1, latest.mode)
-    flies = estimator.modes.vehicle_type in _MULTIROTORS
-    trip_s, gap_s = link.answer_age_s(), link.stream_gap_s()
-    jumped = disturbance is not None and disturbance.code == ConditionCode.POSITION_JUMPED
-    if not jumped and (stood_s := link.decision_age_s()) > config.watchdog_s:
-        # The process stood still within this step: what was read above belongs to different instants.
-        disturbance = condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=stood_s)
+    vehicle_type = estimator.modes.vehicle_type
+    flies = vehicle_type in _MULTIROTORS
+    # The state is at the attitude's stamp; a moment later the vehicle is a little farther.
+    moved_s = min(max(age_s, 0.0), _MAX_EXTRAPOLATION_S)
+    position = vehicle.position_enu_m + np.nan_to_num(vehicle.velocity_enu_m_s) * moved_s
+    position_age_s = max((now_ns - estimator.position_changed_ns) / _NS, estimator.position_behind_s() + abs(age_s))
     return Observed(
-        autopilot=latest.autopilot if flies else f"{latest.autopilot}, vehicle type {estimator.modes.vehicle_type}",
-        mode=latest.mode, in_control=latest.mode == autopilot.control_mode,
-        in_hold=latest.mode == autopilot.hold_mode, heard=heard | {latest.mode},
-        left_by_itself=estimator.modes.intended == autopilot.control_mode != latest.mode == loss_mode,
-        armed=latest.armed, system_status=estimator.modes.system_status, landed_state=latest.landed_state,
-        vehicles=frozenset() if config.target_system_id else estimator.systems,
-        link_age_s=latest.link_age_s,
-        heartbeat_age_s=estimator.modes.age_s(now_ns),
-        state_age_s=abs(age_s),
-        position_age_s=max(
-            (now_ns - estimator.position_changed_ns) / _NS, estimator.position_behind_s() + abs(age_s)
+        autopilot=autopilot if flies else UNKNOWN,
+        autopilot_name=latest.autopilot if flies else f"{latest.autopilot}, vehicle type {vehicle_type}",
+        loss_settings=loss,
+        mode=Mode(
+            name=latest.mode,
+            in_control=latest.mode == autopilot.control_mode,
+            in_hold=latest.mode == autopilot.hold_mode,
+            heard=heard | {latest.mode},
+            left_by_itself=estimator.modes.intended == autopilot.control_mode != latest.mode == loss_mode,
         ),
-        status_age_s=status_age, round_trip_s=trip_s, packet_loss=estimator.packets.loss,
-        stream_gap_s=gap_s,
-        gps_fix_type=latest.gps_fix_type, position_ok=latest.position_ok, battery_fraction=latest.battery_fraction,
-        battery_voltage_v=latest.battery_voltage_v,
-        position=position, velocity=np.asarray(vehicle.velocity_enu_m_s, float), yaw=_yaw(vehicle),
-        height_m=float(position[2]) - config.ground_height_m,
-        subject=None if estimate is None else estimate.position,
-        subject_age_s=math.inf if estimate is None else estimate.age_s,
-        subject_contradicted=estimate is not None and estimate.contradicted,
-        subject_sd_m=math.inf if estimate is None else estimate.position_sd_m,
-        subject_distance_m=distance, closing_m_s=closing, approach_m_s=approach, approach_sd_m_s=approach_sd,
-        disturbance=disturbance, followed=followed, loss_settings=loss,
-        camera_problem=estimator.mount.problem(autopilot, now_ns),
-    )  # fmt: skip
+        link=Link(
+            age_s=latest.link_age_s,
+            heartbeat_age_s=estimator.modes.age_s(now_ns),
+            round_trip_s=link.answer_age_s(),
+            packet_loss=estimator.packets.loss,
+            stream_gap_s=link.stream_gap_s(),
+            vehicles=frozenset() if config.target_system_id else estimator.systems,
+        ),
+        health=Health(
+            armed=latest.armed,
+            system_status=estimator.modes.system_status,
+            landed_state=latest.landed_state,
+            gps_fix_type=latest.gps_fix_type,
+            position_ok=latest.position_ok,
+            battery_fraction=latest.battery_fraction,
+            battery_voltage_v=latest.battery_voltage_v,
+            age_s=max(estimator.age_s(names, now_ns) for names in _STATUS_MESSAGES),
+        ),
+        vehicle=Motion(
+            position=position,
+            velocity=np.asarray(vehicle.velocity_enu_m_s, float),
+            yaw=_yaw(vehicle),
+            height_m=float(position[2]) - config.ground_height_m,
+            age_s=abs(age_s),
+            position_age_s=position_age_s,
+        ),
+        pictures=Pictures(camera_problem=estimator.mount.problem(autopilot, now_ns)),
+    )
+
+
+def _distance(motion: Motion, place: np.ndarray) -> float:
+    return float(np.hypot(*(motion.position[:2] - place[:2])))
+
+
+def _subject(estimate: SubjectEstimate, offset: np.ndarray, motion: Motion, by_size: SizeSight | None) -> Subject:
+    """The subject as filter and guard have him together: no surer than by the less sure one of them.
+
+    offset : (3,) m, from the frame of the camera's poses to that of the reported position, in which is flown
+    """
+    place = estimate.position + offset
+    sight = motion.position[:2] - place[:2]
+    distance = float(np.hypot(*sight))
+    spread = float(sight @ estimate.covariance[3:5, 3:5] @ sight)
+    return Subject(
+        position=place,
+        velocity=estimate.velocity,
+        # Without a size nothing bounds the closing speed.
+        age_s=math.inf if by_size is None else max(estimate.age_s, by_size.age_s),
+        contradicted=estimate.contradicted or (by_size is not None and by_size.contradicted),
+        sd_m=estimate.position_sd_m,
+        nearer=estimate.nearer,
+        distance_m=distance if by_size is None else min(distance, by_size.farthest_m),
+        closing_m_s=-float(sight @ motion.velocity[:2]) / max(distance, 1e-3),
+        approach_m_s=float(sight @ estimate.velocity[:2]) / max(distance, 1e-3),
+        approach_sd_m_s=math.sqrt(max(spread, 0.0)) / max(distance, 1e-3),
+        by_size=by_size,
+    )
+
+
+class PictureWatch:
+    """When pictures come, how old they are then, and whether they stand still.  It reads no clock."""
+
+    def __init__(self) -> None:
+        self._last: PoseObservation | None = None
+        self._frozen = False
+        self._waits = False  # for the step that notes when the last one has come
+        self._arrived_ns = 0
+
+    def take(self, observation: PoseObservation) -> bool:
+        """Take one image; returns whether it shows another instant than the one before."""
+        last, self._last, self._waits = self._last, observation, True
+        same = last is not None and np.array_equal(last.keypoints, observation.keypoints, equal_nan=True)
+        self._frozen = same and observation.has_subject
+        return not self._frozen
+
+    def observed(self, now_ns: int, *, calibrated: bool) -> Pictures:
+        """The pictures at the instant of a step."""
+        if self._waits:
+            self._waits, self._arrived_ns = False, now_ns
+        if self._last is None:
+            return Pictures(calibrated=calibrated)
+        return Pictures(
+            age_s=(now_ns - self._last.stamp_ns) / _NS,
+            silent_s=(now_ns - self._arrived_ns) / _NS,
+            frozen=self._frozen,
+            calibrated=calibrated,
+        )
 
 
 class PositionJumps:

@@ -14,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.orbit_config import OrbitConfig
+from drocap_ros.flight.orbit_goal import OrbitGoal
 from drocap_ros.flight.setpoint import Setpoint
+from drocap_ros.flight.subject.subject_filter import STANDING_M_S, WALKING_M_S
 
-WALKING_M_S, STANDING_M_S = 0.5, 0.3  # speed of one who walks; what the estimate of one who stands has
 #: 1/s, about one who stands and one who walks: his turns are no lasting error; m.
 _TRIM_RATE, _WALKING_TRIM_RATE, _MAX_TRIM_M = 0.15, 0.03, 0.5
 _FREE_LEAD = 0.6  # share of the greatest lead, below which the reference does not wait
@@ -29,14 +30,6 @@ _MAX_HASTE = 0.12  # m/s^2 along the path that the setpoint passes on: the refer
 _SURPRISE_S, _FLIGHT_ERROR_M = 0.5, 0.5  # of the least radius
 _CALIBRATION_S = 15.0  # against the wanted direction, with calibrate_telemetry
 _WORST_RANGE = 5.0  # of size_error: 40 % where the body is not measured, as by a wrong lens or a child
-
-
-class OrbitGoal(NamedTuple):
-    """Radius, height and angular speed that the operator wants."""
-
-    radius_m: float
-    height_m: float
-    angular_speed_rad_s: float
 
 
 class Ramp(NamedTuple):
@@ -69,21 +62,6 @@ class OrbitState(NamedTuple):
     trim: float = 0.0
     flown_s: float = 0.0
     goal_radius: float = 0.0
-
-
-def goal_of(
-    config: OrbitConfig,
-    radius_m: float = math.nan,
-    height_m: float = math.nan,
-    angular_speed_deg_s: float = math.nan,
-    present: OrbitGoal | None = None,
-) -> OrbitGoal:
-    """Goal of a command, not validated; NaN = as at present, or as configured."""
-    base = present or OrbitGoal(config.radius_m, config.height_m, math.radians(config.angular_speed_deg_s))
-    radius = base.radius_m if math.isnan(radius_m) else radius_m
-    height = base.height_m if math.isnan(height_m) else height_m
-    speed = math.degrees(base.angular_speed_rad_s) if math.isnan(angular_speed_deg_s) else angular_speed_deg_s
-    return OrbitGoal(radius, height, math.radians(speed))
 
 
 def least_radius(
@@ -122,25 +100,24 @@ def begin_orbit(vehicle: np.ndarray, velocity: np.ndarray, subject: np.ndarray, 
     )
 
 
-def advance(
-    state: OrbitState,
-    goal: OrbitGoal,
-    vehicle: np.ndarray,
-    subject: np.ndarray,
-    subject_velocity: np.ndarray,
-    ground_m: float,
-    dt: float,
-    config: OrbitConfig,
-    least_radius_m: float = 0.0,
-    greatest_speed_m_s: float = math.inf,
-) -> OrbitState:
-    """The reference ``dt`` seconds later (at most 0.2 s of them).
+class Scene(NamedTuple):
+    """Actual place of the vehicle, place and velocity of the subject: (3,) ENU; height of his ground in the map frame.
 
-    vehicle, subject, subject_velocity : (3,) ENU, actual
-    ground_m : height of the subject's ground in the map frame
     least_radius_m : lower bound of the radius
     greatest_speed_m_s : of the vehicle, beside ``max_speed_m_s``
     """
+
+    vehicle: np.ndarray
+    subject: np.ndarray
+    subject_velocity: np.ndarray
+    ground_m: float = 0.0
+    least_radius_m: float = 0.0
+    greatest_speed_m_s: float = math.inf
+
+
+def advance(state: OrbitState, goal: OrbitGoal, scene: Scene, dt: float, config: OrbitConfig) -> OrbitState:
+    """The reference ``dt`` seconds later (at most 0.2 s of them)."""
+    vehicle, subject, subject_velocity, ground_m, least_radius_m, greatest_speed_m_s = scene
     dt = min(max(dt, 0.0), 0.2)
     if dt == 0.0:
         return state
@@ -196,14 +173,9 @@ def reference_position(state: OrbitState) -> np.ndarray:
     return np.array([state.centre[0] + r * c, state.centre[1] + r * s, state.height.value])
 
 
-def setpoint_of(
-    state: OrbitState,
-    vehicle: np.ndarray,
-    subject: np.ndarray,
-    subject_velocity: np.ndarray,
-    config: OrbitConfig,
-) -> Setpoint:
+def setpoint_of(state: OrbitState, scene: Scene, config: OrbitConfig) -> Setpoint:
     """Setpoint of the reference, at most the greatest lead away from the vehicle."""
+    vehicle, subject, subject_velocity = scene[:3]
     c, s = math.cos(state.phase), math.sin(state.phase)
     outward, along = np.array([c, s]), np.array([-s, c])
     r, omega = state.radius, state.omega

@@ -7,6 +7,7 @@ import math
 
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
+from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.degradation import allowed_pace, next_pace
 from drocap_ros.flight.orbit.hold import begin_hold, request_hold_mode, resumption, retreat, update_hold
 from drocap_ros.flight.orbit.motion_checks import (
@@ -24,7 +25,6 @@ from drocap_ros.flight.orbit.states import (
     Decision,
     Limits,
     ModeRequest,
-    Observed,
     Pace,
     SafetyState,
     State,
@@ -62,11 +62,11 @@ def reduce(
         state = _enter(State.IDLE, condition(_C.ALL_CLEAR), now_s)
     elif foreign := foreign_mode(state, seen) or _misjudged(state, seen, now_s):
         state = _yield(state, seen, foreign, now_s)
-    elif state.state in _ACTIVE and not is_lost(state) and not seen.armed and seen.mode:
+    elif state.state in _ACTIVE and not is_lost(state) and not seen.health.armed and seen.mode.name:
         state = _enter(State.IDLE, condition(_C.DISARMED), now_s)
-    elif state.state in _ACTIVE and seen.in_hold:
+    elif state.state in _ACTIVE and seen.mode.in_hold:
         # Once the autopilot holds, any other mode is somebody's choice.
-        state = dataclasses.replace(state, modes=frozenset({seen.mode}))
+        state = dataclasses.replace(state, modes=frozenset({seen.mode.name}))
     answer = None
     if command is not None:
         state, answer = _execute(state, seen, now_s, command, problem, limits)
@@ -79,7 +79,7 @@ def reduce(
         moved = state if vehicle or place else retreat(state, seen, now_s, limits)
         state = moved if moved is not state else request_hold_mode(state, seen, now_s, limits.safety)
         state = resumption(state, seen, now_s, problem, limits.safety)
-        if state.clear_s <= now_s - _CLEAR_S and seen.in_control and not is_lost(state):
+        if state.clear_s <= now_s - _CLEAR_S and seen.mode.in_control and not is_lost(state):
             state = dataclasses.replace(_begin_orbit(seen, now_s), fence_centre=state.fence_centre)
     state = dataclasses.replace(state, lost_s=lost_s, seen_s=seen_s)
     return state, Decision(*_permitted(state, seen, now_s, limits), answer)
@@ -87,7 +87,12 @@ def reduce(
 
 def _returned(state: SafetyState, seen: Observed) -> bool:
     """Whether the pilot gives control back after our own hold mode: nothing is sent, but a start is enough then."""
-    return state.state == State.HOLDING and bool(state.modes) and seen.in_control and seen.mode not in state.modes
+    return (
+        state.state == State.HOLDING
+        and bool(state.modes)
+        and seen.mode.in_control
+        and seen.mode.name not in state.modes
+    )
 
 
 def _orbit(state: SafetyState, seen: Observed, now_s: float, blind: bool, limits: Limits) -> SafetyState:
@@ -96,7 +101,7 @@ def _orbit(state: SafetyState, seen: Observed, now_s: float, blind: bool, limits
     if problem:
         return begin_hold(state, problem, seen, now_s, blind, retreats=problem.code == _C.SUBJECT_NEAR)
     allowed, cause = allowed_pace(seen, limits)
-    pace = next_pace(state.pace, allowed, now_s, seen.position, contradicted=seen.subject_contradicted)
+    pace = next_pace(state.pace, allowed, now_s, seen.vehicle.position, contradicted=seen.subject.contradicted)
     reason = state.condition
     if cause is not None:
         reason = condition(_C.DEGRADED, cause=cause)
@@ -114,11 +119,11 @@ def _ending(state: SafetyState, seen: Observed, limits: Limits) -> Condition | N
 
 def _yield(state: SafetyState, seen: Observed, mode: str, now_s: float) -> SafetyState:
     """End all commands: the mode is not ours."""
-    if not (seen.left_by_itself and mode == seen.mode):
+    if not (seen.mode.left_by_itself and mode == seen.mode.name):
         return _enter(State.TAKEN_OVER, condition(_C.PILOT_TOOK_OVER, mode=mode), now_s)
     evidence = f"the autopilot has left its control mode for {mode} by itself, as where setpoints do not arrive"
     reason = seen.disturbance or condition(_C.SETPOINTS_NOT_FOLLOWED, evidence=evidence)
-    if not seen.in_hold:
+    if not seen.mode.in_hold:
         return _enter(State.TAKEN_OVER, reason, now_s)
     # Its hold is the one in which a stop ends; nothing is sent in it.
     if state.state in (State.HOLDING, State.FAULT):
@@ -129,8 +134,8 @@ def _yield(state: SafetyState, seen: Observed, mode: str, now_s: float) -> Safet
 def _misjudged(state: SafetyState, seen: Observed, now_s: float) -> str:
     """The mode that was taken for the pilot's because a heartbeat came before the report of what is intended."""
     taken = state.state == State.TAKEN_OVER and state.condition.code == _C.PILOT_TOOK_OVER
-    if taken and seen.left_by_itself and now_s - state.since_s < _INTENTION_S:
-        return seen.mode if state.condition.values.get("mode") == seen.mode else ""
+    if taken and seen.mode.left_by_itself and now_s - state.since_s < _INTENTION_S:
+        return seen.mode.name if state.condition.values.get("mode") == seen.mode.name else ""
     return ""
 
 
@@ -158,23 +163,30 @@ def _execute(
         return state, CommandAnswer(False, problem)
     if state.requesting:
         return state, _accepted(_C.ALREADY_REQUESTING_CONTROL)
-    if seen.in_control and state.modes > {seen.mode} and not math.isnan(state.hold_mode_s):
+    if seen.mode.in_control and state.modes > {seen.mode.name} and not math.isnan(state.hold_mode_s):
         # The hold mode has been requested: it would arrive during the orbit, and count as the pilot's.
-        return state, _refused(_C.HOLD_MODE_PENDING)
-    if seen.in_control:
+        return state, _refused(_C.HOLD_MODE_PENDING, by_hand=_by_hand(seen))
+    if seen.mode.in_control:
         return _begin_orbit(seen, now_s), _accepted(_C.ORBITING)
     if command == Command.START:
-        return state, _refused(_C.NOT_IN_CONTROL_MODE, mode=seen.mode)
+        return state, _refused(_C.NOT_IN_CONTROL_MODE, mode=seen.mode.name, by_hand=_by_hand(seen))
     if not limits.safety.mode_change_allowed:
-        return state, _refused(_C.MODE_CHANGE_FORBIDDEN, mode=seen.mode)
-    if seen.packet_loss > MAX_LOSS:
-        return state, _refused(_C.PACKETS_LOST, lost_percent=100 * seen.packet_loss, most_percent=100 * MAX_LOSS)
+        why = f" ({engaged})" if (engaged := seen.autopilot.hints.engaged) else ""
+        refused = _refused(_C.MODE_CHANGE_FORBIDDEN, mode=seen.mode.name, engaged=why, by_hand=_by_hand(seen))
+        return state, refused
+    if seen.link.packet_loss > MAX_LOSS:
+        return state, _refused(_C.PACKETS_LOST, lost_percent=100 * seen.link.packet_loss, most_percent=100 * MAX_LOSS)
     answer = _accepted(_C.REQUESTING_CONTROL)
     state = _enter(
-        State.READY, answer.condition, now_s, modes=frozenset({seen.mode}), requesting_s=now_s,
-        hold_position=seen.position.copy(), hold_yaw=seen.yaw,
+        State.READY, answer.condition, now_s, modes=frozenset({seen.mode.name}), requesting_s=now_s,
+        hold_position=seen.vehicle.position.copy(), hold_yaw=seen.vehicle.yaw,
     )  # fmt: skip
     return state, answer
+
+
+def _by_hand(seen: Observed) -> str:
+    """How the pilot enters the control mode, as the end of a sentence."""
+    return f", or {seen.autopilot.hints.by_hand}" if seen.autopilot.hints.by_hand else ""
 
 
 def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> tuple[SafetyState, CommandAnswer]:
@@ -198,7 +210,7 @@ def _wait(state: SafetyState, seen: Observed, now_s: float, problem: Condition |
     if state.requesting:
         if problem and (ending := _ending(state, seen, limits)):  # a short gap delays the orbit
             return _enter(State.IDLE, ending, now_s)
-        if seen.in_control and not problem:
+        if seen.mode.in_control and not problem:
             return _begin_orbit(seen, now_s)
         if now_s - state.requesting_s > limits.safety.engage_timeout_s + limits.warm_up_s:
             return _enter(State.READY, condition(_C.CONTROL_NOT_GRANTED), now_s)
@@ -215,7 +227,7 @@ def _permitted(state: SafetyState, seen: Observed, now_s: float, limits: Limits)
     if state.state == State.READY and state.requesting:
         warm = now_s - state.requesting_s >= limits.warm_up_s and mode_visible(state, seen, now_s, limits)
         return Action.HOLD, ModeRequest.CONTROL if warm else ModeRequest.NONE
-    silent = not seen.in_control or is_silent(state, now_s, limits) or stream_ended(seen)
+    silent = not seen.mode.in_control or is_silent(state, now_s, limits) or stream_ended(seen)
     if state.state not in (State.HOLDING, State.FAULT) or silent:
         return Action.NOTHING, ModeRequest.NONE
     action, since = Action.HALT if state.hold_position is None else Action.HOLD, now_s - state.since_s
@@ -224,17 +236,22 @@ def _permitted(state: SafetyState, seen: Observed, now_s: float, limits: Limits)
     # Not at once: the autopilot's brake takes longer than velocity zero.  And not without a visible mode: the pilot
     # may have taken over unseen; setpoints are ignored then, a request for a mode would not be.
     wanted = since > _BLIND_MODE_REQUEST_S if state.blind else not math.isnan(state.hold_mode_s)
-    request = wanted and seen.in_control and mode_visible(state, seen, now_s, limits)
+    request = wanted and seen.mode.in_control and mode_visible(state, seen, now_s, limits)
     return action, ModeRequest.HOLD if request else ModeRequest.NONE
 
 
 def _begin_orbit(seen: Observed, now_s: float) -> SafetyState:
-    assert seen.subject is not None
+    assert seen.subject.position is not None
     return _enter(
-        State.ORBITING, condition(_C.ORBITING), now_s, modes=frozenset({seen.mode}),
-        fence_centre=seen.subject[:2].copy(), hold_position=seen.position.copy(), hold_yaw=seen.yaw,
+        State.ORBITING,
+        condition(_C.ORBITING),
+        now_s,
+        modes=frozenset({seen.mode.name}),
+        fence_centre=seen.subject.position[:2].copy(),
+        hold_position=seen.vehicle.position.copy(),
+        hold_yaw=seen.vehicle.yaw,
         pace=Pace(at_s=now_s),
-    )  # fmt: skip
+    )
 
 
 def _enter(state: State, reason: Condition, now_s: float, **values: object) -> SafetyState:

@@ -11,8 +11,7 @@ import math
 
 import numpy as np
 
-from drocap_ros.flight.autopilot import autopilot_of
-from drocap_ros.flight.orbit.states import Observed
+from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.setpoint import Setpoint
 
 _RATE, _FORGETTING = 0.8, 0.1  # 1/s^2 of the missing velocity; 1/s
@@ -25,24 +24,25 @@ class Shortfall:
     def __init__(self) -> None:
         self._integral: np.ndarray = np.zeros(2)  # m/s^2 ENU
 
-    def added(self, setpoint: Setpoint, seen: Observed, subject: np.ndarray, subject_velocity: np.ndarray) -> Setpoint:
+    def added(self, setpoint: Setpoint, seen: Observed, subject_velocity: np.ndarray) -> Setpoint:
         """The setpoint with the missing acceleration along the line of sight.
 
-        subject : (3,) m;  subject_velocity : (2,) m/s or more, horizontal first; ENU, estimated
+        subject_velocity : (2,) m/s, smoothed
         """
-        if autopilot_of(seen.autopilot).continues_setpoints:
+        subject = seen.subject.position
+        if seen.autopilot.continues_setpoints or subject is None:
             return setpoint
-        sight = subject[:2] - seen.position[:2]
+        sight = subject[:2] - seen.vehicle.position[:2]
         toward = sight / max(float(np.hypot(*sight)), 0.5)
-        speed = float(np.hypot(*subject_velocity[:2]))
+        speed = float(np.hypot(*subject_velocity))
         most = min(_SHARE * max(speed - _STANDING_M_S, 0.0), _GREATEST_M_S2)
         along = min(max(float(self._integral @ toward), -most), most)
         return setpoint._replace(acceleration=setpoint.acceleration + np.append(along * toward, 0.0))
 
     def learn(self, sent: Setpoint, seen: Observed, dt: float) -> None:
         """Take the setpoint that was sent, ``dt`` s after the one before."""
-        wanted = sent.velocity + autopilot_of(seen.autopilot).position_gain_per_s * (sent.position - seen.position)
-        missing = (wanted - seen.velocity)[:2]
+        wanted = sent.velocity + seen.autopilot.position_gain_per_s * (sent.position - seen.vehicle.position)
+        missing = (wanted - seen.vehicle.velocity)[:2]
         dt = min(max(dt, 0.0), 0.2)
         self._integral = self._integral + (_RATE * missing - _FORGETTING * self._integral) * dt
         size = math.hypot(*self._integral)

@@ -8,10 +8,11 @@ import math
 import numpy as np
 
 from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
-from drocap_ros.flight.orbit.states import Limits, Observed, SafetyState, State
+from drocap_ros.flight.observed import Observed
+from drocap_ros.flight.orbit.states import Limits, SafetyState, State
 
 #: Telemetry must arrive for so long after a loss before a mode is requested: longer than the 1 s between two
-#: heartbeats of PX4, and than packets that were late and arrive after newer ones.
+#: heartbeats, and than packets that were late and arrive after newer ones.
 _STEADY_S = 1.3
 _DEFAULT_TIMEOUT_S = 0.5
 #: Out of sight for longer, the reported position may have jumped unseen (observer.PositionJumps).
@@ -27,7 +28,7 @@ def watch(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> S
     lost = not math.isnan(state.lost_s)
     if not _telemetry_fresh(seen, limits):
         return state if lost else dataclasses.replace(state, lost_s=now_s)
-    if not lost or seen.heartbeat_age_s >= now_s - state.lost_s:
+    if not lost or seen.link.heartbeat_age_s >= now_s - state.lost_s:
         return state
     unseen = now_s - state.lost_s > _UNSEEN_S
     state = dataclasses.replace(state, lost_s=math.nan, seen_s=now_s)
@@ -37,9 +38,9 @@ def watch(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> S
     if not unseen:
         return state
     # The vehicle is held where it is now, and not led back: setpoints may have ended, or its position been reset.
-    known = bool(np.isfinite(seen.position).all()) and seen.position_ok and seen.gps_fix_type >= 3
-    place = seen.position.copy() if known else None
-    return dataclasses.replace(state, hold_position=place, hold_yaw=seen.yaw)
+    known = bool(np.isfinite(seen.vehicle.position).all()) and seen.health.position_ok and seen.health.gps_fix_type >= 3
+    place = seen.vehicle.position.copy() if known else None
+    return dataclasses.replace(state, hold_position=place, hold_yaw=seen.vehicle.yaw)
 
 
 def is_lost(state: SafetyState) -> bool:
@@ -59,36 +60,38 @@ def mode_visible(state: SafetyState, seen: Observed, now_s: float, limits: Limit
     are lost none is requested: such a link ends orbits, and the pilot takes over just then.
     """
     steady = now_s - state.seen_s >= _STEADY_S and not is_lost(state)
-    late = seen.round_trip_s > limits.safety.max_round_trip_s  # the request would arrive late too
-    return steady and not late and seen.packet_loss <= MAX_LOSS and seen.heartbeat_age_s <= limits.max_mode_age_s
+    late = seen.link.round_trip_s > limits.safety.max_round_trip_s  # the request would arrive late too
+    return (
+        steady and not late and seen.link.packet_loss <= MAX_LOSS and seen.link.heartbeat_age_s <= limits.max_mode_age_s
+    )
 
 
 def foreign_mode(state: SafetyState, seen: Observed) -> str:
     """A mode that was reported and is not ours; "" = none.
 
-    While the operator's request is pending the control mode is ours, whoever restores it: PX4 keeps OFFBOARD as its
-    intention after a loss, and the first setpoint is enough.
+    While the operator's request is pending the control mode is ours, whoever restores it: an autopilot may keep it
+    as its intention after a loss, and then the first setpoint is enough.
     """
     if not state.modes:
         return ""
-    own = state.modes | ({seen.mode} if state.requesting and seen.in_control else frozenset())
-    foreign = (seen.heard | {seen.mode}) - own - {""}
-    return seen.mode if seen.mode in foreign else min(foreign, default="")
+    own = state.modes | ({seen.mode.name} if state.requesting and seen.mode.in_control else frozenset())
+    foreign = (seen.mode.heard | {seen.mode.name}) - own - {""}
+    return seen.mode.name if seen.mode.name in foreign else min(foreign, default="")
 
 
 def stream_ended(seen: Observed) -> bool:
     """Whether no setpoint was sent for longer than the autopilot's time-out: none may follow by itself.
 
-    A process that was stopped and continues, or a link that returns, would take control back: PX4 restores OFFBOARD
-    with the first setpoint.
+    A process that was stopped and continues, or a link that returns, would take control back: some autopilots restore
+    their control mode with the first setpoint.
     """
     settings = seen.loss_settings
     timeout_s = math.nan if settings is None else settings.timeout_s
-    return seen.stream_gap_s > (_DEFAULT_TIMEOUT_S if math.isnan(timeout_s) else timeout_s)
+    return seen.link.stream_gap_s > (_DEFAULT_TIMEOUT_S if math.isnan(timeout_s) else timeout_s)
 
 
 def _telemetry_fresh(seen: Observed, limits: Limits) -> bool:
     # The attitude's stamp shows packets that arrive late; a heartbeat has no stamp.
     safety = limits.safety
-    newest = max(seen.link_age_s, seen.state_age_s)
-    return newest <= safety.max_state_age_s and seen.heartbeat_age_s <= safety.max_heartbeat_age_s
+    newest = max(seen.link.age_s, seen.vehicle.age_s)
+    return newest <= safety.max_state_age_s and seen.link.heartbeat_age_s <= safety.max_heartbeat_age_s

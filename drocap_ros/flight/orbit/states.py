@@ -1,4 +1,4 @@
-"""Types of the orbit's state machine: its states, the operator's commands, what is observed, what may be sent."""
+"""Types of the orbit's state machine: its states, the operator's commands, what may be sent."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.autopilot.autopilot import LossSettings
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.safety_config import SafetyConfig
@@ -50,86 +49,6 @@ class ModeRequest(enum.Enum):
     NONE = ""
     CONTROL = "control"
     HOLD = "hold"
-
-
-@dataclass(frozen=True)
-class Observed:
-    """Vehicle, link and subject at one instant; ages in s, infinite = never.
-
-    in_control, in_hold : the mode is the autopilot's for setpoints; it is its hold mode
-    heard : all modes that were reported since the last step, late ones too; empty = the mode alone
-    left_by_itself : whether the autopilot left the control mode as for the loss of setpoints, and nobody chose this
-    system_status : MAV_STATE of the autopilot; 0 = unknown
-    vehicles : MAVLink systems of the autopilots on the link, unless the operator has chosen one
-    heartbeat_age_s : since the newest report of the mode
-    position_age_s : since the reported position last changed, so frozen telemetry ages too
-    round_trip_s : since the sending of the message that was answered last; NaN = no answer yet
-    packet_loss : share of the vehicle's last packets that have not arrived
-    stream_gap_s : since the last setpoint left
-    position, velocity : (3,) ENU; the position is extrapolated over the age of the state
-    height_m : above the subject's ground
-    subject_contradicted : whether images since the subject was located showed something else in his place
-    subject_distance_m : horizontal
-    closing_m_s, approach_m_s : speed of the vehicle towards the subject, and of the subject towards the vehicle
-    approach_sd_m_s : standard deviation of ``approach_m_s``
-    intruder : another one that commands, or whose keypoints would be followed
-    disturbance : a condition that ends motion and that no other field shows
-    followed : whether the autopilot follows our setpoints; if not, only a mode can stop it
-    loss_settings : the autopilot's settings for the loss of setpoints
-    camera_problem : why the camera's attitude is unknown
-    calibrated : whether the camera's matrix is known, without which no subject is located
-    away_m, away_s : from the vehicle to its place on the orbit, and for how long this has been too far
-    framing_margin : between the person and the border of a fixed camera's picture, as a share of its height
-    """
-
-    autopilot: str = "other"
-    mode: str = ""
-    in_control: bool = False
-    in_hold: bool = False
-    heard: frozenset[str] = frozenset()
-    left_by_itself: bool = False
-    armed: bool = False
-    system_status: int = 0
-    landed_state: int = 0
-    vehicles: frozenset[int] = frozenset()
-    link_age_s: float = math.inf
-    heartbeat_age_s: float = math.inf
-    state_age_s: float = math.inf
-    position_age_s: float = math.inf
-    status_age_s: float = math.inf
-    round_trip_s: float = math.nan
-    packet_loss: float = 0.0
-    stream_gap_s: float = 0.0
-    gps_fix_type: int = 0
-    position_ok: bool = False
-    battery_fraction: float = math.nan
-    battery_voltage_v: float = math.nan
-    position: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
-    velocity: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
-    yaw: float = math.nan
-    height_m: float = math.nan
-    subject: np.ndarray | None = None
-    subject_age_s: float = math.inf
-    subject_contradicted: bool = False
-    subject_sd_m: float = math.inf
-    subject_distance_m: float = math.nan
-    closing_m_s: float = 0.0
-    approach_m_s: float = 0.0
-    approach_sd_m_s: float = 0.0
-    intruder: Condition | None = None
-    disturbance: Condition | None = None
-    followed: bool = True
-    loss_settings: LossSettings | None = None
-    camera_problem: Condition | None = None
-    calibrated: bool = True
-    away_m: float = 0.0
-    away_s: float = 0.0
-    framing_margin: float = math.inf
-
-    @property
-    def jumped(self) -> bool:
-        """Whether the reported position has jumped: what was latched in it names another place now."""
-        return self.disturbance is not None and self.disturbance.code == ConditionCode.POSITION_JUMPED
 
 
 class Limits(NamedTuple):

@@ -17,8 +17,9 @@ from drocap_ros.flight.conditions import Condition, ConditionCode
 from drocap_ros.flight.mavlink.link import MavlinkLink
 from drocap_ros.flight.mavlink.settings import AutopilotSettings
 from drocap_ros.flight.mavlink.transport import Transport
+from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.motion_checks import start_condition, vehicle_condition
-from drocap_ros.flight.orbit.observer import observe
+from drocap_ros.flight.orbit.observer import observe_vehicle
 from drocap_ros.flight.orbit.states import Limits
 from drocap_ros.flight.preflight.measured import Measured, Stream
 from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, VehicleState
@@ -134,8 +135,11 @@ class Listening:
 
     def _sample(self, now_ns: int) -> None:
         # As in flight, so that not everything hides behind "not armed".
-        seen = observe(self.link, self._config, self._vehicle, None, None, "", now_ns)
-        seen = dataclasses.replace(seen, armed=True, landed_state=LANDED_IN_AIR)
+        seen = Observed()
+        if self._vehicle is not None:
+            seen = observe_vehicle(self.link, self._config, self._vehicle, now_ns)
+        flying = dataclasses.replace(seen.health, armed=True, landed_state=LANDED_IN_AIR)
+        seen = dataclasses.replace(seen, health=flying)
         limits = Limits(self._config, self._config, max_control_timeout_s=self._config.max_control_timeout_s)
         failed = vehicle_condition(seen, limits) or start_condition(seen)
         self._samples += 1

@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.findings import Finding, Level
-from drocap_ros.flight.orbit.planner import goal_of
-from drocap_ros.flight.orbit.states import Observed
+from drocap_ros.flight.observed import Motion
+from drocap_ros.flight.orbit_goal import goal_of
 from drocap_ros.flight.subject.framing import Framing, View, orbit_margin
 from drocap_ros.flight.vehicle_state import VehicleState
 
@@ -161,8 +162,8 @@ def _picture(config: MavlinkBridgeConfig, setup: Setup, matrix: np.ndarray, vehi
     rows, aimed_deg = setup.image_size[1], -best_pitch_deg(config)
     framing = Framing(config)
     framing.matrix, framing.size = matrix, setup.image_size
-    if config.mount != "fixed":
-        framing.watch(vehicle, Observed(), 0.0)
+    if config.mount != "fixed" and vehicle is not None:
+        framing.watch(vehicle, Motion(), math.nan, 0.0)
     view = framing.view()
     pitch_deg = aimed_deg if view is None else math.degrees(view.pitch)
     fit = person_in_picture(config, matrix, -pitch_deg)
@@ -206,7 +207,7 @@ def _unaimed_camera(
     problems = []
     if orbit_margin(view, goal, config.body_height_m, _WIND_LEAN_M_S2) < 0:
         problems.append("a wind of 8 m/s would lean the person out of it: use a gimbal, or fly farther away")
-    walker_m = framing.least_radius(goal, _WALK_M_S, autopilot)
+    walker_m = framing.least_radius(goal, _WALK_M_S, autopilot_of(autopilot).gives_way_s)
     if walker_m > goal.radius_m:
         problems.append(
             f"about one who walks at {_WALK_M_S:g} m/s the orbit is flown at {walker_m:.1f} m, so that he stays in"

@@ -7,18 +7,17 @@ learned while the vehicle hovers.  On an orbit the nose turns through all direct
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import NamedTuple
 
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.orbit.planner import STANDING_M_S, OrbitGoal
-from drocap_ros.flight.orbit.states import Observed
+from drocap_ros.flight.observed import Motion
+from drocap_ros.flight.orbit_goal import OrbitGoal
+from drocap_ros.flight.subject.subject_filter import STANDING_M_S
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 
@@ -155,32 +154,35 @@ class Framing:
             return None
         return condition(ConditionCode.CAMERA_CHANGED, before_px=before[0, 0], now_px=self.matrix[0, 0])
 
-    def watch(self, vehicle: VehicleState | None, seen: Observed, dt: float) -> Observed:
-        """The observation with the margin now; learns the lean against wind, ``dt`` s after the last one."""
-        if vehicle is not None:
-            self._mount_pitch = _pitch(vehicle.gimbal_orientation_xyzw)
+    def watch(self, vehicle: VehicleState, motion: Motion, distance_m: float, dt: float) -> float:
+        """The margin now; infinite = unknown or no matter.  Learns the lean against wind, ``dt`` s after the last one.
+
+        distance_m : from the subject, horizontal; NaN = unknown
+        """
+        self._mount_pitch = _pitch(vehicle.gimbal_orientation_xyzw)
         view = self.view()
-        if view is None or view.level or vehicle is None or not np.isfinite(vehicle.orientation_xyzw).all():
-            return seen
+        if view is None or view.level or not np.isfinite(vehicle.orientation_xyzw).all():
+            return math.inf
         forward, left, up = matrix_from_quaternion(vehicle.orientation_xyzw).T
         if up[2] < _LEAST_UP:
-            return seen
+            return math.inf
         step_s = min(max(dt, 0.0), 0.2)
+        self._learn_lean(up, motion.velocity, step_s)
+        if not math.isfinite(distance_m + motion.height_m):
+            return math.inf
+        ahead, aside = np.arcsin(np.clip([-forward[2:], -left[2:]], -1.0, 1.0))
+        margin = framing_margin(view, max(distance_m, 0.5), motion.height_m, self._config.body_height_m, ahead, aside)
+        share = min(step_s / _STEADY_S, 1.0) if math.isfinite(self._margin) else 1.0
+        self._margin = (1 - share) * np.nan_to_num(self._margin) + share * float(margin[0])
+        return float(self._margin)
+
+    def _learn_lean(self, up: np.ndarray, velocity: np.ndarray, step_s: float) -> None:
         # Only a hover leans by the wind alone.
-        self._still_s = self._still_s + step_s if float(np.hypot(*seen.velocity[:2])) < _STILL_M_S else 0.0
+        self._still_s = self._still_s + step_s if float(np.hypot(*velocity[:2])) < _STILL_M_S else 0.0
         if self._still_s > _SETTLED_S:
             self._learned_s = min(self._learned_s + step_s, _LEARNING_S)
             share = step_s / max(self._learned_s, 1e-3)
             self._wind = self._wind + share * (_GRAVITY * up[:2] / up[2] - self._wind)
-        if not math.isfinite(seen.subject_distance_m + seen.height_m):
-            return seen
-        ahead, aside = np.arcsin(np.clip([-forward[2:], -left[2:]], -1.0, 1.0))
-        margin = framing_margin(
-            view, max(seen.subject_distance_m, 0.5), seen.height_m, self._config.body_height_m, ahead, aside
-        )
-        share = min(step_s / _STEADY_S, 1.0) if math.isfinite(self._margin) else 1.0
-        self._margin = (1 - share) * np.nan_to_num(self._margin) + share * float(margin[0])
-        return dataclasses.replace(seen, framing_margin=self._margin)
 
     def refusal(self, goal: OrbitGoal) -> Condition | None:
         """Why an orbit loses the person, with what would keep them; None = it does not, or nothing is known."""
@@ -201,17 +203,18 @@ class Framing:
             remedy=first + _remedy(view, goal, body, wind, config.max_distance_m),
         )  # fmt: skip
 
-    def least_radius(self, goal: OrbitGoal, subject_speed_m_s: float, autopilot: str) -> float:
+    def least_radius(self, goal: OrbitGoal, subject_speed_m_s: float, gives_way_s: float) -> float:
         """Radius (m) at which one who walks up to the vehicle stays in a fixed camera's picture; 0 = any, or he stands.
 
         At most ``max_distance_m``.
 
         subject_speed_m_s : horizontal
+        gives_way_s : of the autopilot
         """
         view, walking = self.view(), subject_speed_m_s - STANDING_M_S
         if view is None or view.level or walking <= 0.0:
             return 0.0
-        comes_m = autopilot_of(autopilot).gives_way_s * walking
+        comes_m = gives_way_s * walking
         radius = nearest_framed(view, goal.height_m, self._config.body_height_m) + comes_m
         return min(radius, self._config.max_distance_m)
 

@@ -1,12 +1,8 @@
-"""The last check of the distance: the subject by image size and bearing alone, independent of filter and planner.
+"""The subject by image size and bearing alone, independent of the filter, of the planner and of the ground.
 
 Neither the ground, nor the ratio of two ranges, nor the reference of the orbit enters.  An image that shows the subject
-where he cannot be, since the last image that was sure, refreshes nothing: the age of that one counts, and the vehicle
-slows down at once.
-
-No setpoint moves faster towards the subject than ``max_closing_m_s``, and than leaves room to stop before
-``min_distance_m`` if the body is smaller than assumed.  A subject who recedes may be followed as fast as his image
-surely shrinks, and little faster than his estimated place recedes: while it keeps its size, following does not close.
+where he cannot be, since the last image that was sure, refreshes nothing: the age of that one counts.  A subject who
+recedes may be followed as fast as his image surely shrinks, for as long as it does.
 """
 
 from __future__ import annotations
@@ -16,11 +12,8 @@ import math
 
 import numpy as np
 
-from drocap_ros.flight.autopilot import autopilot_of
-from drocap_ros.flight.orbit.pose_history import CameraPose
-from drocap_ros.flight.orbit.states import Observed
-from drocap_ros.flight.orbit_config import OrbitConfig
-from drocap_ros.flight.setpoint import Setpoint
+from drocap_ros.flight.observed import SizeSight
+from drocap_ros.flight.pose_history import CameraPose
 from drocap_ros.flight.subject.subject_measurement import locate_subject
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.observation import PoseObservation
@@ -35,33 +28,21 @@ _SURE = 0.5  # standard deviations of the speed at which he walks away that are 
 #: that swings or crouches shrinks too, for a second or two.
 _AWAY_FAR, _AWAY_NEAR = 0.14, 0.3
 _RESTART_S = 1.0
-_OVERSHOOT = 0.85  # of the greatest closing speed that a setpoint has: the vehicle overshoots
-_SURELY_M_S = 0.1  # so much faster than by the estimated place he may recede by his image, which shrinks as he bends
-#: m, and m/s that his receding must exceed at the second distance: an error of the size is an error of the speed in
-#: proportion to the distance, and from 12 m one who stands recedes at up to 0.4 m/s for a second.
-_NEAR_M, _FAR_M, _FAR_ERROR_M_S = 8.0, 12.0, 0.3
-_POSITION_GAIN = 1.0  # 1/s, the greatest of the autopilots' position loops
-_REACTION_S = 0.5
-#: Most that a setpoint adds to the present closing speed towards one who stands, where setpoints are continued: the
-#: vehicle overshoots a larger step.
-_STEP_M_S = 0.4
-#: Share of the speed at which such a vehicle follows a walker, by which it closes up more slowly: a stop is seen 0.4 s
-#: late.
-_STOPS = 0.3
+#: m, where the distance begins to count and where it counts whole: an error of the size is an error of the speed in
+#: proportion to the distance.
+_NEAR_M, _FAR_M = 8.0, 12.0
 
 
 class Guard:
-    """An estimate of the subject of its own, and the limits that follow from it.  It reads no clock."""
+    """An estimate of the subject of its own.  It reads no clock."""
 
-    def __init__(self, subject: SubjectConfig, orbit: OrbitConfig, braking_m_s2: float) -> None:
-        self._config = dataclasses.replace(subject, use_ground_plane=False)
-        self._size_error, self._orbit, self._braking = subject.size_error, orbit, braking_m_s2
+    def __init__(self, config: SubjectConfig) -> None:
+        self._config = dataclasses.replace(config, use_ground_plane=False)
+        self._size_error = config.size_error
         self._state: np.ndarray | None = None  # (4,) m, m/s ENU: the last sure place and the velocity there
         self._covariance = np.eye(4)
         self._stamp_ns, self._track_id, self._contradicted = 0, 0, False
-        self._last_keypoints: np.ndarray | None = None
         self._away = 0.0  # m/s, at which he has walked away for long enough
-        self._offset, self._now_ns = np.zeros(3), 0
 
     def see(
         self, observation: PoseObservation, camera_matrix: np.ndarray, camera: CameraPose | None, *, locked: bool
@@ -70,9 +51,7 @@ class Guard:
 
         locked : the vehicle flies, so neither another track nor a far place may become the sure one
         """
-        last, self._last_keypoints = self._last_keypoints, observation.keypoints
-        frozen = last is not None and np.array_equal(last, observation.keypoints, equal_nan=True)
-        known = camera is not None and not frozen and observation.has_subject
+        known = camera is not None and observation.has_subject
         found = locate_subject(observation, camera_matrix, camera, self._config) if known and camera else None
         other = observation.track_id != self._track_id
         sure = False
@@ -91,47 +70,30 @@ class Guard:
             self._contradicted = True
         return sure
 
-    def doubt(self, seen: Observed, offset: np.ndarray, now_ns: int) -> Observed:
-        """The observation, no surer of the subject than this estimate: its age, and the greatest distance of his size.
+    def sight(self, vehicle: np.ndarray, offset: np.ndarray, now_ns: int) -> SizeSight | None:
+        """The subject as the vehicle sees him now; None = no image had a size yet.
 
-        offset : (3,) m, from the frame of the camera's poses to that of the reported position
-        """
-        self._offset, self._now_ns = offset, now_ns
-        if seen.subject is None:
-            return seen
-        if self._state is None:  # too few joints for a size: without it nothing bounds the closing speed
-            return dataclasses.replace(seen, subject_age_s=math.inf)
-        distance, _, sd = self._sight(seen.position)
-        farthest = (1 + 2 * self._size_error) * distance + 2 * sd
-        return dataclasses.replace(
-            seen, subject_contradicted=seen.subject_contradicted or self._contradicted,
-            subject_age_s=max(seen.subject_age_s, (now_ns - self._stamp_ns) / _NS),
-            subject_distance_m=min(seen.subject_distance_m, farthest),
-        )  # fmt: skip
-
-    def limit(self, setpoint: Setpoint, seen: Observed, receding_m_s: float = math.inf) -> Setpoint:
-        """The setpoint that may be sent in the step of the last :meth:`doubt`.
-
-        receding_m_s : speed at which the subject walks away by another estimate
+        Parameters
+        ----------
+        vehicle : (3,) m, in the frame of the reported position
+        offset : (3,) m, from the frame of the camera's poses to that one
         """
         if self._state is None:
-            return setpoint
-        distance, inward, _ = self._sight(seen.position)
-        nearest = (1 - 2 * self._size_error) * distance
-        room = math.sqrt(2 * self._braking * max(nearest - self._orbit.min_distance_m, 0.0))
-        receding = min(self._receding(inward, self._now()), self._away)
-        receding = min(receding, max(receding_m_s, 0.0) + _SURELY_M_S)
-        receding = min(receding, max(receding - _farness(distance) * _FAR_ERROR_M_S, 0.0))
-        closing_up = _OVERSHOOT * self._orbit.max_closing_m_s
-        allowed = min(max(closing_up + receding, 0.0), room)
-        if autopilot_of(seen.autopilot).continues_setpoints:
-            closing = float(seen.velocity[:2] @ inward)
-            allowed -= _STOPS * min(max(receding, 0.0), closing_up)
-            # Its path, limited in jerk, overshoots a reversal: from 1.8 m/s away it closed up at 1.3 m/s without this.
-            allowed += min(closing, 0.0)
-            allowed = max(min(allowed, max(closing, 0.0) + _STEP_M_S + receding), 0.0)
-        return _bounded(
-            setpoint, seen.position, seen.velocity, inward, distance, allowed, self._orbit.max_acceleration_m_s2
+            return None
+        age_s = (now_ns - self._stamp_ns) / _NS
+        state, covariance = self._predicted(min(max(age_s, 0.0), 0.5))
+        sight = state[:2] + offset[:2] - vehicle[:2]
+        distance = max(float(np.hypot(*sight)), 1e-3)
+        toward = sight / distance
+        sd = math.sqrt(max(float(toward @ covariance[:2, :2] @ toward), 0.0))
+        return SizeSight(
+            distance_m=distance,
+            toward=toward,
+            nearest_m=(1 - 2 * self._size_error) * distance,
+            farthest_m=(1 + 2 * self._size_error) * distance + 2 * sd,
+            receding_m_s=min(self._receding(toward, (state, covariance)), self._away),
+            age_s=age_s,
+            contradicted=self._contradicted,
         )
 
     def _start(self, place: np.ndarray, observation: PoseObservation) -> None:
@@ -167,7 +129,7 @@ class Guard:
         sight = self._state[:2] - camera
         distance = float(np.hypot(*sight))
         receding = self._receding(sight / max(distance, 1e-3), (self._state, self._covariance))
-        growth = _AWAY_NEAR + _farness(distance) * (_AWAY_FAR - _AWAY_NEAR)
+        growth = _AWAY_NEAR + farness(distance) * (_AWAY_FAR - _AWAY_NEAR)
         receding_s = math.sqrt(self._away / growth) + min(gap_s, 0.5)
         self._away = max(min(receding, growth * receding_s**2), 0.0)
 
@@ -179,14 +141,6 @@ class Guard:
         noise = _ACCELERATION**2 / max(dt, 1e-3) * push @ push.T
         return move @ self._state, move @ self._covariance @ move.T + noise
 
-    def _sight(self, vehicle: np.ndarray) -> tuple[float, np.ndarray, float]:
-        """Distance (m), direction (2,) to the subject, standard deviation of the distance without that of the body."""
-        state, covariance = self._now()
-        sight = state[:2] + self._offset[:2] - vehicle[:2]
-        distance = max(float(np.hypot(*sight)), 1e-3)
-        inward = sight / distance
-        return distance, inward, math.sqrt(max(float(inward @ covariance[:2, :2] @ inward), 0.0))
-
     def _receding(self, inward: np.ndarray, estimate: tuple[np.ndarray, np.ndarray]) -> float:
         """Speed (m/s) at which the subject walks away by his image, negative towards the vehicle; 0 = not sure."""
         state, covariance = estimate
@@ -194,36 +148,7 @@ class Guard:
         sd = math.sqrt(max(float(inward @ covariance[2:, 2:] @ inward), 0.0))
         return math.copysign(max(abs(speed) - _SURE * sd, 0.0), speed)
 
-    def _now(self) -> tuple[np.ndarray, np.ndarray]:
-        return self._predicted(min(max((self._now_ns - self._stamp_ns) / _NS, 0.0), 0.5))
 
-
-def _farness(distance_m: float) -> float:
+def farness(distance_m: float) -> float:
+    """How much of a far subject's errors counts, 0 to 1: his receding is less sure."""
     return min(max((distance_m - _NEAR_M) / (_FAR_M - _NEAR_M), 0.0), 1.0)
-
-
-def _bounded(
-    setpoint: Setpoint, position: np.ndarray, velocity: np.ndarray, toward: np.ndarray, distance: float,
-    allowed_m_s: float, max_acceleration_m_s2: float,
-) -> Setpoint:  # fmt: skip
-    """The setpoint with no more speed towards the subject than allowed.
-
-    The autopilot flies the setpoint's velocity and a share of the way to its position; their sum is bounded, at the
-    cost of the position first.  Acceleration towards the subject turns the vehicle on its circle, and beyond that
-    brings the present closing speed to the allowed one.
-    """
-    inward = np.append(toward, 0.0)
-    ahead, speed = float((setpoint.position - position) @ inward), float(setpoint.velocity @ inward)
-    excess = speed + _POSITION_GAIN * ahead - allowed_m_s
-    place, flown = setpoint.position, setpoint.velocity
-    if excess > 0:
-        back = min(excess / _POSITION_GAIN, max(ahead, 0.0))
-        place = place - back * inward
-        flown = flown - min(excess - _POSITION_GAIN * back, max(speed, 0.0)) * inward
-    closing = float(velocity @ inward)
-    turning = max(float(velocity[:2] @ velocity[:2]) - closing**2, 0.0) / max(distance, 0.5)
-    most = max(turning + (allowed_m_s - closing) / _REACTION_S, -max_acceleration_m_s2)
-    acceleration = setpoint.acceleration - max(float(setpoint.acceleration @ inward) - most, 0.0) * inward
-    size = float(np.linalg.norm(acceleration))
-    acceleration = acceleration * min(1.0, max_acceleration_m_s2 / max(size, 1e-6))
-    return setpoint._replace(position=place, velocity=flown, acceleration=acceleration)

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drocap_ros.flight.orbit.pose_history import CameraPose
+from drocap_ros.flight.pose_history import CameraPose
 from drocap_ros.flight.subject.subject_measurement import SubjectMeasurement, locate_subject
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.observation import PoseObservation
 
+STANDING_M_S, WALKING_M_S = 0.3, 0.5  # speed that the estimate of one who stands has; speed of one who walks
 _NS = 1_000_000_000
 _DRIFT = 0.05  # m/sqrt(s), of the vehicle's position and of the feet that are set down; no motion of the subject
 _RATIO_MEMORY_NS, _LEAST_RATIOS, _RATIO_QUANTILE = 4 * _NS, 15, 0.4  # of size over ground
@@ -65,8 +66,7 @@ def _range_noise(
 class SubjectFilter:
     """Kalman filter of position and velocity, white acceleration; measurements must come in the order of stamps.
 
-    It reads no clock.  A frozen image (the same keypoints bit for bit) and a measurement outside the gate do not
-    refresh the estimate.
+    It reads no clock.  A measurement outside the gate does not refresh the estimate.
     """
 
     def __init__(self, config: SubjectConfig) -> None:
@@ -79,7 +79,6 @@ class SubjectFilter:
         self._stamp_ns = 0
         self._track_id = 0
         self._contradicted = False
-        self._last_keypoints: np.ndarray | None = None
         self._ratio, self._ratios = float("nan"), deque[tuple[int, float]]()
         self._nearer = 0.0
 
@@ -95,11 +94,7 @@ class SubjectFilter:
 
         locked : the vehicle flies by this estimate, so neither another track nor a far measurement may restart it
         """
-        frozen = self._last_keypoints is not None and np.array_equal(
-            self._last_keypoints, observation.keypoints, equal_nan=True
-        )
-        self._last_keypoints = observation.keypoints
-        if camera is None or frozen or not observation.has_subject:
+        if camera is None or not observation.has_subject:
             return False
         measurement = locate_subject(observation, camera_matrix, camera, self._config, self._ratio)
         if measurement is None:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.orbit.pose_history import CameraPose
+from drocap_ros.flight.pose_history import CameraPose
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.joint_maps import joint_map
 from drocap_ros.observation import PoseObservation

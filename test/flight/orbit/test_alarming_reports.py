@@ -1,11 +1,10 @@
 """What the autopilot reports of itself: an emergency, a critical state, a position that jumps or creeps by steps."""
 
-import dataclasses
 import math
 
 import numpy as np
 import pytest
-from orbit_observations import GOOD, LIMITS, orbiting
+from orbit_observations import GOOD, LIMITS, changed, orbiting
 
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.mavlink.link_status import LinkStatus
@@ -20,7 +19,7 @@ S = 1_000_000_000
 
 def test_every_state_of_emergency_holds_and_forbids_a_start():
     for status in (6, 7, 8):
-        seen = dataclasses.replace(GOOD, system_status=status)
+        seen = changed(GOOD, system_status=status)
         state, decision = reduce(orbiting(), seen, 1.0, None, LIMITS)
         assert (state.state, state.condition.code) == (State.HOLDING, ConditionCode.AUTOPILOT_EMERGENCY)
         assert decision.action == Action.HOLD
@@ -29,18 +28,18 @@ def test_every_state_of_emergency_holds_and_forbids_a_start():
 
 
 def test_a_critical_state_forbids_a_start_and_ends_no_orbit():
-    seen = dataclasses.replace(GOOD, system_status=CRITICAL)
+    seen = changed(GOOD, system_status=CRITICAL)
     state, decision = reduce(orbiting(), seen, 1.0, None, LIMITS)
     assert (state.state, decision.action) == (State.ORBITING, Action.ORBIT)
     for command in (Command.START, Command.ENGAGE):
         state, decision = reduce(SafetyState(), seen, 1.0, command, LIMITS)
         assert (state.state, decision.answer.accepted) == (State.IDLE, False)
         assert decision.answer.condition.code == ConditionCode.AUTOPILOT_CRITICAL
-    assert reduce(SafetyState(), dataclasses.replace(seen, system_status=4), 1.0, None, LIMITS)[0].state == State.READY
+    assert reduce(SafetyState(), changed(seen, system_status=4), 1.0, None, LIMITS)[0].state == State.READY
 
 
 def test_several_vehicles_forbid_a_start_and_end_no_orbit():
-    seen = dataclasses.replace(GOOD, vehicles=frozenset({1, 42}))
+    seen = changed(GOOD, vehicles=frozenset({1, 42}))
     assert reduce(orbiting(), seen, 1.0, None, LIMITS)[0].state == State.ORBITING
     answer = reduce(SafetyState(), seen, 1.0, Command.START, LIMITS)[1].answer
     assert (answer.accepted, answer.condition.code) == (False, ConditionCode.SEVERAL_VEHICLES)

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from orbit_observations import BRAKE, GOOD, LIMITS, LOITER, orbiting
+from orbit_observations import BRAKE, GOOD, LIMITS, LOITER, changed, orbiting
 
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.degradation import allowed_pace, next_pace, slowed
@@ -28,7 +28,7 @@ NOT_HARMLESS = {
 
 
 def seen(**values):
-    return dataclasses.replace(GOOD, **values)
+    return changed(GOOD, **values)
 
 
 def fly(state, observed, seconds, start_s, limits=LIMITS, command=None):
@@ -53,7 +53,7 @@ def test_pace_falls_with_every_age_from_one_to_zero(name):
 def test_pace_ends_sooner_at_speed():
     fast = seen(subject_age_s=0.3, velocity=np.array([0.0, 3.4, 0.0]))
     assert allowed_pace(fast, LIMITS).pace == 0.0
-    assert 0.2 < allowed_pace(dataclasses.replace(fast, velocity=np.zeros(3)), LIMITS).pace < 0.5
+    assert 0.2 < allowed_pace(changed(fast, velocity=np.zeros(3)), LIMITS).pace < 0.5
 
 
 def test_usual_age_is_flown_at_full_speed_and_setpoints_stand_before_a_third_of_a_second():
@@ -112,11 +112,11 @@ def test_standing_setpoint_stays_where_the_vehicle_was_and_leaves_along_the_way(
 
 def test_hold_after_a_stand_keeps_the_standing_place():
     state, _ = fly(orbiting(), seen(subject_age_s=0.35), 0.2, 1.0)
-    moved = seen(subject_age_s=1.1, position=GOOD.position + 0.5)
+    moved = seen(subject_age_s=1.1, position=GOOD.vehicle.position + 0.5)
     late, _ = reduce(state, moved, 1.2, None, LIMITS)
-    assert np.array_equal(late.hold_position, GOOD.position)
+    assert np.array_equal(late.hold_position, GOOD.vehicle.position)
     stopped, _ = reduce(state, moved, 1.2, Command.STOP, LIMITS)
-    assert np.array_equal(stopped.hold_position, moved.position)
+    assert np.array_equal(stopped.hold_position, moved.vehicle.position)
 
 
 @pytest.mark.parametrize("name", OLD)

@@ -6,11 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from orbit_observations import GOOD, LIMITS, orbiting
+from orbit_observations import GOOD, LIMITS, changed, orbiting
 
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.orbit.following import Following, Keeping
-from drocap_ros.flight.orbit.planner import begin_orbit
+from drocap_ros.flight.orbit.following import Echoes, Following, Keeping
 from drocap_ros.flight.orbit.safety import reduce
 from drocap_ros.flight.orbit.states import Action, State
 from drocap_ros.flight.vehicle_state import VehicleState
@@ -46,7 +45,7 @@ def fly(
             echoed = (t, echo)
         judged = None if echoed is None else (t - echoed[0], echoed[1])
         seen = vehicle(autopilot, flown(t), x - commanded / 20 if place is None else place(t))
-        if evidence := following.step(t, t, sent, judged, seen, trip_s):
+        if evidence := following.step(t, t, Echoes(sent, judged, trip_s), seen):
             return t, evidence
         sent = [*sent[-79:], (t, setpoint(x, commanded))]
     return math.inf, ""
@@ -130,20 +129,24 @@ def test_each_orbit_is_judged_anew():
     following = Following(MAX_ECHO_AGE_S)
     sent = [(0.05 * i, setpoint(0.1 * i, 2.0)) for i in range(60)]
     slow = vehicle("ardupilot", 0.0)
-    assert following.step(3.0, 3.0, sent, (0.1, setpoint(6.0, 2.0)), slow) == ""
-    assert following.step(3.5, 0.0, sent, (0.1, setpoint(0.0, 0.0)), slow) == ""
-    assert following.step(9.0, 0.2, sent, (0.1, setpoint(0.0, 0.0)), slow) == ""
-    assert following.step(9.1, 0.3, sent, None, dataclasses.replace(slow, velocity_enu_m_s=np.full(3, np.nan))) == ""
+    assert following.step(3.0, 3.0, Echoes(sent, (0.1, setpoint(6.0, 2.0))), slow) == ""
+    assert following.step(3.5, 0.0, Echoes(sent, (0.1, setpoint(0.0, 0.0))), slow) == ""
+    assert following.step(9.0, 0.2, Echoes(sent, (0.1, setpoint(0.0, 0.0))), slow) == ""
+    assert (
+        following.step(9.1, 0.3, Echoes(sent, None), dataclasses.replace(slow, velocity_enu_m_s=np.full(3, np.nan)))
+        == ""
+    )
 
 
 def test_vehicle_that_does_not_reach_its_place_on_the_orbit_slows_down_and_then_holds():
     keeping, state, codes = Keeping(LIMITS.orbit), orbiting(), []
-    place = begin_orbit(GOOD.position, GOOD.velocity, GOOD.subject, LIMITS.orbit)
+    place = GOOD.vehicle.position
     for i in range(500):
         t = 1.0 + 0.05 * i
         blown_m = 2.5 if t >= 4.0 else 1.9  # 1.95 m is the limit
-        blown = dataclasses.replace(GOOD, position=GOOD.position + np.array([0.0, blown_m, 0.0]))
-        state, _ = reduce(state, keeping.watch(place, blown, t), t, None, LIMITS)
+        blown = changed(GOOD, position=GOOD.vehicle.position + np.array([0.0, blown_m, 0.0]))
+        away_m, away_s = keeping.watch(place, blown.vehicle.position, t)
+        state, _ = reduce(state, changed(blown, away_m=away_m, away_s=away_s), t, None, LIMITS)
         codes.append((round(t, 2), state.condition.values.get("cause", state.condition).code, state.state))
         # "take over by hand" is no word for a vehicle that is on its way back.
         away = codes[-1][1] == ConditionCode.ORBIT_NOT_KEPT
@@ -152,15 +155,11 @@ def test_vehicle_that_does_not_reach_its_place_on_the_orbit_slows_down_and_then_
     assert 5.0 <= kept[0][0] <= 5.1
     assert kept[0][1] == State.ORBITING
     assert 23.9 <= next(t for t, now in kept if now == State.HOLDING) <= 24.0
-    carried_off = dataclasses.replace(blown, away_m=6.0, away_s=1.1)
+    carried_off = changed(blown, away_m=6.0, away_s=1.1)
     assert reduce(orbiting(), carried_off, 1.0, None, LIMITS)[0].condition.code == ConditionCode.ORBIT_NOT_KEPT
-    assert (
-        reduce(orbiting(), dataclasses.replace(blown, away_m=5.7, away_s=1.1), 1.0, None, LIMITS)[1].action
-        == Action.ORBIT
-    )
-    back = keeping.watch(place, GOOD, 12.0)
-    assert (back.away_m, back.away_s) == (0.0, 0.0)
-    assert keeping.watch(None, blown, 12.1).away_s == 0.0
+    assert reduce(orbiting(), changed(blown, away_m=5.7, away_s=1.1), 1.0, None, LIMITS)[1].action == Action.ORBIT
+    assert keeping.watch(place, place, 12.0) == (0.0, 0.0)
+    assert keeping.watch(None, blown.vehicle.position, 12.1)[1] == 0.0
 
 
 def test_no_recorded_flight_of_a_real_autopilot_counts_as_standing(shared):
@@ -178,6 +177,6 @@ def test_no_recorded_flight_of_a_real_autopilot_counts_as_standing(shared):
             )
             state = dataclasses.replace(vehicle("px4", 0.0), velocity_enu_m_s=flown, position_enu_m=place)
             command = SimpleNamespace(x=float(north), y=float(east), vx=float(vn), vy=float(ve))
-            assert following.step(at, at + 1.0, [(at, command)], None, state) == "", path.name
+            assert following.step(at, at + 1.0, Echoes([(at, command)]), state) == "", path.name
             judged += 1
     assert judged > 3000

@@ -1,15 +1,12 @@
 """The guard: what the images alone allow, whatever filter and planner want."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from flown_copter import ALL, Flight
-from orbit_observations import GOOD, LIMITS
+from orbit_observations import GOOD, LIMITS, changed
 
-from drocap_ros.flight.orbit.degradation import allowed_pace
-from drocap_ros.flight.orbit.pose_history import CameraPose
-from drocap_ros.flight.orbit_config import OrbitConfig
+from drocap_ros.flight.orbit.closing import limit_closing
+from drocap_ros.flight.pose_history import CameraPose
 from drocap_ros.flight.setpoint import Setpoint
 from drocap_ros.flight.subject.guard import Guard
 from drocap_ros.flight.subject_config import SubjectConfig
@@ -38,7 +35,7 @@ def image(t_s, person=(0.0, 0.0), camera=AT, track_id=1, shift_px=0.0):
 
 def flown(person, camera, seconds=3.0):
     """A guard that has seen both move: functions of time, m."""
-    guard = Guard(SubjectConfig(), OrbitConfig(), 1.3)
+    guard = Guard(SubjectConfig())
     for i in range(int(seconds * 15)):
         t = i / 15
         place = np.array([6.0 + camera(t), 0.0, 1.2])
@@ -47,10 +44,13 @@ def flown(person, camera, seconds=3.0):
     return guard, place, limit
 
 
-def limited(guard, setpoint, place, velocity, now_ns, autopilot="px4"):
-    seen = dataclasses.replace(GOOD, position=place, velocity=velocity, autopilot=autopilot)
-    guard.doubt(seen, np.zeros(3), now_ns)
-    return guard.limit(setpoint, seen)
+def limited(guard, setpoint, place, velocity, now_ns, autopilot="px4", receding_m_s=np.inf):
+    """The setpoint that is left; by the other estimate the subject recedes as fast as one likes."""
+    sight = guard.sight(place, np.zeros(3), now_ns)
+    seen = changed(
+        GOOD, position=place, velocity=velocity, autopilot=autopilot, by_size=sight, approach_m_s=-receding_m_s
+    )
+    return limit_closing(setpoint, seen, LIMITS)
 
 
 def asked(guard, place, now_ns, inward, own=0.0, autopilot="px4"):
@@ -89,11 +89,10 @@ def test_following_is_no_closing_while_the_image_keeps_its_size():
 
 def test_a_person_who_stays_in_place_is_not_followed_however_his_image_shrinks():
     guard, place, now = flown(lambda t: -1.4 * t, lambda t: -1.4 * t)
-    seen = dataclasses.replace(GOOD, position=place, velocity=np.zeros(3), autopilot="px4")
-    guard.doubt(seen, np.zeros(3), now)
     setpoint = STILL._replace(position=place, velocity=np.array([-2.2, 0.0, 0.0]))
-    assert -guard.limit(setpoint, seen, 0.0).velocity[0] == pytest.approx(0.85 + 0.1)
-    assert -guard.limit(setpoint, seen, 1.4).velocity[0] > 1.7
+    stays, walks = (limited(guard, setpoint, place, np.zeros(3), now, receding_m_s=speed) for speed in (0.0, 1.4))
+    assert -stays.velocity[0] < 1.0
+    assert -walks.velocity[0] > 1.7
 
 
 def test_a_person_far_away_is_followed_only_where_he_surely_walks():
@@ -108,20 +107,17 @@ def test_a_person_far_away_is_followed_only_where_he_surely_walks():
 def test_no_speed_towards_a_person_whose_image_is_large():
     guard, place, now = flown(lambda t: 2.9, lambda t: 0.0)  # 3.1 m; 2.6 m if he is 1.43 m tall
     assert asked(guard, place, now, 1.0)[0] < 0.35
-    seen = dataclasses.replace(GOOD, position=place, subject_distance_m=8.0, subject_age_s=0.0)
-    doubted = guard.doubt(seen, np.zeros(3), now)
-    assert 3.1 < doubted.subject_distance_m < 5.0
+    assert 3.1 < guard.sight(place, np.zeros(3), now).farthest_m < 5.0
 
 
 @pytest.mark.parametrize(
     ("spoil", "contradicts"),
     [
-        (lambda last, t: dataclasses.replace(last, stamp_ns=round(t * S) + S), False),
         (lambda last, t: PoseObservation(round(t * S) + S, 0, SIZE), False),
         (lambda last, t: image(t, track_id=2), True),
         (lambda last, t: image(t, shift_px=400.0), True),
     ],
-    ids=["frozen", "nobody", "another", "jumped"],
+    ids=["nobody", "another", "jumped"],
 )
 def test_without_a_sure_image_the_last_sure_one_grows_old(spoil, contradicts):
     guard, place, _ = flown(lambda t: 0.0, lambda t: 0.0)
@@ -130,14 +126,11 @@ def test_without_a_sure_image_the_last_sure_one_grows_old(spoil, contradicts):
     for step in range(1, 9):
         t = 3.0 + step / 15
         assert not guard.see(spoil(last, t), MATRIX, CameraPose(LEVEL, place), locked=True)
-    seen = dataclasses.replace(GOOD, position=place, subject_age_s=0.0)
-    doubted = guard.doubt(seen, np.zeros(3), round(3.55 * S) + S)
-    assert doubted.subject_age_s == pytest.approx(0.55)
-    assert doubted.subject_contradicted == contradicts
-    if contradicts:
-        assert allowed_pace(doubted, LIMITS).pace < 0.5
+    sight = guard.sight(place, np.zeros(3), round(3.55 * S) + S)
+    assert sight.age_s == pytest.approx(0.55)
+    assert sight.contradicted == contradicts
     assert guard.see(image(3.6), MATRIX, CameraPose(LEVEL, place), locked=True)
-    assert not guard.doubt(seen, np.zeros(3), round(3.65 * S) + S).subject_contradicted
+    assert not guard.sight(place, np.zeros(3), round(3.65 * S) + S).contradicted
 
 
 def test_a_body_that_shrinks_for_a_moment_may_not_be_followed():
@@ -162,7 +155,7 @@ def test_ardupilot_that_recedes_is_not_told_to_close_up_at_once():
 @pytest.mark.parametrize("receding", [0.0, 0.5, 1.0, 1.8])
 def test_ardupilot_that_recedes_and_is_told_to_come_near_stays_below_the_closing_speed(receding, wind):
     """It flies away from one who stands; then every setpoint asks for 2 m/s towards him, from 1 m ahead."""
-    flight, guard = Flight(wind=wind), Guard(SubjectConfig(), OrbitConfig(), 1.3)
+    flight, guard = Flight(wind=wind), Guard(SubjectConfig())
     body = flight.copter.body
     body.position[0], body.velocity[0] = 9.0 - 4.0 * receding, receding
     first, ahead = body.position.copy(), np.array([-1.0, 0.0, 0.0])
@@ -212,7 +205,5 @@ def test_ardupilot_never_closes_up_faster_than_the_general_bound(person, own):
 
 
 def test_nothing_is_flown_about_a_person_whose_size_was_never_seen():
-    guard, place = Guard(SubjectConfig(), OrbitConfig(), 1.3), np.array([6.0, 0.0, 1.2])
-    seen = dataclasses.replace(GOOD, position=place)
-    assert allowed_pace(seen, LIMITS)[0] == 1.0
-    assert guard.doubt(seen, np.zeros(3), S).subject_age_s == np.inf
+    guard, place = Guard(SubjectConfig()), np.array([6.0, 0.0, 1.2])
+    assert guard.sight(place, np.zeros(3), S) is None

@@ -5,14 +5,16 @@ import math
 
 import numpy as np
 import pytest
+from orbit_observations import changed
 
 from drocap_ros.flight.autopilot.autopilot import LossSettings
 from drocap_ros.flight.autopilot.px4 import PX4
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.last_setpoint import coast_speed, harmless, slowed_condition
-from drocap_ros.flight.orbit.planner import OrbitGoal
-from drocap_ros.flight.orbit.states import Limits, Observed
+from drocap_ros.flight.orbit.states import Limits
 from drocap_ros.flight.orbit_config import OrbitConfig
+from drocap_ros.flight.orbit_goal import OrbitGoal
 from drocap_ros.flight.safety_config import SafetyConfig
 from drocap_ros.flight.setpoint import Setpoint
 
@@ -21,28 +23,28 @@ ZERO, CENTRE = np.zeros(3), np.zeros(2)
 
 
 def seen(position=(6.0, 0.0, 2.5), velocity=(0.0, 2.0, 0.0), subject=(0.0, 0.0, 1.0), timeout_s=0.5, by="ardupilot"):
-    return Observed(
-        autopilot=by, position=np.array(position), velocity=np.array(velocity), yaw=math.pi,
+    return changed(
+        Observed(), autopilot=by, position=np.array(position), velocity=np.array(velocity), yaw=math.pi,
         subject=np.array(subject), loss_settings=LossSettings("GUID_TIMEOUT", timeout_s, "", math.nan),
     )  # fmt: skip
 
 
-def sent_of(*values):
+def sent_of(setpoint, now, subject_velocity, fence_centre, limits):
     """What is sent, or why nothing may be."""
-    setpoint, problem = harmless(*values)
+    setpoint, problem = harmless(setpoint, changed(now, subject_velocity=subject_velocity), fence_centre, limits)
     return setpoint if problem is None else problem
 
 
 def flight(now, velocity=None, acceleration=(-0.66, 0.0, 0.0)):
-    wanted = now.velocity if velocity is None else np.array(velocity)
-    return Setpoint(now.position.copy(), wanted, np.array(acceleration), math.pi, 0.3)
+    wanted = now.vehicle.velocity if velocity is None else np.array(velocity)
+    return Setpoint(now.vehicle.position.copy(), wanted, np.array(acceleration), math.pi, 0.3)
 
 
 def test_setpoint_of_a_calm_orbit_is_sent_whole():
     now = seen()
     sent = sent_of(flight(now), now, ZERO, CENTRE, LIMITS)
     assert isinstance(sent, Setpoint)
-    assert np.allclose(sent.velocity, now.velocity)
+    assert np.allclose(sent.velocity, now.vehicle.velocity)
     assert np.allclose(sent.acceleration, [-0.66, 0.0, 0.0])
 
 
@@ -56,26 +58,26 @@ def test_setpoint_of_a_long_coast_is_slowed_down():
 def test_px4_falls_behind_along_the_orbit_before_it_yields_the_radius():
     """A walker ahead of it was chased from far behind: after kills it moved by 3.7 m."""
     now = seen(velocity=(-0.9, 0.9, 0.0), by="px4")
-    wanted = flight(now, acceleration=ZERO)._replace(position=now.position + np.array([-0.3, 1.4, 0.0]))
+    wanted = flight(now, acceleration=ZERO)._replace(position=now.vehicle.position + np.array([-0.3, 1.4, 0.0]))
     sent = sent_of(wanted, now, np.array([-0.9, 0.0, 0.0]), CENTRE, LIMITS)
     assert isinstance(sent, Setpoint)
-    assert (sent.position - now.position)[0] == pytest.approx(-0.3)
+    assert (sent.position - now.vehicle.position)[0] == pytest.approx(-0.3)
     assert sent.velocity[0] == pytest.approx(-0.9)
-    assert (sent.position - now.position)[1] < 1.2
-    coast = PX4.coast_of(sent, now.position, now.velocity, 0.5)
+    assert (sent.position - now.vehicle.position)[1] < 1.2
+    coast = PX4.coast_of(sent, now.vehicle.position, now.vehicle.velocity, 0.5)
     assert coast.length_m <= 0.82 * LIMITS.safety.max_coast_m
 
 
 def test_px4_is_not_pulled_to_a_far_place_faster_than_it_may_fly():
     now = seen(velocity=(0.0, 0.9, 0.0), by="px4")
     for way, walking in ((1.4, 0.0), (1.4, 1.4), (0.2, 0.0)):
-        wanted = flight(now, acceleration=ZERO)._replace(position=now.position + np.array([0.0, way, 0.0]))
+        wanted = flight(now, acceleration=ZERO)._replace(position=now.vehicle.position + np.array([0.0, way, 0.0]))
         sent = sent_of(wanted, now, np.array([0.0, walking, 0.0]), CENTRE, LIMITS)
         assert isinstance(sent, Setpoint)
-        commanded = sent.velocity[1] + PX4.position_gain_per_s * (sent.position - now.position)[1]
+        commanded = sent.velocity[1] + PX4.position_gain_per_s * (sent.position - now.vehicle.position)[1]
         assert commanded <= coast_speed(now, LIMITS) + 0.3 + 0.25 * walking
         assert sent.velocity[1] == pytest.approx(0.9)
-    assert sent.position[1] == pytest.approx(now.position[1] + 0.2)
+    assert sent.position[1] == pytest.approx(now.vehicle.position[1] + 0.2)
 
 
 def test_px4_creeps_on_after_its_stop_so_it_comes_nearer_more_slowly():
@@ -83,7 +85,7 @@ def test_px4_creeps_on_after_its_stop_so_it_comes_nearer_more_slowly():
     wanted = flight(now, velocity=(-0.6, 0.0, 0.0), acceleration=ZERO)
     sent = sent_of(wanted, now, ZERO, CENTRE, LIMITS)
     assert isinstance(sent, Setpoint)
-    coast = PX4.coast_of(sent, now.position, now.velocity, 0.5)
+    coast = PX4.coast_of(sent, now.vehicle.position, now.vehicle.velocity, 0.5)
     assert coast.creep_towards(0j) > 0.4
     assert float(coast.place[0].real - coast.place[-1].real) + coast.creep_towards(0j) <= 0.9
     assert -0.5 < sent.velocity[0] < 0.0
@@ -97,11 +99,14 @@ def test_px4_that_lacks_more_of_its_distance_retreats_no_more_slowly():
     now = seen(position=(4.6, 0.0, 2.5), velocity=(1.1, 0.0, 0.0), by="px4")
     comes, ways = np.array([1.4, 0.0, 0.0]), []
     for way in (0.6, 1.0, 1.5):
-        wanted = flight(now, comes, (0.5, 0.0, 0.0))._replace(position=now.position + np.array([way, 0.0, 0.0]))
+        wanted = flight(now, comes, (0.5, 0.0, 0.0))._replace(position=now.vehicle.position + np.array([way, 0.0, 0.0]))
         sent = sent_of(wanted, now, comes, CENTRE, LIMITS)
         assert isinstance(sent, Setpoint)
-        assert PX4.coast_of(sent, now.position, now.velocity, 0.5).length_m <= 0.82 * LIMITS.safety.max_coast_m
-        ways.append((sent.position - now.position)[0])
+        assert (
+            PX4.coast_of(sent, now.vehicle.position, now.vehicle.velocity, 0.5).length_m
+            <= 0.82 * LIMITS.safety.max_coast_m
+        )
+        ways.append((sent.position - now.vehicle.position)[0])
     assert min(ways) > 0.5
     assert np.all(np.diff(ways) > -0.05)
 
@@ -138,12 +143,12 @@ def test_the_coast_stays_inside_the_fence():
     slowed = sent_of(flight(now), now, ZERO, CENTRE, limits)
     assert isinstance(slowed, Setpoint)
     assert slowed.velocity[0] < 0.9
-    late = dataclasses.replace(now, position=np.array([9.3, 0.0, 2.5]))
+    late = changed(now, position=np.array([9.3, 0.0, 2.5]))
     sent = sent_of(flight(late), late, ZERO, CENTRE, limits)
     assert isinstance(sent, Condition)
     assert sent.code == ConditionCode.AT_FENCE
     assert "from where the orbit began" in str(sent)
-    slow = dataclasses.replace(now, velocity=np.array([0.8, 0.0, 0.0]))
+    slow = changed(now, velocity=np.array([0.8, 0.0, 0.0]))
     sent = sent_of(flight(slow), slow, ZERO, CENTRE, limits)
     assert isinstance(sent, Setpoint)
 

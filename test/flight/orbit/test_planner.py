@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.orbit.planner import advance, begin_orbit, goal_of, least_radius, reference_position, setpoint_of
+from drocap_ros.flight.orbit.planner import Scene, advance, begin_orbit, least_radius, reference_position, setpoint_of
 from drocap_ros.flight.orbit_config import OrbitConfig
+from drocap_ros.flight.orbit_goal import goal_of
 
 DT = 0.05
 
@@ -22,8 +23,8 @@ def fly(seconds, subject=lambda t: np.zeros(3), config=None, start=(9.0, 0.0, 4.
     for i in range(int(seconds / DT)):
         t = i * DT
         speed = (subject(t + 1e-3) - subject(t)) / 1e-3
-        state = advance(state, goal, vehicle, subject(t), speed, 0.0, DT, config)
-        setpoint = setpoint_of(state, vehicle, subject(t), speed, config)
+        state = advance(state, goal, Scene(vehicle, subject(t), speed), DT, config)
+        setpoint = setpoint_of(state, Scene(vehicle, subject(t), speed), config)
         vehicle = setpoint.position
         rows.append((t, state, setpoint))
     return rows
@@ -79,7 +80,9 @@ def test_least_radius_grows_for_an_uncertain_or_walking_subject():
     state, vehicle = None, np.array([6.0, 0.0, 2.5])
     state = begin_orbit(vehicle, np.zeros(3), np.zeros(3), config)
     for _ in range(400):
-        state = advance(state, goal_of(config), vehicle, np.zeros(3), np.zeros(3), 0.0, DT, config, 4.5)
+        state = advance(
+            state, goal_of(config), Scene(vehicle, np.zeros(3), np.zeros(3), least_radius_m=4.5), DT, config
+        )
         vehicle = reference_position(state)
     assert state.radius.value == pytest.approx(4.5, abs=0.02)
 
@@ -93,8 +96,8 @@ def test_acceleration_is_what_the_orbit_needs_though_the_subject_is_estimated_wi
     for i in range(800):
         noise = noise + (-noise * 2.0 * DT + 0.25 * np.sqrt(DT) * rng.standard_normal(2))
         subject, speed = np.append(0.5 * noise, 0.0), np.append(noise, 0.0)
-        state = advance(state, goal_of(config), vehicle, subject, speed, 0.0, DT, config)
-        sent = setpoint_of(state, vehicle, subject, speed, config)
+        state = advance(state, goal_of(config), Scene(vehicle, subject, speed), DT, config)
+        sent = setpoint_of(state, Scene(vehicle, subject, speed), config)
         vehicle = sent.position
         if i > 200:
             sizes.append(np.linalg.norm(sent.acceleration))
@@ -110,9 +113,9 @@ def test_angular_speed_yields_where_the_subject_walks_in_its_direction():
     speeds, rates = [], []
     for i in range(1200):
         place = walk * i * DT
-        state = advance(state, goal_of(config), vehicle, place, walk, 0.0, DT, config, greatest_speed_m_s=2.3)
+        state = advance(state, goal_of(config), Scene(vehicle, place, walk, greatest_speed_m_s=2.3), DT, config)
         vehicle = reference_position(state)
-        speeds.append(np.linalg.norm(setpoint_of(state, vehicle, place, walk, config).velocity))
+        speeds.append(np.linalg.norm(setpoint_of(state, Scene(vehicle, place, walk), config).velocity))
         rates.append(math.degrees(state.omega.value))
     assert max(speeds[200:]) < 2.4
     assert max(rates) > 18.5
@@ -132,9 +135,9 @@ def test_reference_waits_for_a_vehicle_that_stands_still():
     vehicle = np.array([6.0, 0.0, 2.5])
     state = begin_orbit(vehicle, np.zeros(3), np.zeros(3), config)
     for _ in range(400):
-        state = advance(state, goal_of(config), vehicle, np.zeros(3), np.zeros(3), 0.0, DT, config)
+        state = advance(state, goal_of(config), Scene(vehicle, np.zeros(3), np.zeros(3)), DT, config)
     assert np.linalg.norm(reference_position(state) - vehicle) <= 1.3 * config.max_lead_m + 0.1
-    sent = setpoint_of(state, vehicle, np.zeros(3), np.zeros(3), config)
+    sent = setpoint_of(state, Scene(vehicle, np.zeros(3), np.zeros(3)), config)
     assert np.linalg.norm(sent.position - vehicle) <= config.max_lead_m + 1e-9
 
 
@@ -142,7 +145,7 @@ def test_a_lag_along_the_orbit_takes_nothing_from_the_way_to_the_radius():
     state = begin_orbit(np.array([6.0, 0.0, 2.5]), np.zeros(3), np.zeros(3), OrbitConfig())
     for behind in (0.0, 0.3, 0.6):  # rad; the vehicle is 1 m too near
         vehicle = np.array([5.0 * math.cos(behind), -5.0 * math.sin(behind), 2.5])
-        sent = setpoint_of(state, vehicle, np.zeros(3), np.zeros(3), OrbitConfig())
+        sent = setpoint_of(state, Scene(vehicle, np.zeros(3), np.zeros(3)), OrbitConfig())
         outward = np.array([math.cos(behind), -math.sin(behind), 0.0])
         assert (sent.position - vehicle) @ outward == pytest.approx(1.0)
         assert np.linalg.norm(sent.position - vehicle) <= OrbitConfig().max_lead_m + 1e-9
@@ -155,7 +158,7 @@ def test_the_angle_yields_where_a_vehicle_falls_behind_a_walking_subject():
     for i in range(400):
         subject, angle = speed * i * DT, -math.radians(9.0) * i * DT
         vehicle = subject + np.array([6.0 * math.cos(angle), 6.0 * math.sin(angle), 2.5])
-        state = advance(state, goal_of(config), vehicle, subject, speed, 0.0, DT, config)
+        state = advance(state, goal_of(config), Scene(vehicle, subject, speed), DT, config)
     assert np.linalg.norm(reference_position(state) - vehicle) <= config.max_lead_m + 0.1
 
 
@@ -190,8 +193,8 @@ def test_limits_hold_for_any_start_and_subject(x, y, z, radius, speed, seed):
     vehicle = np.array([x, y, z])
     state = begin_orbit(vehicle, np.zeros(3), places[0], config)
     for place in places:
-        state = advance(state, goal, vehicle, place, rng.normal(0, 3, 3), 0.0, DT, config)
-        sent = setpoint_of(state, vehicle, place, np.zeros(3), config)
+        state = advance(state, goal, Scene(vehicle, place, rng.normal(0, 3, 3)), DT, config)
+        sent = setpoint_of(state, Scene(vehicle, place, np.zeros(3)), config)
         assert sent.is_finite()
         assert np.linalg.norm(sent.velocity) <= config.max_speed_m_s + 1e-9
         assert np.linalg.norm(sent.acceleration) <= config.max_acceleration_m_s2 + 1e-9
@@ -234,8 +237,8 @@ def test_orbit_turns_its_direction_inside_all_limits(changes, turns_s):
     omega, places, accelerations = [], [], []
     for _ in range(int(55 / DT)):
         vehicle = reference_position(state)
-        state = advance(state, goal_of(config), vehicle, np.zeros(3), np.zeros(3), 0.0, DT, config)
-        setpoint = setpoint_of(state, vehicle, np.zeros(3), np.zeros(3), config)
+        state = advance(state, goal_of(config), Scene(vehicle, np.zeros(3), np.zeros(3)), DT, config)
+        setpoint = setpoint_of(state, Scene(vehicle, np.zeros(3), np.zeros(3)), config)
         omega.append(math.degrees(state.omega.value))
         places.append(reference_position(state)[:2])
         accelerations.append(np.linalg.norm(setpoint.acceleration))

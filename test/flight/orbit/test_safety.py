@@ -1,11 +1,10 @@
-import dataclasses
 import math
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from orbit_observations import BRAKE, GOOD, LIMITS, LOITER, orbiting
+from orbit_observations import BRAKE, GOOD, LIMITS, LOITER, changed, orbiting
 
 from drocap_ros.errors import ParameterError
 from drocap_ros.flight.autopilot.autopilot import LossSettings
@@ -87,7 +86,7 @@ def refusal(decision):
 
 
 def bad(name, base=GOOD):
-    return dataclasses.replace(base, **BAD[name])
+    return changed(base, **BAD[name])
 
 
 @pytest.mark.parametrize("name", BAD)
@@ -113,15 +112,15 @@ def test_motion_ends_at_once_and_never_resumes_by_itself(name):
 
 
 def test_hold_latches_the_position_requests_the_hold_mode_and_then_sends_nothing():
-    moving = dataclasses.replace(GOOD, velocity=np.array([0.0, 2.0, 0.0]))
-    state, decision = reduce(orbiting(), dataclasses.replace(moving, subject=None), 1.0, None, LIMITS)
-    assert np.array_equal(state.hold_position, GOOD.position)
+    moving = changed(GOOD, velocity=np.array([0.0, 2.0, 0.0]))
+    state, decision = reduce(orbiting(), changed(moving, subject=None), 1.0, None, LIMITS)
+    assert np.array_equal(state.hold_position, GOOD.vehicle.position)
     assert decision == (Action.HOLD, ModeRequest.NONE, None)
-    drifted = dataclasses.replace(moving, position=GOOD.position + 1.0)
+    drifted = changed(moving, position=GOOD.vehicle.position + 1.0)
     state, decision = reduce(state, drifted, 2.0, None, LIMITS)
-    assert np.array_equal(state.hold_position, GOOD.position)
+    assert np.array_equal(state.hold_position, GOOD.vehicle.position)
     assert decision.mode_request == ModeRequest.NONE
-    at_rest = dataclasses.replace(drifted, velocity=np.zeros(3))
+    at_rest = changed(drifted, velocity=np.zeros(3))
     state, decision = reduce(state, at_rest, 2.1, None, LIMITS)
     assert decision.mode_request == ModeRequest.NONE  # it may only turn, to spring back
     state, decision = reduce(state, at_rest, 2.45, None, LIMITS)
@@ -134,7 +133,7 @@ def test_hold_latches_the_position_requests_the_hold_mode_and_then_sends_nothing
 
 
 def test_hold_mode_is_requested_even_when_the_vehicle_does_not_come_to_rest():
-    moving = dataclasses.replace(GOOD, velocity=np.array([0.0, 2.0, 0.0]), subject=None)
+    moving = changed(GOOD, velocity=np.array([0.0, 2.0, 0.0]), subject=None)
     state, decision = reduce(orbiting(), moving, 1.0, None, LIMITS)
     state, decision = reduce(state, moving, 4.5, None, LIMITS)
     assert decision.mode_request == ModeRequest.HOLD
@@ -150,22 +149,22 @@ def test_hold_mode_is_requested_even_when_the_vehicle_does_not_come_to_rest():
 
 
 def test_hold_without_a_trustworthy_state_keeps_the_last_position_and_requests_no_mode():
-    lost = dataclasses.replace(GOOD, state_age_s=0.05, position_age_s=0.45)  # frozen
-    lost = dataclasses.replace(lost, velocity=np.array([0.0, 2.0, 0.0]))
+    lost = changed(GOOD, state_age_s=0.05, position_age_s=0.45)  # frozen
+    lost = changed(lost, velocity=np.array([0.0, 2.0, 0.0]))
     state, decision = reduce(orbiting(), lost, 1.0, None, LIMITS)
     assert decision == (Action.HOLD, ModeRequest.NONE, None)
     assert np.allclose(state.hold_position, [6.0, 0.8, 2.5])  # carried on by the last velocity
-    lost = dataclasses.replace(lost, link_age_s=3.0)
+    lost = changed(lost, link_age_s=3.0)
     _, decision = reduce(state, lost, 4.0, None, LIMITS)
     assert decision == (Action.HOLD, ModeRequest.NONE, None)
     _, decision = reduce(state, lost, 12.0, None, LIMITS)
     assert decision == (Action.NOTHING, ModeRequest.NONE, None)
-    older = dataclasses.replace(lost, position_age_s=0.8)
+    older = changed(lost, position_age_s=0.8)
     state, decision = reduce(orbiting(), older, 1.0, None, LIMITS)
     assert decision == (Action.HALT, ModeRequest.NONE, None)
     back, decision = reduce(state, GOOD, 2.5, None, LIMITS)
     assert decision.action == Action.HOLD
-    assert np.array_equal(back.hold_position, GOOD.position)
+    assert np.array_equal(back.hold_position, GOOD.vehicle.position)
 
 
 def test_hold_without_satellite_fix_sends_velocity_zero_then_requests_the_hold_mode():
@@ -177,17 +176,17 @@ def test_hold_without_satellite_fix_sends_velocity_zero_then_requests_the_hold_m
 
 def test_fence_includes_the_braking_distance():
     state = orbiting()
-    out = dataclasses.replace(GOOD, position=np.array([38.5, 0, 2.5]), velocity=np.array([2.0, 0, 0]))
+    out = changed(GOOD, position=np.array([38.5, 0, 2.5]), velocity=np.array([2.0, 0, 0]))
     held, _ = reduce(state, out, 1.0, None, LIMITS)
     assert held.state == State.HOLDING
     assert held.condition.code == ConditionCode.AT_FENCE
-    inward = dataclasses.replace(out, velocity=np.array([-2.0, 0, 0]))
+    inward = changed(out, velocity=np.array([-2.0, 0, 0]))
     assert reduce(state, inward, 1.0, None, LIMITS)[0].state == State.ORBITING
 
 
 @pytest.mark.parametrize("mode", ["LOITER", "STABILIZE", "RTL", "BRAKE", "LAND"])
 def test_uncommanded_mode_is_a_take_over_and_nothing_is_sent(mode):
-    other = dataclasses.replace(GOOD, mode=mode, in_control=False, in_hold=mode == "BRAKE")
+    other = changed(GOOD, mode=mode, in_control=False, in_hold=mode == "BRAKE")
     held = reduce(orbiting(), bad("subject none"), 1.0, None, LIMITS)[0]
     for state in (orbiting(), held):
         state, decision = reduce(state, other, 2.0, None, LIMITS)
@@ -210,7 +209,7 @@ def test_start_never_changes_the_mode_and_engage_only_when_allowed():
     state, decision = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, forbidden)
     assert refusal(decision) == ConditionCode.MODE_CHANGE_FORBIDDEN
     assert decision.mode_request == ModeRequest.NONE
-    lossy = dataclasses.replace(LOITER, packet_loss=0.4)
+    lossy = changed(LOITER, packet_loss=0.4)
     state, decision = reduce(SafetyState(), lossy, 0.0, Command.ENGAGE, LIMITS)
     assert refusal(decision) == ConditionCode.PACKETS_LOST
     assert "40 % of the autopilot's packets" in str(decision.answer.condition)
@@ -228,25 +227,25 @@ def test_engage_warms_up_times_out_and_yields_to_pilot_and_failed_conditions():
     assert decision.answer.condition.code == ConditionCode.REQUESTING_CONTROL
     assert reduce(state, LOITER, 1.3, None, limits)[1].mode_request == ModeRequest.CONTROL
     assert reduce(state, LOITER, 7.0, None, limits)[0].condition.code == ConditionCode.CONTROL_NOT_GRANTED
-    assert reduce(state, dataclasses.replace(LOITER, mode="LAND"), 1.0, None, limits)[0].state == State.TAKEN_OVER
+    assert reduce(state, changed(LOITER, mode="LAND"), 1.0, None, limits)[0].state == State.TAKEN_OVER
     assert reduce(state, bad("gps", LOITER), 1.0, None, limits)[1].action == Action.NOTHING
     assert reduce(state, LOITER, 1.0, Command.STOP, limits)[1].action == Action.NOTHING
 
 
 def test_disarming_ends_the_orbit_and_disabled_commands_are_refused():
-    state, decision = reduce(orbiting(), dataclasses.replace(GOOD, armed=False), 1.0, None, LIMITS)
+    state, decision = reduce(orbiting(), changed(GOOD, armed=False), 1.0, None, LIMITS)
     assert (state.state, decision.action) == (State.IDLE, Action.NOTHING)
     off = LIMITS._replace(safety=SafetyConfig())
     state, decision = reduce(SafetyState(), GOOD, 0.0, Command.START, off)
     assert refusal(decision) == ConditionCode.COMMANDS_DISABLED
 
 
-_SEEN = [GOOD, LOITER, BRAKE, dataclasses.replace(GOOD, armed=False), *(bad(name) for name in BAD)]
+_SEEN = [GOOD, LOITER, BRAKE, changed(GOOD, armed=False), *(bad(name) for name in BAD)]
 
 
 def near(distance_m, **values):
     place = np.array([distance_m, 0, 2.5])
-    return dataclasses.replace(GOOD, position=place, subject_distance_m=distance_m, approach_m_s=1.3, **values)
+    return changed(GOOD, position=place, subject_distance_m=distance_m, approach_m_s=1.3, **values)
 
 
 def test_hold_position_retreats_from_an_approaching_subject():
@@ -257,7 +256,7 @@ def test_hold_position_retreats_from_an_approaching_subject():
     assert state.hold_position[0] > 3.7 + 1.0  # ahead of a vehicle that moves out, up to the fence
     assert state.hold_position[2] == 2.5
     # The subject stands: the hold position stays, and the autopilot's own hold follows.
-    still = dataclasses.replace(near(6.5), approach_m_s=0.0)
+    still = changed(near(6.5), approach_m_s=0.0)
     after, _ = reduce(state, still, 14.0, None, LIMITS)
     assert (after.hold_position == state.hold_position).all()
     assert reduce(after, still, 15.0, None, LIMITS)[1].mode_request == ModeRequest.HOLD
@@ -266,7 +265,7 @@ def test_hold_position_retreats_from_an_approaching_subject():
 def test_vehicle_that_moves_away_fast_is_held_where_it_can_stop():
     """Led back to where the hold began it came back at 1.2 m/s."""
     begun = [
-        reduce(orbiting(), dataclasses.replace(
+        reduce(orbiting(), changed(
             GOOD, position=np.array([8.0, 0.0, 2.5]), velocity=np.array([away, 0.0, 0.0]), subject_distance_m=8.0,
             closing_m_s=-away, approach_m_s=0.0, subject_sd_m=2.0,
         ), 10.0, None, LIMITS)[0] for away in (0.5, 1.8)
@@ -291,10 +290,10 @@ def test_a_hold_follows_a_jump_of_the_reported_position():
     """Else the vehicle flies to the old numbers, which name another place now."""
     state, _ = reduce(orbiting(), GOOD, 10.0, Command.STOP, LIMITS)
     jumped = condition(ConditionCode.POSITION_JUMPED, jump_m=5.0)
-    seen = dataclasses.replace(GOOD, position=np.array([11.0, 0.0, 2.5]), disturbance=jumped)
+    seen = changed(GOOD, position=np.array([11.0, 0.0, 2.5]), disturbance=jumped)
     state, decision = reduce(state, seen, 10.1, None, LIMITS)
     assert (state.hold_position, decision.action) == (None, Action.HALT)
-    seen = dataclasses.replace(seen, disturbance=None)
+    seen = changed(seen, disturbance=None)
     for step in range(12):
         state, decision = reduce(state, seen, 10.15 + 0.05 * step, None, LIMITS)
     assert (state.hold_position.tolist(), decision.action) == ([11.0, 0.0, 2.5], Action.HOLD)
@@ -304,9 +303,9 @@ def test_a_hold_follows_a_jump_of_the_reported_position():
     ("seen", "command"),
     [
         (GOOD, Command.STOP),
-        (dataclasses.replace(GOOD, subject_sd_m=2.0), None),
-        (dataclasses.replace(GOOD, subject_age_s=1.1), None),
-        (dataclasses.replace(GOOD, battery_fraction=0.1), None),
+        (changed(GOOD, subject_sd_m=2.0), None),
+        (changed(GOOD, subject_age_s=1.1), None),
+        (changed(GOOD, battery_fraction=0.1), None),
     ],
 )
 def test_hold_for_another_reason_than_nearness_does_not_move(seen, command):
@@ -358,7 +357,7 @@ def test_contradicting_limits_are_refused():
 
 def test_speed_shortens_the_allowed_age_of_the_subject():
     def stopped(speed, age_s):
-        seen = dataclasses.replace(GOOD, velocity=np.array([0.0, speed, 0.0]), subject_age_s=age_s)
+        seen = changed(GOOD, velocity=np.array([0.0, speed, 0.0]), subject_age_s=age_s)
         state, decision = reduce(orbiting(), seen, 1.0, None, LIMITS)
         assert decision.action == Action.ORBIT  # the orbit stands, and goes on when the subject is located again
         return state.pace.value == 0.0
@@ -373,15 +372,15 @@ def test_speed_shortens_the_allowed_age_of_the_subject():
 
 def test_hold_mode_is_requested_at_once_when_setpoints_are_not_followed():
     ignored = condition(ConditionCode.SETPOINTS_NOT_FOLLOWED, evidence="no echo")
-    deaf = dataclasses.replace(GOOD, followed=False, disturbance=ignored)
+    deaf = changed(GOOD, followed=False, disturbance=ignored)
     _, decision = reduce(orbiting(), deaf, 1.0, None, LIMITS)
     assert decision == (Action.HOLD, ModeRequest.HOLD, None)
-    _, decision = reduce(orbiting(), dataclasses.replace(deaf, followed=True), 1.0, None, LIMITS)
+    _, decision = reduce(orbiting(), changed(deaf, followed=True), 1.0, None, LIMITS)
     assert decision == (Action.HOLD, ModeRequest.NONE, None)
 
 
 def test_too_long_a_timeout_of_the_autopilot_forbids_motion():
-    seen = dataclasses.replace(GOOD, loss_settings=LossSettings("GUID_TIMEOUT", 3.0, "", math.nan))
+    seen = changed(GOOD, loss_settings=LossSettings("GUID_TIMEOUT", 3.0, "", math.nan))
     limits = LIMITS._replace(max_control_timeout_s=0.5)
     _, decision = reduce(SafetyState(), seen, 0.0, Command.START, limits)
     assert refusal(decision) == ConditionCode.TIMEOUT_TOO_LONG

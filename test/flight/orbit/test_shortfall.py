@@ -1,10 +1,8 @@
 """The acceleration that PX4 lacks behind a walking subject."""
 
-import dataclasses
-
 import numpy as np
 import pytest
-from orbit_observations import GOOD
+from orbit_observations import GOOD, changed
 
 from drocap_ros.flight.orbit.shortfall import Shortfall
 from drocap_ros.flight.setpoint import Setpoint
@@ -15,10 +13,10 @@ ASKED = Setpoint(HERE, np.array([-1.4, 0.5, 0.0]), np.zeros(3), np.pi, 0.0)
 
 def added(autopilot="px4", flown=(-0.8, -0.5, 0.0), walking=(-1.4, 0.0, 0.0), seconds=10.0, asked=ASKED):
     shortfall = Shortfall()
-    seen = dataclasses.replace(GOOD, autopilot=autopilot, position=HERE, velocity=np.array(flown))
+    seen = changed(GOOD, autopilot=autopilot, position=HERE, velocity=np.array(flown), subject=SUBJECT)
     for _ in range(int(seconds * 20)):
         shortfall.learn(asked, seen, 0.05)
-    return shortfall.added(asked, seen, SUBJECT, np.array(walking)).acceleration
+    return shortfall.added(asked, seen, np.array(walking)[:2]).acceleration
 
 
 def test_px4_gets_what_it_lacks_along_the_sight_and_no_more_than_the_bound():

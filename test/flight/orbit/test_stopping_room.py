@@ -1,10 +1,8 @@
 """The room to stop in before the subject: own speed and chase count together."""
 
-import dataclasses
-
 import numpy as np
 import pytest
-from orbit_observations import GOOD, LIMITS, orbiting
+from orbit_observations import GOOD, LIMITS, changed, orbiting
 
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.motion_checks import stopping_room, subject_condition
@@ -17,7 +15,7 @@ BRAKING = SAFETY.braking_m_s2
 
 def seen(distance_m=6.0, **values):
     place = np.array([distance_m, 0.0, 2.5])
-    return dataclasses.replace(GOOD, position=place, subject_distance_m=distance_m, subject_sd_m=0.0, **values)
+    return changed(GOOD, position=place, subject_distance_m=distance_m, subject_sd_m=0.0, **values)
 
 
 def braking(speed):
@@ -47,10 +45,10 @@ def test_vehicle_that_flies_away_as_fast_as_the_person_comes_needs_no_room_for_h
 
 
 def test_uncertainty_of_position_and_speeds_is_added():
-    calm = dataclasses.replace(seen(closing_m_s=1.0), subject_sd_m=0.4)
+    calm = changed(seen(closing_m_s=1.0), subject_sd_m=0.4)
     assert stopping_room(calm, SAFETY) >= braking(1.0) + 0.4
     # Faster by a standard deviation than estimated, until the vehicle reacts.
-    unsure = dataclasses.replace(calm, approach_sd_m_s=0.6)
+    unsure = changed(calm, approach_sd_m_s=0.6)
     assert stopping_room(unsure, SAFETY) - stopping_room(calm, SAFETY) == pytest.approx(0.5 - 0.4)
 
 

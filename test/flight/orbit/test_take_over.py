@@ -1,21 +1,20 @@
 """Whose mode it is: the pilot's, the autopilot's own, or one that was requested."""
 
-import dataclasses
 import random
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from orbit_observations import GOOD, LIMITS, orbiting
+from orbit_observations import GOOD, LIMITS, changed, orbiting
 
 from drocap_ros.flight.autopilot.autopilot import LossSettings
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
 from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, SafetyState, State
 
-PX4 = dataclasses.replace(GOOD, autopilot="px4", mode="OFFBOARD", heard=frozenset({"OFFBOARD"}))
-HOLD = dataclasses.replace(PX4, mode="LOITER", heard=frozenset({"LOITER"}), in_control=False, in_hold=True)
-FAILSAFE = dataclasses.replace(HOLD, left_by_itself=True)
+PX4 = changed(GOOD, autopilot="px4", mode="OFFBOARD", heard=frozenset({"OFFBOARD"}))
+HOLD = changed(PX4, mode="LOITER", heard=frozenset({"LOITER"}), in_control=False, in_hold=True)
+FAILSAFE = changed(HOLD, left_by_itself=True)
 WARM = LIMITS._replace(warm_up_s=1.2)
 
 
@@ -27,9 +26,7 @@ def engaged(seen):
 
 
 def test_a_mode_that_was_heard_between_two_steps_is_a_take_over():
-    state, decision = reduce(
-        orbiting(), dataclasses.replace(GOOD, heard=frozenset({"GUIDED", "RTL"})), 1.0, None, LIMITS
-    )
+    state, decision = reduce(orbiting(), changed(GOOD, heard=frozenset({"GUIDED", "RTL"})), 1.0, None, LIMITS)
     assert (state.state, decision.action) == (State.TAKEN_OVER, Action.NOTHING)
     assert state.condition.values["mode"] == "RTL"
 
@@ -38,7 +35,7 @@ def test_control_that_the_stream_restores_while_it_is_requested_is_no_take_over(
     state = engaged(FAILSAFE)
     state, decision = reduce(state, PX4, 0.2, None, WARM)
     assert (state.state, decision.action) == (State.ORBITING, Action.ORBIT)
-    pilot = dataclasses.replace(PX4, mode="POSCTL", heard=frozenset({"POSCTL"}), in_control=False)
+    pilot = changed(PX4, mode="POSCTL", heard=frozenset({"POSCTL"}), in_control=False)
     state, decision = reduce(engaged(FAILSAFE), pilot, 0.2, None, WARM)
     assert (state.state, decision.action) == (State.TAKEN_OVER, Action.NOTHING)
 
@@ -53,7 +50,7 @@ def test_the_autopilots_own_hold_is_not_called_the_pilots_and_engage_follows_it(
 
 
 def test_another_failsafe_ends_the_commands_too():
-    landing = dataclasses.replace(FAILSAFE, mode="LAND", heard=frozenset({"LAND"}), in_hold=False)
+    landing = changed(FAILSAFE, mode="LAND", heard=frozenset({"LAND"}), in_hold=False)
     state, decision = reduce(orbiting(PX4), landing, 1.0, None, WARM)
     assert (state.state, decision.action) == (State.TAKEN_OVER, Action.NOTHING)
     assert state.condition.code == ConditionCode.SETPOINTS_NOT_FOLLOWED
@@ -71,21 +68,21 @@ def test_the_words_follow_when_the_intention_is_reported_after_the_mode():
 @pytest.mark.parametrize("timeout_s", [0.5, 3.0])
 @pytest.mark.parametrize("seen", [GOOD, PX4])
 def test_a_stream_that_was_interrupted_does_not_resume_by_itself(seen, timeout_s):
-    seen = dataclasses.replace(seen, loss_settings=LossSettings("", timeout_s, "", 5))
+    seen = changed(seen, loss_settings=LossSettings("", timeout_s, "", 5))
     limits = LIMITS._replace(max_control_timeout_s=3.0)
     state, decision = reduce(orbiting(), GOOD, 1.0, Command.STOP, limits)
     assert decision.action == Action.HOLD
-    state = permit_mode(state, seen.mode)
+    state = permit_mode(state, seen.mode.name)
     for i in range(1, 400):
         t = 1.0 + timeout_s + 0.05 * i
-        state, decision = reduce(state, dataclasses.replace(seen, stream_gap_s=timeout_s + 0.05 * i), t, None, limits)
+        state, decision = reduce(state, changed(seen, stream_gap_s=timeout_s + 0.05 * i), t, None, limits)
         assert decision[:2] == (Action.NOTHING, ModeRequest.NONE)
         assert state.state == State.HOLDING
-    state, decision = reduce(state, dataclasses.replace(seen, stream_gap_s=30.0), t + 0.1, Command.START, limits)
+    state, decision = reduce(state, changed(seen, stream_gap_s=30.0), t + 0.1, Command.START, limits)
     assert decision.action == Action.ORBIT  # the operator commands
-    short = dataclasses.replace(seen, stream_gap_s=timeout_s - 0.1)
+    short = changed(seen, stream_gap_s=timeout_s - 0.1)
     state, _ = reduce(orbiting(), GOOD, 1.0, Command.STOP, limits)
-    assert reduce(permit_mode(state, seen.mode), short, 1.1, None, limits)[1].action == Action.HOLD
+    assert reduce(permit_mode(state, seen.mode.name), short, 1.1, None, limits)[1].action == Action.HOLD
 
 
 MODES = ("OFFBOARD", "LOITER", "RTL", "POSCTL", "")
@@ -97,7 +94,7 @@ def test_after_a_foreign_mode_nothing_is_sent_until_the_operator_commands(seed):
     state, foreign, t = orbiting(PX4), False, 1.0
     for _ in range(chance.randint(1, 30)):
         mode, heard = chance.choice(MODES), frozenset(chance.sample(MODES, chance.choice((0, 0, 1, 2))))
-        seen = dataclasses.replace(
+        seen = changed(
             PX4, mode=mode, heard=heard | {mode}, in_control=mode == "OFFBOARD", in_hold=mode == "LOITER",
             left_by_itself=chance.random() < 0.5 and mode not in ("OFFBOARD", ""),
         )  # fmt: skip

@@ -6,15 +6,19 @@ import re
 
 import numpy as np
 import pytest
+from orbit_observations import changed
 from scipy.spatial.transform import Rotation
 
+from drocap_ros.flight.autopilot.ardupilot import ARDUPILOT
+from drocap_ros.flight.autopilot.px4 import PX4
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.frames import camera_rotation
+from drocap_ros.flight.observed import Motion, Observed
 from drocap_ros.flight.orbit.controller import OrbitController
 from drocap_ros.flight.orbit.degradation import allowed_pace
-from drocap_ros.flight.orbit.planner import goal_of
-from drocap_ros.flight.orbit.states import Command, Limits, Observed, State
+from drocap_ros.flight.orbit.states import Command, Limits, State
+from drocap_ros.flight.orbit_goal import goal_of
 from drocap_ros.flight.subject.framing import Framing, View, framing_margin, nearest_framed, orbit_margin
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
@@ -23,7 +27,7 @@ from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
 
 SIZE = (1280, 720)
 MATRIX = pinhole_matrix(*SIZE, 60.0)
-FRESH = Observed(subject_age_s=0.1, link_age_s=0.0, state_age_s=0.0, position_age_s=0.0, subject=np.zeros(3))
+FRESH = changed(Observed(), subject_age_s=0.1, link_age_s=0.0, state_age_s=0.0, position_age_s=0.0, subject=np.zeros(3))
 CONFIG = MavlinkBridgeConfig(mount="fixed", camera_pitch_deg=-11.0)
 
 
@@ -34,7 +38,7 @@ def framing(config=CONFIG, wind_m_s2=0.0):
     lean = Rotation.from_euler("y", math.atan2(wind_m_s2, 9.81)).as_quat()  # nose east, wind from the east
     hover = VehicleState(1, orientation_xyzw=lean)
     for _ in range(400):
-        watched.watch(hover, Observed(velocity=np.zeros(3)), 0.05)
+        watched.watch(hover, Motion(velocity=np.zeros(3)), math.nan, 0.05)
     return watched
 
 
@@ -67,12 +71,12 @@ def test_a_camera_that_looks_above_the_ground_frames_nobody():
 
 def test_the_radius_grows_with_the_speed_of_one_who_walks_and_for_a_fixed_camera_only():
     watched = framing()
-    slow, fast = (watched.least_radius(goal_of(CONFIG), speed, "px4") for speed in (0.6, 1.4))
-    assert watched.least_radius(goal_of(CONFIG), 0.2, "px4") == 0.0
+    slow, fast = (watched.least_radius(goal_of(CONFIG), speed, PX4.gives_way_s) for speed in (0.6, 1.4))
+    assert watched.least_radius(goal_of(CONFIG), 0.2, PX4.gives_way_s) == 0.0
     assert slow < 6.0 < fast
-    assert watched.least_radius(goal_of(CONFIG), 1.4, "ardupilot") < fast
-    assert watched.least_radius(goal_of(CONFIG), 50.0, "px4") == CONFIG.max_distance_m
-    assert Framing(MavlinkBridgeConfig()).least_radius(goal_of(CONFIG), 1.4, "px4") == 0.0
+    assert watched.least_radius(goal_of(CONFIG), 1.4, ARDUPILOT.gives_way_s) < fast
+    assert watched.least_radius(goal_of(CONFIG), 50.0, PX4.gives_way_s) == CONFIG.max_distance_m
+    assert Framing(MavlinkBridgeConfig()).least_radius(goal_of(CONFIG), 1.4, PX4.gives_way_s) == 0.0
 
 
 def test_px4_keeps_one_who_walks_in_the_picture_of_a_fixed_camera_and_says_how_far_away():
@@ -127,9 +131,11 @@ def test_a_mount_that_does_not_follow_is_checked_at_the_pitch_that_it_reports(co
     config = MavlinkBridgeConfig(gimbal_control=commanded)
     mount, low, high = Framing(config), goal_of(config), goal_of(config, height_m=6.0)
     mount.matrix, mount.size = MATRIX, SIZE
-    seen = Observed()
+    unknown = Motion()
     down = Rotation.from_euler("y", math.radians(14)).as_quat()
-    assert mount.watch(VehicleState(1, gimbal_orientation_xyzw=down), seen, 0.05) is seen  # it does not lean
+    assert (
+        mount.watch(VehicleState(1, gimbal_orientation_xyzw=down), unknown, 6.0, 0.05) == math.inf
+    )  # it does not lean
     assert (mount.refusal(high) is None) == commanded
     mount.follows = False  # a refusal of the autopilot
     assert mount.refusal(low) is None
@@ -138,9 +144,9 @@ def test_a_mount_that_does_not_follow_is_checked_at_the_pitch_that_it_reports(co
     assert ("set gimbal_control" in str(refusal)) != commanded
     pitch = float(re.search(r"point the mount to (-?\d+) deg", str(refusal)).group(1))
     aimed = Rotation.from_euler("y", math.radians(-pitch)).as_quat()
-    mount.watch(VehicleState(1, gimbal_orientation_xyzw=aimed), seen, 0.05)
+    mount.watch(VehicleState(1, gimbal_orientation_xyzw=aimed), unknown, 6.0, 0.05)
     assert mount.refusal(high) is None
-    mount.watch(VehicleState(1), seen, 0.05)  # another condition says that its pitch is unknown
+    mount.watch(VehicleState(1), unknown, 6.0, 0.05)  # another condition says that its pitch is unknown
     assert mount.refusal(low) is None
 
 
@@ -157,20 +163,20 @@ def test_an_adjustment_that_takes_the_person_out_of_a_still_mounts_picture_is_re
 
 def test_the_margin_now_follows_the_lean():
     watched = framing()
-    seen = Observed(subject_distance_m=6.0, height_m=2.5, velocity=np.zeros(3))
+    motion = Motion(height_m=2.5, velocity=np.zeros(3))
     level = VehicleState(1, orientation_xyzw=np.array([0.0, 0.0, 0.0, 1.0]))
     down = VehicleState(1, orientation_xyzw=Rotation.from_euler("y", 0.6).as_quat())
-    assert watched.watch(level, seen, 0.05).framing_margin > 0.1
+    assert watched.watch(level, motion, 6.0, 0.05) > 0.1
     for _ in range(60):
-        last = watched.watch(down, seen, 0.05)
-    assert last.framing_margin < 0.0
+        last = watched.watch(down, motion, 6.0, 0.05)
+    assert last < 0.0
     limits = Limits(CONFIG, CONFIG)
-    slowed = allowed_pace(dataclasses.replace(FRESH, framing_margin=last.framing_margin), limits)
+    slowed = allowed_pace(changed(FRESH, framing_margin=last), limits)
     assert 0.0 < slowed.pace < 0.5
     assert slowed.cause.code == ConditionCode.SUBJECT_AT_BORDER
-    assert allowed_pace(dataclasses.replace(FRESH, framing_margin=0.2), limits).pace == 1.0
+    assert allowed_pace(changed(FRESH, framing_margin=0.2), limits).pace == 1.0
     # From a person who comes nearer a slower orbit would not give way.
-    coming = dataclasses.replace(FRESH, framing_margin=last.framing_margin, approach_m_s=0.8)
+    coming = changed(FRESH, framing_margin=last, approach_m_s=0.8)
     assert allowed_pace(coming, limits).pace == 1.0
     assert orbit_margin(View(MATRIX, SIZE, math.radians(-11)), goal_of(CONFIG), 1.7, 0.0) > 0.1
 

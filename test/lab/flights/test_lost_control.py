@@ -82,13 +82,13 @@ def test_a_bridge_that_was_stopped_and_continues_sends_nothing_until_it_is_engag
 @branched
 def test_a_step_that_was_interrupted_sends_no_old_setpoint_and_says_that_it_stood_still(loop, autopilot):
     sent = loop.link.sent_setpoints()
-    estimate = loop.controller._subject.estimate
+    echo = loop.link.echo
 
-    def stopped(now_ns):
-        loop.t += 3.0  # between the beginning of the step and its observation
-        return estimate(now_ns)
+    def stopped():
+        loop.t += 3.0  # between the beginning of the step and the end of its observation
+        return echo()
 
-    loop.controller._subject.estimate = stopped
+    loop.link.echo = stopped
     loop.controller.step(loop.clock_ns(), loop.t)
     assert loop.link.sent_setpoints() == sent
     assert loop.copter.mode == ("OFFBOARD" if autopilot == "px4" else "GUIDED")
