@@ -34,8 +34,9 @@ from drocap_ros.evaluation.protocol import (
     protocol_sequences,
 )  # fmt: skip
 from drocap_ros.evaluation.rotation import rotation_study
-from drocap_ros.evaluation.tables import study_markdown
-from drocap_ros.evaluation.world import world_markdown, world_study
+from drocap_ros.evaluation.tables import rotation_markdown, world_markdown
+from drocap_ros.evaluation.world import world_study
+from drocap_ros.evaluation.world_protocol import world_sequences
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.capture_config import SimulationConfig
@@ -55,10 +56,9 @@ def rotation(args: argparse.Namespace) -> None:
     pages = []
     for noisy in (False, True):
         with progress_bars() as progress:
-            rows = rotation_study(
-                args.mocap, noisy=noisy, limit=args.limit, processes=args.processes, progress=progress
-            )  # fmt: skip
-        pages.append(f"## {'Noisy' if noisy else 'Clean'} 2D\n\n{study_markdown(rows)}")
+            sequences = protocol_sequences(args.mocap, limit=args.limit)
+            rows = rotation_study(sequences, noisy=noisy, processes=args.processes, progress=progress)
+        pages.append(f"## {'Noisy' if noisy else 'Clean'} 2D\n\n{rotation_markdown(rows)}")
     write_figures("accuracy", "Accuracy of every method over the camera's orbit speed", "\n".join(pages))
 
 
@@ -139,7 +139,7 @@ def telemetry(args: argparse.Namespace) -> None:
     pages = []
     for level, still in (("exact", False), ("rtk", False), ("gps", False), ("exact", True)):
         with progress_bars() as progress:
-            rows = world_study(args.mocap, level, still=still, every=3, limit=args.limit, progress=progress)
+            rows = world_study(world_sequences(args.mocap, 3, args.limit), level, still=still, progress=progress)
         pages.append(world_markdown(rows, level, still))
     write_figures("accuracy_telemetry", "Motion in the world by telemetry that errs", "\n".join(pages))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +96,7 @@ def _compare(args: argparse.Namespace) -> int:
     path, motion = read_motion(args.motion)
     errors = compare(motion, *load_truth(args.truth))
     name = path.parent.name if path.name == "motion.npz" else path.stem
-    record = tables.comparison_record(name, errors)
+    record = {"motion": name, **tables.errors_record(errors)}
     picture = ("compare.png", lambda file: tables.save_group_bars(file, errors))
     return _finish(args, "compare", [record], tables.comparison_markdown(name, errors), picture)
 
@@ -106,33 +105,35 @@ def _rotation(args: argparse.Namespace) -> int:
     """The camera-motion study."""
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.evaluation import tables
+    from drocap_ros.evaluation.protocol import protocol_sequences
     from drocap_ros.evaluation.rotation import rotation_study
 
     _check_out(args)
-    names = ("methods", "noisy", "seed", "limit", "processes")
+    names = ("methods", "noisy", "seed", "processes")
     with progress_bars(args.quiet) as progress:
-        rows = rotation_study(
-            args.folder, speeds_deg_s=args.speeds, progress=progress, **{name: getattr(args, name) for name in names}
-        )
+        sequences = protocol_sequences(args.folder, limit=args.limit)
+        options = {name: getattr(args, name) for name in names}
+        rows = rotation_study(sequences, speeds_deg_s=args.speeds, progress=progress, **options)
     picture = ("rotation.png", lambda file: tables.save_curves(file, rows))
-    return _finish(args, "rotation", [asdict(row) for row in rows], tables.study_markdown(rows), picture)
+    return _finish(
+        args, "rotation", [tables.study_record(row) for row in rows], tables.rotation_markdown(rows), picture
+    )
 
 
 def _world(args: argparse.Namespace) -> int:
     """The study of the motion in the world."""
     from drocap_ros.cli.progress import progress_bars
-    from drocap_ros.evaluation.world import world_markdown, world_study
+    from drocap_ros.evaluation.tables import study_record, world_markdown
+    from drocap_ros.evaluation.world import world_study
+    from drocap_ros.evaluation.world_protocol import world_sequences
 
     _check_out(args)
-    names = ("still", "seed", "method", "every", "limit")
     with progress_bars(args.quiet) as progress:
+        sequences = world_sequences(args.folder, args.every, args.limit)
         rows = world_study(
-            args.folder, args.telemetry, progress=progress, **{name: getattr(args, name) for name in names}
+            sequences, args.telemetry, still=args.still, seed=args.seed, method=args.method, progress=progress
         )
-    records = [{**asdict(row), **asdict(row.errors)} for row in rows]
-    for record in records:
-        del record["errors"]
-    return _finish(args, "world", records, world_markdown(rows, args.telemetry, args.still))
+    return _finish(args, "world", [study_record(row) for row in rows], world_markdown(rows, args.telemetry, args.still))
 
 
 def _check_out(args: argparse.Namespace) -> None:

@@ -9,16 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.evaluation.metrics import (
-    group_errors,
-    horizon_error,
-    is_mirrored,
-    mirrored_frames,
-    pa_mpjpe,
-    scale_error,
-    toe_error,
-)
-from drocap_ros.evaluation.world_errors import WorldErrors, world_errors
+from drocap_ros.evaluation import metrics
 from drocap_ros.mocap import load_mocap
 from drocap_ros.motion import Motion, load_motion, motion_file
 from drocap_ros.skeleton import BODY_15, BODY_17, LIMB_JOINTS, in_body_order, indices
@@ -30,11 +21,74 @@ _LIMBS = indices(BODY_15.joints, LIMB_JOINTS)
 
 
 @dataclass(frozen=True)
+class WorldErrors:
+    """Errors of one motion in the world; :mod:`metrics` defines them.
+
+    absolute_mm : mean distance of the joints without any alignment
+    root_percent : RTE, percent of the true path
+    scale : estimated over true mean limb length, less 1
+    foot_m_s, foot_mm : speed of the ankles where the true ones are still, and their step between two frames
+    acceleration_ratio : mean acceleration over the truth's; NaN = the truth does not move
+    coverage : share of the joints within their own 90 % ellipsoids; NaN = the motion has none, or one about the pelvis
+    """
+
+    pa_mm: float
+    mpjpe_mm: float
+    w_mm: float
+    wa_mm: float
+    absolute_mm: float
+    root_percent: float
+    scale: float
+    horizon_deg: float
+    foot_m_s: float
+    foot_mm: float
+    penetration_mm: float
+    acceleration_ratio: float
+    acceleration_error_m_s2: float
+    coverage: float = float("nan")
+
+
+def world_errors(
+    estimate: np.ndarray, truth: np.ndarray, rate_hz: metrics.Rate, covariance: np.ndarray | None = None
+) -> WorldErrors:
+    """Errors of joints (F, P, 3) m in the world against the truth, both z up; means are over ``BODY_15``.
+
+    Neck and head may be NaN: the means are then over the other joints.
+
+    rate_hz : frames per second, one number or (F - 1) of the steps
+    covariance : (F, P, 6) m^2 of the estimate, or None
+    """
+    estimate, truth = estimate[:, : len(BODY_15)], truth[:, : len(BODY_15)]
+    nan = float("nan")
+    moving = len(truth) > 2
+    foot = metrics.still_foot_speed(estimate, truth, rate_hz) if moving else nan
+    known = (np.isfinite(estimate) & np.isfinite(truth)).all(axis=(0, 2))
+    est, tru = estimate[:, known], truth[:, known]
+    return WorldErrors(
+        pa_mm=1000 * float(metrics.pa_mpjpe(estimate, truth).mean()),
+        mpjpe_mm=1000 * float(metrics.mpjpe(est, tru).mean()),
+        w_mm=1000 * float(metrics.w_mpjpe(est, tru).mean()),
+        wa_mm=1000 * float(metrics.w_mpjpe(est, tru, metrics.SEGMENT).mean()),
+        absolute_mm=1000 * float(np.linalg.norm(est - tru, axis=-1).mean()),
+        root_percent=100 * metrics.root_error(estimate, truth) if moving else nan,
+        scale=metrics.scale_error(estimate, truth),
+        horizon_deg=float(np.degrees(metrics.horizon_error(estimate, truth)).mean()),
+        foot_m_s=foot,
+        foot_mm=1000 * foot / float(np.median(rate_hz)) if moving else nan,
+        penetration_mm=1000 * metrics.penetration(estimate, truth),
+        acceleration_ratio=metrics.acceleration_ratio(est, tru, rate_hz) if moving else nan,
+        acceleration_error_m_s2=metrics.acceleration_error(est, tru, rate_hz) if moving else nan,
+        coverage=nan
+        if covariance is None
+        else metrics.ellipsoid_coverage(est, tru, covariance[:, : len(BODY_15)][:, known]),
+    )
+
+
+@dataclass(frozen=True)
 class MotionErrors:
     """Errors of one motion.
 
     error_mm, per_group_mm : reconstruction error (PA-MPJPE), over all limb joints and per joint group
-    w_error_mm, horizon_deg : W-MPJPE and horizon error where both motions are in world frames, else NaN
     mirrored, mirrored_share : handedness of the whole sequence, share of mirrored frames
     scale_error : estimated over true mean limb length, less 1
     metric : the motion's scale is measured, not assumed
@@ -45,8 +99,6 @@ class MotionErrors:
     frames: int
     error_mm: float
     per_group_mm: dict[str, float]
-    w_error_mm: float
-    horizon_deg: float
     mirrored: bool
     mirrored_share: float
     scale_error: float
@@ -108,23 +160,22 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
     true = np.where(known[:, None], _at_times(truth, time_s, at[usable]), np.nan)
     if not np.isfinite(true[:, known]).all():
         raise InputError("evaluate compare: expected a truth of finite joints, got NaN or infinity; fill the gaps in")
-    world = motion.frame == "world" and frame == "world"
-    covariance = None
-    if motion.covariance is not None and motion.meta.get("covariance_about") != "pelvis":
-        covariance = in_body_order(motion.covariance, motion.joints, LIMB_JOINTS)[usable]
-    errors_in_world = world_errors(estimate, true, 1 / np.diff(at[usable]), covariance) if world else None
+    in_world = None
+    if motion.frame == "world" and frame == "world":
+        covariance = None
+        if motion.covariance is not None and motion.meta.get("covariance_about") != "pelvis":
+            covariance = in_body_order(motion.covariance, motion.joints, LIMB_JOINTS)[usable]
+        in_world = world_errors(estimate, true, 1 / np.diff(at[usable]), covariance)
     return MotionErrors(
         frames=len(estimate),
-        error_mm=1000.0 * float(pa_mpjpe(estimate, true).mean()),
-        per_group_mm={name: 1000.0 * value for name, value in group_errors(estimate, true).items()},
-        w_error_mm=float("nan") if errors_in_world is None else errors_in_world.w_mm,
-        horizon_deg=float(np.degrees(horizon_error(estimate, true)).mean()) if world else float("nan"),
-        mirrored=is_mirrored(estimate, true),
-        mirrored_share=float(mirrored_frames(estimate, true).mean()),
-        scale_error=scale_error(estimate, true),
+        error_mm=1000.0 * float(metrics.pa_mpjpe(estimate, true).mean()),
+        per_group_mm={name: 1000.0 * value for name, value in metrics.group_errors(estimate, true).items()},
+        mirrored=metrics.is_mirrored(estimate, true),
+        mirrored_share=float(metrics.mirrored_frames(estimate, true).mean()),
+        scale_error=metrics.scale_error(estimate, true),
         metric=motion.metric,
-        world=errors_in_world,
-        toe_mm=1000.0 * toe_error(estimate, true),
+        world=in_world,
+        toe_mm=1000.0 * metrics.toe_error(estimate, true),
     )
 
 
@@ -134,4 +185,4 @@ def _at_times(values: np.ndarray, time_s: np.ndarray, wanted: np.ndarray) -> np.
     after = np.clip(np.searchsorted(time_s, wanted, side="right"), 1, len(time_s) - 1)
     share = (wanted - time_s[after - 1]) / (time_s[after] - time_s[after - 1])
     share = np.clip(share, 0.0, 1.0)[:, None, None]
-    return values[after - 1] * (1 - share) + values[after] * share
+    return np.asarray(values[after - 1] * (1 - share) + values[after] * share)

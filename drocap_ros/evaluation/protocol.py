@@ -20,14 +20,18 @@ from drocap_ros.skeleton import BODY_15, BODY_17
 from drocap_ros.tracks import Tracks
 
 T = TypeVar("T")
+Progress = Callable[[str, float], None]
 
+# The numbers of the protocol; docs/accuracy.md compares with published results under them.
 FPS = 24.0
 ELEVATION_RAD = 0.3
 NOISE_MM = 10.0
+#: Per joint and frame.
 OUTLIER_PROBABILITY = 0.05
 OUTLIER_RANGE_MM = 300.0
 #: Image scale of the virtual camera; a person of 1.7 m is 680 px tall.
 PX_PER_MM = 0.4
+#: Width and height px.
 IMAGE_SIZE = (1280, 1024)
 
 
@@ -53,8 +57,10 @@ def protocol_sequences(
     Raises
     ------
     InputError
-        When the folder has no usable sequence.
+        When the folder has no usable sequence, or ``limit`` is impossible.
     """
+    if limit is not None and limit < 1:
+        raise InputError(f"--limit: expected at least 1, got {limit}")
     out = []
     for path in mocap_files(folder):
         x, fps = load_mocap(path, joints=BODY_17)
@@ -113,7 +119,7 @@ def _with_noise(flat: np.ndarray, seed: int | list[int]) -> np.ndarray:
     return np.where(gross[..., None], thrown, noisy)
 
 
-def reported(items: Iterable[T], count: int, stage: str, progress: Callable[[str, float], None] | None) -> Iterator[T]:
+def reported(items: Iterable[T], count: int, stage: str, progress: Progress | None) -> Iterator[T]:
     """The items; reports the share of ``count`` that is done."""
     for done, item in enumerate(items, 1):
         yield item

@@ -1,4 +1,4 @@
-"""Results of the studies as CSV, Markdown and plots."""
+"""Errors and results of the studies as CSV, Markdown and plots."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drocap_ros.evaluation.compare import MotionErrors
+from drocap_ros.evaluation.compare import MotionErrors, WorldErrors
 from drocap_ros.evaluation.metrics import JOINT_GROUPS
-from drocap_ros.evaluation.rotation import StudyRow
-from drocap_ros.evaluation.world_errors import WORLD_HEAD, world_cells
+from drocap_ros.evaluation.rotation import RotationRow
+from drocap_ros.evaluation.world import WorldRow, world_means
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,11 +26,40 @@ LABELS = {
     "initial": "paper: single-view initialization",
     "mf-nnm": "MF+NNM",
 }
+#: Speed of the tables per joint group and per sequence, deg/s: that of the demo's orbit.
+_SPEED_DEG_S = 25.0
+#: Column -> error in the world, its factor and its form.
+_WORLD = {
+    "PA-MPJPE mm": ("pa_mm", 1, ".1f"),
+    "MPJPE mm": ("mpjpe_mm", 1, ".1f"),
+    "W-MPJPE mm": ("w_mm", 1, ".0f"),
+    "WA-MPJPE mm": ("wa_mm", 1, ".0f"),
+    "not aligned mm": ("absolute_mm", 1, ".0f"),
+    "RTE %": ("root_percent", 1, ".1f"),
+    "scale %": ("scale", 100, "+.1f"),
+    "horizon deg": ("horizon_deg", 1, ".1f"),
+    "still feet m/s": ("foot_m_s", 1, ".2f"),
+    "mm per frame": ("foot_mm", 1, ".1f"),
+    "penetration mm": ("penetration_mm", 1, ".0f"),
+    "acceleration ratio": ("acceleration_ratio", 1, ".2f"),
+    "acceleration error m/s^2": ("acceleration_error_m_s2", 1, ".1f"),
+    "in 90 % ellipsoid": ("coverage", 1, ".0%"),
+}
+WORLD_HEAD = list(_WORLD)
 
 
 def markdown_table(head: list[str], lines: list[list[str]]) -> list[str]:
     """Lines of a Markdown table."""
     return [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *lines)]
+
+
+def world_cells(e: WorldErrors) -> list[str]:
+    """Cells under :data:`WORLD_HEAD`; "-" where an error is not known."""
+    return [_cell(factor * getattr(e, name), form) for name, factor, form in _WORLD.values()]
+
+
+def _cell(value: float, form: str) -> str:
+    return "-" if np.isnan(value) else format(value, form)
 
 
 def save_csv(path: Path, records: Sequence[Mapping[str, object]]) -> None:
@@ -42,87 +71,100 @@ def save_csv(path: Path, records: Sequence[Mapping[str, object]]) -> None:
             writer.writerow({k: f"{v:.4f}" if isinstance(v, float) else v for k, v in record.items()})
 
 
-def mean_errors(rows: list[StudyRow]) -> dict[tuple[str, float], float]:
-    """Mean error in mm over sequences, by (method, speed)."""
-    keys = dict.fromkeys((r.method, r.speed_deg_s) for r in rows)
-    return {key: float(np.mean([r.error_mm for r in rows if (r.method, r.speed_deg_s) == key])) for key in keys}
+def errors_record(e: MotionErrors | WorldErrors) -> dict[str, object]:
+    """Errors as columns for :func:`save_csv`, those in the world after ``world_``."""
+    record: dict[str, object] = asdict(e)
+    if isinstance(e, MotionErrors):
+        del record["per_group_mm"], record["world"]
+        record |= {f"world_{key}": value for key, value in asdict(e.world).items()} if e.world else {}
+        record |= {f"{group}_mm": value for group, value in e.per_group_mm.items()}
+    return record
 
 
-def study_markdown(rows: list[StudyRow]) -> str:
-    """Error over speed, error per joint group, and error per sequence, as Markdown."""
-    methods = list(dict.fromkeys(r.method for r in rows))
-    speeds = sorted({r.speed_deg_s for r in rows})
-    mean = mean_errors(rows)
-    count = len({r.sequence for r in rows})
-    kind = "noisy" if rows[0].noisy else "clean"
-    lines = [f"Reconstruction error in mm, mean over {count} sequences, {kind} 2D, by orbit speed in deg/s.", ""]
-    lines += markdown_table(
-        ["method", *(f"{s:g}" for s in speeds), "mirrored"],
-        [
-            [LABELS[m], *(f"{mean[m, s]:.1f}" for s in speeds), str(sum(r.mirrored for r in rows if r.method == m))]
-            for m in methods
-        ],
-    )
-    speed = 25.0 if 25.0 in speeds else speeds[-1]
-    lines += ["", f"Per joint group at {speed:g} deg/s, mm.", ""]
-    lines += markdown_table(
-        ["method", *JOINT_GROUPS, "toe"],
-        [
-            [LABELS[m], *(_mean_cell([getattr(r, f"{g}_mm") for r in at]) for g in (*JOINT_GROUPS, "toe"))]
-            for m in methods
-            if (at := [r for r in rows if r.method == m and r.speed_deg_s == speed])
-        ],
-    )
-    lines += ["", f"Per sequence at {speed:g} deg/s, mm.", ""]
-    by = {(r.sequence, r.method): r.error_mm for r in rows if r.speed_deg_s == speed}
-    lines += markdown_table(
-        ["sequence", *(LABELS[m] for m in methods)],
-        [[q, *(f"{by[q, m]:.1f}" for m in methods)] for q in dict.fromkeys(r.sequence for r in rows)],
-    )
-    return "\n".join(lines) + "\n"
-
-
-def _mean_cell(values: list[float | None]) -> str:
-    """Mean of the known values, "-" without any."""
-    known = [v for v in values if v is not None and not np.isnan(v)]
-    return f"{np.mean(known):.1f}" if known else "-"
+def study_record(row: RotationRow | WorldRow) -> dict[str, object]:
+    """One result of a study as columns for :func:`save_csv`."""
+    return {key: value for key, value in vars(row).items() if key != "errors"} | errors_record(row.errors)
 
 
 def comparison_markdown(name: str, e: MotionErrors) -> str:
     """Errors of one motion as Markdown."""
     head = ["motion", "frames", "error mm", *(f"{g} mm" for g in JOINT_GROUPS), "toe mm"]
     line = [name, str(e.frames), f"{e.error_mm:.1f}", *(f"{e.per_group_mm[g]:.1f}" for g in JOINT_GROUPS)]
-    line.append(_mean_cell([e.toe_mm]))
-    more = ["scale error", "scale is", "mirrored", "mirrored frames", "W-MPJPE mm", "horizon deg"]
-    rest = [
-        f"{e.scale_error:+.1%}",
-        "measured" if e.metric else "assumed",
-        "yes" if e.mirrored else "no",
-        f"{e.mirrored_share:.1%}",
-        *("-" if np.isnan(v) else f"{v:.1f}" for v in (e.w_error_mm, e.horizon_deg)),
-    ]
-    tables = [*markdown_table(head, [line]), "", *markdown_table(more, [rest])]
+    more = ["scale error", "scale is", "mirrored", "mirrored frames"]
+    scale, mirrored = "measured" if e.metric else "assumed", "yes" if e.mirrored else "no"
+    rest = [f"{e.scale_error:+.1%}", scale, mirrored, f"{e.mirrored_share:.1%}"]
+    tables = [*markdown_table(head, [[*line, _cell(e.toe_mm, ".1f")]]), "", *markdown_table(more, [rest])]
     if e.world is not None:
         tables += ["", *markdown_table(WORLD_HEAD, [world_cells(e.world)])]
     return "\n".join(tables) + "\n"
 
 
-def comparison_record(name: str, e: MotionErrors) -> dict[str, object]:
-    """Errors of one motion as a record for :func:`save_csv`."""
-    record: dict[str, object] = {"motion": name, **asdict(e)}
-    del record["per_group_mm"], record["world"]
-    if e.world is not None:
-        record |= {f"world_{key}": value for key, value in asdict(e.world).items()}
-    return record | {f"{group}_mm": value for group, value in e.per_group_mm.items()}
+def rotation_markdown(rows: list[RotationRow]) -> str:
+    """Error over speed, error per joint group, and error per sequence, as Markdown."""
+    speeds = sorted({r.speed_deg_s for r in rows})
+    speed = _SPEED_DEG_S if _SPEED_DEG_S in speeds else speeds[-1]
+    by_method = _by_method(rows)
+    at_speed = _by_method([r for r in rows if r.speed_deg_s == speed])
+    per_sequence = [
+        [same[0].sequence, *(f"{r.errors.error_mm:.1f}" for r in same)] for same in zip(*at_speed.values(), strict=True)
+    ]
+    kind = "noisy" if rows[0].noisy else "clean"
+    lines = [
+        f"Reconstruction error in mm, mean over {len(per_sequence)} sequences, {kind} 2D, by orbit speed in deg/s.",
+        "",
+        *markdown_table(
+            ["method", *(f"{s:g}" for s in speeds), "mirrored"],
+            [
+                [LABELS[m], *(f"{_mean_mm(of, s):.1f}" for s in speeds), str(sum(r.errors.mirrored for r in of))]
+                for m, of in by_method.items()
+            ],
+        ),
+        *("", f"Per joint group at {speed:g} deg/s, mm.", ""),
+        *markdown_table(["method", *JOINT_GROUPS, "toe"], [_group_cells(m, of) for m, of in at_speed.items()]),
+        *("", f"Per sequence at {speed:g} deg/s, mm.", ""),
+        *markdown_table(["sequence", *(LABELS[m] for m in by_method)], per_sequence),
+    ]
+    return "\n".join(lines) + "\n"
 
 
-def save_curves(path: Path, rows: list[StudyRow]) -> None:
+def _by_method(rows: list[RotationRow]) -> dict[str, list[RotationRow]]:
+    return {method: [r for r in rows if r.method == method] for method in dict.fromkeys(r.method for r in rows)}
+
+
+def _mean_mm(rows: list[RotationRow], speed: float) -> float:
+    return float(np.mean([r.errors.error_mm for r in rows if r.speed_deg_s == speed]))
+
+
+def _group_cells(method: str, rows: list[RotationRow]) -> list[str]:
+    """The method and its mean error per joint group and of the toes, "-" where no row knows it."""
+    errors = [r.errors for r in rows]
+    groups = [np.mean([e.per_group_mm[group] for e in errors]) for group in JOINT_GROUPS]
+    toes = [e.toe_mm for e in errors if not np.isnan(e.toe_mm)]
+    return [LABELS[method], *(f"{g:.1f}" for g in groups), f"{np.mean(toes):.1f}" if toes else "-"]
+
+
+def world_markdown(rows: list[WorldRow], telemetry: str, still: bool) -> str:
+    """Errors of every sequence and their means as Markdown."""
+    cells = [[row.sequence, *world_cells(row.errors)] for row in rows]
+    seconds = sum(row.seconds for row in rows) / sum(row.frames for row in rows) * 300
+    measured, placed = sum(row.metric for row in rows), sum(row.frame == "world" for row in rows)
+    kind = f"{telemetry} telemetry, {'still camera' if still else 'orbit'}"
+    lines = [
+        f"Motion in the world, {len(rows)} sequences, {kind}.",
+        "",
+        *markdown_table(["sequence", *WORLD_HEAD], [*cells, ["mean", *world_cells(world_means(rows))]]),
+        "",
+        f"In the world {placed}, with measured scale {measured} of {len(rows)}; {seconds:.2f} s per 300 frames.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def save_curves(path: Path, rows: list[RotationRow]) -> None:
     """Error over orbit speed, one curve per method, as PNG."""
     figure, axes = _plot(6.4, 4.2)
-    mean = mean_errors(rows)
-    for method in dict.fromkeys(r.method for r in rows):
-        speeds = sorted({r.speed_deg_s for r in rows if r.method == method})
-        axes.plot(speeds, [mean[method, s] for s in speeds], marker="o", label=LABELS[method])
+    for method, found in _by_method(rows).items():
+        speeds = sorted({r.speed_deg_s for r in found})
+        axes.plot(speeds, [_mean_mm(found, s) for s in speeds], marker="o", label=LABELS[method])
     axes.set(xlabel="orbit speed, deg/s", ylabel="reconstruction error, mm")
     axes.set_title(f"{len({r.sequence for r in rows})} sequences, {'noisy' if rows[0].noisy else 'clean'} 2D")
     axes.set_ylim(bottom=0)

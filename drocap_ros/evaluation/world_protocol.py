@@ -13,24 +13,39 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.errors import InputError
 from drocap_ros.evaluation.protocol import FPS, protocol_sequences
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.mocap import Sequence
 from drocap_ros.skeleton import BODY_15, BODY_17, indices
 from drocap_ros.tracks import Tracks
 
-SHORTEST_S, LONGEST_S = 8.0, 20.0
+# The numbers of the protocol; docs/accuracy.md compares under them.
+SHORTEST_S = 8.0
+LONGEST_S = 20.0
+#: Width and height px.
 IMAGE_SIZE = (1280, 720)
+#: A view of 70 degrees across.
 FOCAL_PX = 0.5 * IMAGE_SIZE[0] / np.tan(np.deg2rad(35.0))
-RADIUS_M, HEIGHT_M, SPEED_DEG_S = 6.0, 2.5, 19.0
+RADIUS_M = 6.0
+HEIGHT_M = 2.5
+SPEED_DEG_S = 19.0
+#: Height at which the camera aims, m, and the smoothing of the aim's path.
 _AIM_M = 0.95
+_AIM_SMOOTHING_S = 1.0
 #: Half the time that the orbit takes to turn round.
 _TURN_S = 0.5
+#: Height of a standing ankle, m.
 _ANKLE_M = 0.07
-_AIM_SMOOTHING_S = 1.0
-_NOISE_PX, _NOISE_S = 3.0, 0.1
-_OUTLIERS, _OUTLIER_PX = 0.02, 80.0
-_POSITION_WANDER_S, _ATTITUDE_WANDER_S = 60.0, 10.0
+#: Standard deviation and correlation time of the noise.
+_NOISE_PX = 3.0
+_NOISE_S = 0.1
+#: Share of the joints that are thrown, and their largest shift per coordinate.
+_OUTLIERS = 0.02
+_OUTLIER_PX = 80.0
+#: Correlation times of the errors of position and attitude.
+_POSITION_WANDER_S = 60.0
+_ATTITUDE_WANDER_S = 10.0
 
 
 class TelemetryErrors(NamedTuple):
@@ -73,8 +88,11 @@ def world_sequences(folder: Path, every: int = 1, limit: int | None = None) -> l
     Raises
     ------
     InputError
-        When the folder has no usable sequence.
+        When the folder has no usable sequence, or a number is impossible.
     """
+    for name, value in (("every", every), ("limit", limit)):
+        if value is not None and value < 1:
+            raise InputError(f"--{name}: expected at least 1, got {value}")
     found = enumerate(protocol_sequences(folder, shortest_s=SHORTEST_S, longest_s=LONGEST_S))
     # The published figures are of every third sequence, with the seeds 0, 1, 2 and so on.
     return [(index // 3 + 1000 * (index % 3), sequence) for index, sequence in found][::every][:limit]
@@ -159,7 +177,7 @@ def _camera(
 
 def _project(joints: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     seen = (joints - position[:, None]) @ np.swapaxes(rotation, 1, 2)
-    return FOCAL_PX * seen[..., :2] / seen[..., 2:] + np.array(IMAGE_SIZE) / 2
+    return np.asarray(FOCAL_PX * seen[..., :2] / seen[..., 2:] + np.array(IMAGE_SIZE) / 2)
 
 
 def _with_noise(rng: np.random.Generator, keypoints: np.ndarray) -> np.ndarray:

@@ -77,7 +77,7 @@ class McapSession(Session):
         counts = Counter[tuple[str, str]]()
         summary = stream.summary()
         statistics = None if summary is None else summary.statistics
-        if statistics is not None and len(summary.channels) == statistics.channel_count:
+        if summary is not None and statistics is not None and len(summary.channels) == statistics.channel_count:
             for channel, count in counted_channels(summary):
                 counts[channel.topic, channel.type_name] += count
             return counts, [statistics.message_start_time, statistics.message_end_time] if counts.total() else []

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.evaluation.compare import WorldErrors, world_errors
 from drocap_ros.evaluation.protocol import FPS, reported
-from drocap_ros.evaluation.tables import markdown_table
-from drocap_ros.evaluation.world_errors import WORLD_HEAD, WorldErrors, world_cells, world_errors
+from drocap_ros.evaluation.tables import WORLD_HEAD, markdown_table, world_cells
 from drocap_ros.evaluation.world_protocol import LONGEST_S, WorldView, world_sequences, world_view
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.geometry.rotations import quaternion_from_matrix

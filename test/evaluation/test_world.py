@@ -11,10 +11,10 @@ import pytest
 from walking import Walk, make_walk, write_mocap
 
 from drocap_ros.cli import main
-from drocap_ros.evaluation import world_metrics
-from drocap_ros.evaluation.compare import compare
+from drocap_ros.evaluation import metrics
+from drocap_ros.evaluation.compare import compare, world_errors
+from drocap_ros.evaluation.tables import WORLD_HEAD, world_cells
 from drocap_ros.evaluation.world import measure_world, world_means, world_study
-from drocap_ros.evaluation.world_errors import WORLD_HEAD, world_cells, world_errors
 from drocap_ros.evaluation.world_protocol import FOCAL_PX, FPS, IMAGE_SIZE, TELEMETRY, world_sequences, world_view
 from drocap_ros.mocap import Sequence
 from drocap_ros.reconstruction.reconstruct import reconstruct
@@ -47,18 +47,18 @@ def test_a_shift_counts_only_without_alignment(walk: Walk) -> None:
 
 def test_a_body_that_sinks_penetrates_the_ground(walk: Walk) -> None:
     truth = in_world(walk)
-    truth[:, world_metrics.FEET, 2] = 0.0
+    truth[:, metrics.FEET, 2] = 0.0
     assert world_errors(truth - np.array([0.0, 0.0, 0.02]), truth, FPS).penetration_mm == pytest.approx(20.0)
     assert world_errors(truth + np.array([0.0, 0.0, 0.02]), truth, FPS).penetration_mm == 0.0
 
 
 def test_feet_count_only_where_the_true_ones_are_still() -> None:
     truth = np.zeros((49, 15, 3))
-    truth[24:, world_metrics.FEET[0], 0] = 0.2 * np.arange(25)  # 4.8 m/s
+    truth[24:, metrics.FEET[0], 0] = 0.2 * np.arange(25)  # 4.8 m/s
     estimate = truth + np.arange(49.0)[:, None, None] * [0.01, 0.0, 0.0]  # slides by 0.24 m/s everywhere
-    assert world_metrics.still_foot_speed(estimate, truth, 24.0) == pytest.approx(0.24)
+    assert metrics.still_foot_speed(estimate, truth, 24.0) == pytest.approx(0.24)
     moving = np.arange(49.0)[:, None, None] * np.full((1, 15, 3), 0.1)
-    assert np.isnan(world_metrics.still_foot_speed(moving, moving, 24.0))
+    assert np.isnan(metrics.still_foot_speed(moving, moving, 24.0))
 
 
 def test_root_error_is_a_share_of_the_path() -> None:
@@ -66,7 +66,7 @@ def test_root_error_is_a_share_of_the_path() -> None:
     truth[..., 0] = 0.1 * np.arange(101)[:, None]  # 10 m straight
     estimate = truth.copy()
     estimate[..., 0] *= 1.04  # aligned at its middle, the ends are 0.2 m off and the mean 0.1 m
-    assert world_metrics.root_error(estimate, truth) == pytest.approx(0.01, rel=0.02)
+    assert metrics.root_error(estimate, truth) == pytest.approx(0.01, rel=0.02)
 
 
 def test_coverage_of_ellipsoids_that_are_true_is_90_percent() -> None:
@@ -76,9 +76,9 @@ def test_coverage_of_ellipsoids_that_are_true_is_90_percent() -> None:
     truth = np.zeros((400, 15, 3))
     estimate = rng.multivariate_normal(np.zeros(3), matrix, truth.shape[:2])
     packed = np.broadcast_to(matrix[np.triu_indices(3)], (400, 15, 6))
-    assert world_metrics.ellipsoid_coverage(estimate, truth, packed) == pytest.approx(0.9, abs=0.015)
-    assert world_metrics.ellipsoid_coverage(estimate, truth, 0.25 * packed) < 0.5
-    assert np.isnan(world_metrics.ellipsoid_coverage(estimate, truth, np.full((400, 15, 6), np.nan)))
+    assert metrics.ellipsoid_coverage(estimate, truth, packed) == pytest.approx(0.9, abs=0.015)
+    assert metrics.ellipsoid_coverage(estimate, truth, 0.25 * packed) < 0.5
+    assert np.isnan(metrics.ellipsoid_coverage(estimate, truth, np.full((400, 15, 6), np.nan)))
 
 
 @pytest.mark.parametrize("still", [False, True])
@@ -172,7 +172,7 @@ def test_a_sequence_has_the_same_seed_with_every_choice(tmp_path: Path) -> None:
 
 def test_study_is_the_same_every_time(tmp_path: Path) -> None:
     write_mocap(tmp_path, "a", X=_walker(260))
-    one, two = (astuple(world_study(tmp_path, "gps", seed=4)[0].errors) for _ in range(2))
+    one, two = (astuple(world_study(world_sequences(tmp_path), "gps", seed=4)[0].errors) for _ in range(2))
     np.testing.assert_array_equal(one, two)
 
 

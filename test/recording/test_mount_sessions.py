@@ -105,10 +105,10 @@ def test_a_flight_is_rebuilt_in_the_world_from_its_session(mount, flight):
     errors = compare(motion, loop._joints, time_s, "world")
     print(
         f"{mount}: camera {np.median(camera_deg):.2f} deg, PA-MPJPE {errors.error_mm:.0f} mm, W-MPJPE(100)"
-        f" {errors.world.w_mm:.0f} mm, horizon {errors.horizon_deg:.1f} deg"
+        f" {errors.world.w_mm:.0f} mm, horizon {errors.world.horizon_deg:.1f} deg"
     )
     assert np.median(camera_deg) < 1.0  # the autopilot's own error of the attitude
-    assert errors.horizon_deg < 6.0
+    assert errors.world.horizon_deg < 6.0
     assert errors.world.w_mm < 700.0  # the reported position wanders by 0.4 m: 435 mm with a gimbal
 
 

@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
             print(how)
     print(_flight_sentence(operator, verdict, config))
     print(_image_sentence(verdict, truth))
-    world = "" if math.isnan(errors.w_error_mm) else f", W-MPJPE {errors.w_error_mm:.1f} mm"
+    world = "" if errors.world is None else f", W-MPJPE {errors.world.w_mm:.1f} mm"
     print(
         f"reconstruction error against the simulated truth: {errors.error_mm:.1f} mm (PA-MPJPE, 12 limb joints,"
         f" {errors.frames} frames){world}; scale error {100 * errors.scale_error:+.1f} % ({motion.scale_source}),"

@@ -109,7 +109,7 @@ class McapFile:
 
     def save(self, sync: bool) -> None:
         """Close the open chunk and commit all chunks; an OSError leaves the file at the last commit."""
-        self._mcap.flush()
+        self._mcap.flush()  # type: ignore[no-untyped-call]  # mcap has no types here
         self._chunk_closed()
         self.commit(sync)
 
@@ -120,7 +120,7 @@ class McapFile:
 
     def finish(self, sync: bool) -> None:
         """Write the summary and close; errors as :meth:`save`."""
-        self._mcap.finish()
+        self._mcap.finish()  # type: ignore[no-untyped-call]  # mcap has no types here
         self._chunk_closed()
         self.commit(sync)
         self._file.close()

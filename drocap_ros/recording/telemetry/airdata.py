@@ -85,7 +85,7 @@ class _Table:
             if len(rows) >= _MAX_ROWS:
                 raise InputError(f"{path}: expected at most {_MAX_ROWS} rows, found more; cut the file")
             rows.append([number(row[i]) if i < len(row) else math.nan for i, number in read])
-        table = np.array(rows, dtype=np.float64).reshape(-1, len(read))
+        table: np.ndarray = np.array(rows, dtype=np.float64).reshape(-1, len(read))
         time_ms = table[:, self._names.index(TIME)]
         table = table[(time_ms >= 0) & (time_ms < 1e9)]
         self._rows = table[np.unique(table[:, self._names.index(TIME)], return_index=True)[1]]

@@ -123,7 +123,7 @@ def _gimbal(content: _Content, stamp_ns: np.ndarray, body: np.ndarray) -> tuple[
 def _messages(path: Path) -> Iterator[Any]:
     from pymavlink.DFReader import DFReader_binary
 
-    class Reader(DFReader_binary):
+    class Reader(DFReader_binary):  # type: ignore[misc]  # pymavlink has no types
         # The compiled index prints a line for every byte that it cannot parse.
         def init_arrays_fast(self, progress_callback: Any = None) -> None:
             self.init_arrays(progress_callback=progress_callback)

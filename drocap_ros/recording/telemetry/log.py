@@ -153,7 +153,7 @@ def make_log(
 
     def series(values: np.ndarray | None, size: int) -> np.ndarray:
         found = np.full((count, size), np.nan) if values is None else np.asarray(values, np.float64)
-        return found[order][fresh]
+        return np.asarray(found[order][fresh])
 
     track = VehicleTrack(
         stamps[fresh],

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from telemetry_stream import FPS, Orbit, orbit
 
+from drocap_ros.evaluation.compare import WorldErrors, world_errors
 from drocap_ros.evaluation.metrics import pa_mpjpe
-from drocap_ros.evaluation.world_errors import WorldErrors, world_errors
 from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.geometry.rotations import exp_so3, quaternion_from_matrix
 from drocap_ros.observation import PoseObservation

@@ -11,8 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from drocap_ros.contacts import ANKLES, RestingFeet
-from drocap_ros.evaluation.metrics import scale_error
-from drocap_ros.evaluation.world_metrics import ellipsoid_coverage, still_foot_speed
+from drocap_ros.evaluation.metrics import ellipsoid_coverage, scale_error, still_foot_speed
 from drocap_ros.geometry.rotations import exp_so3, left_jacobian, log_so3
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
