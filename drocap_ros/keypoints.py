@@ -57,7 +57,7 @@ class Keypoints2D:
     @property
     def seen(self) -> np.ndarray:
         """(F, P) bool, both coordinates are finite."""
-        return np.isfinite(self.xy).all(axis=-1)
+        return np.asarray(np.isfinite(self.xy).all(axis=-1))
 
     @property
     def weights(self) -> np.ndarray:

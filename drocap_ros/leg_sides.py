@@ -74,7 +74,7 @@ def _step_costs(xy: np.ndarray, stamp_ns: np.ndarray, box_size: np.ndarray) -> n
         squared = np.square((b[1:] - a[:-1]) / scale[..., None]).sum(axis=2)
         costs = np.minimum(0.5 * squared, _MOST_COST)
         costs[np.isnan(costs)] = 0.0
-        return costs.sum(axis=1)
+        return np.asarray(costs.sum(axis=1))
 
     out[1:, 0] = cost(left, left) + cost(right, right)
     out[1:, 1] = cost(left, right) + cost(right, left)

@@ -63,7 +63,7 @@ def upright_joints(motion: Motion) -> np.ndarray:
     """
     if motion.frame == "world":
         return motion.joints3d
-    return motion.joints3d[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
+    return np.asarray(motion.joints3d[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0]))
 
 
 def save_motion(path: str | Path, motion: Motion, **further: np.ndarray) -> None:

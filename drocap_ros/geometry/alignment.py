@@ -43,7 +43,7 @@ def apply_similarity(
     points: np.ndarray, scale: np.ndarray, rotation: np.ndarray, translation: np.ndarray
 ) -> np.ndarray:
     """``scale * points @ rotation^T + translation`` for points (..., P, 3)."""
-    return scale[..., None, None] * (points @ np.swapaxes(rotation, -1, -2)) + translation[..., None, :]
+    return np.asarray(scale[..., None, None] * (points @ np.swapaxes(rotation, -1, -2)) + translation[..., None, :])
 
 
 def torso_frame(s: np.ndarray, joints: JointSet = BODY_15) -> np.ndarray:

@@ -14,7 +14,7 @@ _RIGID_ENDS = np.array([indices(BODY_15.joints, bone) for bone in RIGID_BONES])
 
 def pair_lengths(joints: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Distances (..., L) over pairs (L, 2) of the joints (..., P, D)."""
-    return np.linalg.norm(joints[..., pairs[:, 1], :] - joints[..., pairs[:, 0], :], axis=-1)
+    return np.asarray(np.linalg.norm(joints[..., pairs[:, 1], :] - joints[..., pairs[:, 0], :], axis=-1))
 
 
 def bone_lengths(joints: np.ndarray) -> np.ndarray:

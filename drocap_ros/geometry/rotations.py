@@ -22,7 +22,7 @@ def exp_so3(v: np.ndarray) -> np.ndarray:
     a = np.where(small, 1.0 - angle2 / 6.0, np.sin(safe) / safe)
     b = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
     k = hat(v)
-    return np.eye(3, dtype=v.dtype) + a * k + b * (k @ k)
+    return np.asarray(np.eye(3, dtype=v.dtype) + a * k + b * (k @ k))
 
 
 def log_so3(r: np.ndarray) -> np.ndarray:
@@ -31,7 +31,7 @@ def log_so3(r: np.ndarray) -> np.ndarray:
     sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
     half = np.arctan2(sine, q[..., 3:])
     angle = 2.0 * np.where(half > 0.5 * np.pi, half - np.pi, half)
-    return np.where(sine < 1e-12, 2.0, angle / np.maximum(sine, 1e-12)) * q[..., :3]
+    return np.asarray(np.where(sine < 1e-12, 2.0, angle / np.maximum(sine, 1e-12)) * q[..., :3])
 
 
 def left_jacobian(v: np.ndarray) -> np.ndarray:
@@ -43,7 +43,7 @@ def left_jacobian(v: np.ndarray) -> np.ndarray:
     a = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
     b = np.where(small, 1.0 / 6.0 - angle2 / 120.0, (safe - np.sin(safe)) / safe**3)
     k = hat(v)
-    return np.eye(3, dtype=v.dtype) + a * k + b * (k @ k)
+    return np.asarray(np.eye(3, dtype=v.dtype) + a * k + b * (k @ k))
 
 
 def project_to_so3(m: np.ndarray) -> np.ndarray:
@@ -51,7 +51,7 @@ def project_to_so3(m: np.ndarray) -> np.ndarray:
     u, _, vt = np.linalg.svd(m)
     u = np.ascontiguousarray(u)
     u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
-    return u @ vt
+    return np.asarray(u @ vt)
 
 
 def complete_rotation(rows: np.ndarray) -> np.ndarray:
@@ -95,7 +95,7 @@ def quaternion_from_matrix(r: np.ndarray) -> np.ndarray:
     )  # fmt: skip
     best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)[..., None, None]
     q = np.take_along_axis(rows, np.broadcast_to(best, (*rows.shape[:-2], 1, 4)), axis=-2)[..., 0, :]
-    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
 
 
 def unit_quaternions(q: np.ndarray) -> np.ndarray:
@@ -120,4 +120,4 @@ def slerp(q0: np.ndarray, q1: np.ndarray, s: np.ndarray | float) -> np.ndarray:
     a = np.where(small, 1.0 - s, np.sin((1.0 - s) * angle) / sine)
     b = np.where(small, s, np.sin(s * angle) / sine)
     out = a * q0 + b * q1
-    return out / np.linalg.norm(out, axis=-1, keepdims=True)
+    return np.asarray(out / np.linalg.norm(out, axis=-1, keepdims=True))

@@ -96,7 +96,7 @@ def _aim(t: np.ndarray, seed: int, config: SimulationConfig) -> np.ndarray:
     pelvis = simulate_person(late.ravel(), config.action, seed, config.stature_m)[:, 0].reshape(*late.shape, 3)
     aim = pelvis.mean(axis=1)
     aim[:, 2] = 0.5 * config.stature_m
-    return aim
+    return np.asarray(aim)
 
 
 def _telemetry(

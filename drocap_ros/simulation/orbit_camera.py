@@ -60,7 +60,7 @@ def pinhole_matrix(image_width: int, image_height: int, horizontal_fov_deg: floa
 
 def to_camera(points: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
     """(F, P, 3) m in the camera frame of world points (F, P, 3)."""
-    return np.einsum("fij,fpj->fpi", rotation, points - position[:, None, :])
+    return np.asarray(np.einsum("fij,fpj->fpi", rotation, points - position[:, None, :]))
 
 
 def project(points: np.ndarray, rotation: np.ndarray, position: np.ndarray, camera_matrix: np.ndarray) -> np.ndarray:
@@ -69,4 +69,4 @@ def project(points: np.ndarray, rotation: np.ndarray, position: np.ndarray, came
     depth = local[..., 2]
     safe = np.where(depth > 1e-3, depth, np.nan)
     pixel = np.einsum("ij,fpj->fpi", camera_matrix, local)
-    return pixel[..., :2] / safe[..., None]
+    return np.asarray(pixel[..., :2] / safe[..., None])

@@ -49,4 +49,4 @@ def add_toes(joints: np.ndarray, heading: np.ndarray, stature_m: float) -> np.nd
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9)
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9))

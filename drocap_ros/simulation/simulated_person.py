@@ -122,12 +122,12 @@ def action_weights(t: np.ndarray, action: str) -> np.ndarray:
 def _smooth(u: np.ndarray) -> np.ndarray:
     """Quintic step from 0 to 1 over u in [0, 1]: continuous in acceleration."""
     u = np.clip(u, 0.0, 1.0)
-    return u**3 * (10 - 15 * u + 6 * u**2)
+    return np.asarray(u**3 * (10 - 15 * u + 6 * u**2))
 
 
 def _plateau(x: np.ndarray, start: float, end: float, ramp: float) -> np.ndarray:
     """1 between start and end, 0 outside, with smooth ramps inside."""
-    return _smooth((x - start) / ramp) * _smooth((end - x) / ramp)
+    return np.asarray(_smooth((x - start) / ramp) * _smooth((end - x) / ramp))
 
 
 def _heading(t: np.ndarray, style: _Style) -> np.ndarray:
@@ -139,7 +139,7 @@ def _heading(t: np.ndarray, style: _Style) -> np.ndarray:
 
 def _walk_speed(t: np.ndarray, action: str, style: _Style) -> np.ndarray:
     weight = action_weights(t, action)
-    return style.speed_m_s * (weight[:, 0] + 0.15 * weight[:, 1]) * _smooth(t / 1.0)
+    return np.asarray(style.speed_m_s * (weight[:, 0] + 0.15 * weight[:, 1]) * _smooth(t / 1.0))
 
 
 def _grid_path(seconds: float, action: str, style: _Style) -> tuple[np.ndarray, np.ndarray]:
@@ -173,7 +173,7 @@ def _foot_heading(t: np.ndarray, side: int, style: _Style) -> np.ndarray:
     """(F,) rad: constant while the foot stands, turned in the swing."""
     count, _, swing = _steps(t, side, style)
     now, then = (_heading(_stance_middle(number, side, style), style) for number in (count, count + 1))
-    return now + _smooth(swing) * (then - now)
+    return np.asarray(now + _smooth(swing) * (then - now))
 
 
 def _footprints(t: np.ndarray, side: int, action: str, style: _Style) -> tuple[np.ndarray, np.ndarray]:
@@ -199,7 +199,7 @@ def _rotation(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarra
     """(F, 3, 3) body -> world: roll about x, then pitch forward about y, then yaw about z."""
     from scipy.spatial.transform import Rotation
 
-    return Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1)).as_matrix()
+    return np.asarray(Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1)).as_matrix())
 
 
 def _apply(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
@@ -314,7 +314,7 @@ def _ankle_goal(
     chamber = hip + 0.35 * leg * ahead3 - np.array([0, 0, 0.42 * leg])
     stretched = hip + 0.93 * leg * ahead3 + np.array([0, 0, 0.12 * leg])
     lifted, extended = (k[:, None] for k in kick)
-    return goal + lifted * (chamber - goal) + extended * (stretched - chamber)
+    return np.asarray(goal + lifted * (chamber - goal) + extended * (stretched - chamber))
 
 
 def _wrist_goal(
@@ -344,4 +344,4 @@ def _wrist_goal(
     forward = along(0.1 + 0.8 * squat_depth, 0.12 * side * one, -0.95 + 0.95 * squat_depth)
     rest = np.clip(1 - walk - box - kick - squat, 0.0, 1.0)
     parts = ((rest, hang), (walk, walking), (box, guard), (kick, balance), (squat, forward))
-    return np.sum([w[:, None] * goal for w, goal in parts], axis=0)
+    return np.asarray(np.sum([w[:, None] * goal for w, goal in parts], axis=0))

@@ -54,7 +54,7 @@ def _draw_ground_and_sky(
 
 def _distance(rise: np.ndarray, position: np.ndarray) -> np.ndarray:
     """(h, w) float32 to the ground along rays that rise by ``rise`` m per unit; very far for rays that do not fall."""
-    return np.float32(max(float(position[2]), 0.05)) / np.maximum(-rise, np.float32(1e-4))
+    return np.asarray(np.float32(max(float(position[2]), 0.05)) / np.maximum(-rise, np.float32(1e-4)))
 
 
 def _affine(row: np.ndarray, width: int, height: int) -> np.ndarray:
