@@ -33,7 +33,7 @@ BUDGETS = {
     ("flight",): 8.6,  # the autopilots stand beside what they replace until preflight and link are smaller
     ("recording",): 4.9,
     ("simulation",): 3.6,
-    ("evaluation",): 1.7,
+    ("evaluation",): 1.1,
     ("export", "report", "view"): 4.2,
     ("ros", "nodes", "bringup"): 4.6,
     ("cli",): 4.5,
