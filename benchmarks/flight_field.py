@@ -165,7 +165,7 @@ def fly_orbit(row: OrbitRow, seed: int) -> str:
 def fly_fault(row: FaultRow, seed: int) -> str:
     """Last moving setpoint, s; farthest from there, m; what the bridge says at the end."""
     settings = LoopSettings(
-        autopilot=row.autopilot, seed=seed, seconds=FAULT_S + WATCH_S + 5.0, guid_timeout_s=row.timeout_s
+        autopilot=row.autopilot, seed=seed, seconds=FAULT_S + WATCH_S + 5.0, timeout_s=row.timeout_s
     )
     loop = OrbitLoop(settings)
     loop.start()

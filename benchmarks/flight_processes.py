@@ -26,6 +26,7 @@ from figures import ROOT, table, write_figures
 
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import NodeError
+from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.conditions import PICTURE_CODES, ConditionCode
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.mavlink.transport import open_transport
@@ -35,6 +36,7 @@ from drocap_ros.simulation.keypoint_errors import noisy_keypoints
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
+from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 from lab.flights.fault_causes import TIMEOUT
 from lab.flights.fault_flight import EXCURSION_M, MOTION_S, Bounds
@@ -85,10 +87,8 @@ class Drone:
     """
 
     def __init__(self, autopilot: str, port: int, camera_port: int, seed: int = 1) -> None:
-        mode = "LOITER" if autopilot == "px4" else "GUIDED"
-        self.copter = SimulatedCopter(
-            open_transport(f"udpout:127.0.0.1:{port}"), np.array([7.0, 0, 2.8]), np.pi, autopilot, mode=mode, seed=seed
-        )
+        setup = CopterSetup(autopilot, mode=autopilot_of(autopilot).handed_over_mode, seed=seed)
+        self.copter = SimulatedCopter(open_transport(f"udpout:127.0.0.1:{port}"), np.array([7.0, 0, 2.8]), np.pi, setup)
         self.autopilot, self.seeing, self.t = autopilot, True, 0.0
         self.rows: list[tuple[float, np.ndarray, int, str]] = []
         self._camera = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -5,6 +5,7 @@ Stops scale with the speed from what was measured on ArduPilot Copter at 2 m/s.
 
 from __future__ import annotations
 
+from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.orbit.states import State
 from lab.flights.fault_flight import FAULT_S, MOTION_S, Bounds, Cause, Flight
 from lab.flights.orbit_loop import LoopSettings
@@ -30,9 +31,9 @@ def _scaled(stop_m: float, speed: float) -> float:
 
 def _timeout_bounds(settings: LoopSettings, speed: float) -> Bounds:
     """The last setpoint acts for the time-out; then ArduPilot holds its position, PX4 changes to its hold mode."""
-    ardupilot = settings.autopilot == "ardupilot"
-    flown_s = settings.guid_timeout_s + 0.02 if ardupilot else settings.offboard_loss_s + _LOSS_CHECK_S
-    stop_m = _POSITION_STOP_M if ardupilot else _LOITER_STOP_M
+    holds = not autopilot_of(settings.autopilot).needs_mode_to_stop
+    flown_s = settings.timeout_s + (0.02 if holds else _LOSS_CHECK_S)
+    stop_m = _POSITION_STOP_M if holds else _LOITER_STOP_M
     return Bounds(max(flown_s, MOTION_S), speed * flown_s + _scaled(stop_m, speed) + _DRIFT_M)
 
 

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.orbit.states import Action, Command, OperatorCommand, State
 from drocap_ros.observation import PoseObservation
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
-from drocap_ros.simulation.vehicle.copter_reports import Readiness
+from drocap_ros.simulation.vehicle.copter_reports import CopterSetup, Readiness
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport, is_setpoint
 from lab.flights.fault_flight import FAULT_S, Injection
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, with_config
@@ -78,7 +79,7 @@ def second_vehicle(loop: OrbitLoop) -> None:
     sight = (loop.pelvis() - loop.copter.body.position)[:2]
     place = np.append(loop.pelvis()[:2] + 6.0 * sight / np.hypot(*sight), loop.copter.body.position[2])
     deaf = LoopbackTransport(Channel(lambda: loop.t), loop.down)
-    other = SimulatedCopter(deaf, place, 0.0, loop.settings.autopilot, seed=99, mode=loop.copter.mode)
+    other = SimulatedCopter(deaf, place, 0.0, CopterSetup(loop.settings.autopilot, seed=99, mode=loop.copter.mode))
     other.armed, other._period_s = True, dict(loop.copter._period_s)
     fly = loop.copter.fly
 
@@ -193,13 +194,13 @@ def stick_mode(settings: LoopSettings) -> LoopSettings:
 
 def short_timeouts(settings: LoopSettings) -> LoopSettings:
     """Time-outs of 0.3 s."""
-    return dataclasses.replace(settings, guid_timeout_s=0.3, offboard_loss_s=0.3)
+    return dataclasses.replace(settings, timeout_s=0.3)
 
 
 def shipped_timeouts(settings: LoopSettings) -> LoopSettings:
     """Time-outs as the autopilots ship: a flight only with the operator's permission."""
     settings = with_config(settings, max_control_timeout_s=0.0)
-    return dataclasses.replace(settings, guid_timeout_s=3.0, offboard_loss_s=1.0)
+    return dataclasses.replace(settings, timeout_s=autopilot_of(settings.autopilot).shipped_timeout_s)
 
 
 def same_radius(loop: OrbitLoop) -> str:

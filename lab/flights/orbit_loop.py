@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition
 from drocap_ros.flight.frames import camera_rotation
@@ -27,9 +28,8 @@ from drocap_ros.observation import PoseObservation
 from drocap_ros.simulation.keypoint_errors import detect_person
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
-from drocap_ros.simulation.vehicle.autopilot_modes import CONTROL_MODE, HANDED_OVER_MODE
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
-from drocap_ros.simulation.vehicle.copter_reports import Readiness
+from drocap_ros.simulation.vehicle.copter_reports import CopterSetup, Readiness
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 from drocap_ros.simulation.vehicle.mount import SimulatedMount
 
@@ -84,8 +84,7 @@ class LoopSettings:
     mount: str = "gimbal"
     camera_pitch_deg: float = math.nan
     field_deg: float = 60.0
-    guid_timeout_s: float = 0.5
-    offboard_loss_s: float = 0.5
+    timeout_s: float = 0.5
     config: MavlinkBridgeConfig = field(
         default_factory=lambda: MavlinkBridgeConfig(
             commands_enabled=True, mode_change_allowed=True, attitude_hz=25.0, position_hz=20.0
@@ -150,11 +149,19 @@ class OrbitLoop:
         start = np.array([math.cos(bearing), math.sin(bearing), 0.0]) * settings.distance_m
         start += np.array([*joints[0, 0, :2], settings.height_m])
         self.copter = SimulatedCopter(
-            LoopbackTransport(self.up, self.down), start, bearing + math.pi, settings.autopilot,
-            wind=np.array(settings.wind_m_s), seed=settings.seed, guid_timeout_s=settings.guid_timeout_s,
-            offboard_loss_s=settings.offboard_loss_s, mode=settings.start_mode or HANDED_OVER_MODE[settings.autopilot],
-            mount=SimulatedMount(settings.mount, settings.camera_pitch_deg), readiness=settings.readiness,
-        )  # fmt: skip
+            LoopbackTransport(self.up, self.down),
+            start,
+            bearing + math.pi,
+            CopterSetup(
+                settings.autopilot,
+                wind=settings.wind_m_s,
+                seed=settings.seed,
+                timeout_s=settings.timeout_s,
+                mode=settings.start_mode or autopilot_of(settings.autopilot).handed_over_mode,
+                mount=SimulatedMount(settings.mount, settings.camera_pitch_deg),
+                readiness=settings.readiness,
+            ),
+        )
         self.rows: list[Row] = []
         self.answers: list[tuple[float, CommandAnswer]] = []
         self.reasons: list[tuple[float, str, Condition]] = []
@@ -209,7 +216,7 @@ class OrbitLoop:
     def start(self, settle_s: float = 4.0, **values: float) -> None:
         """Let link and filter settle, then start the orbit; request control where the pilot has not given it."""
         self.run(self.t + settle_s)
-        in_control = self.copter.mode in CONTROL_MODE.values()
+        in_control = self.copter.mode == self.copter.kind.control_mode
         self.command(Command.START if in_control else Command.ENGAGE, **values)
 
     def observe(self, joints: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> PoseObservation:

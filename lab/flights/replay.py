@@ -12,15 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.simulation.vehicle.arducopter_control import ArduCopterControl
-from drocap_ros.simulation.vehicle.dynamics import AIRFRAMES, Body
-from drocap_ros.simulation.vehicle.flight_control import FlightControl, Manner, Target
-from drocap_ros.simulation.vehicle.px4_control import Px4Control
+from drocap_ros.flight.autopilot import autopilot_of
+from drocap_ros.simulation.vehicle.autopilot_control import control_of
+from drocap_ros.simulation.vehicle.dynamics import Body
+from drocap_ros.simulation.vehicle.flight_control import Manner, Target
 
 STEP_S = 0.01
 FAULT_S = 3.0
-#: From the bridge's process to the autopilot's controller.
-_TRANSIT_S = {"ardupilot": 0.002, "px4": 0.07}
 #: ArduPilot's path, and the integrals of both, depend on all earlier setpoints.
 _RUN_UP_S, _TREND_S = 60.0, 2.0
 #: Of the flights in 8 m/s: its direction is not recorded, and was fitted to them.
@@ -122,14 +120,15 @@ def _fly(
         np.stack([np.interp(times, flight.time_s, values[:, i]) for i in range(3)], axis=1)
         for values in (flight.position, flight.velocity)
     )
-    body = Body(position[0], float(flight.yaw[0]), np.array([*case.wind, 0.0]), AIRFRAMES[autopilot], gust=0.0)
+    kind = autopilot_of(autopilot)
+    assert kind.simulated is not None
+    body = Body(position[0], float(flight.yaw[0]), np.array([*case.wind, 0.0]), kind.simulated.airframe, gust=0.0)
     hovering = body.drag()
     body.velocity = velocity[0]
-    make = ArduCopterControl if autopilot == "ardupilot" else Px4Control
-    control: FlightControl = make(position[0], body.yaw, hovering - np.array([*trim, 0.0]))
+    control = control_of(kind, position[0], body.yaw, hovering - np.array([*trim, 0.0]))
     control.begin(Manner.SETPOINTS, position[0], velocity[0], body.yaw)
     control.push = [float(v) for v in _slope(velocity, 0)[:2]]
-    arrivals = flight.setpoint_s + _TRANSIT_S[autopilot]
+    arrivals = flight.setpoint_s + kind.simulated.transit_s
     heard = flight.setpoint_s <= case.heard_until_s
     index = int(np.searchsorted(arrivals, first_s - 0.1))
     last_s, events, rows = -1.0, list(case.events), []

@@ -7,6 +7,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.frames import enu_to_ned
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
+from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 
 RADIUS, SPEED, RAMP_S, HEIGHT = 6.0, 2.0, 3.0, 2.5
@@ -16,14 +17,18 @@ ALL = 0  # no part of a setpoint is ignored
 class Flight:
     """A copter without estimation errors, and its setpoints."""
 
-    def __init__(self, wind=0.0, centre_speed=0.0, guid_timeout_s=3.0):
+    def __init__(self, wind=0.0, centre_speed=0.0, timeout_s=3.0):
         self.t, self.centre_speed = 0.0, centre_speed
         channels = [Channel(lambda: self.t) for _ in range(2)]
         self.up, self.down = channels
         self.copter = SimulatedCopter(
-            LoopbackTransport(*channels), np.array([RADIUS, 0.0, HEIGHT]), math.pi, mode="GUIDED", gps_noise_m=0.0,
-            attitude_error_deg=0.0, wind=np.array([wind, 0.0, 0.0]), guid_timeout_s=guid_timeout_s,
-        )  # fmt: skip
+            LoopbackTransport(*channels),
+            np.array([RADIUS, 0.0, HEIGHT]),
+            math.pi,
+            CopterSetup(
+                mode="GUIDED", gps_noise_m=0.0, attitude_error_deg=0.0, wind=(wind, 0.0, 0.0), timeout_s=timeout_s
+            ),
+        )
         self.mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
         self.rows = []
 

@@ -25,6 +25,7 @@ from drocap_ros.simulation.keypoint_errors import noisy_keypoints
 from drocap_ros.simulation.orbit_camera import pinhole_matrix, project
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
+from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,7 +38,7 @@ class Drone:
 
     def __init__(self, graph, port):
         transport = open_transport(f"udpout:127.0.0.1:{port}")
-        self.copter = SimulatedCopter(transport, np.array([7.0, 0, 2.8]), np.pi, mode="GUIDED", seed=1)
+        self.copter = SimulatedCopter(transport, np.array([7.0, 0, 2.8]), np.pi, CopterSetup(mode="GUIDED", seed=1))
         self.graph, self.seeing = graph, True
         self._pose2d = graph.node.create_publisher(TOPICS["pose2d"].message, "pose2d", TOPICS["pose2d"].qos)
         self._info = graph.node.create_publisher(CameraInfo, "camera_info", TOPICS["camera_info"].qos)

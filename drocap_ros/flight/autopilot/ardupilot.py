@@ -16,6 +16,7 @@ from drocap_ros.flight.autopilot.autopilot import (
     warn_if,
 )
 from drocap_ros.flight.autopilot.coasting import ContinuedCoasting
+from drocap_ros.flight.autopilot.simulated import Airframe, Decay, Gains, Simulated
 from drocap_ros.flight.findings import Level
 
 _NO_PLACE = 16 | 32  # bits of GUID_OPTIONS: the vehicle drifts off its setpoints and its hold
@@ -106,5 +107,17 @@ ARDUPILOT = Autopilot(
         mount=" (MNT1_TYPE)",
         battery=" (BATT_MONITOR 4 and BATT_CAPACITY)",
         by_hand="switch to GUIDED by hand",
+    ),
+    simulated=Simulated(
+        stick_mode="LOITER",
+        settings={"GUID_TIMEOUT": 0.5},
+        gains=Gains(position=1.0, velocity=2.0, integral=1.0, derivative=0.25),  # PSC_NE_POS_P, PSC_NE_VEL_P, _I, _D
+        # This and the decays: fitted to the recorded flights.
+        airframe=Airframe((0.093, 0.048), drag=0.0275, inflow=0.25, friction=0.0),
+        stop=Decay(0.667, 7.5),  # BRAKE: its jerk limit over its deceleration
+        hold=Decay(1.28, 2.92),
+        stick=Decay(3.0, 2.5),
+        jerk_m_s3=5.0,  # PSC_JERK_NE
+        transit_s=0.002,
     ),
 )  # fmt: skip

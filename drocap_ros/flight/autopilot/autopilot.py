@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.autopilot.coasting import Coast, Coasting, HeldCoasting, coast_of
+from drocap_ros.flight.autopilot.simulated import Simulated
 from drocap_ros.flight.findings import Level
 from drocap_ros.flight.setpoint import Setpoint
 
@@ -182,6 +183,8 @@ class Autopilot:
 
     mount_type_setting : parameter of the mount's kind, whose value ``servo_mount`` means servos without a sensor
     checks, fence, hints
+
+    simulated : its counterpart in the simulation; None = it cannot be simulated
     """
 
     name: str
@@ -218,6 +221,7 @@ class Autopilot:
     checks: tuple[SettingCheck, ...] = ()
     fence: FenceSettings | None = None
     hints: Hints = _NO_HINTS
+    simulated: Simulated | None = None
 
     @property
     def supported(self) -> bool:

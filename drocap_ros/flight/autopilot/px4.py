@@ -18,6 +18,7 @@ from drocap_ros.flight.autopilot.autopilot import (
     warn_if,
 )
 from drocap_ros.flight.autopilot.coasting import HeldCoasting
+from drocap_ros.flight.autopilot.simulated import Airframe, Decay, Gains, Simulated, StickOverride
 from drocap_ros.flight.findings import Level
 
 #: Values of GF_ACTION that guard nobody: its 4 is flight termination, above a person.
@@ -130,5 +131,23 @@ PX4 = Autopilot(
         port=" (MAV_n_MODE Onboard)",
         battery=" (BAT1_CAPACITY)",
         engaged="PX4 grants OFFBOARD only while setpoints arrive",
+    ),
+    simulated=Simulated(
+        stick_mode="POSCTL",
+        settings={"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5},
+        gains=Gains(position=0.95, velocity=1.8, integral=0.4, derivative=0.2),  # as it ships
+        # Its SIH simulator has a friction of 1 N s/m for its 1 kg.  With the wind's part of it nothing would fly in
+        # 8 m/s, so wind pushes by the drag alone; the own motion is slowed down by the friction alone, at 1.4 m/s
+        # against 8 m/s of wind by 1.4 m/s^2, where the drag would add 0.4.  No recorded flight is in wind.
+        airframe=Airframe((0.1, 0.04), drag=0.016, inflow=0.0, friction=1.0),
+        stop=Decay(2.5, 3.3),  # this and the next three: fitted to the recorded flights
+        hold=Decay(2.5, 3.3),
+        stick=Decay(3.0, 3.0),
+        jerk_m_s3=9.4,
+        lost_modes={0: "POSCTL", 1: "ALTCTL", 3: "RTL", 4: "LAND", 5: "LOITER"},
+        loss_check_s=(0.06, 0.13),  # measured
+        override=StickOverride("COM_RC_OVERRIDE", 2, 1),
+        streams={"ATTITUDE": 0.05, "SYS_STATUS": 1.0},
+        transit_s=0.07,
     ),
 )  # fmt: skip

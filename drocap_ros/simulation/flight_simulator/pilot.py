@@ -9,13 +9,10 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.mavlink.transport import Transport
-from drocap_ros.simulation.vehicle.autopilot_modes import HANDED_OVER_MODE
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
+from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
 from drocap_ros.simulation.vehicle.flight_control import Manner, Target
-from drocap_ros.simulation.vehicle.mount import SimulatedMount
 
-#: The mode in which the sticks command velocities.
-STICK_MODE = {"ardupilot": "LOITER", "px4": "POSCTL"}
 _CLIMB_M_S, _BRAKING_M_S2, _LAG_S = 1.2, 1.45, 0.35
 _SKIDS_M = 0.1
 _READY_S, _HOVER_S = 1.0, 1.5
@@ -25,18 +22,12 @@ class PilotedCopter(SimulatedCopter):
     """A copter that stands on the ground until its pilot takes off.
 
     ground : (2,) m ENU, initial position
-    stick : (3,) m/s ENU, the velocity commanded by the sticks in ``STICK_MODE``
+    stick : (3,) m/s ENU, the velocity commanded by the sticks
     The other parameters are those of :class:`SimulatedCopter`.
     """
 
-    def __init__(
-        self, transport: Transport, ground: np.ndarray, yaw: float, autopilot: str, *, wind: np.ndarray, seed: int,
-        mount: SimulatedMount | None = None,
-    ) -> None:  # fmt: skip
-        super().__init__(
-            transport, np.array([*ground, _SKIDS_M]), yaw, autopilot, wind=wind, seed=seed, mode=STICK_MODE[autopilot],
-            mount=mount,
-        )  # fmt: skip
+    def __init__(self, transport: Transport, ground: np.ndarray, yaw: float, setup: CopterSetup) -> None:
+        super().__init__(transport, np.array([*ground, _SKIDS_M]), yaw, setup._replace(mode=""))
         self.armed, self.landed_state = False, mavlink.MAV_LANDED_STATE_ON_GROUND
         self.stick: np.ndarray = np.zeros(3)
         self._ground: np.ndarray = self.body.position.copy()
@@ -49,7 +40,7 @@ class PilotedCopter(SimulatedCopter):
 
     def _move(self, dt: float) -> None:
         control = self.control
-        if self.mode == STICK_MODE[self.autopilot]:
+        if self.mode == self.simulated.stick_mode:
             manner = Manner.STICK if self.stick.any() else Manner.HOLD
             if control.manner != manner:
                 control.begin(manner, self.estimate, self.body.velocity, self.body.yaw)
@@ -100,7 +91,7 @@ class SimulatedPilot:
                 copter.stick, copter.landed_state = np.zeros(3), mavlink.MAV_LANDED_STATE_IN_AIR
                 self._enter(PilotPhase.HOVER, t_s)
         elif self.phase == PilotPhase.HOVER and t_s - self._since_s >= _HOVER_S:
-            copter.set_mode(HANDED_OVER_MODE[copter.autopilot], "pilot")
+            copter.set_mode(copter.kind.handed_over_mode, "pilot")
             self._enter(PilotPhase.HANDED_OVER, t_s)
 
     def _enter(self, phase: PilotPhase, t_s: float) -> None:

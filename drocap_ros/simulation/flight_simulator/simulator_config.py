@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from drocap_ros.flight.autopilot import AUTOPILOTS
 from drocap_ros.parameters import Parameters, param
 from drocap_ros.simulation.simulated_person import ACTIONS
 from drocap_ros.simulation.vehicle.mount import MOUNT_TYPES
-
-_SIMULATED_AUTOPILOTS = ("ardupilot", "px4")
 
 
 @dataclass(frozen=True)
@@ -16,7 +15,7 @@ class FlightSimulatorConfig(Parameters):
     """Vehicle, person and camera of the flight simulator."""
 
     vehicle_url: str = param("udpout:127.0.0.1:14540", "MAVLink URL of the simulated vehicle")
-    autopilot: str = param("ardupilot", "MAVLink dialect of the vehicle", choices=_SIMULATED_AUTOPILOTS)
+    autopilot: str = param("ardupilot", "MAVLink dialect of the vehicle", choices=tuple(AUTOPILOTS))
     seed: int = param(0, "seed of person, take, wind, sensor errors and scenery", minimum=0)
     action: str = param("mixed", "motion of the person while setpoints steer the vehicle", choices=ACTIONS)
     stature_m: float = param(1.75, "height of the person", unit="m", minimum=0.5, maximum=2.5)

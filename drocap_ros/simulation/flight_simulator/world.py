@@ -14,7 +14,7 @@ from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimula
 from drocap_ros.simulation.flight_simulator.truth import MAX_EXPOSURES, FlightTruth
 from drocap_ros.simulation.orbit_camera import pinhole_matrix
 from drocap_ros.simulation.simulated_person import simulate_person
-from drocap_ros.simulation.vehicle.autopilot_modes import CONTROL_MODE
+from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
 from drocap_ros.simulation.vehicle.mount import SimulatedMount
 from drocap_ros.skeleton import BODY_17
 
@@ -51,10 +51,16 @@ class FlightWorld:
         bearing = float(np.random.default_rng([config.seed, 0xF5]).uniform(-math.pi, math.pi))
         ground = config.start_distance_m * np.array([math.cos(bearing), math.sin(bearing)])
         self.copter = PilotedCopter(
-            transport, ground, math.remainder(bearing + math.pi, 2 * math.pi), config.autopilot,
-            wind=np.array([config.wind_m_s, 0.0, 0.0]), seed=config.seed,
-            mount=SimulatedMount(config.mount, config.camera_pitch_deg),
-        )  # fmt: skip
+            transport,
+            ground,
+            math.remainder(bearing + math.pi, 2 * math.pi),
+            CopterSetup(
+                config.autopilot,
+                wind=(config.wind_m_s, 0.0, 0.0),
+                seed=config.seed,
+                mount=SimulatedMount(config.mount, config.camera_pitch_deg),
+            ),
+        )
         self._take = Take(config)
         aim = self._take.at(0.0)[0]
         self.pilot = SimulatedPilot(self.copter, config.takeoff_height_m, aim)
@@ -69,7 +75,7 @@ class FlightWorld:
         passed_s, self._t = t_s - self._t, t_s
         self.copter.fly(t_s)
         self.pilot.step(t_s)
-        if self.copter.mode == CONTROL_MODE[self.copter.autopilot] and self.copter.accepted_setpoints > self._setpoints:
+        if self.copter.mode == self.copter.kind.control_mode and self.copter.accepted_setpoints > self._setpoints:
             if t_s - self._setpoint_s > _GAP_S:
                 self._steered_s = t_s
             self._setpoint_s = t_s

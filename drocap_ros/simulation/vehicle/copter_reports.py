@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,15 +11,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.frames import enu_to_ned, quaternion_multiply
 from drocap_ros.flight.mavlink.transport import Transport
-from drocap_ros.simulation.vehicle.arducopter_control import ArduCopterControl
-from drocap_ros.simulation.vehicle.autopilot_modes import CONTROL_MODE, MODES
-from drocap_ros.simulation.vehicle.dynamics import AIRFRAMES, Body
+from drocap_ros.simulation.vehicle.autopilot_control import control_of
+from drocap_ros.simulation.vehicle.dynamics import Body
 from drocap_ros.simulation.vehicle.estimate_error import EstimateError
 from drocap_ros.simulation.vehicle.flight_control import FlightControl
 from drocap_ros.simulation.vehicle.flight_path import VehiclePose
 from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle
 from drocap_ros.simulation.vehicle.mount import MOUNT_TYPES, SimulatedMount
-from drocap_ros.simulation.vehicle.px4_control import Px4Control
 
 _GPS_NOTICED_S, EKF_NOTICED_S = 0.4, 7.4
 _HEALTHY, _CONSTANT_POSITION = 831, 831 & ~(8 | 16) | 128
@@ -37,30 +36,47 @@ class Readiness(NamedTuple):
     origin_s: float = -1.0
 
 
+class CopterSetup(NamedTuple):
+    """Of a simulated copter.
+
+    wind : (3,) m/s
+    gps_noise_m : of the slow error of the position; fine errors are added
+    timeout_s : its own time-out without setpoints
+    mode : at first; "" = that of the sticks
+    mount : of the camera; None = a gimbal, level
+    readiness : when what the pilot waits for comes, one after the other
+    """
+
+    autopilot: str = "ardupilot"
+    wind: Sequence[float] = (0.0, 0.0, 0.0)
+    seed: int = 0
+    gps_noise_m: float = 0.4
+    attitude_error_deg: float = 0.4
+    timeout_s: float = 0.5
+    mode: str = "LOITER"
+    mount: SimulatedMount | None = None
+    readiness: Readiness = Readiness()
+
+
 class ReportingCopter(SimulatedVehicle):
     """State of a copter and its telemetry; see :class:`drocap_ros.simulation.vehicle.copter.SimulatedCopter`."""
 
-    def __init__(
-        self, transport: Transport, position: np.ndarray, yaw: float, autopilot: str, wind: np.ndarray, seed: int,
-        gps_noise_m: float, attitude_error_deg: float, mode: str, mount: SimulatedMount, readiness: Readiness,
-    ) -> None:  # fmt: skip
-        self.mount = mount
-        super().__init__("", None, autopilot, gimbal=mount.kind != "fixed", transport=transport)
-        if autopilot == "ardupilot":
-            self.settings["MNT1_TYPE"] = float(MOUNT_TYPES[mount.kind])
-        self.body = Body(position, yaw, wind, AIRFRAMES[autopilot], seed)
-        control = ArduCopterControl if autopilot == "ardupilot" else Px4Control
-        self.control: FlightControl = control(position, yaw, self.body.drag())
-        self.error = EstimateError(gps_noise_m, autopilot == "px4", seed)
-        self.readiness = readiness
-        self.mode, self.intended = mode, mode  # intended: chosen last; PX4 keeps it where a failsafe enters another
-        self.armed, self.battery, self.landed_state = True, 87, mavlink.MAV_LANDED_STATE_IN_AIR
+    def __init__(self, transport: Transport, position: np.ndarray, yaw: float, setup: CopterSetup) -> None:
+        self.mount, self.readiness = setup.mount or SimulatedMount(), setup.readiness
+        super().__init__(transport, None, setup.autopilot, gimbal=self.mount.kind != "fixed")
+        if self.kind.mount_type_setting:
+            self.settings[self.kind.mount_type_setting] = float(MOUNT_TYPES[self.mount.kind])
+        self.body = Body(position, yaw, np.array(setup.wind, float), self.simulated.airframe, setup.seed)
+        self.control: FlightControl = control_of(self.kind, position, yaw, self.body.drag())
+        self.error = EstimateError(setup.gps_noise_m, self.kind.height_wanders, setup.seed)
+        self.mode = self.intended = setup.mode or self.simulated.stick_mode
+        self.battery, self.landed_state = 87, mavlink.MAV_LANDED_STATE_IN_AIR
         self.gps_lost_s = self.ekf_failed_s = math.inf
         self.frozen = False  # telemetry repeats its last values, with fresh or old stamps
         self.frozen_clock = False
         self._t = 0.0
-        self._rng = np.random.default_rng([seed, 0xC1])
-        self._attitude_error = math.radians(attitude_error_deg) * self._rng.standard_normal(3)
+        self._rng = np.random.default_rng([setup.seed, 0xC1])
+        self._attitude_error = math.radians(setup.attitude_error_deg) * self._rng.standard_normal(3)
         self._report: VehiclePose | None = None
         self._report_s = -1.0
 
@@ -100,8 +116,7 @@ class ReportingCopter(SimulatedVehicle):
         return self.mount.camera(self.body.orientation_xyzw())
 
     def _known(self) -> frozenset[int]:
-        # PX4 sends its heartbeat once a second, whatever is requested.
-        own = {mavlink.MAVLINK_MSG_ID_HEARTBEAT} if self.autopilot == "ardupilot" else set()
+        own = {mavlink.MAVLINK_MSG_ID_HEARTBEAT} if self.kind.heartbeat_on_request else set()
         return super()._known() | {_ECHO} | own
 
     def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> Any:
@@ -138,14 +153,15 @@ class ReportingCopter(SimulatedVehicle):
         return super()._telemetry(number, reported_s, pose)
 
     def _echo(self, boot_ms: int) -> Any:
-        """The target that is followed.  ArduPilot sends it throughout GUIDED, PX4 in every mode: heard or not.
+        """The target that is followed, whether setpoints arrive or not.
 
-        PX4 sends what its controller commands, the velocity with the correction of the position.
+        A setpoint that is continued is sent throughout the control mode; of one that is held, what the controller
+        commands is sent in every mode: the velocity with the correction of the position.
         """
         target, control = self.control.target, self.control
         mask, velocity, acceleration, yaw = 0, target.velocity, target.acceleration, 0.0
-        if self.autopilot == "ardupilot":
-            if self.mode != CONTROL_MODE[self.autopilot]:
+        if self.kind.continues_setpoints:
+            if self.mode != self.kind.control_mode:
                 return None
             mask = _NO_YAW
             position = np.zeros(3) if target.position is None else target.position
@@ -159,18 +175,4 @@ class ReportingCopter(SimulatedVehicle):
         values = [float(v) for vector in (position, velocity, acceleration) for v in enu_to_ned(vector)]
         return self._mav.position_target_local_ned_encode(
             boot_ms, mavlink.MAV_FRAME_LOCAL_NED, mask, *values, yaw, -target.yaw_rate
-        )
-
-    def _present_modes(self) -> tuple[int, int]:
-        return MODES["px4"][self.mode], MODES["px4"][self.intended]
-
-    def _heartbeat(self) -> Any:
-        px4 = self.autopilot == "px4"
-        armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0
-        return self._mav.heartbeat_encode(
-            mavlink.MAV_TYPE_QUADROTOR,
-            mavlink.MAV_AUTOPILOT_PX4 if px4 else mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
-            mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | armed,
-            MODES[self.autopilot][self.mode],
-            mavlink.MAV_STATE_ACTIVE,
         )

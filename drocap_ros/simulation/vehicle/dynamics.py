@@ -6,37 +6,14 @@ An autopilot's control (:mod:`drocap_ros.simulation.vehicle.flight_control`) com
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
+
+from drocap_ros.flight.autopilot.simulated import Airframe
 
 _YAW_LAG_S, _MAX_YAW_RATE = 0.1, 1.6
 _GUST = 0.09  # share of the wind
 _GUST_TURN = 0.27  # rad/s of yaw per m/s of lateral gust
-
-
-class Airframe(NamedTuple):
-    """Of a copter.
-
-    lags_s : of the thrust, one after the other
-    drag, inflow : of the air, per m and per s: what the body and what the propellers slow down
-    friction : per s of the own motion
-    """
-
-    lags_s: tuple[float, float]
-    drag: float
-    inflow: float
-    friction: float
-
-
-#: Fitted to the recorded flights.  PX4's SIH simulator has a friction of 1 N s/m for its 1 kg; with the wind's part of
-#: it nothing would fly in 8 m/s, so that wind pushes by the drag alone.  Its own motion is slowed down by the friction
-#: alone, at 1.4 m/s against 8 m/s of wind by 1.4 m/s^2, where the drag would add 0.4 (a real copter has no friction).
-#: No recorded flight of PX4 is in wind.
-AIRFRAMES = {
-    "ardupilot": Airframe((0.093, 0.048), 0.0275, 0.25, 0.0),
-    "px4": Airframe((0.1, 0.04), 0.016, 0.0, 1.0),
-}
 
 
 class Body:

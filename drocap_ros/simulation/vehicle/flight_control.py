@@ -1,13 +1,14 @@
-"""Position and velocity loops of an autopilot: what is common to ArduPilot and PX4."""
+"""Position and velocity loops of an autopilot: what is common to all."""
 
 from __future__ import annotations
 
 import enum
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
+
+from drocap_ros.flight.autopilot.simulated import Gains
 
 MAX_LEAN_M_S2 = 5.66  # 30 degrees
 _YAW_GAIN = 5.8
@@ -33,15 +34,6 @@ class Manner(enum.Enum):
     HOLD = "stops and stays"
     BRAKE = "stops sooner, and stays"
     STICK = "velocity of the pilot's stick"
-
-
-class Gains(NamedTuple):
-    """Of position and velocity; the wanted acceleration is passed on as it is."""
-
-    position: float
-    velocity: float
-    integral: float
-    derivative: float
 
 
 class FlightControl:
@@ -83,7 +75,7 @@ class FlightControl:
     def command(self, position: np.ndarray, velocity: np.ndarray, expired: bool, dt: float) -> np.ndarray:
         """(3,) m/s^2 of thrust, from the estimated place and velocity; ``expired`` the last setpoint is too old."""
         here, speed = (float(position[0]), float(position[1])), (float(velocity[0]), float(velocity[1]))
-        self._shape(here, speed, expired, dt)
+        self._shape(here, expired, dt)
         gains, command = self.gains, [0.0, 0.0]
         toward = self._away = self._toward(here)
         error = toward[0] + self.pace[0] - speed[0], toward[1] + self.pace[1] - speed[1]
@@ -112,7 +104,7 @@ class FlightControl:
             rate += _YAW_GAIN * math.remainder(self.target.yaw - yaw, 2 * math.pi)
         return rate
 
-    def _shape(self, here: tuple[float, float], speed: tuple[float, float], expired: bool, dt: float) -> None:
+    def _shape(self, here: tuple[float, float], expired: bool, dt: float) -> None:
         raise NotImplementedError
 
     def _sensed(

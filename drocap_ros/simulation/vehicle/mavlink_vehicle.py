@@ -18,6 +18,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import InputError
+from drocap_ros.flight.autopilot import AUTOPILOTS, autopilot_of
 from drocap_ros.flight.frames import enu_to_geodetic, enu_to_ned, flu_to_frd, orientation_to_aviation
 from drocap_ros.flight.mavlink.current_mode import CURRENT_MODE_ID, CurrentMode
 from drocap_ros.flight.mavlink.parser import MavlinkParser
@@ -25,12 +26,9 @@ from drocap_ros.flight.mavlink.signing import sign_with
 from drocap_ros.flight.mavlink.transport import Transport, open_transport
 from drocap_ros.simulation.vehicle.flight_path import FlightPath, VehiclePose, orbit_path
 
-AUTOPILOTS = ("ardupilot", "px4")
 #: Latitude deg, longitude deg, altitude m of the local frame's origin.
 HOME = np.array([47.397742, 8.545594, 488.0])
-_COPTER_GUIDED = 4
-_PX4_OFFBOARD = 6 << 16
-_CURRENT_MODE_S = 0.5  # PX4 publishes its state so often, and every change at once
+_CURRENT_MODE_S = 0.5  # an autopilot publishes its state so often, and every change at once
 _ESTIMATOR_HEALTHY = 831
 _GIMBAL_FLAGS = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
 _GIMBAL_EARTH = _GIMBAL_FLAGS | mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
@@ -41,13 +39,12 @@ class SimulatedVehicle:
 
     Parameters
     ----------
-    url : of :func:`drocap_ros.flight.mavlink.transport.open_transport`
+    link : a transport, or a URL of :func:`drocap_ros.flight.mavlink.transport.open_transport`
     path : None = the subclass overrides :meth:`at`
-    autopilot : "ardupilot" or "px4"
+    autopilot : name of one that has a simulated counterpart
     gimbal : whether it has a gimbal and reports its attitude
     max_rate_hz : highest delivered rate, whatever was requested and acknowledged (a slow link)
     boot_s : time since boot at path time 0
-    transport : replaces the URL
     signing_key : 32 bytes; it then signs its packets and drops unsigned ones
 
     Raises
@@ -58,35 +55,35 @@ class SimulatedVehicle:
 
     def __init__(
         self,
-        url: str,
+        link: str | Transport,
         path: FlightPath | None,
         autopilot: str = "ardupilot",
         *,
         gimbal: bool = True,
         max_rate_hz: float = 400.0,
         boot_s: float = 30.0,
-        transport: Transport | None = None,
         signing_key: bytes | None = None,
     ) -> None:
-        if autopilot not in AUTOPILOTS:
+        kind = autopilot_of(autopilot)
+        if kind.simulated is None:
             raise InputError(f"autopilot: expected one of {', '.join(AUTOPILOTS)}, got {autopilot!r}")
+        self.kind, self.simulated = kind, kind.simulated
         self.path, self.autopilot, self.gimbal = path, autopilot, gimbal
         self.received: list[str] = []  # names of the received messages, for tests of what is sent
         self._max_rate_hz, self.boot_s = max_rate_hz, boot_s
-        self._transport = transport or open_transport(url)
+        self._transport = open_transport(link) if isinstance(link, str) else link
         self._parser = MavlinkParser()
         #: Parameters of the autopilot by their names: a float, or an int.
-        self.settings: dict[str, float] = (
-            {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5} if autopilot == "px4" else {"GUID_TIMEOUT": 0.5}
-        )
+        self.settings: dict[str, float] = dict(self.simulated.settings)
         self._mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
         if signing_key is not None:
             self.use_key(signing_key, time.time_ns())
         self._period_s: dict[int, float] = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}
-        if autopilot == "px4":  # PX4 streams some messages unrequested, ArduPilot almost none
-            self._period_s[mavlink.MAVLINK_MSG_ID_ATTITUDE] = 0.05
-            self._period_s[mavlink.MAVLINK_MSG_ID_SYS_STATUS] = 1.0
+        self._period_s |= {_number(name): period_s for name, period_s in self.simulated.streams.items()}
         self._due_s: dict[int, float] = {}
+        self.armed = True
+        #: The mode, and the one that was chosen last: an autopilot keeps it where a failsafe enters another.
+        self.mode = self.intended = kind.control_mode
         self._mode_sent: tuple[float, tuple[int, int]] = (-math.inf, (0, 0))
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -170,7 +167,7 @@ class SimulatedVehicle:
         if name not in self.settings:
             return
         value, kind = self.settings[name], mavlink.MAV_PARAM_TYPE_REAL32
-        if isinstance(value, int):  # PX4 sends the bytes of the integer in the field of the float
+        if self.kind.integers_in_bytes and isinstance(value, int):
             value, kind = struct.unpack("<f", struct.pack("<i", value))[0], mavlink.MAV_PARAM_TYPE_INT32
         self._send(self._mav.param_value_encode(name.encode("ascii"), value, kind, len(self.settings), 0))
 
@@ -184,13 +181,8 @@ class SimulatedVehicle:
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _known(self) -> frozenset[int]:
-        estimator = (
-            mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS
-            if self.autopilot == "px4"
-            else mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT
-        )
         numbers = {
-            estimator,
+            _number(self.kind.estimator_message),
             mavlink.MAVLINK_MSG_ID_ATTITUDE,
             mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
             mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
@@ -200,7 +192,7 @@ class SimulatedVehicle:
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
             mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
         }
-        if self.autopilot == "px4":
+        if not self.kind.heartbeat_on_request:
             numbers.add(CURRENT_MODE_ID)
         return frozenset(numbers | ({mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS} if self.gimbal else set()))
 
@@ -232,18 +224,18 @@ class SimulatedVehicle:
         return self._satellite_position(number, boot_ms, pose)
 
     def _heartbeat(self) -> Any:
-        px4 = self.autopilot == "px4"
+        armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0
         return self._mav.heartbeat_encode(
             mavlink.MAV_TYPE_QUADROTOR,
-            mavlink.MAV_AUTOPILOT_PX4 if px4 else mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
-            mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_SAFETY_ARMED,
-            _PX4_OFFBOARD if px4 else _COPTER_GUIDED,
+            self.kind.mav_autopilot,
+            mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | armed,
+            self.kind.modes[self.mode],
             mavlink.MAV_STATE_ACTIVE,
         )
 
     def _present_modes(self) -> tuple[int, int]:
         """Numbers of the present and of the intended mode."""
-        return _PX4_OFFBOARD, _PX4_OFFBOARD
+        return self.kind.modes[self.mode], self.kind.modes[self.intended]
 
     def _current_mode(self, t_s: float) -> Any:
         sent_s, before = self._mode_sent
@@ -276,6 +268,10 @@ class SimulatedVehicle:
         )
 
 
+def _number(name: str) -> int:
+    return int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
+
+
 def _setting(text: str) -> tuple[str, float]:
     """Name and value of NAME=VALUE; a value without a decimal point is an int."""
     name, _, value = text.partition("=")
@@ -289,7 +285,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run an orbit as a process."""
     parser = argparse.ArgumentParser(prog="mavlink_vehicle", description=__doc__)
     parser.add_argument("--url", default="udpout:127.0.0.1:14540", help="address of the companion computer")
-    parser.add_argument("--autopilot", choices=AUTOPILOTS, default="ardupilot")
+    parser.add_argument("--autopilot", choices=tuple(AUTOPILOTS), default="ardupilot")
     parser.add_argument("--seconds", type=float, default=3600.0, help="length of the flight, s")
     parser.add_argument("--radius", type=float, default=6.0, help="of the orbit, m")
     parser.add_argument("--height", type=float, default=2.5, help="above the ground, m")

@@ -78,7 +78,7 @@ def test_settings_are_requested_until_reported_and_then_rarely():
 
 @pytest.mark.parametrize(("autopilot", "name"), [("ardupilot", "GUID_TIMEOUT"), ("px4", "COM_OF_LOSS_T")])
 def test_orbit_is_refused_when_the_autopilot_flies_on_without_setpoints(autopilot, name):
-    loop = OrbitLoop(LoopSettings(autopilot=autopilot, seconds=10, guid_timeout_s=3.0, offboard_loss_s=1.0))
+    loop = OrbitLoop(LoopSettings(autopilot=autopilot, seconds=10, timeout_s=autopilot_of(autopilot).shipped_timeout_s))
     loop.start()
     loop.run(7.0)
     answer = loop.answers[0][1]

@@ -15,6 +15,7 @@ from drocap_ros.flight.preflight.measure import Listening, version_text
 from drocap_ros.flight.preflight.setup_checks import Setup
 from drocap_ros.simulation.orbit_camera import pinhole_matrix
 from drocap_ros.simulation.vehicle.copter import SimulatedCopter
+from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 
 FENCE = {
@@ -33,7 +34,7 @@ class Scene:
         self.t = 0.0
         self.down, self.up = Channel(lambda: self.t, 1), Channel(lambda: self.t, 2)
         self.copter = SimulatedCopter(
-            LoopbackTransport(self.up, self.down), np.zeros(3), 0.0, autopilot, mode="LOITER", seed=3
+            LoopbackTransport(self.up, self.down), np.zeros(3), 0.0, CopterSetup(autopilot, mode="LOITER", seed=3)
         )
         self.copter.armed, self.copter.landed_state = False, 1
         self.copter.settings.update({**FENCE[autopilot], **settings})

@@ -104,7 +104,7 @@ def test_with_the_downlink_lost_px4_ends_in_its_own_hold_and_offboard_does_not_r
     loop.down.cut = False
     loop.run(16.0)
     (t, mode, by) = loop.copter.mode_log[-1]
-    assert (mode, by) == ("LOITER", "failsafe: offboard lost")
+    assert (mode, by) == ("LOITER", "failsafe: setpoints lost")
     assert t <= 7.0 + 0.25 + loop.settings.config.blind_hold_s + 0.7
     assert loop.copter.mode == "LOITER"
     assert {row.action for row in loop.rows if row.t_s > t} == {Action.NOTHING}

@@ -19,9 +19,9 @@ def settled(mask=ALL, yaw_from="reference", **world):
     return float(radius.mean()), float(np.abs(radius).mean()), math.degrees(float(np.abs(rows[:, 8]).mean()))
 
 
-def stop(how, guid_timeout_s=3.0):
+def stop(how, timeout_s=3.0):
     """Greatest distance from the position at the stop, m."""
-    flight = Flight(guid_timeout_s=guid_timeout_s)
+    flight = Flight(timeout_s=timeout_s)
     flight.fly(15.04, lambda: flight.orbit(ALL, "vehicle"))  # the stop begins with the next setpoint, or without it
     first, place, yaw = len(flight.rows), flight.copter.body.position.copy(), flight.copter.body.yaw
     if how in ("BRAKE", "LOITER"):

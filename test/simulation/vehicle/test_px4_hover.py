@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from drocap_ros.simulation.vehicle.dynamics import AIRFRAMES, Body
+from drocap_ros.flight.autopilot.px4 import PX4
+from drocap_ros.simulation.vehicle.autopilot_control import control_of
+from drocap_ros.simulation.vehicle.dynamics import Body
 from drocap_ros.simulation.vehicle.estimate_error import EstimateError
 from drocap_ros.simulation.vehicle.flight_control import Manner, Target
-from drocap_ros.simulation.vehicle.px4_control import Px4Control
 from lab.flights.replay import Case, load_recorded, replay
 
 
@@ -19,8 +20,8 @@ def change_m(path, seconds=4.0):
 def hover(seed):
     """(N, 2) m, a vehicle that holds a place for a minute by an estimate that errs."""
     error, place, rest = EstimateError(0.4, True, seed), np.zeros(3), []
-    body = Body(place, 0.0, np.zeros(3), AIRFRAMES["px4"], gust=0.0)
-    control = Px4Control(error.position, 0.0, body.drag())
+    body = Body(place, 0.0, np.zeros(3), PX4.simulated.airframe, gust=0.0)
+    control = control_of(PX4, error.position, 0.0, body.drag())
     control.begin(Manner.SETPOINTS, error.position, np.zeros(3), 0.0)
     control.take(Target(error.position.copy()))
     for _ in range(6000):
@@ -47,7 +48,7 @@ def test_px4_flies_a_whole_orbit_from_the_setpoints_alone(shared, name):
 
 
 def test_own_motion_in_wind_is_slowed_down_by_the_recorded_friction():
-    body = Body(np.zeros(3), 0.0, np.array([8.0, 0.0, 0.0]), AIRFRAMES["px4"])
+    body = Body(np.zeros(3), 0.0, np.array([8.0, 0.0, 0.0]), PX4.simulated.airframe)
     rest = body.drag()
     body.velocity = np.array([-1.4, 0.0, 0.0])
     assert body.drag() - rest == pytest.approx(np.array([1.4, 0.0, 0.0]))

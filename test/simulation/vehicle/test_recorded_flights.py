@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from drocap_ros.simulation.vehicle.arducopter_control import ArduCopterControl
-from drocap_ros.simulation.vehicle.dynamics import AIRFRAMES, Body
+from drocap_ros.flight.autopilot.ardupilot import ARDUPILOT
+from drocap_ros.simulation.vehicle.autopilot_control import control_of
+from drocap_ros.simulation.vehicle.dynamics import Body
 from drocap_ros.simulation.vehicle.flight_control import Manner, Target
 from lab.flights.replay import WIND_M_S, Case, RecordedFlight, load_recorded, recorded_cases, replay
 
@@ -75,8 +76,8 @@ def test_ardupilot_flies_a_whole_orbit_from_the_setpoints_alone(shared, name, wi
 
 def test_path_waits_for_a_vehicle_that_leans_as_far_as_it_may():
     storm = np.array([-12.0, 0.0, 0.0])
-    body = Body(np.zeros(3), 0.0, storm, AIRFRAMES["ardupilot"], gust=0.0)
-    control = ArduCopterControl(body.position, 0.0, body.drag())
+    body = Body(np.zeros(3), 0.0, storm, ARDUPILOT.simulated.airframe, gust=0.0)
+    control = control_of(ARDUPILOT, body.position, 0.0, body.drag())
     control.begin(Manner.SETPOINTS, body.position, body.velocity, 0.0)
     for step in range(400):
         ahead = np.array([3.0 * 0.01 * step, 0.0, 0.0])

@@ -43,7 +43,7 @@ def answers_of(machine):
 def test_an_answer_is_not_stamped_before_its_question_arrived():
     """On a busy machine it was, by 0.02 s, and counted as a step of the clock."""
     machine = BusyMachine()
-    with SimulatedVehicle("", orbit_path(60), transport=machine, boot_s=30.0) as vehicle:
+    with SimulatedVehicle(machine, orbit_path(60), boot_s=30.0) as vehicle:
         vehicle.run(lambda: machine.now_s, seconds=1.5)
     answers = answers_of(machine)
     assert [m.ts1 for m in answers] == [7]
