@@ -30,6 +30,7 @@ from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_l
 from drocap_ros.reconstruction.live.stamp_join import StampJoin
 from drocap_ros.reconstruction.live.stream_order import StreamEvent
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Telemetry, Window
+from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.recording.pose_messages import add_calibration, add_state, float_array
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import (
@@ -40,7 +41,6 @@ from drocap_ros.ros.conversions import (
     window_to_ros,
 )
 from drocap_ros.ros.diagnostics import Key, of
-from drocap_ros.ros.spin import node_main
 from drocap_ros.skeleton import BODY_15, BODY_17
 
 #: Joint sets of initial poses.
@@ -76,10 +76,11 @@ class BundleAdjusterNode(ComponentNode):
     """
 
     component = "bundle_adjuster"
+    config: BundleAdjusterConfig
     needs = ("pose2d", "pose3d/initial")
 
-    def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
-        super().__init__(config, **node_kwargs)
+    def build(self) -> None:
+        """Declare endpoints and state."""
         self._buffer = FrameBuffer(self.config)
         self._adjuster = LiveAdjuster(self.config)
         self._control = EffortControl(self.config.max_solve_s, self.config.max_stride)
@@ -248,12 +249,3 @@ class BundleAdjusterNode(ComponentNode):
         words = _WORDS[use].format(reason)
         refused = use is Telemetry.REFUSED or (self._had_telemetry and use in (Telemetry.NONE, Telemetry.LATE))
         self.report(WARN if refused else OK, f"{done}; {words}" if words else done)
-
-
-def main() -> int:
-    """Run the node as a process."""
-    return node_main(BundleAdjusterNode)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import time
-from typing import Any
 
 import numpy as np
 from sensor_msgs.msg import CameraInfo
@@ -17,8 +16,8 @@ from drocap_ros.observation import PoseObservation
 from drocap_ros.ros.conversions import header_at, pose2d_to_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.lifecycle import ThreadedSource
-from drocap_ros.ros.spin import node_main
 from drocap_ros.simulation.capture import SimulatedCapture, simulate_capture
+from drocap_ros.simulation.capture_config import SimulationConfig
 from drocap_ros.simulation.vehicle.flight_path import SampledPath
 from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle
 from drocap_ros.tracks import Tracks
@@ -32,15 +31,15 @@ class CaptureSimulatorNode(ThreadedSource):
     """Plays a simulated capture in real time."""
 
     component = "capture_simulator"
+    config: SimulationConfig
 
-    def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
-        super().__init__(config, **node_kwargs)
+    def build(self) -> None:
+        """Declare endpoints and state."""
         self._capture: SimulatedCapture = simulate_capture(
             self.config.seconds, self.config.rate_hz, self.config.seed, self.config
         )
         self._pose2d = self.output("pose2d")
         self._infos = self.output("camera_info")
-        self.set_up()
 
     def play(self) -> None:
         """Fly."""
@@ -95,12 +94,3 @@ def observation_of(tracks: Tracks, i: int, stamp_ns: int) -> PoseObservation:
         covariance=tracks.covariance[i].astype(np.float32),
         confidence=tracks.confidence[i].astype(np.float32),
     )
-
-
-def main() -> int:
-    """Run the node as a process."""
-    return node_main(CaptureSimulatorNode)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -18,14 +18,14 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from drocap_ros.flight.mavlink.transport import Transport, open_transport
+from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.perception.sources.image_files import encode_jpeg
 from drocap_ros.ros.component import OK, WARN
 from drocap_ros.ros.conversions import camera_info_to_ros, compressed_image_to_ros, header_at
 from drocap_ros.ros.diagnostics import PILOT_FLIES, PILOT_HANDS_OFF, Key
 from drocap_ros.ros.lifecycle import ManagedComponent
-from drocap_ros.ros.spin import node_main
+from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimulatorConfig
 from drocap_ros.simulation.flight_simulator.truth import save_flight_truth
 from drocap_ros.simulation.flight_simulator.world import Exposure, FlightWorld
 from drocap_ros.simulation.render.renderer import Renderer
@@ -40,19 +40,16 @@ class FlightSimulatorNode(ManagedComponent):
     """One thread flies and exposes, another renders: a slow image never delays the vehicle.
 
     In simulated time a timer flies and exposes, and waits for the rendering.
-
-    Parameters
-    ----------
-    transport : the vehicle's end of a simulated link in this process, instead of that of ``config.vehicle_url``
     """
 
     component = "flight_simulator"
+    config: FlightSimulatorConfig
 
-    def __init__(self, config: Any = None, *, transport: Transport | None = None, **node_kwargs: Any) -> None:
-        super().__init__(config, **node_kwargs)
+    def build(self) -> None:
+        """Declare endpoints and state."""
         self._images = self.output("image/compressed")
         self._infos = self.output("camera_info")
-        self._world = FlightWorld(self.config, transport or open_transport(self.config.vehicle_url))
+        self._world = FlightWorld(self.config, self.transport or open_transport(self.config.vehicle_url))
         width, height = self.config.image_width, self.config.image_height
         self._camera = CameraModel(width, height, self._world.camera_matrix)
         self._renderer = Renderer(self._world.camera_matrix, width, height, self.config.seed)
@@ -67,7 +64,6 @@ class FlightSimulatorNode(ManagedComponent):
         self._pending: deque[tuple[int, Future[bytes]]] = deque()  # stamps of exposures with their pictures
         self._begin_ns = 0
         self.create_timer(0.5, self._on_timer)
-        self.set_up()
 
     def begin(self) -> None:
         """Let the pilot take off; a flight under way has continued meanwhile."""
@@ -76,6 +72,8 @@ class FlightSimulatorNode(ManagedComponent):
                 self._begin_ns = self.now_ns()
                 self.create_timer(SIMULATED_STEP_S, self._step)
             return
+        # Rendering is many short steps in Python: without this each telemetry message waits its 5 ms for the turn.
+        sys.setswitchinterval(0.0005)
         for thread in self._threads:
             if thread.ident is None:
                 thread.start()
@@ -169,14 +167,3 @@ class FlightSimulatorNode(ManagedComponent):
             self.report(WARN, f"the vehicle has crashed: {copter.crashed}")
         elif self.active:
             self.report(OK, f"pilot: {pilot.phase.value}")
-
-
-def main() -> int:
-    """Run the node as a process."""
-    # Rendering is many short steps in Python: without this each telemetry message waits its 5 ms for the turn.
-    sys.setswitchinterval(0.0005)
-    return node_main(FlightSimulatorNode)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

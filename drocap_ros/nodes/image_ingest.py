@@ -27,12 +27,12 @@ from drocap_ros.perception.calibration import CameraModel, camera_model
 from drocap_ros.perception.sources import Frame, ImageSource, open_source
 from drocap_ros.perception.sources.base import prefetch
 from drocap_ros.perception.sources.image_files import encode_jpeg
+from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.ros.component import ERROR, OK, WARN
 from drocap_ros.ros.conversions import camera_info_to_ros, compressed_image_to_ros, header_at, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key, of
 from drocap_ros.ros.lifecycle import ThreadedSource
-from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import TOPIC_SOURCE
 
 #: An image of a file that is this late when it has been read is dropped.
@@ -47,9 +47,10 @@ class ImageIngestNode(ThreadedSource):
     """Reads its source in a thread of its own, so that a slow source never blocks the node."""
 
     component = "image_ingest"
+    config: ImageIngestConfig
 
-    def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
-        super().__init__(config, **node_kwargs)
+    def build(self) -> None:
+        """Declare endpoints and state."""
         self._images = self.output("image/compressed")
         self._infos = self.output("camera_info")
         self._camera: CameraModel | None = None
@@ -61,7 +62,6 @@ class ImageIngestNode(ThreadedSource):
         self._foreign = ""  # types that are published there, if none is an image
         self._subscription: Subscription | None = None
         self.create_timer(0.5, self._watch)
-        self.set_up()
 
     def acquire(self) -> None:
         """Open the source, or wait for its topic."""
@@ -237,12 +237,3 @@ class ImageIngestNode(ThreadedSource):
             remedy = f"{self._foreign} is published there: name an image topic" if self._foreign else ""
             remedy = remedy or "check the camera and its link"
             self.report(WARN, f"no image from {self.config.source} for {silence_s:.1f} s; {remedy}")
-
-
-def main() -> int:
-    """Run the node as a process."""
-    return node_main(ImageIngestNode)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

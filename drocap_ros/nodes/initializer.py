@@ -6,17 +6,15 @@ of the stream (:mod:`drocap_ros.reconstruction.live.stream_order`) are counted o
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.reconstruction.live.initializer import LiveInitializer
 from drocap_ros.reconstruction.live.stream_order import StreamEvent
+from drocap_ros.reconstruction.reconstruction_config import InitializerConfig
 from drocap_ros.ros.component import OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_to_ros
 from drocap_ros.ros.diagnostics import Key, of
-from drocap_ros.ros.spin import node_main
 from drocap_ros.skeleton import BODY_17
 
 
@@ -24,10 +22,11 @@ class InitializerNode(ComponentNode):
     """Passes every observation to the live initializer."""
 
     component = "initializer"
+    config: InitializerConfig
     needs = ("pose2d",)
 
-    def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
-        super().__init__(config, **node_kwargs)
+    def build(self) -> None:
+        """Declare endpoints and state."""
         self._initializer = LiveInitializer(self.config)
         self._initial = self.output("pose3d/initial")
         self.input("pose2d", self._on_pose2d)
@@ -63,12 +62,3 @@ class InitializerNode(ComponentNode):
         else:
             self.count(Key.IMAGES_INCOMPLETE)
             self.report(WARN, "too few keypoints in the image")
-
-
-def main() -> int:
-    """Run the node as a process."""
-    return node_main(InitializerNode)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -20,9 +20,9 @@ from geometry_msgs.msg import Point, TransformStamped, Vector3
 from sensor_msgs.msg import CameraInfo
 
 from drocap_ros.errors import InputError
+from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.frames import optical_orientation
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.mavlink.transport import Transport
 from drocap_ros.flight.orbit.control_status import ControlStatus
 from drocap_ros.flight.orbit.controller import OrbitController
 from drocap_ros.flight.orbit.states import Command, OperatorCommand, State
@@ -40,7 +40,6 @@ from drocap_ros.ros.conversions import (
 )
 from drocap_ros.ros.diagnostics import Key, of
 from drocap_ros.ros.rclpy_internals import PolledService
-from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import RESULT_QOS, TFMessage
 from drocap_ros.srv import OrbitCommand
 from drocap_ros.tracks import check_camera_matrix
@@ -55,10 +54,6 @@ class MavlinkBridgeNode(ComponentNode):
 
     With a simulated link there are no threads: timers of the node's clock take their place, in a fixed order.
 
-    Parameters
-    ----------
-    transport : a simulated link in this process, instead of that of ``config.url``
-
     Raises
     ------
     InputError
@@ -66,16 +61,17 @@ class MavlinkBridgeNode(ComponentNode):
     """
 
     component = "mavlink_bridge"
+    config: MavlinkBridgeConfig
 
-    def __init__(self, config: Any = None, *, transport: Transport | None = None, **node_kwargs: Any) -> None:
-        super().__init__(config, **node_kwargs)
-        if self.simulated and self.config.commands_enabled and transport is None:
+    def build(self) -> None:
+        """Declare endpoints and state."""
+        if self.simulated and self.config.commands_enabled and self.transport is None:
             raise InputError(
                 "mavlink_bridge.use_sim_time: expected false with commands_enabled, because the autopilot on "
                 f"{self.config.url} flies in real time; set one of the two to false"
             )
-        self._stepped = transport is not None
-        self._link = MavlinkLink(self.config, self.now_ns, monotonic_s=self.now_s, transport=transport)
+        self._stepped = self.transport is not None
+        self._link = MavlinkLink(self.config, self.now_ns, monotonic_s=self.now_s, transport=self.transport)
         self._watchdog = Watchdog(self._link.send_unlocked, self.config.watchdog_s)
         self.controller = OrbitController(self._link, self.config, self._watchdog)
         self._states = self.output("vehicle/state")
@@ -300,12 +296,3 @@ def vehicle_transforms(state: VehicleState) -> list[TransformStamped]:
             transform.transform.rotation = quaternion_to_ros(xyzw)
             transforms.append(transform)
     return transforms
-
-
-def main() -> int:
-    """Run the node as a process."""
-    return node_main(MavlinkBridgeNode)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

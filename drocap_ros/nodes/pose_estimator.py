@@ -7,7 +7,6 @@ drone's own tracker); publishes ``pose2d`` (drocap_ros/Pose2D) with the image's 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 from sensor_msgs.msg import RegionOfInterest
@@ -15,13 +14,13 @@ from sensor_msgs.msg import RegionOfInterest
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.load_shedding import LoadShedding
+from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.ros.component import OK, WARN
 from drocap_ros.ros.conversions import pose2d_to_ros, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.image_input import ImageInput, ImageSample
 from drocap_ros.ros.lifecycle import ManagedComponent
-from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import TOPICS
 
 
@@ -29,10 +28,11 @@ class PoseEstimatorNode(ManagedComponent):
     """Runs detection, subject tracking and 2D pose on images, with less work for each while they queue."""
 
     component = "pose_estimator"
+    config: PoseEstimatorConfig
     needs = ("image/compressed",)
 
-    def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
-        super().__init__(config, **node_kwargs)
+    def build(self) -> None:
+        """Declare endpoints and state."""
         self._estimator: PoseEstimator | None = None
         self._roi: np.ndarray | None = None
         self._load_shedding = LoadShedding(self.config.max_load_level)
@@ -41,7 +41,6 @@ class PoseEstimatorNode(ManagedComponent):
             self, self._on_image, partial(image_from_message, compressed=True), TOPICS["image/compressed"].qos.depth
         )
         self.input("roi", self._on_roi)
-        self.set_up()
 
     def acquire(self) -> None:
         """Load the networks."""
@@ -88,12 +87,3 @@ class PoseEstimatorNode(ManagedComponent):
         else:
             self.details[Key.SUBJECT] = "none"
             self.report(WARN, "no subject in view")
-
-
-def main() -> int:
-    """Run the node as a process."""
-    return node_main(PoseEstimatorNode)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

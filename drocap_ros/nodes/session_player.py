@@ -9,19 +9,18 @@ from __future__ import annotations
 import importlib
 import time
 from collections.abc import Iterator
-from typing import Any
 
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 
 from drocap_ros.errors import DrocapError, InputError
+from drocap_ros.recording.mcap.session_config import SessionPlayerConfig
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, RawMessage, Session, TopicInfo
 from drocap_ros.ros.component import ERROR
 from drocap_ros.ros.conversions import stamp_to_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.lifecycle import ThreadedSource
-from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, RESULT_QOS, TOPICS
 
 #: Topics that this graph publishes itself; played only when they are named.
@@ -33,9 +32,10 @@ class SessionPlayerNode(ThreadedSource):
     """Reads in a thread of its own; holds one chunk in memory."""
 
     component = "session_player"
+    config: SessionPlayerConfig
 
-    def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
-        super().__init__(config, **node_kwargs)
+    def build(self) -> None:
+        """Declare endpoints and state."""
         if not self.config.session:
             raise InputError("session_player.session: expected a session folder or .mcap, got nothing; name one")
         self._session = open_session(self.config.session)
@@ -49,7 +49,6 @@ class SessionPlayerNode(ThreadedSource):
             )
         self._clock_output = self.create_publisher(Clock, "/clock", 10) if self.config.clock else None
         self._clock_ns = 0
-        self.set_up()
 
     def close(self) -> None:
         """Stop and close the session."""
@@ -144,12 +143,3 @@ def _is_installed(type_name: str) -> bool:
         return hasattr(importlib.import_module(f"{package}.msg"), kind)
     except (ImportError, ValueError):
         return False
-
-
-def main() -> int:
-    """Run the node as a process."""
-    return node_main(SessionPlayerNode)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -22,6 +22,7 @@ from sensor_msgs.msg import CameraInfo
 from drocap_ros.errors import InputError
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.recording.mcap.schemas import schema_text
+from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
 from drocap_ros.recording.mcap.writer import SessionWriter
 from drocap_ros.recording.provenance import (
     CALIBRATION,
@@ -36,7 +37,6 @@ from drocap_ros.ros.component import ERROR, HARDWARE_ID, OK, WARN, Gaps
 from drocap_ros.ros.diagnostics import Key, node_of, of, values_of
 from drocap_ros.ros.lifecycle import ACTIVE, ManagedComponent
 from drocap_ros.ros.parameters import ParameterSurvey
-from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, NODES, TOPICS
 
 _IMAGES = "image/compressed"
@@ -47,9 +47,10 @@ class SessionRecorderNode(ManagedComponent):
     """Appends the bytes of every message to the writer's queue."""
 
     component = "session_recorder"
+    config: SessionRecorderConfig
 
-    def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
-        super().__init__(config, **node_kwargs)
+    def build(self) -> None:
+        """Declare endpoints and state."""
         self._writer: SessionWriter | None = None
         self._survey: ParameterSurvey | None = None
         self._calibrated = False
@@ -70,7 +71,6 @@ class SessionRecorderNode(ManagedComponent):
             events = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, name), use_default_callbacks=False)
             self.input(topic, partial(take, name), raw=True, qos=qos, events=events, with_info=True)
         self.create_timer(1.0, self._on_second)
-        self.set_up()
 
     def acquire(self) -> None:
         """Open a session; a second one of this node takes the next free name."""
@@ -205,12 +205,3 @@ def _decoded(data: bytes, kind: type) -> Any:
 def _type_name(message: type) -> str:
     package = message.__module__.split(".")[0]
     return f"{package}/msg/{message.__name__}"
-
-
-def main() -> int:
-    """Run the node as a process."""
-    return node_main(SessionRecorderNode)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

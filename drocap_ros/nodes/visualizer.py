@@ -9,7 +9,6 @@ Subscribes ``pose2d``, ``pose3d/initial``, ``pose3d/latest`` and ``vehicle/state
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
 
 import numpy as np
 from visualization_msgs.msg import MarkerArray
@@ -20,9 +19,9 @@ from drocap_ros.ros.conversions import MAP, pose3d_from_ros, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.markers import body_transforms, keypoint_marker, path_marker, pose_markers
 from drocap_ros.ros.rep155 import MISSING, HumanTopics, hri, human_transforms
-from drocap_ros.ros.spin import node_main
 from drocap_ros.ros.topics import TFMessage
 from drocap_ros.view.rate_limit import RateLimit
+from drocap_ros.view.visualizer_config import VisualizerConfig
 
 #: Time after which a marker without a successor disappears.
 INITIAL_LIFETIME_S, LATEST_LIFETIME_S = 0.5, 3.0
@@ -34,10 +33,11 @@ class VisualizerNode(ComponentNode):
     """Publishes markers and TF of the poses; no other node depends on it."""
 
     component = "visualizer"
+    config: VisualizerConfig
     needs = ("pose2d", "pose3d/initial")
 
-    def __init__(self, config: Any = None, **node_kwargs: Any) -> None:
-        super().__init__(config, **node_kwargs)
+    def build(self) -> None:
+        """Declare endpoints and state."""
         self._keypoints = self.output("markers/keypoints")
         self._initial = self.output("markers/initial")
         self._latest = self.output("markers/latest")
@@ -96,12 +96,3 @@ class VisualizerNode(ComponentNode):
         self._path_ns = stamp_ns
         self._path.append(position)
         self._paths.publish(MarkerArray(markers=[path_marker(message.header, np.array(self._path))]))
-
-
-def main() -> int:
-    """Run the node as a process."""
-    return node_main(VisualizerNode)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -21,6 +21,7 @@ from rclpy.subscription import Subscription
 
 from drocap_ros.config import section_types
 from drocap_ros.errors import InputError
+from drocap_ros.flight.mavlink.transport import Transport
 from drocap_ros.parameters import Parameters
 from drocap_ros.ros.diagnostics import ERROR, HARDWARE_ID, OK, WARN, Key, Latency, of
 from drocap_ros.ros.parameters import declare_parameters
@@ -59,14 +60,18 @@ class ComponentNode(Node):
     Parameters
     ----------
     config : the component's parameters; ROS parameter overrides take precedence
+    transport : a simulated link in this process, instead of that of the configuration
     node_kwargs : passed on to :class:`rclpy.node.Node` (context, namespace, parameter_overrides, ...)
     """
 
     component: ClassVar[str]
+    config: Parameters
     #: Topics without which the node has nothing to do.
     needs: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(self, config: Parameters | None = None, **node_kwargs: Any) -> None:
+    def __init__(
+        self, config: Parameters | None = None, *, transport: Transport | None = None, **node_kwargs: Any
+    ) -> None:
         node_kwargs.setdefault("namespace", "/drocap")
         super().__init__(self.component, **node_kwargs)
         #: Whether ROS' parameter ``use_sim_time`` is set: every time is then that of ``/clock``, and no result depends
@@ -78,7 +83,8 @@ class ComponentNode(Node):
         self.peers: list[str] = [name for name in peers.split(",") if name]
         #: Nodes of the graph that one thread runs, by name: they read each other's parameters without a service.
         self.beside: dict[str, ComponentNode] = {self.component: self}
-        self.config: Any = declare_parameters(self, config or section_types()[self.component]())
+        self.config = declare_parameters(self, config or section_types()[self.component]())
+        self.transport = transport
         self.counters: Counter[str] = Counter()
         self._counting = threading.Lock()
         self.details: dict[str, str] = {Key.READY: "false"}
@@ -105,6 +111,14 @@ class ComponentNode(Node):
         self._clock_ns, self._clock_stands = -1, False
         if self.simulated:
             self.create_timer(_CLOCK_STANDS_S, self._watch_clock, clock=steady)
+        self.start_up()
+
+    def start_up(self) -> None:
+        """Last step of the constructor."""
+        self.build()
+
+    def build(self) -> None:
+        """Declare endpoints and state; the parameters are known."""
 
     # -- time ------------------------------------------------------------------------------------------
 

@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import threading
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
-from drocap_ros.parameters import Parameters
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.rclpy_internals import answer_impossible_transitions
@@ -33,18 +32,23 @@ _WORDS = {
 }
 
 
-class ManagedComponent(LifecycleNodeMixin, ComponentNode):
+class ManagedComponent(ComponentNode, LifecycleNodeMixin):
     """A component with a life cycle.
 
-    A subclass declares its endpoints in its constructor, which ends with :meth:`set_up`, and implements the
-    transitions in :meth:`acquire`, :meth:`begin` and :meth:`release`.  Messages that arrive while it is
-    not active are dropped.
+    A subclass declares its endpoints in :meth:`build` and implements the transitions in :meth:`acquire`,
+    :meth:`begin` and :meth:`release`.  Messages that arrive while it is not active are dropped.
     """
 
     component: ClassVar[str]
 
-    def __init__(self, config: Parameters | None = None, **node_kwargs: Any) -> None:
-        ComponentNode.__init__(self, config, **node_kwargs)
+    def start_up(self) -> None:
+        """Last step of the constructor: with ``autostart``, configure, and activate unless the node is a source.
+
+        Raises
+        ------
+        Exception
+            Raised by ``acquire``; a DrocapError when the resource is not available.
+        """
         LifecycleNodeMixin.__init__(self)
         self.active = False
         self._is_source = NODES[self.component].source
@@ -55,6 +59,14 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
         if self._is_source:
             self.create_timer(0.1, self._shut_down_when_ended)
         answer_impossible_transitions(self, partial(self.report, WARN))
+        self.build()
+        self._enter(UNCONFIGURED)
+        if self._autostart:
+            self.trigger_configure()
+            if self._refusal is not None:
+                raise self._refusal
+            if not self._is_source:
+                self.trigger_activate()
 
     # -- what a subclass implements --------------------------------------------------------------------
 
@@ -79,22 +91,6 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
 
     # -- transitions -----------------------------------------------------------------------------------
 
-    def set_up(self) -> None:
-        """Last step of the constructor: with ``autostart``, configure, and activate unless the node is a source.
-
-        Raises
-        ------
-        Exception
-            Raised by ``acquire``; a DrocapError when the resource is not available.
-        """
-        self._enter(UNCONFIGURED)
-        if self._autostart:
-            self.trigger_configure()
-            if self._refusal is not None:
-                raise self._refusal
-            if not self._is_source:
-                self.trigger_activate()
-
     def on_ready(self) -> None:
         """Activate a source that no bringup activates."""
         if self._autostart and self._is_source and self._activates_itself and not self.active:
@@ -109,7 +105,7 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
             self._ended = False
             self.trigger_shutdown()
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Acquire the resource."""
         self._refusal = None
         try:
@@ -121,34 +117,34 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
         self._enter(INACTIVE)
         return SUCCESS
 
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Start the output."""
         self.active = True
         self.begin()
         self._enter(ACTIVE)
         return SUCCESS
 
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_deactivate(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Stop the output: messages are dropped, and a source's thread publishes nothing."""
         self.active = False
         self._enter(INACTIVE)
         return SUCCESS
 
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Release the resource."""
         self.release()
         self._ended = False
         self._enter(UNCONFIGURED)
         return SUCCESS
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_shutdown(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Stop the output and release the resource for good."""
         self.active = False
         self.release()
         self._enter(FINALIZED)
         return SUCCESS
 
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_error(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """After a transition that raised: release the resource."""
         self.active = False
         self.release()
@@ -166,10 +162,11 @@ class ManagedComponent(LifecycleNodeMixin, ComponentNode):
 class ThreadedSource(ManagedComponent):
     """A source whose thread, from the first activation on, executes :meth:`play`."""
 
-    def __init__(self, config: Parameters | None = None, **node_kwargs: Any) -> None:
-        super().__init__(config, **node_kwargs)
+    def start_up(self) -> None:
+        """Last step of the constructor."""
         self.stopping = threading.Event()
         self._thread: threading.Thread | None = None
+        super().start_up()
 
     def play(self) -> None:
         """Publish while the node is active, until the end or until ``stopping`` is set."""

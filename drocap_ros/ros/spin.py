@@ -128,7 +128,7 @@ def _help(node_class: type[ComponentNode]) -> str:
     """Description of a node, its parameters, and how to give them."""
     text = inspect.getdoc(inspect.getmodule(node_class)) or ""
     return (
-        f"{text.strip()}\n\nusage: python -m drocap_ros.nodes.{node_class.component}"
+        f"{text.strip()}\n\nusage: python -m drocap_ros.nodes {node_class.component}"
         " [--ros-args -p NAME:=VALUE ... | --params-file FILE]\n\n"
         f"parameters (default):\n{parameter_help(node_class.component)}"
     )

@@ -33,7 +33,7 @@ def test_flight_loop_and_pose_precede_all_other_nodes():
 
 
 def run_node(*arguments):
-    command = [sys.executable, "-m", "drocap_ros.nodes.initializer", *arguments]
+    command = [sys.executable, "-m", "drocap_ros.nodes", "initializer", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=60)
 
 
