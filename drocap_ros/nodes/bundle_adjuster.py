@@ -22,6 +22,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.observation import PoseObservation
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.live.adjuster import SOLVER_ERRORS, LiveAdjuster
 from drocap_ros.reconstruction.live.effort import Effort, EffortControl
 from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer
@@ -30,7 +31,6 @@ from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_l
 from drocap_ros.reconstruction.live.stamp_join import StampJoin
 from drocap_ros.reconstruction.live.stream_order import StreamEvent
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Telemetry, Window
-from drocap_ros.reconstruction.reconstruction_config import BundleAdjusterConfig
 from drocap_ros.recording.pose_messages import add_calibration, add_state, float_array
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import (

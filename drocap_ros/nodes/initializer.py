@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from drocap_ros.msg import Pose2D, Pose3D
+from drocap_ros.reconstruction.common.config import InitializerConfig
 from drocap_ros.reconstruction.live.initializer import LiveInitializer
 from drocap_ros.reconstruction.live.stream_order import StreamEvent
-from drocap_ros.reconstruction.reconstruction_config import InitializerConfig
 from drocap_ros.ros.component import OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_to_ros
 from drocap_ros.ros.diagnostics import Key, of
