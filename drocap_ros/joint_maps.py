@@ -20,15 +20,25 @@ from drocap_ros.errors import InputError
 from drocap_ros.skeleton import BODY_15, BODY_17, BODY_19, JOINT_SETS, JointSet
 
 #: Shares of the way from the middle of the shoulders to the middle of the ears.
-_NECK_ON_EARS, _HEAD_ON_EARS = 135 / 190, 232 / 190
-#: Standard deviation of neck and head about that line, share of the same way (20 and 25 mm of 190).
-_NECK_SPREAD, _HEAD_SPREAD = 0.11, 0.14
+_NECK_ON_EARS = 135 / 190
+_HEAD_ON_EARS = 232 / 190
+#: Standard deviation of neck and head about that line, share of the same way: 20 and 25 mm of 190.
+_NECK_SPREAD = 0.11
+_HEAD_SPREAD = 0.14
+#: The same of the head about the line from neck to crown: 21 mm of 175.
+_CROWN_SPREAD = 0.12
+#: Factor on the confidence of an extrapolated joint: the lean of the head is not seen.
 _EXTRAPOLATED_CONFIDENCE = 0.85
+#: Least length of the line, share of the person's box: a view from above shortens it.
+_LEAST_LINE = 0.05
 
 _SIDES = (("l", "left_"), ("r", "right_"))
 _LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 
 Weights = dict[str, float]
+
+_SHOULDERS: Weights = {"left_shoulder": 0.5, "right_shoulder": 0.5}
+_BOTH_EARS: Weights = {"left_ear": 0.5, "right_ear": 0.5}
 
 
 def _mix(start: Weights, end: Weights, share: float) -> Weights:
@@ -43,12 +53,10 @@ def _limbs_by_side() -> dict[str, Weights]:
 
 
 def _coco_like() -> dict[str, Weights]:
-    shoulders = {"left_shoulder": 0.5, "right_shoulder": 0.5}
-    ears = {"left_ear": 0.5, "right_ear": 0.5}
     return _limbs_by_side() | {
         "pelvis": {"left_hip": 0.5, "right_hip": 0.5},
-        "neck": _mix(shoulders, ears, _NECK_ON_EARS),
-        "head": _mix(shoulders, ears, _HEAD_ON_EARS),
+        "neck": _mix(_SHOULDERS, _BOTH_EARS, _NECK_ON_EARS),
+        "head": _mix(_SHOULDERS, _BOTH_EARS, _HEAD_ON_EARS),
     }
 
 
@@ -66,27 +74,24 @@ TABLES: dict[str, dict[str, Weights]] = {
     "wholebody133": _coco_like() | _FEET,
     "halpe26": _coco_like() | _FEET,
     # MPII's upper neck is BODY_15's neck; the crown lies about 310 mm above the middle of the shoulders.
-    "mpii16": _limbs_by_side() | {
+    "mpii16": {
+        **_limbs_by_side(),
         "pelvis": {"left_hip": 0.5, "right_hip": 0.5},
         "neck": {"upper_neck": 1.0},
         "head": _mix({"upper_neck": 1.0}, {"head_top": 1.0}, (232 - 135) / (310 - 135)),
     },
     "h36m17": {name: {name: 1.0} for name in BODY_15.joints},
-}  # fmt: skip
+}
 
 #: Line whose length scales the extra variance of an extrapolated joint: from, to, spread.
-_EXTRA: dict[str, dict[str, tuple[Weights, Weights, float]]] = {
-    **{
-        name: {
-            joint: (
-                {"left_shoulder": 0.5, "right_shoulder": 0.5}, {"left_ear": 0.5, "right_ear": 0.5}, spread,
-            )
-            for joint, spread in (("neck", _NECK_SPREAD), ("head", _HEAD_SPREAD))
-        }
-        for name in ("coco17", "wholebody133", "halpe26")
-    },
-    "mpii16": {"head": ({"upper_neck": 1.0}, {"head_top": 1.0}, 0.12)},
-}  # fmt: skip
+_Line = tuple[Weights, Weights, float]
+_EARS: dict[str, _Line] = {
+    joint: (_SHOULDERS, _BOTH_EARS, spread) for joint, spread in (("neck", _NECK_SPREAD), ("head", _HEAD_SPREAD))
+}
+_EXTRA: dict[str, dict[str, _Line]] = {
+    **dict.fromkeys(("coco17", "wholebody133", "halpe26"), _EARS),
+    "mpii16": {"head": ({"upper_neck": 1.0}, {"head_top": 1.0}, _CROWN_SPREAD)},
+}
 
 
 @dataclass(frozen=True)
@@ -119,7 +124,7 @@ class JointMap:
         out = self.weights @ points
         # The errors of the parts are assumed independent.
         out_covariance = self.weights**2 @ np.nan_to_num(covariance)
-        length = np.maximum(np.linalg.norm(self.lines @ points, axis=-1), 0.05 * np.asarray(box_size)[..., None])
+        length = np.maximum(np.linalg.norm(self.lines @ points, axis=-1), _LEAST_LINE * np.asarray(box_size)[..., None])
         extra = np.where(self.spread > 0, (self.spread * length) ** 2, 0.0)
         out_covariance = out_covariance + extra[..., None] * np.array([1.0, 0.0, 1.0])
         lowest = np.where(used, np.nan_to_num(confidence)[..., None, :], np.inf).min(axis=-1)

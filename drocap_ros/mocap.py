@@ -40,24 +40,31 @@ def load_mocap(
         When the file cannot be used.
     """
     a = read_npz(path, ("X", "fps", "joints"))
-    if a["X"].ndim != 3 or a["X"].shape[1:] != (a["joints"].size, 3) or len(a["X"]) == 0:
-        raise InputError(f"{path}: X: expected (T, {a['joints'].size}, 3), got {a['X'].shape}")
-    x, names = a["X"], [str(j) for j in a["joints"]]
-    if "toes" in a and str(a.get("toe_kind", "tip")) == "tip":
-        toes = [str(j) for j in np.atleast_1d(a.get("toe_joints", ("rtoe", "ltoe")))]
-        if a["toes"].shape != (len(x), len(toes), 3):
-            raise InputError(f"{path}: toes: expected {(len(x), len(toes), 3)}, got {a['toes'].shape}")
-        x, names = np.concatenate([x, a["toes"]], axis=1), [*names, *toes]
-    x = x.astype(np.float64)
-    if not np.isfinite(x).all():
-        raise InputError(f"{path}: X, toes: expected finite millimetres, got NaN or infinity; fill the gaps in")
-    if a["fps"].size != 1 or a["fps"].dtype.kind not in "iuf" or not 1.0 <= float(a["fps"].item()) <= 1000.0:
-        raise InputError(f"{path}: fps: expected a number from 1 to 1000, got {a['fps']}")
     try:
+        x, names = _named_joints(a)
+        fps = a["fps"]
+        if fps.size != 1 or fps.dtype.kind not in "iuf" or not 1.0 <= float(fps.item()) <= 1000.0:
+            raise InputError(f"fps: expected a number from 1 to 1000, got {fps}")
         body = in_body_order(x, names, required)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    return body[:, : len(joints)], float(a["fps"].item())
+    return body[:, : len(joints)], float(fps.item())
+
+
+def _named_joints(a: dict[str, np.ndarray]) -> tuple[np.ndarray, list[str]]:
+    """Joints (T, P, 3) mm of a file with its toes, and their names (P)."""
+    x, names = a["X"], [str(j) for j in a["joints"]]
+    if x.ndim != 3 or x.shape[1:] != (a["joints"].size, 3) or len(x) == 0:
+        raise InputError(f"X: expected (T, {a['joints'].size}, 3), got {x.shape}")
+    if "toes" in a and str(a.get("toe_kind", "tip")) == "tip":
+        toes = [str(j) for j in np.atleast_1d(a.get("toe_joints", ("rtoe", "ltoe")))]
+        if a["toes"].shape != (len(x), len(toes), 3):
+            raise InputError(f"toes: expected {(len(x), len(toes), 3)}, got {a['toes'].shape}")
+        x, names = np.concatenate([x, a["toes"]], axis=1), [*names, *toes]
+    x = x.astype(np.float64)
+    if not np.isfinite(x).all():
+        raise InputError("X, toes: expected finite millimetres, got NaN or infinity; fill the gaps in")
+    return x, names
 
 
 def mocap_files(folder: str | Path, include: str = "*") -> list[Path]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -89,10 +89,9 @@ def save_motion(path: str | Path, motion: Motion, **further: np.ndarray) -> None
     )
 
 
-_ARRAYS = (
-    "joints3d", "joints", "parents", "stamp_ns", "frame", "metric", "scale_source",
-    "camera_rotation", "confidence", "keypoints", "reprojection_px", "meta",
-)  # fmt: skip
+#: Fields that a file may lack.
+_OPTIONAL = ("camera_position", "covariance")
+_REQUIRED = tuple(spec.name for spec in fields(Motion) if spec.name not in _OPTIONAL)
 
 
 def motion_file(path: str | Path, *names: str) -> Path:
@@ -123,21 +122,11 @@ def load_motion(path: str | Path) -> Motion:
         When the file cannot be used.
     """
     path = motion_file(path)
-    a = read_npz(path, _ARRAYS)
-    joints3d = a["joints3d"]
-    if joints3d.ndim != 3 or joints3d.shape[2] != 3 or joints3d.shape[1] != a["joints"].size:
-        raise InputError(f"{path}: joints3d: expected (F, {a['joints'].size}, 3), got {joints3d.shape}")
-    if a["parents"].ndim != 1 or a["parents"].dtype.kind not in "iu" or a["joints"].ndim != 1:
-        raise InputError(f"{path}: joints, parents: expected (P) names and (P) integers, got {a['parents'].dtype}")
-    if a["metric"].shape != () or a["metric"].dtype.kind not in "biu":
-        raise InputError(f"{path}: metric: expected one truth value, got {a['metric'].dtype} {a['metric'].shape}")
+    a = read_npz(path, _REQUIRED)
     try:
-        meta = json.loads(str(a["meta"]))
-    except ValueError:
-        raise InputError(f"{path}: meta: expected JSON text; was the file written by drocap?") from None
-    try:
+        _check_kinds(a)
         motion = Motion(
-            joints3d=joints3d,
+            joints3d=a["joints3d"],
             joints=tuple(str(j) for j in a["joints"]),
             parents=tuple(int(p) for p in a["parents"]),
             stamp_ns=as_stamps(a["stamp_ns"]),
@@ -148,7 +137,7 @@ def load_motion(path: str | Path) -> Motion:
             confidence=a["confidence"],
             keypoints=a["keypoints"],
             reprojection_px=a["reprojection_px"],
-            meta=meta if isinstance(meta, dict) else {},
+            meta=_read_meta(a["meta"]),
             camera_position=a.get("camera_position"),
             covariance=_known(a.get("covariance")),
         )
@@ -156,6 +145,25 @@ def load_motion(path: str | Path) -> Motion:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return motion
+
+
+def _check_kinds(a: dict[str, np.ndarray]) -> None:
+    """Refuse arrays that are not of the kind of their field."""
+    shape, count = a["joints3d"].shape, a["joints"].size
+    if len(shape) != 3 or shape[1:] != (count, 3):
+        raise InputError(f"joints3d: expected (F, {count}, 3), got {shape}")
+    if a["parents"].ndim != 1 or a["parents"].dtype.kind not in "iu" or a["joints"].ndim != 1:
+        raise InputError(f"joints, parents: expected (P) names and (P) integers, got {a['parents'].dtype}")
+    if a["metric"].shape != () or a["metric"].dtype.kind not in "biu":
+        raise InputError(f"metric: expected one truth value, got {a['metric'].dtype} {a['metric'].shape}")
+
+
+def _read_meta(text: np.ndarray) -> dict[str, Any]:
+    try:
+        meta = json.loads(str(text))
+    except ValueError:
+        raise InputError("meta: expected JSON text; was the file written by drocap?") from None
+    return meta if isinstance(meta, dict) else {}
 
 
 def _known(values: np.ndarray | None) -> np.ndarray | None:
@@ -175,13 +183,13 @@ def _check(m: Motion) -> None:
         "confidence": (frames, joints),
         "keypoints": (frames, joints, 2),
         "reprojection_px": (frames, joints),
+        "camera_position": (frames, 3),
+        "covariance": (frames, joints, 6),
     }
-    if m.camera_position is not None:
-        shapes["camera_position"] = (frames, 3)
-    if m.covariance is not None:
-        shapes["covariance"] = (frames, joints, 6)
     for name, shape in shapes.items():
         value = getattr(m, name)
+        if value is None and name in _OPTIONAL:
+            continue
         if value.shape != shape or value.dtype.kind not in "fiu":
             raise InputError(f"{name}: expected numbers of shape {shape}, got {value.dtype} {value.shape}")
         if value.dtype.kind == "f" and np.isinf(value).any():

@@ -71,24 +71,27 @@ def _types(kind: type) -> dict[str, Any]:
     return get_type_hints(kind)  # a millisecond of compilation
 
 
-def _checked(spec: dataclasses.Field[Any], kind: type, value: Any, owner: str) -> Any:
+def _checked(spec: dataclasses.Field[Any], kind: type, value: object, owner: str) -> object:
     name = f"{owner}.{spec.name}"
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not kind:
         raise ParameterError(f"{name}: expected {kind.__name__}, got {value!r}; correct the value")
-    meta = spec.metadata
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ParameterError(f"{name}: expected a finite number, got {value!r}; correct the value")
-    low, high = meta.get("minimum"), meta.get("maximum")
-    if (low is not None and value < low) or (high is not None and value > high):
-        unit = f" {meta['unit']}" if meta.get("unit") else ""
-        raise ParameterError(
-            f"{name}: expected {_range_text(low, high)}{unit}, got {value!r}; choose a value in the range"
-        )
-    if meta.get("choices") and value not in meta["choices"]:
-        raise ParameterError(f"{name}: expected one of {', '.join(meta['choices'])}, got {value!r}")
+    if isinstance(value, int | float):
+        _check_range(name, value, spec.metadata)
+    choices = spec.metadata["choices"]
+    if choices and value not in choices:
+        raise ParameterError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
     return value
+
+
+def _check_range(name: str, value: float, metadata: Mapping[str, Any]) -> None:
+    if not math.isfinite(value):
+        raise ParameterError(f"{name}: expected a finite number, got {value!r}; correct the value")
+    low, high = metadata["minimum"], metadata["maximum"]
+    if (low is not None and value < low) or (high is not None and value > high):
+        wanted = " ".join(filter(None, (_range_text(low, high), metadata["unit"])))
+        raise ParameterError(f"{name}: expected {wanted}, got {value!r}; choose a value in the range")
 
 
 def _range_text(low: float | None, high: float | None) -> str:

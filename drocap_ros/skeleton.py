@@ -43,6 +43,10 @@ class JointSet:
         return np.array([self.joints.index(_other_side(j, self.joints)) for j in self.joints])
 
 
+def _names(words: str) -> tuple[str, ...]:
+    return tuple(words.split())
+
+
 def _other_side(joint: str, joints: tuple[str, ...]) -> str:
     for a, b in (("l", "r"), ("r", "l"), ("left_", "right_"), ("right_", "left_")):
         if joint.startswith(a) and b + joint[len(a) :] in joints:
@@ -52,12 +56,9 @@ def _other_side(joint: str, joints: tuple[str, ...]) -> str:
 
 BODY_15 = JointSet(
     "body15",
-    (
-        "pelvis", "rhip", "rknee", "rankle", "lhip", "lknee", "lankle", "neck", "head",
-        "lshoulder", "lelbow", "lwrist", "rshoulder", "relbow", "rwrist",
-    ),
+    _names("pelvis rhip rknee rankle lhip lknee lankle neck head lshoulder lelbow lwrist rshoulder relbow rwrist"),
     (-1, 0, 1, 2, 0, 4, 5, 0, 7, 7, 9, 10, 7, 12, 13),
-)  # fmt: skip
+)
 
 TOES = ("rtoe", "ltoe")
 
@@ -68,73 +69,68 @@ BODY_19 = JointSet("body19", (*BODY_17.joints, "rheel", "lheel"), (*BODY_17.pare
 
 COCO_17 = JointSet(
     "coco17",
-    (
-        "nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder",
-        "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip",
-        "left_knee", "right_knee", "left_ankle", "right_ankle",
+    _names(
+        "nose left_eye right_eye left_ear right_ear left_shoulder right_shoulder left_elbow right_elbow left_wrist"
+        " right_wrist left_hip right_hip left_knee right_knee left_ankle right_ankle"
     ),
     (-1, 0, 0, 1, 2, 0, 0, 5, 6, 7, 8, 5, 6, 11, 12, 13, 14),
-)  # fmt: skip
+)
 
+_HALPE_FEET = "left_big_toe right_big_toe left_small_toe right_small_toe left_heel right_heel"
 HALPE_26 = JointSet(
     "halpe26",
-    (*COCO_17.joints, "head_top", "neck", "hip", "left_big_toe", "right_big_toe", "left_small_toe", "right_small_toe",
-     "left_heel", "right_heel"),
+    (*COCO_17.joints, *_names(f"head_top neck hip {_HALPE_FEET}")),
     (18, 0, 0, 1, 2, 18, 18, 5, 6, 7, 8, 19, 19, 11, 12, 13, 14, 18, 19, -1, 15, 16, 15, 16, 15, 16),
-)  # fmt: skip
+)
 
+_WHOLEBODY_FEET = "left_big_toe left_small_toe left_heel right_big_toe right_small_toe right_heel"
 #: COCO-WholeBody: the body, six points of the feet, 68 of the face, 21 of each hand.
 WHOLEBODY_133 = JointSet(
     "wholebody133",
     (
-        *COCO_17.joints,
-        "left_big_toe", "left_small_toe", "left_heel", "right_big_toe", "right_small_toe", "right_heel",
-        *(f"face_{i}" for i in range(68)),
-        *(f"left_hand_{i}" for i in range(21)),
-        *(f"right_hand_{i}" for i in range(21)),
+        *(*COCO_17.joints, *_names(_WHOLEBODY_FEET), *(f"face_{i}" for i in range(68))),
+        *(f"{side}_hand_{i}" for side in ("left", "right") for i in range(21)),
     ),
     (
-        *COCO_17.parents, 15, 15, 15, 16, 16, 16, *([0] * 68),
+        *(*COCO_17.parents, *[15] * 3, *[16] * 3, *[0] * 68),
         *(9 if i == 0 else 91 if i % 4 == 1 else 90 + i for i in range(21)),
         *(10 if i == 0 else 112 if i % 4 == 1 else 111 + i for i in range(21)),
     ),
-)  # fmt: skip
+)
 
 MPII_16 = JointSet(
     "mpii16",
-    (
-        "right_ankle", "right_knee", "right_hip", "left_hip", "left_knee", "left_ankle", "pelvis", "thorax",
-        "upper_neck", "head_top", "right_wrist", "right_elbow", "right_shoulder", "left_shoulder", "left_elbow",
-        "left_wrist",
+    _names(
+        "right_ankle right_knee right_hip left_hip left_knee left_ankle pelvis thorax upper_neck head_top right_wrist"
+        " right_elbow right_shoulder left_shoulder left_elbow left_wrist"
     ),
     (1, 2, 6, 6, 3, 4, -1, 6, 7, 8, 11, 12, 7, 7, 13, 14),
-)  # fmt: skip
+)
 
 H36M_17 = JointSet(
     "h36m17",
-    (
-        "pelvis", "rhip", "rknee", "rankle", "lhip", "lknee", "lankle", "spine", "thorax", "neck", "head",
-        "lshoulder", "lelbow", "lwrist", "rshoulder", "relbow", "rwrist",
+    _names(
+        "pelvis rhip rknee rankle lhip lknee lankle spine thorax neck head lshoulder lelbow lwrist rshoulder relbow"
+        " rwrist"
     ),
     (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 9, 8, 11, 12, 8, 14, 15),
-)  # fmt: skip
+)
 
 JOINT_SETS: dict[str, JointSet] = {
     s.name: s for s in (BODY_15, BODY_17, BODY_19, COCO_17, HALPE_26, WHOLEBODY_133, MPII_16, H36M_17)
 }
 
 #: The twelve joints of the averages in the paper's tables.
-LIMB_JOINTS = (
-    "rhip", "rknee", "rankle", "lhip", "lknee", "lankle",
-    "lshoulder", "lelbow", "lwrist", "rshoulder", "relbow", "rwrist",
-)  # fmt: skip
+LIMB_JOINTS = _names("rhip rknee rankle lhip lknee lankle lshoulder lelbow lwrist rshoulder relbow rwrist")
 
 #: Bones of ``BODY_15`` of constant length on a real person (not the spine and the shoulder girdle).
-RIGID_BONES = (
-    ("rhip", "rknee"), ("rknee", "rankle"), ("lhip", "lknee"), ("lknee", "lankle"), ("rhip", "lhip"),
-    ("lshoulder", "lelbow"), ("lelbow", "lwrist"), ("rshoulder", "relbow"), ("relbow", "rwrist"),
-    ("neck", "head"),
-)  # fmt: skip
+RIGID_BONES = tuple(
+    _names(bone)
+    for bone in (
+        *("rhip rknee", "rknee rankle", "lhip lknee", "lknee lankle", "rhip lhip"),
+        *("lshoulder lelbow", "lelbow lwrist", "rshoulder relbow", "relbow rwrist", "neck head"),
+    )
+)
 
 
 def joint_set(name: str) -> JointSet:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drocap_ros.errors import InputError
+from drocap_ros.errors import InputError, first_line
 from drocap_ros.stamps import as_stamps, check_stamps
 
 #: Longest accepted sequence (10 h at 30 fps); longer ones are refused before memory runs out.
@@ -22,7 +22,7 @@ _FARTHEST_PX = 1e9
 #: Keypoints that are all within it are shares of the image, not px.
 _NORMALISED = 2.0
 #: Focal lengths as shares of the image's width or height: a view of 157 degrees, and of 0.6.
-_FOCAL_SHARES = 0.1, 100.0
+_FOCAL_SHARES = (0.1, 100.0)
 
 
 @dataclass(frozen=True)
@@ -70,18 +70,7 @@ def _check(t: Tracks) -> None:
         raise InputError(f"joints: expected {joints} names, one per keypoint, got {len(t.joints)}")
     if len(set(t.joints)) != joints:
         raise InputError("joints: expected distinct names, got a repeated one; rename it")
-    shapes = {
-        "stamp_ns": (frames,),
-        "confidence": (frames, joints),
-        "covariance": (frames, joints, 3),
-        "camera_rotation": (frames, 3, 3),
-        "camera_position": (frames, 3),
-        "camera_matrix": (3, 3),
-    }
-    for name, shape in shapes.items():
-        value = getattr(t, name)
-        if value is not None and value.shape != shape:
-            raise InputError(f"{name}: expected shape {shape}, got {value.shape}; make it fit keypoints {k.shape}")
+    _check_shapes(t)
     if t.stamp_ns.dtype != np.int64:
         raise InputError(f"stamp_ns: expected int64 nanoseconds, got {t.stamp_ns.dtype}")
     check_stamps(t.stamp_ns)
@@ -96,6 +85,23 @@ def _check(t: Tracks) -> None:
             " normalised ones by the image's width and height"
         )
     _check_telemetry(t)
+
+
+def _check_shapes(t: Tracks) -> None:
+    frames, joints = t.keypoints.shape[:2]
+    shapes = {
+        "stamp_ns": (frames,),
+        "confidence": (frames, joints),
+        "covariance": (frames, joints, 3),
+        "camera_rotation": (frames, 3, 3),
+        "camera_position": (frames, 3),
+        "camera_matrix": (3, 3),
+    }
+    for name, shape in shapes.items():
+        value = getattr(t, name)
+        if value is not None and value.shape != shape:
+            wanted = f"make it fit keypoints {t.keypoints.shape}"
+            raise InputError(f"{name}: expected shape {shape}, got {value.shape}; {wanted}")
 
 
 def _check_telemetry(t: Tracks) -> None:
@@ -180,33 +186,34 @@ def read_npz(path: Path, required: tuple[str, ...]) -> dict[str, np.ndarray]:
     InputError
         When the file is missing, is no ``.npz``, or lacks a required array.
     """
+    arrays = _load(path)
+    missing = [name for name in required if name not in arrays]
+    if missing:
+        kind, wanted = kind_of(arrays), kind_of(required)
+        if kind and wanted and kind != wanted:
+            raise wrong_kind(path, arrays, _USES[wanted][0])
+        raise InputError(f"{path}: expected the arrays {', '.join(required)}; missing {', '.join(missing)}")
+    return arrays
+
+
+def _load(path: Path) -> dict[str, np.ndarray]:
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise InputError(f"{path}: expected a readable .npz archive, found a pipe or device; name a file")
     if path.is_file() and not zipfile.is_zipfile(path):
         raise InputError(f"{path}: expected a readable .npz archive, found another or a damaged file; check the path")
     try:
-        archive = np.load(path, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise InputError(f"{path}: expected an .npz archive, got a single array")
-        with archive:
-            size = sum(entry.file_size for entry in archive.zip.infolist()) if archive.zip else 0
+        with np.load(path, allow_pickle=False) as archive:
+            size = sum(entry.file_size for entry in archive.zip.infolist())
             if size > MAX_BYTES:
                 raise InputError(f"{path}: expected at most {MAX_BYTES} bytes of arrays, got {size}; cut the recording")
-            arrays = {name: archive[name] for name in archive.files}
+            return {name: archive[name] for name in archive.files}
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the path") from None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        reason = first_line(error)
         if reason.startswith("Object arrays"):
             reason = "found arrays of Python objects; save names as text: np.array(names, dtype=str)"
         raise InputError(f"{path}: expected a readable .npz archive; {reason}") from None
-    missing = [name for name in required if name not in arrays]
-    kind, wanted = kind_of(arrays), kind_of(required)
-    if missing and kind and wanted and kind != wanted:
-        raise wrong_kind(path, arrays, _USES[wanted][0])
-    if missing:
-        raise InputError(f"{path}: expected the arrays {', '.join(required)}; missing {', '.join(missing)}")
-    return arrays
 
 
 def load_tracks(path: str | Path) -> Tracks:
