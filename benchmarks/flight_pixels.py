@@ -16,7 +16,7 @@ from drocap_ros.cli.demo.operator import Operator
 from drocap_ros.flight.orbit.states import State
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from lab.flights.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
 from lab.flights.pixel_loop import PixelOrbitLoop
 

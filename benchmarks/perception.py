@@ -28,10 +28,10 @@ from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.perception.models.spec import read_spec
 from drocap_ros.perception.pose import NetworkKeypoints, PoseModel
 from drocap_ros.perception.pose.uncertainty import CALIBRATIONS, Calibration, calibrate
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.sources import open_source
 from drocap_ros.perception.sources.image_files import read_image
 from drocap_ros.perception.track_video import observe, subjects
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.skeleton import COCO_17
 
 SHARED = ROOT.parent / "shared"

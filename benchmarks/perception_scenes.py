@@ -23,7 +23,7 @@ sys.path[:0] = [str(ROOT / "test" / "helpers")]
 from field_scenes import SCENES, FieldScene, field_images, on_subject  # noqa: E402
 
 from drocap_ros.perception.estimator import PoseEstimator  # noqa: E402
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig  # noqa: E402
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig  # noqa: E402
 
 MODELS = ROOT.parent / "shared" / "models"
 

@@ -21,8 +21,8 @@ sys.path[:0] = [str(ROOT)]
 from drocap_ros.motion import Motion  # noqa: E402
 from drocap_ros.perception.estimator import PoseEstimator  # noqa: E402
 from drocap_ros.perception.load_models import models_folder  # noqa: E402
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig  # noqa: E402
 from drocap_ros.perception.track_video import tracks_from_observations  # noqa: E402
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig  # noqa: E402
 from drocap_ros.reconstruction.reconstruct import reconstruct  # noqa: E402
 from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix  # noqa: E402
 from drocap_ros.simulation.render.renderer import Renderer  # noqa: E402

@@ -109,7 +109,7 @@ def run_check(args: argparse.Namespace) -> int:
     """Load the models; with an image, run them and draw the result."""
     from drocap_ros.perception.estimator import PoseEstimator
     from drocap_ros.perception.load_models import models_folder
-    from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
+    from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
     estimator = PoseEstimator(models_folder(args.models), PoseEstimatorConfig())
     if args.image is None:

@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.cli.report import open_words
     from drocap_ros.config import load_config
     from drocap_ros.perception.load_models import models_folder
-    from drocap_ros.perception.pose_estimator_config import parse_subject
+    from drocap_ros.perception.tracking.pose_estimator_config import parse_subject
     from drocap_ros.pipeline import Selection, needs_networks, reconstruct_input
 
     out, clip = args.out or default_folder(args.input, "motion"), clip_of(args)

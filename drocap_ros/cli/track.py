@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.perception.estimator import PoseEstimator
     from drocap_ros.perception.load_models import models_folder
     from drocap_ros.perception.persons import find_persons, following
-    from drocap_ros.perception.pose_estimator_config import parse_subject
+    from drocap_ros.perception.tracking.pose_estimator_config import parse_subject
     from drocap_ros.recording.open_images import open_images
 
     out = args.out or default_folder(Path(args.video), "tracks")

@@ -10,29 +10,24 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.observation import PoseObservation
-from drocap_ros.perception.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import without_parts
-from drocap_ros.perception.flow import KeypointFlow
 from drocap_ros.perception.load_models import limited_use, load_detector, load_pose_model
-from drocap_ros.perception.other_poses import OtherPoses
+from drocap_ros.perception.load_shedding import KeypointFlow
 from drocap_ros.perception.pose import NetworkKeypoints
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
-from drocap_ros.perception.tracking import Subject, SubjectTracker
+from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
 from drocap_ros.perception.tracking.camera_motion import CameraMotion, sweeps
-from drocap_ros.perception.tracking.pose_belief import CONFIRM_CONFIDENCE, EMPTY_CONFIDENCE
+from drocap_ros.perception.tracking.other_poses import OtherPoses
+from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, EMPTY_CONFIDENCE, Subject
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking.search import SubjectSearch
+from drocap_ros.perception.tracking.subject import SubjectTracker
 
-#: Detection score from which the next images need no detection, if the pose is clear.
-_CLEAR_SCORE = 0.6
-#: Tolerance of the detection interval against jitter of the stamps.
-_SLACK_S = 0.005
-#: Every so many rows tell whether an image is the last one again.
-_COMPARED_ROWS = 4
-#: Time without a detection and a believable pose after which there are no keypoints; a single blurred image is shorter.
-_UNSEEN_NS = 80_000_000
-#: Under load shedding, longest pause of the pose network, over the one after a first failure: 0.4 s at 30 Hz.
-_LONGEST_PAUSE = 4
+_CLEAR_SCORE = 0.6  # detection score from which the next images need no detection, if the pose is clear
+_SLACK_S = 0.005  # tolerance of the detection interval against jitter of the stamps
+_COMPARED_ROWS = 4  # every so many rows tell whether an image is the last one again
+_UNSEEN_NS = 80_000_000  # without detection and believable pose until there are no keypoints: two images at 25 Hz
+_LONGEST_PAUSE = 4  # of the pose network under load shedding, over that after a first failure: 0.4 s at 30 Hz
 
 log = logging.getLogger(__name__)
 
@@ -128,7 +123,8 @@ class PoseEstimator:
             self._failures, self._seen_ns = 0, stamp_ns
             return observation, True
         predicted = self._estimate_predicted(image, stamp_ns, load_level) if roi is None else None
-        self._seen_ns = stamp_ns if predicted and predicted[1] else self._seen_ns
+        if predicted and predicted[1]:
+            self._seen_ns = stamp_ns
         observation, certain = predicted or self._estimate_detected(image, stamp_ns, roi, load_level)
         # Doubtful persons are not propagated by optical flow; the detector runs again.
         self._flow.start(image if load_level and certain else None, observation)
@@ -155,33 +151,41 @@ class PoseEstimator:
         self._detected_ns, self._score, self._confidence = stamp_ns, 0.0 if subject is None else subject.score, 0.0
         if subject is None:
             return PoseObservation(stamp_ns, 0, _size(image)), False
-        if subject.hidden:
+        if subject.hidden or self._pauses(subject, load_level):
             return self._observation(image, stamp_ns, subject), False
+        return self._estimate_pose(image, stamp_ns, subject, everything, shedding)
+
+    def _pauses(self, subject: Subject, load_level: int) -> bool:
+        """Whether the pose network rests under load shedding, after runs without a person and a clear detection."""
         pause = load_level * min(2 ** (self._failures - 1), _LONGEST_PAUSE) if self._failures else 0
-        if subject.score < _CLEAR_SCORE and self._paused < pause:
-            self._paused += 1
-            return self._observation(image, stamp_ns, subject), False
+        if subject.score >= _CLEAR_SCORE or self._paused >= pause:
+            return False
+        self._paused += 1
+        return True
+
+    def _estimate_pose(
+        self, image: np.ndarray, stamp_ns: int, subject: Subject, found: Detections, shedding: bool
+    ) -> tuple[PoseObservation, bool]:
+        """The pose of the detected or predicted subject, or of a detection that it is instead."""
         pose = self._body.estimate(image, subject.box)
-        subject, pose = self._others.compete(image, stamp_ns, subject, pose, everything, shedding)
+        subject, pose = self._others.compete(image, stamp_ns, subject, pose, found, shedding)
         self.keypoints, self._score, self._confidence = pose.network, subject.score, pose.mean_confidence
         self.tracker.judge(self._confidence, subject.box, stamp_ns)
         self._others.judge_bystander(image, stamp_ns, pose, self._motion, shedding)
         is_person = self._confidence >= CONFIRM_CONFIDENCE
         self._failures, self._paused = 0 if is_person else self._failures + 1, 0
-        self._margins = None
-        extent = pose.extent()
-        if subject.score < self.config.detection_threshold:
-            if is_person and (box := pose.box()) is not None:
-                self.tracker.confirm(box, stamp_ns)
-        elif extent is not None and subject.score >= _CLEAR_SCORE and self._confidence >= CLEAR_CONFIDENCE:
-            self._margins = (subject.box - extent) / (extent[2:] - extent[:2]).max()
-        certain = is_person or subject.score >= self.config.detection_threshold
+        detected = subject.score >= self.config.detection_threshold
+        if is_person and not detected and (box := pose.box()) is not None:
+            self.tracker.confirm(box, stamp_ns)
+        clear = subject.score >= _CLEAR_SCORE and self._confidence >= CLEAR_CONFIDENCE
+        extent = pose.extent() if detected and clear else None
+        self._margins = None if extent is None else (subject.box - extent) / (extent[2:] - extent[:2]).max()
         blurred = sweeps(self._motion, subject.box)
         if is_person or (subject.score > 0 and (blurred or self._confidence >= EMPTY_CONFIDENCE)):
             self._seen_ns = stamp_ns
         elif stamp_ns - self._seen_ns > _UNSEEN_NS:
             return self._observation(image, stamp_ns, subject), False
-        return self._observation(image, stamp_ns, subject, pose), certain
+        return self._observation(image, stamp_ns, subject, pose), is_person or detected
 
     def _estimate_predicted(
         self, image: np.ndarray, stamp_ns: int, load_level: int
@@ -194,11 +198,10 @@ class PoseEstimator:
         predicted = self.tracker.predict(stamp_ns)
         if predicted is None:
             return None
-        size = _size(image)
-        age_s, every_s = (stamp_ns - self._detected_ns) * 1e-9, self.config.detect_every_s
-        shedding = load_level > 0 and self._confidence >= CLEAR_CONFIDENCE
-        shedding = shedding and not age_s > load_level * every_s - _SLACK_S
-        margins = self._margins if shedding or not age_s > every_s - _SLACK_S else None
+        size, age_s, every_s = _size(image), (stamp_ns - self._detected_ns) * 1e-9, self.config.detect_every_s
+        clear = self._confidence >= CLEAR_CONFIDENCE
+        shedding = load_level > 0 and clear and age_s <= load_level * every_s - _SLACK_S
+        margins = self._margins if shedding or age_s <= every_s - _SLACK_S else None
         if margins is not None and not self._search.isolated(predicted.box, size, stamp_ns):
             margins = None
         if margins is None and not shedding:
@@ -231,11 +234,10 @@ class PoseEstimator:
             confidence = np.where(outside, 0.0, pose.confidence)
             unseen = outside | (confidence < self.config.keypoint_threshold)
             xy[unseen], covariance[unseen] = np.nan, np.nan
-        return PoseObservation(
-            stamp_ns, subject.track_id, size, joints, subject.box.astype(np.float32),
-            0.0 if pose is None else subject.score,
-            xy.astype(np.float32), covariance.astype(np.float32), confidence.astype(np.float32),
-        )  # fmt: skip
+        score = 0.0 if pose is None else subject.score
+        arrays = (array.astype(np.float32) for array in (subject.box, xy, covariance, confidence))
+        box, xy, covariance, confidence = arrays
+        return PoseObservation(stamp_ns, subject.track_id, size, joints, box, score, xy, covariance, confidence)
 
 
 def _size(image: np.ndarray) -> tuple[int, int]:

@@ -12,7 +12,7 @@ from drocap_ros.perception.detection import Detector
 from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.perception.models.spec import ModelSpec, read_spec
 from drocap_ros.perception.pose import PoseModel
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
 T = TypeVar("T", Detector, PoseModel)
 

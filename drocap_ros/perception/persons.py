@@ -12,9 +12,9 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.estimator import PoseEstimator
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.sources.base import Frame, prefetch
 from drocap_ros.perception.tracking.person import Person
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
 #: Interval of the detections.
 _EVERY_NS = 200_000_000

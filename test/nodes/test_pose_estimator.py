@@ -9,7 +9,7 @@ from rclpy.context import Context
 from drocap_ros.bringup import bringup, free_domain
 from drocap_ros.config import DrocapConfig
 from drocap_ros.nodes.pose_estimator import PoseEstimatorNode
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.ros.diagnostics import Key, node_of, of, values_of
 from drocap_ros.ros.topics import TOPICS
 

@@ -6,7 +6,7 @@ import pytest
 
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
-from drocap_ros.perception.flow import KeypointFlow
+from drocap_ros.perception.load_shedding import KeypointFlow
 from drocap_ros.skeleton import BODY_15
 
 STEP_NS = 33_333_333

@@ -8,7 +8,7 @@ from rendered_person import rendered_images
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import SIMULATION, models_folder
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
 pytest.importorskip("onnxruntime")
 

@@ -12,8 +12,8 @@ from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.persons import find_persons
 from drocap_ros.perception.pose import NetworkKeypoints
 from drocap_ros.perception.pose.uncertainty import calibrate
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.sources import open_source
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.skeleton import BODY_15, COCO_17
 
 #: COCO's spread of human labels per joint, share of the square root of the person's area.

@@ -67,8 +67,8 @@ class Detector:
             spec = dataclasses.replace(spec, input_size=_reduced_size(window, reduced * min(spec.input_size)))
         canvas, place = letterbox(image, window, spec.input_size, spec.letterbox == "centre")
         raw = self._decode(self.model(self._normalize(canvas)), spec, threshold)
-        boxes = place.to_image(raw.boxes.astype(np.float32).reshape(-1, 2, 2)).reshape(-1, 4)
-        boxes = np.clip(boxes, 0, np.array([width, height, width, height], np.float32))
+        corners = place.to_image(raw.boxes.astype(np.float32).reshape(-1, 2, 2))
+        boxes = np.clip(corners.reshape(-1, 4), 0, np.array([width, height, width, height], np.float32))
         not_empty = (boxes[:, 2:] - boxes[:, :2]).min(axis=1, initial=np.inf) >= 1.0
         kept = np.nonzero(not_empty)[0]
         kept = kept[suppress(boxes[kept], raw.scores[kept])]

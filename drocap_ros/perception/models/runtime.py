@@ -58,7 +58,7 @@ class OnnxModel:
         self._open = lambda source: ort.InferenceSession(source, options, providers=providers)
         try:
             self._session: Any = self._open(str(self.path))
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001  # onnxruntime's exceptions have no common base
             raise InputError(
                 f"{self.path}: expected an ONNX model that onnxruntime {ort.__version__} can run; {_first_line(error)};"
                 " export or fetch it again"
@@ -84,7 +84,7 @@ class OnnxModel:
             return False
         try:
             self._session = self._open(source)
-        except Exception:
+        except Exception:  # noqa: BLE001  # onnxruntime's exceptions have no common base
             return False
         return True
 
@@ -102,7 +102,7 @@ class OnnxModel:
         """
         try:
             outputs = self._session.run(self._names, {self.inputs[0].name: tensor.astype(self._dtype, copy=False)})
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001  # onnxruntime's exceptions have no common base
             raise InputError(f"{self.path}: the model stopped: {_first_line(error)}; check its input size") from None
         for info, value in zip(self.outputs, outputs, strict=True):
             # The sum is NaN or infinite whenever an element is; one pass, no temporary array.
@@ -123,7 +123,7 @@ def with_dynamic_size(path: Path) -> bytes | None:
         import onnx
 
         model = onnx.load(path)
-    except Exception:
+    except Exception:  # noqa: BLE001  # no package, protobuf's own errors, no file of external weights
         return None
     inputs = model.graph.input
     if len(inputs) != 1 or len(inputs[0].type.tensor_type.shape.dim) != 4:

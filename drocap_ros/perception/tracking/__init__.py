@@ -1,6 +1,1 @@
-"""Single-subject tracking: box filter, appearance, association, re-identification."""
-
-from drocap_ros.perception.tracking.person import Subject
-from drocap_ros.perception.tracking.subject import SubjectTracker
-
-__all__ = ["Subject", "SubjectTracker"]
+"""Single-subject tracking: search, association, identity, the belief in poses, and poses of others."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-#: Parts as shares of the box's height, and the middle share of its width, which holds little background.
+#: Head, trunk and legs as shares of the box's height.
 _PARTS = ((0.03, 0.17), (0.2, 0.5), (0.55, 0.9))
-_WIDTH = 0.5
-_BINS = 8
-_PATCH = (12, 12)
+_WIDTH = 0.5  # middle share of the box's width, which holds little background
+_BINS = 8  # of each histogram
+_PATCH_PX = (12, 12)  # size of a part, independent of the person's
 
 
 def describe(image: np.ndarray, box: np.ndarray) -> np.ndarray | None:
@@ -36,13 +36,12 @@ def describe(image: np.ndarray, box: np.ndarray) -> np.ndarray | None:
         rows = slice(max(0, int(y0 + top * height)), max(0, int(y0 + bottom * height) + 1))
         columns = slice(max(0, int(left)), max(0, int(right) + 1))
         view = image[rows, columns]
-        if view.shape[0] < 1 or view.shape[1] < 1:
+        if 0 in view.shape:
             return None
-        lab = cv2.cvtColor(cv2.resize(view, _PATCH, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2LAB)
-        histograms += [
-            _soft_histogram(lab[..., 0].ravel(), 0, 255),
-            *(_soft_histogram(lab[..., c].ravel(), 96, 160) for c in (1, 2)),
-        ]
+        lab = cv2.cvtColor(cv2.resize(view, _PATCH_PX, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2LAB)
+        # Colours of clothes and skin lie within a quarter of the range of a and b.
+        ranges = ((0, 255), (96, 160), (96, 160))
+        histograms += [_soft_histogram(lab[..., c].ravel(), *between) for c, between in enumerate(ranges)]
     return np.sqrt(np.concatenate(histograms) / len(histograms)).astype(np.float32)
 
 

@@ -2,43 +2,56 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient
+from drocap_ros.perception.tracking.identity import MIXED_IOU, known_other, replaced
 from drocap_ros.perception.tracking.person import Person
-from drocap_ros.perception.tracking.reidentification import MIXED_IOU, known_other, replaced
 
-_IMPOSSIBLE = 1e6
-#: Weights of size, appearance and score against the distance: another person's appearance differs by 0.05 to 0.2, the
-#: own by 0.02; a whole person scores higher than a part.
-_SIZE_WEIGHT, _APPEARANCE_WEIGHT, _SCORE_WEIGHT = 0.4, 5.0, 2.0
-#: Distance from the prediction that a person may have, lengths: at once, more per second without detection, and the
-#: largest one of others than the subject.  Nobody looks for them at their places, but who is near the subject is rarely
-#: one of those from far away.
-_REACH, _REACH_PER_S, _OTHERS_REACH = 0.35, 2.0, 1.35
-#: Cost per second without detection: of two persons near one detection the one who was just seen takes it.
-_GAP_WEIGHT = 1.0
-#: Overlap with the last box from which a large change of size is possible: a person enters the image.
-_SAME_PLACE, _ENTRANCE_GROWTH = 0.6, 1.3
-#: Least overlap of a low-score detection with the prediction.
-_LOW_SCORE_IOU = 0.35
+_SIZE_WEIGHT = 0.4  # of the change of size against the distance, each over its gate
+_APPEARANCE_WEIGHT = 5.0  # another person's appearance differs by 0.05 to 0.2, the own by 0.02
+_SCORE_WEIGHT = 2.0  # a whole person scores higher than a part
+_GAP_WEIGHT = 1.0  # per second without detection: of two persons near one detection the one just seen takes it
+_REACH = 0.35  # lengths that a person may be from the prediction at once,
+_REACH_PER_S = 2.0  # and more per second without detection
+#: Largest distance, lengths, of others than the subject.  Nobody looks for them at their places, but who is near the
+#: subject is rarely one of those from far away.
+_OTHERS_REACH = 1.35
+_SCOPE = 0.55  # logarithm of the size by which a person may change at once,
+_SCOPE_PER_S = 0.6  # and more per second without detection
+_SAME_PLACE = 0.6  # overlap with the last box from which a large change of size is possible: a person enters the image,
+_ENTRANCE_GROWTH = 1.3  # and its largest logarithm
+_LOW_SCORE_IOU = 0.35  # least overlap of a low-score detection with the prediction
+
+
+class Seen(NamedTuple):
+    """Detections in one image: boxes (N, 4) px, scores (N,), and N descriptors of the appearance."""
+
+    boxes: np.ndarray
+    scores: np.ndarray
+    appearances: list[np.ndarray | None]
+
+    def at(self, indices: np.ndarray) -> Seen:
+        """Those of the indices (M,)."""
+        return Seen(self.boxes[indices], self.scores[indices], [self.appearances[j] for j in indices])
+
+    def mixed(self, j: int) -> bool:
+        """Whether detection ``j`` overlaps another one, so that its appearance is mixed."""
+        overlap = iou(self.boxes[j][None], self.boxes)[0]
+        overlap[j] = 0.0
+        return bool((overlap > MIXED_IOU).any())
 
 
 def assign_all(
-    subject: Person | None,
-    others: list[Person],
-    boxes: np.ndarray,
-    scores: np.ndarray,
-    appearances: list[np.ndarray | None],
-    stamp_ns: int,
-    threshold: float,
+    subject: Person | None, others: list[Person], seen: Seen, stamp_ns: int, threshold: float
 ) -> tuple[set[int], list[Person]]:
     """Update persons with their detections: first the reliable ones, then the others, then with low scores.
 
     Parameters
     ----------
     subject : None while it is lost
-    boxes : (N, 4) px; scores : (N,); appearances : N descriptors
     threshold : score below which a detection only continues a reliable track
 
     Returns
@@ -47,63 +60,50 @@ def assign_all(
     """
     persons = others if subject is None else [subject, *others]
     reliable = [p for p in persons if p is subject or (p.reliable and not p.double)]
-    unreliable = [p for p in persons if not any(p is q for q in reliable)]
-    high = scores >= threshold
+    unreliable = [p for p in persons if p is not subject and not (p.reliable and not p.double)]
+    high = seen.scores >= threshold
     assigned: set[int] = set()
-    refused: set[int] = set()
     replacements: list[Person] = []
-    for owners, group in ((reliable, high), (unreliable, high), (reliable, ~high)):
-        free = [p for p in owners if p.detected_ns < stamp_ns and id(p) not in refused]
+    refused = False  # a low-score detection must not replace a refused one of the subject either
+    for owners, group, low_score in ((reliable, high, False), (unreliable, high, False), (reliable, ~high, True)):
+        free = [p for p in owners if p.detected_ns < stamp_ns and not (refused and p is subject)]
         at = np.array([j for j in np.nonzero(group)[0] if j not in assigned], int)
-        found = boxes[at], scores[at], [appearances[j] for j in at]
-        pairs = assign(free, *found, stamp_ns, group is not high, subject)
-        for i, k in pairs:
+        for i, k in assign(free, seen.at(at), stamp_ns, low_score, subject):
             person, j = free[i], int(at[k])
-            if person is subject:
-                if replaced(subject, boxes[j], appearances[j], stamp_ns):
-                    replacements.append(Person(boxes[j], float(scores[j]), stamp_ns, appearances[j]))
-                    refused.add(id(person))
-                    assigned.add(j)
-                    continue
-                if known_other(subject, others, boxes[j], appearances[j]):
-                    refused.add(id(person))  # a low-score detection must not replace it either
-                    continue
-            person.update(boxes[j], float(scores[j]), stamp_ns)
-            if group is high:
-                person.confirm(stamp_ns)
-            if person.pose.believed and not _mixed(boxes, j):
-                person.update_appearance(appearances[j])
-            assigned.add(j)
+            box, appearance = seen.boxes[j], seen.appearances[j]
+            if person is subject and replaced(person, box, appearance, stamp_ns):
+                replacements.append(Person(box, float(seen.scores[j]), stamp_ns, appearance))
+                refused = True
+                assigned.add(j)
+            elif person is subject and known_other(person, others, box, appearance):
+                refused = True
+            else:
+                _update(person, seen, j, stamp_ns, low_score)
+                assigned.add(j)
     return assigned, replacements
 
 
-def _mixed(boxes: np.ndarray, j: int) -> bool:
-    """Whether detection ``j`` overlaps another one, so that its appearance is mixed."""
-    overlap = iou(boxes[j][None], boxes)[0]
-    overlap[j] = 0.0
-    return bool((overlap > MIXED_IOU).any())
+def _update(person: Person, seen: Seen, j: int, stamp_ns: int, low_score: bool) -> None:
+    """Continue a track with its detection ``j``."""
+    person.update(seen.boxes[j], float(seen.scores[j]), stamp_ns)
+    if not low_score:
+        person.confirm(stamp_ns)
+    if person.pose.believed and not seen.mixed(j):
+        person.update_appearance(seen.appearances[j])
 
 
 def assign(
-    persons: list[Person],
-    boxes: np.ndarray,
-    scores: np.ndarray,
-    appearances: list[np.ndarray | None],
-    stamp_ns: int,
-    low_score: bool = False,
-    subject: Person | None = None,
+    persons: list[Person], seen: Seen, stamp_ns: int, low_score: bool = False, subject: Person | None = None
 ) -> list[tuple[int, int]]:
     """Pairs (person, detection) of least total cost within the gates of distance and size.
 
     Parameters
     ----------
     persons : predicted to ``stamp_ns``
-    boxes : (N, 4) px
-    scores : (N,)
-    appearances : N descriptors
     low_score : require a high overlap with the prediction, for detections that may be clutter
     subject : the person among them for whom the detector looks in every image
     """
+    boxes = seen.boxes
     if not persons or not len(boxes):
         return []
     from scipy.optimize import linear_sum_assignment
@@ -113,14 +113,12 @@ def assign(
     # The box of a person who is half hidden is shorter than the person.
     usual = np.array([p.pose.length for p in persons])
     length = np.maximum((predicted[:, 2:] - predicted[:, :2]).max(axis=1), np.maximum(usual, 1.0))[:, None]
-    offset = _centres(predicted)[:, None] - _centres(boxes)[None]
-    distance = np.linalg.norm(offset, axis=2) / length
+    distance = np.linalg.norm(_centres(predicted)[:, None] - _centres(boxes)[None], axis=2) / length
     growth = np.abs(np.log(_sizes(boxes)[None] / _sizes(predicted)[:, None]))
-    overlap = np.maximum(
-        overlap_coefficient(predicted, boxes), overlap_coefficient(np.array([p.box for p in persons]), boxes)
-    )
     farthest = np.array([np.inf if p is subject else _OTHERS_REACH for p in persons])[:, None]
-    reach, scope = np.minimum(_REACH + _REACH_PER_S * gap, farthest), 0.55 + 0.6 * gap
+    reach, scope = np.minimum(_REACH + _REACH_PER_S * gap, farthest), _SCOPE + _SCOPE_PER_S * gap
+    last = np.array([p.box for p in persons])
+    overlap = np.maximum(overlap_coefficient(predicted, boxes), overlap_coefficient(last, boxes))
     possible = (distance < reach) & (growth < scope) | (overlap > _SAME_PLACE) & (growth < _ENTRANCE_GROWTH)
     # What is no person stays in its place: a person who comes out from behind it is a new track.
     strict = np.array([low_score or not p.plausible for p in persons])[:, None]
@@ -129,18 +127,17 @@ def assign(
         further = overlap_coefficient(subject.filter.box()[None], boxes) > _SAME_PLACE
         elsewhere = np.array([p is not subject for p in persons])[:, None] & (overlap <= MIXED_IOU)
         possible &= ~(further & elsewhere)
-    cost = np.full(possible.shape, _IMPOSSIBLE)
-    for i, j in zip(*np.nonzero(possible), strict=True):
-        difference = 1.0 - persons[i].similarity(appearances[j])
-        cost[i, j] = (
-            distance[i, j] / reach[i, 0]
-            + _SIZE_WEIGHT * growth[i, j] / scope[i, 0]
-            + _APPEARANCE_WEIGHT * difference
-            + _SCORE_WEIGHT * (1.0 - scores[j])
-            + _GAP_WEIGHT * gap[i, 0]
-        )
+    difference = 1.0 - np.array([[p.similarity(appearance) for appearance in seen.appearances] for p in persons])
+    cost = (
+        distance / reach
+        + _SIZE_WEIGHT * growth / scope
+        + _APPEARANCE_WEIGHT * difference
+        + _SCORE_WEIGHT * (1.0 - seen.scores)
+        + _GAP_WEIGHT * gap
+    )
+    cost[~possible] = 1e6  # more than any possible one
     rows, columns = linear_sum_assignment(cost)
-    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if cost[i, j] < _IMPOSSIBLE]
+    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if possible[i, j]]
 
 
 def _centres(boxes: np.ndarray) -> np.ndarray:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-#: Standard deviations of the measurement (centre in lengths, log size) and of the acceleration (lengths/s^2, 1/s^2):
-#: a runner turns at about 1 g, 5 lengths/s^2, and the camera's yaw adds to it.
+#: Standard deviation of a measured box: centre in lengths, logarithm of the sizes.
 _MEASURED = np.array([0.03, 0.03, 0.08, 0.08])
+#: That of the acceleration, lengths/s^2 and 1/s^2: a runner turns at about 1 g, 5 lengths/s^2; the camera adds to it.
 _ACCELERATION = np.array([4.0, 4.0, 2.0, 2.0])
-#: Longest extrapolation of a velocity; persons turn, stoop or stop within it.
-_LONGEST_PREDICTION_S = 0.4
+#: That of the first rate, lengths/s and 1/s: a walk.
+_FIRST_RATE = np.array([1.0, 1.0, 0.5, 0.5])
+_DECAY_S = np.array([1.0, 1.0, 0.3, 0.3])  # time in which a rate without measurements falls to a third
+_LONGEST_PREDICTION_S = 0.4  # persons turn, stoop or stop within it
 
 
 class BoxFilter:
@@ -20,28 +22,23 @@ class BoxFilter:
 
     def __init__(self, box: np.ndarray, stamp_ns: int) -> None:
         self.stamp_ns = stamp_ns
-        measured = _to_state(box)
-        self.x = np.stack([measured, np.zeros(4)], 1)
-        sigma = self._scaled(_MEASURED)
-        rate = self._scaled(np.array([1.0, 1.0, 0.5, 0.5]))
+        self.x = np.stack([_to_state(box), np.zeros(4)], 1)
         self.p = np.zeros((4, 2, 2))
-        self.p[:, 0, 0] = sigma**2
-        self.p[:, 1, 1] = rate**2
+        self.p[:, 0, 0] = self._scaled(_MEASURED) ** 2
+        self.p[:, 1, 1] = self._scaled(_FIRST_RATE) ** 2
 
     def _scaled(self, values: np.ndarray) -> np.ndarray:
         return values * np.array([self.length, self.length, 1.0, 1.0])
 
     def box(self) -> np.ndarray:
         """(4,) x_min y_min x_max y_max px."""
-        cx, cy, w, h = self.x[0, 0], self.x[1, 0], np.exp(self.x[2, 0]), np.exp(self.x[3, 0])
-        return np.array([cx - w / 2, cy - h / 2, cx + w / 2, cy + h / 2])
+        return _to_box(self.x[:, 0])
 
     def box_at(self, stamp_ns: int) -> np.ndarray:
         """(4,) px predicted for a time; the state stays."""
         dt = float(np.clip((stamp_ns - self.stamp_ns) * 1e-9, 0.0, _LONGEST_PREDICTION_S))
-        cx, cy, w, h = self.x[:, 0] + dt * self.x[:, 1]
-        half = np.exp(np.clip([w, h], 0.0, 10.0)) / 2
-        return np.array([cx - half[0], cy - half[1], cx + half[0], cy + half[1]])
+        x = self.x[:, 0] + dt * self.x[:, 1]
+        return _to_box(np.concatenate([x[:2], np.clip(x[2:], 0.0, 10.0)]))
 
     @property
     def length(self) -> float:
@@ -55,7 +52,7 @@ class BoxFilter:
         if dt <= 0:
             return
         self.x[:, 0] += dt * self.x[:, 1]
-        self.x[:, 1] *= np.exp(-dt / np.array([1.0, 1.0, 0.3, 0.3]))
+        self.x[:, 1] *= np.exp(-dt / _DECAY_S)
         self.x[2:, 0] = np.clip(self.x[2:, 0], 0.0, 10.0)
         q = self._scaled(_ACCELERATION) ** 2
         f = np.array([[1.0, dt], [0.0, 1.0]])
@@ -80,3 +77,8 @@ class BoxFilter:
 def _to_state(box: np.ndarray) -> np.ndarray:
     x0, y0, x1, y1 = (float(v) for v in box)
     return np.array([(x0 + x1) / 2, (y0 + y1) / 2, np.log(max(x1 - x0, 1.0)), np.log(max(y1 - y0, 1.0))])
+
+
+def _to_box(state: np.ndarray) -> np.ndarray:
+    half = np.exp(state[2:]) / 2
+    return np.concatenate([state[:2] - half, state[:2] + half])

@@ -6,21 +6,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-#: Longer side (px) of the image in which it is measured, and points of the ground.
-_SIDE_PX, _POINTS = 480, 150
-#: Quality of the points over the best one's, and their least distance (px).
-_QUALITY, _APART_PX = 0.01, 8
-#: Window and pyramid levels of the optical flow.
-_WINDOW_PX, _LEVELS = (15, 15), 4
-#: Points that agree on a motion: distance (px) up to which they do, least number and share of them, and the share that
-#: makes it certain.
-_AGREE_PX, _LEAST, _SHARE, _CERTAIN = 2.0, 15, 0.4, 0.7
-#: Share of the longer side that counts as motion: the tracks bear less, and each step costs a trace of accuracy.
-_SMALL = 0.01
-#: Way between two images, lengths of the person, from which the blur takes joints from the pose.
-_BLUR = 0.25
-#: Largest change of the size between two images.
-_MOST_ZOOM = 1.5
+_SIDE_PX = 480  # longer side of the image in which it is measured
+_POINTS = 150  # of the ground: ten times the least number that has to agree
+_QUALITY = 0.01  # of the points over the best one's, as in the examples of OpenCV
+_APART_PX = 8  # least distance of the points
+_WINDOW_PX = (15, 15)  # of the optical flow around each point
+_LEVELS = 4  # of the flow's pyramid: steps up to 7 * 2^4 = 112 px
+_AGREE_PX = 2.0  # distance up to which points agree on a motion
+_LEAST = 15  # least number of points that agree,
+_SHARE = 0.4  # least share of them,
+_CERTAIN = 0.7  # and the share that makes the motion certain
+_SMALL = 0.01  # share of the longer side that counts as motion: the tracks bear less, and each step costs accuracy
+_BLUR = 0.25  # way between two images, lengths of the person, from which the blur takes joints from the pose
+_MOST_ZOOM = 1.5  # largest change of the size between two images; more is a wrong consensus
 
 
 class CameraMotion:
@@ -110,10 +108,10 @@ def _consensus(
     """Transform (2, 3) of points (N, 1, 2), by optical flow that starts at a shift, and the share that agrees."""
     import cv2
 
+    start = (points + shift).astype(np.float32)
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
-        last, grey, points, (points + shift).astype(np.float32), winSize=_WINDOW_PX, maxLevel=_LEVELS,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-    )  # fmt: skip
+        last, grey, points, start, winSize=_WINDOW_PX, maxLevel=_LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+    )
     ok = found[:, 0] == 1
     if ok.sum() < _LEAST:
         return None, 0.0

@@ -1,4 +1,4 @@
-"""Track of one person, the subject or a bystander, and the subject in one image."""
+"""Track of one person, the subject or a bystander, with the belief in its poses; the subject in one image."""
 
 from __future__ import annotations
 
@@ -10,18 +10,104 @@ import numpy as np
 from drocap_ros.perception.tracking.appearance import similarity
 from drocap_ros.perception.tracking.box_filter import BoxFilter
 from drocap_ros.perception.tracking.camera_motion import moved_box
-from drocap_ros.perception.tracking.pose_belief import PoseBelief
 
-#: Weight of a new descriptor in the mean appearance.
-_APPEARANCE_RATE = 0.08
-#: Number of descriptors in a settled mean appearance.
-_SETTLED = 10
-#: Speed with which a person may deviate from the predicted motion, lengths/s: who falls gains 3 in half a second.
-_SPEED = 1.5
-#: Weight of a new detection score in the mean score.
-_SCORE_RATE = 0.3
-#: Least mean score of a reliable track; body parts and clutter score below.
-_RELIABLE_SCORE = 0.4
+#: Mean confidence of the joints: on boxes without a person below this,
+EMPTY_CONFIDENCE = 0.33
+#: of a believable pose from here on: shadows have 0.2 to 0.6, persons in bad light or from steeply above 0.5 to 0.9;
+CONFIRM_CONFIDENCE = 0.5
+#: of a pose that is certainly a person's from here on.
+SURE_CONFIDENCE = 0.7
+_IMPLAUSIBLE = 0.45  # recent mean confidence of a track without a person
+_USUAL_SHARE = 0.7  # least share of the usual confidence that is believed: persons of 0.9 do not stay at 0.6
+_SLOW_RATE = 0.1  # weight of a new value in the usual confidence and length, of some ten poses,
+_RECENT_RATE = 0.3  # and in recent means, of some three
+_QUESTION_S = 1.0  # time of poses without belief after which a track is questioned,
+_DROP_S = 2.5  # and after which one without a person is dropped
+_APPEARANCE_RATE = 0.08  # weight of a new descriptor in the mean appearance
+_SETTLED = 10  # descriptors in a settled mean appearance
+_SPEED = 1.5  # lengths/s by which a person may deviate from the predicted motion: who falls gains 3 in half a second
+_RELIABLE_SCORE = 0.4  # least mean score of a reliable track; body parts and clutter score below
+
+
+class PoseBelief:
+    """History of the pose confidence of one track.
+
+    length : px, usual longer side of the believable boxes; partly hidden persons have shorter ones
+    value, last : recent mean of the confidence, and that of the last pose; NaN before the first one
+    judged_ns : last pose; believed_ns, box : last believable one and its box (4,) px, None = none yet
+    plausible_ns : from when on the track was a person, as far as its poses show; None = it is none
+    other : whether track and subject were certainly persons at the same time, hence two of them
+    """
+
+    def __init__(self, stamp_ns: int) -> None:
+        self.value = self.last = float("nan")
+        self.judged_ns: int | None = None
+        self.believed_ns: int | None = None
+        self.box: np.ndarray | None = None
+        self.plausible_ns: int | None = stamp_ns
+        self.other = False
+        self.length = 0.0
+        self._usual = 0.0
+        self._failing_ns: int | None = None
+
+    def judge(self, confidence: float, box: np.ndarray, stamp_ns: int, blurred: bool = False) -> None:
+        """Add a pose by its mean confidence, found in a box (4,) px; a weak one in a blurred image says nothing."""
+        if blurred and confidence < CONFIRM_CONFIDENCE:
+            self.judged_ns = stamp_ns
+            return
+        first = np.isnan(self.value) or (self.plausible_ns is None and confidence >= CONFIRM_CONFIDENCE)
+        self.value = confidence if first else self.value + _RECENT_RATE * (confidence - self.value)
+        self.last, self.judged_ns = confidence, stamp_ns
+        if confidence >= max(CONFIRM_CONFIDENCE, _USUAL_SHARE * self._usual):
+            self.choose(box, stamp_ns)
+            self._usual = confidence if not self._usual else self._usual + _SLOW_RATE * (confidence - self._usual)
+            return
+        if self._failing_ns is None:
+            self._failing_ns = stamp_ns
+        if self.value < _IMPLAUSIBLE:
+            self.plausible_ns = None
+
+    def choose(self, box: np.ndarray, stamp_ns: int) -> None:
+        """Believe a box (4,) px that a user or a drone's tracker gave, whatever its pose."""
+        self.believed_ns, self.box, self._failing_ns = stamp_ns, np.array(box, float), None
+        if self.plausible_ns is None:
+            self.plausible_ns = stamp_ns
+        length = float((self.box[2:] - self.box[:2]).max())
+        self.length = length if not self.length else self.length + _SLOW_RATE * (length - self.length)
+
+    def growth(self, box: np.ndarray, length: float) -> float:
+        """Absolute logarithm of the size of a box (4,) px over the last or the usual one, whichever is nearer.
+
+        length : px, of the person before there is a believable box
+        """
+        size = max(float((box[2:] - box[:2]).max()), 1.0)
+        known = [length] if self.box is None else [self.length, float((self.box[2:] - self.box[:2]).max())]
+        return min(abs(float(np.log(size / max(value, 1.0)))) for value in known)
+
+    def refute(self, confidence: float, stamp_ns: int) -> None:
+        """Mark the track as no person, by a pose that lost against another one."""
+        self.value, self.last, self.judged_ns, self.plausible_ns = confidence, confidence, stamp_ns, None
+        self._failing_ns = stamp_ns
+
+    @property
+    def believed(self) -> bool:
+        """Whether the last pose was believable; a track without poses is believed."""
+        return self._failing_ns is None
+
+    @property
+    def questioned(self) -> bool:
+        """Whether the poses have not been believable for a second."""
+        return self._fails(_QUESTION_S)
+
+    @property
+    def refuted(self) -> bool:
+        """Whether the poses have shown for seconds that there is no person."""
+        return self._fails(_DROP_S) and self.value < _IMPLAUSIBLE
+
+    def _fails(self, seconds: float) -> bool:
+        if self._failing_ns is None or self.judged_ns is None:
+            return False
+        return (self.judged_ns - self._failing_ns) * 1e-9 >= seconds
 
 
 @dataclass(frozen=True)
@@ -47,7 +133,7 @@ class Person:
     score : of the last detection; mean_score : recent mean, low for body parts and clutter
     hits : number of detections
     began_at_subject, double : whether its first box lay on the subject's, and whether it is a second box around the
-        subject; see ``doubles.py``
+        subject; see ``identity.py``
     left_image : whether it left at an edge of the image; set for the subject only
     pose : what its poses say about it
     """
@@ -55,11 +141,8 @@ class Person:
     def __init__(self, box: np.ndarray, score: float, stamp_ns: int, appearance: np.ndarray | None) -> None:
         self.filter = BoxFilter(box, stamp_ns)
         self.box = np.asarray(box, float)
-        self.first_ns = stamp_ns
-        self.detected_ns = stamp_ns
-        self.confirmed_ns = stamp_ns
-        self.score = score
-        self.mean_score = score
+        self.first_ns = self.detected_ns = self.confirmed_ns = stamp_ns
+        self.score = self.mean_score = score
         self.hits = 1
         self.began_at_subject = self.double = self.left_image = False
         self.pose = PoseBelief(stamp_ns)
@@ -102,7 +185,7 @@ class Person:
         self.box = np.asarray(box, float)
         self.detected_ns = stamp_ns
         self.score = score
-        self.mean_score += _SCORE_RATE * (score - self.mean_score)
+        self.mean_score += _RECENT_RATE * (score - self.mean_score)
         self.hits += 1
 
     def move(self, box: np.ndarray, score: float, stamp_ns: int) -> None:
@@ -111,6 +194,12 @@ class Person:
         self.box = np.asarray(box, float)
         self.score = self.mean_score = score
         self.confirm(stamp_ns)
+
+    def remainder(self, stamp_ns: int) -> Person:
+        """A track of what its box shows, which was found to be no person."""
+        clutter = Person(self.box, self.score, stamp_ns, None)
+        clutter.pose.refute(self.pose.value, stamp_ns)
+        return clutter
 
     def move_camera(self, matrix: np.ndarray) -> None:
         """Follow the image's motion (2, 3) by the camera's."""

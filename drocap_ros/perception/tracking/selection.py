@@ -5,16 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from drocap_ros.perception.detection.nms import iou
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig, parse_box
+from drocap_ros.perception.tracking.identity import certainly_others
 from drocap_ros.perception.tracking.person import Person, boxes_of
-from drocap_ros.perception.tracking.reidentification import certainly_others
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig, parse_box
 
-#: Score from which the first person ever needs no confirmation by further images.
-_CERTAIN_SCORE = 0.6
-#: Least overlap of a detection with a given box.
-_GIVEN_IOU = 0.2
-#: For ``on_loss = next``: time beyond coasting after which a subject lost inside the image is given up.
-_GIVE_UP_S = 3.0
+_CERTAIN_SCORE = 0.6  # from which the first person ever needs no confirmation by further images
+_GIVEN_IOU = 0.2  # least overlap of a detection with a given box
+_GIVE_UP_S = 3.0  # for ``on_loss = next``: time beyond coasting after which a subject lost in the image is given up
 
 
 class SubjectChoice:
@@ -61,19 +58,20 @@ class SubjectChoice:
                 return None
             if not last.left_image:
                 persons = certainly_others(last, persons, stamp_ns)
-        candidates = [
-            p
-            for p in persons
-            if p.detected_ns == stamp_ns
-            and p is not last
-            and (p.plausible or first)
-            and p.score >= config.detection_threshold
-            and (p.hits >= config.confirm_frames or (self.nothing_yet and p.score >= _CERTAIN_SCORE))
-        ]
-        if config.subject == "centre":
-            middle = np.array([shape[1], shape[0]]) / 2
-            return min(
-                candidates, key=lambda p: float(np.linalg.norm((p.box[:2] + p.box[2:]) / 2 - middle)), default=None
-            )
-        # After a given box or the drone's the largest person follows.
-        return max(candidates, key=lambda p: float(np.prod(p.box[2:] - p.box[:2])), default=None)
+        seen = [p for p in persons if p is not last and p.detected_ns == stamp_ns and (p.plausible or first)]
+        seen = [p for p in seen if self._confirmed(p)]
+        middle = np.array([shape[1], shape[0]]) / 2
+
+        def rank(person: Person) -> float:
+            if config.subject == "centre":
+                return float(np.linalg.norm((person.box[:2] + person.box[2:]) / 2 - middle))
+            # After a given box or the drone's the largest person follows.
+            return -float(np.prod(person.box[2:] - person.box[:2]))
+
+        return min(seen, key=rank, default=None)
+
+    def _confirmed(self, person: Person) -> bool:
+        """Whether enough images show the person; at the beginning a certain detection is enough."""
+        if person.score < self._config.detection_threshold:
+            return False
+        return person.hits >= self._config.confirm_frames or (self.nothing_yet and person.score >= _CERTAIN_SCORE)

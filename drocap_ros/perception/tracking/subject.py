@@ -2,31 +2,43 @@
 
 from __future__ import annotations
 
+from enum import Enum
+
 import numpy as np
 
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
-from drocap_ros.perception.tracking import doubles
 from drocap_ros.perception.tracking.appearance import describe
-from drocap_ros.perception.tracking.association import assign_all
+from drocap_ros.perception.tracking.association import Seen, assign_all
 from drocap_ros.perception.tracking.box_filter import BoxFilter
-from drocap_ros.perception.tracking.person import Person, Subject, boxes_of
-from drocap_ros.perception.tracking.pose_belief import SURE_CONFIDENCE
-from drocap_ros.perception.tracking.reidentification import (
+from drocap_ros.perception.tracking.identity import (
     FORGET_S,
+    compare_joints,
+    compare_new,
+    compare_places,
     followed_on,
     found_again,
-    leaving,
 )
-from drocap_ros.perception.tracking.rivals import clutter_of, due_bystander, owner_of, rivals
+from drocap_ros.perception.tracking.person import SURE_CONFIDENCE, Person, Subject, boxes_of
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking.selection import SubjectChoice
 
-#: Overlap with another person from which a predicted box counts as hidden.
-_HIDDEN_IOU = 0.25
-#: Overlap coefficient above which an unassigned detection is a part of a tracked person, or that person and more.
-_PART = 0.75
-#: Longest gap of a bystander, and the largest number of persons.
-_BYSTANDER_S, _MAX_PERSONS = 2.0, 30
+SAME_BOX_IOU = 0.6  # overlap from which two boxes of one image are the same
+_HIDDEN_IOU = 0.25  # overlap with another person from which a predicted box counts as hidden
+_PART = 0.75  # overlap coefficient above which a detection is a part of a tracked person, or that person and more
+_CLUTTER_DOUBLE = 0.3  # overlap coefficient from which what the subject was before is a second box of it
+_ROI_IOU = 0.1  # overlap with the subject below which a box of the drone's tracker is another choice
+_BYSTANDER_S = 2.0  # longest gap of a bystander
+_MAX_PERSONS = 30  # in memory: the assignment's time grows with their number
+_LEAVING_SPEED = 0.15  # outward speed, lengths/s, of a box at the image's edge that counts as leaving
+_EDGE = 0.01  # share of the image's longer side within which a box is at its edge
+
+
+class Change(Enum):
+    """Reasons for which the subject is another track than before."""
+
+    CHOSEN = "chosen"
+    FOUND_AGAIN = "found again"
+    EXCHANGED = "exchanged"
 
 
 class SubjectTracker:
@@ -67,6 +79,18 @@ class SubjectTracker:
         """Whether the last image did not show the subject."""
         return self.subject is not None and self.subject.detected_ns < (self._last_ns or 0)
 
+    def current(self, stamp_ns: int) -> Subject | None:
+        """The subject in the image of the last update."""
+        subject = self.subject
+        if subject is None or subject.unconfirmed_s(stamp_ns) > (0.0 if subject.left_image else self._coast_s):
+            return None
+        if subject.detected_ns == stamp_ns:
+            return Subject(self._track_id, subject.box, subject.score, False)
+        box = subject.filter.box()
+        others = [p for p in self.persons if p is not subject and p.confirmed_ns == stamp_ns]
+        boxes = boxes_of(p for p in others if p.plausible and not p.double)
+        return Subject(self._track_id, box, 0.0, bool((iou(box[None], boxes) > _HIDDEN_IOU).any()))
+
     def predict(self, stamp_ns: int) -> Subject | None:
         """The predicted subject; None unless the last update confirmed it."""
         subject = self.subject
@@ -102,13 +126,9 @@ class SubjectTracker:
             return
         subject.pose.judge(confidence, box, stamp_ns)
         if subject.pose.refuted and subject.pose.box is not None:
-            self.persons.append(clutter_of(subject, stamp_ns))
+            self.persons.append(subject.remainder(stamp_ns))
             subject.box, subject.filter = subject.pose.box, BoxFilter(subject.pose.box, subject.certain_ns)
             subject.detected_ns = subject.confirmed_ns = subject.certain_ns
-
-    def bystander_to_judge(self, stamp_ns: int, shedding: bool = False) -> Person | None:
-        """The person detected in this image whose pose should be looked at; see :func:`.rivals.due_bystander`."""
-        return due_bystander(self.subject, self.persons, stamp_ns, shedding)
 
     def judge_bystander(
         self, person: Person, confidence: float, stamp_ns: int, same: bool = False, blurred: bool = False
@@ -117,31 +137,24 @@ class SubjectTracker:
         subject = self.subject
         person.pose.judge(confidence, person.box, stamp_ns, blurred)
         if subject is not None and subject.pose.believed_ns == stamp_ns and confidence >= SURE_CONFIDENCE:
-            doubles.on_joints(person, subject, same)
+            compare_joints(person, subject, same)
         if self.current(stamp_ns) is None:
             self._reidentify(stamp_ns)
 
-    def rivals(
-        self, image: np.ndarray, stamp_ns: int, boxes: np.ndarray, scores: np.ndarray, confidence: float
-    ) -> list[int]:
-        """Indices of the detections (N, 4), (N,) that could be the subject instead, the nearest and best ones first.
-
-        confidence : mean of the subject's pose in this image
-        """
-        subject = self.subject
-        return [] if subject is None else rivals(subject, self.persons, image, boxes, scores, confidence, stamp_ns)
-
     def exchange(self, image: np.ndarray, stamp_ns: int, box: np.ndarray, score: float) -> Subject:
-        """Continue the subject at a rival's box (4,) px; a track of what it was before remains."""
+        """Continue the subject at a better box (4,) px of this image; a track of what it was before remains."""
         subject = self.subject
         assert subject is not None
-        owner = owner_of(box, self.persons, stamp_ns)
-        clutter = clutter_of(subject, stamp_ns)
-        clutter.double = bool(overlap_coefficient(clutter.box[None], box[None].astype(float))[0, 0] > 0.3)
+        detected = [p for p in self.persons if p.detected_ns == stamp_ns]
+        overlap = iou(box[None].astype(float), boxes_of(detected))[0]
+        owner = detected[int(overlap.argmax())] if overlap.max(initial=0.0) > SAME_BOX_IOU else None
+        clutter = subject.remainder(stamp_ns)
+        clutter.double = bool(overlap_coefficient(clutter.box[None], box[None].astype(float))[0, 0] > _CLUTTER_DOUBLE)
         self.persons = [*(p for p in self.persons if p is subject or p is not owner), clutter]
         if subject.pose.believed_ns is None:  # what it learned was not this person's
             subject.appearance = describe(image, box)
         subject.move(box, score, stamp_ns)
+        self._follow(subject, Change.EXCHANGED)
         return Subject(self._track_id, subject.box, score, False)
 
     def update(
@@ -163,42 +176,46 @@ class SubjectTracker:
         self._last_ns = stamp_ns
         for person in self.persons:
             person.filter.predict(stamp_ns)
-        appearances = [describe(image, box) for box in boxes]
+        seen = Seen(boxes, scores, [describe(image, box) for box in boxes])
         subject = self.followed(stamp_ns)
         others = followed_on(self.subject, self.persons, self._coast_s, stamp_ns)
-        assigned, replacements = assign_all(
-            subject, others, boxes, scores, appearances, stamp_ns, self._config.detection_threshold
-        )
+        assigned, replacements = assign_all(subject, others, seen, stamp_ns, self._config.detection_threshold)
         self.persons += replacements
-        doubles.on_detections(self.persons, subject, stamp_ns)
-        self._spawn(boxes, scores, appearances, assigned, stamp_ns)
+        compare_places(self.persons, subject, stamp_ns)
+        self._spawn(seen, assigned, stamp_ns)
         self._reidentify(stamp_ns)
         self._choose(image.shape, stamp_ns)
         self._prune(image.shape, stamp_ns)
         self.choice.nothing_yet &= not len(boxes)
         return self.current(stamp_ns)
 
-    def _spawn(
-        self,
-        boxes: np.ndarray,
-        scores: np.ndarray,
-        appearances: list[np.ndarray | None],
-        assigned: set[int],
-        stamp_ns: int,
-    ) -> None:
+    def _follow(self, person: Person, change: Change) -> None:
+        """Make a person the subject: the one place at which the track of the subject changes."""
+        last, self.subject = self.subject, person
+        if change is Change.EXCHANGED:
+            return
+        person.left_image = False
+        if change is Change.CHOSEN:
+            self._track_id += 1
+            for bystander in self.persons:  # others than the last subject may be this one
+                bystander.pose.other = False
+        elif last is not None:
+            self.persons.remove(last)
+            person.appearance = last.appearance if last.appearance is not None else person.appearance
+
+    def _spawn(self, seen: Seen, assigned: set[int], stamp_ns: int) -> None:
         """Start tracks from unassigned detections, except parts of tracked persons."""
         subject = self.subject
         # Leaves and signs that were found to be no person may cover one.
         known = boxes_of(p for p in self.persons if p.detected_ns == stamp_ns and p.plausible)
         if subject is not None and not subject.left_image and 0.0 < subject.unconfirmed_s(stamp_ns) <= self._coast_s:
             known = np.concatenate([known, subject.filter.box()[None]])
-        for j in range(len(boxes)):
-            if j in assigned or scores[j] < self._config.detection_threshold:
+        free = [j for j, score in enumerate(seen.scores) if score >= self._config.detection_threshold]
+        for j in (j for j in free if j not in assigned):
+            if (overlap_coefficient(seen.boxes[j][None].astype(float), known) > _PART).any():
                 continue
-            if len(known) and overlap_coefficient(boxes[j][None].astype(float), known).max() > _PART:
-                continue
-            person = Person(boxes[j], float(scores[j]), stamp_ns, appearances[j])
-            doubles.compare(person, subject, appearances[j])
+            person = Person(seen.boxes[j], float(seen.scores[j]), stamp_ns, seen.appearances[j])
+            compare_new(person, subject, seen.appearances[j])
             self.persons.append(person)
 
     def _reidentify(self, stamp_ns: int) -> None:
@@ -207,14 +224,12 @@ class SubjectTracker:
         if lost is None or lost.unconfirmed_s(stamp_ns) <= 0:
             return
         if person := found_again(lost, self.persons, self._config.confirm_frames, stamp_ns):
-            self.persons.remove(lost)
-            person.appearance = lost.appearance if lost.appearance is not None else person.appearance
-            self.subject, person.left_image = person, False
+            self._follow(person, Change.FOUND_AGAIN)
 
     def _apply_roi(self, roi: np.ndarray, stamp_ns: int) -> None:
         """A roi away from the subject is a choice; one on the subject replaces missing detections."""
         subject = self.subject
-        if subject is None or iou(roi[None], subject.filter.box()[None])[0, 0] < 0.1:
+        if subject is None or iou(roi[None], subject.filter.box()[None])[0, 0] < _ROI_IOU:
             self.choice.box = roi
         elif self._config.subject == "roi" and subject.unconfirmed_s(stamp_ns) > 0.5 * self._coast_s:
             subject.update(roi, 0.0, stamp_ns)
@@ -227,37 +242,28 @@ class SubjectTracker:
             self.persons.append(given)
         if given is not None and given is not self.subject:
             given.pose.choose(given.box, stamp_ns)
-            self._follow(given)
+            self._follow(given, Change.CHOSEN)
         first = not self._track_id
         best = self.choice.by_rule(self.persons, self.subject, shape, stamp_ns, self._coast_s, first)
         if best is not None:
-            self._follow(best)
-
-    def _follow(self, person: Person) -> None:
-        self.subject = person
-        self._track_id, person.left_image = self._track_id + 1, False
-        for bystander in self.persons:  # others than the last subject may be this one
-            bystander.pose.other = False
+            self._follow(best, Change.CHOSEN)
 
     def _prune(self, shape: tuple[int, ...], stamp_ns: int) -> None:
         """Delete the tracks of bystanders out of view."""
         subject = self.subject
         if subject is not None:
-            subject.left_image = subject.undetected_s(stamp_ns) > 0 and (subject.left_image or leaving(subject, shape))
+            subject.left_image = subject.undetected_s(stamp_ns) > 0 and (subject.left_image or _leaving(subject, shape))
         kept = [p for p in self.persons if p is subject or p.undetected_s(stamp_ns) <= _BYSTANDER_S]
         if len(kept) > _MAX_PERSONS:
             kept.sort(key=lambda p: (p is not subject, -p.detected_ns))
         self.persons = kept[:_MAX_PERSONS]
 
-    def current(self, stamp_ns: int) -> Subject | None:
-        """The subject in the image of the last update."""
-        subject = self.subject
-        if subject is None or subject.unconfirmed_s(stamp_ns) > (0.0 if subject.left_image else self._coast_s):
-            return None
-        if subject.detected_ns == stamp_ns:
-            return Subject(self._track_id, subject.box, subject.score, False)
-        box = subject.filter.box()
-        persons = [p for p in self.persons if p is not subject and p.plausible and not p.double]
-        others = boxes_of(p for p in persons if p.confirmed_ns == stamp_ns)
-        hidden = bool((iou(box[None], others) > _HIDDEN_IOU).any())
-        return Subject(self._track_id, box, 0.0, hidden)
+
+def _leaving(person: Person, image_shape: tuple[int, ...]) -> bool:
+    """Whether the person's last box touches an edge of the image and moves outwards."""
+    height, width = image_shape[:2]
+    edge = _EDGE * max(width, height)
+    x0, y0, x1, y1 = person.box
+    vx, vy = person.filter.x[:2, 1] / person.filter.length
+    out = ((x0 < edge, -vx), (x1 > width - edge, vx), (y0 < edge, -vy), (y1 > height - edge, vy))
+    return any(at_edge and speed > _LEAVING_SPEED for at_edge, speed in out)

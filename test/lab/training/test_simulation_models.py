@@ -11,7 +11,7 @@ from drocap_ros.errors import InputError, ParameterError
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import limited_use, models_folder
 from drocap_ros.perception.models.runtime import OnnxModel
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project
 from drocap_ros.simulation.render.body import dress
 from drocap_ros.simulation.render.renderer import draw

@@ -11,7 +11,7 @@ from drocap_ros.perception.detection.nms import iou, overlap_coefficient, suppre
 from drocap_ros.perception.load_models import load_detector
 from drocap_ros.perception.models.network_input import letterbox
 from drocap_ros.perception.models.spec import grid_centres
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
 #: Output of every tiny model, in px of its 128x96 input; the image is twice as large.
 BOX = np.array([40.0, 20.0, 72.0, 84.0])

@@ -9,7 +9,7 @@ from tiny_models import write_model
 
 from drocap_ros.perception.load_models import load_detector
 from drocap_ros.perception.models.runtime import with_dynamic_size
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
 CONFIG = PoseEstimatorConfig(detector="rtmdet-nano")
 

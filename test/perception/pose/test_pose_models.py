@@ -10,7 +10,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.perception.load_models import load_pose_model
 from drocap_ros.perception.models.network_input import crop_around, cut
 from drocap_ros.perception.pose.peaks import decode_heatmaps, decode_simcc
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
 IMAGE = np.zeros((400, 300, 3), np.uint8)
 #: Aspect ratio of the networks' input, so that the crop is 1.25 times the box.

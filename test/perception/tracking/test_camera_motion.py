@@ -6,10 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from drocap_ros.perception.pose_estimator_config import PoseEstimatorConfig
-from drocap_ros.perception.tracking import SubjectTracker
+from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.tracking.box_filter import BoxFilter
 from drocap_ros.perception.tracking.camera_motion import CameraMotion, moved_box, sweeps
+from drocap_ros.perception.tracking.other_poses import due_bystander, possible_subjects
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
+from drocap_ros.perception.tracking.subject import SubjectTracker
 
 SIZE = (640, 360)
 STEP_NS = 50_000_000
@@ -123,7 +125,7 @@ def test_a_shaken_camera_keeps_its_subject_by_the_known_motion_alone(known):
     assert all(followed) == known
 
 
-def test_a_second_box_around_a_known_other_person_is_no_rival():
+def test_a_second_box_around_a_known_other_person_is_not_the_subject():
     tracker = SubjectTracker(PoseEstimatorConfig())
     image = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
     boxes = np.array([[280.0, 100, 340, 260], [370.0, 100, 430, 260]])
@@ -131,11 +133,12 @@ def test_a_second_box_around_a_known_other_person_is_no_rival():
         stamp = i * STEP_NS
         subject = tracker.update(image, stamp, boxes, np.array([0.9, 0.8]))
         tracker.judge(0.9, subject.box, stamp)
-        if (other := tracker.bystander_to_judge(stamp)) is not None:
+        if (other := due_bystander(tracker, stamp)) is not None:
             tracker.judge_bystander(other, 0.9, stamp)
     wider = np.array([[355.0, 60, 490, 290]])
-    assert tracker.rivals(image, stamp, wider, np.array([0.3]), 0.3) == []
-    assert tracker.rivals(image, stamp, wider - [200, 0, 200, 0], np.array([0.3]), 0.3) == [0]
+    score = np.array([0.3])
+    assert possible_subjects(tracker, image, Detections(wider, score), 0.3, stamp) == []
+    assert possible_subjects(tracker, image, Detections(wider - [200, 0, 200, 0], score), 0.3, stamp) == [0]
 
 
 @pytest.mark.parametrize(("way", "blurred"), [((0.0, 0.0), False), ((30.0, 15.0), False), ((30.0, -30.0), True)])

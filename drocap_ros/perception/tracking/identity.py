@@ -1,42 +1,31 @@
-"""Identity decisions: whether a detection or a new track is the subject or another person."""
+"""Identity decisions: whether a detection or a track is the subject, a second box of it, or another person."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from drocap_ros.perception.detection.nms import iou, overlap_coefficient
-from drocap_ros.perception.tracking.person import Person, boxes_of
-from drocap_ros.perception.tracking.pose_belief import SURE_CONFIDENCE
+from drocap_ros.perception.tracking.person import SURE_CONFIDENCE, Person, boxes_of
 
-#: Overlap above which two persons' appearances mix.
-MIXED_IOU = 0.1
-#: Time after which a lost subject is not re-identified.
-FORGET_S = 20.0
-#: Similarity from which a detection is the subject's without comparison with others.
-_OWN_SIMILARITY = 0.85
-#: Least similarity by which another person's appearance has to fit better.
-_SIMILARITY_MARGIN = 0.05
-#: A detection below this similarity, within this time and at nearly this size, is another person: sun and shade change
-#: the own similarity to 0.8; stooping and entering the image change it to 0.6, but the size with it.
-_OTHER_SIMILARITY, _SUDDEN_S, _SAME_SIZE = 0.7, 0.15, 0.2
-#: Mean score from which the subject's appearance is reliable.
-_CLEAR_SCORE = 0.6
-#: Least similarity of a new track with the lost subject.
-_REIDENTIFY_SIMILARITY = 0.92
-#: The same for the only person who may be the subject, within this time.
-_ALONE_SIMILARITY, _ALONE_S = 0.85, 6.0
-#: Time for which someone new is looked at before the subject is given up for them.
-_KNOWN_S = 1.0
-#: Time of a search over the whole image after which someone whom it does not find is out of view.
-_GONE_S = 0.4
-#: Overlap coefficient above which two boxes are one person's.
-_DOUBLE = 0.75
-#: Longest gap of a person that the search without a subject centres on.
-_CANDIDATE_S = 0.3
-#: Growth of the search around the last place, lengths per second, and its farthest reach, lengths.
-_WIDER_PER_S, _WIDEST = 0.5, 2.0
-#: Outward speed, lengths/s, of a box at the image's edge that counts as leaving.
-_LEAVING_SPEED = 0.15
+MIXED_IOU = 0.1  # overlap above which two persons' appearances mix
+FORGET_S = 20.0  # time after which a lost subject is not re-identified
+_OWN_SIMILARITY = 0.85  # from which a detection is the subject's without comparison with others
+_SIMILARITY_MARGIN = 0.05  # by which another person's appearance has to fit better
+#: A detection below this similarity, at once and at nearly the same size, is another person: sun and shade change the
+#: own similarity to 0.8; stooping and entering the image change it to 0.6, but the size with it.
+_OTHER_SIMILARITY = 0.7
+_SUDDEN_S = 0.15  # longest gap that counts as at once
+_SAME_SIZE = 0.2  # largest logarithm of the ratio of nearly the same sizes
+_CLEAR_SCORE = 0.6  # mean score from which the subject's appearance is reliable
+_REIDENTIFY_SIMILARITY = 0.92  # least similarity of a new track with the lost subject: others have 0.8 to 0.95
+_ALONE_SIMILARITY = 0.85  # the same for the only person who may be the subject: the light may change,
+_ALONE_S = 6.0  # within this time
+_KNOWN_S = 1.0  # time for which someone new is looked at before the subject is given up for them
+_GONE_S = 0.4  # of a search over the whole image after which someone whom it does not find is out of view
+_ONE_PERSON = 0.75  # overlap coefficient above which two boxes are one person's,
+_APART = 0.5  # and below which they hold two persons, if each holds one
+_SECOND_IOU = 0.35  # overlap from which a new track beside the detected subject is a second box of it,
+_SECOND_SIMILARITY = 0.93  # if it looks like it
 
 
 def replaced(subject: Person, box: np.ndarray, appearance: np.ndarray | None, stamp_ns: int) -> bool:
@@ -76,21 +65,19 @@ def same_person(lost: Person, person: Person, alone: bool) -> bool:
 
     alone : no one else in view may be the subject; then a certain pose makes up for some change of the light
     """
-    since_ns = max(person.first_ns, person.pose.plausible_ns or 0)
-    gap = (since_ns - lost.certain_ns) * 1e-9
+    gap = (max(person.first_ns, person.pose.plausible_ns or 0) - lost.certain_ns) * 1e-9
     if gap > FORGET_S:
         return False
     start, end = lost.box if lost.pose.box is None else lost.pose.box, person.box
     length = max(lost.filter.length, lost.pose.length, 1.0)
     distance = float(np.linalg.norm((start[:2] + start[2:] - end[:2] - end[2:]) / 2)) / length
-    growth = lost.pose.growth(end, length)
     similarity = person.similarity(lost.appearance)
     if lost.left_image:  # re-entry at the place of leaving, at half the usual difference of appearance
         return distance < 1.5 and similarity >= 0.5 * (1 + _REIDENTIFY_SIMILARITY)
-    least = _REIDENTIFY_SIMILARITY
-    if alone and gap < _ALONE_S and person.pose.last >= SURE_CONFIDENCE:
-        least = _ALONE_SIMILARITY
-    return distance < 1.0 + 1.5 * gap and growth < 0.5 + 0.3 * gap and similarity >= least
+    certain = alone and gap < _ALONE_S and person.pose.last >= SURE_CONFIDENCE
+    if similarity < (_ALONE_SIMILARITY if certain else _REIDENTIFY_SIMILARITY):
+        return False
+    return distance < 1.0 + 1.5 * gap and lost.pose.growth(end, length) < 0.5 + 0.3 * gap
 
 
 def found_again(lost: Person, persons: list[Person], confirm_frames: int, stamp_ns: int) -> Person | None:
@@ -98,12 +85,10 @@ def found_again(lost: Person, persons: list[Person], confirm_frames: int, stamp_
     seen = [p for p in persons if p is not lost and p.detected_ns == stamp_ns and could_be(lost, p)]
     boxes = boxes_of(seen)
     for person in seen:
-        early = person.hits < confirming_hits(person, confirm_frames)
+        hits = min(2, confirm_frames) if person.pose.last >= SURE_CONFIDENCE else confirm_frames
         # A second box around the same person is no other one.
-        alone = bool((overlap_coefficient(person.box[None], boxes) > _DOUBLE).all())
-        if early or fits_other(lost, person, persons, stamp_ns):
-            continue
-        if same_person(lost, person, alone):
+        alone = bool((overlap_coefficient(person.box[None], boxes) > _ONE_PERSON).all())
+        if person.hits >= hits and not fits_other(lost, person, persons, stamp_ns) and same_person(lost, person, alone):
             return person
     return None
 
@@ -132,34 +117,41 @@ def certainly_others(lost: Person, persons: list[Person], stamp_ns: int) -> list
     return [p for p in persons if (stamp_ns - p.first_ns) * 1e-9 >= _KNOWN_S or not could_be(lost, p)]
 
 
-def confirming_hits(person: Person, confirm_frames: int) -> int:
-    """Number of detections that confirm a track; a certain pose makes up for some."""
-    return min(2, confirm_frames) if person.pose.last >= SURE_CONFIDENCE else confirm_frames
+# Second boxes around the subject: a detector that doubts the extent of a person gives two of it.  As a bystander the
+# second one would take the next detections from the subject and hide it; and a person in view together with the
+# subject is never the subject again.
 
 
-def search_boxes(lost: Person | None, persons: list[Person], confirm_frames: int, stamp_ns: int) -> list[np.ndarray]:
-    """(4,) px each, where to look closely without a subject: a possible new one, and around the last place.
+def _apart(person: Person, subject: Person) -> bool:
+    return bool(overlap_coefficient(person.box[None], subject.box[None])[0, 0] < _APART)
 
-    A small person needs a window around it to be confirmed.
+
+def compare_new(person: Person, subject: Person | None, appearance: np.ndarray | None) -> None:
+    """Mark a new track that began at the place of the subject, detected in the same image, and looks like it."""
+    if subject is None or subject.detected_ns != person.detected_ns:
+        return
+    person.began_at_subject = not _apart(person, subject)
+    overlap = float(iou(person.box[None], subject.box[None])[0, 0])
+    person.double = (
+        appearance is not None and overlap > _SECOND_IOU and subject.similarity(appearance) > _SECOND_SIMILARITY
+    )
+
+
+def compare_joints(person: Person, subject: Person, same: bool) -> None:
+    """Mark a certain person by its joints, seen in the same image as the certain subject's.
+
+    same : whether they are the subject's.  Whoever came from elsewhere is someone else all the same: a pose found
+        behind the subject is the subject's
     """
-    recent = [p for p in persons if p is not lost and p.plausible and p.undetected_s(stamp_ns) <= _CANDIDATE_S]
-    if lost is not None:  # persons in view together with the subject cannot be the subject
-        recent = [p for p in recent if could_be(lost, p)]
-    boxes = []
-    if recent:
-        best = max(recent, key=lambda p: (p.hits < confirm_frames, p.mean_score))
-        boxes.append(best.filter.box_at(stamp_ns))
-    if lost is not None and not lost.left_image and lost.unconfirmed_s(stamp_ns) <= FORGET_S:
-        reach = min(_WIDER_PER_S * lost.unconfirmed_s(stamp_ns), _WIDEST) * lost.filter.length
-        boxes.append(lost.box + reach * np.array([-1, -1, 1, 1]))
-    return boxes
+    # Of two boxes in each other one may hold the person and its shadow.
+    person.pose.other |= _apart(person, subject)
+    person.double |= same and person.began_at_subject
 
 
-def leaving(person: Person, image_shape: tuple[int, ...]) -> bool:
-    """Whether the person's last box touches an edge of the image and moves outwards."""
-    height, width = image_shape[:2]
-    edge = 0.01 * max(width, height)
-    x0, y0, x1, y1 = person.box
-    vx, vy = person.filter.x[:2, 1] / person.filter.length
-    out = ((x0 < edge, -vx), (x1 > width - edge, vx), (y0 < edge, -vy), (y1 > height - edge, vy))
-    return any(at_edge and speed > _LEAVING_SPEED for at_edge, speed in out)
+def compare_places(persons: list[Person], subject: Person | None, stamp_ns: int) -> None:
+    """Unmark those who came out from behind the subject: both were detected, apart from each other."""
+    if subject is None or subject.detected_ns != stamp_ns:
+        return
+    for person in persons:
+        if person.began_at_subject and person.detected_ns == stamp_ns and _apart(person, subject):
+            person.began_at_subject = person.double = False
