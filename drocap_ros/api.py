@@ -17,7 +17,7 @@ from drocap_ros.reconstruction.reconstruct import reconstruct as reconstruct_tra
 from drocap_ros.tracks import Tracks
 
 
-def reconstruct(
+def reconstruct(  # noqa: PLR0913 - the options of the command
     source: str | Path | Tracks,
     *,
     method: str = "ba",
@@ -58,9 +58,12 @@ def reconstruct(
     selection = Selection(Clip(start_s, end_s), person, redetect)
     if isinstance(source, Tracks):
         return reconstruct_tracks(
-            selected_tracks(source, log, selection), method=method, initializer=settings.initializer,
-            adjuster=settings.bundle_adjuster, progress=progress,
-        )  # fmt: skip
+            selected_tracks(source, log, selection),
+            method=method,
+            initializer=settings.initializer,
+            adjuster=settings.bundle_adjuster,
+            progress=progress,
+        )
     motion, _ = reconstruct_input(
         source,
         method=method,

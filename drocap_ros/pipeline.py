@@ -193,26 +193,26 @@ def _track(
     # Offline the most frequent subject of the whole recording is chosen at the end.
     settings, begin_ns = dataclasses.replace(config.pose_estimator, on_loss="next"), None
     folder, clip = models_folder(models or settings.models_dir), selection.clip
-    try:
-        if selection.person is not None:
-            with open_images(path, config.image_ingest) as images:
-                meter = clip.meter(progress, "persons", images.duration_s)
-                persons = find_persons(clip.select(images.frames), folder, settings, meter)
-            settings = following(settings, persons, selection.person)
-            begin_ns = persons[selection.person - 1].first_ns
-        estimator, together = PoseEstimator(folder, settings), 0
+    if selection.person is not None:
         with open_images(path, config.image_ingest) as images:
-            meter = clip.meter(progress, "2D pose", images.duration_s)
+            meter = clip.meter(progress, "persons", images.duration_s)
+            persons = find_persons(clip.select(images.frames), folder, settings, meter)
+        settings = following(settings, persons, selection.person)
+        begin_ns = persons[selection.person - 1].first_ns
+    estimator, together = PoseEstimator(folder, settings), 0
+    with open_images(path, config.image_ingest) as images:
+        meter = clip.meter(progress, "2D pose", images.duration_s)
 
-            def on_frame(frame: Frame, observation: PoseObservation) -> None:
-                nonlocal together
-                meter(frame, observation)
-                together += in_view(estimator.tracker.persons, frame.stamp_ns) > 1
+        def on_frame(frame: Frame, observation: PoseObservation) -> None:
+            nonlocal together
+            meter(frame, observation)
+            together += in_view(estimator.tracker.persons, frame.stamp_ns) > 1
 
-            observations = observe(clip.select(images.frames), estimator, on_frame, begin_ns)
+        observations = observe(clip.select(images.frames), estimator, on_frame, begin_ns)
+    try:
         tracks = tracks_from_observations(observations)
     except InputError as error:
-        raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
+        raise InputError(f"{path}: {error}") from None
     origin: dict[str, Any] = {"pose2d": "estimated"}
     origin["images"] = {"size": list(tracks.image_size), "length": images.length, "rate_hz": images.rate_hz}
     if selection.person is not None:

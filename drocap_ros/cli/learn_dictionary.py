@@ -69,7 +69,7 @@ def learn_from_folder(args: argparse.Namespace) -> Dictionary:
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.mocap import load_mocap, mocap_files
     from drocap_ros.reconstruction.common.threads import blas_threads
-    from drocap_ros.reconstruction.paper.dictionary import learn, normalize_poses
+    from drocap_ros.reconstruction.paper.dictionary import Learning, learn, normalize_poses
     from drocap_ros.tracks import read_npz
 
     files = mocap_files(args.folder, args.include)
@@ -90,11 +90,5 @@ def learn_from_folder(args: argparse.Namespace) -> Dictionary:
         f" --atoms {args.atoms} --sparsity {args.sparsity:g} --seed {args.seed}",
     }
     with progress_bars(args.quiet) as show, blas_threads(1):
-        return learn(
-            np.concatenate(poses),
-            atoms=args.atoms,
-            sparsity=args.sparsity,
-            seed=args.seed,
-            metadata=metadata,
-            progress=lambda done: show("learning", done),
-        )
+        how = Learning(args.atoms, args.sparsity, seed=args.seed)
+        return learn(np.concatenate(poses), how, metadata, lambda done: show("learning", done))

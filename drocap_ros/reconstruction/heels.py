@@ -70,19 +70,20 @@ def with_heels(motion: Motion, heels: Keypoints2D, image_joints: np.ndarray) -> 
     if not (heels.weights > 0).any():
         return motion
     place, error = heel_place(image_joints, heels)
-    added = [joints[:, _ANKLES] + np.einsum("k,fski->fsi", place, foot_axes(joints)) for joints in (
-        motion.joints3d, image_joints
-    )]  # fmt: skip
+    added, in_image = (
+        joints[:, _ANKLES] + np.einsum("k,fski->fsi", place, foot_axes(joints))
+        for joints in (motion.joints3d, image_joints)
+    )
     covariance = motion.covariance
     if covariance is not None:
         foot = np.median(np.linalg.norm(motion.joints3d[:, _TOES] - motion.joints3d[:, _ANKLES], axis=-1))
         spread = (1 - place[0]) ** 2 * covariance[:, _ANKLES] + float(place @ place) * covariance[:, _TOES]
         spread[..., [0, 3, 5]] += (error * foot) ** 2
         covariance = np.concatenate([covariance, spread], axis=1)
-    gap = np.linalg.norm(added[1][..., :2] - heels.xy, axis=-1)
+    gap = np.linalg.norm(in_image[..., :2] - heels.xy, axis=-1)
     return replace(
         motion,
-        joints3d=np.concatenate([motion.joints3d, added[0]], axis=1),
+        joints3d=np.concatenate([motion.joints3d, added], axis=1),
         joints=BODY_19.joints,
         parents=BODY_19.parents,
         confidence=np.concatenate([motion.confidence, heels.weights], axis=1),

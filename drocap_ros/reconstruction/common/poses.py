@@ -75,15 +75,17 @@ class ImagePoses:
     report: Report = field(default_factory=Report)
 
     @staticmethod
-    def uncentred(in_image: np.ndarray, **more: Any) -> ImagePoses:
+    def uncentred(in_image: np.ndarray, report: Report) -> ImagePoses:
         """Poses (F, P, 3) px whose x and y stand in the image, as they are."""
-        return ImagePoses(in_image, np.zeros((len(in_image), 2)), **more)
+        return ImagePoses(in_image, np.zeros((len(in_image), 2)), report=report)
 
     @staticmethod
-    def centred(in_image: np.ndarray, **more: Any) -> ImagePoses:
+    def centred(
+        in_image: np.ndarray, sigma_px: np.ndarray | None = None, still: np.ndarray | None = None
+    ) -> ImagePoses:
         """Poses (F, P, 3) px whose x and y stand in the image, centred about their mean."""
         middle = in_image.mean(axis=1, keepdims=True)
-        return ImagePoses(in_image - middle, middle[:, 0, :2], **more)
+        return ImagePoses(in_image - middle, middle[:, 0, :2], sigma_px, still)
 
     @property
     def in_image(self) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,9 +28,7 @@ def over_windows(data: MethodInput, solve: Callable[[slice], ImagePoses]) -> Ima
         reports.append(found.report)
         data.progress("ba", rows.stop / frames)
     mean = {name: total / _along(weight, total) for name, total in faded.items()}
-    return ImagePoses.centred(
-        mean.pop("in_image"), **mean, report=_together(reports), std_over_sigma=found.std_over_sigma
-    )
+    return replace(ImagePoses.centred(**mean), std_over_sigma=found.std_over_sigma, report=_together(reports))
 
 
 def _along(per_frame: np.ndarray, values: np.ndarray) -> np.ndarray:

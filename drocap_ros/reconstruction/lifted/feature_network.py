@@ -14,6 +14,8 @@ from drocap_ros.skeleton import BODY_17
 _JOINTS = len(BODY_17)
 #: Names of the outputs, and their shapes behind (windows, frames).
 _OUTPUTS = {"joints": (_JOINTS, 3), "log_sigma": (_JOINTS, 2), "deeper": (len(BONES),), "still": (2,)}
+#: ``deeper``, whether a bone's child lies behind its parent, only guides the training.
+_USED = ["joints", "log_sigma", "still"]
 
 
 class FeatureNetwork:
@@ -60,20 +62,11 @@ class FeatureNetwork:
         variants = np.zeros((2, frames.stop + frames.stop % 2, FEATURES), np.float32)
         variants[0, frames] = features
         variants[1, frames] = mirrored(features)
-        outputs = self._session.run(list(_OUTPUTS), {"features": variants})
-        joints, log_sigma, deeper, still = (values[:, frames].astype(np.float64) for values in outputs)
+        outputs = self._session.run(_USED, {"features": variants})
+        joints, log_sigma, still = (values[:, frames].astype(np.float64) for values in outputs)
         place = 0.5 * (joints[0] + joints[1][:, BODY_17.mirror] * np.array([-1, 1, 1])) * scale
         place[..., :2] += centre[:, None]
         place[..., 2] -= place[:, :1, 2]
         sigma = 0.5 * scale * (np.exp(log_sigma[0]) + np.exp(log_sigma[1][:, BODY_17.mirror]))
-        return LiftedMotion(
-            place,
-            sigma,
-            _logistic(0.5 * (deeper[0] + deeper[1][:, BODY_17.mirror[1:] - 1])),
-            _logistic(0.5 * (still[0] + still[1][:, ::-1])),
-        )
-
-
-def _logistic(logit: np.ndarray) -> np.ndarray:
-    probability: np.ndarray = np.asarray(1.0 / (1.0 + np.exp(-logit)))
-    return probability
+        logit = 0.5 * (still[0] + still[1][:, ::-1])
+        return LiftedMotion(place, sigma, still=1.0 / (1.0 + np.exp(-logit)))

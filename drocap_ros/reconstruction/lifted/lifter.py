@@ -161,7 +161,7 @@ def _checked(seen: LifterInput) -> LifterInput:
 
 
 @lru_cache(maxsize=4)
-def _load(path: str, written_ns: int) -> Lifter:
+def _load(path: str, written_ns: int) -> Lifter:  # noqa: ARG001 - a part of the cache's key
     """The file as it was written then."""
     import onnxruntime
 
@@ -176,5 +176,5 @@ def _load(path: str, written_ns: int) -> Lifter:
         return Lifter(kind(session, path))
     except InputError:
         raise
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - of no common class
         raise InputError(f"{path}: expected an ONNX network; {str(error).splitlines()[0][:120]}") from None

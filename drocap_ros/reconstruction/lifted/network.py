@@ -22,13 +22,11 @@ class LiftedMotion:
     joints : (F, 17, 3) in the camera frame (x right, y down, z forward) and the unit of the keypoints; x and y
         in the image, outliers and gaps corrected; depth relative to the pelvis
     sigma : (F, 17, 2) expected absolute error of x, y (each) and of depth, in the same unit
-    deeper : (F, 16) probability that the child of bone j - 1 (joint j) lies behind its parent
     still : (F, 2) probability that the right and the left foot move slower than 0.1 m/s in the world
     """
 
     joints: np.ndarray
     sigma: np.ndarray
-    deeper: np.ndarray
     still: np.ndarray
 
     def map(self, change: Callable[[np.ndarray], np.ndarray]) -> LiftedMotion:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from drocap_ros.keypoints import Keypoints2D
@@ -28,8 +30,7 @@ def run(data: MethodInput) -> ImagePoses:
         joints = found.joints.copy()
         joints[..., :2] += middle[:, None]
         report = Report(found.steps[1], found.stop_reason, found.cost_terms, found.seconds, origin)
-        return ImagePoses.uncentred(
-            joints, sigma_px=found.sigma, still=found.still, std_over_sigma=found.std_over_sigma, report=report
-        )
+        poses = ImagePoses.uncentred(joints, report)
+        return replace(poses, sigma_px=found.sigma, still=found.still, std_over_sigma=found.std_over_sigma)
 
     return over_windows(data, solve)

@@ -10,7 +10,7 @@ S is updated by the accelerated proximal gradient method with backtracking and r
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -153,11 +153,21 @@ def bundle_adjust(
         translation=projection.translation(rotate(objective.rotation, s, 2)).T,
         cost=sum(terms.values()),
         cost_terms=terms,
-        **outcome,
+        iterations=outcome.iterations,
+        stop_reason=outcome.stop_reason,
+        history=outcome.history,
     )
 
 
-def minimize(objective: Objective, s: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+class Outcome(NamedTuple):
+    """Steps, why the solver stopped, and the cost (iterations + 1,) after each step."""
+
+    iterations: int
+    stop_reason: str
+    history: np.ndarray
+
+
+def minimize(objective: Objective, s: np.ndarray) -> tuple[np.ndarray, Outcome]:
     """Accelerated proximal gradient steps (4) with backtracking; momentum restarts when the cost would rise.
 
     Parameters
@@ -166,7 +176,7 @@ def minimize(objective: Objective, s: np.ndarray) -> tuple[np.ndarray, dict[str,
 
     Returns
     -------
-    shapes (3, P, F), and iterations, stop_reason and history of the cost
+    shapes (3, P, F), and what the solver did
     """
     config, alpha = objective.config, objective.alpha
     cost = objective.value(s) + alpha * nuclear_norm(s)
@@ -190,7 +200,7 @@ def minimize(objective: Objective, s: np.ndarray) -> tuple[np.ndarray, dict[str,
         if k >= 20 and history[-11] - cost <= config.tolerance * abs(cost):
             stop = CONVERGED
             break
-    return s, {"iterations": len(history) - 1, "stop_reason": stop, "history": np.array(history)}
+    return s, Outcome(len(history) - 1, stop, np.array(history))
 
 
 def _proximal_step(objective: Objective, at: np.ndarray, mu: float) -> tuple[np.ndarray, float, float]:

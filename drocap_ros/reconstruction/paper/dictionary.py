@@ -100,62 +100,72 @@ def sparse_code(poses: np.ndarray, atoms: np.ndarray, sparsity: float, *, iterat
     return c
 
 
+@dataclass(frozen=True)
+class Learning:
+    """Options of :func:`learn`.
+
+    atoms : size K; components : principal directions D
+    sparsity : weight of the L1 norm, m; larger means fewer active atoms
+    rounds : alternations, of ``batch`` poses each
+    """
+
+    atoms: int = 128
+    sparsity: float = 0.03
+    components: int = 20
+    rounds: int = 40
+    batch: int = 4096
+    seed: int = 0
+
+
 def learn(
     poses: np.ndarray,
-    *,
-    atoms: int = 128,
-    sparsity: float = 0.03,
-    components: int = 20,
-    rounds: int = 40,
-    batch: int = 4096,
-    seed: int = 0,
+    how: Learning = Learning(),
     metadata: dict[str, Any] | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> Dictionary:
     """Learn a dictionary by alternating sparse coding and atom updates over batches (Mairal et al. 2009).
 
     Parameters
     ----------
     poses : (N, 15, 3) of :func:`normalize_poses`; their mirror images are added
-    atoms : size K
-    sparsity : weight of the L1 norm, m; larger means fewer active atoms
+    progress : called with the fraction done
 
     Raises
     ------
     InputError
         When there are fewer poses than atoms.
     """
+    atoms, sparsity, batch = how.atoms, how.sparsity, how.batch
     if len(poses) < atoms:
         raise InputError(f"poses: expected at least as many as atoms ({atoms}), got {len(poses)}; add files")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(how.seed)
     both = np.concatenate([poses, mirror_poses(poses)])
     mean = both.mean(0)
     flat = (both - mean).reshape(len(both), -1).astype(np.float32)
     values, vectors = np.linalg.eigh(np.cov(flat.astype(np.float64), rowvar=False))
-    order = np.argsort(values)[::-1][:components]
+    order = np.argsort(values)[::-1][: how.components]
     d = flat[rng.choice(len(flat), atoms, replace=False)]
     d /= np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-6)
     gram = np.zeros((atoms, atoms), np.float32)
     cross = np.zeros((atoms, flat.shape[1]), np.float32)
-    for i in range(rounds):
+    for i in range(how.rounds):
         x = flat[rng.choice(len(flat), min(batch, len(flat)), replace=False)]
         c = sparse_code(x, d, sparsity)
         forget = np.float32(1.0 - 1.0 / (1.0 + 0.5 * i))
         gram, cross = forget * gram + c.T @ c / len(x), forget * cross + c.T @ x / len(x)
         d = _update_atoms(d, gram, cross, x, c, rng)
-        if progress is not None:
-            progress((i + 1) / rounds)
+        progress((i + 1) / how.rounds)
     d = _canonical(d, sparse_code(flat[rng.permutation(len(flat))[: 4 * batch]], d, sparsity))
     dictionary = Dictionary(
         atoms=d.reshape(atoms, -1, 3).astype(np.float64),
         mean=mean,
         joints=BODY_15.joints,
         sparsity=sparsity,
-        components=vectors[:, order].T.reshape(components, -1, 3),
+        components=vectors[:, order].T.reshape(how.components, -1, 3),
         component_std=np.sqrt(np.maximum(values[order], 0.0)),
         metadata=dict(metadata or {}),
     )
-    dictionary.metadata.update(quality(dictionary, poses), poses=len(poses), seed=seed)
+    dictionary.metadata.update(quality(dictionary, poses), poses=len(poses), seed=how.seed)
     return dictionary
 
 

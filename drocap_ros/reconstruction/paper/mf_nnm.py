@@ -7,7 +7,6 @@ closest to the dictionary's poses wins.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.alignment import to_torso_frame
 from drocap_ros.geometry.rotations import complete_rotation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.paper.bundle_adjustment import Objective, minimize
+from drocap_ros.reconstruction.paper.bundle_adjustment import Objective, Outcome, minimize
 from drocap_ros.reconstruction.paper.dictionary import Dictionary, normalize_poses
 from drocap_ros.reconstruction.paper.reprojection import Projection, frames_first, frames_last
 
@@ -64,7 +63,7 @@ def factorize(
         poses = shape @ np.swapaxes(rotation, 1, 2)
         found += [(candidate, terms, outcome) for candidate in (poses, poses * MIRROR)]
     poses, terms, outcome = min(found, key=lambda one: _distance(one[0], dictionary))
-    return poses, terms, int(outcome["iterations"]), str(outcome["stop_reason"])
+    return poses, terms, outcome.iterations, outcome.stop_reason
 
 
 def minimize_nuclear_norm(
@@ -74,7 +73,7 @@ def minimize_nuclear_norm(
     config: BundleAdjusterConfig,
     *,
     initial: np.ndarray | None = None,
-) -> tuple[np.ndarray, dict[str, float], dict[str, Any]]:
+) -> tuple[np.ndarray, dict[str, float], Outcome]:
     """Shapes (F, P, 3) in the common frame for known rotations (F, 3, 3); cost per term; the solver's outcome.
 
     Without ``initial`` the first shapes are the joints back-projected into the common frame without depth.

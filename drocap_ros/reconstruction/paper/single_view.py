@@ -11,7 +11,7 @@ from drocap_ros.reconstruction.paper.dictionary import Dictionary, sparse_code
 from drocap_ros.reconstruction.paper.expectation import expected_information
 from drocap_ros.reconstruction.paper.reprojection import Projection, frames_first, frames_last
 from drocap_ros.reconstruction.paper.sparse_fit import SparseFit, fit_sparse
-from drocap_ros.reconstruction.paper.viewpoint_search import DenseFit, fit_dense, image_scale, initial_viewpoints
+from drocap_ros.reconstruction.paper.viewpoint_search import search_viewpoints
 from drocap_ros.reconstruction.paper.viterbi import choose_path
 
 
@@ -65,33 +65,6 @@ def projected_joints(projection: Projection, fit: SparseFit) -> np.ndarray:
     """(F, P, 2) the model's joints in the image."""
     flat = frames_last((fit.shape @ np.swapaxes(fit.rotation, 1, 2))[..., :2])
     return frames_first(flat + projection.translation(flat)[:, None])
-
-
-def search_viewpoints(
-    w: np.ndarray, information: np.ndarray, dictionary: Dictionary, config: InitializerConfig
-) -> DenseFit:
-    """Fits from every initial viewpoint, with a leading axis of viewpoints: (A, F, ...)."""
-    views = initial_viewpoints(w, information, config.search_azimuths, np.deg2rad(config.search_elevation_deg))
-    size = min(config.search_components, len(dictionary.components))
-    count, frames = views.shape[:2]
-    tiled_w, tiled_i = np.tile(w, (count, 1, 1)), np.tile(information, (count, 1, 1))
-    rotation = views.reshape(-1, 3, 3)
-    coefficients = np.zeros((len(rotation), 1 + size))
-    half = config.search_iterations // 2
-    scale = image_scale(w, information, dictionary)
-    coefficients[:, 0] = scale
-    # The scale is common to the sequence: fit it loosely first, then hold the frames to their median.
-    loose = fit_dense(
-        tiled_w, tiled_i, rotation, coefficients, dictionary, config,
-        scale=scale, scale_std=3.0 * config.scale_std, iterations=half,
-    )  # fmt: skip
-    best = np.argmin(loose.cost.reshape(count, frames), axis=0)
-    scale = float(np.median(loose.coefficients.reshape(count, frames, -1)[best, np.arange(frames), 0]))
-    fit = fit_dense(
-        tiled_w, tiled_i, loose.rotation, loose.coefficients, dictionary, config,
-        scale=scale, scale_std=config.scale_std, iterations=config.search_iterations - half,
-    )  # fmt: skip
-    return DenseFit(*(value.reshape(count, frames, *value.shape[1:]) for value in vars(fit).values()))
 
 
 def sparse_from_dense(coefficients: np.ndarray, dictionary: Dictionary) -> np.ndarray:

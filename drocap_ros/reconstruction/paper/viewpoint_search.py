@@ -17,6 +17,8 @@ from drocap_ros.skeleton import BODY_15
 
 #: Poses fitted in one batch: their Jacobians fit the processor's cache.
 CHUNK = 256
+#: Spread of the scale in the first half of the steps, over the configured one.
+_LOOSE = 3.0
 
 
 @dataclass(frozen=True)
@@ -64,36 +66,53 @@ def image_scale(w: np.ndarray, information: np.ndarray, dictionary: Dictionary) 
     return float(np.sqrt(np.percentile(spread, 75) / expected))
 
 
-def fit_dense(
-    w: np.ndarray,
-    information: np.ndarray,
-    rotation: np.ndarray,
-    coefficients: np.ndarray,
-    dictionary: Dictionary,
-    config: InitializerConfig,
-    *,
-    scale: float,
-    scale_std: float,
-    iterations: int,
+def search_viewpoints(
+    w: np.ndarray, information: np.ndarray, dictionary: Dictionary, config: InitializerConfig
 ) -> DenseFit:
-    """Damped Gauss-Newton steps.
+    """Fits from every initial viewpoint, with a leading axis of viewpoints: (A, F, ...).
 
     Parameters
     ----------
-    w, information : (N, P, 2), (N, P, 3) one row per pose and viewpoint
-    rotation, coefficients : (N, 3, 3), (N, 1 + D) initial values
-    scale, scale_std : expected coefficient of the mean pose and its relative spread
+    w, information : (F, P, 2), (F, P, 3)
     """
-    parts = [
-        _descend(
-            _Problem(w[rows], information[rows], dictionary, config, scale, scale_std),
-            rotation[rows],
-            coefficients[rows],
-            iterations,
-        )
-        for rows in (slice(first, first + CHUNK) for first in range(0, len(w), CHUNK))
-    ]
-    return DenseFit(*(np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True)))
+    views = initial_viewpoints(w, information, config.search_azimuths, np.deg2rad(config.search_elevation_deg))
+    count, frames = views.shape[:2]
+    search = _Search(np.tile(w, (count, 1, 1)), np.tile(information, (count, 1, 1)), dictionary, config)
+    rotation = views.reshape(-1, 3, 3)
+    coefficients = np.zeros((len(rotation), 1 + min(config.search_components, len(dictionary.components))))
+    half = config.search_iterations // 2
+    scale = image_scale(w, information, dictionary)
+    coefficients[:, 0] = scale
+    # The scale is common to the sequence: fit it loosely first, then hold the frames to their median.
+    loose = search.fit(rotation, coefficients, scale, _LOOSE * config.scale_std, half)
+    best = np.argmin(loose.cost.reshape(count, frames), axis=0)
+    scale = float(np.median(loose.coefficients.reshape(count, frames, -1)[best, np.arange(frames), 0]))
+    fit = search.fit(loose.rotation, loose.coefficients, scale, config.scale_std, config.search_iterations - half)
+    return DenseFit(*(value.reshape(count, frames, *value.shape[1:]) for value in vars(fit).values()))
+
+
+@dataclass(frozen=True)
+class _Search:
+    """2D joints (N, P, 2) and their information (N, P, 3), one row per pose and viewpoint."""
+
+    w: np.ndarray
+    information: np.ndarray
+    dictionary: Dictionary
+    config: InitializerConfig
+
+    def fit(
+        self, rotation: np.ndarray, coefficients: np.ndarray, scale: float, scale_std: float, iterations: int
+    ) -> DenseFit:
+        """Damped Gauss-Newton steps from initial values (N, 3, 3), (N, 1 + D).
+
+        scale, scale_std : expected coefficient of the mean pose and its relative spread
+        """
+        parts = [
+            _descend(_Problem(self, rows, scale, scale_std), rotation[rows], coefficients[rows], iterations)
+            for rows in (slice(first, first + CHUNK) for first in range(0, len(self.w), CHUNK))
+        ]
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        return DenseFit(*(np.concatenate(values) for values in columns))
 
 
 def _descend(problem: _Problem, rotation: np.ndarray, coefficients: np.ndarray, iterations: int) -> DenseFit:
@@ -115,15 +134,8 @@ def _descend(problem: _Problem, rotation: np.ndarray, coefficients: np.ndarray, 
 class _Problem:
     """Cost, Jacobian and step for a batch; unknowns are rotation 3, translation 2, coefficients 1 + D."""
 
-    def __init__(
-        self,
-        w: np.ndarray,
-        information: np.ndarray,
-        dictionary: Dictionary,
-        config: InitializerConfig,
-        scale: float,
-        scale_std: float,
-    ) -> None:
+    def __init__(self, search: _Search, rows: slice, scale: float, scale_std: float) -> None:
+        w, information, dictionary, config = search.w[rows], search.information[rows], search.dictionary, search.config
         size = min(config.search_components, len(dictionary.components))
         basis = np.concatenate([dictionary.mean[None], dictionary.components[:size]])
         self.w = w

@@ -83,7 +83,7 @@ def test_seen_joints_follow_the_keypoints_and_unseen_ones_the_lifter_where_noise
     joints = 1000.0 * simulate_person(np.arange(96) / FPS, "walk", 1, 1.75, BODY_17)
     true = joints[..., [1, 2, 0]] * np.array([1.0, -1.0, 1.0])
     prior = true + np.array([20.0, 0.0, 0.0])
-    lifted = LiftedMotion(prior, np.full((96, 17, 2), 10.0), np.full((96, 16), 0.5), np.full((96, 2), 0.5))
+    lifted = LiftedMotion(prior, np.full((96, 17, 2), 10.0), np.full((96, 2), 0.5))
     flat = true[..., :2] + np.random.default_rng(0).normal(0.0, 10.0, (96, 17, 2))
     flat[:, WRIST] = np.nan
     model = window_model(Keypoints2D(flat), prior[..., :2], 1.0, FPS, LiftedConfig())

@@ -14,6 +14,7 @@ from drocap_ros.geometry.bones import limb_lengths
 from drocap_ros.mocap import load_mocap
 from drocap_ros.reconstruction.paper.dictionary import (
     Dictionary,
+    Learning,
     learn,
     load_dictionary,
     mirror_poses,
@@ -73,7 +74,7 @@ def test_codes_satisfy_the_optimality_conditions() -> None:
 def learned(seed: int = 0) -> Dictionary:
     rng = np.random.default_rng(1)
     poses = normalize_poses(make_walk(300).shape + rng.normal(0.0, 0.02, (300, 15, 3)))
-    return learn(poses, atoms=24, sparsity=0.01, rounds=12, batch=256, seed=seed, components=8)
+    return learn(poses, Learning(24, 0.01, components=8, rounds=12, batch=256, seed=seed))
 
 
 def test_learning_reduces_the_error_and_is_repeatable() -> None:
