@@ -71,10 +71,8 @@ def simulate_capture(
     matrix = pinhole_matrix(config.image_width, config.image_height, config.horizontal_fov_deg)
     exact = project(joints, rotation, position, matrix)
     size = (config.image_width, config.image_height)
-    detection = detect_person(
-        joints, rotation, position, matrix, size, seed, noise_scale=config.noise_scale,
-        outlier_fraction=config.outlier_fraction, missed_fraction=config.missed_fraction,
-    )  # fmt: skip
+    errors = {name: getattr(config, name) for name in ("noise_scale", "outlier_fraction", "missed_fraction")}
+    detection = detect_person(joints, rotation, position, matrix, size, seed, **errors)
     reported_rotation, reported_position = _telemetry(t, rotation, position, rng, config)
     tracks = Tracks(
         keypoints=detection.keypoints,

@@ -10,13 +10,15 @@ from drocap_ros.simulation.orbit_camera import project, to_camera
 from drocap_ros.skeleton import BODY_15, BODY_17
 
 #: Standard deviation over the box height, per kind of joint (detectors are worst at the ends of the limbs).
-_SPREAD = {
-    "pelvis": 0.007, "hip": 0.008, "knee": 0.007, "ankle": 0.010, "neck": 0.006, "head": 0.006,
-    "shoulder": 0.006, "elbow": 0.008, "wrist": 0.011, "toe": 0.010,
-}  # fmt: skip
-_CORRELATION = 0.6  # of the noise of one image with that of the previous one
+_SPREAD = {"pelvis": 0.007, "hip": 0.008, "knee": 0.007, "ankle": 0.010, "neck": 0.006, "head": 0.006, "toe": 0.010}
+_SPREAD |= {"shoulder": 0.006, "elbow": 0.008, "wrist": 0.011}
+#: Correlation of the noise of one image with that of the previous one.
+_CORRELATION = 0.6
+#: Radius of a limb that occludes.
 _LIMB_RADIUS_M = 0.07
+#: Factor on the noise of occluded joints, which detectors guess.
 _OCCLUDED_NOISE = 2.2
+#: Images per step of the occlusion, for the memory's sake.
 _CHUNK = 4096
 
 
@@ -102,13 +104,11 @@ def noisy_keypoints(
     hidden = np.zeros(px.shape[:2], bool) if occluded is None else occluded
     height, count = _box_height(px[:, : len(BODY_15)]), len(BODY_15)
     # The toes have draws of their own: those of the other joints are the same with and without them.
+    rates = (noise_scale, outlier_fraction, missed_fraction)
     parts = [
-        _noisy(
-            px[:, part], hidden[:, part], height, BODY_17.joints[part], np.random.default_rng(key), noise_scale,
-            outlier_fraction, missed_fraction,
-        )
+        _noisy(px[:, part], hidden[:, part], height, BODY_17.joints[part], np.random.default_rng(key), rates)
         for part, key in ((slice(count), [seed, 0x0B5]), (slice(count, px.shape[1]), [seed, 0x0B5, count]))
-    ]  # fmt: skip
+    ]
     return NoisyKeypoints(*(np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True)))
 
 
@@ -118,13 +118,15 @@ def _noisy(
     height: np.ndarray,
     names: tuple[str, ...],
     rng: np.random.Generator,
-    noise_scale: float,
-    outlier_fraction: float,
-    missed_fraction: float,
+    rates: tuple[float, float, float],
 ) -> NoisyKeypoints:
-    """Keypoints (F, P, 2) of the joints ``names`` with errors, in persons of ``height`` (F,) px."""
+    """Keypoints (F, P, 2) of the joints ``names`` with errors, in persons of ``height`` (F,) px.
+
+    rates : noise_scale, outlier_fraction, missed_fraction of :func:`noisy_keypoints`
+    """
     from scipy.signal import lfilter
 
+    noise_scale, outlier_fraction, missed_fraction = rates
     frames, joints = px.shape[:2]
     share = np.array([_SPREAD[name.lstrip("lr") if name[1:] in _SPREAD else name] for name in names])
     sigma = height[:, None] * share * np.where(hidden, _OCCLUDED_NOISE, 1.0)

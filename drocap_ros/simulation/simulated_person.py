@@ -20,14 +20,16 @@ _SINGLE = ("walk", "boxing", "kicking", "squats")
 ACTIONS = ("mixed", "stand", *_SINGLE)
 
 #: Bone lengths as shares of the stature (means of adults; hips and shoulders from the midline).
-_SHARES = {
-    "hip": 0.055, "thigh": 0.245, "shank": 0.246, "foot": 0.045, "trunk": 0.37, "head": 0.055,
-    "shoulder_side": 0.115, "shoulder_drop": 0.075, "upper_arm": 0.172, "forearm": 0.157,
-}  # fmt: skip
+_LEG = {"hip": 0.055, "thigh": 0.245, "shank": 0.246, "foot": 0.045}
+_TRUNK = {"trunk": 0.37, "head": 0.055, "shoulder_side": 0.115, "shoulder_drop": 0.075}
+_SHARES = {**_LEG, **_TRUNK, "upper_arm": 0.172, "forearm": 0.157}
 
+#: Time step in s of the path: at walking speed less than 2 cm.
 _PATH_STEP_S = 0.01
+#: Length of each action of "mixed".
 _MIXED_SEGMENT_S = 5.0
-_STANCE = 0.6  # share of a stride during which a foot stands
+#: Share of a stride during which a foot stands, as in walking.
+_STANCE = 0.6
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ def simulate_person(
         return np.empty((0, len(joint_set), 3))
     weight = action_weights(t, action)
     root, yaw = _walk_path(t, action, style)
-    joints = _assemble(t, weight, root, yaw, action, style)
+    joints = _assemble(_Moment(t, yaw, weight, style), root, action)
     if joint_set is not BODY_17:
         return joints
     return add_toes(joints, np.stack([_foot_heading(t, side, style) for side in (-1, 1)], axis=1), stature_m)
@@ -203,7 +205,8 @@ def _rotation(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarra
 
 
 def _apply(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    return np.einsum("fij,...fj->...fi", rotation, np.broadcast_to(vector, (*vector.shape[:-2], len(rotation), 3)))
+    vectors = np.broadcast_to(vector, (*vector.shape[:-2], len(rotation), 3))
+    return np.asarray(np.einsum("fij,...fj->...fi", rotation, vectors))
 
 
 def two_bone(
@@ -224,57 +227,75 @@ def two_bone(
     return start + along * direction + height * side, start + reach * direction
 
 
-def _assemble(
-    t: np.ndarray, weight: np.ndarray, root: np.ndarray, yaw: np.ndarray, action: str, style: _Style
-) -> np.ndarray:
-    s = style.size
-    walk, box, kick, squat = weight.T
-    stride = 2 * np.pi * (style.stride_hz * t + style.phase)
-    squat_depth = squat * 0.5 * (1 - np.cos(2 * np.pi * style.squat_hz * t))
-    punch = {side: box * _pulse(style.punch_hz * t + (0.5 if side < 0 else 0.0), 0.1, 0.5) for side in (1, -1)}
-    kicks = {side: _kick_phase(style.kick_hz * t + 0.1, side, kick) for side in (1, -1)}
-    kick_any = kicks[1][0] + kicks[-1][0]
+class _Moment:
+    """What the person does at each of F instants; arrays (F,).
 
-    leg = s["thigh"] + s["shank"]
-    height = s["foot"] + leg * (0.965 - 0.025 * walk - 0.05 * box - 0.02 * kick_any - 0.40 * squat_depth)
-    height = height + leg * 0.015 * walk * np.cos(2 * stride)
-    sway = 0.02 * walk * np.sin(stride) + 0.035 * box * np.sin(2 * np.pi * 0.5 * style.punch_hz * t)
-    back = -0.16 * squat_depth
-    ahead, left = _ground_axes(yaw)
-    pelvis = np.concatenate([root + back[:, None] * ahead + sway[:, None] * left, height[:, None]], axis=1)
+    walk, box, kick, squat : weights of the actions
+    stride : phase of the stride, rad; squat_depth : 0 standing to 1
+    punch : side -> reach of the fist; kicks : side -> shares to which the leg is lifted and stretched
+    """
 
-    twist = 0.45 * (punch[-1] - punch[1]) - 0.12 * walk * np.cos(stride) + 0.2 * (kicks[1][1] - kicks[-1][1])
-    hips = _rotation(yaw - 0.4 * twist + 0.05 * np.sin(0.7 * t), 0.25 * squat_depth, 0.03 * walk * np.cos(stride))
-    lean = 0.06 * walk + 0.18 * box + 0.75 * squat_depth - 0.28 * (kicks[1][1] + kicks[-1][1])
-    trunk = _rotation(yaw + twist, lean, 0.04 * np.sin(1.1 * t + 6.28 * style.phase) - 0.03 * walk * np.cos(stride))
-    nod = _rotation(yaw + 0.5 * twist + 0.3 * np.sin(0.5 * t), 0.3 * lean + 0.1 + 0.08 * np.sin(0.9 * t), 0.0 * t)
+    def __init__(self, t: np.ndarray, yaw: np.ndarray, weight: np.ndarray, style: _Style) -> None:
+        self.t, self.yaw, self.style = t, yaw, style
+        self.walk, self.box, self.kick, self.squat = weight.T
+        self.stride = 2 * np.pi * (style.stride_hz * t + style.phase)
+        self.squat_depth = self.squat * 0.5 * (1 - np.cos(2 * np.pi * style.squat_hz * t))
+        self.punch = {
+            side: self.box * _pulse(style.punch_hz * t + (0.5 if side < 0 else 0.0), 0.1, 0.5) for side in (1, -1)
+        }
+        self.kicks = {side: _kick_phase(style.kick_hz * t + 0.1, side, self.kick) for side in (1, -1)}
+        self.ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+        self.left = np.stack([-self.ahead[:, 1], self.ahead[:, 0]], axis=1)
 
-    joints = np.empty((t.size, len(BODY_15), 3))
+    def pelvis(self, root: np.ndarray) -> np.ndarray:
+        """(F, 3) m above the ground points (F, 2)."""
+        s, style = self.style.size, self.style
+        leg = s["thigh"] + s["shank"]
+        kick_any = self.kicks[1][0] + self.kicks[-1][0]
+        bent = 0.965 - 0.025 * self.walk - 0.05 * self.box - 0.02 * kick_any - 0.40 * self.squat_depth
+        height = s["foot"] + leg * bent
+        height = height + leg * 0.015 * self.walk * np.cos(2 * self.stride)
+        sway = 0.02 * self.walk * np.sin(self.stride)
+        sway = sway + 0.035 * self.box * np.sin(2 * np.pi * 0.5 * style.punch_hz * self.t)
+        back = -0.16 * self.squat_depth
+        ground = root + back[:, None] * self.ahead + sway[:, None] * self.left
+        return np.concatenate([ground, height[:, None]], axis=1)
+
+    def frames(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(F, 3, 3) body -> world of hips, trunk and head."""
+        t, yaw, kicks, cosine = self.t, self.yaw, self.kicks, np.cos(self.stride)
+        twist = 0.45 * (self.punch[-1] - self.punch[1]) - 0.12 * self.walk * cosine
+        twist = twist + 0.2 * (kicks[1][1] - kicks[-1][1])
+        turned = yaw - 0.4 * twist + 0.05 * np.sin(0.7 * t)
+        hips = _rotation(turned, 0.25 * self.squat_depth, 0.03 * self.walk * cosine)
+        lean = 0.06 * self.walk + 0.18 * self.box + 0.75 * self.squat_depth - 0.28 * (kicks[1][1] + kicks[-1][1])
+        roll = 0.04 * np.sin(1.1 * t + 6.28 * self.style.phase) - 0.03 * self.walk * cosine
+        nod = 0.3 * lean + 0.1 + 0.08 * np.sin(0.9 * t)
+        head = _rotation(yaw + 0.5 * twist + 0.3 * np.sin(0.5 * t), nod, 0.0 * t)
+        return hips, _rotation(yaw + twist, lean, roll), head
+
+
+def _assemble(moment: _Moment, root: np.ndarray, action: str) -> np.ndarray:
+    s, yaw, zero = moment.style.size, moment.yaw, 0.0 * moment.t
+    pelvis, (hips, trunk, head) = moment.pelvis(root), moment.frames()
+    joints = np.empty((len(yaw), len(BODY_15), 3))
     neck = pelvis + _apply(trunk, np.array([[0.0, 0.0, s["trunk"]]]))
     joints[:, BODY_15.index("pelvis")] = pelvis
     joints[:, BODY_15.index("neck")] = neck
-    joints[:, BODY_15.index("head")] = neck + _apply(nod, np.array([[0.0, 0.0, s["head"]]]))
+    joints[:, BODY_15.index("head")] = neck + _apply(head, np.array([[0.0, 0.0, s["head"]]]))
     for side, letter in ((1, "l"), (-1, "r")):
         hip = pelvis + _apply(hips, np.array([[0.0, side * s["hip"], 0.0]]))
-        ankle = _ankle_goal(t, side, kicks[side], box, squat_depth, hip, yaw, action, style)
-        knee_pole = _apply(_rotation(yaw, 0 * t, 0 * t), np.array([[1.0, side * 0.15, 0.0]]))
-        knee, ankle = two_bone(hip, ankle, knee_pole + np.array([0, 0, 0.1]), s["thigh"], s["shank"])
+        ankle = _ankle_goal(moment, side, hip, action)
+        knee_pole = _apply(_rotation(yaw, zero, zero), np.array([[1.0, side * 0.15, 0.0]])) + np.array([0, 0, 0.1])
+        knee, ankle = two_bone(hip, ankle, knee_pole, s["thigh"], s["shank"])
         shoulder = neck + _apply(trunk, np.array([[0.0, side * s["shoulder_side"], -s["shoulder_drop"]]]))
-        wrist_goal = shoulder + _apply(trunk, _wrist_goal(side, stride, walk, box, kick, squat, squat_depth, punch, s))
+        wrist_goal = shoulder + _apply(trunk, _wrist_goal(moment, side))
         elbow_pole = _apply(trunk, np.array([[-0.6, side * 0.6, -0.6]]))
         elbow, wrist = two_bone(shoulder, wrist_goal, elbow_pole, s["upper_arm"], s["forearm"])
-        for name, value in zip(
-            ("hip", "knee", "ankle", "shoulder", "elbow", "wrist"),
-            (hip, knee, ankle, shoulder, elbow, wrist),
-            strict=True,
-        ):
+        limbs = {"hip": hip, "knee": knee, "ankle": ankle, "shoulder": shoulder, "elbow": elbow, "wrist": wrist}
+        for name, value in limbs.items():
             joints[:, BODY_15.index(letter + name)] = value
     return joints
-
-
-def _ground_axes(yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-    return ahead, np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
 
 
 def _pulse(phase: np.ndarray, start: float, end: float) -> np.ndarray:
@@ -292,56 +313,35 @@ def _kick_phase(phase: np.ndarray, side: int, weight: np.ndarray) -> tuple[np.nd
     return lifted, stretched
 
 
-def _ankle_goal(
-    t: np.ndarray,
-    side: int,
-    kick: tuple[np.ndarray, np.ndarray],
-    box: np.ndarray,
-    squat_depth: np.ndarray,
-    hip: np.ndarray,
-    yaw: np.ndarray,
-    action: str,
-    style: _Style,
-) -> np.ndarray:
-    goal, _ = _footprints(t, side, action, style)
-    ahead, left = _ground_axes(yaw)
+def _ankle_goal(moment: _Moment, side: int, hip: np.ndarray, action: str) -> np.ndarray:
+    goal, _ = _footprints(moment.t, side, action, moment.style)
     # A boxer's stance: left foot before the right; a wider stance for squats.
-    goal[:, :2] += (0.16 * side * box)[:, None] * ahead
-    goal[:, :2] += (side * (0.06 * box + 0.05 * squat_depth))[:, None] * left
-    leg = style.size["thigh"] + style.size["shank"]
-    flat = np.zeros((t.size, 1))
-    ahead3 = np.concatenate([ahead, flat], axis=1)
-    chamber = hip + 0.35 * leg * ahead3 - np.array([0, 0, 0.42 * leg])
-    stretched = hip + 0.93 * leg * ahead3 + np.array([0, 0, 0.12 * leg])
-    lifted, extended = (k[:, None] for k in kick)
+    goal[:, :2] += (0.16 * side * moment.box)[:, None] * moment.ahead
+    goal[:, :2] += (side * (0.06 * moment.box + 0.05 * moment.squat_depth))[:, None] * moment.left
+    leg = moment.style.size["thigh"] + moment.style.size["shank"]
+    ahead = np.pad(moment.ahead, ((0, 0), (0, 1)))
+    chamber = hip + 0.35 * leg * ahead - np.array([0, 0, 0.42 * leg])
+    stretched = hip + 0.93 * leg * ahead + np.array([0, 0, 0.12 * leg])
+    lifted, extended = (k[:, None] for k in moment.kicks[side])
     return np.asarray(goal + lifted * (chamber - goal) + extended * (stretched - chamber))
 
 
-def _wrist_goal(
-    side: int,
-    stride: np.ndarray,
-    walk: np.ndarray,
-    box: np.ndarray,
-    kick: np.ndarray,
-    squat: np.ndarray,
-    squat_depth: np.ndarray,
-    punch: dict[int, np.ndarray],
-    s: dict[str, float],
-) -> np.ndarray:
+def _wrist_goal(moment: _Moment, side: int) -> np.ndarray:
     """(F, 3) m, from the shoulder in the trunk frame."""
-    arm = s["upper_arm"] + s["forearm"]
-    swing = side * 0.5 * np.cos(stride)  # against the leg of the same side
-    one = np.ones_like(stride)
+    arm = moment.style.size["upper_arm"] + moment.style.size["forearm"]
+    swing = side * 0.5 * np.cos(moment.stride)  # against the leg of the same side
+    one = np.ones_like(moment.stride)
 
     def along(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         return arm * np.stack([x * one, y * one, z * one], axis=1)
 
     hang = along(0.1 * one, 0.12 * side * one, -0.95 * one)
     walking = along(np.sin(swing) * 0.85 + 0.18, 0.12 * side * one, -0.88 * np.cos(swing))
-    reach = punch[side]
+    reach, depth = moment.punch[side], moment.squat_depth
     guard = along(0.45 + 0.52 * reach, -side * (0.22 - 0.08 * reach), 0.12 - 0.02 * reach)
     balance = along(0.3 * one, 0.45 * side * one, -0.45 * one)
-    forward = along(0.1 + 0.8 * squat_depth, 0.12 * side * one, -0.95 + 0.95 * squat_depth)
+    forward = along(0.1 + 0.8 * depth, 0.12 * side * one, -0.95 + 0.95 * depth)
+    walk, box, kick, squat = moment.walk, moment.box, moment.kick, moment.squat
     rest = np.clip(1 - walk - box - kick - squat, 0.0, 1.0)
     parts = ((rest, hang), (walk, walking), (box, guard), (kick, balance), (squat, forward))
     return np.asarray(np.sum([w[:, None] * goal for w, goal in parts], axis=0))

@@ -143,7 +143,7 @@ def detector_sample(world: World, rng: np.random.Generator) -> DetectorSample:
         image = draw_background(scene, *arguments)
     else:
         look = dress(FIRST_SEED + int(rng.integers(1_000_000_000)))
-        image, box = draw(scene, look, view.matrix, *view.size, joints, view.rotation, view.position)
+        image, box = draw(scene, look, view.matrix, view.size, joints, view.rotation, view.position)
     for _ in range(int(rng.integers(0, 4)) if rng.random() < 0.4 else 0):
         _occlude(rng, image, box)
     image = degrade(rng, image)
@@ -163,7 +163,7 @@ def pose_sample(world: World, rng: np.random.Generator, degraded: bool = True) -
     size = (int(1.7 * POSE_SIZE[0] * scale), int(1.5 * POSE_SIZE[1] * scale))
     view = _view(rng, joints, size, 0.55, rng.uniform(-0.05, 0.05, 2))
     look = dress(FIRST_SEED + int(rng.integers(1_000_000_000)))
-    image, box = draw(_scene(world, rng), look, view.matrix, *size, joints, view.rotation, view.position)
+    image, box = draw(_scene(world, rng), look, view.matrix, size, joints, view.rotation, view.position)
     if box is None:
         return pose_sample(world, rng, degraded)
     px = project(joints[None], view.rotation[None], view.position[None], view.matrix)[0]

@@ -99,7 +99,7 @@ def field_images(scene: FieldScene) -> Iterator[FieldImage]:
     crowns = _crowns(rng, t, root, position) if scene.canopies else np.empty((0, 4))
     for i in range(len(t)):
         shown = [(person[i], look) for person, look in people]
-        image, boxes = draw_people(scenery, shown, matrix, *SIZE, rotation[i], position[i])
+        image, boxes = draw_people(scenery, shown, matrix, SIZE, rotation[i], position[i])
         px = project(joints[i][None], rotation[i][None], position[i][None], matrix)[0]
         cover = np.zeros(SIZE[::-1], np.uint8)
         for crown in crowns:

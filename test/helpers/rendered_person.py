@@ -20,4 +20,4 @@ def rendered_images(count: int, rate_hz: float = 30.0, seed: int = 0) -> list[np
         t, np.tile([0, 0, 0.9], (count, 1)) + joints[:, 0] * [1, 1, 0], 6.0, 2.5, 25.0, 0.0
     )
     scenery, look = make_scenery(seed), dress(seed)
-    return [draw(scenery, look, matrix, 1280, 720, joints[i], rotation[i], position[i])[0] for i in range(count)]
+    return [draw(scenery, look, matrix, (1280, 720), joints[i], rotation[i], position[i])[0] for i in range(count)]

@@ -33,8 +33,11 @@ class FlightSimulatorConfig(Parameters):
     horizontal_fov_deg: float = param(60.0, "horizontal field of view", unit="deg", minimum=5, maximum=150)
     rate_hz: float = param(15.0, "images per second", unit="Hz", minimum=1, maximum=120)
     latency_s: float = param(
-        0.1, "in simulated time, from exposure to publication: stands for camera, transmission and perception",
-        unit="s", minimum=0, maximum=2,
-    )  # fmt: skip
+        0.1,
+        "in simulated time, from exposure to publication: stands for camera, transmission and perception",
+        unit="s",
+        minimum=0,
+        maximum=2,
+    )
     jpeg_quality: int = param(85, "quality of the published JPEG", minimum=1, maximum=100)
     truth_file: str = param("", "npz for the truth, written at the end as a motion file; empty = none")

@@ -49,17 +49,23 @@ def save_flight_truth(path: Path, truth: FlightTruth) -> None:
     """Write the file atomically."""
     frames, joints = truth.joints3d.shape[:2]
     motion = Motion(
-        joints3d=truth.joints3d, joints=BODY_17.joints[:joints], parents=BODY_17.parents[:joints],
-        stamp_ns=truth.stamp_ns, frame="world", metric=True, scale_source="simulation",
-        camera_rotation=truth.camera_rotation, confidence=np.ones((frames, joints)), keypoints=truth.keypoints,
-        reprojection_px=np.zeros((frames, joints)), meta={"method": "truth of a simulated flight"},
-    )  # fmt: skip
+        joints3d=truth.joints3d,
+        joints=BODY_17.joints[:joints],
+        parents=BODY_17.parents[:joints],
+        stamp_ns=truth.stamp_ns,
+        frame="world",
+        metric=True,
+        scale_source="simulation",
+        camera_rotation=truth.camera_rotation,
+        confidence=np.ones((frames, joints)),
+        keypoints=truth.keypoints,
+        reprojection_px=np.zeros((frames, joints)),
+        meta={"method": "truth of a simulated flight"},
+        camera_position=truth.camera_position,
+    )
     work = path.with_name(f".{path.name}.part.npz")
     try:
-        save_motion(
-            work, motion, camera_position=truth.camera_position, camera_matrix=truth.camera_matrix,
-            image_size=np.array(truth.image_size),
-        )  # fmt: skip
+        save_motion(work, motion, camera_matrix=truth.camera_matrix, image_size=np.array(truth.image_size))
         os.replace(work, path)
     finally:
         work.unlink(missing_ok=True)
@@ -81,9 +87,13 @@ def load_flight_truth(path: Path) -> FlightTruth:
             raise InputError(f"{path}: {name}: expected numbers of shape {shape}, got {more[name].shape}")
     width, height = (int(v) for v in more["image_size"])
     return FlightTruth(
-        motion.stamp_ns, motion.joints3d, motion.camera_rotation, more["camera_position"], more["camera_matrix"],
-        (width, height),
-    )  # fmt: skip
+        stamp_ns=motion.stamp_ns,
+        joints3d=motion.joints3d,
+        camera_rotation=motion.camera_rotation,
+        camera_position=more["camera_position"],
+        camera_matrix=more["camera_matrix"],
+        image_size=(width, height),
+    )
 
 
 class FlownOrbit(NamedTuple):

@@ -19,6 +19,14 @@ _LIMBS = (
     ("shoulder", "elbow", 0.050, 0.041, "upper_arm"),
     ("elbow", "wrist", 0.041, 0.029, "forearm"),
 )
+#: Joint, radius of its ball (m at 1.75 m stature), part of the look.
+_JOINTS = (
+    ("hip", 0.083, "thigh"),
+    ("knee", 0.057, "shank"),
+    ("ankle", 0.041, "shank"),
+    ("shoulder", 0.058, "upper_arm"),
+    ("elbow", 0.041, "forearm"),
+)
 #: Length of the bones below over which the radii are scaled, m at 1.75 m stature (both thighs and shanks).
 _LEG_M = 0.491 * 1.75
 #: Tip of a shoe before and below the ankle, m at 1.75 m stature.
@@ -45,13 +53,10 @@ def dress(seed: int) -> Look:
     shirt, trousers, shoes, front = (_cloth(rng) for _ in range(4))
     long_sleeves, long_legs = rng.random() < 0.5, rng.random() < 0.75
     jacket = rng.random() < 0.5
-    colours = {
-        "skin": skin, "hair": hair, "shirt": shirt, "trousers": trousers, "shoes": shoes,
-        "front": front if jacket else shirt,
-        "nose": 0.85 * skin, "eyes": np.array([30.0, 30.0, 30.0]),
-        "upper_arm": shirt, "forearm": shirt if long_sleeves else skin,
-        "thigh": trousers, "shank": trousers if long_legs else skin,
-    }  # fmt: skip
+    colours = {"skin": skin, "hair": hair, "nose": 0.85 * skin, "eyes": np.array([30.0, 30.0, 30.0])}
+    colours |= {"shirt": shirt, "trousers": trousers, "shoes": shoes, "front": front if jacket else shirt}
+    colours |= {"upper_arm": shirt, "forearm": shirt if long_sleeves else skin}
+    colours |= {"thigh": trousers, "shank": trousers if long_legs else skin}
     return Look(colours, float(rng.uniform(0.85, 1.2)))
 
 
@@ -117,10 +122,7 @@ def body(joints: np.ndarray, look: Look) -> tuple[Quadrics, list[str]]:
 
     straight = np.eye(3)
     for side in "lr":
-        for joint, r, part in (
-            ("hip", 0.083, "thigh"), ("knee", 0.057, "shank"), ("ankle", 0.041, "shank"),
-            ("shoulder", 0.058, "upper_arm"), ("elbow", 0.041, "forearm"),
-        ):  # fmt: skip
+        for joint, r, part in _JOINTS:
             add(part, at[side + joint], straight, (r, r, r), stout)
     hips = _axes(at["lhip"] - at["rhip"], at["neck"] - at["pelvis"])
     chest = _axes(at["lshoulder"] - at["rshoulder"], at["neck"] - at["pelvis"])

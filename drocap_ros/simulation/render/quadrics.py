@@ -48,9 +48,8 @@ def cones(start: np.ndarray, end: np.ndarray, start_m: np.ndarray, end_m: np.nda
     b = local - a_start
     c = np.sum(start * a_start, axis=1) - 2 * np.sum(local * start, axis=1) - start_m**2
     low = np.sum(axis * start, axis=1)
-    return Quadrics(
-        a, b, c, axis, low, low + length, np.stack([start, end], axis=1), np.maximum(start_m, end_m)
-    )  # fmt: skip
+    ends = np.stack([start, end], axis=1)
+    return Quadrics(a, b, c, axis, low, low + length, ends, np.maximum(start_m, end_m))
 
 
 def ellipsoids(centre: np.ndarray, axes: np.ndarray, half_m: np.ndarray) -> Quadrics:
@@ -61,9 +60,8 @@ def ellipsoids(centre: np.ndarray, axes: np.ndarray, half_m: np.ndarray) -> Quad
     b = -np.einsum("nij,nj->ni", a, centre)
     c = -np.sum(b * centre, axis=1) - half_m.min(axis=1) ** 2
     unlimited = np.full(len(centre), 1e9)
-    return Quadrics(
-        a, b, c, axes[:, 0], -unlimited, unlimited, np.stack([centre, centre], axis=1), half_m.max(axis=1)
-    )  # fmt: skip
+    ends = np.stack([centre, centre], axis=1)
+    return Quadrics(a, b, c, axes[:, 0], -unlimited, unlimited, ends, half_m.max(axis=1))
 
 
 def joined(parts: list[Quadrics]) -> Quadrics:

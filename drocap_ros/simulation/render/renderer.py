@@ -13,10 +13,11 @@ from drocap_ros.simulation.render.quadrics import Layer, Quadrics, rasterize
 from drocap_ros.simulation.render.scenery import Scenery, make_scenery
 from drocap_ros.skeleton import BODY_15, BODY_17
 
-#: Larger images have a background of half the resolution.
+#: Larger images, in px, have a background of half the resolution, for speed; haze and blur hide it.
 _FULL_BACKGROUND_PX = 300_000
-#: A person with a larger box is drawn at half the resolution.
+#: A person with a larger box, in px, is drawn at half the resolution, for speed.
 _FULL_PERSON_PX = 150_000
+#: Largest width and height, px.
 _MOST_PX = 8192
 
 
@@ -69,10 +70,9 @@ class Renderer:
                 raise InputError(
                     f"{name}: expected {shape} of finite numbers, got {np.shape(array)}; correct its source"
                 )
-        image, _ = draw(
-            self.scene, self.look, self.camera_matrix, self.width, self.height,
-            np.asarray(joints3d, float), np.asarray(rotation, float), np.asarray(position, float),
-        )  # fmt: skip
+        joints, rotation, position = (np.asarray(values, float) for values in (joints3d, rotation, position))
+        size = (self.width, self.height)
+        image, _ = draw(self.scene, self.look, self.camera_matrix, size, joints, rotation, position)
         return image
 
 
@@ -80,17 +80,16 @@ def draw(
     scene: Scenery,
     look: Look,
     matrix: np.ndarray,
-    width: int,
-    height: int,
+    size: tuple[int, int],
     joints: np.ndarray,
     rotation: np.ndarray,
     position: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Image (H, W, 3) uint8 BGR, and the box (4,) px x_min y_min x_max y_max of the visible person, or None.
 
-    The arguments are those of :class:`Renderer`, unvalidated.
+    The arguments are those of :class:`Renderer`, unvalidated; size is width and height px.
     """
-    image, boxes = draw_people(scene, [(joints, look)], matrix, width, height, rotation, position)
+    image, boxes = draw_people(scene, [(joints, look)], matrix, size, rotation, position)
     return image, boxes[0]
 
 
@@ -98,8 +97,7 @@ def draw_people(
     scene: Scenery,
     people: Sequence[tuple[np.ndarray, Look]],
     matrix: np.ndarray,
-    width: int,
-    height: int,
+    size: tuple[int, int],
     rotation: np.ndarray,
     position: np.ndarray,
 ) -> tuple[np.ndarray, list[np.ndarray | None]]:
@@ -110,33 +108,49 @@ def draw_people(
     import cv2
 
     bodies = [body(joints, look) for joints, look in people]
-    coarse = 2 if width * height > _FULL_BACKGROUND_PX else 1
-    small = _scaled(matrix, 1 / coarse)
-    size = (-(-width // coarse), -(-height // coarse))
-    image = draw_background(scene, small, *size, rotation, position)
-    for surfaces, _ in bodies:
-        draw_shadow(scene, image, surfaces.ends, surfaces.reach, small, rotation, position)
-    if coarse > 1:
-        image = cv2.resize(image, (size[0] * coarse, size[1] * coarse), interpolation=cv2.INTER_LINEAR)
-        image = np.ascontiguousarray(image[:height, :width])
+    image = _draw_surroundings(scene, [surfaces for surfaces, _ in bodies], matrix, size, rotation, position)
     boxes: list[np.ndarray | None] = [None] * len(people)
     distance = [float(np.linalg.norm(joints[0] - position)) for joints, _ in people]
     for i in sorted(range(len(people)), key=lambda i: -distance[i]):
         (surfaces, parts), look = bodies[i], people[i][1]
         visible = _in_camera(surfaces, rotation, position)
         colours = np.array([look.colours[part] for part in parts], np.float32)
-        factor = 2 if _person_px(visible, matrix, width, height) > _FULL_PERSON_PX else 1
-        shrunk = (_scaled(matrix, 1 / factor), -(-width // factor), -(-height // factor))
+        factor = 2 if _person_px(visible, matrix, *size) > _FULL_PERSON_PX else 1
+        shrunk = (_scaled(matrix, 1 / factor), -(-size[0] // factor), -(-size[1] // factor))
         layer = rasterize(visible, *shrunk, rotation @ scene.sun)
         if layer is None:
             continue
-        mask, painted = _shaded(layer, colours, scene.sunlight, rotation)
+        mask, painted = _shaded(layer, colours, scene.sunlight)
         if factor > 1:
             double = (mask.shape[1] * factor, mask.shape[0] * factor)
             mask = np.where(cv2.resize(mask, double, interpolation=cv2.INTER_LINEAR) > 127, np.uint8(255), np.uint8(0))
             painted = cv2.resize(painted, double, interpolation=cv2.INTER_LINEAR)
         boxes[i] = _overlay_person(image, mask, painted, layer.x * factor, layer.y * factor)
     return image, boxes
+
+
+def _draw_surroundings(
+    scene: Scenery,
+    bodies: list[Quadrics],
+    matrix: np.ndarray,
+    size: tuple[int, int],
+    rotation: np.ndarray,
+    position: np.ndarray,
+) -> np.ndarray:
+    """Image (H, W, 3) of the scenery with the shadows of bodies, of larger images at half the resolution."""
+    import cv2
+
+    width, height = size
+    coarse = 2 if width * height > _FULL_BACKGROUND_PX else 1
+    small = _scaled(matrix, 1 / coarse)
+    reduced = (-(-width // coarse), -(-height // coarse))
+    image = draw_background(scene, small, *reduced, rotation, position)
+    for surfaces in bodies:
+        draw_shadow(scene, image, surfaces.ends, surfaces.reach, small, rotation, position)
+    if coarse > 1:
+        image = cv2.resize(image, (reduced[0] * coarse, reduced[1] * coarse), interpolation=cv2.INTER_LINEAR)
+        image = np.ascontiguousarray(image[:height, :width])
+    return image
 
 
 def _scaled(matrix: np.ndarray, scale: float) -> np.ndarray:
@@ -154,10 +168,8 @@ def _in_camera(q: Quadrics, rotation: np.ndarray, position: np.ndarray) -> Quadr
     moved = q.b + q.a @ position
     c = q.c + 2 * q.b @ position + np.einsum("i,nij,j->n", position, q.a, position)
     shift = q.axis @ position
-    return Quadrics(
-        a, moved @ rotation.T, c, q.axis @ rotation.T, q.low - shift, q.high - shift,
-        (q.ends - position) @ rotation.T, q.reach,
-    )  # fmt: skip
+    axis, ends = q.axis @ rotation.T, (q.ends - position) @ rotation.T
+    return Quadrics(a, moved @ rotation.T, c, axis, q.low - shift, q.high - shift, ends, q.reach)
 
 
 def _person_px(visible: Quadrics, matrix: np.ndarray, width: int, height: int) -> float:
@@ -168,7 +180,7 @@ def _person_px(visible: Quadrics, matrix: np.ndarray, width: int, height: int) -
     return float(np.prod(np.ptp(px, axis=0)))
 
 
-def _shaded(layer: Layer, colours: np.ndarray, sunlight: float, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _shaded(layer: Layer, colours: np.ndarray, sunlight: float) -> tuple[np.ndarray, np.ndarray]:
     """Mask (h, w) uint8 0 or 255 and colours (h, w, 3) uint8 of a layer."""
     import cv2
 

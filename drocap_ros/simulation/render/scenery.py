@@ -6,11 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Side of the ground's repeating pattern, near and far.
-NEAR_M, FAR_M = 24.0, 480.0
-_NEAR_PX, _FAR_PX = 1024, 512
+#: Side of the ground's repeating pattern, near and far; the haze hides the repetitions.
+NEAR_M = 24.0
+FAR_M = 480.0
+_NEAR_PX = 1024
+_FAR_PX = 512
 #: Distances of trees and houses from the origin, beyond the person's path.
-_LEAST_M, _MOST_M = 32.0, 95.0
+_LEAST_M = 32.0
+_MOST_M = 95.0
 
 _GROUNDS = (  # base colour BGR, its variation, size of its patches in px of the pattern
     ((60, 115, 85), 22.0, 40),  # grass
@@ -71,10 +74,18 @@ def make_scenery(seed: int) -> Scenery:
     trees, tree_colours = _trees(rng, int(rng.integers(6, 26)))
     far_colour = near.reshape(-1, 3).mean(axis=0)
     return Scenery(
-        _packed(near), _packed(_pattern(rng, _FAR_PX, far_colour, 12.0, 24)),
-        np.array(horizon, float), np.array(zenith, float), sun, sunlight,
-        float(rng.uniform(60, 220)), houses, house_colours, trees, tree_colours,
-    )  # fmt: skip
+        near=_packed(near),
+        far=_packed(_pattern(rng, _FAR_PX, far_colour, 12.0, 24)),
+        horizon=np.array(horizon, float),
+        zenith=np.array(zenith, float),
+        sun=sun,
+        sunlight=sunlight,
+        haze_m=float(rng.uniform(60, 220)),
+        houses=houses,
+        house_colours=house_colours,
+        trees=trees,
+        tree_colours=tree_colours,
+    )
 
 
 def _packed(pattern: np.ndarray) -> np.ndarray:

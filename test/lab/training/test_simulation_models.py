@@ -59,7 +59,7 @@ class Flown:
             estimator = PoseEstimator(FOLDER, PoseEstimatorConfig(detect_every_s=0.0))
             scene, look = make_scenery(seed), dress(seed)
             for i in range(images):
-                image, box = draw(scene, look, matrix, 1280, 720, joints[i], rotation[i], position[i])
+                image, box = draw(scene, look, matrix, (1280, 720), joints[i], rotation[i], position[i])
                 image = as_received(image)
                 whole = estimator.detector.detect(image, None, estimator.config.detection_threshold)
                 self.found.append(len(whole) > 0 and overlap(whole.boxes[0], box) > 0.5)
@@ -112,7 +112,7 @@ def test_empty_scenery_has_no_subject():
     for seed in range(8):
         position = np.array([[1.0, 2.0 + seed, 2.5]])
         rotation = orbit_camera(np.zeros(1), np.zeros((1, 3)), 6.0, 2.5, 0.0, 90.0)[0][0]
-        image, box = draw(make_scenery(seed), dress(0), matrix, 1280, 720, away, rotation, position[0])
+        image, box = draw(make_scenery(seed), dress(0), matrix, (1280, 720), away, rotation, position[0])
         assert box is None
         assert not estimator.process(image, seed * 100_000_000).has_subject
 

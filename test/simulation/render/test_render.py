@@ -88,7 +88,7 @@ def test_near_person_at_half_resolution_has_the_same_outline():
     joints, rotation, position = (v[0] for v in orbit(radius_m=2.6))
     surfaces, _ = body(joints, dress(0))
     ends = to_camera(surfaces.ends, rotation[None].repeat(len(surfaces.ends), 0), position[None])
-    _, box = draw(make_scenery(0), dress(0), MATRIX, 1280, 720, joints, rotation, position)
+    _, box = draw(make_scenery(0), dress(0), MATRIX, (1280, 720), joints, rotation, position)
     assert np.prod(box[2:] - box[:2]) > 150_000
     turned = surfaces._replace(
         a=rotation @ surfaces.a @ rotation.T,
@@ -157,7 +157,7 @@ def test_front_and_back_of_the_head_differ():
     for name, sign in (("front", 1), ("back", -1)):
         position = joints[0, 0] + sign * 4 * ahead + np.array([0, 0, 0.6])
         rotation = look_at(position[None], joints[:, 0])[0]
-        image, _ = draw(scene, look, MATRIX, 1280, 720, joints[0], rotation, position)
+        image, _ = draw(scene, look, MATRIX, (1280, 720), joints[0], rotation, position)
         x, y = np.round(project(joints, rotation[None], position[None], MATRIX)[0, BODY_15.index("head")]).astype(int)
         seen[name] = image[y - 6 : y + 18, x - 8 : x + 9].reshape(-1, 3).mean(axis=0)
     assert np.abs(seen["front"] - seen["back"]).max() > 30
@@ -196,7 +196,7 @@ def test_horizon_lies_at_zero_elevation():
     for roll in (0.0, 0.3, -0.4):
         turn = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
         rotation = turn @ level
-        image, box = draw(scene, look, MATRIX, 1280, 720, far, rotation, position)
+        image, box = draw(scene, look, MATRIX, (1280, 720), far, rotation, position)
         assert box is None
         v, u = np.mgrid[:720:8, :1280:8]
         rise = np.stack([(u - MATRIX[0, 2]) / MATRIX[0, 0], (v - MATRIX[1, 2]) / MATRIX[1, 1], np.ones(u.shape)], -1)
@@ -220,7 +220,7 @@ def test_ground_mark_is_found_at_its_projection_from_two_positions():
     for offset in ([2.0, -5.0, 3.0], [-4.0, -3.0, 2.0]):
         position = spot + np.array(offset)
         rotation = look_at(position[None], (spot + np.array([0.4, 0.3, 0.0]))[None])[0]
-        image, _ = draw(plain, dress(0), MATRIX, 1280, 720, far, rotation, position)
+        image, _ = draw(plain, dress(0), MATRIX, (1280, 720), far, rotation, position)
         blue = image[..., 0].astype(int) - image[..., 2] > 60
         at = project(spot[None, None], rotation[None], position[None], MATRIX)[0, 0]
         rows, columns = np.nonzero(blue)
@@ -245,7 +245,7 @@ def test_person_at_the_border_outside_behind_or_at_the_lens_is_drawn_as_far_as_v
         assert image.shape == (720, 1280, 3)
     scene, look = make_scenery(0), dress(0)
     for away in (sideways, behind):
-        assert draw(scene, look, MATRIX, 1280, 720, away, rotation, position)[1] is None
+        assert draw(scene, look, MATRIX, (1280, 720), away, rotation, position)[1] is None
 
 
 def test_invalid_arguments_are_refused_in_one_line():
