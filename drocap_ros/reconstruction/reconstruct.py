@@ -24,7 +24,7 @@ from drocap_ros.reconstruction.methods.run import run_method
 from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M
 from drocap_ros.reconstruction.world.in_world import in_camera_axes, in_world
 from drocap_ros.reconstruction.world.placement import WorldPoses, metres_per_px
-from drocap_ros.reconstruction.world.refine import RefinedWorld, refinable
+from drocap_ros.reconstruction.world.refine import refinable
 from drocap_ros.reconstruction.world.world_model import world_config
 from drocap_ros.revision import git_revision
 from drocap_ros.skeleton import BODY_15, BODY_17, BODY_19, JointSet, body_set
@@ -208,7 +208,7 @@ def body_keypoints(tracks: Tracks, joints: JointSet = BODY_17) -> Keypoints2D:
     return found.with_joints(len(joints))
 
 
-def _in_metres(tracks: Tracks, keypoints: Keypoints2D, poses: ImagePoses, settings: _Settings) -> _Body | Refusal | str:
+def _in_metres(tracks: Tracks, keypoints: Keypoints2D, poses: ImagePoses, settings: _Settings) -> _Body | Refusal:
     """The one step from px to m: in the world where the camera's rotation is known, else in the camera's axes.
 
     In the world the poses are placed by the reported camera and, with its position and matrix, adjusted with it.  The
@@ -224,7 +224,7 @@ def _in_metres(tracks: Tracks, keypoints: Keypoints2D, poses: ImagePoses, settin
     else:
         frame = "world"
         placed, refined = in_world(tracks, keypoints, poses, per_px, world_config(settings.adjuster))
-        if refined is not None and not isinstance(refined, RefinedWorld):
+        if isinstance(refined, Refusal):
             return refined
     if placed.scale is not None:
         meta["scale"] = dataclasses.asdict(placed.scale)

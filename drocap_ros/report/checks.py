@@ -10,7 +10,7 @@ import numpy as np
 
 from drocap_ros.contacts import MOTION_REST_M_S
 from drocap_ros.motion import Motion
-from drocap_ros.reconstruction.world.calibration_words import telemetry_words
+from drocap_ros.reconstruction.world.telemetry_words import telemetry_words
 from drocap_ros.report.statistics import Statistics, mean_known
 from drocap_ros.skeleton import TOES
 

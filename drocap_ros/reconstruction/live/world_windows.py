@@ -15,9 +15,10 @@ from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.geometry.rotations import log_so3
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses
+from drocap_ros.reconstruction.common.refusal import Refusal
 from drocap_ros.reconstruction.lifted.method import WindowSolution
 from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, Telemetry, Window
-from drocap_ros.reconstruction.world.calibration import Calibration
+from drocap_ros.reconstruction.world.findings import Findings
 from drocap_ros.reconstruction.world.in_world import in_world
 from drocap_ros.reconstruction.world.placement import metres_per_px
 from drocap_ros.reconstruction.world.refine import Before, RefinedWorld
@@ -39,9 +40,9 @@ class WorldWindows:
         self._config = replace(world_config(config), iterations=_STEPS, locking_iterations=_LOCKING_STEPS)
         self._length_ns = round(config.world_window_s * 1e9)
         self._subject: int | None = None
-        self._known = Calibration.unknown()
+        self._known = Findings.unknown()
         #: The window before and its findings.
-        self._before: tuple[Before, Calibration] | None = None
+        self._before: tuple[Before, Findings] | None = None
         self._moved = False
         #: Whether the last window's telemetry was true: the lifter may see the camera's rotation.
         self.trusted = False
@@ -56,7 +57,7 @@ class WorldWindows:
         camera_result : its result in camera axes
         """
         if w.subject != self._subject:
-            self._subject, self._known, self._before = w.subject, Calibration.unknown(), None
+            self._subject, self._known, self._before = w.subject, Findings.unknown(), None
         result = self._adjust(w, found, camera_result)
         self.trusted = result.telemetry in (Telemetry.USED, Telemetry.UNSCALED)
         return result
@@ -69,9 +70,8 @@ class WorldWindows:
             return replace(camera_result, telemetry=Telemetry.LATE)
         camera, stamps, keypoints = w.camera.frames(use), w.stamp_ns[use], w.keypoints[use]
         self._moved |= not unchanged(camera.rotation, camera.position).all()
-        if self._moved and (reason := stopped(camera.rotation, camera.position, stamps)):
-            self._before = None
-            return replace(camera_result, telemetry=Telemetry.REFUSED, reason=reason)
+        if self._moved and (refusal := stopped(camera.rotation, camera.position, stamps)):
+            return self._refused(camera_result, refusal)
         # The size of the images is unknown here, and not used.
         size = (math.ceil(camera.matrix[0, 0]), math.ceil(camera.matrix[1, 1]))
         tracks = Tracks(
@@ -86,9 +86,8 @@ class WorldWindows:
         _, refined = in_world(tracks, keypoints, poses, per_px, config, known, before)
         if refined is None:
             return replace(camera_result, telemetry=Telemetry.LATE)
-        if isinstance(refined, str):
-            self._before = None
-            return replace(camera_result, telemetry=Telemetry.REFUSED, reason=refined)
+        if isinstance(refined, Refusal):
+            return self._refused(camera_result, refined)
         self._known, self._before = known, (refined.before, refined.found)
         if not refined.metric:
             return replace(camera_result, telemetry=Telemetry.UNSCALED)
@@ -103,7 +102,11 @@ class WorldWindows:
             in_map=InMap(refined.rotation, refined.position, _correction(refined, tracks)),
         )
 
-    def _prior(self, stamps: np.ndarray) -> Calibration:
+    def _refused(self, camera_result: AdjustedWindow, refusal: Refusal) -> AdjustedWindow:
+        self._before = None
+        return replace(camera_result, telemetry=Telemetry.REFUSED, reason=str(refusal))
+
+    def _prior(self, stamps: np.ndarray) -> Findings:
         """Findings of earlier windows that the window of these stamps has not itself."""
         if self._before is None:
             return self._known

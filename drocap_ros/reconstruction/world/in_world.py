@@ -9,11 +9,12 @@ import numpy as np
 from drocap_ros.geometry.position_steps import without_steps
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.poses import ImagePoses
-from drocap_ros.reconstruction.world.calibration import Calibration
+from drocap_ros.reconstruction.common.refusal import Refusal
+from drocap_ros.reconstruction.world.findings import Findings
 from drocap_ros.reconstruction.world.placement import WorldPoses, place_in_world
-from drocap_ros.reconstruction.world.refine import Before, PlacedPoses, RefinedWorld, refinable, refine_in_world
+from drocap_ros.reconstruction.world.refine import Before, RefinedWorld, refinable, refine_in_world
 from drocap_ros.reconstruction.world.telemetry_checks import upside_down
-from drocap_ros.reconstruction.world.world_model import WorldConfig
+from drocap_ros.reconstruction.world.world_model import PlacedPoses, WorldConfig
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
 
@@ -32,9 +33,9 @@ def in_world(
     poses: ImagePoses,
     per_px: np.ndarray,
     config: WorldConfig,
-    known: Calibration | None = None,
+    known: Findings | None = None,
     before: Before | None = None,
-) -> tuple[WorldPoses, RefinedWorld | str | None]:
+) -> tuple[WorldPoses, RefinedWorld | Refusal | None]:
     """Poses placed by ``tracks.camera_rotation`` and, with the camera's position and matrix, adjusted with it.
 
     Parameters
@@ -45,7 +46,7 @@ def in_world(
 
     Returns
     -------
-    WorldPoses, and as of :func:`~drocap_ros.reconstruction.world.refine.refine_in_world`
+    The placed poses, and the adjusted ones: a refusal where the telemetry cannot be true, None where it is not enough
     """
     rotation = tracks.camera_rotation
     assert rotation is not None
@@ -55,8 +56,10 @@ def in_world(
     placed = place_in_world(in_camera_axes(poses, per_px), projected, per_px, tracks)
     if poses.sigma_px is None:
         return placed, None
-    if reason := upside_down(placed.joints, rotation):
-        return placed, reason
+    if refusal := upside_down(placed.joints, rotation):
+        return placed, refusal
+    if not refinable(tracks) or not np.isfinite(placed.joints).all():
+        return placed, None
     size = per_px[:, None]
     depth = (poses.joints_px[..., 2] - poses.joints_px[:, [_PELVIS], 2]) * size
     factor = placed.scale.factor if placed.metric and placed.scale is not None else 1.0

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from drocap_ros.contacts import ANKLES, ankles_seen
-from drocap_ros.geometry.interpolation import MAX_GAP_S
-from drocap_ros.geometry.rotations import exp_so3, project_to_so3
+from drocap_ros.contacts import ANKLES
+from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.common.windows import fade_weights, windows
+from drocap_ros.reconstruction.common.refusal import Refusal, Why
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
-from drocap_ros.reconstruction.lifted.even_frames import even_slots
-from drocap_ros.reconstruction.lifted.window_solver import difference_noise
-from drocap_ros.reconstruction.world.calibration import MEASURED, Calibration
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
+from drocap_ros.reconstruction.world.even_capture import (
+    LEAST_FRAMES,
+    CaptureWindow,
+    EvenCapture,
+    at_all_slots,
+    capture_windows,
+    even_capture,
+)
+from drocap_ros.reconstruction.world.findings import MEASURED, Findings
 from drocap_ros.reconstruction.world.telemetry_checks import (
     frozen,
     jump_m,
@@ -31,9 +37,11 @@ from drocap_ros.reconstruction.world.world_model import (
     CALIBRATED,
     CAMERA,
     GLOBALS,
+    JOINTS,
     MISALIGNMENT,
     POSITION_LATENCY,
     SCALE,
+    PlacedPoses,
     WorldConfig,
     WorldInput,
     WorldState,
@@ -41,21 +49,12 @@ from drocap_ros.reconstruction.world.world_model import (
 from drocap_ros.reconstruction.world.world_residuals import WANDER_S
 from drocap_ros.tracks import Tracks
 
-_LEAST_FRAMES = 12
-#: Frames that are adjusted together, and that neighbouring windows of a long recording share.
-_WINDOW, _OVERLAP = 960, 48
 #: Frames whose solution a live window takes over from the one before: two hold place and speed.
 _HELD = 2
-_LEAST_NOISE_PX = 0.5
-#: Weight of the lifter's image position of a joint that is not seen: its errors last for many frames.
-_GUESS_WEIGHT = 0.1
-#: Cost of the telemetry per frame that no camera's flight explains, and least share of contacts: jogging has 0.2,
-#: a yaw off by 40 degrees less than 0.01.
-_LARGEST_COST, _LEAST_CONTACT = 100.0, 0.03
-#: Share of the time in which an ankle has to be seen for the feet to tell wrong telemetry.
-_SEEN = 0.3
-#: A part of a recording that is shorter may hold no step: its feet tell nothing.
-_FEET_S = 4.0
+#: Cost of the telemetry per frame that no camera's flight explains.
+_LARGEST_COST = 100.0
+#: Least share of the time with a foot in contact: jogging has 0.2, a yaw off by 40 degrees less than 0.01.
+_LEAST_CONTACT = 0.03
 #: Frames per second below which a step of a foot ends between two frames: contacts are not seen.
 _CONTACTS_FPS = 8.0
 
@@ -68,7 +67,7 @@ class RefinedWorld:
     metric : whether the scale was measured
     covariance : (F, 17, 6) m^2: xx, xy, xz, yy, yz, zz; NaN = unknown
     calibration : JSON-compatible, of every window: errors of the telemetry and their standard deviations
-    found : findings of the last window; before : that window, for the next one
+    found : of the last window; before : that window, for the next one
     """
 
     joints: np.ndarray
@@ -77,7 +76,7 @@ class RefinedWorld:
     metric: bool
     covariance: np.ndarray
     calibration: list[dict[str, Any]]
-    found: Calibration
+    found: Findings
     before: Before
 
 
@@ -94,29 +93,10 @@ class Before(NamedTuple):
     shared: np.ndarray
 
 
-@dataclass(frozen=True)
-class PlacedPoses:
-    """Input of the refinement: F frames.
-
-    joints : (F, 17, 3) m in the world; factor : their scale over that of the assumed stature
-    depth, depth_sigma : (F, 17) m at the assumed stature: depth behind the pelvis and its expected error
-    image, image_sigma : (F, 17, 2), (F, 17) px: place in the image and its expected error
-    still : (F, 2) probability that the right and the left foot rest in the world, None = unknown
-    """
-
-    joints: np.ndarray
-    factor: float
-    depth: np.ndarray
-    depth_sigma: np.ndarray
-    image: np.ndarray
-    image_sigma: np.ndarray
-    still: np.ndarray | None = None
-
-
 def refinable(tracks: Tracks) -> bool:
     """Whether there are a camera's finite matrix, rotations and positions, and twelve frames."""
     rotation, position = tracks.camera_rotation, tracks.camera_position
-    if rotation is None or position is None or tracks.camera_matrix is None or len(tracks) < _LEAST_FRAMES:
+    if rotation is None or position is None or tracks.camera_matrix is None or len(tracks) < LEAST_FRAMES:
         return False
     return bool(np.isfinite(rotation).all() and np.isfinite(position).all())
 
@@ -126,117 +106,146 @@ def refine_in_world(
     keypoints: Keypoints2D,
     poses: PlacedPoses,
     config: WorldConfig | None = None,
-    known: Calibration | None = None,
+    known: Findings | None = None,
     before: Before | None = None,
-) -> RefinedWorld | str | None:
-    """Adjust poses and camera; None where the tracks are not :func:`refinable`.
+) -> RefinedWorld | Refusal:
+    """Adjust poses and camera of :func:`refinable` tracks; a refusal where the telemetry cannot be true.
 
-    The answer is a reason, in words, where the telemetry cannot be true.  ``known`` : findings of earlier windows;
-    ``before`` : the last of them, which a live window continues.
+    ``known`` : findings of earlier windows; ``before`` : the last of them, which a live window continues.
     """
     config = config or WorldConfig()
     rotation, position, matrix = tracks.camera_rotation, tracks.camera_position, tracks.camera_matrix
-    if not refinable(tracks) or not np.isfinite(poses.joints).all():
-        return None
     assert rotation is not None
     assert position is not None
     assert matrix is not None
-    slot, fps = even_slots(tracks.stamp_ns)
-    frames = int(slot[-1]) + 1
     # The scale turns about the origin: near the camera's path, or the held person.
     origin = position.mean(axis=0) if before is None else _held_pelvis(before, int(tracks.stamp_ns[0]))
-    weight = np.zeros((frames, keypoints.xy.shape[1]))
-    points = np.zeros((*weight.shape, 2))
-    seen = np.zeros(weight.shape, bool)
-    seen[slot] = keypoints.weights > 0
-    weight[slot], points[slot] = _weights(keypoints, poses.image_sigma), _points(keypoints, poses.image)
-    body = (poses.joints - origin) / poses.factor
-    body, depth, sigma, path = (
-        _at_all_slots(values, slot) for values in (body, poses.depth, poses.depth_sigma, position - origin)
-    )
-    turn = project_to_so3(_at_all_slots(rotation, slot))
-    poses_at = body * poses.factor
-    parts = _parts(tracks.stamp_ns, slot)
-    for part in parts:
-        if reason := frozen(turn[part], path[part], fps) or turned_at_once(turn[part], fps):
-            return reason
-    still = None if poses.still is None else _at_all_slots(poses.still, slot)
-    ankles = ankles_seen(seen, fps)
-    # Windows whose feet can tell wrong telemetry.
-    all_windows = [faded for part in parts for faded in _windows(part)]
-    of_feet = [
-        rows
-        for rows, _ in all_windows
-        if config.feet and ankles[rows].mean() > _SEEN and rows.stop - rows.start >= min(frames, _FEET_S * fps)
-    ]
-    for rows in of_feet:
-        if reason := other_time(poses_at[rows], turn[rows], path[rows], fps):
-            return reason
-        if still is not None and (reason := resting_feet_move(poses_at[rows], still[rows], fps)):
-            return reason
+    capture = even_capture(tracks, keypoints, poses, origin)
+    windows = capture_windows(capture, config.feet)
+    if refusal := _impossible(capture, windows):
+        return refusal
     start, held = _start(tracks.stamp_ns, (poses.joints - origin) / poses.factor, origin, 1.0 / poses.factor, before)
-    start = start._replace(joints=_at_all_slots(start.joints, slot), wander=_at_all_slots(start.wander, slot))
-    joints: np.ndarray = np.zeros(body.shape)
-    camera: np.ndarray = np.zeros((frames, CAMERA))
-    wander: np.ndarray = np.zeros((frames, CAMERA))
-    covariance: np.ndarray = np.zeros((*body.shape, 3))
-    total, calibration = np.zeros(frames), []
-    measured, cost, contact = True, 0.0, 1.0
-    lengths, starts = np.median(span_lengths(body), axis=0), [part.start for part in parts]
-    prior = gathered = known  # the findings of one part are known in the next
-    for rows, fade in all_windows:
-        if rows.start in starts:
+    facts, faded = _Facts(), _Faded(len(capture.body))
+    for window, telemetry, found in _adjusted(capture, windows, _Scene(matrix, config, start, held, known)):
+        faded.add(window, found, telemetry)
+        facts.add(window, found, telemetry, config.stature_std)
+        last = found
+    if refusal := facts.refusal():
+        return refusal
+    joints, camera, wander, covariance = (values[capture.slot] for values in faded.mean())
+    joints += origin
+    return RefinedWorld(
+        joints=joints,
+        rotation=exp_so3(camera[:, 3:]) @ rotation,
+        position=position + camera[:, :3],
+        metric=facts.metric,
+        covariance=covariance[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]],
+        calibration=facts.calibration,
+        found=last.findings,
+        before=Before(tracks.stamp_ns, joints, wander, last.state.globals),
+    )
+
+
+def _impossible(capture: EvenCapture, windows: list[CaptureWindow]) -> Refusal | None:
+    """What no true telemetry shows before any adjustment: in the path of a part, or in the feet of a window."""
+    turn, path, fps, still = capture.turn, capture.path, capture.fps, capture.still
+    for part in capture.parts:
+        if refusal := frozen(turn[part], path[part], fps) or turned_at_once(turn[part], fps):
+            return refusal
+    poses = capture.body * capture.factor
+    for rows in (window.rows for window in windows if window.tells):
+        if refusal := other_time(poses[rows], turn[rows], path[rows], fps):
+            return refusal
+        if still is not None and (refusal := resting_feet_move(poses[rows], still[rows], fps)):
+            return refusal
+    return None
+
+
+class _Scene(NamedTuple):
+    """What the windows of a recording have in common: camera (3, 3) px, start, and what is known before."""
+
+    matrix: np.ndarray
+    config: WorldConfig
+    start: Before
+    held: int
+    known: Findings | None
+
+
+def _adjusted(
+    capture: EvenCapture, windows: list[CaptureWindow], scene: _Scene
+) -> Iterator[tuple[CaptureWindow, CameraTelemetry, WorldSolution]]:
+    """Every window adjusted; the findings of one part are known in the next."""
+    joints, wander = (at_all_slots(values, capture.slot) for values in (scene.start.joints, scene.start.wander))
+    lengths = np.median(span_lengths(capture.body), axis=0)
+    prior = gathered = scene.known
+    for window in windows:
+        rows = window.rows
+        if window.begins:
             prior = gathered
-        telemetry = CameraTelemetry(turn[rows], path[rows], fps)
+        telemetry = CameraTelemetry(capture.turn[rows], capture.path[rows], capture.fps)
         data = WorldInput(
-            points[rows], weight[rows], depth[rows], sigma[rows], lengths, telemetry, matrix, config, seen[rows], prior,
-            None if still is None else still[rows],
-        )  # fmt: skip
-        state = WorldState(start.joints[rows], start.wander[rows], start.shared)
-        found = adjust_in_world(data, state, held if rows.start == 0 else 0)
-        gathered = (gathered or Calibration.unknown()).later(found.calibration, 1.0, 0.0)
-        joints[rows] += fade[:, None, None] * found.joints
-        camera[rows] += fade[:, None] * _correction(found, telemetry)
-        wander[rows] += fade[:, None] * found.state.camera
-        covariance[rows] += fade[:, None, None, None] * found.covariance
-        total[rows] += fade
-        calibration.append(_calibration(found, config.stature_std, turn[rows], path[rows], fps))
-        cost = max(cost, found.cost_terms["telemetry"] / len(found.joints))
-        if rows in of_feet and fps >= _CONTACTS_FPS:
-            contact = min(contact, float(found.contact[:, : len(ANKLES)].mean() / ankles[rows].mean()))
-        measured &= bool(found.std[SCALE] < MEASURED * found.state.globals[SCALE])
-    total[total == 0.0] = 1.0  # no window holds the slots of a pause
-    covariance = (covariance / total[:, None, None, None])[slot][..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-    joints, camera = joints / total[:, None, None] + origin, camera / total[:, None]
-    corrected, moved = exp_so3(camera[slot, 3:]) @ rotation, position + camera[slot, :3]
-    if reason := _rejection(cost, contact):
-        return reason
-    last = Before(tracks.stamp_ns, joints[slot], (wander / total[:, None])[slot], found.state.globals)
-    return RefinedWorld(joints[slot], corrected, moved, measured, covariance, calibration, found.calibration, last)
+            keypoints=capture.points[rows],
+            weight=capture.weight[rows],
+            depth=capture.depth[rows],
+            depth_sigma=capture.depth_sigma[rows],
+            lengths=lengths,
+            telemetry=telemetry,
+            camera_matrix=scene.matrix,
+            config=scene.config,
+            seen=capture.seen[rows],
+            known=prior,
+            still=None if capture.still is None else capture.still[rows],
+        )
+        state = WorldState(joints[rows], wander[rows], scene.start.shared)
+        found = adjust_in_world(data, state, scene.held if rows.start == 0 else 0)
+        gathered = (gathered or Findings.unknown()).later(found.findings, 1.0, 0.0)
+        yield window, telemetry, found
 
 
-def _parts(stamp_ns: np.ndarray, slot: np.ndarray) -> list[slice]:
-    """Slots of the parts of a recording between its pauses, each of ``_LEAST_FRAMES`` images at least.
+class _Faded:
+    """Solutions of windows, faded into each other: joints, corrections of the camera, its wander, covariances."""
 
-    A pause is a time without images that exceeds the usual one by ``MAX_GAP_S``.  The even grid holds a second of it:
-    the camera would fly and turn through that second many times too fast.
-    """
-    step = np.diff(stamp_ns)
-    begins = [0]
-    for first in (np.flatnonzero(step > np.median(step) + MAX_GAP_S * 1e9) + 1).tolist():
-        if min(first - begins[-1], len(stamp_ns) - first) >= _LEAST_FRAMES:
-            begins.append(first)
-    ends = [*begins[1:], len(stamp_ns)]
-    return [slice(int(slot[begin]), int(slot[end - 1]) + 1) for begin, end in zip(begins, ends, strict=True)]
+    def __init__(self, slots: int) -> None:
+        shapes = (JOINTS, 3), (CAMERA,), (CAMERA,), (JOINTS, 3, 3)
+        self._sums = [np.zeros((slots, *shape)) for shape in shapes]
+        self._weight = np.zeros(slots)
+
+    def add(self, window: CaptureWindow, found: WorldSolution, telemetry: CameraTelemetry) -> None:
+        values = found.joints, _correction(found, telemetry), found.state.camera, found.covariance
+        for total, value in zip(self._sums, values, strict=True):
+            total[window.rows] += _per_frame(window.fade, value) * value
+        self._weight[window.rows] += window.fade
+
+    def mean(self) -> list[np.ndarray]:
+        weight = np.where(self._weight == 0.0, 1.0, self._weight)  # no window holds the slots of a pause
+        return [total / _per_frame(weight, total) for total in self._sums]
 
 
-def _windows(part: slice) -> list[tuple[slice, np.ndarray]]:
-    """Windows of a part, in slots of the recording, and the weights by which they fade into each other."""
-    frames = part.stop - part.start
-    return [
-        (slice(part.start + rows.start, part.start + rows.stop), fade_weights(rows, frames, _OVERLAP))
-        for rows in windows(frames, _WINDOW, _OVERLAP)
-    ]
+class _Facts:
+    """What the windows of a recording say about its telemetry."""
+
+    def __init__(self) -> None:
+        self.calibration: list[dict[str, Any]] = []
+        self.metric = True
+        self._cost, self._contact = 0.0, 1.0
+
+    def add(self, window: CaptureWindow, found: WorldSolution, telemetry: CameraTelemetry, stature_std: float) -> None:
+        contact = float(found.contact[:, : len(ANKLES)].mean())
+        self.calibration.append(_calibration(found, contact, stature_std, telemetry))
+        self.metric &= bool(found.std[SCALE] < MEASURED * found.state.globals[SCALE])
+        self._cost = max(self._cost, found.cost_terms["telemetry"] / len(found.joints))
+        if window.tells and telemetry.fps >= _CONTACTS_FPS:
+            self._contact = min(self._contact, contact / window.ankles_seen)
+
+    def refusal(self) -> Refusal | None:
+        if not self._cost <= _LARGEST_COST:
+            return Refusal(Why.POSITION_JUMPS)
+        return Refusal(Why.NO_FOOT_RESTS) if self._contact < _LEAST_CONTACT else None
+
+
+def _per_frame(weight: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Weights (F,) with as many axes as the values (F, ...)."""
+    return weight.reshape(-1, *(1,) * (values.ndim - 1))
 
 
 def _held_pelvis(before: Before, stamp_ns: int) -> np.ndarray:
@@ -270,17 +279,6 @@ def _start(
     return Before(stamp_ns, joints, wander, shared), _HELD
 
 
-def _rejection(cost: float, contact: float) -> str:
-    if not cost <= _LARGEST_COST:
-        return "the camera's position jumps as no camera flies; check the log's time and its frame"
-    if contact < _LEAST_CONTACT:
-        return (
-            "no foot of the body ever rests on its path in the world; check that the log belongs to the video, its "
-            "time offset and the gimbal's yaw (or the person glides)"
-        )
-    return ""
-
-
 def _correction(found: WorldSolution, telemetry: CameraTelemetry) -> np.ndarray:
     """(F, 6) corrections of the reported position (m) and rotation (rad, camera axes)."""
     shared, state = found.state.globals, found.state
@@ -291,9 +289,11 @@ def _correction(found: WorldSolution, telemetry: CameraTelemetry) -> np.ndarray:
 
 
 def _calibration(
-    found: WorldSolution, stature_std: float, rotation: np.ndarray, position: np.ndarray, fps: float
+    found: WorldSolution, contact: float, stature_std: float, telemetry: CameraTelemetry
 ) -> dict[str, Any]:
+    """JSON-compatible: errors of the telemetry and their standard deviations; share of the time with contact."""
     shared, std = found.state.globals, found.std
+    rotation, position, fps = telemetry.rotation, telemetry.position, telemetry.fps
     still_s = [(stop.stop - stop.start) / fps for stop in stops(rotation, position, fps)]
     return {
         "scale": 1.0 / float(shared[SCALE]),
@@ -306,37 +306,10 @@ def _calibration(
         "position_latency_s": -float(shared[POSITION_LATENCY]),
         "position_latency_std_s": float(std[POSITION_LATENCY]),
         "ground_spread_m": None if np.isnan(found.ground_spread) else found.ground_spread,
-        "contact_share": float(found.contact[:, : len(ANKLES)].mean()),
+        "contact_share": contact,
         "camera_moves": bool(np.ptp(position, axis=0).max() > 0),
         "camera_stops_s": max(still_s, default=0.0),
         "camera_jumps_m": jump_m(position, fps),
         "iterations": found.iterations,
         "stop_reason": found.stop_reason,
     }
-
-
-def _points(keypoints: Keypoints2D, image: np.ndarray) -> np.ndarray:
-    """(F, 17, 2) px; joints that are not seen, as toes by many networks, stand where the lifter expects them."""
-    return np.where(keypoints.seen[..., None], keypoints.xy, image)
-
-
-def _weights(keypoints: Keypoints2D, image_sigma: np.ndarray) -> np.ndarray:
-    """(F, 17) 1/px^2; without a covariance the noise comes from the third difference in time.
-
-    Errors of 2D joints last for some frames, which halves their differences.
-    """
-    xy, variance = keypoints.xy, keypoints.variance
-    square = np.full(xy.shape[:2], max(2 * difference_noise(xy), _LEAST_NOISE_PX) ** 2)
-    if variance is not None:
-        square = np.where(np.isfinite(variance), np.maximum(variance, _LEAST_NOISE_PX**2), square)
-    weights = np.clip(keypoints.weights, 0.0, 1.0) / square
-    return np.where(keypoints.seen, weights, _GUESS_WEIGHT / np.square(np.maximum(image_sigma, _LEAST_NOISE_PX)))
-
-
-def _at_all_slots(values: np.ndarray, slot: np.ndarray) -> np.ndarray:
-    """Values (F, ...) at their slots, interpolated at the empty ones."""
-    if slot[-1] + 1 == len(slot):
-        return values
-    flat, at = values.reshape(len(values), -1), np.arange(slot[-1] + 1)
-    out = np.stack([np.interp(at, slot, column) for column in flat.T], axis=1)
-    return out.reshape(-1, *values.shape[1:])

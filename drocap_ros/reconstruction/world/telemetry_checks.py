@@ -1,4 +1,4 @@
-"""Reasons, in words, why the telemetry cannot belong to the images; "" = none is found."""
+"""Reasons why the telemetry cannot belong to the images; None = none is found."""
 
 from __future__ import annotations
 
@@ -7,29 +7,45 @@ import numpy as np
 from drocap_ros.contacts import ANKLES, LOOKS_AT_REST, PLACED_REST_M_S, rest_likelihood
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.geometry.rotations import log_so3
+from drocap_ros.reconstruction.common.refusal import Refusal, Why
 from drocap_ros.skeleton import BODY_15
 
-#: A moving camera whose pose stays the same for so long, to the rounding of its interpolation, has no new measurement.
-_FROZEN_S, _MOVING_M_S, _SAME = 1.0, 0.2, 1e-9
-#: A vehicle stops and starts more slowly than this.
+#: Time (s) for which the pose of a moving camera stays the same without a new measurement: reports come more often.
+_FROZEN_S = 1.0
+#: Median speed (m/s) of a camera that moves: a hover drifts more slowly.
+_MOVING_M_S = 0.2
+#: Change (m, or of a rotation's elements) of poses that are the same: the rounding of their interpolation.
+_SAME = 1e-9
+#: A vehicle stops and starts more slowly than this (m/s^2): gravity, by a tilt of 45 degrees.
 _STOP_M_S2 = 10.0
-#: Times within which no gimbal turns by so much and stands still, or turns evenly, before and after: 0 = one frame.
-#: Simulated orbits at 15 frames per second reach 5.3 degrees in both.
+#: Times (s) within which no gimbal turns by so much (degrees) and stands still, or turns evenly, before and after; 0 =
+#: one frame.  Simulated orbits at 15 frames per second reach 5.3 degrees in both.
 _TURNS_S_DEG = ((0.0, 10.0), (0.12, 12.0))
-#: Change of the turn rate of a gimbal: what one frame of a low rate may hold.
+#: Change of the turn rate of a gimbal (degrees/s^2): what one frame of a low rate may hold.
 _TURN_DEG_S2 = 500.0
-#: A position that changes by more within this time, and moves evenly before and after, jumps.
-_JUMP_S, _JUMP_M = 0.12, 0.5
-#: Height (m per m) of the image's lower border above its centre, from which a camera is upside down.
+#: A position that changes by more (m) within this time (s), and moves evenly before and after, jumps: two images, of
+#: which one is between two states; resets of an estimator are larger.
+_JUMP_S = 0.12
+_JUMP_M = 0.5
+#: Height (m per m) of the image's lower border above its centre, from which a camera is upside down: no orbit's tilt.
 _UPSIDE_DOWN = 0.2
-_SHIFTS_S, _SHIFT_STEP_S = 3.0, 0.5
-_LAG_S, _SMOOTHING_S, _STILL_M = 0.4, 0.06, 0.06
-#: Share of still feet at another time over that at the reported time, and its least value.
-_CLEARLY_BETTER, _LEAST_SHARE = 1.8, 0.06
+#: Errors (s) of a log's time that are tried, and their step: half a step of walking.
+_SHIFTS_S = 3.0
+_SHIFT_STEP_S = 0.5
+#: Time (s) in which a foot on the ground stays, and over which placed feet are averaged; error (m) of their places.
+_LAG_S = 0.4
+_SMOOTHING_S = 0.06
+_STILL_M = 0.06
+#: Share of still feet at another time over that at the reported time, and its least value: a judgement.
+_CLEARLY_BETTER = 1.8
+_LEAST_SHARE = 0.06
 #: Feet at rest on a true path are slower than the others by this factor.
 _RESTING_RATIO = 0.7
-#: Share of the time in which a foot has to look at rest, and the times between which its speed is taken.
-_RESTING_SHARE, _RESTING_LAG_S, _RESTING_SMOOTHING_S = 0.05, 0.33, 0.08
+#: Share of the time in which a foot has to look at rest, time (s) between the ends of its way, and over which placed
+#: feet are averaged for it.
+_RESTING_SHARE = 0.05
+_RESTING_LAG_S = 0.33
+_RESTING_SMOOTHING_S = 0.08
 
 
 def stops(rotation: np.ndarray, position: np.ndarray, fps: float) -> list[slice]:
@@ -41,7 +57,7 @@ def stops(rotation: np.ndarray, position: np.ndarray, fps: float) -> list[slice]
     return [slice(begin, end) for begin, end in true_runs(same).tolist() if end - begin >= _FROZEN_S * fps]
 
 
-def frozen(rotation: np.ndarray, position: np.ndarray, fps: float) -> str:
+def frozen(rotation: np.ndarray, position: np.ndarray, fps: float) -> Refusal | None:
     """Whether the poses (F, 3, 3), (F, 3) m stop, or go on, at once: a vehicle that stops slows down before."""
     from scipy.ndimage import maximum_filter1d
 
@@ -54,11 +70,11 @@ def frozen(rotation: np.ndarray, position: np.ndarray, fps: float) -> str:
         if max(beside[stop.start], beside[stop.stop - 1]) > _STOP_M_S2 / fps
     ]
     if not at_once:
-        return ""
-    return f"the camera's reported pose stops at once, for {max(at_once):.1f} s; check the log for gaps"
+        return None
+    return Refusal(Why.FROZEN, max(at_once))
 
 
-def turned_at_once(rotation: np.ndarray, fps: float) -> str:
+def turned_at_once(rotation: np.ndarray, fps: float) -> Refusal | None:
     """Whether rotations (F, 3, 3) jump: a turn that differs from those before and after as no gimbal's does."""
     for within_s, least_deg in _TURNS_S_DEG:
         lag = max(round(within_s * fps), 1)
@@ -66,8 +82,8 @@ def turned_at_once(rotation: np.ndarray, fps: float) -> str:
         differs = np.linalg.norm(turn[lag:] - turn[:-lag], axis=1)
         jump = np.degrees(np.minimum(differs[:-lag], differs[lag:]).max(initial=0.0))
         if jump > max(least_deg, _TURN_DEG_S2 * (lag / fps) ** 2):
-            return f"the camera's reported rotation jumps by {jump:.0f} deg; check the gimbal's yaw in the log"
-    return ""
+            return Refusal(Why.TURNED_AT_ONCE, float(jump))
+    return None
 
 
 def jump_m(position: np.ndarray, fps: float) -> float:
@@ -79,12 +95,12 @@ def jump_m(position: np.ndarray, fps: float) -> float:
     return jump if jump > max(_JUMP_M, _STOP_M_S2 * (lag / fps) ** 2) else 0.0
 
 
-def upside_down(joints: np.ndarray, rotation: np.ndarray) -> str:
+def upside_down(joints: np.ndarray, rotation: np.ndarray) -> Refusal | None:
     """Whether camera (F, 3, 3) and person (F, P, 3) m both stand on their heads: a log whose z points down."""
     trunk = joints[:, BODY_15.index("neck"), 2] - joints[:, BODY_15.index("pelvis"), 2]
     if not (np.median(rotation[:, 1, 2]) > _UPSIDE_DOWN and np.median(trunk) < 0.0):
-        return ""
-    return "camera and person are upside down; check that the log's axes are east, north and up"
+        return None
+    return Refusal(Why.UPSIDE_DOWN)
 
 
 def unchanged(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
@@ -94,28 +110,26 @@ def unchanged(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
     return same
 
 
-def stopped(rotation: np.ndarray, position: np.ndarray, stamp_ns: np.ndarray) -> str:
+def stopped(rotation: np.ndarray, position: np.ndarray, stamp_ns: np.ndarray) -> Refusal | None:
     """Whether the newest poses of a camera that has moved before stay the same: no report of a flight does that."""
     changes = np.flatnonzero(~unchanged(rotation, position))
     since = int(changes[-1]) + 1 if len(changes) else 0
     still_s = float(stamp_ns[-1] - stamp_ns[since]) * 1e-9
-    return f"the camera's reported pose has stopped for {still_s:.1f} s; check the link" if still_s >= _FROZEN_S else ""
+    return Refusal(Why.STOPPED, still_s) if still_s >= _FROZEN_S else None
 
 
-def other_time(joints: np.ndarray, rotation: np.ndarray, position: np.ndarray, fps: float) -> str:
+def other_time(joints: np.ndarray, rotation: np.ndarray, position: np.ndarray, fps: float) -> Refusal | None:
     """Whether the feet of joints (F, 17, 3) m, placed by the poses, rest more often with poses of another time."""
     seen = (joints[:, ANKLES] - position[:, None]) @ np.swapaxes(rotation, 1, 2)
     shifts = np.arange(-_SHIFTS_S, _SHIFTS_S + 1e-9, _SHIFT_STEP_S)
     share = np.array([_still_share(seen, rotation, position, round(shift * fps), fps) for shift in shifts])
     best, own = int(share.argmax()), float(share[len(shifts) // 2])
     if share[best] < max(_CLEARLY_BETTER * own, _LEAST_SHARE):
-        return ""
-    return (
-        f"the feet rest more with poses {shifts[best]:+.1f} s later; check the log's time offset (or the person glides)"
-    )
+        return None
+    return Refusal(Why.OTHER_TIME, float(shifts[best]))
 
 
-def resting_feet_move(joints: np.ndarray, still: np.ndarray, fps: float) -> str:
+def resting_feet_move(joints: np.ndarray, still: np.ndarray, fps: float) -> Refusal | None:
     """Whether feet that look at rest move on their path in the world.
 
     joints : (F, 17, 3) m in the world; still : (F, 2) the network's probability that the right and the left foot rest
@@ -124,20 +138,17 @@ def resting_feet_move(joints: np.ndarray, still: np.ndarray, fps: float) -> str:
 
     lag = max(round(_RESTING_LAG_S * fps), 1)
     if len(joints) <= 2 * lag:
-        return ""
+        return None
     feet = gaussian_filter1d(joints[:, ANKLES], _RESTING_SMOOTHING_S * fps, axis=0, mode="nearest")
     speed = np.linalg.norm(feet[lag:] - feet[:-lag], axis=-1) * fps / lag
     rests = still[lag // 2 :][: len(speed)]
     weight = np.where(rests > LOOKS_AT_REST, rests, 0.0)
     if weight.mean() < _RESTING_SHARE:
-        return ""
+        return None
     resting, moving = _median(speed, weight), _median(speed, np.where(rests > LOOKS_AT_REST, 0.0, 1.0 - rests))
     if not (resting > PLACED_REST_M_S and resting > _RESTING_RATIO * moving):
-        return ""
-    return (
-        f"feet that look at rest move at {resting:.1f} m/s on their path; check that the log belongs to the video and "
-        "is not frozen (or the person glides: skates, lift)"
-    )
+        return None
+    return Refusal(Why.RESTING_FEET_MOVE, resting)
 
 
 def _median(values: np.ndarray, weights: np.ndarray) -> float:

@@ -17,7 +17,7 @@ from drocap_ros.contacts import ANKLES, FEET, HEIGHT_STD_M, MOVING, MOVING_LOCKE
 from drocap_ros.reconstruction.common.banded import backward, band_factor, forward
 from drocap_ros.reconstruction.common.line_search import search_line
 from drocap_ros.reconstruction.common.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
-from drocap_ros.reconstruction.world.calibration import Calibration
+from drocap_ros.reconstruction.world.findings import Findings
 from drocap_ros.reconstruction.world.posterior import posterior
 from drocap_ros.reconstruction.world.world_equations import normal_matrix
 from drocap_ros.reconstruction.world.world_model import (
@@ -61,7 +61,7 @@ class WorldSolution:
     turned, turned_std : (3,) rad about the gimbal's axes: pitch, yaw, roll
     covariance : (F, 17, 3, 3) m^2 of the joints, NaN = unknown
     ground_spread : m, of the heights of resting feet; NaN = no foot rests
-    calibration : findings of this adjustment's measurements, without those known before
+    findings : of this adjustment's measurements, without those known before
     """
 
     joints: np.ndarray
@@ -72,7 +72,7 @@ class WorldSolution:
     turned_std: np.ndarray
     covariance: np.ndarray
     ground_spread: float
-    calibration: Calibration
+    findings: Findings
     cost_terms: dict[str, float]
     iterations: int
     stop_reason: str
@@ -178,7 +178,7 @@ def _solution(final: WorldResiduals, ground: float, iterations: int, stop_reason
     axes = data.telemetry.gimbal_axes()
     std, turned_std = np.full(GLOBALS, np.nan), np.full(3, np.nan)
     covariance = np.full((*state.joints.shape, 3), np.nan)
-    calibration = Calibration.unknown()
+    findings = Findings.unknown()
     if found is not None:
         prior = np.sqrt(fact * np.diag(np.linalg.inv(weights.shared)))
         std = np.minimum(_STD_FACTOR * np.sqrt(fact * np.diag(found.shared)), prior)
@@ -186,7 +186,7 @@ def _solution(final: WorldResiduals, ground: float, iterations: int, stop_reason
         turns = _STD_FACTOR**2 * fact * axes @ found.shared[MISALIGNMENT, MISALIGNMENT] @ axes.T
         least = fact * axes @ np.linalg.inv(weights.shared[MISALIGNMENT, MISALIGNMENT]) @ axes.T
         turned_std = np.sqrt(np.minimum(np.diag(turns), np.diag(least)))
-        calibration = _findings(fact * found.shared, weights.shared / fact, weights.expected, state.globals)
+        findings = _findings(fact * found.shared, weights.shared / fact, weights.expected, state.globals)
     return WorldSolution(
         joints=state.joints / state.globals[SCALE],
         state=state,
@@ -196,7 +196,7 @@ def _solution(final: WorldResiduals, ground: float, iterations: int, stop_reason
         turned_std=turned_std,
         covariance=covariance,
         ground_spread=ground,
-        calibration=calibration,
+        findings=findings,
         cost_terms=final.terms,
         iterations=iterations,
         stop_reason=stop_reason,
@@ -217,7 +217,7 @@ def _floor_std(spread: float) -> float:
     return max(_LEVEL_M, HEIGHT_STD_M * (spread / _STEPS_M) ** 2)
 
 
-def _findings(covariance: np.ndarray, prior: np.ndarray, expected: np.ndarray, at: np.ndarray) -> Calibration:
+def _findings(covariance: np.ndarray, prior: np.ndarray, expected: np.ndarray, at: np.ndarray) -> Findings:
     """What the measurements add to the prior, from the posterior covariance and point of the shared unknowns."""
     by_log = np.ones(GLOBALS)
     by_log[SCALE] = at[SCALE]
@@ -225,7 +225,7 @@ def _findings(covariance: np.ndarray, prior: np.ndarray, expected: np.ndarray, a
     point[SCALE] = np.log(at[SCALE])
     after = np.linalg.inv((covariance / by_log / by_log[:, None])[CALIBRATED, CALIBRATED])
     before = prior[CALIBRATED, CALIBRATED]
-    return Calibration(
+    return Findings(
         (after - before) / _STD_FACTOR**2,
         (after @ point[CALIBRATED] - before @ expected[CALIBRATED]) / _STD_FACTOR**2,
     )

@@ -13,8 +13,8 @@ import numpy as np
 from drocap_ros.parameters import Parameters, param
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.lifted.adjustment import SPAN_STD_MM, SPANS
-from drocap_ros.reconstruction.world.calibration import Calibration
 from drocap_ros.reconstruction.world.camera_telemetry import CameraPath, CameraTelemetry
+from drocap_ros.reconstruction.world.findings import Findings
 from drocap_ros.skeleton import BODY_15, BODY_17
 
 JOINTS = len(BODY_17)
@@ -32,7 +32,7 @@ MISALIGNMENT = slice(SCALE + 1, SCALE + 4)
 ATTITUDE_LATENCY = MISALIGNMENT.stop
 POSITION_LATENCY = ATTITUDE_LATENCY + 1
 GLOBALS = POSITION_LATENCY + 1
-#: The unknowns of a :class:`~drocap_ros.reconstruction.world.calibration.Calibration`.
+#: The unknowns of a :class:`~drocap_ros.reconstruction.world.findings.Findings`.
 CALIBRATED = slice(SCALE, GLOBALS)
 
 
@@ -103,6 +103,25 @@ def world_config(adjuster: BundleAdjusterConfig) -> WorldConfig:
 
 
 @dataclass(frozen=True)
+class PlacedPoses:
+    """Input of the refinement: F frames.
+
+    joints : (F, 17, 3) m in the world; factor : their scale over that of the assumed stature
+    depth, depth_sigma : (F, 17) m at the assumed stature: depth behind the pelvis and its expected error
+    image, image_sigma : (F, 17, 2), (F, 17) px: place in the image and its expected error
+    still : (F, 2) probability that the right and the left foot rest in the world, None = unknown
+    """
+
+    joints: np.ndarray
+    factor: float
+    depth: np.ndarray
+    depth_sigma: np.ndarray
+    image: np.ndarray
+    image_sigma: np.ndarray
+    still: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
 class WorldInput:
     """What is measured and assumed, of evenly spaced frames.
 
@@ -124,7 +143,7 @@ class WorldInput:
     camera_matrix: np.ndarray
     config: WorldConfig = field(default_factory=WorldConfig)
     seen: np.ndarray | None = None
-    known: Calibration | None = None
+    known: Findings | None = None
     still: np.ndarray | None = None
 
     @property

@@ -14,9 +14,9 @@ from drocap_ros.evaluation.metrics import scale_error
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.reconstruction.world import refine
-from drocap_ros.reconstruction.world.calibration_words import telemetry_words
+from drocap_ros.reconstruction.world import even_capture
 from drocap_ros.reconstruction.world.telemetry_checks import frozen, jump_m, turned_at_once
+from drocap_ros.reconstruction.world.telemetry_words import telemetry_words
 from drocap_ros.report.checks import MotionCheck, Severity, run_checks
 from drocap_ros.report.statistics import motion_statistics
 from drocap_ros.skeleton import BODY_17
@@ -53,7 +53,7 @@ def test_a_log_that_stops_at_once_is_frozen(part: slice) -> None:
     rotation, position = orbit(RATE * np.arange(240) / FPS, np.zeros((240, 2)))
     at = np.arange(240)
     at[part] = part.start
-    assert "stops at once" in frozen(rotation[at], position[at], FPS)
+    assert "stops at once" in str(frozen(rotation[at], position[at], FPS))
 
 
 def test_a_camera_that_stands_still_for_some_time_is_mentioned() -> None:
@@ -88,7 +88,7 @@ def test_a_yaw_that_jumps_is_noticed_and_quick_turns_are_not(fps: float) -> None
     spike = np.where(np.arange(frames) == frames // 2, 15.0, 0.0)
     slower = np.interp(time, [4.0, 4.1], [0.0, 15.0])
     for values in (jump, spike, slower):
-        assert "jumps by" in turned_at_once(turned(rotation, values), fps)
+        assert "jumps by" in str(turned_at_once(turned(rotation, values), fps))
 
 
 def turned(rotation: np.ndarray, yaw_deg: np.ndarray) -> np.ndarray:
@@ -98,7 +98,7 @@ def turned(rotation: np.ndarray, yaw_deg: np.ndarray) -> np.ndarray:
 
 def test_one_good_window_does_not_excuse_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """The yaw goes astray slowly in the last third: its feet alone tell."""
-    monkeypatch.setattr(refine, "_WINDOW", 120)
+    monkeypatch.setattr(even_capture, "_WINDOW", 120)
     seen = tracks(walker(300))
     assert seen.camera_rotation is not None
     astray = np.interp(np.arange(300), [200, 224], [0.0, 60.0])

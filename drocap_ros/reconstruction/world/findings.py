@@ -9,16 +9,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-#: Number of unknowns.
-COUNT = 6
-#: Relative standard deviation of the scale below which it counts as measured.
+#: Number of unknowns: scale, misalignment (3), latencies of attitude and position.
+_COUNT = 6
+#: Relative standard deviation of the scale below which it counts as measured: half of that among people.
 MEASURED = 0.03
-#: Time after which findings count a third: telemetry drifts, and errors of the poses do not average out.
+#: Time (s) after which findings count a third: telemetry drifts, and errors of the poses do not average out.
 _MEMORY_S = 60.0
 
 
-class Calibration(NamedTuple):
-    """Findings of the measurements alone: precision (6, 6) and vector (6,); zeros = nothing is known.
+class Findings(NamedTuple):
+    """Of the measurements alone: precision (6, 6) and vector (6,); zeros = nothing is known.
 
     The unknowns are the logarithm of the scale, the misalignment (3) rad, the latencies of attitude and position s.
     """
@@ -27,13 +27,13 @@ class Calibration(NamedTuple):
     vector: np.ndarray
 
     @staticmethod
-    def unknown() -> Calibration:
+    def unknown() -> Findings:
         """Nothing is known."""
-        return Calibration(np.zeros((COUNT, COUNT)), np.zeros(COUNT))
+        return Findings(np.zeros((_COUNT, _COUNT)), np.zeros(_COUNT))
 
-    def later(self, found: Calibration, share: float, passed_s: float) -> Calibration:
+    def later(self, found: Findings, share: float, passed_s: float) -> Findings:
         """Findings ``passed_s`` later, with a share of those of a window: its frames that the next one has not."""
         decay = float(np.exp(-passed_s / _MEMORY_S))
-        return Calibration(
+        return Findings(
             decay * (self.precision + share * found.precision), decay * (self.vector + share * found.vector)
         )

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from drocap_ros.reconstruction.world.calibration import MEASURED
+from drocap_ros.reconstruction.world.findings import MEASURED
 
 #: Standard deviations from zero at which a correction is stated.
 _CLEAR = 2.0
