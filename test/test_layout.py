@@ -29,7 +29,7 @@ BUDGETS = {
      "stamps", "tracks", "motion", "mocap", "clip", "contacts", "api", "config", "pipeline",
      "live_replay"): 3.2,  # the history of the camera, the stamps and the contacts came down from reconstruction
     ("perception",): 5.2,
-    ("reconstruction",): 7.4,
+    ("reconstruction",): 7.6,
     ("flight",): 8.6,  # the autopilots stand beside what they replace until preflight and link are smaller
     ("recording",): 4.9,
     ("simulation",): 3.6,
