@@ -15,9 +15,8 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.stop_reason import NO_WINDOW
-from drocap_ros.reconstruction.live.effort import Effort
 from drocap_ros.reconstruction.live.replay import LivePose, live_poses
-from drocap_ros.reconstruction.live.window import AdjustedWindow
+from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort
 from drocap_ros.reconstruction.reconstruct import reprojection_px
 from drocap_ros.recording.pose_messages import read_observations
 from drocap_ros.recording.provenance import CONFIGURATION

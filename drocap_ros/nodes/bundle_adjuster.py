@@ -24,13 +24,11 @@ from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.live.adjuster import SOLVER_ERRORS, LiveAdjuster
-from drocap_ros.reconstruction.live.effort import Effort, EffortControl
-from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer
+from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer, StampJoin
 from drocap_ros.reconstruction.live.latest_place import LatestPlace
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
-from drocap_ros.reconstruction.live.stamp_join import StampJoin
 from drocap_ros.reconstruction.live.stream_order import StreamEvent
-from drocap_ros.reconstruction.live.window import AdjustedWindow, Telemetry, Window
+from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort, EffortControl, TelemetryUse, Window
 from drocap_ros.recording.pose_messages import add_calibration, add_state, float_array
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import (
@@ -47,11 +45,11 @@ from drocap_ros.skeleton import BODY_15, BODY_17
 _SKELETONS = (BODY_15.name, BODY_17.name)
 #: Words of the use of telemetry.
 _WORDS = {
-    Telemetry.NONE: "",
-    Telemetry.LATE: "poses in the camera's frame: the newest images have no reported camera pose",
-    Telemetry.REFUSED: "poses in the camera's frame, telemetry not used: {}",
-    Telemetry.UNSCALED: "poses in the camera's frame: the camera's motion has not measured the scale yet",
-    Telemetry.USED: "poses in the world",
+    TelemetryUse.NONE: "",
+    TelemetryUse.LATE: "poses in the camera's frame: the newest images have no reported camera pose",
+    TelemetryUse.REFUSED: "poses in the camera's frame, telemetry not used: {}",
+    TelemetryUse.UNSCALED: "poses in the camera's frame: the camera's motion has not measured the scale yet",
+    TelemetryUse.USED: "poses in the world",
 }
 
 
@@ -241,11 +239,11 @@ class BundleAdjusterNode(ComponentNode):
 
     def _report_telemetry(self, window: AdjustedWindow, done: str) -> None:
         use, reason = window.telemetry, window.reason
-        if use is Telemetry.NONE and self._uncalibrated:
-            use, reason = Telemetry.REFUSED, self._uncalibrated
+        if use is TelemetryUse.NONE and self._uncalibrated:
+            use, reason = TelemetryUse.REFUSED, self._uncalibrated
         self.details[Key.TELEMETRY] = use.name.lower()
         self.details[Key.TELEMETRY_REFUSED] = reason
-        self._had_telemetry |= use is Telemetry.USED
+        self._had_telemetry |= use is TelemetryUse.USED
         words = _WORDS[use].format(reason)
-        refused = use is Telemetry.REFUSED or (self._had_telemetry and use in (Telemetry.NONE, Telemetry.LATE))
+        refused = use is TelemetryUse.REFUSED or (self._had_telemetry and use in (TelemetryUse.NONE, TelemetryUse.LATE))
         self.report(WARN if refused else OK, f"{done}; {words}" if words else done)

@@ -56,9 +56,6 @@ class InitializerConfig(Parameters):
 class BundleAdjusterConfig(Parameters):
     """Bundle adjustment: the paper's equations (2) to (4), the default method and the live node."""
 
-    method: str = param(
-        "ba", "the live node's method: the default method, or the paper's equations", choices=("ba", "paper")
-    )
     lifter: str = param("", "the default method's lifter, an ONNX file; empty for the shipped one")
     limb_iterations_first: int = param(
         3, "steps of the default method that find the bone lengths", minimum=0, maximum=1000

@@ -18,12 +18,9 @@ from drocap_ros.reconstruction.lifted.body_size import BodySize, magnification
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig, lifted_config
 from drocap_ros.reconstruction.lifted.method import WindowSolution, prepare, solve_window
 from drocap_ros.reconstruction.lifted.window_solver import Cancelled
-from drocap_ros.reconstruction.live.effort import Effort
-from drocap_ros.reconstruction.live.paper_adjustment import adjust_by_equations
 from drocap_ros.reconstruction.live.stream_lifter import person_size
-from drocap_ros.reconstruction.live.window import AdjustedWindow, Window
+from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort, Window
 from drocap_ros.reconstruction.live.world_windows import WorldWindows
-from drocap_ros.reconstruction.paper.bundle_adjustment import MIN_WINDOW
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS
 from drocap_ros.skeleton import BODY_15
 
@@ -35,17 +32,15 @@ WARM_FRAMES = 72
 
 
 class LiveAdjuster:
-    """Adjusts one window after the other by ``config.method``.
+    """Adjusts one window after the other by the default method.
 
-    "ba": the default method; bone lengths and size in the image of the last window start the next one, while the
-    subject and the pass of time are the same.  "paper": equations (2) to (4) from the initial poses; kept so that
-    the paper's method runs live too.
+    Bone lengths and size in the image of the last window start the next one, while the subject and the pass of time
+    are the same.
     """
 
     def __init__(self, config: BundleAdjusterConfig) -> None:
-        if config.method == "ba":
-            # An invalid lifter file is refused here, and the first window does not pay for loading.
-            prepare(lifted_config(config))
+        # An invalid lifter file is refused here, and the first window does not pay for loading.
+        prepare(lifted_config(config))
         self._config = config
         self._known: tuple[int, np.ndarray, BodySize] | None = None
         self._world = WorldWindows(config)
@@ -71,8 +66,6 @@ class LiveAdjuster:
         keypoints = with_own_legs(part.keypoints, part.stamp_ns, person_size(part.keypoints.xy))
         part = part._replace(keypoints=keypoints)
         with blas_threads(self._config.threads):
-            if self._config.method == "paper" or len(part.stamp_ns) < MIN_WINDOW:
-                return replace(adjust_by_equations(part, self._config), effort=effort)
             return self._by_default(part, effort, cancelled)
 
     def _by_default(self, w: Window, effort: Effort, cancelled: Cancelled | None) -> AdjustedWindow:

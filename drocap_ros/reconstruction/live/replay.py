@@ -16,10 +16,9 @@ from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.live.adjuster import SOLVER_ERRORS, LiveAdjuster
-from drocap_ros.reconstruction.live.effort import Effort
 from drocap_ros.reconstruction.live.frame_buffer import FrameBuffer
 from drocap_ros.reconstruction.live.initializer import InitialPose, LiveInitializer
-from drocap_ros.reconstruction.live.window import AdjustedWindow
+from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort
 from drocap_ros.stamps import StampValidator
 
 

@@ -1,4 +1,4 @@
-"""A live window before and after its adjustment."""
+"""A live window before and after its adjustment, and the work that one may cost: a late node takes fewer images."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ import numpy as np
 
 from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.live.effort import Effort
+
+#: Share of the allowed time above which the next window gets coarser: a tenth is left for its spread.
+_TOO_LONG = 0.9
+#: Share of the allowed time that a finer window has to stay below: half of the other, so that strides do not alternate.
+_SHORT = 0.45
 
 
 class Window(NamedTuple):
@@ -39,7 +43,39 @@ class Window(NamedTuple):
         return Window(self.stamp_ns[use], self.keypoints[use], self.initial_joints[use], self.subject, camera)
 
 
-class Telemetry(Enum):
+@dataclass(frozen=True)
+class Effort:
+    """Every ``stride``-th image, counted from the newest.
+
+    steps : limits of the first and of the final adjustment of the default method; None = the configured ones
+    """
+
+    stride: int = 1
+    steps: tuple[int, int] | None = None
+
+
+class EffortControl:
+    """Chooses the stride of the next window from the duration of the last adjustment.
+
+    Parameters
+    ----------
+    allowed_s : for one adjustment
+    max_stride : the coarsest
+    """
+
+    def __init__(self, allowed_s: float, max_stride: int) -> None:
+        self._allowed_s, self._max_stride = allowed_s, max_stride
+        self.stride = 1
+
+    def record(self, seconds: float) -> None:
+        """Record the duration of an adjustment with the present stride."""
+        if seconds > _TOO_LONG * self._allowed_s:
+            self.stride = min(self.stride + 1, self._max_stride)
+        elif self.stride > 1 and seconds * self.stride / (self.stride - 1) < _SHORT * self._allowed_s:
+            self.stride -= 1
+
+
+class TelemetryUse(Enum):
     """Use of the camera's reported poses in a window.
 
     NONE : there are none; LATE : the newest images have none, or too few have one; REFUSED : they cannot be true;
@@ -70,8 +106,6 @@ class InMap(NamedTuple):
 class AdjustedWindow:
     """Poses of a window: joints3d (F, 17, 3) m and covariance (F, 17, 6) m^2.
 
-    By the paper's equations 15 joints from initial poses of 15 joints, as older recordings hold.
-
     They are in camera axes with the pelvis at the origin, or, where ``in_map`` is known, in ``map`` (ENU) and metric;
     then only the frames with a result there are in the window.
 
@@ -89,6 +123,6 @@ class AdjustedWindow:
     stop_reason: str
     cost_terms: dict[str, float]
     effort: Effort = field(default_factory=Effort)
-    telemetry: Telemetry = Telemetry.NONE
+    telemetry: TelemetryUse = TelemetryUse.NONE
     reason: str = ""
     in_map: InMap | None = None

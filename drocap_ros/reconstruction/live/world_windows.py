@@ -17,7 +17,7 @@ from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.common.refusal import Refusal
 from drocap_ros.reconstruction.lifted.method import WindowSolution
-from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, Telemetry, Window
+from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, TelemetryUse, Window
 from drocap_ros.reconstruction.world.findings import Findings
 from drocap_ros.reconstruction.world.in_world import in_world
 from drocap_ros.reconstruction.world.placement import metres_per_px
@@ -59,7 +59,7 @@ class WorldWindows:
         if w.subject != self._subject:
             self._subject, self._known, self._before = w.subject, Findings.unknown(), None
         result = self._adjust(w, found, camera_result)
-        self.trusted = result.telemetry in (Telemetry.USED, Telemetry.UNSCALED)
+        self.trusted = result.telemetry in (TelemetryUse.USED, TelemetryUse.UNSCALED)
         return result
 
     def _adjust(self, w: Window, found: WindowSolution, camera_result: AdjustedWindow) -> AdjustedWindow:
@@ -67,7 +67,7 @@ class WorldWindows:
             return camera_result
         use = self._frames(w)
         if use is None:
-            return replace(camera_result, telemetry=Telemetry.LATE)
+            return replace(camera_result, telemetry=TelemetryUse.LATE)
         camera, stamps, keypoints = w.camera.frames(use), w.stamp_ns[use], w.keypoints[use]
         self._moved |= not unchanged(camera.rotation, camera.position).all()
         if self._moved and (refusal := stopped(camera.rotation, camera.position, stamps)):
@@ -85,12 +85,12 @@ class WorldWindows:
         config = self._config if before is None else replace(self._config, iterations=_FEWER_STEPS)
         _, refined = in_world(tracks, keypoints, poses, per_px, config, known, before)
         if refined is None:
-            return replace(camera_result, telemetry=Telemetry.LATE)
+            return replace(camera_result, telemetry=TelemetryUse.LATE)
         if isinstance(refined, Refusal):
             return self._refused(camera_result, refined)
         self._known, self._before = known, (refined.before, refined.found)
         if not refined.metric:
-            return replace(camera_result, telemetry=Telemetry.UNSCALED)
+            return replace(camera_result, telemetry=TelemetryUse.UNSCALED)
         return replace(
             camera_result,
             stamp_ns=stamps,
@@ -98,13 +98,13 @@ class WorldWindows:
             covariance=refined.covariance,
             confidence=camera_result.confidence[use],
             reprojection_rms_px=camera_result.reprojection_rms_px[use],
-            telemetry=Telemetry.USED,
+            telemetry=TelemetryUse.USED,
             in_map=InMap(refined.rotation, refined.position, _correction(refined, tracks)),
         )
 
     def _refused(self, camera_result: AdjustedWindow, refusal: Refusal) -> AdjustedWindow:
         self._before = None
-        return replace(camera_result, telemetry=Telemetry.REFUSED, reason=str(refusal))
+        return replace(camera_result, telemetry=TelemetryUse.REFUSED, reason=str(refusal))
 
     def _prior(self, stamps: np.ndarray) -> Findings:
         """Findings of earlier windows that the window of these stamps has not itself."""

@@ -20,7 +20,7 @@ from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, Initia
 from drocap_ros.reconstruction.live.latest_place import LatestPlace
 from drocap_ros.reconstruction.live.latest_pose import LatestPose, median_bone_lengths
 from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
-from drocap_ros.reconstruction.live.window import Telemetry
+from drocap_ros.reconstruction.live.window import TelemetryUse
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.tracks import Tracks
 
@@ -71,10 +71,10 @@ def test_windows_with_telemetry_are_in_map_and_as_near_the_truth_as_offline() ->
     windows = windows_of(followed())
     use = [w.window.telemetry for w in windows]
     # Too short at first, then without a measured scale.
-    assert use[0] is Telemetry.LATE
-    first = use.index(Telemetry.USED)
+    assert use[0] is TelemetryUse.LATE
+    first = use.index(TelemetryUse.USED)
     assert first < 12
-    assert set(use[first:]) == {Telemetry.USED}
+    assert set(use[first:]) == {TelemetryUse.USED}
     found = [w for w in windows if w.window.in_map is not None]
     for w in found:
         assert w.window.in_map is not None
@@ -129,21 +129,21 @@ def test_findings_are_carried_from_window_to_window() -> None:
         replace(o, keypoints=p.astype(np.float32)) for o, p in zip(still.observations, image + noise, strict=True)
     ]
     use = [w.window.telemetry for w in windows_of(run(stream, camera_at, SELDOM))]
-    assert use[-1] is Telemetry.USED
+    assert use[-1] is TelemetryUse.USED
     # Without the orbit before, the same last seconds measure no scale.
     alone = [w.window.telemetry for w in windows_of(run(stream[stop:], camera_at, SELDOM))]
-    assert Telemetry.USED not in alone
-    assert alone[-1] is Telemetry.UNSCALED
+    assert TelemetryUse.USED not in alone
+    assert alone[-1] is TelemetryUse.UNSCALED
 
 
 def test_windows_fall_back_to_the_camera_when_telemetry_stops() -> None:
     history = flown().history(slice(0, round(10.0 * FPS)), keep_s=60.0)
     windows = windows_of(run(flown().observations, history.along))
     use = {round(float(w.window.stamp_ns[-1] / S), 1): w.window for w in windows}
-    assert use[9.3].telemetry is Telemetry.USED
+    assert use[9.3].telemetry is TelemetryUse.USED
     for last in (11.3, 12.3):
         w = use[last]
-        assert w.telemetry is Telemetry.LATE
+        assert w.telemetry is TelemetryUse.LATE
         assert w.in_map is None
         # Camera axes, pelvis at the origin, all images of the window.
         assert np.abs(w.joints3d[:, 0]).max() < 1e-9
@@ -167,7 +167,7 @@ def test_wrong_telemetry_is_refused_and_bends_no_body(kind: str) -> None:
     history = replace(true, rotation=rotation, position=position).history(keep_s=60.0)
     windows = windows_of(run(true.observations, history.along, SELDOM))
     last = windows[-1].window
-    assert last.telemetry is Telemetry.REFUSED
+    assert last.telemetry is TelemetryUse.REFUSED
     assert last.in_map is None
     assert {"yaw": "foot", "frozen": "stopped", "other time": "feet"}[kind] in last.reason
     # The poses are those of a graph without telemetry.
@@ -185,8 +185,8 @@ def test_poses_that_stop_are_refused_even_when_no_window_remembers_the_motion() 
     history = replace(true, rotation=rotation, position=position).history(keep_s=60.0)
     # A standing person looks like one who turns: her feet do not tell.
     use = [w.window.telemetry for w in windows_of(run(true.observations, history.along))]
-    assert Telemetry.USED in use[:7]
-    assert set(use[8:]) == {Telemetry.REFUSED}
+    assert TelemetryUse.USED in use[:7]
+    assert set(use[8:]) == {TelemetryUse.REFUSED}
 
 
 def test_another_subject_starts_without_the_findings_of_the_first() -> None:
