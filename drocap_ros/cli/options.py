@@ -8,7 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
 from drocap_ros.errors import InputError
 
@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 _NAMESPACE = re.compile(r"/|/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 #: Every random generator takes it.
 _LARGEST_SEED = 2**32 - 1
+
+
+#: Where a command adds its parser.
+Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 class LineParser(argparse.ArgumentParser):
@@ -50,10 +54,10 @@ class LineParser(argparse.ArgumentParser):
 
 
 def add_command(
-    subparsers: Any, name: str, run: Callable[[argparse.Namespace], int], *, help: str, description: str
+    subparsers: Subparsers, name: str, run: Callable[[argparse.Namespace], int], *, help: str, description: str
 ) -> argparse.ArgumentParser:
     """Parser of a command with its action."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(name, help=help, description=description)
+    parser = subparsers.add_parser(name, help=help, description=description)
     parser.set_defaults(run=run)
     return parser
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drocap_ros.cli.atomic_output import check_output_file, output_file
-from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
+from drocap_ros.cli.graph.common import add_domain_option, chosen_domain
 from drocap_ros.cli.options import ros_namespace
 from drocap_ros.cli.progress import progress_bars
 from drocap_ros.errors import InputError

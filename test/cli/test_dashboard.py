@@ -1,6 +1,6 @@
 from types import SimpleNamespace
 
-from drocap_ros.cli.graph.dashboard import Dashboard
+from drocap_ros.cli.graph.top import Dashboard
 
 
 def status(name, level, text, **values):

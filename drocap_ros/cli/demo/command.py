@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from drocap_ros.cli.options import add_seed_option
+from drocap_ros.cli.options import Subparsers, add_command, add_quiet_option, add_seed_option
+from drocap_ros.cli.progress import progress_bars
 from drocap_ros.cli.signals import interruptible
 
 if TYPE_CHECKING:
@@ -23,10 +25,12 @@ MOUNTS = ("gimbal", "servo", "fixed")
 _LEAST_S, _MOST_S = 2.0, 3600.0
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's options; ``run`` is its action."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "demo",
+        run,
         help="fly a capture in simulation, reconstruct it, compare with the truth",
         description="A simulated drone takes off and films a simulated person; the real nodes see the person in the"
         " images and fly the orbit by their keypoints. Record it, reconstruct it, and print the errors against the"
@@ -36,23 +40,26 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("--seconds", metavar="S", type=float, default=30.0, help="length of the orbit (default 30)")
     add_seed_option(parser, "of person, wind and scenery", metavar="N")
     parser.add_argument(
-        "--autopilot", choices=("ardupilot", "px4"), default="ardupilot", help="which one is simulated (default"
-        " ardupilot)",
-    )  # fmt: skip
+        "--autopilot",
+        choices=("ardupilot", "px4"),
+        default="ardupilot",
+        help="which one is simulated (default ardupilot)",
+    )
     parser.add_argument(
-        "--mount", choices=MOUNTS, default="gimbal", help="of the simulated camera (default gimbal); a fixed one is"
-        " tilted for the orbit",
-    )  # fmt: skip
+        "--mount",
+        choices=MOUNTS,
+        default="gimbal",
+        help="of the simulated camera (default gimbal); a fixed one is tilted for the orbit",
+    )
     parser.add_argument(
         "--models", metavar="DIR", default=MODELS, help="folder of ONNX models instead of those for simulation"
     )
     parser.add_argument(
-        "--real-time", action="store_true", help="fly as fast as the clock, each node in a process of its own: a busy"
-        " machine is late",
-    )  # fmt: skip
-    parser.add_argument("--quiet", action="store_true", help="print only the result")
-    parser.set_defaults(run=run)
-    return parser
+        "--real-time",
+        action="store_true",
+        help="fly as fast as the clock, each node in a process of its own: a busy machine is late",
+    )
+    add_quiet_option(parser, "print only the result")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -77,7 +84,9 @@ def run(args: argparse.Namespace) -> int:
         fly = fly_in_simulated_time
         if args.real_time:
             config, fly = with_link(config), fly_in_real_time
-        how = fly(config, operator, _silent if args.quiet else _say, interrupted)
+        # On a terminal only: the bars would take the remarks out of a pipe.
+        with progress_bars(args.quiet or not sys.stdout.isatty()) as progress:
+            how = fly(config, operator, _silent if args.quiet else _say, progress, interrupted)
         check_flown(operator)
         truth = load_flight_truth(folder / "truth.npz")
         with open_session(folder / "session") as session:
@@ -113,16 +122,24 @@ def demo_config(folder: Path, seed: int, autopilot: str, models: str, mount: str
     from drocap_ros.config import DrocapConfig
 
     config = DrocapConfig().replace(
-        "flight_simulator", autopilot=autopilot, seed=seed, mount=mount, truth_file=str(folder / "truth.npz"),
-    )  # fmt: skip
+        "flight_simulator",
+        autopilot=autopilot,
+        seed=seed,
+        mount=mount,
+        truth_file=str(folder / "truth.npz"),
+    )
     if mount == "fixed":  # it leans into the wind: with the gimbal's lens the bridge refuses this orbit
         config = config.replace("flight_simulator", horizontal_fov_deg=75.0)
     config = config.replace(
-        "mavlink_bridge", commands_enabled=True, mode_change_allowed=True,
-        gimbal_control=mount != "fixed", body_height_m=config.flight_simulator.stature_m, attitude_hz=25.0,
+        "mavlink_bridge",
+        commands_enabled=True,
+        mode_change_allowed=True,
+        gimbal_control=mount != "fixed",
+        body_height_m=config.flight_simulator.stature_m,
+        attitude_hz=25.0,
         mount="auto" if mount == "gimbal" else mount,
         camera_pitch_deg=config.flight_simulator.camera_pitch_deg if mount == "fixed" else 0.0,
-    )  # fmt: skip
+    )
     # The stature is known, as an operator would ask for it before a flight.
     config = config.replace("initializer", assumed_height_m=config.flight_simulator.stature_m)
     # Another processor than the CPU would give other last bits.
@@ -141,15 +158,16 @@ def with_link(config: DrocapConfig) -> DrocapConfig:
 
 def _reconstruct(folder: Path, config: DrocapConfig, args: argparse.Namespace) -> Motion:
     """Motion of the recorded session, saved with its images and report."""
-    from drocap_ros.cli.progress import progress_bars
     from drocap_ros.motion import save_motion
     from drocap_ros.pipeline import reconstruct_input
     from drocap_ros.report.page import save_report
 
     with progress_bars(args.quiet) as progress:
         motion, _ = reconstruct_input(folder / "session", method="ba", config=config, progress=progress)
-    save_motion(folder / "motion.npz", motion)
-    save_report(folder / "report.html", motion, video=folder / "session", command=args.command_line)
+        save_motion(folder / "motion.npz", motion)
+        progress("report", -1.0)
+        save_report(folder / "report.html", motion, video=folder / "session", command=args.command_line)
+        progress("report", 1.0)
     return motion
 
 

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drocap_ros.cli.demo.operator import REST_S, Operator
-from drocap_ros.cli.graph.live import import_bringup
+from drocap_ros.cli.graph.common import import_bringup
+from drocap_ros.cli.progress import Progress
 from drocap_ros.errors import NodeError
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 
@@ -33,7 +34,9 @@ NODES = (
 Say = Callable[[float, str], None]
 
 
-def fly_in_simulated_time(config: DrocapConfig, operator: Operator, say: Say, interrupted: threading.Event) -> str:
+def fly_in_simulated_time(
+    config: DrocapConfig, operator: Operator, say: Say, progress: Progress, interrupted: threading.Event
+) -> str:
     """Fly until the operator is done: the same seed gives the same flight on any machine.
 
     Returns a sentence about the machine.
@@ -52,15 +55,15 @@ def fly_in_simulated_time(config: DrocapConfig, operator: Operator, say: Say, in
         bridge = next(node for node in graph.components if node.component == "mavlink_bridge")
         _Desk(graph.node, operator, bridge.requests.call, say, lambda: graph.now_s)
         graph.start()
-        graph.run_until(lambda: operator.over or interrupted.is_set(), _longest_s(operator), "the end of the flight")
-        if interrupted.is_set():
-            raise KeyboardInterrupt
+        graph.run_until(_over(operator, progress, interrupted), _longest_s(operator), "the end of the flight")
         if operator.failure:
             graph.run_for(REST_S)  # for the hold after the operator's last command
         return f"simulated time: {graph.now_s:.1f} s in {time.monotonic() - begin_s:.1f} s on this machine"
 
 
-def fly_in_real_time(config: DrocapConfig, operator: Operator, say: Say, interrupted: threading.Event) -> str:
+def fly_in_real_time(
+    config: DrocapConfig, operator: Operator, say: Say, progress: Progress, interrupted: threading.Event
+) -> str:
     """Fly in real time, each node in a process: this machine's speed decides how late the images are.
 
     Arguments, result and errors are those of :func:`fly_in_simulated_time`.
@@ -72,9 +75,7 @@ def fly_in_real_time(config: DrocapConfig, operator: Operator, say: Say, interru
         begin_s = time.monotonic()
         _Desk(graph.node, operator, client.call_async, say, lambda: time.monotonic() - begin_s)
         before = {name: _processor_s(graph.pid(name)) for name in NODES}
-        graph.wait_until(lambda: operator.over or interrupted.is_set(), _longest_s(operator), "the end of the flight")
-        if interrupted.is_set():
-            raise KeyboardInterrupt
+        graph.wait_until(_over(operator, progress, interrupted), _longest_s(operator), "the end of the flight")
         if operator.failure:
             graph.spin_for(REST_S)  # for the hold after the operator's last command
         passed_s = time.monotonic() - begin_s
@@ -96,6 +97,18 @@ def check_flown(operator: Operator) -> None:
         raise NodeError(
             f"demo: expected {operator.seconds:g} s of orbit, flew {operator.orbited_s:.1f} s: {why} ({busy})"
         )
+
+
+def _over(operator: Operator, progress: Progress, interrupted: threading.Event) -> Callable[[], bool]:
+    """Whether the flight has ended; shows how much of the orbit is flown, and raises the user's interruption."""
+
+    def over() -> bool:
+        if interrupted.is_set():
+            raise KeyboardInterrupt
+        progress("orbit", min(1.0, operator.orbited_s / operator.seconds))
+        return operator.over
+
+    return over
 
 
 def _longest_s(operator: Operator) -> float:

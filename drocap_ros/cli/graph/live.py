@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import sys
 import time
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from drocap_ros.cli.graph.dashboard import dashboard_of
-from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
-from drocap_ros.cli.options import ros_namespace
+from drocap_ros.cli.graph.common import add_start_options, chosen_domain, import_bringup
+from drocap_ros.cli.graph.top import dashboard_of
+from drocap_ros.cli.options import Subparsers, add_command
 from drocap_ros.cli.signals import stop_signals
-from drocap_ros.errors import InputError
 from drocap_ros.recording.mcap.metadata import METADATA_FILE
 from drocap_ros.recording.provenance import dated_name
 
@@ -22,10 +19,12 @@ if TYPE_CHECKING:
     from drocap_ros.config import DrocapConfig
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's options; ``run`` is its action."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "live",
+        run,
         help="bring the graph up on real hardware",
         description="Start the nodes and run until the source ends or Ctrl-C. Each in a process of its own.",
     )
@@ -38,20 +37,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument(
         "--nodes", nargs="+", metavar="NODE", help="names of nodes (default: image_ingest to session_recorder)"
     )
-    add_graph_options(parser)
+    add_run_options(parser)
+
+
+def add_run_options(parser: argparse.ArgumentParser) -> None:
+    """Options of :func:`run_graph`."""
+    add_start_options(parser)
     parser.add_argument("--no-respawn", action="store_true", help="end when a node dies instead of restarting it")
-    parser.set_defaults(run=run)
-    return parser
-
-
-def add_graph_options(parser: argparse.ArgumentParser) -> None:
-    """Options of every command that starts nodes."""
-    parser.add_argument("--namespace", type=ros_namespace, default="/drocap", help="of all topics (default /drocap)")
-    add_domain_option(parser)
-    parser.add_argument(
-        "--one-process", action="store_true", help="all nodes in this process, a thread each: for tests"
-    )
-    parser.add_argument("--quiet", action="store_true", help="no status line, only errors")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -113,11 +105,3 @@ def _session_folders(first: Path) -> set[Path]:
     """Finished sessions of a recorder: a restarted one takes the next free name."""
     folders = [first, *first.parent.glob(f"{first.name}_[0-9]*")]
     return {folder for folder in folders if (folder / METADATA_FILE).is_file()}
-
-
-def import_bringup() -> ModuleType:
-    """The module that imports ROS, or an InputError where ROS is missing."""
-    try:
-        return importlib.import_module("drocap_ros.bringup")
-    except ImportError as error:
-        raise InputError(f"expected ROS 2 with drocap_ros's messages, found none ({error}); run `make setup`") from None

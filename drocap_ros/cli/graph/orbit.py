@@ -8,19 +8,20 @@ import math
 import time
 from typing import Any
 
-from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
-from drocap_ros.cli.graph.live import import_bringup
-from drocap_ros.cli.options import ros_namespace
+from drocap_ros.cli.graph.common import add_place_options, chosen_domain, import_bringup
+from drocap_ros.cli.options import Subparsers, add_command
 from drocap_ros.errors import InputError
 
 #: Parameter of the orbit behind each option: its range is checked here, its limits by the bridge.
 _PARAMETERS = {"--radius": "radius_m", "--height": "height_m", "--speed": "angular_speed_deg_s"}
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's options; ``run`` is its action."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "orbit",
+        run,
         help="start, adjust or stop the orbit of a running graph, or print its status",
         description="Send a command to the mavlink_bridge of a running graph and print the answer. Exit status 1 when "
         "the command is refused. `start` needs the vehicle in GUIDED or OFFBOARD already; `engage` requests that mode "
@@ -32,10 +33,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser.add_argument("--height", metavar="M", type=float, help="m, above the subject's ground")
     parser.add_argument("--speed", metavar="DEG_S", type=float, help="deg/s, positive = counter-clockwise from above")
     parser.add_argument("--timeout", metavar="S", type=float, default=10.0, help="to wait for an answer (default 10)")
-    parser.add_argument("--namespace", type=ros_namespace, default="/drocap", help="of all topics (default /drocap)")
-    add_domain_option(parser)
-    parser.set_defaults(run=run)
-    return parser
+    add_place_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:

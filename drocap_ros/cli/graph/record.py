@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-from drocap_ros.cli.graph.live import add_graph_options, run_graph
+from drocap_ros.cli.graph.live import add_run_options, run_graph
+from drocap_ros.cli.options import Subparsers, add_command
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's options; ``run`` is its action."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "record",
+        run,
         help="record a running graph",
         description="Record the topics of a running graph to a rosbag2 session (MCAP) until Ctrl-C.",
     )
     parser.add_argument("--out", metavar="DIR", type=Path, help="new folder of the session (default: named by date)")
     parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
-    add_graph_options(parser)
-    parser.add_argument("--no-respawn", action="store_true", help="end when a node dies instead of restarting it")
-    parser.set_defaults(run=run)
-    return parser
+    add_run_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:

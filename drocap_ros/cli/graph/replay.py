@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-from drocap_ros.cli.graph.domain import chosen_domain
-from drocap_ros.cli.graph.live import add_graph_options, import_bringup
+from drocap_ros.cli.graph.common import add_start_options, chosen_domain, import_bringup
+from drocap_ros.cli.options import Subparsers, add_command
 from drocap_ros.cli.signals import stop_signals
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's options; ``run`` is its action."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "replay",
+        run,
         help="publish a session's topics again",
         description="Publish the topics of a session again, with /clock, at the speed of the recording.",
     )
@@ -37,9 +38,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="names, or their ends, e.g. pose2d (default: all but /diagnostics and /clock)",
     )
     parser.add_argument("--no-clock", action="store_true", help="do not publish /clock")
-    add_graph_options(parser)
-    parser.set_defaults(run=run)
-    return parser
+    add_start_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:

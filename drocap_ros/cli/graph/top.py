@@ -1,42 +1,105 @@
-"""``drocap top``: the diagnostics of a running graph."""
+"""``drocap top``: the diagnostics of a running graph as a table."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
-import time
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
-from drocap_ros.cli.graph.dashboard import dashboard_of
-from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
-from drocap_ros.cli.graph.live import import_bringup
-from drocap_ros.cli.options import ros_namespace
+from drocap_ros.cli.graph.common import add_place_options, chosen_domain, import_bringup
+from drocap_ros.cli.options import Subparsers, add_command
 from drocap_ros.cli.signals import stop_signals
+from drocap_ros.ros.diagnostics import Key, number, words
 
-#: How long ``--once`` waits for a first status, and then at most for further nodes.
+if TYPE_CHECKING:
+    from diagnostic_msgs.msg import DiagnosticArray
+    from rich.table import Table
+
+    from drocap_ros.bringup import Graph
+
+#: How long ``--once`` waits for a first status, and then at most for further nodes: discovery may take seconds.
 ONCE_TIMEOUT_S = 8.0
 #: All nodes have been heard when for so long none was new; each publishes its status once a second.
 _QUIET_S = 1.5
+#: A pipe has no width: wide enough that no name is cut.
+_PIPE_WIDTH = 180
+#: Words and colours of the levels of diagnostic_msgs/DiagnosticStatus.
+_LEVELS = {0: ("ok", "green"), 1: ("warning", "yellow"), 2: ("error", "red"), 3: ("stale", "magenta")}
+_LATENCY = (Key.LATENCY_P50, Key.LATENCY_P95, Key.LATENCY_P99)
+_SHOWN = (Key.SUBJECT, Key.LAST_REFUSED)
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+class Dashboard:
+    """Latest ``/diagnostics`` status of each node."""
+
+    def __init__(self) -> None:
+        self._rows: dict[str, tuple[int, str, dict[str, str]]] = {}
+
+    def take(self, message: DiagnosticArray) -> None:
+        """Store the statuses of a diagnostic_msgs/DiagnosticArray."""
+        for status in message.status:
+            values = {value.key: value.value for value in status.values}
+            # rclpy gives the level as one byte.
+            level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+            self._rows[status.name] = (level, status.message, values)
+
+    def heard(self, namespace: str) -> list[str]:
+        """Names of the nodes whose status has arrived, in a namespace."""
+        inside = f"{namespace.strip('/')}/" if namespace else ""
+        return sorted(name for name in self._rows if name.startswith(inside))
+
+    def table(self, namespace: str = "") -> Table:
+        """Table of the nodes whose status has arrived, in a namespace."""
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table("node", "state", "Hz", "latency, ms (p50 / p95 / p99)", "status", "counts", expand=True)
+        for name in self.heard(namespace):
+            level, text, values = self._rows[name]
+            counts = ", ".join(
+                f"{words(key)} {value}" for key, value in values.items() if value.isdigit() or key in _SHOWN
+            )
+            state, colour = _LEVELS.get(level, (str(level), "white"))
+            latency = " / ".join(f"{number(values[key]):.0f}" for key in _LATENCY if key in values)
+            # As Text: words of nodes, and of messages that they refused, may hold brackets, which are markup.
+            shown, rate, status, amounts = map(Text, (name, values.get(Key.RATE, ""), text, counts))
+            table.add_row(shown, Text(state, colour), rate, latency, status, amounts)
+        return table
+
+
+@contextlib.contextmanager
+def dashboard_of(graph: Graph, show: bool) -> Iterator[tuple[Dashboard, Callable[[], None]]]:
+    """Dashboard of the graph's ``/diagnostics``, and the function that draws it: not in a pipe or without ``show``."""
+    from drocap_ros.ros.topics import TOPICS
+
+    dashboard, entry = Dashboard(), TOPICS["/diagnostics"]
+    graph.node.create_subscription(entry.message, "/diagnostics", dashboard.take, entry.qos)
+    if not show or not sys.stdout.isatty():
+        yield dashboard, lambda: None
+        return
+    from rich.live import Live
+
+    with Live(dashboard.table(graph.namespace), auto_refresh=False) as live:
+        yield dashboard, lambda: live.update(dashboard.table(graph.namespace), refresh=True)
+
+
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's options; ``run`` is its action."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "top",
+        run,
         help="dashboard of a running graph",
         description="Show state, rate, latency and counts of every node of a running graph until Ctrl-C.",
     )
-    parser.add_argument("--namespace", type=ros_namespace, default="/drocap", help="of the graph (default /drocap)")
-    add_domain_option(parser)
+    add_place_options(parser)
     parser.add_argument("--once", action="store_true", help="print the table once and end")
-    parser.set_defaults(run=run)
-    return parser
 
 
 def run(args: argparse.Namespace) -> int:
     """Subscribe and draw; status 1 with ``--once`` when no status arrived."""
-    from rich.console import Console
-
     domain_id = chosen_domain(args)
     with (
         import_bringup().watch(args.namespace, domain_id) as graph,
@@ -44,26 +107,31 @@ def run(args: argparse.Namespace) -> int:
         stop_signals() as stop,
     ):
         if args.once:
-            # Discovery may take seconds, for one node longer than for another.
-            end_s = time.monotonic() + ONCE_TIMEOUT_S
-            while not dashboard.heard(args.namespace) and time.monotonic() < end_s and not stop.is_set():
-                graph.spin_for(0.2, stop)
-            known: list[str] = []
-            end_s = time.monotonic() + ONCE_TIMEOUT_S
-            while dashboard.heard(args.namespace) != known and time.monotonic() < end_s and not stop.is_set():
-                known = dashboard.heard(args.namespace)
-                graph.spin_for(_QUIET_S, stop)
-            if not known:
-                print(
-                    f"drocap: expected the status of a node in {args.namespace}, domain {domain_id}, found none; start"
-                    " the graph, or correct --namespace or --domain-id",
-                    file=sys.stderr,
-                )
-                return 1
-            # A pipe has no width: wide enough that no name is cut.
-            Console(width=None if sys.stdout.isatty() else 180).print(dashboard.table(args.namespace))
-            return 0
+            return _print_once(graph, dashboard, stop.is_set)
         while not stop.is_set():
             graph.spin_for(0.5, stop)
             draw()
+    return 0
+
+
+def _print_once(graph: Graph, dashboard: Dashboard, stopped: Callable[[], bool]) -> int:
+    namespace = graph.namespace
+    graph.wait(lambda: bool(dashboard.heard(namespace)) or stopped(), ONCE_TIMEOUT_S)
+    known: list[str] = []
+
+    def all_heard() -> bool:
+        before, known[:] = known.copy(), dashboard.heard(namespace)
+        return stopped() or known == before or graph.wait(stopped, _QUIET_S)
+
+    graph.wait(all_heard, ONCE_TIMEOUT_S)
+    if not known:
+        print(
+            f"drocap: expected the status of a node in {namespace}, domain {graph.domain_id}, found none; start"
+            " the graph, or correct --namespace or --domain-id",
+            file=sys.stderr,
+        )
+        return 1
+    from rich.console import Console
+
+    Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH).print(dashboard.table(namespace))
     return 0

@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drocap_ros.cli.atomic_output import output_file
-from drocap_ros.cli.graph.domain import add_domain_option, chosen_domain
-from drocap_ros.cli.graph.live import import_bringup
-from drocap_ros.cli.options import read_motion, ros_namespace
+from drocap_ros.cli.graph.common import add_domain_option, chosen_domain, import_bringup
+from drocap_ros.cli.options import Subparsers, add_command, read_motion, ros_namespace
 from drocap_ros.cli.progress import progress_bars
 from drocap_ros.cli.signals import interruptible, stop_signals
 from drocap_ros.errors import InputError
@@ -33,10 +32,12 @@ PORT = 9090
 LIVE_PICTURE_HZ = 10.0
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's options; ``run`` is its action."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "view",
+        run,
         help="a motion, a recording or a running graph in 3D",
         description="Show a motion, a recording or a running graph in the Rerun viewer: body, uncertainty, camera and "
         "picture over the time of the images, delays and errors. In a window, or in a browser where there is no "
@@ -67,8 +68,6 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "--memory", default="1GB", help="of a viewer; beyond it the oldest data go (default 1GB; 25%% works too)"
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing")
-    parser.set_defaults(run=run)
-    return parser
 
 
 def run(args: argparse.Namespace) -> int:
@@ -96,18 +95,21 @@ def is_session(path: Path) -> bool:
 def _check(args: argparse.Namespace) -> None:
     if args.live or args.domain_id is not None:
         chosen_domain(args)
-    if args.live == (args.input is not None):
-        raise InputError(f"expected INPUT or --live, found {'both' if args.live else 'neither'}; name what to show")
-    if args.live and args.video is not None:
-        raise InputError("--video: expected a motion with it, found --live; leave it out")
-    if args.seconds is not None and not (args.live and args.seconds > 0):
-        raise InputError("--seconds: expected more than 0, and --live with it; correct or leave it out")
-    if args.save is not None and args.web:
-        raise InputError("expected --save or --web, found both; choose one")
-    if not 1 <= args.port <= 65534:
-        raise InputError(f"--port: expected 1 to 65534, got {args.port}; choose another")
-    if not re.fullmatch(r"[0-9]+(\.[0-9]+)?(%|[kKMGT]i?B)", args.memory):
-        raise InputError(f"--memory: expected an amount like 1GB or 25%, got {args.memory!r}; correct it")
+    refusals = {
+        f"expected INPUT or --live, found {'both' if args.live else 'neither'}; name what to show": args.live
+        == (args.input is not None),
+        "--video: expected a motion with it, found --live; leave it out": args.live and args.video is not None,
+        "--seconds: expected more than 0, and --live with it; correct or leave it out": args.seconds is not None
+        and not (args.live and args.seconds > 0),
+        "expected --save or --web, found both; choose one": args.save is not None and args.web,
+        f"--port: expected 1 to 65534, got {args.port}; choose another": not 1 <= args.port <= 65534,
+        f"--memory: expected an amount like 1GB or 25%, got {args.memory!r}; correct it": not re.fullmatch(
+            r"[0-9]+(\.[0-9]+)?(%|[kKMGT]i?B)", args.memory
+        ),
+    }
+    for words, refused in refusals.items():
+        if refused:
+            raise InputError(words)
 
 
 def _view_motion(recording: rerun.RecordingStream, args: argparse.Namespace) -> None:
