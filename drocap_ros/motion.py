@@ -66,6 +66,17 @@ def upright_joints(motion: Motion) -> np.ndarray:
     return np.asarray(motion.joints3d[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0]))
 
 
+#: Optical axes of a level camera that looks along y in axes with z up: x right, y away, z up -> x right, y down, z on.
+LEVEL_CAMERA = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+def upright_camera_rotation(motion: Motion) -> np.ndarray:
+    """(F, 3, 3) rows right, down, forward of the camera in the axes of :func:`upright_joints`."""
+    if motion.frame == "world":
+        return motion.camera_rotation
+    return np.broadcast_to(LEVEL_CAMERA, motion.camera_rotation.shape)
+
+
 def save_motion(path: str | Path, motion: Motion, **further: np.ndarray) -> None:
     """Write ``motion.npz``, an unknown covariance as NaN; :func:`load_motion` ignores ``further`` arrays."""
     if motion.camera_position is not None:

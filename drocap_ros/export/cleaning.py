@@ -17,8 +17,10 @@ from drocap_ros.skeleton import indices
 _TWICE = (np.sqrt(2.0) - 1.0) ** 0.25
 #: Time (s) over which the direction of a knee is averaged: as that of a foot's velocity (contacts.py).
 _AVERAGE_S = 0.15
-#: Time in which a foot leaves or reaches its place; farther than this from its median place it is not at rest, m.
-_FADE_S, _FARTHEST_M = 0.2, 0.08
+#: Time, s, in which a foot leaves or reaches its place.
+_FADE_S = 0.2
+#: Farther than this, m, from its median place a foot is not at rest.
+_FARTHEST_M = 0.08
 #: Change of a leg's half length per turn of its knee at which half of the turn is made; 0.07 is that of 8 degrees.
 _DAMPING = 0.07
 #: Distance of a knee from the line of its leg at which its direction counts as much as the moments around, m.

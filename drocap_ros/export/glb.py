@@ -18,7 +18,9 @@ from drocap_ros.export.rig import Rig, rig_of
 from drocap_ros.export.rigid_body import BODY
 from drocap_ros.export.take import Take, y_up
 
-_ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
+#: Codes of glTF 2.0: uses of a buffer, shapes and types of its elements.
+_ARRAY_BUFFER = 34962
+_ELEMENT_BUFFER = 34963
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _COMPONENTS = {"float32": 5126, "uint8": 5121, "uint16": 5123}
 #: Half width of a drawn bone, and its distance from the joint, as shares of the bone's length; a matter of taste.
@@ -158,7 +160,5 @@ def _container(document: dict[str, Any], data: bytes) -> bytes:
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     length = 12 + 8 + len(text) + 8 + len(data)
-    return b"".join(
-        [b"glTF", struct.pack("<II", 2, length), struct.pack("<I", len(text)), b"JSON", text,
-         struct.pack("<I", len(data)), b"BIN\0", data]
-    )  # fmt: skip
+    chunks = [struct.pack("<I", len(text)), b"JSON", text, struct.pack("<I", len(data)), b"BIN\0", data]
+    return b"".join([b"glTF", struct.pack("<II", 2, length), *chunks])

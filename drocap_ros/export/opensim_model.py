@@ -14,15 +14,16 @@ from drocap_ros.export.rigid_body import RigidBody
 from drocap_ros.skeleton import TOES
 
 _X, _Y, _Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
+#: A coordinate's name and the axis about or along which it moves.
+_Axis = tuple[str, tuple[float, ...]]
 _SIX = [(kind, i) for kind in ("rotation", "translation") for i in (1, 2, 3)]
 _LINEAR = '<LinearFunction name="function"><coefficients>1 0</coefficients></LinearFunction>'
 _ZERO = '<Constant name="function"><value>0</value></Constant>'
 #: Ranges of coordinates, degrees; inverse kinematics stays within them.
 _RANGES = {"knee_angle": (-5.0, 160.0), "elbow_flex": (-5.0, 160.0)}
 #: Weights in inverse kinematics, m^2 per rad^2, of coordinates that joint positions show badly or not at all.
-WEIGHTS = {
-    "lumbar_extension": 2.5e-3, "hip_rotation_r": 2e-4, "hip_rotation_l": 2e-4, "arm_rot_r": 2e-4, "arm_rot_l": 2e-4,
-}  # fmt: skip
+WEIGHTS = {"lumbar_extension": 2.5e-3}
+WEIGHTS |= dict.fromkeys(("hip_rotation_r", "hip_rotation_l", "arm_rot_r", "arm_rot_l"), 2e-4)
 
 
 def model_xml(body: RigidBody) -> str:
@@ -58,10 +59,9 @@ def _limbs(model: _Model, body: RigidBody, side: str, sign: int, shoulder: tuple
     if set(TOES) <= set(body.joints):
         model.segment(f"foot_{side}", tibia, shank, [(f"ankle_angle_{side}", _Z)])
         model.markers.append((side + "toe", f"foot_{side}", (body.lengths[side + "toe"], 0, 0)))
-    model.markers += [
-        (side + "hip", "pelvis", hip), (side + "knee", tibia, (0, 0, 0)), (side + "ankle", tibia, shank),
-        (side + "shoulder", "torso", shoulder), (side + "elbow", forearm, (0, 0, 0)), (side + "wrist", forearm, fore),
-    ]  # fmt: skip
+    model.markers += [(side + "hip", "pelvis", hip), (side + "knee", tibia, (0, 0, 0)), (side + "ankle", tibia, shank)]
+    model.markers += [(side + "shoulder", "torso", shoulder), (side + "elbow", forearm, (0, 0, 0))]
+    model.markers.append((side + "wrist", forearm, fore))
 
 
 class _Model:
@@ -77,8 +77,8 @@ class _Model:
         name: str,
         parent: str,
         place: tuple[float, ...],
-        turns: Sequence[tuple[str, tuple[float, ...]]],
-        moves: Sequence[tuple[str, tuple[float, ...]]] | None = None,
+        turns: Sequence[_Axis],
+        moves: Sequence[_Axis] | None = None,
     ) -> None:
         """Add a body and its joint at ``place`` of the parent ("": the ground): rotations in order, translations."""
         # Inverse kinematics needs no masses; the reader refuses bodies without.
@@ -86,15 +86,7 @@ class _Model:
             f'<Body name="{name}"><mass>1</mass><mass_center>0 0 0</mass_center>'
             "<inertia>0.01 0.01 0.01 0 0 0</inertia></Body>"
         )
-        # Rotations without a coordinate need axes too, not parallel to the others.
-        used = np.abs([axis for _, axis in turns])
-        fixed = [("", axis) for axis in (_Z, _X, _Y) if not (used @ axis).any()]
-        axes = [*turns, *fixed, *(moves or [("", axis) for axis in (_X, _Y, _Z)])]
-        transform = "".join(
-            f'<TransformAxis name="{kind}{i}"><coordinates>{coordinate}</coordinates><axis>{_numbers(axis)}</axis>'
-            f"{_LINEAR if coordinate else _ZERO}</TransformAxis>"
-            for (coordinate, axis), (kind, i) in zip(axes, _SIX, strict=True)
-        )
+        axes, transform = _transform(turns, moves)
         above = f"/bodyset/{parent}" if parent else "/ground"
         self.joints.append(
             f'<CustomJoint name="{name}_joint"><socket_parent_frame>{name}_place</socket_parent_frame>'
@@ -112,17 +104,27 @@ class _Model:
             f"<location>{_numbers(place)}</location></Marker>"
             for name, segment, place in self.markers
         )
+        parts = {"BodySet": "\n".join(self.bodies), "JointSet": "\n".join(self.joints), "MarkerSet": markers}
         sets = "\n".join(
-            f'<{kind} name="{kind.lower()}"><objects>\n{objects}\n</objects></{kind}>'
-            for kind, objects in (
-                ("BodySet", "\n".join(self.bodies)), ("JointSet", "\n".join(self.joints)), ("MarkerSet", markers),
-            )
-        )  # fmt: skip
+            f'<{kind} name="{kind.lower()}"><objects>\n{text}\n</objects></{kind}>' for kind, text in parts.items()
+        )
         return (
             '<?xml version="1.0" encoding="UTF-8" ?>\n<OpenSimDocument Version="40500"><Model name="drocap_ros">\n'
             "<credits>drocap_ros: plain skeleton in the sizes of one motion, without muscles</credits>\n"
             f"<length_units>meters</length_units><force_units>N</force_units>\n{sets}\n</Model></OpenSimDocument>\n"
         )
+
+
+def _transform(turns: Sequence[_Axis], moves: Sequence[_Axis] | None) -> tuple[list[_Axis], str]:
+    """The six axes of a joint, and their XML: rotations without a coordinate need axes too, not parallel to others."""
+    used = np.abs([axis for _, axis in turns])
+    fixed = [("", axis) for axis in (_Z, _X, _Y) if not (used @ axis).any()]
+    axes: list[_Axis] = [*turns, *fixed, *(moves or [("", axis) for axis in (_X, _Y, _Z)])]
+    return axes, "".join(
+        f'<TransformAxis name="{kind}{i}"><coordinates>{coordinate}</coordinates><axis>{_numbers(axis)}</axis>'
+        f"{_LINEAR if coordinate else _ZERO}</TransformAxis>"
+        for (coordinate, axis), (kind, i) in zip(axes, _SIX, strict=True)
+    )
 
 
 def _coordinate(name: str) -> str:

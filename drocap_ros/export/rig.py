@@ -38,11 +38,15 @@ NAMES = {
     "mixamo": {joint: "mixamorig:" + _MIXAMO.get(name, name) for joint, name in zip(BODY, _LAFAN1, strict=True)},
 }
 #: Assumed sizes as shares of the shank: the foot's length from below the ankle to the toes, the ankle's height.
-_FOOT, _SOLE = 0.45, 0.16
-#: Length of a hand as a share of the forearm; of what the head's joint is below the crown, of neck to head.
-_HAND, _CROWN = 0.7, 0.9
-#: Percentile of the lower foot's height that is the floor; a root that moves less than this stands still, m.
-_FLOOR_PERCENTILE, _STILL_M = 5.0, 1e-3
+_FOOT = 0.45
+_SOLE = 0.16
+#: Length of a hand as a share of the forearm; of what the head's joint is below the crown, of neck to head; assumed.
+_HAND = 0.7
+_CROWN = 0.9
+#: Percentile of the lower foot's height that is the floor: the lowest would be an error of one frame.
+_FLOOR_PERCENTILE = 5.0
+#: A root that moves less than this, m, stands still: it has no place in the world.
+_STILL_M = 1e-3
 
 
 @dataclass(frozen=True)
@@ -102,10 +106,9 @@ def rig_of(take: Take, *, names: str = "h36m", rest: str = "t") -> tuple[Rig, tu
     path = np.nanmax(pelvis, axis=0) - np.nanmin(pelvis, axis=0)
     lift, floor_note = _onto_the_floor(body, bool(path.max() > _STILL_M))
     rig = _rig(body, take.rate_hz, lift, NAMES[names], rest)
-    feet = (
-        () if set(TOES) <= set(body.joints) else ("no toes in the motion: each foot is assumed, square to its shank",)
-    )
-    return rig, (*notes, floor_note, *feet)
+    if not set(TOES) <= set(body.joints):
+        notes = (*notes, "no toes in the motion: each foot is assumed, square to its shank")
+    return rig, (*notes, floor_note)
 
 
 def body_of(take: Take) -> tuple[RigidBody, tuple[str, ...]]:
@@ -150,42 +153,46 @@ def _onto_the_floor(body: RigidBody, root_moves: bool) -> tuple[np.ndarray, str]
 
 
 def _rig(body: RigidBody, rate_hz: float, lift: np.ndarray, naming: dict[str, str], rest: str) -> Rig:
-    measured_toes = set(TOES) <= set(body.joints)
     offsets = _rest_offsets(body, RESTS[rest])
     turned = _rotations(body, offsets, rate_hz)
     # An assumed toe is a joint only where a naming is not complete without it.
-    dropped = {joint for joint in BODY if naming[joint] == ""}
-    if naming is NAMES["h36m"] and not measured_toes:
-        dropped |= set(TOES)
-    kept = [joint for joint in BODY if joint not in dropped]
-    parents = tuple(kept.index(PARENTS[joint]) if PARENTS[joint] else -1 for joint in kept)
+    assumed = TOES if naming is NAMES["h36m"] and not set(TOES) <= set(body.joints) else ()
+    kept = tuple(joint for joint in BODY if naming[joint] and joint not in assumed)
+    parents = (-1, *(kept.index(PARENTS[joint]) for joint in kept[1:]))
     positions = np.zeros((len(kept), 3))
-    for i, parent in enumerate(parents):
-        if parent >= 0:
-            positions[i] = positions[parent] + offsets[kept[i]]
+    for i, parent in enumerate(parents[1:], start=1):
+        positions[i] = positions[parent] + offsets[kept[i]]
     positions[:, 1] += _SOLE * body.lengths["lankle"] - positions[kept.index("lankle"), 1]
-    tips = {
-        "lwrist": _HAND * offsets["lwrist"], "rwrist": _HAND * offsets["rwrist"], "head": _CROWN * offsets["head"],
-        "ltoe": 0.25 * offsets["ltoe"] * (1, 0, 1), "rtoe": 0.25 * offsets["rtoe"] * (1, 0, 1),
-        "neck": (1 + _CROWN) * offsets["head"], "lankle": offsets["ltoe"], "rankle": offsets["rtoe"],
-    }  # fmt: skip
-    ends = {i: np.asarray(tips[joint]) for i, joint in enumerate(kept) if i not in parents}
-    root = body.positions[:, 0] + lift[:, None] * (0.0, 1.0, 0.0)
+    tips = _tips(offsets)
     return Rig(
-        tuple(naming[joint] for joint in kept),
-        tuple(kept), parents, positions, ends, root, tuple(turned[joint] for joint in kept),
-    )  # fmt: skip
+        names=tuple(naming[joint] for joint in kept),
+        joints=kept,
+        parents=parents,
+        rest=positions,
+        ends={i: tips[joint] for i, joint in enumerate(kept) if i not in parents},
+        root=body.positions[:, 0] + lift[:, None] * (0.0, 1.0, 0.0),
+        turned=tuple(turned[joint] for joint in kept),
+    )
+
+
+def _tips(offsets: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Joint that may end a chain -> (3,) end of its bone relative to it in the rest pose."""
+    tips = {"head": _CROWN * offsets["head"], "neck": (1 + _CROWN) * offsets["head"]}
+    for side in "lr":
+        tips[side + "wrist"] = _HAND * offsets[side + "wrist"]
+        tips[side + "ankle"] = offsets[side + "toe"]
+        tips[side + "toe"] = 0.25 * offsets[side + "toe"] * (1, 0, 1)
+    return tips
 
 
 def _rest_offsets(body: RigidBody, arms_down_deg: float) -> dict[str, np.ndarray]:
     """Offset of each joint of ``BODY`` from its parent in the rest pose."""
     cosine, sine = np.cos(np.radians(arms_down_deg)), np.sin(np.radians(arms_down_deg))
     toe = np.array([0.0, -_SOLE, _FOOT]) * 0.5 * (body.lengths["lankle"] + body.lengths["rankle"])
-    arm, down, up = (cosine, -sine, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)
-    directions = {
-        "knee": down, "ankle": down, "neck": up, "head": up, "shoulder": (1.0, 0.0, 0.0), "elbow": arm, "wrist": arm,
-        "toe": tuple(toe / np.linalg.norm(toe)),
-    }  # fmt: skip
+    directions = {"shoulder": (1.0, 0.0, 0.0), "toe": tuple(toe / np.linalg.norm(toe))}
+    directions |= dict.fromkeys(("knee", "ankle"), (0.0, -1.0, 0.0))
+    directions |= dict.fromkeys(("neck", "head"), (0.0, 1.0, 0.0))
+    directions |= dict.fromkeys(("elbow", "wrist"), (cosine, -sine, 0.0))
     out = {"pelvis": np.zeros(3), **body.fixed}
     for joint in set(BODY) - set(out):
         side = np.array([-1.0 if joint.startswith("r") else 1.0, 1.0, 1.0])

@@ -29,24 +29,31 @@ PARENTS = {
 }  # fmt: skip
 BODY = tuple(PARENTS)
 #: Share of the chest's rotation in the rotation of the segment that ends at a joint; other segments turn freely.
-_SHARE = {
-    "lhip": 0.0, "rhip": 0.0, "spine": 0.0, "chest": 1 / 3, "upperchest": 2 / 3, "thorax": 1.0,
-    "lcollar": 1.0, "rcollar": 1.0,
-}  # fmt: skip
+_SHARE = {"lhip": 0.0, "rhip": 0.0, "spine": 0.0, "chest": 1 / 3, "upperchest": 2 / 3, "thorax": 1.0}
+_SHARE |= {"lcollar": 1.0, "rcollar": 1.0}
 #: Segments of the spine: length as a share of the trunk, pitch in the rest pose, rad.  With this curve a shortened
 #: spine bends forwards; a straight one would buckle either way.
 _SPINE = {"spine": (0.12, -0.2), "chest": (0.22, -0.1), "upperchest": (0.22, 0.0), "thorax": (0.44, 0.1)}
 #: Collar bones begin beside the thorax, at this share of the half width.
 _COLLAR = 0.2
-#: Weights of the priors, m per radian: pitch and other bends of the spine; directions of neck and collar bones.
-_BENDS, _USUAL = np.array([0.05, 0.02, 0.02]), 0.02
+#: Weights of the priors, m per radian: weak beside the joints, whose misfit is some cm.  Pitch and other bends of the
+#: spine; directions of neck and collar bones.
+_BENDS = np.array([0.05, 0.02, 0.02])
+_USUAL = 0.02
 _PRIORS = ("neck", "lshoulder", "rshoulder")
 #: Weight of an interpolated joint relative to a known one.
 _INTERPOLATED = 0.02
 #: A joint farther from its position than this, m, gains weight, so that few joints do not bear a frame's whole misfit.
 FAR_M = 0.02
+#: Most rounds of weighing; the next most steps of one fit: both end before, when the fit has converged.
 _ROUNDS = 20
-_STEPS, _CONVERGED, _DAMPING, _CHUNK = 30, 3e-4, 1e-6, 256
+_STEPS = 30
+#: Largest change, m or rad, of a fit that has converged: below the resolution of the formats.
+_CONVERGED = 3e-4
+#: First damping of Levenberg-Marquardt, relative to the diagonal.
+_DAMPING = 1e-6
+#: Frames that are solved together, to bound the memory.
+_CHUNK = 256
 
 
 @dataclass(frozen=True)
@@ -99,17 +106,15 @@ def fit_rigid_body(
     start = problem.start(at)
     weights = np.where(sure, 1.0, _INTERPOLATED)
     parts = [slice(i, i + _CHUNK) for i in range(0, len(positions), _CHUNK)]
-    solved = [problem.solve(_Pose(*(v[p] for v in start)), measured[p], weights[p]) for p in parts]
+    solved = [problem.solve(start.part(p), measured[p], weights[p]) for p in parts]
     pose = _Pose(*(np.concatenate(values) for values in zip(*solved, strict=True)))
     for _ in range(_ROUNDS):
         off = np.linalg.norm(problem.observed @ problem.segments(pose) - measured, axis=2) * sure
-        (far,) = np.nonzero((off > far_m).any(axis=1))
-        if not len(far):
+        far = (off > far_m).any(axis=1)
+        if not far.any():
             break
         weights[far] *= 1.0 + 0.5 * (off[far] / far_m) ** 2
-        again = problem.solve(_Pose(*(values[far] for values in pose)), measured[far], weights[far])
-        for values, changed in zip(pose, again, strict=True):
-            values[far] = changed
+        pose.replace(far, problem.solve(pose.part(far), measured[far], weights[far]))
     posed = problem.path @ problem.segments(pose)
     return RigidBody(problem.joints, posed, problem.lengths, problem.offsets, pose.pelvis, pose.chest)
 
@@ -139,6 +144,19 @@ def _sizes(at: dict[str, np.ndarray], sure: dict[str, np.ndarray]) -> dict[str, 
     return sizes
 
 
+def _fixed_offsets(sizes: dict[str, float]) -> dict[str, np.ndarray]:
+    """Joint on pelvis, spine or chest -> (3,) offset from its parent in the rest pose, m."""
+    out = {name: np.array([sign * sizes["hips"], 0, 0]) for name, sign in (("lhip", 1), ("rhip", -1))}
+    curve = np.array([(0.0, share * np.cos(pitch), share * np.sin(pitch)) for share, pitch in _SPINE.values()])
+    # The thorax rests above the pelvis.
+    lean = np.arctan2(*curve.sum(axis=0)[[2, 1]])
+    curve = sizes["trunk"] / np.linalg.norm(curve.sum(axis=0)) * curve @ exp_so3(np.array([lean, 0.0, 0.0]))
+    out |= dict(zip(_SPINE, curve, strict=True))
+    for name, sign in (("lcollar", 1), ("rcollar", -1)):
+        out[name] = curve[-1] + (sign * _COLLAR * sizes["shoulders"], 0, 0)
+    return out
+
+
 class _Pose(NamedTuple):
     """Unknowns of F frames: root (F, 3), pelvis and chest (F, 3, 3), free unit directions (F, K, 3)."""
 
@@ -147,30 +165,31 @@ class _Pose(NamedTuple):
     chest: np.ndarray
     free: np.ndarray
 
+    def part(self, frames: slice | np.ndarray) -> _Pose:
+        """Those of some frames."""
+        return _Pose(*(values[frames] for values in self))
+
+    def replace(self, frames: np.ndarray, other: _Pose) -> None:
+        """Take those of some frames from another pose."""
+        for values, changed in zip(self, other, strict=True):
+            values[frames] = changed
+
 
 class _Problem:
     """Least squares over the segments: joint = sum of the segment vectors on its path from the origin."""
 
     def __init__(self, wanted: tuple[str, ...], sizes: dict[str, float]) -> None:
         self.joints = tuple(name for name in BODY if name in wanted or name not in (*BODY_15.joints, *TOES))
-        half, trunk = sizes["shoulders"], sizes["trunk"]
-        self.offsets = {name: np.array([sign * sizes["hips"], 0, 0]) for name, sign in (("lhip", 1), ("rhip", -1))}
-        curve = np.array([(0.0, share * np.cos(pitch), share * np.sin(pitch)) for share, pitch in _SPINE.values()])
-        # The thorax rests above the pelvis.
-        lean = np.arctan2(*curve.sum(axis=0)[[2, 1]])
-        curve = trunk / np.linalg.norm(curve.sum(axis=0)) * curve @ exp_so3(np.array([lean, 0.0, 0.0]))
-        self.offsets |= dict(zip(_SPINE, curve, strict=True))
-        for name, sign in (("lcollar", 1), ("rcollar", -1)):
-            self.offsets[name] = curve[-1] + (sign * _COLLAR * half, 0, 0)
+        self.offsets = _fixed_offsets(sizes)
         self.fixed = {self.joints.index(name): (offset, _SHARE[name]) for name, offset in self.offsets.items()}
         self.ends = [i for i in range(1, len(self.joints)) if i not in self.fixed]
-        self.lengths = {self.joints[i]: sizes.get(self.joints[i], (1 - _COLLAR) * half) for i in self.ends}
+        self.lengths = {
+            self.joints[i]: sizes.get(self.joints[i], (1 - _COLLAR) * sizes["shoulders"]) for i in self.ends
+        }
         self.free_lengths = np.array(list(self.lengths.values()))
-        self.path = np.zeros((len(self.joints), len(self.joints)))
-        for i, name in enumerate(self.joints):
-            self.path[i, i] = 1.0
-            if PARENTS[name]:
-                self.path[i] += self.path[self.joints.index(PARENTS[name])]
+        self.path = np.eye(len(self.joints))
+        for i, name in enumerate(self.joints[1:], start=1):
+            self.path[i] += self.path[self.joints.index(PARENTS[name])]
         self.observed = self.path[[self.joints.index(name) for name in wanted]]
         self.priors = [self.ends.index(self.joints.index(name)) for name in _PRIORS]
         self.usual = np.zeros((len(_PRIORS), 3))
@@ -207,7 +226,7 @@ class _Problem:
         active = np.arange(len(measured))
         pose = _Pose(*(values.copy() for values in pose))
         for _ in range(_STEPS):
-            now = _Pose(*(values[active] for values in pose))
+            now = pose.part(active)
             residual = self._residual(now, measured[active], scale[active])
             across = _tangents(now.free)
             jacobian = self._jacobian(now, across, scale[active])
@@ -225,8 +244,7 @@ class _Problem:
             )
             new = self._residual(moved, measured[active], scale[active])
             better = np.sum(new**2, axis=1) < np.sum(residual**2, axis=1)
-            for values, changed in zip(pose, moved, strict=True):
-                values[active[better]] = changed[better]
+            pose.replace(active[better], moved.part(better))
             damping[active] *= np.where(better, 0.1, 100.0)
             active = active[np.abs(step).max(axis=1) > _CONVERGED]
             if not len(active):

@@ -54,16 +54,7 @@ def take_of(motion: Motion, *, measured: bool = False) -> Take:
     InputError
         When there are fewer than two frames, no known joint, too many joints, or names that some format refuses.
     """
-    frames = len(motion.joints3d)
-    if frames < 2:
-        raise InputError(f"motion: expected at least 2 frames to animate, got {frames}; reconstruct a longer recording")
-    if not np.isfinite(motion.joints3d).all(axis=2).any():
-        raise InputError("motion: expected 3D joints in at least one frame, got NaN in all of them; see its report")
-    if len(motion.joints) > _MAX_JOINTS:
-        raise InputError(f"joints: expected at most {_MAX_JOINTS} joints, got {len(motion.joints)}; leave some out")
-    for name in motion.joints:
-        if not _NAME.fullmatch(name):
-            raise InputError(f"joints: expected names of letters, digits, _ . -, got {name[:60]!r}; rename the joint")
+    _check(motion)
     times = (motion.stamp_ns - motion.stamp_ns[0]) * 1e-9
     step = usual_step(times)
     notes = []
@@ -78,6 +69,19 @@ def take_of(motion: Motion, *, measured: bool = False) -> Take:
     if measured:
         positions = np.where(unseen[:, None, None], np.nan, positions)
     return Take(positions, motion.joints, motion.parents, times, 1.0 / step, notes=tuple(notes))
+
+
+def _check(motion: Motion) -> None:
+    frames = len(motion.joints3d)
+    if frames < 2:
+        raise InputError(f"motion: expected at least 2 frames to animate, got {frames}; reconstruct a longer recording")
+    if not np.isfinite(motion.joints3d).all(axis=2).any():
+        raise InputError("motion: expected 3D joints in at least one frame, got NaN in all of them; see its report")
+    if len(motion.joints) > _MAX_JOINTS:
+        raise InputError(f"joints: expected at most {_MAX_JOINTS} joints, got {len(motion.joints)}; leave some out")
+    for name in motion.joints:
+        if not _NAME.fullmatch(name):
+            raise InputError(f"joints: expected names of letters, digits, _ . -, got {name[:60]!r}; rename the joint")
 
 
 def unseen_frames(motion: Motion) -> np.ndarray:

@@ -20,8 +20,7 @@ from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.markers import body_transforms, keypoint_marker, path_marker, pose_markers
 from drocap_ros.ros.rep155 import MISSING, HumanTopics, hri, human_transforms
 from drocap_ros.ros.topics import TFMessage
-from drocap_ros.view.rate_limit import RateLimit
-from drocap_ros.view.visualizer_config import VisualizerConfig
+from drocap_ros.view.visualizer_config import RateLimit, VisualizerConfig
 
 #: Time after which a marker without a successor disappears.
 INITIAL_LIFETIME_S, LATEST_LIFETIME_S = 0.5, 3.0

@@ -217,6 +217,10 @@ def _of_keypoints(motion: Motion, s: Statistics) -> Iterator[Finding]:
     if outlying > _SOME_OUTLIERS:
         level = _warn if outlying > _MANY_OUTLIERS else _note
         yield level(MotionCheck.OUTLIERS, share=outlying, limit=_OUTLYING, rms=s.rms_px, median=s.median_px)
+    yield from _of_missing_joints(motion, s)
+
+
+def _of_missing_joints(motion: Motion, s: Statistics) -> Iterator[Finding]:
     toes = [motion.joints.index(name) for name in TOES if name in motion.joints]
     estimated = toes if toes and (s.missing[toes] == 1.0).all() else []
     if estimated:

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from drocap_ros.motion import Motion, upright_joints
+from drocap_ros.motion import Motion, upright_camera_rotation, upright_joints
 from drocap_ros.report.motion_images import MotionImages
-from drocap_ros.report.statistics import Statistics, camera_axes
+from drocap_ros.report.statistics import Statistics
 from drocap_ros.skeleton import side_of
 
 #: Most poses in the page; of longer motions every n-th is shown.
@@ -24,7 +24,7 @@ def page_data(motion: Motion, s: Statistics, images: MotionImages | None) -> dic
     ``heading`` milliradians; ``times`` ms.
     """
     shown = np.arange(0, len(motion.joints3d), -(-len(motion.joints3d) // MAX_POSES))
-    axes = camera_axes(motion)[shown][:, [0, 2]]
+    axes = upright_camera_rotation(motion)[shown][:, [0, 2]]
     return {
         "joints": list(motion.joints),
         "parents": list(motion.parents),

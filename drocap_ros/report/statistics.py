@@ -11,7 +11,7 @@ from drocap_ros.contacts import speed_of_lowest
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.alignment import torso_frame
 from drocap_ros.geometry.interpolation import usual_step
-from drocap_ros.motion import Motion, upright_joints
+from drocap_ros.motion import Motion, upright_camera_rotation, upright_joints
 from drocap_ros.skeleton import RIGID_BONES, JointSet, indices
 
 #: Directions of view and of the body are averaged over this time.
@@ -104,9 +104,9 @@ def motion_statistics(motion: Motion) -> Statistics:
     torso = _torso(joints, motion)
     seen = found.any(axis=1)
     counted = seen if seen.any() else np.ones_like(seen)
-    view = _view_azimuth(torso, camera_axes(motion)[:, 2], times)
+    view = _view_azimuth(torso, upright_camera_rotation(motion)[:, 2], times)
     speed = (np.abs(np.gradient(view, times)) if len(times) > 1 else np.zeros(1))[counted]
-    elevation = _elevation(motion, torso[counted], camera_axes(motion)[counted, 2])
+    elevation = _elevation(motion, torso[counted], upright_camera_rotation(motion)[counted, 2])
     heading = _heading(torso, times)
     motion = replace(motion, joints3d=np.where(counted[:, None, None], motion.joints3d, np.nan))
     joints = upright_joints(motion)
@@ -159,13 +159,6 @@ def mean_known(values: np.ndarray, axis: int | None) -> np.ndarray:
     count = known.sum(axis=axis)
     total = np.where(known, values, 0.0).sum(axis=axis)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
-def camera_axes(motion: Motion) -> np.ndarray:
-    """(F, 3, 3) rows right, down, forward of the camera in the axes of ``upright_joints``."""
-    if motion.frame == "world":
-        return motion.camera_rotation
-    return np.tile(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), (len(motion.joints3d), 1, 1))
 
 
 def smooth(values: np.ndarray, times_s: np.ndarray) -> np.ndarray:

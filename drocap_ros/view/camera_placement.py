@@ -7,9 +7,6 @@ import numpy as np
 #: Horizontal field of view where the calibration is unknown: a typical drone camera.
 NOMINAL_FOV_DEG = 70.0
 
-#: Optical axes of a level camera that looks along y in axes with z up: x right, y away, z up -> x right, y down, z on.
-LEVEL_CAMERA = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-
 
 def nominal_camera_matrix(width: float, height: float) -> np.ndarray:
     """(3, 3) px of an image of unknown calibration."""

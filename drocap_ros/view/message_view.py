@@ -1,9 +1,9 @@
-"""The graph's messages in the viewer, decoded by rclpy from a running graph or by rosbags from a file."""
+"""The graph's messages in the viewer, decoded by rclpy from a running graph or by rosbags from a recording."""
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -11,24 +11,28 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.geometry.ellipsoids import unpack_covariance
+from drocap_ros.motion import LEVEL_CAMERA
 from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.recording.pose_messages import float_array, observation_from_message
-from drocap_ros.recording.session import header_stamp_ns
+from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Session, TopicInfo, header_stamp_ns
 from drocap_ros.skeleton import JointSet, joint_set
-from drocap_ros.view.camera_placement import LEVEL_CAMERA, nominal_camera_matrix, place_cameras
-from drocap_ros.view.rate_limit import RateLimit
+from drocap_ros.view.camera_placement import nominal_camera_matrix, place_cameras
 from drocap_ros.view.rerun_scene import Scene
+from drocap_ros.view.visualizer_config import RateLimit
 
 PLOTS = ("latency_ms", "reprojection_px", "orbit")
-#: Images whose keypoints wait for their pose.
+#: Topics by which a recording's namespace is found.
+_MAIN = ("pose2d", "pose3d/initial", "pose3d/latest", "pose3d/refined", "image/compressed")
+#: Images whose keypoints wait for their pose: ten seconds at 30 Hz.
 _WAITING = 300
-#: Points kept of the camera's path, and the distance between two of them.
-_PATH_POINTS, _PATH_STEP_M = 600, 0.1
-#: Farthest state of the vehicle that is used for an image.
+#: Points kept of the camera's path, and the distance between two of them, m: 60 m, more than an orbit of 9 m.
+_PATH_POINTS = 600
+_PATH_STEP_M = 0.1
+#: Farthest state of the vehicle that is used for an image, ns; a judgement.
 _NEAR_NS = 500_000_000
-#: A refined pose is drawn when later images hardly change it.
+#: A refined pose is drawn when images this much later, ns, hardly change it.
 _REFINED_LAG_NS = 2 * 10**9
-#: A longer delay comes from a different clock.
+#: A longer delay, s, comes from a different clock.
 _LONGEST_S = 60.0
 _OURS = "drocap_ros"
 _LEVELS = {0: "INFO", 1: "WARN", 2: "ERROR", 3: "WARN"}
@@ -261,3 +265,56 @@ def _turned(packed: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Covariances (P, 6) of points that are turned by a rotation (3, 3)."""
     full = rotation @ unpack_covariance(packed) @ rotation.T
     return np.asarray(full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
+
+
+def draw_session(
+    view: MessageView,
+    session: Session,
+    namespace: str | None,
+    progress: Callable[[str, float], None],
+) -> None:
+    """Draw a recording's messages in the order of the recording.
+
+    Parameters
+    ----------
+    namespace : of the topics; None = that with most keypoints, poses and images
+    progress : called with a name and the share done
+
+    Raises
+    ------
+    InputError
+        When the recording holds nothing to draw.
+    """
+    named, view.namespace = _topics(view, session, namespace)
+    start_ns, duration_ns = session.info.start_ns or 0, max(session.info.duration_s * 1e9, 1.0)
+    for raw, message in session.messages(tuple(named)):
+        view.take(named[raw.topic], message, raw.log_time_ns)
+        progress("messages", (raw.log_time_ns - start_ns) / duration_ns)
+    view.finish()
+
+
+def _topics(view: MessageView, session: Session, namespace: str | None) -> tuple[dict[str, str], str]:
+    """Topic of the recording -> its name in the graph, and the graph's namespace."""
+    present = [topic for topic in session.info.topics if topic.count]
+    space = _busiest_namespace(present) if namespace is None else f"/{namespace.strip('/')}".rstrip("/")
+    names = {topic.name: topic.name.removeprefix(f"{space}/") for topic in present}
+    found = {topic: name for topic, name in names.items() if name in view.handlers and name != topic}
+    if not found and namespace is None:
+        # Not a recording of this package: its images.
+        found = {topic.name: "image/compressed" for topic in session.topics_of(COMPRESSED_IMAGE, IMAGE)[:1]}
+    if not found:
+        listed = ", ".join(names) or "none"
+        raise InputError(
+            f"{session.path}: expected keypoints, poses or images, found the topics {listed}; record one of them"
+        )
+    return {**found, **{topic: topic for topic in names if topic == "/diagnostics"}}, space
+
+
+def _busiest_namespace(topics: Iterable[TopicInfo]) -> str:
+    """Namespace with most keypoints, poses and images; "" where there is none."""
+    counts: Counter[str] = Counter()
+    for topic in topics:
+        for name in _MAIN:
+            if topic.name.endswith("/" + name):
+                counts[topic.name.removesuffix("/" + name)] += topic.count
+    return max(counts, key=lambda space: (counts[space], space), default="")

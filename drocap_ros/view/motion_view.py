@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from drocap_ros.motion import Motion, upright_joints
+from drocap_ros.motion import Motion, upright_camera_rotation, upright_joints
 from drocap_ros.skeleton import JointSet
-from drocap_ros.view.camera_placement import LEVEL_CAMERA, nominal_camera_matrix, place_cameras
+from drocap_ros.view.camera_placement import nominal_camera_matrix, place_cameras
 from drocap_ros.view.rerun_scene import Scene
 
 PLOTS = ("reprojection_px", "confidence")
@@ -43,9 +43,7 @@ def _draw_frames(
 ) -> None:
     joints_of = JointSet("motion", motion.joints, motion.parents)
     joints = upright_joints(motion)
-    rotation = motion.camera_rotation
-    if motion.frame == "camera":
-        rotation = np.broadcast_to(LEVEL_CAMERA, rotation.shape)
+    rotation = upright_camera_rotation(motion)
     positions, matrix = _cameras(motion, joints, keypoints, rotation, size)
     error = motion.reprojection_px
     scene.at(int(motion.stamp_ns[0]))

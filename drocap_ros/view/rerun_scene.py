@@ -1,4 +1,4 @@
-"""Rerun entities of a capture, from arrays."""
+"""Rerun entities of a capture, from arrays, and their arrangement in the viewer."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from drocap_ros.skeleton import SIDE_COLOURS, JointSet, side_of
 
 if TYPE_CHECKING:
     import rerun
+    import rerun.blueprint as rrb
 
 #: The timeline: exposure time of the image.
 TIMELINE = "image"
@@ -26,6 +27,8 @@ _UNCERTAIN = (200, 150, 20, 40)
 _CURVES = {"initial": (150, 150, 150), "latest": (191, 56, 43), "mean": (36, 112, 163)}
 _PATH = (51, 179, 77)
 _BOX = (255, 220, 0)
+_BACKGROUND = (238, 240, 243)
+#: Half axes of the ellipsoids in standard deviations, as in the markers.
 _SIGMAS = 2.0
 
 
@@ -73,9 +76,13 @@ class Scene:
         use = np.isfinite(joints).all(1) & np.isfinite(covariance).all(1)
         xyzw, half_axes = ellipsoids(unpack_covariance(covariance[use].astype(float)), _SIGMAS)
         drawn = rr.Ellipsoids3D(
-            centers=joints[use], half_sizes=half_axes, quaternions=xyzw, colors=_UNCERTAIN,
-            fill_mode=rr.components.FillMode.MajorWireframe, line_radii=0.0015,
-        )  # fmt: skip
+            centers=joints[use],
+            half_sizes=half_axes,
+            quaternions=xyzw,
+            colors=_UNCERTAIN,
+            fill_mode=rr.components.FillMode.MajorWireframe,
+            line_radii=0.0015,
+        )
         self._log(f"{path}/uncertainty", drawn)
 
     def no_subject(self, *stages: str) -> None:
@@ -148,3 +155,40 @@ class Scene:
 def _joint_colours(joints_of: JointSet, opacity: int) -> np.ndarray:
     rows = [(*SIDE_COLOURS[side_of(joint, joints_of.joints)], opacity) for joint in joints_of.joints]
     return np.array(rows, np.uint8)
+
+
+def layout(views: tuple[str, ...], *, follow: bool = False) -> rrb.Blueprint:
+    """The body in its world beside the image with its keypoints, above curves and the log.
+
+    Parameters
+    ----------
+    views : groups of curves, one view each; "log" for the messages of the nodes
+    follow : show the newest image instead of the first, and hide refined poses
+    """
+    import rerun.blueprint as rrb
+
+    contents = [f"+ /{WORLD}/**"]
+    if follow:  # two seconds old, it would be a second body
+        contents.append(f"- /{subject_path('refined')}/**")
+    below = [
+        rrb.TextLogView(origin="log", name="log")
+        if name == "log"
+        else rrb.TimeSeriesView(origin=f"plots/{name}", name=name.replace("_", " "))
+        for name in views
+    ]
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(
+                rrb.Spatial3DView(
+                    origin=WORLD, contents=contents, name="3D", background=rrb.Background(color=_BACKGROUND)
+                ),
+                rrb.Spatial2DView(origin=IMAGE, name="image"),
+                column_shares=[3, 2],
+            ),
+            rrb.Horizontal(*below),
+            row_shares=[3, 1],
+        ),
+        rrb.TimePanel(state="collapsed", timeline="image", play_state="following" if follow else None),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+    )

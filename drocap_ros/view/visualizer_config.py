@@ -1,10 +1,13 @@
-"""Parameters of the node ``visualizer``."""
+"""Parameters of the node ``visualizer``, and the rate limit of what is drawn."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from drocap_ros.parameters import Parameters, param
+
+#: Share of a period by which a stamp may be early: images at 30 Hz limited to 10 Hz are every third in spite of jitter.
+_EARLY = 0.9
 
 
 @dataclass(frozen=True)
@@ -22,3 +25,18 @@ class VisualizerConfig(Parameters):
     path_period_s: float = param(0.2, "time between two points of the path", unit="s", minimum=0.01, maximum=60)
     frame_prefix: str = param("", "prefix of the body's TF frames, e.g. drone2/ with two drones")
     human_topics: bool = param(False, "publish the subject by REP 155: /humans/bodies topics, frames body_<id>")
+
+
+class RateLimit:
+    """Thins a stream to a rate; a jump back in time restarts it.  Rate 0 keeps all messages."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._least_ns = round(_EARLY * 1e9 / rate_hz) if rate_hz > 0 else 0
+        self._last_ns: int | None = None
+
+    def due(self, stamp_ns: int) -> bool:
+        """Whether the message of this stamp is kept."""
+        if self._last_ns is not None and 0 <= stamp_ns - self._last_ns < self._least_ns:
+            return False
+        self._last_ns = stamp_ns
+        return True

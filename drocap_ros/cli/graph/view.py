@@ -125,9 +125,8 @@ def _view_motion(recording: rerun.RecordingStream, args: argparse.Namespace) -> 
 
 def _view_session(recording: rerun.RecordingStream, args: argparse.Namespace) -> None:
     from drocap_ros.recording.open_session import open_session
-    from drocap_ros.view.message_view import PLOTS, MessageView
+    from drocap_ros.view.message_view import PLOTS, MessageView, draw_session
     from drocap_ros.view.rerun_scene import Scene
-    from drocap_ros.view.session_view import draw_session
 
     if args.video is not None:
         raise InputError("--video: expected a motion with it, found a recording; leave it out")
@@ -175,8 +174,8 @@ def _subscribe(graph: Graph, view: MessageView) -> None:
 @contextlib.contextmanager
 def _shown(recording: rerun.RecordingStream, views: tuple[str, ...], args: argparse.Namespace) -> Iterator[None]:
     """Take what is drawn inside to the file, window or browser that the user wants."""
-    from drocap_ros.view.layout import layout
     from drocap_ros.view.rerun_output import has_screen, to_browser, to_file, to_window
+    from drocap_ros.view.rerun_scene import layout
 
     arranged = layout(views, follow=args.live)
     if args.save is not None:
