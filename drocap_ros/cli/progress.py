@@ -14,7 +14,7 @@ Progress = Callable[[str, float], None]
 def progress_bars(quiet: bool = False) -> Iterator[Progress]:
     """A callback that draws one bar per stage on stderr while the context lasts."""
     if quiet or not sys.stderr.isatty():
-        yield lambda stage, done: None
+        yield lambda _stage, _done: None
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn

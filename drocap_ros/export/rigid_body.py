@@ -36,8 +36,8 @@ _SHARE |= {"lcollar": 1.0, "rcollar": 1.0}
 _SPINE = {"spine": (0.12, -0.2), "chest": (0.22, -0.1), "upperchest": (0.22, 0.0), "thorax": (0.44, 0.1)}
 #: Collar bones begin beside the thorax, at this share of the half width.
 _COLLAR = 0.2
-#: Weights of the priors, m per radian: weak beside the joints, whose misfit is some cm.  Pitch and other bends of the
-#: spine; directions of neck and collar bones.
+#: Weights of the priors, m per radian, chosen weak: pitch and other bends of the spine; directions of neck and collar
+#: bones.
 _BENDS = np.array([0.05, 0.02, 0.02])
 _USUAL = 0.02
 _PRIORS = ("neck", "lshoulder", "rshoulder")
@@ -48,7 +48,7 @@ FAR_M = 0.02
 #: Most rounds of weighing; the next most steps of one fit: both end before, when the fit has converged.
 _ROUNDS = 20
 _STEPS = 30
-#: Largest change, m or rad, of a fit that has converged: below the resolution of the formats.
+#: Largest change, m or rad, of a fit that has converged; a judgement.
 _CONVERGED = 3e-4
 #: First damping of Levenberg-Marquardt, relative to the diagonal.
 _DAMPING = 1e-6

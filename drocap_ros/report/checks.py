@@ -221,13 +221,15 @@ def _of_keypoints(motion: Motion, s: Statistics) -> Iterator[Finding]:
 
 
 def _of_missing_joints(motion: Motion, s: Statistics) -> Iterator[Finding]:
-    toes = [motion.joints.index(name) for name in TOES if name in motion.joints]
-    estimated = toes if toes and (s.missing[toes] == 1.0).all() else []
-    if estimated:
+    joints = np.array(motion.joints)
+    estimated = np.isin(joints, TOES)
+    if estimated.any() and (s.missing[estimated] == 1.0).all():
         yield _note(MotionCheck.ESTIMATED_FEET)
+    else:
+        estimated[:] = False
     order = np.argsort(-s.missing, kind="stable")
-    worst = [int(j) for j in order if s.missing[j] > _MISSING_SHARE and j not in estimated]
-    if worst:
+    worst = order[(s.missing[order] > _MISSING_SHARE) & ~estimated[order]]
+    if len(worst):
         named = ", ".join(f"{motion.joints[j]} {s.missing[j]:.0%}" for j in worst[:4])
         more = f" and {len(worst) - 4} more" if len(worst) > 4 else ""
         yield _warn(MotionCheck.MISSING_JOINTS, limit=_MISSING_SHARE, joints=named + more)

@@ -17,15 +17,19 @@ from drocap_ros.perception.sources import Frame
 from drocap_ros.recording.open_images import Images, open_images
 from drocap_ros.recording.open_session import is_recording, open_session
 
+#: Most images in a report, and bytes of all together, as base64: the page stays quick to open and to mail.
 MAX_IMAGES = 300
-#: Of all images together, as base64 in the page.
 MAX_BYTES = 8_000_000
+#: Longer side of an image in the page, px.
 _LONG_SIDE = 640
 _QUALITIES = (75, 60, 45, 30)
 #: Margin of the crop, as a share of its size.
 _MARGIN = 0.12
-#: Tolerances of the checks whether images belong to a motion; re-encoding loses a few frames.
-_LENGTH_SHARE, _RATE_SHARE, _OUTSIDE_SHARE = 0.02, 0.03, 0.05
+#: Tolerances of the checks whether images belong to a motion: their number (re-encoding loses a few), their rate, and
+#: the share of keypoints outside of them.
+_LENGTH_SHARE = 0.02
+_RATE_SHARE = 0.03
+_OUTSIDE_SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -113,12 +117,19 @@ def _opened(path: Path, motion: Motion) -> Iterator[Images]:
 
 def _check_times(path: Path, images: Images, motion: Motion) -> None:
     """Refuse images of another number or rate than ``meta`` states, or else that cannot be at the motion's times."""
-    stated, found = _stated(motion, "images"), {"length": images.length, "rate_hz": images.rate_hz}
-    for name, share in (("length", _LENGTH_SHARE), ("rate_hz", _RATE_SHARE)):
-        expected, got = stated.get(name), found[name]
-        if isinstance(expected, int | float) and got and abs(got - expected) > share * expected + (name == "length"):
-            words = {"length": "images", "rate_hz": "images per second"}[name]
+    stated = _stated(motion, "images")
+    for expected, got, share, slack, words in (
+        (stated.get("length"), images.length, _LENGTH_SHARE, 1, "images"),
+        (stated.get("rate_hz"), images.rate_hz, _RATE_SHARE, 0, "images per second"),
+    ):
+        if isinstance(expected, int | float) and got and abs(got - expected) > share * expected + slack:
             raise _other(path, f"{expected:.4g} {words}", f"{got:.4g}")
+    _check_span(path, images, motion)
+
+
+def _check_span(path: Path, images: Images, motion: Motion) -> None:
+    """Refuse images whose rate or duration does not fit the motion's stamps, where ``meta`` states no number."""
+    stated = _stated(motion, "images")
     if stated.get("length") or images.rate_hz is None or images.duration_s is None or len(motion.stamp_ns) < 2:
         return
     step_s = usual_step(motion.stamp_ns) * 1e-9

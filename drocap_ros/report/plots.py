@@ -8,11 +8,15 @@ from html import escape
 
 import numpy as np
 
+#: Sizes in units of the SVG, px at its natural size: the plot, its margins, a row of bars and its label.
 WIDTH = 420
-_LEFT, _RIGHT, _TOP, _BOTTOM = 44, 10, 8, 24
+_LEFT = 44
+_RIGHT = 10
+_TOP = 8
+_BOTTOM = 24
 _ROW = 19
 _LABEL = 92
-#: Points of one line; longer series are averaged.
+#: Points of one line, more than its px on a screen; longer series are averaged.
 _POINTS = 700
 
 

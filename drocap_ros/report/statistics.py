@@ -14,9 +14,9 @@ from drocap_ros.geometry.interpolation import usual_step
 from drocap_ros.motion import Motion, upright_camera_rotation, upright_joints
 from drocap_ros.skeleton import RIGID_BONES, JointSet, indices
 
-#: Directions of view and of the body are averaged over this time.
+#: Directions of view and of the body are averaged over this time, s.
 _SMOOTH_S = 0.5
-#: A knee counts as bent from this angle on; below it the direction of the bend is noise.
+#: A knee counts as bent from this angle, degrees, on; below it the direction of the bend is noise.
 _BENT_DEG = 25.0
 #: Spread of the camera's bearings (mean square about the mean of unit vectors) of half a turn: 0.6; of a whole one: 1.
 _BEARINGS = 0.5

@@ -21,7 +21,7 @@ def draw_motion(
     scene: Scene,
     motion: Motion,
     images: Iterable[tuple[int, np.ndarray]] = (),
-    progress: Callable[[str, float], None] = lambda stage, done: None,
+    progress: Callable[[str, float], None] = lambda _stage, _done: None,
 ) -> None:
     """Every frame of a motion at its stamp, and its images: frame and (H, W, 3) uint8 BGR.
 

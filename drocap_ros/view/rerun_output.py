@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import rerun
     import rerun.blueprint as rrb
 
-#: Start of the web server at most.
+#: Start of the web server at most, s; a judgement.
 _START_S = 20.0
 INSTALL = "pip install 'rerun-sdk>=0.39,<0.40'"
 
