@@ -72,7 +72,7 @@ LEFT_OUT: dict[str, Callable[[], AbstractContextManager[Any]]] = {
     "accelerations": lambda: _with(acceleration_std_m_s2=1000.0),
     "network's depths in the adjustment": lambda: _with(depth_weight=0.0),
     "network's places in the image in the adjustment": lambda: _with(image_weight=0.01),
-    "lighter places where noise is fresh": lambda: patch.object(window_solver, "_FRESH_WEIGHT", 1.0),
+    "lighter places where noise is fresh": lambda: _with(fresh_weight=1.0),
 }
 
 

@@ -12,8 +12,9 @@ from drocap_ros.evaluation import compare as comparison
 from drocap_ros.evaluation.compare import MotionErrors
 from drocap_ros.motion import Motion, load_motion
 from drocap_ros.perception.tracking.pose_estimator_config import parse_subject
-from drocap_ros.pipeline import Selection, Telemetry, reconstruct_input, selected_tracks
+from drocap_ros.pipeline import Selection, reconstruct_input, selected_tracks
 from drocap_ros.reconstruction.reconstruct import reconstruct as reconstruct_tracks
+from drocap_ros.recording.video_telemetry import Telemetry
 from drocap_ros.tracks import Tracks
 
 

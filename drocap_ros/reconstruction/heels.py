@@ -17,10 +17,14 @@ from drocap_ros.skeleton import BODY_17, BODY_19, indices
 _KNEES, _ANKLES, _TOES = (
     np.array(indices(BODY_17.joints, (f"r{part}", f"l{part}"))) for part in ("knee", "ankle", "toe")
 )
-#: Usual place in lengths of the bone from ankle to toe, along it and away from the knee, and its spread.
-_USUAL, _SPREAD = np.array([-0.3, 0.25]), 0.15
-#: Error of a heel in the image at which its weight is a half, in the same unit; rounds of the robust fit.
-_OUTLIER, _ROUNDS = 0.2, 4
+#: Usual place in lengths of the bone from ankle to toe, along it and away from the knee.
+_USUAL = np.array([-0.3, 0.25])
+#: Its spread over persons, in the same unit.
+_SPREAD = 0.15
+#: Error of a heel in the image at which its weight is a half, in the same unit.
+_OUTLIER = 0.2
+#: Rounds of the robust fit, chosen by hand.
+_ROUNDS = 4
 
 
 def foot_axes(joints: np.ndarray) -> np.ndarray:

@@ -27,12 +27,8 @@ from drocap_ros.skeleton import BODY_17
 _BONES = BODY_17.bones
 #: Bones whose total length defines the mm of an ordinary person.
 YARDSTICK = [0, 1, 2, 6, 7]
+#: That length of an ordinary person: it defines the mm of the weights in :class:`LiftedConfig`.
 YARDSTICK_MM = 1550.0
-#: Noise of the 2D joints at which the lifter's bone lengths are as good as the adjustment's.
-_LENGTHENING_NOISE_MM = 5.0
-#: A keypoint counts as an outlier farther than so many standard deviations and mm from where the others put it, if its
-#: distance is no more usual over so many frames.
-_OUTLIER_STDS, _OUTLIER_MM, _OUTLIER_FRAMES = 4.0, 40.0, 5
 
 
 @dataclass(frozen=True)
@@ -98,11 +94,11 @@ def measure_size(view: EvenView, config: LiftedConfig, lifter: Lifter, cancelled
     flat = _orthographic(keypoints.xy, prior[..., 2], centre, zoom, mm, focal)
     rough = replace(lifted, joints=prior, sigma=lifted.sigma * mm)
     found = solve_signs_and_adjust(model, flat, rough, None, config.first_iterations, cancelled)
-    lengths = _without_noise(found.lengths, np.median(span_lengths(prior), axis=0), model.lasting_noise_mm)
+    lengths = _without_noise(found.lengths, np.median(span_lengths(prior), axis=0), model)
     zoom = zoom * found.zoom
     flat = _orthographic(keypoints.xy, found.joints[..., 2] - found.joints[:, :1, 2], centre, zoom, mm, focal)
     seconds = time.perf_counter() - clock
-    believed = _without_outliers(flat, found.joints[..., :2], model.noise_mm)
+    believed = _without_outliers(flat, found.joints[..., :2], model)
     lifted = lifter.lift(_flattened(believed, view, mm / zoom, lengths), fps)
     return SizedWindow(model, flat, lifted, lengths, centre, zoom, mm, seconds, found.iterations)
 
@@ -137,28 +133,31 @@ def _flattened(flat: np.ndarray, view: EvenView, scale: np.ndarray, lengths: np.
 
 def magnification(depth_mm: np.ndarray, distance_mm: np.ndarray) -> np.ndarray:
     """(F, 17, 1) true over seen distance from the axis, for joints behind a pelvis at the distance (F,) mm."""
-    return np.maximum(1.0 + depth_mm / distance_mm[:, None], 0.2)[..., None]
+    factor: np.ndarray = np.maximum(1.0 + depth_mm / distance_mm[:, None], 0.2)[..., None]
+    return factor
 
 
-def _without_noise(found: np.ndarray, lifted: np.ndarray, noise_mm: float) -> np.ndarray:
+def _without_noise(found: np.ndarray, lifted: np.ndarray, model: WindowModel) -> np.ndarray:
     """Lengths (18,) mm between those of the adjustment and of the lifter.
 
     The depth of a bone is free: noise lengthens the bones that the adjustment finds, and hardly those of the network.
     """
-    mixed: np.ndarray = lifted + (found - lifted) / (1.0 + (noise_mm / _LENGTHENING_NOISE_MM) ** 2)
+    noise = model.lasting_noise_mm / model.config.lengthening_noise_mm
+    mixed: np.ndarray = lifted + (found - lifted) / (1.0 + noise**2)
     return mixed
 
 
-def _without_outliers(flat: np.ndarray, place: np.ndarray, noise_mm: float) -> np.ndarray:
+def _without_outliers(flat: np.ndarray, place: np.ndarray, model: WindowModel) -> np.ndarray:
     """Keypoints (F, 17, 2) without those that are alone in their frame far from the adjusted places: NaN there.
 
     Where the distance lasts, the adjustment may be wrong instead.
     """
     from scipy.ndimage import median_filter
 
+    config = model.config
     gap = np.nan_to_num(flat - place)
-    alone = np.linalg.norm(gap - median_filter(gap, size=(_OUTLIER_FRAMES, 1, 1), mode="nearest"), axis=-1)
-    limit_mm = _OUTLIER_STDS * noise_mm + _OUTLIER_MM
+    alone = np.linalg.norm(gap - median_filter(gap, size=(config.alone_frames, 1, 1), mode="nearest"), axis=-1)
+    limit_mm = config.alone_stds * model.noise_mm + config.alone_mm
     return np.where((alone > limit_mm)[..., None], np.nan, flat)
 
 
@@ -170,10 +169,10 @@ def _orthographic(
     ``mm`` per unit of the keypoints at zoom 1.  With the focal length the scale gives the pelvis' distance: joints
     ``depth_mm`` (F, 17) behind the pelvis move outwards, those before it inwards.
     """
-    flat = (keypoints - centre[:, None]) * (mm / zoom)[:, None, None]
-    if focal is None:
-        return flat
-    return flat * magnification(depth_mm, focal * mm / zoom)
+    flat: np.ndarray = (keypoints - centre[:, None]) * (mm / zoom)[:, None, None]
+    if focal is not None:
+        flat = flat * magnification(depth_mm, focal * mm / zoom)
+    return flat
 
 
 def _zoom_of(joints: np.ndarray, fps: float) -> np.ndarray:
@@ -184,4 +183,5 @@ def _zoom_of(joints: np.ndarray, fps: float) -> np.ndarray:
     smooth = gaussian_filter1d(size, 1.0 * fps, mode="nearest", truncate=3.0)
     change = np.log(np.maximum(smooth / max(float(np.median(smooth)), 1e-12), 1e-3))
     # The lifter's sizes err by some percent: the adjustment finds small changes better.
-    return np.exp(np.sign(change) * np.maximum(np.abs(change) - 0.03, 0.0))
+    zoom: np.ndarray = np.exp(np.sign(change) * np.maximum(np.abs(change) - 0.03, 0.0))
+    return zoom

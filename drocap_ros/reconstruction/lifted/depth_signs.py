@@ -31,11 +31,12 @@ def depth_signs(
     (F, L) of +1 and -1
     """
     frames, bones = reach.shape
-    signs = np.array([1.0, -1.0])
+    signs: np.ndarray = np.array([1.0, -1.0])
     state = signs * reach[..., None]
     unary = np.abs(state - depth[..., None]) / sigma[..., None]
     if frames == 1:
-        return signs[unary[0].argmin(axis=-1)][None]
+        only: np.ndarray = signs[unary[0].argmin(axis=-1)][None]
+        return only
     move = np.abs(state[1:, :, None, :] - state[:-1, :, :, None]) / speed
     swing = state[2:, :, None, None, :] - 2 * state[1:-1, :, None, :, None] + state[:-2, :, :, None, None]
     # The bound keeps a gross error of the image length from turning the signs of the rest of the sequence.

@@ -31,6 +31,35 @@ class LiftedConfig(Parameters):
     sign_acceleration_m_s2: float = param(
         14.4, "its acceleration that costs one sigma", unit="m/s^2", minimum=0.01, maximum=1000.0
     )
+    fresh_from: float = param(
+        0.47, "share of fresh noise from which the lifter's image position loses weight", minimum=0.0, maximum=1.0
+    )
+    fresh_to: float = param(
+        0.6, "share up to which it does: smoothing removes fresh noise better", minimum=0.0, maximum=1.0
+    )
+    fresh_weight: float = param(
+        0.1, "weight of the lifter's image position of a seen joint then", minimum=0.0, maximum=1.0
+    )
+    outlier_square: float = param(
+        9.0, "squared residual, in standard deviations, that halves a 2D joint's weight", minimum=0.1, maximum=1000.0
+    )
+    fresh_outlier_square: float = param(
+        20.0, "the same where noise is fresh: noise that lasts looks like outliers", minimum=0.1, maximum=1000.0
+    )
+    lasting_factor: float = param(
+        1.6, "most standard deviation of keypoints over that of their fresh noise", minimum=1.0, maximum=10.0
+    )
+    held_noise_mm: float = param(
+        10.0, "lasting noise at which known bone lengths change little", unit="mm", minimum=0.1, maximum=1000.0
+    )
+    lengthening_noise_mm: float = param(
+        5.0, "lasting noise at which the lifter's bone lengths count as much", unit="mm", minimum=0.1, maximum=1000.0
+    )
+    alone_stds: float = param(
+        4.0, "distance of a keypoint alone in its frame that hides it", minimum=0.0, maximum=100.0
+    )
+    alone_mm: float = param(40.0, "added to that distance", unit="mm", minimum=0.0, maximum=1000.0)
+    alone_frames: int = param(5, "frames over which its distance is compared", minimum=1, maximum=99)
 
 
 def lifted_config(adjuster: BundleAdjusterConfig) -> LiftedConfig:

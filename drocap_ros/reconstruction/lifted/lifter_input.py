@@ -20,9 +20,12 @@ PARTS = (2 * _JOINTS, _JOINTS, len(BONES), len(BONES), 2 * _JOINTS, _JOINTS, 3, 
 FEATURES = sum(PARTS)
 
 _TORSO = indices(BODY_17.joints, ("pelvis", "rhip", "lhip", "neck", "lshoulder", "rshoulder"))
+#: Limit of the features of places, in sizes of the person, as in the training.
 _CLIP = 6.0
-#: Factors that bring standard deviations (share of the size) and turns (rad per frame) to the order of one.
-_STD_FACTOR, _TURN_FACTOR = 10.0, 20.0
+#: Factors of the training: they bring standard deviations (share of the size) to the order of one,
+_STD_FACTOR = 10.0
+#: and turns (rad per frame).
+_TURN_FACTOR = 20.0
 
 
 def nanmedian_small(values: np.ndarray, axis: int) -> np.ndarray:
@@ -31,7 +34,8 @@ def nanmedian_small(values: np.ndarray, axis: int) -> np.ndarray:
     count = np.isfinite(values).sum(axis=axis, keepdims=True)
     low = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=axis)
     high = np.take_along_axis(ordered, np.minimum(count // 2, values.shape[axis] - 1), axis=axis)
-    return np.squeeze(0.5 * (low + high), axis=axis)
+    median: np.ndarray = np.squeeze(0.5 * (low + high), axis=axis)
+    return median
 
 
 def centre_of(keypoints: np.ndarray) -> np.ndarray:

@@ -29,20 +29,10 @@ from drocap_ros.skeleton import BODY_17
 Cancelled = Callable[[], bool]
 
 _BONES = BODY_17.bones
-#: Lasting noise of the 2D joints at which known bone lengths change little: noise lengthens free bones.
-_HELD_NOISE_MM = 10.0
-#: Shares of fresh noise from which, and up to which, the lifter's places in the image lose weight, and what is left of
-#: it where a joint is seen: smoothing removes fresh noise better than the lifter does, but not noise that lasts.
-_FRESH_FROM, _FRESH_TO, _FRESH_WEIGHT = 0.47, 0.6, 0.1
 #: What a frame's keypoints count for at these shares of fresh noise.  Noise that lasts repeats itself from frame to
 #: frame: of a share s the information of each is worth s / (2 - s), as for a first-order autoregressive process; at
 #: the least shares the errors of the lifter are what lasts.
-_REPEATED_AT, _REPEATED_WORTH = (0.2, 0.3, _FRESH_FROM, _FRESH_TO), (1.0, 0.3, 0.3, 1.0)
-#: Squared residuals, in standard deviations, at which a 2D joint has half its weight, at these shares of fresh noise:
-#: noise that lasts looks like outliers that do.
-_OUTLIER_SQUARE = (9.0, 20.0)
-#: Standard deviation of keypoints over that of their fresh noise, at most: some of it lasts for a few frames.
-_LASTING_FACTOR = 1.6
+_REPEATED_AT, _REPEATED_WORTH = (0.2, 0.3, 0.47, 0.6), (1.0, 0.3, 0.3, 1.0)
 
 
 @dataclass(frozen=True)
@@ -77,7 +67,7 @@ def window_model(
     seen = np.isfinite(points_mm[..., 0])
     fresh, whole = _gap_noise(points_mm - place * mm, interleaved)
     share = (fresh / whole) ** 2 if whole > 0 else 0.0
-    noise = max(config.noise_mm, min(whole, _LASTING_FACTOR * fresh))
+    noise = max(config.noise_mm, min(whole, config.lasting_factor * fresh))
     covariance = np.broadcast_to(noise**2 * np.array([1.0, 0.0, 1.0]), (*seen.shape, 3))
     if keypoints.covariance is not None:
         known = np.isfinite(keypoints.covariance).all(axis=-1, keepdims=True)
@@ -154,14 +144,14 @@ def solve_signs_and_adjust(
     weight = 0.5 * (model.information[..., 0] + model.information[..., 2])
     points = np.where(weight[..., None] > 0, np.nan_to_num(keypoints), 0.0)
     prior_xy = config.image_weight / (2 * np.square(sigma[..., 0]) + 5.0**2)
-    prior_xy[weight > 0] *= np.interp(model.fresh_share, (_FRESH_FROM, _FRESH_TO), (1.0, _FRESH_WEIGHT))
+    prior_xy[weight > 0] *= _where_fresh(model, 1.0, config.fresh_weight)
     gap = np.square(points - prior[..., :2]).sum(axis=-1)
     inlier = gap < 9 * (2 * model.noise_mm**2 + 2 * np.square(sigma[..., 0]) + 8.0**2)
     smoothing = (1000 * config.smoothing_std_m_s2 / fps**2) ** -2
     flat = _smooth(points, weight * inlier, prior[..., :2], prior_xy, smoothing)
 
     image = span_lengths(flat)
-    length_weight = 0.0 if lengths is None else (model.lasting_noise_mm / _HELD_NOISE_MM) ** 2
+    length_weight = 0.0 if lengths is None else (model.lasting_noise_mm / config.held_noise_mm) ** 2
     if lengths is None:
         seen_lengths = np.median(span_lengths(np.concatenate([flat, prior[..., 2:]], axis=-1)), axis=0)
         # A bone is at least as long as its image, up to the noise.
@@ -192,9 +182,15 @@ def solve_signs_and_adjust(
         zoom_precision=model.zoom_precision,
         lengths=lengths,
         length_weight=length_weight,
-        outlier_square=float(np.interp(model.fresh_share, (_FRESH_FROM, _FRESH_TO), _OUTLIER_SQUARE)),
+        outlier_square=_where_fresh(model, config.outlier_square, config.fresh_outlier_square),
     )
     return adjust(problem, np.concatenate([flat, depth[..., None]], axis=-1), iterations, cancelled=cancelled)
+
+
+def _where_fresh(model: WindowModel, lasting: float, fresh: float) -> float:
+    """A value between those for noise that lasts and for noise that is fresh in every frame."""
+    config = model.config
+    return float(np.interp(model.fresh_share, (config.fresh_from, config.fresh_to), (lasting, fresh)))
 
 
 def _smooth(

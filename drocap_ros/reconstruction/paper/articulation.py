@@ -18,7 +18,8 @@ for _row, (_upper, _lower) in enumerate(RIGID_BONES):
 def best_rank_one(lengths: np.ndarray) -> np.ndarray:
     """The auxiliary matrix L (L, F): the closest matrix of rank 1, by SVD (of the L x L Gram matrix)."""
     u = np.linalg.eigh(lengths @ lengths.T)[1][:, -1]
-    return u[:, None] * (u @ lengths)
+    closest: np.ndarray = u[:, None] * (u @ lengths)
+    return closest
 
 
 def articulation_value(s: np.ndarray) -> float:

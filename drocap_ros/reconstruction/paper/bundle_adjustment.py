@@ -60,7 +60,8 @@ class AdjustmentResult:
     @property
     def camera_shape(self) -> np.ndarray:
         """(F, P, 3) poses in camera axes, in the unit of W."""
-        return self.shape @ np.swapaxes(self.rotation, 1, 2)
+        turned: np.ndarray = self.shape @ np.swapaxes(self.rotation, 1, 2)
+        return turned
 
 
 class Objective:

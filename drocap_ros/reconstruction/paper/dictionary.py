@@ -70,17 +70,20 @@ def normalize_poses(x: np.ndarray) -> np.ndarray:
     """
     scale = REFERENCE_STATURE_M * LIMBS_PER_STATURE / limb_lengths(x).sum(-1)
     shape, _ = to_torso_frame(x * scale[:, None, None])
-    return shape - shape.mean(axis=1, keepdims=True)
+    centred: np.ndarray = shape - shape.mean(axis=1, keepdims=True)
+    return centred
 
 
 def mirror_poses(s: np.ndarray) -> np.ndarray:
     """Poses (..., 15, 3) of the torso frame with left and right exchanged."""
-    return s[..., BODY_15.mirror, :] * np.array([1.0, -1.0, 1.0])
+    mirrored: np.ndarray = s[..., BODY_15.mirror, :] * np.array([1.0, -1.0, 1.0])
+    return mirrored
 
 
 def soft_threshold(x: np.ndarray, tau: float | np.floating | np.ndarray) -> np.ndarray:
     """Proximal step of ``tau * sum |x|``."""
-    return np.sign(x) * np.maximum(np.abs(x) - tau, 0.0)
+    nearer: np.ndarray = np.sign(x) * np.maximum(np.abs(x) - tau, 0.0)
+    return nearer
 
 
 def sparse_code(poses: np.ndarray, atoms: np.ndarray, sparsity: float, *, iterations: int = 60) -> np.ndarray:
@@ -90,7 +93,7 @@ def sparse_code(poses: np.ndarray, atoms: np.ndarray, sparsity: float, *, iterat
     """
     gram, target = atoms @ atoms.T, poses @ atoms.T
     step = 1.0 / np.linalg.norm(atoms, 2) ** 2
-    c = np.zeros_like(target)
+    c: np.ndarray = np.zeros_like(target)
     ahead, t = c, 1.0
     for _ in range(iterations):
         new = soft_threshold(ahead - step * (ahead @ gram - target), np.float32(step * sparsity))
@@ -186,7 +189,8 @@ def _update_atoms(
 
 def _canonical(d: np.ndarray, c: np.ndarray) -> np.ndarray:
     """Atoms in the order of their use, signed so that the sum of their coefficients is positive."""
-    return (d * np.where(c.sum(0) < 0, -1, 1)[:, None])[np.argsort(-np.abs(c).sum(0), kind="stable")]
+    signed: np.ndarray = d * np.where(c.sum(0) < 0, -1, 1)[:, None]
+    return signed[np.argsort(-np.abs(c).sum(0), kind="stable")]
 
 
 def quality(dictionary: Dictionary, poses: np.ndarray) -> dict[str, float]:

@@ -20,11 +20,13 @@ from drocap_ros.reconstruction.paper.reprojection import Projection, frames_firs
 
 #: Candidates of K in the rank 3K of the factorization.
 BASIS_SHAPES = (2, 3)
-#: Proximal gradient steps of the metric upgrade, and Gauss-Newton steps of its refinement.
-_TRACE_STEPS, _REFINING_STEPS = 300, 30
-
+#: Proximal gradient steps of the metric upgrade, chosen by hand.
+_TRACE_STEPS = 300
+#: Gauss-Newton steps of its refinement, chosen by hand.
+_REFINING_STEPS = 30
+#: Two orthographic images fix no rotation.
 MIN_IMAGES = 3
-
+#: Of depth: what a factorization leaves open.
 MIRROR = np.array([1.0, 1.0, -1.0])
 
 
@@ -171,7 +173,8 @@ def _refine_upgrade(g: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _symmetric(m: np.ndarray) -> np.ndarray:
-    return 0.5 * (m + m.T)
+    mean: np.ndarray = 0.5 * (m + m.T)
+    return mean
 
 
 def _continuous(rotation: np.ndarray) -> np.ndarray:

@@ -31,7 +31,8 @@ class SingleViewFit:
     @property
     def camera_shape(self) -> np.ndarray:
         """(F, P, 3) poses in camera axes."""
-        return self.shape @ np.swapaxes(self.rotation, 1, 2)
+        turned: np.ndarray = self.shape @ np.swapaxes(self.rotation, 1, 2)
+        return turned
 
 
 def initialize(

@@ -74,7 +74,7 @@ def sparse_gradient(
 ) -> np.ndarray:
     """(1 + K, F) gradient of the smooth part by the coefficients (1 + K, F), for rotations (3, 3, F)."""
     _, slope = projection.value_and_gradient(_shapes(basis, c), r)
-    gradient = 0.5 * (basis @ slope.reshape(basis.shape[1], -1))
+    gradient: np.ndarray = 0.5 * (basis @ slope.reshape(basis.shape[1], -1))
     if smoothness > 0.0:
         change = smoothness * (c[:, 1:] - c[:, :-1])
         gradient[:, 1:] += change
@@ -84,4 +84,5 @@ def sparse_gradient(
 
 def _shapes(basis: np.ndarray, c: np.ndarray) -> np.ndarray:
     """(3, P, F) shapes of coefficients (1 + K, F)."""
-    return (basis.T @ c).reshape(3, -1, c.shape[1])
+    shapes: np.ndarray = (basis.T @ c).reshape(3, -1, c.shape[1])
+    return shapes

@@ -17,7 +17,7 @@ from drocap_ros.skeleton import BODY_15
 
 #: Poses fitted in one batch: their Jacobians fit the processor's cache.
 CHUNK = 256
-#: Spread of the scale in the first half of the steps, over the configured one.
+#: Spread of the scale in the first half of the steps, over the configured one; chosen by hand.
 _LOOSE = 3.0
 
 
@@ -50,8 +50,9 @@ def initial_viewpoints(w: np.ndarray, information: np.ndarray, azimuths: int, el
     ce, se = np.cos(elevation_rad), np.sin(elevation_rad)
     forward = -np.stack([np.cos(angle) * ce, np.sin(angle) * ce, np.full(azimuths, se)], axis=-1)
     right = np.stack([-np.sin(angle), np.cos(angle), np.zeros(azimuths)], axis=-1)
-    views = np.stack([right, np.cross(forward, right), forward], axis=1)
-    return rolled @ views[:, None]
+    upright = np.stack([right, np.cross(forward, right), forward], axis=1)
+    views: np.ndarray = rolled @ upright[:, None]
+    return views
 
 
 def image_scale(w: np.ndarray, information: np.ndarray, dictionary: Dictionary) -> float:
