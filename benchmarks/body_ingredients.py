@@ -20,7 +20,7 @@ from body import ROOT, Score, long_enough, score
 from figures import table, write_figures
 
 from drocap_ros.mocap import mocap_files
-from drocap_ros.reconstruction.lifted import adjustment, body_size, window_solver
+from drocap_ros.reconstruction.lifted import adjustment, window_solver
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig, lifted_config
 from drocap_ros.reconstruction.lifted.lifter import Lifter
 from drocap_ros.reconstruction.lifted.network import LiftedMotion, LifterInput
@@ -52,16 +52,12 @@ def _signs_of_each_frame(reach: np.ndarray, depth: np.ndarray, *_: Any) -> np.nd
     return np.where(depth < 0, -1.0, 1.0)
 
 
-def _every_keypoint(flat: np.ndarray, *_: Any) -> np.ndarray:
-    return flat
-
-
 LEFT_OUT: dict[str, Callable[[], AbstractContextManager[Any]]] = {
     "nothing": nullcontext,
     "rotation of the camera, as an input": lambda: _blind(rotation=None),
     "covariances, as an input": lambda: _blind(covariance=None),
     "bone lengths of the first look, as an input of the second": lambda: _blind(lengths=None),
-    "hiding outliers from the second look": lambda: patch.object(body_size, "_without_outliers", _every_keypoint),
+    "hiding outliers from the second look": lambda: _with(alone_mm=1000.0),
     "both adjustments": lambda: _with(first_iterations=0, iterations=0),
     "constant bone lengths in the adjustment": lambda: patch.object(
         adjustment, "SPAN_STD_MM", np.full(len(adjustment.SPAN_STD_MM), 1e4)

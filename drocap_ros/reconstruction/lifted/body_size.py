@@ -98,7 +98,7 @@ def measure_size(view: EvenView, config: LiftedConfig, lifter: Lifter, cancelled
     zoom = zoom * found.zoom
     flat = _orthographic(keypoints.xy, found.joints[..., 2] - found.joints[:, :1, 2], centre, zoom, mm, focal)
     seconds = time.perf_counter() - clock
-    believed = _without_outliers(flat, found.joints[..., :2], model)
+    believed = without_outliers(flat, found.joints[..., :2], model.noise_mm, config)
     lifted = lifter.lift(_flattened(believed, view, mm / zoom, lengths), fps)
     return SizedWindow(model, flat, lifted, lengths, centre, zoom, mm, seconds, found.iterations)
 
@@ -147,17 +147,16 @@ def _without_noise(found: np.ndarray, lifted: np.ndarray, model: WindowModel) ->
     return mixed
 
 
-def _without_outliers(flat: np.ndarray, place: np.ndarray, model: WindowModel) -> np.ndarray:
+def without_outliers(flat: np.ndarray, place: np.ndarray, noise_mm: float, config: LiftedConfig) -> np.ndarray:
     """Keypoints (F, 17, 2) without those that are alone in their frame far from the adjusted places: NaN there.
 
     Where the distance lasts, the adjustment may be wrong instead.
     """
     from scipy.ndimage import median_filter
 
-    config = model.config
     gap = np.nan_to_num(flat - place)
     alone = np.linalg.norm(gap - median_filter(gap, size=(config.alone_frames, 1, 1), mode="nearest"), axis=-1)
-    limit_mm = config.alone_stds * model.noise_mm + config.alone_mm
+    limit_mm = config.alone_stds * noise_mm + config.alone_mm
     return np.where((alone > limit_mm)[..., None], np.nan, flat)
 
 

@@ -28,7 +28,7 @@ class Lifter:
     """A trained lifter; ``Lifter.load()`` gives the shipped one."""
 
     def __init__(self, network: Network) -> None:
-        self._network = network
+        self.network = network
 
     @staticmethod
     def load(path: str | Path | None = None) -> Lifter:
@@ -47,27 +47,27 @@ class Lifter:
     @property
     def origin(self) -> dict[str, str]:
         """The network's metadata: data, command, samples seen."""
-        return self._network.origin
+        return self.network.origin
 
     @property
     def fps(self) -> float:
         """Frame rate of the network; others are resampled."""
-        return self._network.fps
+        return self.network.fps
 
     @property
     def errors(self) -> Errors:
         """Measured errors of the network's poses."""
-        return self._network.errors
+        return self.network.errors
 
     def interleaved(self, fps: float) -> int:
         """Number of sequences as which the frames of a fast video are lifted."""
-        return max(round(fps / self._network.fps), 1)
+        return max(round(fps / self.network.fps), 1)
 
     def _pace(self, fps: float | None) -> float:
-        fps = self._network.fps if fps is None else fps
+        fps = self.network.fps if fps is None else fps
         if not 1 <= fps <= 1000:
             raise InputError(f"fps: expected 1 to 1000 frames per second, got {fps!r}; check the time stamps")
-        return fps / self._network.fps
+        return fps / self.network.fps
 
     def lift(self, seen: LifterInput, fps: float | None = None) -> LiftedMotion:
         """Lift a sequence of evenly spaced frames at 1 to 1000 frames per second.
@@ -79,9 +79,9 @@ class Lifter:
         """
         pace = self._pace(fps)
         seen = _checked(seen)
-        if pace > self._network.fastest:
+        if pace > self.network.fastest:
             return self._lift_fast(seen, round(pace))
-        if pace < self._network.slowest and len(seen) > 1:
+        if pace < self.network.slowest and len(seen) > 1:
             factor = round(1 / pace)
             return self._lift_long(seen.spread(factor)).map(lambda values: values[::factor])
         return self._lift_long(seen)
@@ -93,15 +93,15 @@ class Lifter:
         """
         pace = self._pace(fps)
         seen = _checked(seen)
-        if pace > self._network.fastest:
+        if pace > self.network.fastest:
             stride = round(pace)
             seen = seen[(len(seen) - 1) % stride :: stride]
-        elif pace < self._network.slowest and len(seen) > 1:
+        elif pace < self.network.slowest and len(seen) > 1:
             seen = seen.spread(round(1 / pace))
-        seen = seen[-self._network.window :]
+        seen = seen[-self.network.window :]
         if not np.isfinite(seen.keypoints).any():
             raise InputError("keypoints: expected a seen joint among the last frames, got none; check the detector")
-        lifted = self._network.lift(seen, newest=True)
+        lifted = self.network.lift(seen, newest=True)
         joints = lifted.joints
         if len(joints) >= len(_LINE):
             joints = np.tensordot(_LINE, joints[-len(_LINE) :], axes=1)[None]
@@ -118,9 +118,9 @@ class Lifter:
 
     def _lift_long(self, seen: LifterInput) -> LiftedMotion:
         """Windows that overlap and fade into each other: linear time, bounded memory."""
-        frames, length, overlap = len(seen), self._network.window, self._network.overlap
+        frames, length, overlap = len(seen), self.network.window, self.network.overlap
         if frames <= length:
-            return self._network.lift(seen)
+            return self.network.lift(seen)
         total = np.zeros(frames)
         out: LiftedMotion | None = None
         for begin in range(0, max(frames - overlap, 1), length - overlap):
@@ -129,7 +129,7 @@ class Lifter:
             fade = np.minimum(1.0, (there - begin + 1) / (overlap + 1)) if begin else np.ones(len(there))
             if window.stop < frames:
                 fade = np.minimum(fade, (window.stop - there) / (overlap + 1))
-            part = self._network.lift(seen[window])
+            part = self.network.lift(seen[window])
             out = out or part.map(lambda values: np.zeros((frames, *values.shape[1:])))
             for field in fields(part):
                 values = getattr(part, field.name)

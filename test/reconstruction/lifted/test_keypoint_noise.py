@@ -9,8 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.lifted import body_size
-from drocap_ros.reconstruction.lifted.body_size import EvenView, measure_size
+from drocap_ros.reconstruction.lifted.body_size import EvenView, measure_size, without_outliers
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
 from drocap_ros.reconstruction.lifted.lifter import Lifter
 from drocap_ros.reconstruction.lifted.network import LiftedMotion, LifterInput
@@ -104,7 +103,7 @@ class Watched(Lifter):
     """The shipped lifter; keeps what it was shown."""
 
     def __init__(self) -> None:
-        super().__init__(Lifter.load()._network)
+        super().__init__(Lifter.load().network)
         self.shown: list[np.ndarray] = []
 
     def lift(self, seen: LifterInput, fps: float = FPS):  # type: ignore[no-untyped-def]
@@ -129,5 +128,5 @@ def test_a_keypoint_that_stays_far_from_its_place_is_seen() -> None:
     flat = place.copy()
     flat[:, WRIST] += 250.0
     flat[7, WRIST] = np.nan
-    believed = body_size._without_outliers(flat, place, 2.0)
+    believed = without_outliers(flat, place, 2.0, LiftedConfig())
     np.testing.assert_array_equal(np.isnan(believed), np.isnan(flat))
