@@ -7,6 +7,8 @@ import pkgutil
 
 from drocap_ros.flight.autopilot.autopilot import UNKNOWN, Autopilot
 
+__all__ = ["AUTOPILOTS", "UNKNOWN", "Autopilot", "autopilot_by_heartbeat", "autopilot_of", "supported_titles"]
+
 
 def _found() -> dict[str, Autopilot]:
     modules = sorted(module.name for module in pkgutil.iter_modules(__path__))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition
-from drocap_ros.flight.findings import Finding, Level
+from drocap_ros.flight.findings import Finding, Level, Verdict, check, graded
 from drocap_ros.flight.preflight.link_checks import link_findings
 from drocap_ros.flight.preflight.measured import LASTING, Measured
 from drocap_ros.flight.preflight.setup_checks import Setup, setup_findings
@@ -23,11 +23,7 @@ def all_findings(config: MavlinkBridgeConfig, setup: Setup, measured: Measured) 
     if not measured.heard:
         return [*found, _silence(config, measured)]
     found += link_findings(config, measured)
-    if measured.vehicle is None:
-        remedy = "wait until the autopilot has started; check that it may send ATTITUDE_QUATERNION"
-        found.append(Finding("vehicle", "vehicle", Level.MISSING, "no attitude", "attitude and position", remedy))
-    else:
-        found += vehicle_findings(config, measured, measured.vehicle)
+    found += [_no_attitude()] if measured.vehicle is None else vehicle_findings(config, measured, measured.vehicle)
     explained = {code for finding in found if finding.level != Level.OK for code in finding.conditions}
     found += [_unexplained(failed, share) for failed, share in measured.conditions if failed.code not in explained]
     return found
@@ -39,14 +35,19 @@ def is_ready(found: Sequence[Finding]) -> bool:
 
 
 def _unexplained(failed: Condition, share: float) -> Finding:
-    return Finding(
-        f"condition_{failed.code.name.lower()}", "condition for motion",
-        Level.MISSING if share > LASTING else Level.WARNING, f"{failed} ({share:.0%} of the time)", "none that fails",
-        "see docs/flight.md, conditions for motion", {"share": share}, (failed.code,),
-    )  # fmt: skip
+    level, words = graded(missing=share > LASTING, warning=True), f"{failed} ({share:.0%} of the time)"
+    verdict = Verdict(level, words, "none that fails", "see docs/flight.md, conditions for motion", {"share": share})
+    return verdict.finding(f"condition_{failed.code.name.lower()}", "condition for motion", (failed.code,))
 
 
-def _silence(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
+@check("vehicle", "vehicle")
+def _no_attitude() -> Verdict:
+    remedy = "wait until the autopilot has started; check that it may send ATTITUDE_QUATERNION"
+    return Verdict(Level.MISSING, "no attitude", "attitude and position", remedy)
+
+
+@check("link", "link")
+def _silence(config: MavlinkBridgeConfig, measured: Measured) -> Verdict:
     data, remedy = "nothing", "check the cable, the power and the URL"
     if measured.unsigned_count:
         data = f"{measured.unsigned_count} messages that are not signed with the key of signing_key_file"
@@ -56,8 +57,6 @@ def _silence(config: MavlinkBridgeConfig, measured: Measured) -> Finding:
         remedy = "check the baud rate, and that the port's protocol is MAVLink 2"
     elif config.target_system_id:
         remedy += f", and target_system_id {config.target_system_id}"
-    place = measured.bridge or f"on {config.url}"
-    return Finding(
-        "link", "link", Level.MISSING, f"{data} {place}", "an autopilot's heartbeat", remedy,
-        {"bad": measured.bad_count, "unsigned": measured.unsigned_count},
-    )  # fmt: skip
+    found = f"{data} {measured.bridge or f'on {config.url}'}"
+    values = {"bad": measured.bad_count, "unsigned": measured.unsigned_count}
+    return Verdict(Level.MISSING, found, "an autopilot's heartbeat", remedy, values)

@@ -11,21 +11,23 @@ import numpy as np
 from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.findings import Finding, Level
+from drocap_ros.flight.findings import Finding, Level, Values, Verdict, check, graded
 from drocap_ros.flight.observed import Motion
 from drocap_ros.flight.orbit_goal import goal_of
 from drocap_ros.flight.subject.framing import Framing, View, orbit_margin
 from drocap_ros.flight.vehicle_state import VehicleState
 
 _C = ConditionCode
-_EDGE = 0.04
+_EDGE = 0.04  # share of the picture's rows: detectors lose feet and head nearer to the border
 _WIND_LEAN_M_S2 = 0.9  # a copter of this size leans by 5 deg against 8 m/s
-_SIDEWAYS_RAD = 1.5
-_DRIVER, _STREAM_DELAY_S = "/dev/video", 0.1
-_LEAST_PX, _GOOD_PX = 80.0, 150.0
-_WALK_M_S = 1.4
-_MEASURED_SIZE_ERROR = 0.05
-_LEAST_ROOM_M = 10.0
+_SIDEWAYS_RAD = 1.5  # from the optical axis, beyond which a point is beside the camera
+_DRIVER = "/dev/video"
+_STREAM_DELAY_S = 0.1  # of a usual network stream
+_LEAST_PX = 80.0  # height of a person below which the pose networks fail (docs/accuracy.md)
+_GOOD_PX = 150.0  # height of a person from which they do not gain
+_WALK_M_S = 1.4  # of a brisk walk
+_MEASURED_SIZE_ERROR = 0.05  # share: a stature that nobody measured errs by more
+_LEAST_ROOM_M = 10.0  # for the subject's walk
 
 
 class Setup(NamedTuple):
@@ -62,134 +64,108 @@ class Fit(NamedTuple):
 def setup_findings(config: MavlinkBridgeConfig, setup: Setup, vehicle: VehicleState | None = None) -> Iterator[Finding]:
     """Everything that can be checked without a vehicle, and with one the picture of a mount that nothing points."""
     yield _permission(config)
-    yield from _limits(config)
+    yield _limits(config)
     yield _source(setup)
-    yield from _camera(config, setup, vehicle)
+    yield _camera(setup)
+    if setup.camera_matrix is not None:
+        yield _picture(config, setup, setup.camera_matrix, vehicle)
     yield _latency(config, setup)
-    yield from _body(config, setup)
+    yield _body(config, setup)
 
 
-def _permission(config: MavlinkBridgeConfig) -> Finding:
-    allowed = config.commands_enabled
-    return Finding(
-        "commands_enabled", "permission to fly", Level.OK if allowed else Level.MISSING,
-        f"commands_enabled is {str(allowed).lower()}", "true",
-        "" if allowed else "set commands_enabled to true when you have read docs/flight.md", {},
-        (_C.COMMANDS_DISABLED,),
-    )  # fmt: skip
+@check("commands_enabled", "permission to fly", _C.COMMANDS_DISABLED)
+def _permission(config: MavlinkBridgeConfig) -> Verdict:
+    found = f"commands_enabled is {str(config.commands_enabled).lower()}"
+    remedy = "set commands_enabled to true when you have read docs/flight.md"
+    return Verdict(graded(missing=not config.commands_enabled), found, "true", remedy)
 
 
-def _limits(config: MavlinkBridgeConfig) -> Iterator[Finding]:
+@check("limits", "limits")
+def _limits(config: MavlinkBridgeConfig) -> Verdict:
     """Limits that are allowed one by one and hinder each other."""
-    omega = abs(math.radians(config.angular_speed_deg_s))
-    speed = omega * config.radius_m
-    problems = []
+    speed = abs(math.radians(config.angular_speed_deg_s)) * config.radius_m
+    words, remedies = [f"orbit of {config.radius_m:g} m, {config.height_m:g} m high, {speed:.1f} m/s"], []
     room = config.fence_radius_m - config.radius_m - speed**2 / (2 * config.braking_m_s2)
     if room < _LEAST_ROOM_M:
-        problems.append((f"the fence leaves the subject {max(room, 0):.0f} m to walk", "widen fence_radius_m"))
+        words.append(f"the fence leaves the subject {max(room, 0):.0f} m to walk")
+        remedies.append("widen fence_radius_m")
     if config.max_speed_m_s < speed + _WALK_M_S:
-        problems.append((
-            f"max_speed_m_s {config.max_speed_m_s:g} leaves {config.max_speed_m_s - speed:.1f} m/s to follow a walk of "
-            f"{_WALK_M_S:g}", "raise max_speed_m_s, or fly slower",
-        ))  # fmt: skip
+        left = f"{config.max_speed_m_s - speed:.1f} m/s to follow a walk of {_WALK_M_S:g}"
+        words.append(f"max_speed_m_s {config.max_speed_m_s:g} leaves {left}")
+        remedies.append("raise max_speed_m_s, or fly slower")
     braking_s = config.max_speed_m_s / config.braking_m_s2
     if config.blind_hold_s < 0.9 * braking_s:
-        problems.append((
-            f"blind_hold_s {config.blind_hold_s:g} is shorter than braking from max_speed_m_s, {braking_s:.1f} s",
-            "raise blind_hold_s, or lower max_speed_m_s",
-        ))  # fmt: skip
-    found = f"orbit of {config.radius_m:g} m, {config.height_m:g} m high, {speed:.1f} m/s"
-    yield Finding(
-        "limits", "limits", Level.WARNING if problems else Level.OK,
-        "; ".join([found, *(words for words, _ in problems)]), "limits that leave room for each other",
-        "; ".join(remedy for _, remedy in problems), {"speed_m_s": speed, "room_m": room},
-    )  # fmt: skip
+        words.append(
+            f"blind_hold_s {config.blind_hold_s:g} is shorter than braking from max_speed_m_s, {braking_s:.1f} s"
+        )
+        remedies.append("raise blind_hold_s, or lower max_speed_m_s")
+    level, wanted = graded(warning=bool(remedies)), "limits that leave room for each other"
+    return Verdict(level, "; ".join(words), wanted, "; ".join(remedies), {"speed_m_s": speed, "room_m": room})
 
 
-def _source(setup: Setup) -> Finding:
-    remedies = []
-    if not setup.source:
-        remedies.append("set image_ingest.source to the camera")
-    if not setup.models:
-        remedies.append(setup.models_remedy)
-    return Finding(
-        "perception", "pictures and networks", Level.MISSING if remedies else Level.OK,
-        f"{setup.source or 'no source'}, {'networks in ' + setup.models if setup.models else 'no networks'}",
-        "a camera, a detector and a pose network", "; ".join(remedies),
-        {"source": setup.source, "models": setup.models}, (_C.NO_SUBJECT,),
-    )  # fmt: skip
+@check("perception", "pictures and networks", _C.NO_SUBJECT)
+def _source(setup: Setup) -> Verdict:
+    remedies = [] if setup.source else ["set image_ingest.source to the camera"]
+    remedies += [] if setup.models else [setup.models_remedy]
+    found = f"{setup.source or 'no source'}, {'networks in ' + setup.models if setup.models else 'no networks'}"
+    values = {"source": setup.source, "models": setup.models}
+    wanted = "a camera, a detector and a pose network"
+    return Verdict(graded(missing=bool(remedies)), found, wanted, "; ".join(remedies), values)
 
 
-def _camera(config: MavlinkBridgeConfig, setup: Setup, vehicle: VehicleState | None) -> Iterator[Finding]:
+@check("camera", "camera", _C.NO_CAMERA_INFO)
+def _camera(setup: Setup) -> Verdict:
     if setup.camera_matrix is None:
-        yield Finding(
-            "camera", "camera", Level.MISSING, setup.camera_words, "a calibration, or a field of view",
-            "set image_ingest.calibration_file (ROS camera_calibration), or at least horizontal_fov_deg", {},
-            (_C.NO_CAMERA_INFO,),
-        )  # fmt: skip
-        return
-    yield Finding(
-        "camera", "camera", Level.OK if setup.calibrated else Level.WARNING, setup.camera_words, "a calibration",
-        "" if setup.calibrated else "calibrate and set image_ingest.calibration_file: an error of the field of view is "
-        "one of the range", {"fov_deg": _fov_deg(setup.camera_matrix, setup.image_size[0])},
-    )  # fmt: skip
-    yield _picture(config, setup, setup.camera_matrix, vehicle)
+        remedy = "set image_ingest.calibration_file (ROS camera_calibration), or at least horizontal_fov_deg"
+        return Verdict(Level.MISSING, setup.camera_words, "a calibration, or a field of view", remedy)
+    remedy = "calibrate and set image_ingest.calibration_file: an error of the field of view is one of the range"
+    values = {"fov_deg": math.degrees(2 * math.atan(0.5 * setup.image_size[0] / float(setup.camera_matrix[0, 0])))}
+    return Verdict(graded(warning=not setup.calibrated), setup.camera_words, "a calibration", remedy, values)
 
 
-def _latency(config: MavlinkBridgeConfig, setup: Setup) -> Finding:
+@check("camera_latency", "camera latency")
+def _latency(config: MavlinkBridgeConfig, setup: Setup) -> Verdict:
     """Whether the stamps of the pictures are the driver's; how late they are cannot be seen from here."""
     driver, stated_s = setup.source.startswith(_DRIVER), config.camera_latency_s
     stamps = f"stamps are {'' if driver else 'not '}the driver's"
+    values: Values = {"source": setup.source, "camera_latency_s": stated_s}
     if stated_s > 0:
-        return Finding(
-            "camera_latency", "camera latency", Level.OK, f"{stated_s:g} s as stated; {stamps}", "measured or stated",
-            "", {"source": setup.source, "camera_latency_s": stated_s},
-        )  # fmt: skip
+        return Verdict(Level.OK, f"{stated_s:g} s as stated; {stamps}", "measured or stated", values=values)
     aside_deg = abs(config.angular_speed_deg_s) * _STREAM_DELAY_S
     remedy = (
         f"use a camera on {_DRIVER}N, or a topic with stamps of the exposure, or measure the delay and set "
         f"camera_latency_s: {_STREAM_DELAY_S:g} s late, a picture has the person {aside_deg:.1f} deg aside"
     )
-    return Finding(
-        "camera_latency", "camera latency", Level.OK if driver else Level.WARNING,
-        f"not stated; {stamps}", "stamps of the exposure", "" if driver else remedy,
-        {"source": setup.source, "camera_latency_s": stated_s},
-    )  # fmt: skip
+    return Verdict(graded(warning=not driver), f"not stated; {stamps}", "stamps of the exposure", remedy, values)
 
 
-def _picture(config: MavlinkBridgeConfig, setup: Setup, matrix: np.ndarray, vehicle: VehicleState | None) -> Finding:
+@check("picture", "person in the picture", _C.PERSON_LEAVES_PICTURE)
+def _picture(config: MavlinkBridgeConfig, setup: Setup, matrix: np.ndarray, vehicle: VehicleState | None) -> Verdict:
     """Whether the person fits into the picture, and how high it is there."""
-    rows, aimed_deg = setup.image_size[1], -best_pitch_deg(config)
+    rows = setup.image_size[1]
     framing = Framing(config)
     framing.matrix, framing.size = matrix, setup.image_size
     if config.mount != "fixed" and vehicle is not None:
         framing.watch(vehicle, Motion(), math.nan, 0.0)
     view = framing.view()
-    pitch_deg = aimed_deg if view is None else math.degrees(view.pitch)
+    pitch_deg = -best_pitch_deg(config) if view is None else math.degrees(view.pitch)
     fit = person_in_picture(config, matrix, -pitch_deg)
-    level: Level = Level.OK
-    remedies: list[str] = []
-    if view is not None:
-        level, remedies = _unaimed_camera(
-            config, framing, view, _inside(fit, rows), vehicle.autopilot if vehicle else ""
-        )
-    elif not _inside(fit, rows):
-        level = Level.MISSING
-        remedies.append(f"fly at least {_least_radius_m(config, matrix, rows):.0f} m away, or use a wider lens")
-    if fit.height_px < _GOOD_PX:
-        level = max(level, Level.MISSING if fit.height_px < _LEAST_PX else Level.WARNING)
-        remedies.append("fly closer, or raise width_px and height_px")
-    how = "mount aims at the person"
-    if view is not None:
+    inside = _EDGE * rows <= fit.head_px and fit.feet_px <= (1 - _EDGE) * rows
+    if view is None:
+        # From this distance on the person is half as high as the picture.
+        least_m = 2.0 * float(matrix[1, 1]) * config.body_height_m / rows
+        level, remedies = graded(missing=not inside), [f"fly at least {least_m:.0f} m away, or use a wider lens"]
+        how = "mount aims at the person"
+    else:
+        level, remedies = _unaimed_camera(config, framing, view, inside, vehicle.autopilot if vehicle else "")
         how = f"mount at {pitch_deg:.0f} deg" if view.level else f"camera fixed at {pitch_deg:g} deg"
-    return Finding(
-        "picture", "person in the picture", level,
-        f"{fit.height_px:.0f} px high, rows {fit.head_px:.0f} to {fit.feet_px:.0f} of {rows} ({how})",
-        f"inside the picture, {_GOOD_PX:.0f} px high", "; ".join(remedies),
-        {"height_px": fit.height_px, "head_px": fit.head_px, "feet_px": fit.feet_px, "rows": rows,
-         "pitch_deg": pitch_deg},
-        (_C.PERSON_LEAVES_PICTURE,),
-    )  # fmt: skip
+    remedies = remedies if level != Level.OK else []
+    if fit.height_px < _GOOD_PX:
+        level = max(level, graded(missing=fit.height_px < _LEAST_PX, warning=True))
+        remedies.append("fly closer, or raise width_px and height_px")
+    found = f"{fit.height_px:.0f} px high, rows {fit.head_px:.0f} to {fit.feet_px:.0f} of {rows} ({how})"
+    values = {**fit._asdict(), "rows": rows, "pitch_deg": pitch_deg}
+    return Verdict(level, found, f"inside the picture, {_GOOD_PX:.0f} px high", "; ".join(remedies), values)
 
 
 def _unaimed_camera(
@@ -243,32 +219,17 @@ def best_pitch_deg(config: MavlinkBridgeConfig) -> float:
     return math.degrees((head + feet) / 2)
 
 
-def _inside(fit: Fit, rows: int) -> bool:
-    return _EDGE * rows <= fit.head_px and fit.feet_px <= (1 - _EDGE) * rows
-
-
-def _least_radius_m(config: MavlinkBridgeConfig, matrix: np.ndarray, rows: int) -> float:
-    """Distance from which the person is half as high as the picture."""
-    return 2.0 * float(matrix[1, 1]) * config.body_height_m / rows
-
-
-def _fov_deg(matrix: np.ndarray, width: int) -> float:
-    return math.degrees(2 * math.atan(0.5 * width / float(matrix[0, 0])))
-
-
-def _body(config: MavlinkBridgeConfig, setup: Setup) -> Iterator[Finding]:
+@check("body_height", "body height")
+def _body(config: MavlinkBridgeConfig, setup: Setup) -> Verdict:
     measured = config.size_error <= _MEASURED_SIZE_ERROR
-    other = abs(setup.assumed_height_m - config.body_height_m) > 0.005
     remedies = []
     if not measured:
         remedies.append(
             "measure the person, set body_height_m, and size_error to 0.04: a range is as wrong as the height"
         )
-    if other:
+    if abs(setup.assumed_height_m - config.body_height_m) > 0.005:
         remedies.append(f"set initializer.assumed_height_m ({setup.assumed_height_m:g}) to the same")
     words = "measured" if measured else "assumed"
-    yield Finding(
-        "body_height", "body height", Level.WARNING if remedies else Level.OK,
-        f"{config.body_height_m:g} m, {words} (size_error {config.size_error:g})", "measured", "; ".join(remedies),
-        {"body_height_m": config.body_height_m, "size_error": config.size_error},
-    )  # fmt: skip
+    found = f"{config.body_height_m:g} m, {words} (size_error {config.size_error:g})"
+    values = {"body_height_m": config.body_height_m, "size_error": config.size_error}
+    return Verdict(graded(warning=bool(remedies)), found, "measured", "; ".join(remedies), values)

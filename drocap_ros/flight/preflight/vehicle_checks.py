@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 from drocap_ros.flight.autopilot import Autopilot, autopilot_of, supported_titles
-from drocap_ros.flight.autopilot.autopilot import FenceSettings, FlownSpeeds, LossAction
+from drocap_ros.flight.autopilot.autopilot import FenceSettings, FlownSpeeds, LossAction, LossSettings
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.findings import Finding, Level
+from drocap_ros.flight.findings import Finding, Level, Values, Verdict, check, graded
 from drocap_ros.flight.orbit.motion_checks import battery_condition, loss_condition
 from drocap_ros.flight.preflight.measured import LASTING, Measured, Stream
 from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, LANDED_ON_GROUND, SATELLITES_UNKNOWN, VehicleState
 
 _C = ConditionCode
 _CAMERA = (_C.CAMERA_UNKNOWN, _C.MOUNT_TYPE_UNKNOWN, _C.MOUNT_OUTDATED)
-_GOOD_SATELLITES = 8
+_GOOD_SATELLITES = 8  # with fewer the position wanders by metres
 _MOUNT = "GIMBAL_DEVICE_ATTITUDE_STATUS"
 _FIXES = {0: "no receiver", 1: "no fix", 2: "2D", 3: "3D", 4: "3D, differential", 5: "RTK float", 6: "RTK fixed"}
 _LANDED = {LANDED_ON_GROUND: "on the ground", LANDED_IN_AIR: "in the air"}
@@ -28,7 +28,9 @@ def vehicle_findings(config: MavlinkBridgeConfig, measured: Measured, vehicle: V
     yield _identity(measured, vehicle, autopilot)
     yield from _loss(config, measured, autopilot)
     yield from _settings(config, measured, autopilot)
-    yield from _way_into_control(config, vehicle, autopilot)
+    by_hand = autopilot.hints.by_hand or not autopilot.supported
+    if not (by_hand or config.mode_change_allowed or vehicle.mode == autopilot.control_mode):
+        yield _way_into_control(autopilot)
     if autopilot.fence is not None:
         yield _fence(config, measured, autopilot.fence)
     yield _mount(config, measured, autopilot)
@@ -38,208 +40,182 @@ def vehicle_findings(config: MavlinkBridgeConfig, measured: Measured, vehicle: V
     yield _phase(vehicle)
 
 
-def _identity(measured: Measured, vehicle: VehicleState, autopilot: Autopilot) -> Finding:
-    known = autopilot.supported
-    version = measured.version or "version not reported"
-    return Finding(
-        "autopilot", "autopilot", Level.OK if known else Level.MISSING, f"{vehicle.autopilot}, {version}",
-        supported_titles(), "" if known else "the bridge flies no other autopilot",
-        {"autopilot": vehicle.autopilot, "version": measured.version}, (_C.AUTOPILOT_UNSUPPORTED,),
-    )  # fmt: skip
+@check("autopilot", "autopilot", _C.AUTOPILOT_UNSUPPORTED)
+def _identity(measured: Measured, vehicle: VehicleState, autopilot: Autopilot) -> Verdict:
+    level, found = graded(missing=not autopilot.supported), f"{vehicle.autopilot}, "
+    values = {"autopilot": vehicle.autopilot, "version": measured.version}
+    found += measured.version or "version not reported"
+    return Verdict(level, found, supported_titles(), "the bridge flies no other autopilot", values)
 
 
 def _loss(config: MavlinkBridgeConfig, measured: Measured, autopilot: Autopilot) -> Iterator[Finding]:
     settings, meaning = autopilot.loss_settings(measured.settings), autopilot.loss_action
     if settings is None:
         return
-    limit = config.max_control_timeout_s
+    refusal = loss_condition(settings, meaning, config.max_control_timeout_s)
+    too_long = refusal is not None and refusal.code in (_C.TIMEOUT_UNKNOWN, _C.TIMEOUT_TOO_LONG)
     name = settings.timeout_name
-    refusal = loss_condition(settings, meaning, limit)
-    wrong = refusal is not None and refusal.code in (_C.TIMEOUT_UNKNOWN, _C.TIMEOUT_TOO_LONG)
-    level = Level.MISSING if wrong else Level.OK if limit else Level.WARNING
-    yield Finding(
-        name.lower(), name, level, _value(settings.timeout_s, " s"), f"at most {limit:g} s" if limit else "0.5 s",
-        f"set {name} to {limit:g} on the autopilot: for so long it flies on after the bridge's death" if wrong
-        else "" if limit else "set max_control_timeout_s to 0.5: 0 switches the check off",
-        {"value": settings.timeout_s, "limit": limit}, (_C.TIMEOUT_UNKNOWN, _C.TIMEOUT_TOO_LONG),
-    )  # fmt: skip
+    verdict = _loss_timeout(settings, config.max_control_timeout_s, too_long)
+    yield verdict.finding(name.lower(), name, (_C.TIMEOUT_UNKNOWN, _C.TIMEOUT_TOO_LONG))
     if meaning is not None:
-        yield _loss_action(settings.action, meaning, refused=refusal is not None and not wrong)
+        verdict = _loss_action(settings.action, meaning, refused=refusal is not None and not too_long)
+        yield verdict.finding(meaning.setting.lower(), meaning.setting, (_C.LOSS_ACTION_FATAL,))
 
 
-def _loss_action(action: float, meaning: LossAction, refused: bool) -> Finding:
-    holds = action == meaning.hold
-    wanted, remedy = f"{meaning.hold} ({meaning.words[meaning.hold]})", ""
-    if not holds:
-        remedy = f"set {meaning.setting} to {meaning.hold} on the autopilot: what it does after the bridge's death"
-    return Finding(
-        meaning.setting.lower(), meaning.setting,
-        Level.OK if holds else Level.MISSING if refused else Level.WARNING,
-        _value(action) + _words(meaning.words, action), wanted, remedy, {"value": action}, (_C.LOSS_ACTION_FATAL,),
-    )  # fmt: skip
+def _loss_timeout(settings: LossSettings, limit_s: float, too_long: bool) -> Verdict:
+    found, values = _value(settings.timeout_s, " s"), {"value": settings.timeout_s, "limit": limit_s}
+    if not limit_s:
+        return Verdict(
+            Level.WARNING, found, "0.5 s", "set max_control_timeout_s to 0.5: 0 switches the check off", values
+        )
+    remedy = (
+        f"set {settings.timeout_name} to {limit_s:g} on the autopilot: for so long it flies on after the bridge's death"
+    )
+    return Verdict(graded(missing=too_long), found, f"at most {limit_s:g} s", remedy, values)
+
+
+def _loss_action(action: float, meaning: LossAction, refused: bool) -> Verdict:
+    level = graded(missing=refused, warning=True) if action != meaning.hold else Level.OK
+    words = f" ({meaning.words[int(action)]})" if action in meaning.words else ""
+    wanted = f"{meaning.hold} ({meaning.words[meaning.hold]})"
+    remedy = f"set {meaning.setting} to {meaning.hold} on the autopilot: what it does after the bridge's death"
+    return Verdict(level, _value(action) + words, wanted, remedy, {"value": action})
 
 
 def _settings(config: MavlinkBridgeConfig, measured: Measured, autopilot: Autopilot) -> Iterator[Finding]:
     """A finding for each parameter that was reported: no version of an autopilot has all of them."""
-    names = [check.name for check in autopilot.checks]
+    names = [each.name for each in autopilot.checks]
     if names and not any(name in measured.settings for name in names):
-        yield Finding(
-            "settings", "autopilot's settings", Level.WARNING, "not read", f"good values of {', '.join(names)}",
-            "stop the running bridge and run this again to read them",
-        )  # fmt: skip
+        wanted, remedy = f"good values of {', '.join(names)}", "stop the running bridge and run this again to read them"
+        yield Verdict(Level.WARNING, "not read", wanted, remedy).finding("settings", "autopilot's settings")
         return
     speeds = FlownSpeeds(abs(math.radians(config.angular_speed_deg_s)) * config.radius_m, config.max_speed_m_s)
-    for check in autopilot.checks:
-        value = measured.setting(check.name)
-        if math.isnan(value) and not (check.always and check.name in measured.settings):
-            continue
-        level = check.judge(value, speeds)
-        remedy = "" if level == Level.OK else check.remedy.format(speeds=speeds)
-        wanted = check.wanted.format(speeds=speeds)
-        yield Finding(check.name.lower(), check.name, level, _value(value), wanted, remedy, {"value": value})
+    for each in autopilot.checks:
+        value = measured.setting(each.name)
+        if not math.isnan(value) or (each.always and each.name in measured.settings):
+            wanted, remedy = (text.format(speeds=speeds) for text in (each.wanted, each.remedy))
+            verdict = Verdict(each.judge(value, speeds), _value(value), wanted, remedy, {"value": value})
+            yield verdict.finding(each.name.lower(), each.name)
 
 
-def _way_into_control(config: MavlinkBridgeConfig, vehicle: VehicleState, autopilot: Autopilot) -> Iterator[Finding]:
+def _way_into_control(autopilot: Autopilot) -> Finding:
     """Where the pilot cannot enter the control mode by hand, the bridge must be allowed to request it."""
-    mode, hints = autopilot.control_mode, autopilot.hints
-    if autopilot.supported and not hints.by_hand and not config.mode_change_allowed and vehicle.mode != mode:
-        yield Finding(
-            "engage", f"way into {mode}", Level.MISSING, "mode_change_allowed is false", "true",
-            f"set mode_change_allowed to true and start by `drocap orbit engage`: {hints.engaged}", {},
-            (_C.MODE_CHANGE_FORBIDDEN, _C.NOT_IN_CONTROL_MODE),
-        )  # fmt: skip
+    remedy = f"set mode_change_allowed to true and start by `drocap orbit engage`: {autopilot.hints.engaged}"
+    verdict = Verdict(Level.MISSING, "mode_change_allowed is false", "true", remedy)
+    conditions = (_C.MODE_CHANGE_FORBIDDEN, _C.NOT_IN_CONTROL_MODE)
+    return verdict.finding("engage", f"way into {autopilot.control_mode}", conditions)
 
 
-def _fence(config: MavlinkBridgeConfig, measured: Measured, settings: FenceSettings) -> Finding:
+@check("fence", "autopilot's fence")
+def _fence(config: MavlinkBridgeConfig, measured: Measured, settings: FenceSettings) -> Verdict:
     """The autopilot's own fence against ours."""
     problem, radius_m, height_m = settings.read(measured.setting)
-    radius_name, height_name = settings.radius, settings.height
-    if radius_name not in measured.settings and height_name not in measured.settings:
-        found, remedy = "not read", "stop the running bridge and run this again to read it"
-        level = Level.WARNING
-    elif problem:
-        found, level = problem, Level.WARNING
-        remedy = (
-            f"set {settings.how}, {radius_name} above {config.fence_radius_m:g} and {height_name} above "
-            f"{config.max_height_m:g} on the autopilot: the last guard that needs no companion computer"
-        )
-    else:
-        found = f"{_side(radius_m)} wide, {_side(height_m)} high"
-        remedies = []
-        # Ours is around the subject at the start, the autopilot's around its home.
-        if not radius_m > config.fence_radius_m:
-            remedies.append(f"set {radius_name} above {config.fence_radius_m:g}, or fence_radius_m lower")
-        if not height_m > config.max_height_m:
-            remedies.append(f"set {height_name} above {config.max_height_m:g}, or max_height_m lower")
-        level = Level.WARNING if remedies else Level.OK
-        remedy = "; ".join([*remedies, "a breach there ends in its own action"]) if remedies else ""
-    return Finding(
-        "fence", "autopilot's fence", level, found,
-        f"on, beyond ours: {config.fence_radius_m:g} m wide from the subject, {config.max_height_m:g} m high", remedy,
-        {"radius_m": radius_m, "height_m": height_m, "own_radius_m": config.fence_radius_m,
-         "own_height_m": config.max_height_m},
-    )  # fmt: skip
+    own_radius_m, own_height_m = config.fence_radius_m, config.max_height_m
+    wanted = f"on, beyond ours: {own_radius_m:g} m wide from the subject, {own_height_m:g} m high"
+    values = {
+        "radius_m": radius_m, "height_m": height_m, "own_radius_m": own_radius_m, "own_height_m": own_height_m,
+    }  # fmt: skip
+    if not {settings.radius, settings.height} & set(measured.settings):
+        remedy = "stop the running bridge and run this again to read it"
+        return Verdict(Level.WARNING, "not read", wanted, remedy, values)
+    if problem:
+        sizes = f"{settings.radius} above {own_radius_m:g} and {settings.height} above {own_height_m:g}"
+        remedy = f"set {settings.how}, {sizes} on the autopilot: the last guard that needs no companion computer"
+        return Verdict(Level.WARNING, problem, wanted, remedy, values)
+    remedies = []
+    # Ours is around the subject at the start, the autopilot's around its home.
+    if not radius_m > own_radius_m:
+        remedies.append(f"set {settings.radius} above {own_radius_m:g}, or fence_radius_m lower")
+    if not height_m > own_height_m:
+        remedies.append(f"set {settings.height} above {own_height_m:g}, or max_height_m lower")
+    level, found = graded(warning=bool(remedies)), f"{_side(radius_m)} wide, {_side(height_m)} high"
+    return Verdict(level, found, wanted, "; ".join([*remedies, "a breach there ends in its own action"]), values)
 
 
 def _side(metres: float) -> str:
     return "unlimited" if metres == 0 else _value(metres, " m")
 
 
-def _mount(config: MavlinkBridgeConfig, measured: Measured, autopilot: Autopilot) -> Finding:
-    stream = measured.streams.get(_MOUNT, Stream(0.0, config.gimbal_hz))
+@check("mount", "mount", *_CAMERA)
+def _mount(config: MavlinkBridgeConfig, measured: Measured, autopilot: Autopilot) -> Verdict:
+    real_hz = measured.streams.get(_MOUNT, Stream(0.0, config.gimbal_hz)).real_hz
     setting = autopilot.mount_type_setting
     number = measured.setting(setting)
     servo = number == autopilot.servo_mount
     kind = config.mount if config.mount != "auto" else "servo" if servo else "gimbal"
-    reported = stream.real_hz > 0
-    found = f"{kind}, angles at {stream.real_hz:.1f} Hz" + ("" if math.isnan(number) else f", {setting} {number:g}")
-    wanted, level, remedy = f"{config.gimbal_hz:g} Hz", Level.OK, ""
+    found = f"{kind}, angles at {real_hz:.1f} Hz" + ("" if math.isnan(number) else f", {setting} {number:g}")
+    wanted = f"{config.gimbal_hz:g} Hz"
     if kind == "fixed":
         found, wanted = f"fixed, {config.camera_pitch_deg:g} deg against the body", "as built"
-        if reported or config.gimbal_control:
-            level, remedy = (
-                Level.WARNING,
-                "a mount reports its angles: set mount to auto"
-                if reported
-                else ("set gimbal_control to false: there is nothing to turn"),
-            )
-    elif not reported:
+        level, remedy = _fixed_camera(config, real_hz)
+    elif real_hz > 0:
+        level, remedy = _mount_kind(config, kind, real_hz, None if math.isnan(number) else servo)
+    else:
+        how = f"set its type on the autopilot{autopilot.hints.mount}"
         found, level = "no mount reports its angles", Level.MISSING
-        remedy = (
-            f"connect the mount and set its type on the autopilot{autopilot.hints.mount}; without one set mount: fixed "
-            "and camera_pitch_deg"
-        )
-    elif servo and kind == "gimbal":
-        level, remedy = Level.WARNING, "set mount to servo or auto: the angles of servos are against the body"
-    elif kind == "servo" and not servo and not math.isnan(number):
-        level, remedy = Level.WARNING, "set mount to gimbal or auto: the angles of this mount are against the horizon"
-    elif stream.real_hz < config.rate_shortfall * config.gimbal_hz:
-        level, remedy = Level.WARNING, "lower gimbal_hz, or raise the rate of the link"
+        remedy = f"connect the mount and {how}; without one set mount: fixed and camera_pitch_deg"
     problem = next((c for c, share in measured.conditions if c.code in _CAMERA and share > LASTING), None)
     if problem is not None and level != Level.MISSING:
         level, remedy = Level.MISSING, str(problem)
-    return Finding(
-        "mount", "mount", level, found, wanted, remedy,
-        {"kind": kind, "real_hz": stream.real_hz, "type": number}, _CAMERA,
-    )  # fmt: skip
+    return Verdict(level, found, wanted, remedy, {"kind": kind, "real_hz": real_hz, "type": number})
 
 
-def _satellites(vehicle: VehicleState) -> Finding:
+def _fixed_camera(config: MavlinkBridgeConfig, real_hz: float) -> tuple[Level, str]:
+    if real_hz > 0:
+        return Level.WARNING, "a mount reports its angles: set mount to auto"
+    return graded(warning=config.gimbal_control), "set gimbal_control to false: there is nothing to turn"
+
+
+def _mount_kind(config: MavlinkBridgeConfig, kind: str, real_hz: float, servo: bool | None) -> tuple[Level, str]:
+    """Whether a mount that reports its angles is of its configured kind; ``servo`` None = it is not known."""
+    if servo and kind == "gimbal":
+        return Level.WARNING, "set mount to servo or auto: the angles of servos are against the body"
+    if servo is False and kind == "servo":
+        return Level.WARNING, "set mount to gimbal or auto: the angles of this mount are against the horizon"
+    slow = real_hz < config.rate_shortfall * config.gimbal_hz
+    return graded(warning=slow), "lower gimbal_hz, or raise the rate of the link"
+
+
+@check("satellites", "satellite fix", _C.NO_SATELLITE_FIX)
+def _satellites(vehicle: VehicleState) -> Verdict:
     fix, count = vehicle.gps_fix_type, vehicle.satellites
-    few = count != SATELLITES_UNKNOWN and count < _GOOD_SATELLITES
-    level = Level.MISSING if fix < 3 else Level.WARNING if few else Level.OK
-    number = "" if count == SATELLITES_UNKNOWN else f", {count} satellites"
-    return Finding(
-        "satellites", "satellite fix", level, _FIXES.get(fix, f"type {fix}") + number,
-        f"3D, {_GOOD_SATELLITES} satellites", "" if level == Level.OK else "wait, in the open",
-        {"fix_type": fix, "satellites": count}, (_C.NO_SATELLITE_FIX,),
-    )  # fmt: skip
+    known = count != SATELLITES_UNKNOWN
+    level = graded(missing=fix < 3, warning=known and count < _GOOD_SATELLITES)
+    found = _FIXES.get(fix, f"type {fix}") + (f", {count} satellites" if known else "")
+    values = {"fix_type": fix, "satellites": count}
+    return Verdict(level, found, f"3D, {_GOOD_SATELLITES} satellites", "wait, in the open", values)
 
 
-def _estimator(vehicle: VehicleState) -> Finding:
-    return Finding(
-        "estimator", "position estimate", Level.OK if vehicle.position_ok else Level.MISSING,
-        "healthy" if vehicle.position_ok else "not usable", "healthy",
-        "" if vehicle.position_ok else "wait for the autopilot's estimator; see its messages in the ground station", {},
-        (_C.ESTIMATOR_UNHEALTHY, _C.VEHICLE_STATE_UNKNOWN),
-    )  # fmt: skip
+@check("estimator", "position estimate", _C.ESTIMATOR_UNHEALTHY, _C.VEHICLE_STATE_UNKNOWN)
+def _estimator(vehicle: VehicleState) -> Verdict:
+    found = "healthy" if vehicle.position_ok else "not usable"
+    remedy = "wait for the autopilot's estimator; see its messages in the ground station"
+    return Verdict(graded(missing=not vehicle.position_ok), found, "healthy", remedy)
 
 
-def _battery(config: MavlinkBridgeConfig, vehicle: VehicleState, autopilot: Autopilot) -> Finding:
+@check("battery", "battery", _C.BATTERY_UNKNOWN, _C.BATTERY_LOW)
+def _battery(config: MavlinkBridgeConfig, vehicle: VehicleState, autopilot: Autopilot) -> Verdict:
     charge, volts = vehicle.battery_fraction, vehicle.battery_voltage_v
-    level, remedy = Level.OK, ""
     found = _value(volts, " V") if math.isnan(charge) else f"{100 * charge:.0f} %, {_value(volts, ' V')}"
     wanted = f"above {100 * config.min_battery_fraction:.0f} %"
     if config.min_battery_voltage_v:
         wanted += f", {config.min_battery_voltage_v:g} V"
     problem = battery_condition(charge, volts, config)
+    remedy = "charge the battery, or correct its capacity on the autopilot"
     if problem is not None and problem.code == _C.BATTERY_UNKNOWN:
-        level = Level.MISSING
         found += ", no charge" if not math.isnan(volts) else ": no battery monitor"
-        remedy = (
-            f"set up a battery monitor with a current sensor{autopilot.hints.battery}, or min_battery_voltage_v to fly "
-            "by the voltage alone"
-        )
-    elif problem is not None:
-        level, remedy = Level.MISSING, "charge the battery, or correct its capacity on the autopilot"
-    return Finding(
-        "battery", "battery", level, found, wanted, remedy, {"fraction": charge, "voltage_v": volts},
-        (_C.BATTERY_UNKNOWN, _C.BATTERY_LOW),
-    )  # fmt: skip
+        monitor = f"a battery monitor with a current sensor{autopilot.hints.battery}"
+        remedy = f"set up {monitor}, or min_battery_voltage_v to fly by the voltage alone"
+    return Verdict(graded(missing=problem is not None), found, wanted, remedy, {"fraction": charge, "voltage_v": volts})
 
 
-def _phase(vehicle: VehicleState) -> Finding:
+@check("phase", "now")
+def _phase(vehicle: VehicleState) -> Verdict:
     where = _LANDED.get(vehicle.landed_state, "place not reported")
-    armed = "armed" if vehicle.armed else "not armed"
-    return Finding(
-        "phase", "now", Level.OK, f"{where}, {armed}, mode {vehicle.mode}", "", "",
-        {"armed": vehicle.armed, "landed_state": vehicle.landed_state, "mode": vehicle.mode},
-    )  # fmt: skip
+    found = f"{where}, {'armed' if vehicle.armed else 'not armed'}, mode {vehicle.mode}"
+    values: Values = {"armed": vehicle.armed, "landed_state": vehicle.landed_state, "mode": vehicle.mode}
+    return Verdict(Level.OK, found, values=values)
 
 
 def _value(value: float, unit: str = "") -> str:
     return "not reported" if math.isnan(value) else f"{value:.6g}{unit}"
-
-
-def _words(names: Mapping[int, str], value: float) -> str:
-    return f" ({names[int(value)]})" if value in names else ""
