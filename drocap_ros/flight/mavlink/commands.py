@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-_RETRY_S = 0.4
+_RETRY_S = 0.4  # between tries: two round trips at the longest that is flown with
 _TRIES = 5
-_PROGRESS_S = 3.0
-_REPEAT_S = 1.5
-_SECOND_ANSWER_S = 1.0
-_NOT_ANSWERED = -1
+_PROGRESS_S = 3.0  # more patience with an autopilot that answers IN_PROGRESS
+_REPEAT_S = 1.5  # after an answer: the mode it granted has been reported by then
+_SECOND_ANSWER_S = 1.0  # after the first: measured, 0.04 s
+_NOT_ANSWERED = -1  # beside the MAV_RESULTs
 _RESULTS = {
     mavlink.MAV_RESULT_ACCEPTED: "accepted",
     mavlink.MAV_RESULT_TEMPORARILY_REJECTED: "rejected for now",

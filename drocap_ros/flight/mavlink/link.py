@@ -19,21 +19,20 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.errors import InputError
 from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
-from drocap_ros.flight.mavlink.link_status import LinkStatus
 from drocap_ros.flight.mavlink.messages import TELEMETRY_COMMANDS, is_motion, is_telemetry
 from drocap_ros.flight.mavlink.mount import Mount
-from drocap_ros.flight.mavlink.parser import MavlinkParser
+from drocap_ros.flight.mavlink.parser import MavlinkParser, read_signing_key, sign_with, signing_time
 from drocap_ros.flight.mavlink.settings import AutopilotSettings
-from drocap_ros.flight.mavlink.signing import read_signing_key, sign_with, signing_time
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
-from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
+from drocap_ros.flight.mavlink.telemetry_request import LinkStatus, TelemetryRequests
 from drocap_ros.flight.mavlink.transport import LinkError, Transport, open_transport
 from drocap_ros.flight.vehicle_state import VehicleState
 
 _NS = 1_000_000_000
-_STREAM_FALLBACK_S = 5.0
-_RECONNECT_S = 1.0
-_SENT_SETPOINTS = 80
+_RECONNECT_S = 1.0  # between tries to open a broken link again
+_SENT_SETPOINTS = 80  # kept: 1.6 s at the greatest control_hz, longer than any echo is awaited
+_REQUEST_PERIOD_S = 0.02  # between requests: an answer names none, so one is pending at a time
+_PENDING_SYNCS = 64  # questions without an answer, after which the link counts as one-way
 
 logger = logging.getLogger(__name__)
 
@@ -252,16 +251,24 @@ class MavlinkLink:
         self._heard_s = self._monotonic_s()
         self._transport.accept_peer()
         kind = self.estimator.modes.autopilot
-        if kind is not None and kind is not self._autopilot:  # the first one, or another on the same link
-            if self._autopilot:  # nothing that the other one sent, refused or said of its mount is true of this one
-                self._requests = TelemetryRequests(self.config)
-                self.estimator.mount.servos = None
-            self._autopilot = kind
-            self._requests.set_autopilot(kind)
-            self.settings.set_autopilot(kind)
+        if kind is not None and kind is not self._autopilot:
+            self._adopt(kind)
         self._requests.count(message.get_msgId(), now_ns)
-        if message.get_srcComponent() != self.estimator.component_id:
-            return state  # a gimbal, a camera or another companion of this vehicle: it answers for itself alone
+        # A gimbal, a camera or another companion of this vehicle answers for itself alone.
+        if message.get_srcComponent() == self.estimator.component_id:
+            self._take_answer(name, message, now_ns)
+        return state
+
+    def _adopt(self, autopilot: Autopilot) -> None:
+        """Take the first autopilot, or another one on the same link."""
+        if self._autopilot is not None:  # nothing that it sent, refused or said of its mount is true of the new one
+            self._requests = TelemetryRequests(self.config)
+            self.estimator.mount.servos = None
+        self._autopilot = autopilot
+        self._requests.set_autopilot(autopilot)
+        self.settings.set_autopilot(autopilot)
+
+    def _take_answer(self, name: str, message: Any, now_ns: int) -> None:
         if name == "TIMESYNC":
             self._take_time_sync(message, now_ns)
         elif name == "PARAM_VALUE":
@@ -270,7 +277,6 @@ class MavlinkLink:
             self._requests.acknowledge(message.result, now_ns)
         elif name == "COMMAND_ACK" and message.target_system in (0, self.config.system_id):
             self._answers = [*self._answers[-31:], (int(message.command), int(message.result))]
-        return state
 
     def _take_time_sync(self, message: Any, now_ns: int) -> None:
         if message.tc1 == 0:  # a request of the autopilot
@@ -293,12 +299,12 @@ class MavlinkLink:
             return
         now_ns = self._clock_ns()
         if self._is_due("time_sync", 1.0 / config.time_sync_hz):
-            if len(self._sync_sent) > 64:
+            if len(self._sync_sent) > _PENDING_SYNCS:
                 self._sync_sent.clear()
             self._sync_sent[now_ns] = self._monotonic_s()
             self._send(self._mav.timesync_encode(0, now_ns))
         system, component = self.estimator.system_id, self.estimator.component_id
-        if self._is_due("request", 0.02):
+        if self._is_due("request", _REQUEST_PERIOD_S):
             for number, interval_us in self._requests.due(now_ns):
                 self._send(
                     self._mav.command_long_encode(
@@ -307,10 +313,6 @@ class MavlinkLink:
                 )
         for setting in self.settings.due(self._monotonic_s()):
             self._send(self._mav.param_request_read_encode(system, component, setting.encode("ascii"), -1))
-        if self._requests.unanswered() and self._is_due("streams", _STREAM_FALLBACK_S):
-            # Autopilots and proxies too old for SET_MESSAGE_INTERVAL support this one.
-            rate = round(min(config.position_hz, 50))
-            self._send(self._mav.request_data_stream_encode(system, component, mavlink.MAV_DATA_STREAM_ALL, rate, 1))
 
     def _is_due(self, what: str, period_s: float) -> bool:
         now = self._monotonic_s()

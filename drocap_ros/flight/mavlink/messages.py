@@ -18,7 +18,7 @@ from drocap_ros.flight.setpoint import Setpoint
 SET_MODE = mavlink.MAV_CMD_DO_SET_MODE
 GIMBAL_PITCH = mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW
 TELEMETRY_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
-TELEMETRY = frozenset({"HEARTBEAT", "TIMESYNC", "COMMAND_LONG", "REQUEST_DATA_STREAM", "PARAM_REQUEST_READ"})
+TELEMETRY = frozenset({"HEARTBEAT", "TIMESYNC", "COMMAND_LONG", "PARAM_REQUEST_READ"})
 _MODES = frozenset(a.mode_parameters(mode)[1:3] for a in AUTOPILOTS.values() for mode in (a.control_mode, a.hold_mode))
 #: Type masks of SET_POSITION_TARGET_LOCAL_NED: all fields, and velocity with yaw rate alone.
 _ALL, _VELOCITY_ONLY = 0, 1 | 2 | 4 | 64 | 128 | 256 | 1024

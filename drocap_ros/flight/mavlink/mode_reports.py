@@ -9,11 +9,13 @@ from typing import Any
 from drocap_ros.flight.autopilot import Autopilot, autopilot_by_heartbeat
 
 _NS = 1_000_000_000
-_MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, _MAV_MODE_FLAG_SAFETY_ARMED = 1, 128
+_MAV_MODE_FLAG_CUSTOM_MODE_ENABLED = 1  # bits of MAVLink's MAV_MODE_FLAG
+_MAV_MODE_FLAG_SAFETY_ARMED = 128
 #: Packets; farther back a sequence number counts as the beginning of a new sequence.
 _MAX_LATE = 32
-_HISTORY_S = 1.0
-#: Share of lost packets above which no mode is requested: the pilot may have chosen one unseen.
+_HISTORY_S = 1.0  # in which packets of a former mode may still arrive late
+#: Share of lost packets above which no mode is requested: the pilot may have chosen one unseen.  At a quarter, the
+#: chance that both reports of a mode within 0.2 s are lost is 6 %.
 MAX_LOSS = 0.25
 _LOSS_RATE = 1 / 64  # a packet: the share of lost ones is that of the last 64, about half a second of telemetry
 

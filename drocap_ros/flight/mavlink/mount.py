@@ -16,10 +16,13 @@ from drocap_ros.flight.frames import orientation_to_ros, quaternion_from_euler, 
 from drocap_ros.geometry.rotations import slerp, unit_quaternions
 
 _NS = 1_000_000_000
-_YAW_IN_VEHICLE_FRAME, _YAW_IN_EARTH_FRAME, _YAW_LOCK = 32, 64, 16
-_STALE_S = {"gimbal": 3.0, "servo": 0.5}  # the angles of servos follow the body's lean
+# GIMBAL_DEVICE_FLAGS of MAVLink.
+_YAW_LOCK = 16
+_YAW_IN_VEHICLE_FRAME = 32
+_YAW_IN_EARTH_FRAME = 64
+_STALE_S = {"gimbal": 3.0, "servo": 0.5}  # without angles; those of servos follow the body's lean
 _UNKNOWN_S = 0.5  # without angles, from a mount that reports and does not know them
-_STEP_S = 0.25
+_STEP_S = 0.25  # between two reports, beyond which a rotation is not extrapolated
 #: A servo follows its demanded angle this much later: a frame of its signal, and its turning.
 _SERVO_DELAY_S = 0.05
 
@@ -144,8 +147,10 @@ def _status(message: Any) -> tuple[np.ndarray, bool]:
 
 #: Messages of a mount: (4,) x y z w of its angles, and whether the yaw is against north instead of the nose.
 _READERS = {
-    "GIMBAL_DEVICE_ATTITUDE_STATUS": _device_attitude, "MOUNT_ORIENTATION": _orientation, "MOUNT_STATUS": _status,
-}  # fmt: skip
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": _device_attitude,
+    "MOUNT_ORIENTATION": _orientation,
+    "MOUNT_STATUS": _status,
+}
 MESSAGES = frozenset(_READERS)
 
 

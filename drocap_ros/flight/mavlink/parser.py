@@ -1,11 +1,115 @@
-"""Bytes to MAVLink messages; no input raises."""
+"""Bytes to MAVLink messages and back: the parser, whose input never raises, signatures, and CURRENT_MODE."""
 
 from __future__ import annotations
 
+import re
+import struct
+from pathlib import Path
 from typing import Any
 
-import drocap_ros.flight.mavlink.current_mode  # noqa: F401  registers the message
-from drocap_ros.flight.mavlink.signing import SigningMavlink, sign_with
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from drocap_ros.errors import InputError
+
+_EPOCH_NS = 1_420_070_400_000_000_000  # 2015-01-01, from which signing counts in units of 10 us
+_UNIT_NS = 10_000  # of a signature's time: MAVLink's definition
+_LONGEST_FILE = 1024  # bytes of a key's file that are read: it has 64 digits
+CURRENT_MODE_ID = 436  # MAVLink's number
+
+
+class CurrentMode(mavlink.MAVLink_message):
+    """CURRENT_MODE (message 436), which pymavlink 2.4.50 does not have, as its generator would write it.
+
+    An autopilot that refuses an interval for HEARTBEAT may grant one for this message, which it sends twice a second
+    and after every change: a mode of the pilot is seen after one interval, not after the second between two heartbeats.
+    Source: MAVLink's common.xml, https://mavlink.io/en/messages/common.html#CURRENT_MODE.
+
+    Parameters
+    ----------
+    standard_mode : MAV_STANDARD_MODE, 0 = none of them
+    custom_mode : as in HEARTBEAT
+    intended_custom_mode : the mode that was chosen last, and that the vehicle may enter as soon as it can; 0 = unknown
+    """
+
+    id = CURRENT_MODE_ID
+    msgname = "CURRENT_MODE"
+    fieldnames = ("standard_mode", "custom_mode", "intended_custom_mode")
+    orders = (2, 0, 1)  # of the fields in the payload, which has the longest first
+    lengths = (1, 1, 1)
+    crc_extra = 193
+    unpacker = struct.Struct("<IIB")
+
+    def __init__(self, standard_mode: int, custom_mode: int, intended_custom_mode: int) -> None:
+        super().__init__(self.id, self.msgname)
+        self._fieldnames = self.fieldnames
+        self.standard_mode = standard_mode
+        self.custom_mode = custom_mode
+        self.intended_custom_mode = intended_custom_mode
+
+    def pack(self, mav: Any, force_mavlink1: bool = False) -> bytes:
+        """The packet's bytes by this encoder; its sequence number is not advanced."""
+        payload = self.unpacker.pack(self.custom_mode, self.intended_custom_mode, self.standard_mode)
+        return bytes(self._pack(mav, self.crc_extra, payload, force_mavlink1=force_mavlink1))
+
+
+mavlink.mavlink_map.setdefault(CURRENT_MODE_ID, CurrentMode)  # a later pymavlink has its own
+
+
+def read_signing_key(path: str) -> bytes:
+    """32 bytes from a file of 64 hexadecimal digits.  Error messages never contain the content of the file.
+
+    Raises
+    ------
+    InputError
+    """
+    file = Path(path).expanduser()
+    remedy = "write one by `openssl rand -hex 32`, and give the autopilot the same"
+    try:
+        with file.open("rb") as opened:
+            text = opened.read(_LONGEST_FILE + 1)
+    except OSError as error:
+        raise InputError(
+            f"signing_key_file: expected a file that can be read, got {path!r}: {error.strerror}; {remedy}"
+        ) from None
+    digits = text.strip()
+    if not re.fullmatch(rb"[0-9a-fA-F]{64}", digits):
+        raise InputError(
+            f"signing_key_file: expected 64 hexadecimal digits (32 bytes) and nothing else in {path!r}, "
+            f"found {len(digits)} bytes of something else; {remedy}"
+        )
+    return bytes.fromhex(digits.decode("ascii"))
+
+
+def signing_time(now_ns: int) -> int:
+    """Time of a signature: 10 us since 2015; 0 from a clock that was never set."""
+    return max((now_ns - _EPOCH_NS) // _UNIT_NS, 0)
+
+
+def sign_with(mav: Any, key: bytes, now_ns: int, link_id: int = 0) -> None:
+    """Make an encoder or parser sign its packets, and refuse packets that are not signed with this key."""
+    mav.signing.secret_key = key
+    mav.signing.sign_outgoing = True
+    mav.signing.link_id = link_id
+    mav.signing.timestamp = signing_time(now_ns)
+
+
+class SigningMavlink(mavlink.MAVLink):
+    """pymavlink's protocol object, except that a forged signature does not advance the time of its stream.
+
+    Otherwise one forged packet with a time far ahead would make every later genuine packet outdated.
+    """
+
+    def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:
+        """Whether the packet was signed with our key, later than the previous one."""
+        stream = (msgbuf[-13], srcSystem, srcComponent)
+        before = self.signing.stream_timestamps.get(stream)
+        good = bool(super().check_signature(msgbuf, srcSystem, srcComponent))
+        if not good:
+            if before is None:
+                self.signing.stream_timestamps.pop(stream, None)
+            else:
+                self.signing.stream_timestamps[stream] = before
+        return good
 
 
 class MavlinkParser:
@@ -40,7 +144,7 @@ class MavlinkParser:
         """Messages that these bytes complete; damaged ones are counted and left out."""
         try:
             found = self._mav.parse_buffer(data) or []
-        except Exception:  # the parser raises many kinds on damaged packets; none may reach the flight loop
+        except Exception:  # noqa: BLE001  the parser raises many kinds on damaged packets; none may reach the flight loop
             signing = self._mav.signing
             self._mav = self._fresh()
             self._mav.signing = signing

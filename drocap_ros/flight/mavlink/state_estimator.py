@@ -29,10 +29,10 @@ _MAV_TYPE_GCS = 6
 _ESTIMATOR_NEEDED = 1 | 2 | 4 | 32
 _ESTIMATOR_POSITION = 8 | 16
 
-_POSITION_STALE_S = 3.0
-_ESTIMATOR_STALE_S = 5.0
-_QUATERNION_PREFERRED_S = 1.0
-_EXTRAPOLATE_S = 0.5
+_POSITION_STALE_S = 3.0  # without a position: a link's silence counts then too
+_ESTIMATOR_STALE_S = 5.0  # without a report of the estimator's health, which comes once a second at least
+_QUATERNION_PREFERRED_S = 1.0  # after one, the angles of the same attitude do not count
+_EXTRAPOLATE_S = 0.5  # by the velocity, from the position to the attitude: positions come at 2 Hz at least
 
 
 class VehicleStateEstimator:
@@ -91,14 +91,15 @@ class VehicleStateEstimator:
             late = self.packets.is_late(message.get_seq())
             if name == "CURRENT_MODE":
                 self.modes.take_current_mode(message, late, receive_time_ns)
-                return None
         handler = _HANDLERS.get(name) if from_autopilot or name in mount.MESSAGES else None
-        if handler is None:
-            return None
-        if not handler(self, message, receive_time_ns):
-            return None
-        state = self.snapshot(receive_time_ns)
-        # The estimate of the clock offset improves with time: states slightly back in time are left out.
+        return self._next_state(receive_time_ns) if handler and handler(self, message, receive_time_ns) else None
+
+    def _next_state(self, now_ns: int) -> VehicleState | None:
+        """The state of a new attitude.
+
+        The estimate of the clock offset improves with time: states slightly back in time are left out.
+        """
+        state = self.snapshot(now_ns)
         if state is None or 0 <= self._stamp_ns - state.stamp_ns < 5 * _NS:
             return None
         self._stamp_ns = state.stamp_ns

@@ -1,27 +1,68 @@
-"""Requests for telemetry: which messages, at which rates, and when to repeat a request."""
+"""Requests for telemetry, and the state of the link that carries it."""
 
 from __future__ import annotations
 
 import logging
+import math
 from collections import deque
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
-from drocap_ros.flight.mavlink.current_mode import CURRENT_MODE_ID
+from drocap_ros.flight.mavlink.parser import CURRENT_MODE_ID
 
 _NS = 1_000_000_000
-_FAST_HEARTBEAT_HZ = 5.0
-#: CURRENT_MODE is sent twice a second while nothing changes, and a change after one interval.
-_CURRENT_MODE_HZ, _CURRENT_MODE_INTERVAL_HZ = 2.0, 20.0
-_ECHO_HZ = 10.0
+_FAST_HEARTBEAT_HZ = 5.0  # where it may be requested: a pilot's mode is seen within 0.2 s
+_CURRENT_MODE_HZ = 2.0  # while nothing changes: measured
+_CURRENT_MODE_INTERVAL_HZ = 20.0  # asked for: a change comes after one interval
+_ECHO_HZ = 10.0  # two echoes within the time after which a mismatch counts
 _GIMBAL = mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS
-#: Requests for the attitude of a mount that has never sent it, after which there is none: without an answer, refused.
-_MOUNT_REQUESTS, _MOUNT_REFUSALS = 10, 2
+#: Requests for the attitude of a mount that has never sent it, after which there is none.
+_MOUNT_REQUESTS = 10  # without an answer: 20 s at the usual retries
+_MOUNT_REFUSALS = 2  # that were refused
 
 logger = logging.getLogger(__name__)
+
+
+class LinkStatus(NamedTuple):
+    """State of the link.
+
+    connected : a message of the vehicle arrived within the time-out
+    silence_s : since that message; infinity before the first
+    round_trip_s : of the best time synchronization, NaN without one
+    rates_hz : (real, wanted) of each requested message, by its name
+    refused : MAV_RESULT of the messages that the autopilot does not grant
+    bad_count : pieces of data that were no message, or not signed correctly
+    refused_count : of these, whole messages that were not signed with our key
+    unknown_count : messages whose number we do not know
+    critical : whether the autopilot reports a critical state: one of its failsafes has triggered
+    """
+
+    connected: bool
+    silence_s: float
+    round_trip_s: float
+    rates_hz: dict[str, tuple[float, float]]
+    refused: dict[str, int]
+    bad_count: int
+    refused_count: int = 0
+    unknown_count: int = 0
+    critical: bool = False
+
+    def warning(self) -> str:
+        """What a flight over this link lacks, in words; "" = nothing."""
+        if self.critical:
+            return "the autopilot reports a critical state: one of its failsafes has triggered; no orbit can begin"
+        if self.refused:
+            return f"the autopilot refuses to send {', '.join(sorted(self.refused))}"
+        if math.isnan(self.round_trip_s):
+            return (
+                "the autopilot has never answered time synchronization: a late link to it is not noticed, and pictures "
+                "are not matched to its clock; let the router pass TIMESYNC"
+            )
+        return ""
 
 
 @dataclass
@@ -119,30 +160,24 @@ class TelemetryRequests:
         """(message id, interval us) to request now: at most one, so that its answer is unambiguous."""
         if self._since_ns is None or now_ns < self._since_ns:
             self._since_ns = now_ns
-        settle_ns = int(self._config.rate_window_s * _NS)
         for number, wanted in self._wanted.items():
-            wait_s = self._config.request_retry_s * (1 if wanted.result in (None, 0) else 10)
-            since_request_ns = abs(now_ns - wanted.requested_ns)  # a clock that went back must not wait for itself
-            if since_request_ns / _NS < wait_s or self._no_mount(number):
-                continue
-            measured = now_ns - self._since_ns >= settle_ns and since_request_ns >= settle_ns
-            short = measured and self.rate_hz(number, now_ns) < self._config.rate_shortfall * wanted.rate_hz
-            if wanted.request_count == 0 or short:
+            if not self._no_mount(number) and self._is_due(number, wanted, now_ns):
                 wanted.requested_ns, wanted.result = now_ns, None
                 wanted.request_count += 1
                 return [(number, round(1e6 / (wanted.interval_hz or wanted.rate_hz)))]
         return []
 
+    def _is_due(self, number: int, wanted: _Wanted, now_ns: int) -> bool:
+        """Whether a message was never requested, or arrives too rarely since the last request."""
+        since_ns = abs(now_ns - wanted.requested_ns)  # a clock that went back must not wait for itself
+        wait_s = self._config.request_retry_s * (1 if wanted.result in (None, 0) else 10)
+        if since_ns / _NS < wait_s or wanted.request_count == 0:
+            return since_ns / _NS >= wait_s
+        settle_ns = int(self._config.rate_window_s * _NS)
+        measured = self._since_ns is not None and now_ns - self._since_ns >= settle_ns and since_ns >= settle_ns
+        return measured and self.rate_hz(number, now_ns) < self._config.rate_shortfall * wanted.rate_hz
+
     def _no_mount(self, number: int) -> bool:
         wanted = self._wanted[number]
         enough = _MOUNT_REQUESTS if wanted.result in (None, mavlink.MAV_RESULT_ACCEPTED) else _MOUNT_REFUSALS
         return number == _GIMBAL and wanted.request_count >= enough and not wanted.ever
-
-    def unanswered(self) -> bool:
-        """Whether the autopilot ignores the request: three requests for a message, no answer to any."""
-        requested = [w for w in self._wanted.values() if w.request_count]
-        return (
-            bool(requested)
-            and all(w.result is None for w in requested)
-            and max(w.request_count for w in requested) >= 3
-        )

@@ -10,9 +10,9 @@ from typing import Protocol
 from drocap_ros.errors import DrocapError, InputError
 
 URL_FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE[:BAUD]"
-_MAX_DATAGRAM = 65535
-_CONNECT_TIMEOUT_S = 3.0
-_DEFAULT_BAUD = 57600
+_MAX_DATAGRAM = 65535  # bytes of UDP
+_CONNECT_TIMEOUT_S = 3.0  # of TCP, on a local network
+_DEFAULT_BAUD = 57600  # of telemetry radios as shipped
 
 
 class LinkError(DrocapError):
@@ -174,7 +174,7 @@ class _SerialTransport:
             if not select.select([self._port.fileno()], [], [], timeout_s)[0]:
                 return b""
             data = bytes(self._port.read(_MAX_DATAGRAM))
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001  drivers raise many kinds on a lost device
             raise LinkError(f"the serial link to the autopilot broke: {error}") from None
         if not data:
             raise LinkError("the serial link to the autopilot broke: the device is gone")
@@ -183,7 +183,7 @@ class _SerialTransport:
     def write(self, data: bytes) -> bool:
         try:
             return self._port.write(data) == len(data)
-        except Exception:
+        except Exception:  # noqa: BLE001  as above; what is not sent is a gap of the stream
             return False
 
     def accept_peer(self) -> None:

@@ -6,9 +6,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
-from drocap_ros.flight.mavlink.current_mode import CURRENT_MODE_ID, CurrentMode
-from drocap_ros.flight.mavlink.parser import MavlinkParser
-from drocap_ros.flight.mavlink.signing import sign_with
+from drocap_ros.flight.mavlink.parser import CURRENT_MODE_ID, CurrentMode, MavlinkParser, sign_with
 
 NUMBERS = st.integers(0, 2**32 - 1)
 OFFBOARD = 6 << 16

@@ -5,9 +5,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
-from drocap_ros.flight.mavlink.current_mode import CURRENT_MODE_ID
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.mavlink.parser import MavlinkParser
+from drocap_ros.flight.mavlink.parser import CURRENT_MODE_ID, MavlinkParser
 from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 

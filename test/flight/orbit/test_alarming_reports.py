@@ -7,7 +7,7 @@ import pytest
 from orbit_observations import GOOD, LIMITS, changed, orbiting
 
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.mavlink.link_status import LinkStatus
+from drocap_ros.flight.mavlink.telemetry_request import LinkStatus
 from drocap_ros.flight.orbit.observer import PositionJumps
 from drocap_ros.flight.orbit.safety import reduce
 from drocap_ros.flight.orbit.states import Action, Command, SafetyState, State
