@@ -17,13 +17,14 @@ from drocap_ros.cli.options import (
     clip_of,
 )
 from drocap_ros.errors import InputError
+from drocap_ros.reconstruction.methods import METHODS as OFFLINE
 
 if TYPE_CHECKING:
     from drocap_ros.motion import Motion
     from drocap_ros.pipeline import Telemetry
     from drocap_ros.tracks import Tracks
 
-METHODS = ("ba", "paper", "paper-no-articulation", "initial", "mf-nnm", "live")
+METHODS = (*OFFLINE, "live")
 
 
 def add_parser(subparsers: Any) -> None:
@@ -52,9 +53,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--method",
         choices=METHODS,
         default="ba",
-        help="ba: the most accurate (default); paper: the paper as written; paper-no-articulation: without its rank-1"
-        " term; initial: the paper's single-view initialization alone; mf-nnm: factorization and nuclear norm (Dai"
-        " 2012); live: the live graph's sliding windows, from a recording's pose2d",
+        help="; ".join(f"{name}: {offline.summary}" for name, offline in OFFLINE.items())
+        + "; live: the live graph's sliding windows, from a recording's pose2d",
     )
     add_clip_options(parser)
     parser.add_argument(
