@@ -24,7 +24,7 @@ from drocap_ros.reconstruction.common.poses import Progress
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording.open_images import open_images, refuse_other_inputs
 from drocap_ros.recording.open_session import is_recording, open_session
-from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Session
+from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, POSE2D, Session
 from drocap_ros.recording.session_tracks import read_pose2d, with_recorded_camera
 from drocap_ros.recording.video_telemetry import (
     NO_TELEMETRY,
@@ -131,7 +131,7 @@ def needs_networks(path: Path, redetect: bool) -> bool:
     if redetect or not is_recording(path):
         return True
     with open_session(path) as session:
-        return not session.has_pose2d
+        return not session.topics_of(POSE2D)
 
 
 def read_input(

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from drocap_ros.errors import InputError
 from drocap_ros.recording.mcap.metadata import METADATA_RECORD, FileRecord
 from drocap_ros.recording.mcap.schemas import standard_types
 from drocap_ros.recording.mcap.stream import MAGIC, McapChannel, McapStream, counted_channels
 from drocap_ros.recording.session import RawMessage, Session, SessionInfo, TopicInfo
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 
 class McapSession(Session):
@@ -25,7 +28,7 @@ class McapSession(Session):
         self.warnings += [f"{file.name} is empty; `drocap recover` repairs the session" for file in empty]
         self._streams = [McapStream(file) for file in files]
         self._metadata = metadata
-        self._stores: dict[McapChannel, Any] = {}
+        self._stores: dict[McapChannel, Typestore] = {}
         for file in files:
             with file.open("rb") as opened:
                 if opened.read(len(MAGIC)) != MAGIC:
@@ -45,7 +48,8 @@ class McapSession(Session):
 
     def decode(self, raw: RawMessage) -> Any:
         """The message as an object with the fields of its definition."""
-        channel: McapChannel = raw.source
+        channel = raw.source
+        assert isinstance(channel, McapChannel)
         store = self._stores.get(channel)
         if store is None:
             store = self._stores[channel] = _typestore(channel)
@@ -97,7 +101,7 @@ class McapSession(Session):
             self.warn(f"{stream.path.name}: {damage}; read the {count} messages that are whole")
 
 
-def _typestore(channel: McapChannel) -> Any:
+def _typestore(channel: McapChannel) -> Typestore:
     """Types of one channel, from its embedded schema; without one the standard types."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import platform
 from collections.abc import Mapping
@@ -16,7 +15,6 @@ from drocap_ros.revision import git_revision
 #: Keys of a session's metadata.
 CONFIGURATION, MODELS, CALIBRATION = "configuration", "models", "calibration"
 _PACKAGES = ("numpy", "scipy", "onnxruntime", "opencv-python-headless", "mcap", "pymavlink", "rclpy")
-_BLOCK = 1 << 20
 
 
 def session_provenance(namespace: str = "") -> dict[str, str]:
@@ -40,15 +38,9 @@ def configuration_text(sections: Mapping[str, Mapping[str, Any]]) -> str:
 
 def model_hashes(folder: str | Path) -> str:
     """SHA-256 of the ONNX files in a folder, as JSON by name; ``{}`` where there are none."""
-    folder = Path(folder)
-    hashes = {}
-    for path in sorted(folder.glob("*.onnx")) if folder.is_dir() else []:
-        digest = hashlib.sha256()
-        with path.open("rb") as file:
-            while block := file.read(_BLOCK):
-                digest.update(block)
-        hashes[path.name] = digest.hexdigest()
-    return json.dumps(hashes, sort_keys=True)
+    from drocap_ros.perception.models.fetch import sha256_of
+
+    return json.dumps({path.name: sha256_of(path) for path in Path(folder).glob("*.onnx")}, sort_keys=True)
 
 
 def dated_name(now_ns: int) -> str:

@@ -122,14 +122,15 @@ class PublishedPoses:
         """Compare with the published pose of the same stamp, if any."""
         theirs = self._initial.get(stamp_ns)
         if theirs:
-            _count(self.agreement.initial, theirs.popleft() == _fingerprint(joints))
+            compared, equal = self.agreement.initial
+            self.agreement.initial = [compared + 1, equal + (theirs.popleft() == _fingerprint(joints))]
 
     def compare_window(self, stamp_ns: np.ndarray, joints: np.ndarray) -> None:
         """Compare the joints (F, P, 3) at the stamps (F,) with the window that :meth:`next_window` returned last."""
         theirs, self._current = self._current, None
         if theirs is not None:
-            equal = theirs.fingerprint == _fingerprint(stamp_ns, joints)
-            _count(self.agreement.windows, equal)
+            compared, equal = self.agreement.windows
+            self.agreement.windows = [compared + 1, equal + (theirs.fingerprint == _fingerprint(stamp_ns, joints))]
 
 
 def _messages(session: Session, kind: str, name: str) -> Iterator[Any]:
@@ -156,11 +157,6 @@ def _fingerprint(*arrays: np.ndarray) -> bytes:
         digest.update(str(array.shape).encode())
         digest.update(np.where(np.isnan(array), np.float32(np.nan), array).astype(array.dtype).tobytes())
     return digest.digest()
-
-
-def _count(pair: list[int], equal: bool) -> None:
-    pair[0] += 1
-    pair[1] += equal
 
 
 def _joints(message: Any) -> np.ndarray:

@@ -69,7 +69,7 @@ class RawMessage(NamedTuple):
     type_name: str
     log_time_ns: int
     data: bytes
-    source: Any
+    source: object
 
 
 class Session(ABC):
@@ -97,16 +97,6 @@ class Session(ABC):
         if self._info is None:
             self._info = self._read_info()
         return dataclasses.replace(self._info, warnings=tuple(self.warnings))
-
-    @property
-    def has_pose2d(self) -> bool:
-        """Whether it holds keypoints."""
-        return bool(self.topics_of(POSE2D))
-
-    @property
-    def has_images(self) -> bool:
-        """Whether it holds images."""
-        return bool(self.topics_of(IMAGE, COMPRESSED_IMAGE))
 
     def topics_of(self, *type_names: str) -> list[TopicInfo]:
         """Topics of some types that have messages, those with most messages first."""

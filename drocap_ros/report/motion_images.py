@@ -16,6 +16,7 @@ from drocap_ros.motion import Motion
 from drocap_ros.perception.sources import Frame
 from drocap_ros.recording.open_images import Images, open_images
 from drocap_ros.recording.open_session import is_recording, open_session
+from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE
 
 #: Most images in a report, and bytes of all together, as base64: the page stays quick to open and to mail.
 MAX_IMAGES = 300
@@ -55,7 +56,7 @@ def has_images(path: Path) -> bool:
     if not is_recording(path):
         return True
     with open_session(path) as session:
-        return session.has_images
+        return bool(session.topics_of(IMAGE, COMPRESSED_IMAGE))
 
 
 def read_motion_images(path: Path, motion: Motion) -> MotionImages:

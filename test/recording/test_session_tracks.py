@@ -10,6 +10,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.pose_messages import add_calibration, read_observations
+from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE
 from drocap_ros.recording.session_tracks import read_pose2d
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.vehicle.flight_path import SampledPath
@@ -19,8 +20,8 @@ POSE2D, STATE, INFO = NAMES["pose2d"], NAMES["state"], NAMES["info"]
 
 def test_keypoints_exactly_as_in_the_messages(pose_session, capture):
     with open_session(pose_session) as session:
-        assert session.has_pose2d
-        assert not session.has_images
+        assert session.topics_of(POSE2D)
+        assert not session.topics_of(IMAGE, COMPRESSED_IMAGE)
         tracks = read_pose2d(session)
         assert session.warnings == []
     for name in ("keypoints", "confidence", "covariance"):

@@ -11,6 +11,8 @@ from typing import Any
 
 from drocap_ros.recording.mcap.schemas import ROS_DISTRIBUTION
 
+#: A mapping as YAML holds it.
+Yaml = dict[str, Any]
 METADATA_FILE = "metadata.yaml"
 #: Name of the metadata records that this package writes into MCAP files.
 METADATA_RECORD = "drocap_ros"
@@ -27,7 +29,7 @@ class TopicRecord:
     name: str
     type_name: str
     type_hash: str
-    qos: list[dict[str, Any]]
+    qos: list[Yaml]
     count: int = 0
 
 
@@ -50,7 +52,7 @@ class FileRecord:
         self.messages += 1
 
 
-def qos_profile(*, reliable: bool = True, depth: int = 1000) -> list[dict[str, Any]]:
+def qos_profile(*, reliable: bool = True, depth: int = 1000) -> list[Yaml]:
     """Offered quality of service in rosbag2's form."""
     return [
         {
@@ -74,7 +76,7 @@ def dump_yaml(value: object) -> str:
     return str(yaml.safe_dump(json.loads(json.dumps(value)), sort_keys=False, default_flow_style=False))
 
 
-def bag_metadata(files: list[FileRecord], topics: list[TopicRecord], custom: dict[str, str]) -> dict[str, Any]:
+def bag_metadata(files: list[FileRecord], topics: list[TopicRecord], custom: dict[str, str]) -> Yaml:
     """Content of the file: storage files, topics and times."""
     starts = [f.start_ns for f in files if f.start_ns is not None]
     start_ns = min(starts, default=None)
@@ -107,14 +109,14 @@ def bag_metadata(files: list[FileRecord], topics: list[TopicRecord], custom: dic
     }
 
 
-def _time(start_ns: int | None, end_ns: int) -> dict[str, Any]:
+def _time(start_ns: int | None, end_ns: int) -> Yaml:
     return {
         "duration": {"nanoseconds": 0 if start_ns is None else end_ns - start_ns},
         "starting_time": {"nanoseconds_since_epoch": 0 if start_ns is None else start_ns},
     }
 
 
-def read_metadata(folder: Path) -> tuple[dict[str, Any], list[str]]:
+def read_metadata(folder: Path) -> tuple[Yaml, list[str]]:
     """The description in ``metadata.yaml``, empty where there is no usable one, and warnings."""
     import yaml
 
@@ -131,13 +133,13 @@ def read_metadata(folder: Path) -> tuple[dict[str, Any], list[str]]:
         return {}, [f"{METADATA_FILE} cannot be read; read the files in the folder"]
 
 
-def custom_metadata(description: dict[str, Any]) -> dict[str, str]:
+def custom_metadata(description: Yaml) -> dict[str, str]:
     """The recorder's own entries of a description."""
     custom = description.get("custom_data")
     return {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
 
 
-def storage_files(folder: Path, description: dict[str, Any]) -> list[Path]:
+def storage_files(folder: Path, description: Yaml) -> list[Path]:
     """Files of a folder in their order, with MCAP files that a crash left out of the description."""
     there = sorted((p for p in folder.iterdir() if p.suffix == ".mcap"), key=_by_number)
     named = description.get("relative_file_paths")
@@ -148,7 +150,7 @@ def storage_files(folder: Path, description: dict[str, Any]) -> list[Path]:
     return files + [p for p in there if is_mcap and p not in files]
 
 
-def _by_number(path: Path) -> tuple[Any, ...]:
+def _by_number(path: Path) -> tuple[int | str, ...]:
     """``s_10`` comes after ``s_9``."""
     return tuple(int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name))
 

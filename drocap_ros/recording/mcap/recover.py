@@ -12,7 +12,6 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from drocap_ros.errors import InputError
 from drocap_ros.recording.mcap import metadata as bag
@@ -175,9 +174,11 @@ def _copy(stream: McapStream, target: Path) -> None:
 
 def _describe(path: Path, topics: dict[str, TopicRecord]) -> FileRecord:
     """Add the counts of a whole file to those of the session."""
-    summary: Any = McapStream(path).summary()
-    statistics = summary.statistics
     record = FileRecord(path.name)
+    summary = McapStream(path).summary()
+    if summary is None or summary.statistics is None:
+        return record
+    statistics = summary.statistics
     if statistics.message_count:
         record.start_ns, record.end_ns = statistics.message_start_time, statistics.message_end_time
         record.messages = statistics.message_count
@@ -190,7 +191,7 @@ def _describe(path: Path, topics: dict[str, TopicRecord]) -> FileRecord:
     return record
 
 
-def _qos(metadata: dict[str, str]) -> list[dict[str, Any]]:
+def _qos(metadata: dict[str, str]) -> list[bag.Yaml]:
     import yaml
 
     try:

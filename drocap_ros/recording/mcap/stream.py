@@ -6,6 +6,7 @@ chunks are skipped and counted; sizes are checked before unpacking.
 
 from __future__ import annotations
 
+import io
 import logging
 import re
 import struct
@@ -13,17 +14,24 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, NamedTuple
 
 from drocap_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from mcap.records import Channel, Chunk, McapRecord, Schema
+    from mcap.summary import Summary
 
 logger = logging.getLogger(__name__)
 
 MAGIC = b"\x89MCAP0\r\n"
+#: Largest chunk that is unpacked, and how much larger than packed one may be, beyond a size that is harmless anyway.
 _MAX_CHUNK = 512 << 20
 _FREE_EXPANSION = 64 << 20
 _MAX_EXPANSION = 1000
+#: Bytes searched at once for the next chunk.
 _SEARCH = 1 << 20
+#: MCAP's code of a chunk, https://mcap.dev/spec.
 _CHUNK_OPCODE = 6
 #: opcode, length, start and end time, unpacked size, checksum, length of the compression's name
 _CHUNK_HEAD = struct.Struct("<BQQQQII")
@@ -87,18 +95,17 @@ class McapMessage(NamedTuple):
     sequence: int = 0
 
 
-class _BoundedFile:
+class _BoundedFile(io.BufferedReader):
     """A file that limits reads to its size: a wrong length in a damaged file must not take memory."""
 
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file = file
-        self.size = file.seek(0, 2)
-        file.seek(0)
-        self.tell, self.seek = file.tell, file.seek
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self.size = self.seek(0, 2)
+        self.seek(0)
 
-    def read(self, size: int = -1) -> bytes:
-        rest = max(self.size - self._file.tell(), 0)
-        return self._file.read(rest if size < 0 else min(size, rest))
+    def read(self, size: int | None = -1, /) -> bytes:
+        rest = max(self.size - self.tell(), 0)
+        return super().read(rest if size is None or size < 0 else min(size, rest))
 
 
 @dataclass
@@ -127,7 +134,7 @@ class McapStream:
         """
         from mcap.records import Channel, Header, Message, Metadata, Schema
 
-        schemas: dict[int, Any] = {}
+        schemas: dict[int, Schema] = {}
         channels: dict[int, McapChannel] = {}
         lost = 0
         for record in self._records():
@@ -148,18 +155,17 @@ class McapStream:
         if lost:
             self.damage.append(Damage(DamageKind.UNKNOWN_CHANNELS, amount=lost))
 
-    def summary(self) -> Any | None:
-        """The file's own summary (mcap's ``Summary``), or None where there is no usable one."""
+    def summary(self) -> Summary | None:
+        """The file's own summary, or None where there is no usable one."""
         from mcap.reader import SeekingReader
 
         try:
-            with self.path.open("rb") as file:
-                bounded: Any = _BoundedFile(file)
+            with _BoundedFile(self.path) as file:
                 file.seek(-len(MAGIC), 2)
                 if file.read() != MAGIC:
                     return None
                 file.seek(0)
-                return SeekingReader(bounded, record_size_limit=bounded.size).get_summary()
+                return SeekingReader(file, record_size_limit=file.size).get_summary()
         except Exception:  # noqa: BLE001  # a damaged summary fails in many ways; the stream does without
             return None
 
@@ -171,31 +177,29 @@ class McapStream:
             return self._metadata
         found: dict[str, dict[str, str]] = {}
         try:
-            with self.path.open("rb") as file:
-                bounded: Any = _BoundedFile(file)
-                for record in SeekingReader(bounded, record_size_limit=bounded.size).iter_metadata():
+            with _BoundedFile(self.path) as file:
+                for record in SeekingReader(file, record_size_limit=file.size).iter_metadata():
                     found.setdefault(record.name, {}).update(record.metadata)
         except Exception:  # noqa: BLE001  # messages can be read without metadata
             logger.debug("%s: metadata cannot be read", self.path)
         return found
 
-    def _records(self) -> Iterator[Any]:
+    def _records(self) -> Iterator[McapRecord]:
         from mcap.records import Chunk
         from mcap.stream_reader import breakup_chunk
 
         try:
-            file = self.path.open("rb")
+            file = _BoundedFile(self.path)
         except OSError as error:
             raise InputError(f"{self.path}: expected a readable file; {error.strerror}") from None
         with file:
-            bounded: Any = _BoundedFile(file)
-            if bounded.read(len(MAGIC)) != MAGIC:
+            if file.read(len(MAGIC)) != MAGIC:
                 raise InputError(
                     f"{self.path}: expected an MCAP file, found other content at its start; check the path"
                 )
             file.seek(0)
             bad_chunks = 0
-            for record in self._raw_records(bounded, file):
+            for record in self._raw_records(file):
                 if not isinstance(record, Chunk):
                     yield record
                     continue
@@ -208,14 +212,14 @@ class McapStream:
             if bad_chunks:
                 self.damage.append(Damage(DamageKind.DAMAGED_CHUNKS, amount=bad_chunks))
 
-    def _raw_records(self, bounded: Any, file: IO[bytes]) -> Iterator[Any]:
+    def _raw_records(self, file: _BoundedFile) -> Iterator[McapRecord]:
         from mcap.stream_reader import StreamReader
 
         skip = False
         while True:
-            reader = StreamReader(bounded, skip_magic=skip, emit_chunks=True, record_size_limit=bounded.size)
+            reader = StreamReader(file, skip_magic=skip, emit_chunks=True, record_size_limit=file.size)
             known = len(self.damage)
-            yield from self._until_damaged(iter(reader.records), file, bounded.size)
+            yield from self._until_damaged(iter(reader.records), file)
             if not self.resync or len(self.damage) == known:
                 return
             place = _next_chunk(file, self._whole_until + 1)
@@ -225,7 +229,7 @@ class McapStream:
             file.seek(place)
             skip = True
 
-    def _until_damaged(self, records: Iterator[Any], file: IO[bytes], size: int) -> Iterator[Any]:
+    def _until_damaged(self, records: Iterator[McapRecord], file: _BoundedFile) -> Iterator[McapRecord]:
         from mcap.records import Footer
 
         ended, place = False, file.tell()
@@ -237,7 +241,7 @@ class McapStream:
                 return
             except Exception:  # noqa: BLE001  # mcap raises many kinds on cut or damaged records
                 if not ended:
-                    self.damage.append(Damage(DamageKind.CUT_OFF, place, size))
+                    self.damage.append(Damage(DamageKind.CUT_OFF, place, file.size))
                 return
             ended = ended or isinstance(record, Footer)
             place = file.tell()
@@ -263,14 +267,15 @@ def _next_chunk(file: IO[bytes], start: int) -> int | None:
     return None
 
 
-def counted_channels(summary: Any) -> Iterator[tuple[McapChannel, int]]:
+def counted_channels(summary: Summary) -> Iterator[tuple[McapChannel, int]]:
     """Channels of a summary with their numbers of messages."""
+    counts = summary.statistics.channel_message_counts if summary.statistics else {}
     for number, record in summary.channels.items():
         channel = _channel(record, summary.schemas.get(record.schema_id))
-        yield channel, summary.statistics.channel_message_counts.get(number, 0)
+        yield channel, counts.get(number, 0)
 
 
-def _channel(record: Any, schema: Any | None) -> McapChannel:
+def _channel(record: Channel, schema: Schema | None) -> McapChannel:
     text = schema.data.decode("utf-8", "replace") if schema is not None else ""
     return McapChannel(
         topic=record.topic,
@@ -289,7 +294,7 @@ def _ros2_name(name: str) -> str:
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
 
 
-def _unpacked(chunk: Any) -> Any:
+def _unpacked(chunk: Chunk) -> Chunk:
     """The chunk with its records uncompressed; implausible sizes raise."""
     size = chunk.uncompressed_size
     if size > _MAX_CHUNK or size > max(_FREE_EXPANSION, _MAX_EXPANSION * len(chunk.data)):

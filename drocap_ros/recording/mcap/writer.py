@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.recording.mcap.bounded_queue import BoundedQueue, QueuedMessage
@@ -19,6 +18,7 @@ from drocap_ros.recording.mcap.metadata import (
     METADATA_RECORD,
     FileRecord,
     TopicRecord,
+    Yaml,
     bag_metadata,
     dump_yaml,
     qos_profile,
@@ -28,6 +28,7 @@ from drocap_ros.recording.mcap.metadata import (
 from drocap_ros.recording.mcap.schemas import type_hash
 from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
 
+#: Bytes.
 _MIB = 1 << 20
 
 logger = logging.getLogger(__name__)
@@ -123,7 +124,7 @@ class SessionWriter:
         schema: str,
         *,
         image: bool = False,
-        qos: list[dict[str, Any]] | None = None,
+        qos: list[Yaml] | None = None,
     ) -> None:
         """Declare a topic before its first message; a repeated call has no effect.
 
@@ -314,7 +315,7 @@ class SessionWriter:
         self.error = f"{self.folder}: the recording ended early: {reason}; make room and start a new session"
         logger.error("%s", self.error)
 
-    def _description(self, current: bool) -> dict[str, Any]:
+    def _description(self, current: bool) -> Yaml:
         topics = []
         for name in sorted(self._topics):
             topic = self._topics[name]

@@ -20,6 +20,8 @@ TIME = "time(millisecond)"
 _LINE = 16384
 #: Rows: five hours at Airdata's ten a second.
 _MAX_ROWS = 200_000
+#: A later time than eleven days is damage.
+_LATEST_MS = 1e9
 _UNITS_M = {"(feet)": 0.3048, "(meters)": 1.0}
 _HEIGHT = "height_above_takeoff"
 _GIMBAL = ("gimbal_pitch(degrees)", "gimbal_roll(degrees)", "gimbal_heading(degrees)")
@@ -74,10 +76,7 @@ class _Table:
     def __init__(self, path: Path, file: IO[str]) -> None:
         reader = csv.reader(iter(lambda: file.readline(_LINE), ""))
         head = [name.strip().lower() for name in next(reader, [])]
-        if TIME not in head:
-            raise InputError(f"{path}: expected a flight log of Airdata with the column {TIME}, found another")
-        if not any(_HEIGHT + unit in head for unit in _UNITS_M) and any(name.startswith(_HEIGHT) for name in head):
-            raise InputError(f"{path}: expected {_HEIGHT} in (feet) or (meters), found another unit; export it again")
+        _check_head(path, head)
         self._names = [name for name in _USED if name in head]
         read = [(head.index(name), _utc_s if name == _UTC else _number) for name in self._names]
         rows: list[list[float]] = []
@@ -87,7 +86,7 @@ class _Table:
             rows.append([number(row[i]) if i < len(row) else math.nan for i, number in read])
         table: np.ndarray = np.array(rows, dtype=np.float64).reshape(-1, len(read))
         time_ms = table[:, self._names.index(TIME)]
-        table = table[(time_ms >= 0) & (time_ms < 1e9)]
+        table = table[(time_ms >= 0) & (time_ms < _LATEST_MS)]
         self._rows = table[np.unique(table[:, self._names.index(TIME)], return_index=True)[1]]
         if not len(self._rows):
             raise InputError(f"{path}: expected rows with {TIME}, found none; export the flight from Airdata again")
@@ -103,6 +102,13 @@ class _Table:
         """(N, 1) above take-off, in the unit that the file has."""
         unit = next((unit for unit in _UNITS_M if self.has(_HEIGHT + unit)), "(meters)")
         return self.columns(_HEIGHT + unit) * _UNITS_M[unit]
+
+
+def _check_head(path: Path, head: list[str]) -> None:
+    if TIME not in head:
+        raise InputError(f"{path}: expected a flight log of Airdata with the column {TIME}, found another; check it")
+    if not any(_HEIGHT + unit in head for unit in _UNITS_M) and any(name.startswith(_HEIGHT) for name in head):
+        raise InputError(f"{path}: expected {_HEIGHT} in (feet) or (meters), found another unit; export it again")
 
 
 def _number(text: str) -> float:

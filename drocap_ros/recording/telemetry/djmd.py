@@ -117,8 +117,7 @@ def _to_log(path: Path, file: IO[bytes], samples: Samples) -> TelemetryLog:
     count = len(samples.stamp_ns)
     probed = np.unique(np.concatenate([np.arange(min(count, 4)), np.linspace(0, count - 1, _PROBED).astype(int)]))
     messages = [m for i in probed if (m := _message(file, samples, int(i))) is not None]
-    schema = next((v for m in messages if isinstance(v := m.at(SCHEMA), bytes)), b"")
-    name = "".join(c for c in schema.decode("latin1")[:60] if c.isascii() and c.isprintable()).removesuffix(".proto")
+    name = _schema_name(messages)
     model = MODELS.get(name)
     layout = find_layout(messages, model)
     if layout is None:
@@ -136,7 +135,12 @@ def _to_log(path: Path, file: IO[bytes], samples: Samples) -> TelemetryLog:
         raise InputError(f"{path}: expected djmd messages, found {damaged} of {count} damaged; copy the file again")
     lacks = [LogLack(Lack.DAMAGED_STATES, str(damaged))] if damaged else []
     with np.errstate(all="ignore"):  # damaged numbers may be infinite
-        return _from_rows(path, samples.stamp_ns, rows, _title(name, model), model, lacks)
+        return _from_rows(path, samples.stamp_ns, rows, (name, model), lacks)
+
+
+def _schema_name(messages: list[Message]) -> str:
+    schema = next((v for m in messages if isinstance(v := m.at(SCHEMA), bytes)), b"")
+    return "".join(c for c in schema.decode("latin1")[:60] if c.isascii() and c.isprintable()).removesuffix(".proto")
 
 
 def _title(name: str, model: Model | None) -> str:
@@ -174,8 +178,9 @@ def _number(value: Value | None, missing: float) -> float:
 
 
 def _from_rows(
-    path: Path, stamp_ns: np.ndarray, rows: np.ndarray, kind: str, model: Model | None, lacks: list[LogLack]
+    path: Path, stamp_ns: np.ndarray, rows: np.ndarray, schema: tuple[str, Model | None], lacks: list[LogLack]
 ) -> TelemetryLog:
+    name, model = schema
     gimbal, aircraft, quaternion, place, heights, zoom = np.split(rows, _COLUMNS[:-1], axis=1)
     relative, absolute = heights.T * _MM
     above_takeoff = np.isfinite(relative).any()
@@ -197,7 +202,7 @@ def _from_rows(
     lens = model.lens() if model else Lens()
     return make_log(
         path,
-        kind,
+        _title(name, model),
         stamp_ns,
         lacks,
         orientation=dji_attitude(found.aircraft),

@@ -6,6 +6,7 @@ and by the file's size.
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,11 +17,15 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.tracks import MAX_FRAMES
 
+# Bounds against damaged files; whole ones are far below.
 _MAX_CHILDREN = 4096
 _MAX_TRACKS = 64
 _MAX_DURATION_S = 1e6
-_EPOCH_S = 2_082_844_800  # 1904 to 1970
-_EARLIEST_S, _LATEST_S = 946_684_800, 4_102_444_800  # 2000 to 2100
+#: Seconds from 1904, from which MP4 counts, to 1970.
+_EPOCH_S = 2_082_844_800
+#: Creation times, s from 1970, of a clock that was set: 2000 to 2100.
+_EARLIEST_S = 946_684_800
+_LATEST_S = 4_102_444_800
 
 
 class Box(NamedTuple):
@@ -59,11 +64,8 @@ class Track(NamedTuple):
 def read_tracks(file: IO[bytes]) -> list[Track]:
     """Tracks of an open file; none where it is no MP4, or its index is missing or damaged."""
     moov = _find(file, Box(b"", 0, file.seek(0, 2)), b"moov")
-    tracks: list[Track] = []
-    for box in _children(file, moov) if moov else ():
-        if box.name == b"trak" and len(tracks) < _MAX_TRACKS and (track := _track(file, box)):
-            tracks.append(track)
-    return tracks
+    tracks = (_track(file, box) for box in _children(file, moov) if box.name == b"trak")
+    return list(itertools.islice((track for track in tracks if track), _MAX_TRACKS))
 
 
 def read_samples(file: IO[bytes], track: Track) -> Samples:
@@ -118,7 +120,7 @@ def _movie_header(path: Path) -> tuple[int, float] | None:
     try:
         with path.open("rb") as file:
             box = _find(file, Box(b"", 0, file.seek(0, 2)), b"moov", b"mvhd")
-            data = _read(file, box, 0, 32) if box else b""
+            data = _read(file, box, 0, 32)
     except OSError:
         return None
     if len(data) < 32:
@@ -127,10 +129,10 @@ def _movie_header(path: Path) -> tuple[int, float] | None:
     return created, duration / scale if scale else 0.0
 
 
-def _children(file: IO[bytes], parent: Box) -> Iterator[Box]:
-    place = parent.start
+def _children(file: IO[bytes], parent: Box | None) -> Iterator[Box]:
+    place = parent.start if parent else 0
     for _ in range(_MAX_CHILDREN):
-        if place + 8 > parent.end:
+        if parent is None or place + 8 > parent.end:
             return
         file.seek(place)
         head = file.read(16)
@@ -147,34 +149,28 @@ def _children(file: IO[bytes], parent: Box) -> Iterator[Box]:
         place += length
 
 
-def _find(file: IO[bytes], parent: Box, *names: bytes) -> Box | None:
+def _find(file: IO[bytes], parent: Box | None, *names: bytes) -> Box | None:
     """The first box along a path of types."""
     for name in names:
-        found = next((box for box in _children(file, parent) if box.name == name), None)
-        if found is None:
-            return None
-        parent = found
+        parent = next((box for box in _children(file, parent) if box.name == name), None)
     return parent
 
 
-def _read(file: IO[bytes], box: Box, start: int, count: int) -> bytes:
+def _read(file: IO[bytes], box: Box | None, start: int, count: int) -> bytes:
+    """Bytes of a box from ``start`` on, fewer where it ends; none of a missing box."""
+    if box is None:
+        return b""
     file.seek(box.start + start)
     return file.read(max(0, min(count, box.end - box.start - start)))
 
 
 def _track(file: IO[bytes], trak: Box) -> Track | None:
-    mdia = _find(file, trak, b"mdia")
-    if mdia is None:
-        return None
-    boxes = {box.name: box for box in _children(file, mdia)}
-    table = _find(file, boxes[b"minf"], b"stbl") if b"minf" in boxes else None
-    entries = _find(file, table, b"stsd") if table else None
-    if table is None or entries is None or b"mdhd" not in boxes or b"hdlr" not in boxes:
-        return None
-    header = _read(file, boxes[b"mdhd"], 0, 24)
-    handler = _read(file, boxes[b"hdlr"], 8, 4)
-    entry = _read(file, entries, 8, 36)
-    if len(header) < 24 or len(handler) < 4 or len(entry) < 8:
+    boxes = {box.name: box for box in _children(file, _find(file, trak, b"mdia"))}
+    table = _find(file, boxes.get(b"minf"), b"stbl")
+    header = _read(file, boxes.get(b"mdhd"), 0, 24)
+    handler = _read(file, boxes.get(b"hdlr"), 8, 4)
+    entry = _read(file, _find(file, table, b"stsd"), 8, 36)
+    if table is None or len(header) < 24 or len(handler) < 4 or len(entry) < 8:
         return None
     scale = struct.unpack_from(">I", header, 20 if header[0] == 1 else 12)[0]
     size = struct.unpack_from(">HH", entry, 32) if handler == b"vide" and len(entry) == 36 else (0, 0)
@@ -183,7 +179,7 @@ def _track(file: IO[bytes], trak: Box) -> Track | None:
 
 def _table(file: IO[bytes], box: Box | None, kind: str, columns: int) -> np.ndarray:
     """(N, columns) int64 entries of a table with a count before them; values that no int64 holds are clipped."""
-    head = _read(file, box, 4, 4) if box else b""
+    head = _read(file, box, 4, 4)
     if box is None or len(head) < 4:
         raise InputError("expected sample tables, found none")
     count = struct.unpack(">I", head)[0]
@@ -199,7 +195,7 @@ def _table(file: IO[bytes], box: Box | None, kind: str, columns: int) -> np.ndar
 
 def _sizes(file: IO[bytes], box: Box | None, length: int) -> np.ndarray:
     """(N,) bytes; all samples together must fit into the file."""
-    head = _read(file, box, 4, 8) if box else b""
+    head = _read(file, box, 4, 8)
     if box is None or len(head) < 8:
         raise InputError("expected sample sizes (stsz), found none")
     common, count = struct.unpack(">II", head)

@@ -130,22 +130,28 @@ def _subtitles(path: Path) -> Iterator[tuple[int, str]]:
 
 def _entry(stamp_ns: int, text: str) -> tuple[_Entry, str] | None:
     """One subtitle and the source of its height, "" = none; None without telemetry."""
-    values = {name.lower(): float(number) for name, number in _VALUE.findall(text)}
+    values = _values(text)
     angles = {kind: (float(p), float(r), float(y)) for kind, p, r, y in _PRY.findall(text)}
-    if "latitude" not in values and (gps := _GPS.search(text)):
-        values |= {"longitude": float(gps[1]), "latitude": float(gps[2]), "altitude": float(gps[3])}
-    if barometer := _BAROMETER.search(text):
-        values["barometer"] = float(barometer[1] or barometer[2])
     gimbal = angles.get("G", _UNKNOWN)
     if "gb_yaw" in values and "gb_pitch" in values:
         gimbal = (values["gb_pitch"], values.get("gb_roll", 0.0), values["gb_yaw"])
     kind = next((name for name in _HEIGHTS if name in values), "")
     if not kind and not angles and math.isnan(gimbal[0]):
         return None
-    latitude = values.get("latitude", math.nan)
-    longitude = values.get("longitude", values.get("longtitude", math.nan))
-    height = values.get(kind, math.nan)
+    latitude, longitude, height = (values.get(name, math.nan) for name in ("latitude", "longitude", kind))
     return _Entry(stamp_ns, latitude, longitude, height, gimbal, angles.get("F", _UNKNOWN), _focal(text)), kind
+
+
+def _values(text: str) -> dict[str, float]:
+    """Numbers of a subtitle by name: coordinates, heights and the gimbal's angles, in any of its forms."""
+    values = {name.lower(): float(number) for name, number in _VALUE.findall(text)}
+    if "longtitude" in values:  # as some models spell it
+        values.setdefault("longitude", values["longtitude"])
+    if "latitude" not in values and (gps := _GPS.search(text)):
+        values |= {"longitude": float(gps[1]), "latitude": float(gps[2]), "altitude": float(gps[3])}
+    if barometer := _BAROMETER.search(text):
+        values["barometer"] = float(barometer[1] or barometer[2])
+    return values
 
 
 def _focal(text: str) -> tuple[float, float]:

@@ -144,7 +144,7 @@ def test_messages_reach_the_disk_within_the_chunk_time(tmp_path, messages, captu
     end = time.monotonic() + 10
     while time.monotonic() < end:  # the writer is still open, as after a crash
         with open_session(writer.path) as session:
-            if session.has_pose2d:
+            if session.topics_of(POSE2D):
                 break
         time.sleep(0.05)
     with open_session(writer.path) as session:
