@@ -12,15 +12,8 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.rotations import unit_quaternions
 from drocap_ros.perception.calibration import CameraModel
-from drocap_ros.recording.session import (
-    CAMERA_INFO,
-    POSE2D,
-    VEHICLE_STATE,
-    Session,
-    TopicInfo,
-    calibration_of,
-    header_stamp_ns,
-)
+from drocap_ros.recording import session as recorded
+from drocap_ros.recording.session import Session, TopicInfo, calibration_of, header_stamp_ns
 from drocap_ros.recording.telemetry.camera_poses import with_camera
 from drocap_ros.recording.telemetry.log import VehicleTrack
 from drocap_ros.skeleton import joint_set
@@ -50,7 +43,7 @@ def read_pose2d(session: Session, mount_pitch_deg: float | None = None, *, telem
     InputError
         When there are no usable keypoints, or ``mount_pitch_deg`` contradicts the recording.
     """
-    chosen = session.choose_topic(POSE2D)
+    chosen = session.choose_topic(recorded.POSE2D)
     poses: dict[int, Any] = {}
     repeated = 0
     for _, message in session.messages((chosen.name,)):
@@ -100,7 +93,9 @@ def with_recorded_camera(
     vehicle = read_vehicle_track(session, near) if telemetry else None
     if vehicle is None:
         if telemetry and (others := [topic.name for topic in session.topics_of(*_OTHER_POSES)]):
-            session.warn(f"no camera telemetry: {', '.join(others)} is not read, {VEHICLE_STATE} is; add it to the bag")
+            session.warn(
+                f"no camera telemetry: {', '.join(others)} is not read, {recorded.VEHICLE_STATE} is; add it to the bag"
+            )
         return tracks
     has_gimbal = bool(np.isfinite(vehicle.gimbal).all(axis=1).any())
     if mount_pitch_deg is not None and has_gimbal:
@@ -118,7 +113,7 @@ def read_vehicle_track(session: Session, near: str = "") -> VehicleTrack | None:
 
     The topic with the namespace of ``near`` is preferred.
     """
-    topic = _nearest(session.topics_of(VEHICLE_STATE), near)
+    topic = _nearest(session.topics_of(recorded.VEHICLE_STATE), near)
     if topic is None:
         return None
     rows: dict[int, tuple[np.ndarray, ...]] = {}
@@ -187,7 +182,7 @@ def _fill(target: np.ndarray, values: Any, name: str) -> None:
 
 def _camera_matrix(session: Session, near: str, size: tuple[int, int]) -> np.ndarray | None:
     """(3, 3) px of the first usable camera info, for images of ``size`` (width, height) px; or None."""
-    info = _nearest(session.topics_of(CAMERA_INFO), near)
+    info = _nearest(session.topics_of(recorded.CAMERA_INFO), near)
     if info is None:
         return None
     camera = _first_calibration(session, info.name, size)

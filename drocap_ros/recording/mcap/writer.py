@@ -11,20 +11,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from drocap_ros.errors import InputError, first_line
+from drocap_ros.recording.mcap import metadata as bag
 from drocap_ros.recording.mcap.bounded_queue import BoundedQueue, QueuedMessage
 from drocap_ros.recording.mcap.file import McapFile
-from drocap_ros.recording.mcap.metadata import (
-    METADATA_FILE,
-    METADATA_RECORD,
-    FileRecord,
-    TopicRecord,
-    Yaml,
-    bag_metadata,
-    dump_yaml,
-    qos_profile,
-    sync_folder,
-    write_atomically,
-)
+from drocap_ros.recording.mcap.metadata import METADATA_FILE, METADATA_RECORD, FileRecord, TopicRecord, Yaml
 from drocap_ros.recording.mcap.schemas import type_hash
 from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
 
@@ -146,7 +136,7 @@ class SessionWriter:
                 if known.type_name != type_name:
                     raise InputError(f"{topic}: expected type {known.type_name} as registered before, got {type_name}")
                 return
-            profile = qos or qos_profile(reliable=not image)
+            profile = qos or bag.qos_profile(reliable=not image)
             record = TopicRecord(topic, type_name, type_hash(type_name, schema), profile)
             if self.error is None:
                 self._file.register(record, schema)
@@ -262,7 +252,7 @@ class SessionWriter:
         if self._custom:
             file.add_metadata(METADATA_RECORD, self._custom)
         file.commit(self.config.sync)
-        sync_folder(self.folder)
+        bag.sync_folder(self.folder)
         return file
 
     def _file_is_full(self, log_time_ns: int) -> bool:
@@ -273,7 +263,7 @@ class SessionWriter:
         return old or (config.split_mib > 0 and self._file.size >= config.split_mib * _MIB)
 
     def _finish_file(self) -> None:
-        text = dump_yaml(self._description(current=True))
+        text = bag.dump_yaml(self._description(current=True))
         self._file.add_metadata("rosbag2", {"serialized_metadata": text})
         self._file.finish(self.config.sync)
         self._keep_counts()
@@ -322,10 +312,10 @@ class SessionWriter:
             count = topic.count + (self._file.topics[name].count if current else 0)
             topics.append(TopicRecord(name, topic.type_name, topic.type_hash, topic.qos, count))
         files = [*self._finished, self._file.record] if current else self._finished
-        return bag_metadata(files, topics, self._custom)
+        return bag.bag_metadata(files, topics, self._custom)
 
     def _write_description(self, current: bool = True) -> None:
-        write_atomically(self.folder / METADATA_FILE, dump_yaml(self._description(current)))
+        bag.write_atomically(self.folder / METADATA_FILE, bag.dump_yaml(self._description(current)))
 
     def _make_folder(self) -> None:
         folder = self.folder
