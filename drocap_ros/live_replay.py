@@ -15,7 +15,7 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.stop_reason import NO_WINDOW
-from drocap_ros.reconstruction.live.replay import LivePose, live_poses
+from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort
 from drocap_ros.reconstruction.reconstruct import reprojection_px
 from drocap_ros.recording.pose_messages import read_observations
@@ -97,22 +97,13 @@ def reconstruct_live(
         else:
             window = result.window
             published.compare_window(window.stamp_ns, result.joints3d)
-            for i, stamp_ns in enumerate(window.stamp_ns.tolist()):
-                # A pose in map stays: a window after the end of the telemetry holds older frames too.
-                if window.in_map is not None or frames[stamp_ns].camera is None:
-                    frames[stamp_ns] = _Frame(frames[stamp_ns].observation, result.joints3d[i], _camera_of(window, i))
+            _take_window(frames, result)
             stop_reason, iterations = window.stop_reason, iterations + window.iterations
         if progress is not None and done % 50 == 0:
             progress("live", min(1.0, done / max(topic.count, 1)))
     subject = most_frequent_subject(session, (frame.observation for frame in frames.values()))
     frames = {stamp: frame for stamp, frame in frames.items() if frame.observation.track_id == subject}
-    in_map = {stamp: frame for stamp, frame in frames.items() if frame.camera is not None}
-    if in_map and 2 * len(in_map) >= len(frames):
-        tracks, joints3d = _arrays(session, in_map, camera.matrix)
-        motion = _motion_in_world(tracks, joints3d, config)
-    else:
-        tracks, joints3d = _arrays(session, {stamp: frame.in_camera_axes() for stamp, frame in frames.items()})
-        motion = _motion(tracks, joints3d, config)
+    motion, tracks = _motion_of(session, frames, camera.matrix, config)
     motion.meta.update(
         method="live",
         parameters={
@@ -143,6 +134,26 @@ class _Frame(NamedTuple):
         return _Frame(self.observation, (self.joints - self.joints[0]) @ rotation.T)
 
 
+def _take_window(frames: dict[int, _Frame], result: LiveWindow) -> None:
+    """Take the window's poses; a pose in ``map`` stays, as a window after the end of the telemetry holds it too."""
+    window = result.window
+    for i, stamp_ns in enumerate(window.stamp_ns.tolist()):
+        if window.in_map is not None or frames[stamp_ns].camera is None:
+            frames[stamp_ns] = _Frame(frames[stamp_ns].observation, result.joints3d[i], _camera_of(window, i))
+
+
+def _motion_of(
+    session: Session, frames: dict[int, _Frame], matrix: np.ndarray | None, config: DrocapConfig
+) -> tuple[Motion, Tracks]:
+    """The motion in ``map`` of the frames that are there, where at least half are; else of all in camera axes."""
+    in_map = {stamp: frame for stamp, frame in frames.items() if frame.camera is not None}
+    if in_map and 2 * len(in_map) >= len(frames):
+        tracks, joints3d = _arrays(session, in_map, matrix)
+        return _motion_in_world(tracks, joints3d, config), tracks
+    tracks, joints3d = _arrays(session, {stamp: frame.in_camera_axes() for stamp, frame in frames.items()})
+    return _motion(tracks, joints3d, config), tracks
+
+
 def _camera_of(window: AdjustedWindow, frame: int) -> tuple[np.ndarray, np.ndarray] | None:
     return None if window.in_map is None else (window.in_map.rotation[frame], window.in_map.position[frame])
 
@@ -156,12 +167,12 @@ def _arrays(session: Session, frames: dict[int, _Frame], matrix: np.ndarray | No
     cameras = [frames[stamp].camera for stamp in stamps]
     known = [camera for camera in cameras if camera is not None]
     first = observations[0]
-    for other in observations:
-        if (other.joints, other.image_size) != (first.joints, first.image_size):
-            raise InputError(
-                f"{session.path}: expected {_format(first)} throughout, got {_format(other)}; cut the recording where"
-                " that changes"
-            )
+    other = next((o for o in observations if (o.joints, o.image_size) != (first.joints, first.image_size)), None)
+    if other is not None:
+        raise InputError(
+            f"{session.path}: expected {_format(first)} throughout, got {_format(other)}; cut the recording where"
+            " that changes"
+        )
     return (
         Tracks(
             keypoints=np.array([o.keypoints for o in observations], np.float64),

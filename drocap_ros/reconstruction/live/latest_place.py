@@ -12,14 +12,21 @@ from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 
-#: Images of the last half second, and at most so many, have a say.
-_PAST_NS, _MOST_IMAGES = 5 * 10**8, 60
-#: Images whose ranges are compared with a solution's; least number of keypoints; limits of the factor.
-_MOST_RANGES, _LEAST_SEEN, _FACTORS = 90, 4, (0.8, 1.25)
-#: Ordinary speed of a person, against an error of the place that an image's pose leaves, m/s and m.
-_SPEED_M_S, _ERROR_M = 1.0, 0.05
-#: Standard deviation of the place: m across the line of sight, share of the range along it.
-_ACROSS_M, _ALONG = 0.03, 0.03
+#: Images of the last half second (ns) have a say, in which a person moves straight on, and at most so many.
+_PAST_NS = 5 * 10**8
+_MOST_IMAGES = 60
+#: Images whose ranges are compared with a solution's: those of its last three seconds at 30 Hz.
+_MOST_RANGES = 90
+#: Fewer keypoints determine no place: four rays, for three coordinates.
+_LEAST_SEEN = 4
+#: Limits of the factor between ranges: people's statures differ by less.
+_FACTORS = (0.8, 1.25)
+#: Ordinary speed (m/s) of a person, against an error (m) of the place that an image's pose leaves: walking, 5 cm.
+_SPEED_M_S = 1.0
+_ERROR_M = 0.05
+#: Standard deviation of the place: m across the line of sight, share of the range along it; a stature's is 5 %.
+_ACROSS_M = 0.03
+_ALONG = 0.03
 
 
 class PlacedPose(NamedTuple):
@@ -146,4 +153,4 @@ def _covariance(packed: np.ndarray, rotation: np.ndarray, sight: np.ndarray) -> 
     along = np.outer(sight, sight)
     place = _ACROSS_M**2 * (np.eye(3) - along / max(float(sight @ sight), 1e-12)) + _ALONG**2 * along
     full = rotation.T @ unpack_covariance(packed) @ rotation + place
-    return full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    return np.asarray(full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])

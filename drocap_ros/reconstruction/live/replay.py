@@ -61,12 +61,7 @@ def live_poses(
     initial, buffer, solver = LiveInitializer(initializer), FrameBuffer(adjuster), LiveAdjuster(adjuster)
     arrivals = StampValidator()  # of pose3d/initial at the adjuster's node
     for observation in observations:
-        if not observation.has_subject:
-            continue
-        try:
-            pose = initial.push(observation)
-        except InputError:
-            continue
+        pose = _initial_pose(initial, observation)
         if pose is None:
             continue
         joints = pose.joints3d.astype(np.float32)
@@ -87,3 +82,13 @@ def live_poses(
         except SOLVER_ERRORS:
             continue
         yield LiveWindow(result.joints3d.astype(np.float32), result)
+
+
+def _initial_pose(initial: LiveInitializer, observation: PoseObservation) -> InitialPose | None:
+    """The pose that the initializer's node publishes; None = none."""
+    if not observation.has_subject:
+        return None
+    try:
+        return initial.push(observation)
+    except InputError:
+        return None

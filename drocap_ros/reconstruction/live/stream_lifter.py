@@ -15,8 +15,11 @@ from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.lifted.lifter import Lifter
 from drocap_ros.reconstruction.lifted.network import LifterInput
 
-#: Images before the first estimate of the proportions, images between two estimates, and estimates kept.
-FIRST_ESTIMATE, ESTIMATE_EVERY, ESTIMATES = 12, 24, 40
+#: Images before the first estimate of the proportions, half a second, and images between two, a second.
+_FIRST_ESTIMATE = 12
+_ESTIMATE_EVERY = 24
+#: Estimates kept, of which the median counts: of most of a minute.
+_ESTIMATES = 40
 
 #: Images over which the size in the image is the median.
 SIZE_IMAGES = 30
@@ -41,7 +44,7 @@ class StreamLifter:
         self._past_ns = round(past_s * 1e9)
         self._limbs_m = height_m * LIMBS_PER_STATURE
         self._past: deque[tuple[int, np.ndarray, np.ndarray]] = deque(maxlen=MAX_IMAGES)
-        self._proportions: deque[np.ndarray] = deque(maxlen=ESTIMATES)
+        self._proportions: deque[np.ndarray] = deque(maxlen=_ESTIMATES)
         self._since_estimate = 0
         self._limbs_px: deque[float] = deque(maxlen=SIZE_IMAGES)
 
@@ -67,7 +70,7 @@ class StreamLifter:
         weight = np.zeros(points.shape[:2])
         points[slot], weight[slot] = self._with_own_legs(stamps)
         self._since_estimate += 1
-        if self._since_estimate >= (ESTIMATE_EVERY if self._proportions else FIRST_ESTIMATE):
+        if self._since_estimate >= (_ESTIMATE_EVERY if self._proportions else _FIRST_ESTIMATE):
             self._since_estimate = 0
             self._estimate_proportions(points, weight, fps)
         lifted = self._lifter.lift_last(LifterInput(points, weight, self._lengths_px()), fps)

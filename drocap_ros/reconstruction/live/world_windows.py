@@ -11,8 +11,10 @@ from dataclasses import replace
 import numpy as np
 
 from drocap_ros.geometry.bones import LIMBS_PER_STATURE, limb_lengths
+from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.geometry.rotations import log_so3
+from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.common.refusal import Refusal
@@ -27,10 +29,15 @@ from drocap_ros.reconstruction.world.world_model import world_config
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
 
-#: Steps of a first window, and of one that continues another; and those of both that lock feet.
-_STEPS, _FEWER_STEPS, _LOCKING_STEPS = 4, 2, 1
-#: The newest images may lack a reported pose for so long, and shorter windows than this determine nothing.
-_LATE_S, _LEAST_S = 0.5, 2.0
+#: Steps of a first window, of one that continues another, and those of both that lock feet: what more steps would
+#: change, the next window does, half a second later.
+_STEPS = 4
+_FEWER_STEPS = 2
+_LOCKING_STEPS = 1
+#: Time (s) for which the newest images may lack a reported pose: states of the vehicle arrive later than images.
+_LATE_S = 0.5
+#: Shorter windows (s) determine nothing: they hold no two steps of walking.
+_LEAST_S = 2.0
 
 
 class WorldWindows:
@@ -72,16 +79,11 @@ class WorldWindows:
         self._moved |= not unchanged(camera.rotation, camera.position).all()
         if self._moved and (refusal := stopped(camera.rotation, camera.position, stamps)):
             return self._refused(camera_result, refusal)
-        # The size of the images is unknown here, and not used.
-        size = (math.ceil(camera.matrix[0, 0]), math.ceil(camera.matrix[1, 1]))
-        tracks = Tracks(
-            keypoints.xy, BODY_17.joints, stamps, size, camera_rotation=camera.rotation,
-            camera_position=camera.position, camera_matrix=camera.matrix,
-        )  # fmt: skip
+        tracks = _tracks(stamps, keypoints, camera)
         poses = ImagePoses.centred(found.joints[use], sigma_px=found.sigma[use], still=found.still[use])
         per_px = metres_per_px(poses.joints_px, stamps, _assumed_height(w.initial_joints))
         known = self._prior(stamps)
-        before = None if self._before is None or stamps[0] > self._before[0].stamp_ns[-1] else self._before[0]
+        before = self._continued(stamps)
         config = self._config if before is None else replace(self._config, iterations=_FEWER_STEPS)
         _, refined = in_world(tracks, keypoints, poses, per_px, config, known, before)
         if refined is None:
@@ -106,6 +108,12 @@ class WorldWindows:
         self._before = None
         return replace(camera_result, telemetry=TelemetryUse.REFUSED, reason=str(refusal))
 
+    def _continued(self, stamps: np.ndarray) -> Before | None:
+        """The window before, where the window of these stamps shares frames with it."""
+        if self._before is None or stamps[0] > self._before[0].stamp_ns[-1]:
+            return None
+        return self._before[0]
+
     def _prior(self, stamps: np.ndarray) -> Findings:
         """Findings of earlier windows that the window of these stamps has not itself."""
         if self._before is None:
@@ -127,6 +135,19 @@ class WorldWindows:
         if stamps[-1] - stamps[end - 1] > _LATE_S * 1e9 or stamps[end - 1] - stamps[begin] < _LEAST_S * 1e9:
             return None
         return slice(begin, end)
+
+
+def _tracks(stamp_ns: np.ndarray, keypoints: Keypoints2D, camera: WindowCamera) -> Tracks:
+    return Tracks(
+        keypoints=keypoints.xy,
+        joints=BODY_17.joints,
+        stamp_ns=stamp_ns,
+        # The size of the images is unknown here, and not used.
+        image_size=(math.ceil(camera.matrix[0, 0]), math.ceil(camera.matrix[1, 1])),
+        camera_rotation=camera.rotation,
+        camera_position=camera.position,
+        camera_matrix=camera.matrix,
+    )
 
 
 def _correction(refined: RefinedWorld, tracks: Tracks) -> np.ndarray:

@@ -77,4 +77,4 @@ class CameraTelemetry:
         at = np.arange(self.frames)
         path = np.stack([np.interp(inside, at, self._smooth[:, axis]) for axis in range(3)], axis=1)
         ends = np.where((frame < inside)[:, None], self._velocity[0], self._velocity[-1])
-        return path + ends * ((frame - inside) / self.fps)[:, None]
+        return np.asarray(path + ends * ((frame - inside) / self.fps)[:, None])

@@ -56,10 +56,9 @@ def in_world(
     placed = place_in_world(in_camera_axes(poses, per_px), projected, per_px, tracks)
     if poses.sigma_px is None:
         return placed, None
-    if refusal := upside_down(placed.joints, rotation):
+    refusal = upside_down(placed.joints, rotation)
+    if refusal or not refinable(tracks) or not np.isfinite(placed.joints).all():
         return placed, refusal
-    if not refinable(tracks) or not np.isfinite(placed.joints).all():
-        return placed, None
     size = per_px[:, None]
     depth = (poses.joints_px[..., 2] - poses.joints_px[:, [_PELVIS], 2]) * size
     factor = placed.scale.factor if placed.metric and placed.scale is not None else 1.0

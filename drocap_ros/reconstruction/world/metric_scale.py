@@ -12,16 +12,17 @@ import numpy as np
 
 from drocap_ros.contacts import rest_likelihood
 
-#: Time lags between two positions of a foot.
+#: Times (s) between two positions of a foot: parts of the half second for which a walker's foot stands.
 LAGS_S = (0.15, 0.25, 0.4)
 
-#: Distance within which a foot counts as still, m.
+#: Standard deviation (m) of the way of a foot at rest across the line of sight: errors of adjusted poses.
 STILL_M = 0.03
 
 #: Range of the factors; the assumed height of a person keeps people within it.
-LOWEST, HIGHEST = 0.6, 1.6
+LOWEST = 0.6
+HIGHEST = 1.6
 
-#: Most pairs of frames, spread over the recording.
+#: Most pairs of frames, spread over the recording: more take time and tell the same.
 MOST_PAIRS = 4000
 
 

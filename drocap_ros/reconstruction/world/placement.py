@@ -11,14 +11,15 @@ from drocap_ros.reconstruction.world.metric_scale import ScaleEstimate, estimate
 from drocap_ros.skeleton import BODY_15
 from drocap_ros.tracks import Tracks
 
-#: Standard deviation of the average of the person's image size: a drone changes its range slowly.
-SIZE_SMOOTHING_S = 1.0
+#: Standard deviation (s) of the average of the person's image size: a drone changes its range slowly.
+_SIZE_SMOOTHING_S = 1.0
 
 
 def metres_per_px(joints_px: np.ndarray, stamp_ns: np.ndarray, height_m: float) -> np.ndarray:
     """(F,) metres per px that give the body of poses (F, 15, 3) px the limb lengths of a person of ``height_m``."""
     total = limb_lengths(joints_px).sum(-1)
-    return height_m * LIMBS_PER_STATURE / np.maximum(smooth_over_time(total, stamp_ns, SIZE_SMOOTHING_S), 1e-9)
+    size = np.maximum(smooth_over_time(total, stamp_ns, _SIZE_SMOOTHING_S), 1e-9)
+    return np.asarray(height_m * LIMBS_PER_STATURE / size)
 
 
 def smooth_over_time(values: np.ndarray, stamp_ns: np.ndarray, std_s: float) -> np.ndarray:
@@ -29,7 +30,8 @@ def smooth_over_time(values: np.ndarray, stamp_ns: np.ndarray, std_s: float) -> 
         return values
     step_s = float(np.median(np.diff(stamp_ns))) * 1e-9
     # The bound keeps invalid stamps (a counter for nanoseconds) from a kernel of 10^9 taps.
-    return gaussian_filter1d(values, min(std_s / step_s, len(values), 1000.0), axis=0, mode="nearest", truncate=3.0)
+    frames = min(std_s / step_s, len(values), 1000.0)
+    return np.asarray(gaussian_filter1d(values, frames, axis=0, mode="nearest", truncate=3.0))
 
 
 @dataclass(frozen=True)

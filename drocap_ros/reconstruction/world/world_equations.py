@@ -115,9 +115,8 @@ def _add_body(r: WorldResiduals, blocks: np.ndarray, border: np.ndarray, corner:
 
 def _add_time(r: WorldResiduals, band: np.ndarray) -> None:
     """Add the couplings between frames: accelerations, contacts, wander of the camera's errors."""
-    for rows, weight in (
-        (slice(CAMERA, None), r.weights.acceleration), (slice(0, 3), r.weights.camera_acceleration),
-    ):  # fmt: skip
+    of_camera = (slice(0, 3), r.weights.camera_acceleration)
+    for rows, weight in ((slice(CAMERA, None), r.weights.acceleration), of_camera):
         count = len(band) - 2
         if count > 0:
             for offset, factor in ((0, 1.0), (1, 4.0), (2, 1.0)):

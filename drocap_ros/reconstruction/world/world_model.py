@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drocap_ros.parameters import Parameters, param
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.lifted.adjustment import SPAN_STD_MM, SPANS
 from drocap_ros.reconstruction.world.camera_telemetry import CameraPath, CameraTelemetry
@@ -37,56 +36,41 @@ CALIBRATED = slice(SCALE, GLOBALS)
 
 
 @dataclass(frozen=True)
-class WorldConfig(Parameters):
-    """Weights of the adjustment in the world, and the accuracy of the telemetry."""
+class WorldConfig:
+    """Weights of the adjustment in the world, and the accuracy of the telemetry; docs/reconstruction.md has reasons.
 
-    iterations: int = param(4, "steps", minimum=0, maximum=1000)
-    locking_iterations: int = param(
-        2, "further steps that keep feet in contact in their places", minimum=0, maximum=100
-    )
-    stature_std: float = param(0.05, "relative standard deviation of the assumed stature", minimum=0.001, maximum=1)
-    length_std: float = param(
-        0.002, "relative standard deviation of the lifter's bone lengths: noise lengthens free bones", minimum=1e-4,
-        maximum=1,
-    )  # fmt: skip
-    tilt_error_deg: float = param(
-        0.3,
-        "standard deviation of the camera's constant error of pitch and roll",
-        unit="deg",
-        minimum=0.001,
-        maximum=45,
-    )
-    yaw_error_deg: float = param(
-        2.0, "standard deviation of its constant error of yaw: gimbals know the horizon, not north", unit="deg",
-        minimum=0.001, maximum=45,
-    )  # fmt: skip
-    latency_std_s: float = param(
-        0.1, "standard deviation of the latency of attitude and of position", unit="s", minimum=1e-4, maximum=2
-    )
-    position_wander_m: float = param(
-        0.05, "least standard deviation of the slow error of the position; rough telemetry has more", unit="m",
-        minimum=1e-4, maximum=100,
-    )  # fmt: skip
-    attitude_wander_deg: float = param(
-        0.1, "standard deviation of the slow error of the attitude", unit="deg", minimum=1e-3, maximum=45
-    )
-    camera_acceleration_m_s2: float = param(
-        3.0, "ordinary acceleration of the camera", unit="m/s^2", minimum=0.01, maximum=100
-    )
-    acceleration_m_s2: float = param(16.0, "ordinary acceleration of a joint", unit="m/s^2", minimum=0.01, maximum=1000)
-    depth_weight: float = param(0.2, "weight of the lifter's depths", minimum=0, maximum=100)
-    contact_weight: float = param(
-        0.2, "weight of feet in contact: contacts last for some frames", minimum=0, maximum=100
-    )
-    locked_weight: float = param(2.0, "their weight in the locking steps", minimum=0, maximum=100)
-    contact_speed_m_s: float = param(
-        0.1, "standard deviation of the speed of a foot in contact", unit="m/s", minimum=0.001, maximum=10
-    )
-    feet: bool = param(True, "feet in contact keep their place")
-    frames_per_fact: float = param(
-        4.0, "frames that carry one independent piece of information: the priors count as much more", minimum=1,
-        maximum=1000,
-    )  # fmt: skip
+    iterations, locking_iterations : steps, and further ones that keep feet in contact in their places
+    stature_std, length_std : relative standard deviations of the assumed stature and of the lifter's bone lengths:
+        noise lengthens free bones
+    tilt_error_deg, yaw_error_deg : standard deviations of the camera's constant errors: gimbals know the horizon, not
+        north
+    latency_std_s : of attitude and position
+    position_wander_m, attitude_wander_deg : standard deviations of the slow errors; rough positions have more
+    camera_acceleration_m_s2, acceleration_m_s2 : ordinary ones of the camera and of a joint
+    depth_weight : of the lifter's depths
+    contact_weight, locked_weight : of feet in contact, less than 1 as contacts last for some frames, and of locked ones
+    contact_speed_m_s : standard deviation of the speed of a foot in contact
+    feet : whether feet in contact keep their place
+    frames_per_fact : frames that carry one independent piece of information: the priors count as much more
+    """
+
+    iterations: int = 4
+    locking_iterations: int = 2
+    stature_std: float = 0.05
+    length_std: float = 0.002
+    tilt_error_deg: float = 0.3
+    yaw_error_deg: float = 2.0
+    latency_std_s: float = 0.1
+    position_wander_m: float = 0.05
+    attitude_wander_deg: float = 0.1
+    camera_acceleration_m_s2: float = 3.0
+    acceleration_m_s2: float = 16.0
+    depth_weight: float = 0.2
+    contact_weight: float = 0.2
+    locked_weight: float = 2.0
+    contact_speed_m_s: float = 0.1
+    feet: bool = True
+    frames_per_fact: float = 4.0
 
 
 def world_config(adjuster: BundleAdjusterConfig) -> WorldConfig:

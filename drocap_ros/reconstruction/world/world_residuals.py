@@ -288,9 +288,8 @@ def gradient(r: WorldResiduals) -> tuple[np.ndarray, np.ndarray]:
         joints[:, a] -= stretch[:, k]
     shared[LENGTHS] -= (r.stretch / SPAN_STD_M).sum(axis=0)
     shared[:BONES] += r.gauge / GAUGE_M
-    for swing, weight, into in (
-        (r.swing, weights.acceleration, joints), (r.camera_swing, weights.camera_acceleration, camera[:, :3]),
-    ):  # fmt: skip
+    of_camera = (r.camera_swing, weights.camera_acceleration, camera[:, :3])
+    for swing, weight, into in ((r.swing, weights.acceleration, joints), of_camera):
         into[2:] += weight * swing
         into[1:-1] -= 2 * weight * swing
         into[:-2] += weight * swing
