@@ -223,9 +223,9 @@ def _in_metres(tracks: Tracks, keypoints: Keypoints2D, poses: ImagePoses, settin
         placed = WorldPoses(_without_perspective(tracks, poses, per_px), False, "assumed_height", None)
     else:
         frame = "world"
-        placed, refined = in_world(tracks, keypoints, poses, per_px, world_config(settings.adjuster))
-        if isinstance(refined, Refusal):
-            return refined
+        placed, refined, refusal = in_world(tracks, keypoints, poses, per_px, world_config(settings.adjuster))
+        if refusal is not None:
+            return refusal
     if placed.scale is not None:
         meta["scale"] = dataclasses.asdict(placed.scale)
     body = _Body(

@@ -85,11 +85,11 @@ class WorldWindows:
         known = self._prior(stamps)
         before = self._continued(stamps)
         config = self._config if before is None else replace(self._config, iterations=_FEWER_STEPS)
-        _, refined = in_world(tracks, keypoints, poses, per_px, config, known, before)
+        _, refined, refusal = in_world(tracks, keypoints, poses, per_px, config, known, before)
+        if refusal is not None:
+            return self._refused(camera_result, refusal)
         if refined is None:
             return replace(camera_result, telemetry=TelemetryUse.LATE)
-        if isinstance(refined, Refusal):
-            return self._refused(camera_result, refined)
         self._known, self._before = known, (refined.before, refined.found)
         if not refined.metric:
             return replace(camera_result, telemetry=TelemetryUse.UNSCALED)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,14 @@ from drocap_ros.tracks import Tracks
 _PELVIS = BODY_15.index("pelvis")
 
 
+class WorldResult(NamedTuple):
+    """Poses as the reported camera places them; and adjusted with it, or why not, where there is enough telemetry."""
+
+    placed: WorldPoses
+    refined: RefinedWorld | None = None
+    refusal: Refusal | None = None
+
+
 def in_camera_axes(poses: ImagePoses, per_px: np.ndarray) -> np.ndarray:
     """(F, P, 3) m in the camera's axes, pelvis at the origin, at (F,) metres per px."""
     joints: np.ndarray = (poses.joints_px - poses.joints_px[:, _PELVIS][:, None]) * per_px[:, None, None]
@@ -35,7 +44,7 @@ def in_world(
     config: WorldConfig,
     known: Findings | None = None,
     before: Before | None = None,
-) -> tuple[WorldPoses, RefinedWorld | Refusal | None]:
+) -> WorldResult:
     """Poses placed by ``tracks.camera_rotation`` and, with the camera's position and matrix, adjusted with it.
 
     Parameters
@@ -43,10 +52,6 @@ def in_world(
     keypoints : of the method's joints
     per_px : (F,) metres per px at the assumed stature
     known, before : findings of earlier windows, and the last of them
-
-    Returns
-    -------
-    The placed poses, and the adjusted ones: a refusal where the telemetry cannot be true, None where it is not enough
     """
     rotation = tracks.camera_rotation
     assert rotation is not None
@@ -55,13 +60,14 @@ def in_world(
         tracks = replace(tracks, camera_position=without_steps(tracks.camera_position, tracks.stamp_ns))
     placed = place_in_world(in_camera_axes(poses, per_px), projected, per_px, tracks)
     if poses.sigma_px is None:
-        return placed, None
+        return WorldResult(placed)
     refusal = upside_down(placed.joints, rotation)
     if refusal or not refinable(tracks) or not np.isfinite(placed.joints).all():
-        return placed, refusal
+        return WorldResult(placed, refusal=refusal)
     size = per_px[:, None]
     depth = (poses.joints_px[..., 2] - poses.joints_px[:, [_PELVIS], 2]) * size
     factor = placed.scale.factor if placed.metric and placed.scale is not None else 1.0
     sigma = poses.sigma_px
     given = PlacedPoses(placed.joints, factor, depth, sigma[..., 1] * size, projected, sigma[..., 0], poses.still)
-    return placed, refine_in_world(tracks, keypoints, given, config, known, before)
+    found = refine_in_world(tracks, keypoints, given, config, known, before)
+    return WorldResult(placed, refusal=found) if isinstance(found, Refusal) else WorldResult(placed, found)
