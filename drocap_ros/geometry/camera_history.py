@@ -10,8 +10,10 @@ import numpy as np
 from drocap_ros.geometry.interpolation import MAX_GAP_S, interpolate
 from drocap_ros.geometry.rotations import matrix_from_quaternion, unit_quaternions
 
-#: Poses kept: the longest window at 100 Hz, and the most changes of the calibration.
-_MOST_POSES, _MOST_MATRICES = 15_000, 20
+#: Poses kept: the longest window at 100 Hz.
+_MOST_POSES = 15_000
+#: Changes of the calibration that are kept; a camera changes its mode a few times a flight.
+_MOST_MATRICES = 20
 #: A stamp further back than this restarts the history; others out of order are left out.
 _LATE_NS = 10**9
 #: Images may be so much older than the newest pose.

@@ -6,11 +6,18 @@ import numpy as np
 
 from drocap_ros.geometry.interpolation import smoothed
 
+#: Smoothing of the path through the steps.
 _SMOOTHING_S = 0.25
-#: A coordinate that changes by less rests; steps are larger, and so many of them stand alone between frames at rest.
-_REST_M, _STEP_M, _ALONE = 1e-5, 0.005, 0.2
-#: Fewer steps are no pattern; two that differ by more are a jump of the log, which stays as it is.
-_LEAST_STEPS, _JUMP_M = 4, 1.0
+#: A coordinate that changes by less from frame to frame rests: less than any log's rounding.
+_REST_M = 1e-5
+#: Steps in the median: rounded coordinates of 1e-7 deg have 11 mm.
+_STEP_M = 0.005
+#: Least share of the steps that stand alone between frames at rest; a flown path has hardly any.
+_ALONE = 0.2
+#: Fewer steps are no pattern.
+_LEAST_STEPS = 4
+#: Two steps that differ by more are a jump of the log, which stays as it is.
+_JUMP_M = 1.0
 #: Share of the times between reports that are alike where positions are held until the next report.
 _ALIKE = 0.8
 

@@ -16,6 +16,7 @@ from drocap_ros.stamps import StampValidator
 if TYPE_CHECKING:
     from drocap_ros.perception.sources.base import Frame
 
+#: Largest raw image, px.
 _MAX_PIXELS = 200_000_000
 # The header of a small file can declare an image of gigabytes.  OpenCV reads this limit when it is imported.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))

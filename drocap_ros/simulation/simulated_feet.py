@@ -6,13 +6,16 @@ import numpy as np
 
 from drocap_ros.skeleton import BODY_15
 
-#: From the ankle to the tip of the big toe, share of the stature, and the tip's height above the ground, m.
-FOOT_LENGTH, TOE_HEIGHT_M = 0.115, 0.02
+#: From the ankle to the tip of the big toe, share of the stature.
+FOOT_LENGTH = 0.115
+#: Height of a standing toe's tip above the ground.
+TOE_HEIGHT_M = 0.02
 #: Turn of a standing foot to its own side, rad.
 _TOE_OUT = 0.12
 #: Height of the ankle above its place in stance, in lengths of the foot, from which and up to which the foot goes over
 #: from the ground's direction to that of the shank.
-_LEAVES, _FREE = 0.6, 1.3
+_LEAVES = 0.6
+_FREE = 1.3
 
 
 def add_toes(joints: np.ndarray, heading: np.ndarray, stature_m: float) -> np.ndarray:

@@ -15,7 +15,7 @@ from drocap_ros.geometry.interpolation import interpolate
 from drocap_ros.motion import load_motion
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.session_tracks import read_vehicle_track
-from drocap_ros.simulation.flight_simulator.truth import flown_orbit, load_flight_truth
+from drocap_ros.simulation.flight_simulator.truth import load_flight_truth, orbit_quality
 
 
 def test_demo_flies_by_its_images_and_reconstructs_a_motion_near_the_truth(tmp_path, capsys):
@@ -59,7 +59,7 @@ def test_demo_flies_by_its_images_and_reconstructs_a_motion_near_the_truth(tmp_p
     assert orbiting[first : last + 1].mean() > 0.5  # on a busy machine the bridge may hold for a while
     assert status[last][0] - status[first][0] > 7e9
     within = (truth.stamp_ns >= status[first][0]) & (truth.stamp_ns <= status[last][0])
-    flown = flown_orbit(truth, within, 6.0)
+    flown = orbit_quality(truth, within, 6.0)
     assert flown.turned_deg > 60
     assert flown.least_distance_m > 3.0
     # In the world frame the person stands where the simulated one stood, to what an assumed stature allows; the

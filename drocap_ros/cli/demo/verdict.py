@@ -9,7 +9,7 @@ import numpy as np
 from drocap_ros.evaluation.metrics import pa_mpjpe, scale_error
 from drocap_ros.flight.orbit.states import State
 from drocap_ros.recording.session import COMPRESSED_IMAGE, POSE2D, POSE3D, Session, header_stamp_ns
-from drocap_ros.simulation.flight_simulator.truth import FlightTruth, FlownOrbit, flown_orbit
+from drocap_ros.simulation.flight_simulator.truth import FlightTruth, OrbitQuality, orbit_quality
 
 ORBIT_STATUS = "drocap_ros/msg/OrbitStatus"
 #: After the start of an orbit: radius, height and angular speed are still being reached.
@@ -38,7 +38,7 @@ class FlightVerdict:
     pictures: int
     poses: int
     seen: int
-    orbit: FlownOrbit | None
+    orbit: OrbitQuality | None
     live: LivePoses | None
 
 
@@ -52,7 +52,7 @@ def judge_flight(session: Session, truth: FlightTruth, radius_m: float) -> Fligh
     settled = settled_orbit(truth.stamp_ns, statuses)
     return FlightVerdict(
         exposures=len(truth.stamp_ns), pictures=sum(pictures), poses=len(poses), seen=sum(poses),
-        orbit=flown_orbit(truth, settled, radius_m) if int(settled.sum()) > 1 else None,
+        orbit=orbit_quality(truth, settled, radius_m) if int(settled.sum()) > 1 else None,
         live=_live(session, truth),
     )  # fmt: skip
 

@@ -16,12 +16,18 @@ from drocap_ros.recording.telemetry.log import Lack, LogLack
 
 #: Largest magnitudes of pitch, roll and yaw, deg.
 _LIMITS_DEG = np.array([180.0, 180.0, 360.0])
+#: Height, m, that no drone reaches.
 _MAX_HEIGHT_M = 20_000.0
 #: Largest share of states out of range that counts as damage, not as another meaning.
 _DAMAGED_SHARE = 0.02
 #: A turn, or a way, from one state to the next that no gimbal or drone makes.
-_TURN_DEG, _TURN_DEG_S, _TURNS_SHARE = 30.0, 360.0, 0.05
-_STEP_M, _SPEED_M_S = 20.0, 60.0
+_TURN_DEG = 30.0
+_TURN_DEG_S = 360.0
+_STEP_M = 20.0
+_SPEED_M_S = 60.0
+#: Largest share of such turns: angles jump where a gimbal is recentred.
+_TURNS_SHARE = 0.05
+#: Metres of a degree of latitude.
 _METRES_PER_DEG = 111_320.0
 #: States from which zeros throughout mean that nothing was filled in.
 _LEAST_STATES = 10

@@ -10,7 +10,9 @@ import struct
 #: An integer (varint), a number (fixed 32 or 64 bits, as float or double), or bytes (text or a message).
 Value = int | float | bytes
 
-_SIGN, _RANGE = 1 << 63, 1 << 64
+#: Values of a varint: the sign bit of 64, and their number.
+_SIGN = 1 << 63
+_RANGE = 1 << 64
 
 
 def read_message(data: bytes) -> dict[int, Value]:

@@ -28,15 +28,18 @@ from drocap_ros.recording.telemetry.mp4 import creation_time_ns, duration_s
 RATE_HZ = 10.0
 #: Part of a video, from its start, that is used.
 MAX_VIDEO_S = 180.0
+#: Shorter videos hold too few turns.
 MIN_VIDEO_S = 5.0
 #: Least correlation, and its least lead over the second best offset.
-MIN_CORRELATION, MIN_LEAD = 0.7, 0.1
+MIN_CORRELATION = 0.7
+MIN_LEAD = 0.1
 #: Least standard deviation of the camera's turning rate in the log.
 MIN_TURN_DEG_S = 1.5
 #: Largest error of the container's creation time; the correlation searches within it.
 CREATION_SLACK_S = 5.0
 #: Largest difference between a video's length and the part of a log that is marked as video.
 PART_SLACK_S = 2.0
+#: Width, px, of the small images of the phase correlation.
 _WIDTH = 160
 
 Progress = Callable[[str, float], None]

@@ -13,9 +13,16 @@ from drocap_ros.simulation.vehicle.copter import SimulatedCopter
 from drocap_ros.simulation.vehicle.copter_reports import CopterSetup
 from drocap_ros.simulation.vehicle.flight_control import Manner, Target
 
-_CLIMB_M_S, _BRAKING_M_S2, _LAG_S = 1.2, 1.45, 0.35
+#: Climb of the take-off.
+_CLIMB_M_S = 1.2
+#: Deceleration and lag of the simulated vehicle, by which the pilot lets go of the stick in time.
+_BRAKING_M_S2 = 1.45
+_LAG_S = 0.35
+#: Height of the body on its skids.
 _SKIDS_M = 0.1
-_READY_S, _HOVER_S = 1.0, 1.5
+#: Time on the ground, and of the hover before the hand-over.
+_READY_S = 1.0
+_HOVER_S = 1.5
 
 
 class PilotedCopter(SimulatedCopter):

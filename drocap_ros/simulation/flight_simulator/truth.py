@@ -96,7 +96,7 @@ def load_flight_truth(path: Path) -> FlightTruth:
     )
 
 
-class FlownOrbit(NamedTuple):
+class OrbitQuality(NamedTuple):
     """Quality of a flown orbit: mean absolute errors, shares of the exposures, extremes.
 
     in_middle_third : the middle of the person's extent lies in the middle third of the image, in both directions
@@ -112,7 +112,7 @@ class FlownOrbit(NamedTuple):
     turned_deg: float
 
 
-def flown_orbit(truth: FlightTruth, within: np.ndarray, radius_m: float) -> FlownOrbit:
+def orbit_quality(truth: FlightTruth, within: np.ndarray, radius_m: float) -> OrbitQuality:
     """Quality of the orbit over the exposures ``within`` (F,) bool; angles and speeds from pairs of neighbours.
 
     Raises
@@ -131,7 +131,7 @@ def flown_orbit(truth: FlightTruth, within: np.ndarray, radius_m: float) -> Flow
     seconds = np.diff(truth.stamp_ns) * 1e-9
     speed = np.linalg.norm(np.diff(truth.camera_position, axis=0), axis=1) / seconds
     turned = np.abs(np.sum(np.angle(np.exp(1j * np.diff(bearing)))[pairs]))
-    return FlownOrbit(
+    return OrbitQuality(
         int(within.sum()),
         float(np.abs(distance - radius_m)[within].mean()),
         float(np.degrees(yaw_error[within].mean())),

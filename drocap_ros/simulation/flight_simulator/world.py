@@ -21,8 +21,13 @@ from drocap_ros.skeleton import BODY_17
 #: The person stands until setpoints have steered the vehicle for this long, and pauses whenever they stop: a filmed
 #: person sees the drone stop.
 BEGINS_AFTER_S = 3.0
-_GAP_S, _REACTION_S = 0.5, 0.3
-_TAKE_HZ, _TAKE_CHUNK_S = 100.0, 20.0
+#: Setpoints that stop for so long have stopped: several periods of the slowest stream.
+_GAP_S = 0.5
+#: Time constant of the person's start and stop.
+_REACTION_S = 0.3
+#: Rate and length of the pieces in which the person's motion is computed.
+_TAKE_HZ = 100.0
+_TAKE_CHUNK_S = 20.0
 
 
 class Exposure(NamedTuple):
@@ -61,7 +66,7 @@ class FlightWorld:
                 mount=SimulatedMount(config.mount, config.camera_pitch_deg),
             ),
         )
-        self._take = Take(config)
+        self._take = ActingPerson(config)
         aim = self._take.at(0.0)[0]
         self.pilot = SimulatedPilot(self.copter, config.takeoff_height_m, aim)
         self._t = self._take_s = 0.0
@@ -109,7 +114,7 @@ class FlightWorld:
         self.copter.close()
 
 
-class Take:
+class ActingPerson:
     """The person's motion, computed in pieces of 20 s and linear within 10 ms."""
 
     def __init__(self, config: FlightSimulatorConfig) -> None:

@@ -8,6 +8,7 @@ from drocap_ros.simulation.render.scenery import FAR_M, NEAR_M, Scenery
 
 #: Distance over which the fine pattern of the ground fades into the coarse one.
 _FADE_M = 14.0
+#: Corners of the octagon for a circle of radius 1.
 _CIRCLE = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)
 
 

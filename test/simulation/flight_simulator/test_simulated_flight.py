@@ -7,8 +7,13 @@ from drocap_ros.errors import InputError
 from drocap_ros.evaluation.compare import compare, load_truth
 from drocap_ros.motion import load_motion
 from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimulatorConfig
-from drocap_ros.simulation.flight_simulator.truth import FlightTruth, flown_orbit, load_flight_truth, save_flight_truth
-from drocap_ros.simulation.flight_simulator.world import BEGINS_AFTER_S, FlightWorld, Take
+from drocap_ros.simulation.flight_simulator.truth import (
+    FlightTruth,
+    load_flight_truth,
+    orbit_quality,
+    save_flight_truth,
+)
+from drocap_ros.simulation.flight_simulator.world import BEGINS_AFTER_S, ActingPerson, FlightWorld
 from drocap_ros.simulation.orbit_camera import look_at, pinhole_matrix
 from drocap_ros.simulation.simulated_person import simulate_person
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
@@ -92,7 +97,7 @@ def test_person_moves_while_setpoints_steer_the_vehicle_and_the_truth_records_it
 
 def test_take_equals_the_simulated_person_across_its_pieces():
     config = FlightSimulatorConfig(seed=1, action="mixed")
-    take, times = Take(config), np.array([0.0, 0.123, 19.996, 20.0, 47.3])
+    take, times = ActingPerson(config), np.array([0.0, 0.123, 19.996, 20.0, 47.3])
     exact = simulate_person(times, "mixed", 1, config.stature_m, BODY_17)
     assert np.abs(np.array([take.at(t) for t in times]) - exact).max() < 0.002
 
@@ -112,19 +117,19 @@ def orbit_truth(seconds=10.0, radius=6.0, speed_deg_s=20.0, off_deg=0.0, rate=10
 
 def test_orbit_quality_equals_the_constructed_errors():
     truth = orbit_truth(radius=6.4, off_deg=3.0)
-    found = flown_orbit(truth, np.ones(100, bool), 6.0)
+    found = orbit_quality(truth, np.ones(100, bool), 6.0)
     assert found.radius_error_m == pytest.approx(0.4)
     assert found.yaw_error_deg == pytest.approx(3.0)
     assert found.in_middle_third == 1.0
     assert found.least_distance_m == pytest.approx(6.4)
     assert found.top_speed_m_s == pytest.approx(6.4 * np.radians(20.0), rel=1e-3)
     assert found.turned_deg == pytest.approx(20.0 * 9.9, abs=0.1)
-    half = flown_orbit(truth, np.arange(100) < 50, 6.4)
+    half = orbit_quality(truth, np.arange(100) < 50, 6.4)
     assert (half.exposures, round(half.turned_deg)) == (50, 98)
     # 12 deg beside the middle of 60 deg across is outside the middle third.
-    assert flown_orbit(orbit_truth(off_deg=12.0), np.ones(100, bool), 6.0).in_middle_third == 0.0
+    assert orbit_quality(orbit_truth(off_deg=12.0), np.ones(100, bool), 6.0).in_middle_third == 0.0
     with pytest.raises(InputError, match="two exposures"):
-        flown_orbit(truth, np.zeros(100, bool), 6.0)
+        orbit_quality(truth, np.zeros(100, bool), 6.0)
 
 
 def test_truth_file_is_a_motion_and_reads_back(tmp_path):
