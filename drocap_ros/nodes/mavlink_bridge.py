@@ -16,7 +16,7 @@ import time
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Point, TransformStamped, Vector3
+from geometry_msgs.msg import Point, TransformStamped
 from sensor_msgs.msg import CameraInfo
 
 from drocap_ros.errors import InputError
@@ -32,10 +32,11 @@ from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.msg import OrbitStatus, Pose2D
 from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import (
+    MAP,
     header_at,
     pose2d_from_ros,
-    quaternion_to_ros,
     stamp_from_ros,
+    transform_to_ros,
     vehicle_state_to_ros,
 )
 from drocap_ros.ros.diagnostics import Key, of
@@ -284,15 +285,9 @@ def vehicle_transforms(state: VehicleState) -> list[TransformStamped]:
     """``map`` -> ``base_link`` and, with a mount, ``map`` -> ``camera_optical``; none while the position is unknown."""
     if not np.isfinite(state.position_enu_m).all():
         return []
-    x, y, z = state.position_enu_m.tolist()
-    transforms = []
-    for child, xyzw in (
-        ("base_link", state.orientation_xyzw),
-        ("camera_optical", optical_orientation(state.gimbal_orientation_xyzw)),
-    ):
-        if np.isfinite(xyzw).all():
-            transform = TransformStamped(header=header_at(state.stamp_ns, "map"), child_frame_id=child)
-            transform.transform.translation = Vector3(x=x, y=y, z=z)
-            transform.transform.rotation = quaternion_to_ros(xyzw)
-            transforms.append(transform)
-    return transforms
+    camera = optical_orientation(state.gimbal_orientation_xyzw)
+    return [
+        transform_to_ros(header_at(state.stamp_ns, MAP), child, state.position_enu_m, xyzw)
+        for child, xyzw in (("base_link", state.orientation_xyzw), ("camera_optical", camera))
+        if np.isfinite(xyzw).all()
+    ]

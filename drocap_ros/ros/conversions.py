@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from array import array
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Quaternion
+from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_msgs.msg import Header
@@ -54,6 +55,18 @@ def quaternion_to_ros(xyzw: np.ndarray) -> Quaternion:
     return Quaternion(x=x, y=y, z=z, w=w)
 
 
+def transform_to_ros(
+    header: Header, child_frame_id: str, position: np.ndarray, xyzw: np.ndarray | None = None
+) -> TransformStamped:
+    """Place (3,) m and rotation (4,) of a frame in that of the header -> geometry_msgs/TransformStamped."""
+    transform = TransformStamped(header=header, child_frame_id=child_frame_id)
+    x, y, z = (float(v) for v in position)
+    transform.transform.translation = Vector3(x=x, y=y, z=z)
+    if xyzw is not None:
+        transform.transform.rotation = quaternion_to_ros(xyzw)
+    return transform
+
+
 def compressed_image_to_ros(header: Header, jpeg: bytes) -> CompressedImage:
     """JPEG of a BGR image -> sensor_msgs/CompressedImage."""
     return CompressedImage(header=header, format="bgr8; jpeg compressed bgr8", data=array("B", jpeg))
@@ -94,7 +107,7 @@ def pose2d_to_ros(observation: PoseObservation, frame_id: str) -> Pose2D:
 pose2d_from_ros = observation_from_message
 
 
-def pose3d_to_ros(
+def pose3d_to_ros(  # noqa: PLR0913 -- the fields of the message
     header: Header,
     *,
     track_id: int,
@@ -133,18 +146,8 @@ def latest_pose_to_ros(
     initial: Pose3D, joints: np.ndarray, *, refined: bool, placed: PlacedPose | None = None
 ) -> Pose3D:
     """The initial pose's message with other joints (P, 3) m, or with those that are placed in ``map``."""
-    latest = Pose3D(
-        header=initial.header,
-        track_id=initial.track_id,
-        stage=Pose3D.REFINED if refined else Pose3D.INITIAL,
-        skeleton=initial.skeleton,
-        joints=floats(joints),
-        covariance=initial.covariance,
-        confidence=initial.confidence,
-        camera_orientation=initial.camera_orientation,
-        metric=initial.metric,
-        reprojection_rms=initial.reprojection_rms,
-    )
+    latest = copy.copy(initial)
+    latest.stage, latest.joints = Pose3D.REFINED if refined else Pose3D.INITIAL, floats(joints)
     if placed is not None:
         latest.header = Header(stamp=initial.header.stamp, frame_id=MAP)
         latest.joints, latest.covariance = floats(placed.joints), floats(placed.covariance)
@@ -223,24 +226,14 @@ def orbit_request(
 
 def vehicle_state_to_ros(state: VehicleStateData) -> VehicleState:
     """Vehicle state -> message; the two have the same fields."""
-    return VehicleState(
-        header=header_at(state.stamp_ns, "map"),
-        autopilot=state.autopilot,
-        mode=state.mode,
-        armed=state.armed,
-        landed_state=state.landed_state,
-        position_enu_m=np.asarray(state.position_enu_m, np.float64),
-        velocity_enu_m_s=np.asarray(state.velocity_enu_m_s, np.float32),
+    message = VehicleState(
+        header=header_at(state.stamp_ns, MAP),
         orientation=quaternion_to_ros(state.orientation_xyzw),
-        angular_velocity_flu_rad_s=np.asarray(state.angular_velocity_flu_rad_s, np.float32),
-        latitude_deg=float(state.latitude_deg),
-        longitude_deg=float(state.longitude_deg),
-        altitude_amsl_m=float(state.altitude_amsl_m),
-        gps_fix_type=state.gps_fix_type,
-        satellites=state.satellites,
-        position_ok=state.position_ok,
-        battery_fraction=float(state.battery_fraction),
-        battery_voltage_v=float(state.battery_voltage_v),
         gimbal_orientation=quaternion_to_ros(state.gimbal_orientation_xyzw),
-        link_age_s=float(state.link_age_s),
     )
+    for name in VehicleState.get_fields_and_field_types():
+        if hasattr(state, name):
+            value = getattr(state, name)
+            arrays = isinstance(value, np.ndarray)
+            setattr(message, name, value.astype(getattr(message, name).dtype) if arrays else value)
+    return message

@@ -10,7 +10,7 @@ from visualization_msgs.msg import ImageMarker, Marker, MarkerArray
 
 from drocap_ros.geometry.ellipsoids import ellipsoids, unpack_covariance
 from drocap_ros.msg import Pose2D, Pose3D
-from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_from_ros, quaternion_to_ros
+from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_from_ros, quaternion_to_ros, transform_to_ros
 from drocap_ros.skeleton import SIDE_COLOURS, JointSet, joint_set, side_of
 
 _UNCERTAIN = (0.95, 0.75, 0.1, 0.25)
@@ -115,14 +115,11 @@ def _line(marker: ImageMarker, start: np.ndarray, end: np.ndarray, colour: Color
 def body_transforms(message: Pose3D, frame_prefix: str = "") -> list[TransformStamped]:
     """One frame per joint, ``<prefix>body_<id>/<joint>``, for viewers that draw no markers."""
     joints, _ = pose3d_from_ros(message)
-    transforms = []
-    for name, p in zip(joint_set(message.skeleton).joints, joints, strict=False):
-        if np.isfinite(p).all():
-            child = f"{frame_prefix}body_{message.track_id}/{name}"
-            transform = TransformStamped(header=message.header, child_frame_id=child)
-            transform.transform.translation = Vector3(x=float(p[0]), y=float(p[1]), z=float(p[2]))
-            transforms.append(transform)
-    return transforms
+    return [
+        transform_to_ros(message.header, f"{frame_prefix}body_{message.track_id}/{name}", p)
+        for name, p in zip(joint_set(message.skeleton).joints, joints, strict=False)
+        if np.isfinite(p).all()
+    ]
 
 
 def _marker(header: Header, namespace: str, kind: int, number: int = 0) -> Marker:

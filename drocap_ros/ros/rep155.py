@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import TransformStamped, Vector3
+from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
@@ -18,7 +18,7 @@ from drocap_ros.geometry.alignment import torso_frame
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.observation import PoseObservation
-from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_from_ros, quaternion_to_ros
+from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_from_ros, transform_to_ros
 from drocap_ros.skeleton import joint_set
 
 try:
@@ -67,12 +67,11 @@ def human_transforms(message: Pose3D, frame_prefix: str = "") -> list[TransformS
     axes = torso_frame(joints, joints_of)
     middle = joints[trunk[:2]].mean(0)
     name = body_id(message.track_id, frame_prefix)
-    body = _transform(message.header, f"body_{name}", middle)
-    body.transform.rotation = quaternion_to_ros(quaternion_from_matrix(axes))
+    body = transform_to_ros(message.header, f"body_{name}", middle, quaternion_from_matrix(axes))
     inside = (joints - middle) @ axes
     header = Header(stamp=message.header.stamp, frame_id=f"body_{name}")
     links = [
-        _transform(header, f"{LINKS[joint]}_{name}", p)
+        transform_to_ros(header, f"{LINKS[joint]}_{name}", p)
         for joint, p in zip(joints_of.joints, inside, strict=True)
         if joint in LINKS and np.isfinite(p).all()
     ]
@@ -140,9 +139,3 @@ class HumanTopics:
                 self._node.create_publisher(hri.Skeleton2D, f"{_BODIES}/{now}/skeleton2d", _QOS),
                 self._node.create_publisher(hri.NormalizedRegionOfInterest2D, f"{_BODIES}/{now}/roi", _QOS),
             ]
-
-
-def _transform(header: Header, child: str, p: np.ndarray) -> TransformStamped:
-    transform = TransformStamped(header=header, child_frame_id=child)
-    transform.transform.translation = Vector3(x=float(p[0]), y=float(p[1]), z=float(p[2]))
-    return transform
