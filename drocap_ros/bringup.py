@@ -217,7 +217,7 @@ class _NodeThread:
                 self._made.set()
             # Not the EventsExecutor of the processes, which replaces the signal handlers of its process.
             spin(node, SingleThreadedExecutor(context=context), self._stop)
-        except BaseException as error:  # raised in the thread that waits for the graph
+        except BaseException as error:  # noqa: BLE001 -- raised in the thread that waits for the graph
             self._error = error
 
     def check(self) -> None:

@@ -16,7 +16,6 @@ import time
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.perception.calibration import CameraModel
@@ -56,10 +55,7 @@ class FlightSimulatorNode(ManagedComponent):
         self._waiting: Exposure | None = None
         self._exposed = threading.Condition()
         self._stop = threading.Event()
-        self._threads = [
-            threading.Thread(target=self._guarded, args=(body,), name=name, daemon=True)
-            for name, body in (("flight", self._fly), ("camera", self._render))
-        ]
+        self._threads = [self.thread(self._fly, "flight"), self.thread(self._render, "camera")]
         self._camera_thread = ThreadPoolExecutor(1, "camera")  # in simulated time
         self._pending: deque[tuple[int, Future[bytes]]] = deque()  # stamps of exposures with their pictures
         self._begin_ns = 0
@@ -93,13 +89,6 @@ class FlightSimulatorNode(ManagedComponent):
         self._stop.set()
         with self._exposed:
             self._exposed.notify_all()
-
-    def _guarded(self, body: Any) -> None:
-        try:
-            body()
-        except BaseException as error:
-            self.failure = error
-            self._end()
 
     def _fly(self) -> None:
         """Step the world as time passes; expose at the camera's rate."""

@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from typing import Any
 
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -164,15 +163,15 @@ class ImageIngestNode(ThreadedSource):
 
     def _subscribe(self) -> None:
         """Subscribe to the topic with the type and as reliably as its publishers offer, once there are some."""
-        publishers = self.get_publishers_info_by_topic(self._topic)
-        types = {info.topic_type for info in publishers}
-        self._foreign = ", ".join(sorted(types)) if types.isdisjoint(_KINDS) else ""
-        kind = next((kind for name, kind in _KINDS.items() if name in types), None)
-        if kind is None:
+        offers: dict[str, set[ReliabilityPolicy]] = {}
+        for info in self.get_publishers_info_by_topic(self._topic):
+            offers.setdefault(info.topic_type, set()).add(info.qos_profile.reliability)
+        name = next((name for name in _KINDS if name in offers), None)
+        self._foreign = "" if name else ", ".join(sorted(offers))
+        if name is None:
             return
-        offers = {info.qos_profile.reliability for info in publishers if _KINDS.get(info.topic_type) is kind}
-        all_reliable = offers == {ReliabilityPolicy.RELIABLE}
-        wanted = ReliabilityPolicy.RELIABLE if all_reliable else ReliabilityPolicy.BEST_EFFORT
+        kind, reliable = _KINDS[name], {ReliabilityPolicy.RELIABLE}
+        wanted = ReliabilityPolicy.RELIABLE if offers[name] == reliable else ReliabilityPolicy.BEST_EFFORT
         last = self._subscription
         if last is not None and (last.msg_type, last.qos_profile.reliability) == (kind, wanted):
             return
@@ -182,7 +181,7 @@ class ImageIngestNode(ThreadedSource):
         events = SubscriptionEventCallbacks(message_lost=self._on_lost)
         self._subscription = self.create_subscription(kind, self._topic, take, qos, event_callbacks=events)
 
-    def _on_lost(self, event: Any) -> None:
+    def _on_lost(self, event: QoSMessageLostInfo) -> None:
         self.count(of(Key.LOST, self._topic), event.total_count_change)
 
     def _unsubscribe(self) -> None:
@@ -190,7 +189,7 @@ class ImageIngestNode(ThreadedSource):
             self.destroy_subscription(self._subscription)
             self._subscription = None
 
-    def _take(self, message: Any) -> None:
+    def _take(self, message: CompressedImage | Image) -> None:
         stamp_ns = stamp_from_ros(message.header.stamp)
         compressed = isinstance(message, CompressedImage)
         image = image_from_message(message, compressed)

@@ -130,7 +130,7 @@ class MavlinkBridgeNode(ComponentNode):
         """Read the link.  An error in it ends the node: a bridge that hears nothing must not stay."""
         try:
             self._link.run(self._on_state, self._stop)
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 -- whatever it is, it ends the node
             self.failure = error
 
     def _control(self) -> None:
@@ -140,7 +140,7 @@ class MavlinkBridgeNode(ComponentNode):
         while not self._stop.is_set():
             try:
                 self._control_step()
-            except Exception as error:
+            except Exception as error:  # noqa: BLE001 -- whatever it is, the vehicle holds
                 self._watchdog.hold()
                 self.failure = error
                 return

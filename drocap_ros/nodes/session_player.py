@@ -116,21 +116,22 @@ def _chosen(session: Session, wanted: str) -> list[TopicInfo]:
     """Topics to publish: the named ones, else all; a type that is not installed is left out with a warning."""
     names = wanted.split()
     present = [topic for topic in session.info.topics if topic.count]
+    chosen = [topic for topic in present if _is_wanted(topic.name, names)]
     for name in names:
-        if not any(_fits(topic.name, name) for topic in present):
+        if not any(_fits(topic.name, name) for topic in chosen):
             raise InputError(
                 f"{session.path}: expected topic {name!r} with messages, found {', '.join(t.name for t in present)}; "
                 "name some of these"
             )
-    if names:
-        chosen = [topic for topic in present if any(_fits(topic.name, name) for name in names)]
-    else:
-        chosen = [topic for topic in present if topic.name not in _OWN]
     known = [topic for topic in chosen if _is_installed(topic.type_name)]
     for topic in chosen:
         if topic not in known:
             session.warn(f"{topic.name}: type {topic.type_name} is not installed here: left out")
     return known
+
+
+def _is_wanted(topic: str, names: list[str]) -> bool:
+    return any(_fits(topic, name) for name in names) if names else topic not in _OWN
 
 
 def _fits(topic: str, name: str) -> bool:

@@ -12,10 +12,10 @@ import threading
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
 
@@ -33,14 +33,16 @@ from drocap_ros.recording.provenance import (
     model_hashes,
     session_provenance,
 )
-from drocap_ros.ros.component import ERROR, HARDWARE_ID, OK, WARN, Gaps
+from drocap_ros.ros.component import ERROR, HARDWARE_ID, OK, WARN, Gaps, MessageInfo
 from drocap_ros.ros.diagnostics import Key, node_of, of, values_of
 from drocap_ros.ros.lifecycle import ACTIVE, ManagedComponent
 from drocap_ros.ros.parameters import ParameterSurvey
 from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, NODES, TOPICS
 
+M = TypeVar("M")
 _IMAGES = "image/compressed"
-_MOST_WAITING = 1 << 19  # bytes, below the least length of the writer's queue
+#: Bytes that may wait in simulated time: below the least length of the writer's queue, so that none is dropped.
+_MOST_WAITING = 1 << 19
 
 
 class SessionRecorderNode(ManagedComponent):
@@ -62,8 +64,10 @@ class SessionRecorderNode(ManagedComponent):
         self._sessions = 0
         self._image_gaps = Gaps()
         special = {
-            _IMAGES: self._on_image, "camera_info": self._on_camera_info, "/diagnostics": self._on_diagnostics
-        }  # fmt: skip
+            _IMAGES: self._on_image,
+            "camera_info": self._on_camera_info,
+            "/diagnostics": self._on_diagnostics,
+        }
         for topic in TOPICS:
             name = self.resolve_topic_name(topic)
             take = special.get(topic, self._on_message)
@@ -94,7 +98,7 @@ class SessionRecorderNode(ManagedComponent):
                 self._writer.discard()
             self._writer = None
 
-    def _on_message(self, name: str, data: bytes, info: dict[str, Any]) -> None:
+    def _on_message(self, name: str, data: bytes, info: MessageInfo) -> None:
         """Write a message; log time is its arrival in this process, publish time the time at which it was sent."""
         log_ns = info["received_timestamp"]
         sent_ns = info["source_timestamp"]
@@ -103,8 +107,8 @@ class SessionRecorderNode(ManagedComponent):
             log_ns = sent_ns = self.now_ns()
             if not log_ns:  # the first /clock has not come: a session that begins in 1970 cannot be replayed
                 return
-        self._received = self._received or name != "/diagnostics"
-        self._recording = self._recording or name in self._subject
+        self._received |= name != "/diagnostics"
+        self._recording |= name in self._subject
         if self._writer is not None:
             # Simulated time waits for the disk; real time does not, and messages are dropped.
             while self.simulated and self._writer.error is None and self._writer.queued_bytes > _MOST_WAITING:
@@ -112,16 +116,16 @@ class SessionRecorderNode(ManagedComponent):
             self._writer.write(name, data, log_ns, sent_ns or log_ns)
             self.count(Key.MESSAGES)
 
-    def _on_image(self, name: str, data: bytes, info: dict[str, Any]) -> None:
+    def _on_image(self, name: str, data: bytes, info: MessageInfo) -> None:
         if skipped := self._image_gaps.before(info):
             self.missed(name, skipped)
         self._on_message(name, data, info)
 
-    def _on_lost(self, name: str, event: Any) -> None:
+    def _on_lost(self, name: str, event: QoSMessageLostInfo) -> None:
         """Count messages that the middleware lost."""
         self.count(of(Key.LOST, name), event.total_count_change)
 
-    def _on_camera_info(self, name: str, data: bytes, info: dict[str, Any]) -> None:
+    def _on_camera_info(self, name: str, data: bytes, info: MessageInfo) -> None:
         self._on_message(name, data, info)
         if not self._calibrated:
             camera = _decoded(data, CameraInfo)
@@ -132,7 +136,7 @@ class SessionRecorderNode(ManagedComponent):
             )
             self._add_metadata({CALIBRATION: text})
 
-    def _on_diagnostics(self, name: str, data: bytes, info: dict[str, Any]) -> None:
+    def _on_diagnostics(self, name: str, data: bytes, info: MessageInfo) -> None:
         """Record diagnostics, except those of another drone's graph."""
         ours = self.get_namespace().strip("/")
         statuses = _decoded(data, DiagnosticArray).status
@@ -194,10 +198,11 @@ def _free_mib(folder: Path) -> int | str:
         return "unknown"
 
 
-def _decoded(data: bytes, kind: type) -> Any:
+def _decoded(data: bytes, kind: type[M]) -> M:
     """Message of its bytes, which nobody has decoded before; InputError where they are none."""
     try:
-        return deserialize_message(data, kind)
+        message: M = deserialize_message(data, kind)
+        return message
     except RuntimeError:  # RMWError
         raise InputError(f"expected a whole {kind.__name__}, got {len(data)} bytes of none; check its sender") from None
 

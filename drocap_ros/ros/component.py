@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
@@ -15,6 +15,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
@@ -35,6 +36,8 @@ _CLOCK_STANDS_S = 5.0
 _KEPT_PERIOD_S = 0.5
 #: A node whose input has been silent for this long is idle.
 IDLE_S = 3.0
+#: rclpy's information about a message: numbers by name.
+MessageInfo: TypeAlias = Mapping[str, int]
 
 
 class Gaps:
@@ -43,7 +46,7 @@ class Gaps:
     def __init__(self) -> None:
         self._last = 0
 
-    def before(self, info: dict[str, Any]) -> int:
+    def before(self, info: MessageInfo) -> int:
         """Number of messages missing before the message of this info; 0 after a restart of the publisher."""
         number = info["publication_sequence_number"] or 0
         last, self._last = self._last, number
@@ -137,7 +140,7 @@ class ComponentNode(Node):
         if self._clock_stands:
             self.publish_diagnostics()
 
-    def _refuse_another_clock(self, parameters: list[Any]) -> SetParametersResult:
+    def _refuse_another_clock(self, parameters: list[Parameter]) -> SetParametersResult:
         changed = any(p.name == "use_sim_time" and p.value != self.simulated for p in parameters)
         reason = "use_sim_time: expected at the start of the node; start it again" if changed else ""
         return SetParametersResult(successful=not changed, reason=reason)
@@ -219,6 +222,17 @@ class ComponentNode(Node):
         self.count(Key.MESSAGES_REFUSED)
         self.details[Key.LAST_REFUSED] = reason
         self.report(WARN, reason)
+
+    def thread(self, body: Callable[[], None], name: str) -> threading.Thread:
+        """A thread of this node, not started yet; an error in it is raised where the node spins."""
+
+        def run() -> None:
+            try:
+                body()
+            except Exception as error:  # noqa: BLE001 -- whatever it is, it ends the node
+                self.failure = error
+
+        return threading.Thread(target=run, name=name, daemon=True)
 
     def missed(self, topic: str, amount: int) -> None:
         """Count messages that were published and never taken."""
@@ -332,4 +346,4 @@ def _subscribers(topic: str, nodes: list[str]) -> int:
     return subscribers_of(topic, nodes) + (topic == "/diagnostics" and bool(nodes))
 
 
-__all__ = ["ERROR", "HARDWARE_ID", "OK", "WARN", "ComponentNode", "Gaps"]
+__all__ = ["ERROR", "HARDWARE_ID", "OK", "WARN", "ComponentNode", "Gaps", "MessageInfo"]

@@ -5,12 +5,13 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import Header
 
-from drocap_ros.ros.component import ComponentNode, Gaps
+from drocap_ros.ros.component import ComponentNode, Gaps, MessageInfo
 from drocap_ros.ros.topics import IMAGE_IN_GRAPH_QOS, publishers_of
 
 _TOPIC = "image/compressed"
@@ -100,7 +101,7 @@ class ImageInput:
         self._queue = ImageQueue(depth)
         qos = IMAGE_IN_GRAPH_QOS if publishers_of(_TOPIC, node.peers) else None
         node.input(_TOPIC, self._on_message, qos=qos, with_info=True)
-        self._thread = threading.Thread(target=self._run, name="images", daemon=True)
+        self._thread = node.thread(self._run, "images")
         if not node.simulated:
             self._thread.start()
 
@@ -114,7 +115,7 @@ class ImageInput:
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
 
-    def _on_message(self, message: Any, info: dict[str, Any]) -> None:
+    def _on_message(self, message: CompressedImage, info: MessageInfo) -> None:
         image, missed = self._decode(message), self._gaps.before(info)
         if self._node.simulated:
             self._process_now(ImageSample(message.header, image, missed, waited=False, behind=0))
@@ -127,8 +128,5 @@ class ImageInput:
         self._process(sample)
 
     def _run(self) -> None:
-        try:
-            while (sample := self._queue.take()) is not None:
-                self._process_now(sample)
-        except Exception as error:
-            self._node.failure = error
+        while (sample := self._queue.take()) is not None:
+            self._process_now(sample)

@@ -110,7 +110,7 @@ class ManagedComponent(ComponentNode, LifecycleNodeMixin):
         self._refusal = None
         try:
             self.acquire()
-        except Exception as error:  # rclpy would swallow it
+        except Exception as error:  # noqa: BLE001 -- rclpy would swallow it
             self._refusal = error
             self.report(ERROR, str(error))
             return FAILURE

@@ -66,21 +66,22 @@ def _descriptor(spec: dataclasses.Field, default: object) -> ParameterDescriptor
     descriptor = ParameterDescriptor(
         description=meta["description"] + unit, additional_constraints=choices, read_only=True
     )
-    low, high = meta.get("minimum"), meta.get("maximum")
-    if low is None and high is None:
+    bounds = meta.get("minimum"), meta.get("maximum")
+    if bounds == (None, None) or isinstance(default, bool):
         return descriptor
     if isinstance(default, float):
-        big = sys.float_info.max
-        bounds = FloatingPointRange(
-            from_value=float(-big if low is None else low), to_value=float(big if high is None else high)
-        )
-        descriptor.floating_point_range = [bounds]
-    elif isinstance(default, int) and not isinstance(default, bool):
-        whole = IntegerRange(
-            from_value=int(-(2**63) if low is None else low), to_value=int(2**63 - 1 if high is None else high)
-        )
-        descriptor.integer_range = [whole]
+        low, high = _filled(bounds, -sys.float_info.max, sys.float_info.max)
+        descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+    elif isinstance(default, int):
+        low, high = _filled(bounds, -(2**63), 2**63 - 1)
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     return descriptor
+
+
+def _filled(bounds: tuple[float | None, float | None], least: float, most: float) -> tuple[float, float]:
+    """Bounds of which none is open; whole numbers stay whole."""
+    low, high = bounds
+    return least if low is None else low, most if high is None else high
 
 
 class ParameterSurvey:

@@ -66,7 +66,7 @@ def answer_impossible_transitions(node: LifecycleNodeMixin, report: Callable[[st
     def guarded(request: Any, response: Any) -> Any:
         try:
             return change(request, response)
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 -- rclpy has no type of its own for it
             report(f"transition {request.transition.label or request.transition.id}: {error}")
             response.success = False
             return response

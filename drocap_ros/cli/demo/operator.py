@@ -5,11 +5,16 @@ from __future__ import annotations
 import enum
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from drocap_ros.flight.orbit.states import Command, State
 
-#: Longest waits for the bridge to be ready and for the orbit after a command, and the pause between tries.
-READY_TIMEOUT_S, ORBIT_TIMEOUT_S, RETRY_S = 60.0, 10.0, 2.0
+#: Longest wait for the bridge to be ready: the pilot's take-off and hand-over take 6 s.
+READY_TIMEOUT_S = 60.0
+#: Longest wait for the orbit after a command: the autopilot may take seconds to change its mode.
+ORBIT_TIMEOUT_S = 10.0
+#: Pause between tries.
+RETRY_S = 2.0
 #: The bridge must be ready for this long before the start.
 STEADY_S = 1.0
 #: Time for the vehicle to come to rest after the stop.
@@ -25,6 +30,16 @@ class Phase(enum.Enum):
     STOPPED = "has stopped the orbit"
     DONE = "done"
     GIVEN_UP = "has given up"
+
+
+class _Status(NamedTuple):
+    """The bridge's status at a monotonic time, and the time since the one before."""
+
+    state: State
+    condition: int
+    reason: str
+    now_s: float
+    passed_s: float
 
 
 @dataclass
@@ -86,32 +101,25 @@ class Operator:
             return None
         if state == State.TAKEN_OVER and self.phase != Phase.STOPPED:
             return self._give_up(reason)
-        if self.phase == Phase.WAITING:
-            return self._wait(state, condition, reason, now_s)
-        if self.phase == Phase.REQUESTED:
-            return self._expect_orbit(state, condition, reason, now_s)
-        if self.phase == Phase.ORBITING:
-            return self._watch(state, reason, now_s, passed_s)
-        if now_s - self._since_s >= REST_S and state != State.ORBITING:
-            self._enter(Phase.DONE, now_s)
-        return None
+        step = {
+            Phase.WAITING: self._wait,
+            Phase.REQUESTED: self._expect_orbit,
+            Phase.ORBITING: self._watch,
+            Phase.STOPPED: self._rest,
+        }[self.phase]
+        return step(_Status(state, condition, reason, now_s, passed_s))
 
-    def _wait(self, state: State, condition: int, reason: str, now_s: float) -> Command | None:
+    def _wait(self, seen: _Status) -> Command | None:
+        now_s = seen.now_s
         if now_s - self._since_s > READY_TIMEOUT_S:
-            return self._give_up(f"the bridge was not ready within {READY_TIMEOUT_S:g} s: {reason}")
-        if state == State.FAULT and now_s >= self._next_try_s:
+            return self._give_up(f"the bridge was not ready within {READY_TIMEOUT_S:g} s: {seen.reason}")
+        if seen.state == State.FAULT and now_s >= self._next_try_s:
             self._next_try_s = now_s + RETRY_S
-            self._remark(f"fault: {reason}; acknowledged")
+            self._remark(f"fault: {seen.reason}; acknowledged")
             return Command.STOP
-        # A hold ends only by a command; the bridge answers whether its conditions hold again.
-        if state != State.READY:
-            self._ready_s = math.nan
-        elif math.isnan(self._ready_s):
-            self._ready_s = now_s
-        ready = state == State.HOLDING or now_s - self._ready_s >= STEADY_S
-        if not ready or not self.cleared or now_s < self._next_try_s:
-            if state != State.READY:
-                self._remark(f"not ready yet: {reason}", "not ready", condition)
+        if not self._is_steady(seen) or not self.cleared or now_s < self._next_try_s:
+            if seen.state != State.READY:
+                self._remark(f"not ready yet: {seen.reason}", "not ready", seen.condition)
             elif not self.cleared:
                 self._remark("waiting for the pilot", "pilot")
             return None
@@ -121,30 +129,41 @@ class Operator:
         self._next_try_s = now_s + ORBIT_TIMEOUT_S
         return Command.ENGAGE if again or self.requests_control else Command.START
 
-    def _expect_orbit(self, state: State, condition: int, reason: str, now_s: float) -> Command | None:
-        if state == State.ORBITING:
-            self._remark("orbiting")
-            self._enter(Phase.ORBITING, now_s)
-        elif now_s >= self._next_try_s:
-            self._remark(f"no orbit: {reason}", "no orbit", condition)
-            self.phase, self._next_try_s = Phase.WAITING, now_s + RETRY_S
-        return None
+    def _is_steady(self, seen: _Status) -> bool:
+        """Whether the bridge has been ready for long enough; a hold ends only by a command, which it answers."""
+        if seen.state != State.READY:
+            self._ready_s = math.nan
+        elif math.isnan(self._ready_s):
+            self._ready_s = seen.now_s
+        return seen.state == State.HOLDING or seen.now_s - self._ready_s >= STEADY_S
 
-    def _watch(self, state: State, reason: str, now_s: float, passed_s: float) -> Command | None:
-        if state == State.ORBITING:
-            self.orbited_s += passed_s
+    def _expect_orbit(self, seen: _Status) -> None:
+        if seen.state == State.ORBITING:
+            self._remark("orbiting")
+            self._enter(Phase.ORBITING, seen.now_s)
+        elif seen.now_s >= self._next_try_s:
+            self._remark(f"no orbit: {seen.reason}", "no orbit", seen.condition)
+            self.phase, self._next_try_s = Phase.WAITING, seen.now_s + RETRY_S
+
+    def _watch(self, seen: _Status) -> Command | None:
+        if seen.state == State.ORBITING:
+            self.orbited_s += seen.passed_s
             if self.orbited_s < self.seconds:
                 return None
             self._remark(f"{self.orbited_s:.0f} s of orbit flown: stopping")
-            self._enter(Phase.STOPPED, now_s)
+            self._enter(Phase.STOPPED, seen.now_s)
             return Command.STOP
-        self.holds.append(reason)
-        self._remark(f"the bridge holds after {self.orbited_s:.1f} s of orbit: {reason}")
+        self.holds.append(seen.reason)
+        self._remark(f"the bridge holds after {self.orbited_s:.1f} s of orbit: {seen.reason}")
         if len(self.holds) > self.restarts:
-            return self._give_up(f"the orbit was stopped {len(self.holds)} times, the last time: {reason}")
-        self._enter(Phase.WAITING, now_s)
-        self._next_try_s = now_s + REST_S
+            return self._give_up(f"the orbit was stopped {len(self.holds)} times, the last time: {seen.reason}")
+        self._enter(Phase.WAITING, seen.now_s)
+        self._next_try_s = seen.now_s + REST_S
         return None
+
+    def _rest(self, seen: _Status) -> None:
+        if seen.now_s - self._since_s >= REST_S and seen.state != State.ORBITING:
+            self._enter(Phase.DONE, seen.now_s)
 
     def _give_up(self, why: str) -> Command:
         self.failure, self.phase = why, Phase.GIVEN_UP

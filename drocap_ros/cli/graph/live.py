@@ -16,6 +16,7 @@ from drocap_ros.recording.mcap.metadata import METADATA_FILE
 from drocap_ros.recording.provenance import dated_name
 
 if TYPE_CHECKING:
+    from drocap_ros.bringup import Graph
     from drocap_ros.config import DrocapConfig
 
 
@@ -86,19 +87,24 @@ def run_graph(config: DrocapConfig, nodes: list[str], args: argparse.Namespace) 
         domain_id=domain_id,
         respawn=not args.no_respawn,
     ) as graph:
-        if not args.quiet:
-            print(f"running {', '.join(graph.names)} in {args.namespace}, domain {domain_id}; Ctrl-C stops")
-            sys.stdout.flush()
-        with dashboard_of(graph, show=not args.quiet) as (_, draw), stop_signals() as stop:
-            while not stop.is_set() and "image_ingest" not in graph.finished:
-                graph.spin_for(0.5, stop)
-                draw()
-                while graph.events:
-                    print(f"drocap: {graph.events.popleft()}", file=sys.stderr, flush=True)
+        _show(graph, args.quiet)
     if "session_recorder" in nodes and not args.quiet:
         folders = sorted(_session_folders(recorded) - before)
         print("\n".join(f"session: {folder}" for folder in folders) or "no session: nothing was recorded")
     return 0
+
+
+def _show(graph: Graph, quiet: bool) -> None:
+    """Draw the dashboard and print the events until Ctrl-C or the end of the source."""
+    if not quiet:
+        print(f"running {', '.join(graph.names)} in {graph.namespace}, domain {graph.domain_id}; Ctrl-C stops")
+        sys.stdout.flush()
+    with dashboard_of(graph, show=not quiet) as (_, draw), stop_signals() as stop:
+        while not stop.is_set() and "image_ingest" not in graph.finished:
+            graph.spin_for(0.5, stop)
+            draw()
+            while graph.events:
+                print(f"drocap: {graph.events.popleft()}", file=sys.stderr, flush=True)
 
 
 def _session_folders(first: Path) -> set[Path]:
