@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from drocap_ros.cli import reconstruct
-from drocap_ros.cli.options import add_command, add_motion_argument, add_quiet_option, add_seed_option, read_motion
+from drocap_ros.cli.options import (
+    Subparsers,
+    add_command,
+    add_motion_argument,
+    add_quiet_option,
+    add_seed_option,
+    read_motion,
+)
 
 #: ``live`` needs a recording of the live graph.
 METHODS = tuple(method for method in reconstruct.METHODS if method != "live")
 
 
-def add_parser(subparsers: Any) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's kinds."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = subparsers.add_parser(
         "evaluate",
         help="errors of a motion; accuracy studies over MoCap",
         description="Measure accuracy: of one motion against its truth, of every method over MoCap.",
@@ -27,7 +33,7 @@ def add_parser(subparsers: Any) -> None:
     _add_world(kinds)
 
 
-def _add_compare(kinds: Any) -> None:
+def _add_compare(kinds: Subparsers) -> None:
     parser = kinds.add_parser(
         "compare",
         aliases=["pair"],
@@ -41,7 +47,7 @@ def _add_compare(kinds: Any) -> None:
     parser.set_defaults(run=_compare)
 
 
-def _add_rotation(kinds: Any) -> None:
+def _add_rotation(kinds: Subparsers) -> None:
     parser = add_command(
         kinds,
         "rotation",
@@ -59,7 +65,7 @@ def _add_rotation(kinds: Any) -> None:
     parser.add_argument("--processes", metavar="N", type=int, default=1, help="number of processes (default 1)")
 
 
-def _add_world(kinds: Any) -> None:
+def _add_world(kinds: Subparsers) -> None:
     parser = add_command(
         kinds,
         "world",
@@ -147,7 +153,7 @@ def _check_out(args: argparse.Namespace) -> None:
 def _finish(
     args: argparse.Namespace,
     name: str,
-    records: list[Mapping[str, object]],
+    records: Sequence[Mapping[str, object]],
     markdown: str,
     picture: tuple[str, Callable[[Path], None]] | None = None,
 ) -> int:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-from drocap_ros.cli.options import add_command, add_motion_argument, add_quiet_option, read_motion
+from drocap_ros.cli.options import Subparsers, add_command, add_motion_argument, add_quiet_option, read_motion
 from drocap_ros.errors import InputError
 from drocap_ros.export import FORMATS
 
 
-def add_parser(subparsers: Any) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's options; ``run`` is its action."""
     units = "; ".join(f"{form}: {facts}" for form, facts in FORMATS.items())
     parser = add_command(

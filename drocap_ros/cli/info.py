@@ -9,7 +9,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from drocap_ros.cli.options import add_command, table_lines
+from drocap_ros.cli.options import Subparsers, add_command, table_lines
 from drocap_ros.cli.telemetry_summary import is_video_or_log, telemetry_summary
 from drocap_ros.errors import InputError
 
@@ -27,7 +27,7 @@ class Summary(NamedTuple):
     warnings: Sequence[str]
 
 
-def add_parser(subparsers: Any) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's options; ``run`` is its action."""
     parser = add_command(
         subparsers,

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from drocap_ros.cli.options import add_command, add_quiet_option, add_seed_option
+from drocap_ros.cli.options import Subparsers, add_command, add_quiet_option, add_seed_option
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
     from drocap_ros.reconstruction.paper.dictionary import Dictionary
 
 
-def add_parser(subparsers: Any) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's options; ``run`` is its action."""
     parser = add_command(
         subparsers,

@@ -6,9 +6,9 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from drocap_ros.cli.options import add_command, add_quiet_option, table_lines
+from drocap_ros.cli.options import Subparsers, add_command, add_quiet_option, table_lines
 from drocap_ros.errors import DrocapError, InputError
 
 if TYPE_CHECKING:
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from drocap_ros.perception.models.registry import KnownModel
 
 
-def add_parser(subparsers: Any) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's actions."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = subparsers.add_parser(
         "models",
         help="list, fetch or check the networks",
         description="Networks for person detection and 2D pose: list the known and the installed ones, fetch them from"
@@ -55,18 +55,20 @@ def run_list(args: argparse.Namespace) -> int:
         raise InputError(f"{folder}: expected a folder of models, found no such folder; check the path")
     present = sorted(folder.glob("*.onnx"))
     names = {path.name for path in present}
-    rows = [("NAME", "TASK", "MB", "LICENCE", "TRAINED ON", "FROM", "FILE", "INSTALLED")]
-    for model in KNOWN_MODELS:
-        origin = model.home if model.url else f"{model.home} (no ONNX download)"
-        size, installed = f"{model.size_mb:.1f}", "yes" if model.file in names else "-"
-        rows.append((model.name, model.task, size, model.licence, model.training_data, origin, model.file, installed))
-    print("\n".join(table_lines(rows)))
+    head = ("NAME", "TASK", "MB", "LICENCE", "TRAINED ON", "FROM", "FILE", "INSTALLED")
+    print("\n".join(table_lines([head, *(_row(model, model.file in names) for model in KNOWN_MODELS)])))
     print(f"\nfolder {folder}: " + ("" if present else "no models; `drocap models fetch` downloads the default pair"))
     print("".join(f"  {describe(path)}\n" for path in present), end="")
     if folder != shipped:
         print(f"\nshipped, used only with `--models {SIMULATION}`:")
         print("".join(f"  {describe(path)}\n" for path in sorted(shipped.glob("*.onnx"))), end="")
     return 0
+
+
+def _row(model: KnownModel, installed: bool) -> tuple[str, ...]:
+    origin = model.home if model.url else f"{model.home} (no ONNX download)"
+    facts = (model.name, model.task, f"{model.size_mb:.1f}", model.licence, model.training_data, origin, model.file)
+    return (*facts, "yes" if installed else "-")
 
 
 def describe(path: Path) -> str:

@@ -8,7 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
+from typing import TYPE_CHECKING, NoReturn, TypeAlias
 
 from drocap_ros.errors import InputError
 
@@ -80,9 +80,9 @@ def add_network_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_seed_option(parser: argparse.ArgumentParser, help: str, **options: Any) -> None:
+def add_seed_option(parser: argparse.ArgumentParser, help: str, metavar: str | None = None) -> None:
     """Add ``--seed``."""
-    parser.add_argument("--seed", type=_seed, default=0, help=f"{help} (default 0)", **options)
+    parser.add_argument("--seed", type=_seed, default=0, help=f"{help} (default 0)", metavar=metavar)
 
 
 def ros_namespace(text: str) -> str:

@@ -6,9 +6,10 @@ import argparse
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from drocap_ros.cli.options import (
+    Subparsers,
     add_clip_options,
     add_command,
     add_config_option,
@@ -21,13 +22,13 @@ from drocap_ros.reconstruction.methods import METHODS as OFFLINE
 
 if TYPE_CHECKING:
     from drocap_ros.motion import Motion
-    from drocap_ros.pipeline import Telemetry
+    from drocap_ros.recording.video_telemetry import Telemetry
     from drocap_ros.tracks import Tracks
 
 METHODS = (*OFFLINE, "live")
 
 
-def add_parser(subparsers: Any) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's options; ``run`` is its action."""
     parser = add_command(
         subparsers,
@@ -147,7 +148,7 @@ def _write(out: Path, names: list[str], source: Path, motion: Motion, tracks: Tr
 
 
 def _telemetry(args: argparse.Namespace) -> Telemetry:
-    from drocap_ros.pipeline import Telemetry
+    from drocap_ros.recording.video_telemetry import Telemetry
 
     if args.time_offset is not None:
         _check_offset("--time-offset", args.time_offset, args, mount=False)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import contextlib
 import signal
 import threading
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from types import FrameType
+
+#: What :func:`signal.signal` takes and gives.
+Handler = Callable[[int, FrameType | None], object] | int | None
 
 BOTH = (signal.SIGINT, signal.SIGTERM)
 
@@ -31,9 +34,9 @@ def interruptible(signals: Sequence[signal.Signals] = BOTH) -> Iterator[threadin
     destructor is lost, and one in a C++ library can become another one.
     """
     interrupted = threading.Event()
-    before: dict[signal.Signals, Any] = {}
+    before: dict[signal.Signals, Handler] = {}
 
-    def interrupt(number: int, frame: Any) -> None:
+    def interrupt(number: int, frame: FrameType | None) -> None:
         interrupted.set()
         around = before.get(signal.Signals(number))
         if callable(around):

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from drocap_ros.cli.options import (
+    Subparsers,
     add_clip_options,
     add_command,
     add_config_option,
@@ -18,6 +18,9 @@ from drocap_ros.cli.options import (
 from drocap_ros.errors import DrocapError
 
 if TYPE_CHECKING:
+    import cv2
+    import numpy as np
+
     from drocap_ros.cli.progress import Progress
     from drocap_ros.clip import Clip
     from drocap_ros.observation import PoseObservation
@@ -27,7 +30,7 @@ if TYPE_CHECKING:
     from drocap_ros.recording.open_images import Images
 
 
-def add_parser(subparsers: Any) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's options; ``run`` is its action."""
     parser = add_command(
         subparsers,
@@ -65,8 +68,8 @@ def run(args: argparse.Namespace) -> int:
     check_output_folder(out)
     refuse_inputs([out / "persons.jpg"] if args.list else [out / "overlay.mp4"] * args.overlay, [args.video])
     clip, (person, rule) = clip_of(args), parse_subject(args.subject)
-    whole = load_config(args.config)
-    config, ingest = dataclasses.replace(whole.pose_estimator, on_loss="next", **rule), whole.image_ingest
+    whole = load_config(args.config).replace("pose_estimator", on_loss="next", **rule)
+    config, ingest = whole.pose_estimator, whole.image_ingest
     folder = models_folder(args.models or config.models_dir)
     ensure_networks(folder, args.video, args)
     with output_folder(out) as target, progress_bars(args.quiet) as progress:
@@ -141,8 +144,8 @@ class _OverlayWriter:
 
     def __init__(self, path: Path, rate_hz: float | None) -> None:
         self._path, self._rate_hz, self._count = path, rate_hz, 0
-        self._first: tuple[int, Any] | None = None
-        self._video: Any = None
+        self._first: tuple[int, np.ndarray] | None = None
+        self._video: cv2.VideoWriter | None = None
 
     def add(self, frame: Frame, observation: PoseObservation) -> None:
         import cv2
@@ -167,7 +170,8 @@ class _OverlayWriter:
             self._video.release()
             self._check()
 
-    def _write(self, image: Any) -> None:
+    def _write(self, image: np.ndarray) -> None:
+        assert self._video is not None
         self._video.write(image)
         self._count += 1
 

@@ -114,12 +114,12 @@ def _limb(upper: np.ndarray, lower: np.ndarray, bends: float, rate_hz: float) ->
 def _in(axes: np.ndarray, vectors: np.ndarray, side: str = "r") -> np.ndarray:
     """(F, 3) vectors in the coordinates of axes (F, 3, 3); mirrored to the right for the left side."""
     local = np.einsum("fji,fj->fi", axes, vectors)
-    return local @ _MIRROR if side == "l" else local
+    return np.asarray(local @ _MIRROR if side == "l" else local)
 
 
 def _angle(y: np.ndarray, x: np.ndarray) -> np.ndarray:
     """(F,) degrees in [-90, 270): no limb bends backwards by a right angle, so the cut is never crossed."""
-    return np.degrees((np.arctan2(y, x) + 0.5 * np.pi) % (2.0 * np.pi) - 0.5 * np.pi)
+    return np.asarray(np.degrees((np.arctan2(y, x) + 0.5 * np.pi) % (2.0 * np.pi) - 0.5 * np.pi))
 
 
 def continuous_euler(rotations: np.ndarray, order: str) -> np.ndarray:
@@ -131,10 +131,10 @@ def continuous_euler(rotations: np.ndarray, order: str) -> np.ndarray:
     second = first * (1.0, -1.0, 1.0) + (np.pi, 0.0 if proper else np.pi, np.pi)
 
     def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.sum(np.abs(np.angle(np.exp(1j * (a - b)))), axis=1)
+        return np.asarray(np.sum(np.abs(np.angle(np.exp(1j * (a - b)))), axis=1))
 
     crossed = apart(first[1:], second[:-1]) < apart(first[1:], first[:-1])
     swapped = np.concatenate([[False], np.cumsum(crossed) % 2 == 1])
     angles = np.unwrap(np.where(swapped[:, None], second, first), axis=0)
     # The first frame lies within half a turn.
-    return np.degrees(angles - 2.0 * np.pi * np.round(angles[0] / (2.0 * np.pi)))
+    return np.asarray(np.degrees(angles - 2.0 * np.pi * np.round(angles[0] / (2.0 * np.pi))))

@@ -135,10 +135,10 @@ def _two_bones(leg: np.ndarray, target: np.ndarray, rate_hz: float) -> tuple[np.
     both = np.maximum(thigh * shank, 1e-9)
 
     def flexion(reach: np.ndarray) -> np.ndarray:
-        return np.arccos(np.clip((reach**2 - thigh**2 - shank**2) / (2.0 * both), -1.0, 1.0))
+        return np.asarray(np.arccos(np.clip((reach**2 - thigh**2 - shank**2) / (2.0 * both), -1.0, 1.0)))
 
     def reach_at(bend: np.ndarray) -> np.ndarray:
-        return np.sqrt(np.maximum(thigh**2 + shank**2 + 2.0 * both * np.cos(bend), 1e-12))
+        return np.asarray(np.sqrt(np.maximum(thigh**2 + shank**2 + 2.0 * both * np.cos(bend), 1e-12)))
 
     bend = flexion(before)
     turn = flexion(wanted) - bend
@@ -166,4 +166,4 @@ def _aside(knee: np.ndarray, ankle: np.ndarray, rate_hz: float) -> np.ndarray:
     own = knee - line * np.sum(knee * line, axis=1, keepdims=True)
     around = np.nan_to_num(own) * np.linalg.norm(np.nan_to_num(own), axis=1, keepdims=True)
     around = gaussian_filter1d(around, min(max(_AVERAGE_S * rate_hz, 1e-3), 1000.0), axis=0)
-    return own + _CLEAR_M * around / np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-12)
+    return np.asarray(own + _CLEAR_M * around / np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-12))

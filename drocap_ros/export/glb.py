@@ -18,6 +18,8 @@ from drocap_ros.export.rig import Rig, rig_of
 from drocap_ros.export.rigid_body import BODY
 from drocap_ros.export.take import Take, y_up
 
+#: An object of glTF's JSON.
+Json = dict[str, Any]
 #: Codes of glTF 2.0: uses of a buffer, shapes and types of its elements.
 _ARRAY_BUFFER = 34962
 _ELEMENT_BUFFER = 34963
@@ -54,15 +56,15 @@ class _Buffer:
 
     def __init__(self) -> None:
         self.data = bytearray()
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
+        self.views: list[Json] = []
+        self.accessors: list[Json] = []
 
     def add(self, array: np.ndarray, *, bounds: bool = False, target: int | None = None) -> int:
         """Append rows (N,) or (N, k) as float32 or uint8; returns the accessor's index."""
-        view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes}
+        view: Json = {"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes}
         if target:
             view["target"] = target
-        accessor: dict[str, Any] = {
+        accessor: Json = {
             "bufferView": len(self.views),
             "componentType": _COMPONENTS[str(array.dtype)],
             "count": len(array),
@@ -78,7 +80,7 @@ class _Buffer:
         return len(self.accessors) - 1
 
 
-def _document(rig: Rig, times_s: np.ndarray, facts: dict[str, Any]) -> tuple[dict[str, Any], bytes]:
+def _document(rig: Rig, times_s: np.ndarray, facts: Json) -> tuple[Json, bytes]:
     buffer = _Buffer()
     inverse_bind = np.tile(np.eye(4, dtype=np.float32), (len(rig.rest), 1, 1))
     inverse_bind[:, :3, 3] = -rig.rest
@@ -101,17 +103,17 @@ def _document(rig: Rig, times_s: np.ndarray, facts: dict[str, Any]) -> tuple[dic
     return document, bytes(buffer.data)
 
 
-def _joint_nodes(rig: Rig) -> list[dict[str, Any]]:
-    nodes: list[dict[str, Any]] = []
+def _joint_nodes(rig: Rig) -> list[Json]:
+    nodes: list[Json] = []
     for joint, (name, parent) in enumerate(zip(rig.names, rig.parents, strict=True)):
         place = rig.rest[joint] - (rig.rest[parent] if parent >= 0 else 0.0)
-        node: dict[str, Any] = {"name": name, "translation": np.round(place, 7).tolist()}
+        node: Json = {"name": name, "translation": np.round(place, 7).tolist()}
         children = [c for c, p in enumerate(rig.parents) if p == joint]
         nodes.append({**node, "children": children} if children else node)
     return nodes
 
 
-def _bones(buffer: _Buffer, rig: Rig) -> dict[str, Any]:
+def _bones(buffer: _Buffer, rig: Rig) -> Json:
     """Octahedra from each joint to its children or its bone's end; without normals viewers shade them flat."""
     tips = [(parent, rig.rest[child]) for child, parent in enumerate(rig.parents) if parent >= 0]
     tips += [(joint, rig.rest[joint] + end) for joint, end in rig.ends.items()]
@@ -135,12 +137,12 @@ def _bones(buffer: _Buffer, rig: Rig) -> dict[str, Any]:
     return {"attributes": attributes, "indices": buffer.add(triangles.reshape(-1), target=_ELEMENT_BUFFER)}
 
 
-def _animation(buffer: _Buffer, rig: Rig, times_s: np.ndarray) -> dict[str, Any]:
+def _animation(buffer: _Buffer, rig: Rig, times_s: np.ndarray) -> Json:
     times = buffer.add(times_s.astype(np.float32), bounds=True)
     tracks = [(0, "translation", rig.root)]
     tracks += [(joint, "rotation", _continuous(rig.local(joint).as_quat())) for joint in range(len(rig.names))]
-    samplers: list[dict[str, Any]] = []
-    channels: list[dict[str, Any]] = []
+    samplers: list[Json] = []
+    channels: list[Json] = []
     for node, kind, values in tracks:
         channels.append({"sampler": len(samplers), "target": {"node": node, "path": kind}})
         output = buffer.add(values.astype(np.float32))
@@ -155,7 +157,7 @@ def _continuous(quaternions: np.ndarray) -> np.ndarray:
     return quaternions * signs[:, None]
 
 
-def _container(document: dict[str, Any], data: bytes) -> bytes:
+def _container(document: Json, data: bytes) -> bytes:
     """GLB of a JSON chunk and a binary chunk (glTF 2.0 specification, section 4.4)."""
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)

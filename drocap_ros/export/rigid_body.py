@@ -260,7 +260,7 @@ class _Problem:
         return np.concatenate([joints, bend, away.reshape(frames, -1)], axis=1)
 
     def _expected(self, pose: _Pose) -> np.ndarray:
-        return np.einsum("fij,kj->fki", pose.chest, self.usual)
+        return np.asarray(np.einsum("fij,kj->fki", pose.chest, self.usual))
 
     def _jacobian(self, pose: _Pose, across: np.ndarray, scale: np.ndarray) -> np.ndarray:
         """(F, R, 9 + 2 K) of the residuals.

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from html import escape
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import Any
 
 import numpy as np
 
@@ -141,7 +141,7 @@ def _plots(motion: Motion, s: Statistics) -> list[tuple[str, str, str]]:
 def _provenance(motion: Motion, command: str) -> str:
     meta = motion.meta
     versions = meta.get("versions")
-    rows: list[tuple[str, Any]] = [
+    rows: list[tuple[str, object]] = [
         ("reconstructed by", meta.get("command")),
         ("report by", command),
         ("git revision", meta.get("git_revision")),
@@ -157,7 +157,7 @@ def _provenance(motion: Motion, command: str) -> str:
     )
 
 
-def _solver(meta: dict[str, Any]) -> str:
+def _solver(meta: Mapping[str, object]) -> str:
     if "iterations" not in meta:
         return ""
     return f"{meta['iterations']} iterations, stopped by: {meta.get('stop_reason', 'unknown')}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from drocap_ros.skeleton import side_of
 MAX_POSES = 3000
 
 
-def page_data(motion: Motion, s: Statistics, images: MotionImages | None) -> dict[str, Any]:
+def page_data(motion: Motion, s: Statistics, images: MotionImages | None) -> dict[str, object]:
     """JSON-compatible data: integers, row-major, null where unknown.
 
     ``pose`` mm and ``camera`` (right, forward; thousandths) in axes with z up; ``keypoints`` tenths of a px;
@@ -41,7 +40,7 @@ def page_data(motion: Motion, s: Statistics, images: MotionImages | None) -> dic
     }
 
 
-def script_json(data: Any) -> str:
+def script_json(data: object) -> str:
     """JSON for a script element: no character ends the element or a line."""
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     for character in "<>&\u2028\u2029":
@@ -49,7 +48,7 @@ def script_json(data: Any) -> str:
     return text
 
 
-def _images(images: MotionImages, shown: np.ndarray) -> dict[str, Any]:
+def _images(images: MotionImages, shown: np.ndarray) -> dict[str, object]:
     """Images with the index of their frame among those shown, each index once."""
     places, first = np.unique(np.searchsorted(shown, images.frames).clip(0, len(shown) - 1), return_index=True)
     return {

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -143,7 +143,7 @@ def scale_words(motion: Motion) -> str:
     return f"{'measured' if motion.metric else 'assumed'}, from {motion.scale_source.replace('_', ' ')}"
 
 
-def stage_seconds(meta: dict[str, Any]) -> dict[str, float]:
+def stage_seconds(meta: Mapping[str, object]) -> dict[str, float]:
     """Seconds per stage of a motion's ``meta`` in the order of the stages, the total last; others are left out."""
     seconds = meta.get("seconds")
     if not isinstance(seconds, dict):
@@ -169,7 +169,7 @@ def smooth(values: np.ndarray, times_s: np.ndarray) -> np.ndarray:
     total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
     at = np.arange(len(values))
     first, last = np.maximum(at - half, 0), np.minimum(at + half + 1, len(values))
-    return (total[last] - total[first]) / (last - first).reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray((total[last] - total[first]) / (last - first).reshape(-1, *[1] * (values.ndim - 1)))
 
 
 def _torso(joints: np.ndarray, motion: Motion) -> np.ndarray:
@@ -284,4 +284,4 @@ def _path_speeds(motion: Motion, times_s: np.ndarray) -> tuple[float, float]:
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from drocap_ros.skeleton import JointSet, joint_set
 from drocap_ros.view.camera_placement import nominal_camera_matrix, place_cameras
 from drocap_ros.view.rerun_scene import Scene
 from drocap_ros.view.visualizer_config import RateLimit
+
+#: A message of the graph as rclpy or rosbags decodes it: the same fields, no common class.
+Message: TypeAlias = Any
 
 PLOTS = ("latency_ms", "reprojection_px", "orbit")
 #: Topics by which a recording's namespace is found.
@@ -61,13 +64,13 @@ class MessageView:
         self._path: deque[np.ndarray] = deque(maxlen=_PATH_POINTS)
         self._now_ns: int | None = None
         self._refined_ns = -(10**18)
-        self._pending: list[Any] = []
+        self._pending: list[Message] = []
         self._last_text: dict[str, tuple[int, str]] = {}
         self.taken = self.refused = 0
         #: Diagnostics of this package's nodes in other namespaces are ignored; empty = none are.
         self.namespace = ""
         #: Name of a topic in the graph -> drawing function of its messages.
-        self.handlers: dict[str, Callable[[Any, int], None]] = {
+        self.handlers: dict[str, Callable[[Message, int], None]] = {
             "pose2d": self._on_pose2d,
             "pose3d/initial": lambda message, at_ns: self._on_pose3d("initial", message, at_ns),
             "pose3d/latest": lambda message, at_ns: self._on_pose3d("latest", message, at_ns),
@@ -79,7 +82,7 @@ class MessageView:
             "/diagnostics": self._on_diagnostics,
         }
 
-    def take(self, topic: str, message: Any, received_ns: int) -> None:
+    def take(self, topic: str, message: Message, received_ns: int) -> None:
         """Draw a message of a topic of :attr:`handlers`; a malformed one is counted and not drawn."""
         self.taken += not topic.startswith("/")  # /diagnostics is shared by all graphs
         try:
@@ -96,7 +99,7 @@ class MessageView:
 
     # -- images and keypoints ------------------------------------------------------------------------
 
-    def _on_image(self, message: Any, _: int) -> None:
+    def _on_image(self, message: Message, _: int) -> None:
         if not self._image_rate.due(header_stamp_ns(message)):
             return
         data = bytes(message.data)
@@ -106,7 +109,7 @@ class MessageView:
         else:
             self._scene.image(image_from_message(message, compressed=hasattr(message, "format")))
 
-    def _on_pose2d(self, message: Any, _: int) -> None:
+    def _on_pose2d(self, message: Message, _: int) -> None:
         observation = observation_from_message(message)
         self._at(message)
         if self._size != observation.image_size:
@@ -120,7 +123,7 @@ class MessageView:
         while len(self._keypoints) > _WAITING:
             self._keypoints.popitem(last=False)
 
-    def _on_camera_info(self, message: Any, _: int) -> None:
+    def _on_camera_info(self, message: Message, _: int) -> None:
         matrix = np.asarray(getattr(message, "k", getattr(message, "K", ())), float)
         if matrix.size != 9 or not np.isfinite(matrix).all() or matrix[0] <= 0 or matrix[4] <= 0:
             raise InputError("k: expected a camera matrix with a positive focal length; calibrate the camera")
@@ -142,7 +145,7 @@ class MessageView:
 
     # -- the body --------------------------------------------------------------------------------------
 
-    def _on_pose3d(self, stage: str, message: Any, received_ns: int) -> None:
+    def _on_pose3d(self, stage: str, message: Message, received_ns: int) -> None:
         self._at(message)
         self._draw(stage, message)
         late_s = (received_ns - header_stamp_ns(message)) * 1e-9
@@ -151,7 +154,7 @@ class MessageView:
         if message.track_id:
             self._scene.plot(f"reprojection_px/{stage}", float(message.reprojection_rms))
 
-    def _on_window(self, message: Any, _: int) -> None:
+    def _on_window(self, message: Message, _: int) -> None:
         newest_ns = header_stamp_ns(message)
         if newest_ns < self._refined_ns:  # a recording played in a loop
             self._refined_ns = -(10**18)
@@ -163,7 +166,7 @@ class MessageView:
             self._refined_ns = header_stamp_ns(final[-1])
         self._pending = fresh[len(final) :]
 
-    def _draw(self, stage: str, message: Any) -> None:
+    def _draw(self, stage: str, message: Message) -> None:
         self._scene.at(header_stamp_ns(message))
         if not message.track_id:
             self._scene.no_subject(stage)
@@ -181,7 +184,7 @@ class MessageView:
         self._scene.pose(stage, joints_of, joints, covariance if stage != "refined" else None)
 
     def _place(
-        self, message: Any, joints_of: JointSet, joints: np.ndarray, draw_camera: bool
+        self, message: Message, joints_of: JointSet, joints: np.ndarray, draw_camera: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         """Rotation world -> optical, and shift (3,) m in the world, of a pose in the optical frame."""
         at_ns = header_stamp_ns(message)
@@ -209,7 +212,7 @@ class MessageView:
 
     # -- the vehicle and the nodes ---------------------------------------------------------------------
 
-    def _on_state(self, message: Any, _: int) -> None:
+    def _on_state(self, message: Message, _: int) -> None:
         position = np.asarray(message.position_enu_m, float)
         if not np.isfinite(position).all():
             return
@@ -223,13 +226,13 @@ class MessageView:
             self._path.append(position)
             self._scene.camera_path(np.array(self._path))
 
-    def _on_orbit(self, message: Any, _: int) -> None:
+    def _on_orbit(self, message: Message, _: int) -> None:
         self._at_newest(message)
         self._scene.plot("orbit/radius_error_m", float(message.radius_error_m))
         self._scene.plot("orbit/yaw_error_deg", float(message.yaw_error_deg))
         self._log_change("orbit", int(message.state), message.reason, "INFO")
 
-    def _on_diagnostics(self, message: Any, _: int) -> None:
+    def _on_diagnostics(self, message: Message, _: int) -> None:
         self._at_newest(message)
         inside = self.namespace.strip("/") + "/" if self.namespace else ""
         for status in message.status:
@@ -247,17 +250,17 @@ class MessageView:
 
     # -- time ------------------------------------------------------------------------------------------
 
-    def _at(self, message: Any) -> None:
+    def _at(self, message: Message) -> None:
         stamp = header_stamp_ns(message)
         self._now_ns = stamp if self._now_ns is None else max(self._now_ns, stamp)
         self._scene.at(stamp)
 
-    def _at_newest(self, message: Any) -> None:
+    def _at_newest(self, message: Message) -> None:
         """Use the newest image's stamp: the images of a file may have another clock than the nodes."""
         self._scene.at(self._now_ns if self._now_ns is not None else header_stamp_ns(message))
 
 
-def _xyzw(quaternion: Any) -> np.ndarray:
+def _xyzw(quaternion: Message) -> np.ndarray:
     return np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], float)
 
 

@@ -12,9 +12,9 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from drocap_ros.cli.options import add_command, add_quiet_option
+from drocap_ros.cli.options import Subparsers, add_command, add_quiet_option
 from drocap_ros.cli.reconstruct import add_options
 from drocap_ros.errors import InputError
 
@@ -22,13 +22,15 @@ if TYPE_CHECKING:
     from drocap_ros.cli.batch.recording import Record, Task
 
 LOG_FILE, PAGE_FILE = "batch.jsonl", "summary.html"
+#: Period of the page while the batch runs, s (docs/batch.md).
 _PAGE_EVERY_S = 60.0
+#: Failures that are printed; the page has all.
 _FAILURES_PRINTED = 10
 #: Names of the temporary folders that killed processes leave.
 _LEFT_OVER = re.compile(r"\.+[\w-]*-[0-9a-f]{16}\.\w+(\.\w+)?")
 
 
-def add_parser(subparsers: Any) -> None:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's options; ``run`` is its action."""
     parser = add_command(
         subparsers,
@@ -91,14 +93,11 @@ def _read_tasks(args: argparse.Namespace) -> list[Task]:
     """A task for each recording that the arguments name, each once."""
     from drocap_ros.cli.batch.inputs import read_inputs
     from drocap_ros.cli.batch.recording import Task, content_digest, fingerprint, stat_digest, version
-    from drocap_ros.recording.video_telemetry import NO_TELEMETRY
 
     options = argparse.ArgumentParser()
     add_options(options)
     defaults = argparse.Namespace(**{name: getattr(args, name) for name in vars(options.parse_args([]))})
-    for name, value in vars(defaults).items():
-        if isinstance(value, Path) and name != "models" and value != NO_TELEMETRY and not value.exists():
-            raise InputError(f"--{name} {value}: no such file; check the path")
+    _check_files(defaults)
     shared = [value for value in vars(_resolved(defaults)).values() if isinstance(value, Path)]
     digests = {path: content_digest(path) for path in shared}
     current = version()
@@ -107,6 +106,15 @@ def _read_tasks(args: argparse.Namespace) -> list[Task]:
         key = fingerprint(arguments, current, stat_digest)
         tasks[key] = Task(arguments, args.out.absolute(), args.command_line, current, digests, key)
     return list(tasks.values())
+
+
+def _check_files(defaults: argparse.Namespace) -> None:
+    """Refuse a missing file of an option before the work."""
+    from drocap_ros.recording.video_telemetry import NO_TELEMETRY
+
+    for name, value in vars(defaults).items():
+        if isinstance(value, Path) and name != "models" and value != NO_TELEMETRY and not value.exists():
+            raise InputError(f"--{name} {value}: no such file; check the path")
 
 
 def _resolved(arguments: argparse.Namespace) -> argparse.Namespace:

@@ -6,7 +6,7 @@ import argparse
 import copy
 import glob
 import shlex
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 from drocap_ros.cli.options import LineParser
@@ -86,11 +86,14 @@ def _in_folder(folder: Path) -> Iterator[Path]:
         yield folder
         return
     entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-    is_result = (folder / "motion.npz").exists()
-    files = [] if is_result else [path for path in entries if path.suffix.lower() in _RECORDINGS and path.is_file()]
     folders = [path for path in entries if path.is_dir() and not path.is_symlink()]
-    if not (is_result or files or folders) and any(path.suffix.lower() in IMAGES for path in entries):
-        yield folder
-    yield from files
+    if not (folder / "motion.npz").exists():  # else the files are a result
+        files = _of_kinds(entries, _RECORDINGS)
+        images_alone = not (files or folders) and bool(_of_kinds(entries, IMAGES))
+        yield from [folder] if images_alone else files
     for each in folders:
         yield from _in_folder(each)
+
+
+def _of_kinds(entries: list[Path], suffixes: Collection[str]) -> list[Path]:
+    return [path for path in entries if path.suffix.lower() in suffixes and path.is_file()]

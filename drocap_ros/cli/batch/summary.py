@@ -72,9 +72,8 @@ A click on a column's title sorts.</p>
 
 
 def _doubtfulness(record: Record) -> tuple[bool, int, float, str]:
-    return (
-        record["status"] == "done", -len(record.get("doubts", ())), -(record.get("error_body") or 0.0), record["input"]
-    )  # fmt: skip
+    doubts, error = len(record.get("doubts", ())), record.get("error_body") or 0.0
+    return record["status"] == "done", -doubts, -error, record["input"]
 
 
 def _row(record: Record) -> str:

@@ -15,11 +15,16 @@ from drocap_ros.errors import DrocapError, InputError
 
 #: A process of a recording begins as a fork of a server with these modules.
 _PRELOAD = (
-    "drocap_ros.cli.reconstruct", "drocap_ros.pipeline", "drocap_ros.report.page",
-    "scipy.linalg.lapack", "scipy.ndimage", "cv2",
-)  # fmt: skip
-#: Attempts after an unexpected error, such as one of the file system.
+    "drocap_ros.cli.reconstruct",
+    "drocap_ros.pipeline",
+    "drocap_ros.report.page",
+    "scipy.linalg.lapack",
+    "scipy.ndimage",
+    "cv2",
+)
+#: Attempts after an unexpected error, such as one of the file system: three in all (docs/batch.md).
 _RETRIES = 2
+#: Longest wait for the scheduler, s; a judgement.
 _CONNECT_S = 20.0
 
 
@@ -77,18 +82,18 @@ def run_on_cluster(tasks: Sequence[Task], address: str) -> Generator[Record, Non
         install = f"{sys.executable} -m pip install 'drocap_ros[cluster]'"
         raise InputError(f"--cluster: expected dask.distributed, found none; run {install}") from None
     try:
-        client = Client(address, timeout=_CONNECT_S)
+        client = Client(address, timeout=_CONNECT_S)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(f"--cluster {address}: expected the address of a Dask scheduler; {error}") from None
     with client:
-        threads = client.nthreads()
+        threads = client.nthreads()  # type: ignore[no-untyped-call]
         print(f"{len(threads)} workers at {address}, dashboard {client.dashboard_link}", file=sys.stderr)
         if any(count > 1 for count in threads.values()):
             print("workers with several threads use one of them; start them with --nthreads 1", file=sys.stderr)
         futures = client.map(reconstruct_recording, tasks, pure=False, retries=_RETRIES)
         pending = dict(zip(futures, tasks, strict=True))
         del futures
-        for future in as_completed(list(pending)):
+        for future in as_completed(list(pending)):  # type: ignore[no-untyped-call]
             task = pending.pop(future)
             if future.cancelled():
                 raise DrocapError(f"--cluster {address}: the scheduler was lost; start the batch again to go on")
