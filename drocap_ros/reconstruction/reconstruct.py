@@ -24,7 +24,7 @@ from drocap_ros.reconstruction.methods.run import run_method
 from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M
 from drocap_ros.reconstruction.world.in_world import in_camera_axes, in_world
 from drocap_ros.reconstruction.world.placement import WorldPoses, metres_per_px
-from drocap_ros.reconstruction.world.refine import refinable
+from drocap_ros.reconstruction.world.refine import RefinedWorld, refinable
 from drocap_ros.reconstruction.world.world_model import world_config
 from drocap_ros.revision import git_revision
 from drocap_ros.skeleton import BODY_15, BODY_17, BODY_19, JointSet, body_set
@@ -217,7 +217,8 @@ def _in_metres(tracks: Tracks, keypoints: Keypoints2D, poses: ImagePoses, settin
     height_m = settings.initializer.assumed_height_m
     per_px = metres_per_px(poses.joints_px, tracks.stamp_ns, height_m)
     meta: dict[str, Any] = {"assumed_height_m": height_m, "reference_stature_m": REFERENCE_STATURE_M}
-    rotation, refined = tracks.camera_rotation, None
+    refined: RefinedWorld | None = None
+    rotation = tracks.camera_rotation
     if rotation is None:
         rotation, frame = np.broadcast_to(np.eye(3), (len(tracks), 3, 3)).copy(), "camera"
         placed = WorldPoses(_without_perspective(tracks, poses, per_px), False, "assumed_height", None)

@@ -25,7 +25,8 @@ def expected_information(
     """
     fit = _log_density(projected - w, information / std**2)
     inlier = _share(fit + np.log1p(-outlier_share), np.log(outlier_share / OUTLIER_AREA))
-    return information * inlier[..., None]
+    expected: np.ndarray = information * inlier[..., None]
+    return expected
 
 
 def _log_density(gap: np.ndarray, information: np.ndarray) -> np.ndarray:
@@ -33,7 +34,8 @@ def _log_density(gap: np.ndarray, information: np.ndarray) -> np.ndarray:
     xx, xy, yy = np.moveaxis(information, -1, 0)
     det = np.maximum(xx * yy - xy * xy, 1e-300)
     x, y = gap[..., 0], gap[..., 1]
-    return 0.5 * np.log(det) - np.log(2.0 * np.pi) - 0.5 * (xx * x * x + 2.0 * xy * x * y + yy * y * y)
+    density: np.ndarray = 0.5 * np.log(det) - np.log(2.0 * np.pi) - 0.5 * (xx * x * x + 2.0 * xy * x * y + yy * y * y)
+    return density
 
 
 def _share(log_a: np.ndarray, log_b: float) -> np.ndarray:

@@ -88,13 +88,14 @@ class Projection:
         good = det > 1e-12
         self._inverse = np.stack([yy, -xy, xx]) * np.where(good, 1.0 / np.where(good, det, 1.0), 0.0)
         self.isotropic = bool(np.all(self.information[1] == 0.0) and np.all(self.information[0] == self.information[2]))
-        self.weights = self.information[0]
+        self.weights: np.ndarray = self.information[0]
         self.share = self.weights / np.maximum(self.weights.sum(0), 1e-12)
 
     def inform(self, gap: np.ndarray) -> np.ndarray:
         """Information times residuals (2, P, F)."""
         if self.isotropic:
-            return self.weights * gap
+            informed: np.ndarray = self.weights * gap
+            return informed
         xx, xy, yy = self.information
         return np.stack([xx * gap[0] + xy * gap[1], xy * gap[0] + yy * gap[1]])
 
@@ -102,7 +103,8 @@ class Projection:
         """Best translation (2, F) for projected joints (2, P, F)."""
         gap = self.w - projected
         if self.isotropic:
-            return np.einsum("pf,ipf->if", self.share, gap)
+            mean: np.ndarray = np.einsum("pf,ipf->if", self.share, gap)
+            return mean
         x, y = self.inform(gap).sum(1)
         return np.stack([self._inverse[0] * x + self._inverse[1] * y, self._inverse[1] * x + self._inverse[2] * y])
 
@@ -134,4 +136,5 @@ class Projection:
     def per_frame(self, s: np.ndarray, r: np.ndarray) -> np.ndarray:
         """Reprojection cost (F,) of each frame."""
         gap = self.residual(s, r)
-        return np.einsum("ipf,ipf->f", gap, self.inform(gap))
+        cost: np.ndarray = np.einsum("ipf,ipf->f", gap, self.inform(gap))
+        return cost

@@ -13,7 +13,6 @@ from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.evaluation.protocol import PX_PER_MM, orbit_rotations, orbit_view, protocol_sequences
 from drocap_ros.geometry.bones import bone_lengths
 from drocap_ros.keypoints import Keypoints2D
-from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
 from drocap_ros.reconstruction.lifted.method import solve_even_window
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.skeleton import BODY_15, BODY_17
@@ -134,8 +133,6 @@ def test_noise_that_lasts_widens_the_expected_errors(view, plain):
 def test_windows_without_a_seen_joint_are_refused():
     with pytest.raises(InputError, match="at least one seen joint"):
         solve_even_window(Keypoints2D(np.full((5, 17, 2), np.nan)))
-    with pytest.raises(InputError, match="depth_weight"):
-        LiftedConfig(depth_weight=-1.0)
 
 
 def test_known_focal_length_lowers_the_error_of_a_near_camera(shared):
