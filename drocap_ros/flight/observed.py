@@ -14,6 +14,8 @@ import numpy as np
 from drocap_ros.flight.autopilot.autopilot import UNKNOWN, Autopilot, LossSettings
 from drocap_ros.flight.conditions import Condition, ConditionCode
 
+FIX_3D = 3  # MAVLink GPS_FIX_TYPE
+
 
 def _unknown() -> np.ndarray:
     return np.full(3, np.nan)
@@ -71,6 +73,11 @@ class Health:
     battery_voltage_v: float = math.nan
     age_s: float = math.inf
 
+    @property
+    def located(self) -> bool:
+        """Whether the autopilot knows its position."""
+        return self.position_ok and self.gps_fix_type >= FIX_3D
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -88,6 +95,11 @@ class Motion:
     height_m: float = math.nan
     age_s: float = math.inf
     position_age_s: float = math.inf
+
+    @property
+    def known(self) -> bool:
+        """Whether position, velocity and heading are known."""
+        return bool(np.isfinite(self.position).all() and np.isfinite(self.velocity).all()) and math.isfinite(self.yaw)
 
 
 class SizeSight(NamedTuple):

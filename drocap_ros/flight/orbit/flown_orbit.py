@@ -7,10 +7,9 @@ import numpy as np
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition
 from drocap_ros.flight.observed import Observed
-from drocap_ros.flight.orbit.closing import limit_closing
 from drocap_ros.flight.orbit.control_status import widened_condition
 from drocap_ros.flight.orbit.degradation import slowed
-from drocap_ros.flight.orbit.last_setpoint import coast_speed, harmless, slowed_condition
+from drocap_ros.flight.orbit.last_setpoint import Shortfall, coast_speed, harmless, limit_closing, slowed_condition
 from drocap_ros.flight.orbit.planner import (
     OrbitState,
     Scene,
@@ -20,7 +19,6 @@ from drocap_ros.flight.orbit.planner import (
     reference_position,
     setpoint_of,
 )
-from drocap_ros.flight.orbit.shortfall import Shortfall
 from drocap_ros.flight.orbit.states import Limits, SafetyState
 from drocap_ros.flight.orbit_goal import OrbitGoal, goal_of
 from drocap_ros.flight.setpoint import Setpoint
@@ -52,7 +50,7 @@ class FlownOrbit:
         assert seen.subject.position is not None
         vehicle = seen.vehicle
         self._shortfall = Shortfall()
-        self._reference = begin_orbit(vehicle.position, vehicle.velocity, seen.subject.position, self._config)
+        self._reference = begin_orbit(vehicle.position, seen.subject.position, self._config)
 
     def end(self) -> None:
         """No orbit is flown."""
@@ -63,7 +61,7 @@ class FlownOrbit:
         if self._reference is None or seen.subject.position is None:
             return None
         config, limits, pace = self._config, self._limits, safety.pace
-        scene = self._scene(self._reference, seen, framing)
+        scene = self._scene(seen, framing)
         reference = self._reference = advance(self._reference, self.goal, scene, dt * pace.value, config)
         planned = setpoint_of(reference, scene, config)
         pushed = self._shortfall.added(planned, seen, reference.centre_velocity)
@@ -80,7 +78,7 @@ class FlownOrbit:
         widened, goal = widened_condition(present, self.goal, self._reference, self._framed_radius_m, self._config)
         return slowed_condition(widened, goal, seen, self._limits)
 
-    def _scene(self, reference: OrbitState, seen: Observed, framing: Framing) -> Scene:
+    def _scene(self, seen: Observed, framing: Framing) -> Scene:
         subject, config = seen.subject, self._config
         assert subject.position is not None
         speed = float(np.hypot(*subject.velocity[:2]))

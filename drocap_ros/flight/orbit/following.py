@@ -28,7 +28,6 @@ _MISMATCH_S = 0.25  # longer than two echoes
 #: Window in s, least commanded speed in m/s, and share of the commanded speed below which the vehicle stands for all
 #: of the window.  In every recorded flight of the orbit it reached 0.46, and along the command, with the way, 0.27.
 _BY_SPEED, _BY_WAY = (1.0, 0.6, 0.25), (2.0, 0.6, 0.15)
-_POSITION_GAIN = 1.0  # 1/s, of both autopilots' position loops, as in the guard
 _MOST_WAY_M = 1.0  # a walking subject in wind keeps the vehicle at a distance from its place, and it flies
 
 
@@ -87,7 +86,11 @@ class Following:
         along_m_s = float(np.hypot(*commanded))
         # Before a vehicle that stands the reference waits: its speed falls, and the way to its place remains.
         way = np.array([setpoint.y, setpoint.x], dtype=float) - vehicle.position_enu_m[:2]
-        commanded += way * min(1.0, _MOST_WAY_M / max(float(np.hypot(*way)), 1e-6)) * _POSITION_GAIN
+        commanded += (
+            way
+            * min(1.0, _MOST_WAY_M / max(float(np.hypot(*way)), 1e-6))
+            * autopilot_of(vehicle.autopilot).position_gain_per_s
+        )
         speed_m_s = float(np.hypot(*commanded))
         # A vehicle stands where the way to its place and the velocity there cancel, as after an adjustment.
         stands = self._by_speed.judge(now_s, min(along_m_s, speed_m_s), float(np.hypot(*flown)))

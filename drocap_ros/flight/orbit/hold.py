@@ -36,40 +36,47 @@ def begin_hold(
     blind : whether the vehicle's state is not to be trusted
     retreats : see :class:`SafetyState`
     """
-    age_s = max(seen.vehicle.position_age_s, seen.vehicle.age_s)
-    finite = bool(
-        np.isfinite(seen.vehicle.position).all() and np.isfinite(seen.vehicle.velocity).all()
-    ) and math.isfinite(seen.vehicle.yaw)
-    known = (
-        finite
-        and seen.health.position_ok
-        and seen.health.gps_fix_type >= 3
-        and age_s <= _DEAD_RECKONING_S
-        and not seen.jumped
-    )
+    vehicle = seen.vehicle
+    age_s = max(vehicle.position_age_s, vehicle.age_s)
+    known = vehicle.known and seen.health.located and age_s <= _DEAD_RECKONING_S and not seen.jumped
     fresh = known and max(seen.link.age_s, age_s) <= _FRESH_S
-    behind_s = 0.0 if fresh else max(seen.vehicle.position_age_s - seen.vehicle.age_s, 0.0)
-    place = seen.vehicle.position + seen.vehicle.velocity * behind_s if known else None
-    if place is not None and state.pace.value == 0.0 and reason.code in _HARMLESS:
+    place = None
+    if known and state.pace.value == 0.0 and reason.code in _HARMLESS:
         place = state.pace.place  # the setpoint has stood there
-    elif place is not None and seen.subject.position is not None and _moves_away(seen):
-        # It does not return to where it was: the subject may follow, and it would come back fast.
-        outward = (seen.vehicle.position - seen.subject.position)[:2] / max(seen.subject.distance_m, 1e-3)
-        way = min((max(seen.subject.approach_m_s, 0.0) - seen.subject.closing_m_s) * _STOPPING_S, _MAX_WAY_OUT_M)
-        aside = seen.vehicle.velocity[:2] - (seen.vehicle.velocity[:2] @ outward) * outward
-        place = place + np.append(way * outward + 0.5 * _STOPPING_S * aside, 0.0)
+    elif known:
+        behind_s = 0.0 if fresh else max(vehicle.position_age_s - vehicle.age_s, 0.0)
+        place = vehicle.position + vehicle.velocity * behind_s + _way_out(seen)
     return dataclasses.replace(
-        state, state=State.HOLDING, since_s=now_s, condition=reason, blind=blind and not fresh,
-        hold_mode_s=math.nan if seen.course.followed else now_s, hold_position=place, hold_yaw=seen.vehicle.yaw,
-        retreats=retreats, retreated_s=-math.inf, slow_s=math.nan,
-        jumped_s=now_s if seen.jumped else -math.inf, resumable=reason.code in _HARMLESS,
+        state,
+        state=State.HOLDING,
+        since_s=now_s,
+        condition=reason,
+        blind=blind and not fresh,
+        hold_mode_s=math.nan if seen.course.followed else now_s,
+        hold_position=place,
+        hold_yaw=vehicle.yaw,
+        retreats=retreats,
+        retreated_s=-math.inf,
+        slow_s=math.nan,
+        jumped_s=now_s if seen.jumped else -math.inf,
+        resumable=reason.code in _HARMLESS,
         clear_s=math.nan,
-    )  # fmt: skip
+    )
 
 
-def _moves_away(seen: Observed) -> bool:
-    """Whether the vehicle moves away from a near subject, or fast."""
-    return seen.subject.closing_m_s < (0.0 if seen.subject.distance_m < _NEAR_M else -_FAST_M_S)
+def _way_out(seen: Observed) -> np.ndarray:
+    """(3,) m, on the way out for a vehicle that moves away from a near subject, or fast: he may follow.
+
+    It does not return to where it was: it would come back fast.
+    """
+    subject, velocity = seen.subject, seen.vehicle.velocity
+    moves_away = subject.closing_m_s < (0.0 if subject.distance_m < _NEAR_M else -_FAST_M_S)
+    if subject.position is None or not moves_away:
+        return np.zeros(3)
+    outward = (seen.vehicle.position - subject.position)[:2] / max(subject.distance_m, 1e-3)
+    way = min((max(subject.approach_m_s, 0.0) - subject.closing_m_s) * _STOPPING_S, _MAX_WAY_OUT_M)
+    aside = velocity[:2] - (velocity[:2] @ outward) * outward
+    return np.append(way * outward + 0.5 * _STOPPING_S * aside, 0.0)
 
 
 def update_hold(state: SafetyState, seen: Observed, now_s: float, blind: bool) -> SafetyState:

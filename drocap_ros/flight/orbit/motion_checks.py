@@ -9,7 +9,7 @@ import numpy as np
 from drocap_ros.flight.autopilot import supported_titles
 from drocap_ros.flight.autopilot.autopilot import LossAction, LossSettings
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.observed import Observed
+from drocap_ros.flight.observed import FIX_3D, Observed
 from drocap_ros.flight.orbit.states import Limits
 from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.safety_config import SafetyConfig
@@ -37,51 +37,59 @@ def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
     patient : of an orbit that is flown: gaps of telemetry slow it down before they end it
     """
     safety = limits.safety
-    oldest_s = oldest_state_s(safety, patient=patient)
     if not safety.commands_enabled:
         return condition(_C.COMMANDS_DISABLED)
-    if seen.disturbance is not None:
-        return seen.disturbance
+    oldest_s = oldest_state_s(safety, patient=patient)
+    return (
+        seen.disturbance
+        or _autopilot_condition(seen, limits, oldest_s)
+        or _state_condition(seen, safety, oldest_s)
+        or _health_condition(seen, safety)
+        or battery_condition(seen.health.battery_fraction, seen.health.battery_voltage_v, safety)
+        or seen.pictures.camera_problem
+        or seen.intruder
+    )
+
+
+def _autopilot_condition(seen: Observed, limits: Limits, oldest_s: float) -> Condition | None:
+    """Whether an autopilot is heard that the bridge flies, and whose setting for the loss of setpoints is safe."""
     if seen.link.age_s > oldest_s:
         return condition(_C.LINK_SILENT, age_s=seen.link.age_s)
-    autopilot = seen.autopilot
-    if not autopilot.supported:
+    if not seen.autopilot.supported:
         return condition(_C.AUTOPILOT_UNSUPPORTED, autopilot=seen.autopilot_name, supported=supported_titles())
-    if (
-        settings := loss_condition(seen.loss_settings, autopilot.loss_action, limits.max_control_timeout_s)
-    ) is not None:
-        return settings
-    if seen.link.heartbeat_age_s > safety.max_heartbeat_age_s:
-        return condition(_C.MODE_OUTDATED, age_s=seen.link.heartbeat_age_s)
-    if seen.vehicle.age_s > oldest_s:
-        return condition(_C.ATTITUDE_OUTDATED, age_s=seen.vehicle.age_s)
-    if seen.vehicle.position_age_s > oldest_s:
-        return condition(_C.POSITION_FROZEN, age_s=seen.vehicle.position_age_s)
-    if seen.link.round_trip_s > safety.max_round_trip_s:
-        return condition(_C.ROUND_TRIP_TOO_LONG, age_s=seen.link.round_trip_s)
-    if not (
-        np.isfinite(seen.vehicle.position).all()
-        and np.isfinite(seen.vehicle.velocity).all()
-        and math.isfinite(seen.vehicle.yaw)
+    return loss_condition(seen.loss_settings, seen.autopilot.loss_action, limits.max_control_timeout_s)
+
+
+def _state_condition(seen: Observed, safety: SafetyConfig, oldest_s: float) -> Condition | None:
+    """Whether mode, attitude and position are known and fresh."""
+    vehicle, link = seen.vehicle, seen.link
+    for age_s, limit_s, code in (
+        (link.heartbeat_age_s, safety.max_heartbeat_age_s, _C.MODE_OUTDATED),
+        (vehicle.age_s, oldest_s, _C.ATTITUDE_OUTDATED),
+        (vehicle.position_age_s, oldest_s, _C.POSITION_FROZEN),
+        (link.round_trip_s, safety.max_round_trip_s, _C.ROUND_TRIP_TOO_LONG),
     ):
-        return condition(_C.VEHICLE_STATE_UNKNOWN)
-    if not seen.health.armed:
+        if age_s > limit_s:
+            return condition(code, age_s=age_s)
+    return None if vehicle.known else condition(_C.VEHICLE_STATE_UNKNOWN)
+
+
+def _health_condition(seen: Observed, safety: SafetyConfig) -> Condition | None:
+    """Whether the vehicle flies, and is well by its own account, which is fresh."""
+    health = seen.health
+    if not health.armed:
         return condition(_C.NOT_ARMED)
-    if seen.health.landed_state in _LANDED_STATES or (
-        autopilot.starts_from_ground and seen.health.landed_state != LANDED_IN_AIR
-    ):
-        landed = _LANDED_STATES.get(seen.health.landed_state, "not reported to be in the air (EXTENDED_SYS_STATE)")
+    unsure = seen.autopilot.starts_from_ground and health.landed_state != LANDED_IN_AIR
+    if health.landed_state in _LANDED_STATES or unsure:
+        landed = _LANDED_STATES.get(health.landed_state, "not reported to be in the air (EXTENDED_SYS_STATE)")
         return condition(_C.NOT_FLYING, landed_state=landed)
-    if seen.health.system_status in _EMERGENCIES:
-        return condition(_C.AUTOPILOT_EMERGENCY, reported=_EMERGENCIES[seen.health.system_status])
-    if seen.health.gps_fix_type < 3:
-        return condition(_C.NO_SATELLITE_FIX, fix_type=seen.health.gps_fix_type)
-    if not seen.health.position_ok:
+    if health.system_status in _EMERGENCIES:
+        return condition(_C.AUTOPILOT_EMERGENCY, reported=_EMERGENCIES[health.system_status])
+    if health.gps_fix_type < FIX_3D:
+        return condition(_C.NO_SATELLITE_FIX, fix_type=health.gps_fix_type)
+    if not health.position_ok:
         return condition(_C.ESTIMATOR_UNHEALTHY)
-    if seen.health.age_s > safety.max_status_age_s:
-        return condition(_C.STATUS_OUTDATED, age_s=seen.health.age_s)
-    battery = battery_condition(seen.health.battery_fraction, seen.health.battery_voltage_v, safety)
-    return battery or seen.pictures.camera_problem or seen.intruder
+    return condition(_C.STATUS_OUTDATED, age_s=health.age_s) if health.age_s > safety.max_status_age_s else None
 
 
 def start_condition(seen: Observed) -> Condition | None:

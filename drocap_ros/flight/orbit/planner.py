@@ -83,10 +83,10 @@ def least_radius(
     return config.min_distance_m + nearer + surprise + _FLIGHT_ERROR_M
 
 
-def begin_orbit(vehicle: np.ndarray, velocity: np.ndarray, subject: np.ndarray, config: OrbitConfig) -> OrbitState:
+def begin_orbit(vehicle: np.ndarray, subject: np.ndarray, config: OrbitConfig) -> OrbitState:
     """Reference at the vehicle's own position, so that no setpoint jumps at the start.
 
-    vehicle, velocity, subject : (3,) ENU
+    vehicle, subject : (3,) ENU
     """
     offset = vehicle[:2] - subject[:2]
     return OrbitState(

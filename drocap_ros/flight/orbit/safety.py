@@ -57,16 +57,7 @@ def reduce(
     problem = vehicle or place or subject_condition(seen, limits) or start_condition(seen)
     state = watch(state, seen, now_s, limits)
     lost_s, seen_s = state.lost_s, state.seen_s
-    # However late it is heard: a mode of somebody else is a take-over.
-    if _returned(state, seen):
-        state = _enter(State.IDLE, condition(_C.ALL_CLEAR), now_s)
-    elif foreign := foreign_mode(state, seen) or _misjudged(state, seen, now_s):
-        state = _yield(state, seen, foreign, now_s)
-    elif state.state in _ACTIVE and not is_lost(state) and not seen.health.armed and seen.mode.name:
-        state = _enter(State.IDLE, condition(_C.DISARMED), now_s)
-    elif state.state in _ACTIVE and seen.mode.in_hold:
-        # Once the autopilot holds, any other mode is somebody's choice.
-        state = dataclasses.replace(state, modes=frozenset({seen.mode.name}))
+    state = _by_mode(state, seen, now_s)
     answer = None
     if command is not None:
         state, answer = _execute(state, seen, now_s, command, problem, limits)
@@ -83,6 +74,20 @@ def reduce(
             state = dataclasses.replace(_begin_orbit(seen, now_s), fence_centre=state.fence_centre)
     state = dataclasses.replace(state, lost_s=lost_s, seen_s=seen_s)
     return state, Decision(*_permitted(state, seen, now_s, limits), answer)
+
+
+def _by_mode(state: SafetyState, seen: Observed, now_s: float) -> SafetyState:
+    """The state that the reported mode leaves; however late it is heard, a mode of somebody else is a take-over."""
+    if _returned(state, seen):
+        return _enter(State.IDLE, condition(_C.ALL_CLEAR), now_s)
+    if foreign := foreign_mode(state, seen) or _misjudged(state, seen, now_s):
+        return _yield(state, seen, foreign, now_s)
+    if state.state in _ACTIVE and not is_lost(state) and not seen.health.armed and seen.mode.name:
+        return _enter(State.IDLE, condition(_C.DISARMED), now_s)
+    if state.state in _ACTIVE and seen.mode.in_hold:
+        # Once the autopilot holds, any other mode is somebody's choice.
+        return dataclasses.replace(state, modes=frozenset({seen.mode.name}))
+    return state
 
 
 def _returned(state: SafetyState, seen: Observed) -> bool:
@@ -155,33 +160,52 @@ def _execute(
         return state, _refused(_C.NO_ORBIT_TO_ADJUST, state=state.state.name.lower())
     if state.state == State.ORBITING:
         return state, _accepted(_C.ALREADY_ORBITING)
-    if state.state == State.TAKEN_OVER:
-        return state, _refused(_C.PILOT_IN_COMMAND)
-    if state.state == State.FAULT:
-        return state, _refused(_C.FAULT_NOT_ACKNOWLEDGED, cause=state.condition)
-    if problem:
-        return state, CommandAnswer(False, problem)
+    if (refused := _start_refusal(state, seen, problem)) is not None:
+        return state, refused
     if state.requesting:
         return state, _accepted(_C.ALREADY_REQUESTING_CONTROL)
-    if seen.mode.in_control and state.modes > {seen.mode.name} and not math.isnan(state.hold_mode_s):
-        # The hold mode has been requested: it would arrive during the orbit, and count as the pilot's.
-        return state, _refused(_C.HOLD_MODE_PENDING, by_hand=_by_hand(seen))
     if seen.mode.in_control:
         return _begin_orbit(seen, now_s), _accepted(_C.ORBITING)
-    if command == Command.START:
-        return state, _refused(_C.NOT_IN_CONTROL_MODE, mode=seen.mode.name, by_hand=_by_hand(seen))
-    if not limits.safety.mode_change_allowed:
-        why = f" ({engaged})" if (engaged := seen.autopilot.hints.engaged) else ""
-        refused = _refused(_C.MODE_CHANGE_FORBIDDEN, mode=seen.mode.name, engaged=why, by_hand=_by_hand(seen))
+    if (refused := _request_refusal(seen, command, limits)) is not None:
         return state, refused
-    if seen.link.packet_loss > MAX_LOSS:
-        return state, _refused(_C.PACKETS_LOST, lost_percent=100 * seen.link.packet_loss, most_percent=100 * MAX_LOSS)
     answer = _accepted(_C.REQUESTING_CONTROL)
     state = _enter(
-        State.READY, answer.condition, now_s, modes=frozenset({seen.mode.name}), requesting_s=now_s,
-        hold_position=seen.vehicle.position.copy(), hold_yaw=seen.vehicle.yaw,
-    )  # fmt: skip
+        State.READY,
+        answer.condition,
+        now_s,
+        modes=frozenset({seen.mode.name}),
+        requesting_s=now_s,
+        hold_position=seen.vehicle.position.copy(),
+        hold_yaw=seen.vehicle.yaw,
+    )
     return state, answer
+
+
+def _start_refusal(state: SafetyState, seen: Observed, problem: Condition | None) -> CommandAnswer | None:
+    """Why no orbit may begin by a command."""
+    if state.state == State.TAKEN_OVER:
+        return _refused(_C.PILOT_IN_COMMAND)
+    if state.state == State.FAULT:
+        return _refused(_C.FAULT_NOT_ACKNOWLEDGED, cause=state.condition)
+    if problem:
+        return CommandAnswer(False, problem)
+    pending = seen.mode.in_control and state.modes > {seen.mode.name} and not math.isnan(state.hold_mode_s)
+    if pending and not state.requesting:
+        # The hold mode has been requested: it would arrive during the orbit, and count as the pilot's.
+        return _refused(_C.HOLD_MODE_PENDING, by_hand=_by_hand(seen))
+    return None
+
+
+def _request_refusal(seen: Observed, command: Command, limits: Limits) -> CommandAnswer | None:
+    """Why control may not be requested from the autopilot."""
+    if command == Command.START:
+        return _refused(_C.NOT_IN_CONTROL_MODE, mode=seen.mode.name, by_hand=_by_hand(seen))
+    if not limits.safety.mode_change_allowed:
+        engaged = f" ({seen.autopilot.hints.engaged})" if seen.autopilot.hints.engaged else ""
+        return _refused(_C.MODE_CHANGE_FORBIDDEN, mode=seen.mode.name, engaged=engaged, by_hand=_by_hand(seen))
+    if seen.link.packet_loss > MAX_LOSS:
+        return _refused(_C.PACKETS_LOST, lost_percent=100 * seen.link.packet_loss, most_percent=100 * MAX_LOSS)
+    return None
 
 
 def _by_hand(seen: Observed) -> str:
@@ -228,16 +252,19 @@ def _permitted(state: SafetyState, seen: Observed, now_s: float, limits: Limits)
         warm = now_s - state.requesting_s >= limits.warm_up_s and mode_visible(state, seen, now_s, limits)
         return Action.HOLD, ModeRequest.CONTROL if warm else ModeRequest.NONE
     silent = not seen.mode.in_control or is_silent(state, now_s, limits) or stream_ended(seen)
-    if state.state not in (State.HOLDING, State.FAULT) or silent:
-        return Action.NOTHING, ModeRequest.NONE
+    if state.state in (State.HOLDING, State.FAULT) and not silent:
+        return _permitted_in_hold(state, seen, now_s, limits)
+    return Action.NOTHING, ModeRequest.NONE
+
+
+def _permitted_in_hold(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> tuple[Action, ModeRequest]:
     action, since = Action.HALT if state.hold_position is None else Action.HOLD, now_s - state.since_s
     if state.blind and since >= _BLIND_STOP_S:
         action = Action.NOTHING
     # Not at once: the autopilot's brake takes longer than velocity zero.  And not without a visible mode: the pilot
     # may have taken over unseen; setpoints are ignored then, a request for a mode would not be.
     wanted = since > _BLIND_MODE_REQUEST_S if state.blind else not math.isnan(state.hold_mode_s)
-    request = wanted and seen.mode.in_control and mode_visible(state, seen, now_s, limits)
-    return action, ModeRequest.HOLD if request else ModeRequest.NONE
+    return action, ModeRequest.HOLD if wanted and mode_visible(state, seen, now_s, limits) else ModeRequest.NONE
 
 
 def _begin_orbit(seen: Observed, now_s: float) -> SafetyState:

@@ -38,7 +38,7 @@ def watch(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> S
     if not unseen:
         return state
     # The vehicle is held where it is now, and not led back: setpoints may have ended, or its position been reset.
-    known = bool(np.isfinite(seen.vehicle.position).all()) and seen.health.position_ok and seen.health.gps_fix_type >= 3
+    known = bool(np.isfinite(seen.vehicle.position).all()) and seen.health.located
     place = seen.vehicle.position.copy() if known else None
     return dataclasses.replace(state, hold_position=place, hold_yaw=seen.vehicle.yaw)
 

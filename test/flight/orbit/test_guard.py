@@ -5,7 +5,7 @@ import pytest
 from flown_copter import ALL, Flight
 from orbit_observations import GOOD, LIMITS, changed
 
-from drocap_ros.flight.orbit.closing import limit_closing
+from drocap_ros.flight.orbit.last_setpoint import limit_closing
 from drocap_ros.flight.pose_history import CameraPose
 from drocap_ros.flight.setpoint import Setpoint
 from drocap_ros.flight.subject.guard import Guard

@@ -18,7 +18,7 @@ def fly(seconds, subject=lambda t: np.zeros(3), config=None, start=(9.0, 0.0, 4.
     config = config or OrbitConfig()
     goal = goal or goal_of(config)
     vehicle = np.array(start)
-    state = begin_orbit(vehicle, np.zeros(3), subject(0.0), config)
+    state = begin_orbit(vehicle, subject(0.0), config)
     rows = []
     for i in range(int(seconds / DT)):
         t = i * DT
@@ -78,7 +78,7 @@ def test_least_radius_grows_for_an_uncertain_or_walking_subject():
     assert least_radius(config, 0.4, 0.0, 1.3) == pytest.approx(sure + 0.6)
     assert least_radius(config, 0.1, 1.5, 1.3) > sure + 0.5
     state, vehicle = None, np.array([6.0, 0.0, 2.5])
-    state = begin_orbit(vehicle, np.zeros(3), np.zeros(3), config)
+    state = begin_orbit(vehicle, np.zeros(3), config)
     for _ in range(400):
         state = advance(
             state, goal_of(config), Scene(vehicle, np.zeros(3), np.zeros(3), least_radius_m=4.5), DT, config
@@ -92,7 +92,7 @@ def test_acceleration_is_what_the_orbit_needs_though_the_subject_is_estimated_wi
     rng = np.random.default_rng(1)
     config = OrbitConfig()
     vehicle = np.array([6.0, 0.0, 2.5])
-    state, noise, sizes = begin_orbit(vehicle, np.zeros(3), np.zeros(3), config), np.zeros(2), []
+    state, noise, sizes = begin_orbit(vehicle, np.zeros(3), config), np.zeros(2), []
     for i in range(800):
         noise = noise + (-noise * 2.0 * DT + 0.25 * np.sqrt(DT) * rng.standard_normal(2))
         subject, speed = np.append(0.5 * noise, 0.0), np.append(noise, 0.0)
@@ -109,7 +109,7 @@ def test_acceleration_is_what_the_orbit_needs_though_the_subject_is_estimated_wi
 def test_angular_speed_yields_where_the_subject_walks_in_its_direction():
     config = OrbitConfig()
     vehicle, walk = np.array([6.0, 0.0, 2.5]), np.array([0.0, 1.4, 0.0])
-    state = begin_orbit(vehicle, np.zeros(3), np.zeros(3), config)
+    state = begin_orbit(vehicle, np.zeros(3), config)
     speeds, rates = [], []
     for i in range(1200):
         place = walk * i * DT
@@ -133,7 +133,7 @@ def test_jump_of_the_subject_is_smoothed():
 def test_reference_waits_for_a_vehicle_that_stands_still():
     config = OrbitConfig()
     vehicle = np.array([6.0, 0.0, 2.5])
-    state = begin_orbit(vehicle, np.zeros(3), np.zeros(3), config)
+    state = begin_orbit(vehicle, np.zeros(3), config)
     for _ in range(400):
         state = advance(state, goal_of(config), Scene(vehicle, np.zeros(3), np.zeros(3)), DT, config)
     assert np.linalg.norm(reference_position(state) - vehicle) <= 1.3 * config.max_lead_m + 0.1
@@ -142,7 +142,7 @@ def test_reference_waits_for_a_vehicle_that_stands_still():
 
 
 def test_a_lag_along_the_orbit_takes_nothing_from_the_way_to_the_radius():
-    state = begin_orbit(np.array([6.0, 0.0, 2.5]), np.zeros(3), np.zeros(3), OrbitConfig())
+    state = begin_orbit(np.array([6.0, 0.0, 2.5]), np.zeros(3), OrbitConfig())
     for behind in (0.0, 0.3, 0.6):  # rad; the vehicle is 1 m too near
         vehicle = np.array([5.0 * math.cos(behind), -5.0 * math.sin(behind), 2.5])
         sent = setpoint_of(state, Scene(vehicle, np.zeros(3), np.zeros(3)), OrbitConfig())
@@ -153,7 +153,7 @@ def test_a_lag_along_the_orbit_takes_nothing_from_the_way_to_the_radius():
 
 def test_the_angle_yields_where_a_vehicle_falls_behind_a_walking_subject():
     config = OrbitConfig()
-    state = begin_orbit(np.array([6.0, 0.0, 2.5]), np.zeros(3), np.zeros(3), config)
+    state = begin_orbit(np.array([6.0, 0.0, 2.5]), np.zeros(3), config)
     speed = np.array([0.0, 1.4, 0.0])
     for i in range(400):
         subject, angle = speed * i * DT, -math.radians(9.0) * i * DT
@@ -191,7 +191,7 @@ def test_limits_hold_for_any_start_and_subject(x, y, z, radius, speed, seed):
     rng = np.random.default_rng(seed)
     places = np.cumsum(rng.normal(0, 0.3, (200, 3)), axis=0)
     vehicle = np.array([x, y, z])
-    state = begin_orbit(vehicle, np.zeros(3), places[0], config)
+    state = begin_orbit(vehicle, places[0], config)
     for place in places:
         state = advance(state, goal, Scene(vehicle, place, rng.normal(0, 3, 3)), DT, config)
         sent = setpoint_of(state, Scene(vehicle, place, np.zeros(3)), config)
@@ -233,7 +233,7 @@ def test_nan_in_a_command_keeps_the_present_value():
 )
 def test_orbit_turns_its_direction_inside_all_limits(changes, turns_s):
     config = OrbitConfig(**changes)
-    state = begin_orbit(np.array([6.0, 0.0, 2.5]), np.zeros(3), np.zeros(3), config)
+    state = begin_orbit(np.array([6.0, 0.0, 2.5]), np.zeros(3), config)
     omega, places, accelerations = [], [], []
     for _ in range(int(55 / DT)):
         vehicle = reference_position(state)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from orbit_observations import GOOD, changed
 
-from drocap_ros.flight.orbit.shortfall import Shortfall
+from drocap_ros.flight.orbit.last_setpoint import Shortfall
 from drocap_ros.flight.setpoint import Setpoint
 
 HERE, SUBJECT = np.array([6.0, 0.0, 2.5]), np.zeros(3)
