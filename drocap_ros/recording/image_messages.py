@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Session, header_stamp_ns
+from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Message, Session, header_stamp_ns
 from drocap_ros.stamps import StampValidator
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ _ENCODINGS: dict[str, tuple[int, str | None]] = {
 }
 
 
-def image_from_message(message: Any, compressed: bool) -> np.ndarray:
+def image_from_message(message: Message, compressed: bool) -> np.ndarray:
     """(H, W, 3) uint8 BGR of a ``sensor_msgs`` Image or CompressedImage.
 
     Raises
@@ -109,7 +109,7 @@ def _decompressed(data: np.ndarray, form: str) -> np.ndarray:
     return np.asarray(image)
 
 
-def _raw(message: Any, data: np.ndarray) -> np.ndarray:
+def _raw(message: Message, data: np.ndarray) -> np.ndarray:
     import cv2
 
     height, width, step, encoding = message.height, message.width, message.step, str(message.encoding)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from drocap_ros.errors import InputError
 from drocap_ros.recording.mcap.metadata import METADATA_RECORD, FileRecord
 from drocap_ros.recording.mcap.schemas import standard_types
 from drocap_ros.recording.mcap.stream import MAGIC, McapChannel, McapStream, counted_channels
-from drocap_ros.recording.session import RawMessage, Session, SessionInfo, TopicInfo
+from drocap_ros.recording.session import Message, RawMessage, Session, SessionInfo, TopicInfo
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -46,7 +46,7 @@ class McapSession(Session):
                     yield RawMessage(channel.topic, channel.type_name, message.log_time_ns, message.data, channel)
             self._warn_of_damage(stream, count)
 
-    def decode(self, raw: RawMessage) -> Any:
+    def decode(self, raw: RawMessage) -> Message:
         """The message as an object with the fields of its definition."""
         channel = raw.source
         assert isinstance(channel, McapChannel)

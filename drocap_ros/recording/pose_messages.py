@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import optical_orientation
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.observation import PoseObservation
-from drocap_ros.recording.session import calibration_of, header_stamp_ns
+from drocap_ros.recording.session import Message, calibration_of, header_stamp_ns
 from drocap_ros.skeleton import joint_set
 from drocap_ros.stamps import StampValidator
 from drocap_ros.tracks import check_camera_matrix, check_keypoints
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from drocap_ros.recording.session import Session
 
 
-def observation_from_message(message: Any) -> PoseObservation:
+def observation_from_message(message: Message) -> PoseObservation:
     """Message -> observation; its arrays stay float32, as they were sent.
 
     Raises
@@ -57,14 +57,14 @@ def observation_from_message(message: Any) -> PoseObservation:
     )
 
 
-def add_state(history: CameraHistory, message: Any) -> None:
+def add_state(history: CameraHistory, message: Message) -> None:
     """Give a camera's history a ``VehicleState``; one without position or camera attitude changes nothing."""
     q = message.gimbal_orientation
     orientation = optical_orientation(np.array([q.x, q.y, q.z, q.w], np.float64))
     history.add_pose(header_stamp_ns(message), np.asarray(message.position_enu_m, np.float64), orientation)
 
 
-def add_calibration(history: CameraHistory, message: Any) -> None:
+def add_calibration(history: CameraHistory, message: Message) -> None:
     """Give a camera's history a ``CameraInfo``; an uncalibrated one changes nothing.
 
     Raises
@@ -80,7 +80,7 @@ def add_calibration(history: CameraHistory, message: Any) -> None:
         history.add_matrix(header_stamp_ns(message), matrix, size)
 
 
-def float_array(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
+def float_array(values: Sequence[float] | np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
     """Flat ``float32[]`` of a message -> array of a shape.
 
     Raises

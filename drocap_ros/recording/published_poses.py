@@ -8,7 +8,7 @@ from collections import defaultdict, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.camera_history import CameraHistory, WindowCamera
 from drocap_ros.recording import session as recorded
 from drocap_ros.recording.pose_messages import add_calibration, add_state
-from drocap_ros.recording.session import Session, header_stamp_ns, stamp_of
+from drocap_ros.recording.session import Message, Session, header_stamp_ns, stamp_of
 from drocap_ros.stamps import StampValidator
 
 _INITIAL = 1  # Pose3D.INITIAL
@@ -133,13 +133,13 @@ class PublishedPoses:
             self.agreement.windows = [compared + 1, equal + (theirs.fingerprint == _fingerprint(stamp_ns, joints))]
 
 
-def _messages(session: Session, kind: str, name: str) -> Iterator[Any]:
+def _messages(session: Session, kind: str, name: str) -> Iterator[Message]:
     """Messages of a topic, none when the session lacks it."""
     if any(topic.name == name for topic in session.topics_of(kind)):
         yield from (message for _, message in session.messages((name,)))
 
 
-def _accepted(messages: Iterator[Any]) -> Iterator[Any]:
+def _accepted(messages: Iterator[Message]) -> Iterator[Message]:
     """Messages whose stamps the live graph did not refuse."""
     stamps = StampValidator()
     for message in messages:
@@ -159,5 +159,5 @@ def _fingerprint(*arrays: np.ndarray) -> bytes:
     return digest.digest()
 
 
-def _joints(message: Any) -> np.ndarray:
+def _joints(message: Message) -> np.ndarray:
     return np.asarray(message.joints, np.float32).reshape(-1, 3)

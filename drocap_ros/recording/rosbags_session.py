@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any
 
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.recording.mcap.schemas import standard_types
-from drocap_ros.recording.session import FORMS, RawMessage, Session, SessionInfo, TopicInfo
+from drocap_ros.recording.session import FORMS, Message, RawMessage, Session, SessionInfo, TopicInfo
 
 
 class RosbagsSession(Session):
@@ -41,7 +40,7 @@ class RosbagsSession(Session):
                 return
             yield RawMessage(connection.topic, connection.msgtype, log_time_ns, bytes(data), connection)
 
-    def decode(self, raw: RawMessage) -> Any:
+    def decode(self, raw: RawMessage) -> Message:
         """The message as an object with the fields of its definition."""
         return self._reader.deserialize(raw.data, raw.type_name)
 

@@ -13,6 +13,8 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 
+#: A decoded message: an object with the fields of its definition.
+Message = Any
 POSE2D = "drocap_ros/msg/Pose2D"
 POSE3D = "drocap_ros/msg/Pose3D"
 POSE3D_WINDOW = "drocap_ros/msg/Pose3DWindow"
@@ -121,7 +123,7 @@ class Session(ABC):
             self.warn(f"several topics of type {kinds}: {', '.join(t.name for t in found)}; took {found[0].name}")
         return found[0]
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[RawMessage, Any]]:
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[RawMessage, Message]]:
         """Decoded messages of some topics; messages that cannot be decoded are left out with a warning."""
         failed = 0
         for raw in self.raw_messages(topics):
@@ -144,7 +146,7 @@ class Session(ABC):
         """Messages of some topics (default: all) in the order of the recording."""
 
     @abstractmethod
-    def decode(self, raw: RawMessage) -> Any:
+    def decode(self, raw: RawMessage) -> Message:
         """The message as an object with the fields of its definition."""
 
     @abstractmethod
@@ -155,18 +157,18 @@ class Session(ABC):
         return
 
 
-def header_stamp_ns(message: Any) -> int:
+def header_stamp_ns(message: Message) -> int:
     """Stamp of a message's header, ns."""
     return stamp_of(message.header.stamp)
 
 
-def calibration_of(message: Any) -> np.ndarray | None:
+def calibration_of(message: Message) -> np.ndarray | None:
     """(3, 3) px of a ``CameraInfo``; None where it holds no matrix."""
     # ROS 2 names the matrix k, ROS 1 names it K.
     matrix = np.asarray(getattr(message, "k", getattr(message, "K", ())), dtype=np.float64)
     return matrix.reshape(3, 3) if matrix.size == 9 else None
 
 
-def stamp_of(time: Any) -> int:
+def stamp_of(time: Message) -> int:
     """A ``builtin_interfaces/Time`` in ns."""
     return int(time.sec) * 10**9 + int(time.nanosec)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.rotations import unit_quaternions
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.recording import session as recorded
-from drocap_ros.recording.session import Session, TopicInfo, calibration_of, header_stamp_ns
+from drocap_ros.recording.session import Message, Session, TopicInfo, calibration_of, header_stamp_ns
 from drocap_ros.recording.telemetry.camera_poses import with_camera
 from drocap_ros.recording.telemetry.log import VehicleTrack
 from drocap_ros.skeleton import joint_set
@@ -44,7 +43,7 @@ def read_pose2d(session: Session, mount_pitch_deg: float | None = None, *, telem
         When there are no usable keypoints, or ``mount_pitch_deg`` contradicts the recording.
     """
     chosen = session.choose_topic(recorded.POSE2D)
-    poses: dict[int, Any] = {}
+    poses: dict[int, Message] = {}
     repeated = 0
     for _, message in session.messages((chosen.name,)):
         stamp_ns = header_stamp_ns(message)
@@ -63,7 +62,7 @@ def read_pose2d(session: Session, mount_pitch_deg: float | None = None, *, telem
     ordered = [poses[stamp] for stamp in stamps]
     track_id = most_frequent_subject(session, ordered)
     try:
-        tracks = Tracks(stamp_ns=np.array(stamps, np.int64), **_pose_arrays(ordered, track_id))
+        tracks = _tracks_of(np.array(stamps, np.int64), ordered, track_id)
         return with_recorded_camera(session, tracks, chosen.name, mount_pitch_deg, telemetry=telemetry)
     except InputError as error:
         raise InputError(f"{session.path}: {chosen.name}: {error}") from None
@@ -128,7 +127,7 @@ def read_vehicle_track(session: Session, near: str = "") -> VehicleTrack | None:
     return VehicleTrack(stamp_ns, position, unit_quaternions(orientation), unit_quaternions(gimbal))
 
 
-def most_frequent_subject(session: Session, messages: Iterable[Any]) -> int:
+def most_frequent_subject(session: Session, messages: Iterable[Message]) -> int:
     """Track id of the subject in most of the messages or observations, the first of equals; 0 where none has one."""
     count = Counter(int(m.track_id) for m in messages if m.track_id)
     if not count:
@@ -142,8 +141,8 @@ def most_frequent_subject(session: Session, messages: Iterable[Any]) -> int:
     return track_id
 
 
-def _pose_arrays(messages: list[Any], track_id: int) -> dict[str, Any]:
-    """Arrays of a tracks object from Pose2D messages: those of one track, 0 = none."""
+def _tracks_of(stamp_ns: np.ndarray, messages: list[Message], track_id: int) -> Tracks:
+    """Tracks from Pose2D messages of the stamps (F,): those of one track, 0 = none."""
     seen = next((m for m in messages if m.track_id == track_id), messages[0])
     joints = joint_set(seen.skeleton)
     size = (int(seen.image_width), int(seen.image_height))
@@ -164,16 +163,10 @@ def _pose_arrays(messages: list[Any], track_id: int) -> dict[str, Any]:
         _fill(keypoints[i], message.keypoints, "keypoints")
         _fill(covariance[i], message.covariance, "covariance")
         _fill(confidence[i], message.confidence, "confidence")
-    return {
-        "keypoints": keypoints,
-        "joints": joints.joints,
-        "image_size": size,
-        "confidence": confidence,
-        "covariance": covariance,
-    }
+    return Tracks(keypoints, joints.joints, stamp_ns, size, confidence, covariance)
 
 
-def _fill(target: np.ndarray, values: Any, name: str) -> None:
+def _fill(target: np.ndarray, values: Sequence[float] | np.ndarray, name: str) -> None:
     array = np.asarray(values, dtype=np.float64)
     if array.size != target.size:
         raise InputError(f"{name}: expected {target.size} values, got {array.size}; was it recorded by drocap?")
@@ -223,5 +216,5 @@ def _nearest(topics: list[TopicInfo], near: str) -> TopicInfo | None:
     return max(topics, key=shared, default=None)
 
 
-def _xyzw(quaternion: Any) -> np.ndarray:
+def _xyzw(quaternion: Message) -> np.ndarray:
     return np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], dtype=np.float64)

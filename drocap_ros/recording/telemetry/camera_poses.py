@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -79,11 +79,19 @@ def with_camera(
     at_ns : (F,) times of the images by the clock of the vehicle's states
     """
     poses = camera_poses(vehicle, at_ns, mount_pitch_deg)
-    arrays: dict[str, Any] = {}
-    for name in ("keypoints", "stamp_ns", "confidence", "covariance"):
-        value = getattr(tracks, name)
-        arrays[name] = None if value is None else value[poses.keep]
-    changed = dataclasses.replace(tracks, **arrays, camera_rotation=poses.rotation, camera_position=poses.position)
+
+    def kept(values: np.ndarray | None) -> np.ndarray | None:
+        return None if values is None else values[poses.keep]
+
+    changed = dataclasses.replace(
+        tracks,
+        keypoints=tracks.keypoints[poses.keep],
+        stamp_ns=tracks.stamp_ns[poses.keep],
+        confidence=kept(tracks.confidence),
+        covariance=kept(tracks.covariance),
+        camera_rotation=poses.rotation,
+        camera_position=poses.position,
+    )
     return changed, poses.reason
 
 
