@@ -54,9 +54,10 @@ _WORDS = {
 
 
 class _Solved(NamedTuple):
-    """The adjusted window, or why there is none; ``seconds`` on the wall clock."""
+    """The adjusted window, None after a failure, which is in words; ``seconds`` on the wall clock."""
 
-    result: AdjustedWindow | str
+    window: AdjustedWindow | None
+    failure: str
     header: Header
     track_id: int
     telemetry_ns: int
@@ -207,19 +208,18 @@ class BundleAdjusterNode(ComponentNode):
     def _solve(self, window: Window, header: Header, track_id: int, telemetry_ns: int, stride: int) -> _Solved:
         begin = time.perf_counter()
         deadline = math.inf if self.simulated else begin + self.config.max_solve_s
+        adjusted, failure = None, ""
         try:
-            result: AdjustedWindow | str = self._adjuster.adjust(
-                window, Effort(stride), lambda: time.perf_counter() > deadline
-            )
+            adjusted = self._adjuster.adjust(window, Effort(stride), lambda: time.perf_counter() > deadline)
         except SOLVER_ERRORS as error:
-            result = str(error)
-        return _Solved(result, header, track_id, telemetry_ns, time.perf_counter() - begin)
+            failure = str(error)
+        return _Solved(adjusted, failure, header, track_id, telemetry_ns, time.perf_counter() - begin)
 
     def _publish(self, solved: _Solved) -> AdjustedWindow | None:
-        window, seconds = solved.result, solved.seconds
-        if isinstance(window, str):
+        window, seconds = solved.window, solved.seconds
+        if window is None:
             self.count(Key.ADJUSTMENTS_FAILED)
-            self.report(ERROR, f"adjustment failed, the last solution stays: {window}")
+            self.report(ERROR, f"adjustment failed, the last solution stays: {solved.failure}")
             return None
         if not self.simulated:
             self._control.record(seconds)

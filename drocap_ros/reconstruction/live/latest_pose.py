@@ -44,12 +44,10 @@ class LatestPose:
         return self._to is not None
 
     def set_solution(self, lengths: np.ndarray, stamp_ns: int) -> None:
-        """Blend in a solution's bone lengths (16,) m, or (14,) without toes, from the image of ``stamp_ns`` on."""
+        """Blend in a solution's bone lengths (16,) m from the image of ``stamp_ns`` on."""
         if not np.isfinite(lengths).all():
             return
-        before = self._lengths(stamp_ns)
-        # Bones that only the new solution has are not blended, those that only the old one had are dropped.
-        self._from = None if before is None else np.concatenate([before, lengths[len(before) :]])[: len(lengths)]
+        self._from = self._lengths(stamp_ns)
         self._to, self._begin_ns = lengths, stamp_ns
 
     def pose(self, stamp_ns: int, joints: np.ndarray) -> np.ndarray:
