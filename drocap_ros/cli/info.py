@@ -136,7 +136,7 @@ def _of_arrays(path: Path) -> Summary:
 def _motion_facts(motion: Motion) -> list[tuple[str, str]]:
     from drocap_ros.geometry.flexion import flexion_words
     from drocap_ros.reconstruction.world.telemetry_words import telemetry_words
-    from drocap_ros.report.statistics import scale_words
+    from drocap_ros.report.statistics import scale_of
 
     found = [
         ("median flexion", flexion_words(motion.joints3d, motion.joints)),
@@ -148,7 +148,7 @@ def _motion_facts(motion: Motion) -> list[tuple[str, str]]:
         *_times(motion.stamp_ns),
         ("joints", ", ".join(motion.joints)),
         ("frame", motion.frame),
-        ("scale", scale_words(motion)),
+        ("scale", ", ".join(scale_of(motion))),
         *((name, words) for name, words in found if words),
     ]
 

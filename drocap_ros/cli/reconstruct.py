@@ -175,7 +175,7 @@ def _check_offset(name: str, value: float, args: argparse.Namespace, *, mount: b
 def summary(motion: Motion, method: str) -> str:
     """Four lines: frames, method, frame and scale; reprojection error as in the report; seconds; quality."""
     from drocap_ros.report.checks import quality_sentence, run_checks
-    from drocap_ros.report.statistics import motion_statistics, scale_words, stage_seconds
+    from drocap_ros.report.statistics import motion_statistics, scale_of, stage_seconds
 
     s = motion_statistics(motion)
     stages = stage_seconds(motion.meta)
@@ -183,7 +183,7 @@ def summary(motion: Motion, method: str) -> str:
     poses = "; 2D poses as recorded (--redetect estimates them from the images)"
     return (
         f"{len(motion.joints3d)} frames, a subject in {s.seen.mean():.1%}; method {method}, frame {motion.frame},"
-        f" scale {scale_words(motion)}{poses if motion.meta.get('pose2d') == 'recorded' else ''}\n"
+        f" scale {', '.join(scale_of(motion))}{poses if motion.meta.get('pose2d') == 'recorded' else ''}\n"
         f"median reprojection error {s.median_px:.1f} px, {s.median_px / s.body_px:.1%} of the body\n"
         f"{total:.2f} s: {', '.join(f'{name} {value:.2f} s' for name, value in stages.items())}\n"
         f"{quality_sentence(run_checks(motion, s))}"

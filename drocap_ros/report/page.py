@@ -16,7 +16,7 @@ from drocap_ros.report import plots
 from drocap_ros.report.checks import Finding, Severity, run_checks
 from drocap_ros.report.motion_images import MotionImages, read_motion_images
 from drocap_ros.report.page_data import page_data, script_json
-from drocap_ros.report.statistics import Statistics, mean_known, motion_statistics, scale_words, stage_seconds
+from drocap_ros.report.statistics import Statistics, mean_known, motion_statistics, scale_of, stage_seconds
 from drocap_ros.skeleton import side_of
 
 _SCRIPTS = ("data.js", "scene.js", "image.js", "player.js")
@@ -71,7 +71,7 @@ def _tile(value: str, unit: str, label: str) -> str:
 
 def _tiles(motion: Motion, s: Statistics) -> list[tuple[str, str, str]]:
     share = s.median_px / s.body_px
-    scale, source = scale_words(motion).split(", ")
+    scale, source = scale_of(motion)
     return [
         (f"{s.times_s[-1]:.1f}", "s", f"{len(s.times_s)} frames at {s.rate_hz:.3g} Hz"),
         (f"{100 * s.seen.mean():.0f}", "%", "of frames with a subject"),
@@ -150,7 +150,7 @@ def _provenance(motion: Motion, command: str) -> str:
             for name, version in sorted(versions.items() if isinstance(versions, dict) else ())
         ),
         ("solver", _solver(meta)),
-        ("scale", scale_words(motion)),
+        ("scale", ", ".join(scale_of(motion))),
     ]
     return "".join(
         f"<tr><th>{escape(name)}</th><td><code>{escape(str(value))}</code></td></tr>" for name, value in rows if value

@@ -138,9 +138,9 @@ def motion_statistics(motion: Motion) -> Statistics:
     )
 
 
-def scale_words(motion: Motion) -> str:
-    """Whether metres are measured, and by what."""
-    return f"{'measured' if motion.metric else 'assumed'}, from {motion.scale_source.replace('_', ' ')}"
+def scale_of(motion: Motion) -> tuple[str, str]:
+    """Whether metres are measured or assumed, and from what, in words."""
+    return "measured" if motion.metric else "assumed", f"from {motion.scale_source.replace('_', ' ')}"
 
 
 def stage_seconds(meta: Mapping[str, object]) -> dict[str, float]:

@@ -77,8 +77,7 @@ def run(args: argparse.Namespace) -> int:
         _remove_left_overs(args.out)
     failures = [record for record in records if record["status"] != "done"]
     for record in failures[:_FAILURES_PRINTED]:
-        name, error = record["input"], record["error"]
-        print(f"failed: {error if error.startswith(name) else f'{name}: {error}'}", file=sys.stderr)
+        print(f"failed: {record['input']}: {record['error']}", file=sys.stderr)
     if not args.quiet:
         print(
             f"{len(tasks)} recording{'s' * (len(tasks) != 1)}: {len(records) - len(failures)} done,"

@@ -112,8 +112,9 @@ def reconstruct_recording(task: Task) -> Record:
 
 
 def failure(task: Task, error: str, seconds: float | None = None) -> Record:
-    """Record of a failure; ``seconds`` = None where the process is gone."""
-    record = {**task.record, "status": "failed", "error": " ".join(error.split())}
+    """Record of a failure; ``seconds`` = None where the process is gone.  The error leaves out the input's path."""
+    words = " ".join(error.split()).removeprefix(f"{task.arguments.input}: ")
+    record = {**task.record, "status": "failed", "error": words}
     return record if seconds is None else {**record, **_costs(seconds)}
 
 
