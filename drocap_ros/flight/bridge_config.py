@@ -44,9 +44,12 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
         5.0, "wanted rate of GPS, battery, estimator and landed state", unit="Hz", minimum=0.2, maximum=20
     )
     time_sync_hz: float = param(
-        10.0, "rate of time synchronization; its answers show that the link works in both directions", unit="Hz",
-        minimum=0.1, maximum=20,
-    )  # fmt: skip
+        10.0,
+        "rate of time synchronization; its answers show that the link works in both directions",
+        unit="Hz",
+        minimum=0.1,
+        maximum=20,
+    )
     rate_window_s: float = param(3.0, "time over which the real rates are measured", unit="s", minimum=1, maximum=30)
     rate_shortfall: float = param(
         0.5, "share of the wanted rate below which a message is requested again", minimum=0, maximum=1
@@ -55,14 +58,20 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
     link_timeout_s: float = param(3.0, "silence after which the link counts as lost", unit="s", minimum=0.5, maximum=60)
     control_hz: float = param(20.0, "rate of setpoints", unit="Hz", minimum=5, maximum=50)
     watchdog_s: float = param(
-        0.2, "time without a step of the control loop after which the watchdog holds the vehicle", unit="s",
-        minimum=0.1, maximum=2,
-    )  # fmt: skip
+        0.2,
+        "time without a step of the control loop after which the watchdog holds the vehicle",
+        unit="s",
+        minimum=0.1,
+        maximum=2,
+    )
     max_control_timeout_s: float = param(
-        0.5, "longest time-out after which the autopilot may stop by itself when our setpoints stay away "
+        0.5,
+        "longest time-out after which the autopilot may stop by itself when our setpoints stay away "
         "(read from its parameters): a longer or unknown one forbids motion; 0 = not checked",
-        unit="s", minimum=0, maximum=10,
-    )  # fmt: skip
+        unit="s",
+        minimum=0,
+        maximum=10,
+    )
     gimbal_control: bool = param(False, "whether the mount's pitch follows the subject")
 
     def __post_init__(self) -> None:

@@ -31,21 +31,31 @@ class OrbitConfig(Parameters):
     )
     min_distance_m: float = param(3.0, "least horizontal distance from the subject", unit="m", minimum=1.0, maximum=100)
     max_distance_m: float = param(
-        20.0, "greatest horizontal distance from the subject at which an orbit may begin", unit="m", minimum=2,
+        20.0,
+        "greatest horizontal distance from the subject at which an orbit may begin",
+        unit="m",
+        minimum=2,
         maximum=200,
-    )  # fmt: skip
+    )
     max_speed_m_s: float = param(4.5, "greatest speed asked of the vehicle", unit="m/s", minimum=0.2, maximum=15)
     max_acceleration_m_s2: float = param(
-        2.0, "greatest acceleration asked of the vehicle; an orbit needs omega^2 radius", unit="m/s^2", minimum=0.1,
+        2.0,
+        "greatest acceleration asked of the vehicle; an orbit needs omega^2 radius",
+        unit="m/s^2",
+        minimum=0.1,
         maximum=5,
-    )  # fmt: skip
+    )
     max_jerk_m_s3: float = param(2.0, "greatest change of acceleration", unit="m/s^3", minimum=0.1, maximum=20)
     ramp_s: float = param(3.0, "time to reach the angular speed", unit="s", minimum=0.5, maximum=30)
     approach_speed_m_s: float = param(1.0, "speed of changes of radius and height", unit="m/s", minimum=0.05, maximum=5)
     max_closing_m_s: float = param(
-        1.0, "greatest speed towards the subject, whatever his estimate says; behind one who walks away, the speed at "
-        "which his image surely shrinks is added", unit="m/s", minimum=0.2, maximum=5,
-    )  # fmt: skip
+        1.0,
+        "greatest speed towards the subject, whatever his estimate says; behind one who walks away, the speed at "
+        "which his image surely shrinks is added",
+        unit="m/s",
+        minimum=0.2,
+        maximum=5,
+    )
     max_subject_speed_m_s: float = param(
         2.5, "greatest speed at which the orbit's centre follows the subject", unit="m/s", minimum=0, maximum=10
     )
@@ -54,13 +64,18 @@ class OrbitConfig(Parameters):
     )
 
     reverse_every_s: float = param(
-        0.0, "time after which the orbit turns its direction, again and again: turns tell the camera's yaw from the "
-        "latency; 0 = never, else at least 10 s", unit="s", minimum=0, maximum=3600,
-    )  # fmt: skip
+        0.0,
+        "time after which the orbit turns its direction, again and again: turns tell the camera's yaw from the "
+        "latency; 0 = never, else at least 10 s",
+        unit="s",
+        minimum=0,
+        maximum=3600,
+    )
     calibrate_telemetry: bool = param(
-        False, "whether the orbit begins against its direction and turns once, after 15 s, so that a reconstruction "
+        False,
+        "whether the orbit begins against its direction and turns once, after 15 s, so that a reconstruction "
         "can calibrate the telemetry; reverse_every_s replaces it",
-    )  # fmt: skip
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -82,17 +97,22 @@ def orbit_condition(config: OrbitConfig, radius_m: float, angular_speed_deg_s: f
     if radius_m > config.max_distance_m * ROUNDING:
         return condition(
             ConditionCode.RADIUS_TOO_LARGE, value=radius_m, limit=config.max_distance_m, limited_by="max_distance_m"
-        )  # fmt: skip
+        )
     omega = abs(math.radians(angular_speed_deg_s))
     if omega * radius_m > config.max_speed_m_s * ROUNDING:
         return condition(
-            ConditionCode.SPEED_ABOVE_LIMIT, value=angular_speed_deg_s, radius_m=radius_m,
-            limit=math.degrees(config.max_speed_m_s / radius_m), max_speed_m_s=config.max_speed_m_s,
-        )  # fmt: skip
+            ConditionCode.SPEED_ABOVE_LIMIT,
+            value=angular_speed_deg_s,
+            radius_m=radius_m,
+            limit=math.degrees(config.max_speed_m_s / radius_m),
+            max_speed_m_s=config.max_speed_m_s,
+        )
     if omega**2 * radius_m > config.max_acceleration_m_s2 * ROUNDING:
         return condition(
-            ConditionCode.ACCELERATION_ABOVE_LIMIT, value=angular_speed_deg_s, radius_m=radius_m,
+            ConditionCode.ACCELERATION_ABOVE_LIMIT,
+            value=angular_speed_deg_s,
+            radius_m=radius_m,
             limit=math.degrees(math.sqrt(config.max_acceleration_m_s2 / radius_m)),
             max_acceleration_m_s2=config.max_acceleration_m_s2,
-        )  # fmt: skip
+        )
     return None

@@ -167,9 +167,12 @@ class MavlinkBridgeNode(ComponentNode):
                 return
             request, header = taken
             command = OperatorCommand(
-                int(request.command), float(request.radius_m), float(request.height_m),
-                float(request.angular_speed_deg_s), stamp_from_ros(request.stamp),
-            )  # fmt: skip
+                int(request.command),
+                float(request.radius_m),
+                float(request.height_m),
+                float(request.angular_speed_deg_s),
+                stamp_from_ros(request.stamp),
+            )
             self._unanswered.append((command, request, header))
             self.controller.command(command)
 
@@ -179,9 +182,11 @@ class MavlinkBridgeNode(ComponentNode):
             code, words = int(answer.condition.code), str(answer.condition)
             response = OrbitCommand.Response(accepted=answer.accepted, condition=code, words=words)
             self._last_command = {
-                "command": command.kind, "command_accepted": answer.accepted, "command_condition": code,
+                "command": command.kind,
+                "command_accepted": answer.accepted,
+                "command_condition": code,
                 "command_answer": words,
-            }  # fmt: skip
+            }
             for entry in self._unanswered:
                 if entry[0] is command:
                     self._last_command["command_stamp"] = entry[1].stamp

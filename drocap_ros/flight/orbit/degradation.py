@@ -27,7 +27,8 @@ _C = ConditionCode
 _USUAL_SUBJECT_AGE_S = 0.24  # a camera at 15 Hz, and 0.17 s for its network
 _STANDING_AGE = 5 / 6  # of max_subject_age_s, 0.33 s: the last moving setpoint
 _CONTRADICTED_PACE = 0.3
-_AWAY_S, _COMES_M_S = 1.0, 0.3
+_AWAY_S = 1.0  # away from the place on the orbit, after which the operator is told: a gust passes
+_COMES_M_S = 0.3  # speed of the subject towards the vehicle, from which the orbit gives way unslowed
 _WHOLE_WAY_PACE = 0.3  # below it the setpoint is nearer than the reference
 _CHANGE = 0.6  # 1/s; how fast a vehicle of 2 m/s brakes and accelerates, 1.2 m/s^2
 

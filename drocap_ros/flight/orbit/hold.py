@@ -14,12 +14,19 @@ from drocap_ros.flight.orbit.motion_checks import braking_distance, subject_loca
 from drocap_ros.flight.orbit.states import Limits, SafetyState, State
 from drocap_ros.flight.safety_config import SafetyConfig
 
-_AT_REST_M_S, _AT_REST_S, _SETTLED_S = 0.35, 0.5, 0.3
+_AT_REST_M_S = 0.35  # below it a vehicle stands, by a velocity that errs by as much
+_AT_REST_S = 0.5  # least time of a hold, before its mode is requested
+_SETTLED_S = 0.3  # slow for so long: a vehicle that springs back is slow for a moment where it turns
 _DEAD_RECKONING_S = 0.6
 _FRESH_S = 0.25
 _UNSURE_S = 0.5  # without a place after a jump of the reported position: velocity zero
-_NEAR_M, _FAST_M_S, _STOPPING_S, _MAX_WAY_OUT_M = 5.0, 1.0, 1.2, 1.5
-_LEAD_S, _CLEAR_M, _MAX_LEAD_M = 1.5, 0.3, 3.0
+_NEAR_M = 5.0  # distance of the subject, below which the hold lies on the way out
+_FAST_M_S = 1.0  # speed away from him, above which it does anyway
+_STOPPING_S = 1.2  # from 1.5 m/s at braking_m_s2, 1.3
+_MAX_WAY_OUT_M = 1.5  # as max_lead_m
+_LEAD_S = 1.5  # of his way, by which a retreat is ahead of one who comes
+_CLEAR_M = 0.3  # of a retreat, beyond min_distance_m
+_MAX_LEAD_M = 3.0  # of the retreat's place from the vehicle: its speed is bounded by it
 _HOLD_MODE_PATIENCE_S = 5.0
 #: Causes that pass by themselves.  A silent link is none of them: motion does not resume because a link returns.
 _HARMLESS = PICTURE_CODES | {ConditionCode.ATTITUDE_OUTDATED, ConditionCode.POSITION_FROZEN}

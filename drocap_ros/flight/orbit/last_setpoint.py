@@ -25,12 +25,15 @@ from drocap_ros.flight.subject.subject_filter import STANDING_M_S, WALKING_M_S
 
 #: m; no coast brings the vehicle by more nearer to the subject, which is required of the bridge's death
 #: (benchmarks/flight_kills.py); and with the creep after the stop the setpoint is slowed down before.
-_NEARER_M, _CREEPS_NEARER_M = 1.0, 0.9
+_NEARER_M = 1.0
+_CREEPS_NEARER_M = 0.9
 #: m/s beyond a steady flight's speed, and share of the subject's speed added: most that setpoint and way together ask
 #: of a vehicle that holds setpoints.  A far place lets it fly faster than predicted: after it had caught up with a
 #: walker it went on for 3.1 m.
-_PULLED_M_S, _PULLED_BEHIND = 0.3, 0.25
-_SLACK_M, _SLACK_M_S = 0.2, 0.1  # what the vehicle has already is no effect of the setpoint
+_PULLED_M_S = 0.3
+_PULLED_BEHIND = 0.25
+_SLACK_M = 0.2  # what the vehicle has already is no effect of the setpoint
+_SLACK_M_S = 0.1
 #: Levels that are tried, one after the other, see :func:`_shares`: of the whole setpoint, and of its part across the
 #: line of sight where that is taken away first.  A step is a fifth of the speed, a quarter or half of the way.
 _LEVELS = (2.0, 1.5, 1.0, 0.8, 0.6, 0.4, 0.2)
@@ -274,10 +277,10 @@ def _bounded(
 
 # -- what a vehicle behind a walker lacks -----------------------------------------------------------------------------
 
-_RATE_PER_S2 = 0.8  # of the missing velocity: as fast as an autopilot's own integral is slow
+_RATE_PER_S2 = 0.8  # of the missing velocity
 _FORGETTING_PER_S = 0.1
 _SHARE_PER_S = 0.6  # of the subject's speed beyond one who stands: standing needs none
-_GREATEST_M_S2 = 0.6  # friction and wind of 8 m/s in the closed loop
+_GREATEST_M_S2 = 0.6  # most that is added
 
 
 class Shortfall:

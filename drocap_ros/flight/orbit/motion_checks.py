@@ -16,12 +16,13 @@ from drocap_ros.flight.safety_config import SafetyConfig
 from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, LANDED_LANDING, LANDED_ON_GROUND, LANDED_TAKEOFF
 
 _C = ConditionCode
-_REACTION_S = 0.5
-_OWN_SPEED_SD_M_S = 0.1
-_LEAST_SUBJECT_AGE_S = 0.25
-_TIMEOUT_ROUNDING_S = 1e-3
+_REACTION_S = 0.5  # from a step of the subject until the vehicle slows down
+_OWN_SPEED_SD_M_S = 0.1  # of the reported velocity
+_LEAST_SUBJECT_AGE_S = 0.25  # the usual age of a picture at 15 Hz, its network included
+_TIMEOUT_ROUNDING_S = 1e-3  # parameters are float32
 _WAITING_LEADS = 1.3  # of max_lead_m, as in planner.advance
-_CARRIED_OFF, _CARRIED_OFF_S = 3.0, 1.0  # times that limit: beyond the 3.7 m behind walking subjects
+_CARRIED_OFF = 3.0  # times that limit: beyond the 3.7 m that vehicles were behind walking subjects
+_CARRIED_OFF_S = 1.0  # for so long: a gust passes
 _LONGEST_AWAY_S = 20.0  # behind walking subjects in 8 m/s of wind: 10 s
 #: The clocks of image and step differ by a transmission at most.
 _FUTURE_S = 0.2

@@ -24,9 +24,10 @@ from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.observation import PoseObservation
 
 _NS = 1_000_000_000
-_CLOCK_JUMP_S = 0.25
-_MAX_EXTRAPOLATION_S = 0.3
-_POSITION_JUMP_M, _JUMP_PERIOD_S = 1.0, 0.5
+_CLOCK_JUMP_S = 0.25  # between the clock of the stamps and the monotonic one: a subject's age would be wrong by it
+_MAX_EXTRAPOLATION_S = 0.3  # of a position by its velocity
+_POSITION_JUMP_M = 1.0  # five times the drift below
+_JUMP_PERIOD_S = 0.5  # between two states, beyond which the way is not known
 _FADES_S = 4.0  # in recorded flights of both autopilots the steps added up to 0.2 m at most
 #: MAV_TYPE of the vehicles for which the control was made: multirotors, and a helicopter under the same autopilot.
 _MULTIROTORS = frozenset({2, 3, 4, 13, 14, 15, 29, 35})

@@ -19,15 +19,19 @@ from drocap_ros.flight.setpoint import Setpoint
 from drocap_ros.flight.subject.subject_filter import STANDING_M_S, WALKING_M_S
 
 #: 1/s, about one who stands and one who walks: his turns are no lasting error; m.
-_TRIM_RATE, _WALKING_TRIM_RATE, _MAX_TRIM_M = 0.15, 0.03, 0.5
+_TRIM_RATE = 0.15
+_WALKING_TRIM_RATE = 0.03
+_MAX_TRIM_M = 0.5
 _FREE_LEAD = 0.6  # share of the greatest lead, below which the reference does not wait
 _CENTRE_RATE = 3.0  # 1/s; a slower centre is an error of the radius, a faster one passes on the estimate's noise
 _CENTRE_ACCELERATION = 8.0  # m/s^2; above any acceleration of a subject, so it limits only jumps
 _FORWARD_S = 0.5  # s; filter of the centre's acceleration
 #: 1/s, m/s^2: so much of it is passed on, by the centre's speed beyond that of one who stands: noise.
-_FORWARD_RATE, _MAX_FORWARD = 0.5, 0.5
+_FORWARD_RATE = 0.5
+_MAX_FORWARD = 0.5
 _MAX_HASTE = 0.12  # m/s^2 along the path that the setpoint passes on: the reference waits for a vehicle that lags
-_SURPRISE_S, _FLIGHT_ERROR_M = 0.5, 0.5  # of the least radius
+_SURPRISE_S = 0.5  # of the least radius: until a turn of the subject is seen
+_FLIGHT_ERROR_M = 0.5  # of the least radius: error of the flown one
 _CALIBRATION_S = 15.0  # against the wanted direction, with calibrate_telemetry
 _WORST_RANGE = 5.0  # of size_error: 40 % where the body is not measured, as by a wrong lens or a child
 
@@ -65,9 +69,13 @@ class OrbitState(NamedTuple):
 
 
 def least_radius(
-    config: OrbitConfig, subject_sd_m: float, subject_speed_m_s: float, braking_m_s2: float,
-    size_error: float = 0.0, nearer_m: float = 0.0,
-) -> float:  # fmt: skip
+    config: OrbitConfig,
+    subject_sd_m: float,
+    subject_speed_m_s: float,
+    braking_m_s2: float,
+    size_error: float = 0.0,
+    nearer_m: float = 0.0,
+) -> float:
     """Radius (m) at which an orbit stays clear of the minimum distance, whatever is wrong with the range.
 
     It includes two standard deviations of the subject's position, the worst error of a range by body size, what one of
@@ -154,9 +162,17 @@ def advance(state: OrbitState, goal: OrbitGoal, scene: Scene, dt: float, config:
         rate = _TRIM_RATE if math.hypot(*centre_velocity) < WALKING_M_S else _WALKING_TRIM_RATE
         trim = min(max(trim + rate * error * dt, -most), _MAX_TRIM_M)
     return OrbitState(
-        math.remainder(phase, 2 * math.pi), omega, radius, height, centre, centre_velocity, centre_acceleration, trim,
-        state.flown_s + dt, goal_radius,
-    )  # fmt: skip
+        math.remainder(phase, 2 * math.pi),
+        omega,
+        radius,
+        height,
+        centre,
+        centre_velocity,
+        centre_acceleration,
+        trim,
+        state.flown_s + dt,
+        goal_radius,
+    )
 
 
 def sense(config: OrbitConfig, flown_s: float) -> float:

@@ -25,14 +25,17 @@ _GRAVITY = 9.81
 _HALF_WIDTH_M = 0.3  # of a person with the arms
 _HEADROOM_M = 0.1  # above the head
 _DIRECTIONS = 12
-_GUSTS, _RESERVE = 1.2, 0.4  # times the wind's lean; m/s^2 of corrections
+_GUSTS = 1.2  # times the lean by the mean wind
+_RESERVE_M_S2 = 0.4  # of corrections
 _LEAST_UP = 0.3  # of the body's axis; beyond it the vehicle tumbles
-_STILL_M_S, _SETTLED_S = 0.5, 1.0
+_STILL_M_S = 0.5  # a hover: below it for so long, the vehicle leans by the wind alone
+_SETTLED_S = 1.0
 _LEARNING_S = 4.0  # of the lean against wind: a gust passes, the wind stays
 _STEADY_S = 0.7  # over which the margin now is averaged: a slower orbit cannot follow a gust
 _SAME_CAMERA = 0.03  # of the focal length, by which a camera matrix may change
 _CUT_OFF = 0.2  # share of the picture's height by which a mount may cut off feet or head: it does not lean further
-_COMFORT, _LEAST_PACE = 0.08, 0.3  # share of the picture's height below which the orbit slows down, and how far
+_COMFORT = 0.08  # share of the picture's height below which the orbit slows down
+_LEAST_PACE = 0.3  # of its speed: a standing orbit would not give way
 
 
 class View(NamedTuple):
@@ -96,7 +99,7 @@ def orbit_margin(view: View, goal: OrbitGoal, body_height_m: float, wind: float)
     if view.level:
         none = np.zeros(1)
         return float(framing_margin(view, goal.radius_m, goal.height_m, body_height_m, none, none)[0])
-    lean = _GUSTS * wind + _RESERVE
+    lean = _GUSTS * wind + _RESERVE_M_S2
     around = np.linspace(0.0, 2 * math.pi, _DIRECTIONS, endpoint=False)
     inward = np.array([[0.0], [goal.angular_speed_rad_s**2 * goal.radius_m]])
     ahead = np.arctan2(inward + lean * np.cos(around), _GRAVITY).ravel()
@@ -196,12 +199,16 @@ class Framing:
             return None
         first = "set gimbal_control to true, or " if view.level and not config.gimbal_control else ""
         return condition(
-            ConditionCode.PERSON_LEAVES_PICTURE, missing_percent=-100 * margin, radius_m=goal.radius_m,
-            height_m=goal.height_m, speed_deg_s=math.degrees(abs(goal.angular_speed_rad_s)),
-            camera=f"a mount that stays at {math.degrees(view.pitch):.0f} deg" if view.level else
-            "the fixed camera, as the body leans,",
+            ConditionCode.PERSON_LEAVES_PICTURE,
+            missing_percent=-100 * margin,
+            radius_m=goal.radius_m,
+            height_m=goal.height_m,
+            speed_deg_s=math.degrees(abs(goal.angular_speed_rad_s)),
+            camera=f"a mount that stays at {math.degrees(view.pitch):.0f} deg"
+            if view.level
+            else "the fixed camera, as the body leans,",
             remedy=first + _remedy(view, goal, body, wind, config.max_distance_m),
-        )  # fmt: skip
+        )
 
     def least_radius(self, goal: OrbitGoal, subject_speed_m_s: float, gives_way_s: float) -> float:
         """Radius (m) at which one who walks up to the vehicle stays in a fixed camera's picture; 0 = any, or he stands.

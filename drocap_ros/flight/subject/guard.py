@@ -19,18 +19,24 @@ from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.observation import PoseObservation
 
 _NS = 1_000_000_000
-_RADIAL_NOISE, _BEARING_NOISE, _NOISE_M = 0.06, 0.01, 0.04  # of one image: shares of the range, and m
+_RADIAL_NOISE = 0.06  # of one image, share of the range: as the range by size in subject_measurement.py
+_BEARING_NOISE = 0.01  # share of the range
+_NOISE_M = 0.04
 _ACCELERATION = 0.7  # m/s^2: standard deviation of the change of the subject's velocity in a second
-_MAX_BENDING, _BENT = 0.3, 4.0  # a bent body looks smaller: its size counts for less
-_BEARING_GATE, _SIZE_GATE = 4.0, 0.35  # standard deviations across the sight; share of the range along it
+_MAX_BENDING = 0.3  # as in subject_filter.py
+_BENT = 4.0  # times the noise: a bent body looks smaller, its size counts for less
+_BEARING_GATE = 4.0  # standard deviations across the sight
+_SIZE_GATE = 0.35  # share of the range along it
 _SURE = 0.5  # standard deviations of the speed at which he walks away that are left out
 #: m/s over the square of the seconds for which he recedes, far and near: the speed at which he may be followed.  A body
 #: that swings or crouches shrinks too, for a second or two.
-_AWAY_FAR, _AWAY_NEAR = 0.14, 0.3
-_RESTART_S = 1.0
+_AWAY_FAR = 0.14
+_AWAY_NEAR = 0.3
+_RESTART_S = 1.0  # without a sure image, after which any image is sure, unless the vehicle flies by him
 #: m, where the distance begins to count and where it counts whole: an error of the size is an error of the speed in
 #: proportion to the distance.
-_NEAR_M, _FAR_M = 8.0, 12.0
+_NEAR_M = 8.0
+_FAR_M = 12.0
 
 
 class Guard:

@@ -12,11 +12,15 @@ from drocap_ros.flight.subject.subject_measurement import SubjectMeasurement, lo
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.observation import PoseObservation
 
-STANDING_M_S, WALKING_M_S = 0.3, 0.5  # speed that the estimate of one who stands has; speed of one who walks
+STANDING_M_S = 0.3  # speed that the estimate of one who stands has
+WALKING_M_S = 0.5  # least speed of one who walks
 _NS = 1_000_000_000
 _DRIFT = 0.05  # m/sqrt(s), of the vehicle's position and of the feet that are set down; no motion of the subject
-_RATIO_MEMORY_NS, _LEAST_RATIOS, _RATIO_QUANTILE = 4 * _NS, 15, 0.4  # of size over ground
-_WANDERING_MEMORY_NS, _WANDERING_RATIOS = 2 * _NS, 12  # where the height wanders: a longer memory lags behind it
+_RATIO_MEMORY_NS = 4 * _NS  # of size over ground: several strides
+_LEAST_RATIOS = 15  # images: a second of them
+_RATIO_QUANTILE = 0.4
+_WANDERING_MEMORY_NS = 2 * _NS  # where the height wanders: a longer memory lags behind it
+_WANDERING_RATIOS = 12  # images
 _MAX_BENDING = 0.3  # of a body whose size counts; 0.1 by noise alone
 _NEARER_S = 1.0  # filter of what the two ranges disagree by
 _MAX_SURPRISE = 0.3  # share of the range, beyond which the gate decides
@@ -138,11 +142,16 @@ class SubjectFilter:
         state, covariance = self._predicted(min(max(age_s, 0.0), 0.5))
         total = covariance[:3, :3] + self._systematic
         return SubjectEstimate(
-            position=state[:3], velocity=state[3:], covariance=covariance,
+            position=state[:3],
+            velocity=state[3:],
+            covariance=covariance,
             position_sd_m=float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[-1])),
-            stamp_ns=self._stamp_ns, age_s=age_s, track_id=self._track_id, contradicted=self._contradicted,
+            stamp_ns=self._stamp_ns,
+            age_s=age_s,
+            track_id=self._track_id,
+            contradicted=self._contradicted,
             nearer=self._nearer,
-        )  # fmt: skip
+        )
 
     def _learn_ratio(self, measurement: SubjectMeasurement, stamp_ns: int) -> None:
         """Ratio of the two ranges over the last seconds.

@@ -43,8 +43,11 @@ _STEEP = np.sin(np.deg2rad(75.0))
 _SHALLOW = np.sin(np.deg2rad(4.0))
 _MAX_RANGE_M = 200.0
 _THIRD_LONGEST = 0.99  # of the true length
-_GROUND_NOISE, _SIZE_NOISE, _BEARING_NOISE = 0.025, 0.06, 0.008  # of one image, shares of the range
-_LIFTED, _APART_NOISE = 0.15, 0.1  # apart by this share, one foot is lifted; noise per distance between them
+_GROUND_NOISE = 0.025  # of one image, share of the range, as the next two
+_SIZE_NOISE = 0.06
+_BEARING_NOISE = 0.008
+_LIFTED = 0.15  # feet apart by this share of the range: one is lifted
+_APART_NOISE = 0.1  # per distance between them
 _LEAN_RAD = 0.12  # standard deviation of the body's lean; looking down by a slope it changes lengths by as much
 
 
@@ -92,9 +95,11 @@ def locate_subject(
     if not observation.has_subject or len(observation.keypoints) == 0:
         return None
     points, _, confidence = joint_map(observation.joints.name).apply(
-        observation.keypoints.astype(float), observation.covariance.astype(float),
-        observation.confidence.astype(float), float(observation.image_size[1]),
-    )  # fmt: skip
+        observation.keypoints.astype(float),
+        observation.covariance.astype(float),
+        observation.confidence.astype(float),
+        float(observation.image_size[1]),
+    )
     seen = np.isfinite(points).all(axis=1) & (confidence >= _CONFIDENCE)
     trunk = _TRUNK[seen[_TRUNK]]
     if len(trunk) == 0:
@@ -137,9 +142,8 @@ def locate_subject(
     # Feet give a precise range from image to image, bones do not.
     noise = noise if np.isfinite(noise) else _SIZE_NOISE * distance + 0.05
     return SubjectMeasurement(
-        position, spread(noise, _BEARING_NOISE * distance + 0.03), spread(sd, turn), size, ground, bending,
-        nearer,
-    )  # fmt: skip
+        position, spread(noise, _BEARING_NOISE * distance + 0.03), spread(sd, turn), size, ground, bending, nearer
+    )
 
 
 def _range_from_size(
