@@ -6,9 +6,8 @@ from pathlib import Path
 
 from drocap_ros.errors import InputError
 from drocap_ros.recording.mcap.metadata import METADATA_FILE, custom_metadata, read_metadata, storage_files
-from drocap_ros.recording.mcap_session import McapSession
-from drocap_ros.recording.rosbags_session import RosbagsSession
 from drocap_ros.recording.session import FORMS, Session, SessionInfo
+from drocap_ros.recording.session_readers import McapSession, RosbagsSession
 
 _SUFFIXES = (".mcap", ".bag", ".db3")
 

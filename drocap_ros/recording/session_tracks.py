@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.rotations import unit_quaternions
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.recording import session as recorded
+from drocap_ros.recording.pose_messages import float_array
 from drocap_ros.recording.session import Message, Session, TopicInfo, calibration_of, header_stamp_ns
 from drocap_ros.recording.telemetry.camera_poses import with_camera
 from drocap_ros.recording.telemetry.log import VehicleTrack
@@ -160,17 +161,10 @@ def _tracks_of(stamp_ns: np.ndarray, messages: list[Message], track_id: int) -> 
                 f"image size: expected {size[0]}x{size[1]} px throughout, got "
                 f"{message.image_width}x{message.image_height}; cut the recording where it changes"
             )
-        _fill(keypoints[i], message.keypoints, "keypoints")
-        _fill(covariance[i], message.covariance, "covariance")
-        _fill(confidence[i], message.confidence, "confidence")
+        keypoints[i] = float_array(message.keypoints, keypoints[i].shape, "keypoints")
+        covariance[i] = float_array(message.covariance, covariance[i].shape, "covariance")
+        confidence[i] = float_array(message.confidence, confidence[i].shape, "confidence")
     return Tracks(keypoints, joints.joints, stamp_ns, size, confidence, covariance)
-
-
-def _fill(target: np.ndarray, values: Sequence[float] | np.ndarray, name: str) -> None:
-    array = np.asarray(values, dtype=np.float64)
-    if array.size != target.size:
-        raise InputError(f"{name}: expected {target.size} values, got {array.size}; was it recorded by drocap?")
-    target[...] = array.reshape(target.shape)
 
 
 def _camera_matrix(session: Session, near: str, size: tuple[int, int]) -> np.ndarray | None:
