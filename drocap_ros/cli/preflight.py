@@ -149,16 +149,15 @@ def _print(found: Sequence[Finding], quiet: bool) -> None:
             table.add_column(title, ratio=share)
         before = ""
         for finding in shown:
-            word = finding.level.name.lower()
-            same = finding.remedy and finding.remedy == before
-            before = finding.remedy or before
-            texts = (finding.name, finding.found, finding.wanted, "as above" if same else finding.remedy)
+            word, remedy = finding.level.name.lower(), finding.remedy
+            texts = (finding.name, finding.found, finding.wanted, "as above" if remedy and remedy == before else remedy)
             table.add_row(Text(word, _COLOURS[word]), *map(Text, texts))
+            before = remedy or before
         # A pipe has no width.
         Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH, highlight=False).print(table)
-    missing = ", ".join(f.name for f in counts[Level.MISSING])
-    verdict = f"not ready, missing: {missing}" if missing else "ready"
     if not quiet:
+        missing = ", ".join(f.name for f in counts[Level.MISSING])
+        verdict = f"not ready, missing: {missing}" if missing else "ready"
         print(f"{verdict} ({len(counts[Level.OK])} checks are ok, {len(counts[Level.WARNING])} warnings)")
 
 

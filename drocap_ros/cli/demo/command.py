@@ -41,9 +41,9 @@ def add_parser(subparsers: Subparsers) -> None:
     add_seed_option(parser, "of person, wind and scenery", metavar="N")
     parser.add_argument(
         "--autopilot",
-        choices=("ardupilot", "px4"),
+        metavar="NAME",
         default="ardupilot",
-        help="which one is simulated (default ardupilot)",
+        help="which one is simulated, ardupilot or px4 (default ardupilot)",
     )
     parser.add_argument(
         "--mount",
@@ -72,13 +72,14 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.cli.report import open_words
     from drocap_ros.errors import InputError
     from drocap_ros.evaluation.compare import compare
+    from drocap_ros.flight.autopilot import autopilot_of
     from drocap_ros.recording.open_session import open_session
     from drocap_ros.simulation.flight_simulator.truth import load_flight_truth
 
     if not (math.isfinite(args.seconds) and _LEAST_S <= args.seconds <= _MOST_S):
         raise InputError(f"--seconds: expected {_LEAST_S:g} to {_MOST_S:g}, got {args.seconds:g}; choose another")
     check_output_folder(args.out)
-    operator = Operator(args.seconds, requests_control=args.autopilot == "px4")
+    operator = Operator(args.seconds, requests_control=not autopilot_of(args.autopilot).hints.by_hand)
     with interruptible() as interrupted, output_folder(args.out) as folder:
         config = demo_config(folder, args.seed, args.autopilot, args.models, args.mount)
         fly = fly_in_simulated_time

@@ -93,7 +93,7 @@ class ContinuedControl(_AutopilotControl):
             self.place = [self.place[i] + float(shift[i]) for i in (0, 1)]
 
     def _sensed(
-        self, error: tuple[float, float], speed: tuple[float, float], dt: float
+        self, error: tuple[float, float], _speed: tuple[float, float], dt: float
     ) -> tuple[tuple[float, float], tuple[float, float]]:
         share, (x, y) = filter_share(dt), self._filtered
         self._filtered = x + (error[0] - x) * share, y + (error[1] - y) * share
@@ -147,11 +147,11 @@ class HeldControl(_AutopilotControl):
         self.push = list(self.lean)
 
     def _sensed(
-        self, error: tuple[float, float], speed: tuple[float, float], dt: float
+        self, error: tuple[float, float], speed: tuple[float, float], _dt: float
     ) -> tuple[tuple[float, float], tuple[float, float]]:
         return error, (-speed[0], -speed[1])
 
-    def _shape(self, here: tuple[float, float], expired: bool, dt: float) -> None:
+    def _shape(self, _here: tuple[float, float], _expired: bool, dt: float) -> None:
         target = self.target
         if self.manner != Manner.SETPOINTS:
             self._without_setpoints(dt)

@@ -164,23 +164,28 @@ class SimulatedCopter(ReportingCopter):
     def _take_setpoint(self, m: Any) -> None:
         if m.target_system not in (0, self._mav.srcSystem):
             return
-        values = (m.x, m.y, m.z, m.vx, m.vy, m.vz, m.afx, m.afy, m.afz, m.yaw, m.yaw_rate)
         self._setpoint_s = self._t
         if self.deaf or self.mode != self.kind.control_mode:
             return
-        if not all(math.isfinite(v) for v in (*values[:3], m.yaw)):
+        if not all(map(math.isfinite, (m.x, m.y, m.z, m.yaw))):
             self.crashed = "a setpoint with NaN"
             return
-        if not all(map(math.isfinite, values)) or m.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED:
-            return
-        mask = m.type_mask
-        vectors = [ned_to_enu(np.array(values[i : i + 3])) for i in (0, 3, 6)]
-        keep = [not mask & bit for bit in (1, 8, 64)]
-        yaw = None if mask & 1024 else math.remainder(math.pi / 2 - m.yaw, 2 * math.pi)
-        target = Target(
-            vectors[0] if keep[0] else None, vectors[1] if keep[1] else np.zeros(3),
-            vectors[2] if keep[2] else np.zeros(3), yaw, 0.0 if mask & 2048 else -m.yaw_rate,
-        )  # fmt: skip
-        self.control.take(target)
-        self._accepted_s = self._t
-        self.accepted_setpoints += 1
+        target = _target_of(m)
+        if target is not None:
+            self.control.take(target)
+            self._accepted_s = self._t
+            self.accepted_setpoints += 1
+
+
+def _target_of(m: Any) -> Target | None:
+    """What a SET_POSITION_TARGET_LOCAL_NED asks for; None = values or a frame that are silently ignored."""
+    values = (m.x, m.y, m.z, m.vx, m.vy, m.vz, m.afx, m.afy, m.afz, m.yaw, m.yaw_rate)
+    if not all(map(math.isfinite, values)) or m.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED:
+        return None
+    vectors = [ned_to_enu(np.array(values[i : i + 3])) for i in (0, 3, 6)]
+    velocity, acceleration = (
+        np.zeros(3) if m.type_mask & bit else vector for vector, bit in zip(vectors[1:], (8, 64), strict=True)
+    )
+    yaw = None if m.type_mask & 1024 else math.remainder(math.pi / 2 - m.yaw, 2 * math.pi)
+    rate = 0.0 if m.type_mask & 2048 else -m.yaw_rate
+    return Target(None if m.type_mask & 1 else vectors[0], velocity, acceleration, yaw, rate)

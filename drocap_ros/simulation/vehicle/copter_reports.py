@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,16 +16,15 @@ from drocap_ros.simulation.vehicle.dynamics import Body
 from drocap_ros.simulation.vehicle.estimate_error import EstimateError
 from drocap_ros.simulation.vehicle.flight_control import FlightControl
 from drocap_ros.simulation.vehicle.flight_path import VehiclePose
-from drocap_ros.simulation.vehicle.mavlink_vehicle import SimulatedVehicle
+from drocap_ros.simulation.vehicle.mavlink_vehicle import ESTIMATOR_HEALTHY, SimulatedVehicle
 from drocap_ros.simulation.vehicle.mount import MOUNT_TYPES, SimulatedMount
 
-_GPS_NOTICED_S, EKF_NOTICED_S = 0.4, 7.4
-_HEALTHY, _CONSTANT_POSITION = 831, 831 & ~(8 | 16) | 128
-_ECHO = mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED
-_NO_POSITION, _NO_ACCELERATION, _NO_YAW = 1 | 2 | 4, 64 | 128 | 256, 1024 | 2048
-_PLACES = {
-    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
-}  # fmt: skip
+_GPS_NOTICED_S = 0.4  # from the loss of satellites to its report: measured
+EKF_NOTICED_S = 7.4  # from the loss of satellites to the estimator's report: measured
+_CONSTANT_POSITION = ESTIMATOR_HEALTHY & ~(8 | 16) | 128
+_NO_POSITION = 1 | 2 | 4  # POSITION_TARGET_TYPEMASK
+_NO_YAW = 1024 | 2048
+_PLACES = {mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT}
 
 
 class Readiness(NamedTuple):
@@ -70,7 +69,6 @@ class ReportingCopter(SimulatedVehicle):
         self.control: FlightControl = control_of(self.kind, position, yaw, self.body.drag())
         self.error = EstimateError(setup.gps_noise_m, self.kind.height_wanders, setup.seed)
         self.mode = self.intended = setup.mode or self.simulated.stick_mode
-        self.battery, self.landed_state = 87, mavlink.MAV_LANDED_STATE_IN_AIR
         self.gps_lost_s = self.ekf_failed_s = math.inf
         self.frozen = False  # telemetry repeats its last values, with fresh or old stamps
         self.frozen_clock = False
@@ -106,9 +104,12 @@ class ReportingCopter(SimulatedVehicle):
         lean = np.array([*(0.5 * self._attitude_error[:2]), 0.0, 1.0])
         body = quaternion_multiply(self.body.orientation_xyzw(), lean / np.linalg.norm(lean))
         self._report = VehiclePose(
-            self.estimate + 0.01 * fine[:3], self.body.velocity + self.error.velocity + 0.04 * fine[3:],
-            body, np.array([0.0, 0.0, self.body.yaw_rate]), self.camera_orientation(),
-        )  # fmt: skip
+            self.estimate + 0.01 * fine[:3],
+            self.body.velocity + self.error.velocity + 0.04 * fine[3:],
+            body,
+            np.array([0.0, 0.0, self.body.yaw_rate]),
+            self.camera_orientation(),
+        )
         return self._report
 
     def camera_orientation(self) -> np.ndarray:
@@ -117,42 +118,35 @@ class ReportingCopter(SimulatedVehicle):
 
     def _known(self) -> frozenset[int]:
         own = {mavlink.MAVLINK_MSG_ID_HEARTBEAT} if self.kind.heartbeat_on_request else set()
-        return super()._known() | {_ECHO} | own
+        return super()._known() | own
+
+    def _all_encoders(self) -> dict[int, Callable[[float, VehiclePose], Any]]:
+        return super()._all_encoders() | {mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: self._echo}
 
     def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> Any:
-        reported_s = self._report_s if self.frozen and self.frozen_clock else t_s
-        boot_ms = int((reported_s + self.boot_s) * 1e3) % 2**32
-        mav = self._mav
-        if number == _ECHO:
-            return self._echo(boot_ms)
-        if number == mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS:
-            _, pitch, yaw = self._attitude_error
-            mounted = self.mount.report(pose.orientation_xyzw, (pitch, yaw))
-            if mounted is None:
-                return None
-            return mav.gimbal_device_attitude_status_encode(
-                0, 0, boot_ms, mounted.flags, mounted.quaternion_wxyz, 0, 0, 0, 0
-            )
         if number in _PLACES and self._t < self.readiness.origin_s:
             return None
-        if number in (mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT, mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS):
-            lost = self._t > min(self.ekf_failed_s, self.gps_lost_s + EKF_NOTICED_S)
-            flags = _CONSTANT_POSITION if lost or self._t < self.readiness.estimator_s else _HEALTHY
-            if number == mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT:
-                return mav.ekf_status_report_encode(flags, 0.1, 0.1, 0.1, 0.1, 0)
-            return mav.estimator_status_encode(boot_ms * 1000, flags, 0.1, 0.1, 0.1, 0.1, 0, 0, 0.3, 0.3)
-        if number == mavlink.MAVLINK_MSG_ID_SYS_STATUS:
-            return mav.sys_status_encode(0, 0, 0, 200, 15800, 1200, self.battery, 0, 0, 0, 0, 0, 0)
-        if number == mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE:
-            return mav.extended_sys_state_encode(0, self.landed_state)
-        if number == mavlink.MAVLINK_MSG_ID_GPS_RAW_INT:
-            there = self.readiness.fix_s <= self._t <= self.gps_lost_s + _GPS_NOTICED_S
-            return mav.gps_raw_int_encode(
-                boot_ms * 1000, 3 if there else 1, 473977420, 85455940, 488000, 60, 90, 0, 0, 17
-            )
-        return super()._telemetry(number, reported_s, pose)
+        return super()._telemetry(number, self._report_s if self.frozen and self.frozen_clock else t_s, pose)
 
-    def _echo(self, boot_ms: int) -> Any:
+    def _mount_angles(self, t_s: float, pose: VehiclePose) -> Any:
+        _, pitch, yaw = self._attitude_error
+        mounted = self.mount.report(pose.orientation_xyzw, (pitch, yaw))
+        if mounted is None:
+            return None
+        return self._mav.gimbal_device_attitude_status_encode(
+            0, 0, self._boot_ms(t_s), mounted.flags, mounted.quaternion_wxyz, 0, 0, 0, 0
+        )
+
+    def _estimator_flags(self) -> int:
+        lost = self._t > min(self.ekf_failed_s, self.gps_lost_s + EKF_NOTICED_S)
+        return _CONSTANT_POSITION if lost or self._t < self.readiness.estimator_s else ESTIMATOR_HEALTHY
+
+    def _satellites(self, t_s: float, _pose: VehiclePose) -> Any:
+        there = self.readiness.fix_s <= self._t <= self.gps_lost_s + _GPS_NOTICED_S
+        fix, place = 3 if there else 1, (473977420, 85455940, 488000)
+        return self._mav.gps_raw_int_encode(self._boot_ms(t_s) * 1000, fix, *place, 60, 90, 0, 0, 17)
+
+    def _echo(self, t_s: float, _pose: VehiclePose) -> Any:
         """The target that is followed, whether setpoints arrive or not.
 
         A setpoint that is continued is sent throughout the control mode; of one that is held, what the controller
@@ -174,5 +168,5 @@ class ReportingCopter(SimulatedVehicle):
             yaw = math.nan if target.yaw is None else math.remainder(math.pi / 2 - target.yaw, 2 * math.pi)
         values = [float(v) for vector in (position, velocity, acceleration) for v in enu_to_ned(vector)]
         return self._mav.position_target_local_ned_encode(
-            boot_ms, mavlink.MAV_FRAME_LOCAL_NED, mask, *values, yaw, -target.yaw_rate
+            self._boot_ms(t_s), mavlink.MAV_FRAME_LOCAL_NED, mask, *values, yaw, -target.yaw_rate
         )

@@ -11,7 +11,8 @@ import numpy as np
 
 from drocap_ros.flight.autopilot.simulated import Airframe
 
-_YAW_LAG_S, _MAX_YAW_RATE = 0.1, 1.6
+_YAW_LAG_S = 0.1  # this and the next three: fitted to recorded orbits in 0 and 8 m/s of wind
+_MAX_YAW_RATE = 1.6  # rad/s
 _GUST = 0.09  # share of the wind
 _GUST_TURN = 0.27  # rad/s of yaw per m/s of lateral gust
 

@@ -11,9 +11,12 @@ import numpy as np
 from drocap_ros.flight.autopilot.simulated import Gains
 
 MAX_LEAN_M_S2 = 5.66  # 30 degrees
-_YAW_GAIN = 5.8
-_CLIMB_GAIN, _CLIMB_RATE_GAIN, _MAX_CLIMB_M_S, _MAX_CLIMB_M_S2 = 1.0, 4.0, 2.5, 3.0
-_FILTER_HZ = 5.0
+_YAW_GAIN = 5.8  # 1/s: yaw errors of recorded orbits
+_CLIMB_GAIN = 1.0  # 1/s of the height; this and the next two as ArduPilot ships
+_CLIMB_RATE_GAIN = 4.0  # 1/s of the climb
+_MAX_CLIMB_M_S = 2.5
+_MAX_CLIMB_M_S2 = 3.0  # assumed
+_FILTER_HZ = 5.0  # of the velocity's error: PSC_NE_VEL_FLTE as shipped
 
 
 @dataclass

@@ -25,7 +25,7 @@ class Channel:
         self._waiting: list[tuple[float, int, bytes]] = []
         self.delay_s, self.jitter_s, self.loss, self.duplicate, self.cut = 0.01, 0.0, 0.0, 0.0, False
         self.gaps_hz, self.longest_gap_s = 0.0, 0.3
-        self.drops: Callable[[bytes], bool] = lambda packet: False
+        self.drops: Callable[[bytes], bool] = lambda _: False
         self._gap_from_s = self._gap_until_s = 0.0
 
     def write(self, data: bytes) -> None:
@@ -61,7 +61,7 @@ class LoopbackTransport:
     def __init__(self, incoming: Channel, outgoing: Channel) -> None:
         self._incoming, self._outgoing = incoming, outgoing
 
-    def read(self, timeout_s: float) -> bytes:
+    def read(self, _timeout_s: float) -> bytes:
         """Arrived packets, joined."""
         return self._incoming.read()
 

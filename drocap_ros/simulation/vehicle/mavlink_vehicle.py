@@ -26,8 +26,8 @@ from drocap_ros.simulation.vehicle.flight_path import FlightPath, VehiclePose, o
 
 #: Latitude deg, longitude deg, altitude m of the local frame's origin.
 HOME = np.array([47.397742, 8.545594, 488.0])
-_CURRENT_MODE_S = 0.5  # an autopilot publishes its state so often, and every change at once
-_ESTIMATOR_HEALTHY = 831
+_CURRENT_MODE_S = 0.5  # an autopilot publishes its state so often, and every change at once: measured
+ESTIMATOR_HEALTHY = 831  # flags of both autopilots in the air: recorded
 _GIMBAL_FLAGS = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
 _GIMBAL_EARTH = _GIMBAL_FLAGS | mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
 
@@ -78,8 +78,9 @@ class SimulatedVehicle:
             self.use_key(signing_key, time.time_ns())
         self._period_s: dict[int, float] = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}
         self._period_s |= {_number(name): period_s for name, period_s in self.simulated.streams.items()}
+        self._encoders = self._all_encoders()
         self._due_s: dict[int, float] = {}
-        self.armed = True
+        self.armed, self.battery, self.landed_state = True, 87, mavlink.MAV_LANDED_STATE_IN_AIR
         #: The mode, and the one that was chosen last: an autopilot keeps it where a failsafe enters another.
         self.mode = self.intended = kind.control_mode
         self._mode_sent: tuple[float, tuple[int, int]] = (-math.inf, (0, 0))
@@ -179,47 +180,61 @@ class SimulatedVehicle:
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _known(self) -> frozenset[int]:
-        numbers = {
-            _number(self.kind.estimator_message),
-            mavlink.MAVLINK_MSG_ID_ATTITUDE,
-            mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
-            mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
-            mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
-            mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
-            mavlink.MAVLINK_MSG_ID_SYS_STATUS,
-            mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
-            mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
+        """Messages whose rates it grants."""
+        without = set() if self.gimbal else {mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS}
+        return frozenset(self._encoders) - {mavlink.MAVLINK_MSG_ID_HEARTBEAT} - without
+
+    def _all_encoders(self) -> dict[int, Callable[[float, VehiclePose], Any]]:
+        """Messages by path time and pose."""
+        encoders: dict[str, Callable[[float, VehiclePose], Any]] = {
+            "HEARTBEAT": lambda _t_s, _pose: self._heartbeat(),
+            "ATTITUDE": self._attitude,
+            "ATTITUDE_QUATERNION": self._attitude_quaternion,
+            "LOCAL_POSITION_NED": self._local_position,
+            "GLOBAL_POSITION_INT": self._global_position,
+            "GPS_RAW_INT": self._satellites,
+            "SYS_STATUS": self._status,
+            "EXTENDED_SYS_STATE": self._landed,
+            "SYSTEM_TIME": self._system_time,
+            "GIMBAL_DEVICE_ATTITUDE_STATUS": self._mount_angles,
+            self.kind.estimator_message: self._estimator,
         }
-        if not self.kind.heartbeat_on_request:
-            numbers.add(CURRENT_MODE_ID)
-        return frozenset(numbers | ({mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS} if self.gimbal else set()))
+        numbered = {_number(name): encode for name, encode in encoders.items()}
+        return numbered if self.kind.heartbeat_on_request else numbered | {CURRENT_MODE_ID: self._current_mode}
 
     def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> Any:
-        mav, boot_ms = self._mav, int((t_s + self.boot_s) * 1e3) % 2**32
-        if number == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
-            return self._heartbeat()
-        if number == CURRENT_MODE_ID:
-            return self._current_mode(t_s)
-        if number in (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION):
-            return self._attitude(number, boot_ms, pose)
-        if number == mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
-            return mav.local_position_ned_encode(
-                boot_ms, *enu_to_ned(pose.position_enu_m), *enu_to_ned(pose.velocity_enu_m_s)
-            )
-        if number == mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS:
-            x, y, z, w = orientation_to_aviation(pose.gimbal_orientation_xyzw)
-            return mav.gimbal_device_attitude_status_encode(0, 0, boot_ms, _GIMBAL_EARTH, [w, x, y, z], 0, 0, 0, 0)
-        if number == mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT:
-            return mav.ekf_status_report_encode(_ESTIMATOR_HEALTHY, 0.1, 0.1, 0.1, 0.1, 0)
-        if number == mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS:
-            return mav.estimator_status_encode(boot_ms * 1000, _ESTIMATOR_HEALTHY, 0.1, 0.1, 0.1, 0.1, 0, 0, 0.3, 0.3)
-        if number == mavlink.MAVLINK_MSG_ID_SYS_STATUS:
-            return mav.sys_status_encode(0, 0, 0, 200, 15800, 1200, 87, 0, 0, 0, 0, 0, 0)
-        if number == mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE:
-            return mav.extended_sys_state_encode(mavlink.MAV_VTOL_STATE_UNDEFINED, mavlink.MAV_LANDED_STATE_IN_AIR)
-        if number == mavlink.MAVLINK_MSG_ID_SYSTEM_TIME:
-            return mav.system_time_encode(time.time_ns() // 1000, boot_ms)
-        return self._satellite_position(number, boot_ms, pose)
+        return self._encoders[number](t_s, pose)
+
+    def _boot_ms(self, t_s: float) -> int:
+        return int((t_s + self.boot_s) * 1e3) % 2**32
+
+    def _local_position(self, t_s: float, pose: VehiclePose) -> Any:
+        vectors = (*enu_to_ned(pose.position_enu_m), *enu_to_ned(pose.velocity_enu_m_s))
+        return self._mav.local_position_ned_encode(self._boot_ms(t_s), *vectors)
+
+    def _mount_angles(self, t_s: float, pose: VehiclePose) -> Any:
+        x, y, z, w = orientation_to_aviation(pose.gimbal_orientation_xyzw)
+        return self._mav.gimbal_device_attitude_status_encode(
+            0, 0, self._boot_ms(t_s), _GIMBAL_EARTH, [w, x, y, z], 0, 0, 0, 0
+        )
+
+    def _estimator_flags(self) -> int:
+        return ESTIMATOR_HEALTHY
+
+    def _estimator(self, t_s: float, _pose: VehiclePose) -> Any:
+        flags, ratios = self._estimator_flags(), (0.1, 0.1, 0.1, 0.1)
+        if self.kind.estimator_message == "EKF_STATUS_REPORT":
+            return self._mav.ekf_status_report_encode(flags, *ratios, 0)
+        return self._mav.estimator_status_encode(self._boot_ms(t_s) * 1000, flags, *ratios, 0, 0, 0.3, 0.3)
+
+    def _status(self, _t_s: float, _pose: VehiclePose) -> Any:
+        return self._mav.sys_status_encode(0, 0, 0, 200, 15800, 1200, self.battery, 0, 0, 0, 0, 0, 0)
+
+    def _landed(self, _t_s: float, _pose: VehiclePose) -> Any:
+        return self._mav.extended_sys_state_encode(mavlink.MAV_VTOL_STATE_UNDEFINED, self.landed_state)
+
+    def _system_time(self, t_s: float, _pose: VehiclePose) -> Any:
+        return self._mav.system_time_encode(time.time_ns() // 1000, self._boot_ms(t_s))
 
     def _heartbeat(self) -> Any:
         armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0
@@ -235,7 +250,7 @@ class SimulatedVehicle:
         """Numbers of the present and of the intended mode."""
         return self.kind.modes[self.mode], self.kind.modes[self.intended]
 
-    def _current_mode(self, t_s: float) -> Any:
+    def _current_mode(self, t_s: float, _pose: VehiclePose) -> Any:
         sent_s, before = self._mode_sent
         present = self._present_modes()
         if present == before and t_s - sent_s < _CURRENT_MODE_S:
@@ -243,27 +258,35 @@ class SimulatedVehicle:
         self._mode_sent = t_s, present
         return CurrentMode(0, *present)
 
-    def _attitude(self, number: int, boot_ms: int, pose: VehiclePose) -> Any:
+    def _attitude_quaternion(self, t_s: float, pose: VehiclePose) -> Any:
         x, y, z, w = orientation_to_aviation(pose.orientation_xyzw)
         rates = flu_to_frd(pose.angular_velocity_flu_rad_s)
-        if number == mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION:
-            return self._mav.attitude_quaternion_encode(boot_ms, w, x, y, z, *rates)
+        return self._mav.attitude_quaternion_encode(self._boot_ms(t_s), w, x, y, z, *rates)
+
+    def _attitude(self, t_s: float, pose: VehiclePose) -> Any:
+        x, y, z, w = orientation_to_aviation(pose.orientation_xyzw)
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         pitch = math.asin(min(1.0, max(-1.0, 2 * (w * y - z * x))))
         yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        return self._mav.attitude_encode(boot_ms, roll, pitch, yaw, *rates)
+        rates = flu_to_frd(pose.angular_velocity_flu_rad_s)
+        return self._mav.attitude_encode(self._boot_ms(t_s), roll, pitch, yaw, *rates)
 
-    def _satellite_position(self, number: int, boot_ms: int, pose: VehiclePose) -> Any:
-        lat, lon, alt = enu_to_geodetic(pose.position_enu_m, HOME)
-        place = (round(lat * 1e7), round(lon * 1e7), round(alt * 1e3))
-        if number == mavlink.MAVLINK_MSG_ID_GPS_RAW_INT:
-            return self._mav.gps_raw_int_encode(
-                boot_ms * 1000, mavlink.GPS_FIX_TYPE_RTK_FIXED, *place, 60, 90, 0, 0, 17
-            )
+    def _satellites(self, t_s: float, pose: VehiclePose) -> Any:
+        fix = mavlink.GPS_FIX_TYPE_RTK_FIXED
+        return self._mav.gps_raw_int_encode(self._boot_ms(t_s) * 1000, fix, *_degrees(pose), 60, 90, 0, 0, 17)
+
+    def _global_position(self, t_s: float, pose: VehiclePose) -> Any:
         velocity = np.round(enu_to_ned(pose.velocity_enu_m_s) * 100).astype(int)
+        above_mm = round(pose.position_enu_m[2] * 1e3)
         return self._mav.global_position_int_encode(
-            boot_ms, *place, round(pose.position_enu_m[2] * 1e3), *(int(v) for v in velocity), 65535
+            self._boot_ms(t_s), *_degrees(pose), above_mm, *(int(v) for v in velocity), 65535
         )
+
+
+def _degrees(pose: VehiclePose) -> tuple[int, int, int]:
+    """Latitude and longitude in 1e-7 degrees, altitude in mm."""
+    lat, lon, alt = enu_to_geodetic(pose.position_enu_m, HOME)
+    return round(lat * 1e7), round(lon * 1e7), round(alt * 1e3)
 
 
 def _number(name: str) -> int:
