@@ -75,10 +75,8 @@ def load_calibration(path: Path) -> CameraModel:
         data: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
         matrix = np.array(data["camera_matrix"]["data"], float).reshape(3, 3)
         distortion = np.array(data.get("distortion_coefficients", {}).get("data", []), float).ravel()
-        model = CameraModel(
-            int(data["image_width"]), int(data["image_height"]), matrix, distortion,
-            str(data.get("distortion_model", "plumb_bob")),
-        )  # fmt: skip
+        lens = str(data.get("distortion_model", "plumb_bob"))
+        model = CameraModel(int(data["image_width"]), int(data["image_height"]), matrix, distortion, lens)
     except OSError as error:
         raise InputError(f"{path}: expected a calibration file; {error.strerror or error}") from None
     except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:

@@ -113,10 +113,10 @@ class PoseEstimator:
         self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None, load_level: int
     ) -> tuple[PoseObservation, bool]:
         """The subject in an image that differs from the last one, and whether it is certainly a person."""
-        self._motion = motion = self._camera.update(image, [person.box for person in self.tracker.persons])
-        if motion is not None:
-            self.tracker.move_camera(motion)
-            self._others.move_camera(motion)
+        self._motion = self._camera.update(image, [person.box for person in self.tracker.persons])
+        if self._motion is not None:
+            self.tracker.move_camera(self._motion)
+            self._others.move_camera(self._motion)
         self.keypoints = None
         observation = self._flow.propagate(image, stamp_ns) if roi is None and self._flow.steps < load_level else None
         if observation is not None:
@@ -177,15 +177,20 @@ class PoseEstimator:
         detected = subject.score >= self.config.detection_threshold
         if is_person and not detected and (box := pose.box()) is not None:
             self.tracker.confirm(box, stamp_ns)
-        clear = subject.score >= _CLEAR_SCORE and self._confidence >= CLEAR_CONFIDENCE
-        extent = pose.extent() if detected and clear else None
-        self._margins = None if extent is None else (subject.box - extent) / (extent[2:] - extent[:2]).max()
+        self._margins = self._clear_margins(subject, pose) if detected else None
         blurred = sweeps(self._motion, subject.box)
         if is_person or (subject.score > 0 and (blurred or self._confidence >= EMPTY_CONFIDENCE)):
             self._seen_ns = stamp_ns
         elif stamp_ns - self._seen_ns > _UNSEEN_NS:
             return self._observation(image, stamp_ns, subject), False
         return self._observation(image, stamp_ns, subject, pose), is_person or detected
+
+    def _clear_margins(self, subject: Subject, pose: BodyPose) -> np.ndarray | None:
+        """(4,) margins of the box around the joints, over their longer extent; None unless both are clear."""
+        if subject.score < _CLEAR_SCORE or self._confidence < CLEAR_CONFIDENCE or (extent := pose.extent()) is None:
+            return None
+        margins: np.ndarray = (subject.box - extent) / (extent[2:] - extent[:2]).max()
+        return margins
 
     def _estimate_predicted(
         self, image: np.ndarray, stamp_ns: int, load_level: int
@@ -198,19 +203,18 @@ class PoseEstimator:
         predicted = self.tracker.predict(stamp_ns)
         if predicted is None:
             return None
-        size, age_s, every_s = _size(image), (stamp_ns - self._detected_ns) * 1e-9, self.config.detect_every_s
+        age_s, every_s = (stamp_ns - self._detected_ns) * 1e-9, self.config.detect_every_s
         clear = self._confidence >= CLEAR_CONFIDENCE
         shedding = load_level > 0 and clear and age_s <= load_level * every_s - _SLACK_S
-        margins = self._margins if shedding or age_s <= every_s - _SLACK_S else None
-        if margins is not None and not self._search.isolated(predicted.box, size, stamp_ns):
-            margins = None
+        recent = shedding or age_s <= every_s - _SLACK_S
+        margins = self._margins if recent and self._isolated(predicted, image, stamp_ns) else None
         if margins is None and not shedding:
             return None
         pose = self._body.estimate(image, predicted.box)
         confidence, extent = pose.mean_confidence, pose.extent()
         if margins is not None and extent is not None and confidence >= CLEAR_CONFIDENCE:
             box = extent + margins * (extent[2:] - extent[:2]).max()
-            box = np.clip(box, 0, np.array([*size, *size], float))
+            box = np.clip(box, 0, np.tile(np.array(_size(image), float), 2))
             self.tracker.propagate(box, stamp_ns)
             self.tracker.judge(confidence, box, stamp_ns)
             predicted = Subject(predicted.track_id, box, predicted.score, False)
@@ -218,6 +222,9 @@ class PoseEstimator:
             return None
         self.keypoints, self._confidence = pose.network, confidence
         return self._observation(image, stamp_ns, predicted, pose), confidence >= CONFIRM_CONFIDENCE
+
+    def _isolated(self, predicted: Subject, image: np.ndarray, stamp_ns: int) -> bool:
+        return self._margins is not None and self._search.isolated(predicted.box, _size(image), stamp_ns)
 
     def _observation(
         self, image: np.ndarray, stamp_ns: int, subject: Subject, pose: BodyPose | None = None

@@ -81,24 +81,27 @@ def _load(
         raise InputError(f"{folder}: expected a folder with a {what} (.onnx), found no such folder; {_FETCH}")
     if name != "auto":
         path = folder / (name if name.endswith(".onnx") else f"{name}.onnx")
-        model = OnnxModel(path, config.threads, config.provider)
-        spec = read_spec(model)
+        model, spec = _read(path, config)
         if spec.task not in (task, "both"):
             raise InputError(f"{path}: expected a {what}, found a {spec.task} model ({spec.layout}); name another")
         return build(model, spec)
-    refused: list[str] = []
-    for path in sorted(folder.glob("*.onnx"), key=lambda p: _rank(p, order)):
+    paths = sorted(folder.glob("*.onnx"), key=lambda path: _rank(path, order))
+    why = ""
+    for path in paths:
         try:
-            model = OnnxModel(path, config.threads, config.provider)
-            spec = read_spec(model)
+            model, spec = _read(path, config)
         except InputError as error:
-            refused.append(str(error))
+            why = why or f" ({error})"
             continue
         if spec.task in (task, "both"):
             return build(model, spec)
-    found = ", ".join(p.name for p in sorted(folder.glob("*.onnx"))) or "no .onnx file"
-    why = f" ({refused[0]})" if refused else ""
+    found = ", ".join(sorted(path.name for path in paths)) or "no .onnx file"
     raise InputError(f"{folder}: expected a {what} (.onnx), found {found}{why}; {_FETCH}")
+
+
+def _read(path: Path, config: PoseEstimatorConfig) -> tuple[OnnxModel, ModelSpec]:
+    model = OnnxModel(path, config.threads, config.provider)
+    return model, read_spec(model)
 
 
 def _rank(path: Path, order: tuple[str, ...]) -> tuple[int, str]:

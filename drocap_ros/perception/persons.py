@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,12 +16,11 @@ from drocap_ros.perception.sources.base import Frame, prefetch
 from drocap_ros.perception.tracking.person import Person
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
-#: Interval of the detections.
-_EVERY_NS = 200_000_000
-#: Least recent mean score of a person; clutter and parts of bodies lie below.
-_LEAST_SCORE = 0.45
-#: A picture shows at most this many images, each at most this wide (px).
-_MOST_IMAGES, _WIDTH = 12, 960
+_EVERY_NS = 200_000_000  # interval of the detections: a walking person moves by a fifth of the length
+_JITTER_NS = 5_000_000  # by which an image may come earlier
+_LEAST_SCORE = 0.45  # least recent mean score of a person; clutter and parts of bodies lie below
+_MOST_IMAGES = 12  # in a picture: four columns fill a screen
+_WIDTH_PX = 960  # largest width of each
 
 
 @dataclass(frozen=True)
@@ -60,15 +59,10 @@ def find_persons(
     # Without a box of the drone the rule `roi` never chooses a subject: all persons are bystanders.
     estimator = PoseEstimator(models_dir, dataclasses.replace(config, subject="roi", subject_box=""))
     seen: dict[Person, dict[int, np.ndarray]] = {}
-    detected_ns: int | None = None
     images = 0
-    for frame in prefetch(frames):
-        if on_frame is not None:
-            on_frame(frame, None)
-        if detected_ns is not None and frame.stamp_ns - detected_ns < _EVERY_NS - 5_000_000:
-            continue
+    for frame in _five_a_second(prefetch(frames), on_frame):
         estimator.process(frame.image, frame.stamp_ns)
-        detected_ns, images = frame.stamp_ns, images + 1
+        images += 1
         for person in estimator.tracker.persons:
             # A track that clutter has taken over is a person's up to there.
             if person.detected_ns == frame.stamp_ns and person.mean_score >= _LEAST_SCORE:
@@ -79,6 +73,16 @@ def find_persons(
         raise InputError(f"expected a person in view, found none in {images} images; try another video or model")
     found.sort(key=lambda boxes: (min(boxes), float(boxes[min(boxes)][0])))
     return [FoundPerson(number, boxes) for number, boxes in enumerate(found, 1)]
+
+
+def _five_a_second(frames: Iterable[Frame], on_frame: Callable[[Frame, None], None] | None) -> Iterator[Frame]:
+    last_ns: int | None = None
+    for frame in frames:
+        if on_frame is not None:
+            on_frame(frame, None)
+        if last_ns is None or frame.stamp_ns - last_ns >= _EVERY_NS - _JITTER_NS:
+            last_ns = frame.stamp_ns
+            yield frame
 
 
 def in_view(persons: Sequence[Person], stamp_ns: int) -> int:
@@ -129,7 +133,7 @@ def persons_picture(frames: Iterable[Frame], persons: Sequence[FoundPerson]) -> 
         begin_ns = begin_ns if number else frame.stamp_ns
         if frame.stamp_ns not in wanted:
             continue
-        shrink = min(1.0, _WIDTH / frame.image.shape[1])
+        shrink = min(1.0, _WIDTH_PX / frame.image.shape[1])
         small = cv2.resize(frame.image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
         boxes = {p.number: p.boxes[frame.stamp_ns] * shrink for p in persons if frame.stamp_ns in p.boxes}
         tiles.append(draw_numbers(small, boxes, f"{(frame.stamp_ns - begin_ns) * 1e-9:.1f} s"))

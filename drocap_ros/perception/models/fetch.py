@@ -74,26 +74,10 @@ def download(url: str, part: Path, progress: Progress | None = None) -> None:
     FetchError
         When the download fails; ``part`` keeps the received bytes.
     """
-    have = part.stat().st_size if part.exists() else 0
-    request = urllib.request.Request(url, headers={"User-Agent": "drocap_ros", "Accept-Encoding": "identity"})
-    if have:
-        request.add_header("Range", f"bytes={have}-")
     try:
-        with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
-            if have and answer.status != 206:  # the server cannot resume: restart
-                have = 0
-            length = int(answer.headers.get("Content-Length") or 0)
-            total = have + length if length else 0
-            with part.open("ab" if have else "wb") as file:
-                while block := answer.read(_CHUNK):
-                    have += len(block)
-                    if have > _MAX_BYTES:
-                        raise FetchError(f"{url}: expected at most {_MAX_BYTES} bytes, got more; the address is wrong")
-                    file.write(block)
-                    if progress is not None:
-                        progress(have, total)
+        have, total = _transfer(url, part, progress)
     except urllib.error.HTTPError as error:
-        if error.code == 416 and have:  # nothing left to send: the checksum decides whether it is complete
+        if error.code == 416 and _size(part):  # nothing left to send: the checksum decides whether it is complete
             return
         raise FetchError(
             f"{url}: expected the model, the server answered {error.code} {error.reason}; try later"
@@ -102,10 +86,40 @@ def download(url: str, part: Path, progress: Progress | None = None) -> None:
         reason = getattr(error, "reason", error)
         raise FetchError(
             f"{url}: no download ({reason}); check the network or proxy and run the command again, it continues at"
-            f" {have} bytes"
+            f" {_size(part)} bytes"
         ) from None
-    if total and have < total:
+    if have < total:
         raise FetchError(f"{url}: cut off after {have} of {total} bytes; run the command again to continue")
+
+
+def _transfer(url: str, part: Path, progress: Progress | None) -> tuple[int, int]:
+    """Bytes that the file has at the end of the answer, and the total as far as the server states it, else 0."""
+    have = _size(part)
+    request = urllib.request.Request(url, headers={"User-Agent": "drocap_ros", "Accept-Encoding": "identity"})
+    if have:
+        request.add_header("Range", f"bytes={have}-")
+    with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
+        if answer.status != 206:  # the server cannot resume: restart
+            have = 0
+        length = int(answer.headers.get("Content-Length") or 0)
+        total = have + length if length else 0
+        with part.open("ab" if have else "wb") as file:
+            while block := answer.read(_CHUNK):
+                have += len(block)
+                _check_size(url, have)
+                file.write(block)
+                if progress is not None:
+                    progress(have, total)
+    return have, total
+
+
+def _size(part: Path) -> int:
+    return part.stat().st_size if part.exists() else 0
+
+
+def _check_size(name: str, size: int) -> None:
+    if size > _MAX_BYTES:
+        raise FetchError(f"{name}: expected a model of at most {_MAX_BYTES} bytes, got more; the address is wrong")
 
 
 def _install(model: KnownModel, part: Path, target: Path) -> None:
@@ -133,10 +147,7 @@ def _extract(archive: Path, member: str, target: Path) -> None:
             names = [n for n in files.namelist() if n == member or n.endswith("/" + member)]
             if len(names) != 1:
                 raise FetchError(f"{archive.name}: expected one {member} in it, found {len(names)}; try again later")
-            if files.getinfo(names[0]).file_size > _MAX_BYTES:
-                raise FetchError(
-                    f"{archive.name}: expected a model of at most {_MAX_BYTES} bytes; the address is wrong"
-                )
+            _check_size(archive.name, files.getinfo(names[0]).file_size)
             with files.open(names[0]) as source, target.open("wb") as sink:
                 shutil.copyfileobj(source, sink, _CHUNK)
     except zipfile.BadZipFile as error:

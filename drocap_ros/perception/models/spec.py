@@ -243,7 +243,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
         raise InputError(f"{path}: expected YAML; {str(error).splitlines()[0]}; correct it") from None
     known = [f.name for f in dataclasses.fields(ModelSpec)]
-    found = values if isinstance(values, dict) else {type(values).__name__: None}
+    found: dict[str, Any] = values if isinstance(values, dict) else {type(values).__name__: None}
     if wrong := sorted(str(name) for name in found if name not in known):
         raise InputError(f"{path}: expected a mapping with {', '.join(known)}; found {', '.join(wrong)}; correct it")
     try:

@@ -59,37 +59,51 @@ def assign_all(
     Indices of the assigned detections, and new persons who stand at once in the subject's place.
     """
     persons = others if subject is None else [subject, *others]
-    reliable = [p for p in persons if p is subject or (p.reliable and not p.double)]
-    unreliable = [p for p in persons if p is not subject and not (p.reliable and not p.double)]
+    first = [p is subject or (p.reliable and not p.double) for p in persons]
+    reliable = [p for p, is_first in zip(persons, first, strict=True) if is_first]
+    unreliable = [p for p, is_first in zip(persons, first, strict=True) if not is_first]
     high = seen.scores >= threshold
-    assigned: set[int] = set()
-    replacements: list[Person] = []
-    refused = False  # a low-score detection must not replace a refused one of the subject either
-    for owners, group, low_score in ((reliable, high, False), (unreliable, high, False), (reliable, ~high, True)):
-        free = [p for p in owners if p.detected_ns < stamp_ns and not (refused and p is subject)]
-        at = np.array([j for j in np.nonzero(group)[0] if j not in assigned], int)
-        for i, k in assign(free, seen.at(at), stamp_ns, low_score, subject):
+    rounds = _Rounds(subject, others, seen, stamp_ns)
+    rounds.assign(reliable, high)
+    rounds.assign(unreliable, high)
+    rounds.assign(reliable, ~high, low_score=True)
+    return rounds.assigned, rounds.replacements
+
+
+class _Rounds:
+    """Assignment of one image's detections in several rounds."""
+
+    def __init__(self, subject: Person | None, others: list[Person], seen: Seen, stamp_ns: int) -> None:
+        self._subject, self._others, self._seen, self._stamp_ns = subject, others, seen, stamp_ns
+        self.assigned: set[int] = set()
+        self.replacements: list[Person] = []
+        #: A detection of the subject was someone else's: a low-score one must not replace it either.
+        self._refused = False
+
+    def assign(self, owners: list[Person], group: np.ndarray, low_score: bool = False) -> None:
+        """Update owners without detection from those of the group (N,) that are not yet assigned."""
+        free = [p for p in owners if p.detected_ns < self._stamp_ns and not (self._refused and p is self._subject)]
+        at = np.array([j for j in np.nonzero(group)[0] if j not in self.assigned], int)
+        for i, k in assign(free, self._seen.at(at), self._stamp_ns, low_score, self._subject):
             person, j = free[i], int(at[k])
-            box, appearance = seen.boxes[j], seen.appearances[j]
-            if person is subject and replaced(person, box, appearance, stamp_ns):
-                replacements.append(Person(box, float(seen.scores[j]), stamp_ns, appearance))
-                refused = True
-                assigned.add(j)
-            elif person is subject and known_other(person, others, box, appearance):
-                refused = True
-            else:
-                _update(person, seen, j, stamp_ns, low_score)
-                assigned.add(j)
-    return assigned, replacements
+            if person is self._subject and self._is_other(person, j):
+                self._refused = True
+                continue
+            self.assigned.add(j)
+            person.update(self._seen.boxes[j], float(self._seen.scores[j]), self._stamp_ns)
+            if not low_score:
+                person.confirm(self._stamp_ns)
+            if person.pose.believed and not self._seen.mixed(j):
+                person.update_appearance(self._seen.appearances[j])
 
-
-def _update(person: Person, seen: Seen, j: int, stamp_ns: int, low_score: bool) -> None:
-    """Continue a track with its detection ``j``."""
-    person.update(seen.boxes[j], float(seen.scores[j]), stamp_ns)
-    if not low_score:
-        person.confirm(stamp_ns)
-    if person.pose.believed and not seen.mixed(j):
-        person.update_appearance(seen.appearances[j])
+    def _is_other(self, subject: Person, j: int) -> bool:
+        """Whether the subject's detection ``j`` is another person: a new track, or for a later round a known one."""
+        box, score, appearance = self._seen.boxes[j], float(self._seen.scores[j]), self._seen.appearances[j]
+        if not replaced(subject, box, appearance, self._stamp_ns):
+            return known_other(subject, self._others, box, appearance)
+        self.replacements.append(Person(box, score, self._stamp_ns, appearance))
+        self.assigned.add(j)
+        return True
 
 
 def assign(
@@ -120,13 +134,7 @@ def assign(
     last = np.array([p.box for p in persons])
     overlap = np.maximum(overlap_coefficient(predicted, boxes), overlap_coefficient(last, boxes))
     possible = (distance < reach) & (growth < scope) | (overlap > _SAME_PLACE) & (growth < _ENTRANCE_GROWTH)
-    # What is no person stays in its place: a person who comes out from behind it is a new track.
-    strict = np.array([low_score or not p.plausible for p in persons])[:, None]
-    possible &= ~strict | (iou(predicted, boxes) > _LOW_SCORE_IOU)
-    if subject is not None:  # a further box at the subject's place is its limb or shadow, nobody's from elsewhere
-        further = overlap_coefficient(subject.filter.box()[None], boxes) > _SAME_PLACE
-        elsewhere = np.array([p is not subject for p in persons])[:, None] & (overlap <= MIXED_IOU)
-        possible &= ~(further & elsewhere)
+    possible &= _allowed(persons, predicted, boxes, low_score, subject, overlap)
     difference = 1.0 - np.array([[p.similarity(appearance) for appearance in seen.appearances] for p in persons])
     cost = (
         distance / reach
@@ -138,6 +146,25 @@ def assign(
     cost[~possible] = 1e6  # more than any possible one
     rows, columns = linear_sum_assignment(cost)
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if possible[i, j]]
+
+
+def _allowed(
+    persons: list[Person],
+    predicted: np.ndarray,
+    boxes: np.ndarray,
+    low_score: bool,
+    subject: Person | None,
+    overlap: np.ndarray,
+) -> np.ndarray:
+    """(M, N) bool: pairs that are not forbidden whatever their distance."""
+    # What is no person stays in its place: a person who comes out from behind it is a new track.
+    strict = np.array([low_score or not p.plausible for p in persons])[:, None]
+    allowed: np.ndarray = ~strict | (iou(predicted, boxes) > _LOW_SCORE_IOU)
+    if subject is not None:  # a further box at the subject's place is its limb or shadow, nobody's from elsewhere
+        further = overlap_coefficient(subject.filter.box()[None], boxes) > _SAME_PLACE
+        elsewhere = np.array([p is not subject for p in persons])[:, None] & (overlap <= MIXED_IOU)
+        allowed &= ~(further & elsewhere)
+    return allowed
 
 
 def _centres(boxes: np.ndarray) -> np.ndarray:

@@ -99,29 +99,23 @@ def possible_subjects(
     if subject is None or not len(found):
         return []
     detected = [p for p in tracker.persons if p is not subject and p.plausible and p.detected_ns == stamp_ns]
-    if subject.detected_ns != stamp_ns and _overlap_any(subject.filter.box(), detected, MIXED_IOU, doubles=False):
+    seen = [p for p in detected if not p.double]
+    if subject.detected_ns != stamp_ns and _overlap_any(subject.filter.box(), seen, MIXED_IOU):
         return []  # without detection, at another person's place: a clear pose there is that person's
-    others = [p for p in detected if p.pose.other]
-    present = describe(image, subject.box)
-    possible: list[int] = []
-    for j, box in enumerate(np.asarray(found.boxes, float)):
-        if iou(box[None], subject.box[None])[0, 0] > SAME_BOX_IOU or not _in_reach(subject, box, confidence, stamp_ns):
-            continue
-        if _overlap_any(box, others, _INSIDE):
-            continue  # it may be a second box around someone else
-        # A box around person and shadow has the colours of both: inside it they say nothing.
-        inside = float(overlap_coefficient(box[None], subject.box[None])[0, 0]) > _INSIDE
-        if inside or _looks_right(subject, describe(image, box), present):
-            possible.append(j)
+    boxes = np.asarray(found.boxes, float)
+    # A box on someone else may be a second one around them.
+    others = overlap_coefficient(boxes, boxes_of(p for p in detected if p.pose.other)) > _INSIDE
+    free = (iou(boxes, subject.box[None])[:, 0] <= SAME_BOX_IOU) & ~others.any(axis=1)
+    near = [j for j in np.nonzero(free)[0].tolist() if _in_reach(subject, boxes[j], confidence, stamp_ns)]
+    possible = _of_its_colours(subject, image, boxes, near)
     predicted = subject.filter.box()
     offset = (predicted[:2] + predicted[2:] - found.boxes[:, :2] - found.boxes[:, 2:]) / 2
     lengths = np.round(np.linalg.norm(offset, axis=1) / max(subject.filter.length, subject.pose.length))
     return sorted(possible, key=lambda j: (lengths[j], -found.scores[j]))
 
 
-def _overlap_any(box: np.ndarray, persons: list[Person], least: float, doubles: bool = True) -> bool:
-    boxes = boxes_of(p for p in persons if doubles or not p.double)
-    return bool((overlap_coefficient(box[None], boxes) > least).any())
+def _overlap_any(box: np.ndarray, persons: list[Person], least: float) -> bool:
+    return bool((overlap_coefficient(box[None], boxes_of(persons)) > least).any())
 
 
 def _in_reach(subject: Person, box: np.ndarray, confidence: float, stamp_ns: int) -> bool:
@@ -141,12 +135,19 @@ def _in_reach(subject: Person, box: np.ndarray, confidence: float, stamp_ns: int
     return distance < _REACH + _REACH_PER_S * gap and growth < _GROWTH + _GROWTH_PER_S * gap
 
 
-def _looks_right(subject: Person, other: np.ndarray | None, present: np.ndarray | None) -> bool:
-    """Whether an appearance fits the subject, not less than that of the box which the subject has at present."""
-    if not subject.appearance_settled or other is None:
-        return True
-    similarity = subject.similarity(other)
-    return similarity >= _SIMILARITY and similarity >= subject.similarity(present) - _LESS_SIMILAR
+def _of_its_colours(subject: Person, image: np.ndarray, boxes: np.ndarray, indices: list[int]) -> list[int]:
+    """Those of the boxes whose appearance fits the subject, not less than that of its present box."""
+    if not subject.appearance_settled:
+        return indices
+    least = max(_SIMILARITY, subject.similarity(describe(image, subject.box)) - _LESS_SIMILAR)
+    fitting = []
+    for j in indices:
+        # A box around person and shadow has the colours of both: inside it they say nothing.
+        inside = _overlap_any(boxes[j], [subject], _INSIDE)
+        appearance = None if inside else describe(image, boxes[j])
+        if appearance is None or subject.similarity(appearance) >= least:
+            fitting.append(j)
+    return fitting
 
 
 def due_bystander(tracker: SubjectTracker, stamp_ns: int, shedding: bool = False) -> Person | None:
@@ -158,15 +159,19 @@ def due_bystander(tracker: SubjectTracker, stamp_ns: int, shedding: bool = False
     searching = subject is None or subject.detected_ns != stamp_ns
     if subject is not None and not searching and subject.pose.believed_ns != stamp_ns:
         return None
+    due = [p for p in tracker.persons if p is not subject and _due(p, searching, stamp_ns)]
+    due = [p for p in due if not (shedding and p.pose.other)]
+    return min(due, key=lambda p: p.pose.judged_ns or 0, default=None)
 
-    def due(person: Person) -> bool:
-        judged_ns = person.pose.judged_ns
-        if judged_ns is None or not searching:
-            return judged_ns is None or stamp_ns - judged_ns >= _JUDGE_EVERY_NS
-        # A person who comes out of cover shows more joints in every image.
-        coming_out = CONFIRM_CONFIDENCE <= person.pose.last < SURE_CONFIDENCE
-        return coming_out or stamp_ns - judged_ns >= _SEARCH_EVERY_NS
 
-    seen = [p for p in tracker.persons if p is not subject and p.detected_ns == stamp_ns and p.hits > 1]
-    seen = [p for p in seen if not p.double and not (shedding and p.pose.other) and due(p)]
-    return min(seen, key=lambda p: p.pose.judged_ns or 0, default=None)
+def _due(person: Person, searching: bool, stamp_ns: int) -> bool:
+    """Whether a person has been seen more than once, in this image too, and its last pose is old."""
+    if person.detected_ns != stamp_ns or person.hits < 2 or person.double:
+        return False
+    judged_ns = person.pose.judged_ns
+    if judged_ns is None:
+        return True
+    # A person who comes out of cover shows more joints in every image.
+    if searching and CONFIRM_CONFIDENCE <= person.pose.last < SURE_CONFIDENCE:
+        return True
+    return stamp_ns - judged_ns >= (_SEARCH_EVERY_NS if searching else _JUDGE_EVERY_NS)

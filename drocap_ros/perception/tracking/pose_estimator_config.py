@@ -22,9 +22,10 @@ class PoseEstimatorConfig(Parameters):
     detector: str = param("auto", "detector: file name in the models folder, or auto")
     pose_model: str = param("auto", "2D pose model: file name in the models folder, or auto")
     provider: str = param(
-        "auto", "execution provider of onnxruntime; auto = CUDA where offered, else CPU",
+        "auto",
+        "execution provider of onnxruntime; auto = CUDA where offered, else CPU",
         choices=("auto", "cpu", "cuda", "tensorrt", "openvino", "coreml"),
-    )  # fmt: skip
+    )
     threads: int = param(1, "threads of one model run on the CPU", minimum=1, maximum=256)
     detection_threshold: float = param(0.35, "least score that spawns a track", minimum=0.01, maximum=1)
     low_threshold: float = param(0.2, "least score that continues a track near its prediction", minimum=0.01, maximum=1)
@@ -32,9 +33,10 @@ class PoseEstimatorConfig(Parameters):
         0.10, "keypoints below this confidence are reported as not seen (NaN)", minimum=0, maximum=1
     )
     subject: str = param(
-        "largest", "initial subject: the largest person, the one nearest the centre, a given box, or the drone's roi",
+        "largest",
+        "initial subject: the largest person, the one nearest the centre, a given box, or the drone's roi",
         choices=("largest", "centre", "box", "roi"),
-    )  # fmt: skip
+    )
     subject_box: str = param("", "for subject = box: x_min,y_min,x_max,y_max in the first image, px")
     on_loss: str = param(
         "wait",
@@ -50,14 +52,17 @@ class PoseEstimatorConfig(Parameters):
     detect_every_s: float = param(
         0.1,
         "longest time between detections of an isolated subject with high pose confidence; 0 = every image",
-        unit="s", minimum=0, maximum=10,
-    )  # fmt: skip
+        unit="s",
+        minimum=0,
+        maximum=10,
+    )
     max_load_level: int = param(
         3,
         "highest level of load shedding: images in sequence whose keypoints are propagated by optical flow; 0 = full"
         " work always, images are dropped instead",
-        minimum=0, maximum=10,
-    )  # fmt: skip
+        minimum=0,
+        maximum=10,
+    )
 
 
 def parse_box(text: str) -> np.ndarray:

@@ -81,17 +81,23 @@ class SubjectSearch:
         subject = tracker.followed(stamp_ns)
         if subject is None:
             return self._anywhere(self._likely_places(stamp_ns), image_size, stamp_ns, single)
-        box = subject.filter.box_at(stamp_ns)
-        if single and tracker.missed:
-            box, close = subject.sought_box(stamp_ns), False
-        near = window_around(box, image_size, CLOSE if close else WIDE)
-        windows = [near]
-        if near is None or self._full_image_due(stamp_ns):
-            self._full_ns = stamp_ns
-            windows = [None] if single else list({near: None, None: None})
+        windows = self._around(subject, image_size, stamp_ns, single, close)
         if subject.pose.questioned and windows != [None]:  # whoever it is: the search goes on beside it
             windows += [w for w in self._anywhere([], image_size, stamp_ns, True) if w not in windows]
         return windows[-1:] if single else windows
+
+    def _around(
+        self, subject: Person, image_size: tuple[int, int], stamp_ns: int, single: bool, close: bool
+    ) -> list[Window | None]:
+        """Window around the subject, and at intervals the whole image."""
+        box = subject.filter.box_at(stamp_ns)
+        if single and self._tracker.missed:
+            box, close = subject.sought_box(stamp_ns), False
+        near = window_around(box, image_size, CLOSE if close else WIDE)
+        if near is not None and not self._full_image_due(stamp_ns):
+            return [near]
+        self._full_ns = stamp_ns
+        return [None] if single else list({near: None, None: None})
 
     def sought_window(
         self, subject: Person, found: Detections, image_size: tuple[int, int], stamp_ns: int

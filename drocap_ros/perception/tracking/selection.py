@@ -49,26 +49,28 @@ class SubjectChoice:
         last : the last subject, predicted over ``coast_s``; shape : of the image
         first : whether there was no subject yet; then a person whose poses are not believable can be chosen
         """
-        config = self._config
-        if config.subject in ("box", "roi") and (first or config.on_loss == "wait"):
+        if self._waits(last, stamp_ns, coast_s, first):
             return None
-        if last is not None:
-            patience_s = 0.0 if last.left_image else coast_s + _GIVE_UP_S
-            if config.on_loss == "wait" or last.unconfirmed_s(stamp_ns) <= patience_s:
-                return None
-            if not last.left_image:
-                persons = certainly_others(last, persons, stamp_ns)
+        if last is not None and not last.left_image:
+            persons = certainly_others(last, persons, stamp_ns)
         seen = [p for p in persons if p is not last and p.detected_ns == stamp_ns and (p.plausible or first)]
         seen = [p for p in seen if self._confirmed(p)]
         middle = np.array([shape[1], shape[0]]) / 2
 
         def rank(person: Person) -> float:
-            if config.subject == "centre":
+            if self._config.subject == "centre":
                 return float(np.linalg.norm((person.box[:2] + person.box[2:]) / 2 - middle))
             # After a given box or the drone's the largest person follows.
             return -float(np.prod(person.box[2:] - person.box[:2]))
 
         return min(seen, key=rank, default=None)
+
+    def _waits(self, last: Person | None, stamp_ns: int, coast_s: float, first: bool) -> bool:
+        """Whether a box is to come that chooses, or the last subject may come back."""
+        waits = self._config.on_loss == "wait"
+        if last is None:
+            return self._config.subject in ("box", "roi") and (first or waits)
+        return waits or last.unconfirmed_s(stamp_ns) <= (0.0 if last.left_image else coast_s + _GIVE_UP_S)
 
     def _confirmed(self, person: Person) -> bool:
         """Whether enough images show the person; at the beginning a certain detection is enough."""

@@ -205,18 +205,22 @@ class SubjectTracker:
 
     def _spawn(self, seen: Seen, assigned: set[int], stamp_ns: int) -> None:
         """Start tracks from unassigned detections, except parts of tracked persons."""
+        known = self._known_boxes(stamp_ns)
+        for j in np.nonzero(seen.scores >= self._config.detection_threshold)[0].tolist():
+            if j in assigned or (overlap_coefficient(seen.boxes[j][None].astype(float), known) > _PART).any():
+                continue
+            person = Person(seen.boxes[j], float(seen.scores[j]), stamp_ns, seen.appearances[j])
+            compare_new(person, self.subject, seen.appearances[j])
+            self.persons.append(person)
+
+    def _known_boxes(self, stamp_ns: int) -> np.ndarray:
+        """(N, 4) px of the persons in the image, the predicted subject among them."""
         subject = self.subject
         # Leaves and signs that were found to be no person may cover one.
         known = boxes_of(p for p in self.persons if p.detected_ns == stamp_ns and p.plausible)
-        if subject is not None and not subject.left_image and 0.0 < subject.unconfirmed_s(stamp_ns) <= self._coast_s:
-            known = np.concatenate([known, subject.filter.box()[None]])
-        free = [j for j, score in enumerate(seen.scores) if score >= self._config.detection_threshold]
-        for j in (j for j in free if j not in assigned):
-            if (overlap_coefficient(seen.boxes[j][None].astype(float), known) > _PART).any():
-                continue
-            person = Person(seen.boxes[j], float(seen.scores[j]), stamp_ns, seen.appearances[j])
-            compare_new(person, subject, seen.appearances[j])
-            self.persons.append(person)
+        if subject is None or subject.left_image or not 0.0 < subject.unconfirmed_s(stamp_ns) <= self._coast_s:
+            return known
+        return np.concatenate([known, subject.filter.box()[None]])
 
     def _reidentify(self, stamp_ns: int) -> None:
         """Re-identify a lost subject in a new track."""
