@@ -15,6 +15,7 @@ from sensor_msgs.msg import CameraInfo
 from drocap_ros.bringup import bringup
 from drocap_ros.cli import main
 from drocap_ros.config import DrocapConfig
+from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.msg import OrbitStatus
@@ -121,7 +122,7 @@ def test_operator_flies_an_orbit_from_the_command_line():
         assert sentence.startswith("orbiting: orbiting the subject; ")
         drone.seeing = False
         graph.wait_until(lambda: got[-1].state == OrbitStatus.HOLDING, 10, "a hold when perception stops")
-        assert got[-1].condition == OrbitStatus.CONDITION_SUBJECT_OUTDATED
+        assert got[-1].condition == ConditionCode.PICTURES_LOST
         graph.wait_until(lambda: drone.copter.mode == "BRAKE", 15, "the hold mode")
         drone.copter.set_mode("LOITER", "pilot")
         graph.wait_until(lambda: got[-1].state == OrbitStatus.TAKEN_OVER, 10, "the take-over to be seen")

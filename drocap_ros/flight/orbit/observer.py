@@ -254,7 +254,7 @@ class PictureWatch:
         """Take one image; returns whether it shows another instant than the one before."""
         last, self._last, self._waits = self._last, observation, True
         same = last is not None and np.array_equal(last.keypoints, observation.keypoints, equal_nan=True)
-        self._frozen = same and observation.has_subject
+        self._frozen = same and bool(np.isfinite(observation.keypoints).any())  # nobody is no picture that stands still
         return not self._frozen
 
     def observed(self, now_ns: int, *, calibrated: bool) -> Pictures:

@@ -37,6 +37,11 @@ FAULTS = {
         _C.OTHER_SUBJECT,
         "somebody else",
     ),
+    "no joint": (
+        lambda seen: dataclasses.replace(seen, keypoints=seen.keypoints * np.float32(np.nan)),
+        _C.SUBJECT_OUTDATED,
+        "last located",
+    ),
     "nobody": (lambda seen: dataclasses.replace(seen, track_id=0), _C.SUBJECT_OUTDATED, "last located"),
 }
 

@@ -75,4 +75,4 @@ def test_each_violated_requirement_is_reported():
     for words in ("motion for 0.60 s", "excursion of 9.00 m", "without the operator", "no evidence", "2.00 m"):
         assert words in report
     other = fault_named("perception stops")
-    assert "the condition is not SUBJECT_OUTDATED" in failures(other, "px4", result)[0]
+    assert "the condition is not PICTURES_LOST" in failures(other, "px4", result)[0]
