@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from std_msgs.msg import Header
@@ -88,7 +87,7 @@ class BundleAdjusterNode(ComponentNode):
         self._cameras = CameraHistory(self.config.window_s)
         self._join: StampJoin[PoseObservation, Pose3D] = StampJoin(self.config.max_pending)
         self._worker = ThreadPoolExecutor(1, "bundle_adjuster")
-        self._job: Future[Any] | None = None  # in simulated time of a result that is still to be published
+        self._job: Future[_Solved] | None = None  # in simulated time its result is still to be published
         self._job_subject = 0
         self._job_due_ns = 0  # in simulated time
         self._sequence = 0
@@ -165,11 +164,10 @@ class BundleAdjusterNode(ComponentNode):
         self._take_solution(observation.stamp_ns)
         self._job_subject = self._buffer.subject
         self._job_due_ns = observation.stamp_ns + round(self.config.max_solve_s * 1e9)
-        work: Callable[..., Any] = self._solve if self.simulated else self._adjust
         window = self._buffer.window()
         window = window._replace(camera=self._cameras.along(window.stamp_ns, observation.image_size))
         arguments = initial.header, observation.track_id, self._cameras.newest_ns, self._control.stride
-        self._job = self._worker.submit(work, window, *arguments)
+        self._job = self._worker.submit(self._adjust, window, *arguments)
 
     def _publish_latest(self, observation: PoseObservation, initial: Pose3D, joints: np.ndarray) -> None:
         stamp_ns = observation.stamp_ns
@@ -193,34 +191,33 @@ class BundleAdjusterNode(ComponentNode):
         """Blend a finished solution into the latest pose."""
         if self._job is None or self._is_running(stamp_ns):
             return
-        job, self._job = self._job, None
-        solution = self._publish(job.result()) if self.simulated else job.result()
-        if solution is not None and self._job_subject == self._buffer.subject:
-            self._latest_pose.set_solution(median_bone_lengths(solution.joints3d), stamp_ns)
-            self._latest_place.set_solution(solution, stamp_ns)
+        solved, self._job = self._job.result(), None
+        if self.simulated:
+            self._publish(solved)
+        if solved.window is not None and self._job_subject == self._buffer.subject:
+            self._latest_pose.set_solution(median_bone_lengths(solved.window.joints3d), stamp_ns)
+            self._latest_place.set_solution(solved.window, stamp_ns)
 
-    def _adjust(
-        self, window: Window, header: Header, track_id: int, telemetry_ns: int, stride: int
-    ) -> AdjustedWindow | None:
-        """Adjust, publish and return the solution, in the worker; None after a failure."""
-        return self._publish(self._solve(window, header, track_id, telemetry_ns, stride))
-
-    def _solve(self, window: Window, header: Header, track_id: int, telemetry_ns: int, stride: int) -> _Solved:
+    def _adjust(self, window: Window, header: Header, track_id: int, telemetry_ns: int, stride: int) -> _Solved:
+        """Adjust a window in the worker, which in real time also publishes the result."""
         begin = time.perf_counter()
         deadline = math.inf if self.simulated else begin + self.config.max_solve_s
-        adjusted, failure = None, ""
+        result, failure = None, ""
         try:
-            adjusted = self._adjuster.adjust(window, Effort(stride), lambda: time.perf_counter() > deadline)
+            result = self._adjuster.adjust(window, Effort(stride), lambda: time.perf_counter() > deadline)
         except SOLVER_ERRORS as error:
             failure = str(error)
-        return _Solved(adjusted, failure, header, track_id, telemetry_ns, time.perf_counter() - begin)
+        solved = _Solved(result, failure, header, track_id, telemetry_ns, time.perf_counter() - begin)
+        if not self.simulated:
+            self._publish(solved)
+        return solved
 
-    def _publish(self, solved: _Solved) -> AdjustedWindow | None:
+    def _publish(self, solved: _Solved) -> None:
         window, seconds = solved.window, solved.seconds
         if window is None:
             self.count(Key.ADJUSTMENTS_FAILED)
             self.report(ERROR, f"adjustment failed, the last solution stays: {solved.failure}")
-            return None
+            return
         if not self.simulated:
             self._control.record(seconds)
         if window.effort.steps is not None:
@@ -235,7 +232,6 @@ class BundleAdjusterNode(ComponentNode):
         self.produced(int(window.stamp_ns[-1]))
         took = "" if self.simulated else f" in {seconds:.2f} s"
         self._report_telemetry(window, f"{len(window.stamp_ns)} poses{took}: {window.stop_reason}")
-        return window
 
     def _report_telemetry(self, window: AdjustedWindow, done: str) -> None:
         use, reason = window.telemetry, window.reason

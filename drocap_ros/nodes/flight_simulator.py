@@ -24,15 +24,15 @@ from drocap_ros.ros.component import OK, WARN
 from drocap_ros.ros.conversions import camera_info_to_ros, compressed_image_to_ros, header_at
 from drocap_ros.ros.diagnostics import PILOT_FLIES, PILOT_HANDS_OFF, Key
 from drocap_ros.ros.lifecycle import ManagedComponent
+from drocap_ros.ros.lockstep import STEP_S
 from drocap_ros.simulation.flight_simulator.simulator_config import FlightSimulatorConfig
 from drocap_ros.simulation.flight_simulator.truth import save_flight_truth
 from drocap_ros.simulation.flight_simulator.world import Exposure, FlightWorld
 from drocap_ros.simulation.render.renderer import Renderer
 
 FRAME_ID = "camera_optical"
+#: Pause between steps of the vehicle in real time, below the period of its fastest telemetry (20 ms).
 _STEP_S = 0.005
-#: Step of the simulated time.
-SIMULATED_STEP_S = 0.01
 
 
 class FlightSimulatorNode(ManagedComponent):
@@ -66,7 +66,7 @@ class FlightSimulatorNode(ManagedComponent):
         if self.simulated:
             if not self._begin_ns:
                 self._begin_ns = self.now_ns()
-                self.create_timer(SIMULATED_STEP_S, self._step)
+                self.create_timer(STEP_S, self._step)
             return
         # Rendering is many short steps in Python: without this each telemetry message waits its 5 ms for the turn.
         sys.setswitchinterval(0.0005)

@@ -25,6 +25,7 @@ from drocap_ros.ros.topics import IMAGE_RECORDING_QOS, RESULT_QOS, TOPICS
 
 #: Topics that this graph publishes itself; played only when they are named.
 _OWN = ("/diagnostics", "/clock")
+#: Of /clock between messages, s: that of the simulated time of a graph.
 _CLOCK_PERIOD_S = 0.01
 
 

@@ -22,8 +22,10 @@ from drocap_ros.ros.rep155 import MISSING, HumanTopics, hri, human_transforms
 from drocap_ros.ros.topics import TFMessage
 from drocap_ros.view.visualizer_config import RateLimit, VisualizerConfig
 
-#: Time after which a marker without a successor disappears.
-INITIAL_LIFETIME_S, LATEST_LIFETIME_S = 0.5, 3.0
+#: Time after which a marker of an initial pose without a successor disappears.
+INITIAL_LIFETIME_S = 0.5
+#: That of an adjusted pose, which stays while the person is hidden for a moment.
+LATEST_LIFETIME_S = 3.0
 #: Time after a pose in ``map`` in which initial poses, whose place is unknown, are not on TF.
 _PLACED_NS = 10**9
 

@@ -174,9 +174,12 @@ class ComponentNode(Node):
         if qos is None:  # in simulated time no driver publishes, and every message counts
             qos = RESULT_QOS if topic == "camera_info" and self.simulated else TOPICS[topic].qos
         subscribe = partial(
-            self.create_subscription, TOPICS[topic].message, topic, taking_info(guarded) if with_info else guarded,
+            self.create_subscription,
+            TOPICS[topic].message,
+            topic,
+            taking_info(guarded) if with_info else guarded,
             raw=raw,
-        )  # fmt: skip
+        )
         events = events or SubscriptionEventCallbacks(use_default_callbacks=topic in FROM_OUTSIDE)
         subscription: Subscription = subscribe(qos, event_callbacks=events)
         self._inputs.append((topic, subscription))

@@ -20,8 +20,10 @@ from drocap_ros.ros.diagnostics import HARDWARE_ID, OK, WARN, Key, node_of, of, 
 from drocap_ros.ros.lifecycle import ACTIVE, FINALIZED
 from drocap_ros.ros.topics import TOPICS
 
-#: A dead node is restarted at once; if it dies again, after pauses that double from the first to the longest.
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 10.0
+#: A dead node is restarted at once; if it dies again, after pauses that double from this one ...
+FIRST_PAUSE_S = 0.2
+#: ... to this one.
+LONGEST_PAUSE_S = 10.0
 #: A node that dies more often than this within a minute ends the graph.
 MOST_RESTARTS = 5
 

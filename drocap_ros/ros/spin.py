@@ -27,9 +27,10 @@ from drocap_ros.ros.topics import NODES
 
 #: After the order to stop, messages that have arrived are still processed, for this long at most.
 DRAIN_S = 5.0
-#: A node has processed all messages when none came for this long and for so many turns of the executor: on a busy
-#: machine a single timer's callback may take longer.
-_QUIET_S, _QUIET_TURNS = 0.05, 5
+#: A node has processed all messages when none came for this long ...
+_QUIET_S = 0.05
+#: ... and for so many turns of the executor: on a busy machine a single timer's callback may take longer.
+_QUIET_TURNS = 5
 #: At or above this niceness nodes use SCHED_BATCH: a message for them does not preempt other nodes.
 _BATCH = 10
 

@@ -51,10 +51,13 @@ def judge_flight(session: Session, truth: FlightTruth, radius_m: float) -> Fligh
     ]
     settled = settled_orbit(truth.stamp_ns, statuses)
     return FlightVerdict(
-        exposures=len(truth.stamp_ns), pictures=sum(pictures), poses=len(poses), seen=sum(poses),
+        exposures=len(truth.stamp_ns),
+        pictures=sum(pictures),
+        poses=len(poses),
+        seen=sum(poses),
         orbit=orbit_quality(truth, settled, radius_m) if int(settled.sum()) > 1 else None,
         live=_live(session, truth),
-    )  # fmt: skip
+    )
 
 
 def settled_orbit(stamp_ns: np.ndarray, statuses: list[tuple[int, State]]) -> np.ndarray:

@@ -26,9 +26,16 @@ if TYPE_CHECKING:
 #: A running bridge publishes its status five times a second; discovery may take longer.
 _FIND_S = 2.0
 _STATE_FIELDS = (
-    "autopilot", "mode", "armed", "landed_state", "gps_fix_type", "satellites", "position_ok", "battery_fraction",
+    "autopilot",
+    "mode",
+    "armed",
+    "landed_state",
+    "gps_fix_type",
+    "satellites",
+    "position_ok",
+    "battery_fraction",
     "battery_voltage_v",
-)  # fmt: skip
+)
 
 
 #: Conditions that a vehicle on the ground fails, and those of place and subject, which follow a take-off.
@@ -96,9 +103,10 @@ class BridgeListener:
             message = self.states[-1][1]
             q = message.gimbal_orientation
             vehicle = VehicleState(
-                0, **{name: getattr(message, name) for name in _STATE_FIELDS},
+                0,
+                **{name: getattr(message, name) for name in _STATE_FIELDS},
                 gimbal_orientation_xyzw=np.array([q.x, q.y, q.z, q.w]),
-            )  # fmt: skip
+            )
             requests.set_autopilot(autopilot_of(vehicle.autopilot))
         known = {name for autopilot in AUTOPILOTS.values() for name in autopilot.preflight_names}
         streams = {
@@ -108,11 +116,15 @@ class BridgeListener:
         }
         trips_s = np.array([number(self.values.get(Key.ROUND_TRIP, ""))])
         return Measured(
-            vehicle=vehicle, heard=vehicle is not None, streams=streams, round_trips_s=trips_s[np.isfinite(trips_s)],
+            vehicle=vehicle,
+            heard=vehicle is not None,
+            streams=streams,
+            round_trips_s=trips_s[np.isfinite(trips_s)],
             settings={name: number(text) for name, text in self.values.items() if name in known},
-            delays_s=np.array([age for age, _ in self.states]), conditions=self._failed(),
+            delays_s=np.array([age for age, _ in self.states]),
+            conditions=self._failed(),
             bridge=f"by the running bridge in {namespace}, {state}: {status.reason}",
-        )  # fmt: skip
+        )
 
 
 def listen_to_bridge(

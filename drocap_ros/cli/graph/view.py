@@ -44,9 +44,12 @@ def add_parser(subparsers: Subparsers) -> None:
         "screen or with --web.",
     )
     parser.add_argument(
-        "input", metavar="INPUT", type=Path, nargs="?",
+        "input",
+        metavar="INPUT",
+        type=Path,
+        nargs="?",
         help="motion.npz or the folder that holds it; session folder, .mcap, .bag or rosbag2 folder",
-    )  # fmt: skip
+    )
     parser.add_argument("--live", action="store_true", help="show a running graph until Ctrl-C")
     parser.add_argument("--save", metavar="FILE", type=Path, help="write an .rrd file instead of opening a viewer")
     parser.add_argument("--web", action="store_true", help="serve a page for a browser, also when there is a screen")
