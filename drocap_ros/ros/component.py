@@ -170,16 +170,13 @@ class ComponentNode(Node):
 
         with_info : the callback's second argument is rclpy's message info
         """
-        guarded = self.guarded(topic, callback, stamps=TOPICS[topic].one_clock)
+        entry = TOPICS[topic]
+        take = self.guarded(topic, callback, stamps=entry.one_clock)
+        if with_info:
+            take = taking_info(take)
         if qos is None:  # in simulated time no driver publishes, and every message counts
-            qos = RESULT_QOS if topic == "camera_info" and self.simulated else TOPICS[topic].qos
-        subscribe = partial(
-            self.create_subscription,
-            TOPICS[topic].message,
-            topic,
-            taking_info(guarded) if with_info else guarded,
-            raw=raw,
-        )
+            qos = RESULT_QOS if topic == "camera_info" and self.simulated else entry.qos
+        subscribe = partial(self.create_subscription, entry.message, topic, take, raw=raw)
         events = events or SubscriptionEventCallbacks(use_default_callbacks=topic in FROM_OUTSIDE)
         subscription: Subscription = subscribe(qos, event_callbacks=events)
         self._inputs.append((topic, subscription))
