@@ -154,8 +154,6 @@ RULES = [
     large_files, rooms_without_docstring, circles, arrows_upwards, ros_outside_its_rooms, laboratory_in_the_product,
     autopilots_outside_their_room,
 ]  # fmt: skip
-#: What the tree does not keep yet.
-OPEN = {circles, autopilots_outside_their_room}
 
 
 @pytest.fixture(scope="module")
@@ -164,9 +162,7 @@ def package(root):
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_package_keeps_rule(package, rule, request):
-    if rule in OPEN:
-        request.applymarker(pytest.mark.xfail(reason="open"))
+def test_package_keeps_rule(package, rule):
     found = rule(package)
     assert not found, "\n".join(found)
 

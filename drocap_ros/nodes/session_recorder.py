@@ -86,7 +86,7 @@ class SessionRecorderNode(ManagedComponent):
             kind = _type_name(entry.message)
             writer.register(self.resolve_topic_name(topic), kind, schema_text(kind), image=topic == _IMAGES)
         self._writer, self._calibrated, self._received, self._recording = writer, False, False, False
-        self._survey = ParameterSurvey(self, self._on_parameters)
+        self._survey = ParameterSurvey(self, self.beside, self._on_parameters)
         self._sessions += 1
 
     def release(self) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -18,9 +18,6 @@ from drocap_ros.config import section_types
 from drocap_ros.errors import ParameterError
 from drocap_ros.parameters import Parameters
 from drocap_ros.ros.rclpy_internals import overridden_parameters
-
-if TYPE_CHECKING:
-    from drocap_ros.ros.component import ComponentNode
 
 P = TypeVar("P", bound=Parameters)
 
@@ -87,12 +84,16 @@ def _filled(bounds: tuple[float | None, float | None], least: float, most: float
 class ParameterSurvey:
     """Requests the parameters of every component of the graph in the background.
 
-    node : the node that asks; those ``beside`` it are read without a service
+    node : the node that asks
+    beside : nodes of its process by name, which are read without a service
     done : called with all parameters so far, by node, whenever a node has answered
     """
 
-    def __init__(self, node: ComponentNode, done: Callable[[dict[str, dict[str, Any]]], None]) -> None:
+    def __init__(
+        self, node: Node, beside: Mapping[str, Node], done: Callable[[dict[str, dict[str, Any]]], None]
+    ) -> None:
         self._node = node
+        self._beside = beside
         self._done = done
         self._types = section_types()
         self._clients: dict[str, AsyncParameterClient] = {}
@@ -101,7 +102,7 @@ class ParameterSurvey:
 
     def ask_new_nodes(self) -> None:
         """Ask the nodes that appeared since the last call; returns at once."""
-        for name, near in self._node.beside.items():
+        for name, near in self._beside.items():
             if name not in self._asked:
                 self._asked.add(name)
                 self._take(name, {key: near.get_parameter(key).value for key in self._names(name)})

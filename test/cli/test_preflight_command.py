@@ -18,8 +18,8 @@ import yaml
 from drocap_ros.cli import main
 from drocap_ros.cli.graph.running_bridge import BridgeListener
 from drocap_ros.errors import InputError
+from drocap_ros.flight.autopilot.autopilot import Level
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
-from drocap_ros.flight.findings import Level
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.preflight.checks import all_findings
 from drocap_ros.flight.preflight.link_checks import link_findings
@@ -161,7 +161,7 @@ def test_an_option_out_of_range_is_refused(tmp_path, option):
 
 
 def test_a_file_that_cannot_be_written_is_refused_before_listening(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("drocap_ros.cli.preflight._measure", None)
+    monkeypatch.setattr("drocap_ros.cli.graph.preflight._measure", None)
     config = write_config(tmp_path / "c.yaml", "udpin:127.0.0.1:1", "simulation")
     assert main(["preflight", "--config", str(config), "--json", str(tmp_path)]) == 2
     assert capsys.readouterr().err.startswith(f"drocap: --json {tmp_path}: expected a file, found a folder")

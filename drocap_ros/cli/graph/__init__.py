@@ -1,1 +1,1 @@
-"""Commands around a running graph: live, orbit, record, replay, top, view."""
+"""Commands around a running graph: live, preflight, orbit, record, replay, top, view."""

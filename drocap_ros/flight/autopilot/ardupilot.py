@@ -12,12 +12,12 @@ from drocap_ros.flight.autopilot.autopilot import (
     FenceSettings,
     FlownSpeeds,
     Hints,
+    Level,
     SettingCheck,
     warn_if,
 )
 from drocap_ros.flight.autopilot.coasting import ContinuedCoasting
 from drocap_ros.flight.autopilot.simulated import Airframe, Decay, Gains, Simulated
-from drocap_ros.flight.findings import Level
 
 _NO_PLACE = 16 | 32  # bits of GUID_OPTIONS: the vehicle drifts off its setpoints and its hold
 _WEATHERVANE = 128  # bit of GUID_OPTIONS: turns into the wind

@@ -7,6 +7,7 @@ the conditions for motion refuse it.
 
 from __future__ import annotations
 
+import enum
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -16,9 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.autopilot.coasting import Coast, Coasting, HeldCoasting, coast_of
+from drocap_ros.flight.autopilot.setpoint import Setpoint
 from drocap_ros.flight.autopilot.simulated import Simulated
-from drocap_ros.flight.findings import Level
-from drocap_ros.flight.setpoint import Setpoint
 
 _MAV_MODE_FLAG_CUSTOM_MODE_ENABLED = 1  # MAV_MODE_FLAG of MAVLink's common.xml
 
@@ -52,6 +52,14 @@ class LossAction(NamedTuple):
     fatal: Mapping[int, str]
     leaves: Mapping[int, str]
     modes: Mapping[int, str]
+
+
+class Level(enum.IntEnum):
+    """How much a finding before a flight matters."""
+
+    OK = 0
+    WARNING = 1  # it flies; the setting or the link should change
+    MISSING = 2  # the bridge refuses motion, or soon ends it
 
 
 class FlownSpeeds(NamedTuple):

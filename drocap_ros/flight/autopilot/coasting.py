@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from drocap_ros.flight.setpoint import Setpoint
+from drocap_ros.flight.autopilot.setpoint import Setpoint
 
 _STEP_S = 0.05  # of the prediction: the period of the setpoints, so that a coast is as fine as what is sent
 _LONGEST_S = 5.0  # of a prediction: every recorded vehicle stood sooner

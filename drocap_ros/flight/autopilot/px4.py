@@ -13,13 +13,13 @@ from drocap_ros.flight.autopilot.autopilot import (
     FenceSettings,
     FlownSpeeds,
     Hints,
+    Level,
     LossAction,
     SettingCheck,
     warn_if,
 )
 from drocap_ros.flight.autopilot.coasting import HeldCoasting
 from drocap_ros.flight.autopilot.simulated import Airframe, Decay, Gains, Simulated, StickOverride
-from drocap_ros.flight.findings import Level
 
 #: Values of GF_ACTION that guard nobody: its 4 is flight termination, above a person.
 _IDLE_FENCES = {0.0: "off", 1.0: "warns only", 4.0: "stops the motors"}

@@ -12,8 +12,8 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import AUTOPILOTS
+from drocap_ros.flight.autopilot.setpoint import Setpoint
 from drocap_ros.flight.frames import enu_to_ned
-from drocap_ros.flight.setpoint import Setpoint
 
 SET_MODE = mavlink.MAV_CMD_DO_SET_MODE
 GIMBAL_PITCH = mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW

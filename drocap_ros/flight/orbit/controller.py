@@ -12,6 +12,7 @@ import threading
 import numpy as np
 
 from drocap_ros.flight.autopilot import autopilot_of
+from drocap_ros.flight.autopilot.setpoint import Setpoint, hold_setpoint
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition
 from drocap_ros.flight.mavlink.commands import CommandQueue
@@ -25,7 +26,6 @@ from drocap_ros.flight.orbit.observer import Observer, OwnFlight
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
 from drocap_ros.flight.orbit.states import Action, Limits, ModeRequest, OperatorCommand, SafetyState, State
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
-from drocap_ros.flight.setpoint import Setpoint, hold_setpoint
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.observation import PoseObservation
 

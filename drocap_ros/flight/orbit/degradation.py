@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.flight.autopilot.setpoint import Setpoint
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.motion_checks import (
@@ -20,7 +21,6 @@ from drocap_ros.flight.orbit.motion_checks import (
     outdated_condition,
 )
 from drocap_ros.flight.orbit.states import Limits, Pace
-from drocap_ros.flight.setpoint import Setpoint
 from drocap_ros.flight.subject.framing import framed_pace
 
 _C = ConditionCode

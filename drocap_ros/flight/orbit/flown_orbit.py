@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from drocap_ros.flight.autopilot.setpoint import Setpoint
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition
 from drocap_ros.flight.observed import Observed
@@ -21,7 +22,6 @@ from drocap_ros.flight.orbit.planner import (
 )
 from drocap_ros.flight.orbit.states import Limits, SafetyState
 from drocap_ros.flight.orbit_goal import OrbitGoal, goal_of
-from drocap_ros.flight.setpoint import Setpoint
 from drocap_ros.flight.subject.framing import Framing
 
 

@@ -15,11 +15,11 @@ import numpy as np
 
 from drocap_ros.flight.autopilot.autopilot import greatest_speed
 from drocap_ros.flight.autopilot.coasting import Coast
+from drocap_ros.flight.autopilot.setpoint import Setpoint, hold_setpoint
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.observed import Observed, SizeSight
 from drocap_ros.flight.orbit.states import Limits
 from drocap_ros.flight.orbit_goal import OrbitGoal
-from drocap_ros.flight.setpoint import Setpoint, hold_setpoint
 from drocap_ros.flight.subject.guard import farness
 from drocap_ros.flight.subject.subject_filter import STANDING_M_S, WALKING_M_S
 

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.flight.autopilot.setpoint import Setpoint
 from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.orbit_goal import OrbitGoal
-from drocap_ros.flight.setpoint import Setpoint
 from drocap_ros.flight.subject.subject_filter import STANDING_M_S, WALKING_M_S
 
 #: 1/s, about one who stands and one who walks: his turns are no lasting error; m.

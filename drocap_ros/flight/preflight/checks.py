@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from drocap_ros.flight.autopilot.autopilot import Level
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition
-from drocap_ros.flight.findings import Finding, Level, Verdict, check, graded
+from drocap_ros.flight.preflight.findings import Finding, Verdict, check, graded
 from drocap_ros.flight.preflight.link_checks import link_findings
 from drocap_ros.flight.preflight.measured import LASTING, Measured
 from drocap_ros.flight.preflight.setup_checks import Setup, setup_findings

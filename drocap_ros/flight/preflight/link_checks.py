@@ -8,10 +8,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from drocap_ros.flight.autopilot import UNKNOWN, Autopilot, autopilot_of
+from drocap_ros.flight.autopilot.autopilot import Level
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.findings import Finding, Level, Verdict, check, graded
 from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
+from drocap_ros.flight.preflight.findings import Finding, Verdict, check, graded
 from drocap_ros.flight.preflight.measured import Measured, Stream
 
 _C = ConditionCode

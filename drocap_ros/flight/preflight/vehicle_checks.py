@@ -6,11 +6,11 @@ import math
 from collections.abc import Iterator
 
 from drocap_ros.flight.autopilot import Autopilot, autopilot_of, supported_titles
-from drocap_ros.flight.autopilot.autopilot import FenceSettings, FlownSpeeds, LossAction, LossSettings
+from drocap_ros.flight.autopilot.autopilot import FenceSettings, FlownSpeeds, Level, LossAction, LossSettings
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.findings import Finding, Level, Values, Verdict, check, graded
 from drocap_ros.flight.orbit.motion_checks import battery_condition, loss_condition
+from drocap_ros.flight.preflight.findings import Finding, Values, Verdict, check, graded
 from drocap_ros.flight.preflight.measured import LASTING, Measured, Stream
 from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, LANDED_ON_GROUND, SATELLITES_UNKNOWN, VehicleState
 

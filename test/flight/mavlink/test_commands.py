@@ -10,6 +10,7 @@ from drocap_ros.errors import ParameterError
 from drocap_ros.flight.autopilot import AUTOPILOTS
 from drocap_ros.flight.autopilot.ardupilot import ARDUPILOT
 from drocap_ros.flight.autopilot.px4 import PX4
+from drocap_ros.flight.autopilot.setpoint import Setpoint, hold_setpoint
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.frames import ned_to_enu
 from drocap_ros.flight.mavlink.commands import CommandQueue
@@ -18,7 +19,6 @@ from drocap_ros.flight.mavlink.messages import halt_message, setpoint_message
 from drocap_ros.flight.mavlink.parser import MavlinkParser
 from drocap_ros.flight.mavlink.transport import LinkError
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
-from drocap_ros.flight.setpoint import Setpoint, hold_setpoint
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 
 MAV = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)

@@ -5,9 +5,9 @@ import pytest
 from flown_copter import ALL, Flight
 from orbit_observations import GOOD, LIMITS, changed
 
+from drocap_ros.flight.autopilot.setpoint import Setpoint
 from drocap_ros.flight.orbit.last_setpoint import limit_closing
 from drocap_ros.flight.pose_history import CameraPose
-from drocap_ros.flight.setpoint import Setpoint
 from drocap_ros.flight.subject.guard import Guard
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.observation import PoseObservation

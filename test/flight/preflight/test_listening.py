@@ -7,9 +7,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import autopilot_of
+from drocap_ros.flight.autopilot.autopilot import Level
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.findings import Level
 from drocap_ros.flight.preflight.checks import all_findings, is_ready
 from drocap_ros.flight.preflight.measure import Listening, version_text
 from drocap_ros.flight.preflight.setup_checks import Setup

@@ -17,7 +17,7 @@ from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
     from drocap_ros.config import DrocapConfig
-    from drocap_ros.flight.findings import Finding
+    from drocap_ros.flight.preflight.findings import Finding
     from drocap_ros.flight.preflight.measured import Measured
     from drocap_ros.flight.preflight.setup_checks import Setup
 
@@ -139,7 +139,7 @@ def _print(found: Sequence[Finding], quiet: bool) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from drocap_ros.flight.findings import Level
+    from drocap_ros.flight.autopilot.autopilot import Level
 
     counts = {level: [f for f in found if f.level == level] for level in Level}
     shown = counts[Level.MISSING] if quiet else found

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import enum
 import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, ParamSpec
 
+from drocap_ros.flight.autopilot.autopilot import Level
 from drocap_ros.flight.conditions import ConditionCode
 
 P = ParamSpec("P")
 Values = Mapping[str, float | str | bool]
-
-
-class Level(enum.IntEnum):
-    """How much a finding matters."""
-
-    OK = 0
-    WARNING = 1  # it flies; the setting or the link should change
-    MISSING = 2  # the bridge refuses motion, or soon ends it
 
 
 @dataclass(frozen=True)
