@@ -84,6 +84,7 @@ class ConditionCode(enum.IntEnum):
     AUTOPILOT_CRITICAL = 127
     SEVERAL_VEHICLES = 128
     CAMERA_CHANGED = 129
+    REPORTS_CONTRADICT = 132
     # Others in the graph
     OTHER_POSE_PUBLISHER = 130
     SECOND_BRIDGE = 131
@@ -174,7 +175,8 @@ _SENTENCES = {
     "it is{by_hand}",
     _C.COMMANDS_DISABLED: "no motion: commands are disabled; set commands_enabled to true to allow it",
     _C.CLOCK_JUMPED: "our clock jumped by {jump_s:.1f} s",
-    _C.POSITION_JUMPED: "the reported position jumped by {jump_m:.1f} m",
+    _C.POSITION_JUMPED: "the reported position jumped by {jump_m:.1f} m, which the reported velocity does not explain",
+    _C.REPORTS_CONTRADICT: "the autopilot's reported velocity contradicts its reported position by {error_m_s:.1f} m/s",
     _C.CONTROL_LOOP_STALLED: "the control loop stood still for {gap_s:.1f} s",
     _C.SETPOINTS_NOT_FOLLOWED: "the vehicle does not follow the setpoints: {evidence}",
     _C.LINK_SILENT: "nothing heard from the autopilot; last message: {ago}",

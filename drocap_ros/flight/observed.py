@@ -83,7 +83,9 @@ class Health:
 class Motion:
     """The vehicle's motion.
 
-    position, velocity : (3,) m, m/s; the position is extrapolated over the age of the state
+    position, velocity : (3,) m, m/s; the position as reported, extrapolated over the age of the state; the velocity of
+        the filter
+    velocity_offset : (3,) m/s, reported minus filtered velocity: the autopilot flies by the reported one
     height_m : above the subject's ground
     age_s : of the attitude
     position_age_s : since the reported position last changed, so frozen telemetry ages too
@@ -91,6 +93,7 @@ class Motion:
 
     position: np.ndarray = field(default_factory=_unknown)
     velocity: np.ndarray = field(default_factory=_unknown)
+    velocity_offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     yaw: float = math.nan
     height_m: float = math.nan
     age_s: float = math.inf

@@ -1,8 +1,7 @@
 """The camera's pose at the instant of an image, from the vehicle's states around it.
 
-The reported position wanders by decimetres within seconds, the reported velocity hardly.  So positions here are the
-integrated velocity with a slow correction towards the reported position: noise of the satellites does not appear as
-motion of the subject, nor noise of the height as its range from the ground.
+Positions are those of ``vehicle_filter.py``, not the reported ones: an error that wanders does not appear as motion of
+the subject, nor noise of the height as its range from the ground.
 """
 
 from __future__ import annotations
@@ -17,8 +16,6 @@ from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import slerp
 
 _NS = 1_000_000_000
-_CORRECTION_S = 6.0
-_JUMP_M = 3.0  # beyond which the reported position replaces the integrated one
 
 
 class CameraPose(NamedTuple):
@@ -40,34 +37,23 @@ class PoseHistory:
     def __init__(self, keep_s: float = 3.0, extrapolate_s: float = 0.15) -> None:
         self._keep_ns, self._extrapolate_ns = int(keep_s * _NS), int(extrapolate_s * _NS)
         self._poses: deque[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = deque()
-        #: (3,) m, reported minus integrated position now: add it to a position from here.
+        #: (3,) m, reported minus filtered position now: add it to a position from here.
         self.offset: np.ndarray = np.zeros(3)
 
-    def add(self, state: VehicleState) -> None:
-        """Take a state; without position or camera's attitude it is left out.  A stamp that goes back clears all."""
+    def add(self, state: VehicleState, place: np.ndarray) -> None:
+        """Take a state; without position or camera's attitude it is left out.  A stamp that goes back clears all.
+
+        place : (3,) m, its filtered position
+        """
         camera = state.gimbal_orientation_xyzw
         if not (np.isfinite(camera).all() and np.isfinite(state.position_enu_m).all()):
             return
         if self._poses and state.stamp_ns <= self._poses[-1][0]:
             self._poses.clear()
-        velocity = np.nan_to_num(state.velocity_enu_m_s)
-        steady = self._steady(state.stamp_ns, state.position_enu_m, velocity)
-        self.offset = state.position_enu_m - steady
-        self._poses.append((state.stamp_ns, camera, steady, velocity))
+        self.offset = state.position_enu_m - place
+        self._poses.append((state.stamp_ns, camera, place, np.nan_to_num(state.velocity_enu_m_s)))
         while state.stamp_ns - self._poses[0][0] > self._keep_ns:
             self._poses.popleft()
-
-    def _steady(self, stamp_ns: int, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """(3,) m, last position plus integrated velocity, with the correction towards the reported position."""
-        if not self._poses:
-            return position
-        before = self._poses[-1]
-        dt = (stamp_ns - before[0]) / _NS
-        moved: np.ndarray = before[2] + 0.5 * dt * (before[3] + velocity)
-        gap = position - moved
-        if float(np.linalg.norm(gap)) > _JUMP_M:
-            return position
-        return moved + (1 - np.exp(-dt / _CORRECTION_S)) * gap
 
     def at(self, stamp_ns: int) -> CameraPose | None:
         """Pose at an instant; None outside the states."""

@@ -26,7 +26,7 @@ class Flight:
             np.array([RADIUS, 0.0, HEIGHT]),
             math.pi,
             CopterSetup(
-                mode="GUIDED", gps_noise_m=0.0, attitude_error_deg=0.0, wind=(wind, 0.0, 0.0), timeout_s=timeout_s
+                mode="GUIDED", estimate_error=0.0, attitude_error_deg=0.0, wind=(wind, 0.0, 0.0), timeout_s=timeout_s
             ),
         )
         self.mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)

@@ -46,6 +46,24 @@ class StickOverride(NamedTuple):
 
 
 @dataclass(frozen=True)
+class ReportErrors:
+    """Errors (position in m, velocity in m/s) of the autopilot's estimate along one axis, as a process.
+
+    e[t] = first e[t-1] + second e[t-2] + noise, in steps of 0.1 s, fitted to recorded flights by
+    ``lab/studies/report_errors.py``.
+
+    first, second : rows of (2, 2)
+    noise : standard deviations of one step
+    correlation : of the two noises
+    """
+
+    first: tuple[tuple[float, float], tuple[float, float]]
+    second: tuple[tuple[float, float], tuple[float, float]]
+    noise: tuple[float, float]
+    correlation: float
+
+
+@dataclass(frozen=True)
 class Simulated:
     """The simulated counterpart.
 
@@ -59,6 +77,10 @@ class Simulated:
     override : whether the sticks end the control mode; None = never
     streams : messages that are sent unrequested, with their periods in s
     transit_s : from the bridge's process to the controller
+    horizontal, vertical : errors of its estimate; the vehicle flies by it
+    clock_rate : seconds of its clock per second
+    critical_when_lost : whether its heartbeat reports a critical state while the loss action flies
+    flags_at_rest : flags of its estimator that it adds while the vehicle stands on the ground
     """
 
     stick_mode: str
@@ -69,8 +91,13 @@ class Simulated:
     hold: Decay
     stick: Decay
     jerk_m_s3: float
+    horizontal: ReportErrors
+    vertical: ReportErrors
     lost_modes: Mapping[int, str] = field(default_factory=dict)
     loss_check_s: tuple[float, float] = (0.0, 0.0)
     override: StickOverride | None = None
     streams: Mapping[str, float] = field(default_factory=dict)
     transit_s: float = 0.0
+    clock_rate: float = 1.0
+    critical_when_lost: bool = False
+    flags_at_rest: int = 0

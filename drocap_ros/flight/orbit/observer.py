@@ -19,6 +19,7 @@ from drocap_ros.flight.pose_history import PoseHistory
 from drocap_ros.flight.subject.framing import Framing
 from drocap_ros.flight.subject.guard import Guard
 from drocap_ros.flight.subject.subject_filter import SubjectEstimate, SubjectFilter
+from drocap_ros.flight.vehicle_filter import Doubt, VehicleFilter
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.observation import PoseObservation
@@ -26,9 +27,6 @@ from drocap_ros.observation import PoseObservation
 _NS = 1_000_000_000
 _CLOCK_JUMP_S = 0.25  # between the clock of the stamps and the monotonic one: a subject's age would be wrong by it
 _MAX_EXTRAPOLATION_S = 0.3  # of a position by its velocity
-_POSITION_JUMP_M = 1.0  # five times the drift below
-_JUMP_PERIOD_S = 0.5  # between two states, beyond which the way is not known
-_FADES_S = 4.0  # in recorded flights of both autopilots the steps added up to 0.2 m at most
 #: MAV_TYPE of the vehicles for which the control was made: multirotors, and a helicopter under the same autopilot.
 _MULTIROTORS = frozenset({2, 3, 4, 13, 14, 15, 29, 35})
 _STATUS_MESSAGES = (("GPS_RAW_INT",), ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS"), ("SYS_STATUS",))
@@ -62,7 +60,8 @@ class Observer:
         self._config = config
         self.vehicle: VehicleState | None = None
         self.framing = Framing(config)
-        self._history, self._jumps, self._pictures = PoseHistory(), PositionJumps(), PictureWatch()
+        self._filter, self._doubt = VehicleFilter(), Doubt()
+        self._history, self._pictures = PoseHistory(), PictureWatch()
         self._subject, self._guard = SubjectFilter(config), Guard(config)
         self._following, self._keeping = Following(config.max_echo_age_s), Keeping(config)
         self._before: tuple[int, float] | None = None  # stamp and monotonic time of the last step
@@ -70,9 +69,12 @@ class Observer:
 
     def on_state(self, state: VehicleState) -> None:
         """Take a state of the vehicle."""
-        self._jumps.take(state)
+        if np.isfinite(state.position_enu_m).all() and np.isfinite(state.velocity_enu_m_s).all():
+            doubt = self._filter.take(state.stamp_ns / _NS, state.position_enu_m, state.velocity_enu_m_s)
+            self._doubt = self._doubt.worse(doubt)
+            state = dataclasses.replace(state, velocity_enu_m_s=self._filter.velocity)
         self.vehicle = state
-        self._history.add(state)
+        self._history.add(state, self._filter.position)
         self._subject.height_wanders = autopilot_of(state.autopilot).height_wanders
 
     def on_camera(self, camera_matrix: np.ndarray) -> None:
@@ -109,7 +111,7 @@ class Observer:
         if vehicle is None:
             return Observed(pictures=pictures, intruder=own.intruder, disturbance=disturbance), dt
         seen = observe_vehicle(link, config, vehicle, now_ns)
-        motion = seen.vehicle
+        motion = dataclasses.replace(seen.vehicle, velocity_offset=self._filter.velocity_offset)
         by_size = self._guard.sight(motion.position, self._history.offset, now_ns)
         subject = Subject() if estimate is None else _subject(estimate, self._history.offset, motion, by_size)
         away_m, away_s = self._keeping.watch(own.reference, motion.position, now_s)
@@ -124,6 +126,7 @@ class Observer:
             disturbance = condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=stood_s)
         observed = dataclasses.replace(
             seen,
+            vehicle=motion,
             subject=subject,
             pictures=dataclasses.replace(pictures, camera_problem=seen.pictures.camera_problem, framing_margin=margin),
             course=Course(followed, away_m, away_s),
@@ -147,8 +150,11 @@ class Observer:
         jump_s = (now_ns - before[0]) / _NS - dt
         if abs(jump_s) > _CLOCK_JUMP_S:
             return condition(ConditionCode.CLOCK_JUMPED, jump_s=jump_s)
-        if (jump_m := self._jumps.pop()) > 0:
-            return condition(ConditionCode.POSITION_JUMPED, jump_m=jump_m)
+        doubt, self._doubt = self._doubt, Doubt()
+        if doubt.jump_m > 0:
+            return condition(ConditionCode.POSITION_JUMPED, jump_m=doubt.jump_m)
+        if doubt.error_m_s > 0:
+            return condition(ConditionCode.REPORTS_CONTRADICT, error_m_s=doubt.error_m_s)
         if hung or dt > self._config.watchdog_s:
             return condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=dt)
         return None
@@ -269,40 +275,6 @@ class PictureWatch:
             frozen=self._frozen,
             calibrated=calibrated,
         )
-
-
-class PositionJumps:
-    """Finds jumps of the reported position: one step, or small ones that add up, as of an estimator that is reset."""
-
-    def __init__(self) -> None:
-        self._before: VehicleState | None = None  # the last one whose position was known
-        self._drift = np.zeros(3)  # m, that velocity does not explain, and that fades
-        self._greatest_m = 0.0
-
-    def take(self, state: VehicleState) -> None:
-        """Take a state of the vehicle; one without a position is left out, and the next may jump from before it."""
-        if not np.isfinite(state.position_enu_m).all():
-            return
-        before, self._before = self._before, state
-        if before is None:
-            return
-        since_s = (state.stamp_ns - before.stamp_ns) / _NS
-        # Stamps may jump with the position, as where the autopilot restarts: the way since then is bounded anyway.
-        dt = min(max(since_s, 0.0), _JUMP_PERIOD_S)
-        mean = 0.5 * (before.velocity_enu_m_s + state.velocity_enu_m_s)
-        step = state.position_enu_m - before.position_enu_m - mean * dt
-        if not np.isfinite(step).all():
-            return
-        known = 0.0 <= since_s <= _JUMP_PERIOD_S
-        self._drift = math.exp(-dt / _FADES_S) * self._drift + (step if known else 0.0)
-        jump_m = max(float(np.linalg.norm(step)), float(np.linalg.norm(self._drift)))
-        if jump_m > _POSITION_JUMP_M:
-            self._greatest_m, self._drift = max(self._greatest_m, jump_m), np.zeros(3)
-
-    def pop(self) -> float:
-        """Greatest jump in m since the last call; 0 = none."""
-        greatest_m, self._greatest_m = self._greatest_m, 0.0
-        return greatest_m
 
 
 def _yaw(vehicle: VehicleState) -> float:

@@ -15,7 +15,7 @@ from drocap_ros.flight.orbit.states import Limits, SafetyState, State
 #: heartbeats, and than packets that were late and arrive after newer ones.
 _STEADY_S = 1.3
 _DEFAULT_TIMEOUT_S = 0.5
-#: Out of sight for longer, the reported position may have jumped unseen (observer.PositionJumps).
+#: Out of sight for longer, the reported position may have jumped unseen (``vehicle_filter.py``).
 _UNSEEN_S = 0.25
 
 

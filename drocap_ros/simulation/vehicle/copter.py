@@ -79,6 +79,8 @@ class SimulatedCopter(ReportingCopter):
             return
         self.mode = mode
         self.mode_log.append((self._t, mode, by))
+        lost = by == _LOST and self.simulated.critical_when_lost
+        self.system_status = mavlink.MAV_STATE_CRITICAL if lost else mavlink.MAV_STATE_ACTIVE
         manner = manner_of(self.kind, mode)
         self.control.begin(manner, self.estimate, self.body.velocity + self.error.velocity, self.body.yaw)
         if mode in _CLIMB_M_S:

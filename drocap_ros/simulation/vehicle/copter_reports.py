@@ -39,7 +39,7 @@ class CopterSetup(NamedTuple):
     """Of a simulated copter.
 
     wind : (3,) m/s
-    gps_noise_m : of the slow error of the position; fine errors are added
+    estimate_error : of the estimate, as a share of the recorded ones
     timeout_s : its own time-out without setpoints
     mode : at first; "" = that of the sticks
     mount : of the camera; None = a gimbal, level
@@ -49,7 +49,7 @@ class CopterSetup(NamedTuple):
     autopilot: str = "ardupilot"
     wind: Sequence[float] = (0.0, 0.0, 0.0)
     seed: int = 0
-    gps_noise_m: float = 0.4
+    estimate_error: float = 1.0
     attitude_error_deg: float = 0.4
     timeout_s: float = 0.5
     mode: str = "LOITER"
@@ -67,7 +67,7 @@ class ReportingCopter(SimulatedVehicle):
             self.settings[self.kind.mount_type_setting] = float(MOUNT_TYPES[self.mount.kind])
         self.body = Body(position, yaw, np.array(setup.wind, float), self.simulated.airframe, setup.seed)
         self.control: FlightControl = control_of(self.kind, position, yaw, self.body.drag())
-        self.error = EstimateError(setup.gps_noise_m, self.kind.height_wanders, setup.seed)
+        self.error = EstimateError(self.simulated.horizontal, self.simulated.vertical, setup.estimate_error, setup.seed)
         self.mode = self.intended = setup.mode or self.simulated.stick_mode
         self.gps_lost_s = self.ekf_failed_s = math.inf
         self.frozen = False  # telemetry repeats its last values, with fresh or old stamps
@@ -98,14 +98,13 @@ class ReportingCopter(SimulatedVehicle):
         """Reported pose: the estimate, not the truth."""
         if self._report is not None and (self.frozen or t_s == self._report_s):
             return self._report
-        fine = self._rng.standard_normal(6)
         self._report_s = t_s
         # The estimate of the body leans wrongly by as much as that of a gimbal.
         lean = np.array([*(0.5 * self._attitude_error[:2]), 0.0, 1.0])
         body = quaternion_multiply(self.body.orientation_xyzw(), lean / np.linalg.norm(lean))
         self._report = VehiclePose(
-            self.estimate + 0.01 * fine[:3],
-            self.body.velocity + self.error.velocity + 0.04 * fine[3:],
+            self.estimate,
+            self.body.velocity + self.error.velocity,
             body,
             np.array([0.0, 0.0, self.body.yaw_rate]),
             self.camera_orientation(),
@@ -139,7 +138,9 @@ class ReportingCopter(SimulatedVehicle):
 
     def _estimator_flags(self) -> int:
         lost = self._t > min(self.ekf_failed_s, self.gps_lost_s + EKF_NOTICED_S)
-        return _CONSTANT_POSITION if lost or self._t < self.readiness.estimator_s else ESTIMATOR_HEALTHY
+        flags = _CONSTANT_POSITION if lost or self._t < self.readiness.estimator_s else ESTIMATOR_HEALTHY
+        rests = self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
+        return flags | self.simulated.flags_at_rest if rests else flags
 
     def _satellites(self, t_s: float, _pose: VehiclePose) -> Any:
         there = self.readiness.fix_s <= self._t <= self.gps_lost_s + _GPS_NOTICED_S

@@ -81,6 +81,7 @@ class SimulatedVehicle:
         self._encoders = self._all_encoders()
         self._due_s: dict[int, float] = {}
         self.armed, self.battery, self.landed_state = True, 87, mavlink.MAV_LANDED_STATE_IN_AIR
+        self.system_status = mavlink.MAV_STATE_ACTIVE
         #: The mode, and the one that was chosen last: an autopilot keeps it where a failsafe enters another.
         self.mode = self.intended = kind.control_mode
         self._mode_sent: tuple[float, tuple[int, int]] = (-math.inf, (0, 0))
@@ -149,7 +150,7 @@ class SimulatedVehicle:
     def _answer(self, message: Any, t_s: float) -> None:
         name = message.get_type()
         if name == "TIMESYNC" and message.tc1 == 0:
-            self._send(self._mav.timesync_encode(int((t_s + self.boot_s) * 1e9), message.ts1))
+            self._send(self._mav.timesync_encode(int(self.clock_s(t_s) * 1e9), message.ts1))
         elif name == "PARAM_REQUEST_READ":
             self._report_setting(message.param_id)
         elif name == "COMMAND_LONG":
@@ -205,8 +206,12 @@ class SimulatedVehicle:
     def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> Any:
         return self._encoders[number](t_s, pose)
 
+    def clock_s(self, t_s: float) -> float:
+        """Time since boot by its own clock, at a path time."""
+        return self.boot_s + self.simulated.clock_rate * t_s
+
     def _boot_ms(self, t_s: float) -> int:
-        return int((t_s + self.boot_s) * 1e3) % 2**32
+        return int(self.clock_s(t_s) * 1e3) % 2**32
 
     def _local_position(self, t_s: float, pose: VehiclePose) -> Any:
         vectors = (*enu_to_ned(pose.position_enu_m), *enu_to_ned(pose.velocity_enu_m_s))
@@ -243,7 +248,7 @@ class SimulatedVehicle:
             self.kind.mav_autopilot,
             mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | armed,
             self.kind.modes[self.mode],
-            mavlink.MAV_STATE_ACTIVE,
+            self.system_status,
         )
 
     def _present_modes(self) -> tuple[int, int]:

@@ -79,6 +79,26 @@ def test_no_delay_of_a_link_counts_as_a_step_of_a_clock(delays):
         assert abs(clock.offset_ns - true) <= clock.round_trip_ns // 2 + 1 <= S // 100 + 1
 
 
+@pytest.mark.parametrize("rate", [0.006, -0.006, 0.03])
+def test_a_clock_that_runs_slow_is_no_step_and_its_stamps_stay_right(rate, caplog):
+    """The simulated PX4 of recorded flights: its clock ran slower by 0.6 %, and by 3 % where the machine was busy."""
+    rng = np.random.default_rng(3)
+    clock, start, worst = ClockOffset(), 1_700_000_000 * S, 0
+    for i in range(300):
+        sent = start + i * S // 2
+        there, back = (int(rng.exponential(0.005) * S) + 1_000_000 for _ in range(2))
+
+        def remote(now):
+            return 30 * S + round((now - start) * (1.0 - rate))
+
+        clock.exchange(sent, remote(sent + there), sent + there + back)
+        if i > 20:
+            exposed = sent + there + back + S // 4
+            worst = max(worst, abs(clock.to_local_ns(remote(exposed), exposed + S // 20) - exposed))
+    assert not caplog.records
+    assert worst < 25_000_000
+
+
 def test_stamp_is_never_later_than_its_reception():
     clock = ClockOffset()
     assert clock.to_local_ns(5, 77) == 77

@@ -18,7 +18,8 @@ def test_pose_is_interpolated_and_briefly_extrapolated():
     history = PoseHistory()
     assert history.at(S) is None
     for i in range(20):
-        history.add(state(1 + 0.1 * i, 3.0 * i))
+        seen = state(1 + 0.1 * i, 3.0 * i)
+        history.add(seen, seen.position_enu_m)
     middle = history.at(int(1.55 * S))
     assert np.allclose(middle.position, [1.55, 0, 2])
     yaw = np.deg2rad(16.5)
@@ -29,5 +30,5 @@ def test_pose_is_interpolated_and_briefly_extrapolated():
     assert np.allclose(after.rotation[2], [np.cos(yaw), np.sin(yaw), 0])
     assert history.at(int(3.3 * S)) is None
     assert history.at(int(0.5 * S)) is None
-    history.add(state(0.2))  # the clock went back
+    history.add(state(0.2), np.zeros(3))  # the clock went back
     assert history.at(int(1.5 * S)) is None

@@ -9,6 +9,7 @@ from drocap_ros.flight.pose_history import CameraPose, PoseHistory
 from drocap_ros.flight.subject.subject_filter import SubjectFilter
 from drocap_ros.flight.subject.subject_measurement import locate_subject
 from drocap_ros.flight.subject_config import SubjectConfig
+from drocap_ros.flight.vehicle_filter import VehicleFilter
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.observation import PoseObservation
@@ -131,14 +132,17 @@ def test_velocity_of_a_standing_person_is_small_while_the_position_wanders():
     wander = np.cumsum(rng.normal(0, 0.03, (len(capture.tracks.stamp_ns), 3)), axis=0)
     velocity = np.gradient(capture.camera_position, 1 / 15.0, axis=0)
     history, subject, speeds, places = PoseHistory(), SubjectFilter(SubjectConfig()), [], []
+    own = VehicleFilter()
     for i, pose, seen in observations(capture):
         reported = capture.camera_position[i] + wander[i]
         forward_left_up = quaternion_from_matrix(pose.rotation.T @ OPTICAL_FROM_FLU)
+        own.take(seen.stamp_ns * 1e-9, reported, velocity[i])
         history.add(
             VehicleState(
                 seen.stamp_ns, position_enu_m=reported, velocity_enu_m_s=velocity[i],
                 orientation_xyzw=np.array([0.0, 0.0, 0.0, 1.0]), gimbal_orientation_xyzw=forward_left_up,
-            )
+            ),
+            own.position,
         )  # fmt: skip
         camera = history.at(seen.stamp_ns)
         assert np.allclose(camera.position + history.offset, reported)

@@ -1,4 +1,8 @@
-"""PX4 follows its wandering estimate: off its setpoints by 0.26 m (RMS) within 4 s in recorded orbits."""
+"""PX4 follows its wandering estimate: off its setpoints by 0.26 m (RMS) within 4 s in recorded orbits.
+
+Where its reports were recorded, too (``t3_*``), it is off by 0.5 m per axis: the error of
+its velocity alone moves it by 0.26 m.
+"""
 
 import numpy as np
 import pytest
@@ -19,7 +23,7 @@ def change_m(path, seconds=4.0):
 
 def hover(seed):
     """(N, 2) m, a vehicle that holds a place for a minute by an estimate that errs."""
-    error, place, rest = EstimateError(0.4, True, seed), np.zeros(3), []
+    error, place, rest = EstimateError(PX4.simulated.horizontal, PX4.simulated.vertical, 1.0, seed), np.zeros(3), []
     body = Body(place, 0.0, np.zeros(3), PX4.simulated.airframe, gust=0.0)
     control = control_of(PX4, error.position, 0.0, body.drag())
     control.begin(Manner.SETPOINTS, error.position, np.zeros(3), 0.0)
@@ -33,7 +37,7 @@ def hover(seed):
 
 
 def test_vehicle_wanders_no_less_than_the_recorded_one():
-    assert 0.26 <= np.mean([change_m(hover(seed)) for seed in range(8)]) <= 0.4
+    assert 0.26 <= np.mean([change_m(hover(seed)) for seed in range(8)]) <= 0.54
 
 
 @pytest.mark.parametrize("name", ["px4_stand_calm", "px4_walk_calm"])

@@ -1,0 +1,59 @@
+"""Orbits by reports that err as those of the real autopilots: none lasted while limits were set by the true motion."""
+
+import numpy as np
+import pytest
+
+from drocap_ros.flight.autopilot import AUTOPILOTS
+from drocap_ros.flight.orbit.states import State
+from lab.flights.orbit_loop import LoopSettings, OrbitLoop, orbit_quality, with_config
+from lab.studies.report_errors import LEFT_OUT, recorded_errors, simulated_errors
+
+
+def flown(autopilot, seed, seconds=62.0, **values):
+    """An orbit of 6 m at 19 deg/s, and where the subject was believed, less the error of the estimate."""
+    settings = LoopSettings(autopilot=autopilot, seed=seed, seconds=seconds + 1.0, **values)
+    loop = OrbitLoop(with_config(settings, radius_m=6.0, angular_speed_deg_s=19.0))
+    loop.start()
+    places = []
+
+    def watch(loop):
+        if loop.t > 12.0 and loop.status is not None:
+            places.append(loop.status.subject_position[:2] - loop.copter.error.position[:2] - loop.pelvis()[:2])
+
+    loop.run(seconds, watch)
+    return loop, np.array(places)
+
+
+@pytest.mark.parametrize("seed", [0, 11])
+@pytest.mark.parametrize("autopilot", AUTOPILOTS)
+def test_an_orbit_about_one_who_stands_lasts_and_his_place_stays(autopilot, seed):
+    loop, places = flown(autopilot, seed)
+    states = {row.state for row in loop.rows if row.t_s > 8.0}
+    assert states == {State.ORBITING}, loop.reasons[-2:]
+    quality = orbit_quality(loop, 6.0, 12.0)
+    assert quality.radius_error_m < 0.7
+    assert quality.least_distance_m > 4.5
+    seconds = places[: len(places) // 20 * 20].reshape(-1, 20, 2).mean(axis=1)
+    assert np.hypot(*(seconds - seconds.mean(axis=0)).T).max() < 1.2  # he was believed 4.6 m away from his place
+
+
+def test_an_orbit_about_one_who_walks_lasts():
+    loop, _ = flown("px4", 1, action="walk")
+    assert {row.state for row in loop.rows if row.t_s > 8.0} == {State.ORBITING}, loop.reasons[-2:]
+    assert orbit_quality(loop, 6.0, 12.0).radius_error_m < 0.9
+
+
+@pytest.mark.parametrize("autopilot", AUTOPILOTS)
+def test_simulated_reports_err_as_much_as_the_recorded_ones(shared, autopilot):
+    paths = [p for p in (shared / "flight").glob(f"t3_{autopilot}_*.npz") if not any(w in p.name for w in LEFT_OUT)]
+    recorded = [errors for path in paths if len(errors := recorded_errors(path)) > 30]
+    kind = AUTOPILOTS[autopilot].simulated
+    simulated = [simulated_errors(kind.horizontal, kind.vertical, 50.0, seed) for seed in range(20)]
+
+    def sizes(series):
+        """(2, 3, 2): of the errors and of their changes within a second, by axis, of position and velocity."""
+        changes = np.concatenate([errors[10:] - errors[:-10] for errors in series])
+        return np.stack([np.concatenate(series).std(axis=0), changes.std(axis=0)])
+
+    ratio = sizes(simulated) / sizes(recorded)
+    assert np.all((ratio > 0.5) & (ratio < 1.7)), ratio.round(2)
