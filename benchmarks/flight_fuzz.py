@@ -36,7 +36,7 @@ class Block(NamedTuple):
     flew: bool
 
 
-def fuzz(seed: int, key_file: Path, block_s: float = _BLOCK_S) -> Block:
+def fuzz(seed: int, key_file: Path, block_s: float = _BLOCK_S) -> Block:  # noqa: C901 - one disturbance after the other, of one chance
     """One block of simulated flight.
 
     Raises

@@ -29,23 +29,21 @@ _ECCENTRICITY2 = 6.694379990141316e-3
 
 
 def ned_to_enu(vector: np.ndarray) -> np.ndarray:
-    """(..., 3) NED -> ENU."""
-    return vector[..., _ENU_OF_NED] * _SIGNS
+    """(..., 3) NED -> ENU, or back."""
+    enu: np.ndarray = vector[..., _ENU_OF_NED] * _SIGNS
+    return enu
 
 
-def enu_to_ned(vector: np.ndarray) -> np.ndarray:
-    """(..., 3) ENU -> NED."""
-    return ned_to_enu(vector)
+enu_to_ned = ned_to_enu
 
 
 def frd_to_flu(vector: np.ndarray) -> np.ndarray:
-    """(..., 3) body FRD -> FLU."""
-    return vector * np.array([1.0, -1.0, -1.0])
+    """(..., 3) body FRD -> FLU, or back."""
+    flu: np.ndarray = vector * np.array([1.0, -1.0, -1.0])
+    return flu
 
 
-def flu_to_frd(vector: np.ndarray) -> np.ndarray:
-    """(..., 3) body FLU -> FRD."""
-    return frd_to_flu(vector)
+flu_to_frd = frd_to_flu
 
 
 def quaternion_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -74,19 +72,18 @@ _FLU_TO_OPTICAL = _as_matrix(np.array([0.0, 0.0, 0.0, 1.0]), quaternion_from_mat
 
 
 def orientation_to_ros(frd_to_ned: np.ndarray) -> np.ndarray:
-    """(..., 4) x y z w, rotation body FRD -> NED, to the rotation body FLU -> ENU; the w of the result is >= 0."""
+    """(..., 4) x y z w, rotation body FRD -> NED, to the rotation body FLU -> ENU, or back; w of the result >= 0."""
     q = frd_to_ned @ _BETWEEN_AVIATION_AND_ROS
     return np.where(q[..., 3:] < 0, -q, q)
 
 
-def orientation_to_aviation(flu_to_enu: np.ndarray) -> np.ndarray:
-    """(..., 4) x y z w, rotation body FLU -> ENU, to the rotation body FRD -> NED; the w of the result is >= 0."""
-    return orientation_to_ros(flu_to_enu)
+orientation_to_aviation = orientation_to_ros
 
 
 def optical_orientation(camera_flu_to_enu: np.ndarray) -> np.ndarray:
     """(..., 4) x y z w, rotation camera body FLU -> ENU, to the rotation optical frame -> ENU."""
-    return camera_flu_to_enu @ _FLU_TO_OPTICAL
+    orientation: np.ndarray = camera_flu_to_enu @ _FLU_TO_OPTICAL
+    return orientation
 
 
 def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> np.ndarray:
@@ -106,12 +103,14 @@ def quaternion_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> 
 def yaw_of(frd_to_ned: np.ndarray) -> np.ndarray:
     """(...) rad, heading from north towards east, of rotations (..., 4) x y z w body FRD -> NED."""
     x, y, z, w = (frd_to_ned[..., i] for i in range(4))
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    yaw: np.ndarray = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return yaw
 
 
 def camera_rotation(camera_flu_to_enu: np.ndarray) -> np.ndarray:
     """(..., 3, 3) world ENU -> optical frame, from the rotation (..., 4) x y z w camera FLU -> ENU."""
-    return OPTICAL_FROM_FLU @ np.swapaxes(matrix_from_quaternion(camera_flu_to_enu), -1, -2)
+    rotation: np.ndarray = OPTICAL_FROM_FLU @ np.swapaxes(matrix_from_quaternion(camera_flu_to_enu), -1, -2)
+    return rotation
 
 
 def _ecef(latitude_deg: np.ndarray, longitude_deg: np.ndarray, altitude_m: np.ndarray) -> np.ndarray:
@@ -145,7 +144,8 @@ def geodetic_to_enu(geodetic: np.ndarray, origin: np.ndarray) -> np.ndarray:
     ``origin`` is (3,) of the same kind.
     """
     offset = _ecef(*np.moveaxis(geodetic, -1, 0)) - _ecef(*origin)
-    return offset @ _enu_axes(origin[0], origin[1]).T
+    enu: np.ndarray = offset @ _enu_axes(origin[0], origin[1]).T
+    return enu
 
 
 def enu_to_geodetic(enu: np.ndarray, origin: np.ndarray) -> np.ndarray:

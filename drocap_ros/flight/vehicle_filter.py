@@ -71,7 +71,8 @@ class VehicleFilter:
     @property
     def velocity_sd(self) -> np.ndarray:
         """(3,) m/s."""
-        return np.sqrt(self._variance)
+        deviation: np.ndarray = np.sqrt(self._variance)
+        return deviation
 
     def take(self, stamp_s: float, position: np.ndarray, velocity: np.ndarray) -> Doubt:
         """Take a report, (3,) m and (3,) m/s ENU, and say what it contradicts.

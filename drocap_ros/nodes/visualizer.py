@@ -18,7 +18,7 @@ from drocap_ros.ros.component import OK, WARN, ComponentNode
 from drocap_ros.ros.conversions import MAP, pose3d_from_ros, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.markers import body_transforms, keypoint_marker, path_marker, pose_markers
-from drocap_ros.ros.rep155 import MISSING, HumanTopics, hri, human_transforms
+from drocap_ros.ros.rep155 import AVAILABLE, MISSING, HumanTopics, human_transforms
 from drocap_ros.ros.topics import TFMessage
 from drocap_ros.view.visualizer_config import RateLimit, VisualizerConfig
 
@@ -47,8 +47,8 @@ class VisualizerNode(ComponentNode):
         self._pace = {stage: RateLimit(self.config.marker_rate_hz) for stage in ("initial", "latest")}
         self._path: deque[np.ndarray] = deque(maxlen=self.config.path_points)
         self._path_ns = self._placed_ns = -(10**18)
-        self._humans = HumanTopics(self, self.config.frame_prefix) if self.config.human_topics and hri else None
-        if self.config.human_topics and hri is None:
+        self._humans = HumanTopics(self, self.config.frame_prefix) if self.config.human_topics and AVAILABLE else None
+        if self.config.human_topics and not AVAILABLE:
             self.get_logger().warning(MISSING)
         self.input("pose2d", self._on_pose2d)
         self.input("pose3d/initial", self._on_initial)

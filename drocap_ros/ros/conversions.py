@@ -36,7 +36,7 @@ def stamp_to_ros(stamp_ns: int) -> Time:
 
 def stamp_from_ros(stamp: Time) -> int:
     """builtin_interfaces/Time -> integer nanoseconds."""
-    return stamp.sec * 10**9 + stamp.nanosec
+    return int(stamp.sec * 10**9 + stamp.nanosec)
 
 
 def header_at(stamp_ns: int, frame_id: str) -> Header:

@@ -26,6 +26,7 @@ try:
 except ImportError:  # optional: see above
     hri = None
 
+AVAILABLE = hri is not None
 MISSING = "hri_msgs is missing: only the frames of REP 155; install ros-$ROS_DISTRO-hri-msgs, or run `make setup`"
 _BODIES = "/humans/bodies"
 _QOS = QoSProfile(depth=10)

@@ -14,7 +14,7 @@ from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleSta
 from drocap_ros.srv import OrbitCommand
 
 try:
-    from tf2_msgs.msg import TFMessage
+    from tf2_msgs.msg import TFMessage as TFMessage
 except ImportError:  # missing from the ROS wheels; `make setup` builds it
     TFMessage = None
 

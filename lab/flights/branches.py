@@ -29,7 +29,7 @@ def branch(end: Callable[[], Result]) -> Result:
             with os.fdopen(write, "wb") as file:
                 pickle.dump(end(), file)
             status = 0
-        except BaseException:
+        except BaseException:  # noqa: BLE001 - the child ends here, whatever it is
             traceback.print_exc()
         finally:
             os._exit(status)

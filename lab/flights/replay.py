@@ -172,7 +172,7 @@ def _lost(name: str, last_s: float) -> Case:
     return Case(name, last_s, (Event(last_s + _LOST_S, Manner.HOLD),), heard_until_s=last_s + 0.01)
 
 
-def recorded_cases(flight: RecordedFlight, name: str) -> Sequence[Case]:
+def recorded_cases(flight: RecordedFlight, name: str) -> Sequence[Case]:  # noqa: C901 - a table of names, one line each
     """What happened in a recording, by its name; a whole orbit is compared from several instants on."""
     last_s = float(flight.setpoint_s[-1]) if len(flight.setpoint_s) else FAULT_S
     if name.startswith("bridge_killed"):

@@ -217,4 +217,5 @@ def standardized_error(joints_m: np.ndarray, std_m: np.ndarray, truth_mm: np.nda
 
 
 def _std(covariance: np.ndarray) -> np.ndarray:
-    return np.sqrt(covariance[..., [0, 3, 5]])
+    deviation: np.ndarray = np.sqrt(covariance[..., [0, 3, 5]])
+    return deviation

@@ -49,8 +49,8 @@ def fit(series: list[np.ndarray]) -> ReportErrors:
     noise = np.sqrt(np.diag(left))
     rows = solved.round(4).tolist()
     return ReportErrors(
-        first=(tuple(rows[0][:2]), tuple(rows[1][:2])),  # type: ignore[arg-type]
-        second=(tuple(rows[0][2:]), tuple(rows[1][2:])),  # type: ignore[arg-type]
+        first=(tuple(rows[0][:2]), tuple(rows[1][:2])),
+        second=(tuple(rows[0][2:]), tuple(rows[1][2:])),
         noise=(round(float(noise[0]), 5), round(float(noise[1]), 5)),
         correlation=round(float(left[0, 1] / noise.prod()), 2),
     )

@@ -40,7 +40,8 @@ def shortening(motion: np.ndarray, reach: np.ndarray, least_flexion: np.ndarray)
     _, thigh, shank = _leg(motion)
     ratio = np.median(thigh / (thigh + shank), axis=(1, 2))
     longest = np.sqrt(ratio**2 + (1 - ratio) ** 2 + 2 * ratio * (1 - ratio) * np.cos(least_flexion))
-    return np.minimum(reach / longest, 1.0)
+    factor: np.ndarray = np.minimum(reach / longest, 1.0)
+    return factor
 
 
 def refit_knees(motion: np.ndarray, factor: np.ndarray) -> np.ndarray:

@@ -174,7 +174,7 @@ def _known_rotation(rotation: np.ndarray, rng: np.random.Generator) -> np.ndarra
     """What a gimbal reports: turned by 1.5 degrees and slowly wandering; NaN in half of the windows."""
     windows, frames = rotation.shape[:2]
     error = 0.026 * rng.standard_normal((windows, 1, 3)) + 0.006 * slow(rng, windows, frames, (3,))
-    reported = exp_so3(error) @ rotation
+    reported: np.ndarray = exp_so3(error) @ rotation
     reported[rng.random(windows) < 0.5] = np.nan
     return reported
 

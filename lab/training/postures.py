@@ -144,7 +144,7 @@ _OF_LEVEL = [np.flatnonzero(level == _LEVELS) for level in range(_LYING_LEVEL + 
 def _draw_angles(rng: np.random.Generator, kinds: np.ndarray) -> np.ndarray:
     """(B, K, 28) angles of postures of the kinds (B, K)."""
     low, high = _LOW[kinds], _HIGH[kinds]
-    angle = low + rng.random(low.shape) * (high - low)
+    angle: np.ndarray = low + rng.random(low.shape) * (high - low)
     # Both sides are drawn alike where the kind's own ranges are the same.
     same = (rng.random(kinds.shape) < 0.5)[..., None] & ~(low[..., _RIGHT] != low[..., _LEFT])
     angle[..., _LEFT] = np.where(same, angle[..., _RIGHT] * rng.uniform(0.85, 1.15, same.shape), angle[..., _LEFT])
@@ -195,7 +195,8 @@ def draw_postures(rng: np.random.Generator, windows: int, frames: int) -> np.nda
     part = np.clip((np.arange(frames)[:, None, None] - begin[:, None]) / lasts[:, None, :, None], 0, 1)
     change = np.diff(angle, axis=1)
     curve = np.einsum("bkj,btkj->btj", change, part * part * (3 - 2 * part))
-    return (angle[:, None, 0] + curve).astype(np.float32)
+    swept: np.ndarray = (angle[:, None, 0] + curve).astype(np.float32)
+    return swept
 
 
 def turn(vector: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
@@ -207,7 +208,8 @@ def turn(vector: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
     vx, vy, vz = vector[..., 0], vector[..., 1], vector[..., 2]
     cross = np.stack([ay * vz - az * vy, az * vx - ax * vz, ax * vy - ay * vx], axis=-1)
     along = (axis * vector).sum(axis=-1, keepdims=True)
-    return vector * cosine + cross * sine + axis * along * (1 - cosine)
+    turned: np.ndarray = vector * cosine + cross * sine + axis * along * (1 - cosine)
+    return turned
 
 
 def _axes(bone: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -117,7 +117,7 @@ def _scene(world: World, rng: np.random.Generator) -> Scenery:
 
 def _person(world: World, rng: np.random.Generator) -> np.ndarray:
     """(15, 3) m, a random pose within 12 m of the origin."""
-    joints = world.poses[int(rng.integers(len(world.poses)))].copy()
+    joints: np.ndarray = world.poses[int(rng.integers(len(world.poses)))].copy()
     turn = rng.uniform(-np.pi, np.pi)
     cos, sin = np.cos(turn), np.sin(turn)
     joints = joints @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1.0]])
@@ -210,7 +210,8 @@ def _shown(image: np.ndarray, px: np.ndarray) -> np.ndarray:
     """(15,) bool, whether points (15, 2) px lie inside the border, where the image is not black."""
     height, width = image.shape[:2]
     at = np.clip(np.round(np.nan_to_num(px)), 0, [width - 1, height - 1]).astype(int)
-    return image[at[:, 1], at[:, 0]].any(axis=1)
+    inside: np.ndarray = image[at[:, 1], at[:, 0]].any(axis=1)
+    return inside
 
 
 def _occlude(rng: np.random.Generator, image: np.ndarray, box: np.ndarray | None) -> None:
@@ -257,4 +258,5 @@ def degrade(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
     if rng.random() < 0.4:
         _, code = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 96))])
         image = np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR))
-    return np.maximum(image, 1)  # black marks the outside of the image
+    marked: np.ndarray = np.maximum(image, 1)  # black marks the outside of the image
+    return marked

@@ -27,6 +27,6 @@ def branched(test: Callable[..., None]) -> Callable[..., None]:
 def _failure(test: Callable[..., None], args: tuple[Any, ...], kwargs: dict[str, Any]) -> str:
     try:
         test(*args, **kwargs)
-    except BaseException:
+    except BaseException:  # noqa: BLE001 - the parent fails with it
         return traceback.format_exc()
     return ""

@@ -172,7 +172,7 @@ def test_tracked_body_is_published_while_it_is_tracked(capture, prefix, name):
 
 
 def test_without_hri_msgs_the_frames_remain_and_the_status_names_the_reason(capture, monkeypatch):
-    monkeypatch.setattr(visualizer, "hri", None)
+    monkeypatch.setattr(visualizer, "AVAILABLE", False)
     with graph(human_topics=True) as (node, other, until):
         frames = []
         other.create_subscription(TFMessage, "/tf", lambda m: frames.extend(m.transforms), RESULT_QOS)

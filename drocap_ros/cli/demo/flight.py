@@ -132,7 +132,7 @@ class _Desk:
         from drocap_ros.ros.topics import TOPICS
 
         self._node, self._operator, self._call, self._now_s = node, operator, call, now_s
-        self._say = lambda words: say(now_s(), words)
+        self._say: Callable[[str], None] = lambda words: say(now_s(), words)
         self._pilot = ""
         operator.cleared = False
         for topic, take in (("orbit/status", self._on_status), ("/diagnostics", self._on_diagnostics)):

@@ -182,7 +182,7 @@ class _SerialTransport:
 
     def write(self, data: bytes) -> bool:
         try:
-            return self._port.write(data) == len(data)
+            return bool(self._port.write(data) == len(data))
         except Exception:  # noqa: BLE001  as above; what is not sent is a gap of the stream
             return False
 

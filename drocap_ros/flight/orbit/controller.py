@@ -164,8 +164,9 @@ class OrbitController:
         setpoint: Setpoint | None = None
         if action == Action.ORBIT:
             setpoint = self._orbit.setpoint(seen, self.safety, self._observer.framing, dt)
-            # The autopilot's loop compares it with the velocity that it reports, error included.
-            setpoint = setpoint._replace(velocity=setpoint.velocity + seen.vehicle.velocity_offset)
+            if setpoint is not None:
+                # The autopilot's loop compares it with the velocity that it reports, error included.
+                setpoint = setpoint._replace(velocity=setpoint.velocity + seen.vehicle.velocity_offset)
         elif action == Action.HOLD and self.safety.hold_position is not None:
             setpoint = hold_setpoint(self.safety.hold_position, self.safety.hold_yaw)
         if setpoint is not None and setpoint.is_finite():

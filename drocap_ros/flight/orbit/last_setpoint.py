@@ -139,7 +139,7 @@ class _Coasting(NamedTuple):
         now = complex(*self.seen.subject.position[:2])
         then = now + self.subject_velocity * float(coast.time_s[-1])
         alone = min(abs(coast.place[0] - now), abs(coast.place[0] - then))
-        return alone - abs(coast.place[-1] - then) + coast.creep_towards(then)
+        return float(alone - abs(coast.place[-1] - then) + coast.creep_towards(then))
 
 
 def harmless(

@@ -20,7 +20,8 @@ class RawDetections(NamedTuple):
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
-    return 1.0 / (1.0 + np.exp(-np.clip(x, -50, 50)))
+    y: np.ndarray = 1.0 / (1.0 + np.exp(-np.clip(x, -50, 50)))
+    return y
 
 
 def _corners(boxes: np.ndarray) -> np.ndarray:

@@ -16,14 +16,16 @@ def iou(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     """(N, M) intersection over union of (N, 4) and (M, 4) boxes x_min y_min x_max y_max; 0 for empty boxes."""
     common, areas, other_areas = _areas(boxes, others)
     union = areas[:, None] + other_areas[None] - common
-    return np.divide(common, union, out=np.zeros_like(common), where=union > 0)
+    ratio: np.ndarray = np.divide(common, union, out=np.zeros_like(common), where=union > 0)
+    return ratio
 
 
 def overlap_coefficient(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     """(N, M) intersection over the smaller of two boxes; 0 for empty boxes."""
     common, areas, other_areas = _areas(boxes, others)
     smaller = np.minimum(areas[:, None], other_areas[None])
-    return np.divide(common, smaller, out=np.zeros_like(common), where=smaller > 0)
+    ratio: np.ndarray = np.divide(common, smaller, out=np.zeros_like(common), where=smaller > 0)
+    return ratio
 
 
 def _areas(boxes: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

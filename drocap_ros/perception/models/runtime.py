@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ class OnnxModel:
         # A spinning thread pool starves the decoder and the other nodes of a companion computer.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         providers = choose_providers(provider, ort.get_available_providers())
-        self._open = lambda source: ort.InferenceSession(source, options, providers=providers)
+        self._open = partial(ort.InferenceSession, sess_options=options, providers=providers)
         try:
             self._session: Any = self._open(str(self.path))
         except Exception as error:  # noqa: BLE001  # onnxruntime's exceptions have no common base

@@ -44,7 +44,8 @@ class BodyPose(NamedTuple):
         if seen.sum() < share * len(seen):
             return None
         xy = self.xy[: len(BODY_15)][seen]
-        return np.concatenate([xy.min(axis=0), xy.max(axis=0)])
+        box: np.ndarray = np.concatenate([xy.min(axis=0), xy.max(axis=0)])
+        return box
 
     def box(self, least: float = _SEEN, share: float = 0.7) -> np.ndarray | None:
         """(4,) px box of the person with these joints; None as for :meth:`extent`."""

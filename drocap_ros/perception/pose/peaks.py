@@ -79,7 +79,8 @@ def _second_peak(maps: np.ndarray, top: np.ndarray, score: np.ndarray) -> np.nda
     highest = np.maximum(np.maximum(across[:, :-2], across[:, 1:-1]), across[:, 2:])
     peak = (maps >= highest) & (maps > _LEAST_SECOND * score[:, None, None])
     peak[np.arange(len(maps)), top[:, 1], top[:, 0]] = False
-    return np.where(peak, maps, 0.0).max(axis=(1, 2)).astype(np.float32)
+    second: np.ndarray = np.where(peak, maps, 0.0).max(axis=(1, 2)).astype(np.float32)
+    return second
 
 
 def _blur(maps: np.ndarray) -> np.ndarray:

@@ -42,7 +42,8 @@ def describe(image: np.ndarray, box: np.ndarray) -> np.ndarray | None:
         # Colours of clothes and skin lie within a quarter of the range of a and b.
         ranges = ((0, 255), (96, 160), (96, 160))
         histograms += [_soft_histogram(lab[..., c].ravel(), *between) for c, between in enumerate(ranges)]
-    return np.sqrt(np.concatenate(histograms) / len(histograms)).astype(np.float32)
+    roots: np.ndarray = np.sqrt(np.concatenate(histograms) / len(histograms)).astype(np.float32)
+    return roots
 
 
 def _soft_histogram(values: np.ndarray, low: float, high: float) -> np.ndarray:

@@ -168,9 +168,11 @@ def _allowed(
 
 
 def _centres(boxes: np.ndarray) -> np.ndarray:
-    return (boxes[:, :2] + boxes[:, 2:]) / 2
+    centres: np.ndarray = (boxes[:, :2] + boxes[:, 2:]) / 2
+    return centres
 
 
 def _sizes(boxes: np.ndarray) -> np.ndarray:
     """Square root of the area, at least 1 px."""
-    return np.sqrt(np.maximum(np.prod(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None), axis=1), 1.0))
+    sizes: np.ndarray = np.sqrt(np.maximum(np.prod(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None), axis=1), 1.0))
+    return sizes

@@ -28,7 +28,8 @@ class BoxFilter:
         self.p[:, 1, 1] = self._scaled(_FIRST_RATE) ** 2
 
     def _scaled(self, values: np.ndarray) -> np.ndarray:
-        return values * np.array([self.length, self.length, 1.0, 1.0])
+        scaled: np.ndarray = values * np.array([self.length, self.length, 1.0, 1.0])
+        return scaled
 
     def box(self) -> np.ndarray:
         """(4,) x_min y_min x_max y_max px."""

@@ -200,7 +200,9 @@ def uncut(boxes: np.ndarray, window: Window | None, image_size: tuple[int, int])
         return np.ones(len(boxes), bool)
     low, high = np.array(window[:2]), np.array(window[2:])
     uncut_low = (boxes[:, :2] > low + _CUT_PX) | (low == 0)
-    return (uncut_low & ((boxes[:, 2:] < high - _CUT_PX) | (high == np.array(image_size)))).all(axis=1)
+    uncut_high = (boxes[:, 2:] < high - _CUT_PX) | (high == np.array(image_size))
+    free: np.ndarray = (uncut_low & uncut_high).all(axis=1)
+    return free
 
 
 def _overlaps(box: np.ndarray, boxes: np.ndarray, least: float) -> bool:

@@ -92,7 +92,8 @@ class ReportingCopter(SimulatedVehicle):
     @property
     def estimate(self) -> np.ndarray:
         """(3,) m, the autopilot's position estimate."""
-        return self.body.position + self.error.position
+        estimate: np.ndarray = self.body.position + self.error.position
+        return estimate
 
     def at(self, t_s: float) -> VehiclePose:
         """Reported pose: the estimate, not the truth."""

@@ -35,7 +35,8 @@ class EstimateError:
     @property
     def position(self) -> np.ndarray:
         """(3,) m, estimate less truth."""
-        return self._between()[:, 0] + self.glitch
+        error: np.ndarray = self._between()[:, 0] + self.glitch
+        return error
 
     @property
     def velocity(self) -> np.ndarray:
