@@ -30,7 +30,7 @@ BUDGETS = {
      "live_replay"): 3.2,  # the history of the camera, the stamps and the contacts came down from reconstruction
     ("perception",): 5.2,
     ("reconstruction",): 7.6,
-    ("flight",): 8.9,  # the filter of what the autopilot reports replaced the sum of its steps
+    ("flight",): 9.1,  # the filter of reports, what waits for the air, and words of what leads out of each state
     ("recording",): 4.9,
     ("simulation",): 3.6,
     ("evaluation",): 1.1,

@@ -29,6 +29,7 @@ from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.observation import PoseObservation
 
+_STANDING_M_S = 0.05  # speed below which a setpoint stands
 _GIMBAL_PERIOD_S = 0.5
 _MODE_AGE_STEPS = 1.5  # a report of the mode is seen in the step that follows it
 
@@ -164,7 +165,8 @@ class OrbitController:
         setpoint: Setpoint | None = None
         if action == Action.ORBIT:
             setpoint = self._orbit.setpoint(seen, self.safety, self._observer.framing, dt)
-            if setpoint is not None:
+            # A setpoint that stands stays at zero: nothing moves by an estimate alone.
+            if setpoint is not None and float(np.linalg.norm(setpoint.velocity)) > _STANDING_M_S:
                 # The autopilot's loop compares it with the velocity that it reports, error included.
                 setpoint = setpoint._replace(velocity=setpoint.velocity + seen.vehicle.velocity_offset)
         elif action == Action.HOLD and self.safety.hold_position is not None:
