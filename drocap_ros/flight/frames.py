@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
+from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, quaternion_multiply
 
 _ENU_OF_NED, _SIGNS = np.array([1, 0, 2]), np.array([1.0, 1.0, -1.0])
 _HALF = np.sqrt(0.5)
@@ -22,10 +22,6 @@ _NED_ENU = np.array([_HALF, _HALF, 0.0, 0.0])
 _FRD_FLU = np.array([1.0, 0.0, 0.0, 0.0])
 #: Camera body (x forward, y left, z up) -> optical frame (x right, y down, z forward).
 OPTICAL_FROM_FLU = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-
-# WGS 84
-_EQUATOR_RADIUS_M = 6_378_137.0
-_ECCENTRICITY2 = 6.694379990141316e-3
 
 
 def ned_to_enu(vector: np.ndarray) -> np.ndarray:
@@ -44,22 +40,6 @@ def frd_to_flu(vector: np.ndarray) -> np.ndarray:
 
 
 flu_to_frd = frd_to_flu
-
-
-def quaternion_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Product (..., 4) x y z w: first ``b``, then ``a``."""
-    # By components: np.cross takes ten times as long for one quaternion.
-    ax, ay, az, aw = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
-    bx, by, bz, bw = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
-    return np.stack(
-        [
-            aw * bx + bw * ax + (ay * bz - az * by),
-            aw * by + bw * ay + (az * bx - ax * bz),
-            aw * bz + bw * az + (ax * by - ay * bx),
-            aw * bw - (ax * bx + ay * by + az * bz),
-        ],
-        axis=-1,
-    )
 
 
 def _as_matrix(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -111,52 +91,3 @@ def camera_rotation(camera_flu_to_enu: np.ndarray) -> np.ndarray:
     """(..., 3, 3) world ENU -> optical frame, from the rotation (..., 4) x y z w camera FLU -> ENU."""
     rotation: np.ndarray = OPTICAL_FROM_FLU @ np.swapaxes(matrix_from_quaternion(camera_flu_to_enu), -1, -2)
     return rotation
-
-
-def _ecef(latitude_deg: np.ndarray, longitude_deg: np.ndarray, altitude_m: np.ndarray) -> np.ndarray:
-    lat, lon = np.deg2rad(latitude_deg), np.deg2rad(longitude_deg)
-    normal = _EQUATOR_RADIUS_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(lat) ** 2)
-    return np.stack(
-        [
-            (normal + altitude_m) * np.cos(lat) * np.cos(lon),
-            (normal + altitude_m) * np.cos(lat) * np.sin(lon),
-            (normal * (1 - _ECCENTRICITY2) + altitude_m) * np.sin(lat),
-        ],
-        axis=-1,
-    )
-
-
-def _enu_axes(latitude_deg: float, longitude_deg: float) -> np.ndarray:
-    """(3, 3) rotation ECEF -> ENU."""
-    lat, lon = np.deg2rad(latitude_deg), np.deg2rad(longitude_deg)
-    return np.array(
-        [
-            [-np.sin(lon), np.cos(lon), 0.0],
-            [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
-            [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
-        ]
-    )
-
-
-def geodetic_to_enu(geodetic: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """(..., 3) m ENU at ``origin``, of (..., 3) latitude deg, longitude deg, altitude m (WGS 84).
-
-    ``origin`` is (3,) of the same kind.
-    """
-    offset = _ecef(*np.moveaxis(geodetic, -1, 0)) - _ecef(*origin)
-    enu: np.ndarray = offset @ _enu_axes(origin[0], origin[1]).T
-    return enu
-
-
-def enu_to_geodetic(enu: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """(..., 3) latitude deg, longitude deg, altitude m, of (..., 3) m ENU at ``origin`` (3,)."""
-    x, y, z = np.moveaxis(enu @ _enu_axes(origin[0], origin[1]) + _ecef(*origin), -1, 0)
-    across = np.hypot(x, y)
-    lat = np.arctan2(z, across * (1 - _ECCENTRICITY2))
-    for _ in range(5):  # converges by a factor of about 300 a step near the ground
-        normal = _EQUATOR_RADIUS_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(lat) ** 2)
-        lat = np.arctan2(z + _ECCENTRICITY2 * normal * np.sin(lat), across)
-    normal = _EQUATOR_RADIUS_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(lat) ** 2)
-    # This form of the altitude holds at the poles too, where across / cos(lat) does not.
-    altitude = across * np.cos(lat) + z * np.sin(lat) - _EQUATOR_RADIUS_M**2 / normal
-    return np.stack([np.rad2deg(lat), np.rad2deg(np.arctan2(y, x)), altitude], axis=-1)

@@ -121,3 +121,19 @@ def slerp(q0: np.ndarray, q1: np.ndarray, s: np.ndarray | float) -> np.ndarray:
     b = np.where(small, s, np.sin(s * angle) / sine)
     out = a * q0 + b * q1
     return np.asarray(out / np.linalg.norm(out, axis=-1, keepdims=True))
+
+
+def quaternion_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Product (..., 4) x y z w: first ``b``, then ``a``."""
+    # By components: np.cross takes ten times as long for one quaternion.
+    ax, ay, az, aw = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
+    bx, by, bz, bw = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
+    return np.stack(
+        [
+            aw * bx + bw * ax + (ay * bz - az * by),
+            aw * by + bw * ay + (az * bx - ax * bz),
+            aw * bz + bw * az + (ax * by - ay * bx),
+            aw * bw - (ax * bx + ay * by + az * bz),
+        ],
+        axis=-1,
+    )

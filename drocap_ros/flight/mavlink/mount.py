@@ -12,8 +12,8 @@ import numpy as np
 
 from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.frames import orientation_to_ros, quaternion_from_euler, quaternion_multiply, yaw_of
-from drocap_ros.geometry.rotations import slerp, unit_quaternions
+from drocap_ros.flight.frames import orientation_to_ros, quaternion_from_euler, yaw_of
+from drocap_ros.geometry.rotations import quaternion_multiply, slerp, unit_quaternions
 
 _NS = 1_000_000_000
 # GIMBAL_DEVICE_FLAGS of MAVLink.

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.flight.frames import geodetic_to_enu, orientation_to_ros, quaternion_from_euler, quaternion_multiply
+from drocap_ros.flight.frames import orientation_to_ros, quaternion_from_euler
+from drocap_ros.geometry.geodesy import geodetic_to_enu
+from drocap_ros.geometry.rotations import quaternion_multiply
 from drocap_ros.recording.telemetry.log import Lack, LogFormat, LogLack, TelemetryLog, at_stamps, make_log
 
 #: UTC in s from which a time is one of a GPS (2001); before its first fix the reader counts from 1970.

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.frames import geodetic_to_enu, orientation_to_ros, quaternion_from_euler
+from drocap_ros.flight.frames import orientation_to_ros, quaternion_from_euler
+from drocap_ros.geometry.geodesy import geodetic_to_enu
 from drocap_ros.geometry.interpolation import interpolate
 from drocap_ros.geometry.rotations import unit_quaternions
 

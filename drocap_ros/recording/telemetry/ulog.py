@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.flight.frames import ned_to_enu, orientation_to_ros, quaternion_multiply, yaw_of
+from drocap_ros.flight.frames import ned_to_enu, orientation_to_ros, yaw_of
+from drocap_ros.geometry.rotations import quaternion_multiply
 from drocap_ros.recording.telemetry.log import (
     Lack,
     LogFormat,

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drocap_ros.flight.frames import enu_to_ned, quaternion_multiply
+from drocap_ros.flight.frames import enu_to_ned
 from drocap_ros.flight.mavlink.transport import Transport
+from drocap_ros.geometry.rotations import quaternion_multiply
 from drocap_ros.simulation.vehicle.autopilot_control import control_of
 from drocap_ros.simulation.vehicle.dynamics import Body
 from drocap_ros.simulation.vehicle.estimate_error import EstimateError

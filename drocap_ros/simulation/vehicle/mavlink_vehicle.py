@@ -19,9 +19,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.autopilot import AUTOPILOTS, autopilot_of
-from drocap_ros.flight.frames import enu_to_geodetic, enu_to_ned, flu_to_frd, orientation_to_aviation
+from drocap_ros.flight.frames import enu_to_ned, flu_to_frd, orientation_to_aviation
 from drocap_ros.flight.mavlink.parser import CURRENT_MODE_ID, CurrentMode, MavlinkParser, sign_with
 from drocap_ros.flight.mavlink.transport import Transport, open_transport
+from drocap_ros.geometry.geodesy import enu_to_geodetic
 from drocap_ros.simulation.vehicle.flight_path import FlightPath, VehiclePose, orbit_path
 
 #: Latitude deg, longitude deg, altitude m of the local frame's origin.

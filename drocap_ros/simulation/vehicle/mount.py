@@ -8,13 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from drocap_ros.flight.frames import (
-    orientation_to_aviation,
-    orientation_to_ros,
-    quaternion_from_euler,
-    quaternion_multiply,
-    yaw_of,
-)
+from drocap_ros.flight.frames import orientation_to_aviation, orientation_to_ros, quaternion_from_euler, yaw_of
+from drocap_ros.geometry.rotations import quaternion_multiply
 
 #: By the value of ArduPilot's MNT1_TYPE.
 MOUNT_TYPES = {"fixed": 0, "servo": 1, "gimbal": 6}

@@ -9,7 +9,7 @@ from djmd_clips import plain_video
 from telemetry_logs import angles_of, mutated, wrapped
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.frames import geodetic_to_enu
+from drocap_ros.geometry.geodesy import geodetic_to_enu
 from drocap_ros.recording.telemetry.read import read_telemetry
 from drocap_ros.recording.telemetry.time_offset import OffsetSource, find_offset
 

@@ -10,7 +10,8 @@ from dataflash import write_dataflash
 from telemetry_logs import angles_of, dji_subtitle, mutated, srt_text, wrapped
 
 from drocap_ros.errors import InputError
-from drocap_ros.flight.frames import geodetic_to_enu, ned_to_enu, orientation_to_aviation, quaternion_from_euler, yaw_of
+from drocap_ros.flight.frames import ned_to_enu, orientation_to_aviation, quaternion_from_euler, yaw_of
+from drocap_ros.geometry.geodesy import geodetic_to_enu
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.recording.telemetry.camera_poses import camera_attitude, camera_poses
 from drocap_ros.recording.telemetry.log import Lack, LogLack
