@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from drocap_ros.flight.preflight.measured import Measured
     from drocap_ros.flight.preflight.setup_checks import Setup
 
-_COLOURS = {"ok": "green", "warning": "yellow", "missing": "red"}
+_COLOURS = {"ok": "green", "waits": "cyan", "warning": "yellow", "missing": "red"}
 _PIPE_WIDTH = 160
 #: Images of a camera whose size is not configured.
 _USUAL_SIZE = (1280, 720)
@@ -35,8 +35,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         description="Listen to the autopilot of a configuration for some seconds and print every check: found, wanted, "
         "how to mend it. Sends requests for telemetry and parameters only; it never arms, moves or changes the "
         "vehicle. With a running graph it listens to that graph's bridge.",
-        epilog="Exit status: 0 nothing is missing (warnings may remain), 1 something is missing, 2 the configuration "
-        "or the link cannot be used, or no autopilot is heard.",
+        epilog="Exit status: 0 nothing is missing (warnings may remain, and what waits for the air), 1 something is "
+        "missing, 2 the configuration or the link cannot be used, or no autopilot is heard.",
     )
     parser.add_argument(
         "--config", metavar="FILE", type=Path, required=True, help="parameters of the components (YAML)"
@@ -159,6 +159,8 @@ def _print(found: Sequence[Finding], quiet: bool) -> None:
         missing = ", ".join(f.name for f in counts[Level.MISSING])
         verdict = f"not ready, missing: {missing}" if missing else "ready"
         print(f"{verdict} ({len(counts[Level.OK])} checks are ok, {len(counts[Level.WARNING])} warnings)")
+        if counts[Level.WAITS]:
+            print(f"waits for the air: {', '.join(f.name for f in counts[Level.WAITS])}")
 
 
 def _write(path: Path, status: str, exit_status: int, found: Sequence[Finding]) -> None:

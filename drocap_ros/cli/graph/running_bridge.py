@@ -38,8 +38,7 @@ _STATE_FIELDS = (
 )
 
 
-#: Conditions that a vehicle on the ground fails, and those of place and subject, which follow a take-off.
-_BEFORE_TAKE_OFF = {ConditionCode.NOT_ARMED, ConditionCode.NOT_FLYING}
+#: Without those of place and subject, which follow a take-off.
 _OF_VEHICLE = range(ConditionCode.COMMANDS_DISABLED, ConditionCode.TOO_FAST)
 
 
@@ -88,7 +87,7 @@ class BridgeListener:
         return tuple(
             (_Reported(ConditionCode(code), words=reason), times[code] / len(self.statuses))
             for code, reason in sorted(idle.items())
-            if code in _OF_VEHICLE and code not in _BEFORE_TAKE_OFF
+            if code in _OF_VEHICLE
         )
 
     def measured(self, config: MavlinkBridgeConfig, namespace: str) -> Measured:

@@ -58,8 +58,9 @@ class Level(enum.IntEnum):
     """How much a finding before a flight matters."""
 
     OK = 0
-    WARNING = 1  # it flies; the setting or the link should change
-    MISSING = 2  # the bridge refuses motion, or soon ends it
+    WAITS = 1  # on the ground: only in the air it can be judged
+    WARNING = 2  # it flies; the setting or the link should change
+    MISSING = 3  # the bridge refuses motion, or soon ends it
 
 
 class FlownSpeeds(NamedTuple):
@@ -169,6 +170,7 @@ class Autopilot:
     Telemetry
 
     estimator_message : by which it reports the health of its estimator;  estimator_bad : flags that deny it
+    rest_flags : those of them that it sets whenever it is at rest: they do not count on the ground
     heartbeat_on_request : whether it grants a rate for its heartbeat; else CURRENT_MODE shows a change of the mode
     integers_in_bytes : whether an integer parameter has its bytes in the field of the float
     height_wanders : whether the reported height wanders by decimetres within seconds
@@ -208,6 +210,7 @@ class Autopilot:
 
     estimator_message: str = ""
     estimator_bad: int = 0
+    rest_flags: int = 0
     heartbeat_on_request: bool = True
     integers_in_bytes: bool = False
     height_wanders: bool = False

@@ -7,17 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from drocap_ros.flight.frames import (
-    frd_to_flu,
-    geodetic_to_enu,
-    ned_to_enu,
-    orientation_to_ros,
-    quaternion_from_euler,
-)
+from drocap_ros.flight.autopilot import Autopilot
+from drocap_ros.flight.frames import frd_to_flu, ned_to_enu, orientation_to_ros, quaternion_from_euler
 from drocap_ros.flight.mavlink import mount
 from drocap_ros.flight.mavlink.clock_offset import ClockOffset
 from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS, ModeReports, PacketOrder
-from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.flight.vehicle_state import LANDED_ON_GROUND, VehicleState
+from drocap_ros.geometry.geodesy import geodetic_to_enu
 
 _NS = 1_000_000_000
 _MS = 1_000_000
@@ -63,7 +59,7 @@ class VehicleStateEstimator:
         self._position: tuple[int, np.ndarray, np.ndarray] | None = None  # boot ns, ENU m, ENU m/s
         self._local_position_ns = -(10**18)
         self._origin: np.ndarray | None = None
-        self._estimator: tuple[int, bool] | None = None
+        self._estimator: tuple[int, int] | None = None  # reception, flags
         self._attitude_received_ns = 0
         self._values: dict[str, Any] = {}
         #: The target that the autopilot follows, and its reception.
@@ -131,10 +127,6 @@ class VehicleStateEstimator:
             return None
         boot_ns, orientation, rates = self._attitude
         position, velocity = self._position_at(boot_ns)
-        estimator_ok = False
-        if self._estimator is not None:
-            age_s = (self._heard_ns - self._estimator[0]) / _NS
-            estimator_ok = self._estimator[1] and age_s < _ESTIMATOR_STALE_S
         return VehicleState(
             stamp_ns=self.clock.to_local_ns(boot_ns, self._heard_ns),
             autopilot=autopilot.name,
@@ -144,11 +136,18 @@ class VehicleStateEstimator:
             velocity_enu_m_s=velocity,
             orientation_xyzw=orientation_to_ros(orientation),
             angular_velocity_flu_rad_s=frd_to_flu(rates),
-            position_ok=estimator_ok and bool(np.isfinite(position).all()),
+            position_ok=self._estimator_ok(autopilot, self._heard_ns) and bool(np.isfinite(position).all()),
             gimbal_orientation_xyzw=self.mount.camera_at(orientation, self._attitude_received_ns),
             link_age_s=max(0.0, (now_ns - self._heard_ns) / _NS),
             **self._values,
         )
+
+    def _estimator_ok(self, autopilot: Autopilot, now_ns: int) -> bool:
+        if self._estimator is None or (now_ns - self._estimator[0]) / _NS >= _ESTIMATOR_STALE_S:
+            return False
+        rests = not self.modes.armed and self._values.get("landed_state") == LANDED_ON_GROUND
+        flags, bad = self._estimator[1], autopilot.estimator_bad & ~(autopilot.rest_flags if rests else 0)
+        return flags & _ESTIMATOR_NEEDED == _ESTIMATOR_NEEDED and bool(flags & _ESTIMATOR_POSITION) and not flags & bad
 
     def _take_heartbeat(self, message: Any, now_ns: int) -> None:
         if message.autopilot == _MAV_AUTOPILOT_INVALID or message.type == _MAV_TYPE_GCS:
@@ -233,10 +232,9 @@ class VehicleStateEstimator:
         return False
 
     def _take_estimator(self, message: Any, now_ns: int) -> bool:
-        autopilot, flags = self.modes.autopilot, message.flags
+        autopilot = self.modes.autopilot
         if autopilot is not None and message.get_type() == autopilot.estimator_message:
-            known = flags & _ESTIMATOR_NEEDED == _ESTIMATOR_NEEDED and bool(flags & _ESTIMATOR_POSITION)
-            self._estimator = (now_ns, known and not flags & autopilot.estimator_bad)
+            self._estimator = (now_ns, message.flags)
         return False
 
     def _take_echo(self, message: Any, now_ns: int) -> bool:

@@ -138,8 +138,10 @@ def _round_trip(config: MavlinkBridgeConfig, measured: Measured) -> Verdict:
 @check("clock_offset", "clock of the autopilot")
 def _clock_offset(measured: Measured) -> Verdict:
     # The exchanges with the shortest round trips are the sure ones: the rest adds its queueing.
-    sure = measured.offsets_s[measured.round_trips_s <= np.percentile(measured.round_trips_s, 50)]
-    spread = float(np.ptp(np.percentile(sure, (5, 95))))
+    chosen = np.flatnonzero(measured.round_trips_s <= np.percentile(measured.round_trips_s, 50))
+    sure = measured.offsets_s[chosen]
+    steady = sure - np.polyval(np.polyfit(chosen, sure, 1), chosen) if len(sure) > 2 else sure  # without a steady drift
+    spread = float(np.ptp(np.percentile(steady, (5, 95))))
     values = {"spread_s": spread, "drift_s": float(np.median(sure))}
     remedy = (
         "a pose belongs to another instant than its image; stop NTP steps (chrony: makestep at the start only), and "

@@ -9,17 +9,22 @@ from drocap_ros.flight.autopilot import Autopilot, autopilot_of, supported_title
 from drocap_ros.flight.autopilot.autopilot import FenceSettings, FlownSpeeds, Level, LossAction, LossSettings
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import ConditionCode
-from drocap_ros.flight.orbit.motion_checks import battery_condition, loss_condition
+from drocap_ros.flight.orbit.motion_checks import LANDED_STATES, battery_condition, loss_condition
 from drocap_ros.flight.preflight.findings import Finding, Values, Verdict, check, graded
 from drocap_ros.flight.preflight.measured import LASTING, Measured, Stream
-from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, LANDED_ON_GROUND, SATELLITES_UNKNOWN, VehicleState
+from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, SATELLITES_UNKNOWN, VehicleState
 
 _C = ConditionCode
 _CAMERA = (_C.CAMERA_UNKNOWN, _C.MOUNT_TYPE_UNKNOWN, _C.MOUNT_OUTDATED)
 _GOOD_SATELLITES = 8  # with fewer the position wanders by metres
 _MOUNT = "GIMBAL_DEVICE_ATTITUDE_STATUS"
 _FIXES = {0: "no receiver", 1: "no fix", 2: "2D", 3: "3D", 4: "3D, differential", 5: "RTK float", 6: "RTK fixed"}
-_LANDED = {LANDED_ON_GROUND: "on the ground", LANDED_IN_AIR: "in the air"}
+_LANDED = {**LANDED_STATES, LANDED_IN_AIR: "in the air"}
+#: Code, name, and what the bridge's own conditions want in the air.
+_IN_THE_AIR = (
+    ("subject", "subject", "located, farther than min_distance_m"),
+    ("place", "height, fence, speed", "inside the limits"),
+)
 
 
 def vehicle_findings(config: MavlinkBridgeConfig, measured: Measured, vehicle: VehicleState) -> Iterator[Finding]:
@@ -38,6 +43,8 @@ def vehicle_findings(config: MavlinkBridgeConfig, measured: Measured, vehicle: V
     yield _estimator(vehicle)
     yield _battery(config, vehicle, autopilot)
     yield _phase(vehicle)
+    if not _flies(vehicle):
+        yield from _waiting(autopilot)
 
 
 @check("autopilot", "autopilot", _C.AUTOPILOT_UNSUPPORTED)
@@ -209,12 +216,27 @@ def _battery(config: MavlinkBridgeConfig, vehicle: VehicleState, autopilot: Auto
     return Verdict(graded(missing=problem is not None), found, wanted, remedy, {"fraction": charge, "voltage_v": volts})
 
 
-@check("phase", "now")
+@check("phase", "now", _C.NOT_ARMED, _C.NOT_FLYING)
 def _phase(vehicle: VehicleState) -> Verdict:
     where = _LANDED.get(vehicle.landed_state, "place not reported")
     found = f"{where}, {'armed' if vehicle.armed else 'not armed'}, mode {vehicle.mode}"
     values: Values = {"armed": vehicle.armed, "landed_state": vehicle.landed_state, "mode": vehicle.mode}
-    return Verdict(Level.OK, found, values=values)
+    level = Level.OK if _flies(vehicle) else Level.WAITS
+    return Verdict(level, found, "armed, in the air", "the bridge moves it only there", values)
+
+
+def _flies(vehicle: VehicleState) -> bool:
+    return vehicle.armed and vehicle.landed_state not in LANDED_STATES
+
+
+def _waiting(autopilot: Autopilot) -> Iterator[Finding]:
+    """What can be judged in the air only."""
+    rows = [*_IN_THE_AIR]
+    if autopilot.rest_flags:  # at rest the estimator shows nothing of them
+        rows.insert(0, ("estimator_flight", "position estimate in flight", "healthy"))
+    for code, name, wanted in rows:
+        verdict = Verdict(Level.WAITS, "not judged on the ground", wanted, "hover, and see `drocap orbit status`")
+        yield verdict.finding(code, name)
 
 
 def _value(value: float, unit: str = "") -> str:

@@ -300,6 +300,26 @@ def test_every_condition_of_the_vehicle_that_fails_is_named():
     assert not is_ready(scene.findings.values())
 
 
+@BOTH
+def test_on_the_ground_what_waits_for_the_air_is_named_and_nothing_is_missing(autopilot):
+    scene = Scene(autopilot, seconds=2.0)
+    waiting = {code for code, finding in scene.findings.items() if finding.level == Level.WAITS}
+    assert waiting == {"phase", "subject", "place"} | ({"estimator_flight"} if autopilot == "px4" else set())
+    assert is_ready(scene.findings.values())
+
+    def take_off(scene):
+        scene.copter.armed, scene.copter.landed_state = True, 2
+
+    flying = Scene(autopilot, before=take_off, seconds=2.0)
+    assert not [finding for finding in flying.findings.values() if finding.level == Level.WAITS]
+    assert flying.missing() == set()
+
+
+def test_the_flag_of_rest_counts_as_soon_as_the_vehicle_is_armed():
+    scene = Scene("px4", before=lambda scene: setattr(scene.copter, "armed", True), seconds=2.0)
+    assert scene.missing() == {"estimator"}
+
+
 def test_a_critical_state_forbids_a_start():
     def critical(scene):
         beat = scene.copter._heartbeat()
