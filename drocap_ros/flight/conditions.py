@@ -35,6 +35,7 @@ class ConditionCode(enum.IntEnum):
     DEGRADED = 16
     SLOWED = 17
     WIDENED = 18
+    REQUEST_ENDED = 19
     # Commands that are refused for what they ask, or for the state in which they come
     UNKNOWN_COMMAND = 40
     COMMAND_OUTDATED = 41
@@ -141,13 +142,14 @@ _SENTENCES = {
     _C.NOT_ORBITING: "not orbiting",
     _C.DISARMED: "the motors were disarmed",
     _C.PILOT_TOOK_OVER: "the mode changed to {mode} without a request of ours: the pilot has taken over, or a "
-    "failsafe of the autopilot; silent until the operator acknowledges it by stop",
+    "failsafe of the autopilot; nothing is sent",
     _C.CONTROL_NOT_GRANTED: "the autopilot did not grant control",
     _C.HOLD_MODE_MISSING: "{cause}; the autopilot does not enter its hold mode: take over by hand",
     _C.DEGRADED: "the orbit is slowed down: {cause}",
     _C.SLOWED: "{cause}, at {speed_deg_s:.1f} deg/s instead of {wanted_deg_s:.1f}: without setpoints the autopilot "
     "flies on for {timeout_s:g} s, and the vehicle must stop within max_coast_m, {limit_m:g} m",
     _C.WIDENED: "{cause}, {radius_m:.1f} m away instead of {wanted_m:.1f}: {why}",
+    _C.REQUEST_ENDED: "engage ended without an orbit: {cause}",
     _C.UNKNOWN_COMMAND: "no command has the number {number}",
     _C.COMMAND_OUTDATED: "the command is {age_s:.1f} s old by the bridge's clock, and {limit_s:g} s is the limit; "
     "synchronize the clocks of the two computers",
@@ -208,7 +210,7 @@ _SENTENCES = {
     "mode is requested; let routers pass all of them, or mend the link",
     _C.AUTOPILOT_EMERGENCY: "the autopilot reports {reported}: take over by hand",
     _C.AUTOPILOT_CRITICAL: "the autopilot reports {reported}: one of its failsafes has triggered; the ground station "
-    "shows the cause",
+    "shows the cause, and where it is gone another mode of the pilot's choice ends the failsafe",
     _C.SEVERAL_VEHICLES: "the link carries more than one vehicle, systems {systems}: set target_system_id to that of "
     "the one with this camera",
     _C.CAMERA_CHANGED: "camera_info changed (focal length {before_px:.0f} px, now {now_px:.0f}): another zoom, crop or "
@@ -237,7 +239,8 @@ _SENTENCES = {
     _C.OTHER_SUBJECT: "the pictures show somebody else, or a person where the subject cannot be; he was last located "
     "{ago}",
     _C.SUBJECT_UNCERTAIN: "the subject's position is uncertain by {sd_m:.1f} m",
-    _C.SUBJECT_NEAR: "the subject is {distance_m:.1f} m away, give or take {sd_m:.1f} m: at the limit of {limit_m:g} m",
+    _C.SUBJECT_NEAR: "the subject is {distance_m:.1f} m away, give or take {sd_m:.1f} m, and by the speeds of both the "
+    "last {room_m:.1f} m may be lost until the vehicle stands: at the limit of {limit_m:g} m",
     _C.SUBJECT_AT_BORDER: "the body leans, and the person is {margin_percent:.0f} % of the picture's height from the "
     "border of the fixed camera's picture; a wider orbit, a wider lens or a gimbal keeps them inside",
     _C.SUBJECT_FAR: "the subject is {distance_m:.1f} m away: farther than {limit_m:g} m",

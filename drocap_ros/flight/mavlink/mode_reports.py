@@ -11,6 +11,7 @@ from drocap_ros.flight.autopilot import Autopilot, autopilot_by_heartbeat
 _NS = 1_000_000_000
 _MAV_MODE_FLAG_CUSTOM_MODE_ENABLED = 1  # bits of MAVLink's MAV_MODE_FLAG
 _MAV_MODE_FLAG_SAFETY_ARMED = 128
+MAV_STATE_CRITICAL = 5
 #: Packets; farther back a sequence number counts as the beginning of a new sequence.
 _MAX_LATE = 32
 _HISTORY_S = 1.0  # in which packets of a former mode may still arrive late
@@ -52,7 +53,8 @@ class ModeReports:
         present mode; "" = unknown.  An autopilot may keep it where a failsafe enters another mode.
     vehicle_type : MAV_TYPE, by the last heartbeat
     armed : by the last heartbeat
-    system_status : MAV_STATE, by the last heartbeat; 0 = unknown
+    system_status : MAV_STATE, by the last heartbeat; 0 = unknown, also where a critical state was reported together
+        with a mode that has changed since: a failsafe that acts sets the mode
     received_ns : reception of the newest report that did not arrive late
     """
 
@@ -82,10 +84,10 @@ class ModeReports:
         """Take a CURRENT_MODE; before the first heartbeat its numbers have no names."""
         if self._heartbeat is None:
             return
-        intended = message.intended_custom_mode
-        self._take(
-            self._name(message.custom_mode), self._name(intended) if intended else "", message.get_seq(), late, now_ns
-        )
+        intended, mode = message.intended_custom_mode, self._name(message.custom_mode)
+        if not late and mode != self.mode and self.system_status == MAV_STATE_CRITICAL:
+            self.system_status = 0
+        self._take(mode, self._name(intended) if intended else "", message.get_seq(), late, now_ns)
 
     def take_heard(self) -> frozenset[str]:
         """All modes that were reported since the last call, late ones too."""

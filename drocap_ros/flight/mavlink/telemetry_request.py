@@ -54,7 +54,7 @@ class LinkStatus(NamedTuple):
     def warning(self) -> str:
         """What a flight over this link lacks, in words; "" = nothing."""
         if self.critical:
-            return "the autopilot reports a critical state: one of its failsafes has triggered; no orbit can begin"
+            return "the autopilot reports a critical state: unless it is that of lost setpoints, no orbit can begin"
         if self.refused:
             return f"the autopilot refuses to send {', '.join(sorted(self.refused))}"
         if math.isnan(self.round_trip_s):

@@ -26,6 +26,7 @@ from drocap_ros.flight.orbit.observer import Observer, OwnFlight
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
 from drocap_ros.flight.orbit.states import Action, Limits, ModeRequest, OperatorCommand, SafetyState, State
 from drocap_ros.flight.orbit.watchdog import FallbackCommands, Watchdog
+from drocap_ros.flight.orbit.way_out import way_out
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.observation import PoseObservation
 
@@ -152,8 +153,8 @@ class OrbitController:
         autopilot = seen.autopilot
         if request == ModeRequest.NONE or not autopilot.supported:
             # A request that waits for a visible mode is not sent, but it is not forgotten either: a mode that was
-            # granted must not be requested again.
-            waiting = self.safety.requesting or self.safety.state in (State.HOLDING, State.FAULT)
+            # granted must not be requested again, and the answer to one that failed stays on the status.
+            waiting = self.safety.requesting or self.safety.state in (State.HOLDING, State.FAULT) or self.safety.failed
             (self._queue.pause if waiting and not seen.mode.in_hold else self._queue.cancel)(SET_MODE)
             return
         mode = autopilot.hold_mode if request == ModeRequest.HOLD else autopilot.control_mode
@@ -225,7 +226,9 @@ class OrbitController:
         return ControlStatus(
             state=self.safety.state,
             condition=self._orbit.flown_condition(present, seen) if orbiting else present,
+            failed=self.safety.failed,
             mode_failure=self._queue.failure(SET_MODE),
+            way_out=way_out(self.safety, seen, mode_change_allowed=self._config.mode_change_allowed),
             answers=self._desk.take_answers(),
             radius_m=distance_m,
             height_m=vehicle.height_m,

@@ -9,6 +9,7 @@ import numpy as np
 from drocap_ros.flight.autopilot import supported_titles
 from drocap_ros.flight.autopilot.autopilot import LossAction, LossSettings
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.mavlink.mode_reports import MAV_STATE_CRITICAL
 from drocap_ros.flight.observed import FIX_3D, Observed
 from drocap_ros.flight.orbit.states import Limits
 from drocap_ros.flight.orbit_config import OrbitConfig
@@ -26,10 +27,9 @@ _CARRIED_OFF_S = 1.0  # for so long: a gust passes
 _LONGEST_AWAY_S = 20.0  # behind walking subjects in 8 m/s of wind: 10 s
 #: The clocks of image and step differ by a transmission at most.
 _FUTURE_S = 0.2
-_MAV_STATE_CRITICAL = 5
 #: MAV_STATE of a vehicle that nobody should command; the first may stand for stopped motors.
 _EMERGENCIES = {6: "an emergency", 7: "that it is shutting down", 8: "that the flight is terminated"}
-_LANDED_STATES = {LANDED_ON_GROUND: "on the ground", LANDED_TAKEOFF: "taking off", LANDED_LANDING: "landing"}
+LANDED_STATES = {LANDED_ON_GROUND: "on the ground", LANDED_TAKEOFF: "taking off", LANDED_LANDING: "landing"}
 
 
 def vehicle_condition(seen: Observed, limits: Limits, *, patient: bool = False) -> Condition | None:
@@ -81,8 +81,8 @@ def _health_condition(seen: Observed, safety: SafetyConfig) -> Condition | None:
     if not health.armed:
         return condition(_C.NOT_ARMED)
     unsure = seen.autopilot.starts_from_ground and health.landed_state != LANDED_IN_AIR
-    if health.landed_state in _LANDED_STATES or unsure:
-        landed = _LANDED_STATES.get(health.landed_state, "not reported to be in the air (EXTENDED_SYS_STATE)")
+    if health.landed_state in LANDED_STATES or unsure:
+        landed = LANDED_STATES.get(health.landed_state, "not reported to be in the air (EXTENDED_SYS_STATE)")
         return condition(_C.NOT_FLYING, landed_state=landed)
     if health.system_status in _EMERGENCIES:
         return condition(_C.AUTOPILOT_EMERGENCY, reported=_EMERGENCIES[health.system_status])
@@ -97,11 +97,14 @@ def start_condition(seen: Observed) -> Condition | None:
     """Why no orbit may begin; one that is flown goes on.
 
     A critical state is reported after a failsafe of battery, radio or ground station has triggered, or while one acts.
+    That for the loss of setpoints is our own, and ends with them: the hold that it flies while the control mode is
+    still intended forbids nothing.  Where another failsafe flies the same hold, the autopilot does not leave it.
     Of several vehicles the first one that was heard would fly, and need not be the one with the camera.
     """
     if len(seen.link.vehicles) > 1:
         return condition(_C.SEVERAL_VEHICLES, systems=", ".join(map(str, sorted(seen.link.vehicles))))
-    if seen.health.system_status == _MAV_STATE_CRITICAL:
+    own_loss = seen.mode.left_by_itself and seen.mode.in_hold
+    if seen.health.system_status == MAV_STATE_CRITICAL and not own_loss:
         return condition(_C.AUTOPILOT_CRITICAL, reported="a critical state")
     return None
 
@@ -206,12 +209,9 @@ def subject_condition(seen: Observed, limits: Limits, *, patient: bool = False) 
     if not seen.subject.sd_m <= safety.max_subject_sd_m:
         return condition(_C.SUBJECT_UNCERTAIN, sd_m=seen.subject.sd_m)
     if _too_near(seen, limits):
-        return condition(
-            _C.SUBJECT_NEAR,
-            distance_m=seen.subject.distance_m,
-            sd_m=seen.subject.sd_m,
-            limit_m=limits.orbit.min_distance_m,
-        )
+        near, room_m = seen.subject, stopping_room(seen, safety)
+        values = {"distance_m": near.distance_m, "sd_m": near.sd_m, "limit_m": limits.orbit.min_distance_m}
+        return condition(_C.SUBJECT_NEAR, room_m=room_m, **values)
     if seen.subject.distance_m > limits.orbit.max_distance_m:
         return condition(_C.SUBJECT_FAR, distance_m=seen.subject.distance_m, limit_m=limits.orbit.max_distance_m)
     return None

@@ -29,6 +29,7 @@ from drocap_ros.flight.orbit.states import (
     SafetyState,
     State,
 )
+from drocap_ros.flight.orbit.way_out import by_hand
 
 _C = ConditionCode
 _BLIND_MODE_REQUEST_S = 2.0
@@ -152,6 +153,7 @@ def permit_mode(state: SafetyState, mode: str) -> SafetyState:
 def _execute(
     state: SafetyState, seen: Observed, now_s: float, command: Command, problem: Condition | None, limits: Limits
 ) -> tuple[SafetyState, CommandAnswer]:
+    state = dataclasses.replace(state, failed=None)
     if command == Command.STOP:
         return _stop(state, seen, now_s, limits)
     if command == Command.ADJUST:
@@ -192,25 +194,20 @@ def _start_refusal(state: SafetyState, seen: Observed, problem: Condition | None
     pending = seen.mode.in_control and state.modes > {seen.mode.name} and not math.isnan(state.hold_mode_s)
     if pending and not state.requesting:
         # The hold mode has been requested: it would arrive during the orbit, and count as the pilot's.
-        return _refused(_C.HOLD_MODE_PENDING, by_hand=_by_hand(seen))
+        return _refused(_C.HOLD_MODE_PENDING, by_hand=by_hand(seen))
     return None
 
 
 def _request_refusal(seen: Observed, command: Command, limits: Limits) -> CommandAnswer | None:
     """Why control may not be requested from the autopilot."""
     if command == Command.START:
-        return _refused(_C.NOT_IN_CONTROL_MODE, mode=seen.mode.name, by_hand=_by_hand(seen))
+        return _refused(_C.NOT_IN_CONTROL_MODE, mode=seen.mode.name, by_hand=by_hand(seen))
     if not limits.safety.mode_change_allowed:
         engaged = f" ({seen.autopilot.hints.engaged})" if seen.autopilot.hints.engaged else ""
-        return _refused(_C.MODE_CHANGE_FORBIDDEN, mode=seen.mode.name, engaged=engaged, by_hand=_by_hand(seen))
+        return _refused(_C.MODE_CHANGE_FORBIDDEN, mode=seen.mode.name, engaged=engaged, by_hand=by_hand(seen))
     if seen.link.packet_loss > MAX_LOSS:
         return _refused(_C.PACKETS_LOST, lost_percent=100 * seen.link.packet_loss, most_percent=100 * MAX_LOSS)
     return None
-
-
-def _by_hand(seen: Observed) -> str:
-    """How the pilot enters the control mode, as the end of a sentence."""
-    return f", or {seen.autopilot.hints.by_hand}" if seen.autopilot.hints.by_hand else ""
 
 
 def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> tuple[SafetyState, CommandAnswer]:
@@ -232,17 +229,22 @@ def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> t
 def _wait(state: SafetyState, seen: Observed, now_s: float, problem: Condition | None, limits: Limits) -> SafetyState:
     """Idle and ready, and while control is requested."""
     if state.requesting:
-        if problem and (ending := _ending(state, seen, limits)):  # a short gap delays the orbit
-            return _enter(State.IDLE, ending, now_s)
-        if seen.mode.in_control and not problem:
+        # A short gap delays the orbit.
+        failed = condition(_C.REQUEST_ENDED, cause=ending) if (ending := _ending(state, seen, limits)) else None
+        if failed is None and seen.mode.in_control and not problem:
             return _begin_orbit(seen, now_s)
-        if now_s - state.requesting_s > limits.safety.engage_timeout_s + limits.warm_up_s:
-            return _enter(State.READY, condition(_C.CONTROL_NOT_GRANTED), now_s)
-        return state
+        if failed is None and now_s - state.requesting_s > limits.safety.engage_timeout_s + limits.warm_up_s:
+            # With the mode granted, the condition has delayed the orbit for all this time.
+            delayed = seen.mode.in_control and problem
+            failed = condition(_C.REQUEST_ENDED, cause=problem) if delayed else condition(_C.CONTROL_NOT_GRANTED)
+        if failed is None:
+            return state
+        return _enter(State.IDLE if problem else State.READY, failed, now_s, failed=failed)
+    reason = problem or state.failed or condition(_C.ALL_CLEAR)
     wanted = State.IDLE if problem else State.READY
-    if state.state == wanted and (problem is None or state.condition == problem):
+    if (state.state, state.condition) == (wanted, reason):
         return state
-    return _enter(wanted, problem or condition(_C.ALL_CLEAR), now_s)
+    return _enter(wanted, reason, now_s, failed=state.failed)
 
 
 def _permitted(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> tuple[Action, ModeRequest]:

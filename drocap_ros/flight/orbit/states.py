@@ -96,6 +96,7 @@ class SafetyState:
     fence_centre : (2,) where the orbit began
     modes : modes that are no take-over at present; empty = any
     requesting_s : since when control is requested; NaN = it is not
+    failed : why the last request of control ended without an orbit, until the next command; None = it did not
     hold_mode_s : when the hold mode was first requested; NaN = not yet
     blind : whether the hold began without a trustworthy vehicle state
     resumable : whether the orbit may resume by itself: a harmless cause alone began the hold
@@ -117,6 +118,7 @@ class SafetyState:
     fence_centre: np.ndarray | None = None
     modes: frozenset[str] = frozenset()
     requesting_s: float = math.nan
+    failed: Condition | None = None
     hold_mode_s: float = math.nan
     blind: bool = False
     resumable: bool = False

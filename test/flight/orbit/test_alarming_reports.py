@@ -2,7 +2,7 @@
 
 import math
 
-from orbit_observations import GOOD, LIMITS, changed, orbiting
+from orbit_observations import GOOD, LIMITS, LOITER, changed, orbiting
 
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.mavlink.telemetry_request import LinkStatus
@@ -31,6 +31,14 @@ def test_a_critical_state_forbids_a_start_and_ends_no_orbit():
         assert (state.state, decision.answer.accepted) == (State.IDLE, False)
         assert decision.answer.condition.code == ConditionCode.AUTOPILOT_CRITICAL
     assert reduce(SafetyState(), changed(seen, system_status=4), 1.0, None, LIMITS)[0].state == State.READY
+
+
+def test_a_critical_state_of_the_failsafe_for_lost_setpoints_alone_lets_an_orbit_begin():
+    own = changed(LOITER, autopilot="px4", mode="LOITER", in_hold=True, left_by_itself=True, system_status=CRITICAL)
+    assert reduce(SafetyState(), own, 1.0, Command.ENGAGE, LIMITS)[1].answer.accepted
+    for other in ({"left_by_itself": False}, {"in_hold": False}):
+        answer = reduce(SafetyState(), changed(own, **other), 1.0, Command.ENGAGE, LIMITS)[1].answer
+        assert (answer.accepted, answer.condition.code) == (False, ConditionCode.AUTOPILOT_CRITICAL)
 
 
 def test_several_vehicles_forbid_a_start_and_end_no_orbit():

@@ -12,6 +12,7 @@ from drocap_ros.flight.conditions import ConditionCode, condition
 from drocap_ros.flight.orbit.motion_checks import battery_condition
 from drocap_ros.flight.orbit.safety import permit_mode, reduce
 from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, SafetyState, State
+from drocap_ros.flight.orbit.way_out import way_out
 from drocap_ros.flight.safety_config import SafetyConfig
 
 BAD = {
@@ -218,6 +219,54 @@ def test_start_never_changes_the_mode_and_engage_only_when_allowed():
     assert decision.mode_request == ModeRequest.CONTROL
     state, decision = reduce(permit_mode(state, "GUIDED"), GOOD, 0.3, None, LIMITS)
     assert (state.state, decision.action) == (State.ORBITING, Action.ORBIT)
+
+
+def test_why_an_engage_ended_without_an_orbit_stays_until_the_next_command():
+    requesting = reduce(SafetyState(), LOITER, 0.0, Command.ENGAGE, LIMITS)[0]
+    state = reduce(requesting, bad("gps", LOITER), 1.0, None, LIMITS)[0]
+    assert (state.state, state.failed.code) == (State.IDLE, ConditionCode.REQUEST_ENDED)
+    assert "satellite" in str(state.failed)
+    state = reduce(state, bad("battery low", LOITER), 2.0, None, LIMITS)[0]
+    assert state.condition.code == ConditionCode.BATTERY_LOW
+    for now_s in (3.0, 60.0):
+        state = reduce(state, LOITER, now_s, None, LIMITS)[0]
+        assert (state.state, state.condition) == (State.READY, state.failed)
+    assert reduce(state, LOITER, 61.0, Command.STOP, LIMITS)[0].failed is None
+    again = reduce(state, LOITER, 61.0, Command.ENGAGE, LIMITS)[0]
+    assert (again.requesting, again.failed) == (True, None)
+
+
+@pytest.mark.parametrize(
+    ("state", "seen", "words"),
+    [
+        (SafetyState(State.READY), GOOD, "`drocap orbit start` begins"),
+        (SafetyState(State.READY), LOITER, "`drocap orbit engage` requests control and begins an orbit, or switch to"),
+        (SafetyState(State.HOLDING), GOOD, "`drocap orbit start` begins"),
+        (SafetyState(State.HOLDING), changed(GOOD, stream_gap_s=3.0), "nothing is sent any more; `drocap orbit start`"),
+        (SafetyState(State.TAKEN_OVER), LOITER, "`drocap orbit stop` acknowledges"),
+        (SafetyState(State.FAULT), GOOD, "`drocap orbit stop` acknowledges"),
+        (SafetyState(State.ORBITING), GOOD, ""),
+        (SafetyState(State.IDLE), GOOD, ""),
+    ],
+)
+def test_a_state_says_what_leads_out(state, seen, words):
+    found = way_out(state, seen, mode_change_allowed=True)
+    assert found.startswith(words)
+    assert bool(found) == bool(words)
+
+
+def test_without_the_permission_to_change_the_mode_the_pilot_or_the_configuration_leads_out():
+    assert way_out(SafetyState(State.READY), LOITER, mode_change_allowed=False).endswith("then `drocap orbit start`")
+    px4 = changed(LOITER, autopilot="px4")
+    assert "mode_change_allowed" in way_out(SafetyState(State.READY), px4, mode_change_allowed=False)
+
+
+def test_where_the_speed_decides_the_words_of_a_near_subject_name_its_share():
+    near = changed(GOOD, subject_distance_m=7.1, closing_m_s=4.0)
+    words = str(reduce(orbiting(), near, 1.0, None, LIMITS)[0].condition)
+    room_m = float(words.split("the last ")[1].split(" m")[0])
+    assert "7.1 m away" in words
+    assert 7.1 - room_m < 3.0
 
 
 def test_engage_warms_up_times_out_and_yields_to_pilot_and_failed_conditions():

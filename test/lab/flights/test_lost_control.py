@@ -5,6 +5,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from branched import branched
+from pymavlink.dialects.v20.ardupilotmega import MAV_STATE_CRITICAL as CRITICAL
 
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.orbit.states import Action, Command, State
@@ -94,6 +95,60 @@ def test_a_step_that_was_interrupted_sends_no_old_setpoint_and_says_that_it_stoo
     assert loop.copter.mode == ("OFFBOARD" if autopilot == "px4" else "GUIDED")
     assert loop.controller.safety.state == State.HOLDING
     assert loop.controller.safety.condition.code == ConditionCode.CONTROL_LOOP_STALLED
+
+
+def cut(*channels):
+    """Cuts channels of a loop; the function that it returns mends them."""
+
+    def change(loop):
+        for name in channels:
+            getattr(loop, name).cut = True
+        return lambda: [setattr(getattr(loop, name), "cut", False) for name in channels]
+
+    return change
+
+
+def kill(loop):
+    """Returns a function that starts the bridge again."""
+    loop.stopped = True
+
+    def end():
+        loop.stopped = False
+        loop.restart()
+
+    return end
+
+
+@pytest.mark.parametrize("lose", [drop_setpoints, cut("up"), cut("up", "down"), kill])
+@pytest.mark.parametrize("autopilot", ["px4"])
+@branched
+def test_engage_is_granted_within_a_second_of_each_loss_of_setpoints(loop, lose):
+    end = lose(loop)
+    loop.run(9.5)
+    assert loop.copter.mode_log[-1][1:] == ("LOITER", "failsafe: setpoints lost")
+    assert loop.copter.system_status == CRITICAL  # for as long as this failsafe acts
+    end()
+    loop.run(14.0)
+    assert loop.copter.mode == "LOITER"
+    loop.command(Command.ENGAGE)
+    loop.run(15.0)
+    assert [answer.condition.code for _, answer in loop.answers][-1:] == [ConditionCode.REQUESTING_CONTROL]
+    assert (loop.controller.safety.state, loop.copter.mode) == (State.ORBITING, "OFFBOARD")
+    assert loop.copter.system_status != CRITICAL
+
+
+@pytest.mark.parametrize("autopilot", ["px4"])
+@branched
+def test_a_critical_state_with_another_cause_forbids_to_engage(loop):
+    loop.command(Command.STOP)
+    loop.run(10.0)
+    loop.copter.system_status = CRITICAL  # in the hold mode that the bridge has requested
+    loop.run(12.0)
+    loop.command(Command.ENGAGE)
+    loop.run(13.0)
+    answer = loop.answers[-1][1]
+    assert (answer.accepted, answer.condition.code) == (False, ConditionCode.AUTOPILOT_CRITICAL)
+    assert "ends the failsafe" in str(answer)
 
 
 @pytest.mark.parametrize("autopilot", ["px4"])
