@@ -120,8 +120,8 @@ def run_check(args: argparse.Namespace) -> int:
         return 0
     import cv2
 
-    from drocap_ros.perception.overlay import draw
     from drocap_ros.perception.sources.image_files import read_image
+    from drocap_ros.report.overlay import draw
 
     image = read_image(args.image)
     observation = estimator.process(image, 0)
@@ -154,8 +154,8 @@ def ensure_networks(folder: Path, source: str | Path, args: argparse.Namespace) 
     InputError
         When the source has no images, or the folder has no network and none is to be fetched.
     """
+    from drocap_ros.open_images import open_images
     from drocap_ros.perception.models.registry import DEFAULT_FETCH, KNOWN_MODELS
-    from drocap_ros.recording.open_images import open_images
 
     if any(folder.glob("*.onnx")):
         return

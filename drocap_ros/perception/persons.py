@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +18,6 @@ from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorCo
 _EVERY_NS = 200_000_000  # interval of the detections: a walking person moves by a fifth of the length
 _JITTER_NS = 5_000_000  # by which an image may come earlier
 _LEAST_SCORE = 0.45  # least recent mean score of a person; clutter and parts of bodies lie below
-_MOST_IMAGES = 12  # in a picture: four columns fill a screen
-_WIDTH_PX = 960  # largest width of each
 
 
 @dataclass(frozen=True)
@@ -103,42 +100,3 @@ def following(config: PoseEstimatorConfig, persons: Sequence[FoundPerson], numbe
     person = persons[number - 1]
     box = ",".join(f"{value:.2f}" for value in person.boxes[person.first_ns])
     return dataclasses.replace(config, subject="box", subject_box=box, on_loss="wait")
-
-
-def chosen_stamps(persons: Sequence[FoundPerson]) -> list[int]:
-    """Stamps of few images that show all persons, in the order of time: each the one with most of those left."""
-    there = {ns: {p.number: p.boxes[ns] for p in persons if ns in p.boxes} for p in persons for ns in p.boxes}
-
-    def worth(ns: int, left: set[int]) -> tuple[int, float, int]:
-        # The larger the smallest of the new persons, the better the picture.
-        new = [float(np.prod(box[2:] - box[:2])) for number, box in there[ns].items() if number in left]
-        return len(new), min(new, default=0.0), -ns
-
-    left = {person.number for person in persons}
-    stamps: list[int] = []
-    while left and len(stamps) < _MOST_IMAGES:
-        stamps.append(max(there, key=partial(worth, left=left)))
-        left = left - there[stamps[-1]].keys()
-    return sorted(stamps)
-
-
-def persons_picture(frames: Iterable[Frame], persons: Sequence[FoundPerson]) -> tuple[np.ndarray, int]:
-    """(H, W, 3) uint8 BGR, images of :func:`chosen_stamps` with numbered boxes; the first frame's stamp, ns."""
-    import cv2
-
-    from drocap_ros.perception.overlay import draw_numbers
-
-    wanted, tiles, begin_ns = chosen_stamps(persons), [], 0
-    for number, frame in enumerate(frames):
-        begin_ns = begin_ns if number else frame.stamp_ns
-        if frame.stamp_ns not in wanted:
-            continue
-        shrink = min(1.0, _WIDTH_PX / frame.image.shape[1])
-        small = cv2.resize(frame.image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-        boxes = {p.number: p.boxes[frame.stamp_ns] * shrink for p in persons if frame.stamp_ns in p.boxes}
-        tiles.append(draw_numbers(small, boxes, f"{(frame.stamp_ns - begin_ns) * 1e-9:.1f} s"))
-        if frame.stamp_ns == wanted[-1]:
-            break
-    columns = int(np.ceil(np.sqrt(len(tiles))))
-    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
-    return np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]), begin_ns

@@ -13,8 +13,8 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.interpolation import usual_step
 from drocap_ros.motion import Motion
+from drocap_ros.open_images import Images, open_images
 from drocap_ros.perception.sources import Frame
-from drocap_ros.recording.open_images import Images, open_images
 from drocap_ros.recording.open_session import is_recording, open_session
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE
 
@@ -110,7 +110,8 @@ def _opened(path: Path, motion: Motion) -> Iterator[Images]:
     """Images of a path; refused when they cannot be those of the motion."""
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
-    with open_images(path) as images:
+    topic = str(_stated(motion, "images").get("topic", "")) if is_recording(path) else ""
+    with open_images(path, topic=topic) as images:
         if not is_recording(path):  # a recording may hold more images than poses, with the same clock
             _check_times(path, images, motion)
         yield images._replace(frames=_checked_sizes(path, images.frames, motion))

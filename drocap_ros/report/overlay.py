@@ -1,16 +1,25 @@
-"""Overlay of the subject on an image."""
+"""Overlay of the subject on an image, and the picture of all persons with their numbers."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import partial
 
 import numpy as np
 
 from drocap_ros.observation import PoseObservation
+from drocap_ros.perception.persons import FoundPerson
+from drocap_ros.perception.sources.base import Frame
 from drocap_ros.skeleton import side_of
 
 #: BGR; the sides as in the markers and the viewer.
 _COLOURS = {"left": (255, 160, 40), "right": (60, 60, 255), "middle": (90, 220, 90)}
 #: Radius of the ellipses in standard deviations.
 _SIGMAS = 2.0
+#: Most images of the picture of all persons: four columns fill a screen.
+_MOST_IMAGES = 12
+#: Largest width of each, px.
+_WIDTH_PX = 960
 
 
 def draw(image: np.ndarray, observation: PoseObservation) -> np.ndarray:
@@ -79,3 +88,40 @@ def _label(image: np.ndarray, text: str, place: tuple[int, int], line_px: int) -
 
     for colour, width in (((0, 0, 0), 3 * line_px), ((255, 255, 255), line_px)):
         cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5 * line_px, colour, width, cv2.LINE_AA)
+
+
+def chosen_stamps(persons: Sequence[FoundPerson]) -> list[int]:
+    """Stamps of few images that show all persons, in the order of time: each the one with most of those left."""
+    there = {ns: {p.number: p.boxes[ns] for p in persons if ns in p.boxes} for p in persons for ns in p.boxes}
+
+    def worth(ns: int, left: set[int]) -> tuple[int, float, int]:
+        # The larger the smallest of the new persons, the better the picture.
+        new = [float(np.prod(box[2:] - box[:2])) for number, box in there[ns].items() if number in left]
+        return len(new), min(new, default=0.0), -ns
+
+    left = {person.number for person in persons}
+    stamps: list[int] = []
+    while left and len(stamps) < _MOST_IMAGES:
+        stamps.append(max(there, key=partial(worth, left=left)))
+        left = left - there[stamps[-1]].keys()
+    return sorted(stamps)
+
+
+def persons_picture(frames: Iterable[Frame], persons: Sequence[FoundPerson]) -> tuple[np.ndarray, int]:
+    """(H, W, 3) uint8 BGR, images of :func:`chosen_stamps` with numbered boxes; the first frame's stamp, ns."""
+    import cv2
+
+    wanted, tiles, begin_ns = chosen_stamps(persons), [], 0
+    for number, frame in enumerate(frames):
+        begin_ns = begin_ns if number else frame.stamp_ns
+        if frame.stamp_ns not in wanted:
+            continue
+        shrink = min(1.0, _WIDTH_PX / frame.image.shape[1])
+        small = cv2.resize(frame.image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+        boxes = {p.number: p.boxes[frame.stamp_ns] * shrink for p in persons if frame.stamp_ns in p.boxes}
+        tiles.append(draw_numbers(small, boxes, f"{(frame.stamp_ns - begin_ns) * 1e-9:.1f} s"))
+        if frame.stamp_ns == wanted[-1]:
+            break
+    columns = int(np.ceil(np.sqrt(len(tiles))))
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
+    return np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]), begin_ns
