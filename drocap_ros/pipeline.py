@@ -15,6 +15,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.live_replay import reconstruct_live, recorded_config
 from drocap_ros.motion import Motion
 from drocap_ros.observation import PoseObservation
+from drocap_ros.open_images import open_images, refuse_other_inputs
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.persons import find_persons, following, in_view
@@ -22,9 +23,9 @@ from drocap_ros.perception.sources import Frame
 from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
 from drocap_ros.reconstruction.common.poses import Progress
 from drocap_ros.reconstruction.reconstruct import reconstruct
-from drocap_ros.recording.open_images import open_images, refuse_other_inputs
+from drocap_ros.recording.image_messages import choose_images
 from drocap_ros.recording.open_session import is_recording, open_session
-from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, POSE2D, Session
+from drocap_ros.recording.session import POSE2D, Session
 from drocap_ros.recording.session_tracks import read_pose2d, with_recorded_camera
 from drocap_ros.recording.video_telemetry import (
     NO_TELEMETRY,
@@ -43,11 +44,13 @@ class Selection:
 
     person : number of a person of :func:`~drocap_ros.perception.persons.find_persons`; None = as configured
     redetect : estimate the 2D poses of a recording from its images, although it holds recorded ones
+    topic : of the images of a recording; empty: colour before grey, then that with most messages
     """
 
     clip: Clip = field(default_factory=Clip)
     person: int | None = None
     redetect: bool = False
+    topic: str = ""
 
 
 _WHOLE, _FOUND = Selection(), Telemetry()
@@ -152,7 +155,7 @@ def read_input(
         tracks, more = _track(path, config, models, progress, selection)
         if is_recording(path):
             with open_session(path) as session:
-                near = session.choose_topic(IMAGE, COMPRESSED_IMAGE).name
+                near = choose_images(session, selection.topic).name
                 session.warnings.clear()  # reported with the images
                 tracks = with_recorded_camera(session, tracks, near, pitch, telemetry=in_use)
                 _log_warnings(session)
@@ -194,13 +197,14 @@ def _track(
     settings, begin_ns = dataclasses.replace(config.pose_estimator, on_loss="next"), None
     folder, clip = models_folder(models or settings.models_dir), selection.clip
     if selection.person is not None:
-        with open_images(path, config.image_ingest) as images:
+        with open_images(path, config.image_ingest, selection.topic) as images:
             meter = clip.meter(progress, "persons", images.duration_s)
             persons = find_persons(clip.select(images.frames), folder, settings, meter)
         settings = following(settings, persons, selection.person)
         begin_ns = persons[selection.person - 1].first_ns
-    estimator, together = PoseEstimator(folder, settings), 0
-    with open_images(path, config.image_ingest) as images:
+    together, topic = 0, selection.topic
+    with open_images(path, config.image_ingest, topic) as images:
+        estimator = PoseEstimator(folder, settings)
         meter = clip.meter(progress, "2D pose", images.duration_s)
 
         def on_frame(frame: Frame, observation: PoseObservation) -> None:
@@ -215,6 +219,7 @@ def _track(
         raise InputError(f"{path}: {error}") from None
     origin: dict[str, Any] = {"pose2d": "estimated"}
     origin["images"] = {"size": list(tracks.image_size), "length": images.length, "rate_hz": images.rate_hz}
+    origin["images"] |= {"topic": topic} if topic else {}
     if selection.person is not None:
         return tracks, {**origin, "person": selection.person}
     if (in_turn := len(subjects(observations)) > 1) or together > 1:  # the whole image is searched once a second

@@ -12,9 +12,9 @@ import pytest
 #: Bottom to top; a room imports rooms of its own layer or below.
 LAYERS = (
     ("errors", "revision", "parameters", "skeleton", "joint_maps", "leg_sides", "geometry", "keypoints", "observation",
-     "stamps", "tracks", "motion", "mocap", "clip", "contacts"),
+     "stamps", "tracks", "motion", "mocap", "clip", "contacts", "file_kind"),
     ("perception", "flight", "reconstruction", "recording", "simulation"),
-    ("api", "config", "pipeline", "live_replay", "evaluation", "export", "report", "view"),
+    ("open_images", "api", "config", "pipeline", "live_replay", "evaluation", "export", "report", "view"),
     ("ros",),
     ("nodes", "bringup"),
     ("cli",),
@@ -26,7 +26,7 @@ MAX_LINES = 350
 #: budget writes the reason beside the number.
 BUDGETS = {
     ("errors", "revision", "parameters", "skeleton", "joint_maps", "leg_sides", "geometry", "keypoints", "observation",
-     "stamps", "tracks", "motion", "mocap", "clip", "contacts", "api", "config", "pipeline",
+     "stamps", "tracks", "motion", "mocap", "clip", "contacts", "file_kind", "open_images", "api", "config", "pipeline",
      "live_replay"): 3.2,  # the history of the camera, the stamps and the contacts came down from reconstruction
     ("perception",): 5.2,
     ("reconstruction",): 7.6,

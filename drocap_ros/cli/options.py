@@ -99,7 +99,7 @@ def _seed(text: str) -> int:
 
 
 def add_clip_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--start``, ``--end`` and ``--subject``."""
+    """Add ``--start``, ``--end``, ``--subject`` and ``--topic``."""
     first = "seconds from the first image (default 0)"
     parser.add_argument("--start", metavar="S", type=float, default=0.0, help=first)
     parser.add_argument("--end", metavar="S", type=float, default=math.inf, help="likewise (default: the last image)")
@@ -109,6 +109,9 @@ def add_clip_options(parser: argparse.ArgumentParser) -> None:
         default="",
         help="number of a person in the picture of `drocap track --list`; or largest (default), centre, or a box"
         " x_min,y_min,x_max,y_max px in the first image",
+    )
+    parser.add_argument(
+        "--topic", metavar="NAME", default="", help="topic of the images of a recording (default: colour before grey)"
     )
 
 

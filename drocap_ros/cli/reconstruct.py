@@ -120,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
             models=args.models,
             progress=progress,
             telemetry=telemetry,
-            selection=Selection(clip, person, args.redetect),
+            selection=Selection(clip, person, args.redetect, args.topic),
         )
     motion = dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line})
     _write(out, names, args.input, motion, tracks)

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from drocap_ros.cli.progress import Progress
     from drocap_ros.clip import Clip
     from drocap_ros.observation import PoseObservation
+    from drocap_ros.open_images import Images
     from drocap_ros.perception.estimator import PoseEstimator
     from drocap_ros.perception.persons import FoundPerson
     from drocap_ros.perception.sources import Frame
-    from drocap_ros.recording.open_images import Images
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -47,6 +47,7 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     add_clip_options(parser)
     add_network_options(parser)
+    parser.add_argument("--wait", action="store_true", help="track no other person after the subject is lost")
     parser.add_argument("--overlay", action="store_true", help="also write overlay.mp4 with the subject drawn")
     add_config_option(parser)
     add_quiet_option(parser)
@@ -58,30 +59,30 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.cli.models import ensure_networks
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.config import load_config
+    from drocap_ros.open_images import open_images
     from drocap_ros.perception.estimator import PoseEstimator
     from drocap_ros.perception.load_models import models_folder
     from drocap_ros.perception.persons import find_persons, following
     from drocap_ros.perception.tracking.pose_estimator_config import parse_subject
-    from drocap_ros.recording.open_images import open_images
 
     out = args.out or default_folder(Path(args.video), "tracks")
     check_output_folder(out)
     refuse_inputs([out / "persons.jpg"] if args.list else [out / "overlay.mp4"] * args.overlay, [args.video])
     clip, (person, rule) = clip_of(args), parse_subject(args.subject)
-    whole = load_config(args.config).replace("pose_estimator", on_loss="next", **rule)
+    whole = load_config(args.config).replace("pose_estimator", on_loss="wait" if args.wait else "next", **rule)
     config, ingest = whole.pose_estimator, whole.image_ingest
     folder = models_folder(args.models or config.models_dir)
     ensure_networks(folder, args.video, args)
     with output_folder(out) as target, progress_bars(args.quiet) as progress:
         begin_ns, persons = None, []
         if args.list or person is not None:
-            with open_images(args.video, ingest) as images:
+            with open_images(args.video, ingest, args.topic) as images:
                 meter = clip.meter(progress, "persons", images.duration_s)
                 persons = find_persons(clip.select(images.frames), folder, config, meter)
         if person is not None:
             config = following(config, persons, person)
             begin_ns = persons[person - 1].first_ns
-        with open_images(args.video, ingest) as images:
+        with open_images(args.video, ingest, args.topic) as images:
             if args.list:
                 text = _list(images, persons, target)
             else:
@@ -95,7 +96,7 @@ def _list(images: Images, persons: list[FoundPerson], target: Path) -> str:
     """Write the picture of the persons; returns a line for each."""
     import cv2
 
-    from drocap_ros.perception.persons import persons_picture
+    from drocap_ros.report.overlay import persons_picture
 
     picture, begin_ns = persons_picture(images.frames, persons)
     # Unlike imwrite, this raises the system's error: a full disk.
@@ -150,7 +151,7 @@ class _OverlayWriter:
     def add(self, frame: Frame, observation: PoseObservation) -> None:
         import cv2
 
-        from drocap_ros.perception.overlay import draw
+        from drocap_ros.report.overlay import draw
 
         height, width = frame.image.shape[:2]
         scale = min(1.0, 1280 / max(width, height))

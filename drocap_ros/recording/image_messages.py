@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import os
+import base64
+import itertools
+import re
 from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -10,56 +12,82 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Message, Session, header_stamp_ns
+from drocap_ros.perception.sources.packets import decoded_packets
+from drocap_ros.perception.sources.pixels import decoded, is_depth, is_grey, raw_to_bgr
+from drocap_ros.recording.session import IMAGES, Message, Session, TopicInfo, header_stamp_ns
 from drocap_ros.stamps import StampValidator
 
 if TYPE_CHECKING:
     from drocap_ros.perception.sources.base import Frame
 
-#: Largest raw image, px.
-_MAX_PIXELS = 200_000_000
-# The header of a small file can declare an image of gigabytes.  OpenCV reads this limit when it is imported.
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
-#: Last bytes of a JPEG that must contain its end marker; cameras append padding.
-_JPEG_TAIL = 4096
-#: encoding -> (bytes per pixel, name of OpenCV's conversion to BGR)
-_ENCODINGS: dict[str, tuple[int, str | None]] = {
-    "bgr8": (3, None),
-    "8UC3": (3, None),
-    "rgb8": (3, "COLOR_RGB2BGR"),
-    "bgra8": (4, "COLOR_BGRA2BGR"),
-    "rgba8": (4, "COLOR_RGBA2BGR"),
-    "mono8": (1, "COLOR_GRAY2BGR"),
-    "8UC1": (1, "COLOR_GRAY2BGR"),
-    # ROS names a Bayer pattern by its first two pixels, OpenCV by those of the second row.
-    "bayer_rggb8": (1, "COLOR_BayerBG2BGR"),
-    "bayer_bggr8": (1, "COLOR_BayerRG2BGR"),
-    "bayer_gbrg8": (1, "COLOR_BayerGR2BGR"),
-    "bayer_grbg8": (1, "COLOR_BayerGB2BGR"),
-    "yuv422": (2, "COLOR_YUV2BGR_UYVY"),
-    "uyvy": (2, "COLOR_YUV2BGR_UYVY"),
-    "yuv422_yuy2": (2, "COLOR_YUV2BGR_YUYV"),
-    "yuyv": (2, "COLOR_YUV2BGR_YUYV"),
-}
+#: A topic of this name holds no pictures of a camera.
+_NO_PICTURE = re.compile(r"depth|disparity|mask|label|segment|confidence", re.IGNORECASE)
+#: Messages by which a clock that stands still is known.
+_FIRST = 32
 
 
-def image_from_message(message: Message, compressed: bool) -> np.ndarray:
-    """(H, W, 3) uint8 BGR of a ``sensor_msgs`` Image or CompressedImage.
+def image_from_message(message: Message, compressed: bool | None = None) -> np.ndarray:
+    """(H, W, 3) uint8 BGR of an image or compressed image of ROS or Foxglove.
+
+    compressed : None = by the fields of the message
 
     Raises
     ------
     InputError
         When the encoding is unknown or the data does not fit.
     """
-    data = np.ascontiguousarray(np.frombuffer(bytes(message.data), np.uint8))
-    return _decompressed(data, str(message.format)) if compressed else _raw(message, data)
+    data = np.ascontiguousarray(np.frombuffer(_data(message), np.uint8))
+    if hasattr(message, "format") if compressed is None else compressed:
+        return decoded(data, str(message.format))
+    size = int(message.width), int(message.height)
+    return raw_to_bgr(data, size, int(message.step), str(message.encoding), bool(getattr(message, "is_bigendian", 0)))
 
 
-def read_images(session: Session) -> Iterator[Frame]:
+def choose_images(session: Session, wanted: str = "") -> TopicInfo:
+    """The topic of a name, else that of colour images with most messages, else of grey ones; depth is passed over.
+
+    Raises
+    ------
+    InputError
+        When there is none.
+    """
+    found = session.topics_of(*IMAGES)
+    names = ", ".join(topic.name for topic in found)
+    if wanted:
+        named = [topic for topic in found if topic.name.strip("/") == wanted.strip("/")]
+        if not named:
+            raise InputError(
+                f"--topic {wanted}: expected a topic with images, found {names or 'none'}; correct the name"
+            )
+        return named[0]
+    if len(found) < 2:
+        return session.choose_topic(*IMAGES)
+    ranks = [_rank(session, topic) for topic in found]
+    best = [topic for topic, rank in zip(found, ranks, strict=True) if rank == min(ranks)]
+    if min(ranks) == _DEPTH_RANK:
+        raise InputError(f"{session.path}: expected colour or grey images, found {names}; choose one with --topic NAME")
+    if len(best) > 1:
+        session.warn(f"several topics of images: {names}; took {best[0].name}, --topic NAME chooses another")
+    return best[0]
+
+
+_DEPTH_RANK = 2
+
+
+def _rank(session: Session, topic: TopicInfo) -> int:
+    """0 for colour, 1 for grey, 2 for distances and labels, by the first message."""
+    first = next((message for _, message in session.messages((topic.name,))), None)
+    form = str(getattr(first, "encoding", getattr(first, "format", "")))
+    if first is None or _NO_PICTURE.search(topic.name) or is_depth(form):
+        return _DEPTH_RANK
+    return int(is_grey(form))
+
+
+def read_images(session: Session, topic: str = "") -> Iterator[Frame]:
     """Images of a recording, one at a time, with strictly increasing stamps.
 
     Images that do not decode, or with a stamp not later than the previous one or far from it, are left out with a
-    warning.
+    warning.  Where the stamps of the messages do not advance, the times at which they were recorded are taken.
 
     Raises
     ------
@@ -68,63 +96,61 @@ def read_images(session: Session) -> Iterator[Frame]:
     """
     from drocap_ros.perception.sources.base import Frame
 
-    chosen = session.choose_topic(IMAGE, COMPRESSED_IMAGE)
-    compressed = chosen.type_name == COMPRESSED_IMAGE
+    chosen = choose_images(session, topic)
     last_ns, unordered, problems, stamps = None, 0, Counter[str](), StampValidator()
-    for _, message in session.messages((chosen.name,)):
-        stamp_ns = header_stamp_ns(message)
+    for stamp_ns, image in _images(session, chosen, problems):
         try:
-            stamps.check(message.header.stamp.sec, message.header.stamp.nanosec)
-            if last_ns is not None and stamp_ns <= last_ns:
-                unordered += 1
-                continue
-            image = image_from_message(message, compressed)
+            stamps.check(*divmod(stamp_ns, 10**9))
+        except InputError as error:
+            problems[str(error)] += 1
+            continue
+        if last_ns is not None and stamp_ns <= last_ns:
+            unordered += 1
+            continue
+        try:
+            pixels = image if isinstance(image, np.ndarray) else image_from_message(image)
         except InputError as error:
             problems[str(error)] += 1
             continue
         last_ns = stamp_ns
-        yield Frame(stamp_ns, image)
+        yield Frame(stamp_ns, pixels)
     if unordered:
         session.warn(f"{unordered} images on {chosen.name} with a stamp not later than the previous one were left out")
     if problems:
         worst, _ = problems.most_common(1)[0]
-        session.warn(f"{sum(problems.values())} images on {chosen.name} were left out: {worst}")
+        session.warn(f"{problems.total()} images on {chosen.name} were left out: {worst}")
         if last_ns is None:
             raise InputError(f"{session.path}: {chosen.name}: {worst}")
 
 
-def _decompressed(data: np.ndarray, form: str) -> np.ndarray:
-    import cv2
-
-    image = None
-    if data[:2].tobytes() == b"\xff\xd8" and b"\xff\xd9" not in data[-_JPEG_TAIL:].tobytes():
-        raise InputError(f"image: expected a whole JPEG, got {data.size} bytes without its end; check the link")
-    if data.size:
-        try:
-            image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        except cv2.error:
-            image = None
-    if image is None:
-        raise InputError(f"image: expected JPEG, PNG or another image, got format {form[:40]!r} that does not decode")
-    return np.asarray(image)
-
-
-def _raw(message: Message, data: np.ndarray) -> np.ndarray:
-    import cv2
-
-    height, width, step, encoding = message.height, message.width, message.step, str(message.encoding)
-    if encoding not in _ENCODINGS:
-        raise InputError(f"image: expected encoding {', '.join(_ENCODINGS)}, got {encoding[:40]!r}; convert it")
-    size, conversion = _ENCODINGS[encoding]
-    if not 0 < height * width <= _MAX_PIXELS or step < width * size or data.size < height * step:
-        raise InputError(
-            f"image: expected {height} rows of {step} bytes for {width}x{height} px {encoding}, got {data.size} bytes"
-        )
-    rows = data[: height * step].reshape(height, step)[:, : width * size]
-    pixels = rows.reshape(height, width, size) if size > 1 else rows
-    if conversion is None:
-        return np.ascontiguousarray(pixels)
+def _images(session: Session, chosen: TopicInfo, problems: Counter[str]) -> Iterator[tuple[int, Message | np.ndarray]]:
+    """Stamps with messages, or with the images that a video's packets decode to."""
+    stamped = _stamped(session, chosen.name)
+    first = next(stamped, None)
+    if first is None:
+        return
+    stamped = itertools.chain((first,), stamped)
+    if not chosen.type_name.endswith(("CompressedVideo", "FFMPEGPacket")):
+        yield from stamped
+        return
+    codec = str(getattr(first[1], "encoding", getattr(first[1], "format", "")))
     try:
-        return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), getattr(cv2, conversion)))
-    except cv2.error:
-        raise InputError(f"image: expected a size that {encoding} can have, got {width}x{height} px") from None
+        yield from decoded_packets(codec, ((stamp_ns, _data(message)) for stamp_ns, message in stamped))
+    except InputError as error:
+        problems[str(error)] += 1
+
+
+def _stamped(session: Session, topic: str) -> Iterator[tuple[int, Message]]:
+    """Messages with their stamps, or with the recorder's times where the stamps do not advance."""
+    heads = [header_stamp_ns(m) for _, m in itertools.islice(session.messages((topic,)), _FIRST)]
+    advancing = sum(b > a for a, b in itertools.pairwise(heads))
+    by_recorder = advancing < (len(heads) - 1) / 2
+    if by_recorder:
+        session.warn(f"the stamps on {topic} do not advance: the recorder's times are used, late by the transport")
+    for raw, message in session.messages((topic,)):
+        yield raw.log_time_ns if by_recorder else header_stamp_ns(message), message
+
+
+def _data(message: Message) -> bytes:
+    """Bytes of an image; JSON holds them as text."""
+    return base64.b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)

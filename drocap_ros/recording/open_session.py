@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from drocap_ros.errors import InputError
+from drocap_ros.file_kind import RECORDINGS, FileKind, file_kind
 from drocap_ros.recording.mcap.metadata import METADATA_FILE, custom_metadata, read_metadata, storage_files
 from drocap_ros.recording.session import FORMS, Session, SessionInfo
 from drocap_ros.recording.session_readers import McapSession, RosbagsSession
@@ -13,11 +14,11 @@ _SUFFIXES = (".mcap", ".bag", ".db3")
 
 
 def is_recording(path: str | Path) -> bool:
-    """Whether :func:`open_session` may read a path, by its name and the names in it."""
+    """Whether :func:`open_session` may read a path: by its first bytes, its name, or the names in a folder."""
     path = Path(path)
     if path.is_dir():
         return (path / METADATA_FILE).is_file() or any(p.suffix in (".mcap", ".db3") for p in path.iterdir())
-    return path.suffix in _SUFFIXES
+    return path.suffix in _SUFFIXES or (path.is_file() and file_kind(path) in RECORDINGS)
 
 
 def open_session(path: str | Path) -> Session:
@@ -36,7 +37,7 @@ def open_session(path: str | Path) -> Session:
     if not is_recording(path):
         raise InputError(f"{path}: expected {FORMS}, found something else; check the path")
     try:
-        if path.suffix == ".mcap" and path.is_file():
+        if path.is_file() and (path.suffix == ".mcap" or file_kind(path) is FileKind.MCAP):
             return McapSession(path, [path], {})
         return _open_folder(path) if path.is_dir() else RosbagsSession(path)
     except OSError as error:

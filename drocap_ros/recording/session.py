@@ -22,6 +22,14 @@ VEHICLE_STATE = "drocap_ros/msg/VehicleState"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+#: Types of images and of packets of a video.
+IMAGES = (
+    IMAGE,
+    COMPRESSED_IMAGE,
+    *(f"{package}{kind}" for package in ("foxglove_msgs/msg/", "foxglove.") for kind in
+      ("RawImage", "CompressedImage", "CompressedVideo")),
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
+)  # fmt: skip
 
 #: Forms of a recording, for messages.
 FORMS = "a session folder, .mcap, .bag, .db3 or rosbag2 folder"
@@ -158,8 +166,8 @@ class Session(ABC):
 
 
 def header_stamp_ns(message: Message) -> int:
-    """Stamp of a message's header, ns."""
-    return stamp_of(message.header.stamp)
+    """Stamp of a message's header, or of Foxglove's messages, ns."""
+    return stamp_of(message.header.stamp if hasattr(message, "header") else message.timestamp)
 
 
 def calibration_of(message: Message) -> np.ndarray | None:
@@ -170,5 +178,5 @@ def calibration_of(message: Message) -> np.ndarray | None:
 
 
 def stamp_of(time: Message) -> int:
-    """A ``builtin_interfaces/Time`` in ns."""
-    return int(time.sec) * 10**9 + int(time.nanosec)
+    """A ``builtin_interfaces/Time`` in ns; ROS 1 and JSON name its second part otherwise."""
+    return int(time.sec) * 10**9 + int(time.nanosec if hasattr(time, "nanosec") else time.nsec)

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.recording.mcap.metadata import METADATA_RECORD, FileRecord
+from drocap_ros.recording.foxglove import foxglove_message
+from drocap_ros.recording.mcap.metadata import METADATA_FILE, METADATA_RECORD, FileRecord
 from drocap_ros.recording.mcap.schemas import standard_types
 from drocap_ros.recording.mcap.stream import MAGIC, McapChannel, McapStream, counted_channels
 from drocap_ros.recording.session import FORMS, Message, RawMessage, Session, SessionInfo, TopicInfo
@@ -50,6 +51,8 @@ class McapSession(Session):
         """The message as an object with the fields of its definition."""
         channel = raw.source
         assert isinstance(channel, McapChannel)
+        if channel.message_encoding in ("json", "protobuf"):
+            return foxglove_message(raw.data, channel.message_encoding, channel.type_name)
         store = self._stores.get(channel)
         if store is None:
             store = self._stores[channel] = _typestore(channel)
@@ -120,7 +123,9 @@ class RosbagsSession(Session):
         from rosbags.highlevel import AnyReader
 
         try:
-            self._reader = AnyReader([path], default_typestore=standard_types())
+            # A folder without metadata.yaml is read by its files.
+            files = [path] if path.is_file() or (path / METADATA_FILE).is_file() else sorted(path.glob("*.db3"))
+            self._reader = AnyReader(files, default_typestore=standard_types())
             self._reader.open()
         except Exception as error:  # noqa: BLE001  # rosbags passes on any error of its storages
             raise InputError(f"{path}: expected {FORMS} that can be read; {first_line(error)}") from None

@@ -38,6 +38,26 @@ def test_track_writes_tracks_and_an_overlay(models, shared, tmp_path, capsys):
     assert "the subject in 65 (100.0%)" in capsys.readouterr().out
 
 
+def test_wait_follows_nobody_after_the_subject(tmp_path, capsys):
+    """The first images show one man, the later ones another at another place."""
+    cv2 = pytest.importorskip("cv2")
+    (tmp_path / "images").mkdir()
+    rate_hz = 8.0
+    men = rendered_images(10, rate_hz), [np.fliplr(image) for image in rendered_images(24, rate_hz, seed=3)]
+    empty = [np.full_like(men[0][0], 120)] * 60  # longer than a subject is waited for
+    for number, image in enumerate([*men[0], *empty, *men[1]]):
+        cv2.imwrite(str(tmp_path / "images" / f"{number:04}.jpg"), cv2.resize(image, (640, 360)))
+    (tmp_path / "config.yaml").write_text(f"image_ingest:\n  folder_rate_hz: {rate_hz}\n")
+    words = ["track", str(tmp_path / "images"), "--models", "simulation", "--config", str(tmp_path / "config.yaml")]
+    persons = {}
+    for option in ((), ("--wait",)):
+        out = tmp_path / f"out{len(option)}"
+        assert main([*words, *option, "--out", str(out)]) == 0
+        persons[option] = sorted(path.name for path in out.glob("*.npz"))
+    assert persons["--wait",] == ["tracks.npz"]
+    assert len(persons[()]) == 2
+
+
 @pytest.mark.parametrize("content", [b"", b"no video"], ids=["empty", "text"])
 def test_invalid_video_ends_with_status_2_and_one_line(models, tmp_path, capsys, content):
     (tmp_path / "a.mp4").write_bytes(content)

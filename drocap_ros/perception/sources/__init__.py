@@ -6,8 +6,9 @@ import re
 from pathlib import Path
 
 from drocap_ros.errors import InputError
+from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind, prefetch
-from drocap_ros.perception.sources.image_files import SUFFIXES, ImageFileSource
+from drocap_ros.perception.sources.image_files import ImageFileSource
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.perception.sources.live_source import open_camera, open_stream
 from drocap_ros.perception.sources.video import VideoSource
@@ -45,6 +46,6 @@ def open_source(uri: str | Path, config: ImageIngestConfig | None = None) -> Ima
         )
     if path.is_fifo() or path.suffix.lower() == ".sdp":
         return open_stream(str(path), config)
-    if path.is_dir() or path.suffix.lower() in SUFFIXES:
+    if path.is_dir() or file_kind(path) is FileKind.IMAGE:
         return ImageFileSource(path, config.folder_rate_hz)
     return VideoSource(path)

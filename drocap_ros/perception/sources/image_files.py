@@ -10,24 +10,12 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.sources.base import Frame, ImageSource
+from drocap_ros.perception.sources.pixels import to_bgr
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
 
 #: Least number of digits of a file name that is a time in nanoseconds (the EuRoC and TUM convention).
 _STAMP_DIGITS = 16
-
-
-def to_bgr(image: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 BGR from a grey, alpha, 16-bit or float image."""
-    if image.dtype == np.uint16:
-        image = (image >> 8).astype(np.uint8)
-    elif image.dtype.kind == "f":
-        image = np.clip(np.nan_to_num(image) * 255.0, 0, 255).astype(np.uint8)
-    if image.ndim == 2:
-        image = image[..., None]
-    if image.shape[2] in (1, 2):  # grey, grey + alpha
-        image = np.repeat(image[..., :1], 3, axis=2)
-    return np.ascontiguousarray(image[..., :3])
 
 
 def read_image(path: Path) -> np.ndarray:

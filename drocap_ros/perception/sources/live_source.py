@@ -10,8 +10,8 @@ from typing import Any
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
-from drocap_ros.perception.sources.image_files import to_bgr
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
+from drocap_ros.perception.sources.pixels import to_bgr
 from drocap_ros.perception.sources.video import ffmpeg_options, quiet_ffmpeg
 
 log = logging.getLogger(__name__)

@@ -5,14 +5,19 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import struct
 import threading
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from drocap_ros.errors import InputError
+from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
-from drocap_ros.perception.sources.image_files import to_bgr
+from drocap_ros.perception.sources.pixels import to_bgr
 
 log = logging.getLogger(__name__)
 
@@ -20,6 +25,17 @@ log = logging.getLogger(__name__)
 _TAIL_FRAMES = 2
 #: First bytes of Matroska and WebM, which state a duration and no count.
 _MATROSKA = b"\x1a\x45\xdf\xa3"
+#: Codecs in words by their codes; others are named by their codes.
+_CODECS = {"AV01": "AV1", "AVC1": "H.264", "H264": "H.264", "HEVC": "H.265", "HVC1": "H.265", "HEV1": "H.265"}
+#: First pictures that are compared, since OpenCV 4.13 leaves interlaced ones unwritten.
+_PROBED = 5
+#: A larger packet changes its picture: that of a still one has some bytes, and a bit or two for each block of 256 px.
+_STILL_BYTES, _STILL_PIXELS = 200, 1024
+#: Pixels of other shapes are not believed.
+_MAX_ASPECT = 4.0
+#: Boxes of an MP4 file that are passed on the way to its index.
+_MAX_BOXES = 4096
+_CONVERT = "ffmpeg -i IN -vf yadif -c:v libx264 -pix_fmt yuv420p OUT.mp4"
 
 
 def quiet_ffmpeg() -> None:
@@ -52,6 +68,27 @@ def ffmpeg_options(options: str | None) -> Iterator[None]:
             del os.environ[_OPTIONS]
 
 
+def _movie_s(path: Path) -> float | None:
+    """Seconds that an MP4 or MOV file shows (``mvhd``, ISO/IEC 14496-12), None where it does not state them."""
+    length = path.stat().st_size
+    with path.open("rb") as file:
+        place = 0
+        for _ in range(_MAX_BOXES):
+            file.seek(place)
+            head = file.read(48)
+            if len(head) < 48:
+                return None
+            size = int.from_bytes(head[8:16], "big") if head[:4] == b"\0\0\0\x01" else int.from_bytes(head[:4], "big")
+            if head[4:8] == b"moov" and head[12:16] == b"mvhd":
+                version_1 = head[16] == 1
+                scale, duration = struct.unpack_from(">IQ" if version_1 else ">II", head, 36 if version_1 else 28)
+                return duration / scale if scale and duration else None
+            if size < 8 or place + size >= length:
+                return None
+            place += size
+    return None
+
+
 class VideoSource(ImageSource):
     """Frames of a video file.
 
@@ -62,46 +99,85 @@ class VideoSource(ImageSource):
     Raises
     ------
     InputError
-        When the file is missing or empty, or its index or first frame cannot be decoded.
+        When the file is missing or no video, or its index or first frame cannot be decoded.
     """
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        import cv2
 
         quiet_ffmpeg()
         self.path = path
         if not path.is_file():
             raise InputError(f"{path}: expected a video file, found no such file; check the path")
-        size = path.stat().st_size
-        if size == 0:
-            raise InputError(f"{path}: expected a video file, found 0 bytes; copy or record it again")
+        if (kind := file_kind(path)) is not FileKind.VIDEO:
+            raise InputError(f"{path}: expected a video file, found {kind.value}; check the path, or record it again")
+        self._capture: Any = None
+        self._pending = deque[Frame]()
+        self._begin(self._opened())
+        if not self._pending or self._unwritten():
+            self._refuse()
+        height, width = self._pending[0].image.shape[:2]
+        self.size = (width, height)
+
+    def _opened(self) -> Any:
+        import cv2
+
         with ffmpeg_options(None):  # not while another thread opens a stream with its options
-            self._capture: Any = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        if not self._capture.isOpened():
+            # An absolute path has no colon before its first slash, which FFmpeg would take for a protocol.
+            capture = cv2.VideoCapture(str(self.path.absolute()), cv2.CAP_FFMPEG)
+        if not capture.isOpened():
             raise InputError(
-                f"{path}: expected a video that FFmpeg can open, found {size} bytes without a readable header or index"
-                " (not a video, or cut off); copy or record it again"
+                f"{self.path}: expected a video that FFmpeg can open, found {self.path.stat().st_size} bytes without a"
+                " readable header or index (cut off, or of an unknown codec); copy or record it again"
             )
+        return capture
+
+    def _begin(self, capture: Any) -> None:
+        """Read the first picture, and what the container states."""
+        import cv2
+
+        self._capture = capture
         self._origin_ns: int | None = None
         self._last_ns: int | None = None
         self._count = 0
-        with path.open("rb") as file:
+        with self.path.open("rb") as file:
             self._counted = file.read(4) != _MATROSKA
-        stated = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        stated, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), self._nominal_rate()
         # A container without an index states a negative or huge number.
         self.length = int(stated) if 0 < stated < 1e9 else None
-        self.duration_s = (self.length - 1) / self._nominal_rate() if self.length else None
-        self._pending = self._decode()
-        if self._pending is None:
-            self.close()
-            raise InputError(f"{path}: expected a video, found no frame that decodes; copy or record it again")
-        height, width = self._pending.image.shape[:2]
-        self.size = (width, height)
+        shown_s = _movie_s(self.path)
+        if self.length and shown_s and shown_s * rate < self.length - _TAIL_FRAMES:
+            self.length = max(1, round(shown_s * rate))  # an edit list hides the others, as after a trim
+        self.duration_s = (self.length - 1) / rate if self.length else None
+        self._pending = deque(frame for frame in (self._decode(),) if frame)
+
+    def _unwritten(self) -> bool:
+        """Whether the first pictures are equal although their packets differ and change them."""
+        import cv2
+
+        first = self._pending[0].image
+        while len(self._pending) < _PROBED and (frame := self._decode()):
+            self._pending.append(frame)
+            if not np.array_equal(frame.image, first):
+                return False
+        raw = cv2.VideoCapture(str(self.path.absolute()), cv2.CAP_FFMPEG)
+        raw.set(cv2.CAP_PROP_FORMAT, -1)  # packets as they are
+        packets = [packet.tobytes() for ok, packet in (raw.read() for _ in self._pending) if ok]
+        raw.release()
+        largest_still = _STILL_BYTES + first.shape[0] * first.shape[1] // _STILL_PIXELS
+        return len(set(packets)) == _PROBED and min(map(len, packets)) > largest_still
+
+    def _refuse(self) -> None:
+        import cv2
+
+        code = int(self._capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("latin1").upper()
+        words = "no interlaced pictures" if self._pending else f"no frame of its {_CODECS.get(code, code)}"
+        self.close()
+        raise InputError(f"{self.path}: expected a video, found {words} that OpenCV decodes; convert it: {_CONVERT}")
 
     def read(self) -> Frame | None:
         """Next frame, or None at the end."""
-        frame, self._pending = self._pending or self._decode(), None
+        frame = self._pending.popleft() if self._pending else self._decode()
         if frame is None:
             self._report_end()
             return None
@@ -116,7 +192,20 @@ class VideoSource(ImageSource):
         ok, image = self._capture.read()
         if not ok:
             return None
-        return Frame(self._stamp(self._capture.get(cv2.CAP_PROP_POS_MSEC)), to_bgr(image))
+        return Frame(self._stamp(self._capture.get(cv2.CAP_PROP_POS_MSEC)), self._square(to_bgr(image)))
+
+    def _square(self, image: np.ndarray) -> np.ndarray:
+        """The picture as it is shown, where its pixels are no squares."""
+        import cv2
+
+        ratio = self._capture.get(cv2.CAP_PROP_SAR_NUM) / (self._capture.get(cv2.CAP_PROP_SAR_DEN) or 1.0)
+        if ratio == 1.0 or not 1 / _MAX_ASPECT <= ratio <= _MAX_ASPECT:
+            return image
+        turned = int(self._capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 180 == 90
+        across = 1 / ratio if turned else ratio
+        height, width = image.shape[:2]
+        size = (round(width * across), height) if across > 1 else (width, round(height / across))
+        return cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
 
     def _stamp(self, position_ms: float) -> int:
         now = round(position_ms * 1e6)

@@ -11,12 +11,16 @@ from typing import NamedTuple
 from drocap_ros.errors import InputError
 from drocap_ros.perception.sources import Frame, open_source
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
-from drocap_ros.recording.image_messages import read_images
+from drocap_ros.recording.image_messages import choose_images, read_images
 from drocap_ros.recording.open_session import is_recording, open_session
-from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE
 from drocap_ros.recording.telemetry.read import LOG_SUFFIXES
 
 logger = logging.getLogger(__name__)
+
+#: Standard deviation of the values, of 255, below which a picture shows nothing: noise of a covered lens.
+_BLANK = 1.0
+#: Every such pixel of a row and of a column counts for it.
+_SAMPLING = 8
 
 
 class Images(NamedTuple):
@@ -37,8 +41,10 @@ class Images(NamedTuple):
 
 
 @contextlib.contextmanager
-def open_images(source: str | Path, config: ImageIngestConfig | None = None) -> Iterator[Images]:
+def open_images(source: str | Path, config: ImageIngestConfig | None = None, topic: str = "") -> Iterator[Images]:
     """Open a video file, image, folder of images, stream or recording; warnings of a recording are logged at the end.
+
+    topic : of a recording; empty: that of :func:`drocap_ros.recording.image_messages.choose_images`
 
     Raises
     ------
@@ -50,13 +56,29 @@ def open_images(source: str | Path, config: ImageIngestConfig | None = None) -> 
         refuse_other_inputs(path)
     if path.exists() and is_recording(path):
         with open_session(path) as session:
-            session.choose_topic(IMAGE, COMPRESSED_IMAGE)  # read_images refuses only when it begins
-            yield Images(read_images(session), None, session.info.duration_s)
+            choose_images(session, topic)  # read_images refuses only when it begins
+            yield Images(_visible(path, read_images(session, topic)), None, session.info.duration_s)
             for warning in session.warnings:
                 logger.warning("%s: %s", path, warning)
         return
+    if topic:
+        raise InputError(f"--topic {topic}: expected a recording with topics, found {source}; leave the option out")
     with open_source(source, config) as images:
-        yield Images(images, images.length, images.duration_s)
+        yield Images(_visible(source, images), images.length, images.duration_s)
+
+
+def _visible(source: str | Path, frames: Iterable[Frame]) -> Iterator[Frame]:
+    """The frames; refused at their end when none of them shows anything."""
+    count, blank = 0, True
+    for frame in frames:
+        count += 1
+        blank = blank and float(frame.image[::_SAMPLING, ::_SAMPLING].std()) < _BLANK
+        yield frame
+    if count > 1 and blank:
+        raise InputError(
+            f"{source}: expected pictures, found {count} of one colour; look at them, or convert them:"
+            " ffmpeg -i IN -pix_fmt yuv420p OUT.mp4"
+        )
 
 
 def refuse_other_inputs(path: Path) -> None:

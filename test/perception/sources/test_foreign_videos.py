@@ -1,0 +1,142 @@
+"""Videos that other programs write."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+from test_sources import patch_box, write_video
+
+from drocap_ros.cli import main
+from drocap_ros.errors import InputError
+from drocap_ros.perception.sources import open_source
+from drocap_ros.perception.sources.pixels import to_bgr
+
+cv2 = pytest.importorskip("cv2")
+
+
+@pytest.mark.parametrize(
+    "text", ["a man walks\n" * 60, "#EXTM3U\n#EXTINF:1,\nother.mp4\n", "\x1b[42m   \x1b[0m\n" * 99]
+)
+@pytest.mark.parametrize("name", ["notes.txt", "clip.mp4"])
+def test_text_is_no_video(tmp_path, capsys, text, name):
+    write_video(tmp_path / "other.mp4")
+    (tmp_path / name).write_text(text)
+    words = ["--models", "simulation", "--out", str(tmp_path / "out")]
+    assert main(["track", str(tmp_path / name), *words]) == 2
+    assert main(["reconstruct", str(tmp_path / name), *words]) == 2
+    err = capsys.readouterr().err
+    assert err.count("found text") == 2
+    assert err.count("\n") == 2
+
+
+def test_names_do_not_decide(tmp_path):
+    write_video(tmp_path / "a.mp4").rename(tmp_path / "video")
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((10, 12, 3), 90, np.uint8))
+    (tmp_path / "a.png").rename(tmp_path / "image.mp4")
+    for name, size in (("video", (64, 48)), ("image.mp4", (12, 10))):
+        with open_source(tmp_path / name) as source:
+            assert source.size == size
+
+
+@pytest.mark.parametrize(
+    ("across", "down", "size"), [(4, 3, (85, 48)), (1, 2, (64, 96)), (1, 1, (64, 48)), (900, 1, (64, 48))]
+)
+def test_pixels_that_are_no_squares_are_shown_as_they_are(tmp_path, across, down, size):
+    path = write_video(tmp_path / "a.mp4")
+    data = path.read_bytes()
+    # An MPEG-4 stream states the shape in its own header; the container's box takes precedence.
+    box = struct.pack(">I4sII", 16, b"pasp", across, down)
+    at = data.index(b"mp4v") - 4
+    grown = bytearray(data)
+    found = data.find(b"pasp", at)
+    if found > 0:
+        grown[found - 4 : found + 12] = box
+    else:
+        length = struct.unpack(">I", data[at : at + 4])[0]
+        grown[at + length : at + length] = box
+        for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"mp4v"):
+            place = data.index(name) - 4
+            grown[place : place + 4] = struct.pack(">I", struct.unpack(">I", data[place : place + 4])[0] + len(box))
+    path.write_bytes(bytes(grown))
+    with open_source(path) as source:
+        frame = next(iter(source))
+    assert source.size == size
+    assert frame.image.shape[1::-1] == size
+
+
+def test_trimmed_video_is_whole(tmp_path, caplog):
+    """An edit list that shows the first 20 of 60 frames, as after a trim."""
+    path = write_video(tmp_path / "a.mp4", frames=60)
+
+    def shorter(content: bytes) -> bytes:
+        scale = struct.unpack(">I", content[12:16])[0]
+        return content[:16] + struct.pack(">I", 2 * scale) + content[20:]
+
+    def edit(content: bytes) -> bytes:
+        scale = struct.unpack(">I", path.read_bytes()[path.read_bytes().index(b"mvhd") + 16 :][:4])[0]
+        return content[:8] + struct.pack(">I", 2 * scale) + content[12:]
+
+    if b"elst" not in path.read_bytes():
+        pytest.skip("this OpenCV writes no edit list")
+    patch_box(path, b"mvhd", shorter)
+    patch_box(path, b"elst", edit)
+    with open_source(path) as source:
+        assert source.length == 20
+        assert 19 <= len(list(source)) <= 22
+        assert source.events() == []
+    assert "ended early" not in caplog.text
+
+
+def test_black_pictures_are_not_nobody(tmp_path, capsys):
+    writer = cv2.VideoWriter(str(tmp_path / "a.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (64, 48))
+    for _ in range(6):
+        writer.write(np.zeros((48, 64, 3), np.uint8))
+    writer.release()
+    assert main(["track", str(tmp_path / "a.mp4"), "--models", "simulation", "--out", str(tmp_path / "out")]) == 2
+    assert "expected pictures, found 6 of one colour" in capsys.readouterr().err
+
+
+def test_undecoded_video_names_its_codec(shared):
+    try:
+        with open_source(shared / "cases" / "av1_codec" / "av1.mp4") as source:
+            assert len(list(source)) == 24
+    except InputError as error:
+        assert "AV1" in str(error)  # noqa: PT017
+        assert "convert it: ffmpeg" in str(error)  # noqa: PT017
+
+
+def test_interlaced_video_gives_pictures_or_is_named(shared):
+    path = shared / "cases" / "interlaced_black" / "interlaced.mp4"
+    try:
+        with open_source(path) as source, open_source(path.with_name("progressive.mp4")) as progressive:
+            assert np.abs(next(iter(source)).image.astype(int) - next(iter(progressive)).image).mean() < 10
+    except InputError as error:
+        assert "interlaced" in str(error)  # noqa: PT017
+
+
+@pytest.mark.parametrize(("low", "high"), [(0, 4095), (7000, 9000), (0, 65535)], ids=["12 bit", "thermal", "16 bit"])
+def test_sixteen_bits_keep_their_contrast(low, high):
+    ramp = np.linspace(low, high, 64 * 64).reshape(64, 64).astype(np.uint16)
+    ramp[0, 0] = 65535  # a dead pixel
+    image = to_bgr(ramp)
+    assert image.std() > 60
+    assert image[40, 40, 0] > image[20, 20, 0]
+
+
+def test_damaged_heads_end_in_one_line(tmp_path):
+    """Seeded mutations of whole files: refused in one line, or read."""
+    rng = np.random.default_rng(0)
+    whole = write_video(tmp_path / "a.mp4", frames=4).read_bytes()
+    for number in range(60):
+        data = bytearray(whole)
+        for at in rng.integers(0, len(data), rng.integers(1, 12)):
+            data[at] = rng.integers(256)
+        data = data[: rng.integers(1, len(data))] if number % 3 == 0 else data
+        (tmp_path / "b.mp4").write_bytes(data)
+        try:
+            with open_source(tmp_path / "b.mp4") as source:
+                assert len(list(source)) < 1000
+        except InputError as error:
+            assert "\n" not in str(error)  # noqa: PT017

@@ -1,0 +1,194 @@
+"""Images in recordings of other programs: topics, clocks, encodings, packets of video."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import struct
+
+import numpy as np
+import pytest
+from recorded import NAMES, START_NS, image_message, random_image, record
+from rendered_person import rendered_images
+
+from drocap_ros.cli import main
+from drocap_ros.errors import InputError
+from drocap_ros.recording.image_messages import image_from_message, read_images
+from drocap_ros.recording.open_session import open_session
+from drocap_ros.tracks import load_tracks
+
+cv2 = pytest.importorskip("cv2")
+STEP_NS = 100_000_000
+
+
+def jpeg(messages, image, stamp_ns):
+    data = cv2.imencode(".jpg", image)[1].ravel()
+    return messages(
+        NAMES["compressed"], header=messages.header(stamp_ns), format="bgr8; jpeg compressed bgr8", data=data
+    )
+
+
+def raw(messages, pixels, encoding, stamp_ns=START_NS, step=None, **values):
+    height, width = pixels.shape[:2] if "nv" not in encoding else (pixels.shape[0] * 2 // 3, pixels.shape[1])
+    data = np.ascontiguousarray(pixels).view(np.uint8).ravel()
+    return messages(
+        NAMES["image"], header=messages.header(stamp_ns), height=height, width=width, encoding=encoding,
+        step=step or data.size // pixels.shape[0], data=data, **values,
+    )  # fmt: skip
+
+
+def test_depth_is_passed_over_and_a_topic_chosen(tmp_path, messages, capsys):
+    images, depth = rendered_images(4), np.full((48, 64), 3000, np.uint16)
+    entries = []
+    for i, image in enumerate(images):
+        stamp = START_NS + i * STEP_NS
+        for topic, message in (
+            ("/aligned_depth/image_raw", raw(messages, depth, "16UC1", stamp)),
+            ("/camera/image_raw", jpeg(messages, image, stamp)),
+            ("/left/image_mono", raw(messages, depth.astype(np.uint8), "mono8", stamp)),
+        ):
+            entries.append((topic, message, stamp, messages.cdr(message)))
+    record(tmp_path / "s", entries)
+    words = ["track", str(tmp_path / "s"), "--models", "simulation", "--out"]
+    assert main([*words, str(tmp_path / "a")]) == 0
+    assert load_tracks(tmp_path / "a" / "tracks.npz").image_size == images[0].shape[1::-1]
+    assert main([*words, str(tmp_path / "b"), "--topic", "camera/image_raw"]) == 0
+    assert main([*words, str(tmp_path / "c"), "--topic", "/nothing"]) == 2
+    assert "correct the name" in capsys.readouterr().err
+    with open_session(tmp_path / "s") as session:
+        assert next(read_images(session, "/left/image_mono")).image.shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize("stamp", [lambda i: 0, lambda i: START_NS, lambda i: START_NS + i // 10 * 10**9])
+def test_stamps_that_stand_still_give_way_to_the_recorder(tmp_path, messages, stamp):
+    entries = []
+    for i in range(12):
+        message = image_message(messages, random_image(i), stamp(i))
+        entries.append(("/camera", message, START_NS + i * STEP_NS, messages.cdr(message)))
+    record(tmp_path / "s", entries)
+    with open_session(tmp_path / "s") as session:
+        assert [f.stamp_ns for f in read_images(session)] == [START_NS + i * STEP_NS for i in range(12)]
+        assert "do not advance" in session.warnings[0]
+
+
+@pytest.mark.parametrize(
+    "encoding", ["mono16", "16UC1", "mono12", "bayer_rggb16", "rgb16", "bgr16", "nv12", "nv21", "8UC4"]
+)
+def test_encodings_keep_the_picture(messages, encoding):
+    grey = np.tile(np.linspace(20, 220, 64).astype(np.uint8), (48, 1))
+    pixels = {
+        "nv12": np.vstack([grey, np.full((24, 64), 128, np.uint8)]),
+        "nv21": np.vstack([grey, np.full((24, 64), 128, np.uint8)]),
+        "8UC4": np.dstack([grey] * 4),
+        "rgb16": np.dstack([grey.astype(np.uint16) * 16] * 3),
+        "bgr16": np.dstack([grey.astype(np.uint16) * 16] * 3),
+    }.get(encoding, grey.astype(np.uint16) * 16)
+    for big in (False, True) if pixels.dtype == np.uint16 else (False,):
+        data = pixels.astype(">u2") if big else pixels
+        image = image_from_message(raw(messages, data, encoding, is_bigendian=int(big)))
+        assert image.shape == (48, 64, 3)
+        assert np.corrcoef(image.mean(axis=2).ravel(), grey.ravel())[0, 1] > 0.98
+        assert np.ptp(image.mean(axis=2)) > 150
+
+
+def video_packets(path, images):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP90"), 10.0, images[0].shape[1::-1])
+    if not writer.isOpened():
+        pytest.skip("this OpenCV encodes no VP9")
+    for image in images:
+        writer.write(image)
+    writer.release()
+    reader = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    reader.set(cv2.CAP_PROP_FORMAT, -1)
+    packets = []
+    while (read := reader.read())[0]:
+        packets.append(read[1].tobytes())
+    return packets
+
+
+def field(number, value):
+    if isinstance(value, int):
+        return bytes([number << 3 | 5]) + struct.pack("<I", value)
+    size, head = len(value), b""
+    while size > 0x7F:
+        head, size = head + bytes([size & 0x7F | 0x80]), size >> 7
+    return bytes([number << 3 | 2]) + head + bytes([size]) + value
+
+
+def foxglove_file(path, kind, encoding, payloads):
+    """An MCAP file of (bytes of an image or packet, format)."""
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("", "")
+        schema = writer.register_schema(f"foxglove.{kind}", "jsonschema" if encoding == "json" else "protobuf", b"{}")
+        channel = writer.register_channel("/camera", encoding, schema)
+        for i, (payload, form) in enumerate(payloads):
+            stamp = START_NS + i * STEP_NS
+            sec, nsec = divmod(stamp, 10**9)
+            if encoding == "json":
+                fields = {
+                    "timestamp": {"sec": sec, "nsec": nsec},
+                    "format": form,
+                    "data": base64.b64encode(payload).decode(),
+                }
+                data = json.dumps(fields).encode()
+            else:
+                time = b"\x08" + bytes([sec >> s & 0x7F | 0x80 * (s < 28) for s in range(0, 35, 7)])
+                time += b"\x10" + bytes([nsec >> s & 0x7F | 0x80 * (s < 28) for s in range(0, 35, 7)])
+                parts = ((1, time), (2, payload), (3, form.encode()), (4, b"cam"))
+                if kind == "CompressedVideo":
+                    parts = ((1, time), (2, b"cam"), (3, payload), (4, form.encode()))
+                data = b"".join(field(*part) for part in parts)
+            writer.add_message(channel, stamp, data, stamp)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("encoding", ["json", "protobuf"])
+@pytest.mark.parametrize("kind", ["CompressedImage", "CompressedVideo"])
+def test_foxglove_images_and_videos_are_read(tmp_path, encoding, kind):
+    images = [cv2.GaussianBlur(random_image(i, (96, 128, 3)), (0, 0), 9) for i in range(8)]
+    if kind == "CompressedImage":
+        payloads = [(cv2.imencode(".jpg", image)[1].tobytes(), "jpeg") for image in images]
+    else:
+        payloads = [(packet, "vp9") for packet in video_packets(tmp_path / "a.webm", images)]
+    path = foxglove_file(tmp_path / "a.mcap", kind, encoding, payloads)
+    with open_session(path) as session:
+        frames = list(read_images(session))
+        assert session.warnings == []
+    assert [f.stamp_ns for f in frames] == [START_NS + i * STEP_NS for i in range(8)]
+    for frame, image in zip(frames, images, strict=True):
+        assert np.abs(frame.image.astype(int) - image).mean() < 6
+
+
+@pytest.mark.parametrize("name", ["ffmpeg_packet", "fox_video"])
+def test_h264_packets_are_read(shared, name):
+    with open_session(shared / "cases" / "video_messages_mcap" / name) as session:
+        frames = list(read_images(session))
+    assert len(frames) == 24
+    assert {round((b.stamp_ns - a.stamp_ns) * 1e-6) for a, b in itertools.pairwise(frames)} == {67}
+
+
+def test_damaged_messages_end_in_one_line(tmp_path):
+    """Seeded mutations of images and packets in both encodings: refused in one line, or left out."""
+    rng = np.random.default_rng(0)
+    packets = video_packets(tmp_path / "a.webm", [random_image(i) for i in range(3)])
+    for number in range(40):
+        kind, encoding = ("CompressedImage", "CompressedVideo")[number % 2], ("json", "protobuf")[number // 2 % 2]
+        payloads = []
+        for packet in packets:
+            data = bytearray(packet)
+            for at in rng.integers(0, len(data), 4):
+                data[at] = rng.integers(256)
+            payloads.append(
+                (bytes(data[: rng.integers(0, len(data))]), ("vp9", "h264", "jpeg", "\x1b")[rng.integers(4)])
+            )
+        path = foxglove_file(tmp_path / "b.mcap", kind, encoding, payloads)
+        try:
+            with open_session(path) as session:
+                assert len(list(read_images(session))) <= len(packets)
+        except InputError as error:
+            assert "\n" not in str(error)  # noqa: PT017
