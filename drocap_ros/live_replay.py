@@ -163,29 +163,30 @@ def _arrays(session: Session, frames: dict[int, _Frame], matrix: np.ndarray | No
     stamps = sorted(stamp for stamp, frame in frames.items() if np.isfinite(frame.joints).all())
     if not stamps:
         raise InputError(f"{session.path}: expected keypoints of a person, found none that gives a pose; check them")
-    observations = [frames[stamp].observation for stamp in stamps]
-    cameras = [frames[stamp].camera for stamp in stamps]
-    known = [camera for camera in cameras if camera is not None]
-    first = observations[0]
-    other = next((o for o in observations if (o.joints, o.image_size) != (first.joints, first.image_size)), None)
-    if other is not None:
-        raise InputError(
-            f"{session.path}: expected {_format(first)} throughout, got {_format(other)}; cut the recording where"
-            " that changes"
-        )
-    return (
-        Tracks(
-            keypoints=np.array([o.keypoints for o in observations], np.float64),
-            joints=first.joints.joints,
-            stamp_ns=np.array(stamps, np.int64),
-            image_size=first.image_size,
-            confidence=np.array([o.confidence for o in observations], np.float64),
-            covariance=np.array([o.covariance for o in observations], np.float64),
-            camera_rotation=np.array([rotation for rotation, _ in known]) if known else None,
-            camera_position=np.array([position for _, position in known]) if known else None,
-            camera_matrix=matrix,
-        ),
-        np.array([frames[stamp].joints for stamp in stamps], np.float64),
+    used = [frames[stamp] for stamp in stamps]
+    first = used[0].observation
+    for other in (frame.observation for frame in used):
+        if (other.joints, other.image_size) != (first.joints, first.image_size):
+            raise InputError(
+                f"{session.path}: expected {_format(first)} throughout, got {_format(other)}; cut the recording where"
+                " that changes"
+            )
+    return _tracks(stamps, used, matrix), np.array([frame.joints for frame in used], np.float64)
+
+
+def _tracks(stamps: list[int], frames: list[_Frame], matrix: np.ndarray | None) -> Tracks:
+    observations = [frame.observation for frame in frames]
+    known = [frame.camera for frame in frames if frame.camera is not None]
+    return Tracks(
+        keypoints=np.array([o.keypoints for o in observations], np.float64),
+        joints=observations[0].joints.joints,
+        stamp_ns=np.array(stamps, np.int64),
+        image_size=observations[0].image_size,
+        confidence=np.array([o.confidence for o in observations], np.float64),
+        covariance=np.array([o.covariance for o in observations], np.float64),
+        camera_rotation=np.array([rotation for rotation, _ in known]) if known else None,
+        camera_position=np.array([position for _, position in known]) if known else None,
+        camera_matrix=matrix,
     )
 
 

@@ -187,6 +187,16 @@ def _check(m: Motion) -> None:
     frames, joints = m.joints3d.shape[:2]
     if not 1 <= frames <= MAX_FRAMES:
         raise InputError(f"joints3d: expected 1 to {MAX_FRAMES} frames, got {frames}; cut the motion")
+    _check_arrays(m, frames, joints)
+    if np.any(np.abs(m.joints3d) > _FARTHEST_M):
+        raise InputError(f"joints3d: expected metres up to {_FARTHEST_M:g}, got larger; is the unit right?")
+    check_stamps(m.stamp_ns)
+    if m.frame not in ("world", "camera"):
+        raise InputError(f"frame: expected 'world' or 'camera', got {m.frame[:40]!r}")
+    _check_tree(m.joints, m.parents)
+
+
+def _check_arrays(m: Motion, frames: int, joints: int) -> None:
     shapes = {
         "joints3d": (frames, joints, 3),
         "stamp_ns": (frames,),
@@ -205,12 +215,6 @@ def _check(m: Motion) -> None:
             raise InputError(f"{name}: expected numbers of shape {shape}, got {value.dtype} {value.shape}")
         if value.dtype.kind == "f" and np.isinf(value).any():
             raise InputError(f"{name}: expected finite numbers or NaN, got infinity; use NaN for unknown")
-    if np.any(np.abs(m.joints3d) > _FARTHEST_M):
-        raise InputError(f"joints3d: expected metres up to {_FARTHEST_M:g}, got larger; is the unit right?")
-    check_stamps(m.stamp_ns)
-    if m.frame not in ("world", "camera"):
-        raise InputError(f"frame: expected 'world' or 'camera', got {m.frame[:40]!r}")
-    _check_tree(m.joints, m.parents)
 
 
 def _check_tree(joints: tuple[str, ...], parents: tuple[int, ...]) -> None:

@@ -77,14 +77,18 @@ def _check(t: Tracks) -> None:
     check_keypoints(k, t.covariance)
     if min(t.image_size) < 1:
         raise InputError(f"image_size: expected positive width and height, got {t.image_size}")
-    seen = np.abs(k[np.isfinite(k)])
-    if seen.any() and seen.max() <= _NORMALISED and min(t.image_size) > 16 * _NORMALISED:
-        width, height = t.image_size
+    _check_unit(k, t.image_size)
+    _check_telemetry(t)
+
+
+def _check_unit(keypoints: np.ndarray, image_size: tuple[int, int]) -> None:
+    seen = np.abs(keypoints[np.isfinite(keypoints)])
+    if seen.any() and seen.max() <= _NORMALISED and min(image_size) > 16 * _NORMALISED:
+        width, height = image_size
         raise InputError(
             f"keypoints: expected px of an image of {width}x{height}, got none above {seen.max():g}; multiply"
             " normalised ones by the image's width and height"
         )
-    _check_telemetry(t)
 
 
 def _check_shapes(t: Tracks) -> None:

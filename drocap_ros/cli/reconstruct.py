@@ -104,11 +104,10 @@ def run(args: argparse.Namespace) -> int:
     if clip.whole and is_same(out / "tracks.npz", args.input):
         names.remove("tracks.npz")  # they stay as they are
     refuse_inputs([out / name for name in names], [args.input])
-    config = load_config(args.config)
+    person, rule = parse_subject(args.subject)
+    config = load_config(args.config).replace("pose_estimator", **rule)
     if args.dictionary:
         config = config.replace("initializer", dictionary=str(args.dictionary))
-    person, rule = parse_subject(args.subject)
-    config = config.replace("pose_estimator", **rule)
     telemetry = _telemetry(args)
     if needs_networks(args.input, args.redetect):
         ensure_networks(models_folder(args.models or config.pose_estimator.models_dir), args.input, args)

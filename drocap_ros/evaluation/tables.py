@@ -104,6 +104,7 @@ def rotation_markdown(rows: list[RotationRow]) -> str:
     speeds = sorted({r.speed_deg_s for r in rows})
     speed = _SPEED_DEG_S if _SPEED_DEG_S in speeds else speeds[-1]
     by_method = _by_method(rows)
+    by_speed = [_speed_cells(method, of, speeds) for method, of in by_method.items()]
     at_speed = _by_method([r for r in rows if r.speed_deg_s == speed])
     per_sequence = [
         [same[0].sequence, *(f"{r.errors.error_mm:.1f}" for r in same)] for same in zip(*at_speed.values(), strict=True)
@@ -112,19 +113,17 @@ def rotation_markdown(rows: list[RotationRow]) -> str:
     lines = [
         f"Reconstruction error in mm, mean over {len(per_sequence)} sequences, {kind} 2D, by orbit speed in deg/s.",
         "",
-        *markdown_table(
-            ["method", *(f"{s:g}" for s in speeds), "mirrored"],
-            [
-                [LABELS[m], *(f"{_mean_mm(of, s):.1f}" for s in speeds), str(sum(r.errors.mirrored for r in of))]
-                for m, of in by_method.items()
-            ],
-        ),
+        *markdown_table(["method", *(f"{s:g}" for s in speeds), "mirrored"], by_speed),
         *("", f"Per joint group at {speed:g} deg/s, mm.", ""),
         *markdown_table(["method", *JOINT_GROUPS, "toe"], [_group_cells(m, of) for m, of in at_speed.items()]),
         *("", f"Per sequence at {speed:g} deg/s, mm.", ""),
         *markdown_table(["sequence", *(LABELS[m] for m in by_method)], per_sequence),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _speed_cells(method: str, rows: list[RotationRow], speeds: list[float]) -> list[str]:
+    return [LABELS[method], *(f"{_mean_mm(rows, s):.1f}" for s in speeds), str(sum(r.errors.mirrored for r in rows))]
 
 
 def _by_method(rows: list[RotationRow]) -> dict[str, list[RotationRow]]:

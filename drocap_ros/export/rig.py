@@ -159,20 +159,27 @@ def _rig(body: RigidBody, rate_hz: float, lift: np.ndarray, naming: dict[str, st
     assumed = TOES if naming is NAMES["h36m"] and not set(TOES) <= set(body.joints) else ()
     kept = tuple(joint for joint in BODY if naming[joint] and joint not in assumed)
     parents = (-1, *(kept.index(PARENTS[joint]) for joint in kept[1:]))
-    positions = np.zeros((len(kept), 3))
-    for i, parent in enumerate(parents[1:], start=1):
-        positions[i] = positions[parent] + offsets[kept[i]]
-    positions[:, 1] += _SOLE * body.lengths["lankle"] - positions[kept.index("lankle"), 1]
     tips = _tips(offsets)
     return Rig(
         names=tuple(naming[joint] for joint in kept),
         joints=kept,
         parents=parents,
-        rest=positions,
+        rest=_rest_positions(kept, parents, offsets, _SOLE * body.lengths["lankle"]),
         ends={i: tips[joint] for i, joint in enumerate(kept) if i not in parents},
         root=body.positions[:, 0] + lift[:, None] * (0.0, 1.0, 0.0),
         turned=tuple(turned[joint] for joint in kept),
     )
+
+
+def _rest_positions(
+    kept: tuple[str, ...], parents: tuple[int, ...], offsets: dict[str, np.ndarray], ankle_m: float
+) -> np.ndarray:
+    """(J, 3) of the joints in the rest pose, the ankles at their height above the floor."""
+    positions = np.zeros((len(kept), 3))
+    for i, parent in enumerate(parents[1:], start=1):
+        positions[i] = positions[parent] + offsets[kept[i]]
+    positions[:, 1] += ankle_m - positions[kept.index("lankle"), 1]
+    return positions
 
 
 def _tips(offsets: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

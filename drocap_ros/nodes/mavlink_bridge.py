@@ -23,6 +23,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.frames import optical_orientation
 from drocap_ros.flight.mavlink.link import MavlinkLink
+from drocap_ros.flight.mavlink.telemetry_request import LinkStatus
 from drocap_ros.flight.orbit.control_status import ControlStatus
 from drocap_ros.flight.orbit.controller import OrbitController
 from drocap_ros.flight.orbit.states import Command, OperatorCommand, State
@@ -238,6 +239,18 @@ class MavlinkBridgeNode(ComponentNode):
         publishers = self.get_publishers_info_by_topic(self.resolve_topic_name("pose2d"))
         self._rivals.set_names(f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers)
         status = self._link.status()
+        self._report_state(status)
+        for name, (real, _) in status.rates_hz.items():
+            self.details[of(Key.STREAM_RATE, name)] = f"{real:.1f}"
+        self.details[Key.MAVLINK_BAD] = str(status.bad_count)
+        self.details[Key.ROUND_TRIP] = f"{status.round_trip_s:.3f}"
+        if self.config.signing_key_file:
+            self.details[Key.MAVLINK_UNSIGNED] = str(status.refused_count)
+        for name, value in self._link.settings.reported().items():
+            self.details[name] = f"{value:g}"
+
+    def _report_state(self, status: LinkStatus) -> None:
+        """The link first, then the safety machine, then settings; what is well says what the node does."""
         safety = self.controller.safety
         if not status.connected:
             silence = "never heard" if np.isinf(status.silence_s) else f"silent for {status.silence_s:.0f} s"
@@ -256,14 +269,6 @@ class MavlinkBridgeNode(ComponentNode):
             if not self.config.commands_enabled:
                 doing = "reading telemetry; commands_enabled is false, so it moves nothing"
             self.report(OK, doing + ("" if self._tf else "; tf2_msgs is not installed, so no TF"))
-        for name, (real, _) in status.rates_hz.items():
-            self.details[of(Key.STREAM_RATE, name)] = f"{real:.1f}"
-        self.details[Key.MAVLINK_BAD] = str(status.bad_count)
-        self.details[Key.ROUND_TRIP] = f"{status.round_trip_s:.3f}"
-        if self.config.signing_key_file:
-            self.details[Key.MAVLINK_UNSIGNED] = str(status.refused_count)
-        for name, value in self._link.settings.reported().items():
-            self.details[name] = f"{value:g}"
 
     def _publish_status(self, status: ControlStatus) -> None:
         x, y, z = (float(v) for v in status.subject_position)

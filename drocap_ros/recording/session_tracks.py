@@ -90,12 +90,12 @@ def with_recorded_camera(
         When ``mount_pitch_deg`` contradicts the recording.
     """
     tracks = dataclasses.replace(tracks, camera_matrix=_camera_matrix(session, near, tracks.image_size))
-    vehicle = read_vehicle_track(session, near) if telemetry else None
+    if not telemetry:
+        return tracks
+    vehicle = read_vehicle_track(session, near)
     if vehicle is None:
-        if telemetry and (others := [topic.name for topic in session.topics_of(*_OTHER_POSES)]):
-            session.warn(
-                f"no camera telemetry: {', '.join(others)} is not read, {recorded.VEHICLE_STATE} is; add it to the bag"
-            )
+        if others := ", ".join(topic.name for topic in session.topics_of(*_OTHER_POSES)):
+            session.warn(f"no camera telemetry: {others} is not read, {recorded.VEHICLE_STATE} is; add it to the bag")
         return tracks
     has_gimbal = bool(np.isfinite(vehicle.gimbal).all(axis=1).any())
     if mount_pitch_deg is not None and has_gimbal:

@@ -16,10 +16,13 @@ from drocap_ros.cli.progress import progress_bars
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from drocap_ros.config import DrocapConfig
     from drocap_ros.flight.preflight.findings import Finding
     from drocap_ros.flight.preflight.measured import Measured
     from drocap_ros.flight.preflight.setup_checks import Setup
+    from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 
 _COLOURS = {"ok": "green", "waits": "cyan", "warning": "yellow", "missing": "red"}
 _PIPE_WIDTH = 160
@@ -84,26 +87,10 @@ def run(args: argparse.Namespace) -> int:
 def setup_of(config: DrocapConfig, models: Path | None = None) -> Setup:
     """Camera, source and networks that a configuration names."""
     from drocap_ros.flight.preflight.setup_checks import Setup
-    from drocap_ros.perception.calibration import camera_model, load_calibration
     from drocap_ros.perception.load_models import models_folder
 
     ingest = config.image_ingest
-    size = (ingest.width_px or _USUAL_SIZE[0], ingest.height_px or _USUAL_SIZE[1])
-    matrix, words = None, "neither calibration_file nor horizontal_fov_deg is set"
-    try:
-        if ingest.calibration_file and not (ingest.width_px and ingest.height_px):
-            calibration = load_calibration(Path(ingest.calibration_file))
-            size = (calibration.width, calibration.height)
-        camera = camera_model(ingest, size)
-    except InputError as error:
-        camera, words = None, str(error)
-    if camera is not None:
-        matrix = camera.matrix
-        words = f"{size[0]}x{size[1]}, " + (
-            f"calibrated by {ingest.calibration_file}"
-            if ingest.calibration_file
-            else f"{ingest.horizontal_fov_deg:g} deg wide as stated"
-        )
+    matrix, size, words = _camera(ingest)
     folder = models_folder(models or config.pose_estimator.models_dir)
     present = folder.is_dir() and any(folder.glob("*.onnx"))
     return Setup(
@@ -112,6 +99,25 @@ def setup_of(config: DrocapConfig, models: Path | None = None) -> Setup:
         models=str(folder) if present else "",
         models_remedy="run `drocap models fetch` or name a folder with --models or DROCAP_MODELS",
     )  # fmt: skip
+
+
+def _camera(ingest: ImageIngestConfig) -> tuple[np.ndarray | None, tuple[int, int], str]:
+    """Matrix of the camera, None = not known, size of the images, and both in words."""
+    from drocap_ros.perception.calibration import camera_model, load_calibration
+
+    size = (ingest.width_px or _USUAL_SIZE[0], ingest.height_px or _USUAL_SIZE[1])
+    try:
+        if ingest.calibration_file and not (ingest.width_px and ingest.height_px):
+            calibration = load_calibration(Path(ingest.calibration_file))
+            size = (calibration.width, calibration.height)
+        camera = camera_model(ingest, size)
+    except InputError as error:
+        return None, size, str(error)
+    if camera is None:
+        return None, size, "neither calibration_file nor horizontal_fov_deg is set"
+    width = f"{ingest.horizontal_fov_deg:g} deg wide as stated"
+    how = f"calibrated by {ingest.calibration_file}" if ingest.calibration_file else width
+    return camera.matrix, size, f"{size[0]}x{size[1]}, {how}"
 
 
 def _measure(config: DrocapConfig, args: argparse.Namespace) -> Measured:
@@ -135,32 +141,35 @@ def _measure(config: DrocapConfig, args: argparse.Namespace) -> Measured:
 
 
 def _print(found: Sequence[Finding], quiet: bool) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
     from drocap_ros.flight.autopilot.autopilot import Level
 
     counts = {level: [f for f in found if f.level == level] for level in Level}
-    shown = counts[Level.MISSING] if quiet else found
-    if shown:
-        table = Table("", "check", box=None, pad_edge=False)
-        for title, share in (("found", 3), ("wanted", 3), ("how to mend it", 5)):
-            table.add_column(title, ratio=share)
-        before = ""
-        for finding in shown:
-            word, remedy = finding.level.name.lower(), finding.remedy
-            texts = (finding.name, finding.found, finding.wanted, "as above" if remedy and remedy == before else remedy)
-            table.add_row(Text(word, _COLOURS[word]), *map(Text, texts))
-            before = remedy or before
-        # A pipe has no width.
-        Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH, highlight=False).print(table)
+    if shown := counts[Level.MISSING] if quiet else found:
+        _print_table(shown)
     if not quiet:
         missing = ", ".join(f.name for f in counts[Level.MISSING])
         verdict = f"not ready, missing: {missing}" if missing else "ready"
         print(f"{verdict} ({len(counts[Level.OK])} checks are ok, {len(counts[Level.WARNING])} warnings)")
         if counts[Level.WAITS]:
             print(f"waits for the air: {', '.join(f.name for f in counts[Level.WAITS])}")
+
+
+def _print_table(shown: Sequence[Finding]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table("", "check", box=None, pad_edge=False)
+    for title, share in (("found", 3), ("wanted", 3), ("how to mend it", 5)):
+        table.add_column(title, ratio=share)
+    before = ""
+    for finding in shown:
+        word, remedy = finding.level.name.lower(), finding.remedy
+        texts = (finding.name, finding.found, finding.wanted, "as above" if remedy and remedy == before else remedy)
+        table.add_row(Text(word, _COLOURS[word]), *map(Text, texts))
+        before = remedy or before
+    # A pipe has no width.
+    Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH, highlight=False).print(table)
 
 
 def _write(path: Path, status: str, exit_status: int, found: Sequence[Finding]) -> None:

@@ -79,11 +79,7 @@ class CommandDesk:
         """The command to execute in this step, a stop before all others; an invalid one is refused here."""
         stop = next((c for c in self._waiting if c.kind == Command.STOP), None)
         if stop is not None:
-            overruled = condition(ConditionCode.OVERRULED_BY_STOP)
-            for other in self._waiting:
-                if other is not stop:
-                    self.answer(other, CommandAnswer(other.kind == Command.STOP, overruled))
-            self._waiting.clear()
+            self._overrule(stop)
             return Order(stop, Command.STOP)
         if not self._waiting:
             return None
@@ -100,6 +96,13 @@ class CommandDesk:
             self.answer(command, CommandAnswer(False, wanted))
             return None
         return Order(command, kind, wanted)
+
+    def _overrule(self, stop: OperatorCommand) -> None:
+        overruled = condition(ConditionCode.OVERRULED_BY_STOP)
+        for other in self._waiting:
+            if other is not stop:
+                self.answer(other, CommandAnswer(other.kind == Command.STOP, overruled))
+        self._waiting.clear()
 
     def answer(self, command: OperatorCommand, answer: CommandAnswer) -> None:
         """Note the answer to a command."""

@@ -78,7 +78,7 @@ def _rate(
     if not real >= _ENOUGH * wanted:
         short = not real >= config.rate_shortfall * wanted or real * limit_s < 1.0
         level = graded(missing=short and bool(conditions), warning=True)
-    elif limit_s and gap_s > limit_s:
+    elif 0.0 < limit_s < gap_s:
         level, cause = Level.WARNING, f"a gap above {limit_s:g} s ends an orbit by a hold; "
     autopilot = _autopilot(measured)
     in_control = measured.vehicle is not None and measured.vehicle.mode == autopilot.control_mode
