@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import struct
 import threading
 from collections import deque
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
+from drocap_ros.perception.sources.movie_index import largest_alone, movie_s
 from drocap_ros.perception.sources.pixels import to_bgr
 
 log = logging.getLogger(__name__)
@@ -33,8 +33,6 @@ _PROBED = 5
 _STILL_BYTES, _STILL_PIXELS = 200, 1024
 #: Pixels of other shapes are not believed.
 _MAX_ASPECT = 4.0
-#: Boxes of an MP4 file that are passed on the way to its index.
-_MAX_BOXES = 4096
 _CONVERT = "ffmpeg -i IN -vf yadif -c:v libx264 -pix_fmt yuv420p OUT.mp4"
 
 
@@ -66,27 +64,6 @@ def ffmpeg_options(options: str | None) -> Iterator[None]:
             yield
         finally:
             del os.environ[_OPTIONS]
-
-
-def _movie_s(path: Path) -> float | None:
-    """Seconds that an MP4 or MOV file shows (``mvhd``, ISO/IEC 14496-12), None where it does not state them."""
-    length = path.stat().st_size
-    with path.open("rb") as file:
-        place = 0
-        for _ in range(_MAX_BOXES):
-            file.seek(place)
-            head = file.read(48)
-            if len(head) < 48:
-                return None
-            size = int.from_bytes(head[8:16], "big") if head[:4] == b"\0\0\0\x01" else int.from_bytes(head[:4], "big")
-            if head[4:8] == b"moov" and head[12:16] == b"mvhd":
-                version_1 = head[16] == 1
-                scale, duration = struct.unpack_from(">IQ" if version_1 else ">II", head, 36 if version_1 else 28)
-                return duration / scale if scale and duration else None
-            if size < 8 or place + size >= length:
-                return None
-            place += size
-    return None
 
 
 class VideoSource(ImageSource):
@@ -122,9 +99,8 @@ class VideoSource(ImageSource):
     def _opened(self) -> Any:
         import cv2
 
-        with ffmpeg_options(None):  # not while another thread opens a stream with its options
-            # An absolute path has no colon before its first slash, which FFmpeg would take for a protocol.
-            capture = cv2.VideoCapture(str(self.path.absolute()), cv2.CAP_FFMPEG)
+        with ffmpeg_options(None), largest_alone(self.path) as name:  # not while another thread opens with its options
+            capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
         if not capture.isOpened():
             raise InputError(
                 f"{self.path}: expected a video that FFmpeg can open, found {self.path.stat().st_size} bytes without a"
@@ -145,7 +121,7 @@ class VideoSource(ImageSource):
         stated, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), self._nominal_rate()
         # A container without an index states a negative or huge number.
         self.length = int(stated) if 0 < stated < 1e9 else None
-        shown_s = _movie_s(self.path)
+        shown_s = movie_s(self.path)
         if self.length and shown_s and shown_s * rate < self.length - _TAIL_FRAMES:
             self.length = max(1, round(shown_s * rate))  # an edit list hides the others, as after a trim
         self.duration_s = (self.length - 1) / rate if self.length else None
@@ -171,9 +147,11 @@ class VideoSource(ImageSource):
         import cv2
 
         code = int(self._capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("latin1").upper()
-        words = "no interlaced pictures" if self._pending else f"no frame of its {_CODECS.get(code, code)}"
+        words = f"{_CODECS.get(code, code)} without a frame that it decodes"
+        words = "interlaced pictures that it leaves empty" if self._pending else words
         self.close()
-        raise InputError(f"{self.path}: expected a video, found {words} that OpenCV decodes; convert it: {_CONVERT}")
+        opencv = f"OpenCV {cv2.__version__}"
+        raise InputError(f"{self.path}: expected a video for {opencv}, found {words}; convert it: {_CONVERT}")
 
     def read(self) -> Frame | None:
         """Next frame, or None at the end."""

@@ -66,6 +66,32 @@ def test_pixels_that_are_no_squares_are_shown_as_they_are(tmp_path, across, down
     assert frame.image.shape[1::-1] == size
 
 
+def test_largest_of_several_streams_is_read(tmp_path):
+    """A second video track of twice the size behind the first: that of another file, its samples appended."""
+    small, large = (write_video(tmp_path / f"{k}.mp4", size=(64 * k, 48 * k)).read_bytes() for k in (1, 2))
+    shift = len(small)
+
+    def box(data, name):
+        at = data.index(name) - 4
+        return at, struct.unpack(">I", data[at : at + 4])[0]
+
+    at, size = box(large, b"trak")
+    track = bytearray(large[at : at + size])
+    place = track.index(b"stco") + 8
+    for i in range(struct.unpack(">I", track[place : place + 4])[0]):
+        spot = place + 4 + 4 * i
+        track[spot : spot + 4] = struct.pack(">I", struct.unpack(">I", track[spot : spot + 4])[0] + shift)
+    at, size = box(small, b"moov")
+    moov = bytearray(small[at : at + size]) + track
+    moov[:4] = struct.pack(">I", len(moov))
+    whole = bytearray(small[:at] + small[at : at + size].replace(b"moov", b"free", 1) + small[at + size :])
+    path = tmp_path / "two streams.mp4"
+    path.write_bytes(bytes(whole) + large.replace(b"moov", b"free", 1).replace(b"ftyp", b"free", 1) + bytes(moov))
+    with open_source(path) as source:
+        assert source.size == (128, 96)
+        assert len(list(source)) == 12
+
+
 def test_trimmed_video_is_whole(tmp_path, caplog):
     """An edit list that shows the first 20 of 60 frames, as after a trim."""
     path = write_video(tmp_path / "a.mp4", frames=60)
