@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from station_files import station_settings
 
 from drocap_ros.cli import main
 from drocap_ros.cli.graph.running_bridge import BridgeListener
@@ -24,17 +25,25 @@ from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.preflight.checks import all_findings
 from drocap_ros.flight.preflight.link_checks import link_findings
 from drocap_ros.flight.preflight.setup_checks import Setup
+from drocap_ros.flight.vehicle_state import LANDED_ON_GROUND, VehicleState
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 
 ROOT = Path(__file__).resolve().parents[2]
 ENV = {**os.environ, "PYTHONPATH": str(ROOT), "ROS_DOMAIN_ID": "99"}
-ARDUPILOT = ("FENCE_ENABLE=1.0", "FENCE_TYPE=3.0", "FENCE_RADIUS=60.0", "FENCE_ALT_MAX=50.0", "MNT1_TYPE=6.0")
-PX4 = ("GF_ACTION=2", "GF_MAX_HOR_DIST=60.0", "GF_MAX_VER_DIST=50.0", "COM_RC_OVERRIDE=3")
+#: What a ground station loads, and a gimbal.
+SETTINGS = {
+    name: tuple(f"{setting}={value}" for setting, value in {**station_settings(name), **more}.items())
+    for name, more in {"ardupilot": {"MNT1_TYPE": 6.0}, "px4": {}}.items()
+}
+#: Checks that wait for the air.
+WAITING = {"phase", "subject", "place"}
 #: Name: autopilot ("" = nobody), more words of the vehicle, expected status, expected missing checks.
 CASES = {
     "ready": ("ardupilot", (), 0, set()),
     "ready_px4": ("px4", (), 0, set()),
+    "ground": ("ardupilot", ("--on-ground",), 0, set()),
+    "ground_px4": ("px4", ("--on-ground",), 0, set()),
     "timeout": ("ardupilot", ("GUID_TIMEOUT=3.0",), 1, {"guid_timeout"}),
     "timeout_px4": ("px4", ("COM_OF_LOSS_T=3.0",), 1, {"com_of_loss_t"}),
     "rates": ("ardupilot", ("--max-rate", "4"), 1, {"rate_attitude_quaternion", "rate_local_position_ned"}),
@@ -66,8 +75,8 @@ def fly(folder, names):
         port = free_udp_port()
         config = write_config(folder / f"{name}.yaml", f"udpin:127.0.0.1:{port}", "simulation")
         if autopilot:
-            more = words if words[:1] == ("--max-rate",) else ()
-            settings = (*(ARDUPILOT if autopilot == "ardupilot" else PX4), *(words if not more else ()))
+            more = words if words and words[0].startswith("--") else ()
+            settings = (*SETTINGS[autopilot], *(words if not more else ()))
             module = "drocap_ros.simulation.vehicle.mavlink_vehicle"
             place = ("--url", f"udpout:127.0.0.1:{port}", "--autopilot", autopilot)
             vehicles.append(start(module, *place, *more, "--set", *settings, log=folder / f"{name}.vehicle"))
@@ -92,7 +101,12 @@ def fly(folder, names):
 def runs(tmp_path_factory):
     """All cases; two vehicles at a time, so that each keeps its rates."""
     folder = tmp_path_factory.mktemp("preflight")
-    groups = ("silent", "garbage", "rates"), ("ready", "timeout"), ("ready_px4", "timeout_px4")
+    groups = (
+        ("silent", "garbage", "rates"),
+        ("ready", "timeout"),
+        ("ready_px4", "timeout_px4"),
+        ("ground", "ground_px4"),
+    )
     return {name: run for names in groups for name, run in fly(folder, names).items()}
 
 
@@ -118,6 +132,16 @@ def test_the_table_names_value_limit_and_remedy(runs):
     assert check["remedy"].startswith("set GUID_TIMEOUT to 0.5 on the autopilot")
     assert check["values"] == {"value": 3.0, "limit": 0.5}
     assert table.splitlines()[-1].startswith("not ready, missing: GUID_TIMEOUT (")
+
+
+@pytest.mark.parametrize(("name", "more"), [("ground", set()), ("ground_px4", {"estimator_flight"})])
+def test_on_the_ground_it_names_what_waits_for_the_air(runs, name, more):
+    _, table, _, content = runs[name]
+    waiting = {check["code"]: check["name"] for check in content["checks"] if check["level"] == "waits"}
+    assert waiting.keys() == WAITING | more
+    assert table.splitlines()[-1] == f"waits for the air: {', '.join(waiting.values())}"
+    flying = runs["ready_px4" if more else "ready"]
+    assert "waits for the air" not in flying[1]
 
 
 def test_silence_and_noise_have_different_remedies(runs):
@@ -217,13 +241,14 @@ def test_what_the_running_bridge_refuses_is_missing_whatever_the_file_permits():
     listener = BridgeListener(graph)
     for code, reason in ((115, "not armed"), (100, "commands are disabled"), (100, "commands are disabled")):
         listener.statuses.append(SimpleNamespace(state=0, condition=code, reason=reason))
-    config = MavlinkBridgeConfig(commands_enabled=True)
-    measured = dataclasses.replace(listener.measured(config, "/drocap"), heard=True)
+    config, standing = MavlinkBridgeConfig(commands_enabled=True), VehicleState(0, "px4", landed_state=LANDED_ON_GROUND)
+    measured = dataclasses.replace(listener.measured(config, "/drocap"), heard=True, vehicle=standing)
     setup = Setup(None, (1280, 720), "", True, "/dev/video0", 1.7, "models")
     found = {finding.code: finding for finding in all_findings(config, setup, measured)}
     assert found["condition_commands_disabled"].level == Level.MISSING
     assert found["condition_commands_disabled"].found == "commands are disabled (67% of the time)"
     assert "condition_not_armed" not in found
+    assert found["phase"].level == Level.WAITS
 
 
 def test_values_of_the_bridge_that_are_no_numbers_are_unknown():

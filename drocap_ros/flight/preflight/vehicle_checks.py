@@ -23,7 +23,7 @@ _LANDED = {**LANDED_STATES, LANDED_IN_AIR: "in the air"}
 #: Code, name, and what the bridge's own conditions want in the air.
 _IN_THE_AIR = (
     ("subject", "subject", "located, farther than min_distance_m"),
-    ("place", "height, fence, speed", "inside the limits"),
+    ("place", "place and speed", "inside the limits"),
 )
 
 

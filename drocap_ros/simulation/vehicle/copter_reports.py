@@ -140,9 +140,8 @@ class ReportingCopter(SimulatedVehicle):
 
     def _estimator_flags(self) -> int:
         lost = self._t > min(self.ekf_failed_s, self.gps_lost_s + EKF_NOTICED_S)
-        flags = _CONSTANT_POSITION if lost or self._t < self.readiness.estimator_s else ESTIMATOR_HEALTHY
-        rests = self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
-        return flags | self.simulated.flags_at_rest if rests else flags
+        blind = lost or self._t < self.readiness.estimator_s
+        return _CONSTANT_POSITION if blind else super()._estimator_flags()
 
     def _satellites(self, t_s: float, _pose: VehiclePose) -> Any:
         there = self.readiness.fix_s <= self._t <= self.gps_lost_s + _GPS_NOTICED_S

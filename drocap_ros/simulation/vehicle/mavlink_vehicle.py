@@ -225,7 +225,8 @@ class SimulatedVehicle:
         )
 
     def _estimator_flags(self) -> int:
-        return ESTIMATOR_HEALTHY
+        rests = self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
+        return ESTIMATOR_HEALTHY | (self.simulated.flags_at_rest if rests else 0)
 
     def _estimator(self, t_s: float, _pose: VehiclePose) -> Any:
         flags, ratios = self._estimator_flags(), (0.1, 0.1, 0.1, 0.1)
@@ -321,12 +322,15 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--set", nargs="*", default=[], metavar="NAME=VALUE", help="parameters of the autopilot, e.g. GUID_TIMEOUT=3"
     )
+    parser.add_argument("--on-ground", action="store_true", help="it reports that it stands there, not armed")
     args = parser.parse_args(arguments)
     path = orbit_path(args.seconds, args.radius, args.height, args.speed)
     try:
         settings = dict(map(_setting, args.set))
         with SimulatedVehicle(args.url, path, args.autopilot, max_rate_hz=args.max_rate) as vehicle:
             vehicle.settings.update(settings)
+            if args.on_ground:
+                vehicle.armed, vehicle.landed_state = False, mavlink.MAV_LANDED_STATE_ON_GROUND
             vehicle.run(seconds=args.seconds)
     except InputError as error:
         parser.exit(2, f"{error}\n")

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from station_files import station_settings
 
 from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.autopilot.autopilot import Level
@@ -71,6 +72,23 @@ def test_a_vehicle_with_everything_set_is_ready_on_the_ground(autopilot):
     assert scene.findings["round_trip"].values["median_s"] == pytest.approx(0.02, abs=0.01)
     assert scene.findings["clock_offset"].values["spread_s"] < 0.01
     assert "on the ground, not armed" in scene.findings["phase"].found
+
+
+@BOTH
+def test_with_the_file_that_the_ground_station_loads_nothing_is_missing_and_nothing_warns(autopilot):
+    loaded = station_settings(autopilot)
+    judged = set(autopilot_of(autopilot).preflight_names) - {autopilot_of(autopilot).mount_type_setting}
+    assert judged == loaded.keys()
+
+    def load(scene):
+        mount = scene.copter.settings.get("MNT1_TYPE")
+        scene.copter.settings = loaded if mount is None else {**loaded, "MNT1_TYPE": mount}
+
+    scene = Scene(autopilot, before=load)
+    found = {code: finding for code, finding in scene.findings.items() if finding.level >= Level.WARNING}
+    assert found == {}, found
+    assert {name.lower() for name in judged} & scene.findings.keys()
+    assert scene.findings["fence"].found == "60 m wide, 30 m high"
 
 
 @BOTH
