@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import itertools
 import re
 from collections import Counter
@@ -22,6 +21,8 @@ if TYPE_CHECKING:
 
 #: A topic of this name holds no pictures of a camera.
 _NO_PICTURE = re.compile(r"depth|disparity|mask|label|segment|confidence", re.IGNORECASE)
+#: Rank of a topic of distances or labels, behind colour (0) and grey (1).
+_DEPTH_RANK = 2
 #: Messages by which a clock that stands still is known.
 _FIRST = 32
 
@@ -36,7 +37,7 @@ def image_from_message(message: Message, compressed: bool | None = None) -> np.n
     InputError
         When the encoding is unknown or the data does not fit.
     """
-    data = np.ascontiguousarray(np.frombuffer(_data(message), np.uint8))
+    data = np.ascontiguousarray(np.frombuffer(bytes(message.data), np.uint8))
     if hasattr(message, "format") if compressed is None else compressed:
         return decoded(data, str(message.format))
     size = int(message.width), int(message.height)
@@ -71,9 +72,6 @@ def choose_images(session: Session, wanted: str = "") -> TopicInfo:
     return best[0]
 
 
-_DEPTH_RANK = 2
-
-
 def _rank(session: Session, topic: TopicInfo) -> int:
     """0 for colour, 1 for grey, 2 for distances and labels, by the first message."""
     first = next((message for _, message in session.messages((topic.name,))), None)
@@ -97,13 +95,8 @@ def read_images(session: Session, topic: str = "") -> Iterator[Frame]:
     from drocap_ros.perception.sources.base import Frame
 
     chosen = choose_images(session, topic)
-    last_ns, unordered, problems, stamps = None, 0, Counter[str](), StampValidator()
+    last_ns, unordered, problems = None, 0, Counter[str]()
     for stamp_ns, image in _images(session, chosen, problems):
-        try:
-            stamps.check(*divmod(stamp_ns, 10**9))
-        except InputError as error:
-            problems[str(error)] += 1
-            continue
         if last_ns is not None and stamp_ns <= last_ns:
             unordered += 1
             continue
@@ -125,7 +118,7 @@ def read_images(session: Session, topic: str = "") -> Iterator[Frame]:
 
 def _images(session: Session, chosen: TopicInfo, problems: Counter[str]) -> Iterator[tuple[int, Message | np.ndarray]]:
     """Stamps with messages, or with the images that a video's packets decode to."""
-    stamped = _stamped(session, chosen.name)
+    stamped = _stamped(session, chosen.name, problems)
     first = next(stamped, None)
     if first is None:
         return
@@ -135,22 +128,23 @@ def _images(session: Session, chosen: TopicInfo, problems: Counter[str]) -> Iter
         return
     codec = str(getattr(first[1], "encoding", getattr(first[1], "format", "")))
     try:
-        yield from decoded_packets(codec, ((stamp_ns, _data(message)) for stamp_ns, message in stamped))
+        yield from decoded_packets(codec, ((stamp_ns, bytes(message.data)) for stamp_ns, message in stamped))
     except InputError as error:
         problems[str(error)] += 1
 
 
-def _stamped(session: Session, topic: str) -> Iterator[tuple[int, Message]]:
+def _stamped(session: Session, topic: str, problems: Counter[str]) -> Iterator[tuple[int, Message]]:
     """Messages with their stamps, or with the recorder's times where the stamps do not advance."""
     heads = [header_stamp_ns(m) for _, m in itertools.islice(session.messages((topic,)), _FIRST)]
-    advancing = sum(b > a for a, b in itertools.pairwise(heads))
-    by_recorder = advancing < (len(heads) - 1) / 2
+    by_recorder = sum(b > a for a, b in itertools.pairwise(heads)) < (len(heads) - 1) / 2
     if by_recorder:
         session.warn(f"the stamps on {topic} do not advance: the recorder's times are used, late by the transport")
+    stamps = StampValidator()
     for raw, message in session.messages((topic,)):
-        yield raw.log_time_ns if by_recorder else header_stamp_ns(message), message
-
-
-def _data(message: Message) -> bytes:
-    """Bytes of an image; JSON holds them as text."""
-    return base64.b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)
+        stamp_ns = raw.log_time_ns if by_recorder else header_stamp_ns(message)
+        try:
+            stamps.check(*divmod(stamp_ns, 10**9))
+        except InputError as error:
+            problems[str(error)] += 1
+            continue
+        yield stamp_ns, message

@@ -23,13 +23,11 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 #: Types of images and of packets of a video.
+_FOXGLOVE = ("RawImage", "CompressedImage", "CompressedVideo")
 IMAGES = (
-    IMAGE,
-    COMPRESSED_IMAGE,
-    *(f"{package}{kind}" for package in ("foxglove_msgs/msg/", "foxglove.") for kind in
-      ("RawImage", "CompressedImage", "CompressedVideo")),
-    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
-)  # fmt: skip
+    *(IMAGE, COMPRESSED_IMAGE, "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"),
+    *(f"{package}{kind}" for package in ("foxglove_msgs/msg/", "foxglove.") for kind in _FOXGLOVE),
+)
 
 #: Forms of a recording, for messages.
 FORMS = "a session folder, .mcap, .bag, .db3 or rosbag2 folder"

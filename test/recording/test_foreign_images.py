@@ -192,3 +192,33 @@ def test_damaged_messages_end_in_one_line(tmp_path):
                 assert len(list(read_images(session))) <= len(packets)
         except InputError as error:
             assert "\n" not in str(error)  # noqa: PT017
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        {"timestamp": 5, "data": "", "format": "jpeg"},
+        {"timestamp": {"sec": 10**30, "nsec": 0}, "data": "/9j/", "format": "jpeg"},
+        {"timestamp": {"sec": -1, "nsec": 10**12}, "data": "no base 64!", "format": 7},
+        {"timestamp": {"sec": 1}, "data": 12, "format": None},
+        {"timestamp": None},
+        [1, 2],
+        "text",
+    ],
+)
+@pytest.mark.parametrize("kind", ["CompressedImage", "CompressedVideo", "RawImage"])
+def test_json_of_wrong_types_ends_in_one_line(tmp_path, capsys, message, kind):
+    from mcap.writer import Writer
+
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("", "")
+        schema = writer.register_schema(f"foxglove.{kind}", "jsonschema", b"{}")
+        channel = writer.register_channel("/camera", "json", schema)
+        for i in range(3):
+            writer.add_message(channel, START_NS + i, json.dumps(message).encode(), START_NS + i)
+        writer.finish()
+    words = ["--models", "simulation", "--quiet", "--out", str(tmp_path / "out")]
+    assert main(["track", str(tmp_path / "a.mcap"), *words]) == 2
+    assert "Traceback" not in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -50,6 +50,8 @@ def quiet_ffmpeg() -> None:
 #: OpenCV passes options to FFmpeg through one environment variable of the process.
 _OPTIONS_LOCK = threading.Lock()
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+#: A header of a small file can declare pictures of gigabytes: 2^27 px at most.
+_OPTIONS_OF_FILES = "max_pixels;134217728"
 
 
 @contextlib.contextmanager
@@ -99,7 +101,10 @@ class VideoSource(ImageSource):
     def _opened(self) -> Any:
         import cv2
 
-        with ffmpeg_options(None), largest_alone(self.path) as name:  # not while another thread opens with its options
+        with (
+            ffmpeg_options(_OPTIONS_OF_FILES),
+            largest_alone(self.path) as name,
+        ):  # not while another thread opens with its options
             capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
         if not capture.isOpened():
             raise InputError(
