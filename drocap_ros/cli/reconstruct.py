@@ -109,7 +109,12 @@ def run(args: argparse.Namespace) -> int:
     if args.dictionary:
         config = config.replace("initializer", dictionary=str(args.dictionary))
     telemetry = _telemetry(args)
-    if needs_networks(args.input, args.redetect):
+    needed = needs_networks(args.input, args.redetect)
+    if args.topic and not needed:
+        raise InputError(
+            f"--topic {args.topic}: expected images, found recorded 2D poses; add --redetect, or leave it out"
+        )
+    if needed:
         ensure_networks(models_folder(args.models or config.pose_estimator.models_dir), args.input, args)
     with progress_bars(args.quiet) as progress:
         motion, tracks = reconstruct_input(

@@ -21,10 +21,12 @@ Parts = tuple[list[tuple[str, str]], tuple[str, ...], list[tuple[str, ...]], lis
 
 
 def is_video_or_log(path: Path) -> bool:
-    """Whether a file's name is that of a video container or a telemetry log."""
+    """Whether a file begins as a video, or its name is that of a video or a telemetry log."""
+    from drocap_ros.file_kind import FileKind, file_kind
     from drocap_ros.recording.telemetry.read import LOG_SUFFIXES
 
-    return path.is_file() and path.suffix.lower() in (*_VIDEOS, *LOG_SUFFIXES)
+    named = path.suffix.lower() in (*_VIDEOS, *LOG_SUFFIXES)
+    return path.is_file() and (named or file_kind(path) is FileKind.VIDEO)
 
 
 def telemetry_summary(path: Path) -> Parts:
@@ -36,12 +38,12 @@ def telemetry_summary(path: Path) -> Parts:
         When a log or a video's index cannot be used; damage of the telemetry inside a video is a warning.
     """
     from drocap_ros.errors import InputError
-    from drocap_ros.recording.telemetry.read import read_telemetry
+    from drocap_ros.recording.telemetry.read import LOG_SUFFIXES, read_telemetry
 
     columns = ("telemetry", "states", "share", "rate")
     warnings: list[str] = []
     facts, log = [("path", str(path))], None
-    if path.suffix.lower() not in _VIDEOS:
+    if path.suffix.lower() in LOG_SUFFIXES:
         log = read_telemetry(path)
     else:
         from drocap_ros.recording.telemetry.djmd import has_djmd, read_djmd
@@ -74,9 +76,21 @@ def _video_facts(path: Path) -> list[tuple[str, str]]:
             except InputError as error:
                 words += f", damaged: {error}"
             facts.append((f"{_KINDS.get(track.handler) or _printable(track.handler)} track", words))
+    if not facts and path.suffix.lower() not in _VIDEOS:
+        return _other_video_facts(path)
     if not facts:
         raise InputError(f"{path}: expected a video file (MP4, MOV) with its index, found none; copy it again")
     return facts
+
+
+def _other_video_facts(path: Path) -> list[tuple[str, str]]:
+    """Facts of a video in another container."""
+    from drocap_ros.perception.sources import open_source
+
+    with open_source(path) as video:
+        rate = f", {(video.length - 1) / video.duration_s:.2f}/s" if video.length and video.duration_s else ""
+        count = f", {video.length} frames" if video.length else ""
+        return [("video track", f"{video.size[0]}x{video.size[1]} px{count}{rate}")]
 
 
 def _printable(code: str) -> str:

@@ -14,6 +14,7 @@ from rendered_person import rendered_images
 
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
+from drocap_ros.motion import load_motion
 from drocap_ros.recording.image_messages import image_from_message, read_images
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.tracks import load_tracks
@@ -56,6 +57,8 @@ def test_depth_is_passed_over_and_a_topic_chosen(tmp_path, messages, capsys):
     assert main([*words, str(tmp_path / "b"), "--topic", "camera/image_raw"]) == 0
     assert main([*words, str(tmp_path / "c"), "--topic", "/nothing"]) == 2
     assert "correct the name" in capsys.readouterr().err
+    assert main(["reconstruct", *words[1:], str(tmp_path / "d"), "--topic", "/camera/image_raw", "--no-report"]) == 0
+    assert load_motion(tmp_path / "d" / "motion.npz").meta["images"]["topic"] == "/camera/image_raw"
     with open_session(tmp_path / "s") as session:
         assert next(read_images(session, "/left/image_mono")).image.shape == (48, 64, 3)
 

@@ -115,6 +115,17 @@ def test_trimmed_video_is_whole(tmp_path, caplog):
     assert "ended early" not in caplog.text
 
 
+def test_info_knows_videos_of_any_name_and_container(tmp_path, capsys):
+    path = tmp_path / "a.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
+    for i in range(6):
+        writer.write(np.full((48, 64, 3), 30 * i, np.uint8))
+    writer.release()
+    path.rename(tmp_path / "clip")
+    assert main(["info", str(tmp_path / "clip")]) == 0
+    assert "64x48 px, 6 frames, 10.00/s" in capsys.readouterr().out
+
+
 def test_black_pictures_are_not_nobody(tmp_path, capsys):
     writer = cv2.VideoWriter(str(tmp_path / "a.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (64, 48))
     for _ in range(6):
