@@ -26,10 +26,11 @@ from drocap_ros.evaluation.protocol import (
     OUTLIER_RANGE_MM,
     PX_PER_MM,
     orbit_rotations,
+    resample,
 )  # fmt: skip
 from drocap_ros.geometry.alignment import apply_similarity, similarity
 from drocap_ros.geometry.ellipsoids import unpack_covariance
-from drocap_ros.mocap import load_mocap, mocap_files, resample
+from drocap_ros.mocap import load_mocap, mocap_files
 from drocap_ros.reconstruction.lifted.lifter import Lifter
 from drocap_ros.reconstruction.lifted.network import LifterInput
 from drocap_ros.reconstruction.reconstruct import reconstruct

@@ -82,20 +82,3 @@ def mocap_files(folder: str | Path, include: str = "*") -> list[Path]:
     if not files:
         raise InputError(f"{folder}: expected MoCap files {include}.npz, found none; check the folder and the pattern")
     return files
-
-
-def resample(x: np.ndarray, fps: float, wanted_fps: float) -> np.ndarray:
-    """Cubic interpolation of joints (T, P, 3) at another frame rate, over the same span of time.
-
-    Joints that are NaN in any frame are NaN in all.
-    """
-    from scipy.interpolate import CubicSpline
-
-    if len(x) < 2 or fps == wanted_fps:
-        return x
-    t = np.arange(len(x)) / fps
-    wanted = np.arange(int(np.floor(t[-1] * wanted_fps + 1e-9)) + 1) / wanted_fps
-    known = np.isfinite(x).all(axis=(0, 2))
-    out = np.full((len(wanted), *x.shape[1:]), np.nan)
-    out[:, known] = CubicSpline(t, x[:, known], axis=0)(wanted)
-    return out

@@ -137,20 +137,16 @@ def load_motion(path: str | Path) -> Motion:
     try:
         _check_kinds(a)
         motion = Motion(
-            joints3d=a["joints3d"],
             joints=tuple(str(j) for j in a["joints"]),
             parents=tuple(int(p) for p in a["parents"]),
             stamp_ns=as_stamps(a["stamp_ns"]),
             frame=str(a["frame"]),
             metric=bool(a["metric"]),
             scale_source=str(a["scale_source"]),
-            camera_rotation=a["camera_rotation"],
-            confidence=a["confidence"],
-            keypoints=a["keypoints"],
-            reprojection_px=a["reprojection_px"],
             meta=_read_meta(a["meta"]),
             camera_position=a.get("camera_position"),
             covariance=_known(a.get("covariance")),
+            **{name: a[name] for name in ("joints3d", "camera_rotation", "confidence", "keypoints", "reprojection_px")},
         )
         _check(motion)
     except InputError as error:

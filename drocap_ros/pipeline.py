@@ -45,12 +45,14 @@ class Selection:
     person : number of a person of :func:`~drocap_ros.perception.persons.find_persons`; None = as configured
     redetect : estimate the 2D poses of a recording from its images, although it holds recorded ones
     topic : of the images of a recording; empty: colour before grey, then that with most messages
+    rate_hz : true rate of the images where a video plays them slower
     """
 
     clip: Clip = field(default_factory=Clip)
     person: int | None = None
     redetect: bool = False
     topic: str = ""
+    rate_hz: float | None = None
 
 
 _WHOLE, _FOUND = Selection(), Telemetry()
@@ -96,6 +98,8 @@ def reconstruct_input(
     tracks, origin = read_input(Path(path), config, models, progress, telemetry, selection)
     if log is not None:
         tracks, origin["telemetry"] = with_telemetry(Path(path), tracks, telemetry, log, config.image_ingest, progress)
+    if selection.rate_hz:
+        tracks = tracks.at_rate(selection.rate_hz)
     seconds = time.perf_counter() - begin
     motion = reconstruct(
         tracks, method=method, initializer=config.initializer, adjuster=config.bundle_adjuster, progress=progress
@@ -145,10 +149,7 @@ def read_input(
     telemetry: Telemetry = _FOUND,
     selection: Selection = _WHOLE,
 ) -> tuple[Tracks, dict[str, Any]]:
-    """2D tracks of the subject, from the input where it holds them, else estimated from its images; their origin.
-
-    The latter is for the motion's ``meta``.
-    """
+    """2D tracks of the subject, of the input where it holds them, else of its images, and their origin for ``meta``."""
     pitch, in_use = telemetry.mount_pitch_deg, telemetry.path != NO_TELEMETRY
     origin: dict[str, Any] = {} if selection.clip.whole else {"clip": selection.clip.meta}
     if needs_networks(path, selection.redetect):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import zipfile
 import zlib
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,8 @@ MAX_BYTES = 4 * 2**30
 _FARTHEST_PX = 1e9
 #: Keypoints that are all within it are shares of the image, not px.
 _NORMALISED = 2.0
+#: Share of the picture's size beyond its edge at which networks still place joints of a person who is cut off.
+_OUTSIDE = 0.1
 #: Focal lengths as shares of the image's width or height: a view of 157 degrees, and of 0.6.
 _FOCAL_SHARES = (0.1, 100.0)
 
@@ -55,6 +58,12 @@ class Tracks:
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+    def at_rate(self, rate_hz: float) -> Tracks:
+        """The same frames with ``rate_hz`` of them a second, gaps kept: slow motion at its true speed."""
+        step_ns = float(np.median(np.diff(self.stamp_ns))) if len(self) > 1 else 1.0
+        since = (self.stamp_ns - self.stamp_ns[0]) / step_ns
+        return replace(self, stamp_ns=self.stamp_ns[0] + np.round(since * 1e9 / rate_hz).astype(np.int64))
 
 
 def _check(t: Tracks) -> None:
@@ -104,8 +113,7 @@ def _check_shapes(t: Tracks) -> None:
     for name, shape in shapes.items():
         value = getattr(t, name)
         if value is not None and value.shape != shape:
-            wanted = f"make it fit keypoints {t.keypoints.shape}"
-            raise InputError(f"{name}: expected shape {shape}, got {value.shape}; {wanted}")
+            raise InputError(f"{name}: expected shape {shape}, got {value.shape} beside keypoints {t.keypoints.shape}")
 
 
 def _check_telemetry(t: Tracks) -> None:
@@ -232,19 +240,31 @@ def load_tracks(path: str | Path) -> Tracks:
     arrays = read_npz(path, _REQUIRED)
     try:
         size = arrays["image_size"]
-        if size.shape != (2,) or size.dtype.kind not in "iuf":
-            raise InputError(f"image_size: expected two numbers, width and height, got {size.dtype} {size.shape}")
-        if not np.isfinite(size).all():
-            raise InputError(f"image_size: expected positive width and height, got {size.tolist()}")
+        if size.shape != (2,) or size.dtype.kind not in "iuf" or not np.isfinite(size).all():
+            raise InputError(f"image_size: expected positive width and height, two numbers, got {size.tolist()}")
+        more = {name: _as_float(arrays[name], name) for name in _OPTIONAL if name in arrays}
+        xy = _as_float(arrays["keypoints"], "keypoints")
+        if xy.ndim == 3 and xy.shape[2] == 3:  # x, y, score
+            more.setdefault("confidence", np.clip(np.nan_to_num(xy[..., 2]), 0.0, 1.0))
+            xy = xy[..., :2]
         return Tracks(
-            keypoints=_as_float(arrays["keypoints"], "keypoints"),
+            keypoints=without_unseen(path, xy, size) if xy.ndim == 3 and "covariance" not in more else xy,
             joints=tuple(np.atleast_1d(arrays["joints"]).astype(str).tolist()),  # bytes, too
             stamp_ns=as_stamps(arrays["stamp_ns"]),
             image_size=(int(size[0]), int(size[1])),
-            **{name: _as_float(arrays[name], name) for name in _OPTIONAL if name in arrays},
+            **more,
         )
     except (InputError, ValueError) as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def without_unseen(path: Path, xy: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Keypoints (F, P, 2) with NaN for zeros, pairs below zero and places far outside, as other tools mark them."""
+    unseen = np.asarray((xy <= 0).all(axis=2)) | ((xy < -_OUTSIDE * size) | (xy > (1 + _OUTSIDE) * size)).any(axis=2)
+    if not unseen.any() or unseen.all():
+        return xy
+    logging.getLogger(__name__).warning("%s: %d keypoints at (0, 0) or outside are not seen", path, unseen.sum())
+    return np.where(unseen[..., None], np.nan, xy)
 
 
 def _as_float(array: np.ndarray, name: str) -> np.ndarray:

@@ -9,7 +9,8 @@ import pytest
 from walking import write_mocap
 
 from drocap_ros.errors import InputError
-from drocap_ros.mocap import load_mocap, resample
+from drocap_ros.evaluation.protocol import resample
+from drocap_ros.mocap import load_mocap
 from drocap_ros.skeleton import BODY_17
 
 

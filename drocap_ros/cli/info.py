@@ -71,7 +71,9 @@ def summarize(path: Path) -> Summary:
         found = "a pipe or device" if path.exists() else "no such file"
         raise InputError(f"{path}: expected a recording, motion or tracks file, found {found}; check the path")
     path = _motion_in(path)
-    if path.suffix == ".npz":
+    from drocap_ros.cli.keypoint_files import is_keypoint_file
+
+    if is_keypoint_file(path):
         return _of_arrays(path)
     return Summary(*telemetry_summary(path)) if is_video_or_log(path) else _of_session(path)
 
@@ -119,18 +121,20 @@ def _print_metadata(path: Path) -> int:
 
 
 def _of_arrays(path: Path) -> Summary:
+    from drocap_ros.cli.keypoint_files import read_keypoints
     from drocap_ros.motion import load_motion
-    from drocap_ros.tracks import load_tracks, read_npz, wrong_kind
+    from drocap_ros.tracks import kind_of, read_npz, wrong_kind
 
-    arrays = read_npz(path, ())
+    arrays = read_npz(path, ()) if path.suffix == ".npz" else {}
     if "joints3d" in arrays:
         facts = _motion_facts(load_motion(path))
-    elif "keypoints" in arrays:
-        facts = _tracks_facts(load_tracks(path))
-    else:
+    elif kind_of(arrays) == "MoCap":
         raise wrong_kind(path, arrays, "a motion or 2D tracks")
+    else:
+        facts = _tracks_facts(read_keypoints(path))
+    columns = ("array", "type", "shape") if arrays else ()
     rows = [(name, str(a.dtype), " x ".join(map(str, a.shape)) or "scalar") for name, a in sorted(arrays.items())]
-    return Summary([("path", str(path)), *facts], ("array", "type", "shape"), rows, ())
+    return Summary([("path", str(path)), *facts], columns, rows, ())
 
 
 def _motion_facts(motion: Motion) -> list[tuple[str, str]]:

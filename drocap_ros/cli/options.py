@@ -92,6 +92,23 @@ def ros_namespace(text: str) -> str:
     return text if text.startswith("/") else f"/{text}"
 
 
+def rate(text: str) -> float:
+    """Type of ``--rate``: images per second."""
+    try:
+        if 0.1 <= (value := float(text)) <= 10_000.0:
+            return value
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"expected images per second from 0.1 to 10000, got {text}")
+
+
+def image_size(text: str) -> tuple[int, int]:
+    """Type of ``--image-size``: width and height px."""
+    if not (found := re.fullmatch(r"([1-9]\d{1,4})[x,]([1-9]\d{1,4})", text)):
+        raise argparse.ArgumentTypeError(f"expected width and height in px, as 1920x1080, got {text}")
+    return int(found[1]), int(found[2])
+
+
 def _seed(text: str) -> int:
     if not text.isdecimal() or int(text) > _LARGEST_SEED:
         raise argparse.ArgumentTypeError(f"expected an integer from 0 to {_LARGEST_SEED}, got {text}")

@@ -16,6 +16,8 @@ from drocap_ros.cli.options import (
     add_network_options,
     add_quiet_option,
     clip_of,
+    image_size,
+    rate,
 )
 from drocap_ros.errors import InputError
 from drocap_ros.reconstruction.methods import METHODS as OFFLINE
@@ -41,7 +43,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "input",
         metavar="INPUT",
         type=Path,
-        help="video file, image folder, .mcap, rosbag1 .bag, rosbag2 folder, or tracks .npz",
+        help="video file, image folder, .mcap, rosbag1 .bag, rosbag2 folder, tracks .npz, or 2D keypoints of another"
+        " tool (.json or a folder of them, .csv, .npz, .npy)",
     )
     parser.add_argument("--out", metavar="DIR", type=Path, help="output folder (default: INPUT's name + _motion)")
     add_options(parser)
@@ -81,6 +84,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="pitch of a camera fixed to a vehicle without a gimbal, negative looks down; for telemetry, or a session,"
         " without the camera's attitude",
     )
+    parser.add_argument(
+        "--rate",
+        metavar="HZ",
+        type=rate,
+        help="true rate of the images where a video plays them slower, or a file of keypoints does not say it",
+    )
+    parser.add_argument(
+        "--image-size", metavar="WxH", type=image_size, help="px, where a file of keypoints does not say it"
+    )
     add_network_options(parser)
     parser.add_argument("--dictionary", metavar="NPZ", type=Path, help="pose dictionary instead of the shipped one")
     add_config_option(parser)
@@ -90,6 +102,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Reconstruct and write the output folder."""
     from drocap_ros.cli.atomic_output import check_output_folder, default_folder, is_same, refuse_inputs
+    from drocap_ros.cli.keypoint_files import as_tracks_file
     from drocap_ros.cli.models import ensure_networks
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.cli.report import open_words
@@ -109,32 +122,32 @@ def run(args: argparse.Namespace) -> int:
     if args.dictionary:
         config = config.replace("initializer", dictionary=str(args.dictionary))
     telemetry = _telemetry(args)
-    needed = needs_networks(args.input, args.redetect)
-    if args.topic and not needed:
-        raise InputError(
-            f"--topic {args.topic}: expected images, found recorded 2D poses; add --redetect, or leave it out"
-        )
-    if needed:
-        ensure_networks(models_folder(args.models or config.pose_estimator.models_dir), args.input, args)
-    with progress_bars(args.quiet) as progress:
+    with as_tracks_file(args.input, args.rate, args.image_size) as source, progress_bars(args.quiet) as progress:
+        if needs_networks(source, args.redetect):
+            ensure_networks(models_folder(args.models or config.pose_estimator.models_dir), source, args)
+        elif args.topic:
+            raise InputError(
+                f"--topic {args.topic}: expected images, found recorded 2D poses; add --redetect, or leave it out"
+            )
         motion, tracks = reconstruct_input(
-            args.input,
+            source,
             method=args.method,
             config=config,
             models=args.models,
             progress=progress,
             telemetry=telemetry,
-            selection=Selection(clip, person, args.redetect, args.topic),
+            selection=Selection(clip, person, args.redetect, args.topic, args.rate if source == args.input else None),
         )
-    motion = dataclasses.replace(motion, meta={**motion.meta, "command": args.command_line})
-    _write(out, names, args.input, motion, tracks)
+    meta = {**motion.meta, "input": args.input.name, "command": args.command_line}
+    motion = dataclasses.replace(motion, meta=meta)
+    _write(out, names, None if source != args.input else source, motion, tracks)
     if not args.quiet:
         opened = f"\n{open_words(out / 'report.html')}" if "report.html" in names else ""
         print(f"{summary(motion, args.method)}\nwritten: {out}/{', '.join(names)}{opened}")
     return 0
 
 
-def _write(out: Path, names: list[str], source: Path, motion: Motion, tracks: Tracks) -> None:
+def _write(out: Path, names: list[str], source: Path | None, motion: Motion, tracks: Tracks) -> None:
     from drocap_ros.cli.atomic_output import output_folder
     from drocap_ros.motion import save_motion
     from drocap_ros.report.motion_images import has_images
@@ -146,7 +159,7 @@ def _write(out: Path, names: list[str], source: Path, motion: Motion, tracks: Tr
         if "tracks.npz" in names:
             save_tracks(folder / "tracks.npz", tracks)
         if "report.html" in names:
-            save_report(folder / "report.html", motion, video=source if has_images(source) else None)
+            save_report(folder / "report.html", motion, video=source if source and has_images(source) else None)
     if "report.html" not in names:
         (out / "report.html").unlink(missing_ok=True)  # of an older motion
 

@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.mocap import Sequence, load_mocap, mocap_files, resample
+from drocap_ros.mocap import Sequence, load_mocap, mocap_files
 from drocap_ros.skeleton import BODY_15, BODY_17
 from drocap_ros.tracks import Tracks
 
@@ -125,3 +125,20 @@ def reported(items: Iterable[T], count: int, stage: str, progress: Progress | No
         yield item
         if progress is not None:
             progress(stage, done / count)
+
+
+def resample(x: np.ndarray, fps: float, wanted_fps: float) -> np.ndarray:
+    """Cubic interpolation of joints (T, P, 3) at another frame rate, over the same span of time.
+
+    Joints that are NaN in any frame are NaN in all.
+    """
+    from scipy.interpolate import CubicSpline
+
+    if len(x) < 2 or fps == wanted_fps:
+        return x
+    t = np.arange(len(x)) / fps
+    wanted = np.arange(int(np.floor(t[-1] * wanted_fps + 1e-9)) + 1) / wanted_fps
+    known = np.isfinite(x).all(axis=(0, 2))
+    out = np.full((len(wanted), *x.shape[1:]), np.nan)
+    out[:, known] = CubicSpline(t, x[:, known], axis=0)(wanted)
+    return out

@@ -143,7 +143,7 @@ def test_one_frame_gives_a_pose(tracks_file, tmp_path):
     [
         ({"keypoints": np.zeros((72, 15))}, "keypoints: expected float (F, P, 2)"),
         ({"keypoints": np.full((72, 15, 2), np.nan)}, "keypoints"),
-        ({"stamp_ns": None}, "missing stamp_ns"),
+        ({"joints": None}, "expected points with names"),
         ({"joints": np.array([f"j{i}" for i in range(15)])}, "joints: expected at least 4"),
         ({"covariance": np.full((72, 15, 3), -1.0)}, "covariance"),
     ],

@@ -1,0 +1,231 @@
+"""2D keypoints of other tools: one person's walk in every form gives the same tracks."""
+
+import json
+import random
+
+import numpy as np
+import pytest
+from telemetry_logs import mutated
+
+from drocap_ros.cli import main
+from drocap_ros.cli.keypoint_files import read_keypoints
+from drocap_ros.errors import InputError
+from drocap_ros.skeleton import COCO_17
+from drocap_ros.tracks import load_tracks
+
+SIZE = (1280, 720)
+#: Places about the hips, px, of COCO's points: a person who faces the camera.
+BODY = np.array(
+    [(0, -90), (4, -94), (-4, -94), (9, -90), (-9, -90), (22, -60), (-22, -60), (30, -25), (-30, -25),
+     (32, 5), (-32, 5), (12, 0), (-12, 0), (13, 45), (-13, 45), (13, 90), (-13, 90)]
+)  # fmt: skip
+
+
+def walk(frames=12):
+    """(F, 17, 3) x, y px and score."""
+    at = np.stack([600 + 4.0 * np.arange(frames), 350 + np.zeros(frames)], axis=1)
+    swing = np.sin(0.4 * np.arange(frames))[:, None, None] * np.where(np.arange(17) % 2, 6, -6)[:, None] * [1.0, 0.0]
+    xy = np.round(at[:, None] + BODY + swing, 2)
+    return np.concatenate([xy, np.full((frames, 17, 1), 0.9)], axis=2)
+
+
+def rows(points):
+    return [[round(float(v), 3) for v in p] for p in points]
+
+
+def flat(points):
+    return [v for p in rows(points) for v in p]
+
+
+def alphapose(folder, k, far):
+    entries = [{"image_id": f"{i}.jpg", "category_id": 1, "keypoints": flat(p), "score": 2.0, "idx": [w]}
+               for i, both in enumerate(zip(k, far, strict=True)) for w, p in enumerate(both)]  # fmt: skip
+    # The second person is missing in the first frames.
+    return write(folder / "alphapose-results.json", entries[:1] + entries[2:3] + entries[4:])
+
+
+def cmu_form(folder, k, far):
+    return write(folder / "pose.json", {f"{i}.jpg": {"version": "AlphaPose", "bodies": [{"joints": flat(p)}]}
+                                        for i, p in enumerate(k)})  # fmt: skip
+
+
+def openpose(folder, k, far):
+    (folder / "json").mkdir()
+    for i, (one, other) in enumerate(zip(k, far, strict=True)):
+        people = [{"person_id": [-1], "pose_keypoints_2d": flat(p), "face_keypoints_2d": []} for p in (other, one)]
+        write(folder / "json" / f"walk_{i:012d}_keypoints.json", {"version": 1.3, "people": people})
+    return folder / "json"
+
+
+def mmpose(folder, k, far):
+    people = [[{"keypoints": rows(p[:, :2]), "keypoint_scores": p[:, 2].tolist(), "bbox": [[0, 0, 9, 9]]} for p in both]
+              for both in zip(k, far, strict=True)]  # fmt: skip
+    names = {str(i): name for i, name in enumerate(COCO_17.joints)}
+    frames = [{"frame_id": 10 * (i + 1), "instances": each} for i, each in enumerate(people)]
+    return write(folder / "results.json", {"meta_info": {"keypoint_id2name": names}, "instance_info": frames})
+
+
+def coco(folder, k, far):
+    points = np.where(k[..., 2:] > 0, [1, 1, 2], 1) * np.concatenate([k[..., :2], np.ones((*k.shape[:2], 1))], axis=2)
+    return write(folder / "coco.json", {
+        "images": [{"id": i, "width": 1280, "height": 720, "file_name": f"{i:05d}.jpg"} for i in range(len(k))],
+        "annotations": [{"id": 7 + i, "image_id": i, "keypoints": flat(p)} for i, p in enumerate(points)],
+        "categories": [{"id": 1, "keypoints": list(COCO_17.joints)}],
+    })  # fmt: skip
+
+
+def named_points(folder, k, far):
+    return write(folder / "tfjs.json", [
+        [{"keypoints": [{"name": n, "x": x, "y": y, "score": s}
+                        for n, (x, y, s) in zip(COCO_17.joints, p, strict=True)]}]
+        for p in k.tolist()
+    ])  # fmt: skip
+
+
+def deeplabcut(folder, k, far):
+    names = ["_".join(reversed(n.split("_", 1))).title() if "_" in n else n for n in COCO_17.joints]  # Shoulder_Left
+    head = [["scorer"] + ["net"] * 51, ["bodyparts"] + [n for n in names for _ in range(3)],
+            ["coords"] + ["x", "y", "likelihood"] * 17]  # fmt: skip
+    body = [[i, *flat(p)] for i, p in enumerate(k)]
+    return text(folder / "walkDLC.csv", "\n".join(",".join(map(str, row)) for row in head + body))
+
+
+def several_animals(folder, k, far):
+    both = np.concatenate([k, far], axis=1)
+    head = [["scorer"] + ["net"] * 102, ["individuals"] + ["one"] * 51 + ["two"] * 51,
+            ["bodyparts"] + [n for n in COCO_17.joints * 2 for _ in range(3)],
+            ["coords"] + ["x", "y", "likelihood"] * 34]  # fmt: skip
+    body = [[i, *flat(p)] for i, p in enumerate(both)]
+    return text(folder / "walk_el.csv", "\n".join(";".join(map(str, row)) for row in head + body))
+
+
+def with_scores(folder, k, far):
+    np.savez(folder / "a.npz", keypoints=k, joints=COCO_17.joints, stamp_ns=np.arange(len(k)) * 10**9, image_size=SIZE)
+    return folder / "a.npz"
+
+
+def rate_only(folder, k, far):
+    np.savez(folder / "b.npz", keypoints=k[..., :2], scores=k[..., 2], joints=COCO_17.joints, fps=15, image_size=SIZE)
+    return folder / "b.npz"
+
+
+def bare_array(folder, k, far):
+    np.save(folder / "c.npy", k)
+    return folder / "c.npy"
+
+
+def write(path, data):
+    return text(path, json.dumps(data))
+
+
+def text(path, content):
+    path.write_text(content)
+    return path
+
+
+FORMS = [alphapose, cmu_form, openpose, mmpose, coco, named_points, deeplabcut, several_animals,
+         with_scores, rate_only, bare_array]  # fmt: skip
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_gives_the_same_tracks(tmp_path, form):
+    k = walk()
+    k[3, 9] = 0.0  # not seen, as COCO, OpenPose and AlphaPose write it
+    far = walk() * [0.3, 0.3, 1.0] + [100, 100, 0]
+    found = read_keypoints(form(tmp_path, k, far), 15.0, SIZE)
+    assert found.joints == COCO_17.joints
+    assert np.isnan(found.keypoints[3, 9]).all()
+    seen = k[..., 2] > 0
+    assert np.abs(found.keypoints - k[..., :2])[seen].max() < 0.01
+    assert np.isfinite(found.keypoints).all(axis=2).sum() == seen.sum()
+    step_s = np.diff(found.stamp_ns) * 1e-9
+    assert step_s == pytest.approx(10 / 15 if form is mmpose else 1 / 15, rel=1e-6)
+    assert found.image_size == SIZE
+
+
+@pytest.mark.parametrize("form", [alphapose, openpose, deeplabcut, bare_array])
+def test_reconstruct_and_info_read_other_tools_files(tmp_path, capsys, form):
+    path = form(tmp_path, walk(), walk() * 0.5)
+    assert main(["info", str(path)]) == 0
+    assert "frames: 12" in capsys.readouterr().out
+    options = ["--rate", "15", "--image-size", "1280x720", "--method", "initial", "--no-report", "--quiet"]
+    assert main(["reconstruct", str(path), "--out", str(tmp_path / "out"), *options]) == 0
+    assert "assumed" not in capsys.readouterr().err
+    assert load_tracks(tmp_path / "out" / "tracks.npz").stamp_ns[-1] == pytest.approx(11e9 / 15, abs=2)
+    assert main(["reconstruct", str(path), "--image-size", "1280"]) == 2
+
+
+def test_what_a_file_does_not_say_is_assumed_aloud(tmp_path, caplog):
+    found = read_keypoints(alphapose(tmp_path, walk(), walk()))
+    assert "assumed: 30 images per second" in caplog.text
+    assert (found.keypoints <= found.image_size).all()
+
+
+def test_frames_without_a_person_stay_frames(tmp_path):
+    folder = openpose(tmp_path, walk(), walk())
+    write(folder / "walk_000000000004_keypoints.json", {"people": []})
+    found = read_keypoints(folder, 15.0, SIZE)
+    assert np.isnan(found.keypoints[4]).all()
+    assert len(found) == 12
+
+
+def test_shares_of_the_picture_need_its_size(tmp_path):
+    k = walk() / [*SIZE, 1.0]
+    np.save(tmp_path / "n.npy", k)
+    with pytest.raises(InputError, match="--image-size"):
+        read_keypoints(tmp_path / "n.npy")
+    assert read_keypoints(tmp_path / "n.npy", 15.0, SIZE).keypoints == pytest.approx(walk()[..., :2])
+
+
+def test_zeros_and_places_outside_the_picture_are_not_seen(tmp_path, caplog):
+    k = walk()[..., :2]
+    k[2, 5], k[3, 6], k[4, 7], k[5, 8] = (0, 0), (-1, -1), (5000, 300), (1300, 300)
+    arrays = {"joints": COCO_17.joints, "stamp_ns": np.arange(12) * 10**8, "image_size": SIZE}
+    np.savez(tmp_path / "t.npz", keypoints=k, **arrays)
+    found = load_tracks(tmp_path / "t.npz").keypoints
+    assert np.argwhere(np.isnan(found[..., 0])).tolist() == [[2, 5], [3, 6], [4, 7]]
+    assert "3 keypoints" in caplog.text
+
+
+def test_arrays_of_objects_are_refused(tmp_path):
+    np.savez(tmp_path / "h.npz", positions_2d={"walk.mp4": {"custom": [walk()]}})
+    with pytest.raises(InputError, match="Python objects"):
+        read_keypoints(tmp_path / "h.npz")
+
+
+@pytest.mark.parametrize("name", ["a.json", "a.npz", "a.npy", "a.csv", "a.pkl", "a.h5"])
+@pytest.mark.parametrize("content", [b"", b"{}", b"[[[[", b"[" * 100_000, b'{"people": [{"keypoints": ["a", {}]}]}',
+                                     b"scorer,a\nbodyparts,b\ncoords,x\n0,1e999\n", bytes(500)])  # fmt: skip
+def test_files_without_a_person_are_refused_in_one_line(tmp_path, capsys, name, content):
+    (tmp_path / name).write_bytes(content)
+    assert main(["info", str(tmp_path / name)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_damaged_files_give_tracks_or_one_clear_line(tmp_path):
+    rng, k = random.Random(5), walk(4)
+    whole = [form(tmp_path, k, k) for form in (alphapose, mmpose, coco, named_points, deeplabcut, with_scores)]
+    words = [b"NaN", b"1e999", b"-7", b"null", b'"x"', b"[]", b"{}", b"10000000000000000000000"]
+    for path in whole:
+        data = path.read_bytes()
+        for i in range(25):
+            damaged = mutated(data, rng) if i % 2 else swapped(data, words, rng)
+            path.write_bytes(damaged)
+            seen, refusal = attempt(path)
+            assert seen or refusal
+            assert "\n" not in refusal
+
+
+def attempt(path):
+    try:
+        return np.isfinite(read_keypoints(path).keypoints).any(), ""
+    except InputError as error:
+        return False, str(error)
+
+
+def swapped(data, words, rng):
+    """Some of the numbers in a text are other words."""
+    parts = data.split(b",")
+    for _ in range(rng.randrange(1, 5)):
+        parts[rng.randrange(len(parts))] = rng.choice(words)
+    return b",".join(parts)
