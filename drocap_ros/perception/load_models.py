@@ -68,6 +68,13 @@ def load_pose_model(models_dir: str | Path, config: PoseEstimatorConfig) -> Pose
     return _load(Path(models_dir), config.pose_model, "pose", _POSE_ORDER, config, PoseModel)
 
 
+def _read_named(path: Path, what: str, task: str, config: PoseEstimatorConfig) -> tuple[OnnxModel, ModelSpec]:
+    model, spec = _read(path, config)
+    if spec.task not in (task, "both"):
+        raise InputError(f"{path}: expected a {what}, found a {spec.task} model ({spec.layout}); name another")
+    return model, spec
+
+
 def _load(
     folder: Path,
     name: str,
@@ -80,11 +87,7 @@ def _load(
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder with a {what} (.onnx), found no such folder; {_FETCH}")
     if name != "auto":
-        path = folder / (name if name.endswith(".onnx") else f"{name}.onnx")
-        model, spec = _read(path, config)
-        if spec.task not in (task, "both"):
-            raise InputError(f"{path}: expected a {what}, found a {spec.task} model ({spec.layout}); name another")
-        return build(model, spec)
+        return build(*_read_named(folder / (name if name.endswith(".onnx") else f"{name}.onnx"), what, task, config))
     paths = sorted(folder.glob("*.onnx"), key=lambda path: _rank(path, order))
     why = ""
     for path in paths:

@@ -217,7 +217,8 @@ class MessageView:
         if not np.isfinite(position).all():
             return
         self._at(message)
-        xyzw = _xyzw(message.gimbal_orientation)
+        turned = message.gimbal_orientation
+        xyzw = np.array([turned.x, turned.y, turned.z, turned.w], float)
         if np.isfinite(xyzw).all() and xyzw.any():
             rotation = camera_rotation(xyzw)
             self._cameras.append((header_stamp_ns(message), position, rotation))
@@ -258,10 +259,6 @@ class MessageView:
     def _at_newest(self, message: Message) -> None:
         """Use the newest image's stamp: the images of a file may have another clock than the nodes."""
         self._scene.at(self._now_ns if self._now_ns is not None else header_stamp_ns(message))
-
-
-def _xyzw(quaternion: Message) -> np.ndarray:
-    return np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], float)
 
 
 def _turned(packed: np.ndarray, rotation: np.ndarray) -> np.ndarray:

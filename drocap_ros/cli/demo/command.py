@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
             config, fly = with_link(config), fly_in_real_time
         # On a terminal only: the bars would take the remarks out of a pipe.
         with progress_bars(args.quiet or not sys.stdout.isatty()) as progress:
-            how = fly(config, operator, _silent if args.quiet else _say, progress, interrupted)
+            how = fly(config, operator, (lambda *_: None) if args.quiet else _say, progress, interrupted)
         check_flown(operator)
         truth = load_flight_truth(folder / "truth.npz")
         with open_session(folder / "session") as session:
@@ -114,10 +114,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _say(seconds: float, text: str) -> None:
     print(f"{seconds:6.1f} s  {text}", flush=True)
-
-
-def _silent(_seconds: float, _text: str) -> None:
-    pass
 
 
 def demo_config(folder: Path, seed: int, autopilot: str, models: str, mount: str = "gimbal") -> DrocapConfig:

@@ -30,6 +30,15 @@ def telemetry_words(meta: Mapping[str, Any]) -> str:
 
 def _calibrations(windows: list[Mapping[str, Any]], height_m: float | None) -> str:
     """The worst of each fact over the windows of a long recording."""
+    corrections = ", ".join(_corrections(windows)) or "no error of the telemetry is clear"
+    scale = f"scale known to {100 * max(w['scale_std'] for w in windows):.1f} %"
+    feet = f"feet in contact for {100 * min(w['contact_share'] for w in windows):.0f} % of the time"
+    worst = f" (worst of {len(windows)} windows)" if len(windows) > 1 else ""
+    rest = f"{worst}{_path(windows)}{_stature(windows, height_m)}."
+    return f"{corrections[0].upper()}{corrections[1:]}; {scale}, {feet}{rest}"
+
+
+def _corrections(windows: list[Mapping[str, Any]]) -> list[str]:
     turned = [(w["misalignment_deg"], w["misalignment_std_deg"]) for w in windows]
     facts = [
         _correction(f"gimbal {name}", [(v[axis], std[axis]) for v, std in turned], "deg")
@@ -43,13 +52,7 @@ def _calibrations(windows: list[Mapping[str, Any]], height_m: float | None) -> s
         )
         for name in ("attitude", "position")
     ]
-    stated = [fact for fact in facts if fact]
-    scale = f"scale known to {100 * max(w['scale_std'] for w in windows):.1f} %"
-    feet = f"feet in contact for {100 * min(w['contact_share'] for w in windows):.0f} % of the time"
-    corrections = ", ".join(stated) if stated else "no error of the telemetry is clear"
-    worst = f" (worst of {len(windows)} windows)" if len(windows) > 1 else ""
-    rest = f"{worst}{_path(windows)}{_stature(windows, height_m)}."
-    return f"{corrections[0].upper()}{corrections[1:]}; {scale}, {feet}{rest}"
+    return [fact for fact in facts if fact]
 
 
 def _path(windows: list[Mapping[str, Any]]) -> str:

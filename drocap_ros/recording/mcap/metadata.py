@@ -52,12 +52,12 @@ class FileRecord:
         self.messages += 1
 
 
-def qos_profile(*, reliable: bool = True, depth: int = 1000) -> list[Yaml]:
+def qos_profile(*, reliable: bool = True) -> list[Yaml]:
     """Offered quality of service in rosbag2's form."""
     return [
         {
             "history": "keep_last",
-            "depth": depth,
+            "depth": 1000,
             "reliability": "reliable" if reliable else "best_effort",
             "durability": "volatile",
             "deadline": dict(_FOREVER),

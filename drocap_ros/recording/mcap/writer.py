@@ -107,15 +107,7 @@ class SessionWriter:
         """Bytes in the queue to the disk."""
         return self._queue.size
 
-    def register(
-        self,
-        topic: str,
-        type_name: str,
-        schema: str,
-        *,
-        image: bool = False,
-        qos: list[Yaml] | None = None,
-    ) -> None:
+    def register(self, topic: str, type_name: str, schema: str, *, image: bool = False) -> None:
         """Declare a topic before its first message; a repeated call has no effect.
 
         Parameters
@@ -123,7 +115,6 @@ class SessionWriter:
         type_name : ``package/msg/Name``
         schema : its definition with all dependencies, see :func:`drocap_ros.recording.mcap.schemas.schema_text`
         image : whether its messages may be dropped before others
-        qos : offered quality of service, see :func:`drocap_ros.recording.mcap.metadata.qos_profile`
 
         Raises
         ------
@@ -136,7 +127,7 @@ class SessionWriter:
                 if known.type_name != type_name:
                     raise InputError(f"{topic}: expected type {known.type_name} as registered before, got {type_name}")
                 return
-            profile = qos or bag.qos_profile(reliable=not image)
+            profile = bag.qos_profile(reliable=not image)
             record = TopicRecord(topic, type_name, type_hash(type_name, schema), profile)
             if self.error is None:
                 self._file.register(record, schema)
