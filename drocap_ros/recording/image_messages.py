@@ -12,7 +12,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.sources.packets import decoded_packets
-from drocap_ros.perception.sources.pixels import decoded, is_depth, is_grey, raw_to_bgr
+from drocap_ros.perception.sources.pixels import colour_rank, decoded, raw_to_bgr
 from drocap_ros.recording.session import IMAGES, Message, Session, TopicInfo, header_stamp_ns
 from drocap_ros.stamps import StampValidator
 
@@ -76,9 +76,7 @@ def _rank(session: Session, topic: TopicInfo) -> int:
     """0 for colour, 1 for grey, 2 for distances and labels, by the first message."""
     first = next((message for _, message in session.messages((topic.name,))), None)
     form = str(getattr(first, "encoding", getattr(first, "format", "")))
-    if first is None or _NO_PICTURE.search(topic.name) or is_depth(form):
-        return _DEPTH_RANK
-    return int(is_grey(form))
+    return _DEPTH_RANK if first is None or _NO_PICTURE.search(topic.name) else colour_rank(form)
 
 
 def read_images(session: Session, topic: str = "") -> Iterator[Frame]:

@@ -24,6 +24,12 @@ def movie_s(path: Path) -> float | None:
     return duration / scale if scale and duration else None
 
 
+def formats(path: Path) -> str:
+    """Codes of the tracks' formats behind a colon, nothing where there are none."""
+    found = re.findall(rb"stsd.{12}([\w ]{4})", _index(path)[1], re.DOTALL)
+    return f": {', '.join(code.decode() for code in found)}" if found else ""
+
+
 @contextlib.contextmanager
 def largest_alone(path: Path) -> Iterator[str]:
     """A name by which FFmpeg opens a file without its other video tracks, where the largest one is not the first.

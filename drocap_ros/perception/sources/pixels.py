@@ -45,14 +45,9 @@ _DEPTH = re.compile(r"16[US]C1|32FC1|64FC1|.*compressedDepth.*")
 _GREY = re.compile(r"mono|8UC1")
 
 
-def is_depth(encoding: str) -> bool:
-    """Whether an encoding or format is mostly that of distances; some thermal cameras use it too."""
-    return bool(_DEPTH.match(encoding))
-
-
-def is_grey(encoding: str) -> bool:
-    """Whether an encoding has no colours."""
-    return bool(_GREY.match(encoding))
+def colour_rank(encoding: str) -> int:
+    """0 of an encoding or format with colours, 1 of grey, 2 of mostly distances; some thermal cameras use those too."""
+    return 2 if _DEPTH.match(encoding) else int(bool(_GREY.match(encoding)))
 
 
 def to_bgr(image: np.ndarray) -> np.ndarray:
@@ -87,15 +82,13 @@ def decoded(data: np.ndarray, form: str) -> np.ndarray:
     """
     import cv2
 
-    image = None
     if data[:2].tobytes() == b"\xff\xd8" and b"\xff\xd9" not in data[-_JPEG_TAIL:].tobytes():
         raise InputError(f"image: expected a whole JPEG, got {data.size} bytes without its end; check the link")
-    if data.size:
-        try:
-            flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-            image = cv2.imdecode(data, flags)
-        except cv2.error:
-            image = None
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(data, flags) if data.size else None
+    except cv2.error:
+        image = None
     if image is None:
         raise InputError(f"image: expected JPEG, PNG or another image, got format {form[:40]!r} that does not decode")
     return to_bgr(np.asarray(image))

@@ -16,7 +16,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
-from drocap_ros.perception.sources.movie_index import largest_alone, movie_s
+from drocap_ros.perception.sources.movie_index import formats, largest_alone, movie_s
 from drocap_ros.perception.sources.pixels import to_bgr
 
 log = logging.getLogger(__name__)
@@ -27,8 +27,8 @@ _TAIL_FRAMES = 2
 _MATROSKA = b"\x1a\x45\xdf\xa3"
 #: Codecs in words by their codes; others are named by their codes.
 _CODECS = {"AV01": "AV1", "AVC1": "H.264", "H264": "H.264", "HEVC": "H.265", "HVC1": "H.265", "HEV1": "H.265"}
-#: First pictures that are compared, since OpenCV 4.13 leaves interlaced ones unwritten.
-_PROBED = 5
+#: Least and most first pictures that are compared, since OpenCV 4.13 leaves interlaced ones unwritten.
+_PROBED = (5, 24)
 #: A larger packet changes its picture: that of a still one has some bytes, and a bit or two for each block of 256 px.
 _STILL_BYTES, _STILL_PIXELS = 200, 1024
 #: Pixels of other shapes are not believed.
@@ -109,7 +109,7 @@ class VideoSource(ImageSource):
         if not capture.isOpened():
             raise InputError(
                 f"{self.path}: expected a video that FFmpeg can open, found {self.path.stat().st_size} bytes without a"
-                " readable header or index (cut off, or of an unknown codec); copy or record it again"
+                f" readable header or index (cut off, or of an unknown codec{formats(self.path)}); copy it again"
             )
         return capture
 
@@ -137,16 +137,18 @@ class VideoSource(ImageSource):
         import cv2
 
         first = self._pending[0].image
-        while len(self._pending) < _PROBED and (frame := self._decode()):
-            self._pending.append(frame)
+        while len(self._pending) < _PROBED[1] and (frame := self._decode()):
             if not np.array_equal(frame.image, first):
+                self._pending.append(frame)
                 return False
+            self._pending.append(Frame(frame.stamp_ns, first))  # many of them are one in memory
         raw = cv2.VideoCapture(str(self.path.absolute()), cv2.CAP_FFMPEG)
         raw.set(cv2.CAP_PROP_FORMAT, -1)  # packets as they are
         packets = [packet.tobytes() for ok, packet in (raw.read() for _ in self._pending) if ok]
         raw.release()
         largest_still = _STILL_BYTES + first.shape[0] * first.shape[1] // _STILL_PIXELS
-        return len(set(packets)) == _PROBED and min(map(len, packets)) > largest_still
+        differ = len(set(packets)) == len(self._pending) >= _PROBED[0]
+        return differ and float(np.median([len(packet) for packet in packets])) > largest_still
 
     def _refuse(self) -> None:
         import cv2

@@ -144,6 +144,30 @@ def test_undecoded_video_names_its_codec(shared):
         assert "convert it: ffmpeg" in str(error)  # noqa: PT017
 
 
+def test_unknown_codec_is_named(tmp_path):
+    path = write_video(tmp_path / "a.mp4")
+    data = bytearray(path.read_bytes())
+    at = data.index(b"stsd") + 16
+    data[at : at + 4] = b"aprn"
+    data = data.replace(b"esds", b"free")
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"aprn|APRN"):
+        open_source(path)
+
+
+def test_a_still_picture_is_a_video(tmp_path):
+    writer = cv2.VideoWriter(str(tmp_path / "a.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (64, 48))
+    for _ in range(40):
+        writer.write(random_picture())
+    writer.release()
+    with open_source(tmp_path / "a.mp4") as source:
+        assert len(list(source)) == 40
+
+
+def random_picture():
+    return np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+
+
 def test_interlaced_video_gives_pictures_or_is_named(shared):
     path = shared / "cases" / "interlaced_black" / "interlaced.mp4"
     try:
