@@ -74,7 +74,7 @@ class Lack(Enum):
     DAMAGED_STATES = "{} of the states are damaged: left out"
     AIRCRAFT_ZERO = "the aircraft's angles are zero throughout: left out"
     QUATERNION = "the gimbal's quaternion contradicts its angles: the angles are used"
-    ZOOM = "the digital zoom changes ({}): one camera matrix cannot hold it"
+    ZOOM = "the zoom changes ({}): one camera matrix cannot hold it, so the camera is taken as unknown"
 
 
 class LogLack(NamedTuple):

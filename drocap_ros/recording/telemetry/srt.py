@@ -1,12 +1,13 @@
 """States of the camera from the subtitles that a DJI drone writes beside its video.
 
 Supported forms: bracketed ``[latitude: 47.3] [rel_alt: 10.0 abs_alt: 450.1] [gb_yaw: 12.3 gb_pitch: -20.0
-gb_roll: 0.0]``; ``F_PRY (..°, ..°, ..°), G_PRY (..)`` (flight and gimbal pitch, roll, yaw); and the older
-``GPS(lon,lat,n) BAROMETER:20.5``.
+gb_roll: 0.0]``; ``F_PRY (..°, ..°, ..°), G.PRY (..)`` (flight and gimbal pitch, roll, yaw); and the older
+``GPS(lon,lat,n) BAROMETER:20.5``, of some models ``GPS(lat,lon,0.0M)`` or ``GPS(E:lon, N:lat, 5.0m)``.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Iterator
@@ -38,22 +39,20 @@ _VALUE = re.compile(
     rf"\b(latitude|longitude|longtitude|rel_alt|abs_alt|altitude|gb_yaw|gb_pitch|gb_roll)\s*:\s*{_NUMBER}",
     re.IGNORECASE,
 )
-_GPS = re.compile(rf"\bGPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER}")
+_GPS = re.compile(rf"\bGPS\s*\(\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(m?)", re.I)
 _BAROMETER = re.compile(rf"\bBAROMETER\s*:\s*{_NUMBER}|,\s*H\s*{_NUMBER}\s*m")
 _LENS = re.compile(rf"\b(focal_len|dzoom_ratio)\s*:\s*{_NUMBER}", re.IGNORECASE)
-_PRY = re.compile(rf"\b([FG])_PRY\s*\(\s*{_NUMBER}°?\s*,\s*{_NUMBER}°?\s*,\s*{_NUMBER}°?\s*\)")
+_PRY = re.compile(rf"\b([FG])[._ ]?PRY\s*\(\s*{_NUMBER}°?\s*,\s*{_NUMBER}°?\s*,\s*{_NUMBER}°?\s*\)")
 
 
 class _Entry(NamedTuple):
-    """One subtitle: time ns in the video, geodetic, and pitch, roll, yaw in degrees of gimbal and body.
-
-    lens : 35 mm equivalent in mm and digital zoom
-    """
+    """One subtitle: time ns in the video, geodetic, source of the height, pitch roll yaw deg, lens mm and zoom."""
 
     stamp_ns: int
     latitude: float
     longitude: float
     height: float
+    kind: str
     gimbal: tuple[float, float, float]
     body: tuple[float, float, float]
     lens: tuple[float, float]
@@ -70,17 +69,25 @@ def read_srt(path: Path) -> TelemetryLog:
     InputError
         When the file cannot be read or holds no telemetry.
     """
-    entries, heights = _entries(path)
-    if not entries:
-        raise InputError(f"{path}: expected DJI subtitles with telemetry, found none; check the path")
+    found = (_entry(stamp_ns, text) for stamp_ns, text in _subtitles(path))
+    entries = list(itertools.islice((entry for entry in found if entry), MAX_FRAMES + 1))
+    if not 0 < len(entries) <= MAX_FRAMES:
+        raise InputError(f"{path}: expected 1 to {MAX_FRAMES} DJI subtitles with telemetry, found {len(entries)}")
+    heights = next((kind for kind in _HEIGHTS if any(e.kind == kind for e in entries)), "height")
     stamps = np.array([e.stamp_ns for e in entries], np.int64)
     geodetic = np.array([(e.latitude, e.longitude, e.height) for e in entries])
+    place = np.abs(geodetic[np.isfinite(geodetic[:, 0]), :2]).max(axis=0, initial=0.0)
+    if place.any() and (place <= (np.pi / 2, np.pi)).all():  # as degrees all of it would be the open Atlantic
+        geodetic[:, :2] = np.rad2deg(geodetic[:, :2])
     impossible = (np.abs(geodetic[:, 0]) > 90) | (np.abs(geodetic[:, 1]) > 180)
     nowhere = (geodetic[:, 0] == 0) & (geodetic[:, 1] == 0)
     geodetic[impossible | nowhere] = np.nan
     # rel_alt is the height above take-off.
     position = from_first_fix(geodetic, above_takeoff=heights == "rel_alt")
     lacks = [LogLack(Lack.HEIGHT, heights)] if position is not None and heights != "rel_alt" else []
+    lens = np.array([e.lens for e in entries])
+    if (steady := _lens(lens)) is None:
+        lacks.append(LogLack(Lack.ZOOM, " to ".join(f"{f(np.nanprod(lens, axis=1)):.0f} mm" for f in (np.min, np.max))))
     return make_log(
         path,
         "DJI subtitles",
@@ -89,22 +96,7 @@ def read_srt(path: Path) -> TelemetryLog:
         orientation=dji_attitude(np.array([e.body for e in entries])),
         position=position,
         gimbal=dji_attitude(np.array([e.gimbal for e in entries])),
-    )._replace(video_clock=True, lens=_lens(np.array([e.lens for e in entries])))
-
-
-def _entries(path: Path) -> tuple[list[_Entry], str]:
-    """Subtitles with telemetry, and the source of their heights."""
-    entries: list[_Entry] = []
-    kinds: set[str] = set()
-    for stamp_ns, text in _subtitles(path):
-        found = _entry(stamp_ns, text)
-        if found is not None:
-            entry, kind = found
-            entries.append(entry)
-            kinds.add(kind)
-        if len(entries) > MAX_FRAMES:
-            raise InputError(f"{path}: expected at most {MAX_FRAMES} subtitles; cut the file")
-    return entries, next((kind for kind in _HEIGHTS if kind in kinds), "height")
+    )._replace(video_clock=True, lens=steady)
 
 
 def _subtitles(path: Path) -> Iterator[tuple[int, str]]:
@@ -128,10 +120,10 @@ def _subtitles(path: Path) -> Iterator[tuple[int, str]]:
         yield stamp_ns, text
 
 
-def _entry(stamp_ns: int, text: str) -> tuple[_Entry, str] | None:
-    """One subtitle and the source of its height, "" = none; None without telemetry."""
+def _entry(stamp_ns: int, text: str) -> _Entry | None:
+    """One subtitle; None without telemetry."""
     values = _values(text)
-    angles = {kind: (float(p), float(r), float(y)) for kind, p, r, y in _PRY.findall(text)}
+    angles = {kind.upper(): (float(p), float(r), float(y)) for kind, p, r, y in _PRY.findall(text)}
     gimbal = angles.get("G", _UNKNOWN)
     if "gb_yaw" in values and "gb_pitch" in values:
         gimbal = (values["gb_pitch"], values.get("gb_roll", 0.0), values["gb_yaw"])
@@ -139,7 +131,7 @@ def _entry(stamp_ns: int, text: str) -> tuple[_Entry, str] | None:
     if not kind and not angles and math.isnan(gimbal[0]):
         return None
     latitude, longitude, height = (values.get(name, math.nan) for name in ("latitude", "longitude", kind))
-    return _Entry(stamp_ns, latitude, longitude, height, gimbal, angles.get("F", _UNKNOWN), _focal(text)), kind
+    return _Entry(stamp_ns, latitude, longitude, height, kind, gimbal, angles.get("F", _UNKNOWN), _focal(text))
 
 
 def _values(text: str) -> dict[str, float]:
@@ -148,7 +140,10 @@ def _values(text: str) -> dict[str, float]:
     if "longtitude" in values:  # as some models spell it
         values.setdefault("longitude", values["longtitude"])
     if "latitude" not in values and (gps := _GPS.search(text)):
-        values |= {"longitude": float(gps[1]), "latitude": float(gps[2]), "altitude": float(gps[3])}
+        first, second = (float(gps[i + 1]) * (-1 if gps[i].upper() in ("S", "W") and gps[i] else 1) for i in (1, 3))
+        if gps[1].upper() in ("N", "S") if gps[1] else gps[6]:  # with a height in m latitude is first, else longitude
+            first, second = second, first
+        values |= {"longitude": first, "latitude": second, "altitude": float(gps[5])}
     if barometer := _BAROMETER.search(text):
         values["barometer"] = float(barometer[1] or barometer[2])
     return values

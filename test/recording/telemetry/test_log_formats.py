@@ -9,6 +9,7 @@ from angles import angle_between
 from dataflash import write_dataflash
 from telemetry_logs import angles_of, dji_subtitle, mutated, srt_text, wrapped
 
+from drocap_ros.cli import main
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import ned_to_enu, orientation_to_aviation, quaternion_from_euler, yaw_of
 from drocap_ros.geometry.geodesy import geodetic_to_enu
@@ -150,6 +151,45 @@ def test_dji_subtitles_of_older_models_are_read(tmp_path):
     misspelt = ["[latitude : 47.0] [longtitude : 8.0] [altitude: 10.0]"] * 30
     (tmp_path / "m.srt").write_text(srt_text(t, misspelt))
     assert np.isfinite(read_telemetry(tmp_path / "m.srt").track.position).all()
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "GPS(8.00{i:02d}00,47.000000,17) BAROMETER:5.0",
+        "GPS(47.000000,8.00{i:02d}00,0.0M) BAROMETER:5.0M",
+        "GPS(E:8.00{i:02d}00, N:47.000000, 5.00m)",
+        "GPS(N:47.000000, E:8.00{i:02d}00, 5.00m)",
+        "GPS (8.00{i:02d}00, 47.000000, 17), D 8.00m, H 5.00m",
+    ],
+)
+@pytest.mark.parametrize("angles", ["F_PRY ({0}), G_PRY ({1})", "F.PRY ({0}), G.PRY ({1})", "F PRY({0}) G PRY({1})"])
+def test_every_spelling_of_subtitles_is_one_flight(tmp_path, place, angles):
+    pry = "-3.0°, 0.5°, {i}.0°", "-20.0°, 0.0°, {i}.5°"
+    lines = [
+        (place + "\n" + angles.format(*pry)).replace("{i:02d}", f"{i:02d}").replace("{i}", str(i)) for i in range(20)
+    ]
+    (tmp_path / "x.SRT").write_text(srt_text(np.arange(20.0), lines))
+    track = read_telemetry(tmp_path / "x.SRT").track
+    metres = 19e-4 * 111_320 * math.cos(math.radians(47))
+    assert np.ptp(track.position, axis=0) == pytest.approx([metres, 0, 0], abs=0.01 * metres)
+    assert np.rad2deg(angles_of(track.gimbal))[7] == pytest.approx([0, -20, 7.5], abs=1e-6)
+    assert np.rad2deg(angles_of(track.orientation))[7] == pytest.approx([0.5, -3, 7], abs=1e-6)
+
+
+def test_radians_in_subtitles_are_degrees_of_another_unit(tmp_path):
+    lines = [f"[latitude : {math.radians(47):.9f}] [longtitude : {math.radians(8 + i * 1e-4):.9f}] [altitude: 9.0]"
+             for i in range(20)]  # fmt: skip
+    (tmp_path / "r.srt").write_text(srt_text(np.arange(20.0), lines))
+    metres = 19e-4 * 111_320 * math.cos(math.radians(47))
+    assert np.ptp(read_telemetry(tmp_path / "r.srt").track.position[:, 0]) == pytest.approx(metres, rel=0.01)
+
+
+def test_zoom_during_a_clip_is_said(tmp_path, capsys):
+    lines = [f"[focal_len: {24 + i}.00] [rel_alt: 5.0] [gb_yaw: 1.0 gb_pitch: -9.0 gb_roll: 0.0]" for i in range(25)]
+    (tmp_path / "z.srt").write_text(srt_text(np.arange(25.0), lines))
+    assert main(["info", str(tmp_path / "z.srt")]) == 0
+    assert "the zoom changes (24 mm to 48 mm)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", ["x.tlog", "x.ulg", "x.bin", "x.srt", "x.txt"])
