@@ -143,7 +143,7 @@ _SENTENCES = {
     _C.DISARMED: "the motors were disarmed",
     _C.PILOT_TOOK_OVER: "the mode changed to {mode} without a request of ours: the pilot has taken over, or a "
     "failsafe of the autopilot; nothing is sent",
-    _C.CONTROL_NOT_GRANTED: "the autopilot did not grant control",
+    _C.CONTROL_NOT_GRANTED: "the autopilot did not grant control{answer}",
     _C.HOLD_MODE_MISSING: "{cause}; the autopilot does not enter its hold mode: take over by hand",
     _C.DEGRADED: "the orbit is slowed down: {cause}",
     _C.SLOWED: "{cause}, at {speed_deg_s:.1f} deg/s instead of {wanted_deg_s:.1f}: without setpoints the autopilot "

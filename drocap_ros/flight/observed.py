@@ -191,6 +191,7 @@ class Observed:
     loss_settings : the autopilot's settings for the loss of setpoints
     intruder : another one that commands, or whose keypoints would be followed
     disturbance : a condition that ends motion and that no other field shows
+    refusal : why the autopilot does not enter the requested mode, as a sentence; "" = it does not refuse
     """
 
     autopilot: Autopilot = UNKNOWN
@@ -205,6 +206,7 @@ class Observed:
     course: Course = Course()
     intruder: Condition | None = None
     disturbance: Condition | None = None
+    refusal: str = ""
 
     @property
     def jumped(self) -> bool:

@@ -33,6 +33,7 @@ class _Pending:
     paused: bool = False
     result: int | None = None  # MAV_RESULT, or _NOT_ANSWERED
     answered_s: float = -1e9
+    refusal: int | None = None  # while there is no result: the last answer, also to the same command before
 
 
 class CommandQueue:
@@ -50,7 +51,8 @@ class CommandQueue:
         present = self._pending.get(command)
         same = present is not None and present.parameters == parameters
         if present is None or not same or (present.result is not None and now_s - present.answered_s > _REPEAT_S):
-            self._pending[command] = _Pending(parameters, label)
+            before = None if present is None or not same else present.result
+            self._pending[command] = _Pending(parameters, label, refusal=before)
         self._pending[command].paused = False
 
     def pause(self, command: int) -> None:
@@ -82,7 +84,7 @@ class CommandQueue:
         if result == mavlink.MAV_RESULT_IN_PROGRESS:
             pending.sent_s = now_s + _PROGRESS_S - _RETRY_S
         elif result == mavlink.MAV_RESULT_TEMPORARILY_REJECTED and pending.tries < _TRIES:
-            pending.sent_s = now_s  # retried after the usual time
+            pending.sent_s, pending.refusal = now_s, result  # retried after the usual time
         else:
             pending.result, pending.answered_s = result, now_s
 
@@ -101,9 +103,10 @@ class CommandQueue:
         return ready
 
     def failure(self, command: int) -> str:
-        """Why the last command of this kind failed, as a sentence; "" = it is pending or succeeded."""
+        """Why the last command of this kind failed, or is refused so far, as a sentence; "" = neither."""
         pending = self._pending.get(command)
-        if pending is None or pending.result in (None, mavlink.MAV_RESULT_ACCEPTED):
+        result = None if pending is None else pending.refusal if pending.result is None else pending.result
+        if pending is None or result in (None, mavlink.MAV_RESULT_ACCEPTED):
             return ""
-        words = _RESULTS.get(pending.result, f"answered with result {pending.result}")
+        words = _RESULTS.get(result, f"answered with result {result}")
         return f"{pending.label}: {words}"

@@ -104,7 +104,8 @@ class OrbitController:
         self._link.decided_s = now_s
         hung = self._watchdog_acted()
         orbiting_s = now_s - self.safety.since_s if self.safety.state == State.ORBITING else 0.0
-        own = OwnFlight(orbiting_s, self._orbit.place, hung, self._orbit.unsafe, self.intruder)
+        refusal = self._queue.failure(SET_MODE)
+        own = OwnFlight(orbiting_s, self._orbit.place, hung, self._orbit.unsafe, self.intruder, refusal)
         seen, dt = self._observer.observe(self._link, now_ns, now_s, own)
         request = self._decide(seen, now_ns, now_s, hung=hung)
         self._observer.forget_changed_camera()
@@ -153,9 +154,9 @@ class OrbitController:
         autopilot = seen.autopilot
         if request == ModeRequest.NONE or not autopilot.supported:
             # A request that waits for a visible mode is not sent, but it is not forgotten either: a mode that was
-            # granted must not be requested again, and the answer to one that failed stays on the status.
-            waiting = self.safety.requesting or self.safety.state in (State.HOLDING, State.FAULT) or self.safety.failed
-            (self._queue.pause if waiting and not seen.mode.in_hold else self._queue.cancel)(SET_MODE)
+            # granted must not be requested again.
+            holds = self.safety.state in (State.HOLDING, State.FAULT) and not seen.mode.in_hold
+            (self._queue.pause if holds or self.safety.requesting else self._queue.cancel)(SET_MODE)
             return
         mode = autopilot.hold_mode if request == ModeRequest.HOLD else autopilot.control_mode
         self.safety = permit_mode(self.safety, mode)

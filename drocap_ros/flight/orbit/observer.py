@@ -40,6 +40,7 @@ class OwnFlight(NamedTuple):
     hung : whether the watchdog has acted since the last step
     unsafe : why the setpoint of the last step was not sent
     intruder : another one that commands or is followed, found in the graph
+    refusal : why the autopilot does not enter the requested mode, as a sentence; "" = it does not refuse
     """
 
     orbiting_s: float = 0.0
@@ -47,6 +48,7 @@ class OwnFlight(NamedTuple):
     hung: bool = False
     unsafe: Condition | None = None
     intruder: Condition | None = None
+    refusal: str = ""
 
 
 class Observer:
@@ -132,6 +134,7 @@ class Observer:
             course=Course(followed, away_m, away_s),
             intruder=own.intruder,
             disturbance=disturbance,
+            refusal=own.refusal,
         )
         return observed, dt
 

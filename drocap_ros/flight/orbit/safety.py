@@ -236,7 +236,7 @@ def _wait(state: SafetyState, seen: Observed, now_s: float, problem: Condition |
         if failed is None and now_s - state.requesting_s > limits.safety.engage_timeout_s + limits.warm_up_s:
             # With the mode granted, the condition has delayed the orbit for all this time.
             delayed = seen.mode.in_control and problem
-            failed = condition(_C.REQUEST_ENDED, cause=problem) if delayed else condition(_C.CONTROL_NOT_GRANTED)
+            failed = condition(_C.REQUEST_ENDED, cause=problem) if delayed else _not_granted(seen)
         if failed is None:
             return state
         return _enter(State.IDLE if problem else State.READY, failed, now_s, failed=failed)
@@ -245,6 +245,10 @@ def _wait(state: SafetyState, seen: Observed, now_s: float, problem: Condition |
     if (state.state, state.condition) == (wanted, reason):
         return state
     return _enter(wanted, reason, now_s, failed=state.failed)
+
+
+def _not_granted(seen: Observed) -> Condition:
+    return condition(_C.CONTROL_NOT_GRANTED, answer=f" ({seen.refusal})" if seen.refusal else "")
 
 
 def _permitted(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> tuple[Action, ModeRequest]:

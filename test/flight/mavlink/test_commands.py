@@ -201,6 +201,7 @@ def test_both_acknowledgements_of_a_mode_count():
     queue.due(3.0)
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_ACCEPTED, 3.05)
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, 3.07)
+    assert queue.failure(SET_MODE) == "mode OFFBOARD: rejected for now"
     assert len(queue.due(3.6)) == 1  # asked again
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_ACCEPTED, 3.65)
     queue.acknowledge(SET_MODE, mavlink.MAV_RESULT_ACCEPTED, 3.67)

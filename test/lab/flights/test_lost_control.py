@@ -197,3 +197,20 @@ def test_wind_that_is_stronger_than_the_vehicle_ends_the_orbit(loop):
     assert max(row.distance_m for row in flown) < 14.0
     degraded = [reason.values["cause"].code for _, _, reason in loop.reasons if reason.code == ConditionCode.DEGRADED]
     assert ConditionCode.ORBIT_NOT_KEPT in degraded
+
+
+@BOTH
+@branched
+def test_the_autopilots_refusal_stays_on_the_status_until_the_next_command(loop):
+    loop.command(Command.STOP)
+    loop.run(12.0)
+    loop.copter.denied_modes = frozenset({loop.copter.kind.control_mode})
+    loop.command(Command.ENGAGE)
+    loop.run(24.0)
+    assert loop.status.state == State.READY
+    mode = loop.copter.kind.control_mode
+    words = f"the autopilot did not grant control (mode {mode}: rejected for now); `drocap orbit engage` requests"
+    assert loop.status.reason.startswith(words)
+    loop.command(Command.STOP)
+    loop.run(25.0)
+    assert loop.status.reason.startswith("all conditions for motion hold; `drocap orbit engage` requests")
