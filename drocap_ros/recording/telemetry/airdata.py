@@ -1,34 +1,43 @@
-"""States of the camera from a flight log that Airdata (https://airdata.com) exports as CSV, ten rows a second."""
+"""States of the camera from a flight log as CSV: of Airdata (https://airdata.com), ten rows a second, of Litchi, or a
+DJI flight record as its readers export it; also as a spreadsheet saves it, with semicolons or as UTF-16.
+"""
 
 from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Collection
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 
-from drocap_ros.errors import InputError
+from drocap_ros.errors import InputError, first_line
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.recording.telemetry.log import Lens, LogFormat, TelemetryLog, dji_attitude, from_first_fix, make_log
 from drocap_ros.recording.telemetry.plausibility import Series, plausible
 
-TIME = "time(millisecond)"
 #: Characters of a line, beyond which the file is no table: Airdata's lines have about a thousand.
 _LINE = 16384
 #: Rows: five hours at Airdata's ten a second.
 _MAX_ROWS = 200_000
 #: A later time than eleven days is damage.
 _LATEST_MS = 1e9
-_UNITS_M = {"(feet)": 0.3048, "(meters)": 1.0}
-_HEIGHT = "height_above_takeoff"
-_GIMBAL = ("gimbal_pitch(degrees)", "gimbal_roll(degrees)", "gimbal_heading(degrees)")
-_AIRCRAFT = ("pitch(degrees)", "roll(degrees)", "compass_heading(degrees)")
-_PLACE = ("latitude", "longitude")
-_UTC, _VIDEO = "datetime(utc)", "isvideo"
-_USED = (TIME, _UTC, *_PLACE, *(_HEIGHT + unit for unit in _UNITS_M), *_AIRCRAFT, *_GIMBAL, _VIDEO)
+_GIMBAL, _AIRCRAFT = ("gimbal pitch", "gimbal roll", "gimbal yaw"), ("pitch", "roll", "yaw")
+#: Name of a column in lower case -> ours, and our unit of it: ms, deg, m.
+_COLUMNS: dict[str, tuple[str, float]] = {
+    "time(millisecond)": ("time", 1.0), "osd.flytime [s]": ("time", 1000.0),
+    "datetime(utc)": ("utc", 1.0), "isvideo": ("video", 1.0), "camera.isvideo": ("video", 1.0),
+    **{f"{before}{name}": (name, 1.0) for before in ("", "osd.") for name in ("latitude", "longitude")},
+    "height_above_takeoff(feet)": ("height", 0.3048), "height_above_takeoff(meters)": ("height", 1.0),
+    "osd.height [ft]": ("height", 0.3048), "osd.height [m]": ("height", 1.0), "altitude(m)": ("height", 1.0),
+    "altitude(feet)": ("height", 0.3048), "compass_heading(degrees)": ("yaw", 1.0), "gimbal_heading(degrees)":
+    ("gimbal yaw", 1.0), "yaw(deg)": ("yaw", 1.0), "osd.yaw": ("yaw", 1.0), "gimbal.yaw": ("gimbal yaw", 1.0),
+    **{form.format(a): (a, 1.0) for a in ("pitch", "roll") for form in ("{}(degrees)", "{}(deg)", "osd.{}")},
+    **{form.format(a): (f"gimbal {a}", 1.0) for a in ("pitch", "roll") for form in ("gimbal_{}(degrees)", "gimbal.{}")},
+    **{f"gimbal{a}raw": (f"gimbal {a}", 0.1) for a in ("pitch", "roll", "yaw")},
+}  # fmt: skip
 
 
 def read_airdata(path: Path) -> TelemetryLog:
@@ -37,26 +46,28 @@ def read_airdata(path: Path) -> TelemetryLog:
     Raises
     ------
     InputError
-        When the file cannot be read, lacks the columns of Airdata, or cannot be true.
+        When the file cannot be read, lacks the columns, or cannot be true.
     """
     try:
-        with path.open("r", encoding="utf-8-sig", errors="replace", newline="") as file:
+        with path.open("rb") as file:
+            wide = file.read(2) in (b"\xff\xfe", b"\xfe\xff")
+        with path.open("r", encoding="utf-16" if wide else "utf-8-sig", errors="replace", newline="") as file:
             table = _Table(path, file)
     except OSError as error:
         raise InputError(f"{path}: expected a readable file; {error.strerror}") from None
-    except csv.Error as error:
-        raise InputError(f"{path}: expected a CSV file of Airdata; {error}") from None
-    stamp_ns = np.round(table.columns(TIME)[:, 0] * 1e6).astype(np.int64)
+    except (csv.Error, UnicodeError) as error:
+        raise InputError(f"{path}: expected a flight log as CSV; {first_line(error)}") from None
+    stamp_ns = np.round(table.columns("time")[:, 0] * 1e6).astype(np.int64)
     gimbal = table.columns(*_GIMBAL)
     if not table.has(_GIMBAL[1]):
         gimbal[:, 1] = 0.0  # older exports have no roll
-    geodetic = np.column_stack([table.columns(*_PLACE), table.height_m()])
+    geodetic = table.columns("latitude", "longitude", "height")
     found, lacks = plausible(path, Series(stamp_ns, gimbal, table.columns(*_AIRCRAFT), geodetic))
-    utc_s = table.columns(_UTC)[:, 0] - stamp_ns * 1e-9
-    video = true_runs(table.columns(_VIDEO)[:, 0] == 1)
+    utc_s = table.columns("utc")[:, 0] - stamp_ns * 1e-9
+    video = true_runs(table.columns("video")[:, 0] == 1)
     return make_log(
         path,
-        "Airdata CSV",
+        table.kind,
         stamp_ns,
         lacks,
         orientation=dji_attitude(found.aircraft),
@@ -74,22 +85,31 @@ class _Table:
     """Rows of a file at times that increase; a column that is not there is NaN."""
 
     def __init__(self, path: Path, file: IO[str]) -> None:
-        reader = csv.reader(iter(lambda: file.readline(_LINE), ""))
-        head = [name.strip().lower() for name in next(reader, [])]
-        _check_head(path, head)
-        self._names = [name for name in _USED if name in head]
-        read = [(head.index(name), _utc_s if name == _UTC else _number) for name in self._names]
+        first = file.readline(_LINE)
+        spreadsheet = first.count(";") > first.count(",")
+        head = [name.strip().lower() for name in next(csv.reader([first], delimiter=";" if spreadsheet else ","), [])]
+        reader = csv.reader(iter(lambda: file.readline(_LINE), ""), delimiter=";" if spreadsheet else ",")
+        found = {
+            _COLUMNS[name][0]: (i, _COLUMNS[name][1]) for i, name in reversed([*enumerate(head)]) if name in _COLUMNS
+        }
+        _check_head(path, head, found)
+        self.kind = "flight record CSV" if "osd.yaw" in head else "Airdata CSV"
+        self.kind = "Litchi CSV" if "gimbalpitchraw" in head else self.kind
+        self._names = list(found)
+        read = [(i, _utc_s if name == "utc" else _number, unit) for name, (i, unit) in found.items()]
         rows: list[list[float]] = []
         for row in reader:
             if len(rows) >= _MAX_ROWS:
                 raise InputError(f"{path}: expected at most {_MAX_ROWS} rows, found more; cut the file")
-            rows.append([number(row[i]) if i < len(row) else math.nan for i, number in read])
+            if spreadsheet:
+                row = [cell.replace(",", ".") for cell in row]
+            rows.append([number(row[i]) * unit if i < len(row) else math.nan for i, number, unit in read])
         table: np.ndarray = np.array(rows, dtype=np.float64).reshape(-1, len(read))
-        time_ms = table[:, self._names.index(TIME)]
+        time_ms = table[:, self._names.index("time")]
         table = table[(time_ms >= 0) & (time_ms < _LATEST_MS)]
-        self._rows = table[np.unique(table[:, self._names.index(TIME)], return_index=True)[1]]
+        self._rows = table[np.unique(table[:, self._names.index("time")], return_index=True)[1]]
         if not len(self._rows):
-            raise InputError(f"{path}: expected rows with {TIME}, found none; export the flight from Airdata again")
+            raise InputError(f"{path}: expected rows with a time, found none; export the flight again")
 
     def has(self, name: str) -> bool:
         return name in self._names
@@ -98,22 +118,19 @@ class _Table:
         unknown = np.full(len(self._rows), np.nan)
         return np.stack([self._rows[:, self._names.index(n)] if self.has(n) else unknown for n in names], axis=1)
 
-    def height_m(self) -> np.ndarray:
-        """(N, 1) above take-off, in the unit that the file has."""
-        unit = next((unit for unit in _UNITS_M if self.has(_HEIGHT + unit)), "(meters)")
-        return self.columns(_HEIGHT + unit) * _UNITS_M[unit]
 
-
-def _check_head(path: Path, head: list[str]) -> None:
-    if TIME not in head:
-        raise InputError(f"{path}: expected a flight log of Airdata with the column {TIME}, found another; check it")
-    if not any(_HEIGHT + unit in head for unit in _UNITS_M) and any(name.startswith(_HEIGHT) for name in head):
-        raise InputError(f"{path}: expected {_HEIGHT} in (feet) or (meters), found another unit; export it again")
+def _check_head(path: Path, head: list[str], found: Collection[str]) -> None:
+    if "time" not in found:
+        raise InputError(
+            f"{path}: expected a flight log of Airdata, Litchi or a DJI record, found no column of its time; check it"
+        )
+    if "height" not in found and any(name.startswith(("height_above", "osd.height", "altitude")) for name in head):
+        raise InputError(f"{path}: expected heights in feet or meters, found another unit; export it again")
 
 
 def _number(text: str) -> float:
     try:
-        value = float(text)
+        value = float({"true": "1", "false": "0"}.get(text.strip().lower(), text))
     except ValueError:
         return math.nan
     return value if math.isfinite(value) else math.nan

@@ -8,6 +8,7 @@ from airdata_tables import COLUMNS, airdata_flight, write_airdata
 from djmd_clips import plain_video
 from telemetry_logs import angles_of, mutated, wrapped
 
+from drocap_ros.cli import main
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.geodesy import geodetic_to_enu
 from drocap_ros.recording.telemetry.read import read_telemetry
@@ -27,6 +28,53 @@ def test_columns_give_attitudes_and_position_in_their_units(tmp_path, unit):
     assert log.lacks == ()
 
 
+def litchi(folder):
+    t, gimbal, body, geodetic = airdata_flight()
+    g, b = np.rad2deg(gimbal), np.rad2deg(body)
+    rows = ["latitude,longitude,altitude(m),time(millisecond),pitch(deg),roll(deg),yaw(deg),gimbalPitchRaw,"
+            "gimbalRollRaw,gimbalYawRaw,isVideo"]  # fmt: skip
+    rows += [f"{p[0]:.7f},{p[1]:.7f},{p[2]:.3f},{1000 * s:.0f},{y[1]:.5f},{y[0]:.5f},{y[2]:.5f},"
+             f"{10 * x[1]:.4f},{10 * x[0]:.4f},{10 * x[2]:.4f},1"
+             for s, p, y, x in zip(t, geodetic, b, g, strict=True)]  # fmt: skip
+    return "\n".join(rows)
+
+
+def flight_record(folder):
+    t, gimbal, body, geodetic = airdata_flight()
+    g, b = np.rad2deg(gimbal), np.rad2deg(body)
+    rows = ["CUSTOM.date [local],OSD.flyTime [s],OSD.latitude,OSD.longitude,OSD.height [ft],OSD.pitch,OSD.roll,OSD.yaw,"
+            "GIMBAL.pitch,GIMBAL.roll,GIMBAL.yaw,CAMERA.isVideo"]  # fmt: skip
+    rows += [f"5/1/2024,{s:.3f},{p[0]:.7f},{p[1]:.7f},{p[2] / 0.3048:.4f},{y[1]:.5f},{y[0]:.5f},{y[2]:.5f},"
+             f"{x[1]:.5f},{x[0]:.5f},{x[2]:.5f},True"
+             for s, p, y, x in zip(t, geodetic, b, g, strict=True)]  # fmt: skip
+    return "\n".join(rows)
+
+
+def airdata(folder):
+    return write_airdata(folder / "whole.csv", [(0.0, 39.9)]).read_text(encoding="utf-8-sig")
+
+
+@pytest.mark.parametrize("form", [airdata, litchi, flight_record])
+@pytest.mark.parametrize("save", [lambda s: s.encode(), lambda s: s.encode("utf-16"),
+                                  lambda s: s.replace(",", ";").replace(".", ",").encode()])  # fmt: skip
+def test_every_flight_log_in_every_saving_is_one_flight(tmp_path, form, save):
+    content = form(tmp_path)
+    head, rest = content.split("\n", 1)
+    saved = save(rest)
+    # A spreadsheet keeps the points in the names of the columns.
+    head = head.replace(",", ";").encode() if b";" in saved else save(head)
+    parts = save(content) if saved[:2] in (b"\xff\xfe", b"\xfe\xff") else head + b"\n" + saved
+    (tmp_path / "f.csv").write_bytes(parts)
+    _, gimbal, body, geodetic = airdata_flight()
+    assert main(["info", str(tmp_path / "f.csv")]) == 0
+    log = read_telemetry(tmp_path / "f.csv")
+    assert wrapped(angles_of(log.track.gimbal) - gimbal).max() < 1e-5
+    assert wrapped(angles_of(log.track.orientation) - body).max() < 1e-5
+    enu = geodetic_to_enu(geodetic, np.array([*geodetic[0, :2], 0.0]))
+    assert np.abs(log.track.position - enu).max() < 0.02
+    assert len(log.video_parts) == 1
+
+
 def test_video_belongs_to_the_part_of_its_length(tmp_path):
     video = plain_video(tmp_path / "v.mp4", 75)  # 2.5 s
     log = read_telemetry(write_airdata(tmp_path / "f.csv", [(12.0, 14.5), (20.0, 31.0)]))
@@ -43,7 +91,7 @@ def test_tables_that_cannot_be_used_are_refused_in_one_line(tmp_path):
     refusals = {
         "zeros throughout": lambda: write_airdata(path, [], flown=(t, 0 * gimbal, body, geodetic)),
         "found another unit": lambda: write_airdata(path, [], unit="furlongs"),
-        "expected a flight log of Airdata": lambda: path.write_text("a,b\n1,2\n"),
+        "no column of its time": lambda: path.write_text("a,b\n1,2\n"),
         "expected rows": lambda: write_airdata(path, [], flown=(t[:0], gimbal[:0], body[:0], geodetic[:0])),
         "jumps": lambda: write_airdata(
             path, [], flown=(t, gimbal, body, geodetic + np.outer(np.arange(len(t)) > 99, [1, 0, 0]))
