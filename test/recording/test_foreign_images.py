@@ -15,6 +15,7 @@ from rendered_person import rendered_images
 from drocap_ros.cli import main
 from drocap_ros.errors import InputError
 from drocap_ros.motion import load_motion
+from drocap_ros.perception.sources.packets import decoded_packets
 from drocap_ros.recording.image_messages import image_from_message, read_images
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.tracks import load_tracks
@@ -165,6 +166,14 @@ def test_foxglove_images_and_videos_are_read(tmp_path, encoding, kind):
     assert [f.stamp_ns for f in frames] == [START_NS + i * STEP_NS for i in range(8)]
     for frame, image in zip(frames, images, strict=True):
         assert np.abs(frame.image.astype(int) - image).mean() < 6
+
+
+@pytest.mark.parametrize(
+    ("codec", "first"), [("hevc_nvenc", b"\0\0\0\x01\x40\x01"), ("libx264", b"\0\0\x01\x67"), ("vvc", b"")]
+)
+def test_codecs_without_a_picture_are_named(codec, first):
+    with pytest.raises(InputError, match="H.265, VP9 or MJPEG" if codec == "vvc" else "expected a"):
+        list(decoded_packets(codec, [(START_NS + i, first + b"\0" * 50) for i in range(3)]))
 
 
 @pytest.mark.parametrize("name", ["ffmpeg_packet", "fox_video"])

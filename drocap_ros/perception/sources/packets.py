@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import struct
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -13,17 +12,19 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.perception.sources.video import VideoSource
 
-#: name of a codec -> (its code in an IVF file, the packet with which decoding begins)
+#: name of a codec -> (its name in Matroska, the packet with which decoding begins)
 _CODECS = (
-    (re.compile(r"h\.?264|avc", re.IGNORECASE), b"H264", re.compile(rb"\0\0\x01[\x07\x27\x47\x67]")),
-    (re.compile(r"h\.?265|hevc", re.IGNORECASE), b"HEVC", re.compile(rb"\0\0\x01[\x40\x42]\x01")),
-    (re.compile(r"vp9", re.IGNORECASE), b"VP90", re.compile(b"")),
-    (re.compile(r"av0?1", re.IGNORECASE), b"AV01", re.compile(b"")),
-    (re.compile(r"mjpe?g", re.IGNORECASE), b"MJPG", re.compile(b"")),
+    (re.compile(r"[hx]\.?264|avc", re.IGNORECASE), b"V_MPEG4/ISO/AVC", re.compile(rb"\0\0\x01[\x07\x27\x47\x67]")),
+    (re.compile(r"[hx]\.?265|hevc", re.IGNORECASE), b"V_MPEGH/ISO/HEVC", re.compile(rb"\0\0\x01[\x40\x42]\x01")),
+    (re.compile(r"vp9", re.IGNORECASE), b"V_VP9", re.compile(b"")),
+    (re.compile(r"mjpe?g", re.IGNORECASE), b"V_MJPEG", re.compile(b"")),
 )
-#: IVF: https://wiki.multimedia.cx/index.php/IVF; the stamps are microseconds.
-_IVF_HEAD = struct.Struct("<4sHH4sHHIIII")
-_IVF_PACKET = struct.Struct("<IQ")
+
+
+def _element(number: str, content: bytes | int) -> bytes:
+    """An element of Matroska (RFC 9559) with its length in eight bytes."""
+    data = content.to_bytes(8, "big") if isinstance(content, int) else content
+    return bytes.fromhex(number) + (len(data) | 1 << 56).to_bytes(8, "big") + data
 
 
 def decoded_packets(codec: str, packets: Iterable[tuple[int, bytes]]) -> Iterator[tuple[int, np.ndarray]]:
@@ -38,9 +39,9 @@ def decoded_packets(codec: str, packets: Iterable[tuple[int, bytes]]) -> Iterato
     """
     found = next(((code, key) for name, code, key in _CODECS if name.search(codec)), None)
     if found is None:
-        raise InputError(f"video: expected H.264, H.265, VP9, AV1 or MJPEG, found {codec[:40]!r}; convert it")
+        raise InputError(f"video: expected H.264, H.265, VP9 or MJPEG, found {codec[:40]!r}; convert it")
     with tempfile.TemporaryDirectory(prefix="drocap_") as folder:
-        path = Path(folder) / "video.ivf"
+        path = Path(folder) / "video.mkv"
         stamps = _write(path, packets, *found)
         if not len(stamps):
             raise InputError(f"video: expected a key frame of {found[0].decode()}, found none; record it again")
@@ -56,9 +57,13 @@ def _write(path: Path, packets: Iterable[tuple[int, bytes]], code: bytes, key: r
     """Write the packets from the first key frame on; their stamps (N,) ns, sorted."""
     stamps: list[int] = []
     with path.open("wb") as file:
-        file.write(_IVF_HEAD.pack(b"DKIF", 0, _IVF_HEAD.size, code, 0, 0, 1_000_000, 1, 0, 0))
+        file.write(_element("1A45DFA3", _element("4282", b"matroska")) + bytes.fromhex("1853806701FFFFFFFFFFFFFF"))
+        track = _element("D7", 1) + _element("73C5", 1) + _element("83", 1) + _element("86", code)
+        track += _element("E0", _element("B0", 16) + _element("BA", 16))  # the stream itself states its size
+        file.write(_element("1549A966", _element("2AD7B1", 1000)) + _element("1654AE6B", _element("AE", track)))
         for stamp_ns, data in packets:
             if data and (stamps or key.search(data)):
                 stamps.append(stamp_ns)
-                file.write(_IVF_PACKET.pack(len(data), max(stamp_ns - stamps[0], 0) // 1000) + data)
+                time = _element("E7", max(stamp_ns - stamps[0], 0) // 1000)  # us
+                file.write(_element("1F43B675", time + _element("A3", b"\x81\0\0\x80" + data)))
     return np.sort(np.array(stamps, np.int64))

@@ -50,8 +50,6 @@ def quiet_ffmpeg() -> None:
 #: OpenCV passes options to FFmpeg through one environment variable of the process.
 _OPTIONS_LOCK = threading.Lock()
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
-#: A header of a small file can declare pictures of gigabytes: 2^27 px at most.
-_OPTIONS_OF_FILES = "max_pixels;134217728"
 
 
 @contextlib.contextmanager
@@ -102,7 +100,7 @@ class VideoSource(ImageSource):
         import cv2
 
         with (
-            ffmpeg_options(_OPTIONS_OF_FILES),
+            ffmpeg_options(None),
             largest_alone(self.path) as name,
         ):  # not while another thread opens with its options
             capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
