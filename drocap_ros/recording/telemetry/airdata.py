@@ -53,10 +53,8 @@ def read_airdata(path: Path) -> TelemetryLog:
             wide = file.read(2) in (b"\xff\xfe", b"\xfe\xff")
         with path.open("r", encoding="utf-16" if wide else "utf-8-sig", errors="replace", newline="") as file:
             table = _Table(path, file)
-    except OSError as error:
-        raise InputError(f"{path}: expected a readable file; {error.strerror}") from None
-    except (csv.Error, UnicodeError) as error:
-        raise InputError(f"{path}: expected a flight log as CSV; {first_line(error)}") from None
+    except (OSError, csv.Error, UnicodeError) as error:
+        raise InputError(f"{path}: expected a readable flight log as CSV; {first_line(error)}") from None
     stamp_ns = np.round(table.columns("time")[:, 0] * 1e6).astype(np.int64)
     gimbal = table.columns(*_GIMBAL)
     if not table.has(_GIMBAL[1]):
@@ -65,15 +63,10 @@ def read_airdata(path: Path) -> TelemetryLog:
     found, lacks = plausible(path, Series(stamp_ns, gimbal, table.columns(*_AIRCRAFT), geodetic))
     utc_s = table.columns("utc")[:, 0] - stamp_ns * 1e-9
     video = true_runs(table.columns("video")[:, 0] == 1)
-    return make_log(
-        path,
-        table.kind,
-        stamp_ns,
-        lacks,
-        orientation=dji_attitude(found.aircraft),
-        position=from_first_fix(found.geodetic, above_takeoff=True),
-        gimbal=dji_attitude(found.gimbal),
-    )._replace(
+    body, camera = dji_attitude(found.aircraft), dji_attitude(found.gimbal)
+    place = from_first_fix(found.geodetic, above_takeoff=True)
+    log = make_log(path, table.kind, stamp_ns, lacks, orientation=body, position=place, gimbal=camera)
+    return log._replace(
         # The column has whole seconds.
         utc_minus_stamp_ns=round((float(np.nanmedian(utc_s)) + 0.5) * 1e9) if np.isfinite(utc_s).any() else None,
         video_parts=tuple((int(stamp_ns[a]), int(stamp_ns[b - 1])) for a, b in video),
@@ -93,8 +86,8 @@ class _Table:
             _COLUMNS[name][0]: (i, _COLUMNS[name][1]) for i, name in reversed([*enumerate(head)]) if name in _COLUMNS
         }
         _check_head(path, head, found)
-        self.kind = "flight record CSV" if "osd.yaw" in head else "Airdata CSV"
-        self.kind = "Litchi CSV" if "gimbalpitchraw" in head else self.kind
+        record = "flight record CSV" if "osd.yaw" in head else "Airdata CSV"
+        self.kind = "Litchi CSV" if "gimbalpitchraw" in head else record
         self._names = list(found)
         read = [(i, _utc_s if name == "utc" else _number, unit) for name, (i, unit) in found.items()]
         rows: list[list[float]] = []
@@ -115,8 +108,8 @@ class _Table:
         return name in self._names
 
     def columns(self, *names: str) -> np.ndarray:
-        unknown = np.full(len(self._rows), np.nan)
-        return np.stack([self._rows[:, self._names.index(n)] if self.has(n) else unknown for n in names], axis=1)
+        rows = np.pad(self._rows, ((0, 0), (0, 1)), constant_values=np.nan)  # the last column is the unknown one
+        return rows[:, [self._names.index(name) if self.has(name) else -1 for name in names]]
 
 
 def _check_head(path: Path, head: list[str], found: Collection[str]) -> None:

@@ -36,6 +36,7 @@ from drocap_ros.recording.telemetry.log import (
 from drocap_ros.recording.telemetry.mp4 import Samples, Track, read_samples, read_tracks
 from drocap_ros.recording.telemetry.plausibility import Series, plausible
 from drocap_ros.recording.telemetry.protobuf import Message, Value
+from drocap_ros.recording.telemetry.srt import TEXT_TRACKS, read_srt
 
 #: Format of the track's samples.
 _SAMPLES = "djmd"
@@ -61,8 +62,9 @@ _COLUMNS = (3, 6, 10, 13, 15, 16)
 
 
 def _find_track(file: IO[bytes]) -> Track | None:
-    """The telemetry track of an open video file, None where there is none."""
-    return next((track for track in read_tracks(file) if track.sample_format == _SAMPLES), None)
+    """The telemetry track of an open video file, else its subtitles, None where there is none."""
+    tracks = {track.sample_format: track for track in read_tracks(file)}
+    return next((tracks[kind] for kind in (_SAMPLES, *TEXT_TRACKS) if kind in tracks), None)
 
 
 def has_djmd(path: Path) -> bool:
@@ -87,6 +89,8 @@ def read_djmd(path: Path) -> TelemetryLog:
             track = _find_track(file)
             if track is None:
                 raise InputError(f"{path}: expected a DJI djmd track in the video, found none; give a log beside it")
+            if track.sample_format in TEXT_TRACKS:
+                return read_srt(path)
             try:
                 samples = _in_order(read_samples(file, track))
             except InputError as error:
@@ -200,15 +204,9 @@ def _from_rows(
     if not steady:
         lacks.append(LogLack(Lack.ZOOM, f"{np.nanmin(zoom):.1f} to {np.nanmax(zoom):.1f}"))
     lens = model.lens() if model else Lens()
-    return make_log(
-        path,
-        _title(name, model),
-        stamp_ns,
-        lacks,
-        orientation=dji_attitude(found.aircraft),
-        position=position,
-        gimbal=attitude,
-    )._replace(video_clock=True, lens=lens._replace(zoom=factor) if steady else None)
+    body, title = dji_attitude(found.aircraft), _title(name, model)
+    log = make_log(path, title, stamp_ns, lacks, orientation=body, position=position, gimbal=attitude)
+    return log._replace(video_clock=True, lens=lens._replace(zoom=factor) if steady else None)
 
 
 def _check_unknown(path: Path, series: Series) -> None:

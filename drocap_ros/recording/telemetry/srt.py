@@ -27,8 +27,11 @@ from drocap_ros.recording.telemetry.log import (
     from_first_fix,
     make_log,
 )
+from drocap_ros.recording.telemetry.mp4 import read_samples, read_tracks
 from drocap_ros.tracks import MAX_FRAMES
 
+#: Formats of a video's subtitle tracks (3GPP TS 26.245, QuickTime).
+TEXT_TRACKS = ("tx3g", "text")
 #: Characters of a line, and of a subtitle; more are cut off.  DJI's have some hundreds.
 _LINE = 8192
 #: Sources of a height, the preferred one first.
@@ -69,7 +72,8 @@ def read_srt(path: Path) -> TelemetryLog:
     InputError
         When the file cannot be read or holds no telemetry.
     """
-    found = (_entry(stamp_ns, text) for stamp_ns, text in _subtitles(path))
+    read = _subtitles if path.suffix.lower() == FORMAT.suffix else _inside
+    found = (_entry(stamp_ns, text) for stamp_ns, text in read(path))
     entries = list(itertools.islice((entry for entry in found if entry), MAX_FRAMES + 1))
     if not 0 < len(entries) <= MAX_FRAMES:
         raise InputError(f"{path}: expected 1 to {MAX_FRAMES} DJI subtitles with telemetry, found {len(entries)}")
@@ -79,24 +83,27 @@ def read_srt(path: Path) -> TelemetryLog:
     place = np.abs(geodetic[np.isfinite(geodetic[:, 0]), :2]).max(axis=0, initial=0.0)
     if place.any() and (place <= (np.pi / 2, np.pi)).all():  # as degrees all of it would be the open Atlantic
         geodetic[:, :2] = np.rad2deg(geodetic[:, :2])
-    impossible = (np.abs(geodetic[:, 0]) > 90) | (np.abs(geodetic[:, 1]) > 180)
-    nowhere = (geodetic[:, 0] == 0) & (geodetic[:, 1] == 0)
-    geodetic[impossible | nowhere] = np.nan
-    # rel_alt is the height above take-off.
+    geodetic[(np.abs(geodetic[:, :2]) > (90, 180)).any(axis=1) | (geodetic[:, :2] == 0).all(axis=1)] = np.nan
     position = from_first_fix(geodetic, above_takeoff=heights == "rel_alt")
     lacks = [LogLack(Lack.HEIGHT, heights)] if position is not None and heights != "rel_alt" else []
     lens = np.array([e.lens for e in entries])
     if (steady := _lens(lens)) is None:
         lacks.append(LogLack(Lack.ZOOM, " to ".join(f"{f(np.nanprod(lens, axis=1)):.0f} mm" for f in (np.min, np.max))))
-    return make_log(
-        path,
-        "DJI subtitles",
-        stamps,
-        lacks,
-        orientation=dji_attitude(np.array([e.body for e in entries])),
-        position=position,
-        gimbal=dji_attitude(np.array([e.gimbal for e in entries])),
-    )._replace(video_clock=True, lens=steady)
+    body, gimbal = (
+        dji_attitude(np.array(angles)) for angles in ([e.body for e in entries], [e.gimbal for e in entries])
+    )
+    log = make_log(path, "DJI subtitles", stamps, lacks, orientation=body, position=position, gimbal=gimbal)
+    return log._replace(video_clock=True, lens=steady)
+
+
+def _inside(path: Path) -> Iterator[tuple[int, str]]:
+    """Time ns and text of each sample of a video's subtitle track: two bytes of length, then the text."""
+    with path.open("rb") as file:
+        for track in [track for track in read_tracks(file) if track.sample_format in TEXT_TRACKS][:1]:
+            for offset, size, stamp_ns in zip(*(a.tolist() for a in read_samples(file, track)), strict=True):
+                file.seek(offset)
+                data = file.read(min(size, _LINE))
+                yield stamp_ns, data[2 : 2 + int.from_bytes(data[:2], "big")].decode("utf-8", errors="replace")
 
 
 def _subtitles(path: Path) -> Iterator[tuple[int, str]]:
