@@ -53,9 +53,7 @@ def read_video_telemetry(video: Path, telemetry: Telemetry) -> TelemetryLog | No
         return None
     if telemetry.path is not None:
         if video.is_dir() or video.suffix == ".npz" or is_recording(video):
-            raise InputError(
-                f"--telemetry: expected a video file as input, found {video}; recordings hold their telemetry"
-            )
+            raise InputError(f"--telemetry: expected a video file, found {video}; recordings hold their telemetry")
         return read_telemetry(telemetry.path)
     from drocap_ros.recording.telemetry.djmd import has_djmd, read_djmd
 

@@ -94,8 +94,7 @@ class _Table:
         for row in reader:
             if len(rows) >= _MAX_ROWS:
                 raise InputError(f"{path}: expected at most {_MAX_ROWS} rows, found more; cut the file")
-            if spreadsheet:
-                row = [cell.replace(",", ".") for cell in row]
+            row = [cell.replace(",", ".") if spreadsheet else cell for cell in row]
             rows.append([number(row[i]) * unit if i < len(row) else math.nan for i, number, unit in read])
         table: np.ndarray = np.array(rows, dtype=np.float64).reshape(-1, len(read))
         time_ms = table[:, self._names.index("time")]
@@ -114,9 +113,7 @@ class _Table:
 
 def _check_head(path: Path, head: list[str], found: Collection[str]) -> None:
     if "time" not in found:
-        raise InputError(
-            f"{path}: expected a flight log of Airdata, Litchi or a DJI record, found no column of its time; check it"
-        )
+        raise InputError(f"{path}: expected a log of Airdata, Litchi or DJI, found no column of its time; check it")
     if "height" not in found and any(name.startswith(("height_above", "osd.height", "altitude")) for name in head):
         raise InputError(f"{path}: expected heights in feet or meters, found another unit; export it again")
 

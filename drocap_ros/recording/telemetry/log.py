@@ -74,6 +74,7 @@ class Lack(Enum):
     DAMAGED_STATES = "{} of the states are damaged: left out"
     AIRCRAFT_ZERO = "the aircraft's angles are zero throughout: left out"
     QUATERNION = "the gimbal's quaternion contradicts its angles: the angles are used"
+    SLOW = "its dates run {} times slower than the video, slow motion: --rate HZ gives the images' true rate"
     ZOOM = "the zoom changes ({}): one camera matrix cannot hold it, so the camera is taken as unknown"
 
 

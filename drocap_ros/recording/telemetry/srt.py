@@ -42,6 +42,7 @@ _VALUE = re.compile(
     rf"\b(latitude|longitude|longtitude|rel_alt|abs_alt|altitude|gb_yaw|gb_pitch|gb_roll)\s*:\s*{_NUMBER}",
     re.IGNORECASE,
 )
+_CLOCK = re.compile(r"\d\s+(\d{1,2}):(\d\d):(\d\d[.,]\d{3})")
 _GPS = re.compile(rf"\bGPS\s*\(\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*([NSEW]?):?\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(m?)", re.I)
 _BAROMETER = re.compile(rf"\bBAROMETER\s*:\s*{_NUMBER}|,\s*H\s*{_NUMBER}\s*m")
 _LENS = re.compile(rf"\b(focal_len|dzoom_ratio)\s*:\s*{_NUMBER}", re.IGNORECASE)
@@ -59,6 +60,7 @@ class _Entry(NamedTuple):
     gimbal: tuple[float, float, float]
     body: tuple[float, float, float]
     lens: tuple[float, float]
+    clock_s: float
 
 
 _UNKNOWN = (math.nan, math.nan, math.nan)
@@ -86,6 +88,9 @@ def read_srt(path: Path) -> TelemetryLog:
     geodetic[(np.abs(geodetic[:, :2]) > (90, 180)).any(axis=1) | (geodetic[:, :2] == 0).all(axis=1)] = np.nan
     position = from_first_fix(geodetic, above_takeoff=heights == "rel_alt")
     lacks = [LogLack(Lack.HEIGHT, heights)] if position is not None and heights != "rel_alt" else []
+    real_s, shown_s = entries[-1].clock_s - entries[0].clock_s, float(stamps[-1] - stamps[0]) * 1e-9
+    if 1 < real_s < shown_s / 1.5:  # a second or more, and no rounding of the dates
+        lacks.append(LogLack(Lack.SLOW, f"{shown_s / real_s:.1f}"))
     lens = np.array([e.lens for e in entries])
     if (steady := _lens(lens)) is None:
         lacks.append(LogLack(Lack.ZOOM, " to ".join(f"{f(np.nanprod(lens, axis=1)):.0f} mm" for f in (np.min, np.max))))
@@ -138,7 +143,9 @@ def _entry(stamp_ns: int, text: str) -> _Entry | None:
     if not kind and not angles and math.isnan(gimbal[0]):
         return None
     latitude, longitude, height = (values.get(name, math.nan) for name in ("latitude", "longitude", kind))
-    return _Entry(stamp_ns, latitude, longitude, height, kind, gimbal, angles.get("F", _UNKNOWN), _focal(text))
+    clock = _CLOCK.search(text)
+    clock_s = 3600 * int(clock[1]) + 60 * int(clock[2]) + float(clock[3].replace(",", ".")) if clock else math.nan
+    return _Entry(stamp_ns, latitude, longitude, height, kind, gimbal, angles.get("F", _UNKNOWN), _focal(text), clock_s)
 
 
 def _values(text: str) -> dict[str, float]:
@@ -161,10 +168,8 @@ def _focal(text: str) -> tuple[float, float]:
     found = {name.lower(): number for name, number in _LENS.findall(text)}
     focal, zoom = found.get("focal_len", "nan"), found.get("dzoom_ratio", "1")
     # Without a decimal point they count tenths of a mm and ten thousandths.
-    return (
-        float(focal) * (1.0 if "." in focal else 0.1),
-        float(zoom) * (1.0 if "." in zoom or float(zoom) < 100 else 1e-4),
-    )
+    factor = 1.0 if "." in zoom or float(zoom) < 100 else 1e-4
+    return float(focal) * (1.0 if "." in focal else 0.1), float(zoom) * factor
 
 
 def _lens(values: np.ndarray) -> Lens | None:

@@ -219,6 +219,14 @@ def test_subtitles_inside_a_video_are_read_as_those_beside_it(tmp_path, invented
     assert "source: DJI subtitles" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("slow", "said"), [(4, True), (1, False)])
+def test_dates_that_run_slower_than_the_video_are_slow_motion(tmp_path, slow, said):
+    lines = [f"2024-05-01 10:00:{i / 30 / slow:06.3f}\n[rel_alt: 5.0] [gb_yaw: 1.0 gb_pitch: -9.0]" for i in range(300)]
+    (tmp_path / "s.srt").write_text(srt_text(np.arange(300) / 30, lines))
+    lacks = read_telemetry(tmp_path / "s.srt").lacks
+    assert (LogLack(Lack.SLOW, "4.0") in lacks) == said
+
+
 def test_radians_in_subtitles_are_degrees_of_another_unit(tmp_path):
     lines = [f"[latitude : {math.radians(47):.9f}] [longtitude : {math.radians(8 + i * 1e-4):.9f}] [altitude: 9.0]"
              for i in range(20)]  # fmt: skip
