@@ -225,6 +225,7 @@ def _load(path: Path) -> dict[str, np.ndarray]:
         reason = first_line(error)
         if reason.startswith("Object arrays"):
             reason = "found arrays of Python objects; save names as text: np.array(names, dtype=str)"
+            reason += ", of VideoPose3D one video: np.save('walk.npy', data['positions_2d'].item()[VIDEO]['custom'][0])"
         raise InputError(f"{path}: expected a readable .npz archive; {reason}") from None
 
 

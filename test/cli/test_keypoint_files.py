@@ -189,7 +189,7 @@ def test_zeros_and_places_outside_the_picture_are_not_seen(tmp_path, caplog):
 
 def test_arrays_of_objects_are_refused(tmp_path):
     np.savez(tmp_path / "h.npz", positions_2d={"walk.mp4": {"custom": [walk()]}})
-    with pytest.raises(InputError, match="Python objects"):
+    with pytest.raises(InputError, match="of VideoPose3D one video"):
         read_keypoints(tmp_path / "h.npz")
 
 
