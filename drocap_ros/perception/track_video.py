@@ -13,6 +13,7 @@ from drocap_ros.leg_sides import with_own_legs
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.sources.base import Frame, prefetch
+from drocap_ros.perception.tracking.subject import Change, SubjectChange
 from drocap_ros.tracks import Tracks
 
 
@@ -47,6 +48,17 @@ def subjects(observations: Sequence[PoseObservation]) -> list[tuple[int, int]]:
     """(track_id, number of images with keypoints) of each subject, by falling number."""
     count = Counter(o.track_id for o in observations if o.track_id and np.isfinite(o.keypoints).any())
     return sorted(count.items(), key=lambda item: (-item[1], item[0]))
+
+
+def changes_in_words(changes: Iterable[SubjectChange], begin_ns: int) -> list[str]:
+    """A line for each time at which a subject was lost, found again, or another one followed.
+
+    begin_ns : stamp of the first image
+
+    An exchange of the box for a better one of the same person is none of them.
+    """
+    told = [change for change in changes if change.change is not Change.EXCHANGED][1:]
+    return [f"{(c.stamp_ns - begin_ns) * 1e-9:.1f} s: person {c.track_id} {c.change.value}" for c in told]
 
 
 def tracks_from_observations(observations: Sequence[PoseObservation], track_id: int | None = None) -> Tracks:

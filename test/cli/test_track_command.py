@@ -58,6 +58,26 @@ def test_wait_follows_nobody_after_the_subject(tmp_path, capsys):
     assert len(persons[()]) == 2
 
 
+def test_person_who_leaves_the_picture_and_comes_back_is_one_file_and_a_word(models, shared, tmp_path, capsys):
+    """A real drone's picture: another man stays in view, and crosses him later."""
+    out = tmp_path / "out"
+    aerial = shared / "aerial"
+    assert main(["track", str(aerial / "person9.mp4"), "--out", str(out), "--models", models]) == 0
+    keypoints = load_tracks(out / "tracks.npz").keypoints
+    box = np.load(aerial / "person9.npz")["box"][: len(keypoints)]
+    margin = 0.15 * box[:, 2:].max(axis=1, keepdims=True)
+    low, high = (box[:, :2] - margin)[:, None], (box[:, :2] + box[:, 2:] + margin)[:, None]
+    seen = np.isfinite(keypoints).all(axis=2)
+    inside = seen & (keypoints >= low).all(axis=2) & (keypoints <= high).all(axis=2)
+    right = inside.sum(axis=1) > 0.5 * seen.sum(axis=1)
+    there, found = np.isfinite(box).all(axis=1), seen.any(axis=1)
+    assert (right & there).sum() >= 0.9 * there.sum()
+    assert not (found & there & ~right).any()
+    text = capsys.readouterr().out
+    assert "person 1 left the picture" in text
+    assert "person 1 is found again" in text
+
+
 @pytest.mark.parametrize("content", [b"", b"no video"], ids=["empty", "text"])
 def test_invalid_video_ends_with_status_2_and_one_line(models, tmp_path, capsys, content):
     (tmp_path / "a.mp4").write_bytes(content)

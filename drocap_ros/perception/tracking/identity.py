@@ -21,6 +21,8 @@ _REIDENTIFY_SIMILARITY = 0.92  # least similarity of a new track with the lost s
 _ALONE_SIMILARITY = 0.85  # the same for the only person who may be the subject: the light may change,
 _ALONE_S = 6.0  # within this time
 _KNOWN_S = 1.0  # time for which someone new is looked at before the subject is given up for them
+_REACH = 1.0  # lengths from the last certain place at which a lost subject may come into view at once,
+_REACH_PER_S = 1.5  # and more per second: a run
 _GONE_S = 0.4  # of a search over the whole image after which someone whom it does not find is out of view
 _ONE_PERSON = 0.75  # overlap coefficient above which two boxes are one person's,
 _APART = 0.5  # and below which they hold two persons, if each holds one
@@ -52,42 +54,48 @@ def known_other(subject: Person, persons: list[Person], box: np.ndarray, appeara
 
 
 def could_be(lost: Person, person: Person) -> bool:
-    """Whether a person may be the lost subject: not certainly in view together with it.
+    """Whether a person may be the lost subject: not certainly in view together with it, and begun within its reach.
 
     Someone in view may be the subject if the track of the subject was no person's by then, or its own was none before.
     """
     since_ns = person.pose.plausible_ns
-    return since_ns is not None and max(since_ns, person.first_ns) > lost.certain_ns and not person.pose.other
+    if since_ns is None or person in lost.others or since_ns <= lost.certain_ns:
+        return False
+    start, length = lost.box if lost.pose.box is None else lost.pose.box, _length(lost)
+    distance = float(np.linalg.norm((start[:2] + start[2:] - person.pose.began[:2] - person.pose.began[2:]) / 2))
+    return distance < (_REACH + _REACH_PER_S * (since_ns - lost.certain_ns) * 1e-9) * length
+
+
+def _length(person: Person) -> float:
+    """Usual longer side, px: by the believable boxes, before there is one by the last."""
+    return max(person.pose.length or person.filter.length, 1.0)
 
 
 def same_person(lost: Person, person: Person, alone: bool) -> bool:
-    """Whether a track fits the lost subject's appearance, and its distance and size the elapsed time.
+    """Whether a track that may be the lost subject fits its appearance, and its size the elapsed time.
 
-    alone : no one else in view may be the subject; then a certain pose makes up for some change of the light
+    alone : no one else in view may as well be the subject; then a certain pose makes up for some change of the light
     """
-    gap = (max(person.first_ns, person.pose.plausible_ns or 0) - lost.certain_ns) * 1e-9
+    gap = ((person.pose.plausible_ns or 0) - lost.certain_ns) * 1e-9
     if gap > FORGET_S:
         return False
-    start, end = lost.box if lost.pose.box is None else lost.pose.box, person.box
-    length = max(lost.filter.length, lost.pose.length, 1.0)
-    distance = float(np.linalg.norm((start[:2] + start[2:] - end[:2] - end[2:]) / 2)) / length
     similarity = person.similarity(lost.appearance)
-    if lost.left_image:  # re-entry at the place of leaving, at half the usual difference of appearance
-        return distance < 1.5 and similarity >= 0.5 * (1 + _REIDENTIFY_SIMILARITY)
     certain = alone and gap < _ALONE_S and person.pose.last >= SURE_CONFIDENCE
     if similarity < (_ALONE_SIMILARITY if certain else _REIDENTIFY_SIMILARITY):
         return False
-    return distance < 1.0 + 1.5 * gap and lost.pose.growth(end, length) < 0.5 + 0.3 * gap
+    return lost.pose.growth(person.box, _length(lost)) < 0.5 + 0.3 * gap
 
 
 def found_again(lost: Person, persons: list[Person], confirm_frames: int, stamp_ns: int) -> Person | None:
     """Whom of the persons detected in this image is the lost subject."""
     seen = [p for p in persons if p is not lost and p.detected_ns == stamp_ns and could_be(lost, p)]
     boxes = boxes_of(seen)
-    for person in seen:
+    looks = np.array([p.similarity(lost.appearance) for p in seen])
+    for person, look in zip(seen, looks, strict=True):
         hits = min(2, confirm_frames) if person.pose.last >= SURE_CONFIDENCE else confirm_frames
-        # A second box around the same person is no other one.
-        alone = bool((overlap_coefficient(person.box[None], boxes) > _ONE_PERSON).all())
+        # A second box around the same person is no other one, and someone who looks clearly different is none.
+        same = overlap_coefficient(person.box[None], boxes)[0] > _ONE_PERSON
+        alone = bool((same | (looks < look - _SIMILARITY_MARGIN)).all())
         if person.hits >= hits and not fits_other(lost, person, persons, stamp_ns) and same_person(lost, person, alone):
             return person
     return None
@@ -144,7 +152,8 @@ def compare_joints(person: Person, subject: Person, same: bool) -> None:
         behind the subject is the subject's
     """
     # Of two boxes in each other one may hold the person and its shadow.
-    person.pose.other |= _apart(person, subject)
+    if _apart(person, subject):
+        subject.others.add(person)
     person.double |= same and person.began_at_subject
 
 

@@ -9,7 +9,7 @@ from drocap_ros.perception.detection.nms import iou, overlap_coefficient
 from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
 from drocap_ros.perception.tracking.appearance import describe
 from drocap_ros.perception.tracking.camera_motion import moved_box, sweeps
-from drocap_ros.perception.tracking.identity import MIXED_IOU
+from drocap_ros.perception.tracking.identity import MIXED_IOU, could_be
 from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, SURE_CONFIDENCE, Person, Subject, boxes_of
 from drocap_ros.perception.tracking.subject import SAME_BOX_IOU, SubjectTracker
 
@@ -104,7 +104,9 @@ def possible_subjects(
         return []  # without detection, at another person's place: a clear pose there is that person's
     boxes = np.asarray(found.boxes, float)
     # A box on someone else may be a second one around them.
-    others = overlap_coefficient(boxes, boxes_of(p for p in detected if p.pose.other)) > _INSIDE
+    believed = subject.pose.believed_ns is not None
+    known = [p for p in detected if p in subject.others or (believed and not could_be(subject, p))]
+    others = overlap_coefficient(boxes, boxes_of(known)) > _INSIDE
     free = (iou(boxes, subject.box[None])[:, 0] <= SAME_BOX_IOU) & ~others.any(axis=1)
     near = [j for j in np.nonzero(free)[0].tolist() if _in_reach(subject, boxes[j], confidence, stamp_ns)]
     possible = _of_its_colours(subject, image, boxes, near)
@@ -160,7 +162,7 @@ def due_bystander(tracker: SubjectTracker, stamp_ns: int, shedding: bool = False
     if subject is not None and not searching and subject.pose.believed_ns != stamp_ns:
         return None
     due = [p for p in tracker.persons if p is not subject and _due(p, searching, stamp_ns)]
-    due = [p for p in due if not (shedding and p.pose.other)]
+    due = [p for p in due if not (shedding and subject is not None and p in subject.others)]
     return min(due, key=lambda p: p.pose.judged_ns or 0, default=None)
 
 

@@ -35,17 +35,17 @@ class PoseBelief:
     length : px, usual longer side of the believable boxes; partly hidden persons have shorter ones
     value, last : recent mean of the confidence, and that of the last pose; NaN before the first one
     judged_ns : last pose; believed_ns, box : last believable one and its box (4,) px, None = none yet
-    plausible_ns : from when on the track was a person, as far as its poses show; None = it is none
-    other : whether track and subject were certainly persons at the same time, hence two of them
+    plausible_ns, began : from when on the track was a person, as far as its poses show, and its box (4,) px then, which
+        follows the camera; None = it is none
     """
 
-    def __init__(self, stamp_ns: int) -> None:
+    def __init__(self, box: np.ndarray, stamp_ns: int) -> None:
         self.value = self.last = float("nan")
         self.judged_ns: int | None = None
         self.believed_ns: int | None = None
         self.box: np.ndarray | None = None
         self.plausible_ns: int | None = stamp_ns
-        self.other = False
+        self.began = np.asarray(box, float)
         self.length = 0.0
         self._usual = 0.0
         self._failing_ns: int | None = None
@@ -71,7 +71,7 @@ class PoseBelief:
         """Believe a box (4,) px that a user or a drone's tracker gave, whatever its pose."""
         self.believed_ns, self.box, self._failing_ns = stamp_ns, np.array(box, float), None
         if self.plausible_ns is None:
-            self.plausible_ns = stamp_ns
+            self.plausible_ns, self.began = stamp_ns, self.box
         length = float((self.box[2:] - self.box[:2]).max())
         self.length = length if not self.length else self.length + _SLOW_RATE * (length - self.length)
 
@@ -135,6 +135,7 @@ class Person:
     began_at_subject, double : whether its first box lay on the subject's, and whether it is a second box around the
         subject; see ``identity.py``
     left_image : whether it left at an edge of the image; set for the subject only
+    others : tracks that were certainly persons in an image of it as the subject, hence not this one
     pose : what its poses say about it
     """
 
@@ -145,7 +146,8 @@ class Person:
         self.score = self.mean_score = score
         self.hits = 1
         self.began_at_subject = self.double = self.left_image = False
-        self.pose = PoseBelief(stamp_ns)
+        self.others: set[Person] = set()
+        self.pose = PoseBelief(box, stamp_ns)
         self.appearance = appearance
         self._descriptors = 1 if appearance is not None else 0
 
@@ -204,7 +206,7 @@ class Person:
     def move_camera(self, matrix: np.ndarray) -> None:
         """Follow the image's motion (2, 3) by the camera's."""
         self.filter.move_camera(matrix)
-        self.box = moved_box(matrix, self.box)
+        self.box, self.pose.began = moved_box(matrix, self.box), moved_box(matrix, self.pose.began)
         if self.pose.box is not None:
             self.pose.box = moved_box(matrix, self.pose.box)
 

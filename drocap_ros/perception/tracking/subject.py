@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,6 +29,7 @@ _HIDDEN_IOU = 0.25  # overlap with another person from which a predicted box cou
 _PART = 0.75  # overlap coefficient above which a detection is a part of a tracked person, or that person and more
 _CLUTTER_DOUBLE = 0.3  # overlap coefficient from which what the subject was before is a second box of it
 _ROI_IOU = 0.1  # overlap with the subject below which a box of the drone's tracker is another choice
+_MOST_CHANGES = 1000  # kept of a run that may last for days
 _BYSTANDER_S = 2.0  # longest gap of a bystander
 _MAX_PERSONS = 30  # in memory: the assignment's time grows with their number
 _LEAVING_SPEED = 0.15  # outward speed, lengths/s, of a box at the image's edge that counts as leaving
@@ -34,11 +37,21 @@ _EDGE = 0.01  # share of the image's longer side within which a box is at its ed
 
 
 class Change(Enum):
-    """Reasons for which the subject is another track than before."""
+    """What happened to the subject: another track than before, or none; the value ends "person N ..."."""
 
-    CHOSEN = "chosen"
-    FOUND_AGAIN = "found again"
-    EXCHANGED = "exchanged"
+    CHOSEN = "is followed"
+    FOUND_AGAIN = "is found again by place, size and look"
+    EXCHANGED = "is taken to be another detection than before"
+    LEFT = "left the picture"
+    LOST = "is lost from view"
+
+
+class SubjectChange(NamedTuple):
+    """A change at ``stamp_ns``, of the subject ``track_id``."""
+
+    stamp_ns: int
+    track_id: int
+    change: Change
 
 
 class SubjectTracker:
@@ -55,7 +68,12 @@ class SubjectTracker:
         self.persons: list[Person] = []
         #: The last subject, lost or not.
         self.subject: Person | None = None
-        self._track_id = 0
+        #: Lost subjects and their track ids, after whom the rule chose the next one: whoever comes back is it again.
+        self._away: list[tuple[int, Person]] = []
+        self._track_id = self._last_id = 0
+        self._is_shown = False
+        #: The last changes of the subject, in the order of time.
+        self.changes: deque[SubjectChange] = deque(maxlen=_MOST_CHANGES)
         self.choice = SubjectChoice(config)
         self._coast_s = config.coast_s
         self._last_ns: int | None = None
@@ -63,16 +81,18 @@ class SubjectTracker:
     def reset(self) -> None:
         """Delete all tracks, for stamps that restarted; track ids continue."""
         self.persons, self.subject, self.choice.nothing_yet, self._last_ns = [], None, True, None
+        self._away = []
 
     def move_camera(self, matrix: np.ndarray) -> None:
         """Let all persons follow the image's motion (2, 3) by the camera's, those out of view as well."""
-        for person in self.persons:
+        for person in (*self.persons, *(away for _, away in self._away)):
             person.move_camera(matrix)
 
     def followed(self, stamp_ns: int) -> Person | None:
-        """The subject while it is in view or predicted; None while it is lost."""
+        """The subject while it is in view or predicted; None while it is lost, or when it has left the image."""
         subject = self.subject
-        return None if subject is None or subject.unconfirmed_s(stamp_ns) > self._coast_s else subject
+        lost = subject is None or subject.left_image or subject.unconfirmed_s(stamp_ns) > self._coast_s
+        return None if lost else subject
 
     @property
     def missed(self) -> bool:
@@ -154,7 +174,7 @@ class SubjectTracker:
         if subject.pose.believed_ns is None:  # what it learned was not this person's
             subject.appearance = describe(image, box)
         subject.move(box, score, stamp_ns)
-        self._follow(subject, Change.EXCHANGED)
+        self._follow(subject, Change.EXCHANGED, self._track_id)
         return Subject(self._track_id, subject.box, score, False)
 
     def update(
@@ -187,21 +207,27 @@ class SubjectTracker:
         self._choose(image.shape, stamp_ns)
         self._prune(image.shape, stamp_ns)
         self.choice.nothing_yet &= not len(boxes)
-        return self.current(stamp_ns)
+        shown = self.current(stamp_ns)
+        if self.subject is not None and shown is None and self._is_shown:
+            self._note(Change.LEFT if self.subject.left_image else Change.LOST)
+        self._is_shown = shown is not None
+        return shown
 
-    def _follow(self, person: Person, change: Change) -> None:
-        """Make a person the subject: the one place at which the track of the subject changes."""
-        last, self.subject = self.subject, person
-        if change is Change.EXCHANGED:
-            return
-        person.left_image = False
-        if change is Change.CHOSEN:
-            self._track_id += 1
-            for bystander in self.persons:  # others than the last subject may be this one
-                bystander.pose.other = False
-        elif last is not None:
-            self.persons.remove(last)
-            person.appearance = last.appearance if last.appearance is not None else person.appearance
+    def _follow(self, person: Person, change: Change, track_id: int | None = None) -> None:
+        """Make a person the subject: the one place at which the track of the subject changes.
+
+        track_id : of the subject that it is again or still; None = the next one
+        """
+        self.subject = person
+        if track_id is None:
+            track_id = self._last_id = self._last_id + 1
+        self._track_id = track_id
+        if change is not Change.EXCHANGED:
+            person.left_image = False
+        self._note(change)
+
+    def _note(self, change: Change) -> None:
+        self.changes.append(SubjectChange(self._last_ns or 0, self._track_id, change))
 
     def _spawn(self, seen: Seen, assigned: set[int], stamp_ns: int) -> None:
         """Start tracks from unassigned detections, except parts of tracked persons."""
@@ -223,12 +249,22 @@ class SubjectTracker:
         return np.concatenate([known, subject.filter.box()[None]])
 
     def _reidentify(self, stamp_ns: int) -> None:
-        """Re-identify a lost subject in a new track."""
-        lost = self.subject
-        if lost is None or lost.unconfirmed_s(stamp_ns) <= 0:
+        """Re-identify a lost subject in a new track, the first one before those followed in its absence."""
+        subject = self.subject
+        if subject is None:
             return
-        if person := found_again(lost, self.persons, self._config.confirm_frames, stamp_ns):
-            self._follow(person, Change.FOUND_AGAIN)
+        self._away = [(i, p) for i, p in self._away if p.unconfirmed_s(stamp_ns) <= FORGET_S]
+        in_view = subject.unconfirmed_s(stamp_ns) <= 0
+        lost = self._away if in_view else [*self._away, (self._track_id, subject)]
+        free = [p for p in self.persons if p is not subject]
+        for track_id, last in lost:
+            if person := found_again(last, free, self._config.confirm_frames, stamp_ns):
+                self._away = [(i, p) for i, p in lost if p is not last]
+                self.persons = [p for p in self.persons if p is not subject or in_view]
+                person.appearance = last.appearance if last.appearance is not None else person.appearance
+                person.others |= last.others
+                self._follow(person, Change.FOUND_AGAIN, track_id)
+                return
 
     def _apply_roi(self, roi: np.ndarray, stamp_ns: int) -> None:
         """A roi away from the subject is a choice; one on the subject replaces missing detections."""
@@ -246,11 +282,16 @@ class SubjectTracker:
             self.persons.append(given)
         if given is not None and given is not self.subject:
             given.pose.choose(given.box, stamp_ns)
+            self._away = []
             self._follow(given, Change.CHOSEN)
         first = not self._track_id
         best = self.choice.by_rule(self.persons, self.subject, shape, stamp_ns, self._coast_s, first)
-        if best is not None:
-            self._follow(best, Change.CHOSEN)
+        if best is None:
+            return
+        if self.subject is not None:
+            self.persons.remove(self.subject)
+            self._away.append((self._track_id, self.subject))
+        self._follow(best, Change.CHOSEN)
 
     def _prune(self, shape: tuple[int, ...], stamp_ns: int) -> None:
         """Delete the tracks of bystanders out of view."""

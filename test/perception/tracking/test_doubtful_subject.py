@@ -162,7 +162,7 @@ def test_refuted_subject_is_lost_and_its_person_in_view_is_the_same():
 
 
 def test_track_is_questioned_after_a_second_and_refuted_after_more():
-    belief = PoseBelief(0)
+    belief = PoseBelief(np.array([0.0, 0, 10, 20]), 0)
     box = box_of(100, 100, 80)
     assert belief.believed
     for i in range(10):
@@ -183,7 +183,7 @@ def test_track_is_questioned_after_a_second_and_refuted_after_more():
 
 
 def test_persons_seen_badly_from_the_start_are_believed_at_their_usual_confidence():
-    belief = PoseBelief(0)
+    belief = PoseBelief(np.array([0.0, 0, 10, 20]), 0)
     for i in range(100):
         belief.judge(0.55, box_of(100, 100, 40), i * SECOND // 10)
     assert belief.believed
@@ -277,7 +277,7 @@ def test_person_who_comes_into_view_in_blurred_images_is_found_by_its_appearance
 
 
 def test_weak_pose_in_a_blurred_image_says_nothing_and_a_certain_one_counts():
-    belief = PoseBelief(0)
+    belief = PoseBelief(np.array([0.0, 0, 10, 20]), 0)
     box = box_of(100, 100, 80)
     belief.judge(0.3, box, SECOND, blurred=True)
     assert belief.judged_ns == SECOND
@@ -285,7 +285,7 @@ def test_weak_pose_in_a_blurred_image_says_nothing_and_a_certain_one_counts():
     assert np.isnan(belief.last)
     belief.judge(0.8, box, 2 * SECOND, blurred=True)
     assert (belief.value, belief.believed_ns) == (0.8, 2 * SECOND)
-    sharp = PoseBelief(0)
+    sharp = PoseBelief(np.array([0.0, 0, 10, 20]), 0)
     sharp.judge(0.3, box, SECOND)
     assert sharp.plausible_ns is None
 

@@ -8,6 +8,7 @@ import pytest
 from drocap_ros.errors import ParameterError
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.tracking.association import Seen, assign
+from drocap_ros.perception.tracking.identity import could_be
 from drocap_ros.perception.tracking.other_poses import due_bystander
 from drocap_ros.perception.tracking.person import Person
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
@@ -249,6 +250,42 @@ def test_next_person_after_the_subject_left_has_a_new_track_id():
     assert scene.show([]) is None
     newcomers = [scene.show([(40 + 6 * t, 180, 160, RED)]) for t in range(10)]
     assert newcomers[-1].track_id == 2
+
+
+def leaves(colours, back):
+    """The subject in red walks out at the right, another one stands; someone in ``colours`` comes ``back`` at x."""
+    scene = Scene(on_loss="next")
+    bystander = (200, 180, 140, BLUE)
+    for t in range(50):
+        scene.show([(300 + 8 * t, 180, 160, RED), bystander])
+    away = [scene.show([bystander]) for _ in range(30)]
+    assert away[-1].track_id == 2
+    subjects = [scene.show([(back - 4 * t, 180, 160, colours), bystander]) for t in range(30)]
+    last = back - 4 * 29
+    return subjects[-1], last
+
+
+def test_subject_that_comes_back_where_it_left_has_its_track_id_again():
+    subject, x = leaves(RED, 640)
+    assert subject.track_id == 1
+    assert offset(subject, x) < 15
+
+
+@pytest.mark.parametrize(("colours", "x"), [(GREEN, 640), (RED, 130)], ids=["another look", "another place"])
+def test_someone_else_who_comes_is_not_the_subject_that_left(colours, x):
+    subject, _ = leaves(colours, x)
+    assert subject.track_id == 2
+
+
+def test_person_who_began_out_of_reach_is_not_the_lost_subject():
+    lost = Person(np.array([600.0, 100, 640, 200]), 0.8, 0, None)
+    near, far = (Person(np.array([x, 100.0, x + 40, 200]), 0.8, 10 * STEP, None) for x in (500.0, 300.0))
+    assert could_be(lost, near)
+    assert not could_be(lost, far)
+    for person in (lost, far):  # the camera turns: places follow, and the person that walks in does not
+        person.move_camera(np.array([[1.0, 0, -50], [0, 1, 0]]))
+    far.update(near.box, 0.8, 11 * STEP)
+    assert not could_be(lost, far)
 
 
 def test_on_loss_wait_follows_nobody_until_a_roi_chooses():
