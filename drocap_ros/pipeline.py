@@ -20,7 +20,7 @@ from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.persons import find_persons, following, in_view
 from drocap_ros.perception.sources import Frame
-from drocap_ros.perception.track_video import changes_in_words, observe, subjects, tracks_from_observations
+from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
 from drocap_ros.reconstruction.common.poses import Progress
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording.image_messages import choose_images
@@ -219,7 +219,8 @@ def _track(
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     origin: dict[str, Any] = {"pose2d": "estimated"}
-    if changes := changes_in_words(estimator.tracker.changes, observations[0].stamp_ns):
+    begin = observations[0].stamp_ns
+    if changes := [f"{(ns - begin) * 1e-9:.1f} s: {text}" for ns, text in estimator.tracker.changes][1:]:
         origin["subject"] = changes
         logger.warning("%s: %s", path, "; ".join(changes))
     origin["images"] = {"size": list(tracks.image_size), "length": images.length, "rate_hz": images.rate_hz}

@@ -118,7 +118,7 @@ def _track(
     progress: Progress,
 ) -> str:
     """Write the tracks of every subject, and the overlay; returns a line about them."""
-    from drocap_ros.perception.track_video import changes_in_words, observe, subjects, tracks_from_observations
+    from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
     from drocap_ros.tracks import save_tracks
 
     overlay = _OverlayWriter(target / "overlay.mp4", images.rate_hz) if with_overlay else None
@@ -137,8 +137,9 @@ def _track(
     for rank, (track_id, _) in enumerate(found):
         name = "tracks.npz" if rank == 0 else f"tracks_person_{track_id}.npz"
         save_tracks(target / name, tracks_from_observations(observations, track_id))
-    changes = changes_in_words(estimator.tracker.changes, observations[0].stamp_ns)
-    return "\n".join([_summary(found, len(observations)), *changes])
+    begin = observations[0].stamp_ns
+    changes = [f"{(stamp_ns - begin) * 1e-9:.1f} s: {text}" for stamp_ns, text in estimator.tracker.changes]
+    return "\n".join([_summary(found, len(observations)), *changes[1:]])
 
 
 class _OverlayWriter:

@@ -13,7 +13,6 @@ from sensor_msgs.msg import RegionOfInterest
 
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
-from drocap_ros.perception.load_shedding import LoadShedding
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.ros.component import OK, WARN
@@ -21,6 +20,7 @@ from drocap_ros.ros.conversions import pose2d_to_ros, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.image_input import ImageInput, ImageSample
 from drocap_ros.ros.lifecycle import ManagedComponent
+from drocap_ros.ros.load_level import LoadShedding
 from drocap_ros.ros.topics import TOPICS
 
 

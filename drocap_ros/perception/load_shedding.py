@@ -1,4 +1,4 @@
-"""Less work per image while images queue: its level, and keypoints by optical flow instead of a network.
+"""Less work per image while images queue: keypoints by optical flow instead of a network.
 
 Pyramidal Lucas-Kanade (Bouguet 2001) around each joint, forward and backward (forward-backward error, Kalal et al.
 2010).  At 30 Hz, joints whose backward flow returns to within 0.2 % of the box are as accurate as the network's
@@ -8,7 +8,6 @@ repeatability: median 0.3 to 0.6 % of the box, 1 to 2 % at the 90th percentile.
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +15,6 @@ import numpy as np
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.models.network_input import shrink
 
-_CALM_S = 1.0  # time without a queued image before the level falls; a shorter one lets the backlog return at once
-_RISE_S = 0.2  # shortest time between two rises: each level needs time to take effect
 _SIDE_PX = 192  # longer side of the box in the flow's image; smaller boxes are not enlarged
 _MARGIN = 0.25  # around the box, share of its longer side
 _WINDOW_PX = (15, 15)  # of the flow around each joint
@@ -26,33 +23,6 @@ _MAX_ERROR = 0.01  # largest forward-backward error of a joint, share of the box
 _SIGMA = 0.005  # standard deviation that each step adds beside that error, same unit; measured as above
 _MIN_VALID = 0.5  # least share of valid joints; below it the scene changed or the image is blurred
 _LONGEST_S = 0.1  # between the two images: three of 30 Hz
-
-
-class LoadShedding:
-    """Level from 0 (full work) to ``max_level``: rises while images queue, falls by one per second without."""
-
-    def __init__(self, max_level: int) -> None:
-        self._max_level = max_level
-        self._level = 0
-        self._queued_s = -math.inf
-        self._raised_s = -math.inf
-
-    def level(self, now_s: float, queued: bool, backlog: int) -> int:
-        """Level for the current image.
-
-        Parameters
-        ----------
-        now_s : monotonic time
-        queued : whether the image arrived while the previous one was processed
-        backlog : number of images still queued
-        """
-        if queued:
-            self._queued_s = now_s
-            if now_s - self._raised_s >= _RISE_S and self._level < self._max_level:
-                self._level, self._raised_s = self._level + 1, now_s
-        elif self._level and now_s - self._queued_s >= _CALM_S:
-            self._level, self._queued_s = self._level - 1, now_s
-        return min(self._level + backlog, self._max_level) if self._level else 0
 
 
 @dataclass(frozen=True)

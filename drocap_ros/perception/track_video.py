@@ -13,7 +13,6 @@ from drocap_ros.leg_sides import with_own_legs
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.sources.base import Frame, prefetch
-from drocap_ros.perception.tracking.subject import Change, SubjectChange
 from drocap_ros.tracks import Tracks
 
 
@@ -50,31 +49,11 @@ def subjects(observations: Sequence[PoseObservation]) -> list[tuple[int, int]]:
     return sorted(count.items(), key=lambda item: (-item[1], item[0]))
 
 
-def changes_in_words(changes: Iterable[SubjectChange], begin_ns: int) -> list[str]:
-    """A line for each time at which a subject was lost, found again, or another one followed.
-
-    begin_ns : stamp of the first image
-
-    An exchange of the box for a better one of the same person is none of them.
-    """
-    told = [change for change in changes if change.change is not Change.EXCHANGED][1:]
-    return [f"{(c.stamp_ns - begin_ns) * 1e-9:.1f} s: person {c.track_id} {c.change.value}" for c in told]
-
-
 def tracks_from_observations(observations: Sequence[PoseObservation], track_id: int | None = None) -> Tracks:
-    """Tracks of one subject over all images; NaN in images without it.
+    """Tracks of one subject, of None the one with keypoints in most images, over all images; NaN in those without it.
 
-    Legs that the network exchanged for some images are put right (:mod:`drocap_ros.leg_sides`).
-
-    Parameters
-    ----------
-    observations : in the order of time, of images of one size
-    track_id : the subject; None = the one with keypoints in most images
-
-    Raises
-    ------
-    InputError
-        When there are no images, or none shows the subject.
+    Legs that the network exchanged for some images are put right (:mod:`drocap_ros.leg_sides`).  An InputError says
+    that there are no images, or that none shows the subject.
     """
     if not observations:
         raise InputError("images: expected at least one, got none")

@@ -61,14 +61,9 @@ def could_be(lost: Person, person: Person) -> bool:
     since_ns = person.pose.plausible_ns
     if since_ns is None or person in lost.others or since_ns <= lost.certain_ns:
         return False
-    start, length = lost.box if lost.pose.box is None else lost.pose.box, _length(lost)
+    start = lost.box if lost.pose.box is None else lost.pose.box
     distance = float(np.linalg.norm((start[:2] + start[2:] - person.pose.began[:2] - person.pose.began[2:]) / 2))
-    return distance < (_REACH + _REACH_PER_S * (since_ns - lost.certain_ns) * 1e-9) * length
-
-
-def _length(person: Person) -> float:
-    """Usual longer side, px: by the believable boxes, before there is one by the last."""
-    return max(person.pose.length or person.filter.length, 1.0)
+    return distance < (_REACH + _REACH_PER_S * (since_ns - lost.certain_ns) * 1e-9) * lost.usual_length
 
 
 def same_person(lost: Person, person: Person, alone: bool) -> bool:
@@ -83,7 +78,7 @@ def same_person(lost: Person, person: Person, alone: bool) -> bool:
     certain = alone and gap < _ALONE_S and person.pose.last >= SURE_CONFIDENCE
     if similarity < (_ALONE_SIMILARITY if certain else _REIDENTIFY_SIMILARITY):
         return False
-    return lost.pose.growth(person.box, _length(lost)) < 0.5 + 0.3 * gap
+    return lost.pose.growth(person.box, lost.usual_length) < 0.5 + 0.3 * gap
 
 
 def found_again(lost: Person, persons: list[Person], confirm_frames: int, stamp_ns: int) -> Person | None:

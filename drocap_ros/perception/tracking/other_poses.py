@@ -104,8 +104,7 @@ def possible_subjects(
         return []  # without detection, at another person's place: a clear pose there is that person's
     boxes = np.asarray(found.boxes, float)
     # A box on someone else may be a second one around them.
-    believed = subject.pose.believed_ns is not None
-    known = [p for p in detected if p in subject.others or (believed and not could_be(subject, p))]
+    known = [p for p in detected if p in subject.others or (subject.pose.box is not None and not could_be(subject, p))]
     others = overlap_coefficient(boxes, boxes_of(known)) > _INSIDE
     free = (iou(boxes, subject.box[None])[:, 0] <= SAME_BOX_IOU) & ~others.any(axis=1)
     near = [j for j in np.nonzero(free)[0].tolist() if _in_reach(subject, boxes[j], confidence, stamp_ns)]

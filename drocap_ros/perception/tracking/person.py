@@ -165,6 +165,11 @@ class Person:
         return self.confirmed_ns if self.pose.believed_ns is None else min(self.pose.believed_ns, self.confirmed_ns)
 
     @property
+    def usual_length(self) -> float:
+        """Longer side, px, by the believable boxes; before there is one by the filter."""
+        return max(self.pose.length or self.filter.length, 1.0)
+
+    @property
     def plausible(self) -> bool:
         """Whether its poses leave it to be a person."""
         return self.pose.plausible_ns is not None

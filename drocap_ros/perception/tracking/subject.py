@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from enum import Enum
-from typing import NamedTuple
 
 import numpy as np
 
@@ -46,14 +45,6 @@ class Change(Enum):
     LOST = "is lost from view"
 
 
-class SubjectChange(NamedTuple):
-    """A change at ``stamp_ns``, of the subject ``track_id``."""
-
-    stamp_ns: int
-    track_id: int
-    change: Change
-
-
 class SubjectTracker:
     """Tracks all persons in view, so that each detection in a crossing has its owner; one of them is the subject.
 
@@ -66,14 +57,13 @@ class SubjectTracker:
         self._config = config
         #: All persons in view or lately in view, the subject among them.
         self.persons: list[Person] = []
-        #: The last subject, lost or not.
-        self.subject: Person | None = None
+        self.subject: Person | None = None  # the last one, lost or not
         #: Lost subjects and their track ids, after whom the rule chose the next one: whoever comes back is it again.
         self._away: list[tuple[int, Person]] = []
         self._track_id = self._last_id = 0
         self._is_shown = False
-        #: The last changes of the subject, in the order of time.
-        self.changes: deque[SubjectChange] = deque(maxlen=_MOST_CHANGES)
+        #: The last changes of the subject, stamp and words; an exchange keeps the person and is none.
+        self.changes: deque[tuple[int, str]] = deque(maxlen=_MOST_CHANGES)
         self.choice = SubjectChoice(config)
         self._coast_s = config.coast_s
         self._last_ns: int | None = None
@@ -209,25 +199,20 @@ class SubjectTracker:
         self.choice.nothing_yet &= not len(boxes)
         shown = self.current(stamp_ns)
         if self.subject is not None and shown is None and self._is_shown:
-            self._note(Change.LEFT if self.subject.left_image else Change.LOST)
+            gone = Change.LEFT if self.subject.left_image else Change.LOST
+            self.changes.append((stamp_ns, f"person {self._track_id} {gone.value}"))
         self._is_shown = shown is not None
         return shown
 
     def _follow(self, person: Person, change: Change, track_id: int | None = None) -> None:
-        """Make a person the subject: the one place at which the track of the subject changes.
-
-        track_id : of the subject that it is again or still; None = the next one
-        """
+        """Make a person the subject, a next one without ``track_id``: the one place at which its track changes."""
         self.subject = person
         if track_id is None:
             track_id = self._last_id = self._last_id + 1
         self._track_id = track_id
         if change is not Change.EXCHANGED:
             person.left_image = False
-        self._note(change)
-
-    def _note(self, change: Change) -> None:
-        self.changes.append(SubjectChange(self._last_ns or 0, self._track_id, change))
+            self.changes.append((self._last_ns or 0, f"person {track_id} {change.value}"))
 
     def _spawn(self, seen: Seen, assigned: set[int], stamp_ns: int) -> None:
         """Start tracks from unassigned detections, except parts of tracked persons."""
