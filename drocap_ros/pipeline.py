@@ -218,11 +218,9 @@ def _track(
         tracks = tracks_from_observations(observations)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    origin: dict[str, Any] = {"pose2d": "estimated"}
-    begin = observations[0].stamp_ns
-    if changes := [f"{(ns - begin) * 1e-9:.1f} s: {text}" for ns, text in estimator.tracker.changes][1:]:
-        origin["subject"] = changes
-        logger.warning("%s: %s", path, "; ".join(changes))
+    words = [f"{(t - tracks.stamp_ns[0]) * 1e-9:.1f} s: {text}" for t, text in estimator.tracker.changes][1:]
+    origin: dict[str, Any] = {"pose2d": "estimated", "subject": words}
+    logger.log(logging.WARNING if words else logging.DEBUG, "%s: %s", path, "; ".join(words))
     origin["images"] = {"size": list(tracks.image_size), "length": images.length, "rate_hz": images.rate_hz}
     origin["images"] |= {"topic": topic} if topic else {}
     if selection.person is not None:
