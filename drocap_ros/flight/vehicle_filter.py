@@ -14,14 +14,18 @@ import numpy as np
 
 #: Time, s, over which the error of a reported velocity fades: recorded ones halve within 2 s.
 _FADES_S = 2.5
-#: Fine noise of a reported position: standard deviation in m of reports this time in s apart (recorded: 0.01 to 0.1 m).
-_FINE_M = 0.05
-_FINE_PERIOD_S = 0.1
+#: A reported position wanders by itself: as a random walk, m^2/s, at least (recorded of both autopilots), averaged over
+#: some seconds.  It counts as noise of what it wanders within the time beside it.
+_LEAST_WANDER_M2_S = 4e-4
+_WANDER_AVERAGED_S = 5.0
+_WANDERED_S = 2.0
 #: Bounds of the velocity's estimated standard deviation, m/s: half the best recorded one, twice the worst.
 _LEAST_M_S = 0.01
 _GREATEST_M_S = 0.6
-#: Time, s, over which that size is averaged: a few times that of the error itself.
-_AVERAGED_S = 5.0
+#: Blocks, s, whose mean errors are compared with the next one's, and the time over which this is averaged.  A position
+#: that wanders by itself errs otherwise from block to block; the error of a velocity lasts.
+_BLOCK_S = 0.5
+_AVERAGED_S = 20.0
 #: Longest gap in s that the velocity bridges.
 _LONGEST_GAP_S = 0.5
 #: A step from one reported position to the next, m, beyond what the velocity explains.  Recorded: 0.1 m at most.
@@ -54,7 +58,7 @@ class VehicleFilter:
     velocity_sd : (3,) m/s, estimated error of the reported velocity
     """
 
-    def __init__(self, velocity_sd_m_s: float = 0.1) -> None:
+    def __init__(self, velocity_sd_m_s: float) -> None:
         self._variance: np.ndarray = np.full(3, velocity_sd_m_s**2)
         self._stamp_s = math.nan
         self._reported: tuple[np.ndarray, np.ndarray] = (np.full(3, np.nan), np.full(3, np.nan))
@@ -62,6 +66,9 @@ class VehicleFilter:
         self.velocity: np.ndarray = np.full(3, np.nan)
         self._error: np.ndarray = np.zeros(3)  # of the reported velocity
         self._covariance: np.ndarray = np.zeros((3, 2, 2))  # of position and error
+        self._wander: np.ndarray = np.full(3, _LEAST_WANDER_M2_S)
+        self._block: tuple[float, np.ndarray] = (0.0, np.zeros(3))  # s, and m that the velocity does not explain
+        self._before: np.ndarray | None = None  # (3,) m/s, mean of the block before
 
     @property
     def velocity_offset(self) -> np.ndarray:
@@ -83,10 +90,12 @@ class VehicleFilter:
         gap_s, jump_m = stamp_s - self._stamp_s, 0.0
         if math.isfinite(gap_s):
             way = min(max(gap_s, 0.0), _LONGEST_GAP_S) * 0.5 * (self._reported[1] + velocity)
-            jump_m = float(np.linalg.norm(position - self._reported[0] - way))
+            step = position - self._reported[0] - way
+            jump_m = float(np.linalg.norm(step))
         if 0.0 < gap_s <= _LONGEST_GAP_S and jump_m <= _JUMP_M:
             self._predict(gap_s, 0.5 * (self._reported[1] + velocity))
             self._correct(gap_s, position)
+            self._learn(gap_s, step)
         else:
             self._begin(position)
         self._stamp_s, self._reported = stamp_s, (position, velocity)
@@ -98,9 +107,10 @@ class VehicleFilter:
         )
 
     def _begin(self, position: np.ndarray) -> None:
+        self._block, self._before = (0.0, np.zeros(3)), None
         self.position = position.copy()
         self._covariance = np.zeros((3, 2, 2))
-        self._covariance[:, 0, 0], self._covariance[:, 1, 1] = _FINE_M**2, self._variance
+        self._covariance[:, 0, 0], self._covariance[:, 1, 1] = self._wander * _WANDERED_S, self._variance
 
     def _predict(self, gap_s: float, velocity: np.ndarray) -> None:
         """Move on by a mean reported velocity; its error fades and is renewed."""
@@ -112,14 +122,28 @@ class VehicleFilter:
         self._covariance[:, 1, 1] += (1.0 - fade**2) * self._variance
 
     def _correct(self, gap_s: float, position: np.ndarray) -> None:
-        """Move towards a reported position, and the size of the velocity's error towards what was found of it."""
+        """Move towards a reported position."""
         # Reports that follow each other sooner hold less news each.
-        noise = _FINE_M**2 * _FINE_PERIOD_S / gap_s
-        gain = self._covariance[:, :, 0] / (self._covariance[:, :1, 0] + noise)
+        noise = self._wander * _WANDERED_S**2 / gap_s
+        gain = self._covariance[:, :, 0] / (self._covariance[:, 0, 0] + noise)[:, None]
         innovation = position - self.position
         self.position = self.position + gain[:, 0] * innovation
         self._error = self._error + gain[:, 1] * innovation
         self._covariance = self._covariance - gain[:, :, None] * self._covariance[:, None, 0, :]
-        found = self._error**2 + self._covariance[:, 1, 1]
-        share = 1.0 - math.exp(-gap_s / _AVERAGED_S)
-        self._variance = np.clip(self._variance + share * (found - self._variance), _LEAST_M_S**2, _GREATEST_M_S**2)
+
+    def _learn(self, gap_s: float, step: np.ndarray) -> None:
+        """Sizes of the velocity's error and of the position's wander, from a step (3,) m that neither explains."""
+        wander = step**2 / gap_s - self._variance * gap_s
+        self._wander = np.maximum(
+            self._wander + (wander - self._wander) * (1.0 - math.exp(-gap_s / _WANDER_AVERAGED_S)), _LEAST_WANDER_M2_S
+        )
+        seconds, way = self._block[0] + gap_s, self._block[1] + step
+        self._block = (seconds, way)
+        if seconds < _BLOCK_S:
+            return
+        mean, before = way / seconds, self._before
+        self._block, self._before = (0.0, np.zeros(3)), mean
+        if before is not None:
+            found = mean * before * math.exp(seconds / _FADES_S)
+            variance = self._variance + (found - self._variance) * (1.0 - math.exp(-seconds / _AVERAGED_S))
+            self._variance = np.clip(variance, _LEAST_M_S**2, _GREATEST_M_S**2)

@@ -54,6 +54,7 @@ ARDUPILOT = Autopilot(
     handed_over_mode="GUIDED",  # it waits there for setpoints
     estimator_message="EKF_STATUS_REPORT",
     estimator_bad=128 | 1024 | 32768,  # EKF_STATUS_FLAGS: constant position, uninitialized, GPS glitch
+    velocity_sd_m_s=0.02,  # recorded
     position_gain_per_s=1.0,  # PSC_POSXY_P
     continues_setpoints=True,
     needs_mode_to_stop=False,  # the time-out has ended the motion, and BRAKE would take longer

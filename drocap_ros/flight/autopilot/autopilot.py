@@ -173,6 +173,7 @@ class Autopilot:
     rest_flags : those of them that it sets whenever it is at rest: they do not count on the ground
     heartbeat_on_request : whether it grants a rate for its heartbeat; else CURRENT_MODE shows a change of the mode
     integers_in_bytes : whether an integer parameter has its bytes in the field of the float
+    velocity_sd_m_s : of its reported velocity, until a flight has shown it
     height_wanders : whether the reported height wanders by decimetres within seconds
 
     Flight by setpoints, and without them
@@ -213,6 +214,7 @@ class Autopilot:
     rest_flags: int = 0
     heartbeat_on_request: bool = True
     integers_in_bytes: bool = False
+    velocity_sd_m_s: float = 0.1
     height_wanders: bool = False
 
     position_gain_per_s: float = 1.0

@@ -60,6 +60,7 @@ PX4 = Autopilot(
     rest_flags=128,  # recorded: constant position from the start to the take-off, and again after the landing
     heartbeat_on_request=False,  # once a second, whatever is requested
     integers_in_bytes=True,
+    velocity_sd_m_s=0.25,  # recorded, as errors for seconds
     height_wanders=True,  # by 0.2 to 0.45 m in recorded flights
     position_gain_per_s=0.95,  # MPC_XY_P
     timeout_setting="COM_OF_LOSS_T",

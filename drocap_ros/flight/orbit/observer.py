@@ -62,7 +62,7 @@ class Observer:
         self._config = config
         self.vehicle: VehicleState | None = None
         self.framing = Framing(config)
-        self._filter, self._doubt = VehicleFilter(), Doubt()
+        self._filter, self._doubt = VehicleFilter(UNKNOWN.velocity_sd_m_s), Doubt()
         self._history, self._pictures = PoseHistory(), PictureWatch()
         self._subject, self._guard = SubjectFilter(config), Guard(config)
         self._following, self._keeping = Following(config.max_echo_age_s), Keeping(config)
@@ -71,6 +71,8 @@ class Observer:
 
     def on_state(self, state: VehicleState) -> None:
         """Take a state of the vehicle."""
+        if self.vehicle is None or self.vehicle.autopilot != state.autopilot:
+            self._filter = VehicleFilter(autopilot_of(state.autopilot).velocity_sd_m_s)
         if np.isfinite(state.position_enu_m).all() and np.isfinite(state.velocity_enu_m_s).all():
             doubt = self._filter.take(state.stamp_ns / _NS, state.position_enu_m, state.velocity_enu_m_s)
             self._doubt = self._doubt.worse(doubt)

@@ -132,7 +132,7 @@ def test_velocity_of_a_standing_person_is_small_while_the_position_wanders():
     wander = np.cumsum(rng.normal(0, 0.03, (len(capture.tracks.stamp_ns), 3)), axis=0)
     velocity = np.gradient(capture.camera_position, 1 / 15.0, axis=0)
     history, subject, speeds, places = PoseHistory(), SubjectFilter(SubjectConfig()), [], []
-    own = VehicleFilter()
+    own = VehicleFilter(0.02)
     for i, pose, seen in observations(capture):
         reported = capture.camera_position[i] + wander[i]
         forward_left_up = quaternion_from_matrix(pose.rotation.T @ OPTICAL_FROM_FLU)
