@@ -27,16 +27,16 @@ MAX_LINES = 350
 BUDGETS = {
     ("errors", "revision", "parameters", "skeleton", "joint_maps", "leg_sides", "geometry", "keypoints", "observation",
      "stamps", "tracks", "motion", "mocap", "clip", "contacts", "file_kind", "open_images", "api", "config", "pipeline",
-     "live_replay"): 3.20,  # 0.60 over the plan: poses' history, stamps, places on the Earth and images came down
+     "live_replay"): 3.30,  # 0.70 over the plan: poses' history, stamps, places on the Earth and images came down
     ("perception",): 5.20,  # 1.10 over the plan: tracking keeps its own association; foreign pictures and streams came
     ("reconstruction",): 7.60,  # 1.30 over the plan: world/ and live/ kept their steps; a constant a line, with reasons
     ("flight",): 8.95,  # 3.75 over the plan: an argument or constant a line, with reasons; filter of reports, preflight
-    ("recording",): 4.90,  # 0.60 over the plan: every format of telemetry stayed, and the recovery of damaged files
+    ("recording",): 5.30,  # 1.00 over the plan: every format of telemetry stayed; keypoints of other tools came (0.38)
     ("simulation",): 3.60,  # 0.40 over the plan: reports err as recorded ones; one encoder a message
     ("evaluation",): 1.05,  # 0.25 over the plan: `drocap evaluate rotation` and `world` stayed commands
-    ("export", "report", "view"): 4.15,  # 0.95 over the plan: the skinned body of glTF stayed; keypoints of other tools
+    ("export", "report", "view"): 3.95,  # 0.75 over the plan: exports for OpenSim, persons, the viewer stayed
     ("ros", "nodes", "bringup"): 4.45,  # 0.85 over the plan: lockstep and processes stayed; one argument a line
-    ("cli",): 4.50,  # 1.30 over the plan: batch, preflight and top stayed whole; one argument a line
+    ("cli",): 4.35,  # 1.15 over the plan: batch, preflight and top stayed whole; one argument a line
     ("lab", "benchmarks"): 9.65,  # 0.15 over the plan: studies of the reports of recorded flights
 }  # fmt: skip
 #: Names of autopilots and of their settings; `ardupilotmega` is a dialect of MAVLink.
@@ -140,6 +140,14 @@ def laboratory_in_the_product(package: Package) -> list[str]:
     ]  # fmt: skip
 
 
+def reconstruction_in_recording(package: Package) -> list[str]:
+    """Files are read without the methods; what both need stands below them."""
+    return [
+        f"{name}: {target}" for name, targets in package.imports.items() if room(name) == "recording"
+        for target in targets if target.startswith("drocap_ros.reconstruction")
+    ]  # fmt: skip
+
+
 def autopilots_outside_their_room(package: Package) -> list[str]:
     """Words of an autopilot in the flight room, comments included: what differs is a field of its object."""
     found = []
@@ -152,7 +160,7 @@ def autopilots_outside_their_room(package: Package) -> list[str]:
 
 RULES = [
     large_files, rooms_without_docstring, circles, arrows_upwards, ros_outside_its_rooms, laboratory_in_the_product,
-    autopilots_outside_their_room,
+    reconstruction_in_recording, autopilots_outside_their_room,
 ]  # fmt: skip
 
 
@@ -204,6 +212,7 @@ def test_every_room_has_a_budget():
             "flight/c.py": "from drocap_ros.flight.orbit.d import e\n", "flight/orbit/d.py": "",
         }),
         (laboratory_in_the_product, {"cli/train.py": "def run():\n    from lab.training import lifter\n"}),
+        (reconstruction_in_recording, {"recording/a.py": "from drocap_ros.reconstruction.world import contacts\n"}),
         (autopilots_outside_their_room, {"flight/orbit/a.py": "# PX4 grants it\n"}),
         (autopilots_outside_their_room, {"flight/link.py": 'NAME = "GUID_TIMEOUT"\n', "flight/autopilot/a.py": ""}),
         (arrows_upwards, {"flight/a.py": "from drocap_ros import pipeline\n", "pipeline.py": ""}),

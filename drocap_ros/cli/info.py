@@ -71,7 +71,7 @@ def summarize(path: Path) -> Summary:
         found = "a pipe or device" if path.exists() else "no such file"
         raise InputError(f"{path}: expected a recording, motion or tracks file, found {found}; check the path")
     path = _motion_in(path)
-    from drocap_ros.cli.keypoint_files import is_keypoint_file
+    from drocap_ros.recording.keypoints.files import is_keypoint_file
 
     if is_keypoint_file(path):
         return _of_arrays(path)
@@ -121,8 +121,8 @@ def _print_metadata(path: Path) -> int:
 
 
 def _of_arrays(path: Path) -> Summary:
-    from drocap_ros.cli.keypoint_files import read_keypoints
     from drocap_ros.motion import load_motion
+    from drocap_ros.recording.keypoints.files import read_keypoints
     from drocap_ros.tracks import kind_of, read_npz, wrong_kind
 
     arrays = read_npz(path, ()) if path.suffix == ".npz" else {}

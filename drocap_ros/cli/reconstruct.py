@@ -102,7 +102,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Reconstruct and write the output folder."""
     from drocap_ros.cli.atomic_output import check_output_folder, default_folder, is_same, refuse_inputs
-    from drocap_ros.cli.keypoint_files import as_tracks_file
     from drocap_ros.cli.models import ensure_networks
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.cli.report import open_words
@@ -110,6 +109,7 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.perception.load_models import models_folder
     from drocap_ros.perception.tracking.pose_estimator_config import parse_subject
     from drocap_ros.pipeline import Selection, needs_networks, reconstruct_input
+    from drocap_ros.recording.keypoints.files import as_tracks_file
 
     out, clip = args.out or default_folder(args.input, "motion"), clip_of(args)
     check_output_folder(out)

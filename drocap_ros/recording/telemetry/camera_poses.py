@@ -9,8 +9,8 @@ import numpy as np
 
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.geometry.interpolation import interpolate, true_runs
+from drocap_ros.geometry.position_steps import without_steps
 from drocap_ros.geometry.rotations import quaternion_multiply
-from drocap_ros.reconstruction.world.position_steps import without_steps
 from drocap_ros.recording.telemetry.log import VehicleTrack
 from drocap_ros.tracks import Tracks
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.export.keypoint_names import NAMES_BY_COUNT
+from drocap_ros.recording.keypoints.names import NAMES_BY_COUNT
 
 #: Keys of a person's points, their scores, a frame, a person, all persons of one frame, the rate.
 POINTS = ("keypoints", "pose_keypoints_2d", "keypoints_2d", "landmarks", "pose_landmarks", "joints", "points")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drocap_ros.reconstruction.world.position_steps import without_steps
+from drocap_ros.geometry.position_steps import without_steps
 from drocap_ros.recording.telemetry.camera_poses import camera_poses
 from drocap_ros.recording.telemetry.log import VehicleTrack
 

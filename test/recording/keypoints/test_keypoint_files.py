@@ -8,8 +8,8 @@ import pytest
 from telemetry_logs import mutated
 
 from drocap_ros.cli import main
-from drocap_ros.cli.keypoint_files import read_keypoints
 from drocap_ros.errors import InputError
+from drocap_ros.recording.keypoints.files import read_keypoints
 from drocap_ros.skeleton import COCO_17
 from drocap_ros.tracks import load_tracks
 

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.export.keypoint_content import POINTS, SCORES, Content, numbers_of, one_person, scored, table, walk
-from drocap_ros.export.keypoint_names import NAMES_BY_COUNT, joint_name
+from drocap_ros.recording.keypoints.content import POINTS, SCORES, Content, numbers_of, one_person, scored, table, walk
+from drocap_ros.recording.keypoints.names import NAMES_BY_COUNT, joint_name
 from drocap_ros.tracks import MAX_FRAMES, Tracks, kind_of, load_tracks, read_npz, save_tracks, without_unseen
 
 logger = logging.getLogger(__name__)

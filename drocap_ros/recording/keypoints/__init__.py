@@ -1,0 +1,1 @@
+"""2D keypoints out of the files of other tools."""
