@@ -88,6 +88,11 @@ def _points_of(node: Mapping[str, Any], content: Content) -> np.ndarray | None:
             return points
         if len(value) >= _LEAST and all(isinstance(name, str) for name in value):
             content.names = value  # COCO's categories
+    return _named_points(node, content)
+
+
+def _named_points(node: Mapping[str, Any], content: Content) -> np.ndarray | None:
+    """Points of a node whose keys are the names of joints."""
     named = {key: p for key, p in node.items() if isinstance(p, dict) and {"x", "y"} <= p.keys()}
     if len(named) < _LEAST:
         return None

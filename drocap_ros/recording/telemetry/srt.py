@@ -81,12 +81,7 @@ def read_srt(path: Path) -> TelemetryLog:
         raise InputError(f"{path}: expected 1 to {MAX_FRAMES} DJI subtitles with telemetry, found {len(entries)}")
     heights = next((kind for kind in _HEIGHTS if any(e.kind == kind for e in entries)), "height")
     stamps = np.array([e.stamp_ns for e in entries], np.int64)
-    geodetic = np.array([(e.latitude, e.longitude, e.height) for e in entries])
-    place = np.abs(geodetic[np.isfinite(geodetic[:, 0]), :2]).max(axis=0, initial=0.0)
-    if place.any() and (place <= (np.pi / 2, np.pi)).all():  # as degrees all of it would be the open Atlantic
-        geodetic[:, :2] = np.rad2deg(geodetic[:, :2])
-    geodetic[(np.abs(geodetic[:, :2]) > (90, 180)).any(axis=1) | (geodetic[:, :2] == 0).all(axis=1)] = np.nan
-    position = from_first_fix(geodetic, above_takeoff=heights == "rel_alt")
+    position = from_first_fix(_geodetic(entries), above_takeoff=heights == "rel_alt")
     lacks = [LogLack(Lack.HEIGHT, heights)] if position is not None and heights != "rel_alt" else []
     real_s, shown_s = entries[-1].clock_s - entries[0].clock_s, float(stamps[-1] - stamps[0]) * 1e-9
     if 1 < real_s < shown_s / 1.5:  # a second or more, and no rounding of the dates
@@ -99,6 +94,16 @@ def read_srt(path: Path) -> TelemetryLog:
     )
     log = make_log(path, "DJI subtitles", stamps, lacks, orientation=body, position=position, gimbal=gimbal)
     return log._replace(video_clock=True, lens=steady)
+
+
+def _geodetic(entries: list[_Entry]) -> np.ndarray:
+    """(N, 3) latitude and longitude in degrees, height; NaN where they are no place."""
+    geodetic = np.array([(e.latitude, e.longitude, e.height) for e in entries])
+    place = np.abs(geodetic[np.isfinite(geodetic[:, 0]), :2]).max(axis=0, initial=0.0)
+    if place.any() and (place <= (np.pi / 2, np.pi)).all():  # as degrees all of it would be the open Atlantic
+        geodetic[:, :2] = np.rad2deg(geodetic[:, :2])
+    geodetic[(np.abs(geodetic[:, :2]) > (90, 180)).any(axis=1) | (geodetic[:, :2] == 0).all(axis=1)] = np.nan
+    return geodetic
 
 
 def _inside(path: Path) -> Iterator[tuple[int, str]]:
