@@ -59,4 +59,4 @@ def test_video_with_subtitles_gives_a_motion_in_the_world(shared, tmp_path, inve
     assert "expected --telemetry" in capsys.readouterr().err
     save_tracks(tmp_path / "t.npz", capture.tracks)
     assert reconstruct(tmp_path / "t.npz", "--telemetry", tmp_path / "v.srt", *options) == 2
-    assert "expected a video file as input" in capsys.readouterr().err
+    assert "expected a video file, found" in capsys.readouterr().err
