@@ -7,6 +7,7 @@ import numpy as np
 from drocap_ros.flight.autopilot.simulated import ReportErrors
 
 _STEP_S = 0.1  # of the fitted processes; between their steps the errors are interpolated
+_SETTLED = 600  # steps from zero: several times the longest correlation, 13 s
 _DEAD_RECKONING_M_S = np.array([0.15, 0.075, 0.0])  # drift without satellites
 
 
@@ -17,20 +18,16 @@ class EstimateError:
     """
 
     def __init__(self, horizontal: ReportErrors, vertical: ReportErrors, share: float, seed: int) -> None:
-        from scipy.linalg import solve_discrete_lyapunov
-
         self._rng = np.random.default_rng([seed, 0xC0])
         self.glitch: np.ndarray = np.zeros(3)
         axes = (horizontal, horizontal, vertical)
-        self._transition = np.stack([np.vstack([np.hstack([a.first, a.second]), np.eye(2, 4)]) for a in axes])
-        covariance = np.stack([_covariance(axis) for axis in axes]) * share**2
-        self._noise = np.linalg.cholesky(covariance + 1e-18 * np.eye(2))
-        driven = np.pad(covariance, ((0, 0), (0, 2), (0, 2)))
-        steady = [solve_discrete_lyapunov(*pair) for pair in zip(self._transition, driven, strict=True)]
-        self._state: np.ndarray = np.stack(
-            [self._rng.multivariate_normal(np.zeros(4), spread, method="eigh") for spread in steady]
-        )
+        self._first, self._second = (np.array(rows) for rows in zip(*((a.first, a.second) for a in axes), strict=True))
+        self._noise = share * np.array([axis.noise for axis in axes])
+        self._correlation = np.array([axis.correlation for axis in axes])
+        self._now, self._before = np.zeros((3, 2)), np.zeros((3, 2))
         self._part = 0.0
+        for _ in range(_SETTLED):
+            self._advance()
 
     @property
     def position(self) -> np.ndarray:
@@ -48,19 +45,19 @@ class EstimateError:
         self._part += dt / _STEP_S
         while self._part >= 1.0:
             self._part -= 1.0
-            state = np.einsum("aij,aj->ai", self._transition, self._state)
-            state[:, :2] += np.einsum("aij,aj->ai", self._noise, self._rng.standard_normal((3, 2)))
-            self._state = state
+            self._advance()
         if dead_reckoning:
             self.glitch = self.glitch + _DEAD_RECKONING_M_S * dt
 
+    def _advance(self) -> None:
+        """One step of the processes, by sums in a fixed order: the same bits wherever the arrays lie in memory."""
+        (one, other), now, before = self._rng.standard_normal((2, 3)), self._now, self._before
+        noise = np.stack([one, self._correlation * one + np.sqrt(1.0 - self._correlation**2) * other], axis=1)
+        after = self._first[:, :, 0] * now[:, :1] + self._first[:, :, 1] * now[:, 1:]
+        after = after + self._second[:, :, 0] * before[:, :1] + self._second[:, :, 1] * before[:, 1:]
+        self._now, self._before = after + self._noise * noise, now
+
     def _between(self) -> np.ndarray:
         """(3, 2) position and velocity per axis, interpolated from the step before to the last one."""
-        between: np.ndarray = (1.0 - self._part) * self._state[:, 2:] + self._part * self._state[:, :2]
+        between: np.ndarray = (1.0 - self._part) * self._before + self._part * self._now
         return between
-
-
-def _covariance(axis: ReportErrors) -> np.ndarray:
-    """(2, 2) of the noise of one step."""
-    both = axis.correlation * axis.noise[0] * axis.noise[1]
-    return np.array([[axis.noise[0] ** 2, both], [both, axis.noise[1] ** 2]])

