@@ -8,21 +8,23 @@ from typing import Any
 
 from drocap_ros.recording.open_session import open_session
 
+_LARGE = 1000  # elements: of a picture, not of a pose
 _DECODED = ("/diagnostics", "/drocap/pose3d/refined")
 
 
 def session_contents(path: Path) -> dict[str, list[tuple[int, Any]]]:
     """Messages by topic, each with its log time, in the order of the recording.
 
-    A message is the digest of its bytes; in ``/diagnostics`` and ``pose3d/refined`` its fields, without
-    ``solve_seconds`` (wall clock) and without the recorder's status, which names its folder and the disk's state.
+    A message is the digest of its fields, not of its bytes: the serializer leaves the gaps between aligned fields as
+    the memory was.  In ``/diagnostics`` and ``pose3d/refined`` it is the fields, without ``solve_seconds`` (wall
+    clock) and without the recorder's status, which names its folder and the disk's state.
     """
     contents: dict[str, list[tuple[int, Any]]] = {}
     with open_session(path) as session:
         for raw in session.raw_messages():
-            found: Any = hashlib.blake2b(raw.data, digest_size=16).hexdigest()
-            if raw.topic in _DECODED:
-                found = str(_fields(session.decode(raw)))
+            found = str(_fields(session.decode(raw)))
+            if raw.topic not in _DECODED:
+                found = hashlib.blake2b(found.encode(), digest_size=16).hexdigest()
             contents.setdefault(raw.topic, []).append((raw.log_time_ns, found))
     return contents
 
@@ -37,4 +39,6 @@ def _fields(value: Any) -> Any:
         }  # fmt: skip
     if isinstance(value, list | tuple):
         return [_fields(element) for element in value]
-    return value.tolist() if hasattr(value, "tolist") else value
+    if hasattr(value, "tobytes"):
+        return value.tobytes() if value.size > _LARGE else value.tolist()
+    return value
