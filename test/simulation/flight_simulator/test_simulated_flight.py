@@ -53,11 +53,22 @@ def test_pilot_takes_off_hovers_and_hands_over(autopilot, mode):
     truth = flight.truth()
     assert ((truth.keypoints > 0) & (truth.keypoints < truth.image_size)).all()  # the person stays in view
     assert (flight.pilot.handed_over, flight.copter.landed_state, flight.copter.mode) == (True, IN_AIR, mode)
-    # In recorded flights PX4's height errs by 0.42 m, and PX4 is off its place by 0.54 m per axis.
-    height_m, wander_m = (0.6, 1.0) if autopilot == "ardupilot" else (1.3, 2.0)
-    assert abs(flight.copter.body.position[2] - 3.0) < height_m
-    assert np.linalg.norm(flight.copter.body.position[:2] - start[:2]) < wander_m
     assert np.linalg.norm(flight.copter.body.velocity) < 0.3
+
+
+@pytest.mark.parametrize(
+    "autopilot",
+    [
+        "ardupilot",
+        pytest.param("px4", marks=pytest.mark.xfail(reason="its estimate wanders as the recorded one", strict=True)),
+    ],
+)
+def test_pilot_hovers_where_he_took_off(autopilot):
+    clock, flight = world(autopilot=autopilot, wind_m_s=6.0, seed=3)
+    start = flight.copter.body.position.copy()
+    fly(clock, flight, 10.0)
+    assert abs(flight.copter.body.position[2] - 3.0) < 0.6
+    assert np.linalg.norm(flight.copter.body.position[:2] - start[:2]) < 1.0
 
 
 @pytest.mark.parametrize(("mount", "number"), [("servo", 1), ("fixed", 0)])
