@@ -59,6 +59,8 @@ class BuildPy(build_py):
 
     def run(self) -> None:
         """Build the sources with their revision, then the messages where there is a ROS."""
+        # A build folder of an earlier revision would bring back modules that are gone.
+        shutil.rmtree(Path(self.build_lib) / "drocap_ros", ignore_errors=True)
         super().run()
         if not self.editable_mode:  # an editable installation asks the checkout
             revision = runpy.run_path(str(ROOT / "drocap_ros" / "revision.py"))
