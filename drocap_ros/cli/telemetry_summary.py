@@ -51,7 +51,7 @@ def telemetry_summary(path: Path) -> Parts:
         facts += _video_facts(path)
         try:
             log = read_djmd(path) if has_djmd(path) else None
-        except InputError as error:
+        except (InputError, OSError) as error:
             warnings.append(str(error))
     if log is None:
         return [*facts, ("telemetry", "not usable" if warnings else "none in the file")], (), [], warnings

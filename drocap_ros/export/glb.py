@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from drocap_ros.export.rigid_body import BODY
 from drocap_ros.export.take import Take, y_up
 
 #: An object of glTF's JSON.
-Json = dict[str, Any]
+Json = dict[str, object]
 #: Codes of glTF 2.0: uses of a buffer, shapes and types of its elements.
 _ARRAY_BUFFER = 34962
 _ELEMENT_BUFFER = 34963

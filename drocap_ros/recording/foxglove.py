@@ -9,7 +9,6 @@ import base64
 import json
 import struct
 from types import SimpleNamespace
-from typing import Any
 
 from drocap_ros.errors import InputError
 from drocap_ros.recording.telemetry.protobuf import Value, read_message
@@ -21,7 +20,7 @@ _FIELDS: dict[str, dict[str, int]] = {
     "foxglove.CompressedVideo": {"timestamp": 1, "frame_id": 2, "data": 3, "format": 4},
     "foxglove.RawImage": {"timestamp": 1, "width": 2, "height": 3, "encoding": 4, "step": 5, "data": 6, "frame_id": 7},
 }
-_LATEST_S = 2**63 // 10**9
+_LATEST_S = 2**63 // 10**9  # s: ns must fit into 64 bits with a sign
 
 
 def foxglove_message(data: bytes, encoding: str, type_name: str) -> SimpleNamespace:
@@ -52,7 +51,7 @@ def foxglove_message(data: bytes, encoding: str, type_name: str) -> SimpleNamesp
     return SimpleNamespace(**{name: kinds.get(name, lambda v: v)(value) for name, value in values.items()})
 
 
-def _of_protobuf(name: str, value: Value | None) -> Any:
+def _of_protobuf(name: str, value: Value | None) -> Value | str:
     """A field; proto3 leaves out zeros and empty ones."""
     if name == "data" or name in _TEXT:
         content = value if isinstance(value, bytes) else b""

@@ -55,17 +55,17 @@ def choose_images(session: Session, wanted: str = "") -> TopicInfo:
     found = session.topics_of(*IMAGES)
     names = ", ".join(topic.name for topic in found)
     if wanted:
-        named = [topic for topic in found if topic.name.strip("/") == wanted.strip("/")]
-        if not named:
-            raise InputError(
-                f"--topic {wanted}: expected a topic with images, found {names or 'none'}; correct the name"
-            )
-        return named[0]
+        for topic in found:
+            if topic.name.strip("/") == wanted.strip("/"):
+                return topic
+        raise InputError(f"--topic {wanted}: expected a topic with images, found {names or 'none'}; correct the name")
     if len(found) < 2:
         return session.choose_topic(*IMAGES)
-    ranks = [_rank(session, topic) for topic in found]
-    best = [topic for topic, rank in zip(found, ranks, strict=True) if rank == min(ranks)]
-    if min(ranks) == _DEPTH_RANK:
+    by_rank: dict[int, list[TopicInfo]] = {}
+    for topic in found:
+        by_rank.setdefault(_rank(session, topic), []).append(topic)
+    least, best = min(by_rank.items())
+    if least == _DEPTH_RANK:
         raise InputError(f"{session.path}: expected colour or grey images, found {names}; choose one with --topic NAME")
     if len(best) > 1:
         session.warn(f"several topics of images: {names}; took {best[0].name}, --topic NAME chooses another")

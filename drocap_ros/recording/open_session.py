@@ -37,9 +37,10 @@ def open_session(path: str | Path) -> Session:
     if not is_recording(path):
         raise InputError(f"{path}: expected {FORMS}, found something else; check the path")
     try:
-        if path.is_file() and (path.suffix == ".mcap" or file_kind(path) is FileKind.MCAP):
-            return McapSession(path, [path], {})
-        return _open_folder(path) if path.is_dir() else RosbagsSession(path)
+        if path.is_dir():
+            return _open_folder(path)
+        is_mcap = path.suffix == ".mcap" or file_kind(path) is FileKind.MCAP
+        return McapSession(path, [path], {}) if is_mcap else RosbagsSession(path)
     except OSError as error:
         raise InputError(f"{path}: expected a readable recording; {error.strerror or error}") from None
 

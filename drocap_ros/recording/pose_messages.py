@@ -11,7 +11,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import optical_orientation
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.observation import PoseObservation
-from drocap_ros.recording.session import Message, calibration_of, header_stamp_ns
+from drocap_ros.recording.session import Message, calibration_of, header_stamp_ns, xyzw_of
 from drocap_ros.skeleton import joint_set
 from drocap_ros.stamps import StampValidator
 from drocap_ros.tracks import check_camera_matrix, check_keypoints
@@ -59,8 +59,7 @@ def observation_from_message(message: Message) -> PoseObservation:
 
 def add_state(history: CameraHistory, message: Message) -> None:
     """Give a camera's history a ``VehicleState``; one without position or camera attitude changes nothing."""
-    q = message.gimbal_orientation
-    orientation = optical_orientation(np.array([q.x, q.y, q.z, q.w], np.float64))
+    orientation = optical_orientation(xyzw_of(message.gimbal_orientation))
     history.add_pose(header_stamp_ns(message), np.asarray(message.position_enu_m, np.float64), orientation)
 
 

@@ -7,7 +7,6 @@ import platform
 from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 from drocap_ros import __version__
 from drocap_ros.revision import git_revision
@@ -28,7 +27,7 @@ def session_provenance(namespace: str = "") -> dict[str, str]:
     return values
 
 
-def configuration_text(sections: Mapping[str, Mapping[str, Any]]) -> str:
+def configuration_text(sections: Mapping[str, Mapping[str, object]]) -> str:
     """Parameters by node as YAML, in the form of a configuration file."""
     import yaml
 

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from drocap_ros.errors import InputError
 
-#: A decoded message: an object with the fields of its definition.
-Message = Any
+#: A message as rclpy or rosbags decodes it: the fields of its definition, no common class.
+Message: TypeAlias = Any
 POSE2D = "drocap_ros/msg/Pose2D"
 POSE3D = "drocap_ros/msg/Pose3D"
 POSE3D_WINDOW = "drocap_ros/msg/Pose3DWindow"
@@ -158,6 +159,13 @@ class Session(ABC):
     @abstractmethod
     def _read_info(self) -> SessionInfo: ...
 
+    def _info_of(
+        self, kind: str, counts: Counter[tuple[str, str]], times: Sequence[int], metadata: dict[str, str]
+    ) -> SessionInfo:
+        """From the numbers of messages by topic and type, and times of first and last ones."""
+        topics = tuple(TopicInfo(name, of, count) for (name, of), count in sorted(counts.items()))
+        return SessionInfo(self.path, kind, topics, min(times, default=None), max(times, default=None), metadata)
+
     def close(self) -> None:
         """Release the files, where they stay open between readings."""
         return
@@ -173,6 +181,11 @@ def calibration_of(message: Message) -> np.ndarray | None:
     # ROS 2 names the matrix k, ROS 1 names it K.
     matrix = np.asarray(getattr(message, "k", getattr(message, "K", ())), dtype=np.float64)
     return matrix.reshape(3, 3) if matrix.size == 9 else None
+
+
+def xyzw_of(quaternion: Message) -> np.ndarray:
+    """(4,) x y z w of a ``geometry_msgs/Quaternion``."""
+    return np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], np.float64)
 
 
 def stamp_of(time: Message) -> int:

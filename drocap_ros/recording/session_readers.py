@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.recording.foxglove import foxglove_message
 from drocap_ros.recording.mcap.metadata import METADATA_FILE, METADATA_RECORD, FileRecord
-from drocap_ros.recording.mcap.schemas import standard_types
+from drocap_ros.recording.mcap.schemas import standard_types, types_of
 from drocap_ros.recording.mcap.stream import MAGIC, McapChannel, McapStream, counted_channels
-from drocap_ros.recording.session import FORMS, Message, RawMessage, Session, SessionInfo, TopicInfo
+from drocap_ros.recording.session import FORMS, Message, RawMessage, Session, SessionInfo
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -55,7 +55,8 @@ class McapSession(Session):
             return foxglove_message(raw.data, channel.message_encoding, channel.type_name)
         store = self._stores.get(channel)
         if store is None:
-            store = self._stores[channel] = _typestore(channel)
+            schema, name = channel.schema, channel.type_name
+            store = self._stores[channel] = types_of(name, schema) if schema else standard_types()
         if channel.message_encoding == "ros1":
             return store.deserialize_ros1(raw.data, channel.type_name)
         return store.deserialize_cdr(raw.data, channel.type_name)
@@ -66,18 +67,10 @@ class McapSession(Session):
         metadata = dict(self._metadata)
         for stream in self._streams:
             of_file, span = self._content(stream)
-            for key, count in of_file.items():
-                counts[key] += count
+            counts.update(of_file)
             times += span
             metadata = stream.metadata().get(METADATA_RECORD, {}) | metadata
-        return SessionInfo(
-            path=self.path,
-            kind="rosbag2 folder, MCAP" if self.path.is_dir() else "MCAP",
-            topics=tuple(TopicInfo(name, kind, count) for (name, kind), count in sorted(counts.items())),
-            start_ns=min(times, default=None),
-            end_ns=max(times, default=None),
-            metadata=metadata,
-        )
+        return self._info_of("rosbag2 folder, MCAP" if self.path.is_dir() else "MCAP", counts, times, metadata)
 
     def _content(self, stream: McapStream) -> tuple[Counter[tuple[str, str]], list[int]]:
         """Messages by (topic, type) and log times of the first and last one, by the summary or else by reading all."""
@@ -102,17 +95,6 @@ class McapSession(Session):
         if stream.damage:
             damage = "; ".join(map(str, stream.damage))
             self.warn(f"{stream.path.name}: {damage}; read the {count} messages that are whole")
-
-
-def _typestore(channel: McapChannel) -> Typestore:
-    """Types of one channel, from its embedded schema; without one the standard types."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    if not channel.schema:
-        return standard_types()
-    store = get_typestore(Stores.EMPTY)
-    store.register(get_types_from_msg(channel.schema, channel.type_name))
-    return store
 
 
 class RosbagsSession(Session):
@@ -154,15 +136,9 @@ class RosbagsSession(Session):
         counts = Counter[tuple[str, str]]()
         for connection in self._reader.connections:
             counts[connection.topic, connection.msgtype] += connection.msgcount
-        any_message = counts.total() > 0
-        return SessionInfo(
-            path=self.path,
-            kind="rosbag2 folder" if self.path.is_dir() else f"rosbag ({self.path.suffix})",
-            topics=tuple(TopicInfo(name, kind, count) for (name, kind), count in sorted(counts.items())),
-            start_ns=self._reader.start_time if any_message else None,
-            end_ns=self._reader.end_time - 1 if any_message else None,
-            metadata={},
-        )
+        times = [self._reader.start_time, self._reader.end_time - 1] if counts.total() else []
+        kind = "rosbag2 folder" if self.path.is_dir() else f"rosbag ({self.path.suffix})"
+        return self._info_of(kind, counts, times, {})
 
     def close(self) -> None:
         """Release the files."""

@@ -13,7 +13,7 @@ from drocap_ros.geometry.rotations import unit_quaternions
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.recording import session as recorded
 from drocap_ros.recording.pose_messages import float_array
-from drocap_ros.recording.session import Message, Session, TopicInfo, calibration_of, header_stamp_ns
+from drocap_ros.recording.session import Message, Session, TopicInfo, calibration_of, header_stamp_ns, xyzw_of
 from drocap_ros.recording.telemetry.camera_poses import with_camera
 from drocap_ros.recording.telemetry.log import VehicleTrack
 from drocap_ros.skeleton import joint_set
@@ -119,7 +119,7 @@ def read_vehicle_track(session: Session, near: str = "") -> VehicleTrack | None:
     rows: dict[int, tuple[np.ndarray, ...]] = {}
     for _, message in session.messages((topic.name,)):
         position = np.asarray(message.position_enu_m, dtype=np.float64)
-        rows[header_stamp_ns(message)] = (position, _xyzw(message.orientation), _xyzw(message.gimbal_orientation))
+        rows[header_stamp_ns(message)] = (position, xyzw_of(message.orientation), xyzw_of(message.gimbal_orientation))
     if not rows:
         return None
     stamps = sorted(rows)
@@ -208,7 +208,3 @@ def _nearest(topics: list[TopicInfo], near: str) -> TopicInfo | None:
         return sum(a == b for a, b in zip(topic.name.split("/")[:-1], near.split("/")[:-1], strict=False))
 
     return max(topics, key=shared, default=None)
-
-
-def _xyzw(quaternion: Message) -> np.ndarray:
-    return np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], dtype=np.float64)

@@ -61,7 +61,7 @@ def read_video_telemetry(video: Path, telemetry: Telemetry) -> TelemetryLog | No
         return None
     try:
         return read_djmd(video)
-    except InputError as error:
+    except (InputError, OSError) as error:
         logger.warning("%s; the video is used without telemetry", error)
         return None
 

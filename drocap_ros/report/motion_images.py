@@ -6,7 +6,6 @@ import contextlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -162,7 +161,7 @@ def _check_size(path: Path, width: int, height: int, motion: Motion) -> None:
         raise _other(path, "its keypoints inside the images", f"{outside:.0%} of them outside {width}x{height} px")
 
 
-def _stated(motion: Motion, name: str) -> dict[str, Any]:
+def _stated(motion: Motion, name: str) -> dict[str, object]:
     """An entry of ``meta`` that is a table; empty where it is none."""
     value = motion.meta.get(name)
     return value if isinstance(value, dict) else {}

@@ -15,7 +15,7 @@ _TOE_OUT = 0.12
 #: Height of the ankle above its place in stance, in lengths of the foot, from which and up to which the foot goes over
 #: from the ground's direction to that of the shank.
 _LEAVES = 0.6
-_FREE = 1.3
+_FREE = 1.3  # lengths of the foot; a judgement, as the lower bound
 
 
 def add_toes(joints: np.ndarray, heading: np.ndarray, stature_m: float) -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterable
-from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -14,14 +13,11 @@ from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.motion import LEVEL_CAMERA
 from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.recording.pose_messages import float_array, observation_from_message
-from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Session, TopicInfo, header_stamp_ns
+from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Message, Session, TopicInfo, header_stamp_ns
 from drocap_ros.skeleton import JointSet, joint_set
 from drocap_ros.view.camera_placement import nominal_camera_matrix, place_cameras
 from drocap_ros.view.rerun_scene import Scene
 from drocap_ros.view.visualizer_config import RateLimit
-
-#: A message of the graph as rclpy or rosbags decodes it: the same fields, no common class.
-Message: TypeAlias = Any
 
 PLOTS = ("latency_ms", "reprojection_px", "orbit")
 #: Topics by which a recording's namespace is found.

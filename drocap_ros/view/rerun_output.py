@@ -13,7 +13,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from drocap_ros.errors import InputError
@@ -149,7 +150,7 @@ def _wait_for(server: subprocess.Popen[bytes], host: str, port: int) -> None:
     raise InputError(f"--host, --port: expected Rerun's server on {host}:{port}, it did not start; choose another port")
 
 
-def _rerun() -> Any:
+def _rerun() -> ModuleType:
     try:
         import rerun
     except ImportError as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -46,7 +46,7 @@ class Scene:
     def __init__(self, recording: rerun.RecordingStream) -> None:
         import rerun
 
-        self._rr: Any = rerun
+        self._rr = rerun
         self.recording = recording
         self._curves: set[str] = set()
         self._log(WORLD, rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -148,7 +148,7 @@ class Scene:
         """A line of the log."""
         self._log(f"log/{source}", self._rr.TextLog(text, level=level))
 
-    def _log(self, path: str, entity: Any, static: bool = False) -> None:
+    def _log(self, path: str, entity: rerun.AsComponents, static: bool = False) -> None:
         self._rr.log(path, entity, static=static, recording=self.recording)
 
 

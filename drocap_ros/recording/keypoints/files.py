@@ -13,13 +13,22 @@ import logging
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
-from drocap_ros.recording.keypoints.content import POINTS, SCORES, Content, numbers_of, one_person, scored, table, walk
+from drocap_ros.recording.keypoints.content import (
+    LARGEST_PX,
+    Content,
+    Label,
+    numbers_of,
+    one_person,
+    read_arrays,
+    table,
+    walk,
+)
 from drocap_ros.recording.keypoints.names import NAMES_BY_COUNT, joint_name
 from drocap_ros.tracks import MAX_FRAMES, Tracks, kind_of, load_tracks, read_npz, save_tracks, without_unseen
 
@@ -29,9 +38,9 @@ logger = logging.getLogger(__name__)
 _OWN = {"joints", "stamp_ns", "image_size"}
 #: Images per second, assumed where a file does not say.
 _USUAL_HZ = 30.0
-#: Coordinates that are all within the first are shares of the picture; no camera has the second, px.  Scores beyond
-#: the third are no shares of one: some networks exceed 1 a little, and COCO's flags end there.
-_LARGEST_SHARE, _LARGEST_PX, _HIGHEST_SCORE = 2.0, 1e5, 2.0
+#: Coordinates that are all within the first are shares of the picture.  Scores beyond the second are no shares of one:
+#: some networks exceed 1 a little, and COCO's flags end there.
+_LARGEST_SHARE, _HIGHEST_SCORE = 2.0, 2.0
 #: Frames so many times as far apart as they are many are no video's.
 _SPARSE = 10
 
@@ -100,29 +109,40 @@ def _content(path: Path) -> Content | Tracks:
         arrays = {"keypoints": np.load(path, allow_pickle=False)} if suffix == ".npy" else read_npz(path, ())
         if arrays.keys() >= _OWN:
             return load_tracks(path)
-        _of_arrays(arrays, content)
+        read_arrays(arrays, content)
     else:
         raise InputError(f"expected keypoints as JSON, CSV, .npz or .npy, found {suffix}; save them as one of these")
     return content
 
 
-def _of_arrays(arrays: Mapping[str, np.ndarray], content: Content) -> None:
-    """Points (F, P, 2 to 4) of the first array that holds some."""
-    content.note({name: a.item() for name, a in arrays.items() if a.size == 1 and a.dtype.kind in "fiu"})
-    size = np.atleast_1d(arrays.get("image_size", ()))
-    if size.shape == (2,) and size.dtype.kind in "iuf" and (size >= 1).all():
-        content.size = (int(size[0]), int(size[1]))
-    content.names = np.atleast_1d(arrays.get("joints", ())).astype(str).tolist()
-    scores = next((arrays[name] for name in SCORES if name in arrays), None)
-    for value in (arrays[name] for name in (*POINTS, *arrays) if name in arrays):
-        if value.ndim == 3 and value.dtype.kind in "fiu":
-            points = scored(value.astype(np.float64), scores)
-            for i, person in enumerate(() if points is None or content.people else points):
-                content.add(i, None, person)
-
-
 def _tracks(path: Path, content: Content, rate_hz: float | None, size: tuple[int, int] | None) -> Tracks:
     """Tracks of the person in most frames; warns of what is assumed."""
+    frames, names, points = _series(path, content)
+    xy, scores = points[..., :2], np.nan_to_num(points[..., 2])
+    if scores.max(initial=0.0) > _HIGHEST_SCORE:  # per cent, or a heat map's unit
+        scores = scores / scores.max()
+    if np.nanmax(xy) <= _LARGEST_SHARE:
+        if size is None:
+            raise InputError("expected px, found shares of the picture; give its size with --image-size WxH")
+        xy = xy * size
+    assumed = [] if rate_hz else [f"{_USUAL_HZ:g} images per second (--rate HZ)"]
+    if size is None:
+        middle, end = np.nanmedian(xy, axis=(0, 1)), np.nanmax(xy, axis=(0, 1))
+        size = tuple(np.ceil(np.clip(np.maximum(2 * middle, end), 1, LARGEST_PX)).astype(int).tolist())
+        assumed.append(f"the person in the middle of images of {size[0]}x{size[1]} px (--image-size WxH)")
+    if assumed:
+        logger.warning("%s: the file does not say, assumed: %s", path, ", ".join(assumed))
+    return Tracks(
+        keypoints=without_unseen(path, xy, np.array(size)),
+        joints=tuple(map(joint_name, names)),
+        stamp_ns=np.round((frames - frames[0]) * (1e9 / (rate_hz or _USUAL_HZ))).astype(np.int64),
+        image_size=(size[0], size[1]),
+        confidence=np.clip(scores, 0.0, 1.0),
+    )
+
+
+def _series(path: Path, content: Content) -> tuple[np.ndarray, Sequence[str], np.ndarray]:
+    """Numbers (F,) of the frames, names (P) of the joints, and the person's points (F, P, 3), NaN where unseen."""
     counts = Counter(len(points) for _, _, points in content.people)
     if not counts:
         raise InputError("expected 2D keypoints of a person, found none; check the file")
@@ -130,35 +150,19 @@ def _tracks(path: Path, content: Content, rate_hz: float | None, size: tuple[int
     names = content.names if len(content.names) == count else NAMES_BY_COUNT.get(count, ())
     if not names:
         raise InputError(f"expected points with names, or {', '.join(map(str, NAMES_BY_COUNT))} of them, found {count}")
-    numbers = numbers_of(content.frames)
-    people = [(numbers[frame], who, p) for frame, who, p in content.people if len(p) == count]
+    frames, people = _by_time(content, count)
     if len({frame for frame, _, _ in people}) < len(people):
         logger.warning("%s: several persons, the one in most frames or the largest is reconstructed", path)
-    chosen = one_person(people)
-    frames = sorted(set(numbers.values()))
-    step = int(np.gcd.reduce(np.diff(frames))) if len(frames) > 1 else 1
+    chosen, missing = one_person(people), np.full((count, 3), np.nan)
+    return frames, names, np.stack([chosen.get(frame, missing) for frame in frames.tolist()])[:, : len(names)]
+
+
+def _by_time(content: Content, count: int) -> tuple[np.ndarray, list[tuple[int, Label, np.ndarray]]]:
+    """Numbers (F,) of the frames, gaps filled up, and the persons of ``count`` points by these numbers."""
+    numbers = numbers_of(content.frames)
+    people = [(numbers[frame], who, p) for frame, who, p in content.people if len(p) == count]
+    frames = np.unique(list(numbers.values()))
+    step = np.gcd.reduce(np.diff(frames)) if len(frames) > 1 else 1
     if (frames[-1] - frames[0]) // step < min(_SPARSE * len(frames), MAX_FRAMES):
-        frames = list(range(frames[0], frames[-1] + 1, step))
-    missing = np.full((count, 3), np.nan)
-    xy, scores = np.split(np.stack([chosen.get(frame, missing) for frame in frames])[:, : len(names)], [2], axis=2)
-    scores = np.nan_to_num(scores[..., 0])
-    if scores.max(initial=0.0) > _HIGHEST_SCORE:  # per cent, or a heat map's unit
-        scores = scores / scores.max()
-    shares = np.nanmax(xy) <= _LARGEST_SHARE
-    if shares and size is None:
-        raise InputError("expected px, found shares of the picture; give its size with --image-size WxH")
-    xy = xy * size if shares else xy
-    assumed = [] if rate_hz else [f"{_USUAL_HZ:g} images per second (--rate HZ)"]
-    if size is None:
-        middle, end = np.nanmedian(xy, axis=(0, 1)), np.nanmax(xy, axis=(0, 1))
-        size = tuple(np.ceil(np.clip(np.maximum(2 * middle, end), 1, _LARGEST_PX)).astype(int).tolist())
-        assumed.append(f"the person in the middle of images of {size[0]}x{size[1]} px (--image-size WxH)")
-    if assumed:
-        logger.warning("%s: the file does not say, assumed: %s", path, ", ".join(assumed))
-    return Tracks(
-        keypoints=without_unseen(path, xy, np.array(size)),
-        joints=tuple(map(joint_name, names)),
-        stamp_ns=np.round((np.array(frames) - frames[0]) * (1e9 / (rate_hz or _USUAL_HZ))).astype(np.int64),
-        image_size=(size[0], size[1]),
-        confidence=np.clip(scores, 0.0, 1.0),
-    )
+        frames = np.arange(frames[0], frames[-1] + 1, step)
+    return frames, people

@@ -7,12 +7,11 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from drocap_ros.recording.mcap.schemas import ROS_DISTRIBUTION
 
 #: A mapping as YAML holds it.
-Yaml = dict[str, Any]
+Yaml = dict[str, object]
 METADATA_FILE = "metadata.yaml"
 #: Name of the metadata records that this package writes into MCAP files.
 METADATA_RECORD = "drocap_ros"
@@ -141,13 +140,13 @@ def custom_metadata(description: Yaml) -> dict[str, str]:
 
 def storage_files(folder: Path, description: Yaml) -> list[Path]:
     """Files of a folder in their order, with MCAP files that a crash left out of the description."""
-    there = sorted((p for p in folder.iterdir() if p.suffix == ".mcap"), key=_by_number)
+    there = sorted(folder.glob("*.mcap"), key=_by_number)
     named = description.get("relative_file_paths")
     files = [folder / Path(str(name)).name for name in named] if isinstance(named, list) else []
-    if not files or not all(file.is_file() for file in files):
+    if not all(file.is_file() for file in files):
         return there
-    is_mcap = all(file.suffix == ".mcap" for file in files)
-    return files + [p for p in there if is_mcap and p not in files]
+    others = any(file.suffix != ".mcap" for file in files)
+    return files if others else files + [p for p in there if p not in files]
 
 
 def _by_number(path: Path) -> tuple[int | str, ...]:

@@ -79,13 +79,18 @@ def schema_text(type_name: str) -> str:
     return _SEPARATOR.join(part.rstrip("\n") + "\n" for part in parts)
 
 
-def type_hash(type_name: str, schema: str) -> str:
-    """REP 2011 hash of a type from its schema text; empty for unusable text."""
+def types_of(type_name: str, schema: str) -> Typestore:
+    """The types of a schema text alone."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(schema, type_name))
+    return store
+
+
+def type_hash(type_name: str, schema: str) -> str:
+    """REP 2011 hash of a type from its schema text; empty for unusable text."""
     try:
-        store.register(get_types_from_msg(schema, type_name))
-        return store.hash_rihs01(type_name)
+        return types_of(type_name, schema).hash_rihs01(type_name)
     except Exception:  # noqa: BLE001  # readers do without a hash
         return ""

@@ -27,8 +27,8 @@ logger = logging.getLogger(__name__)
 MAGIC = b"\x89MCAP0\r\n"
 #: Largest chunk that is unpacked, and how much larger than packed one may be, beyond a size that is harmless anyway.
 _MAX_CHUNK = 512 << 20
-_FREE_EXPANSION = 64 << 20
-_MAX_EXPANSION = 1000
+_FREE_EXPANSION = 64 << 20  # bytes
+_MAX_EXPANSION = 1000  # times; a judgement: what is packed more and is large is no recording
 #: Bytes searched at once for the next chunk.
 _SEARCH = 1 << 20
 #: MCAP's code of a chunk, https://mcap.dev/spec.
@@ -276,16 +276,9 @@ def counted_channels(summary: Summary) -> Iterator[tuple[McapChannel, int]]:
 
 
 def _channel(record: Channel, schema: Schema | None) -> McapChannel:
-    text = schema.data.decode("utf-8", "replace") if schema is not None else ""
-    return McapChannel(
-        topic=record.topic,
-        type_name=_ros2_name(schema.name) if schema is not None else "",
-        message_encoding=record.message_encoding,
-        schema_encoding=schema.encoding if schema is not None else "",
-        schema=text,
-        raw_type_name=schema.name if schema is not None else "",
-        metadata=tuple(sorted(record.metadata.items())),
-    )
+    name, encoding, data = (schema.name, schema.encoding, schema.data) if schema is not None else ("", "", b"")
+    text, metadata = data.decode("utf-8", "replace"), tuple(sorted(record.metadata.items()))
+    return McapChannel(record.topic, _ros2_name(name), record.message_encoding, encoding, text, name, metadata)
 
 
 def _ros2_name(name: str) -> str:

@@ -5,18 +5,19 @@ DJI flight record as its readers export it; also as a spreadsheet saves it, with
 from __future__ import annotations
 
 import csv
+import itertools
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.geometry.interpolation import true_runs
-from drocap_ros.recording.telemetry.log import Lens, LogFormat, TelemetryLog, dji_attitude, from_first_fix, make_log
+from drocap_ros.recording.telemetry.log import Lens, LogFormat, TelemetryLog, make_log
 from drocap_ros.recording.telemetry.plausibility import Series, plausible
+from drocap_ros.recording.telemetry.series import dji_attitude, from_first_fix
 
 #: Characters of a line, beyond which the file is no table: Airdata's lines have about a thousand.
 _LINE = 16384
@@ -49,11 +50,8 @@ def read_airdata(path: Path) -> TelemetryLog:
         When the file cannot be read, lacks the columns, or cannot be true.
     """
     try:
-        with path.open("rb") as file:
-            wide = file.read(2) in (b"\xff\xfe", b"\xfe\xff")
-        with path.open("r", encoding="utf-16" if wide else "utf-8-sig", errors="replace", newline="") as file:
-            table = _Table(path, file)
-    except (OSError, csv.Error, UnicodeError) as error:
+        table = _Table(path)
+    except (csv.Error, UnicodeError) as error:
         raise InputError(f"{path}: expected a readable flight log as CSV; {first_line(error)}") from None
     stamp_ns = np.round(table.columns("time")[:, 0] * 1e6).astype(np.int64)
     gimbal = table.columns(*_GIMBAL)
@@ -77,26 +75,20 @@ def read_airdata(path: Path) -> TelemetryLog:
 class _Table:
     """Rows of a file at times that increase; a column that is not there is NaN."""
 
-    def __init__(self, path: Path, file: IO[str]) -> None:
-        first = file.readline(_LINE)
-        spreadsheet = first.count(";") > first.count(",")
-        head = [name.strip().lower() for name in next(csv.reader([first], delimiter=";" if spreadsheet else ","), [])]
-        reader = csv.reader(iter(lambda: file.readline(_LINE), ""), delimiter=";" if spreadsheet else ",")
-        found = {
-            _COLUMNS[name][0]: (i, _COLUMNS[name][1]) for i, name in reversed([*enumerate(head)]) if name in _COLUMNS
-        }
+    def __init__(self, path: Path) -> None:
+        cells = _cells(path)
+        head = [name.strip().lower() for name in next(cells, [])]
+        found: dict[str, tuple[int, float]] = {}
+        for i, (name, unit) in ((i, _COLUMNS[title]) for i, title in enumerate(head) if title in _COLUMNS):
+            found.setdefault(name, (i, unit))
         _check_head(path, head, found)
         record = "flight record CSV" if "osd.yaw" in head else "Airdata CSV"
         self.kind = "Litchi CSV" if "gimbalpitchraw" in head else record
         self._names = list(found)
-        read = [(i, _utc_s if name == "utc" else _number, unit) for name, (i, unit) in found.items()]
-        rows: list[list[float]] = []
-        for row in reader:
-            if len(rows) >= _MAX_ROWS:
-                raise InputError(f"{path}: expected at most {_MAX_ROWS} rows, found more; cut the file")
-            row = [cell.replace(",", ".") if spreadsheet else cell for cell in row]
-            rows.append([number(row[i]) * unit if i < len(row) else math.nan for i, number, unit in read])
-        table: np.ndarray = np.array(rows, dtype=np.float64).reshape(-1, len(read))
+        rows = [_row(row, found) for row in itertools.islice(cells, _MAX_ROWS + 1)]
+        if len(rows) > _MAX_ROWS:
+            raise InputError(f"{path}: expected at most {_MAX_ROWS} rows, found more; cut the file")
+        table: np.ndarray = np.array(rows, dtype=np.float64).reshape(-1, len(found))
         time_ms = table[:, self._names.index("time")]
         table = table[(time_ms >= 0) & (time_ms < _LATEST_MS)]
         self._rows = table[np.unique(table[:, self._names.index("time")], return_index=True)[1]]
@@ -109,6 +101,26 @@ class _Table:
     def columns(self, *names: str) -> np.ndarray:
         rows = np.pad(self._rows, ((0, 0), (0, 1)), constant_values=np.nan)  # the last column is the unknown one
         return rows[:, [self._names.index(name) if self.has(name) else -1 for name in names]]
+
+
+def _cells(path: Path) -> Iterator[list[str]]:
+    """Rows as text, numbers with a point; a spreadsheet of some countries writes semicolons and decimal commas."""
+    with path.open("rb") as file:
+        wide = file.read(2) in (b"\xff\xfe", b"\xfe\xff")
+    with path.open("r", encoding="utf-16" if wide else "utf-8-sig", errors="replace", newline="") as text:
+        first = text.readline(_LINE)
+        lines = itertools.chain([first], iter(lambda: text.readline(_LINE), ""))
+        if first.count(";") <= first.count(","):
+            yield from csv.reader(lines)
+            return
+        for row in csv.reader(lines, delimiter=";"):
+            yield [cell.replace(",", ".") for cell in row]
+
+
+def _row(cells: list[str], columns: dict[str, tuple[int, float]]) -> list[float]:
+    """Numbers of a row by the places and units of the columns; NaN where it ends before."""
+    texts = ((name, unit, cells[i] if i < len(cells) else "") for name, (i, unit) in columns.items())
+    return [(_utc_s if name == "utc" else _number)(text) * unit for name, unit, text in texts]
 
 
 def _check_head(path: Path, head: list[str], found: Collection[str]) -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.flight.frames import camera_rotation
+from drocap_ros.flight.frames import camera_rotation, quaternion_from_euler
 from drocap_ros.geometry.interpolation import interpolate, true_runs
 from drocap_ros.geometry.position_steps import without_steps
 from drocap_ros.geometry.rotations import quaternion_multiply
@@ -43,8 +43,8 @@ def camera_attitude(track: VehicleTrack, mount_pitch_deg: float | None = None) -
     """
     if mount_pitch_deg is None or np.isfinite(track.gimbal).all(axis=1).any():
         return track.gimbal
-    half = -0.5 * np.deg2rad(mount_pitch_deg)  # FLU: positive about y (left) turns the nose down
-    return quaternion_multiply(track.orientation, np.array([0.0, np.sin(half), 0.0, np.cos(half)]))
+    # FLU: positive about y (left) turns the nose down.
+    return quaternion_multiply(track.orientation, quaternion_from_euler(0.0, -np.deg2rad(mount_pitch_deg), 0.0))
 
 
 def camera_poses(track: VehicleTrack, stamp_ns: np.ndarray, mount_pitch_deg: float | None = None) -> CameraPoses:
@@ -55,18 +55,15 @@ def camera_poses(track: VehicleTrack, stamp_ns: np.ndarray, mount_pitch_deg: flo
     """
     attitude = camera_attitude(track, mount_pitch_deg)
     missing = "gimbal" if mount_pitch_deg is None else "attitude"
-    keep, reasons = np.ones(len(stamp_ns), bool), []
-    rotation, keep, words = _series(track.stamp_ns, attitude, stamp_ns, keep, missing, spherical=True)
-    reasons += words
-    place = _without_steps(track, stamp_ns)
-    position, keep, words = _series(track.stamp_ns, place, stamp_ns, keep, "position", spherical=False)
-    reasons += words
+    keep, place = np.ones(len(stamp_ns), bool), _without_steps(track, stamp_ns)
+    rotation, keep, reasons = _series(track.stamp_ns, attitude, stamp_ns, keep, missing, spherical=True)
+    position, keep, more = _series(track.stamp_ns, place, stamp_ns, keep, "position", spherical=False)
     runs = true_runs(keep)
     return CameraPoses(
         None if rotation is None else camera_rotation(rotation[keep]),
         None if position is None else position[keep],
         slice(*runs[0].tolist()) if len(runs) == 1 else keep,
-        "; ".join(reasons),
+        "; ".join(reasons + more),
     )
 
 

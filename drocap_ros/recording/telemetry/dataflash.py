@@ -6,15 +6,20 @@ import os
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.flight.frames import orientation_to_ros, quaternion_from_euler
-from drocap_ros.geometry.geodesy import geodetic_to_enu
 from drocap_ros.geometry.rotations import quaternion_multiply
-from drocap_ros.recording.telemetry.log import Lack, LogFormat, LogLack, TelemetryLog, at_stamps, make_log
+from drocap_ros.recording.telemetry.log import Lack, LogFormat, LogLack, TelemetryLog, make_log
+from drocap_ros.recording.telemetry.series import at_stamps, from_first_fix
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pymavlink.DFReader import DFMessage
 
 #: UTC in s from which a time is one of a GPS (2001); before its first fix the reader counts from 1970.
 _EARLIEST_UTC_S = 1e9
@@ -27,7 +32,7 @@ _FIELDS = {
 _PARAMETER = "PARM"
 #: ArduPilot's parameter for the kind of its first mount; 1 = servos.
 _MOUNT_TYPE = "MNT1_TYPE"
-_SERVOS = 1
+_SERVOS = 1  # of that parameter
 
 
 def read_dataflash(path: Path) -> TelemetryLog:
@@ -38,11 +43,8 @@ def read_dataflash(path: Path) -> TelemetryLog:
     Raises
     ------
     InputError
-        When the file cannot be read, is no DataFlash log, or holds no attitude.
+        When the file is no DataFlash log or holds no attitude.
     """
-    with path.open("rb") as file:
-        if file.read(2) != FORMAT.magic[:2]:
-            raise InputError(f"{path}: expected an ArduPilot DataFlash log, found other content at its start")
     content, lacks = _Content(), []
     try:
         # pymavlink prints remarks on damaged files.
@@ -60,16 +62,10 @@ def read_dataflash(path: Path) -> TelemetryLog:
     body = quaternion_from_euler(*np.deg2rad(angles).T).T
     position, position_lacks = _position(content, stamp_ns)
     gimbal, gimbal_lacks = _gimbal(content, stamp_ns, body)
-    utc_us = content.utc_us
-    return make_log(
-        path,
-        "ArduPilot DataFlash log",
-        stamp_ns,
-        lacks + position_lacks + gimbal_lacks,
-        orientation=orientation_to_ros(body),
-        position=position,
-        gimbal=gimbal,
-    )._replace(utc_minus_stamp_ns=int(np.median(utc_us)) * 1000 if utc_us else None)
+    lacks += position_lacks + gimbal_lacks
+    attitude, kind = orientation_to_ros(body), "ArduPilot DataFlash log"
+    log = make_log(path, kind, stamp_ns, lacks, orientation=attitude, position=position, gimbal=gimbal)
+    return log._replace(utc_minus_stamp_ns=int(np.median(content.utc_us)) * 1000 if content.utc_us else None)
 
 
 class _Content:
@@ -80,7 +76,7 @@ class _Content:
         self.utc_us: list[float] = []
         self.servos = False
 
-    def take(self, message: Any) -> None:
+    def take(self, message: DFMessage) -> None:
         name = message.get_type()
         if name == _PARAMETER:
             if message.Name == _MOUNT_TYPE:
@@ -102,11 +98,11 @@ def _position(content: _Content, stamp_ns: np.ndarray) -> tuple[np.ndarray | Non
     if not content.rows["POS"]:
         return None, []
     known_ns, geodetic = content.series("POS")
-    fixed = (geodetic[:, 0] != 0) | (geodetic[:, 1] != 0)
-    if not fixed.any():
+    geodetic[(geodetic[:, :2] == 0).all(axis=1)] = np.nan
+    enu = from_first_fix(geodetic)
+    if enu is None:
         return None, []
-    enu = geodetic_to_enu(geodetic, geodetic[fixed][0])
-    return at_stamps(known_ns[fixed], enu[fixed], stamp_ns, spherical=False), [LogLack(Lack.LOCAL_POSITION, "POS")]
+    return at_stamps(known_ns, enu, stamp_ns, spherical=False), [LogLack(Lack.LOCAL_POSITION, "POS")]
 
 
 def _gimbal(content: _Content, stamp_ns: np.ndarray, body: np.ndarray) -> tuple[np.ndarray | None, list[LogLack]]:
@@ -122,12 +118,12 @@ def _gimbal(content: _Content, stamp_ns: np.ndarray, body: np.ndarray) -> tuple[
     return orientation_to_ros(quaternion_multiply(body, camera) if content.servos else camera), []
 
 
-def _messages(path: Path) -> Iterator[Any]:
+def _messages(path: Path) -> Iterator[DFMessage]:
     from pymavlink.DFReader import DFReader_binary
 
     class Reader(DFReader_binary):  # type: ignore[misc]  # pymavlink has no types
         # The compiled index prints a line for every byte that it cannot parse.
-        def init_arrays_fast(self, progress_callback: Any = None) -> None:
+        def init_arrays_fast(self, progress_callback: Callable[[float], None] | None = None) -> None:
             self.init_arrays(progress_callback=progress_callback)
 
     log = Reader(str(path))

@@ -13,41 +13,25 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import orientation_to_ros
 from drocap_ros.geometry.rotations import unit_quaternions
-from drocap_ros.recording.telemetry.djmd_layouts import (
-    LATITUDE,
-    LONGITUDE,
-    MODELS,
-    SCHEMA,
-    UNIT,
-    Layout,
-    Model,
-    find_layout,
-)
-from drocap_ros.recording.telemetry.log import (
-    Lack,
-    Lens,
-    LogFormat,
-    LogLack,
-    TelemetryLog,
-    dji_attitude,
-    from_first_fix,
-    make_log,
-)
+from drocap_ros.recording.telemetry import djmd_layouts as layouts
+from drocap_ros.recording.telemetry.djmd_layouts import Layout, Model
+from drocap_ros.recording.telemetry.log import Lack, Lens, LogFormat, LogLack, TelemetryLog, make_log
 from drocap_ros.recording.telemetry.mp4 import Samples, Track, read_samples, read_tracks
 from drocap_ros.recording.telemetry.plausibility import Series, plausible
 from drocap_ros.recording.telemetry.protobuf import Message, Value
+from drocap_ros.recording.telemetry.series import dji_attitude, from_first_fix
 from drocap_ros.recording.telemetry.srt import TEXT_TRACKS, read_srt
 
 #: Format of the track's samples.
 _SAMPLES = "djmd"
 #: Bytes of a message; known ones have some kilobytes.
 _MAX_MESSAGE = 1 << 18
-_MIN_MESSAGE = 4
+_MIN_MESSAGE = 4  # bytes: a field's key, its length and a message of one value
 #: Messages from which the layout is found.
 _PROBED = 32
 #: Units of the file: angles in tenths of a degree, heights in mm; ExifTool's DJI tags.
 _TENTH_DEG = 0.1
-_MM = 1e-3
+_MM = 1e-3  # m; of the file's heights
 #: Largest angle between the gimbal's quaternion and its angles, deg: five times their rounding to 0.1 deg.
 _AGREEMENT_DEG = 0.5
 #: Digital zooms; others are another value at that place.
@@ -83,21 +67,20 @@ def read_djmd(path: Path) -> TelemetryLog:
     ------
     InputError
         When there is no such track, or its content is damaged or cannot be true.
+    OSError
+        When the file cannot be read.
     """
-    try:
-        with path.open("rb") as file:
-            track = _find_track(file)
-            if track is None:
-                raise InputError(f"{path}: expected a DJI djmd track in the video, found none; give a log beside it")
-            if track.sample_format in TEXT_TRACKS:
-                return read_srt(path)
-            try:
-                samples = _in_order(read_samples(file, track))
-            except InputError as error:
-                raise InputError(f"{path}: djmd track: {error}; copy the file again") from None
-            return _to_log(path, file, samples)
-    except OSError as error:
-        raise InputError(f"{path}: expected a readable video file; {error.strerror}") from None
+    with path.open("rb") as file:
+        track = _find_track(file)
+        if track is None:
+            raise InputError(f"{path}: expected a DJI djmd track in the video, found none; give a log beside it")
+        if track.sample_format in TEXT_TRACKS:
+            return read_srt(path)
+        try:
+            samples = _in_order(read_samples(file, track))
+        except InputError as error:
+            raise InputError(f"{path}: djmd track: {error}; copy the file again") from None
+        return _to_log(path, file, samples)
 
 
 def _in_order(samples: Samples) -> Samples:
@@ -122,8 +105,8 @@ def _to_log(path: Path, file: IO[bytes], samples: Samples) -> TelemetryLog:
     probed = np.unique(np.concatenate([np.arange(min(count, 4)), np.linspace(0, count - 1, _PROBED).astype(int)]))
     messages = [m for i in probed if (m := _message(file, samples, int(i))) is not None]
     name = _schema_name(messages)
-    model = MODELS.get(name)
-    layout = find_layout(messages, model)
+    model = layouts.MODELS.get(name)
+    layout = layouts.find_layout(messages, model)
     if layout is None:
         raise InputError(
             f"{path}: expected attitude or position at the known places of a djmd track, found neither (schema"
@@ -143,7 +126,7 @@ def _to_log(path: Path, file: IO[bytes], samples: Samples) -> TelemetryLog:
 
 
 def _schema_name(messages: list[Message]) -> str:
-    schema = next((v for m in messages if isinstance(v := m.at(SCHEMA), bytes)), b"")
+    schema = next((v for m in messages if isinstance(v := m.at(layouts.SCHEMA), bytes)), b"")
     return "".join(c for c in schema.decode("latin1")[:60] if c.isascii() and c.isprintable()).removesuffix(".proto")
 
 
@@ -155,7 +138,7 @@ def _title(name: str, model: Model | None) -> str:
 
 def _numbers_of(message: Message, layout: Layout, model: Model | None) -> tuple[float, ...]:
     """The numbers of one message in the units of the file, NaN where missing."""
-    place = _numbers(message, layout.position, (LATITUDE, LONGITUDE, UNIT))
+    place = _numbers(message, layout.position, (layouts.LATITUDE, layouts.LONGITUDE, layouts.UNIT))
     relative = _numbers(message, layout.relative_height[:-1], layout.relative_height[-1:])
     return (
         *(_numbers(message, layout.gimbal, (1, 2, 3)) if layout.gimbal else (np.nan,) * 3),

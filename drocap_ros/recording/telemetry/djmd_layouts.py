@@ -18,8 +18,8 @@ Path = tuple[int, ...]
 SCHEMA: Path = (1, 1, 1)
 #: Fields of a position: unit (1 = degrees), latitude, longitude.
 UNIT = 1
-LATITUDE = 2
-LONGITUDE = 3
+LATITUDE = 2  # number of its field
+LONGITUDE = 3  # number of its field
 #: Highest field number at which a position is searched; the known ones are below 6.
 _SEARCHED = 12
 

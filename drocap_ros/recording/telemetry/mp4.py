@@ -19,13 +19,13 @@ from drocap_ros.tracks import MAX_FRAMES
 
 # Bounds against damaged files; whole ones are far below.
 _MAX_CHILDREN = 4096
-_MAX_TRACKS = 64
-_MAX_DURATION_S = 1e6
+_MAX_TRACKS = 64  # a drone's video has less than ten
+_MAX_DURATION_S = 1e6  # s: eleven days
 #: Seconds from 1904, from which MP4 counts, to 1970.
 _EPOCH_S = 2_082_844_800
 #: Creation times, s from 1970, of a clock that was set: 2000 to 2100.
 _EARLIEST_S = 946_684_800
-_LATEST_S = 4_102_444_800
+_LATEST_S = 4_102_444_800  # s: 2100-01-01
 
 
 class Box(NamedTuple):

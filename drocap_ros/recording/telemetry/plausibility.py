@@ -22,9 +22,9 @@ _MAX_HEIGHT_M = 20_000.0
 _DAMAGED_SHARE = 0.02
 #: A turn, or a way, from one state to the next that no gimbal or drone makes.
 _TURN_DEG = 30.0
-_TURN_DEG_S = 360.0
-_STEP_M = 20.0
-_SPEED_M_S = 60.0
+_TURN_DEG_S = 360.0  # deg/s: twice what DJI's gimbals are specified to turn
+_STEP_M = 20.0  # m: a fix that is renewed moves a place by some metres
+_SPEED_M_S = 60.0  # m/s: beyond DJI's fastest drones, some 40 m/s
 #: Largest share of such turns: angles jump where a gimbal is recentred.
 _TURNS_SHARE = 0.05
 #: Metres of a degree of latitude.

@@ -12,7 +12,10 @@ Value = int | float | bytes
 
 #: Values of a varint: the sign bit of 64, and their number.
 _SIGN = 1 << 63
-_RANGE = 1 << 64
+_RANGE = 1 << 64  # values of 64 bits
+
+#: Wire type -> bytes of a number of fixed size.
+_SIZES = {1: 8, 5: 4}
 
 
 def read_message(data: bytes) -> dict[int, Value]:
@@ -32,14 +35,9 @@ def read_message(data: bytes) -> dict[int, Value]:
             value, place = _varint(data, place)
             fields[number] = value - _RANGE if value >= _SIGN else value
             continue
-        if wire == 2:
-            size, place = _varint(data, place)
-        elif wire in (1, 5):
-            size = 8 if wire == 1 else 4
-        else:
-            raise ValueError(f"wire type {wire}")
+        size, place = _varint(data, place) if wire == 2 else (_SIZES.get(wire, end), place)
         if number == 0 or place + size > end:
-            raise ValueError("a field that is cut off")
+            raise ValueError("a field that is cut off or of an unknown kind")
         content = data[place : place + size]
         place += size
         fields[number] = content if wire == 2 else struct.unpack("<d" if wire == 1 else "<f", content)[0]

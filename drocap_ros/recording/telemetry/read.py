@@ -26,14 +26,14 @@ def read_telemetry(path: str | Path) -> TelemetryLog:
     try:
         with path.open("rb") as file:
             head = file.read(16)
+        suffix = path.suffix.lower()
+        fitting = [f for f in FORMATS if f.begins(head)] or [f for f in FORMATS if f.suffix and f.suffix == suffix]
+        if not fitting:
+            raise InputError(
+                f"{path}: expected a telemetry log ({', '.join(LOG_SUFFIXES)}, DJI video), found another; check it"
+            )
+        return fitting[0].read(path)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the path") from None
     except OSError as error:
         raise InputError(f"{path}: expected a readable telemetry log; {error.strerror}") from None
-    suffix = path.suffix.lower()
-    fitting = [f for f in FORMATS if f.begins(head)] or [f for f in FORMATS if f.suffix and f.suffix == suffix]
-    if not fitting:
-        raise InputError(
-            f"{path}: expected a telemetry log ({', '.join(LOG_SUFFIXES)}, DJI video), found another; check it"
-        )
-    return fitting[0].read(path)

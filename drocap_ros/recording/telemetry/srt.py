@@ -17,17 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.telemetry.log import (
-    Lack,
-    Lens,
-    LogFormat,
-    LogLack,
-    TelemetryLog,
-    dji_attitude,
-    from_first_fix,
-    make_log,
-)
+from drocap_ros.recording.telemetry.log import Lack, Lens, LogFormat, LogLack, TelemetryLog, make_log
 from drocap_ros.recording.telemetry.mp4 import read_samples, read_tracks
+from drocap_ros.recording.telemetry.series import dji_attitude, from_first_fix
 from drocap_ros.tracks import MAX_FRAMES
 
 #: Formats of a video's subtitle tracks (3GPP TS 26.245, QuickTime).
@@ -50,12 +42,14 @@ _PRY = re.compile(rf"\b([FG])[._ ]?PRY\s*\(\s*{_NUMBER}°?\s*,\s*{_NUMBER}°?\s*
 
 
 class _Entry(NamedTuple):
-    """One subtitle: time ns in the video, geodetic, source of the height, pitch roll yaw deg, lens mm and zoom."""
+    """One subtitle: time ns in the video; latitude, longitude deg and height m; pitch roll yaw deg; lens mm and zoom.
+
+    kind : of the height, "" = none
+    clock_s : time of day
+    """
 
     stamp_ns: int
-    latitude: float
-    longitude: float
-    height: float
+    geodetic: tuple[float, float, float]
     kind: str
     gimbal: tuple[float, float, float]
     body: tuple[float, float, float]
@@ -72,35 +66,38 @@ def read_srt(path: Path) -> TelemetryLog:
     Raises
     ------
     InputError
-        When the file cannot be read or holds no telemetry.
+        When the file holds no telemetry.
     """
-    read = _subtitles if path.suffix.lower() == FORMAT.suffix else _inside
-    found = (_entry(stamp_ns, text) for stamp_ns, text in read(path))
-    entries = list(itertools.islice((entry for entry in found if entry), MAX_FRAMES + 1))
-    if not 0 < len(entries) <= MAX_FRAMES:
-        raise InputError(f"{path}: expected 1 to {MAX_FRAMES} DJI subtitles with telemetry, found {len(entries)}")
-    heights = next((kind for kind in _HEIGHTS if any(e.kind == kind for e in entries)), "height")
-    stamps = np.array([e.stamp_ns for e in entries], np.int64)
-    position = from_first_fix(_geodetic(entries), above_takeoff=heights == "rel_alt")
+    entries = _entries(path)
+    stamps, places, kinds, gimbal, body, lens, clock_s = map(np.array, zip(*entries, strict=True))
+    heights = next((kind for kind in _HEIGHTS if kind in kinds), "height")
+    position = from_first_fix(_geodetic(places), above_takeoff=heights == "rel_alt")
     lacks = [LogLack(Lack.HEIGHT, heights)] if position is not None and heights != "rel_alt" else []
-    real_s, shown_s = entries[-1].clock_s - entries[0].clock_s, float(stamps[-1] - stamps[0]) * 1e-9
+    real_s, shown_s = clock_s[-1] - clock_s[0], float(stamps[-1] - stamps[0]) * 1e-9
     if 1 < real_s < shown_s / 1.5:  # a second or more, and no rounding of the dates
         lacks.append(LogLack(Lack.SLOW, f"{shown_s / real_s:.1f}"))
-    lens = np.array([e.lens for e in entries])
-    if (steady := _lens(lens)) is None:
+    steady = _lens(lens)
+    if steady is None:
         lacks.append(LogLack(Lack.ZOOM, " to ".join(f"{f(np.nanprod(lens, axis=1)):.0f} mm" for f in (np.min, np.max))))
-    body, gimbal = (
-        dji_attitude(np.array(angles)) for angles in ([e.body for e in entries], [e.gimbal for e in entries])
-    )
-    log = make_log(path, "DJI subtitles", stamps, lacks, orientation=body, position=position, gimbal=gimbal)
+    attitudes = {"orientation": dji_attitude(body), "gimbal": dji_attitude(gimbal)}
+    log = make_log(path, "DJI subtitles", stamps, lacks, position=position, **attitudes)
     return log._replace(video_clock=True, lens=steady)
 
 
-def _geodetic(entries: list[_Entry]) -> np.ndarray:
+def _entries(path: Path) -> list[_Entry]:
+    read = _subtitles if path.suffix.lower() == FORMAT.suffix else _inside
+    found = (_entry(stamp_ns, text) for stamp_ns, text in read(path))
+    entries = list(itertools.islice(filter(None, found), MAX_FRAMES + 1))
+    if not 0 < len(entries) <= MAX_FRAMES:
+        raise InputError(f"{path}: expected 1 to {MAX_FRAMES} DJI subtitles with telemetry, found {len(entries)}")
+    return entries
+
+
+def _geodetic(places: np.ndarray) -> np.ndarray:
     """(N, 3) latitude and longitude in degrees, height; NaN where they are no place."""
-    geodetic = np.array([(e.latitude, e.longitude, e.height) for e in entries])
-    place = np.abs(geodetic[np.isfinite(geodetic[:, 0]), :2]).max(axis=0, initial=0.0)
-    if place.any() and (place <= (np.pi / 2, np.pi)).all():  # as degrees all of it would be the open Atlantic
+    geodetic = places.copy()
+    farthest = np.abs(geodetic[np.isfinite(geodetic[:, 0]), :2]).max(axis=0, initial=0.0)
+    if farthest.any() and (farthest <= (np.pi / 2, np.pi)).all():  # as degrees all of it would be the open Atlantic
         geodetic[:, :2] = np.rad2deg(geodetic[:, :2])
     geodetic[(np.abs(geodetic[:, :2]) > (90, 180)).any(axis=1) | (geodetic[:, :2] == 0).all(axis=1)] = np.nan
     return geodetic
@@ -119,20 +116,17 @@ def _inside(path: Path) -> Iterator[tuple[int, str]]:
 def _subtitles(path: Path) -> Iterator[tuple[int, str]]:
     """Time ns in the video and text of each subtitle."""
     stamp_ns, text = None, ""
-    try:
-        with path.open("r", encoding="utf-8", errors="replace") as file:
-            while line := file.readline(_LINE):
-                match = _TIME.search(line)
-                if match is None:
-                    text = (text + line)[:_LINE]
-                    continue
-                if stamp_ns is not None:
-                    yield stamp_ns, text
-                hours, minutes, seconds = (int(match[i]) for i in (1, 2, 3))
-                stamp_ns = ((hours * 60 + minutes) * 60 + seconds) * 10**9 + int(match[4].ljust(3, "0")) * 10**6
-                text = ""
-    except OSError as error:
-        raise InputError(f"{path}: expected a readable file; {error.strerror}") from None
+    with path.open("r", encoding="utf-8", errors="replace") as file:
+        while line := file.readline(_LINE):
+            match = _TIME.search(line)
+            if match is None:
+                text = (text + line)[:_LINE]
+                continue
+            if stamp_ns is not None:
+                yield stamp_ns, text
+            hours, minutes, seconds = (int(match[i]) for i in (1, 2, 3))
+            stamp_ns = ((hours * 60 + minutes) * 60 + seconds) * 10**9 + int(match[4].ljust(3, "0")) * 10**6
+            text = ""
     if stamp_ns is not None:
         yield stamp_ns, text
 
@@ -141,16 +135,14 @@ def _entry(stamp_ns: int, text: str) -> _Entry | None:
     """One subtitle; None without telemetry."""
     values = _values(text)
     angles = {kind.upper(): (float(p), float(r), float(y)) for kind, p, r, y in _PRY.findall(text)}
-    gimbal = angles.get("G", _UNKNOWN)
     if "gb_yaw" in values and "gb_pitch" in values:
-        gimbal = (values["gb_pitch"], values.get("gb_roll", 0.0), values["gb_yaw"])
+        angles["G"] = (values["gb_pitch"], values.get("gb_roll", 0.0), values["gb_yaw"])
     kind = next((name for name in _HEIGHTS if name in values), "")
-    if not kind and not angles and math.isnan(gimbal[0]):
+    if not kind and not angles:
         return None
-    latitude, longitude, height = (values.get(name, math.nan) for name in ("latitude", "longitude", kind))
-    clock = _CLOCK.search(text)
-    clock_s = 3600 * int(clock[1]) + 60 * int(clock[2]) + float(clock[3].replace(",", ".")) if clock else math.nan
-    return _Entry(stamp_ns, latitude, longitude, height, kind, gimbal, angles.get("F", _UNKNOWN), _focal(text), clock_s)
+    place = (values.get("latitude", math.nan), values.get("longitude", math.nan), values.get(kind, math.nan))
+    gimbal, body = (angles.get(of, _UNKNOWN) for of in "GF")
+    return _Entry(stamp_ns, place, kind, gimbal, body, _focal(text), _clock_s(text))
 
 
 def _values(text: str) -> dict[str, float]:
@@ -159,13 +151,24 @@ def _values(text: str) -> dict[str, float]:
     if "longtitude" in values:  # as some models spell it
         values.setdefault("longitude", values["longtitude"])
     if "latitude" not in values and (gps := _GPS.search(text)):
-        first, second = (float(gps[i + 1]) * (-1 if gps[i].upper() in ("S", "W") and gps[i] else 1) for i in (1, 3))
-        if gps[1].upper() in ("N", "S") if gps[1] else gps[6]:  # with a height in m latitude is first, else longitude
-            first, second = second, first
-        values |= {"longitude": first, "latitude": second, "altitude": float(gps[5])}
+        # Without letters: with a height in m latitude is first, else longitude.
+        latitude_first = gps[1].upper() in ("N", "S") if gps[1] else gps[6]
+        names = ("latitude", "longitude") if latitude_first else ("longitude", "latitude")
+        values |= {names[0]: _coordinate(gps[1], gps[2]), names[1]: _coordinate(gps[3], gps[4])}
+        values["altitude"] = float(gps[5])
     if barometer := _BAROMETER.search(text):
         values["barometer"] = float(barometer[1] or barometer[2])
     return values
+
+
+def _coordinate(letter: str, number: str) -> float:
+    return -float(number) if letter.upper() in ("S", "W") else float(number)
+
+
+def _clock_s(text: str) -> float:
+    """Time of day, NaN where the subtitle has none."""
+    found = _CLOCK.search(text)
+    return 3600 * int(found[1]) + 60 * int(found[2]) + float(found[3].replace(",", ".")) if found else math.nan
 
 
 def _focal(text: str) -> tuple[float, float]:

@@ -32,7 +32,7 @@ MAX_VIDEO_S = 180.0
 MIN_VIDEO_S = 5.0
 #: Least correlation, and its least lead over the second best offset.
 MIN_CORRELATION = 0.7
-MIN_LEAD = 0.1
+MIN_LEAD = 0.1  # of the correlation, which is at most 1; a judgement
 #: Least standard deviation of the camera's turning rate in the log.
 MIN_TURN_DEG_S = 1.5
 #: Largest error of the container's creation time; the correlation searches within it.

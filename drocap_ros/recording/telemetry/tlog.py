@@ -5,12 +5,15 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.recording.telemetry.log import LogFormat, TelemetryLog, make_log
+
+if TYPE_CHECKING:
+    from pymavlink.dialects.v20.ardupilotmega import MAVLink_message
 
 #: UTC in ns from which a time is one of a clock that was set (2001); a ground station without one starts at 1970.
 _MIN_UTC_NS = 1_000_000_000 * 10**9
@@ -18,7 +21,7 @@ _MIN_UTC_NS = 1_000_000_000 * 10**9
 _LATEST_US = 4_102_444_800_000_000
 #: First bytes of a packet of MAVLink 1 and 2, https://mavlink.io/en/guide/serialization.html.
 _MAGIC_V1 = 0xFE
-_MAGIC_V2 = 0xFD
+_MAGIC_V2 = 0xFD  # of MAVLink 2
 #: Bytes read at once.
 _CHUNK = 1 << 20
 
@@ -29,7 +32,7 @@ def read_tlog(path: Path) -> TelemetryLog:
     Raises
     ------
     InputError
-        When the file cannot be read, is no tlog, or holds no attitude.
+        When the file is no tlog or holds no attitude.
     """
     from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
 
@@ -43,40 +46,27 @@ def read_tlog(path: Path) -> TelemetryLog:
             rows.append((state.stamp_ns, state.position_enu_m, state.orientation_xyzw, state.gimbal_orientation_xyzw))
     if not rows:
         raise InputError(f"{path}: expected the attitude of an autopilot, found none; was ATTITUDE streamed?")
-    stamps, position, orientation, gimbal = (np.array([row[i] for row in rows]) for i in range(4))
-    return make_log(
-        path,
-        "MAVLink tlog",
-        stamps,
-        [],
-        orientation=orientation,
-        position=position,
-        gimbal=gimbal,
-    )._replace(utc_minus_stamp_ns=0 if stamps[0] > _MIN_UTC_NS else None)
+    stamps, position, body, gimbal = map(np.array, zip(*rows, strict=True))
+    log = make_log(path, "MAVLink tlog", stamps, [], orientation=body, position=position, gimbal=gimbal)
+    return log._replace(utc_minus_stamp_ns=0 if stamps[0] > _MIN_UTC_NS else None)
 
 
-def tlog_messages(path: str | Path) -> Iterator[tuple[Any, int]]:
+def tlog_messages(path: Path) -> Iterator[tuple[MAVLink_message, int]]:
     """Messages of a log with their times of reception, ns; damaged parts are skipped.
 
     Raises
     ------
     InputError
-        When the file cannot be read or holds no MAVLink message.
+        When the file holds no MAVLink message.
     """
     from drocap_ros.flight.mavlink.parser import MavlinkParser
 
-    path = Path(path)
     parser, found = MavlinkParser(), False
-    try:
-        with path.open("rb") as file:
-            for stamp_us, packet in _packets(file):
-                for message in parser.feed(packet):
-                    found = True
-                    yield message, stamp_us * 1000
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check the path") from None
-    except OSError as error:
-        raise InputError(f"{path}: expected a readable file; {error.strerror}") from None
+    with path.open("rb") as file:
+        for stamp_us, packet in _packets(file):
+            for message in parser.feed(packet):
+                found = True
+                yield message, stamp_us * 1000
     if not found:
         raise InputError(f"{path}: expected a MAVLink telemetry log, found no message in it; is it a .tlog?")
 

@@ -6,33 +6,26 @@ import contextlib
 import io
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.flight.frames import ned_to_enu, orientation_to_ros, yaw_of
 from drocap_ros.geometry.rotations import quaternion_multiply
-from drocap_ros.recording.telemetry.log import (
-    Lack,
-    LogFormat,
-    LogLack,
-    TelemetryLog,
-    at_stamps,
-    from_first_fix,
-    make_log,
-)
+from drocap_ros.recording.telemetry.log import Lack, LogFormat, LogLack, TelemetryLog, make_log
+from drocap_ros.recording.telemetry.series import at_stamps, from_first_fix
+
+if TYPE_CHECKING:
+    from pyulog import ULog
 
 #: Fields of a topic by name, each (N,).
 _Data = dict[str, np.ndarray]
 
+_GPS = ("vehicle_gps_position", "sensor_gps")
 _TOPICS = (
-    "vehicle_attitude",
-    "vehicle_local_position",
-    "vehicle_global_position",
-    "gimbal_device_attitude_status",
-    "vehicle_gps_position",
-    "sensor_gps",
+    *("vehicle_attitude", "vehicle_local_position", "vehicle_global_position", "gimbal_device_attitude_status"),
+    *_GPS,
 )
 #: UTC in us from which a time is one of a GPS (2001).
 _EARLIEST_UTC_US = 1_000_000_000_000_000
@@ -40,8 +33,8 @@ _EARLIEST_UTC_US = 1_000_000_000_000_000
 _FIX_3D = 3
 #: MAVLink's GIMBAL_DEVICE_FLAGS_YAW_LOCK, _YAW_IN_VEHICLE_FRAME and _YAW_IN_EARTH_FRAME.
 _YAW_LOCK = 16
-_YAW_IN_VEHICLE = 32
-_YAW_IN_EARTH = 64
+_YAW_IN_VEHICLE = 32  # bit of the flags, as the next
+_YAW_IN_EARTH = 64  # bit
 
 
 def read_ulog(path: Path) -> TelemetryLog:
@@ -67,46 +60,45 @@ def read_ulog(path: Path) -> TelemetryLog:
         raise InputError(f"{path}: expected the fields of PX4's topics, found a damaged log ({error})") from None
 
 
-def _to_log(path: Path, log: Any) -> TelemetryLog:
+def _to_log(path: Path, ulog: ULog) -> TelemetryLog:
     series: dict[str, _Data] = {}
-    for data in log.data_list:
+    for data in ulog.data_list:
         if "timestamp" in data.data and (data.multi_id == 0 or data.name not in series):
             series[data.name] = data.data
     attitude = series.get("vehicle_attitude")
     if attitude is None or not len(attitude["timestamp"]):
         raise InputError(f"{path}: expected vehicle_attitude in the ULog, found none; log it")
-    lacks = [LogLack(Lack.DROPOUTS, str(len(log.dropouts)))] if log.dropouts else []
+    lacks = [LogLack(Lack.DROPOUTS, str(len(ulog.dropouts)))] if ulog.dropouts else []
     stamp_ns = _stamps(attitude)
     frd_to_ned = _quaternion(attitude, "q")
     position, position_lacks = _position(series, stamp_ns)
-    return make_log(
-        path,
-        "PX4 ULog",
-        stamp_ns,
-        lacks + position_lacks,
-        orientation=orientation_to_ros(frd_to_ned),
-        position=position,
-        gimbal=_gimbal(series, stamp_ns, frd_to_ned),
-    )._replace(utc_minus_stamp_ns=_utc(series))
+    lacks += position_lacks
+    body, gimbal = orientation_to_ros(frd_to_ned), _gimbal(series, stamp_ns, frd_to_ned)
+    log = make_log(path, "PX4 ULog", stamp_ns, lacks, orientation=body, position=position, gimbal=gimbal)
+    return log._replace(utc_minus_stamp_ns=_utc(series))
 
 
 def _position(series: dict[str, _Data], stamp_ns: np.ndarray) -> tuple[np.ndarray | None, list[LogLack]]:
     """(N, 3) m ENU: the estimator's local position where valid, else its global one, else the GPS's."""
     local = series.get("vehicle_local_position")
-    if local is not None and len(local["timestamp"]):
-        ned = np.stack([local[axis] for axis in "xyz"], axis=1).astype(np.float64)
-        for flag, columns in (("xy_valid", [0, 1]), ("z_valid", [2])):
-            if flag in local:
-                ned[np.ix_(local[flag] == 0, columns)] = np.nan
-        if np.isfinite(ned).all(axis=1).any():
-            return at_stamps(_stamps(local), ned_to_enu(ned), stamp_ns, spherical=False), []
-    for name, read in (("vehicle_global_position", _global), ("vehicle_gps_position", _gps), ("sensor_gps", _gps)):
+    ned = _local(local) if local else np.zeros((0, 3))
+    if local and np.isfinite(ned).all(axis=1).any():
+        return at_stamps(_stamps(local), ned_to_enu(ned), stamp_ns, spherical=False), []
+    for name, read in (("vehicle_global_position", _global), *((name, _gps) for name in _GPS)):
         geodetic = read(series[name]) if name in series else None
         enu = None if geodetic is None else from_first_fix(geodetic)
         if enu is not None:
             position = at_stamps(_stamps(series[name]), enu, stamp_ns, spherical=False)
             return position, [LogLack(Lack.LOCAL_POSITION, name)]
     return None, []
+
+
+def _local(data: _Data) -> np.ndarray:
+    ned = np.stack([data[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    for flag, columns in (("xy_valid", [0, 1]), ("z_valid", [2])):
+        if flag in data:
+            ned[np.ix_(data[flag] == 0, columns)] = np.nan
+    return ned
 
 
 def _global(data: _Data) -> np.ndarray | None:
@@ -136,13 +128,13 @@ def _gimbal(series: dict[str, _Data], stamp_ns: np.ndarray, frd_to_ned: np.ndarr
     earth = (nearest & _YAW_IN_EARTH > 0) | (
         (nearest & (_YAW_IN_EARTH | _YAW_IN_VEHICLE) == 0) & (nearest & _YAW_LOCK > 0)
     )
-    half = 0.5 * yaw_of(frd_to_ned)
-    turn = np.stack([np.zeros_like(half), np.zeros_like(half), np.sin(half), np.cos(half)], axis=1)
+    turn, half = np.zeros((len(stamp_ns), 4)), 0.5 * yaw_of(frd_to_ned)
+    turn[:, 2], turn[:, 3] = np.sin(half), np.cos(half)
     return orientation_to_ros(np.where(earth[:, None], camera, quaternion_multiply(turn, camera)))
 
 
 def _utc(series: dict[str, _Data]) -> int | None:
-    for name in ("vehicle_gps_position", "sensor_gps"):
+    for name in _GPS:
         gps = series.get(name)
         if gps is None or "time_utc_usec" not in gps:
             continue

@@ -17,12 +17,12 @@ from drocap_ros.simulation.vehicle.flight_control import Manner, Target
 _CLIMB_M_S = 1.2
 #: Deceleration and lag of the simulated vehicle, by which the pilot lets go of the stick in time.
 _BRAKING_M_S2 = 1.45
-_LAG_S = 0.35
+_LAG_S = 0.35  # s, of the simulated vehicle as well
 #: Height of the body on its skids.
 _SKIDS_M = 0.1
 #: Time on the ground, and of the hover before the hand-over.
 _READY_S = 1.0
-_HOVER_S = 1.5
+_HOVER_S = 1.5  # s; a judgement
 
 
 class PilotedCopter(SimulatedCopter):

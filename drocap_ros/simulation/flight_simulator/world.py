@@ -27,7 +27,7 @@ _GAP_S = 0.5
 _REACTION_S = 0.3
 #: Rate and length of the pieces in which the person's motion is computed.
 _TAKE_HZ = 100.0
-_TAKE_CHUNK_S = 20.0
+_TAKE_CHUNK_S = 20.0  # s: a piece is computed while one is flown; a judgement
 
 
 class Exposure(NamedTuple):

@@ -8,12 +8,12 @@ import numpy as np
 
 #: Side of the ground's repeating pattern, near and far; the haze hides the repetitions.
 NEAR_M = 24.0
-FAR_M = 480.0
-_NEAR_PX = 1024
-_FAR_PX = 512
+FAR_M = 480.0  # m: twenty near ones
+_NEAR_PX = 1024  # px of the pattern: 2.3 cm each, about one px of an image from 20 m
+_FAR_PX = 512  # px of the pattern: 0.9 m each; the haze hides finer ones
 #: Distances of trees and houses from the origin, beyond the person's path.
 _LEAST_M = 32.0
-_MOST_M = 95.0
+_MOST_M = 95.0  # m; a judgement, as the least
 
 _GROUNDS = (  # base colour BGR, its variation, size of its patches in px of the pattern
     ((60, 115, 85), 22.0, 40),  # grass

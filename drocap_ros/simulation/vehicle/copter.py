@@ -7,7 +7,6 @@ reports its estimate: the truth with the errors of GPS and attitude.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -46,7 +45,7 @@ class SimulatedCopter(ReportingCopter):
         self.mode_log: list[tuple[float, str, str]] = [(0.0, self.mode, "start")]
         self._accepted_s = -1e9  # last accepted setpoint
         self._setpoint_s = -1e9  # last setpoint, accepted or not
-        self._answers: list[tuple[float, Any]] = []
+        self._answers: list[tuple[float, mavlink.MAVLink_message]] = []
         self._loss_delay_s = float(np.random.default_rng([setup.seed, 0xC2]).uniform(*self.simulated.loss_check_s))
         self.control.begin(manner_of(self.kind, self.mode), self.estimate, self.body.velocity, yaw)
 
@@ -125,7 +124,7 @@ class SimulatedCopter(ReportingCopter):
         elif self.intended == control_mode and silent_s < self.timeout_s and self.mode_log[-1][2] == _LOST:
             self.set_mode(control_mode, "failsafe: setpoints returned")
 
-    def _answer(self, message: Any, t_s: float) -> None:
+    def _answer(self, message: mavlink.MAVLink_message, t_s: float) -> None:
         name = message.get_type()
         if name == "SET_POSITION_TARGET_LOCAL_NED":
             self._take_setpoint(message)
@@ -145,10 +144,10 @@ class SimulatedCopter(ReportingCopter):
         else:
             super()._answer(message, t_s)
 
-    def _acknowledge(self, message: Any, result: int) -> None:
+    def _acknowledge(self, message: mavlink.MAVLink_message, result: int) -> None:
         self._send(self._acknowledgement(message, result))
 
-    def _acknowledgement(self, message: Any, result: int) -> Any:
+    def _acknowledgement(self, message: mavlink.MAVLink_message, result: int) -> mavlink.MAVLink_message:
         sender = message.get_srcSystem(), message.get_srcComponent()
         return self._mav.command_ack_encode(message.command, result, 0, 0, *sender)
 
@@ -163,7 +162,7 @@ class SimulatedCopter(ReportingCopter):
         self.set_mode(mode, "command")
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
-    def _take_setpoint(self, m: Any) -> None:
+    def _take_setpoint(self, m: mavlink.MAVLink_message) -> None:
         if m.target_system not in (0, self._mav.srcSystem):
             return
         self._setpoint_s = self._t
@@ -179,7 +178,7 @@ class SimulatedCopter(ReportingCopter):
             self.accepted_setpoints += 1
 
 
-def _target_of(m: Any) -> Target | None:
+def _target_of(m: mavlink.MAVLink_message) -> Target | None:
     """What a SET_POSITION_TARGET_LOCAL_NED asks for; None = values or a frame that are silently ignored."""
     values = (m.x, m.y, m.z, m.vx, m.vy, m.vz, m.afx, m.afy, m.afz, m.yaw, m.yaw_rate)
     if not all(map(math.isfinite, values)) or m.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -17,14 +17,14 @@ from drocap_ros.simulation.vehicle.dynamics import Body
 from drocap_ros.simulation.vehicle.estimate_error import EstimateError
 from drocap_ros.simulation.vehicle.flight_control import FlightControl
 from drocap_ros.simulation.vehicle.flight_path import VehiclePose
-from drocap_ros.simulation.vehicle.mavlink_vehicle import ESTIMATOR_HEALTHY, SimulatedVehicle
+from drocap_ros.simulation.vehicle.mavlink_vehicle import ESTIMATOR_HEALTHY, Encode, SimulatedVehicle
 from drocap_ros.simulation.vehicle.mount import MOUNT_TYPES, SimulatedMount
 
 _GPS_NOTICED_S = 0.4  # from the loss of satellites to its report: measured
 EKF_NOTICED_S = 7.4  # from the loss of satellites to the estimator's report: measured
 _CONSTANT_POSITION = ESTIMATOR_HEALTHY & ~(8 | 16) | 128
 _NO_POSITION = 1 | 2 | 4  # POSITION_TARGET_TYPEMASK
-_NO_YAW = 1024 | 2048
+_NO_YAW = 1024 | 2048  # POSITION_TARGET_TYPEMASK: neither yaw nor its rate
 _PLACES = {mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT}
 
 
@@ -121,15 +121,15 @@ class ReportingCopter(SimulatedVehicle):
         own = {mavlink.MAVLINK_MSG_ID_HEARTBEAT} if self.kind.heartbeat_on_request else set()
         return super()._known() | own
 
-    def _all_encoders(self) -> dict[int, Callable[[float, VehiclePose], Any]]:
+    def _all_encoders(self) -> dict[int, Encode]:
         return super()._all_encoders() | {mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: self._echo}
 
-    def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> Any:
+    def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> mavlink.MAVLink_message | None:
         if number in _PLACES and self._t < self.readiness.origin_s:
             return None
         return super()._telemetry(number, self._report_s if self.frozen and self.frozen_clock else t_s, pose)
 
-    def _mount_angles(self, t_s: float, pose: VehiclePose) -> Any:
+    def _mount_angles(self, t_s: float, pose: VehiclePose) -> mavlink.MAVLink_message | None:
         _, pitch, yaw = self._attitude_error
         mounted = self.mount.report(pose.orientation_xyzw, (pitch, yaw))
         if mounted is None:
@@ -143,12 +143,12 @@ class ReportingCopter(SimulatedVehicle):
         blind = lost or self._t < self.readiness.estimator_s
         return _CONSTANT_POSITION if blind else super()._estimator_flags()
 
-    def _satellites(self, t_s: float, _pose: VehiclePose) -> Any:
+    def _satellites(self, t_s: float, _pose: VehiclePose) -> mavlink.MAVLink_message:
         there = self.readiness.fix_s <= self._t <= self.gps_lost_s + _GPS_NOTICED_S
         fix, place = 3 if there else 1, (473977420, 85455940, 488000)
         return self._mav.gps_raw_int_encode(self._boot_ms(t_s) * 1000, fix, *place, 60, 90, 0, 0, 17)
 
-    def _echo(self, t_s: float, _pose: VehiclePose) -> Any:
+    def _echo(self, t_s: float, _pose: VehiclePose) -> mavlink.MAVLink_message | None:
         """The target that is followed, whether setpoints arrive or not.
 
         A setpoint that is continued is sent throughout the control mode; of one that is held, what the controller

@@ -14,7 +14,7 @@ MAX_LEAN_M_S2 = 5.66  # 30 degrees
 _YAW_GAIN = 5.8  # 1/s: yaw errors of recorded orbits
 _CLIMB_GAIN = 1.0  # 1/s of the height; this and the next two as ArduPilot ships
 _CLIMB_RATE_GAIN = 4.0  # 1/s of the climb
-_MAX_CLIMB_M_S = 2.5
+_MAX_CLIMB_M_S = 2.5  # as ArduPilot ships
 _MAX_CLIMB_M_S2 = 3.0  # assumed
 _FILTER_HZ = 5.0  # of the velocity's error: PSC_NE_VEL_FLTE as shipped
 

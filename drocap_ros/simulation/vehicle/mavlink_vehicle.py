@@ -12,7 +12,6 @@ import struct
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -25,6 +24,8 @@ from drocap_ros.flight.mavlink.transport import Transport, open_transport
 from drocap_ros.geometry.geodesy import enu_to_geodetic
 from drocap_ros.simulation.vehicle.flight_path import FlightPath, VehiclePose, orbit_path
 
+#: A message by path time, s, and pose; None = none is due.
+Encode = Callable[[float, VehiclePose], mavlink.MAVLink_message | None]
 #: Latitude deg, longitude deg, altitude m of the local frame's origin.
 HOME = np.array([47.397742, 8.545594, 488.0])
 _CURRENT_MODE_S = 0.5  # an autopilot publishes its state so often, and every change at once: measured
@@ -142,13 +143,13 @@ class SimulatedVehicle:
             self._thread.join(2.0)
         self._transport.close()
 
-    def _send(self, message: Any) -> None:
+    def _send(self, message: mavlink.MAVLink_message | None) -> None:
         if message is None:
             return
         self._transport.write(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
 
-    def _answer(self, message: Any, t_s: float) -> None:
+    def _answer(self, message: mavlink.MAVLink_message, t_s: float) -> None:
         name = message.get_type()
         if name == "TIMESYNC" and message.tc1 == 0:
             self._send(self._mav.timesync_encode(int(self.clock_s(t_s) * 1e9), message.ts1))
@@ -186,9 +187,9 @@ class SimulatedVehicle:
         without = set() if self.gimbal else {mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS}
         return frozenset(self._encoders) - {mavlink.MAVLINK_MSG_ID_HEARTBEAT} - without
 
-    def _all_encoders(self) -> dict[int, Callable[[float, VehiclePose], Any]]:
+    def _all_encoders(self) -> dict[int, Encode]:
         """Messages by path time and pose."""
-        encoders: dict[str, Callable[[float, VehiclePose], Any]] = {
+        encoders: dict[str, Encode] = {
             "HEARTBEAT": lambda _t_s, _pose: self._heartbeat(),
             "ATTITUDE": self._attitude,
             "ATTITUDE_QUATERNION": self._attitude_quaternion,
@@ -204,7 +205,7 @@ class SimulatedVehicle:
         numbered = {_number(name): encode for name, encode in encoders.items()}
         return numbered if self.kind.heartbeat_on_request else numbered | {CURRENT_MODE_ID: self._current_mode}
 
-    def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> Any:
+    def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> mavlink.MAVLink_message | None:
         return self._encoders[number](t_s, pose)
 
     def clock_s(self, t_s: float) -> float:
@@ -214,11 +215,11 @@ class SimulatedVehicle:
     def _boot_ms(self, t_s: float) -> int:
         return int(self.clock_s(t_s) * 1e3) % 2**32
 
-    def _local_position(self, t_s: float, pose: VehiclePose) -> Any:
+    def _local_position(self, t_s: float, pose: VehiclePose) -> mavlink.MAVLink_message:
         vectors = (*enu_to_ned(pose.position_enu_m), *enu_to_ned(pose.velocity_enu_m_s))
         return self._mav.local_position_ned_encode(self._boot_ms(t_s), *vectors)
 
-    def _mount_angles(self, t_s: float, pose: VehiclePose) -> Any:
+    def _mount_angles(self, t_s: float, pose: VehiclePose) -> mavlink.MAVLink_message | None:
         x, y, z, w = orientation_to_aviation(pose.gimbal_orientation_xyzw)
         return self._mav.gimbal_device_attitude_status_encode(
             0, 0, self._boot_ms(t_s), _GIMBAL_EARTH, [w, x, y, z], 0, 0, 0, 0
@@ -228,22 +229,22 @@ class SimulatedVehicle:
         rests = self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
         return ESTIMATOR_HEALTHY | (self.simulated.flags_at_rest if rests else 0)
 
-    def _estimator(self, t_s: float, _pose: VehiclePose) -> Any:
+    def _estimator(self, t_s: float, _pose: VehiclePose) -> mavlink.MAVLink_message:
         flags, ratios = self._estimator_flags(), (0.1, 0.1, 0.1, 0.1)
         if self.kind.estimator_message == "EKF_STATUS_REPORT":
             return self._mav.ekf_status_report_encode(flags, *ratios, 0)
         return self._mav.estimator_status_encode(self._boot_ms(t_s) * 1000, flags, *ratios, 0, 0, 0.3, 0.3)
 
-    def _status(self, _t_s: float, _pose: VehiclePose) -> Any:
+    def _status(self, _t_s: float, _pose: VehiclePose) -> mavlink.MAVLink_message:
         return self._mav.sys_status_encode(0, 0, 0, 200, 15800, 1200, self.battery, 0, 0, 0, 0, 0, 0)
 
-    def _landed(self, _t_s: float, _pose: VehiclePose) -> Any:
+    def _landed(self, _t_s: float, _pose: VehiclePose) -> mavlink.MAVLink_message:
         return self._mav.extended_sys_state_encode(mavlink.MAV_VTOL_STATE_UNDEFINED, self.landed_state)
 
-    def _system_time(self, t_s: float, _pose: VehiclePose) -> Any:
+    def _system_time(self, t_s: float, _pose: VehiclePose) -> mavlink.MAVLink_message:
         return self._mav.system_time_encode(time.time_ns() // 1000, self._boot_ms(t_s))
 
-    def _heartbeat(self) -> Any:
+    def _heartbeat(self) -> mavlink.MAVLink_message:
         armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0
         return self._mav.heartbeat_encode(
             mavlink.MAV_TYPE_QUADROTOR,
@@ -257,7 +258,7 @@ class SimulatedVehicle:
         """Numbers of the present and of the intended mode."""
         return self.kind.modes[self.mode], self.kind.modes[self.intended]
 
-    def _current_mode(self, t_s: float, _pose: VehiclePose) -> Any:
+    def _current_mode(self, t_s: float, _pose: VehiclePose) -> mavlink.MAVLink_message | None:
         sent_s, before = self._mode_sent
         present = self._present_modes()
         if present == before and t_s - sent_s < _CURRENT_MODE_S:
@@ -265,12 +266,12 @@ class SimulatedVehicle:
         self._mode_sent = t_s, present
         return CurrentMode(0, *present)
 
-    def _attitude_quaternion(self, t_s: float, pose: VehiclePose) -> Any:
+    def _attitude_quaternion(self, t_s: float, pose: VehiclePose) -> mavlink.MAVLink_message:
         x, y, z, w = orientation_to_aviation(pose.orientation_xyzw)
         rates = flu_to_frd(pose.angular_velocity_flu_rad_s)
         return self._mav.attitude_quaternion_encode(self._boot_ms(t_s), w, x, y, z, *rates)
 
-    def _attitude(self, t_s: float, pose: VehiclePose) -> Any:
+    def _attitude(self, t_s: float, pose: VehiclePose) -> mavlink.MAVLink_message:
         x, y, z, w = orientation_to_aviation(pose.orientation_xyzw)
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         pitch = math.asin(min(1.0, max(-1.0, 2 * (w * y - z * x))))
@@ -278,11 +279,11 @@ class SimulatedVehicle:
         rates = flu_to_frd(pose.angular_velocity_flu_rad_s)
         return self._mav.attitude_encode(self._boot_ms(t_s), roll, pitch, yaw, *rates)
 
-    def _satellites(self, t_s: float, pose: VehiclePose) -> Any:
+    def _satellites(self, t_s: float, pose: VehiclePose) -> mavlink.MAVLink_message:
         fix = mavlink.GPS_FIX_TYPE_RTK_FIXED
         return self._mav.gps_raw_int_encode(self._boot_ms(t_s) * 1000, fix, *_degrees(pose), 60, 90, 0, 0, 17)
 
-    def _global_position(self, t_s: float, pose: VehiclePose) -> Any:
+    def _global_position(self, t_s: float, pose: VehiclePose) -> mavlink.MAVLink_message:
         velocity = np.round(enu_to_ned(pose.velocity_enu_m_s) * 100).astype(int)
         above_mm = round(pose.position_enu_m[2] * 1e3)
         return self._mav.global_position_int_encode(

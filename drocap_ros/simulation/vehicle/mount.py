@@ -14,7 +14,7 @@ from drocap_ros.geometry.rotations import quaternion_multiply
 #: By the value of ArduPilot's MNT1_TYPE.
 MOUNT_TYPES = {"fixed": 0, "servo": 1, "gimbal": 6}
 _LIMITS_DEG = (-90.0, 30.0)
-_SERVO_LAG_S = 0.06
+_SERVO_LAG_S = 0.06  # s: a hobby servo turns 60 deg in 0.1 to 0.2 s; assumed
 #: ArduPilot sets the first two for every mount, servos included.
 _LOCKED = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
 _YAW_FROM_NOSE = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME

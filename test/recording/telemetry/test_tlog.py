@@ -7,6 +7,7 @@ import pytest
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import quaternion_from_euler, yaw_of
 from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
+from drocap_ros.recording.telemetry.read import read_telemetry
 from drocap_ros.recording.telemetry.tlog import tlog_messages
 
 SHARED = Path(__file__).parents[3].parent / "shared"
@@ -76,7 +77,7 @@ def test_files_without_messages_are_refused(tmp_path, content):
 
 def test_missing_log_is_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
-        list(tlog_messages(tmp_path / "x.tlog"))
+        read_telemetry(tmp_path / "x.tlog")
 
 
 def test_damaged_log_loses_only_damaged_messages(messages, tmp_path):
