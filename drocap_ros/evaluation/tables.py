@@ -106,9 +106,7 @@ def rotation_markdown(rows: list[RotationRow]) -> str:
     by_method = _by_method(rows)
     by_speed = [_speed_cells(method, of, speeds) for method, of in by_method.items()]
     at_speed = _by_method([r for r in rows if r.speed_deg_s == speed])
-    per_sequence = [
-        [same[0].sequence, *(f"{r.errors.error_mm:.1f}" for r in same)] for same in zip(*at_speed.values(), strict=True)
-    ]
+    per_sequence = [_sequence_cells(same) for same in zip(*at_speed.values(), strict=True)]
     kind = "noisy" if rows[0].noisy else "clean"
     lines = [
         f"Reconstruction error in mm, mean over {len(per_sequence)} sequences, {kind} 2D, by orbit speed in deg/s.",
@@ -120,6 +118,11 @@ def rotation_markdown(rows: list[RotationRow]) -> str:
         *markdown_table(["sequence", *(LABELS[m] for m in by_method)], per_sequence),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _sequence_cells(rows: tuple[RotationRow, ...]) -> list[str]:
+    """The sequence and its error by every method."""
+    return [rows[0].sequence, *(f"{r.errors.error_mm:.1f}" for r in rows)]
 
 
 def _speed_cells(method: str, rows: list[RotationRow], speeds: list[float]) -> list[str]:

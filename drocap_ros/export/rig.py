@@ -155,9 +155,7 @@ def _onto_the_floor(body: RigidBody, root_moves: bool) -> tuple[np.ndarray, str]
 def _rig(body: RigidBody, rate_hz: float, lift: np.ndarray, naming: dict[str, str], rest: str) -> Rig:
     offsets = _rest_offsets(body, RESTS[rest])
     turned = _rotations(body, offsets, rate_hz)
-    # An assumed toe is a joint only where a naming is not complete without it.
-    assumed = TOES if naming is NAMES["h36m"] and not set(TOES) <= set(body.joints) else ()
-    kept = tuple(joint for joint in BODY if naming[joint] and joint not in assumed)
+    kept = _kept_joints(body, naming)
     parents = (-1, *(kept.index(PARENTS[joint]) for joint in kept[1:]))
     tips = _tips(offsets)
     return Rig(
@@ -169,6 +167,12 @@ def _rig(body: RigidBody, rate_hz: float, lift: np.ndarray, naming: dict[str, st
         root=body.positions[:, 0] + lift[:, None] * (0.0, 1.0, 0.0),
         turned=tuple(turned[joint] for joint in kept),
     )
+
+
+def _kept_joints(body: RigidBody, naming: dict[str, str]) -> tuple[str, ...]:
+    """Joints with a name; an assumed toe is one only where the naming is not complete without it."""
+    assumed = TOES if naming is NAMES["h36m"] and not set(TOES) <= set(body.joints) else ()
+    return tuple(joint for joint in BODY if naming[joint] and joint not in assumed)
 
 
 def _rest_positions(

@@ -190,7 +190,7 @@ class _Problem:
         self.path = np.eye(len(self.joints))
         for i, name in enumerate(self.joints[1:], start=1):
             self.path[i] += self.path[self.joints.index(PARENTS[name])]
-        self.observed = self.path[[self.joints.index(name) for name in wanted]]
+        self.observed = self.path[indices(self.joints, wanted)]
         self.priors = [self.ends.index(self.joints.index(name)) for name in _PRIORS]
         self.usual = np.zeros((len(_PRIORS), 3))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -13,7 +13,15 @@ from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.motion import LEVEL_CAMERA
 from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.recording.pose_messages import float_array, observation_from_message
-from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE, Message, Session, TopicInfo, header_stamp_ns
+from drocap_ros.recording.session import (
+    COMPRESSED_IMAGE,
+    IMAGE,
+    Message,
+    Session,
+    calibration_of,
+    header_stamp_ns,
+    xyzw_of,
+)
 from drocap_ros.skeleton import JointSet, joint_set
 from drocap_ros.view.camera_placement import nominal_camera_matrix, place_cameras
 from drocap_ros.view.rerun_scene import Scene
@@ -120,10 +128,9 @@ class MessageView:
             self._keypoints.popitem(last=False)
 
     def _on_camera_info(self, message: Message, _: int) -> None:
-        matrix = np.asarray(getattr(message, "k", getattr(message, "K", ())), float)
-        if matrix.size != 9 or not np.isfinite(matrix).all() or matrix[0] <= 0 or matrix[4] <= 0:
+        matrix = calibration_of(message)
+        if matrix is None or not np.isfinite(matrix).all() or np.diag(matrix)[:2].min() <= 0:
             raise InputError("k: expected a camera matrix with a positive focal length; calibrate the camera")
-        matrix = matrix.reshape(3, 3)
         if self._matrix is None or not np.array_equal(matrix, self._matrix):
             self._at(message)
             self._matrix = matrix
@@ -135,9 +142,7 @@ class MessageView:
             self._scene.calibration(self._camera_matrix(), self._size)
 
     def _camera_matrix(self) -> np.ndarray:
-        if self._matrix is not None:
-            return self._matrix
-        return nominal_camera_matrix(*(self._size or (1280, 720)))
+        return nominal_camera_matrix(*(self._size or (1280, 720))) if self._matrix is None else self._matrix
 
     # -- the body --------------------------------------------------------------------------------------
 
@@ -213,8 +218,7 @@ class MessageView:
         if not np.isfinite(position).all():
             return
         self._at(message)
-        turned = message.gimbal_orientation
-        xyzw = np.array([turned.x, turned.y, turned.z, turned.w], float)
+        xyzw = xyzw_of(message.gimbal_orientation)
         if np.isfinite(xyzw).all() and xyzw.any():
             rotation = camera_rotation(xyzw)
             self._cameras.append((header_stamp_ns(message), position, rotation))
@@ -291,26 +295,24 @@ def draw_session(
 
 def _topics(view: MessageView, session: Session, namespace: str | None) -> tuple[dict[str, str], str]:
     """Topic of the recording -> its name in the graph, and the graph's namespace."""
-    present = [topic for topic in session.info.topics if topic.count]
-    space = _busiest_namespace(present) if namespace is None else f"/{namespace.strip('/')}".rstrip("/")
-    names = {topic.name: topic.name.removeprefix(f"{space}/") for topic in present}
-    found = {topic: name for topic, name in names.items() if name in view.handlers and name != topic}
+    counts = {topic.name: topic.count for topic in session.info.topics if topic.count}
+    space = _busiest_namespace(counts) if namespace is None else f"/{namespace.strip('/')}".rstrip("/")
+    found = {f"{space}/{name}": name for name in view.handlers if f"{space}/{name}" in counts}
     if not found and namespace is None:
         # Not a recording of this package: its images.
         found = {topic.name: "image/compressed" for topic in session.topics_of(COMPRESSED_IMAGE, IMAGE)[:1]}
     if not found:
-        listed = ", ".join(names) or "none"
+        listed = ", ".join(counts) or "none"
         raise InputError(
             f"{session.path}: expected keypoints, poses or images, found the topics {listed}; record one of them"
         )
-    return {**found, **{topic: topic for topic in names if topic == "/diagnostics"}}, space
+    return found | ({"/diagnostics": "/diagnostics"} if "/diagnostics" in counts else {}), space
 
 
-def _busiest_namespace(topics: Iterable[TopicInfo]) -> str:
-    """Namespace with most keypoints, poses and images; "" where there is none."""
-    counts: Counter[str] = Counter()
-    for topic in topics:
-        for name in _MAIN:
-            if topic.name.endswith("/" + name):
-                counts[topic.name.removesuffix("/" + name)] += topic.count
-    return max(counts, key=lambda space: (counts[space], space), default="")
+def _busiest_namespace(counts: Mapping[str, int]) -> str:
+    """Namespace with most keypoints, poses and images, by the messages of each topic; "" where there is none."""
+    spaces: Counter[str] = Counter()
+    for topic, count in counts.items():
+        for end in (f"/{name}" for name in _MAIN if topic.endswith(f"/{name}")):
+            spaces[topic.removesuffix(end)] += count
+    return max(spaces, key=lambda space: (spaces[space], space), default="")
