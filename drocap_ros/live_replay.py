@@ -177,6 +177,7 @@ def _arrays(session: Session, frames: dict[int, _Frame], matrix: np.ndarray | No
 def _tracks(stamps: list[int], frames: list[_Frame], matrix: np.ndarray | None) -> Tracks:
     observations = [frame.observation for frame in frames]
     known = [frame.camera for frame in frames if frame.camera is not None]
+    rotation, position = map(np.array, zip(*known, strict=True)) if known else (None, None)
     return Tracks(
         keypoints=np.array([o.keypoints for o in observations], np.float64),
         joints=observations[0].joints.joints,
@@ -184,8 +185,8 @@ def _tracks(stamps: list[int], frames: list[_Frame], matrix: np.ndarray | None) 
         image_size=observations[0].image_size,
         confidence=np.array([o.confidence for o in observations], np.float64),
         covariance=np.array([o.covariance for o in observations], np.float64),
-        camera_rotation=np.array([rotation for rotation, _ in known]) if known else None,
-        camera_position=np.array([position for _, position in known]) if known else None,
+        camera_rotation=rotation,
+        camera_position=position,
         camera_matrix=matrix,
     )
 

@@ -18,9 +18,10 @@ from drocap_ros.observation import PoseObservation
 from drocap_ros.open_images import open_images, refuse_other_inputs
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
-from drocap_ros.perception.persons import find_persons, following, in_view
+from drocap_ros.perception.persons import FoundPerson, find_persons, following, in_view
 from drocap_ros.perception.sources import Frame
 from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
+from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.reconstruction.common.poses import Progress
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording.image_messages import choose_images
@@ -191,18 +192,39 @@ def selected_tracks(tracks: Tracks, telemetry: Telemetry, selection: Selection) 
     return selection.clip.cut(tracks)
 
 
+def persons_of(
+    source: str | Path, config: DrocapConfig, models: Path, selection: Selection, progress: Progress | None
+) -> list[FoundPerson]:
+    """All persons in the selected part of a source's images."""
+    with open_images(source, config.image_ingest, selection.topic) as images:
+        meter = selection.clip.meter(progress, "persons", images.duration_s)
+        return find_persons(selection.clip.select(images.frames), models, config.pose_estimator, meter)
+
+
+def follow_selected(
+    source: str | Path, config: DrocapConfig, models: Path, selection: Selection, progress: Progress | None
+) -> tuple[PoseEstimatorConfig, int | None]:
+    """Parameters of the estimator that follow the selected person, and the stamp (ns) of its first detection, or None.
+
+    Raises
+    ------
+    InputError
+        When there is no such person.
+    """
+    if selection.person is None:
+        return config.pose_estimator, None
+    persons = persons_of(source, config, models, selection, progress)
+    settings = following(config.pose_estimator, persons, selection.person)
+    return settings, persons[selection.person - 1].first_ns
+
+
 def _track(
     path: Path, config: DrocapConfig, models: Path | None, progress: Progress | None, selection: Selection
 ) -> tuple[Tracks, dict[str, Any]]:
     # Offline the most frequent subject of the whole recording is chosen at the end.
-    settings, begin_ns = dataclasses.replace(config.pose_estimator, on_loss="next"), None
-    folder, clip = models_folder(models or settings.models_dir), selection.clip
-    if selection.person is not None:
-        with open_images(path, config.image_ingest, selection.topic) as images:
-            meter = clip.meter(progress, "persons", images.duration_s)
-            persons = find_persons(clip.select(images.frames), folder, settings, meter)
-        settings = following(settings, persons, selection.person)
-        begin_ns = persons[selection.person - 1].first_ns
+    config = config.replace("pose_estimator", on_loss="next")
+    folder, clip = models_folder(models or config.pose_estimator.models_dir), selection.clip
+    settings, begin_ns = follow_selected(path, config, folder, selection, progress)
     together, topic = 0, selection.topic
     with open_images(path, config.image_ingest, topic) as images:
         estimator = PoseEstimator(folder, settings)

@@ -209,10 +209,7 @@ def read_npz(path: Path, required: tuple[str, ...]) -> dict[str, np.ndarray]:
 
 
 def _load(path: Path) -> dict[str, np.ndarray]:
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise InputError(f"{path}: expected a readable .npz archive, found a pipe or device; name a file")
-    if path.is_file() and not zipfile.is_zipfile(path):
-        raise InputError(f"{path}: expected a readable .npz archive, found another or a damaged file; check the path")
+    _check_kind(path)
     try:
         with np.load(path, allow_pickle=False) as archive:
             size = sum(entry.file_size for entry in archive.zip.infolist())
@@ -222,11 +219,22 @@ def _load(path: Path) -> dict[str, np.ndarray]:
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the path") from None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, NotImplementedError) as error:
-        reason = first_line(error)
-        if reason.startswith("Object arrays"):
-            reason = "found arrays of Python objects; save names as text: np.array(names, dtype=str)"
-            reason += ", of VideoPose3D one video: np.save('walk.npy', data['positions_2d'].item()[VIDEO]['custom'][0])"
-        raise InputError(f"{path}: expected a readable .npz archive; {reason}") from None
+        raise InputError(f"{path}: expected a readable .npz archive; {_reason(error)}") from None
+
+
+def _check_kind(path: Path) -> None:
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(f"{path}: expected a readable .npz archive, found a pipe or device; name a file")
+    if path.is_file() and not zipfile.is_zipfile(path):
+        raise InputError(f"{path}: expected a readable .npz archive, found another or a damaged file; check the path")
+
+
+def _reason(error: Exception) -> str:
+    reason = first_line(error)
+    if reason.startswith("Object arrays"):
+        reason = "found arrays of Python objects; save names as text: np.array(names, dtype=str)"
+        reason += ", of VideoPose3D one video: np.save('walk.npy', data['positions_2d'].item()[VIDEO]['custom'][0])"
+    return reason
 
 
 def load_tracks(path: str | Path) -> Tracks:
@@ -240,9 +248,7 @@ def load_tracks(path: str | Path) -> Tracks:
     path = Path(path)
     arrays = read_npz(path, _REQUIRED)
     try:
-        size = arrays["image_size"]
-        if size.shape != (2,) or size.dtype.kind not in "iuf" or not np.isfinite(size).all():
-            raise InputError(f"image_size: expected positive width and height, two numbers, got {size.tolist()}")
+        size = _checked_size(arrays["image_size"])
         more = {name: _as_float(arrays[name], name) for name in _OPTIONAL if name in arrays}
         xy = _as_float(arrays["keypoints"], "keypoints")
         if xy.ndim == 3 and xy.shape[2] == 3:  # x, y, score
@@ -266,6 +272,12 @@ def without_unseen(path: Path, xy: np.ndarray, size: np.ndarray) -> np.ndarray:
         return xy
     logging.getLogger(__name__).warning("%s: %d keypoints at (0, 0) or outside are not seen", path, unseen.sum())
     return np.where(unseen[..., None], np.nan, xy)
+
+
+def _checked_size(size: np.ndarray) -> np.ndarray:
+    if size.shape != (2,) or size.dtype.kind not in "iuf" or not np.isfinite(size).all():
+        raise InputError(f"image_size: expected positive width and height, two numbers, got {size.tolist()}")
+    return size
 
 
 def _as_float(array: np.ndarray, name: str) -> np.ndarray:

@@ -23,6 +23,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.reconstruction.methods import METHODS as OFFLINE
 
 if TYPE_CHECKING:
+    from drocap_ros.clip import Clip
     from drocap_ros.motion import Motion
     from drocap_ros.recording.video_telemetry import Telemetry
     from drocap_ros.tracks import Tracks
@@ -101,7 +102,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Reconstruct and write the output folder."""
-    from drocap_ros.cli.atomic_output import check_output_folder, default_folder, is_same, refuse_inputs
+    from drocap_ros.cli.atomic_output import default_folder
     from drocap_ros.cli.models import ensure_networks
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.cli.report import open_words
@@ -112,11 +113,7 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.recording.keypoints.files import as_tracks_file
 
     out, clip = args.out or default_folder(args.input, "motion"), clip_of(args)
-    check_output_folder(out)
-    names = ["motion.npz", "tracks.npz", *([] if args.no_report else ["report.html"])]
-    if clip.whole and is_same(out / "tracks.npz", args.input):
-        names.remove("tracks.npz")  # they stay as they are
-    refuse_inputs([out / name for name in names], [args.input])
+    names = _outputs(args, out, clip)
     person, rule = parse_subject(args.subject)
     config = load_config(args.config).replace("pose_estimator", **rule)
     if args.dictionary:
@@ -142,9 +139,22 @@ def run(args: argparse.Namespace) -> int:
     motion = dataclasses.replace(motion, meta=meta)
     _write(out, names, None if source != args.input else source, motion, tracks)
     if not args.quiet:
-        opened = f"\n{open_words(out / 'report.html')}" if "report.html" in names else ""
-        print(f"{summary(motion, args.method)}\nwritten: {out}/{', '.join(names)}{opened}")
+        print(f"{summary(motion, args.method)}\nwritten: {out}/{', '.join(names)}")
+        if "report.html" in names:
+            print(open_words(out / "report.html"))
     return 0
+
+
+def _outputs(args: argparse.Namespace, out: Path, clip: Clip) -> list[str]:
+    """Names of the files to write; refuses a folder that cannot be written, and a file that is the input."""
+    from drocap_ros.cli.atomic_output import check_output_folder, is_same, refuse_inputs
+
+    check_output_folder(out)
+    names = ["motion.npz", "tracks.npz", *([] if args.no_report else ["report.html"])]
+    if clip.whole and is_same(out / "tracks.npz", args.input):
+        names.remove("tracks.npz")  # they stay as they are
+    refuse_inputs([out / name for name in names], [args.input])
+    return names
 
 
 def _write(out: Path, names: list[str], source: Path | None, motion: Motion, tracks: Tracks) -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
+
+from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
     from drocap_ros.recording.telemetry.log import TelemetryLog
+    from drocap_ros.recording.telemetry.mp4 import Track
 
 _VIDEOS = (".mp4", ".mov", ".lrf")
 #: Codes of ISO/IEC 14496-12 and its registry in words.
@@ -37,7 +40,6 @@ def telemetry_summary(path: Path) -> Parts:
     InputError
         When a log or a video's index cannot be used; damage of the telemetry inside a video is a warning.
     """
-    from drocap_ros.errors import InputError
     from drocap_ros.recording.telemetry.read import LOG_SUFFIXES, read_telemetry
 
     columns = ("telemetry", "states", "share", "rate")
@@ -59,28 +61,32 @@ def telemetry_summary(path: Path) -> Parts:
 
 
 def _video_facts(path: Path) -> list[tuple[str, str]]:
-    from drocap_ros.errors import InputError
-    from drocap_ros.recording.telemetry.mp4 import read_samples, read_tracks
+    from drocap_ros.recording.telemetry.mp4 import read_tracks
 
-    facts = []
     with path.open("rb") as file:
-        for track in read_tracks(file):
-            code = _printable(track.sample_format)
-            words = f"{_FORMATS[code]} ({code})" if code in _FORMATS else code
-            if track.handler == "vide":
-                words += f", {track.size[0]}x{track.size[1]} px"
-            try:
-                stamp_ns = read_samples(file, track).stamp_ns
-                span = float(stamp_ns[-1] - stamp_ns[0]) * 1e-9 if len(stamp_ns) else 0.0
-                words += f", {len(stamp_ns)} samples" + (f", {(len(stamp_ns) - 1) / span:.2f}/s" if span > 0 else "")
-            except InputError as error:
-                words += f", damaged: {error}"
-            facts.append((f"{_KINDS.get(track.handler) or _printable(track.handler)} track", words))
-    if not facts and path.suffix.lower() not in _VIDEOS:
+        facts = [_track_fact(file, track) for track in read_tracks(file)]
+    if facts:
+        return facts
+    if path.suffix.lower() not in _VIDEOS:
         return _other_video_facts(path)
-    if not facts:
-        raise InputError(f"{path}: expected a video file (MP4, MOV) with its index, found none; copy it again")
-    return facts
+    raise InputError(f"{path}: expected a video file (MP4, MOV) with its index, found none; copy it again")
+
+
+def _track_fact(file: BinaryIO, track: Track) -> tuple[str, str]:
+    """Kind of a track; its format, size, samples and rate in words."""
+    from drocap_ros.recording.telemetry.mp4 import read_samples
+
+    code = _printable(track.sample_format)
+    words = f"{_FORMATS[code]} ({code})" if code in _FORMATS else code
+    if track.handler == "vide":
+        words += f", {track.size[0]}x{track.size[1]} px"
+    try:
+        stamp_ns = read_samples(file, track).stamp_ns
+        span = float(stamp_ns[-1] - stamp_ns[0]) * 1e-9 if len(stamp_ns) else 0.0
+        words += f", {len(stamp_ns)} samples" + (f", {(len(stamp_ns) - 1) / span:.2f}/s" if span > 0 else "")
+    except InputError as error:
+        words += f", damaged: {error}"
+    return f"{_KINDS.get(track.handler) or _printable(track.handler)} track", words
 
 
 def _other_video_facts(path: Path) -> list[tuple[str, str]]:

@@ -22,12 +22,10 @@ if TYPE_CHECKING:
     import numpy as np
 
     from drocap_ros.cli.progress import Progress
-    from drocap_ros.clip import Clip
+    from drocap_ros.config import DrocapConfig
     from drocap_ros.observation import PoseObservation
-    from drocap_ros.open_images import Images
-    from drocap_ros.perception.estimator import PoseEstimator
-    from drocap_ros.perception.persons import FoundPerson
     from drocap_ros.perception.sources import Frame
+    from drocap_ros.pipeline import Selection
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -59,46 +57,43 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.cli.models import ensure_networks
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.config import load_config
-    from drocap_ros.open_images import open_images
-    from drocap_ros.perception.estimator import PoseEstimator
     from drocap_ros.perception.load_models import models_folder
-    from drocap_ros.perception.persons import find_persons, following
     from drocap_ros.perception.tracking.pose_estimator_config import parse_subject
+    from drocap_ros.pipeline import Selection
 
     out = args.out or default_folder(Path(args.video), "tracks")
     check_output_folder(out)
     refuse_inputs([out / "persons.jpg"] if args.list else [out / "overlay.mp4"] * args.overlay, [args.video])
-    clip, (person, rule) = clip_of(args), parse_subject(args.subject)
-    whole = load_config(args.config).replace("pose_estimator", on_loss="wait" if args.wait else "next", **rule)
-    config, ingest = whole.pose_estimator, whole.image_ingest
-    folder = models_folder(args.models or config.models_dir)
+    person, rule = parse_subject(args.subject)
+    config = load_config(args.config).replace("pose_estimator", on_loss="wait" if args.wait else "next", **rule)
+    folder = models_folder(args.models or config.pose_estimator.models_dir)
     ensure_networks(folder, args.video, args)
+    write = _list if args.list else _track
     with output_folder(out) as target, progress_bars(args.quiet) as progress:
-        begin_ns, persons = None, []
-        if args.list or person is not None:
-            with open_images(args.video, ingest, args.topic) as images:
-                meter = clip.meter(progress, "persons", images.duration_s)
-                persons = find_persons(clip.select(images.frames), folder, config, meter)
-        if person is not None:
-            config = following(config, persons, person)
-            begin_ns = persons[person - 1].first_ns
-        with open_images(args.video, ingest, args.topic) as images:
-            if args.list:
-                text = _list(images, persons, target)
-            else:
-                text = _track(images, clip, PoseEstimator(folder, config), begin_ns, target, args.overlay, progress)
+        text = write(args, config, folder, Selection(clip_of(args), person, topic=args.topic), target, progress)
     if not args.quiet:
         print(f"{text}\nwritten: {out}/{'persons.jpg' if args.list else 'tracks.npz'}")
     return 0
 
 
-def _list(images: Images, persons: list[FoundPerson], target: Path) -> str:
+def _list(
+    args: argparse.Namespace,
+    config: DrocapConfig,
+    models: Path,
+    selection: Selection,
+    target: Path,
+    progress: Progress,
+) -> str:
     """Write the picture of the persons; returns a line for each."""
     import cv2
 
+    from drocap_ros.open_images import open_images
+    from drocap_ros.pipeline import persons_of
     from drocap_ros.report.overlay import persons_picture
 
-    picture, begin_ns = persons_picture(images.frames, persons)
+    persons = persons_of(args.video, config, models, selection, progress)
+    with open_images(args.video, config.image_ingest, args.topic) as images:
+        picture, begin_ns = persons_picture(images.frames, persons)
     # Unlike imwrite, this raises the system's error: a full disk.
     (target / "persons.jpg").write_bytes(cv2.imencode(".jpg", picture)[1].tobytes())
     lines = [
@@ -109,27 +104,32 @@ def _list(images: Images, persons: list[FoundPerson], target: Path) -> str:
 
 
 def _track(
-    images: Images,
-    clip: Clip,
-    estimator: PoseEstimator,
-    begin_ns: int | None,
+    args: argparse.Namespace,
+    config: DrocapConfig,
+    models: Path,
+    selection: Selection,
     target: Path,
-    with_overlay: bool,
     progress: Progress,
 ) -> str:
     """Write the tracks of every subject, and the overlay; returns a line about them."""
+    from drocap_ros.open_images import open_images
+    from drocap_ros.perception.estimator import PoseEstimator
     from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
+    from drocap_ros.pipeline import follow_selected
     from drocap_ros.tracks import save_tracks
 
-    overlay = _OverlayWriter(target / "overlay.mp4", images.rate_hz) if with_overlay else None
-    meter = clip.meter(progress, "2D pose", images.duration_s)
+    settings, begin_ns = follow_selected(args.video, config, models, selection, progress)
+    estimator = PoseEstimator(models, settings)
+    with open_images(args.video, config.image_ingest, args.topic) as images:
+        overlay = _OverlayWriter(target / "overlay.mp4", images.rate_hz) if args.overlay else None
+        meter = selection.clip.meter(progress, "2D pose", images.duration_s)
 
-    def on_frame(frame: Frame, observation: PoseObservation) -> None:
-        meter(frame, observation)
-        if overlay is not None:
-            overlay.add(frame, observation)
+        def on_frame(frame: Frame, observation: PoseObservation) -> None:
+            meter(frame, observation)
+            if overlay is not None:
+                overlay.add(frame, observation)
 
-    observations = observe(clip.select(images.frames), estimator, on_frame, begin_ns)
+        observations = observe(selection.clip.select(images.frames), estimator, on_frame, begin_ns)
     if overlay is not None:
         overlay.close()
     tracks_from_observations(observations)  # raises for a recording without a person

@@ -115,20 +115,24 @@ class SessionPlayerNode(ThreadedSource):
 
 def _chosen(session: Session, wanted: str) -> list[TopicInfo]:
     """Topics to publish: the named ones, else all; a type that is not installed is left out with a warning."""
-    names = wanted.split()
+    installed = []
+    for topic in _named(session, wanted.split()):
+        if _is_installed(topic.type_name):
+            installed.append(topic)
+        else:
+            session.warn(f"{topic.name}: type {topic.type_name} is not installed here: left out")
+    return installed
+
+
+def _named(session: Session, names: list[str]) -> list[TopicInfo]:
     present = [topic for topic in session.info.topics if topic.count]
-    chosen = [topic for topic in present if _is_wanted(topic.name, names)]
     for name in names:
-        if not any(_fits(topic.name, name) for topic in chosen):
+        if not any(_fits(topic.name, name) for topic in present):
             raise InputError(
                 f"{session.path}: expected topic {name!r} with messages, found {', '.join(t.name for t in present)}; "
                 "name some of these"
             )
-    known = [topic for topic in chosen if _is_installed(topic.type_name)]
-    for topic in chosen:
-        if topic not in known:
-            session.warn(f"{topic.name}: type {topic.type_name} is not installed here: left out")
-    return known
+    return [topic for topic in present if _is_wanted(topic.name, names)]
 
 
 def _is_wanted(topic: str, names: list[str]) -> bool:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import copy
 import glob
+import itertools
 import shlex
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from drocap_ros.cli.options import LineParser
@@ -77,22 +78,21 @@ def _read_list(path: Path, defaults: argparse.Namespace) -> list[argparse.Namesp
     return found
 
 
-def _in_folder(folder: Path) -> Iterator[Path]:
+def _in_folder(folder: Path) -> list[Path]:
     """Recordings at any depth; a session, or a folder of images alone, is one recording."""
     from drocap_ros.perception.sources.image_files import SUFFIXES as IMAGES
     from drocap_ros.recording.mcap.metadata import METADATA_FILE
 
     if (folder / METADATA_FILE).is_file():
-        yield folder
-        return
-    entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+        return [folder]
+    entries = sorted(folder.glob("[!.]*"))
     folders = [path for path in entries if path.is_dir() and not path.is_symlink()]
-    if not (folder / "motion.npz").exists():  # else the files are a result
-        files = _of_kinds(entries, _RECORDINGS)
-        images_alone = not (files or folders) and bool(_of_kinds(entries, IMAGES))
-        yield from [folder] if images_alone else files
-    for each in folders:
-        yield from _in_folder(each)
+    inside = list(itertools.chain.from_iterable(map(_in_folder, folders)))
+    if (folder / "motion.npz").exists():  # the files are a result
+        return inside
+    files = _of_kinds(entries, _RECORDINGS)
+    images_alone = not (files or folders) and _of_kinds(entries, IMAGES)
+    return [folder] if images_alone else files + inside
 
 
 def _of_kinds(entries: list[Path], suffixes: Collection[str]) -> list[Path]:

@@ -113,16 +113,20 @@ class Operator:
         now_s = seen.now_s
         if now_s - self._since_s > READY_TIMEOUT_S:
             return self._give_up(f"the bridge was not ready within {READY_TIMEOUT_S:g} s: {seen.reason}")
-        if seen.state == State.FAULT and now_s >= self._next_try_s:
+        may_try = now_s >= self._next_try_s
+        if seen.state == State.FAULT and may_try:
             self._next_try_s = now_s + RETRY_S
             self._remark(f"fault: {seen.reason}; acknowledged")
             return Command.STOP
-        if not self._is_steady(seen) or not self.cleared or now_s < self._next_try_s:
-            if seen.state != State.READY:
-                self._remark(f"not ready yet: {seen.reason}", "not ready", seen.condition)
-            elif not self.cleared:
-                self._remark("waiting for the pilot", "pilot")
-            return None
+        if self._is_steady(seen) and self.cleared and may_try:
+            return self._start(now_s)
+        if seen.state != State.READY:
+            self._remark(f"not ready yet: {seen.reason}", "not ready", seen.condition)
+        elif not self.cleared:
+            self._remark("waiting for the pilot", "pilot")
+        return None
+
+    def _start(self, now_s: float) -> Command:
         again = bool(self.holds)
         self._remark("starting the orbit again" if again else "ready: starting the orbit")
         self.phase = Phase.REQUESTED

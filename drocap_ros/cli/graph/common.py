@@ -13,6 +13,8 @@ from drocap_ros.errors import InputError
 _VARIABLE = "ROS_DOMAIN_ID"
 #: Of the DDS domains: the ports of a larger one belong to Linux.
 _LARGEST_DOMAIN = 101
+#: Columns of a table in a pipe, which has no width: enough that no name is cut.
+PIPE_WIDTH = 180
 
 
 def add_place_options(parser: argparse.ArgumentParser) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drocap_ros.cli.atomic_output import check_output_file, output_file
-from drocap_ros.cli.graph.common import add_domain_option, chosen_domain
+from drocap_ros.cli.graph.common import PIPE_WIDTH, add_domain_option, chosen_domain
 from drocap_ros.cli.options import ros_namespace
 from drocap_ros.cli.progress import progress_bars
 from drocap_ros.errors import InputError
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 
 _COLOURS = {"ok": "green", "waits": "cyan", "warning": "yellow", "missing": "red"}
-_PIPE_WIDTH = 160
 #: Images of a camera whose size is not configured.
 _USUAL_SIZE = (1280, 720)
 
@@ -143,15 +142,15 @@ def _measure(config: DrocapConfig, args: argparse.Namespace) -> Measured:
 def _print(found: Sequence[Finding], quiet: bool) -> None:
     from drocap_ros.flight.autopilot.autopilot import Level
 
-    counts = {level: [f for f in found if f.level == level] for level in Level}
-    if shown := counts[Level.MISSING] if quiet else found:
-        _print_table(shown)
-    if not quiet:
-        missing = ", ".join(f.name for f in counts[Level.MISSING])
-        verdict = f"not ready, missing: {missing}" if missing else "ready"
-        print(f"{verdict} ({len(counts[Level.OK])} checks are ok, {len(counts[Level.WARNING])} warnings)")
-        if counts[Level.WAITS]:
-            print(f"waits for the air: {', '.join(f.name for f in counts[Level.WAITS])}")
+    at = {level: [f for f in found if f.level == level] for level in Level}
+    _print_table(at[Level.MISSING] if quiet else found)
+    if quiet:
+        return
+    missing, waiting = (", ".join(f.name for f in at[level]) for level in (Level.MISSING, Level.WAITS))
+    verdict = f"not ready, missing: {missing}" if missing else "ready"
+    print(f"{verdict} ({len(at[Level.OK])} checks are ok, {len(at[Level.WARNING])} warnings)")
+    if waiting:
+        print(f"waits for the air: {waiting}")
 
 
 def _print_table(shown: Sequence[Finding]) -> None:
@@ -168,8 +167,8 @@ def _print_table(shown: Sequence[Finding]) -> None:
         texts = (finding.name, finding.found, finding.wanted, "as above" if remedy and remedy == before else remedy)
         table.add_row(Text(word, _COLOURS[word]), *map(Text, texts))
         before = remedy or before
-    # A pipe has no width.
-    Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH, highlight=False).print(table)
+    if shown:
+        Console(width=None if sys.stdout.isatty() else PIPE_WIDTH, highlight=False).print(table)
 
 
 def _write(path: Path, status: str, exit_status: int, found: Sequence[Finding]) -> None:

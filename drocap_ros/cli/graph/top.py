@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-from drocap_ros.cli.graph.common import add_place_options, chosen_domain, import_bringup
+from drocap_ros.cli.graph.common import PIPE_WIDTH, add_place_options, chosen_domain, import_bringup
 from drocap_ros.cli.options import Subparsers, add_command
 from drocap_ros.cli.signals import stop_signals
 from drocap_ros.ros.diagnostics import Key, number, words
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 ONCE_TIMEOUT_S = 8.0
 #: All nodes have been heard when for so long none was new; each publishes its status once a second.
 _QUIET_S = 1.5
-#: A pipe has no width: wide enough that no name is cut.
-_PIPE_WIDTH = 180
 #: Words and colours of the levels of diagnostic_msgs/DiagnosticStatus.
 _LEVELS = {0: ("ok", "green"), 1: ("warning", "yellow"), 2: ("error", "red"), 3: ("stale", "magenta")}
 _LATENCY = (Key.LATENCY_P50, Key.LATENCY_P95, Key.LATENCY_P99)
@@ -133,5 +131,5 @@ def _print_once(graph: Graph, dashboard: Dashboard, stopped: Callable[[], bool])
         return 1
     from rich.console import Console
 
-    Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH).print(dashboard.table(namespace))
+    Console(width=None if sys.stdout.isatty() else PIPE_WIDTH).print(dashboard.table(namespace))
     return 0
