@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 
-from drocap_ros.clip import Clip
+from drocap_ros.clip import Clip, Progress
 from drocap_ros.config import DrocapConfig, load_config
 from drocap_ros.evaluation import compare as comparison
 from drocap_ros.evaluation.compare import MotionErrors
@@ -29,7 +28,7 @@ def reconstruct(  # noqa: PLR0913 - the options of the command
     end_s: float = math.inf,
     subject: int | str = "",
     redetect: bool = False,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Motion:
     """3D motion of the person in a video, image folder, recording, tracks file, or in tracks.
 

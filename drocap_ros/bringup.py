@@ -18,7 +18,6 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import rclpy
 from rclpy.context import Context
@@ -27,8 +26,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from drocap_ros.config import DrocapConfig
-from drocap_ros.errors import DrocapError, InputError, NodeError
+from drocap_ros.errors import InputError, NodeError
 from drocap_ros.flight.mavlink.transport import Transport
+from drocap_ros.parameters import Values
 from drocap_ros.reconstruction.common.threads import blas_threads
 from drocap_ros.ros import fastdds
 from drocap_ros.ros.component import ComponentNode
@@ -157,7 +157,7 @@ def lockstep(
         context = Context()
         rclpy.init(args=["--ros-args", "--disable-stdout-logs"], context=context, domain_id=domain_id)
         stack.callback(context.try_shutdown)
-        place: dict[str, Any] = {"context": context, "namespace": DEFAULT_NAMESPACE, "use_global_arguments": False}
+        place: Values = {"context": context, "namespace": DEFAULT_NAMESPACE, "use_global_arguments": False}
         components: list[ComponentNode] = []
         stack.callback(_close, components)
         for name in names:
@@ -211,14 +211,14 @@ class _NodeThread:
 
     def _run(self, make: Callable[[], ComponentNode], context: Context) -> None:
         try:
-            try:
-                node = make()
-            finally:
-                self._made.set()
+            node = make()
+            self._made.set()
             # Not the EventsExecutor of the processes, which replaces the signal handlers of its process.
             spin(node, SingleThreadedExecutor(context=context), self._stop)
         except BaseException as error:  # noqa: BLE001 -- raised in the thread that waits for the graph
             self._error = error
+        finally:
+            self._made.set()
 
     def check(self) -> None:
         if self._error is not None:
@@ -247,4 +247,4 @@ def free_domain() -> Iterator[int]:
     raise NodeError("expected a free DDS domain id between 1 and 100, found none; stop other graphs")
 
 
-__all__ = ["DrocapError", "Graph", "bringup", "free_domain", "lockstep", "node_class", "watch"]
+__all__ = ["Graph", "Lockstep", "bringup", "free_domain", "lockstep", "node_class", "watch"]

@@ -6,10 +6,13 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeAlias, TypeVar
 
 from drocap_ros.errors import InputError
 from drocap_ros.tracks import Tracks
+
+#: Called with the name of a stage and its completed share, 0 to 1; a negative share = unknown length.
+Progress: TypeAlias = Callable[[str, float], None]
 
 #: Tolerance of the bounds against rounded stamps.
 _SLACK_NS = 500_000
@@ -100,13 +103,13 @@ class Clip:
         return dataclasses.replace(tracks, **{k: v[use] for k, v in values.items() if v is not None})
 
     def meter(
-        self, progress: Callable[[str, float], None] | None, stage: str, duration_s: float | None
-    ) -> Callable[[Stamped, Any], None]:
+        self, progress: Progress | None, stage: str, duration_s: float | None
+    ) -> Callable[[Stamped, object], None]:
         """A function of each selected item that reports the completed share; -1 where the duration is unknown."""
         end_s = min(self.end_s, math.inf if duration_s is None else duration_s)
         first_ns: int | None = None
 
-        def report(item: Stamped, _: Any) -> None:
+        def report(item: Stamped, _: object) -> None:
             nonlocal first_ns
             first_ns = item.stamp_ns if first_ns is None else first_ns
             if progress is not None:

@@ -14,11 +14,11 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import get_type_hints
 
 from drocap_ros.errors import InputError, ParameterError
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
-from drocap_ros.parameters import Parameters
+from drocap_ros.parameters import Parameters, Values
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
@@ -48,12 +48,12 @@ class DrocapConfig:
         value: Parameters = getattr(self, component)
         return value
 
-    def replace(self, component: str, **values: Any) -> DrocapConfig:
+    def replace(self, component: str, **values: object) -> DrocapConfig:
         """Copy with some values of one component changed; the values are validated."""
-        changes: dict[str, Any] = {component: dataclasses.replace(self.section(component), **values)}
+        changes: Values = {component: dataclasses.replace(self.section(component), **values)}
         return dataclasses.replace(self, **changes)
 
-    def to_parameter_file(self) -> dict[str, Any]:
+    def to_parameter_file(self) -> Values:
         """The whole configuration in the form of a ROS 2 parameter file."""
         return {
             f"/**/{spec.name}": {"ros__parameters": dataclasses.asdict(self.section(spec.name))}
@@ -91,7 +91,7 @@ def load_config(path: str | Path | None) -> DrocapConfig:
     return parse_config(data or {}, str(path))
 
 
-def parse_config(data: Any, where: str) -> DrocapConfig:
+def parse_config(data: object, where: str) -> DrocapConfig:
     """Configuration from the content of a parameter file; ``where`` names the file in errors."""
     if not isinstance(data, Mapping):
         raise InputError(f"{where}: expected a mapping of components, found {type(data).__name__}")

@@ -54,7 +54,7 @@ _PARTING_OF_MEDIAN = 0.7
 
 #: Time (s) over which the velocity of a foot of a finished motion is averaged, and least duration of its rest.
 _SPAN_AVERAGE_S = 0.15
-_SHORTEST_SPAN_S = 0.2
+_SHORTEST_SPAN_S = 0.2  # the latter
 
 
 class RestingFeet:

@@ -21,10 +21,10 @@ from drocap_ros.skeleton import BODY_15, BODY_17, BODY_19, JOINT_SETS, JointSet
 
 #: Shares of the way from the middle of the shoulders to the middle of the ears.
 _NECK_ON_EARS = 135 / 190
-_HEAD_ON_EARS = 232 / 190
+_HEAD_ON_EARS = 232 / 190  # likewise
 #: Standard deviation of neck and head about that line, share of the same way: 20 and 25 mm of 190.
 _NECK_SPREAD = 0.11
-_HEAD_SPREAD = 0.14
+_HEAD_SPREAD = 0.14  # likewise
 #: The same of the head about the line from neck to crown: 21 mm of 175.
 _CROWN_SPREAD = 0.12
 #: Factor on the confidence of an extrapolated joint: the lean of the head is not seen.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,7 @@ class Keypoints2D:
     def __len__(self) -> int:
         return len(self.xy)
 
-    def __getitem__(self, frames: Any) -> Keypoints2D:
+    def __getitem__(self, frames: slice | np.ndarray | None) -> Keypoints2D:
         """The keypoints of some frames; ``frames`` indexes the leading axis as it does in numpy."""
         return replace(self, **{name: value[frames] for name, value in vars(self).items() if value is not None})
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.clip import Progress
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.keypoints import Keypoints2D
@@ -25,8 +25,6 @@ from drocap_ros.recording.session import POSE2D, Session
 from drocap_ros.recording.session_tracks import most_frequent_subject
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
-
-Progress = Callable[[str, float], None]
 
 
 def recorded_config(session: Session) -> DrocapConfig | None:

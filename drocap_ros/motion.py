@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.parameters import Values
 from drocap_ros.stamps import as_stamps, check_stamps
 from drocap_ros.tracks import MAX_FRAMES, read_npz
 
@@ -51,7 +51,7 @@ class Motion:
     confidence: np.ndarray
     keypoints: np.ndarray
     reprojection_px: np.ndarray
-    meta: dict[str, Any] = field(default_factory=dict)
+    meta: Values = field(default_factory=dict)
     camera_position: np.ndarray | None = None
     covariance: np.ndarray | None = None
 
@@ -165,7 +165,7 @@ def _check_kinds(a: dict[str, np.ndarray]) -> None:
         raise InputError(f"metric: expected one truth value, got {a['metric'].dtype} {a['metric'].shape}")
 
 
-def _read_meta(text: np.ndarray) -> dict[str, Any]:
+def _read_meta(text: np.ndarray) -> Values:
     try:
         meta = json.loads(str(text))
     except ValueError:

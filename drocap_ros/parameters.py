@@ -11,22 +11,25 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeAlias, TypeVar, get_type_hints
 
 from drocap_ros.errors import ParameterError
 
 P = TypeVar("P", bound="Parameters")
+T = TypeVar("T", bool, int, float, str)
+#: Values by name, as YAML and JSON hold them.
+Values: TypeAlias = dict[str, Any]
 
 
 def param(
-    default: Any,
+    default: T,
     description: str,
     *,
     unit: str = "",
     minimum: float | None = None,
     maximum: float | None = None,
     choices: tuple[str, ...] | None = None,
-) -> Any:
+) -> T:
     """Dataclass field of a :class:`Parameters` class; the range is inclusive at both ends."""
     metadata = {
         "description": description,
@@ -35,7 +38,8 @@ def param(
         "maximum": maximum,
         "choices": choices,
     }
-    return field(default=default, metadata=metadata)
+    value: T = field(default=default, metadata=metadata)
+    return value
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class Parameters:
             object.__setattr__(self, spec.name, value)
 
     @classmethod
-    def from_mapping(cls: type[P], values: Mapping[str, Any], where: str = "") -> P:
+    def from_mapping(cls: type[P], values: Mapping[str, object], where: str = "") -> P:
         """Build from a mapping; an unknown name is refused."""
         known = {spec.name for spec in dataclasses.fields(cls)}
         unknown = sorted(set(values) - known)
@@ -67,30 +71,30 @@ class Parameters:
 
 
 @functools.cache
-def _types(kind: type) -> dict[str, Any]:
+def _types(kind: type) -> dict[str, type]:
     return get_type_hints(kind)  # a millisecond of compilation
 
 
-def _checked(spec: dataclasses.Field[Any], kind: type, value: object, owner: str) -> object:
+def _checked(spec: dataclasses.Field, kind: type, value: object, owner: str) -> object:
     name = f"{owner}.{spec.name}"
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not kind:
         raise ParameterError(f"{name}: expected {kind.__name__}, got {value!r}; correct the value")
     if isinstance(value, int | float):
-        _check_range(name, value, spec.metadata)
+        _check_range(name, value, spec)
     choices = spec.metadata["choices"]
     if choices and value not in choices:
         raise ParameterError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
     return value
 
 
-def _check_range(name: str, value: float, metadata: Mapping[str, Any]) -> None:
+def _check_range(name: str, value: float, spec: dataclasses.Field) -> None:
     if not math.isfinite(value):
         raise ParameterError(f"{name}: expected a finite number, got {value!r}; correct the value")
-    low, high = metadata["minimum"], metadata["maximum"]
+    low, high = spec.metadata["minimum"], spec.metadata["maximum"]
     if (low is not None and value < low) or (high is not None and value > high):
-        wanted = " ".join(filter(None, (_range_text(low, high), metadata["unit"])))
+        wanted = " ".join(filter(None, (_range_text(low, high), spec.metadata["unit"])))
         raise ParameterError(f"{name}: expected {wanted}, got {value!r}; choose a value in the range")
 
 

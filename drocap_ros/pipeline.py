@@ -7,33 +7,27 @@ import logging
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from drocap_ros.clip import Clip
+from drocap_ros.clip import Clip, Progress
 from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.live_replay import reconstruct_live, recorded_config
 from drocap_ros.motion import Motion
 from drocap_ros.observation import PoseObservation
 from drocap_ros.open_images import open_images, refuse_other_inputs
+from drocap_ros.parameters import Values
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.persons import FoundPerson, find_persons, following, in_view
 from drocap_ros.perception.sources import Frame
 from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
-from drocap_ros.reconstruction.common.poses import Progress
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.recording.image_messages import choose_images
 from drocap_ros.recording.open_session import is_recording, open_session
 from drocap_ros.recording.session import POSE2D, Session
 from drocap_ros.recording.session_tracks import read_pose2d, with_recorded_camera
-from drocap_ros.recording.video_telemetry import (
-    NO_TELEMETRY,
-    Telemetry,
-    read_video_telemetry,
-    with_telemetry,
-)
+from drocap_ros.recording.video_telemetry import NO_TELEMETRY, Telemetry, read_video_telemetry, with_telemetry
 from drocap_ros.tracks import Tracks, load_tracks
 
 logger = logging.getLogger(__name__)
@@ -149,10 +143,10 @@ def read_input(
     progress: Progress | None = None,
     telemetry: Telemetry = _FOUND,
     selection: Selection = _WHOLE,
-) -> tuple[Tracks, dict[str, Any]]:
+) -> tuple[Tracks, Values]:
     """2D tracks of the subject, of the input where it holds them, else of its images, and their origin for ``meta``."""
     pitch, in_use = telemetry.mount_pitch_deg, telemetry.path != NO_TELEMETRY
-    origin: dict[str, Any] = {} if selection.clip.whole else {"clip": selection.clip.meta}
+    origin: Values = {} if selection.clip.whole else {"clip": selection.clip.meta}
     if needs_networks(path, selection.redetect):
         tracks, more = _track(path, config, models, progress, selection)
         if is_recording(path):
@@ -220,7 +214,7 @@ def follow_selected(
 
 def _track(
     path: Path, config: DrocapConfig, models: Path | None, progress: Progress | None, selection: Selection
-) -> tuple[Tracks, dict[str, Any]]:
+) -> tuple[Tracks, Values]:
     # Offline the most frequent subject of the whole recording is chosen at the end.
     config = config.replace("pose_estimator", on_loss="next")
     folder, clip = models_folder(models or config.pose_estimator.models_dir), selection.clip
@@ -241,7 +235,7 @@ def _track(
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     words = [f"{(t - tracks.stamp_ns[0]) * 1e-9:.1f} s: {text}" for t, text in estimator.tracker.changes][1:]
-    origin: dict[str, Any] = {"pose2d": "estimated", "subject": words}
+    origin: Values = {"pose2d": "estimated", "subject": words}
     logger.log(logging.WARNING if words else logging.DEBUG, "%s: %s", path, "; ".join(words))
     origin["images"] = {"size": list(tracks.image_size), "length": images.length, "rate_hz": images.rate_hz}
     origin["images"] |= {"topic": topic} if topic else {}

@@ -103,8 +103,8 @@ def _compare(args: argparse.Namespace) -> int:
     errors = compare(motion, *load_truth(args.truth))
     name = path.parent.name if path.name == "motion.npz" else path.stem
     record = {"motion": name, **tables.errors_record(errors)}
-    picture = ("compare.png", lambda file: tables.save_group_bars(file, errors))
-    return _finish(args, "compare", [record], tables.comparison_markdown(name, errors), picture)
+    words = tables.comparison_markdown(name, errors)
+    return _finish(args, "compare", [record], words, lambda file: tables.save_group_bars(file, errors))
 
 
 def _rotation(args: argparse.Namespace) -> int:
@@ -120,10 +120,8 @@ def _rotation(args: argparse.Namespace) -> int:
         sequences = protocol_sequences(args.folder, limit=args.limit)
         options = {name: getattr(args, name) for name in names}
         rows = rotation_study(sequences, speeds_deg_s=args.speeds, progress=progress, **options)
-    picture = ("rotation.png", lambda file: tables.save_curves(file, rows))
-    return _finish(
-        args, "rotation", [tables.study_record(row) for row in rows], tables.rotation_markdown(rows), picture
-    )
+    records, words = [tables.study_record(row) for row in rows], tables.rotation_markdown(rows)
+    return _finish(args, "rotation", records, words, lambda file: tables.save_curves(file, rows))
 
 
 def _world(args: argparse.Namespace) -> int:
@@ -155,7 +153,7 @@ def _finish(
     name: str,
     records: Sequence[Mapping[str, object]],
     markdown: str,
-    picture: tuple[str, Callable[[Path], None]] | None = None,
+    draw: Callable[[Path], None] | None = None,
 ) -> int:
     """Print the tables and write the files."""
     from drocap_ros.cli.atomic_output import output_folder
@@ -166,6 +164,6 @@ def _finish(
         with output_folder(args.out) as out:
             save_csv(out / f"{name}.csv", records)
             (out / f"{name}.md").write_text(markdown, encoding="utf-8")
-            if picture is not None:
-                picture[1](out / picture[0])
+            if draw is not None:
+                draw(out / f"{name}.png")
     return 0

@@ -4,27 +4,19 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 from drocap_ros.cli.options import Subparsers, add_command, table_lines
-from drocap_ros.cli.telemetry_summary import is_video_or_log, telemetry_summary
+from drocap_ros.cli.telemetry_summary import Summary, is_video_or_log, telemetry_summary
 from drocap_ros.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from drocap_ros.motion import Motion
     from drocap_ros.tracks import Tracks
-
-
-class Summary(NamedTuple):
-    """Facts by name, one table (none without columns), and warnings."""
-
-    facts: list[tuple[str, str]]
-    columns: tuple[str, ...]
-    rows: Sequence[tuple[str, ...]]
-    warnings: Sequence[str]
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -75,7 +67,7 @@ def summarize(path: Path) -> Summary:
 
     if is_keypoint_file(path):
         return _of_arrays(path)
-    return Summary(*telemetry_summary(path)) if is_video_or_log(path) else _of_session(path)
+    return telemetry_summary(path) if is_video_or_log(path) else _of_session(path)
 
 
 def _motion_in(path: Path) -> Path:
@@ -134,7 +126,7 @@ def _of_arrays(path: Path) -> Summary:
         facts = _tracks_facts(read_keypoints(path))
     columns = ("array", "type", "shape") if arrays else ()
     rows = [(name, str(a.dtype), " x ".join(map(str, a.shape)) or "scalar") for name, a in sorted(arrays.items())]
-    return Summary([("path", str(path)), *facts], columns, rows, ())
+    return Summary([("path", str(path)), *facts], columns, rows)
 
 
 def _motion_facts(motion: Motion) -> list[tuple[str, str]]:
@@ -168,7 +160,7 @@ def _tracks_facts(tracks: Tracks) -> list[tuple[str, str]]:
     ]
 
 
-def _times(stamp_ns: Any) -> list[tuple[str, str]]:
+def _times(stamp_ns: np.ndarray) -> list[tuple[str, str]]:
     frames = len(stamp_ns)
     duration = float(stamp_ns[-1] - stamp_ns[0]) * 1e-9 if frames else 0.0
     rate = f", {(frames - 1) / duration:.2f} frames/s" if duration > 0 else ""

@@ -67,14 +67,20 @@ def add_quiet_option(parser: argparse.ArgumentParser, help: str = "no progress, 
     parser.add_argument("--quiet", action="store_true", help=help)
 
 
-def add_config_option(parser: argparse.ArgumentParser) -> None:
+def add_config_option(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
     """Add ``--config``."""
-    parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
+    words = "parameters of the components (YAML)"
+    parser.add_argument("--config", metavar="FILE", type=Path, required=required, help=words)
+
+
+def add_models_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--models``."""
+    parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
 
 
 def add_network_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--models`` and ``--fetch``."""
-    parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
+    add_models_option(parser)
     parser.add_argument(
         "--fetch", action="store_true", help="download the default networks first where the folder of models has none"
     )

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
-#: Called with the name of a stage and its completed share, 0 to 1; a negative share = unknown length.
-Progress = Callable[[str, float], None]
+from drocap_ros.clip import Progress
 
 
 @contextlib.contextmanager
@@ -17,11 +16,12 @@ def progress_bars(quiet: bool = False) -> Iterator[Progress]:
         yield lambda _stage, _done: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
 
     columns = (TextColumn("{task.description:<24}"), BarColumn(), TextColumn("{task.percentage:>3.0f}%"))
     times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
-    with Progress(*columns, *times, console=Console(stderr=True)) as bars:
+    with Bars(*columns, *times, console=Console(stderr=True)) as bars:
         tasks: dict[str, TaskID] = {}
 
         def show(stage: str, done: float) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 from drocap_ros.errors import InputError
 
@@ -19,8 +20,14 @@ _FORMATS = {
     "mp4a": "AAC", "djmd": "DJI telemetry", "dbgi": "DJI debugging data", "mebx": "metadata", "tmcd": "time code",
 }  # fmt: skip
 
-#: Facts by name, names of the columns, rows, warnings.
-Parts = tuple[list[tuple[str, str]], tuple[str, ...], list[tuple[str, ...]], list[str]]
+
+class Summary(NamedTuple):
+    """Facts by name, one table (none without columns), and warnings."""
+
+    facts: list[tuple[str, str]]
+    columns: tuple[str, ...] = ()
+    rows: Sequence[tuple[str, ...]] = ()
+    warnings: Sequence[str] = ()
 
 
 def is_video_or_log(path: Path) -> bool:
@@ -32,7 +39,7 @@ def is_video_or_log(path: Path) -> bool:
     return path.is_file() and (named or file_kind(path) is FileKind.VIDEO)
 
 
-def telemetry_summary(path: Path) -> Parts:
+def telemetry_summary(path: Path) -> Summary:
     """What a video or log holds: rates, shares, lens, and what is missing.
 
     Raises
@@ -42,7 +49,6 @@ def telemetry_summary(path: Path) -> Parts:
     """
     from drocap_ros.recording.telemetry.read import LOG_SUFFIXES, read_telemetry
 
-    columns = ("telemetry", "states", "share", "rate")
     warnings: list[str] = []
     facts, log = [("path", str(path))], None
     if path.suffix.lower() in LOG_SUFFIXES:
@@ -56,8 +62,9 @@ def telemetry_summary(path: Path) -> Parts:
         except (InputError, OSError) as error:
             warnings.append(str(error))
     if log is None:
-        return [*facts, ("telemetry", "not usable" if warnings else "none in the file")], (), [], warnings
-    return [*facts, *_log_facts(log)], columns, _rows(log), warnings
+        found = "not usable" if warnings else "none in the file"
+        return Summary([*facts, ("telemetry", found)], warnings=warnings)
+    return Summary([*facts, *_log_facts(log)], ("telemetry", "states", "share", "rate"), _rows(log), warnings)
 
 
 def _video_facts(path: Path) -> list[tuple[str, str]]:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import cv2
     import numpy as np
 
-    from drocap_ros.cli.progress import Progress
+    from drocap_ros.clip import Progress
     from drocap_ros.config import DrocapConfig
     from drocap_ros.observation import PoseObservation
     from drocap_ros.perception.sources import Frame

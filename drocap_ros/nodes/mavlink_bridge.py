@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from typing import Any
+from functools import partial
 
 import numpy as np
 from geometry_msgs.msg import Point, TransformStamped
@@ -31,7 +31,8 @@ from drocap_ros.flight.orbit.watchdog import Watchdog
 from drocap_ros.flight.rivals import Rivals
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.msg import OrbitStatus, Pose2D
-from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode
+from drocap_ros.parameters import Values
+from drocap_ros.ros.component import ERROR, OK, WARN, ComponentNode, MessageInfo
 from drocap_ros.ros.conversions import (
     MAP,
     header_at,
@@ -41,13 +42,16 @@ from drocap_ros.ros.conversions import (
     vehicle_state_to_ros,
 )
 from drocap_ros.ros.diagnostics import Key, of
-from drocap_ros.ros.rclpy_internals import PolledService
+from drocap_ros.ros.rclpy_internals import AnswerKey, PolledService
 from drocap_ros.ros.topics import RESULT_QOS, TFMessage
 from drocap_ros.srv import OrbitCommand
 from drocap_ros.tracks import check_camera_matrix
 
+#: Of a status without a change, s: an operator who joins sees it at once.
 _STATUS_PERIOD_S = 0.2
-_LINK_PERIOD_S = 0.01  # of a simulated link
+#: Between looks at a simulated link, s: one step of the simulated time (ros/lockstep.py).
+_LINK_PERIOD_S = 0.01
+#: Requests that one control step takes: thousands a second, and a flood never delays the step.
 _MAX_REQUESTS = 100
 
 
@@ -84,16 +88,17 @@ class MavlinkBridgeNode(ComponentNode):
         self.input("orbit/status", self._on_status)
         self._rivals = Rivals(self.get_namespace())
         self.requests = PolledService(self, OrbitCommand, "orbit/command", RESULT_QOS)
-        self._unanswered: list[tuple[OperatorCommand, Any, Any]] = []  # with request and header
-        self._last_command: dict[str, Any] = {"command": OrbitStatus.NO_COMMAND}
+        self._unanswered: list[tuple[OperatorCommand, OrbitCommand.Request, AnswerKey]] = []
+        self._last_command: Values = {"command": OrbitStatus.NO_COMMAND}
         self.create_timer(1.0, self._on_second)
         self._calibrated_size = (0, 0)  # width and height px of camera_info; 0 = not stated
         self._stop = threading.Event()
         self._reported: tuple[State, str] | None = None
         self._reported_s = -math.inf
+        # An error in either ends the node: a bridge that hears nothing must not stay.
         self._threads = [
-            threading.Thread(target=self._listen, name="mavlink", daemon=True),
-            threading.Thread(target=self._control, name="flight-control", daemon=True),
+            self.thread(partial(self._link.run, self._on_state, self._stop), "mavlink"),
+            self.thread(self._control, "flight-control"),
         ]
 
     def on_ready(self) -> None:
@@ -126,13 +131,6 @@ class MavlinkBridgeNode(ComponentNode):
         self._watchdog.close()
         self.requests.close()
         self._link.close()
-
-    def _listen(self) -> None:
-        """Read the link.  An error in it ends the node: a bridge that hears nothing must not stay."""
-        try:
-            self._link.run(self._on_state, self._stop)
-        except Exception as error:  # noqa: BLE001 -- whatever it is, it ends the node
-            self.failure = error
 
     def _control(self) -> None:
         """Step the controller at its rate.  An error in it holds the vehicle at once, and ends the node."""
@@ -212,7 +210,7 @@ class MavlinkBridgeNode(ComponentNode):
             if transforms:
                 self._tf.publish(TFMessage(transforms=transforms))
 
-    def _on_pose2d(self, message: Pose2D, info: dict[str, Any]) -> None:
+    def _on_pose2d(self, message: Pose2D, info: MessageInfo) -> None:
         self._rivals.take_pose2d(info["publication_sequence_number"] or 0, self.now_s())
         observation = pose2d_from_ros(message)
         if all(self._calibrated_size) and observation.image_size != self._calibrated_size:

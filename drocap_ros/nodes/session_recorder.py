@@ -12,7 +12,7 @@ import threading
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
@@ -20,6 +20,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
 
 from drocap_ros.errors import InputError
+from drocap_ros.parameters import Values
 from drocap_ros.perception.load_models import models_folder
 from drocap_ros.recording.mcap.schemas import schema_text
 from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
@@ -146,7 +147,7 @@ class SessionRecorderNode(ManagedComponent):
         if not all(s.hardware_id == HARDWARE_ID and node_of(s)[0] != ours for s in statuses):
             self._on_message(name, data, info)
 
-    def _on_parameters(self, sections: dict[str, dict[str, Any]]) -> None:
+    def _on_parameters(self, sections: dict[str, Values]) -> None:
         self._add_metadata({CONFIGURATION: configuration_text(sections)})
         if "pose_estimator" in sections:
             folder = models_folder(sections["pose_estimator"].get("models_dir") or None)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
@@ -24,9 +24,10 @@ from drocap_ros.config import section_types
 from drocap_ros.errors import InputError
 from drocap_ros.flight.mavlink.transport import Transport
 from drocap_ros.parameters import Parameters
+from drocap_ros.recording.session import Message
 from drocap_ros.ros.diagnostics import ERROR, HARDWARE_ID, OK, WARN, Key, Latency, of
 from drocap_ros.ros.parameters import declare_parameters
-from drocap_ros.ros.rclpy_internals import taking_info
+from drocap_ros.ros.rclpy_internals import MessageInfo, taking_info
 from drocap_ros.ros.topics import FROM_OUTSIDE, KEPT_QOS, RESULT_QOS, TOPICS, publishers_of, subscribers_of
 from drocap_ros.stamps import StampValidator
 
@@ -36,8 +37,6 @@ _CLOCK_STANDS_S = 5.0
 _KEPT_PERIOD_S = 0.5
 #: A node whose input has been silent for this long is idle.
 IDLE_S = 3.0
-#: rclpy's information about a message: numbers by name.
-MessageInfo: TypeAlias = Mapping[str, int]
 
 
 class Gaps:
@@ -202,7 +201,7 @@ class ComponentNode(Node):
         """Wrap a callback: an InputError is counted and reported, not raised; with ``stamps`` they are validated."""
         validator = StampValidator() if stamps else None
 
-        def run(*arguments: Any) -> None:
+        def run(*arguments: Message) -> None:
             self.callbacks_done += 1
             self._heard_s[topic] = self.now_s()
             if not self.active:

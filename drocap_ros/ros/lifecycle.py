@@ -176,7 +176,7 @@ class ThreadedSource(ManagedComponent):
         """Start the thread; work under way has continued meanwhile."""
         if self._thread is None:
             self.stopping.clear()
-            self._thread = threading.Thread(target=self.play, name=self.component, daemon=True)
+            self._thread = self.thread(self.play, self.component)
             self._thread.start()
 
     def release(self) -> None:

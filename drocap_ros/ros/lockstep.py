@@ -8,7 +8,7 @@ import itertools
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import cast
 
 from rclpy.clock import ClockType, ROSClock
 from rclpy.node import Node
@@ -19,6 +19,7 @@ from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
 from drocap_ros.errors import NodeError
+from drocap_ros.recording.session import Message
 from drocap_ros.ros.component import ComponentNode
 from drocap_ros.ros.conversions import stamp_to_ros
 from drocap_ros.ros.lifecycle import ManagedComponent
@@ -141,7 +142,9 @@ class Lockstep:
         for node in self._nodes:
             cast(ROSClock, node.get_clock()).set_ros_time_override(now)
 
-    def _publish(self, topic: str, publish: Callable[[Any], None], numbers: Iterator[int], message: Any) -> None:
+    def _publish(
+        self, topic: str, publish: Callable[[Message], None], numbers: Iterator[int], message: Message
+    ) -> None:
         publish(message)
         self._published.append((topic, serialize_message(message), next(numbers)))
 

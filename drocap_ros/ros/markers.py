@@ -13,8 +13,9 @@ from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_from_ros, quaternion_to_ros, transform_to_ros
 from drocap_ros.skeleton import SIDE_COLOURS, JointSet, joint_set, side_of
 
+#: Colours, red, green, blue and opacity from 0 to 1: a joint is seen through its ellipsoid; a judgement.
 _UNCERTAIN = (0.95, 0.75, 0.1, 0.25)
-_PATH = (0.2, 0.7, 0.3, 0.9)
+_PATH = (0.2, 0.7, 0.3, 0.9)  # likewise
 #: Ellipsoids show two standard deviations.
 _SIGMAS = 2.0
 

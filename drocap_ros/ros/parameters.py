@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -16,7 +16,7 @@ from rclpy.task import Future
 
 from drocap_ros.config import section_types
 from drocap_ros.errors import ParameterError
-from drocap_ros.parameters import Parameters
+from drocap_ros.parameters import Parameters, Values
 from drocap_ros.ros.rclpy_internals import overridden_parameters
 
 P = TypeVar("P", bound=Parameters)
@@ -89,16 +89,14 @@ class ParameterSurvey:
     done : called with all parameters so far, by node, whenever a node has answered
     """
 
-    def __init__(
-        self, node: Node, beside: Mapping[str, Node], done: Callable[[dict[str, dict[str, Any]]], None]
-    ) -> None:
+    def __init__(self, node: Node, beside: Mapping[str, Node], done: Callable[[dict[str, Values]], None]) -> None:
         self._node = node
         self._beside = beside
         self._done = done
         self._types = section_types()
         self._clients: dict[str, AsyncParameterClient] = {}
         self._asked: set[str] = set()
-        self._sections: dict[str, dict[str, Any]] = {}
+        self._sections: dict[str, Values] = {}
 
     def ask_new_nodes(self) -> None:
         """Ask the nodes that appeared since the last call; returns at once."""
@@ -128,6 +126,6 @@ class ParameterSurvey:
     def _names(self, name: str) -> list[str]:
         return [spec.name for spec in dataclasses.fields(self._types[name])]
 
-    def _take(self, name: str, values: dict[str, Any]) -> None:
+    def _take(self, name: str, values: Values) -> None:
         self._sections[name] = {key: value for key, value in values.items() if value is not None}
         self._done(dict(self._sections))

@@ -14,9 +14,10 @@ from __future__ import annotations
 import inspect
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import TypeAlias
 
+from lifecycle_msgs.srv import ChangeState
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.lifecycle import LifecycleNodeMixin
@@ -25,12 +26,20 @@ from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from rclpy.type_support import check_for_type_support
 
+from drocap_ros.recording.session import Message
+from drocap_ros.srv import OrbitCommand
+
 try:
     from rclpy.experimental import EventsExecutor
 except ImportError:  # a distribution without it
     EventsExecutor = SingleThreadedExecutor
 
 logger = logging.getLogger(__name__)
+
+#: rclpy's information about a message: numbers by name.
+MessageInfo: TypeAlias = Mapping[str, int]
+#: Whom a service answers: a caller of this process by its future, another one by rclpy's identifier.
+AnswerKey: TypeAlias = Future | _rclpy.rmw_request_id_t
 
 
 def node_executor() -> Executor:
@@ -42,7 +51,7 @@ def node_executor() -> Executor:
 def taking_info(callback: Callable[..., None]) -> Callable[..., None]:
     """Callback of message and info for either executor: rclpy 7.1's EventsExecutor passes both as one tuple."""
 
-    def take(message: Any, info: Any = None) -> None:
+    def take(message: Message, info: MessageInfo | None = None) -> None:
         callback(*(message if info is None else (message, info)))
 
     # rclpy chooses the kind of callback by the number of its parameters.
@@ -63,7 +72,7 @@ def answer_impossible_transitions(node: LifecycleNodeMixin, report: Callable[[st
     service = node._service_change_state
     change = service.callback
 
-    def guarded(request: Any, response: Any) -> Any:
+    def guarded(request: ChangeState.Request, response: ChangeState.Response) -> ChangeState.Response:
         try:
             return change(request, response)
         except Exception as error:  # noqa: BLE001 -- rclpy has no type of its own for it
@@ -77,20 +86,20 @@ def answer_impossible_transitions(node: LifecycleNodeMixin, report: Callable[[st
 class PolledService:
     """Server of one service; requests wait until the thread that decides takes them all, and answers them later."""
 
-    def __init__(self, node: Node, service_type: Any, name: str, qos: QoSProfile) -> None:
+    def __init__(self, node: Node, service_type: type[OrbitCommand], name: str, qos: QoSProfile) -> None:
         check_for_type_support(service_type)
-        self._calls: deque[tuple[Any, Future]] = deque()
+        self._calls: deque[tuple[Message, AnswerKey]] = deque()
         self._request_type = service_type.Request
         with node.handle:
             self._handle = _rclpy.Service(node.handle, service_type, name, qos.get_c_qos_profile())
 
-    def call(self, request: Any) -> Future:
+    def call(self, request: Message) -> Future:
         """The answer to a request of this process, which does not pass the middleware."""
         future = Future()
         self._calls.append((request, future))
         return future
 
-    def take(self) -> tuple[Any, Any] | None:
+    def take(self) -> tuple[Message, AnswerKey] | None:
         """The next request with the key for its answer; None when no request waits."""
         if self._calls:
             return self._calls.popleft()
@@ -102,7 +111,7 @@ class PolledService:
             return None
         return None if header is None else (request, header.request_id)
 
-    def answer(self, key: Any, response: Any) -> None:
+    def answer(self, key: AnswerKey, response: Message) -> None:
         """Send the response to a request; a client that has gone is no error."""
         if isinstance(key, Future):
             key.set_result(response)

@@ -6,11 +6,10 @@ The messages are those of ``hri_msgs`` 2; ``make setup`` builds the four of them
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 
@@ -18,6 +17,7 @@ from drocap_ros.geometry.alignment import torso_frame
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.msg import Pose2D, Pose3D
 from drocap_ros.observation import PoseObservation
+from drocap_ros.recording.session import Message
 from drocap_ros.ros.conversions import pose2d_from_ros, pose3d_from_ros, transform_to_ros
 from drocap_ros.skeleton import joint_set
 
@@ -79,7 +79,7 @@ def human_transforms(message: Pose3D, frame_prefix: str = "") -> list[TransformS
     return [body, *links]
 
 
-def skeleton2d(observation: PoseObservation, header: Header) -> Any:
+def skeleton2d(observation: PoseObservation, header: Header) -> Message:
     """Keypoints as ``hri_msgs/Skeleton2D``; an unknown one, or one outside the image, has confidence 0."""
     message = hri.Skeleton2D(header=header)
     unit = observation.keypoints / np.array(observation.image_size)
@@ -93,7 +93,7 @@ def skeleton2d(observation: PoseObservation, header: Header) -> Any:
     return message
 
 
-def region(observation: PoseObservation, header: Header) -> Any:
+def region(observation: PoseObservation, header: Header) -> Message:
     """Box as ``hri_msgs/NormalizedRegionOfInterest2D``."""
     size = np.tile(observation.image_size, 2)
     corners = np.clip(np.nan_to_num(observation.roi / size), 0.0, 1.0)
@@ -111,7 +111,7 @@ class HumanTopics:
         self._node, self._prefix = node, frame_prefix
         self._ids = node.create_publisher(hri.IdsList, f"{_BODIES}/tracked", _QOS)
         self._now = ""
-        self._publishers: list[Any] = []
+        self._publishers: list[Publisher] = []
 
     def publish(self, message: Pose2D) -> None:
         """Publish the tracked body's identifier, box and keypoints.

@@ -16,6 +16,7 @@ import pytest
 import yaml
 from station_files import station_settings
 
+from drocap_ros.bringup import free_domain
 from drocap_ros.cli import main
 from drocap_ros.cli.graph.running_bridge import BridgeListener
 from drocap_ros.errors import InputError
@@ -30,7 +31,7 @@ from drocap_ros.ros.diagnostics import Key
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 
 ROOT = Path(__file__).resolve().parents[2]
-ENV = {**os.environ, "PYTHONPATH": str(ROOT), "ROS_DOMAIN_ID": "99"}
+ENV = {**os.environ, "PYTHONPATH": str(ROOT), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 #: What a ground station loads, and a gimbal.
 SETTINGS = {
     name: tuple(f"{setting}={value}" for setting, value in {**station_settings(name), **more}.items())
@@ -50,6 +51,14 @@ CASES = {
     "silent": ("", (), 2, {"link"}),
     "garbage": ("", (), 2, {"link"}),
 }
+
+
+@pytest.fixture(scope="module", autouse=True)
+def own_domain():
+    """The command reads the bridge of any graph that it hears: those of other tests live in other domains."""
+    with free_domain() as domain:
+        ENV["ROS_DOMAIN_ID"] = str(domain)
+        yield
 
 
 def start(*arguments, log):

@@ -16,17 +16,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from drocap_ros.errors import DrocapError, InputError
+from drocap_ros.parameters import Values
 
 if TYPE_CHECKING:
     from drocap_ros.motion import Motion
 
 #: In each output folder; the folder appears with it, complete, so its presence means "done".
 RECORD_FILE = "record.json"
-#: JSON-compatible values; None = unknown.
-Record = dict[str, Any]
+#: None = unknown.
+Record = Values
 
 #: Threads of one cluster worker would share the limit of BLAS threads and the peak of memory.
 _ONE_AT_A_TIME = threading.Lock()

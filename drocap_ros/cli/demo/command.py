@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 #: The networks of this package, for simulated images only.
 MODELS = "simulation"
 MOUNTS = ("gimbal", "servo", "fixed")
-#: Bounds of the orbit's length: of a shorter one nothing is left to judge, and the truth holds two hours at 15 Hz.
+#: Shortest orbit, s: of a shorter one nothing is left to judge.
 _LEAST_S = 2.0
+#: Longest orbit, s: with its waits it fits the two hours at 15 Hz that a file of the truth holds.
 _MOST_S = 3600.0
 
 

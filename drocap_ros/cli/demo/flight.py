@@ -9,15 +9,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Protocol
 
 from drocap_ros.cli.demo.operator import REST_S, Operator
 from drocap_ros.cli.graph.common import import_bringup
-from drocap_ros.cli.progress import Progress
+from drocap_ros.clip import Progress
 from drocap_ros.errors import NodeError
+from drocap_ros.recording.session import Message
+from drocap_ros.ros.diagnostics import PILOT_HANDS_OFF, Key, node_of, values_of
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 
 if TYPE_CHECKING:
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    from drocap_ros.bringup import Graph, Lockstep
     from drocap_ros.config import DrocapConfig
 
 #: The whole graph, with the flight simulator instead of drone and camera.
@@ -53,7 +58,7 @@ def fly_in_simulated_time(
     transports = {"mavlink_bridge": LoopbackTransport(down, up), "flight_simulator": LoopbackTransport(up, down)}
     with _errors_only(), import_bringup().lockstep(config, NODES, transports=transports) as graph:
         bridge = next(node for node in graph.components if node.component == "mavlink_bridge")
-        _Desk(graph.node, operator, bridge.requests.call, say, lambda: graph.now_s)
+        _Desk(graph, operator, bridge.requests.call, say, lambda: graph.now_s)
         graph.start()
         graph.run_until(_over(operator, progress, interrupted), _longest_s(operator), "the end of the flight")
         if operator.failure:
@@ -73,7 +78,7 @@ def fly_in_real_time(
     with import_bringup().bringup(config, NODES, processes=True) as graph:
         client = graph.node.create_client(SERVICES["orbit/command"], "orbit/command", qos_profile=RESULT_QOS)
         begin_s = time.monotonic()
-        _Desk(graph.node, operator, client.call_async, say, lambda: time.monotonic() - begin_s)
+        _Desk(graph, operator, client.call_async, say, lambda: time.monotonic() - begin_s)
         before = {name: _processor_s(graph.pid(name)) for name in NODES}
         graph.wait_until(_over(operator, progress, interrupted), _longest_s(operator), "the end of the flight")
         if operator.failure:
@@ -116,29 +121,44 @@ def _longest_s(operator: Operator) -> float:
     return 3.0 * operator.seconds + 120.0 * (operator.restarts + 1)
 
 
+class _Answer(Protocol):
+    """rclpy's future of the answer to a request."""
+
+    def add_done_callback(self, callback: Callable[[_Answer], None]) -> None:
+        """Call it with this future when the answer is there."""
+
+    def result(self) -> Message:
+        """The answer."""
+
+
 class _Desk:
     """Connects the operator with the graph: status and diagnostics in, commands out.
 
     Parameters
     ----------
-    node : of the graph's namespace
+    graph : its node is in the namespace of the nodes
     call : sends a request to the bridge; returns the future of its answer
     now_s : the operator's clock
     """
 
     def __init__(
-        self, node: Any, operator: Operator, call: Callable[[Any], Any], say: Say, now_s: Callable[[], float]
+        self,
+        graph: Graph | Lockstep,
+        operator: Operator,
+        call: Callable[[Message], _Answer],
+        say: Say,
+        now_s: Callable[[], float],
     ) -> None:
         from drocap_ros.ros.topics import TOPICS
 
-        self._node, self._operator, self._call, self._now_s = node, operator, call, now_s
+        self._node, self._operator, self._call, self._now_s = graph.node, operator, call, now_s
         self._say: Callable[[str], None] = lambda words: say(now_s(), words)
         self._pilot = ""
         operator.cleared = False
         for topic, take in (("orbit/status", self._on_status), ("/diagnostics", self._on_diagnostics)):
-            node.create_subscription(TOPICS[topic].message, topic, take, TOPICS[topic].qos)
+            graph.node.create_subscription(TOPICS[topic].message, topic, take, TOPICS[topic].qos)
 
-    def _on_status(self, message: Any) -> None:
+    def _on_status(self, message: Message) -> None:
         from drocap_ros.flight.orbit.states import State
         from drocap_ros.ros.conversions import orbit_request
 
@@ -147,7 +167,7 @@ class _Desk:
             self._call(orbit_request(self._node, int(command))).add_done_callback(self._on_answer)
         self._print_remarks()
 
-    def _on_answer(self, future: Any) -> None:
+    def _on_answer(self, future: _Answer) -> None:
         answer = future.result()
         self._operator.on_answer(answer.accepted, answer.condition, answer.words, self._now_s())
         self._print_remarks()
@@ -157,10 +177,8 @@ class _Desk:
             self._say(f"operator: {words}")
         self._operator.remarks.clear()
 
-    def _on_diagnostics(self, message: Any) -> None:
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
         """Print what the pilot does, and clear the operator once the pilot has handed over."""
-        from drocap_ros.ros.diagnostics import PILOT_HANDS_OFF, Key, node_of, values_of
-
         for status in message.status:
             if node_of(status)[1] != "flight_simulator":
                 continue

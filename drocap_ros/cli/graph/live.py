@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from drocap_ros.cli.graph.common import add_start_options, chosen_domain, import_bringup
 from drocap_ros.cli.graph.top import dashboard_of
-from drocap_ros.cli.options import Subparsers, add_command
+from drocap_ros.cli.options import Subparsers, add_command, add_config_option, add_models_option
 from drocap_ros.cli.signals import stop_signals
 from drocap_ros.recording.mcap.metadata import METADATA_FILE
 from drocap_ros.recording.provenance import dated_name
@@ -29,10 +29,8 @@ def add_parser(subparsers: Subparsers) -> None:
         help="bring the graph up on real hardware",
         description="Start the nodes and run until the source ends or Ctrl-C. Each in a process of its own.",
     )
-    parser.add_argument(
-        "--config", metavar="FILE", type=Path, required=True, help="parameters of the components (YAML)"
-    )
-    parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
+    add_config_option(parser, required=True)
+    add_models_option(parser)
     parser.add_argument("--source", metavar="URI", help="replaces the configuration's image_ingest.source")
     parser.add_argument("--session", metavar="DIR", type=Path, help="record to this new folder")
     parser.add_argument(
@@ -100,7 +98,7 @@ def _show(graph: Graph, quiet: bool) -> None:
         print(f"running {', '.join(graph.names)} in {graph.namespace}, domain {graph.domain_id}; Ctrl-C stops")
         sys.stdout.flush()
     with dashboard_of(graph, show=not quiet) as (_, draw), stop_signals() as stop:
-        while not stop.is_set() and "image_ingest" not in graph.finished:
+        while not stop.is_set() and not graph.finished:
             graph.spin_for(0.5, stop)
             draw()
             while graph.events:

@@ -6,11 +6,11 @@ import argparse
 import dataclasses
 import math
 import time
-from typing import Any
 
 from drocap_ros.cli.graph.common import add_place_options, chosen_domain, import_bringup
 from drocap_ros.cli.options import Subparsers, add_command
 from drocap_ros.errors import InputError
+from drocap_ros.recording.session import Message
 
 #: Parameter of the orbit behind each option: its range is checked here, its limits by the bridge.
 _PARAMETERS = {"--radius": "radius_m", "--height": "height_m", "--speed": "angular_speed_deg_s"}
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     end_s = time.monotonic() + args.timeout
     with bringup.watch(args.namespace, domain_id) as graph:
         if args.action == "status":
-            statuses: list[Any] = []
+            statuses: list[Message] = []
             graph.node.create_subscription(TOPICS["orbit/status"].message, "orbit/status", statuses.append, RESULT_QOS)
             if not graph.wait(lambda: bool(statuses), end_s - time.monotonic()):
                 raise no_graph
@@ -100,7 +100,7 @@ def _check_range(name: str, value: float) -> None:
         )
 
 
-def _sentence(status: Any) -> str:
+def _sentence(status: Message) -> str:
     from drocap_ros.flight.conditions import ConditionCode
     from drocap_ros.flight.orbit.states import State
 

@@ -7,11 +7,11 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from drocap_ros.cli.atomic_output import check_output_file, output_file
-from drocap_ros.cli.graph.common import PIPE_WIDTH, add_domain_option, chosen_domain
-from drocap_ros.cli.options import ros_namespace
+from drocap_ros.cli.graph.common import PIPE_WIDTH, add_place_options, chosen_domain
+from drocap_ros.cli.options import Subparsers, add_command, add_config_option, add_models_option
 from drocap_ros.cli.progress import progress_bars
 from drocap_ros.errors import InputError
 
@@ -29,32 +29,29 @@ _COLOURS = {"ok": "green", "waits": "cyan", "warning": "yellow", "missing": "red
 _USUAL_SIZE = (1280, 720)
 
 
-def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+def add_parser(subparsers: Subparsers) -> None:
     """Add the command's options; ``run`` is its action."""
-    parser: argparse.ArgumentParser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "preflight",
+        run,
         help="what is missing before a flight, and how to mend it",
         description="Listen to the autopilot of a configuration for some seconds and print every check: found, wanted, "
         "how to mend it. Sends requests for telemetry and parameters only; it never arms, moves or changes the "
         "vehicle. With a running graph it listens to that graph's bridge.",
-        epilog="Exit status: 0 nothing is missing (warnings may remain, and what waits for the air), 1 something is "
-        "missing, 2 the configuration or the link cannot be used, or no autopilot is heard.",
     )
-    parser.add_argument(
-        "--config", metavar="FILE", type=Path, required=True, help="parameters of the components (YAML)"
+    parser.epilog = (
+        "Exit status: 0 nothing is missing (warnings may remain, and what waits for the air), 1 something is "
+        "missing, 2 the configuration or the link cannot be used, or no autopilot is heard."
     )
+    add_config_option(parser, required=True)
     parser.add_argument(
         "--seconds", metavar="S", type=float, default=8.0, help="to listen, 2 to 300 (default 8); more finds rarer gaps"
     )
     parser.add_argument("--json", metavar="FILE", type=Path, help="write the checks with their values, for programs")
-    parser.add_argument("--models", metavar="DIR", type=Path, help="folder of ONNX models (default: $DROCAP_MODELS)")
-    parser.add_argument(
-        "--namespace", type=ros_namespace, default="/drocap", help="of a running graph (default /drocap)"
-    )
-    add_domain_option(parser)
+    add_models_option(parser)
+    add_place_options(parser)
     parser.add_argument("--quiet", action="store_true", help="print what is missing only")
-    parser.set_defaults(run=run)
-    return parser
 
 
 def run(args: argparse.Namespace) -> int:

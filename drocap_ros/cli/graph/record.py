@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from drocap_ros.cli.graph.live import add_run_options, run_graph
-from drocap_ros.cli.options import Subparsers, add_command
+from drocap_ros.cli.options import Subparsers, add_command, add_config_option
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -19,7 +19,7 @@ def add_parser(subparsers: Subparsers) -> None:
         description="Record the topics of a running graph to a rosbag2 session (MCAP) until Ctrl-C.",
     )
     parser.add_argument("--out", metavar="DIR", type=Path, help="new folder of the session (default: named by date)")
-    parser.add_argument("--config", metavar="FILE", type=Path, help="parameters of the components (YAML)")
+    add_config_option(parser)
     add_run_options(parser)
 
 

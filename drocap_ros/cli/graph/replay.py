@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from drocap_ros.cli.graph.common import add_start_options, chosen_domain, import_bringup
+from drocap_ros.cli.graph.common import add_start_options
+from drocap_ros.cli.graph.live import run_graph
 from drocap_ros.cli.options import Subparsers, add_command
-from drocap_ros.cli.signals import stop_signals
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -39,13 +39,13 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument("--no-clock", action="store_true", help="do not publish /clock")
     add_start_options(parser)
+    parser.set_defaults(no_respawn=True)  # a restarted player would begin again
 
 
 def run(args: argparse.Namespace) -> int:
     """Publish until the session ends or the user interrupts."""
     from drocap_ros.config import DrocapConfig
 
-    domain_id = chosen_domain(args)
     config = DrocapConfig().replace(
         "session_player",
         session=str(args.session.absolute()),
@@ -56,16 +56,4 @@ def run(args: argparse.Namespace) -> int:
         topics=" ".join(args.topics),
         clock=not args.no_clock,
     )
-    with import_bringup().bringup(
-        config,
-        ["session_player"],
-        processes=not args.one_process,
-        namespace=args.namespace,
-        domain_id=domain_id,
-    ) as graph:
-        if not args.quiet:
-            print(f"publishing {args.session} in domain {domain_id}; Ctrl-C stops", flush=True)
-        with stop_signals() as stop:
-            while not stop.is_set() and "session_player" not in graph.finished:
-                graph.spin_for(0.2, stop)
-    return 0
+    return run_graph(config, ["session_player"], args)

@@ -7,11 +7,11 @@ import dataclasses
 import time
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drocap_ros.cli.progress import Progress
+from drocap_ros.clip import Progress
 from drocap_ros.flight.autopilot import AUTOPILOTS, autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode
@@ -19,6 +19,8 @@ from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
 from drocap_ros.flight.orbit.states import State
 from drocap_ros.flight.preflight.measured import Measured, Stream
 from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.recording.session import Message
+from drocap_ros.ros.diagnostics import Key, number, of, values_of
 
 if TYPE_CHECKING:
     from drocap_ros.bringup import Graph
@@ -58,8 +60,8 @@ class BridgeListener:
     def __init__(self, graph: Graph) -> None:
         from drocap_ros.ros.topics import TOPICS
 
-        self.statuses: list[Any] = []
-        self.states: list[tuple[float, Any]] = []  # age at the arrival, message
+        self.statuses: list[Message] = []
+        self.states: list[tuple[float, Message]] = []  # age at the arrival, message
         self.values: dict[str, str] = {}
         self._graph = graph
         takers = {
@@ -70,15 +72,15 @@ class BridgeListener:
         for topic, take in takers.items():
             graph.node.create_subscription(TOPICS[topic].message, topic, take, TOPICS[topic].qos)
 
-    def _take_state(self, message: Any) -> None:
+    def _take_state(self, message: Message) -> None:
         stamp = message.header.stamp
         now_ns = self._graph.node.get_clock().now().nanoseconds
         self.states.append((now_ns * 1e-9 - stamp.sec - stamp.nanosec * 1e-9, message))
 
-    def _take_diagnostics(self, message: Any) -> None:
+    def _take_diagnostics(self, message: Message) -> None:
         for status in message.status:
             if status.name == f"{self._graph.namespace.strip('/')}/mavlink_bridge":
-                self.values.update({value.key: value.value for value in status.values})
+                self.values.update(values_of(status))
 
     def _failed(self) -> tuple[tuple[Condition, float], ...]:
         """Conditions for motion that the bridge has reported, with their share of the time."""
@@ -92,8 +94,6 @@ class BridgeListener:
 
     def measured(self, config: MavlinkBridgeConfig, namespace: str) -> Measured:
         """What the bridge has reported; it reads fewer of the autopilot's parameters than a link of our own."""
-        from drocap_ros.ros.diagnostics import Key, number, of
-
         status = self.statuses[-1]
         state = State(status.state).name.lower().replace("_", " ")
         requests = TelemetryRequests(dataclasses.replace(config, commands_enabled=True))

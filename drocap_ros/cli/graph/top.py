@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from drocap_ros.cli.graph.common import PIPE_WIDTH, add_place_options, chosen_domain, import_bringup
 from drocap_ros.cli.options import Subparsers, add_command
 from drocap_ros.cli.signals import stop_signals
-from drocap_ros.ros.diagnostics import Key, number, words
+from drocap_ros.ros.diagnostics import Key, number, values_of, words
 
 if TYPE_CHECKING:
     from diagnostic_msgs.msg import DiagnosticArray
@@ -38,10 +38,9 @@ class Dashboard:
     def take(self, message: DiagnosticArray) -> None:
         """Store the statuses of a diagnostic_msgs/DiagnosticArray."""
         for status in message.status:
-            values = {value.key: value.value for value in status.values}
             # rclpy gives the level as one byte.
             level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
-            self._rows[status.name] = (level, status.message, values)
+            self._rows[status.name] = (level, status.message, values_of(status))
 
     def heard(self, namespace: str) -> list[str]:
         """Names of the nodes whose status has arrived, in a namespace."""

@@ -11,7 +11,7 @@ import time
 import webbrowser
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from drocap_ros.cli.atomic_output import output_file
 from drocap_ros.cli.graph.common import add_domain_option, chosen_domain, import_bringup
@@ -19,6 +19,7 @@ from drocap_ros.cli.options import Subparsers, add_command, read_motion, ros_nam
 from drocap_ros.cli.progress import progress_bars
 from drocap_ros.cli.signals import interruptible, stop_signals
 from drocap_ros.errors import InputError
+from drocap_ros.recording.session import Message
 
 if TYPE_CHECKING:
     import rerun
@@ -166,7 +167,7 @@ def _view_live(recording: rerun.RecordingStream, args: argparse.Namespace) -> in
 def _subscribe(graph: Graph, view: MessageView) -> None:
     from drocap_ros.ros.topics import TOPICS
 
-    def receiver(name: str) -> Callable[[Any], None]:
+    def receiver(name: str) -> Callable[[Message], None]:
         return lambda message: view.take(name, message, graph.node.get_clock().now().nanoseconds)
 
     for name in view.handlers:
