@@ -21,12 +21,12 @@ import cv2
 import numpy as np
 from figures import ROOT, table, write_figures
 
-from drocap_ros.perception.detection import Detector
+from drocap_ros.perception.detection.detector import Detector
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import load_detector, load_pose_model
 from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.perception.models.spec import read_spec
-from drocap_ros.perception.pose import NetworkKeypoints, PoseModel
+from drocap_ros.perception.pose.pose_model import NetworkKeypoints, PoseModel
 from drocap_ros.perception.pose.uncertainty import CALIBRATIONS, Calibration, calibrate
 from drocap_ros.perception.sources import open_source
 from drocap_ros.perception.sources.image_files import read_image

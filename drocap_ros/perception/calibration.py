@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from drocap_ros.errors import InputError
+from drocap_ros.errors import InputError, first_line
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.tracks import check_camera_matrix
 
@@ -72,7 +71,7 @@ def load_calibration(path: Path) -> CameraModel:
     import yaml
 
     try:
-        data: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
         matrix = np.array(data["camera_matrix"]["data"], float).reshape(3, 3)
         distortion = np.array(data.get("distortion_coefficients", {}).get("data", []), float).ravel()
         lens = str(data.get("distortion_model", "plumb_bob"))
@@ -82,7 +81,7 @@ def load_calibration(path: Path) -> CameraModel:
     except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
             f"{path}: expected image_width, image_height, camera_matrix as camera_calibration writes them;"
-            f" found a problem with {str(error).splitlines()[0] or type(error).__name__}"
+            f" found a problem with {first_line(error)}"
         ) from None
     if min(model.width, model.height) < 1:
         raise InputError(f"{path}: expected a positive image size, found {model.width}x{model.height}; correct it")

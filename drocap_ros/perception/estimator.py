@@ -14,8 +14,8 @@ from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import without_parts
 from drocap_ros.perception.load_models import limited_use, load_detector, load_pose_model
 from drocap_ros.perception.load_shedding import KeypointFlow
-from drocap_ros.perception.pose import NetworkKeypoints
 from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
+from drocap_ros.perception.pose.pose_model import NetworkKeypoints
 from drocap_ros.perception.tracking.camera_motion import CameraMotion, sweeps
 from drocap_ros.perception.tracking.other_poses import OtherPoses
 from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, EMPTY_CONFIDENCE, Subject
@@ -117,12 +117,12 @@ class PoseEstimator:
         if self._motion is not None:
             self.tracker.move_camera(self._motion)
             self._others.move_camera(self._motion)
-        self.keypoints = None
-        observation = self._flow.propagate(image, stamp_ns) if roi is None and self._flow.steps < load_level else None
-        if observation is not None:
-            self._failures, self._seen_ns = 0, stamp_ns
-            return observation, True
-        predicted = self._estimate_predicted(image, stamp_ns, load_level) if roi is None else None
+        self.keypoints = predicted = None
+        if roi is None:
+            if self._flow.steps < load_level and (moved := self._flow.propagate(image, stamp_ns)) is not None:
+                self._failures, self._seen_ns = 0, stamp_ns
+                return moved, True
+            predicted = self._estimate_predicted(image, stamp_ns, load_level)
         if predicted and predicted[1]:
             self._seen_ns = stamp_ns
         observation, certain = predicted or self._estimate_detected(image, stamp_ns, roi, load_level)
@@ -178,12 +178,15 @@ class PoseEstimator:
         if is_person and not detected and (box := pose.box()) is not None:
             self.tracker.confirm(box, stamp_ns)
         self._margins = self._clear_margins(subject, pose) if detected else None
-        blurred = sweeps(self._motion, subject.box)
-        if is_person or (subject.score > 0 and (blurred or self._confidence >= EMPTY_CONFIDENCE)):
+        if is_person or self._is_in_view(subject):
             self._seen_ns = stamp_ns
         elif stamp_ns - self._seen_ns > _UNSEEN_NS:
             return self._observation(image, stamp_ns, subject), False
         return self._observation(image, stamp_ns, subject, pose), is_person or detected
+
+    def _is_in_view(self, subject: Subject) -> bool:
+        """Whether a detected subject's last pose, doubtful as it is, may be a person's."""
+        return subject.score > 0 and (self._confidence >= EMPTY_CONFIDENCE or sweeps(self._motion, subject.box))
 
     def _clear_margins(self, subject: Subject, pose: BodyPose) -> np.ndarray | None:
         """(4,) margins of the box around the joints, over their longer extent; None unless both are clear."""
@@ -204,27 +207,28 @@ class PoseEstimator:
         if predicted is None:
             return None
         age_s, every_s = (stamp_ns - self._detected_ns) * 1e-9, self.config.detect_every_s
-        clear = self._confidence >= CLEAR_CONFIDENCE
-        shedding = load_level > 0 and clear and age_s <= load_level * every_s - _SLACK_S
+        shedding = self._confidence >= CLEAR_CONFIDENCE and age_s <= load_level * every_s - _SLACK_S
         recent = shedding or age_s <= every_s - _SLACK_S
-        margins = self._margins if recent and self._isolated(predicted, image, stamp_ns) else None
-        if margins is None and not shedding:
+        alone = recent and self._margins is not None and self._search.isolated(predicted.box, _size(image), stamp_ns)
+        if not (alone or shedding):
             return None
         pose = self._body.estimate(image, predicted.box)
-        confidence, extent = pose.mean_confidence, pose.extent()
-        if margins is not None and extent is not None and confidence >= CLEAR_CONFIDENCE:
-            box = extent + margins * (extent[2:] - extent[:2]).max()
-            box = np.clip(box, 0, np.tile(np.array(_size(image), float), 2))
-            self.tracker.propagate(box, stamp_ns)
-            self.tracker.judge(confidence, box, stamp_ns)
-            predicted = Subject(predicted.track_id, box, predicted.score, False)
-        elif not shedding:
+        subject = self._moved(predicted, pose, _size(image), stamp_ns) if alone else None
+        if subject is None and not shedding:
             return None
-        self.keypoints, self._confidence = pose.network, confidence
-        return self._observation(image, stamp_ns, predicted, pose), confidence >= CONFIRM_CONFIDENCE
+        self.keypoints, self._confidence = pose.network, pose.mean_confidence
+        return self._observation(image, stamp_ns, subject or predicted, pose), self._confidence >= CONFIRM_CONFIDENCE
 
-    def _isolated(self, predicted: Subject, image: np.ndarray, stamp_ns: int) -> bool:
-        return self._margins is not None and self._search.isolated(predicted.box, _size(image), stamp_ns)
+    def _moved(self, subject: Subject, pose: BodyPose, size: tuple[int, int], stamp_ns: int) -> Subject | None:
+        """The subject at the box around a clear pose's joints, in the tracker too; None where it is not clear."""
+        confidence, extent = pose.mean_confidence, pose.extent()
+        if extent is None or confidence < CLEAR_CONFIDENCE or self._margins is None:
+            return None
+        box = extent + self._margins * (extent[2:] - extent[:2]).max()
+        box = np.clip(box, 0, np.tile(np.array(size, float), 2))
+        self.tracker.propagate(box, stamp_ns)
+        self.tracker.judge(confidence, box, stamp_ns)
+        return Subject(subject.track_id, box, subject.score, False)
 
     def _observation(
         self, image: np.ndarray, stamp_ns: int, subject: Subject, pose: BodyPose | None = None
@@ -242,8 +246,7 @@ class PoseEstimator:
             unseen = outside | (confidence < self.config.keypoint_threshold)
             xy[unseen], covariance[unseen] = np.nan, np.nan
         score = 0.0 if pose is None else subject.score
-        arrays = (array.astype(np.float32) for array in (subject.box, xy, covariance, confidence))
-        box, xy, covariance, confidence = arrays
+        box, xy, covariance, confidence = (a.astype(np.float32) for a in (subject.box, xy, covariance, confidence))
         return PoseObservation(stamp_ns, subject.track_id, size, joints, box, score, xy, covariance, confidence)
 
 

@@ -8,17 +8,20 @@ from pathlib import Path
 from typing import TypeVar
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.detection import Detector
+from drocap_ros.perception.detection.detector import Detector
 from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.perception.models.spec import ModelSpec, read_spec
-from drocap_ros.perception.pose import PoseModel
+from drocap_ros.perception.pose.pose_model import PoseModel
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
 T = TypeVar("T", Detector, PoseModel)
 
+_WHAT = {"detector": "person detector", "pose": "2D pose model"}
 #: Name parts in the order of preference of ``auto``; other names come last.
-_DETECTOR_ORDER = ("rtmdet", "yolox", "yolo", "rtmo")
-_POSE_ORDER = ("rtmpose", "tinypose", "vitpose", "hrnet", "hourglass", "movenet", "yolo", "rtmo")
+_ORDER = {
+    "detector": ("rtmdet", "yolox", "yolo", "rtmo"),
+    "pose": ("rtmpose", "tinypose", "vitpose", "hrnet", "hourglass", "movenet", "yolo", "rtmo"),
+}
 
 #: Name of the shipped networks, in place of a folder.  They are trained on rendered images only, so nothing falls back
 #: to them.
@@ -54,41 +57,27 @@ def load_detector(models_dir: str | Path, config: PoseEstimatorConfig) -> Detect
     InputError
         When the folder has none, or the configured one cannot be used.
     """
-    return _load(Path(models_dir), config.detector, "detector", _DETECTOR_ORDER, config, Detector)
+    return _load(Path(models_dir), "detector", config.detector, config, Detector)
 
 
 def load_pose_model(models_dir: str | Path, config: PoseEstimatorConfig) -> PoseModel:
-    """The configured 2D pose model of a folder, or the preferred one with ``auto``.
-
-    Raises
-    ------
-    InputError
-        When the folder has none, or the configured one cannot be used.
-    """
-    return _load(Path(models_dir), config.pose_model, "pose", _POSE_ORDER, config, PoseModel)
-
-
-def _read_named(path: Path, what: str, task: str, config: PoseEstimatorConfig) -> tuple[OnnxModel, ModelSpec]:
-    model, spec = _read(path, config)
-    if spec.task not in (task, "both"):
-        raise InputError(f"{path}: expected a {what}, found a {spec.task} model ({spec.layout}); name another")
-    return model, spec
+    """As :func:`load_detector`, for the 2D pose model."""
+    return _load(Path(models_dir), "pose", config.pose_model, config, PoseModel)
 
 
 def _load(
-    folder: Path,
-    name: str,
-    task: str,
-    order: tuple[str, ...],
-    config: PoseEstimatorConfig,
-    build: Callable[[OnnxModel, ModelSpec], T],
+    folder: Path, task: str, name: str, config: PoseEstimatorConfig, build: Callable[[OnnxModel, ModelSpec], T]
 ) -> T:
-    what = "person detector" if task == "detector" else "2D pose model"
+    what = _WHAT[task]
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder with a {what} (.onnx), found no such folder; {_FETCH}")
     if name != "auto":
-        return build(*_read_named(folder / (name if name.endswith(".onnx") else f"{name}.onnx"), what, task, config))
-    paths = sorted(folder.glob("*.onnx"), key=lambda path: _rank(path, order))
+        path = folder / f"{name.removesuffix('.onnx')}.onnx"
+        model, spec = _read(path, config)
+        if spec.task not in (task, "both"):
+            raise InputError(f"{path}: expected a {what}, found a {spec.task} model ({spec.layout}); name another")
+        return build(model, spec)
+    paths = sorted(folder.glob("*.onnx"), key=lambda path: _rank(path, _ORDER[task]))
     why = ""
     for path in paths:
         try:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import platform
 import time
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from drocap_ros.reconstruction.heels import with_heels
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.methods.run import run_method
 from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M
+from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS
 from drocap_ros.reconstruction.world.in_world import in_camera_axes, in_world
 from drocap_ros.reconstruction.world.placement import WorldPoses, metres_per_px
 from drocap_ros.reconstruction.world.refine import RefinedWorld, refinable
@@ -32,8 +32,6 @@ from drocap_ros.tracks import Tracks
 
 #: Steps of each of the body's adjustments where the one in the world goes on from them: more change nothing there.
 _STEPS_BEFORE_WORLD = 2
-#: Fewer known joints, of the 15 of a body, determine no pose.
-_LEAST_JOINTS = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +58,7 @@ class _Body:
     camera_position: np.ndarray | None
     reprojection_px: np.ndarray
     covariance: np.ndarray | None
-    meta: dict[str, Any]
+    meta: dict[str, object]
 
 
 def reconstruct(
@@ -152,7 +150,7 @@ def _solve(tracks: Tracks, keypoints: Keypoints2D, settings: _Settings) -> Image
     return poses
 
 
-def _meta(poses: ImagePoses, settings: _Settings) -> dict[str, Any]:
+def _meta(poses: ImagePoses, settings: _Settings) -> dict[str, object]:
     """What made the motion."""
     report, origin = poses.report, dict(poses.report.origin)
     parameters = {"initializer": settings.initializer, "adjuster": settings.adjuster, **origin.pop("parameters", {})}
@@ -185,9 +183,9 @@ def body_keypoints(tracks: Tracks, joints: JointSet = BODY_17) -> Keypoints2D:
     have = place >= 0
     names = tuple(np.array(source.joints)[have])
     given = sum(set(parts) <= set(names) for parts in TABLES[source.name].values())
-    if given < _LEAST_JOINTS:
+    if given < MIN_JOINTS:
         raise InputError(
-            f"joints: expected at least {_LEAST_JOINTS} of {', '.join(BODY_15.joints)}, or names of"
+            f"joints: expected at least {MIN_JOINTS} of {', '.join(BODY_15.joints)}, or names of"
             f" {', '.join(list(TABLES)[3:])}, got {given} of them; rename the joints"
         )
     shape = (len(tracks), len(source))
@@ -216,7 +214,7 @@ def _in_metres(tracks: Tracks, keypoints: Keypoints2D, poses: ImagePoses, settin
     """
     height_m = settings.initializer.assumed_height_m
     per_px = metres_per_px(poses.joints_px, tracks.stamp_ns, height_m)
-    meta: dict[str, Any] = {"assumed_height_m": height_m, "reference_stature_m": REFERENCE_STATURE_M}
+    meta: dict[str, object] = {"assumed_height_m": height_m, "reference_stature_m": REFERENCE_STATURE_M}
     refined: RefinedWorld | None = None
     rotation = tracks.camera_rotation
     if rotation is None:

@@ -10,7 +10,7 @@ import pytest
 
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.persons import find_persons
-from drocap_ros.perception.pose import NetworkKeypoints
+from drocap_ros.perception.pose.pose_model import NetworkKeypoints
 from drocap_ros.perception.pose.uncertainty import calibrate
 from drocap_ros.perception.sources import open_source
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig

@@ -16,16 +16,19 @@ def iou(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     """(N, M) intersection over union of (N, 4) and (M, 4) boxes x_min y_min x_max y_max; 0 for empty boxes."""
     common, areas, other_areas = _areas(boxes, others)
     union = areas[:, None] + other_areas[None] - common
-    ratio: np.ndarray = np.divide(common, union, out=np.zeros_like(common), where=union > 0)
-    return ratio
+    return np.asarray(np.divide(common, union, out=np.zeros_like(common), where=union > 0))
 
 
 def overlap_coefficient(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     """(N, M) intersection over the smaller of two boxes; 0 for empty boxes."""
     common, areas, other_areas = _areas(boxes, others)
     smaller = np.minimum(areas[:, None], other_areas[None])
-    ratio: np.ndarray = np.divide(common, smaller, out=np.zeros_like(common), where=smaller > 0)
-    return ratio
+    return np.asarray(np.divide(common, smaller, out=np.zeros_like(common), where=smaller > 0))
+
+
+def areas_of(boxes: np.ndarray) -> np.ndarray:
+    """(N,) areas of (N, 4) boxes, 0 for empty ones."""
+    return np.asarray(np.prod(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None), axis=1))
 
 
 def _areas(boxes: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -33,8 +36,7 @@ def _areas(boxes: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarra
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
     common = np.prod(np.clip(high - low, 0, None), axis=2)
-    areas = np.prod(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None), axis=1)
-    return common, areas, np.prod(np.clip(others[:, 2:] - others[:, :2], 0, None), axis=1)
+    return common, areas_of(boxes), areas_of(others)
 
 
 def suppress(boxes: np.ndarray, scores: np.ndarray, max_iou: float = 0.6) -> np.ndarray:
@@ -60,7 +62,7 @@ def without_parts(boxes: np.ndarray, scores: np.ndarray) -> np.ndarray:
 
     boxes : (N, 4); scores : (N,)
     """
-    areas = np.prod(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None), axis=1)
+    areas = areas_of(boxes)
     better = scores[None] > scores[:, None]
     part = better & (overlap_coefficient(boxes, boxes) > _PART_INSIDE) & (areas[:, None] < _PART_AREA * areas[None])
     return np.nonzero(~part.any(axis=1))[0]

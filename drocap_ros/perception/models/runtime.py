@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from drocap_ros.errors import InputError
+from drocap_ros.errors import InputError, first_line
 
 _PROVIDERS = {
     "cpu": "CPUExecutionProvider",
@@ -58,11 +57,11 @@ class OnnxModel:
         providers = choose_providers(provider, ort.get_available_providers())
         self._open = partial(ort.InferenceSession, sess_options=options, providers=providers)
         try:
-            self._session: Any = self._open(str(self.path))
+            self._session = self._open(str(self.path))
         except Exception as error:  # noqa: BLE001  # onnxruntime's exceptions have no common base
             raise InputError(
-                f"{self.path}: expected an ONNX model that onnxruntime {ort.__version__} can run; {_first_line(error)};"
-                " export or fetch it again"
+                f"{self.path}: expected an ONNX model that onnxruntime {ort.__version__} can run;"
+                f" {first_line(error)[:200]}; export or fetch it again"
             ) from None
         self.provider: str = self._session.get_providers()[0]
         self.inputs = self._session.get_inputs()
@@ -104,7 +103,9 @@ class OnnxModel:
         try:
             outputs = self._session.run(self._names, {self.inputs[0].name: tensor.astype(self._dtype, copy=False)})
         except Exception as error:  # noqa: BLE001  # onnxruntime's exceptions have no common base
-            raise InputError(f"{self.path}: the model stopped: {_first_line(error)}; check its input size") from None
+            raise InputError(
+                f"{self.path}: the model stopped: {first_line(error)[:200]}; check its input size"
+            ) from None
         for info, value in zip(self.outputs, outputs, strict=True):
             # The sum is NaN or infinite whenever an element is; one pass, no temporary array.
             if value.dtype.kind == "f" and not np.isfinite(value.sum(dtype=np.float64)):
@@ -156,8 +157,3 @@ def choose_providers(wanted: str, offered: list[str]) -> list[str]:
         raise InputError(f"provider: expected one of {have} (offered by this onnxruntime), got {wanted!r}")
     cpu = _PROVIDERS["cpu"]
     return [name] if name == cpu else [name, cpu]
-
-
-def _first_line(error: Exception) -> str:
-    text = str(error).strip().splitlines()
-    return text[0][:200] if text else type(error).__name__

@@ -10,12 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from drocap_ros.errors import InputError
+from drocap_ros.errors import InputError, first_line
 from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.skeleton import JOINT_SETS
 
 #: Shapes of a network's outputs.
 Shapes = list[tuple[int, ...]]
+
+#: Fields of a :class:`ModelSpec` by their names, in part.
+Fields = dict[str, Any]
 
 #: Joint sets by their number of joints.
 JOINTS_BY_COUNT = {17: "coco17", 133: "wholebody133", 26: "halpe26", 16: "mpii16"}
@@ -74,14 +77,14 @@ class _Layout:
 
     task: str
     fits: Callable[[Shapes, tuple[int, int]], bool] | None = None
-    fields: dict[str, Any] = field(default_factory=dict)
+    fields: Fields = field(default_factory=dict)
     joints: int | None = None
 
 
-_RAW_BGR: dict[str, Any] = {"colour": "bgr"}
-_UNIT_RGB: dict[str, Any] = {"std": (255.0, 255.0, 255.0), "letterbox": "centre"}
-_IMAGENET: dict[str, Any] = {"mean": (123.675, 116.28, 103.53), "std": (58.395, 57.12, 57.375)}
-_MMDET: dict[str, Any] = {"mean": (103.53, 116.28, 123.675), "std": (57.375, 57.12, 58.395), "colour": "bgr"}
+_RAW_BGR: Fields = {"colour": "bgr"}
+_UNIT_RGB: Fields = {"std": (255.0, 255.0, 255.0), "letterbox": "centre"}
+_IMAGENET: Fields = {"mean": (123.675, 116.28, 103.53), "std": (58.395, 57.12, 57.375)}
+_MMDET: Fields = {"mean": (103.53, 116.28, 123.675), "std": (57.375, 57.12, 58.395), "colour": "bgr"}
 
 #: The first one that fits is inferred.  Those of other families than the registry's are named in a YAML.
 LAYOUTS = {
@@ -196,7 +199,7 @@ def _anchors(size: tuple[int, int]) -> set[int]:
     return {sum(cells[:3]), sum(cells)}
 
 
-def _input_size(model: OnnxModel, given: dict[str, Any]) -> tuple[tuple[int, int], bool]:
+def _input_size(model: OnnxModel, given: Fields) -> tuple[tuple[int, int], bool]:
     """(width, height) px of the input, and whether its channels are last."""
     shape = model.inputs[0].shape
     if len(shape) != 4:
@@ -209,7 +212,7 @@ def _input_size(model: OnnxModel, given: dict[str, Any]) -> tuple[tuple[int, int
     return (width, height), channels_last
 
 
-def _family(stem: str, given: dict[str, Any]) -> dict[str, Any]:
+def _family(stem: str, given: Fields) -> Fields:
     """Input of RTMDet or YOLOX with NMS: their outputs are equal, only the name distinguishes them."""
     for part, fields in (("yolox", _RAW_BGR), ("rtmdet", _MMDET)):
         if part in stem.lower():
@@ -233,7 +236,7 @@ def _skeleton(layout: _Layout, shape: tuple[int, ...], stem: str) -> str:
     return JOINTS_BY_COUNT[count]
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def _read_yaml(path: Path) -> Fields:
     if not path.is_file():
         return {}
     import yaml
@@ -241,18 +244,21 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         values = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-        raise InputError(f"{path}: expected YAML; {str(error).splitlines()[0]}; correct it") from None
+        raise InputError(f"{path}: expected YAML; {first_line(error)}; correct it") from None
     known = [f.name for f in dataclasses.fields(ModelSpec)]
-    found: dict[str, Any] = values if isinstance(values, dict) else {type(values).__name__: None}
+    found: Fields = values if isinstance(values, dict) else {type(values).__name__: None}
     if wrong := sorted(str(name) for name in found if name not in known):
         raise InputError(f"{path}: expected a mapping with {', '.join(known)}; found {', '.join(wrong)}; correct it")
+    return _with_numbers(found, path)
+
+
+def _with_numbers(fields: Fields, path: Path) -> Fields:
+    """The fields with tuples of numbers where these are due."""
+    lists = {"mean": float, "std": float, "input_size": int}
     try:
-        for name, number in (("mean", float), ("std", float), ("input_size", int)):
-            if name in found:
-                found[name] = tuple(number(v) for v in found[name])
+        return {name: tuple(map(lists[name], value)) if name in lists else value for name, value in fields.items()}
     except (TypeError, ValueError):
-        raise InputError(f"{path}: mean, std, input_size: expected lists of numbers; correct them") from None
-    return found
+        raise InputError(f"{path}: {', '.join(lists)}: expected lists of numbers; correct them") from None
 
 
 def _checked(spec: ModelSpec, path: Path) -> ModelSpec:
@@ -275,5 +281,5 @@ def _checked(spec: ModelSpec, path: Path) -> ModelSpec:
     return spec
 
 
-def _within(value: Any, least: float, most: float) -> bool:
+def _within(value: object, least: float, most: float) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and least <= value <= most

@@ -14,8 +14,9 @@ from drocap_ros.perception.models.spec import ModelSpec
 from drocap_ros.perception.pose.peaks import Peaks, certain_peaks, decode_heatmaps, decode_movenet, decode_simcc
 from drocap_ros.skeleton import JointSet, joint_set
 
-#: Least score of a person of a one-stage model, and least overlap with the box of the crop.
+#: Least score of a person of a one-stage model: the detector has seen the person already;
 _LEAST_SCORE = 0.05
+#: and least overlap (IoU) with the box of the crop: another person's box hardly has it.
 _LEAST_OVERLAP = 0.1
 
 

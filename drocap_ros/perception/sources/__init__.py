@@ -32,12 +32,13 @@ def open_source(uri: str | Path, config: ImageIngestConfig | None = None) -> Ima
     InputError
         When the source cannot be opened.
     """
-    config = config or ImageIngestConfig()
-    text = str(uri)
+    config, text = config or ImageIngestConfig(), str(uri)
     if camera := _CAMERA.match(text):
         return open_camera(int(camera[1]), config)
-    if _STREAM.match(text):
-        return open_stream(text, config)
+    return open_stream(text, config) if _STREAM.match(text) else _open_path(text, config)
+
+
+def _open_path(text: str, config: ImageIngestConfig) -> ImageSource:
     path = Path(text.removeprefix("file://"))
     if not text or not path.exists():
         raise InputError(

@@ -6,13 +6,16 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 from drocap_ros.errors import InputError
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.perception.sources.pixels import to_bgr
 from drocap_ros.perception.sources.video import ffmpeg_options, quiet_ffmpeg
+
+if TYPE_CHECKING:
+    import cv2
 
 log = logging.getLogger(__name__)
 
@@ -88,7 +91,7 @@ class LiveSource(ImageSource):
 
     live = True
 
-    def __init__(self, name: str, connect: Callable[[], Any], config: ImageIngestConfig) -> None:
+    def __init__(self, name: str, connect: Callable[[], cv2.VideoCapture], config: ImageIngestConfig) -> None:
         super().__init__()
         self.name = name
         self._connect = connect
@@ -164,10 +167,8 @@ class LiveSource(ImageSource):
                     return
             if self._closed:
                 return
-            self._event(
-                SourceEventKind.RECONNECTING,
-                f"connection ended after {self._received} images; next attempt in {pause:.2g} s",
-            )
+            words = f"connection ended after {self._received} images; next attempt in {pause:.2g} s"
+            self._event(SourceEventKind.RECONNECTING, words)
             with self._condition:
                 self._condition.wait_for(lambda: self._closed, timeout=pause)
             pause = min(2 * pause, self._backoff_max_s)
@@ -177,7 +178,7 @@ class LiveSource(ImageSource):
             self._error = why
             self._condition.notify_all()
 
-    def _drain(self, capture: Any) -> int:
+    def _drain(self, capture: cv2.VideoCapture) -> int:
         """Read until the connection ends; returns the number of images."""
         import cv2
 
@@ -204,7 +205,7 @@ class LiveSource(ImageSource):
 def open_camera(index: int, config: ImageIngestConfig) -> LiveSource:
     """V4L2 camera ``/dev/videoN``; its stamps are the driver's buffer times."""
 
-    def connect() -> Any:
+    def connect() -> cv2.VideoCapture:
         import cv2
 
         quiet_ffmpeg()
@@ -230,7 +231,7 @@ def open_stream(url: str, config: ImageIngestConfig) -> LiveSource:
     ``OPENCV_FFMPEG_CAPTURE_OPTIONS`` of the environment replaces the options for FFmpeg.
     """
 
-    def connect() -> Any:
+    def connect() -> cv2.VideoCapture:
         import cv2
 
         quiet_ffmpeg()

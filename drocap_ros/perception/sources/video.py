@@ -9,7 +9,7 @@ import threading
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.perception.sources.base import Frame, ImageSource, SourceEvent, SourceEventKind
 from drocap_ros.perception.sources.movie_index import formats, largest_alone, movie_s
 from drocap_ros.perception.sources.pixels import to_bgr
+
+if TYPE_CHECKING:
+    import cv2
 
 log = logging.getLogger(__name__)
 
@@ -81,14 +84,12 @@ class VideoSource(ImageSource):
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-
         quiet_ffmpeg()
         self.path = path
         if not path.is_file():
             raise InputError(f"{path}: expected a video file, found no such file; check the path")
         if (kind := file_kind(path)) is not FileKind.VIDEO:
             raise InputError(f"{path}: expected a video file, found {kind.value}; check the path, or record it again")
-        self._capture: Any = None
         self._pending = deque[Frame]()
         self._begin(self._opened())
         if not self._pending or self._unwritten():
@@ -96,13 +97,11 @@ class VideoSource(ImageSource):
         height, width = self._pending[0].image.shape[:2]
         self.size = (width, height)
 
-    def _opened(self) -> Any:
+    def _opened(self) -> cv2.VideoCapture:
         import cv2
 
-        with (
-            ffmpeg_options(None),
-            largest_alone(self.path) as name,
-        ):  # not while another thread opens with its options
+        # The options are held: not while another thread opens with its own.
+        with ffmpeg_options(None), largest_alone(self.path) as name:
             capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
         if not capture.isOpened():
             raise InputError(
@@ -111,7 +110,7 @@ class VideoSource(ImageSource):
             )
         return capture
 
-    def _begin(self, capture: Any) -> None:
+    def _begin(self, capture: cv2.VideoCapture) -> None:
         """Read the first picture, and what the container states."""
         import cv2
 
@@ -170,8 +169,6 @@ class VideoSource(ImageSource):
     def _decode(self) -> Frame | None:
         import cv2
 
-        if self._capture is None:
-            return None
         ok, image = self._capture.read()
         if not ok:
             return None
@@ -212,7 +209,7 @@ class VideoSource(ImageSource):
         return rate if 0.1 < rate < 1000 else 30.0
 
     def _report_end(self) -> None:
-        if self._capture is not None and (detail := self._missing_end()):
+        if self._capture.isOpened() and (detail := self._missing_end()):
             event = SourceEvent(SourceEventKind.ENDED_EARLY, str(self.path), f"cut off or damaged, {detail} decoded")
             log.warning(str(event))
             self._events.append(event)
@@ -232,6 +229,4 @@ class VideoSource(ImageSource):
 
     def close(self) -> None:
         """Close the file."""
-        if self._capture is not None:
-            self._capture.release()
-            self._capture = None
+        self._capture.release()

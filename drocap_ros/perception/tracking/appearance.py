@@ -53,8 +53,3 @@ def _soft_histogram(values: np.ndarray, low: float, high: float) -> np.ndarray:
     upper_share = at - lower
     total = np.bincount(lower, 1 - upper_share, _BINS) + np.bincount(lower + 1, upper_share, _BINS)
     return total / len(values)
-
-
-def similarity(a: np.ndarray | None, b: np.ndarray | None) -> float:
-    """Bhattacharyya coefficient of two descriptors in [0, 1]; 0.5 when one is unknown."""
-    return 0.5 if a is None or b is None else float(a @ b)

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drocap_ros.perception.detection.nms import iou, overlap_coefficient
+from drocap_ros.perception.detection.nms import areas_of, iou, overlap_coefficient
 from drocap_ros.perception.tracking.identity import MIXED_IOU, known_other, replaced
-from drocap_ros.perception.tracking.person import Person
+from drocap_ros.perception.tracking.person import Person, boxes_of
 
 _SIZE_WEIGHT = 0.4  # of the change of size against the distance, each over its gate
 _APPEARANCE_WEIGHT = 5.0  # another person's appearance differs by 0.05 to 0.2, the own by 0.02
@@ -24,6 +24,7 @@ _SCOPE_PER_S = 0.6  # and more per second without detection
 _SAME_PLACE = 0.6  # overlap with the last box from which a large change of size is possible: a person enters the image,
 _ENTRANCE_GROWTH = 1.3  # and its largest logarithm
 _LOW_SCORE_IOU = 0.35  # least overlap of a low-score detection with the prediction
+_IMPOSSIBLE = 1e6  # cost of a pair outside the gates: more than any possible one
 
 
 class Seen(NamedTuple):
@@ -85,16 +86,19 @@ class _Rounds:
         free = [p for p in owners if p.detected_ns < self._stamp_ns and not (self._refused and p is self._subject)]
         at = np.array([j for j in np.nonzero(group)[0] if j not in self.assigned], int)
         for i, k in assign(free, self._seen.at(at), self._stamp_ns, low_score, self._subject):
-            person, j = free[i], int(at[k])
-            if person is self._subject and self._is_other(person, j):
-                self._refused = True
-                continue
-            self.assigned.add(j)
-            person.update(self._seen.boxes[j], float(self._seen.scores[j]), self._stamp_ns)
-            if not low_score:
-                person.confirm(self._stamp_ns)
-            if person.pose.believed and not self._seen.mixed(j):
-                person.update_appearance(self._seen.appearances[j])
+            self._update(free[i], int(at[k]), low_score)
+
+    def _update(self, person: Person, j: int, low_score: bool) -> None:
+        """Update a person with the detection ``j``, unless it shows someone else in the subject's place."""
+        if person is self._subject and self._is_other(person, j):
+            self._refused = True
+            return
+        self.assigned.add(j)
+        person.update(self._seen.boxes[j], float(self._seen.scores[j]), self._stamp_ns)
+        if not low_score:
+            person.confirm(self._stamp_ns)
+        if person.pose.believed and not self._seen.mixed(j):
+            person.update_appearance(self._seen.appearances[j])
 
     def _is_other(self, subject: Person, j: int) -> bool:
         """Whether the subject's detection ``j`` is another person: a new track, or for a later round a known one."""
@@ -117,35 +121,41 @@ def assign(
     low_score : require a high overlap with the prediction, for detections that may be clutter
     subject : the person among them for whom the detector looks in every image
     """
-    boxes = seen.boxes
-    if not persons or not len(boxes):
+    if not persons or not len(seen.boxes):
         return []
     from scipy.optimize import linear_sum_assignment
 
+    cost = _costs(persons, seen, stamp_ns, low_score, subject)
+    rows, columns = linear_sum_assignment(cost)
+    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if cost[i, j] < _IMPOSSIBLE]
+
+
+def _costs(persons: list[Person], seen: Seen, stamp_ns: int, low_score: bool, subject: Person | None) -> np.ndarray:
+    """(M, N) of the pairs of :func:`assign`."""
+    boxes = seen.boxes
     predicted = np.array([p.filter.box() for p in persons])
     gap = np.array([p.undetected_s(stamp_ns) for p in persons])[:, None]
     # The box of a person who is half hidden is shorter than the person.
     usual = np.array([p.pose.length for p in persons])
     length = np.maximum((predicted[:, 2:] - predicted[:, :2]).max(axis=1), np.maximum(usual, 1.0))[:, None]
-    distance = np.linalg.norm(_centres(predicted)[:, None] - _centres(boxes)[None], axis=2) / length
-    growth = np.abs(np.log(_sizes(boxes)[None] / _sizes(predicted)[:, None]))
+    centres, places = ((b[:, :2] + b[:, 2:]) / 2 for b in (boxes, predicted))
+    distance = np.linalg.norm(places[:, None] - centres[None], axis=2) / length
+    size, usual_size = (np.sqrt(np.maximum(areas_of(b), 1.0)) for b in (boxes, predicted))
+    growth = np.abs(np.log(size[None] / usual_size[:, None]))
     farthest = np.array([np.inf if p is subject else _OTHERS_REACH for p in persons])[:, None]
     reach, scope = np.minimum(_REACH + _REACH_PER_S * gap, farthest), _SCOPE + _SCOPE_PER_S * gap
-    last = np.array([p.box for p in persons])
-    overlap = np.maximum(overlap_coefficient(predicted, boxes), overlap_coefficient(last, boxes))
+    overlap = np.maximum(overlap_coefficient(predicted, boxes), overlap_coefficient(boxes_of(persons), boxes))
     possible = (distance < reach) & (growth < scope) | (overlap > _SAME_PLACE) & (growth < _ENTRANCE_GROWTH)
     possible &= _allowed(persons, predicted, boxes, low_score, subject, overlap)
     difference = 1.0 - np.array([[p.similarity(appearance) for appearance in seen.appearances] for p in persons])
-    cost = (
+    cost: np.ndarray = (
         distance / reach
         + _SIZE_WEIGHT * growth / scope
         + _APPEARANCE_WEIGHT * difference
         + _SCORE_WEIGHT * (1.0 - seen.scores)
         + _GAP_WEIGHT * gap
     )
-    cost[~possible] = 1e6  # more than any possible one
-    rows, columns = linear_sum_assignment(cost)
-    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if possible[i, j]]
+    return np.where(possible, cost, _IMPOSSIBLE)
 
 
 def _allowed(
@@ -165,14 +175,3 @@ def _allowed(
         elsewhere = np.array([p is not subject for p in persons])[:, None] & (overlap <= MIXED_IOU)
         allowed &= ~(further & elsewhere)
     return allowed
-
-
-def _centres(boxes: np.ndarray) -> np.ndarray:
-    centres: np.ndarray = (boxes[:, :2] + boxes[:, 2:]) / 2
-    return centres
-
-
-def _sizes(boxes: np.ndarray) -> np.ndarray:
-    """Square root of the area, at least 1 px."""
-    sizes: np.ndarray = np.sqrt(np.maximum(np.prod(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None), axis=1), 1.0))
-    return sizes

@@ -84,16 +84,21 @@ def same_person(lost: Person, person: Person, alone: bool) -> bool:
 def found_again(lost: Person, persons: list[Person], confirm_frames: int, stamp_ns: int) -> Person | None:
     """Whom of the persons detected in this image is the lost subject."""
     seen = [p for p in persons if p is not lost and p.detected_ns == stamp_ns and could_be(lost, p)]
-    boxes = boxes_of(seen)
-    looks = np.array([p.similarity(lost.appearance) for p in seen])
-    for person, look in zip(seen, looks, strict=True):
+    for person in seen:
         hits = min(2, confirm_frames) if person.pose.last >= SURE_CONFIDENCE else confirm_frames
-        # A second box around the same person is no other one, and someone who looks clearly different is none.
-        same = overlap_coefficient(person.box[None], boxes)[0] > _ONE_PERSON
-        alone = bool((same | (looks < look - _SIMILARITY_MARGIN)).all())
-        if person.hits >= hits and not fits_other(lost, person, persons, stamp_ns) and same_person(lost, person, alone):
+        if person.hits < hits or fits_other(lost, person, persons, stamp_ns):
+            continue
+        if same_person(lost, person, _alone(lost, person, seen)):
             return person
     return None
+
+
+def _alone(lost: Person, person: Person, persons: list[Person]) -> bool:
+    """Whether no one else of the persons, one of whom is the person, may as well be the lost subject."""
+    # A second box around the same person is no other one, and someone who looks clearly different is none.
+    looks = np.array([p.similarity(lost.appearance) for p in persons])
+    same = overlap_coefficient(person.box[None], boxes_of(persons))[0] > _ONE_PERSON
+    return bool((same | (looks < person.similarity(lost.appearance) - _SIMILARITY_MARGIN)).all())
 
 
 def followed_on(lost: Person | None, persons: list[Person], coast_s: float, stamp_ns: int) -> list[Person]:

@@ -98,21 +98,28 @@ def possible_subjects(
     subject = tracker.subject
     if subject is None or not len(found):
         return []
-    detected = [p for p in tracker.persons if p is not subject and p.plausible and p.detected_ns == stamp_ns]
-    seen = [p for p in detected if not p.double]
-    if subject.detected_ns != stamp_ns and _overlap_any(subject.filter.box(), seen, MIXED_IOU):
+    detected = tracker.detected(stamp_ns)
+    others = [p for p in detected if p.other]
+    if subject.detected_ns != stamp_ns and _overlap_any(subject.filter.box(), others, MIXED_IOU):
         return []  # without detection, at another person's place: a clear pose there is that person's
     boxes = np.asarray(found.boxes, float)
-    # A box on someone else may be a second one around them.
-    known = [p for p in detected if p in subject.others or (subject.pose.box is not None and not could_be(subject, p))]
-    others = overlap_coefficient(boxes, boxes_of(known)) > _INSIDE
-    free = (iou(boxes, subject.box[None])[:, 0] <= SAME_BOX_IOU) & ~others.any(axis=1)
-    near = [j for j in np.nonzero(free)[0].tolist() if _in_reach(subject, boxes[j], confidence, stamp_ns)]
+    free = np.nonzero(_free(subject, detected, boxes))[0].tolist()
+    near = [j for j in free if _in_reach(subject, boxes[j], confidence, stamp_ns)]
     possible = _of_its_colours(subject, image, boxes, near)
     predicted = subject.filter.box()
     offset = (predicted[:2] + predicted[2:] - found.boxes[:, :2] - found.boxes[:, 2:]) / 2
     lengths = np.round(np.linalg.norm(offset, axis=1) / max(subject.filter.length, subject.pose.length))
     return sorted(possible, key=lambda j: (lengths[j], -found.scores[j]))
+
+
+def _free(subject: Person, persons: list[Person], boxes: np.ndarray) -> np.ndarray:
+    """(N,) bool: boxes that are neither the subject's own nor someone else's."""
+    # A box on someone else may be a second one around them.
+    certain = subject.pose.box is not None
+    persons = [p for p in persons if p.plausible]
+    known = [p for p in persons if p in subject.others or (certain and not could_be(subject, p))]
+    others = overlap_coefficient(boxes, boxes_of(known)) > _INSIDE
+    return np.asarray((iou(boxes, subject.box[None])[:, 0] <= SAME_BOX_IOU) & ~others.any(axis=1))
 
 
 def _overlap_any(box: np.ndarray, persons: list[Person], least: float) -> bool:
@@ -160,14 +167,14 @@ def due_bystander(tracker: SubjectTracker, stamp_ns: int, shedding: bool = False
     searching = subject is None or subject.detected_ns != stamp_ns
     if subject is not None and not searching and subject.pose.believed_ns != stamp_ns:
         return None
-    due = [p for p in tracker.persons if p is not subject and _due(p, searching, stamp_ns)]
-    due = [p for p in due if not (shedding and subject is not None and p in subject.others)]
+    known = subject.others if shedding and subject is not None else ()
+    due = [p for p in tracker.detected(stamp_ns) if p not in known and _due(p, searching, stamp_ns)]
     return min(due, key=lambda p: p.pose.judged_ns or 0, default=None)
 
 
 def _due(person: Person, searching: bool, stamp_ns: int) -> bool:
-    """Whether a person has been seen more than once, in this image too, and its last pose is old."""
-    if person.detected_ns != stamp_ns or person.hits < 2 or person.double:
+    """Whether a person has been seen more than once, and its last pose is old."""
+    if person.hits < 2 or person.double:
         return False
     judged_ns = person.pose.judged_ns
     if judged_ns is None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drocap_ros.perception.tracking.appearance import similarity
+from drocap_ros.perception.detection.nms import iou
 from drocap_ros.perception.tracking.box_filter import BoxFilter
 from drocap_ros.perception.tracking.camera_motion import moved_box
 
@@ -175,6 +175,11 @@ class Person:
         return self.pose.plausible_ns is not None
 
     @property
+    def other(self) -> bool:
+        """Whether its poses leave it to be a person, and it is no second box around the subject."""
+        return self.plausible and not self.double
+
+    @property
     def reliable(self) -> bool:
         """Whether the scores and the poses of a bystander let it be compared with the subject."""
         return self.plausible and self.mean_score >= _RELIABLE_SCORE
@@ -215,6 +220,11 @@ class Person:
         if self.pose.box is not None:
             self.pose.box = moved_box(matrix, self.pose.box)
 
+    def continue_as(self, lost: Person) -> None:
+        """Take over what is known of a lost person who was found again in this track."""
+        self.appearance = lost.appearance if lost.appearance is not None else self.appearance
+        self.others |= lost.others
+
     def confirm(self, stamp_ns: int) -> None:
         """Confirm the detection at this time."""
         self.detected_ns = self.confirmed_ns = stamp_ns
@@ -237,8 +247,15 @@ class Person:
         return self._descriptors >= _SETTLED
 
     def similarity(self, appearance: np.ndarray | None) -> float:
-        """Similarity to a descriptor in [0, 1]."""
-        return similarity(self.appearance, appearance)
+        """Bhattacharyya coefficient with a descriptor in [0, 1]; 0.5 when one is unknown."""
+        return 0.5 if self.appearance is None or appearance is None else float(self.appearance @ appearance)
+
+
+def person_at(box: np.ndarray, persons: Iterable[Person], stamp_ns: int, least: float) -> Person | None:
+    """Who was detected in this image where a box (4,) px is, with at least this overlap (IoU)."""
+    detected = [p for p in persons if p.detected_ns == stamp_ns]
+    overlap = iou(box[None].astype(float), boxes_of(detected))[0]
+    return detected[int(overlap.argmax())] if overlap.max(initial=0.0) >= least else None
 
 
 def boxes_of(persons: Iterable[Person]) -> np.ndarray:

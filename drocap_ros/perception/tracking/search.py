@@ -140,21 +140,21 @@ class SubjectSearch:
         return [None] if window is None else [window] if single else [None, window]
 
     def _likely_places(self, stamp_ns: int) -> list[np.ndarray]:
-        """(4,) px each, where to look closely without a subject: a possible new one, and around the last place.
-
-        A small person needs a window around it to be confirmed.
-        """
-        lost, places = self._tracker.subject, []
-        recent = [p for p in self._tracker.persons if p.plausible and p.undetected_s(stamp_ns) <= _CANDIDATE_S]
-        # Persons in view together with the subject cannot be the subject.
-        recent = [p for p in recent if lost is None or (p is not lost and could_be(lost, p))]
-        if recent:
-            best = max(recent, key=lambda p: (p.hits < self._config.confirm_frames, p.mean_score))
-            places.append(best.filter.box_at(stamp_ns))
+        """(4,) px each, where to look closely without a subject: a possible new one, and around the last place."""
+        lost, new = self._tracker.subject, self._possible_subject(stamp_ns)
+        places = [] if new is None else [new.filter.box_at(stamp_ns)]
         if lost is not None and not lost.left_image and lost.unconfirmed_s(stamp_ns) <= FORGET_S:
             reach = min(_WIDER_PER_S * lost.unconfirmed_s(stamp_ns), _WIDEST) * lost.filter.length
             places.append(lost.box + reach * np.array([-1, -1, 1, 1]))
         return places
+
+    def _possible_subject(self, stamp_ns: int) -> Person | None:
+        """Who may become the subject: a small person needs a window around it to be confirmed."""
+        lost = self._tracker.subject
+        recent = [p for p in self._tracker.persons if p.plausible and p.undetected_s(stamp_ns) <= _CANDIDATE_S]
+        if lost is not None:  # persons in view together with the subject cannot be the subject
+            recent = [p for p in recent if p is not lost and could_be(lost, p)]
+        return max(recent, key=lambda p: (p.hits < self._config.confirm_frames, p.mean_score), default=None)
 
     def _detect_in(self, image: np.ndarray, window: Window | None, shedding: bool) -> Detections:
         """Detections in a window, without those that its edge cuts."""
@@ -201,8 +201,7 @@ def uncut(boxes: np.ndarray, window: Window | None, image_size: tuple[int, int])
     low, high = np.array(window[:2]), np.array(window[2:])
     uncut_low = (boxes[:, :2] > low + _CUT_PX) | (low == 0)
     uncut_high = (boxes[:, 2:] < high - _CUT_PX) | (high == np.array(image_size))
-    free: np.ndarray = (uncut_low & uncut_high).all(axis=1)
-    return free
+    return np.asarray((uncut_low & uncut_high).all(axis=1))
 
 
 def _overlaps(box: np.ndarray, boxes: np.ndarray, least: float) -> bool:

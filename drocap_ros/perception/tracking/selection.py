@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.perception.detection.nms import iou
 from drocap_ros.perception.tracking.identity import certainly_others
-from drocap_ros.perception.tracking.person import Person, boxes_of
+from drocap_ros.perception.tracking.person import Person, person_at
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig, parse_box
 
 _CERTAIN_SCORE = 0.6  # from which the first person ever needs no confirmation by further images
@@ -29,11 +28,7 @@ class SubjectChoice:
         if self.box is None:
             return None
         box, self.box = self.box, None
-        detected = [p for p in persons if p.detected_ns == stamp_ns]
-        overlap = iou(box[None], boxes_of(detected))[0]
-        if len(overlap) and overlap.max() >= _GIVEN_IOU:
-            return detected[int(overlap.argmax())]
-        return Person(box, 0.0, stamp_ns, None)
+        return person_at(box, persons, stamp_ns, _GIVEN_IOU) or Person(box, 0.0, stamp_ns, None)
 
     def by_rule(
         self,
@@ -53,17 +48,16 @@ class SubjectChoice:
             return None
         if last is not None and not last.left_image:
             persons = certainly_others(last, persons, stamp_ns)
-        seen = [p for p in persons if p is not last and p.detected_ns == stamp_ns and (p.plausible or first)]
-        seen = [p for p in seen if self._confirmed(p)]
-        middle = np.array([shape[1], shape[0]]) / 2
+        persons = [p for p in persons if p is not last and p.detected_ns == stamp_ns]
+        confirmed = (p for p in persons if self._confirmed(p, first))
+        return min(confirmed, key=lambda p: self._rank(p, shape), default=None)
 
-        def rank(person: Person) -> float:
-            if self._config.subject == "centre":
-                return float(np.linalg.norm((person.box[:2] + person.box[2:]) / 2 - middle))
-            # After a given box or the drone's the largest person follows.
-            return -float(np.prod(person.box[2:] - person.box[:2]))
-
-        return min(seen, key=rank, default=None)
+    def _rank(self, person: Person, shape: tuple[int, ...]) -> float:
+        """The lowest is chosen: the distance from the image's middle, or the size."""
+        if self._config.subject == "centre":
+            return float(np.linalg.norm((person.box[:2] + person.box[2:]) / 2 - np.array([shape[1], shape[0]]) / 2))
+        # After a given box or the drone's the largest person follows.
+        return -float(np.prod(person.box[2:] - person.box[:2]))
 
     def _waits(self, last: Person | None, stamp_ns: int, coast_s: float, first: bool) -> bool:
         """Whether a box is to come that chooses, or the last subject may come back."""
@@ -72,8 +66,8 @@ class SubjectChoice:
             return self._config.subject in ("box", "roi") and (first or waits)
         return waits or last.unconfirmed_s(stamp_ns) <= (0.0 if last.left_image else coast_s + _GIVE_UP_S)
 
-    def _confirmed(self, person: Person) -> bool:
+    def _confirmed(self, person: Person, first: bool) -> bool:
         """Whether enough images show the person; at the beginning a certain detection is enough."""
-        if person.score < self._config.detection_threshold:
+        if person.score < self._config.detection_threshold or not (person.plausible or first):
             return False
         return person.hits >= self._config.confirm_frames or (self.nothing_yet and person.score >= _CERTAIN_SCORE)

@@ -19,7 +19,7 @@ from drocap_ros.perception.tracking.identity import (
     followed_on,
     found_again,
 )
-from drocap_ros.perception.tracking.person import SURE_CONFIDENCE, Person, Subject, boxes_of
+from drocap_ros.perception.tracking.person import SURE_CONFIDENCE, Person, Subject, boxes_of, person_at
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking.selection import SubjectChoice
 
@@ -84,6 +84,10 @@ class SubjectTracker:
         lost = subject is None or subject.left_image or subject.unconfirmed_s(stamp_ns) > self._coast_s
         return None if lost else subject
 
+    def detected(self, stamp_ns: int) -> list[Person]:
+        """Those detected in the image of this time, without the subject."""
+        return [p for p in self.persons if p.detected_ns == stamp_ns and p is not self.subject]
+
     @property
     def missed(self) -> bool:
         """Whether the last image did not show the subject."""
@@ -96,10 +100,9 @@ class SubjectTracker:
             return None
         if subject.detected_ns == stamp_ns:
             return Subject(self._track_id, subject.box, subject.score, False)
-        box = subject.filter.box()
-        others = [p for p in self.persons if p is not subject and p.confirmed_ns == stamp_ns]
-        boxes = boxes_of(p for p in others if p.plausible and not p.double)
-        return Subject(self._track_id, box, 0.0, bool((iou(box[None], boxes) > _HIDDEN_IOU).any()))
+        box, confirmed = subject.filter.box(), [p for p in self.persons if p.confirmed_ns == stamp_ns]
+        hiding = boxes_of(p for p in confirmed if p is not subject and p.other)
+        return Subject(self._track_id, box, 0.0, bool((iou(box[None], hiding) > _HIDDEN_IOU).any()))
 
     def predict(self, stamp_ns: int) -> Subject | None:
         """The predicted subject; None unless the last update confirmed it."""
@@ -155,9 +158,7 @@ class SubjectTracker:
         """Continue the subject at a better box (4,) px of this image; a track of what it was before remains."""
         subject = self.subject
         assert subject is not None
-        detected = [p for p in self.persons if p.detected_ns == stamp_ns]
-        overlap = iou(box[None].astype(float), boxes_of(detected))[0]
-        owner = detected[int(overlap.argmax())] if overlap.max(initial=0.0) > SAME_BOX_IOU else None
+        owner = person_at(box, self.persons, stamp_ns, SAME_BOX_IOU)
         clutter = subject.remainder(stamp_ns)
         clutter.double = bool(overlap_coefficient(clutter.box[None], box[None].astype(float))[0, 0] > _CLUTTER_DOUBLE)
         self.persons = [*(p for p in self.persons if p is subject or p is not owner), clutter]
@@ -240,14 +241,15 @@ class SubjectTracker:
             return
         self._away = [(i, p) for i, p in self._away if p.unconfirmed_s(stamp_ns) <= FORGET_S]
         in_view = subject.unconfirmed_s(stamp_ns) <= 0
-        lost = self._away if in_view else [*self._away, (self._track_id, subject)]
+        lost = [*self._away, *(() if in_view else [(self._track_id, subject)])]
         free = [p for p in self.persons if p is not subject]
         for track_id, last in lost:
             if person := found_again(last, free, self._config.confirm_frames, stamp_ns):
-                self._away = [(i, p) for i, p in lost if p is not last]
-                self.persons = [p for p in self.persons if p is not subject or in_view]
-                person.appearance = last.appearance if last.appearance is not None else person.appearance
-                person.others |= last.others
+                lost.remove((track_id, last))
+                self._away = lost
+                if not in_view:
+                    self.persons.remove(subject)
+                person.continue_as(last)
                 self._follow(person, Change.FOUND_AGAIN, track_id)
                 return
 

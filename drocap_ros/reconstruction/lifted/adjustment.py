@@ -40,7 +40,8 @@ SPAN_STD_MM = np.array([4.0 if (p, c) in _RIGID else 6.0 if (p, c) in _FEET else
 _SIZE = 3 * len(BODY_17)
 #: Relative addition to the normal equations' diagonal.
 _DAMPING = 1e-4
-_DEPTH_ROUNDING_MM = 15.0
+#: Error (mm) of a depth below which its term is quadratic, so that its curvature stays finite; a judgement.
+DEPTH_ROUNDING_MM = 15.0
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ class _Residuals:
         self.robust = 1.0 / (1.0 + square / p.outlier_square)
         self.flat = joints[..., :2] - p.prior[..., :2]
         self.depth = joints[..., 2] - p.prior[..., 2]
-        self.rounded = np.sqrt(np.square(self.depth) + _DEPTH_ROUNDING_MM**2)
+        self.rounded = np.sqrt(np.square(self.depth) + DEPTH_ROUNDING_MM**2)
         span = joints[:, SPANS[:, 1]] - joints[:, SPANS[:, 0]]
         length = np.sqrt(np.square(span).sum(axis=-1) + 1e-6)
         self.direction = span / length[..., None]
@@ -124,7 +125,7 @@ class _Residuals:
         self.terms = {
             "reprojection": 0.5 * float((square * self.robust).sum()),
             "lifter_image": 0.5 * float((p.prior_weight_xy * np.square(self.flat).sum(axis=-1)).sum()),
-            "lifter_depth": float((p.prior_weight_z * (self.rounded - _DEPTH_ROUNDING_MM)).sum()),
+            "lifter_depth": float((p.prior_weight_z * (self.rounded - DEPTH_ROUNDING_MM)).sum()),
             "articulation": 0.5 * float(np.square(self.stretch).sum()),
             "acceleration": 0.5 * p.acceleration_weight * float(np.square(self.swing).sum()),
             "zoom": 0.5 * float(zooms @ self.zoom_pull),

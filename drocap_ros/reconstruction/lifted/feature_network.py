@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,6 +10,9 @@ from drocap_ros.errors import InputError
 from drocap_ros.reconstruction.lifted.lifter_input import BONES, FEATURES, LIFTER_FPS, mirrored, normalise
 from drocap_ros.reconstruction.lifted.network import Errors, LiftedMotion, LifterInput
 from drocap_ros.skeleton import BODY_17
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
 
 _JOINTS = len(BODY_17)
 #: Names of the outputs, and their shapes behind (windows, frames).
@@ -29,7 +32,7 @@ class FeatureNetwork:
     window, overlap = 240, 80
     errors = Errors(adjusted=(1.3, 2.2), newest=(1.45, 2.2), lasting=1.2)
 
-    def __init__(self, session: Any, path: str) -> None:
+    def __init__(self, session: InferenceSession, path: str) -> None:
         """From an onnxruntime session; an ``InputError`` names the file where the network is another."""
         self._session = session
         inputs = [(i.name, i.shape[-1]) for i in session.get_inputs()]

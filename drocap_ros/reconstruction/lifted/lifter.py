@@ -6,20 +6,23 @@ from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drocap_ros.errors import InputError
+from drocap_ros.errors import InputError, first_line
 from drocap_ros.reconstruction.lifted.feature_network import FeatureNetwork
 from drocap_ros.reconstruction.lifted.network import Errors, LiftedMotion, LifterInput, Network
 from drocap_ros.skeleton import BODY_17
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
 
 SHIPPED = Path(__file__).parents[2] / "data" / "lifter_cmu.onnx"
 
 _JOINTS = len(BODY_17)
 #: Kinds of network by the name of their only input.
-NETWORKS: dict[str, Callable[[Any, str], Network]] = {"features": FeatureNetwork}
+NETWORKS: dict[str, Callable[[InferenceSession, str], Network]] = {"features": FeatureNetwork}
 #: Weights that give the end of the least-squares line through five values: 1 mm better than the last one alone.
 _LINE = np.array([-0.2, 0.0, 0.2, 0.4, 0.6])
 
@@ -177,4 +180,4 @@ def _load(path: str, written_ns: int) -> Lifter:  # noqa: ARG001 - a part of the
     except InputError:
         raise
     except Exception as error:  # noqa: BLE001 - of no common class
-        raise InputError(f"{path}: expected an ONNX network; {str(error).splitlines()[0][:120]}") from None
+        raise InputError(f"{path}: expected an ONNX network; {first_line(error)[:120]}") from None

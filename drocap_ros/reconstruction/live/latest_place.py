@@ -11,22 +11,19 @@ from drocap_ros.geometry.camera_history import WindowCamera
 from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.live.window import AdjustedWindow
+from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS
+from drocap_ros.reconstruction.world.findings import MEASURED
 
-#: Images of the last half second (ns) have a say, in which a person moves straight on, and at most so many.
+#: Images of the last half second (ns) have a say, in which a person moves straight on.
 _PAST_NS = 5 * 10**8
-_MOST_IMAGES = 60
-#: Images whose ranges are compared with a solution's: those of its last three seconds at 30 Hz.
-_MOST_RANGES = 90
-#: Fewer keypoints determine no place: four rays, for three coordinates.
-_LEAST_SEEN = 4
+#: Images that are kept, at most: a solution's ranges are compared over its last three seconds at 30 Hz.
+_MOST_IMAGES = 90
 #: Limits of the factor between ranges: people's statures differ by less.
 _FACTORS = (0.8, 1.25)
-#: Ordinary speed (m/s) of a person, against an error (m) of the place that an image's pose leaves: walking, 5 cm.
-_SPEED_M_S = 1.0
-_ERROR_M = 0.05
-#: Standard deviation of the place: m across the line of sight, share of the range along it; a stature's is 5 %.
+#: Error (m) of the place that an image's pose leaves, over the speed (m/s) of a person who walks: 5 cm at 1 m/s.
+_ERROR_OVER_SPEED_S = 0.05
+#: Standard deviation (m) of the place across the line of sight; a judgement.
 _ACROSS_M = 0.03
-_ALONG = 0.03
 
 
 class PlacedPose(NamedTuple):
@@ -90,7 +87,7 @@ class LatestPlace:
         """
         joints, covariance = pose
         seen = np.isfinite(keypoints).all(axis=1)
-        if camera is None or not camera.known[0] or not np.isfinite(joints).all() or seen.sum() < _LEAST_SEEN:
+        if camera is None or not camera.known[0] or not np.isfinite(joints).all() or seen.sum() < MIN_JOINTS:
             return None
         solution = self._blended(stamp_ns) if self._solution is not None else _UNSOLVED
         rotation: np.ndarray = exp_so3(solution.correction[None, 3:])[0] @ camera.rotation[0]
@@ -104,7 +101,7 @@ class LatestPlace:
         self._past.append((stamp_ns, across.mean(axis=0), target.mean(axis=0)))
         sight = self._root(stamp_ns) - position
         self._ranges[stamp_ns] = float(np.linalg.norm(sight))
-        while len(self._ranges) > _MOST_RANGES:
+        while len(self._ranges) > _MOST_IMAGES:
             self._ranges.popitem(last=False)
         if self._solution is None:
             return None
@@ -119,7 +116,7 @@ class LatestPlace:
         across, target = (np.array([row[i] for row in self._past]) for i in (1, 2))
         time = np.stack([np.ones(len(ago)), ago], axis=1)
         matrix = np.einsum("fa,fb,fij->aibj", time, time, across).reshape(6, 6)
-        matrix[3:, 3:] += (_ERROR_M / _SPEED_M_S) ** 2 * np.eye(3)
+        matrix[3:, 3:] += _ERROR_OVER_SPEED_S**2 * np.eye(3)
         found: np.ndarray = np.linalg.lstsq(matrix, np.einsum("fa,fi->ai", time, target).reshape(6), rcond=1e-9)[0]
         return found[:3]
 
@@ -149,8 +146,11 @@ class LatestPlace:
 
 
 def _covariance(packed: np.ndarray, rotation: np.ndarray, sight: np.ndarray) -> np.ndarray:
-    """(P, 6) m^2 in ``map`` of a pose's covariances (P, 6) in camera axes, and of its place after the window."""
+    """(P, 6) m^2 in ``map`` of a pose's covariances (P, 6) in camera axes, and of its place after the window.
+
+    Along the line of sight the place is as uncertain as the scale of a window in ``map`` may be at most.
+    """
     along = np.outer(sight, sight)
-    place = _ACROSS_M**2 * (np.eye(3) - along / max(float(sight @ sight), 1e-12)) + _ALONG**2 * along
+    place = _ACROSS_M**2 * (np.eye(3) - along / max(float(sight @ sight), 1e-12)) + MEASURED**2 * along
     full = rotation.T @ unpack_covariance(packed) @ rotation + place
     return np.asarray(full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])

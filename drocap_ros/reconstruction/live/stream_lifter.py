@@ -15,8 +15,7 @@ from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.lifted.lifter import Lifter
 from drocap_ros.reconstruction.lifted.network import LifterInput
 
-#: Images before the first estimate of the proportions, half a second, and images between two, a second.
-_FIRST_ESTIMATE = 12
+#: Images between two estimates of the proportions, a second of the lifter's rate; the first one comes after half of it.
 _ESTIMATE_EVERY = 24
 #: Estimates kept, of which the median counts: of most of a minute.
 _ESTIMATES = 40
@@ -70,7 +69,7 @@ class StreamLifter:
         weight = np.zeros(points.shape[:2])
         points[slot], weight[slot] = self._with_own_legs(stamps)
         self._since_estimate += 1
-        if self._since_estimate >= (_ESTIMATE_EVERY if self._proportions else _FIRST_ESTIMATE):
+        if self._since_estimate >= _ESTIMATE_EVERY // (1 if self._proportions else 2):
             self._since_estimate = 0
             self._estimate_proportions(points, weight, fps)
         lifted = self._lifter.lift_last(LifterInput(points, weight, self._lengths_px()), fps)

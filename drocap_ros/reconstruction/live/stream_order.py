@@ -92,11 +92,11 @@ class StreamOrder:
             return StreamEvent.DUPLICATE
         if -self._late_ns <= step < 0:
             return StreamEvent.LATE if self._late < LATE_RUN else StreamEvent.TIME_JUMP
-        if step < 0 or step > self._leap_ns:
-            follows = self._stray_ns is not None and 0 < stamp_ns - self._stray_ns <= self._leap_ns
-            return StreamEvent.TIME_JUMP if follows or not self._confirm else StreamEvent.STRAY
-        if track_id != self._last[1]:
-            return StreamEvent.NEW_SUBJECT
-        if size != self._last[2]:
-            return StreamEvent.RESIZED
+        if not 0 < step <= self._leap_ns:
+            return StreamEvent.STRAY if self._confirm and not self._follows_stray(stamp_ns) else StreamEvent.TIME_JUMP
+        if (track_id, size) != self._last[1:]:
+            return StreamEvent.RESIZED if track_id == self._last[1] else StreamEvent.NEW_SUBJECT
         return StreamEvent.GAP if step > self._gap_ns else StreamEvent.CONTINUED
+
+    def _follows_stray(self, stamp_ns: int) -> bool:
+        return self._stray_ns is not None and 0 < stamp_ns - self._stray_ns <= self._leap_ns

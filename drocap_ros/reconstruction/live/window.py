@@ -13,8 +13,6 @@ from drocap_ros.keypoints import Keypoints2D
 
 #: Share of the allowed time above which the next window gets coarser: a tenth is left for its spread.
 _TOO_LONG = 0.9
-#: Share of the allowed time that a finer window has to stay below: half of the other, so that strides do not alternate.
-_SHORT = 0.45
 
 
 class Window(NamedTuple):
@@ -71,7 +69,8 @@ class EffortControl:
         """Record the duration of an adjustment with the present stride."""
         if seconds > _TOO_LONG * self._allowed_s:
             self.stride = min(self.stride + 1, self._max_stride)
-        elif self.stride > 1 and seconds * self.stride / (self.stride - 1) < _SHORT * self._allowed_s:
+        # A finer window has to stay below half of that, so that strides do not alternate.
+        elif self.stride > 1 and seconds * self.stride / (self.stride - 1) < 0.5 * _TOO_LONG * self._allowed_s:
             self.stride -= 1
 
 

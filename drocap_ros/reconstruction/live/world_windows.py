@@ -29,11 +29,9 @@ from drocap_ros.reconstruction.world.world_model import world_config
 from drocap_ros.skeleton import BODY_17
 from drocap_ros.tracks import Tracks
 
-#: Steps of a first window, of one that continues another, and those of both that lock feet: what more steps would
-#: change, the next window does, half a second later.
-_STEPS = 4
+#: Share of a recording's steps that lock feet, and of all steps of a window that continues another, as its inverse:
+#: what more steps would change, the next window does, half a second later.
 _FEWER_STEPS = 2
-_LOCKING_STEPS = 1
 #: Time (s) for which the newest images may lack a reported pose: states of the vehicle arrive later than images.
 _LATE_S = 0.5
 #: Shorter windows (s) determine nothing: they hold no two steps of walking.
@@ -44,7 +42,9 @@ class WorldWindows:
     """Adjusts one window after the other; what was found out is forgotten with the subject."""
 
     def __init__(self, config: BundleAdjusterConfig) -> None:
-        self._config = replace(world_config(config), iterations=_STEPS, locking_iterations=_LOCKING_STEPS)
+        first = world_config(config)
+        self._first = replace(first, locking_iterations=first.locking_iterations // _FEWER_STEPS)
+        self._next = replace(self._first, iterations=first.iterations // _FEWER_STEPS)
         self._length_ns = round(config.world_window_s * 1e9)
         self._subject: int | None = None
         self._known = Findings.unknown()
@@ -84,7 +84,7 @@ class WorldWindows:
         per_px = metres_per_px(poses.joints_px, stamps, _assumed_height(w.initial_joints))
         known = self._prior(stamps)
         before = self._continued(stamps)
-        config = self._config if before is None else replace(self._config, iterations=_FEWER_STEPS)
+        config = self._first if before is None else self._next
         _, refined, refusal = in_world(tracks, keypoints, poses, per_px, config, known, before)
         if refusal is not None:
             return self._refused(camera_result, refusal)

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -43,7 +42,7 @@ class Dictionary:
     sparsity: float
     components: np.ndarray
     component_std: np.ndarray
-    metadata: dict[str, Any] = field(default_factory=dict)
+    metadata: dict[str, object] = field(default_factory=dict)
 
     @cached_property
     def basis(self) -> np.ndarray:
@@ -123,7 +122,7 @@ class Learning:
 def learn(
     poses: np.ndarray,
     how: Learning = Learning(),
-    metadata: dict[str, Any] | None = None,
+    metadata: dict[str, object] | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Dictionary:
     """Learn a dictionary by alternating sparse coding and atom updates over batches (Mairal et al. 2009).

@@ -10,7 +10,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.paper.reprojection import information_from
 
-#: Fewer joints in every image determine no pose.
+#: Fewer joints in every image determine no pose, and fewer rays no place in the world.
 MIN_JOINTS = 4
 
 

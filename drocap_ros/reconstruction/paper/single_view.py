@@ -8,11 +8,12 @@ import numpy as np
 
 from drocap_ros.reconstruction.common.config import InitializerConfig
 from drocap_ros.reconstruction.paper.dictionary import Dictionary, sparse_code
-from drocap_ros.reconstruction.paper.expectation import expected_information
 from drocap_ros.reconstruction.paper.reprojection import Projection, frames_first, frames_last
 from drocap_ros.reconstruction.paper.sparse_fit import SparseFit, fit_sparse
 from drocap_ros.reconstruction.paper.viewpoint_search import search_viewpoints
-from drocap_ros.reconstruction.paper.viterbi import choose_path
+
+#: Area over which gross outliers are uniform, squared 2D std: about that of the person's box.
+OUTLIER_AREA = 12.0
 
 
 @dataclass(frozen=True)
@@ -75,3 +76,63 @@ def sparse_from_dense(coefficients: np.ndarray, dictionary: Dictionary) -> np.nd
     scale = np.maximum(np.abs(coefficients[:, :1]), 1e-6)
     code = sparse_code((coefficients[:, 1:] / scale) @ components, atoms, dictionary.sparsity, iterations=30)
     return np.concatenate([coefficients[:, :1], code * scale], axis=1)
+
+
+def choose_path(cost: np.ndarray, poses: np.ndarray, switch_cost: float) -> np.ndarray:
+    """Hypothesis (F,) int of each frame with the least total cost over the sequence (Viterbi 1967).
+
+    Parameters
+    ----------
+    cost : (H, F) of each hypothesis alone
+    poses : (H, F, P, 3) camera axes
+    switch_cost : weight of the squared distance between the poses of neighbouring frames
+    """
+    flat = np.swapaxes(poses.reshape(*cost.shape, -1), 0, 1)
+    square = np.sum(flat * flat, axis=-1)
+    cross = flat[:-1] @ np.swapaxes(flat[1:], 1, 2)
+    change = switch_cost * np.maximum(square[:-1, :, None] + square[1:, None, :] - 2.0 * cross, 0.0)
+    total, frames = cost[:, 0], cost.shape[1]
+    came_from = np.zeros((frames, len(cost)), dtype=np.int64)
+    for t in range(1, frames):
+        sums = total[:, None] + change[t - 1]
+        came_from[t] = np.argmin(sums, axis=0)
+        total = np.min(sums, axis=0) + cost[:, t]
+    path = np.empty(frames, dtype=np.int64)
+    path[-1] = int(np.argmin(total))
+    for t in range(frames - 1, 0, -1):
+        path[t - 1] = came_from[t, path[t]]
+    return path
+
+
+def expected_information(
+    w: np.ndarray, information: np.ndarray, projected: np.ndarray, std: float, *, outlier_share: float = 0.05
+) -> np.ndarray:
+    """Information (F, P, 3) times the probability that the joint is no outlier, given the model's joints.
+
+    The E-step of Zhou et al. 2016, section 4: one Gaussian per joint and a share of gross outliers.
+
+    Parameters
+    ----------
+    w, information : (F, P, 2), (F, P, 3), 0 where not seen
+    projected : (F, P, 2) the model's joints in the image
+    std : standard deviation of an ordinary joint about the model
+    outlier_share : prior probability of an outlier
+    """
+    fit = _log_density(projected - w, information / std**2)
+    inlier = _share(fit + np.log1p(-outlier_share), np.log(outlier_share / OUTLIER_AREA))
+    expected: np.ndarray = information * inlier[..., None]
+    return expected
+
+
+def _log_density(gap: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Log of the Gaussian density of gaps (..., 2) under information (..., 3)."""
+    xx, xy, yy = np.moveaxis(information, -1, 0)
+    det = np.maximum(xx * yy - xy * xy, 1e-300)
+    x, y = gap[..., 0], gap[..., 1]
+    density: np.ndarray = 0.5 * np.log(det) - np.log(2.0 * np.pi) - 0.5 * (xx * x * x + 2.0 * xy * x * y + yy * y * y)
+    return density
+
+
+def _share(log_a: np.ndarray, log_b: float) -> np.ndarray:
+    """``a / (a + b)`` from logarithms."""
+    return 1.0 / (1.0 + np.exp(np.clip(log_b - log_a, -700.0, 700.0)))

@@ -9,6 +9,7 @@ import numpy as np
 from drocap_ros.geometry.interpolation import smoothed
 from drocap_ros.geometry.rotations import exp_so3, log_so3
 
+#: Standard deviation (s) of the average of the reported motion: longer than noise lasts, shorter than a manoeuvre.
 _SMOOTHING_S = 0.25
 
 

@@ -18,8 +18,9 @@ from drocap_ros.tracks import Tracks
 
 #: Least images of a part of a recording: with fewer no camera's motion shows.
 LEAST_FRAMES = 12
-#: Frames of one adjustment: 40 s at 24 Hz, which bounds memory; and those that neighbouring windows share, 2 s.
+#: Frames of one adjustment: 40 s at 24 Hz, which bounds memory;
 _WINDOW = 960
+#: and those that neighbouring windows share, 2 s.
 _OVERLAP = 48
 #: Least noise (px) of a keypoint: no network is better.
 _LEAST_NOISE_PX = 0.5

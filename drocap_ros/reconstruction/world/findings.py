@@ -9,8 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-#: Number of unknowns: scale, misalignment (3), latencies of attitude and position.
-_COUNT = 6
 #: Relative standard deviation of the scale below which it counts as measured: half of that among people.
 MEASURED = 0.03
 #: Time (s) after which findings count a third: telemetry drifts, and errors of the poses do not average out.
@@ -29,7 +27,7 @@ class Findings(NamedTuple):
     @staticmethod
     def unknown() -> Findings:
         """Nothing is known."""
-        return Findings(np.zeros((_COUNT, _COUNT)), np.zeros(_COUNT))
+        return Findings(np.zeros((6, 6)), np.zeros(6))
 
     def later(self, found: Findings, share: float, passed_s: float) -> Findings:
         """Findings ``passed_s`` later, with a share of those of a window: its frames that the next one has not."""

@@ -55,19 +55,18 @@ def in_world(
     """
     rotation = tracks.camera_rotation
     assert rotation is not None
-    projected = poses.joints_px[..., :2] + poses.translation_px[:, None]
-    if tracks.camera_position is not None and poses.sigma_px is not None and refinable(tracks):
+    projected, sigma = poses.joints_px[..., :2] + poses.translation_px[:, None], poses.sigma_px
+    whole = sigma is not None and refinable(tracks)
+    if tracks.camera_position is not None and whole:
         tracks = replace(tracks, camera_position=without_steps(tracks.camera_position, tracks.stamp_ns))
     placed = place_in_world(in_camera_axes(poses, per_px), projected, per_px, tracks)
-    if poses.sigma_px is None:
-        return WorldResult(placed)
-    refusal = upside_down(placed.joints, rotation)
-    if refusal or not refinable(tracks) or not np.isfinite(placed.joints).all():
+    refusal = None if sigma is None else upside_down(placed.joints, rotation)
+    if refusal or sigma is None or not whole or not np.isfinite(placed.joints).all():
         return WorldResult(placed, refusal=refusal)
     size = per_px[:, None]
     depth = (poses.joints_px[..., 2] - poses.joints_px[:, [_PELVIS], 2]) * size
-    factor = placed.scale.factor if placed.metric and placed.scale is not None else 1.0
-    sigma = poses.sigma_px
-    given = PlacedPoses(placed.joints, factor, depth, sigma[..., 1] * size, projected, sigma[..., 0], poses.still)
+    given = PlacedPoses(
+        placed.joints, placed.factor, depth, sigma[..., 1] * size, projected, sigma[..., 0], poses.still
+    )
     found = refine_in_world(tracks, keypoints, given, config, known, before)
     return WorldResult(placed, refusal=found) if isinstance(found, Refusal) else WorldResult(placed, found)

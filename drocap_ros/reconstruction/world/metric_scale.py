@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.contacts import rest_likelihood
+from drocap_ros.reconstruction.world.findings import MEASURED
 
 #: Times (s) between two positions of a foot: parts of the half second for which a walker's foot stands.
 LAGS_S = (0.15, 0.25, 0.4)
@@ -18,8 +19,9 @@ LAGS_S = (0.15, 0.25, 0.4)
 #: Standard deviation (m) of the way of a foot at rest across the line of sight: errors of adjusted poses.
 STILL_M = 0.03
 
-#: Range of the factors; the assumed height of a person keeps people within it.
+#: Least factor: a person of 1.02 m at the usual assumed stature of 1.70 m;
 LOWEST = 0.6
+#: and the greatest one, beyond all people.
 HIGHEST = 1.6
 
 #: Most pairs of frames, spread over the recording: more take time and tell the same.
@@ -37,7 +39,7 @@ class ScaleEstimate:
     @property
     def trusted(self) -> bool:
         """Whether camera and feet determine the scale: to 3 %, by a fifth of the pairs, within the range."""
-        return self.std < 0.03 and self.support > 0.2 and LOWEST * 1.02 < self.factor < HIGHEST / 1.02
+        return self.std < MEASURED and self.support > 0.2 and LOWEST * 1.02 < self.factor < HIGHEST / 1.02
 
 
 def estimate_scale(feet: np.ndarray, camera_position: np.ndarray, stamp_ns: np.ndarray) -> ScaleEstimate | None:

@@ -43,6 +43,11 @@ class WorldPoses:
     scale_source: str
     scale: ScaleEstimate | None
 
+    @property
+    def factor(self) -> float:
+        """Metres of the world over those of the assumed stature."""
+        return self.scale.factor if self.metric and self.scale is not None else 1.0
+
 
 def place_in_world(joints: np.ndarray, projected_px: np.ndarray, per_px: np.ndarray, tracks: Tracks) -> WorldPoses:
     """Poses (F, 15, 3) m in camera axes, pelvis at the origin, rotated and translated to the world (ENU, z up).

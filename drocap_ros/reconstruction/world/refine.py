@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -75,7 +75,7 @@ class RefinedWorld:
     position: np.ndarray
     metric: bool
     covariance: np.ndarray
-    calibration: list[dict[str, Any]]
+    calibration: list[dict[str, object]]
     found: Findings
     before: Before
 
@@ -225,7 +225,7 @@ class _Facts:
     """What the windows of a recording say about its telemetry."""
 
     def __init__(self) -> None:
-        self.calibration: list[dict[str, Any]] = []
+        self.calibration: list[dict[str, object]] = []
         self.metric = True
         self._cost, self._contact = 0.0, 1.0
 
@@ -290,7 +290,7 @@ def _correction(found: WorldSolution, telemetry: CameraTelemetry) -> np.ndarray:
 
 def _calibration(
     found: WorldSolution, contact: float, stature_std: float, telemetry: CameraTelemetry
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """JSON-compatible: errors of the telemetry and their standard deviations; share of the time with contact."""
     shared, std = found.state.globals, found.std
     rotation, position, fps = telemetry.rotation, telemetry.position, telemetry.fps

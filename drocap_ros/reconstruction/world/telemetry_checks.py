@@ -8,6 +8,7 @@ from drocap_ros.contacts import ANKLES, LOOKS_AT_REST, PLACED_REST_M_S, rest_lik
 from drocap_ros.geometry.interpolation import true_runs
 from drocap_ros.geometry.rotations import log_so3
 from drocap_ros.reconstruction.common.refusal import Refusal, Why
+from drocap_ros.reconstruction.world.metric_scale import STILL_M
 from drocap_ros.skeleton import BODY_15
 
 #: Time (s) for which the pose of a moving camera stays the same without a new measurement: reports come more often.
@@ -23,28 +24,33 @@ _STOP_M_S2 = 10.0
 _TURNS_S_DEG = ((0.0, 10.0), (0.12, 12.0))
 #: Change of the turn rate of a gimbal (degrees/s^2): what one frame of a low rate may hold.
 _TURN_DEG_S2 = 500.0
-#: A position that changes by more (m) within this time (s), and moves evenly before and after, jumps: two images, of
-#: which one is between two states; resets of an estimator are larger.
+#: Time (s) within which a position jumps and moves evenly before and after: two images, one between two states;
 _JUMP_S = 0.12
+#: and the least jump (m): resets of an estimator are larger.
 _JUMP_M = 0.5
 #: Height (m per m) of the image's lower border above its centre, from which a camera is upside down: no orbit's tilt.
 _UPSIDE_DOWN = 0.2
-#: Errors (s) of a log's time that are tried, and their step: half a step of walking.
+#: Largest error (s) of a log's time that is tried; a judgement;
 _SHIFTS_S = 3.0
+#: and the step (s) between two: half a step of walking.
 _SHIFT_STEP_S = 0.5
-#: Time (s) in which a foot on the ground stays, and over which placed feet are averaged; error (m) of their places.
+#: Time (s) in which a foot on the ground stays: most of the half second for which a walker's foot stands;
 _LAG_S = 0.4
+#: that over which placed feet are averaged: one or two images of 24 Hz;
 _SMOOTHING_S = 0.06
-_STILL_M = 0.06
-#: Share of still feet at another time over that at the reported time, and its least value: a judgement.
+#: and the error (m) of their places: twice that of adjusted ones (metric_scale.py).
+_STILL_M = 2.0 * STILL_M
+#: Share of still feet at another time over that at the reported time: a judgement;
 _CLEARLY_BETTER = 1.8
+#: and its least value: fewer tell nothing.
 _LEAST_SHARE = 0.06
 #: Feet at rest on a true path are slower than the others by this factor.
 _RESTING_RATIO = 0.7
-#: Share of the time in which a foot has to look at rest, time (s) between the ends of its way, and over which placed
-#: feet are averaged for it.
+#: Share of the time in which a foot has to look at rest to be judged.
 _RESTING_SHARE = 0.05
+#: Time (s) between the ends of the way of a foot that looks at rest; a judgement;
 _RESTING_LAG_S = 0.33
+#: and over which placed feet are averaged for it: two images of 24 Hz.
 _RESTING_SMOOTHING_S = 0.08
 
 

@@ -36,11 +36,11 @@ from drocap_ros.reconstruction.world.world_residuals import WorldResiduals, grad
 
 #: Relative decrease of the cost below which the adjustment has converged.
 _CONVERGED = 1e-4
-#: Standard deviation (m/s) of the speed of feet in contact in the first steps, when the body still slides, and later.
-_FIRST_CONTACT_SPEEDS_M_S = (0.6, 0.4, 0.3, 0.2)
-_CONTACT_SPEED_M_S = 0.15
-#: Spread (m) of the heights of resting feet on level ground, as the body's errors leave it, and on steps.
+#: Standard deviation (m/s) of the speed of feet in contact, step by step: at first the body slides; the last one stays.
+_CONTACT_SPEEDS_M_S = (0.6, 0.4, 0.3, 0.2, 0.15)
+#: Spread (m) of the heights of resting feet on level ground, as the body's errors leave it,
 _LEVEL_M = 0.025
+#: and on steps, a third of a stair's riser.
 _STEPS_M = 0.06
 #: Scale below which a step of the adjustment goes astray: no person measures five times the assumed stature.
 _LEAST_SCALE = 0.2
@@ -105,16 +105,16 @@ class _Stage(NamedTuple):
 
 def _stages(config: WorldConfig, held: int) -> Iterator[_Stage]:
     """The steps in order; a window that continues another one does not slide, and its scale and camera are known."""
-    first = len(_FIRST_CONTACT_SPEEDS_M_S)
+    last = len(_CONTACT_SPEEDS_M_S) - 1
     for number in range(config.iterations + config.locking_iterations):
         locking = number >= config.iterations
-        stage = number + (first if held else 0)
+        stage = number + (last if held else 0)
         yield _Stage(
             locking=locking,
-            speed_std_m_s=_FIRST_CONTACT_SPEEDS_M_S[stage] if stage < first else _CONTACT_SPEED_M_S,
+            speed_std_m_s=_CONTACT_SPEEDS_M_S[min(stage, last)],
             moving=MOVING_LOCKED if locking or held else MOVING,
             weight=config.locked_weight if locking else config.contact_weight,
-            finds_floor=stage == first,
+            finds_floor=stage == last,
         )
 
 

@@ -18,7 +18,8 @@ import numpy as np
 
 from drocap_ros.contacts import FEET, HEIGHT_STD_M, step_height
 from drocap_ros.geometry.rotations import exp_so3, left_jacobian
-from drocap_ros.reconstruction.lifted.adjustment import SPANS
+from drocap_ros.reconstruction.lifted.adjustment import DEPTH_ROUNDING_MM, SPANS
+from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
 from drocap_ros.reconstruction.world.world_model import (
     ATTITUDE_LATENCY,
     BONES,
@@ -36,12 +37,11 @@ from drocap_ros.reconstruction.world.world_model import (
     WorldState,
 )
 
-#: Squared image residual, in standard deviations, at which a joint has half its weight: three of them, as usual.
-OUTLIER_SQUARE = 9.0
+#: Squared image residual, in standard deviations, at which a joint has half its weight.
+OUTLIER_SQUARE = LiftedConfig.outlier_square
 #: The same over the median square, while all residuals are large: two standard deviations of the usual joint.
 _OVER_MEDIAN = 4.0
-#: Error (m) of a depth below which its term is quadratic: that of the default method's adjustment.
-_DEPTH_ROUNDING_M = 0.015
+_DEPTH_ROUNDING_M = DEPTH_ROUNDING_MM / 1000.0
 #: Least depth (m) of a joint before the camera: no drone is nearer.
 _NEAREST_M = 0.3
 #: Square (m^2) below which a bone has no direction: a hundredth of a millimetre.

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drocap_ros.perception.pose import NetworkKeypoints
+from drocap_ros.perception.pose.pose_model import NetworkKeypoints
 from drocap_ros.perception.pose.uncertainty import CALIBRATIONS, calibrate
 
 

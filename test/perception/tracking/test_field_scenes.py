@@ -20,7 +20,7 @@ from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import iou
 from drocap_ros.perception.estimator import PoseEstimator
 from drocap_ros.perception.load_models import SIMULATION, models_folder
-from drocap_ros.perception.pose import NetworkKeypoints
+from drocap_ros.perception.pose.pose_model import NetworkKeypoints
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.skeleton import BODY_15
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drocap_ros.reconstruction.paper.expectation import expected_information
+from drocap_ros.reconstruction.paper.single_view import expected_information
 
 ONE = np.array([1.0, 0.0, 1.0])
 
