@@ -24,11 +24,11 @@ Progress = Callable[[str, float], None]
 
 # The numbers of the protocol; docs/accuracy.md compares with published results under them.
 FPS = 24.0
-ELEVATION_RAD = 0.3
-NOISE_MM = 10.0
+ELEVATION_RAD = 0.3  # rad, of the camera above the horizon
+NOISE_MM = 10.0  # mm at the body, standard deviation per coordinate
 #: Per joint and frame.
 OUTLIER_PROBABILITY = 0.05
-OUTLIER_RANGE_MM = 300.0
+OUTLIER_RANGE_MM = 300.0  # mm at the body, largest shift per coordinate
 #: Image scale of the virtual camera; a person of 1.7 m is 680 px tall.
 PX_PER_MM = 0.4
 #: Width and height px.

@@ -22,30 +22,30 @@ from drocap_ros.tracks import Tracks
 
 # The numbers of the protocol; docs/accuracy.md compares under them.
 SHORTEST_S = 8.0
-LONGEST_S = 20.0
+LONGEST_S = 20.0  # s, from the first frame on
 #: Width and height px.
 IMAGE_SIZE = (1280, 720)
 #: A view of 70 degrees across.
 FOCAL_PX = 0.5 * IMAGE_SIZE[0] / np.tan(np.deg2rad(35.0))
-RADIUS_M = 6.0
-HEIGHT_M = 2.5
-SPEED_DEG_S = 19.0
+RADIUS_M = 6.0  # m, of the orbit
+HEIGHT_M = 2.5  # m above the ground
+SPEED_DEG_S = 19.0  # deg/s: two metres a second at the radius
 #: Height at which the camera aims, m, and the smoothing of the aim's path.
 _AIM_M = 0.95
-_AIM_SMOOTHING_S = 1.0
+_AIM_SMOOTHING_S = 1.0  # s, standard deviation
 #: Half the time that the orbit takes to turn round.
 _TURN_S = 0.5
 #: Height of a standing ankle, m.
 _ANKLE_M = 0.07
 #: Standard deviation and correlation time of the noise.
 _NOISE_PX = 3.0
-_NOISE_S = 0.1
+_NOISE_S = 0.1  # s
 #: Share of the joints that are thrown, and their largest shift per coordinate.
 _OUTLIERS = 0.02
-_OUTLIER_PX = 80.0
+_OUTLIER_PX = 80.0  # px
 #: Correlation times of the errors of position and attitude.
 _POSITION_WANDER_S = 60.0
-_ATTITUDE_WANDER_S = 10.0
+_ATTITUDE_WANDER_S = 10.0  # s
 
 
 class TelemetryErrors(NamedTuple):

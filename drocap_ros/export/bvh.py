@@ -10,7 +10,7 @@ from drocap_ros.export.angles import continuous_euler
 from drocap_ros.export.rig import Rig, rig_of
 from drocap_ros.export.take import Take, at_constant_rate, y_up
 
-_CM = 100.0
+_CM = 100.0  # in a metre
 _FORMAT = "%.5f"
 
 

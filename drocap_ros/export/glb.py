@@ -21,7 +21,7 @@ from drocap_ros.export.take import Take, y_up
 Json = dict[str, object]
 #: Codes of glTF 2.0: uses of a buffer, shapes and types of its elements.
 _ARRAY_BUFFER = 34962
-_ELEMENT_BUFFER = 34963
+_ELEMENT_BUFFER = 34963  # of indices
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _COMPONENTS = {"float32": 5126, "uint8": 5121, "uint16": 5123}
 #: Half width of a drawn bone, and its distance from the joint, as shares of the bone's length; a matter of taste.

@@ -14,7 +14,7 @@ import numpy as np
 from drocap_ros.errors import InputError
 from drocap_ros.export.take import Take, at_constant_rate, y_up
 
-_MM = 1000.0
+_MM = 1000.0  # in a metre
 #: The format counts frames in 16 bits; readers differ in longer files.
 _MAX_C3D_FRAMES = 65_535
 #: Rows of a CSV file formatted at a time, to bound the memory.

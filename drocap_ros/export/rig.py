@@ -39,10 +39,10 @@ NAMES = {
 }
 #: Assumed sizes as shares of the shank: the foot's length from below the ankle to the toes, the ankle's height.
 _FOOT = 0.45
-_SOLE = 0.16
+_SOLE = 0.16  # of the shank; assumed
 #: Length of a hand as a share of the forearm; of what the head's joint is below the crown, of neck to head; assumed.
 _HAND = 0.7
-_CROWN = 0.9
+_CROWN = 0.9  # of neck to head; assumed
 #: Percentile of the lower foot's height that is the floor: the lowest would be an error of one frame.
 _FLOOR_PERCENTILE = 5.0
 #: A root that moves less than this, m, stands still: it has no place in the world.

@@ -39,7 +39,7 @@ _COLLAR = 0.2
 #: Weights of the priors, m per radian, chosen weak: pitch and other bends of the spine; directions of neck and collar
 #: bones.
 _BENDS = np.array([0.05, 0.02, 0.02])
-_USUAL = 0.02
+_USUAL = 0.02  # m per radian, as the bends
 _PRIORS = ("neck", "lshoulder", "rshoulder")
 #: Weight of an interpolated joint relative to a known one.
 _INTERPOLATED = 0.02
@@ -47,7 +47,7 @@ _INTERPOLATED = 0.02
 FAR_M = 0.02
 #: Most rounds of weighing; the next most steps of one fit: both end before, when the fit has converged.
 _ROUNDS = 20
-_STEPS = 30
+_STEPS = 30  # of Levenberg-Marquardt; a judgement
 #: Largest change, m or rad, of a fit that has converged; a judgement.
 _CONVERGED = 3e-4
 #: First damping of Levenberg-Marquardt, relative to the diagonal.

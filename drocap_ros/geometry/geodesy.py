@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-_EQUATOR_RADIUS_M = 6_378_137.0
-_ECCENTRICITY2 = 6.694379990141316e-3
+_EQUATOR_RADIUS_M = 6_378_137.0  # m, WGS 84
+_ECCENTRICITY2 = 6.694379990141316e-3  # WGS 84, first eccentricity squared
 
 
 def _ecef(latitude_deg: np.ndarray, longitude_deg: np.ndarray, altitude_m: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.alignment import to_torso_frame
 from drocap_ros.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix, slerp
 
-_NS = 1e-9
+_NS = 1e-9  # s
 #: Longest time between two states over which values are interpolated.
 MAX_GAP_S = 2.0
 #: Time beyond the first and last state for which these still hold; at 25 deg/s it is 2.5 deg.

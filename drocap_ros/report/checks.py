@@ -20,13 +20,13 @@ _SLOW_VIEW_DPS = 10.0
 _NARROW_VIEW_DEG = 30.0
 #: Elevation of the camera above the body, degrees: from the first on the error grows by a fifth, and nearly doubles.
 _HIGH_VIEW_DEG = 45.0
-_STEEP_VIEW_DEG = 60.0
+_STEEP_VIEW_DEG = 60.0  # deg: the error nearly doubles
 #: Images per second: below the first errors grow, at the second by half, at 5 threefold.
 _FEW_HZ = 20.0
-_LOW_HZ = 12.5
+_LOW_HZ = 12.5  # images/s: half as much again
 #: Seconds and frames; a judgement: with fewer there are few views to join.
 _SHORT_S = 2.0
-_SHORT_FRAMES = 30
+_SHORT_FRAMES = 30  # frames: a second at the usual rate
 #: Share of the frames without a joint's keypoint; a judgement.
 _MISSING_SHARE = 0.1
 #: Standard deviation of a bone's length over its mean; a judgement.
@@ -37,10 +37,10 @@ _HIGH_ERROR = 0.02
 _OUTLYING = 0.08
 #: Shares of outlying keypoints that are noted and warned of; a judgement: the method ignores few.
 _SOME_OUTLIERS = 0.01
-_MANY_OUTLIERS = 0.1
+_MANY_OUTLIERS = 0.1  # share; a judgement
 #: Share of forward knees at which a body is no likelier right than mirrored, and the least number of bent knees.
 _MIRRORED_SHARE = 0.5
-_MIRRORED_COUNT = 10
+_MIRRORED_COUNT = 10  # knees; a judgement: with fewer the share is chance
 #: Share of the pelvis's speed: the lower foot of no take of 523 with real walks, runs, jumps and squats exceeds the
 #: larger of it and of ``MOTION_REST_M_S``.
 _SLIDING_SHARE = 0.3

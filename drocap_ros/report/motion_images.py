@@ -19,7 +19,7 @@ from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE
 
 #: Most images in a report, and bytes of all together, as base64: the page stays quick to open and to mail.
 MAX_IMAGES = 300
-MAX_BYTES = 8_000_000
+MAX_BYTES = 8_000_000  # bytes; mail often ends at 10 MB
 #: Longer side of an image in the page, px.
 _LONG_SIDE = 640
 _QUALITIES = (75, 60, 45, 30)
@@ -28,8 +28,8 @@ _MARGIN = 0.12
 #: Tolerances of the checks whether images belong to a motion: their number (re-encoding loses a few), their rate, and
 #: the share of keypoints outside of them.
 _LENGTH_SHARE = 0.02
-_RATE_SHARE = 0.03
-_OUTSIDE_SHARE = 0.05
+_RATE_SHARE = 0.03  # share; a judgement
+_OUTSIDE_SHARE = 0.05  # share; a judgement: networks place a few joints beyond the edge
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ import numpy as np
 
 #: Sizes in units of the SVG, px at its natural size: the plot, its margins, a row of bars and its label.
 WIDTH = 420
-_LEFT = 44
-_RIGHT = 10
-_TOP = 8
-_BOTTOM = 24
-_ROW = 19
-_LABEL = 92
+_LEFT = 44  # px: the widest tick's label
+_RIGHT = 10  # px
+_TOP = 8  # px
+_BOTTOM = 24  # px: a line of ticks' labels
+_ROW = 19  # px: a line of text
+_LABEL = 92  # px: the longest joint's name
 #: Points of one line, more than its px on a screen; longer series are averaged.
 _POINTS = 700
 

@@ -34,7 +34,7 @@ _MAIN = ("pose2d", "pose3d/initial", "pose3d/latest", "pose3d/refined", "image/c
 _WAITING = 300
 #: Points kept of the camera's path, and the distance between two of them, m: 60 m, more than an orbit of 9 m.
 _PATH_POINTS = 600
-_PATH_STEP_M = 0.1
+_PATH_STEP_M = 0.1  # m
 #: Farthest state of the vehicle that is used for an image, ns; a judgement.
 _NEAR_NS = 500_000_000
 #: A refined pose is drawn when images this much later, ns, hardly change it.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +9,8 @@ import numpy as np
 from drocap_ros.simulation.render.quadrics import Quadrics, cones, ellipsoids, joined
 from drocap_ros.skeleton import BODY_17
 
-_Add = Callable[[str, np.ndarray, np.ndarray, tuple[float, float, float], float], None]
+#: Part of the look, centre (3,) m, axes (3, 3), half lengths for 1.75 m stature, and the factor of these.
+_Solid = tuple[str, np.ndarray, np.ndarray, tuple[float, float, float], float]
 
 #: From joint, to joint, radius at both (m at 1.75 m stature), part of the look.
 _LIMBS = (
@@ -26,6 +26,16 @@ _JOINTS = (
     ("ankle", 0.041, "shank"),
     ("shoulder", 0.058, "upper_arm"),
     ("elbow", 0.041, "forearm"),
+)
+#: Part of the look, place forward, left, up of the head's joint, half lengths, m at 1.75 m stature.
+_HEAD = (
+    ("skin", (0.008, 0.0, -0.015), (0.098, 0.078, 0.120)),
+    ("hair", (-0.024, 0.0, 0.018), (0.098, 0.085, 0.112)),
+    ("nose", (0.105, 0.0, -0.025), (0.018, 0.013, 0.020)),
+    ("eyes", (0.090, 0.032, 0.005), (0.014, 0.014, 0.010)),
+    ("eyes", (0.090, -0.032, 0.005), (0.014, 0.014, 0.010)),
+    ("skin", (0.0, 0.080, -0.015), (0.020, 0.012, 0.030)),
+    ("skin", (0.0, -0.080, -0.015), (0.020, 0.012, 0.030)),
 )
 #: Length of the bones below over which the radii are scaled, m at 1.75 m stature (both thighs and shanks).
 _LEG_M = 0.491 * 1.75
@@ -91,75 +101,54 @@ def body(joints: np.ndarray, look: Look) -> tuple[Quadrics, list[str]]:
     at = dict(zip(BODY_17.joints, joints, strict=False))
     leg = sum(np.linalg.norm(at[s + a] - at[s + b]) for s in "lr" for a, b in (("hip", "knee"), ("knee", "ankle")))
     unit = 0.5 * float(leg) / _LEG_M  # metres of this person per metre of one of 1.75 m
-    stout = unit * look.girth
-    names: list[str] = []
-    starts, ends, radii = [], [], []
-    for side in "lr":
-        for first, second, r0, r1, part in _LIMBS:
-            starts.append(at[side + first])
-            ends.append(at[side + second])
-            radii.append((r0 * stout, r1 * stout))
-            names.append(part)
-    starts.append(at["lshoulder"])
-    ends.append(at["rshoulder"])
-    radii.append((0.058 * stout, 0.058 * stout))
-    names.append("shirt")
-    up = _unit(at["neck"] - at["pelvis"])
-    starts.append(at["neck"] - 0.10 * unit * up)
-    ends.append(at["head"])
-    radii.append((0.062 * stout, 0.055 * stout))
-    names.append("skin")
-    radius = np.array(radii)
-    limbs = cones(np.array(starts), np.array(ends), radius[:, 0], radius[:, 1])
-
-    centres, axes, halves = [], [], []
-
-    def add(part: str, centre: np.ndarray, frame: np.ndarray, half: tuple[float, float, float], width: float) -> None:
-        centres.append(centre)
-        axes.append(frame)
-        halves.append(np.array(half) * width)
-        names.append(part)
-
-    straight = np.eye(3)
-    for side in "lr":
-        for joint, r, part in _JOINTS:
-            add(part, at[side + joint], straight, (r, r, r), stout)
-    hips = _axes(at["lhip"] - at["rhip"], at["neck"] - at["pelvis"])
-    chest = _axes(at["lshoulder"] - at["rshoulder"], at["neck"] - at["pelvis"])
-    trunk = at["neck"] - at["pelvis"]
-    add("trousers", at["pelvis"] + 0.02 * unit * up, hips, (0.115, 0.165, 0.125), stout)
-    add("shirt", at["pelvis"] + 0.34 * trunk, hips, (0.108, 0.148, 0.21), stout)
-    add("shirt", at["pelvis"] + 0.62 * trunk, chest, (0.122, 0.178, 0.215), stout)
-    add("front", at["pelvis"] + 0.56 * trunk + 0.055 * stout * chest[0], chest, (0.072, 0.062, 0.21), stout)
-    _add_head(add, at, 0.5 * (hips + chest), unit)
-    for side in "lr":
-        _add_hand_and_foot(add, at, side, hips, unit)
-    return joined([limbs, ellipsoids(np.array(centres), np.array(axes), np.array(halves))]), names
+    stout, trunk = unit * look.girth, at["neck"] - at["pelvis"]
+    up = _unit(trunk)
+    limbs = [(part, at[s + a], at[s + b], r0 * stout, r1 * stout) for s in "lr" for a, b, r0, r1, part in _LIMBS]
+    limbs.append(("shirt", at["lshoulder"], at["rshoulder"], 0.058 * stout, 0.058 * stout))
+    limbs.append(("skin", at["neck"] - 0.10 * unit * up, at["head"], 0.062 * stout, 0.055 * stout))
+    sides, starts, ends, *radii = zip(*limbs, strict=True)
+    hips, chest = (_axes(at["l" + joint] - at["r" + joint], trunk) for joint in ("hip", "shoulder"))
+    front = at["pelvis"] + 0.56 * trunk + 0.055 * stout * chest[0]
+    solids: list[_Solid] = [
+        *((part, at[s + joint], np.eye(3), (r, r, r), stout) for s in "lr" for joint, r, part in _JOINTS),
+        ("trousers", at["pelvis"] + 0.02 * unit * up, hips, (0.115, 0.165, 0.125), stout),
+        ("shirt", at["pelvis"] + 0.34 * trunk, hips, (0.108, 0.148, 0.21), stout),
+        ("shirt", at["pelvis"] + 0.62 * trunk, chest, (0.122, 0.178, 0.215), stout),
+        ("front", front, chest, (0.072, 0.062, 0.21), stout),
+        *_head(at, 0.5 * (hips + chest), unit),
+        *(solid for side in "lr" for solid in (_hand(at, side, hips, unit), _shoe(at, side, hips, unit))),
+    ]
+    parts, centres, axes, shapes, widths = zip(*solids, strict=True)
+    halves = np.array(shapes) * np.array(widths)[:, None]
+    tapered = cones(np.array(starts), np.array(ends), np.array(radii[0]), np.array(radii[1]))
+    return joined([tapered, ellipsoids(np.array(centres), np.array(axes), halves)]), [*sides, *parts]
 
 
-def _add_head(add: _Add, at: dict[str, np.ndarray], facing: np.ndarray, unit: float) -> None:
+def _head(at: dict[str, np.ndarray], facing: np.ndarray, unit: float) -> list[_Solid]:
     """Head with the body's direction; the hair is behind and above the face."""
     frame = _axes(facing[1], at["head"] - at["neck"])
     forward, left, up = frame
-    head = at["head"]
-    for part, offset, half in (
-        ("skin", (0.008, 0.0, -0.015), (0.098, 0.078, 0.120)),
-        ("hair", (-0.024, 0.0, 0.018), (0.098, 0.085, 0.112)),
-        ("nose", (0.105, 0.0, -0.025), (0.018, 0.013, 0.020)),
-        ("eyes", (0.090, 0.032, 0.005), (0.014, 0.014, 0.010)),
-        ("eyes", (0.090, -0.032, 0.005), (0.014, 0.014, 0.010)),
-        ("skin", (0.0, 0.080, -0.015), (0.020, 0.012, 0.030)),
-        ("skin", (0.0, -0.080, -0.015), (0.020, 0.012, 0.030)),
-    ):
-        centre = head + unit * (offset[0] * forward + offset[1] * left + offset[2] * up)
-        add(part, centre, frame, half, unit)
+    return [
+        (part, at["head"] + unit * (x * forward + y * left + z * up), frame, half, unit)
+        for part, (x, y, z), half in _HEAD
+    ]
 
 
-def _add_hand_and_foot(add: _Add, at: dict[str, np.ndarray], side: str, hips: np.ndarray, unit: float) -> None:
+def _hand(at: dict[str, np.ndarray], side: str, hips: np.ndarray, unit: float) -> _Solid:
     arm = _unit(at[side + "wrist"] - at[side + "elbow"])
     across = _unit(_cross(arm, hips[0] + 0.01 * hips[2]))
     hand = np.stack([arm, across, _cross(arm, across)])
-    add("skin", at[side + "wrist"] + 0.075 * unit * arm, hand, (0.095, 0.024, 0.045), unit)
+    return "skin", at[side + "wrist"] + 0.075 * unit * arm, hand, (0.095, 0.024, 0.045), unit
+
+
+def _shoe(at: dict[str, np.ndarray], side: str, hips: np.ndarray, unit: float) -> _Solid:
+    ankle = at[side + "ankle"]
+    sole = _sole(at, side, hips, unit)
+    return "shoes", ankle + unit * (0.062 * sole[0] - 0.038 * sole[2]), sole, (0.135, 0.048, 0.045), unit
+
+
+def _sole(at: dict[str, np.ndarray], side: str, hips: np.ndarray, unit: float) -> np.ndarray:
+    """(3, 3) rows forward, left, up of a shoe: towards the toe, or without one square to the shank."""
     ankle = at[side + "ankle"]
     shank = _unit(ankle - at[side + "knee"])
     if side + "toe" in at:
@@ -167,17 +156,11 @@ def _add_hand_and_foot(add: _Add, at: dict[str, np.ndarray], side: str, hips: np
         across = _unit(_cross(-shank, tip))
         # The tip lies below the middle line of the shoe.
         toes = _unit(_TIP[0] * tip + _TIP[1] * _cross(tip, across))
-        _add_shoe(add, ankle, _axes(across, _cross(toes, across)), unit)
-        return
+        return _axes(across, _cross(toes, across))
     toes = _unit(hips[0] - (hips[0] @ shank) * shank)
     # The toes stay above the ground.
     drop = max((0.035 * unit - ankle[2]) / (0.19 * unit), -0.95)
     if toes[2] < drop:
         flat = _unit(np.array([toes[0], toes[1], 0.0]))
         toes = np.append(flat[:2] * np.sqrt(1 - min(drop, 0.95) ** 2), min(drop, 0.95))
-    _add_shoe(add, ankle, _axes(_cross(-shank, toes), _cross(toes, _cross(-shank, toes))), unit)
-
-
-def _add_shoe(add: _Add, ankle: np.ndarray, sole: np.ndarray, unit: float) -> None:
-    centre = ankle + unit * (0.062 * sole[0] - 0.038 * sole[2])
-    add("shoes", centre, sole, (0.135, 0.048, 0.045), unit)
+    return _axes(_cross(-shank, toes), _cross(toes, _cross(-shank, toes)))
