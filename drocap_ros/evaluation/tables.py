@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from itertools import starmap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -113,7 +114,7 @@ def rotation_markdown(rows: list[RotationRow]) -> str:
         "",
         *markdown_table(["method", *(f"{s:g}" for s in speeds), "mirrored"], by_speed),
         *("", f"Per joint group at {speed:g} deg/s, mm.", ""),
-        *markdown_table(["method", *JOINT_GROUPS, "toe"], [_group_cells(m, of) for m, of in at_speed.items()]),
+        *markdown_table(["method", *JOINT_GROUPS, "toe"], list(starmap(_group_cells, at_speed.items()))),
         *("", f"Per sequence at {speed:g} deg/s, mm.", ""),
         *markdown_table(["sequence", *(LABELS[m] for m in by_method)], per_sequence),
     ]

@@ -285,7 +285,9 @@ def draw_session(
     InputError
         When the recording holds nothing to draw.
     """
-    named, view.namespace = _topics(view, session, namespace)
+    counts = {topic.name: topic.count for topic in session.info.topics if topic.count}
+    space = _busiest_namespace(counts) if namespace is None else f"/{namespace.strip('/')}".rstrip("/")
+    named, view.namespace = _topics(view, session, counts, space, only=namespace is not None), space
     start_ns, duration_ns = session.info.start_ns or 0, max(session.info.duration_s * 1e9, 1.0)
     for raw, message in session.messages(tuple(named)):
         view.take(named[raw.topic], message, raw.log_time_ns)
@@ -293,12 +295,12 @@ def draw_session(
     view.finish()
 
 
-def _topics(view: MessageView, session: Session, namespace: str | None) -> tuple[dict[str, str], str]:
-    """Topic of the recording -> its name in the graph, and the graph's namespace."""
-    counts = {topic.name: topic.count for topic in session.info.topics if topic.count}
-    space = _busiest_namespace(counts) if namespace is None else f"/{namespace.strip('/')}".rstrip("/")
+def _topics(
+    view: MessageView, session: Session, counts: Mapping[str, int], space: str, *, only: bool
+) -> dict[str, str]:
+    """Topic of the recording -> its name in the graph; where none is in the namespace, the images unless ``only``."""
     found = {f"{space}/{name}": name for name in view.handlers if f"{space}/{name}" in counts}
-    if not found and namespace is None:
+    if not found and not only:
         # Not a recording of this package: its images.
         found = {topic.name: "image/compressed" for topic in session.topics_of(COMPRESSED_IMAGE, IMAGE)[:1]}
     if not found:
@@ -306,7 +308,7 @@ def _topics(view: MessageView, session: Session, namespace: str | None) -> tuple
         raise InputError(
             f"{session.path}: expected keypoints, poses or images, found the topics {listed}; record one of them"
         )
-    return found | ({"/diagnostics": "/diagnostics"} if "/diagnostics" in counts else {}), space
+    return found | ({"/diagnostics": "/diagnostics"} if "/diagnostics" in counts else {})
 
 
 def _busiest_namespace(counts: Mapping[str, int]) -> str:
