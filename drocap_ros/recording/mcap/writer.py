@@ -182,17 +182,18 @@ class SessionWriter:
 
     def _run(self) -> None:
         while True:
+            closed = self._queue.closed  # before the look: what comes during a slow save is taken in the next turn
             message = self._queue.take(self._wait_s())
             try:
                 with self._lock:
                     if message is not None:
                         self._add(message)
-                    self._save_if_due(ended=message is None and self._queue.closed)
+                    self._save_if_due(ended=message is None and closed)
             except Exception as error:  # noqa: BLE001  # the graph continues; diagnostics report the reason
                 self._fail(error)
             if self.error is not None:
                 self._queue.drop_all()
-            if message is None and self._queue.closed:
+            if message is None and closed:
                 return
 
     def _wait_s(self) -> float:
