@@ -6,8 +6,10 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 
+#: Nanoseconds of a second.
+NS = 10**9
 #: Longest time from the first to the last frame, ns: a year. More is no recording, and overflows.
-_LONGEST_NS = 365 * 86_400 * 10**9
+_LONGEST_NS = 365 * 86_400 * NS
 #: A stamp this far from the previous one belongs to another time.
 JUMP_S = 3600.0
 #: Successive stamps of another time after which the stream has moved there: a replay began, a clock was set.
@@ -34,9 +36,9 @@ class StampValidator:
         InputError
             When it lies before 1970, is no time, or is far from the others of its stream.
         """
-        if sec < 0 or nanosec >= 10**9:
+        if sec < 0 or nanosec >= NS:
             raise InputError(f"stamp: expected a time after 1970, got {sec} s {nanosec} ns; set the sender's clock")
-        stamp_ns = sec * 10**9 + nanosec
+        stamp_ns = sec * NS + nanosec
         if self._last_ns is not None and _far(stamp_ns, self._last_ns):
             agrees = self._other_ns is not None and not _far(stamp_ns, self._other_ns)
             self._others = self._others + 1 if agrees else 1

@@ -10,11 +10,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot.autopilot import UNKNOWN, Autopilot, LossSettings
 from drocap_ros.flight.conditions import Condition, ConditionCode
 
-FIX_3D = 3  # MAVLink GPS_FIX_TYPE
+FIX_3D: int = mavlink.GPS_FIX_TYPE_3D_FIX
 
 
 def _unknown() -> np.ndarray:

@@ -14,8 +14,7 @@ import numpy as np
 from drocap_ros.flight.frames import camera_rotation
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import slerp
-
-_NS = 1_000_000_000
+from drocap_ros.stamps import NS
 
 
 class CameraPose(NamedTuple):
@@ -35,7 +34,7 @@ class PoseHistory:
     """
 
     def __init__(self, keep_s: float = 3.0, extrapolate_s: float = 0.15) -> None:
-        self._keep_ns, self._extrapolate_ns = int(keep_s * _NS), int(extrapolate_s * _NS)
+        self._keep_ns, self._extrapolate_ns = int(keep_s * NS), int(extrapolate_s * NS)
         self._poses: deque[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = deque()
         #: (3,) m, reported minus filtered position now: add it to a position from here.
         self.offset: np.ndarray = np.zeros(3)
@@ -67,7 +66,7 @@ class PoseHistory:
             before = self._poses[-2] if len(self._poses) > 1 else newest
             step = newest[0] - before[0]
             camera = slerp(before[1], newest[1], 1.0 + min(gap_ns / step, 3.0)) if step > 0 else newest[1]
-            return CameraPose(camera_rotation(camera), newest[2] + newest[3] * gap_ns / _NS)
+            return CameraPose(camera_rotation(camera), newest[2] + newest[3] * gap_ns / NS)
         later = newest
         for pose in reversed(self._poses):
             if pose[0] <= stamp_ns:

@@ -15,12 +15,11 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot.coasting import Coast, Coasting, HeldCoasting, coast_of
 from drocap_ros.flight.autopilot.setpoint import Setpoint
 from drocap_ros.flight.autopilot.simulated import Simulated
-
-_MAV_MODE_FLAG_CUSTOM_MODE_ENABLED = 1  # MAV_MODE_FLAG of MAVLink's common.xml
 
 
 class LossSettings(NamedTuple):
@@ -253,7 +252,7 @@ class Autopilot:
     def mode_parameters(self, mode: str) -> tuple[float, ...]:
         """The seven parameters of MAV_CMD_DO_SET_MODE."""
         main, sub = self.mode_numbers(mode)
-        return (float(_MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), float(main), float(sub), 0.0, 0.0, 0.0, 0.0)
+        return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), float(main), float(sub), 0.0, 0.0, 0.0, 0.0)
 
     @property
     def loss_names(self) -> tuple[str, ...]:

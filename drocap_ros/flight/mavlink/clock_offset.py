@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 from collections import deque
 
-_NS = 1_000_000_000
+from drocap_ros.stamps import NS
+
 #: Both ends stamp a packet within a few ms of its way.
 _TOLERANCE_NS = 20_000_000
 #: Greatest rate at which the two clocks drift apart: recorded of a simulated autopilot on a busy machine.
 _GREATEST_RATE = 0.035
 #: Least time between two exchanges, ns, that show the rate.
-_RATE_SPAN_NS = 5 * _NS
+_RATE_SPAN_NS = 5 * NS
 
 logger = logging.getLogger(__name__)
 
@@ -30,9 +31,9 @@ class ClockOffset:
     """
 
     def __init__(self, window_s: float = 60.0, one_way_window_s: float = 10.0, jump_s: float = 1.0) -> None:
-        self._window_ns = int(window_s * _NS)
-        self._one_way_window_ns = int(one_way_window_s * _NS)
-        self._jump_ns = int(jump_s * _NS)
+        self._window_ns = int(window_s * NS)
+        self._one_way_window_ns = int(one_way_window_s * NS)
+        self._jump_ns = int(jump_s * NS)
         self._exchanges: deque[tuple[int, int, int]] = deque(maxlen=512)  # received, round trip, offset
         self._best: tuple[int, int, int] | None = None
         self._rate = 0.0  # of the offset
@@ -59,14 +60,14 @@ class ClockOffset:
     def exchange(self, sent_ns: int, remote_ns: int, received_ns: int) -> None:
         """Take an answer to TIMESYNC: our time of sending, the autopilot's of answering, ours of receiving."""
         trip = received_ns - sent_ns
-        if not 0 <= trip <= 2 * _NS:
+        if not 0 <= trip <= 2 * NS:
             return
         offset = sent_ns + trip // 2 - remote_ns
         if self._exchanges:
             before = self._exchanges[-1]
             drifted = _GREATEST_RATE * abs(received_ns - before[0])
             if abs(offset - before[2]) > (trip + before[1]) // 2 + _TOLERANCE_NS + drifted:
-                step_s = (offset - before[2]) / _NS
+                step_s = (offset - before[2]) / NS
                 logger.warning("our clock and the autopilot's stepped apart by %+.2f s; synchronized again", step_s)
                 self.reset()
         self._exchanges.append((received_ns, trip, offset))
@@ -112,7 +113,7 @@ class ClockOffset:
         if offset is None:
             return received_ns
         stamp = min(remote_ns + offset, received_ns)
-        return stamp if received_ns - stamp <= 5 * _NS else received_ns
+        return stamp if received_ns - stamp <= 5 * NS else received_ns
 
     def reset(self) -> None:
         """Forget everything."""

@@ -12,13 +12,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import InputError
 from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
+from drocap_ros.flight.mavlink.message import Message
 from drocap_ros.flight.mavlink.messages import TELEMETRY_COMMANDS, is_motion, is_telemetry
 from drocap_ros.flight.mavlink.mount import Mount
 from drocap_ros.flight.mavlink.parser import MavlinkParser, read_signing_key, sign_with, signing_time
@@ -27,8 +27,8 @@ from drocap_ros.flight.mavlink.state_estimator import VehicleStateEstimator
 from drocap_ros.flight.mavlink.telemetry_request import LinkStatus, TelemetryRequests
 from drocap_ros.flight.mavlink.transport import LinkError, Transport, open_transport
 from drocap_ros.flight.vehicle_state import VehicleState
+from drocap_ros.stamps import NS
 
-_NS = 1_000_000_000
 _RECONNECT_S = 1.0  # between tries to open a broken link again
 _SENT_SETPOINTS = 80  # kept: 1.6 s at the greatest control_hz, longer than any echo is awaited
 _REQUEST_PERIOD_S = 0.02  # between requests: an answer names none, so one is pending at a time
@@ -83,7 +83,7 @@ class MavlinkLink:
         self._due: dict[str, float] = {}
         self._sync_sent: dict[int, float] = {}  # monotonic s by our stamp, ns
         self._answered_s = math.nan  # when the message was sent that was answered last, monotonic
-        self._sent: deque[tuple[float, Any]] = deque(maxlen=_SENT_SETPOINTS)  # monotonic s
+        self._sent: deque[tuple[float, Message]] = deque(maxlen=_SENT_SETPOINTS)  # monotonic s
         #: Monotonic time of the control step that decides what is sent: what is older than ``watchdog_s`` is dropped.
         self.decided_s = math.inf
         self._broken_s: float | None = None
@@ -116,7 +116,7 @@ class MavlinkLink:
         return [state for state in states if state is not None]
 
     @property
-    def mav(self) -> Any:
+    def mav(self) -> mavlink.MAVLink:
         """Encoder of our own messages."""
         return self._mav
 
@@ -125,7 +125,7 @@ class MavlinkLink:
         """System and component of the autopilot."""
         return self.estimator.system_id, self.estimator.component_id
 
-    def send_motion(self, message: Any) -> None:
+    def send_motion(self, message: Message) -> None:
         """Send a setpoint or a command of the allow-list; one that was decided too long ago is dropped.
 
         A process that was stopped within a control step continues with its setpoint of that time.
@@ -143,7 +143,7 @@ class MavlinkLink:
             self._note_stream(message)
             self._transmit(message)
 
-    def check_motion(self, message: Any) -> Any:
+    def check_motion(self, message: Message) -> Message:
         """The message itself, if it is on the allow-list; for the watchdog.
 
         Raises
@@ -155,7 +155,7 @@ class MavlinkLink:
             raise AssertionError(f"this link sends no {message.get_type()}")
         return message
 
-    def send_unlocked(self, message: Any) -> None:
+    def send_unlocked(self, message: Message) -> None:
         """Send a motion message without any lock: for the watchdog of a loop that hangs."""
         self.check_motion(message)
         self._note_stream(message)
@@ -169,14 +169,14 @@ class MavlinkLink:
         sent = self.sent_setpoints()
         return self._monotonic_s() - sent[-1][0] if sent else math.inf
 
-    def sent_setpoints(self) -> list[tuple[float, Any]]:
+    def sent_setpoints(self) -> list[tuple[float, Message]]:
         """(monotonic s, message) of the last ones, in order of time."""
         return list(self._sent)
 
-    def echo(self) -> tuple[float, Any] | None:
+    def echo(self) -> tuple[float, Message] | None:
         """(age in s, POSITION_TARGET_LOCAL_NED): the target that the autopilot follows; None before the first."""
         latest = self.estimator.echo
-        return None if latest is None else ((self._clock_ns() - latest[0]) / _NS, latest[1])
+        return None if latest is None else ((self._clock_ns() - latest[0]) / NS, latest[1])
 
     def fresh_mode(self, max_age_s: float) -> str:
         """The mode by a report of at most this age; "" = it cannot be seen.  Takes no lock."""
@@ -204,7 +204,7 @@ class MavlinkLink:
             return LinkStatus(
                 connected=silence_s < self.config.link_timeout_s,
                 silence_s=silence_s,
-                round_trip_s=math.nan if trip_ns is None else trip_ns / _NS,
+                round_trip_s=math.nan if trip_ns is None else trip_ns / NS,
                 rates_hz=self._requests.rates_hz(self._clock_ns()),
                 refused=self._requests.refused(),
                 bad_count=self._parser.bad_count,
@@ -239,7 +239,7 @@ class MavlinkLink:
         self._broken_s = None
         return True
 
-    def _take(self, message: Any, now_ns: int) -> VehicleState | None:
+    def _take(self, message: Message, now_ns: int) -> VehicleState | None:
         name = message.get_type()
         try:
             state = self.estimator.update(message, now_ns)
@@ -268,7 +268,7 @@ class MavlinkLink:
         self._requests.set_autopilot(autopilot)
         self.settings.set_autopilot(autopilot)
 
-    def _take_answer(self, name: str, message: Any, now_ns: int) -> None:
+    def _take_answer(self, name: str, message: Message, now_ns: int) -> None:
         if name == "TIMESYNC":
             self._take_time_sync(message, now_ns)
         elif name == "PARAM_VALUE":
@@ -278,7 +278,7 @@ class MavlinkLink:
         elif name == "COMMAND_ACK" and message.target_system in (0, self.config.system_id):
             self._answers = [*self._answers[-31:], (int(message.command), int(message.result))]
 
-    def _take_time_sync(self, message: Any, now_ns: int) -> None:
+    def _take_time_sync(self, message: Message, now_ns: int) -> None:
         if message.tc1 == 0:  # a request of the autopilot
             self._send(self._mav.timesync_encode(now_ns, message.ts1))
             return
@@ -321,17 +321,17 @@ class MavlinkLink:
         self._due[what] = now + period_s
         return True
 
-    def _send(self, message: Any) -> None:
+    def _send(self, message: Message) -> None:
         if not is_telemetry(message):
             raise AssertionError(f"this link sends no {message.get_type()}")
         self._transmit(message)
 
-    def _note_stream(self, message: Any) -> None:
+    def _note_stream(self, message: Message) -> None:
         # Over a broken link nothing leaves: the stream counts as interrupted.
         if self._broken_s is None and message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
             self._sent.append((self._monotonic_s(), message))
 
-    def _transmit(self, message: Any) -> None:
+    def _transmit(self, message: Message) -> None:
         if self._broken_s is not None:
             return
         try:
@@ -339,7 +339,7 @@ class MavlinkLink:
         except LinkError as error:
             self._break(error)
 
-    def _pack(self, message: Any, mav: Any) -> bytes:
+    def _pack(self, message: Message, mav: mavlink.MAVLink) -> bytes:
         if mav.signing.sign_outgoing:
             # Never backwards, whatever our clock does, and never far behind the time that others sign.
             heard = self._parser.signing.timestamp

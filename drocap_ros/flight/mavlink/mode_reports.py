@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import Autopilot, autopilot_by_heartbeat
+from drocap_ros.flight.mavlink.message import Message
+from drocap_ros.stamps import NS
 
-_NS = 1_000_000_000
-_MAV_MODE_FLAG_CUSTOM_MODE_ENABLED = 1  # bits of MAVLink's MAV_MODE_FLAG
-_MAV_MODE_FLAG_SAFETY_ARMED = 128
-MAV_STATE_CRITICAL = 5
 #: Packets; farther back a sequence number counts as the beginning of a new sequence.
 _MAX_LATE = 32
 _HISTORY_S = 1.0  # in which packets of a former mode may still arrive late
@@ -64,28 +63,28 @@ class ModeReports:
         self.vehicle_type = self.system_status = 0
         self.armed = False
         self.received_ns: int | None = None
-        self._heartbeat: Any = None
+        self._heartbeat: Message | None = None
         self._before = ""
         self._changed = (0, 0)  # sequence and reception of the first report of the present mode
         self._heard: deque[str] = deque(maxlen=32)  # appended by one thread and drained by another
 
-    def take_heartbeat(self, message: Any, late: bool, now_ns: int) -> None:
+    def take_heartbeat(self, message: Message, late: bool, now_ns: int) -> None:
         """Take a HEARTBEAT; ``late``: it was sent before a packet that has already arrived."""
         self._heartbeat = message
         self.autopilot, self.vehicle_type = autopilot_by_heartbeat(message.autopilot), int(message.type)
         if not late:
-            self.armed = bool(message.base_mode & _MAV_MODE_FLAG_SAFETY_ARMED)
+            self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
             self.system_status = int(message.system_status)
         # The mode that is intended belongs to the mode with which it was reported.
-        mode = _mode_name(message)
+        mode = self._name(message.custom_mode)
         self._take(mode, self.intended if mode == self.mode else "", message.get_seq(), late, now_ns)
 
-    def take_current_mode(self, message: Any, late: bool, now_ns: int) -> None:
+    def take_current_mode(self, message: Message, late: bool, now_ns: int) -> None:
         """Take a CURRENT_MODE; before the first heartbeat its numbers have no names."""
         if self._heartbeat is None:
             return
         intended, mode = message.intended_custom_mode, self._name(message.custom_mode)
-        if not late and mode != self.mode and self.system_status == MAV_STATE_CRITICAL:
+        if not late and mode != self.mode and self.system_status == mavlink.MAV_STATE_CRITICAL:
             self.system_status = 0
         self._take(mode, self._name(intended) if intended else "", message.get_seq(), late, now_ns)
 
@@ -98,14 +97,14 @@ class ModeReports:
 
     def age_s(self, now_ns: int) -> float:
         """Time in s since the newest report; infinity before the first."""
-        return math.inf if self.received_ns is None else (now_ns - self.received_ns) / _NS
+        return math.inf if self.received_ns is None else (now_ns - self.received_ns) / NS
 
     def _take(self, mode: str, intended: str, sequence: int, late: bool, now_ns: int) -> None:
         if late:
             # What was sent before the present mode began, with the mode of that time, is no news.  Any other mode is
             # one in between: the vehicle was in it.
             first, since_ns = self._changed
-            history = 0 < (first - sequence) % 256 <= _MAX_LATE and now_ns - since_ns < _HISTORY_S * _NS
+            history = 0 < (first - sequence) % 256 <= _MAX_LATE and now_ns - since_ns < _HISTORY_S * NS
             if not (history and mode == self._before):
                 self._heard.append(mode)
             return
@@ -115,23 +114,13 @@ class ModeReports:
         self._heard.append(mode)
 
     def _name(self, custom_mode: int) -> str:
-        return _mode_name(_Numbered(self._heartbeat, custom_mode))
+        """A mode by the autopilot's own name, or its number where neither its table nor pymavlink knows one."""
+        from pymavlink import mavutil
 
-
-class _Numbered:
-    """A heartbeat with another mode, for pymavlink's table of names."""
-
-    def __init__(self, heartbeat: Any, custom_mode: int) -> None:
-        self.autopilot, self.type, self.custom_mode = heartbeat.autopilot, heartbeat.type, custom_mode
-        self.base_mode = _MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-
-    def get_type(self) -> str:
-        return "HEARTBEAT"
-
-
-def _mode_name(heartbeat: Any) -> str:
-    """Flight mode by the autopilot's own name, or its number where neither its table nor pymavlink knows one."""
-    from pymavlink import mavutil
-
-    name = autopilot_by_heartbeat(heartbeat.autopilot).mode_name(heartbeat.custom_mode)
-    return name or str(mavutil.mode_string_v10(heartbeat))
+        assert self.autopilot is not None
+        assert self._heartbeat is not None
+        if name := self.autopilot.mode_name(custom_mode):
+            return name
+        kind, custom = self._heartbeat, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        numbered = mavlink.MAVLink_heartbeat_message(kind.type, kind.autopilot, custom, custom_mode, 0, 3)
+        return str(mavutil.mode_string_v10(numbered))

@@ -6,20 +6,19 @@ Angles of a mount follow MAVLink: pitch is positive up, so a camera that looks d
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.frames import orientation_to_ros, quaternion_from_euler, yaw_of
+from drocap_ros.flight.mavlink.message import Message
 from drocap_ros.geometry.rotations import quaternion_multiply, slerp, unit_quaternions
+from drocap_ros.stamps import NS
 
-_NS = 1_000_000_000
-# GIMBAL_DEVICE_FLAGS of MAVLink.
-_YAW_LOCK = 16
-_YAW_IN_VEHICLE_FRAME = 32
-_YAW_IN_EARTH_FRAME = 64
+_EARTH, _NOSE = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME, mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
 _STALE_S = {"gimbal": 3.0, "servo": 0.5}  # without angles; those of servos follow the body's lean
 _UNKNOWN_S = 0.5  # without angles, from a mount that reports and does not know them
 _STEP_S = 0.25  # between two reports, beyond which a rotation is not extrapolated
@@ -60,7 +59,7 @@ class Mount:
         """Greatest age of the angles in s: less where the mount still reports, and not its angles (NaN)."""
         return min(_STALE_S.get(self.kind, math.inf), math.inf if self._knows else _UNKNOWN_S)
 
-    def take(self, message: Any, now_ns: int) -> None:
+    def take(self, message: Message, now_ns: int) -> None:
         """Take a message of the mount."""
         angles = _READERS[message.get_type()](message)
         self._knows = angles is not None
@@ -71,7 +70,7 @@ class Mount:
         """Time in s since the mount's last message, infinity before the first; 0 for a fixed camera."""
         if self.kind == "fixed":
             return 0.0
-        return math.inf if self._latest is None else (now_ns - self._latest.received_ns) / _NS
+        return math.inf if self._latest is None else (now_ns - self._latest.received_ns) / NS
 
     def problem(self, autopilot: Autopilot, now_ns: int) -> Condition | None:
         """Why the camera's attitude must not be relied on; None = it may be."""
@@ -98,9 +97,9 @@ class Mount:
         angles = latest.quaternion
         if before is not None and before.from_north == latest.from_north:
             step_ns = latest.received_ns - before.received_ns
-            if 0 < step_ns <= _STEP_S * _NS:
+            if 0 < step_ns <= _STEP_S * NS:
                 delay_s = _SERVO_DELAY_S if self.kind == "servo" else 0.0
-                after_ns = received_ns - int(delay_s * _NS) - latest.received_ns
+                after_ns = received_ns - int(delay_s * NS) - latest.received_ns
                 part = min(max(after_ns / step_ns, -1.0), 1.0)
                 angles = slerp(before.quaternion, angles, 1.0 + part)
         if self.kind == "servo":
@@ -119,18 +118,16 @@ class _Angles(NamedTuple):
     from_north: bool
 
 
-def _device_attitude(message: Any) -> tuple[np.ndarray, bool] | None:
+def _device_attitude(message: Message) -> tuple[np.ndarray, bool] | None:
     w, x, y, z = message.q
     quaternion = finite_quaternion(x, y, z, w)
     if quaternion is None:
         return None
-    flags = message.flags
-    if flags & (_YAW_IN_EARTH_FRAME | _YAW_IN_VEHICLE_FRAME):
-        return quaternion, bool(flags & _YAW_IN_EARTH_FRAME)
-    return quaternion, bool(flags & _YAW_LOCK)
+    from_north = _EARTH if message.flags & (_EARTH | _NOSE) else mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK
+    return quaternion, bool(message.flags & from_north)
 
 
-def _orientation(message: Any) -> tuple[np.ndarray, bool] | None:
+def _orientation(message: Message) -> tuple[np.ndarray, bool] | None:
     absolute = message.yaw_absolute
     # A v1 message has no absolute yaw and decodes it as 0: the yaw relative to the vehicle is used instead.
     from_north = math.isfinite(absolute) and absolute != 0.0
@@ -138,7 +135,7 @@ def _orientation(message: Any) -> tuple[np.ndarray, bool] | None:
     return (quaternion_from_euler(*angles), from_north) if np.isfinite(angles).all() else None
 
 
-def _status(message: Any) -> tuple[np.ndarray, bool]:
+def _status(message: Message) -> tuple[np.ndarray, bool]:
     pitch, roll, yaw = np.deg2rad(
         np.array([message.pointing_a, message.pointing_b, message.pointing_c], dtype=float) * 1e-2
     )

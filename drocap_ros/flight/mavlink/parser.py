@@ -5,16 +5,15 @@ from __future__ import annotations
 import re
 import struct
 from pathlib import Path
-from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.errors import InputError
+from drocap_ros.flight.mavlink.message import Message
 
 _EPOCH_NS = 1_420_070_400_000_000_000  # 2015-01-01, from which signing counts in units of 10 us
 _UNIT_NS = 10_000  # of a signature's time: MAVLink's definition
 _LONGEST_FILE = 1024  # bytes of a key's file that are read: it has 64 digits
-CURRENT_MODE_ID = 436  # MAVLink's number
 
 
 class CurrentMode(mavlink.MAVLink_message):
@@ -31,7 +30,7 @@ class CurrentMode(mavlink.MAVLink_message):
     intended_custom_mode : the mode that was chosen last, and that the vehicle may enter as soon as it can; 0 = unknown
     """
 
-    id = CURRENT_MODE_ID
+    id = 436  # as the next ones, by MAVLink's definition
     msgname = "CURRENT_MODE"
     fieldnames = ("standard_mode", "custom_mode", "intended_custom_mode")
     orders = (2, 0, 1)  # of the fields in the payload, which has the longest first
@@ -46,13 +45,13 @@ class CurrentMode(mavlink.MAVLink_message):
         self.custom_mode = custom_mode
         self.intended_custom_mode = intended_custom_mode
 
-    def pack(self, mav: Any, force_mavlink1: bool = False) -> bytes:
+    def pack(self, mav: mavlink.MAVLink, force_mavlink1: bool = False) -> bytes:
         """The packet's bytes by this encoder; its sequence number is not advanced."""
         payload = self.unpacker.pack(self.custom_mode, self.intended_custom_mode, self.standard_mode)
         return bytes(self._pack(mav, self.crc_extra, payload, force_mavlink1=force_mavlink1))
 
 
-mavlink.mavlink_map.setdefault(CURRENT_MODE_ID, CurrentMode)  # a later pymavlink has its own
+mavlink.mavlink_map.setdefault(CurrentMode.id, CurrentMode)  # a later pymavlink has its own
 
 
 def read_signing_key(path: str) -> bytes:
@@ -85,7 +84,7 @@ def signing_time(now_ns: int) -> int:
     return max((now_ns - _EPOCH_NS) // _UNIT_NS, 0)
 
 
-def sign_with(mav: Any, key: bytes, now_ns: int, link_id: int = 0) -> None:
+def sign_with(mav: mavlink.MAVLink, key: bytes, now_ns: int, link_id: int = 0) -> None:
     """Make an encoder or parser sign its packets, and refuse packets that are not signed with this key."""
     mav.signing.secret_key = key
     mav.signing.sign_outgoing = True
@@ -136,11 +135,11 @@ class MavlinkParser:
         self.bad_count = self.refused_count = self.unknown_count = 0
 
     @property
-    def signing(self) -> Any:
+    def signing(self) -> mavlink.MAVLinkSigning:
         """Pymavlink's state of the signatures: counts and times."""
         return self._mav.signing
 
-    def feed(self, data: bytes) -> list[Any]:
+    def feed(self, data: bytes) -> list[Message]:
         """Messages that these bytes complete; damaged ones are counted and left out."""
         try:
             found = self._mav.parse_buffer(data) or []
@@ -163,7 +162,7 @@ class MavlinkParser:
         return good
 
     @staticmethod
-    def _fresh() -> Any:
+    def _fresh() -> SigningMavlink:
         mav = SigningMavlink(None)
         mav.robust_parsing = True
         return mav

@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import dataclass
-from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot.autopilot import UNKNOWN, Autopilot, LossSettings
+from drocap_ros.flight.mavlink.message import Message
 
 _RETRY_S = 0.7  # between requests for a parameter: two round trips of a slow radio
 _TRIES = 10  # then the autopilot lacks the parameter, or the link its answers
@@ -56,7 +56,7 @@ class AutopilotSettings:
                 names.append(name)
         return names
 
-    def take(self, message: Any) -> None:
+    def take(self, message: Message) -> None:
         """Take a PARAM_VALUE."""
         setting = self._settings.get(str(message.param_id).rstrip("\0"))
         if setting is None:

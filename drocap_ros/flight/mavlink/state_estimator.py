@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from typing import Any
 
 import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.frames import frd_to_flu, ned_to_enu, orientation_to_ros, quaternion_from_euler
 from drocap_ros.flight.mavlink import mount
 from drocap_ros.flight.mavlink.clock_offset import ClockOffset
+from drocap_ros.flight.mavlink.message import Message
 from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS, ModeReports, PacketOrder
 from drocap_ros.flight.vehicle_state import LANDED_ON_GROUND, VehicleState
 from drocap_ros.geometry.geodesy import geodetic_to_enu
+from drocap_ros.stamps import NS
 
-_NS = 1_000_000_000
-_MS = 1_000_000
-
-# MAVLink's enumerations, by the names of its definition.
-_MAV_AUTOPILOT_INVALID = 8
-_MAV_TYPE_GCS = 6
-#: All of attitude, horizontal and vertical velocity and vertical position; either horizontal position.
-_ESTIMATOR_NEEDED = 1 | 2 | 4 | 32
-_ESTIMATOR_POSITION = 8 | 16
+#: Flags of a usable estimate: all of these, and either horizontal position.
+_ESTIMATOR_NEEDED = (
+    mavlink.ESTIMATOR_ATTITUDE
+    | mavlink.ESTIMATOR_VELOCITY_HORIZ
+    | mavlink.ESTIMATOR_VELOCITY_VERT
+    | mavlink.ESTIMATOR_POS_VERT_ABS
+)
+_ESTIMATOR_POSITION = mavlink.ESTIMATOR_POS_HORIZ_REL | mavlink.ESTIMATOR_POS_HORIZ_ABS
 
 _POSITION_STALE_S = 3.0  # without a position: a link's silence counts then too
 _ESTIMATOR_STALE_S = 5.0  # without a report of the estimator's health, which comes once a second at least
@@ -61,14 +63,14 @@ class VehicleStateEstimator:
         self._origin: np.ndarray | None = None
         self._estimator: tuple[int, int] | None = None  # reception, flags
         self._attitude_received_ns = 0
-        self._values: dict[str, Any] = {}
+        self._reported = VehicleState(0)  # what comes with neither attitude nor position
         #: The target that the autopilot follows, and its reception.
-        self.echo: tuple[int, Any] | None = None
+        self.echo: tuple[int, Message] | None = None
         #: Reception of the latest message of each kind, and of the last change of the position: our clock.
         self.received_ns: dict[str, int] = {}
         self.position_changed_ns = -(10**18)
 
-    def update(self, message: Any, receive_time_ns: int) -> VehicleState | None:
+    def update(self, message: Message, receive_time_ns: int) -> VehicleState | None:
         """Take one decoded pymavlink message; returns a state for each attitude, else None.
 
         Stamps increase, except after a jump of a clock by more than five seconds.  Values that are not finite and
@@ -96,7 +98,7 @@ class VehicleStateEstimator:
         The estimate of the clock offset improves with time: states slightly back in time are left out.
         """
         state = self.snapshot(now_ns)
-        if state is None or 0 <= self._stamp_ns - state.stamp_ns < 5 * _NS:
+        if state is None or 0 <= self._stamp_ns - state.stamp_ns < 5 * NS:
             return None
         self._stamp_ns = state.stamp_ns
         return state
@@ -104,20 +106,20 @@ class VehicleStateEstimator:
     def age_s(self, names: tuple[str, ...], now_ns: int) -> float:
         """Time in s since the latest message of these kinds; infinity before the first."""
         latest = max((self.received_ns[name] for name in names if name in self.received_ns), default=None)
-        return math.inf if latest is None else (now_ns - latest) / _NS
+        return math.inf if latest is None else (now_ns - latest) / NS
 
     def position_behind_s(self) -> float:
         """Time in s by which the position is older than the attitude, by the autopilot's stamps; at least 0."""
         if self._position is None or self._attitude is None:
             return 0.0
-        return max((self._attitude[0] - self._position[0]) / _NS, 0.0)
+        return max((self._attitude[0] - self._position[0]) / NS, 0.0)
 
     def fresh_mode(self, now_ns: int, mode_s: float, attitude_s: float) -> str:
         """The mode, if its report and the attitude are not older than this; "" = it cannot be seen.  Needs no lock.
 
         Nor can it be seen where many packets are lost.
         """
-        unseen = abs(now_ns - self._stamp_ns) / _NS > attitude_s or self.packets.loss > MAX_LOSS
+        unseen = abs(now_ns - self._stamp_ns) / NS > attitude_s or self.packets.loss > MAX_LOSS
         return "" if unseen or self.modes.age_s(now_ns) > mode_s else self.modes.mode
 
     def snapshot(self, now_ns: int) -> VehicleState | None:
@@ -127,7 +129,8 @@ class VehicleStateEstimator:
             return None
         boot_ns, orientation, rates = self._attitude
         position, velocity = self._position_at(boot_ns)
-        return VehicleState(
+        return dataclasses.replace(
+            self._reported,
             stamp_ns=self.clock.to_local_ns(boot_ns, self._heard_ns),
             autopilot=autopilot.name,
             mode=self.modes.mode,
@@ -138,19 +141,21 @@ class VehicleStateEstimator:
             angular_velocity_flu_rad_s=frd_to_flu(rates),
             position_ok=self._estimator_ok(autopilot, self._heard_ns) and bool(np.isfinite(position).all()),
             gimbal_orientation_xyzw=self.mount.camera_at(orientation, self._attitude_received_ns),
-            link_age_s=max(0.0, (now_ns - self._heard_ns) / _NS),
-            **self._values,
+            link_age_s=max(0.0, (now_ns - self._heard_ns) / NS),
         )
 
+    def _report(self, **values: float) -> None:
+        self._reported = dataclasses.replace(self._reported, **values)  # type: ignore[arg-type]  # a field of each kind
+
     def _estimator_ok(self, autopilot: Autopilot, now_ns: int) -> bool:
-        if self._estimator is None or (now_ns - self._estimator[0]) / _NS >= _ESTIMATOR_STALE_S:
+        if self._estimator is None or (now_ns - self._estimator[0]) / NS >= _ESTIMATOR_STALE_S:
             return False
-        rests = not self.modes.armed and self._values.get("landed_state") == LANDED_ON_GROUND
+        rests = not self.modes.armed and self._reported.landed_state == LANDED_ON_GROUND
         flags, bad = self._estimator[1], autopilot.estimator_bad & ~(autopilot.rest_flags if rests else 0)
         return flags & _ESTIMATOR_NEEDED == _ESTIMATOR_NEEDED and bool(flags & _ESTIMATOR_POSITION) and not flags & bad
 
-    def _take_heartbeat(self, message: Any, now_ns: int) -> None:
-        if message.autopilot == _MAV_AUTOPILOT_INVALID or message.type == _MAV_TYPE_GCS:
+    def _take_heartbeat(self, message: Message, now_ns: int) -> None:
+        if message.autopilot == mavlink.MAV_AUTOPILOT_INVALID or message.type == mavlink.MAV_TYPE_GCS:
             return
         system = message.get_srcSystem()
         self.systems |= {system}
@@ -163,34 +168,34 @@ class VehicleStateEstimator:
         self.received_ns["HEARTBEAT"] = now_ns
         self.modes.take_heartbeat(message, self.packets.is_late(message.get_seq()), now_ns)
 
-    def _boot_ns(self, message: Any, now_ns: int) -> int:
-        boot_ns = int(message.time_boot_ms) * _MS
+    def _boot_ns(self, message: Message, now_ns: int) -> int:
+        boot_ns = int(message.time_boot_ms) * 10**6
         self.clock.observe(boot_ns, now_ns)
         return boot_ns
 
-    def _take_attitude(self, message: Any, now_ns: int) -> bool:
+    def _take_attitude(self, message: Message, now_ns: int) -> bool:
         # With both forms of the attitude only the quaternion is used: one state for each instant.
-        if (now_ns - self._quaternion_ns) / _NS < _QUATERNION_PREFERRED_S:
+        if (now_ns - self._quaternion_ns) / NS < _QUATERNION_PREFERRED_S:
             return False
         angles = (message.roll, message.pitch, message.yaw)
         if not all(map(math.isfinite, angles)):
             return False
         return self._set_attitude(message, quaternion_from_euler(*angles), now_ns)
 
-    def _take_attitude_quaternion(self, message: Any, now_ns: int) -> bool:
+    def _take_attitude_quaternion(self, message: Message, now_ns: int) -> bool:
         quaternion = mount.finite_quaternion(message.q2, message.q3, message.q4, message.q1)
         if quaternion is None:
             return False
         self._quaternion_ns = now_ns
         return self._set_attitude(message, quaternion, now_ns)
 
-    def _set_attitude(self, message: Any, quaternion: np.ndarray, now_ns: int) -> bool:
+    def _set_attitude(self, message: Message, quaternion: np.ndarray, now_ns: int) -> bool:
         self._attitude_received_ns = now_ns
         rates = np.array([message.rollspeed, message.pitchspeed, message.yawspeed], dtype=float)
         self._attitude = (self._boot_ns(message, now_ns), quaternion, np.where(np.isfinite(rates), rates, np.nan))
         return True
 
-    def _take_local_position(self, message: Any, now_ns: int) -> bool:
+    def _take_local_position(self, message: Message, now_ns: int) -> bool:
         ned = np.array([message.x, message.y, message.z], dtype=float)
         velocity = np.array([message.vx, message.vy, message.vz], dtype=float)
         if np.isfinite(ned).all() and np.isfinite(velocity).all():
@@ -202,17 +207,16 @@ class VehicleStateEstimator:
             self._position = (self._boot_ns(message, now_ns), position, ned_to_enu(velocity))
         return False
 
-    def _take_global_position(self, message: Any, now_ns: int) -> bool:
+    def _take_global_position(self, message: Message, now_ns: int) -> bool:
         boot_ns = self._boot_ns(message, now_ns)
         if message.lat == 0 and message.lon == 0:  # autopilots send zeros before the first fix
             return False
         geodetic = np.array([message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3])
         if abs(geodetic[0]) > 90 or abs(geodetic[1]) > 180:
             return False
-        self._values.update(
-            latitude_deg=float(geodetic[0]), longitude_deg=float(geodetic[1]), altitude_amsl_m=float(geodetic[2])
-        )
-        if (now_ns - self._local_position_ns) / _NS < _POSITION_STALE_S:
+        latitude, longitude, altitude = geodetic.tolist()
+        self._report(latitude_deg=latitude, longitude_deg=longitude, altitude_amsl_m=altitude)
+        if (now_ns - self._local_position_ns) / NS < _POSITION_STALE_S:
             return False
         # No local position: our own frame, with its origin on the ground below the first position.
         if self._origin is None:
@@ -221,42 +225,44 @@ class VehicleStateEstimator:
         self._position = (boot_ns, geodetic_to_enu(geodetic, self._origin), ned_to_enu(velocity))
         return False
 
-    def _take_gps(self, message: Any, _now_ns: int) -> bool:
-        self._values.update(gps_fix_type=int(message.fix_type), satellites=int(message.satellites_visible))
+    def _take_gps(self, message: Message, _now_ns: int) -> bool:
+        self._report(gps_fix_type=int(message.fix_type), satellites=int(message.satellites_visible))
         return False
 
-    def _take_sys_status(self, message: Any, _now_ns: int) -> bool:
+    def _take_sys_status(self, message: Message, _now_ns: int) -> bool:
         volts, percent = message.voltage_battery, message.battery_remaining
-        self._values["battery_voltage_v"] = volts * 1e-3 if 0 < volts < 65535 else math.nan
-        self._values["battery_fraction"] = percent * 1e-2 if 0 <= percent <= 100 else math.nan
+        self._report(
+            battery_voltage_v=volts * 1e-3 if 0 < volts < 65535 else math.nan,
+            battery_fraction=percent * 1e-2 if 0 <= percent <= 100 else math.nan,
+        )
         return False
 
-    def _take_estimator(self, message: Any, now_ns: int) -> bool:
+    def _take_estimator(self, message: Message, now_ns: int) -> bool:
         autopilot = self.modes.autopilot
         if autopilot is not None and message.get_type() == autopilot.estimator_message:
             self._estimator = (now_ns, message.flags)
         return False
 
-    def _take_echo(self, message: Any, now_ns: int) -> bool:
+    def _take_echo(self, message: Message, now_ns: int) -> bool:
         self.echo = (now_ns, message)
         return False
 
-    def _take_extended_state(self, message: Any, _now_ns: int) -> bool:
-        self._values["landed_state"] = int(message.landed_state) if 0 <= message.landed_state <= 4 else 0
+    def _take_extended_state(self, message: Message, _now_ns: int) -> bool:
+        self._report(landed_state=int(message.landed_state) if 0 <= message.landed_state <= 4 else 0)
         return False
 
-    def _take_mount(self, message: Any, now_ns: int) -> bool:
+    def _take_mount(self, message: Message, now_ns: int) -> bool:
         self.mount.take(message, now_ns)
         return False
 
-    def _take_parameter(self, message: Any, _now_ns: int) -> bool:
+    def _take_parameter(self, message: Message, _now_ns: int) -> bool:
         autopilot = self.modes.autopilot
         if autopilot is not None and str(message.param_id).rstrip("\0") == autopilot.mount_type_setting:
             value = float(message.param_value)
             self.mount.servos = None if math.isnan(value) else value == autopilot.servo_mount
         return False
 
-    def _take_system_time(self, message: Any, now_ns: int) -> bool:
+    def _take_system_time(self, message: Message, now_ns: int) -> bool:
         self._boot_ns(message, now_ns)
         return False
 
@@ -265,7 +271,7 @@ class VehicleStateEstimator:
         if self._position is None:
             return np.full(3, np.nan), np.full(3, np.nan)
         since, position, velocity = self._position
-        gap_s = (boot_ns - since) / _NS
+        gap_s = (boot_ns - since) / NS
         if abs(gap_s) > _POSITION_STALE_S:
             return np.full(3, np.nan), np.full(3, np.nan)
         return position + velocity * min(max(gap_s, -_EXTRAPOLATE_S), _EXTRAPOLATE_S), velocity

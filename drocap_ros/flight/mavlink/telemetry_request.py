@@ -12,9 +12,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import Autopilot
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
-from drocap_ros.flight.mavlink.parser import CURRENT_MODE_ID
+from drocap_ros.flight.mavlink.parser import CurrentMode
+from drocap_ros.stamps import NS
 
-_NS = 1_000_000_000
 _FAST_HEARTBEAT_HZ = 5.0  # where it may be requested: a pilot's mode is seen within 0.2 s
 _CURRENT_MODE_HZ = 2.0  # while nothing changes: measured
 _CURRENT_MODE_INTERVAL_HZ = 20.0  # asked for: a change comes after one interval
@@ -108,7 +108,7 @@ class TelemetryRequests:
             self._wanted.setdefault(number, _Wanted(self._config.status_hz))
         fixed = not autopilot.heartbeat_on_request
         if fixed and self._wanted.pop(mavlink.MAVLINK_MSG_ID_HEARTBEAT, None) is not None:
-            self._wanted[CURRENT_MODE_ID] = _Wanted(_CURRENT_MODE_HZ, _CURRENT_MODE_INTERVAL_HZ)
+            self._wanted[CurrentMode.id] = _Wanted(_CURRENT_MODE_HZ, _CURRENT_MODE_INTERVAL_HZ)
 
     def count(self, message_id: int, now_ns: int) -> None:
         """Count a message."""
@@ -124,22 +124,22 @@ class TelemetryRequests:
             return
         asked = min(waiting, key=lambda w: w.requested_ns)
         asked.result = result
-        if asked is self._wanted.get(CURRENT_MODE_ID) and result != mavlink.MAV_RESULT_ACCEPTED:
-            del self._wanted[CURRENT_MODE_ID]
+        if asked is self._wanted.get(CurrentMode.id) and result != mavlink.MAV_RESULT_ACCEPTED:
+            del self._wanted[CurrentMode.id]
             logger.warning(
                 "the autopilot does not send CURRENT_MODE: a mode that the pilot chooses is noticed up to 1 s late"
             )
 
     def rate_hz(self, message_id: int, now_ns: int) -> float:
         """Real rate of a wanted message over the configured window."""
-        window_ns = int(self._config.rate_window_s * _NS)
+        window_ns = int(self._config.rate_window_s * NS)
         if self._since_ns is not None:
             window_ns = min(window_ns, max(now_ns - self._since_ns, 1))
         arrivals = self._wanted[message_id].arrivals
         # Called at every turn of the link: each outdated arrival is visited once.
         while arrivals and not 0 <= now_ns - arrivals[0] <= window_ns:  # below 0: the clock went back
             arrivals.popleft()
-        return len(arrivals) * _NS / window_ns
+        return len(arrivals) * NS / window_ns
 
     def rates_hz(self, now_ns: int) -> dict[str, tuple[float, float]]:
         """(real, wanted) Hz of every wanted message by its name."""
@@ -171,9 +171,9 @@ class TelemetryRequests:
         """Whether a message was never requested, or arrives too rarely since the last request."""
         since_ns = abs(now_ns - wanted.requested_ns)  # a clock that went back must not wait for itself
         wait_s = self._config.request_retry_s * (1 if wanted.result in (None, 0) else 10)
-        if since_ns / _NS < wait_s or wanted.request_count == 0:
-            return since_ns / _NS >= wait_s
-        settle_ns = int(self._config.rate_window_s * _NS)
+        if since_ns / NS < wait_s or wanted.request_count == 0:
+            return since_ns / NS >= wait_s
+        settle_ns = int(self._config.rate_window_s * NS)
         measured = self._since_ns is not None and now_ns - self._since_ns >= settle_ns and since_ns >= settle_ns
         return measured and self.rate_hz(number, now_ns) < self._config.rate_shortfall * wanted.rate_hz
 

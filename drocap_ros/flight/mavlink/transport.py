@@ -5,9 +5,12 @@ from __future__ import annotations
 import re
 import select
 import socket
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from drocap_ros.errors import DrocapError, InputError
+
+if TYPE_CHECKING:
+    import serial
 
 URL_FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE[:BAUD]"
 _MAX_DATAGRAM = 65535  # bytes of UDP
@@ -164,10 +167,8 @@ class _TcpTransport:
 
 
 class _SerialTransport:
-    def __init__(self, port: object) -> None:
-        from typing import Any, cast
-
-        self._port = cast(Any, port)
+    def __init__(self, port: serial.Serial) -> None:
+        self._port = port
 
     def read(self, timeout_s: float) -> bytes:
         try:

@@ -13,8 +13,8 @@ from drocap_ros.flight.orbit_config import orbit_condition
 from drocap_ros.flight.orbit_goal import OrbitGoal, goal_of
 from drocap_ros.flight.safety_config import height_condition
 from drocap_ros.flight.subject.framing import Framing
+from drocap_ros.stamps import NS
 
-_NS = 1_000_000_000
 _COMMAND_AGE_S = 2.0  # as srv/OrbitCommand.srv states
 _MAX_WAITING = 16  # commands: one a step is answered, so the last one waits for 0.8 s at 20 Hz
 
@@ -23,7 +23,7 @@ def command_condition(command: OperatorCommand, now_ns: int) -> Condition | None
     """Why a command is refused whatever the state: an unknown number, or a stamp too far from now."""
     if command.kind not in list(Command):
         return condition(ConditionCode.UNKNOWN_COMMAND, number=command.kind)
-    age_s = (now_ns - command.stamp_ns) / _NS
+    age_s = (now_ns - command.stamp_ns) / NS
     if command.stamp_ns and abs(age_s) > _COMMAND_AGE_S:
         return condition(ConditionCode.COMMAND_OUTDATED, age_s=age_s, limit_s=_COMMAND_AGE_S)
     return None

@@ -11,12 +11,13 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.autopilot.autopilot import Echo
+from drocap_ros.flight.mavlink.message import Message
 from drocap_ros.flight.orbit.motion_checks import away_limit_m
 from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.vehicle_state import VehicleState
@@ -39,8 +40,8 @@ class Echoes(NamedTuple):
     trip_s : since the sending of the message that was answered last: two transmissions at least; NaN = unknown
     """
 
-    sent: Sequence[tuple[float, Any]]
-    echo: tuple[float, Any] | None = None
+    sent: Sequence[tuple[float, Message]]
+    echo: tuple[float, Message] | None = None
     trip_s: float = math.nan
 
 
@@ -145,7 +146,7 @@ class Keeping:
         return away_m, now_s - self._near_s
 
 
-def _agrees(echo: Any, sent: list[Any], most: Echo) -> bool:
+def _agrees(echo: Message, sent: list[Message], most: Echo) -> bool:
     """Whether the echoed target lies on the way of a setpoint, and has its velocity."""
     place = np.array([echo.x, echo.y], dtype=float)
     if not sent or not np.isfinite(place).all():

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import supported_titles
 from drocap_ros.flight.autopilot.autopilot import LossAction, LossSettings
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
-from drocap_ros.flight.mavlink.mode_reports import MAV_STATE_CRITICAL
 from drocap_ros.flight.observed import FIX_3D, Observed
 from drocap_ros.flight.orbit.states import Limits
 from drocap_ros.flight.orbit_config import OrbitConfig
@@ -28,7 +28,11 @@ _LONGEST_AWAY_S = 20.0  # behind walking subjects in 8 m/s of wind: 10 s
 #: The clocks of image and step differ by a transmission at most.
 _FUTURE_S = 0.2
 #: MAV_STATE of a vehicle that nobody should command; the first may stand for stopped motors.
-_EMERGENCIES = {6: "an emergency", 7: "that it is shutting down", 8: "that the flight is terminated"}
+_EMERGENCIES = {
+    mavlink.MAV_STATE_EMERGENCY: "an emergency",
+    mavlink.MAV_STATE_POWEROFF: "that it is shutting down",
+    mavlink.MAV_STATE_FLIGHT_TERMINATION: "that the flight is terminated",
+}
 LANDED_STATES = {LANDED_ON_GROUND: "on the ground", LANDED_TAKEOFF: "taking off", LANDED_LANDING: "landing"}
 
 
@@ -104,7 +108,7 @@ def start_condition(seen: Observed) -> Condition | None:
     if len(seen.link.vehicles) > 1:
         return condition(_C.SEVERAL_VEHICLES, systems=", ".join(map(str, sorted(seen.link.vehicles))))
     own_loss = seen.mode.left_by_itself and seen.mode.in_hold
-    if seen.health.system_status == MAV_STATE_CRITICAL and not own_loss:
+    if seen.health.system_status == mavlink.MAV_STATE_CRITICAL and not own_loss:
         return condition(_C.AUTOPILOT_CRITICAL, reported="a critical state")
     return None
 

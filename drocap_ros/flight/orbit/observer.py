@@ -23,8 +23,8 @@ from drocap_ros.flight.vehicle_filter import Doubt, VehicleFilter
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 from drocap_ros.observation import PoseObservation
+from drocap_ros.stamps import NS
 
-_NS = 1_000_000_000
 _CLOCK_JUMP_S = 0.25  # between the clock of the stamps and the monotonic one: a subject's age would be wrong by it
 _MAX_EXTRAPOLATION_S = 0.3  # of a position by its velocity
 #: MAV_TYPE of the vehicles for which the control was made: multirotors, and a helicopter under the same autopilot.
@@ -74,7 +74,7 @@ class Observer:
         if self.vehicle is None or self.vehicle.autopilot != state.autopilot:
             self._filter = VehicleFilter(autopilot_of(state.autopilot).velocity_sd_m_s)
         if np.isfinite(state.position_enu_m).all() and np.isfinite(state.velocity_enu_m_s).all():
-            doubt = self._filter.take(state.stamp_ns / _NS, state.position_enu_m, state.velocity_enu_m_s)
+            doubt = self._filter.take(state.stamp_ns / NS, state.position_enu_m, state.velocity_enu_m_s)
             self._doubt = self._doubt.worse(doubt)
             state = dataclasses.replace(state, velocity_enu_m_s=self._filter.velocity)
         self.vehicle = state
@@ -87,7 +87,7 @@ class Observer:
 
     def on_pose2d(self, observation: PoseObservation, *, locked: bool) -> None:
         """Take the keypoints of one image; ``locked``: the vehicle flies by the present subject."""
-        stamp_ns = observation.stamp_ns - round(self._config.camera_latency_s * _NS)
+        stamp_ns = observation.stamp_ns - round(self._config.camera_latency_s * NS)
         observation = dataclasses.replace(observation, stamp_ns=stamp_ns)
         self.framing.size = observation.image_size
         fresh = self._pictures.take(observation)
@@ -152,7 +152,7 @@ class Observer:
         """Disturbance of our own time, or of the reported position, since the last step."""
         if before is None:
             return None
-        jump_s = (now_ns - before[0]) / _NS - dt
+        jump_s = (now_ns - before[0]) / NS - dt
         if abs(jump_s) > _CLOCK_JUMP_S:
             return condition(ConditionCode.CLOCK_JUMPED, jump_s=jump_s)
         doubt, self._doubt = self._doubt, Doubt()
@@ -169,7 +169,7 @@ def observe_vehicle(link: MavlinkLink, config: MavlinkBridgeConfig, vehicle: Veh
     """The observation of vehicle and link alone; ``vehicle``: latest state."""
     estimator = link.estimator
     heard = estimator.modes.take_heard()
-    age_s = (now_ns - vehicle.stamp_ns) / _NS
+    age_s = (now_ns - vehicle.stamp_ns) / NS
     latest = estimator.snapshot(now_ns) or vehicle  # mode and health are newer than the attitude
     autopilot = autopilot_of(latest.autopilot)
     loss = link.settings.loss_settings()
@@ -181,7 +181,7 @@ def observe_vehicle(link: MavlinkLink, config: MavlinkBridgeConfig, vehicle: Veh
     # The state is at the attitude's stamp; a moment later the vehicle is a little farther.
     moved_s = min(max(age_s, 0.0), _MAX_EXTRAPOLATION_S)
     position = vehicle.position_enu_m + np.nan_to_num(vehicle.velocity_enu_m_s) * moved_s
-    position_age_s = max((now_ns - estimator.position_changed_ns) / _NS, estimator.position_behind_s() + abs(age_s))
+    position_age_s = max((now_ns - estimator.position_changed_ns) / NS, estimator.position_behind_s() + abs(age_s))
     return Observed(
         autopilot=autopilot if flies else UNKNOWN,
         autopilot_name=latest.autopilot if flies else f"{latest.autopilot}, vehicle type {vehicle_type}",
@@ -275,8 +275,8 @@ class PictureWatch:
         if self._last is None:
             return Pictures(calibrated=calibrated)
         return Pictures(
-            age_s=(now_ns - self._last.stamp_ns) / _NS,
-            silent_s=(now_ns - self._arrived_ns) / _NS,
+            age_s=(now_ns - self._last.stamp_ns) / NS,
+            silent_s=(now_ns - self._arrived_ns) / NS,
             frozen=self._frozen,
             calibrated=calibrated,
         )

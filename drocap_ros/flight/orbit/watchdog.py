@@ -5,7 +5,9 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from drocap_ros.flight.mavlink.message import Message
 
 _PERIOD_S = 0.1
 _CHECK_S = 0.02
@@ -21,8 +23,8 @@ class FallbackCommands(NamedTuple):
         requested, because the pilot may have chosen another one
     """
 
-    hold: Any
-    hold_mode: Any
+    hold: Message
+    hold_mode: Message
     in_control: Callable[[], bool]
 
 
@@ -35,7 +37,7 @@ class Watchdog:
     limit_s : time without :meth:`kick`
     """
 
-    def __init__(self, send: Callable[[Any], None], limit_s: float) -> None:
+    def __init__(self, send: Callable[[Message], None], limit_s: float) -> None:
         self._send, self._limit_s = send, limit_s
         self._latest: tuple[float, FallbackCommands | None] = (-1e18, None)  # replaced whole: no lock
         self._sent_s = self._checked_s = -1e18

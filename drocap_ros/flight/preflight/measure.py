@@ -7,7 +7,7 @@ import math
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode
 from drocap_ros.flight.mavlink.link import MavlinkLink
+from drocap_ros.flight.mavlink.message import Message
 from drocap_ros.flight.mavlink.settings import AutopilotSettings
 from drocap_ros.flight.mavlink.transport import Transport
 from drocap_ros.flight.observed import Observed
@@ -23,8 +24,8 @@ from drocap_ros.flight.orbit.observer import observe_vehicle
 from drocap_ros.flight.orbit.states import Limits
 from drocap_ros.flight.preflight.measured import Measured, Stream
 from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, VehicleState
+from drocap_ros.stamps import NS
 
-_NS = 1_000_000_000
 _CONDITIONS_PERIOD_S, _VERSION_PERIOD_S, _VERSION_TRIES = 0.1, 1.0, 4
 
 
@@ -34,16 +35,24 @@ class ListeningLink(MavlinkLink):
     It never arms, changes a mode or writes a parameter.
     """
 
-    def __init__(self, config: MavlinkBridgeConfig, **keywords: Any) -> None:
+    def __init__(
+        self,
+        config: MavlinkBridgeConfig,
+        clock_ns: Callable[[], int],
+        monotonic_s: Callable[[], float],
+        transport: Transport | None,
+    ) -> None:
         # With motion enabled the link asks for the rates and parameters of a flight.
-        super().__init__(dataclasses.replace(config, commands_enabled=True), **keywords)
+        super().__init__(
+            dataclasses.replace(config, commands_enabled=True), clock_ns, monotonic_s=monotonic_s, transport=transport
+        )
         self.settings = AutopilotSettings(preflight=True)
         self.version = ""
         self.arrivals: defaultdict[str, list[int]] = defaultdict(list)
         self.exchanges: list[tuple[int, int]] = []  # round trip, offset, ns
         self._version_tries = 0
 
-    def check_motion(self, message: Any) -> NoReturn:
+    def check_motion(self, message: Message) -> NoReturn:
         """Refuse every motion.
 
         Raises
@@ -53,7 +62,7 @@ class ListeningLink(MavlinkLink):
         """
         raise AssertionError(f"this link sends no {message.get_type()}")
 
-    def _take(self, message: Any, now_ns: int) -> VehicleState | None:
+    def _take(self, message: Message, now_ns: int) -> VehicleState | None:
         name = message.get_type()
         if name == "TIMESYNC" and message.tc1 and message.ts1 in self._sync_sent:
             trip = now_ns - message.ts1
@@ -123,7 +132,7 @@ class Listening:
         now_ns, now_s = self._clock_ns(), self._monotonic_s()
         for state in states:
             self._vehicle = state
-            self._delays.append((now_ns, (now_ns - state.stamp_ns) / _NS))
+            self._delays.append((now_ns, (now_ns - state.stamp_ns) / NS))
         if math.isinf(self._heard_s) and self.link.estimator.component_id:
             self._heard_s = now_s
         # The autopilot needs the first half to grant the requests and to answer.
@@ -160,7 +169,7 @@ class Listening:
                 for name, (_, wanted) in status.rates_hz.items()
             },
             refused=status.refused, settings=link.settings.reported(),
-            round_trips_s=trips[:, 0] / _NS, offsets_s=(trips[:, 1] - trips[:1, 1].sum()) / _NS,
+            round_trips_s=trips[:, 0] / NS, offsets_s=(trips[:, 1] - trips[:1, 1].sum()) / NS,
             delays_s=np.array([delay for at, delay in self._delays if at >= from_ns]),
             good_count=sum(map(len, link.arrivals.values())), bad_count=status.bad_count,
             unsigned_count=status.refused_count, packet_loss=link.estimator.packets.loss,
@@ -184,8 +193,8 @@ def version_text(number: int) -> str:
 
 def _stream(arrivals: list[int], from_ns: int, now_ns: int, wanted_hz: float) -> Stream:
     recent = [at for at in arrivals if at >= from_ns]
-    seconds = (now_ns - from_ns) / _NS
+    seconds = (now_ns - from_ns) / NS
     if seconds <= 0:
         return Stream(math.nan, wanted_hz)
-    gap_s = max(np.diff([from_ns, *recent, now_ns])) / _NS
+    gap_s = max(np.diff([from_ns, *recent, now_ns])) / NS
     return Stream(len(recent) / seconds, wanted_hz, float(gap_s))

@@ -17,8 +17,8 @@ from drocap_ros.flight.pose_history import CameraPose
 from drocap_ros.flight.subject.subject_measurement import locate_subject
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.observation import PoseObservation
+from drocap_ros.stamps import NS
 
-_NS = 1_000_000_000
 _RADIAL_NOISE = 0.06  # of one image, share of the range: as the range by size in subject_measurement.py
 _BEARING_NOISE = 0.01  # share of the range
 _NOISE_M = 0.04
@@ -62,7 +62,7 @@ class Guard:
         other = observation.track_id != self._track_id
         sure = False
         if found is not None and camera is not None:
-            gap_s = (observation.stamp_ns - self._stamp_ns) / _NS
+            gap_s = (observation.stamp_ns - self._stamp_ns) / NS
             if self._state is None or (not locked and (other or abs(gap_s) > _RESTART_S)):
                 self._start(found.position[:2], observation)
                 sure = True
@@ -86,7 +86,7 @@ class Guard:
         """
         if self._state is None:
             return None
-        age_s = (now_ns - self._stamp_ns) / _NS
+        age_s = (now_ns - self._stamp_ns) / NS
         state, covariance = self._predicted(min(max(age_s, 0.0), 0.5))
         sight = state[:2] + offset[:2] - vehicle[:2]
         distance = max(float(np.hypot(*sight)), 1e-3)

@@ -11,15 +11,15 @@ from drocap_ros.flight.pose_history import CameraPose
 from drocap_ros.flight.subject.subject_measurement import SubjectMeasurement, locate_subject
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.observation import PoseObservation
+from drocap_ros.stamps import NS
 
 STANDING_M_S = 0.3  # speed that the estimate of one who stands has
 WALKING_M_S = 0.5  # least speed of one who walks
-_NS = 1_000_000_000
 _DRIFT = 0.05  # m/sqrt(s), of the vehicle's position and of the feet that are set down; no motion of the subject
-_RATIO_MEMORY_NS = 4 * _NS  # of size over ground: several strides
+_RATIO_MEMORY_NS = 4 * NS  # of size over ground: several strides
 _LEAST_RATIOS = 15  # images: a second of them
 _RATIO_QUANTILE = 0.4
-_WANDERING_MEMORY_NS = 1 * _NS  # where the height wanders: recorded ones change by 0.1 m within it, 4 % of the range
+_WANDERING_MEMORY_NS = 1 * NS  # where the height wanders: recorded ones change by 0.1 m within it, 4 % of the range
 _WANDERING_RATIOS = 8  # images: half a second of them
 _MAX_BENDING = 0.3  # of a body whose size counts; 0.1 by noise alone
 _NEARER_S = 1.0  # filter of what the two ranges disagree by
@@ -103,7 +103,7 @@ class SubjectFilter:
         measurement = locate_subject(observation, camera_matrix, camera, self._config, self._ratio)
         if measurement is None:
             return False
-        gap_s = (observation.stamp_ns - self._stamp_ns) / _NS
+        gap_s = (observation.stamp_ns - self._stamp_ns) / NS
         other = observation.track_id != self._track_id
         if locked and (self._state is None or other):
             self._contradicted = True
@@ -138,7 +138,7 @@ class SubjectFilter:
         """The subject predicted to ``now_ns`` (half a second at most); None before the first measurement."""
         if self._state is None:
             return None
-        age_s = (now_ns - self._stamp_ns) / _NS
+        age_s = (now_ns - self._stamp_ns) / NS
         state, covariance = self._predicted(min(max(age_s, 0.0), 0.5))
         total = covariance[:3, :3] + self._systematic
         return SubjectEstimate(

@@ -19,7 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.errors import InputError
 from drocap_ros.flight.autopilot import AUTOPILOTS, autopilot_of
 from drocap_ros.flight.frames import enu_to_ned, flu_to_frd, orientation_to_aviation
-from drocap_ros.flight.mavlink.parser import CURRENT_MODE_ID, CurrentMode, MavlinkParser, sign_with
+from drocap_ros.flight.mavlink.parser import CurrentMode, MavlinkParser, sign_with
 from drocap_ros.flight.mavlink.transport import Transport, open_transport
 from drocap_ros.geometry.geodesy import enu_to_geodetic
 from drocap_ros.simulation.vehicle.flight_path import FlightPath, VehiclePose, orbit_path
@@ -203,7 +203,7 @@ class SimulatedVehicle:
             self.kind.estimator_message: self._estimator,
         }
         numbered = {_number(name): encode for name, encode in encoders.items()}
-        return numbered if self.kind.heartbeat_on_request else numbered | {CURRENT_MODE_ID: self._current_mode}
+        return numbered if self.kind.heartbeat_on_request else numbered | {CurrentMode.id: self._current_mode}
 
     def _telemetry(self, number: int, t_s: float, pose: VehiclePose) -> mavlink.MAVLink_message | None:
         return self._encoders[number](t_s, pose)

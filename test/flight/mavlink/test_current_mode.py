@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
-from drocap_ros.flight.mavlink.parser import CURRENT_MODE_ID, CurrentMode, MavlinkParser, sign_with
+from drocap_ros.flight.mavlink.parser import CurrentMode, MavlinkParser, sign_with
 
 NUMBERS = st.integers(0, 2**32 - 1)
 OFFBOARD = 6 << 16
@@ -27,7 +27,7 @@ def test_bytes_of_a_real_packet_decode():
     body = bytes([7, 0, 0, 0, 1, 1, 436 & 0xFF, 436 >> 8, 0]) + bytes([0, 0, 6, 0, 0, 0, 6])
     packet = b"\xfd" + body + x25crc(body + bytes([193])).crc.to_bytes(2, "little")
     (got,) = MavlinkParser().feed(packet)
-    assert (got.get_type(), got.get_msgId()) == ("CURRENT_MODE", CURRENT_MODE_ID)
+    assert (got.get_type(), got.get_msgId()) == ("CURRENT_MODE", CurrentMode.id)
     assert (got.custom_mode, got.intended_custom_mode, got.standard_mode) == (OFFBOARD, OFFBOARD, 0)
     assert (got.get_srcSystem(), got.get_srcComponent()) == (1, 1)
 

@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from drocap_ros.flight.autopilot import autopilot_of
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.link import MavlinkLink
-from drocap_ros.flight.mavlink.parser import CURRENT_MODE_ID, MavlinkParser
+from drocap_ros.flight.mavlink.parser import CurrentMode, MavlinkParser
 from drocap_ros.flight.mavlink.telemetry_request import TelemetryRequests
 from drocap_ros.simulation.vehicle.loopback import Channel, LoopbackTransport
 
@@ -32,21 +32,21 @@ def test_px4_is_asked_for_current_mode_and_not_for_a_faster_heartbeat(caplog):
     requests.set_autopilot(autopilot_of("px4"))
     first = {number: interval for _, number, interval in asked(requests, 1)}
     assert BEAT not in first
-    assert first[CURRENT_MODE_ID] == 50_000
+    assert first[CurrentMode.id] == 50_000
     twice_a_second = [number for _, number, _ in asked(requests, 10, start_s=1)]
-    assert CURRENT_MODE_ID in twice_a_second  # nothing arrived
+    assert CurrentMode.id in twice_a_second  # nothing arrived
     for i in range(40):
-        requests.count(CURRENT_MODE_ID, (20 * 50 + i * 25) * S // 50)
-    assert requests.rate_hz(CURRENT_MODE_ID, 40 * S) == pytest.approx(2.0, rel=0.2)
-    assert CURRENT_MODE_ID not in [number for number, _ in requests.due(40 * S)]
+        requests.count(CurrentMode.id, (20 * 50 + i * 25) * S // 50)
+    assert requests.rate_hz(CurrentMode.id, 40 * S) == pytest.approx(2.0, rel=0.2)
+    assert CurrentMode.id not in [number for number, _ in requests.due(40 * S)]
     assert caplog.records == []
 
 
 def test_an_autopilot_that_refuses_current_mode_is_named_once(caplog):
     requests = TelemetryRequests(MavlinkBridgeConfig(commands_enabled=True))
     requests.set_autopilot(autopilot_of("px4"))
-    times = asked(requests, 60, {CURRENT_MODE_ID: mavlink.MAV_RESULT_DENIED})
-    assert [number for _, number, _ in times].count(CURRENT_MODE_ID) == 1
+    times = asked(requests, 60, {CurrentMode.id: mavlink.MAV_RESULT_DENIED})
+    assert [number for _, number, _ in times].count(CurrentMode.id) == 1
     assert requests.refused() == {}
     assert ["CURRENT_MODE" in record.message for record in caplog.records] == [True]
 
@@ -55,7 +55,7 @@ def test_ardupilot_is_asked_for_a_fast_heartbeat():
     requests = TelemetryRequests(MavlinkBridgeConfig(commands_enabled=True))
     requests.set_autopilot(autopilot_of("ardupilot"))
     assert {n: i for _, n, i in asked(requests, 1)}[BEAT] == 200_000
-    assert CURRENT_MODE_ID not in {n for _, n, _ in asked(requests, 5, start_s=1)}
+    assert CurrentMode.id not in {n for _, n, _ in asked(requests, 5, start_s=1)}
 
 
 @pytest.mark.parametrize(("result", "count"), [(0, 10), (mavlink.MAV_RESULT_DENIED, 2)])

@@ -65,7 +65,7 @@ def test_px4_falls_behind_along_the_orbit_before_it_yields_the_radius():
     assert sent.velocity[0] == pytest.approx(-0.9)
     assert (sent.position - now.vehicle.position)[1] < 1.2
     coast = PX4.coast_of(sent, now.vehicle.position, now.vehicle.velocity, 0.5)
-    assert coast.length_m <= LIMITS.safety.max_coast_m
+    assert coast.length_m <= 0.82 * LIMITS.safety.max_coast_m
 
 
 def test_px4_is_not_pulled_to_a_far_place_faster_than_it_may_fly():
@@ -91,7 +91,7 @@ def test_px4_creeps_on_after_its_stop_so_it_comes_nearer_more_slowly():
     assert isinstance(sent, Setpoint)
     coast = PX4.coast_of(sent, now.vehicle.position, now.vehicle.velocity, 0.5)
     assert coast.creep_towards(0j) > 0.4
-    assert float(coast.place[0].real - coast.place[-1].real) + coast.creep_towards(0j) <= 1.0
+    assert float(coast.place[0].real - coast.place[-1].real) + coast.creep_towards(0j) <= 0.9
     assert -0.5 < sent.velocity[0] < 0.0
     follows = sent_of(wanted, now, np.array([-0.6, 0.0, 0.0]), CENTRE, LIMITS)
     assert isinstance(follows, Setpoint)
@@ -106,7 +106,8 @@ def test_px4_that_lacks_more_of_its_distance_retreats_no_more_slowly():
         wanted = flight(now, comes, (0.5, 0.0, 0.0))._replace(position=now.vehicle.position + np.array([way, 0.0, 0.0]))
         sent = sent_of(wanted, now, comes, CENTRE, LIMITS)
         assert isinstance(sent, Setpoint)
-        assert PX4.coast_of(sent, now.vehicle.position, now.vehicle.velocity, 0.5).length_m <= LIMITS.safety.max_coast_m
+        coast = PX4.coast_of(sent, now.vehicle.position, now.vehicle.velocity, 0.5)
+        assert coast.length_m <= 0.82 * LIMITS.safety.max_coast_m
         ways.append((sent.position - now.vehicle.position)[0])
     assert min(ways) > 0.5
     assert np.all(np.diff(ways) > -0.05)
