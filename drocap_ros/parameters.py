@@ -24,10 +24,10 @@ Values: TypeAlias = dict[str, Any]
 def param(
     default: T,
     description: str,
-    *,
     unit: str = "",
     minimum: float | None = None,
     maximum: float | None = None,
+    *,
     choices: tuple[str, ...] | None = None,
 ) -> T:
     """Dataclass field of a :class:`Parameters` class; the range is inclusive at both ends."""

@@ -10,8 +10,7 @@ from drocap_ros.flight.safety_config import SafetyConfig, height_condition
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.parameters import param
 
-#: Least distance of an orbit from the fence.
-FENCE_ROOM_M = 1.0
+FENCE_ROOM_M = 1.0  # of an orbit from the fence: its braking distance at 1.6 m/s
 
 
 @dataclass(frozen=True)
@@ -34,43 +33,26 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
     signing_key_file: str = param(
         "", "file with the 64 hexadecimal digits of the key by which packets are signed, both ways; empty = unsigned"
     )
-    heartbeat_hz: float = param(1.0, "rate of our heartbeat", unit="Hz", minimum=0.2, maximum=10)
-    attitude_hz: float = param(50.0, "wanted rate of attitude", unit="Hz", minimum=1, maximum=200)
-    position_hz: float = param(30.0, "wanted rate of local position", unit="Hz", minimum=1, maximum=100)
-    gimbal_hz: float = param(
-        20.0, "wanted rate of the gimbal's attitude; 0 = not requested", unit="Hz", minimum=0, maximum=100
-    )
-    status_hz: float = param(
-        5.0, "wanted rate of GPS, battery, estimator and landed state", unit="Hz", minimum=0.2, maximum=20
-    )
+    heartbeat_hz: float = param(1.0, "rate of our heartbeat", "Hz", 0.2, 10)
+    attitude_hz: float = param(50.0, "wanted rate of attitude", "Hz", 1, 200)
+    position_hz: float = param(30.0, "wanted rate of local position", "Hz", 1, 100)
+    gimbal_hz: float = param(20.0, "wanted rate of the gimbal's attitude; 0 = not requested", "Hz", 0, 100)
+    status_hz: float = param(5.0, "wanted rate of GPS, battery, estimator and landed state", "Hz", 0.2, 20)
     time_sync_hz: float = param(
-        10.0,
-        "rate of time synchronization; its answers show that the link works in both directions",
-        unit="Hz",
-        minimum=0.1,
-        maximum=20,
+        10.0, "rate of time synchronization; its answers show that the link works in both directions", "Hz", 0.1, 20
     )
-    rate_window_s: float = param(3.0, "time over which the real rates are measured", unit="s", minimum=1, maximum=30)
+    rate_window_s: float = param(3.0, "time over which the real rates are measured", "s", 1, 30)
     rate_shortfall: float = param(
         0.5, "share of the wanted rate below which a message is requested again", minimum=0, maximum=1
     )
-    request_retry_s: float = param(2.0, "time between requests for the same message", unit="s", minimum=0.2, maximum=60)
-    link_timeout_s: float = param(3.0, "silence after which the link counts as lost", unit="s", minimum=0.5, maximum=60)
-    control_hz: float = param(20.0, "rate of setpoints", unit="Hz", minimum=5, maximum=50)
+    request_retry_s: float = param(2.0, "time between requests for the same message", "s", 0.2, 60)
+    link_timeout_s: float = param(3.0, "silence after which the link counts as lost", "s", 0.5, 60)
+    control_hz: float = param(20.0, "rate of setpoints", "Hz", 5, 50)
     watchdog_s: float = param(
-        0.2,
-        "time without a step of the control loop after which the watchdog holds the vehicle",
-        unit="s",
-        minimum=0.1,
-        maximum=2,
+        0.2, "time without a step of the control loop after which the watchdog holds the vehicle", "s", 0.1, 2
     )
     max_control_timeout_s: float = param(
-        0.5,
-        "longest time-out after which the autopilot may stop by itself when our setpoints stay away "
-        "(read from its parameters): a longer or unknown one forbids motion; 0 = not checked",
-        unit="s",
-        minimum=0,
-        maximum=10,
+        0.5, "longest time-out of the autopilot without setpoints that allows motion; 0 = not checked", "s", 0, 10
     )
     gimbal_control: bool = param(False, "whether the mount's pitch follows the subject")
 

@@ -125,7 +125,7 @@ PICTURE_CODES = frozenset(
 ROUNDING = 1.0 + 1e-6
 
 _C = ConditionCode
-_NEVER_S = 1e8
+_NEVER_S = 1e8  # ages from here on, three years, are those of what never came
 _SENTENCES = {
     _C.NONE: "",
     _C.NO_DATA: "no data of the vehicle yet",

@@ -9,8 +9,8 @@ from drocap_ros.errors import ParameterError
 from drocap_ros.flight.conditions import ROUNDING, Condition, ConditionCode, condition
 from drocap_ros.parameters import Parameters, param
 
-_ROOM_M = 0.5
-LEAST_REVERSAL_S = 10.0
+_ROOM_M = 0.5  # of an orbit from min_distance_m: the error of the flown radius
+LEAST_REVERSAL_S = 10.0  # a turn takes two ramps
 
 
 @dataclass(frozen=True)
@@ -24,52 +24,32 @@ class OrbitConfig(Parameters):
         speed or acceleration than allowed.
     """
 
-    radius_m: float = param(6.0, "horizontal distance from the subject", unit="m", minimum=0, maximum=100)
-    height_m: float = param(2.5, "height above the subject's ground", unit="m", minimum=0, maximum=100)
+    radius_m: float = param(6.0, "horizontal distance from the subject", "m", 0, 100)
+    height_m: float = param(2.5, "height above the subject's ground", "m", 0, 100)
     angular_speed_deg_s: float = param(
-        19.0, "angular speed, positive = counter-clockwise seen from above", unit="deg/s", minimum=-60, maximum=60
+        19.0, "angular speed, positive = counter-clockwise seen from above", "deg/s", -60, 60
     )
-    min_distance_m: float = param(3.0, "least horizontal distance from the subject", unit="m", minimum=1.0, maximum=100)
+    min_distance_m: float = param(3.0, "least horizontal distance from the subject", "m", 1.0, 100)
     max_distance_m: float = param(
-        20.0,
-        "greatest horizontal distance from the subject at which an orbit may begin",
-        unit="m",
-        minimum=2,
-        maximum=200,
+        20.0, "greatest horizontal distance from the subject at which an orbit may begin", "m", 2, 200
     )
-    max_speed_m_s: float = param(4.5, "greatest speed asked of the vehicle", unit="m/s", minimum=0.2, maximum=15)
+    max_speed_m_s: float = param(4.5, "greatest speed asked of the vehicle", "m/s", 0.2, 15)
     max_acceleration_m_s2: float = param(
-        2.0,
-        "greatest acceleration asked of the vehicle; an orbit needs omega^2 radius",
-        unit="m/s^2",
-        minimum=0.1,
-        maximum=5,
+        2.0, "greatest acceleration asked of the vehicle; an orbit needs omega^2 radius", "m/s^2", 0.1, 5
     )
-    max_jerk_m_s3: float = param(2.0, "greatest change of acceleration", unit="m/s^3", minimum=0.1, maximum=20)
-    ramp_s: float = param(3.0, "time to reach the angular speed", unit="s", minimum=0.5, maximum=30)
-    approach_speed_m_s: float = param(1.0, "speed of changes of radius and height", unit="m/s", minimum=0.05, maximum=5)
+    max_jerk_m_s3: float = param(2.0, "greatest change of acceleration", "m/s^3", 0.1, 20)
+    ramp_s: float = param(3.0, "time to reach the angular speed", "s", 0.5, 30)
+    approach_speed_m_s: float = param(1.0, "speed of changes of radius and height", "m/s", 0.05, 5)
     max_closing_m_s: float = param(
-        1.0,
-        "greatest speed towards the subject, whatever his estimate says; behind one who walks away, the speed at "
-        "which his image surely shrinks is added",
-        unit="m/s",
-        minimum=0.2,
-        maximum=5,
+        1.0, "greatest speed towards the subject, beside that at which his image surely shrinks", "m/s", 0.2, 5
     )
     max_subject_speed_m_s: float = param(
-        2.5, "greatest speed at which the orbit's centre follows the subject", unit="m/s", minimum=0, maximum=10
+        2.5, "greatest speed at which the orbit's centre follows the subject", "m/s", 0, 10
     )
-    max_lead_m: float = param(
-        1.5, "greatest distance of the position setpoint from the vehicle", unit="m", minimum=0.2, maximum=10
-    )
+    max_lead_m: float = param(1.5, "greatest distance of the position setpoint from the vehicle", "m", 0.2, 10)
 
     reverse_every_s: float = param(
-        0.0,
-        "time after which the orbit turns its direction, again and again: turns tell the camera's yaw from the "
-        "latency; 0 = never, else at least 10 s",
-        unit="s",
-        minimum=0,
-        maximum=3600,
+        0.0, "time between turns of the direction, which tell yaw from latency; 0 = never, else >= 10 s", "s", 0, 3600
     )
     calibrate_telemetry: bool = param(
         False,

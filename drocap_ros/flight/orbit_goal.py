@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 from drocap_ros.flight.orbit_config import OrbitConfig
 
+WORTH_TELLING = 0.05  # share by which the flown radius or speed differs from the goal where the status says so
+
 
 class OrbitGoal(NamedTuple):
     """Radius, height and angular speed that the operator wants."""

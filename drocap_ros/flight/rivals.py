@@ -11,9 +11,8 @@ from collections.abc import Iterable
 
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 
-#: Time for which a rival counts after its last message, and messages that make one.
-_LASTS_S = 3.0
-_TIMES = 2
+_LASTS_S = 3.0  # for which a rival counts after its last message: it sends several a second
+_TIMES = 2  # that numbers go back, of a rival: those of a restarted publisher do once
 
 
 class Rivals:

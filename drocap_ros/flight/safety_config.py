@@ -21,120 +21,63 @@ class SafetyConfig(Parameters):
         0.4,
         "greatest age of the subject's position at which an orbit may begin; one that is flown slows down from "
         "0.24 s on, and its setpoints stand from 5/6 of this age, 0.33 s, on",
-        unit="s",
-        minimum=0.05,
-        maximum=2,
+        "s",
+        0.05,
+        2,
     )
     max_subject_gap_s: float = param(
-        1.0,
-        "age of the subject's position beyond which an orbit that has slowed down ends by a hold; with a younger "
-        "one it goes on",
-        unit="s",
-        minimum=0.05,
-        maximum=5,
+        1.0, "age of the subject's position beyond which an orbit that has slowed down ends by a hold", "s", 0.05, 5
     )
     max_blind_m: float = param(
-        0.85,
-        "greatest distance flown since the subject was located: at speed its age is limited further, to this "
-        "over the speed, not below 0.25 s",
-        unit="m",
-        minimum=0.1,
-        maximum=10,
+        0.85, "greatest distance flown since the subject was located: it limits his age, to 0.25 s", "m", 0.1, 10
     )
-    max_subject_sd_m: float = param(
-        1.5, "greatest standard deviation of the subject's position", unit="m", minimum=0.05, maximum=10
-    )
+    max_subject_sd_m: float = param(1.5, "greatest standard deviation of the subject's position", "m", 0.05, 10)
     max_state_age_s: float = param(
-        0.2,
-        "greatest age of the vehicle's attitude and position at full speed: 0.4 m at 2 m/s",
-        unit="s",
-        minimum=0.05,
-        maximum=2,
+        0.2, "greatest age of the vehicle's attitude and position at full speed: 0.4 m at 2 m/s", "s", 0.05, 2
     )
     max_state_gap_s: float = param(
-        0.4,
-        "age of the vehicle's attitude or position beyond which an orbit ends by a hold; it slows down before, "
-        "to a stop halfway from max_state_age_s",
-        unit="s",
-        minimum=0.05,
-        maximum=2,
+        0.4, "age of attitude or position beyond which an orbit, slowed down before, ends by a hold", "s", 0.05, 2
     )
-    max_status_age_s: float = param(
-        1.5, "greatest age of GPS, estimator and battery messages", unit="s", minimum=0.3, maximum=10
-    )
-    max_heartbeat_age_s: float = param(2.5, "greatest age of the flight mode", unit="s", minimum=0.3, maximum=10)
+    max_status_age_s: float = param(1.5, "greatest age of GPS, estimator and battery messages", "s", 0.3, 10)
+    max_heartbeat_age_s: float = param(2.5, "greatest age of the flight mode", "s", 0.3, 10)
     max_round_trip_s: float = param(
-        0.5,
-        "greatest time since the sending of the message that the autopilot has answered last",
-        unit="s",
-        minimum=0.02,
-        maximum=5,
+        0.5, "greatest time since the sending of the message that the autopilot has answered last", "s", 0.02, 5
     )
     max_echo_age_s: float = param(
-        0.5,
-        "time without the autopilot's echo of our setpoints after which it counts as not following them",
-        unit="s",
-        minimum=0.3,
-        maximum=10,
+        0.5, "time without the autopilot's echo after which it counts as not following our setpoints", "s", 0.3, 10
     )
     min_battery_fraction: float = param(0.25, "least charge of the battery", minimum=0, maximum=1)
     min_battery_voltage_v: float = param(
-        0.0,
-        "least voltage of the battery in flight, for a monitor that reports no charge too; 0 = not used",
-        unit="V",
-        minimum=0,
-        maximum=120,
+        0.0, "least voltage of the battery in flight, also where no charge is reported; 0 = not used", "V", 0, 120
     )
-    fence_radius_m: float = param(
-        40.0, "greatest horizontal distance from where the orbit began", unit="m", minimum=5, maximum=1000
-    )
-    min_height_m: float = param(1.2, "least height above the subject's ground", unit="m", minimum=0.3, maximum=100)
-    max_height_m: float = param(20.0, "greatest height above the subject's ground", unit="m", minimum=1, maximum=120)
+    fence_radius_m: float = param(40.0, "greatest horizontal distance from where the orbit began", "m", 5, 1000)
+    min_height_m: float = param(1.2, "least height above the subject's ground", "m", 0.3, 100)
+    max_height_m: float = param(20.0, "greatest height above the subject's ground", "m", 1, 120)
     braking_m_s2: float = param(
-        1.3,
-        "assumed deceleration: the margin to every limit is v^2 / (2 of this)",
-        unit="m/s^2",
-        minimum=0.2,
-        maximum=10,
+        1.3, "assumed deceleration: the margin to every limit is v^2 / (2 of this)", "m/s^2", 0.2, 10
     )
     max_coast_m: float = param(
         3.0,
         "distance that the vehicle may fly on if setpoints end, the autopilot's time-out included: it limits the "
         "speed, to 1.3 to 1.8 m/s by the autopilot with a time-out of 0.5 s, up to 2.1 m/s with 0.3 s",
-        unit="m",
-        minimum=0.5,
-        maximum=50,
+        "m",
+        0.5,
+        50,
     )
     speed_margin: float = param(
         1.3, "share of max_speed_m_s above which the vehicle is stopped", minimum=1.0, maximum=3.0
     )
     hold_s: float = param(
-        3.0,
-        "time for which setpoints hold the position before the autopilot's hold mode is requested, if the "
-        "vehicle has not come to rest before",
-        unit="s",
-        minimum=0.5,
-        maximum=30,
+        3.0, "longest time of a moving vehicle's hold before the autopilot's hold mode is requested", "s", 0.5, 30
     )
     blind_hold_s: float = param(
-        3.5,
-        "time for which setpoints hold the position after the vehicle is lost from sight (telemetry silent or "
-        "late), before nothing more is sent and the autopilot's time-out ends the "
-        "control: braking from 4.5 m/s at 1.3 m/s^2 takes 3.5 s",
-        unit="s",
-        minimum=0.5,
-        maximum=30,
+        3.5, "longest hold while telemetry is silent or late: braking from 4.5 m/s takes 3.5 s", "s", 0.5, 30
     )
     resume_after_hold_s: float = param(
-        0.0,
-        "time after the beginning of a hold in which the orbit may resume by itself, if only the age of subject, "
-        "picture, attitude or position began it and has passed; 0 = never",
-        unit="s",
-        minimum=0,
-        maximum=30,
+        0.0, "from the beginning of a hold by old data, in which the orbit may resume by itself; 0 = never", "s", 0, 30
     )
     engage_timeout_s: float = param(
-        5.0, "time for the autopilot to enter GUIDED or OFFBOARD after `engage`", unit="s", minimum=1, maximum=30
+        5.0, "time for the autopilot to enter GUIDED or OFFBOARD after `engage`", "s", 1, 30
     )
 
     def __post_init__(self) -> None:

@@ -15,13 +15,9 @@ MOUNT_KINDS = ("auto", "gimbal", "servo", "fixed")
 class SubjectConfig(Parameters):
     """Assumptions about body, ground and sensors that locate the subject."""
 
-    body_height_m: float = param(1.7, "assumed height of the subject", unit="m", minimum=0.5, maximum=2.5)
+    body_height_m: float = param(1.7, "assumed height of the subject", "m", 0.5, 2.5)
     ground_height_m: float = param(
-        0.0,
-        "height of the subject's ground in the map frame (0 = where the autopilot's local frame begins)",
-        unit="m",
-        minimum=-500,
-        maximum=500,
+        0.0, "height of the subject's ground in the map frame; 0 = where the local frame begins", "m", -500, 500
     )
     use_ground_plane: bool = param(True, "use the range of the feet on level ground too; switch off on slopes")
     size_error: float = param(
@@ -31,28 +27,14 @@ class SubjectConfig(Parameters):
         maximum=1,
     )
     height_error_m: float = param(
-        0.5,
-        "standard deviation of the camera's height above the subject's ground, as much as reports of it wander",
-        unit="m",
-        minimum=0,
-        maximum=20,
+        0.5, "standard deviation of the camera's height above the subject's ground", "m", 0, 20
     )
-    attitude_error_deg: float = param(
-        0.6, "standard deviation of the camera's attitude", unit="deg", minimum=0, maximum=20
-    )
+    attitude_error_deg: float = param(0.6, "standard deviation of the camera's attitude", "deg", 0, 20)
     camera_latency_s: float = param(
-        0.0,
-        "time from the exposure to the stamp of an image, subtracted from the stamps: 0.07 s were seen of USB cameras",
-        unit="s",
-        minimum=0,
-        maximum=0.5,
+        0.0, "exposure to stamp of an image, subtracted from it; 0.07 s were seen of USB cameras", "s", 0, 0.5
     )
     subject_acceleration_m_s2: float = param(
-        1.2,
-        "standard deviation of the change of a subject's velocity in a second",
-        unit="m/s^2",
-        minimum=0.05,
-        maximum=20,
+        1.2, "standard deviation of the change of a subject's velocity in a second", "m/s^2", 0.05, 20
     )
     subject_gate: float = param(
         16.3, "squared Mahalanobis distance beyond which a measurement is not the subject", minimum=3, maximum=1000
@@ -65,9 +47,5 @@ class SubjectConfig(Parameters):
         choices=MOUNT_KINDS,
     )
     camera_pitch_deg: float = param(
-        0.0,
-        "pitch of a fixed camera against the body, as in MAVLink: negative = it looks down",
-        unit="deg",
-        minimum=-90,
-        maximum=90,
+        0.0, "pitch of a fixed camera against the body, as in MAVLink: negative = it looks down", "deg", -90, 90
     )

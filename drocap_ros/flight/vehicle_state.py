@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 LANDED_UNDEFINED, LANDED_ON_GROUND, LANDED_IN_AIR, LANDED_TAKEOFF, LANDED_LANDING = range(5)
-SATELLITES_UNKNOWN = 255
+SATELLITES_UNKNOWN = 255  # by GPS_RAW_INT
 
 
 def _unknown(size: int) -> np.ndarray:

@@ -19,15 +19,13 @@ from drocap_ros.flight.autopilot.autopilot import (
 from drocap_ros.flight.autopilot.coasting import ContinuedCoasting
 from drocap_ros.flight.autopilot.simulated import Airframe, Decay, Gains, ReportErrors, Simulated
 
-_NO_PLACE = 16 | 32  # bits of GUID_OPTIONS: the vehicle drifts off its setpoints and its hold
-_WEATHERVANE = 128  # bit of GUID_OPTIONS: turns into the wind
 _GOES_ON = "on the autopilot: else the orbit goes on when the remote control is lost, and nobody takes over by it"
 _SLOW_STOP = "on the autopilot, as shipped since 4.1: with less each stop is longer, that after the bridge's death too"
 
 
 def _guided_options(value: float, _: FlownSpeeds) -> Level:
-    bits = int(value)
-    return Level.MISSING if bits & _NO_PLACE else Level.WARNING if bits & _WEATHERVANE else Level.OK
+    bits = int(value)  # 4 and 5: it drifts off its setpoints and its hold; 7: it turns into the wind
+    return Level.MISSING if bits & (16 | 32) else Level.WARNING if bits & 128 else Level.OK
 
 
 def _fence(setting: Callable[[str], float]) -> Fence:

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 _RETRY_S = 0.4  # between tries: two round trips at the longest that is flown with
-_TRIES = 5
+_TRIES = 5  # 2 s of them: an autopilot that does not answer then has not heard
 _PROGRESS_S = 3.0  # more patience with an autopilot that answers IN_PROGRESS
-_REPEAT_S = 1.5  # after an answer: the mode it granted has been reported by then
-_SECOND_ANSWER_S = 1.0  # after the first: measured, 0.04 s
+_REPEAT_S = 1.5  # after an answer: the mode it granted has been reported by then, and a second answer has come
 _NOT_ANSWERED = -1  # beside the MAV_RESULTs
 _RESULTS = {
     mavlink.MAV_RESULT_ACCEPTED: "accepted",
@@ -78,7 +77,7 @@ class CommandQueue:
             return
         if pending.result is not None:
             accepted = pending.result == mavlink.MAV_RESULT_ACCEPTED
-            if not accepted or result == pending.result or now_s - pending.answered_s > _SECOND_ANSWER_S:
+            if not accepted or result == pending.result or now_s - pending.answered_s > _REPEAT_S:
                 return
             pending.result = None
         if result == mavlink.MAV_RESULT_IN_PROGRESS:

@@ -20,7 +20,6 @@ from drocap_ros.stamps import NS
 
 _EARTH, _NOSE = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME, mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
 _STALE_S = {"gimbal": 3.0, "servo": 0.5}  # without angles; those of servos follow the body's lean
-_UNKNOWN_S = 0.5  # without angles, from a mount that reports and does not know them
 _STEP_S = 0.25  # between two reports, beyond which a rotation is not extrapolated
 #: A servo follows its demanded angle this much later: a frame of its signal, and its turning.
 _SERVO_DELAY_S = 0.05
@@ -57,7 +56,7 @@ class Mount:
     @property
     def _stale_s(self) -> float:
         """Greatest age of the angles in s: less where the mount still reports, and not its angles (NaN)."""
-        return min(_STALE_S.get(self.kind, math.inf), math.inf if self._knows else _UNKNOWN_S)
+        return min(_STALE_S.get(self.kind, math.inf), math.inf if self._knows else _STALE_S["servo"])
 
     def take(self, message: Message, now_ns: int) -> None:
         """Take a message of the mount."""

@@ -12,7 +12,6 @@ from drocap_ros.errors import InputError
 from drocap_ros.flight.mavlink.message import Message
 
 _EPOCH_NS = 1_420_070_400_000_000_000  # 2015-01-01, from which signing counts in units of 10 us
-_UNIT_NS = 10_000  # of a signature's time: MAVLink's definition
 _LONGEST_FILE = 1024  # bytes of a key's file that are read: it has 64 digits
 
 
@@ -81,7 +80,7 @@ def read_signing_key(path: str) -> bytes:
 
 def signing_time(now_ns: int) -> int:
     """Time of a signature: 10 us since 2015; 0 from a clock that was never set."""
-    return max((now_ns - _EPOCH_NS) // _UNIT_NS, 0)
+    return max((now_ns - _EPOCH_NS) // 10_000, 0)
 
 
 def sign_with(mav: mavlink.MAVLink, key: bytes, now_ns: int, link_id: int = 0) -> None:

@@ -19,16 +19,11 @@ from drocap_ros.geometry.geodesy import geodetic_to_enu
 from drocap_ros.stamps import NS
 
 #: Flags of a usable estimate: all of these, and either horizontal position.
-_ESTIMATOR_NEEDED = (
-    mavlink.ESTIMATOR_ATTITUDE
-    | mavlink.ESTIMATOR_VELOCITY_HORIZ
-    | mavlink.ESTIMATOR_VELOCITY_VERT
-    | mavlink.ESTIMATOR_POS_VERT_ABS
-)
+_ESTIMATOR_NEEDED = mavlink.ESTIMATOR_ATTITUDE | mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_VELOCITY_VERT
+_ESTIMATOR_NEEDED |= mavlink.ESTIMATOR_POS_VERT_ABS
 _ESTIMATOR_POSITION = mavlink.ESTIMATOR_POS_HORIZ_REL | mavlink.ESTIMATOR_POS_HORIZ_ABS
 
-_POSITION_STALE_S = 3.0  # without a position: a link's silence counts then too
-_ESTIMATOR_STALE_S = 5.0  # without a report of the estimator's health, which comes once a second at least
+_STALE_S = 3.0  # of position and estimator's health, which come once a second at least: a link's silence counts then
 _QUATERNION_PREFERRED_S = 1.0  # after one, the angles of the same attitude do not count
 _EXTRAPOLATE_S = 0.5  # by the velocity, from the position to the attitude: positions come at 2 Hz at least
 
@@ -148,7 +143,7 @@ class VehicleStateEstimator:
         self._reported = dataclasses.replace(self._reported, **values)  # type: ignore[arg-type]  # a field of each kind
 
     def _estimator_ok(self, autopilot: Autopilot, now_ns: int) -> bool:
-        if self._estimator is None or (now_ns - self._estimator[0]) / NS >= _ESTIMATOR_STALE_S:
+        if self._estimator is None or (now_ns - self._estimator[0]) / NS >= _STALE_S:
             return False
         rests = not self.modes.armed and self._reported.landed_state == LANDED_ON_GROUND
         flags, bad = self._estimator[1], autopilot.estimator_bad & ~(autopilot.rest_flags if rests else 0)
@@ -216,7 +211,7 @@ class VehicleStateEstimator:
             return False
         latitude, longitude, altitude = geodetic.tolist()
         self._report(latitude_deg=latitude, longitude_deg=longitude, altitude_amsl_m=altitude)
-        if (now_ns - self._local_position_ns) / NS < _POSITION_STALE_S:
+        if (now_ns - self._local_position_ns) / NS < _STALE_S:
             return False
         # No local position: our own frame, with its origin on the ground below the first position.
         if self._origin is None:
@@ -272,7 +267,7 @@ class VehicleStateEstimator:
             return np.full(3, np.nan), np.full(3, np.nan)
         since, position, velocity = self._position
         gap_s = (boot_ns - since) / NS
-        if abs(gap_s) > _POSITION_STALE_S:
+        if abs(gap_s) > _STALE_S:
             return np.full(3, np.nan), np.full(3, np.nan)
         return position + velocity * min(max(gap_s, -_EXTRAPOLATE_S), _EXTRAPOLATE_S), velocity
 

@@ -84,18 +84,22 @@ class CommandDesk:
         if not self._waiting:
             return None
         command = self._waiting.popleft()
-        if (refusal := command_condition(command, now_ns)) is not None:
-            self.answer(command, CommandAnswer(False, refusal))
-            return None
-        kind = Command(command.kind)
-        running = state.state == State.ORBITING
-        if (kind == Command.ADJUST and not running) or (kind != Command.ADJUST and (running or state.requesting)):
+        order = command_condition(command, now_ns) or self._order(command, state, goal, framing)
+        if isinstance(order, Order):
+            return order
+        self.answer(command, CommandAnswer(False, order))
+        return None
+
+    def _order(
+        self, command: OperatorCommand, state: SafetyState, goal: OrbitGoal, framing: Framing
+    ) -> Order | Condition:
+        """The order of a valid command, or why the limits forbid what it asks for."""
+        kind, running = Command(command.kind), state.state == State.ORBITING
+        adjusts = kind == Command.ADJUST
+        if adjusts != running or (state.requesting and not adjusts):
             return Order(command, kind)  # the state decides, and the goal stays
-        wanted = commanded_goal(self._config, command, goal if kind == Command.ADJUST else None, framing)
-        if isinstance(wanted, Condition):
-            self.answer(command, CommandAnswer(False, wanted))
-            return None
-        return Order(command, kind, wanted)
+        wanted = commanded_goal(self._config, command, goal if adjusts else None, framing)
+        return wanted if isinstance(wanted, Condition) else Order(command, kind, wanted)
 
     def _overrule(self, stop: OperatorCommand) -> None:
         overruled = condition(ConditionCode.OVERRULED_BY_STOP)

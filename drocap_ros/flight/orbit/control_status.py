@@ -10,9 +10,8 @@ from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.orbit.planner import OrbitState
 from drocap_ros.flight.orbit.states import Action, CommandAnswer, OperatorCommand, State
-from drocap_ros.flight.orbit_goal import OrbitGoal
+from drocap_ros.flight.orbit_goal import WORTH_TELLING, OrbitGoal
 
-_WIDER = 1.05
 _CLEAR = (
     "clear of min_distance_m, {:g} m, if the range is wrong; size_error, {:g}, may be 0.04 where body_height_m is the"
     " subject's"
@@ -60,7 +59,7 @@ def widened_condition(
 
     framed_radius_m : least radius at which one who walks stays in the picture
     """
-    if present.code != ConditionCode.ORBITING or orbit.goal_radius <= _WIDER * goal.radius_m:
+    if present.code != ConditionCode.ORBITING or orbit.goal_radius <= (1.0 + WORTH_TELLING) * goal.radius_m:
         return present, goal
     why = _FRAMED if orbit.goal_radius <= framed_radius_m else _CLEAR.format(config.min_distance_m, config.size_error)
     widened = condition(

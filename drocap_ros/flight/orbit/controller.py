@@ -31,7 +31,7 @@ from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.observation import PoseObservation
 
 _STANDING_M_S = 0.05  # speed below which a setpoint stands
-_GIMBAL_PERIOD_S = 0.5
+_GIMBAL_PERIOD_S = 0.5  # between pitches of the mount: radius and height change slowly
 _MODE_AGE_STEPS = 1.5  # a report of the mode is seen in the step that follows it
 
 
@@ -133,14 +133,17 @@ class OrbitController:
             self._desk.answer(order.command, decision.answer)
             if order.goal is not None and decision.answer.accepted:
                 self._orbit.goal = order.goal
-        if hung and not seen.jumped and self.safety.state == State.HOLDING and self._fallback is not None:
-            # The watchdog already holds a position: a new one, farther on, would let the vehicle move on.
-            self.safety = dataclasses.replace(
-                self.safety, hold_position=self._fallback.position, hold_yaw=self._fallback.yaw
-            )
+        if hung and not seen.jumped:
+            self._hold_as_watchdog()
         if self.safety.state != before.state:
             self._on_change(seen)
         return decision.action, decision.mode_request
+
+    def _hold_as_watchdog(self) -> None:
+        """The watchdog already holds a position: a new one, farther on, would let the vehicle move on."""
+        held = self._fallback
+        if held is not None and self.safety.state == State.HOLDING:
+            self.safety = dataclasses.replace(self.safety, hold_position=held.position, hold_yaw=held.yaw)
 
     def _on_change(self, seen: Observed) -> None:
         if self.safety.state == State.ORBITING and seen.subject.position is not None:

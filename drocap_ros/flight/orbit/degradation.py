@@ -15,21 +15,19 @@ from drocap_ros.flight.autopilot.setpoint import Setpoint
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.motion_checks import (
+    GUST_S,
     keeping_condition,
     oldest_state_s,
     oldest_subject_s,
     outdated_condition,
 )
 from drocap_ros.flight.orbit.states import Limits, Pace
-from drocap_ros.flight.subject.framing import framed_pace
+from drocap_ros.flight.subject.framing import LEAST_PACE, framed_pace
 
 _C = ConditionCode
 _USUAL_SUBJECT_AGE_S = 0.24  # a camera at 15 Hz, and 0.17 s for its network
 _STANDING_AGE = 5 / 6  # of max_subject_age_s, 0.33 s: the last moving setpoint
-_CONTRADICTED_PACE = 0.3
-_AWAY_S = 1.0  # away from the place on the orbit, after which the operator is told: a gust passes
 _COMES_M_S = 0.3  # speed of the subject towards the vehicle, from which the orbit gives way unslowed
-_WHOLE_WAY_PACE = 0.3  # below it the setpoint is nearer than the reference
 _CHANGE = 0.6  # 1/s; how fast a vehicle of 2 m/s brakes and accelerates, 1.2 m/s^2
 
 
@@ -49,7 +47,7 @@ def allowed_pace(seen: Observed, limits: Limits) -> Allowed:
     usual_subject_s = min(_USUAL_SUBJECT_AGE_S, 0.8 * subject_s)
     allowed = Allowed(1.0, None)
     if seen.subject.contradicted:  # at once: most of what is flown after a jump is flown before the hold
-        allowed = Allowed(_CONTRADICTED_PACE, condition(_C.OTHER_SUBJECT, age_s=seen.subject.age_s))
+        allowed = Allowed(LEAST_PACE, condition(_C.OTHER_SUBJECT, age_s=seen.subject.age_s))
     pace = _share(seen.subject.age_s, usual_subject_s, subject_s)
     if pace < allowed.pace:
         allowed = Allowed(pace, outdated_condition(seen, usual_subject_s))
@@ -62,7 +60,7 @@ def allowed_pace(seen: Observed, limits: Limits) -> Allowed:
         if pace < allowed.pace:
             allowed = Allowed(pace, condition(code, age_s=age_s))
     if allowed.cause is None:  # the reference waits by itself
-        allowed = allowed._replace(cause=keeping_condition(seen, limits, _AWAY_S))
+        allowed = allowed._replace(cause=keeping_condition(seen, limits, GUST_S))
     # A slower orbit gives way more slowly: a subject who comes nearer leaves the picture, and is near.
     framed = min(max(framed_pace(seen.pictures.framing_margin), seen.subject.approach_m_s / _COMES_M_S), 1.0)
     if framed < allowed.pace:
@@ -105,7 +103,7 @@ def slowed(setpoint: Setpoint, pace: Pace, max_acceleration_m_s2: float) -> Setp
     if pace.value == 1.0 and pace.rate == 0.0:
         return setpoint
     if pace.place is not None:
-        way = min(pace.value / _WHOLE_WAY_PACE, 1.0)
+        way = min(pace.value / LEAST_PACE, 1.0)  # below it the setpoint is nearer than the reference
         setpoint = setpoint._replace(position=pace.place + way * (setpoint.position - pace.place))
     acceleration = pace.value**2 * setpoint.acceleration
     if pace.value > 0.0:

@@ -23,9 +23,8 @@ from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.vehicle_state import VehicleState
 
 _SENT_S = 0.7  # a setpoint may be echoed for so long at most: two transmissions and the period of the echo
-_ECHOED_S = 0.25  # beyond the age of the echo and two transmissions: two periods of it, and a step
+_ECHOED_S = 0.25  # two periods of the echo, and a step: beyond its age and two transmissions, and without agreement
 _AHEAD_S = 0.5  # along its velocity, by which the echoed place may be ahead
-_MISMATCH_S = 0.25  # longer than two echoes
 #: Window in s, least commanded speed in m/s, and share of the commanded speed below which the vehicle stands for all
 #: of the window.  In every recorded flight of the orbit it reached 0.46, and along the command, with the way, 0.27.
 _BY_SPEED, _BY_WAY = (1.0, 0.6, 0.25), (2.0, 0.6, 0.15)
@@ -66,32 +65,35 @@ class Following:
         now_s : monotonic
         orbiting_s : how long the orbit has been flown; 0 = it is not
         """
-        sent, echo, trip_s = echoes
-        if orbiting_s == 0.0 or not sent or vehicle is None:
+        if orbiting_s == 0.0 or not echoes.sent or vehicle is None:
             self._matched_s = math.nan
             self._by_speed.clear()
             self._by_way.clear()
             return ""
-        if echo is not None:
-            age_s, target = echo
-            if min(age_s, orbiting_s) > self._max_echo_age_s:
-                return f"no echo of a target for {age_s:.1f} s"
-            oldest_s = min(_SENT_S, age_s + trip_s + _ECHOED_S) if math.isfinite(trip_s) else _SENT_S
-            recent = [message for at_s, message in sent if now_s - at_s <= oldest_s]
-            if _agrees(target, recent, autopilot_of(vehicle.autopilot).echo):
-                self._matched_s = now_s
-            elif now_s - self._matched_s > _MISMATCH_S:  # NaN: its content has not agreed yet, and is not judged
-                return "the autopilot's target is none that was sent"
-        setpoint, flown = sent[-1][1], vehicle.velocity_enu_m_s[:2]
+        autopilot = autopilot_of(vehicle.autopilot)
+        evidence = self._by_echo(now_s, orbiting_s, echoes, autopilot.echo)
+        return evidence or self._by_motion(now_s, echoes.sent[-1][1], vehicle, autopilot.position_gain_per_s)
+
+    def _by_echo(self, now_s: float, orbiting_s: float, echoes: Echoes, most: Echo) -> str:
+        sent, echo, trip_s = echoes
+        if echo is None:
+            return ""
+        age_s, target = echo
+        if min(age_s, orbiting_s) > self._max_echo_age_s:
+            return f"no echo of a target for {age_s:.1f} s"
+        oldest_s = min(_SENT_S, age_s + trip_s + _ECHOED_S) if math.isfinite(trip_s) else _SENT_S
+        if _agrees(target, [message for at_s, message in sent if now_s - at_s <= oldest_s], most):
+            self._matched_s = now_s
+        # NaN: its content has not agreed yet, and is not judged.
+        return "the autopilot's target is none that was sent" if now_s - self._matched_s > _ECHOED_S else ""
+
+    def _by_motion(self, now_s: float, setpoint: Message, vehicle: VehicleState, gain_per_s: float) -> str:
+        flown = vehicle.velocity_enu_m_s[:2]
         commanded = np.array([setpoint.vy, setpoint.vx], dtype=float)
         along_m_s = float(np.hypot(*commanded))
         # Before a vehicle that stands the reference waits: its speed falls, and the way to its place remains.
         way = np.array([setpoint.y, setpoint.x], dtype=float) - vehicle.position_enu_m[:2]
-        commanded += (
-            way
-            * min(1.0, _MOST_WAY_M / max(float(np.hypot(*way)), 1e-6))
-            * autopilot_of(vehicle.autopilot).position_gain_per_s
-        )
+        commanded += gain_per_s * min(1.0, _MOST_WAY_M / max(float(np.hypot(*way)), 1e-6)) * way
         speed_m_s = float(np.hypot(*commanded))
         # A vehicle stands where the way to its place and the velocity there cancel, as after an adjustment.
         stands = self._by_speed.judge(now_s, min(along_m_s, speed_m_s), float(np.hypot(*flown)))

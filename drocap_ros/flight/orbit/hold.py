@@ -11,15 +11,14 @@ from drocap_ros.flight.conditions import PICTURE_CODES, Condition, ConditionCode
 from drocap_ros.flight.mavlink.mode_reports import MAX_LOSS
 from drocap_ros.flight.observed import Observed
 from drocap_ros.flight.orbit.motion_checks import braking_distance, subject_located
+from drocap_ros.flight.orbit.sight import UNSEEN_S
 from drocap_ros.flight.orbit.states import Limits, SafetyState, State
 from drocap_ros.flight.safety_config import SafetyConfig
 
 _AT_REST_M_S = 0.35  # below it a vehicle stands, by a velocity that errs by as much
-_AT_REST_S = 0.5  # least time of a hold, before its mode is requested
 _SETTLED_S = 0.3  # slow for so long: a vehicle that springs back is slow for a moment where it turns
-_DEAD_RECKONING_S = 0.6
-_FRESH_S = 0.25
-_UNSURE_S = 0.5  # without a place after a jump of the reported position: velocity zero
+_LEAST_S = 0.5  # of a hold before its mode is requested, and of reports without a jump before their place is latched
+_DEAD_RECKONING_S = 0.6  # of a position by the last velocity: 0.15 m at its recorded error
 _NEAR_M = 5.0  # distance of the subject, below which the hold lies on the way out
 _FAST_M_S = 1.0  # speed away from him, above which it does anyway
 _STOPPING_S = 1.2  # from 1.5 m/s at braking_m_s2, 1.3
@@ -27,7 +26,7 @@ _MAX_WAY_OUT_M = 1.5  # as max_lead_m
 _LEAD_S = 1.5  # of his way, by which a retreat is ahead of one who comes
 _CLEAR_M = 0.3  # of a retreat, beyond min_distance_m
 _MAX_LEAD_M = 3.0  # of the retreat's place from the vehicle: its speed is bounded by it
-_HOLD_MODE_PATIENCE_S = 5.0
+_HOLD_MODE_PATIENCE_S = 5.0  # as engage_timeout_s
 #: Causes that pass by themselves.  A silent link is none of them: motion does not resume because a link returns.
 _HARMLESS = PICTURE_CODES | {ConditionCode.ATTITUDE_OUTDATED, ConditionCode.POSITION_FROZEN}
 
@@ -45,14 +44,12 @@ def begin_hold(
     """
     vehicle = seen.vehicle
     age_s = max(vehicle.position_age_s, vehicle.age_s)
-    known = vehicle.known and seen.health.located and age_s <= _DEAD_RECKONING_S and not seen.jumped
-    fresh = known and max(seen.link.age_s, age_s) <= _FRESH_S
+    known = located(seen) and age_s <= _DEAD_RECKONING_S
+    fresh = known and max(seen.link.age_s, age_s) <= UNSEEN_S
     place = None
-    if known and state.pace.value == 0.0 and reason.code in _HARMLESS:
-        place = state.pace.place  # the setpoint has stood there
-    elif known:
-        behind_s = 0.0 if fresh else max(vehicle.position_age_s - vehicle.age_s, 0.0)
-        place = vehicle.position + vehicle.velocity * behind_s + _way_out(seen)
+    if known:
+        stood = state.pace.value == 0.0 and reason.code in _HARMLESS
+        place = state.pace.place if stood else _stopping_place(seen, fresh)
     return dataclasses.replace(
         state,
         state=State.HOLDING,
@@ -69,6 +66,19 @@ def begin_hold(
         resumable=reason.code in _HARMLESS,
         clear_s=math.nan,
     )
+
+
+def located(seen: Observed) -> bool:
+    """Whether the vehicle's place is known, and is the place that the last steps meant."""
+    return seen.vehicle.known and seen.health.located and not seen.jumped
+
+
+def _stopping_place(seen: Observed, fresh: bool) -> np.ndarray:
+    """(3,) m, where a vehicle is to stop whose position is as old as reported."""
+    vehicle = seen.vehicle
+    behind_s = 0.0 if fresh else max(vehicle.position_age_s - vehicle.age_s, 0.0)
+    place: np.ndarray = vehicle.position + vehicle.velocity * behind_s + _way_out(seen)
+    return place
 
 
 def _way_out(seen: Observed) -> np.ndarray:
@@ -94,16 +104,16 @@ def update_hold(state: SafetyState, seen: Observed, now_s: float, blind: bool) -
     """
     if seen.jumped:  # no place is known, not even the new one: the reports may be two vehicles'
         state = dataclasses.replace(state, hold_position=None, blind=True, since_s=now_s, jumped_s=now_s)
-    settled = now_s - state.jumped_s > _UNSURE_S
+    settled = now_s - state.jumped_s > _LEAST_S
     if state.blind and not blind and settled:
         state = dataclasses.replace(state, blind=False, since_s=now_s, hold_mode_s=math.nan)
         if state.hold_position is None:
             state = dataclasses.replace(state, hold_position=seen.vehicle.position.copy(), hold_yaw=seen.vehicle.yaw)
-    late = not math.isnan(state.hold_mode_s) and now_s - state.hold_mode_s > _HOLD_MODE_PATIENCE_S
-    if state.state == State.HOLDING and late and not seen.mode.in_hold and math.isnan(state.lost_s):
-        reason = condition(ConditionCode.HOLD_MODE_MISSING, cause=state.condition)
-        return dataclasses.replace(state, state=State.FAULT, since_s=now_s, condition=reason)
-    return state
+    late = now_s - state.hold_mode_s > _HOLD_MODE_PATIENCE_S  # NaN: it was not requested
+    if not late or state.state != State.HOLDING or seen.mode.in_hold or not math.isnan(state.lost_s):
+        return state
+    reason = condition(ConditionCode.HOLD_MODE_MISSING, cause=state.condition)
+    return dataclasses.replace(state, state=State.FAULT, since_s=now_s, condition=reason)
 
 
 def resumption(
@@ -125,11 +135,8 @@ def retreat(state: SafetyState, seen: Observed, now_s: float, limits: Limits) ->
 
     Only a subject that is located counts, and only until the autopilot's hold mode has been requested.
     """
-    place, subject, safety = state.hold_position, seen.subject.position, limits.safety
-    settled = state.blind or not math.isnan(state.hold_mode_s) or seen.mode.in_hold
-    if settled or not state.retreats or place is None or subject is None or state.fence_centre is None:
-        return state
-    if not subject_located(seen, safety):
+    place, subject, fence, safety = state.hold_position, seen.subject.position, state.fence_centre, limits.safety
+    if place is None or subject is None or fence is None or not _may_retreat(state, seen, safety):
         return state
     wanted = limits.orbit.min_distance_m + seen.subject.sd_m + _LEAD_S * max(seen.subject.approach_m_s, 0.0) + _CLEAR_M
     if not seen.subject.distance_m < wanted or np.hypot(*(place - subject)[:2]) >= wanted:
@@ -138,23 +145,30 @@ def retreat(state: SafetyState, seen: Observed, now_s: float, limits: Limits) ->
     target = subject[:2] + wanted * outward
     step = target - seen.vehicle.position[:2]
     target = seen.vehicle.position[:2] + step * min(1.0, _MAX_LEAD_M / max(float(np.hypot(*step)), 1e-6))
-    offset = target - state.fence_centre
+    offset = target - fence
     room = safety.fence_radius_m - braking_distance(limits.orbit.max_speed_m_s, safety)
-    target = state.fence_centre + offset * min(1.0, room / max(float(np.hypot(*offset)), 1e-6))
+    target = fence + offset * min(1.0, room / max(float(np.hypot(*offset)), 1e-6))
     return dataclasses.replace(state, hold_position=np.append(target, place[2]), retreated_s=now_s)
+
+
+def _may_retreat(state: SafetyState, seen: Observed, safety: SafetyConfig) -> bool:
+    settled = state.blind or not math.isnan(state.hold_mode_s) or seen.mode.in_hold
+    return state.retreats and not settled and subject_located(seen, safety)
 
 
 def request_hold_mode(state: SafetyState, seen: Observed, now_s: float, config: SafetyConfig) -> SafetyState:
     """Allow the request of the hold mode once the vehicle is at rest, or after ``hold_s``; not on a lossy link."""
-    if state.state != State.HOLDING or not math.isnan(state.hold_mode_s) or state.blind or not math.isnan(state.lost_s):
+    if not _awaits_hold_mode(state) or state.blind or seen.link.packet_loss > MAX_LOSS:
         return state
-    if seen.link.packet_loss > MAX_LOSS or (state.resumable and now_s - state.since_s <= config.resume_after_hold_s):
+    if state.resumable and now_s - state.since_s <= config.resume_after_hold_s:
         return state
+    slow = bool(np.linalg.norm(seen.vehicle.velocity) < _AT_REST_M_S)
+    if slow == math.isnan(state.slow_s):
+        state = dataclasses.replace(state, slow_s=now_s if slow else math.nan)
     held_s = now_s - max(state.since_s, state.retreated_s)
-    if not np.linalg.norm(seen.vehicle.velocity) < _AT_REST_M_S:
-        state = dataclasses.replace(state, slow_s=math.nan)
-    elif math.isnan(state.slow_s):
-        state = dataclasses.replace(state, slow_s=now_s)
-    # Slow for a while: a vehicle that springs back is slow for a moment where it turns.
-    still = now_s - state.slow_s >= _SETTLED_S and held_s > _AT_REST_S
+    still = now_s - state.slow_s >= _SETTLED_S and held_s > _LEAST_S
     return dataclasses.replace(state, hold_mode_s=now_s) if still or held_s > config.hold_s else state
+
+
+def _awaits_hold_mode(state: SafetyState) -> bool:
+    return state.state == State.HOLDING and math.isnan(state.hold_mode_s) and math.isnan(state.lost_s)

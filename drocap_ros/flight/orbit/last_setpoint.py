@@ -18,28 +18,27 @@ from drocap_ros.flight.autopilot.coasting import Coast
 from drocap_ros.flight.autopilot.setpoint import Setpoint, hold_setpoint
 from drocap_ros.flight.conditions import Condition, ConditionCode, condition
 from drocap_ros.flight.observed import Observed, SizeSight
+from drocap_ros.flight.orbit.motion_checks import OWN_SPEED_SD_M_S, REACTION_S
 from drocap_ros.flight.orbit.states import Limits
-from drocap_ros.flight.orbit_goal import OrbitGoal
+from drocap_ros.flight.orbit_goal import WORTH_TELLING, OrbitGoal
 from drocap_ros.flight.subject.guard import farness
 from drocap_ros.flight.subject.subject_filter import STANDING_M_S, WALKING_M_S
 
-#: m; no coast brings the vehicle by more nearer to the subject, which is required of the bridge's death
-#: (benchmarks/flight_kills.py); and with the creep after the stop the setpoint is slowed down before.
-_NEARER_M = 1.0
-_CREEPS_NEARER_M = 0.9
-#: m/s beyond a steady flight's speed, and share of the subject's speed added: most that setpoint and way together ask
-#: of a vehicle that holds setpoints.  A far place lets it fly faster than predicted: after it had caught up with a
-#: walker it went on for 3.1 m.
-_PULLED_M_S = 0.3
-_PULLED_BEHIND = 0.25
+#: m; no coast, the creep after its stop included, brings the vehicle by more nearer to the subject: 1 m is required of
+#: the bridge's death (benchmarks/flight_kills.py), and the prediction errs.
+_NEARER_M = 0.9
+#: Share of a steady flight's and of the subject's speed, by which setpoint and way together may ask more than a steady
+#: flight's of a vehicle that holds setpoints.  A far place lets it fly faster than predicted: after it had caught up
+#: with a walker it went on for 3.1 m.
+_PULLED = 0.25
 _SLACK_M = 0.2  # what the vehicle has already is no effect of the setpoint
-_SLACK_M_S = 0.1
-#: Levels that are tried, one after the other, see :func:`_shares`: of the whole setpoint, and of its part across the
-#: line of sight where that is taken away first.  A step is a fifth of the speed, a quarter or half of the way.
+#: Levels that are tried, one after the other, see :func:`_shares`: of the setpoint's part along and of that across the
+#: line of sight, both at once or the one across first.  A step is a fifth of the speed, a quarter or half of the way.
 _LEVELS = (2.0, 1.5, 1.0, 0.8, 0.6, 0.4, 0.2)
-_LEVELS_ACROSS = (2.0, 1.75, 1.5, 1.25, 1.0, 0.8, 0.6, 0.4)
+_TRIES = [(level, level) for level in _LEVELS]
+_TRIES_ACROSS_FIRST = [(2.0, across) for across in (2.0, 1.75, 1.5, 1.25, 1.0, 0.8, 0.6, 0.4)]
+_TRIES_ACROSS_FIRST += [(level, min(level, 0.4)) for level in _LEVELS[1:]]
 _HALVINGS = 3  # between two levels, where setpoints are held: a vehicle that lacks more retreats no more slowly
-_SLOWED = 0.95  # share of the wanted angular speed, below which the status says so
 
 
 def coast_speed(seen: Observed, limits: Limits) -> float:
@@ -52,7 +51,7 @@ def slowed_condition(present: Condition, goal: OrbitGoal, seen: Observed, limits
     """The condition of a flown orbit, with the angular speed that is flown if the coast limits it."""
     wanted = abs(goal.angular_speed_rad_s)
     allowed = coast_speed(seen, limits) / goal.radius_m
-    if present.code not in (ConditionCode.ORBITING, ConditionCode.WIDENED) or allowed >= _SLOWED * wanted:
+    if present.code not in (ConditionCode.ORBITING, ConditionCode.WIDENED) or allowed >= (1.0 - WORTH_TELLING) * wanted:
         return present
     return condition(
         ConditionCode.SLOWED,
@@ -107,7 +106,7 @@ class _Coasting(NamedTuple):
         """The limit that the coast breaks; None = none."""
         limits, place = self.limits, self.seen.subject.position
         speed = float(coast.speed_m_s.max())
-        if speed > max(limits.orbit.max_speed_m_s, float(coast.speed_m_s[0]) + _SLACK_M_S):
+        if speed > max(limits.orbit.max_speed_m_s, float(coast.speed_m_s[0]) + OWN_SPEED_SD_M_S):
             return condition(ConditionCode.COAST_UNSAFE, reach=f"reach {speed:.1f} m/s")
         if self.fence_centre is not None:
             away = np.abs(coast.place - complex(*self.fence_centre))
@@ -130,7 +129,7 @@ class _Coasting(NamedTuple):
     def too_long(self, coast: Coast, part: Setpoint) -> bool:
         """Whether the coast is too long, or comes too near by its creep, or the setpoint pulls too fast."""
         pulled = math.hypot(*_commanded(part, self.seen))
-        return coast.length_m > self.longest_m or pulled > self.fastest_m_s or self._creep_m(coast) > _CREEPS_NEARER_M
+        return coast.length_m > self.longest_m or pulled > self.fastest_m_s or self._creep_m(coast) > _NEARER_M
 
     def _creep_m(self, coast: Coast) -> float:
         """Way (m) nearer, creep included, to a subject who moves as estimated; his own approach does not count."""
@@ -160,25 +159,19 @@ def harmless(
     ----------
     fence_centre : (2,) m; None = there is no fence
     """
-    autopilot, velocity = seen.autopilot, seen.subject.velocity
-    held, walks = not autopilot.continues_setpoints, float(np.hypot(*velocity[:2])) > WALKING_M_S
-    longest_m = autopilot.coast.greatest * limits.safety.max_coast_m
-    speed = float(np.hypot(*velocity[:2]))
-    fastest_m_s = coast_speed(seen, limits) + _PULLED_M_S + _PULLED_BEHIND * speed if held else math.inf
-    judge = _Coasting(seen, complex(*velocity[:2]), fence_centre, limits, longest_m, fastest_m_s)
-    tries = [(level, level) for level in _LEVELS]
-    if seen.subject.position is not None and (held or walks):
-        least = _LEVELS_ACROSS[-1]
-        tries = [(2.0, across) for across in _LEVELS_ACROSS] + [(level, min(level, least)) for level in _LEVELS[1:]]
-    problem: Condition | None = None
+    held, velocity = not seen.autopilot.continues_setpoints, complex(*seen.subject.velocity[:2])
+    longest_m, steady_m_s = seen.autopilot.coast.greatest * limits.safety.max_coast_m, coast_speed(seen, limits)
+    fastest_m_s = steady_m_s + _PULLED * (steady_m_s + abs(velocity)) if held else math.inf
+    judge = _Coasting(seen, velocity, fence_centre, limits, longest_m, fastest_m_s)
+    across_first = seen.subject.position is not None and (held or abs(velocity) > WALKING_M_S)
+    tries, problem = _TRIES_ACROSS_FIRST if across_first else _TRIES, None
     for i, (along, across) in enumerate(tries):
         part, problem, too_long = judge.part(setpoint, along, across)
         if problem is None and not too_long:
-            between = held and i > 0 and along != tries[i - 1][0] and _retreats(setpoint, seen)
+            between = held and along != tries[max(i - 1, 0)][0] and _retreats(setpoint, seen)
             return judge.refined(setpoint, tries[i], tries[i - 1]) if between else part, None
-    if problem is None:  # a coast that is only too long is not shorter after a hold: the slowest setpoint is sent
-        return part, None
-    return hold_setpoint(seen.vehicle.position, seen.vehicle.yaw), problem
+    # A coast that is only too long is not shorter after a hold: the slowest setpoint is sent.
+    return part if problem is None else hold_setpoint(seen.vehicle.position, seen.vehicle.yaw), problem
 
 
 def _shares(level: float) -> tuple[float, float, float]:
@@ -215,17 +208,27 @@ def _timeout_s(seen: Observed) -> float:
 
 # -- the closing speed ------------------------------------------------------------------------------------------------
 
-_OVERSHOOT = 0.85  # of the greatest closing speed that a setpoint has: the vehicle overshoots
-_SURELY_M_S = 0.1  # so much faster than by the estimated place he may recede by his image, which shrinks as he bends
-#: m/s that his receding must exceed far away: from 12 m one who stands recedes at up to 0.4 m/s for a second.
-_FAR_ERROR_M_S = 0.3
-_REACTION_S = 0.5
-#: Most that a setpoint adds to the present closing speed towards one who stands, where setpoints are continued: the
-#: vehicle overshoots a larger step.
-_STEP_M_S = 0.4
-#: Share of the speed at which such a vehicle follows a walker, by which it closes up more slowly: a stop is seen 0.4 s
-#: late.
-_STOPS = 0.3
+
+class _Closing(NamedTuple):
+    """What bounds the speed towards the subject.
+
+    overshoot : share of the greatest closing speed that a setpoint has: the vehicle overshoots
+    surely_m_s : so much faster than by the estimated place he may recede by his image, which shrinks as he bends
+    far_error_m_s : that his receding must exceed far away: from 12 m one who stands recedes at up to 0.4 m/s
+    step_m_s : most that a setpoint adds to the present closing speed towards one who stands, where setpoints are
+        continued: the vehicle overshoots a larger step
+    stops : share of the speed at which such a vehicle follows a walker, by which it closes up more slowly: a stop is
+        seen 0.4 s late
+    """
+
+    overshoot: float = 0.85
+    surely_m_s: float = 0.1
+    far_error_m_s: float = 0.3
+    step_m_s: float = 0.4
+    stops: float = 0.3
+
+
+_CLOSING = _Closing()
 
 
 def limit_closing(setpoint: Setpoint, seen: Observed, limits: Limits) -> Setpoint:
@@ -234,16 +237,16 @@ def limit_closing(setpoint: Setpoint, seen: Observed, limits: Limits) -> Setpoin
     if sight is None:
         return setpoint
     room = math.sqrt(2 * limits.safety.braking_m_s2 * max(sight.nearest_m - orbit.min_distance_m, 0.0))
-    receding = min(sight.receding_m_s, max(-seen.subject.approach_m_s, 0.0) + _SURELY_M_S)
-    receding = min(receding, max(receding - farness(sight.distance_m) * _FAR_ERROR_M_S, 0.0))
-    closing_up = _OVERSHOOT * orbit.max_closing_m_s
+    receding = min(sight.receding_m_s, max(-seen.subject.approach_m_s, 0.0) + _CLOSING.surely_m_s)
+    receding = min(receding, max(receding - farness(sight.distance_m) * _CLOSING.far_error_m_s, 0.0))
+    closing_up = _CLOSING.overshoot * orbit.max_closing_m_s
     allowed = min(max(closing_up + receding, 0.0), room)
     if seen.autopilot.continues_setpoints:
         closing = float(seen.vehicle.velocity[:2] @ sight.toward)
-        allowed -= _STOPS * min(max(receding, 0.0), closing_up)
+        allowed -= _CLOSING.stops * min(max(receding, 0.0), closing_up)
         # Its path, limited in jerk, overshoots a reversal: from 1.8 m/s away it closed up at 1.3 m/s without this.
         allowed += min(closing, 0.0)
-        allowed = max(min(allowed, max(closing, 0.0) + _STEP_M_S + receding), 0.0)
+        allowed = max(min(allowed, max(closing, 0.0) + _CLOSING.step_m_s + receding), 0.0)
     return _bounded(setpoint, seen, sight, allowed, orbit.max_acceleration_m_s2)
 
 
@@ -268,7 +271,7 @@ def _bounded(
     velocity = vehicle.velocity
     closing = float(velocity @ inward)
     turning = max(float(velocity[:2] @ velocity[:2]) - closing**2, 0.0) / max(sight.distance_m, 0.5)
-    most = max(turning + (allowed_m_s - closing) / _REACTION_S, -max_acceleration_m_s2)
+    most = max(turning + (allowed_m_s - closing) / REACTION_S, -max_acceleration_m_s2)
     acceleration = setpoint.acceleration - max(float(setpoint.acceleration @ inward) - most, 0.0) * inward
     size = float(np.linalg.norm(acceleration))
     acceleration = acceleration * min(1.0, max_acceleration_m_s2 / max(size, 1e-6))
@@ -278,9 +281,8 @@ def _bounded(
 # -- what a vehicle behind a walker lacks -----------------------------------------------------------------------------
 
 _RATE_PER_S2 = 0.8  # of the missing velocity
-_FORGETTING_PER_S = 0.1
-_SHARE_PER_S = 0.6  # of the subject's speed beyond one who stands: standing needs none
-_GREATEST_M_S2 = 0.6  # most that is added
+_FORGETTING_PER_S = 0.1  # of what was missing: gusts pass
+_MOST_M_S2 = 0.6  # that is added behind one who walks, 1 m/s faster than one seems to who stands: he needs none
 
 
 class Shortfall:
@@ -300,7 +302,7 @@ class Shortfall:
         sight = subject[:2] - seen.vehicle.position[:2]
         toward = sight / max(float(np.hypot(*sight)), 0.5)
         speed = float(np.hypot(*subject_velocity))
-        most = min(_SHARE_PER_S * max(speed - STANDING_M_S, 0.0), _GREATEST_M_S2)
+        most = _MOST_M_S2 * min(max(speed - STANDING_M_S, 0.0), 1.0)
         along = min(max(float(self._integral @ toward), -most), most)
         return setpoint._replace(acceleration=setpoint.acceleration + np.append(along * toward, 0.0))
 

@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from drocap_ros.flight.autopilot import supported_titles
 from drocap_ros.flight.autopilot.autopilot import LossAction, LossSettings
-from drocap_ros.flight.conditions import Condition, ConditionCode, condition
+from drocap_ros.flight.conditions import ROUNDING, Condition, ConditionCode, condition
 from drocap_ros.flight.observed import FIX_3D, Observed
 from drocap_ros.flight.orbit.states import Limits
 from drocap_ros.flight.orbit_config import OrbitConfig
@@ -17,16 +17,14 @@ from drocap_ros.flight.safety_config import SafetyConfig
 from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, LANDED_LANDING, LANDED_ON_GROUND, LANDED_TAKEOFF
 
 _C = ConditionCode
-_REACTION_S = 0.5  # from a step of the subject until the vehicle slows down
-_OWN_SPEED_SD_M_S = 0.1  # of the reported velocity
+REACTION_S = 0.5  # from a step of the subject until the vehicle slows down
+OWN_SPEED_SD_M_S = 0.1  # of the reported velocity
 _LEAST_SUBJECT_AGE_S = 0.25  # the usual age of a picture at 15 Hz, its network included
-_TIMEOUT_ROUNDING_S = 1e-3  # parameters are float32
 _WAITING_LEADS = 1.3  # of max_lead_m, as in planner.advance
 _CARRIED_OFF = 3.0  # times that limit: beyond the 3.7 m that vehicles were behind walking subjects
-_CARRIED_OFF_S = 1.0  # for so long: a gust passes
+GUST_S = 1.0  # away for so long: a gust passes
 _LONGEST_AWAY_S = 20.0  # behind walking subjects in 8 m/s of wind: 10 s
-#: The clocks of image and step differ by a transmission at most.
-_FUTURE_S = 0.2
+_FUTURE_S = 0.2  # the clocks of image and step differ by a transmission at most
 #: MAV_STATE of a vehicle that nobody should command; the first may stand for stopped motors.
 _EMERGENCIES = {
     mavlink.MAV_STATE_EMERGENCY: "an emergency",
@@ -134,7 +132,7 @@ def loss_condition(settings: LossSettings | None, meaning: LossAction | None, lo
         return None
     if math.isnan(settings.timeout_s):
         return condition(_C.TIMEOUT_UNKNOWN, name=settings.timeout_name, limit_s=longest_s)
-    if settings.timeout_s > longest_s + _TIMEOUT_ROUNDING_S:
+    if settings.timeout_s > longest_s * ROUNDING:  # it is float32
         return condition(_C.TIMEOUT_TOO_LONG, name=settings.timeout_name, value_s=settings.timeout_s, limit_s=longest_s)
     if meaning is None:
         return None
@@ -179,7 +177,7 @@ def keeping_condition(seen: Observed, limits: Limits, longest_s: float = _LONGES
     limit_m = away_limit_m(limits.orbit)
     carried_off = seen.course.away_m > _CARRIED_OFF * limit_m
     if carried_off:
-        longest_s = min(longest_s, _CARRIED_OFF_S)
+        longest_s = min(longest_s, GUST_S)
     if seen.course.away_s <= longest_s:
         return None
     # A reversed orbit, a gust and a subject who turns leave a healthy vehicle behind for some seconds.
@@ -251,14 +249,14 @@ def stopping_room(seen: Observed, safety: SafetyConfig) -> float:
     the vehicle reacts, is added.
     """
     toward = (
-        max(seen.subject.closing_m_s, -seen.subject.approach_m_s, 0.0) + _OWN_SPEED_SD_M_S
+        max(seen.subject.closing_m_s, -seen.subject.approach_m_s, 0.0) + OWN_SPEED_SD_M_S
     )  # own speed and chase together
     gaining = seen.subject.approach_m_s + min(seen.subject.closing_m_s, 0.0)  # on a vehicle that flies away
-    steps = max(gaining, 0.0) * _REACTION_S + max(seen.subject.approach_m_s, 0.0) * toward / safety.braking_m_s2
+    steps = max(gaining, 0.0) * REACTION_S + max(seen.subject.approach_m_s, 0.0) * toward / safety.braking_m_s2
     return (
         braking_distance(toward, safety)
         + steps
-        + math.hypot(seen.subject.sd_m, _REACTION_S * seen.subject.approach_sd_m_s)
+        + math.hypot(seen.subject.sd_m, REACTION_S * seen.subject.approach_sd_m_s)
     )
 
 

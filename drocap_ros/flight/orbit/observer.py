@@ -107,7 +107,7 @@ class Observer:
         vehicle, config = self.vehicle, self._config
         before, self._before = self._before, (now_ns, now_s)
         dt = 0.0 if before is None else now_s - before[1]
-        disturbance = self._own_disturbance(before, now_ns, dt, hung=own.hung) or self._camera_changed or own.unsafe
+        disturbance = self._own_disturbance(before, now_ns, dt, own)
         estimate = self._subject.estimate(now_ns)
         echoes = Echoes(link.sent_setpoints(), link.echo(), link.answer_age_s())
         not_followed = self._following.step(now_s, own.orbiting_s, echoes, vehicle)
@@ -124,10 +124,6 @@ class Observer:
         followed = not not_followed or not seen.autopilot.needs_mode_to_stop
         if not_followed and disturbance is None:
             disturbance = condition(ConditionCode.SETPOINTS_NOT_FOLLOWED, evidence=not_followed)
-        jumped = disturbance is not None and disturbance.code == ConditionCode.POSITION_JUMPED
-        if not jumped and (stood_s := link.decision_age_s()) > config.watchdog_s:
-            # The process stood still within this step: what was read above belongs to different instants.
-            disturbance = condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=stood_s)
         observed = dataclasses.replace(
             seen,
             vehicle=motion,
@@ -138,6 +134,10 @@ class Observer:
             disturbance=disturbance,
             refusal=own.refusal,
         )
+        if not observed.jumped and (stood_s := link.decision_age_s()) > config.watchdog_s:
+            # The process stood still within this step: what was read above belongs to different instants.
+            stalled = condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=stood_s)
+            observed = dataclasses.replace(observed, disturbance=stalled)
         return observed, dt
 
     def forget_changed_camera(self) -> None:
@@ -147,11 +147,11 @@ class Observer:
             self._subject, self._guard = SubjectFilter(self._config), Guard(self._config)
 
     def _own_disturbance(
-        self, before: tuple[int, float] | None, now_ns: int, dt: float, *, hung: bool
+        self, before: tuple[int, float] | None, now_ns: int, dt: float, own: OwnFlight
     ) -> Condition | None:
-        """Disturbance of our own time, or of the reported position, since the last step."""
+        """Disturbance of our own time, of the reports, of the camera or of the setpoint since the last step."""
         if before is None:
-            return None
+            return self._camera_changed or own.unsafe
         jump_s = (now_ns - before[0]) / NS - dt
         if abs(jump_s) > _CLOCK_JUMP_S:
             return condition(ConditionCode.CLOCK_JUMPED, jump_s=jump_s)
@@ -160,9 +160,9 @@ class Observer:
             return condition(ConditionCode.POSITION_JUMPED, jump_m=doubt.jump_m)
         if doubt.error_m_s > 0:
             return condition(ConditionCode.REPORTS_CONTRADICT, error_m_s=doubt.error_m_s)
-        if hung or dt > self._config.watchdog_s:
+        if own.hung or dt > self._config.watchdog_s:
             return condition(ConditionCode.CONTROL_LOOP_STALLED, gap_s=dt)
-        return None
+        return self._camera_changed or own.unsafe
 
 
 def observe_vehicle(link: MavlinkLink, config: MavlinkBridgeConfig, vehicle: VehicleState, now_ns: int) -> Observed:

@@ -14,24 +14,20 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.flight.autopilot.setpoint import Setpoint
+from drocap_ros.flight.orbit.motion_checks import REACTION_S
 from drocap_ros.flight.orbit_config import OrbitConfig
 from drocap_ros.flight.orbit_goal import OrbitGoal
 from drocap_ros.flight.subject.subject_filter import STANDING_M_S, WALKING_M_S
 
-#: 1/s, about one who stands and one who walks: his turns are no lasting error; m.
-_TRIM_RATE = 0.15
-_WALKING_TRIM_RATE = 0.03
-_MAX_TRIM_M = 0.5
+_TRIM_RATE = 0.15  # 1/s, about one who stands
+_WALKING_TRIM_RATE = 0.03  # 1/s: the turns of one who walks are no lasting error
+_FLIGHT_ERROR_M = 0.5  # of the flown radius: of the least one, and the most that is trimmed
 _FREE_LEAD = 0.6  # share of the greatest lead, below which the reference does not wait
 _CENTRE_RATE = 3.0  # 1/s; a slower centre is an error of the radius, a faster one passes on the estimate's noise
 _CENTRE_ACCELERATION = 8.0  # m/s^2; above any acceleration of a subject, so it limits only jumps
 _FORWARD_S = 0.5  # s; filter of the centre's acceleration
-#: 1/s, m/s^2: so much of it is passed on, by the centre's speed beyond that of one who stands: noise.
-_FORWARD_RATE = 0.5
-_MAX_FORWARD = 0.5
+_FORWARD = 0.5  # m/s^2: most of it that is passed on, from 1 m/s beyond one who stands: slower, it is noise
 _MAX_HASTE = 0.12  # m/s^2 along the path that the setpoint passes on: the reference waits for a vehicle that lags
-_SURPRISE_S = 0.5  # of the least radius: until a turn of the subject is seen
-_FLIGHT_ERROR_M = 0.5  # of the least radius: error of the flown one
 _CALIBRATION_S = 15.0  # against the wanted direction, with calibrate_telemetry
 _WORST_RANGE = 5.0  # of size_error: 40 % where the body is not measured, as by a wrong lens or a child
 
@@ -85,7 +81,7 @@ def least_radius(
     nearer_m : by so much the nearer of body size and ground puts the subject nearer
     """
     speed = min(max(subject_speed_m_s - STANDING_M_S, 0.0), config.max_subject_speed_m_s)
-    surprise = max(_SURPRISE_S * speed, speed**2 / (2 * braking_m_s2))
+    surprise = max(REACTION_S * speed, speed**2 / (2 * braking_m_s2))
     worst = _WORST_RANGE * size_error * config.min_distance_m
     nearer = max(2 * subject_sd_m, nearer_m + subject_sd_m, worst)
     return config.min_distance_m + nearer + surprise + _FLIGHT_ERROR_M
@@ -130,7 +126,8 @@ def advance(state: OrbitState, goal: OrbitGoal, scene: Scene, dt: float, config:
     if dt == 0.0:
         return state
     goal = goal._replace(angular_speed_rad_s=sense(config, state.flown_s) * goal.angular_speed_rad_s)
-    centre, centre_velocity, centre_acceleration = _follow(state, subject[:2], subject_velocity[:2], dt, config)
+    followed = _follow(state, subject[:2], subject_velocity[:2], dt, config)
+    centre, centre_velocity, _ = followed
     jerk = config.max_jerk_m_s3
     slow = min(0.5 * config.max_acceleration_m_s2, 1.0)
     approach = _approach_speed(state, config)
@@ -158,21 +155,11 @@ def advance(state: OrbitState, goal: OrbitGoal, scene: Scene, dt: float, config:
     if creep == 1.0:
         error = radius.value - float(np.hypot(*(vehicle[:2] - subject[:2])))
         error = min(max(error, -1.0), 1.0)
-        most = min(max(radius.value - least_radius_m, 0.0), _MAX_TRIM_M)  # no nearer than the least radius
+        most = min(max(radius.value - least_radius_m, 0.0), _FLIGHT_ERROR_M)  # no nearer than the least radius
         rate = _TRIM_RATE if math.hypot(*centre_velocity) < WALKING_M_S else _WALKING_TRIM_RATE
-        trim = min(max(trim + rate * error * dt, -most), _MAX_TRIM_M)
-    return OrbitState(
-        math.remainder(phase, 2 * math.pi),
-        omega,
-        radius,
-        height,
-        centre,
-        centre_velocity,
-        centre_acceleration,
-        trim,
-        state.flown_s + dt,
-        goal_radius,
-    )
+        trim = min(max(trim + rate * error * dt, -most), _FLIGHT_ERROR_M)
+    phase = math.remainder(phase, 2 * math.pi)
+    return OrbitState(phase, omega, radius, height, *followed, trim, state.flown_s + dt, goal_radius)
 
 
 def sense(config: OrbitConfig, flown_s: float) -> float:
@@ -198,7 +185,7 @@ def setpoint_of(state: OrbitState, scene: Scene, config: OrbitConfig) -> Setpoin
     walking = max(float(np.hypot(*state.centre_velocity)) - STANDING_M_S, 0.0)
     flat_velocity = state.centre_velocity + r.rate * outward + r.value * omega.value * along
     flat_acceleration = (
-        _limited(state.centre_acceleration, min(_FORWARD_RATE * walking, _MAX_FORWARD))
+        _limited(state.centre_acceleration, _FORWARD * min(walking, 1.0))
         + (r.acceleration - omega.value**2 * r.value) * outward
         + (min(max(r.value * omega.rate, -_MAX_HASTE), _MAX_HASTE) + 2 * r.rate * omega.value) * along
     )

@@ -29,13 +29,13 @@ from drocap_ros.flight.orbit.states import (
     SafetyState,
     State,
 )
+from drocap_ros.flight.orbit.watchdog import GIVE_UP_S
 from drocap_ros.flight.orbit.way_out import by_hand
 
 _C = ConditionCode
-_BLIND_MODE_REQUEST_S = 2.0
-_BLIND_STOP_S = 10.0
+_BLIND_MODE_REQUEST_S = 2.0  # of velocity zero, from 2.5 m/s at braking_m_s2: a brake by the mode takes longer
 _CLEAR_S = 1.0  # for which all conditions hold before an orbit resumes by itself
-_INTENTION_S = 1.0
+_INTENTION_S = 1.0  # two periods of CURRENT_MODE, which says what is intended
 _ACTIVE = frozenset({State.ORBITING, State.HOLDING, State.FAULT})
 
 
@@ -64,15 +64,13 @@ def reduce(
         state, answer = _execute(state, seen, now_s, command, problem, limits)
     if state.state == State.ORBITING:
         state = _orbit(state, seen, now_s, vehicle is not None, limits)
+    elif state.requesting:
+        state = _request(state, seen, now_s, problem, limits)
     elif state.state in (State.IDLE, State.READY):
-        state = _wait(state, seen, now_s, problem, limits)
+        state = _wait(state, now_s, problem)
     elif state.state in (State.HOLDING, State.FAULT) and not stream_ended(seen):
         state = update_hold(state, seen, now_s, vehicle is not None)
-        moved = state if vehicle or place else retreat(state, seen, now_s, limits)
-        state = moved if moved is not state else request_hold_mode(state, seen, now_s, limits.safety)
-        state = resumption(state, seen, now_s, problem, limits.safety)
-        if state.clear_s <= now_s - _CLEAR_S and seen.mode.in_control and not is_lost(state):
-            state = dataclasses.replace(_begin_orbit(seen, now_s), fence_centre=state.fence_centre)
+        state = _hold(state, seen, now_s, problem, limits, astray=bool(vehicle or place))
     state = dataclasses.replace(state, lost_s=lost_s, seen_s=seen_s)
     return state, Decision(*_permitted(state, seen, now_s, limits), answer)
 
@@ -114,6 +112,18 @@ def _orbit(state: SafetyState, seen: Observed, now_s: float, blind: bool, limits
     elif pace.value == 1.0:
         reason = condition(_C.ORBITING)
     return dataclasses.replace(state, pace=pace, condition=reason)
+
+
+def _hold(
+    state: SafetyState, seen: Observed, now_s: float, problem: Condition | None, limits: Limits, *, astray: bool
+) -> SafetyState:
+    """Retreat, hand over or resume; ``astray``: vehicle or place forbid motion."""
+    moved = state if astray else retreat(state, seen, now_s, limits)
+    state = moved if moved is not state else request_hold_mode(state, seen, now_s, limits.safety)
+    state = resumption(state, seen, now_s, problem, limits.safety)
+    if state.clear_s <= now_s - _CLEAR_S and seen.mode.in_control and not is_lost(state):
+        return dataclasses.replace(_begin_orbit(seen, now_s), fence_centre=state.fence_centre)
+    return state
 
 
 def _ending(state: SafetyState, seen: Observed, limits: Limits) -> Condition | None:
@@ -226,20 +236,23 @@ def _stop(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> t
     return state, _accepted(_C.NOT_ORBITING)
 
 
-def _wait(state: SafetyState, seen: Observed, now_s: float, problem: Condition | None, limits: Limits) -> SafetyState:
-    """Idle and ready, and while control is requested."""
-    if state.requesting:
-        # A short gap delays the orbit.
-        failed = condition(_C.REQUEST_ENDED, cause=ending) if (ending := _ending(state, seen, limits)) else None
-        if failed is None and seen.mode.in_control and not problem:
+def _request(
+    state: SafetyState, seen: Observed, now_s: float, problem: Condition | None, limits: Limits
+) -> SafetyState:
+    """While control is requested; a short gap of the data delays the orbit."""
+    cause = _ending(state, seen, limits)
+    if cause is None:
+        if seen.mode.in_control and not problem:
             return _begin_orbit(seen, now_s)
-        if failed is None and now_s - state.requesting_s > limits.safety.engage_timeout_s + limits.warm_up_s:
-            # With the mode granted, the condition has delayed the orbit for all this time.
-            delayed = seen.mode.in_control and problem
-            failed = condition(_C.REQUEST_ENDED, cause=problem) if delayed else _not_granted(seen)
-        if failed is None:
+        if now_s - state.requesting_s <= limits.safety.engage_timeout_s + limits.warm_up_s:
             return state
-        return _enter(State.IDLE if problem else State.READY, failed, now_s, failed=failed)
+        cause = problem if seen.mode.in_control else None  # with the mode granted, it has delayed the orbit so long
+    failed = condition(_C.REQUEST_ENDED, cause=cause) if cause else _not_granted(seen)
+    return _enter(State.IDLE if problem else State.READY, failed, now_s, failed=failed)
+
+
+def _wait(state: SafetyState, now_s: float, problem: Condition | None) -> SafetyState:
+    """Idle and ready."""
     reason = problem or state.failed or condition(_C.ALL_CLEAR)
     wanted = State.IDLE if problem else State.READY
     if (state.state, state.condition) == (wanted, reason):
@@ -265,7 +278,7 @@ def _permitted(state: SafetyState, seen: Observed, now_s: float, limits: Limits)
 
 def _permitted_in_hold(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> tuple[Action, ModeRequest]:
     action, since = Action.HALT if state.hold_position is None else Action.HOLD, now_s - state.since_s
-    if state.blind and since >= _BLIND_STOP_S:
+    if state.blind and since >= GIVE_UP_S:
         action = Action.NOTHING
     # Not at once: the autopilot's brake takes longer than velocity zero.  And not without a visible mode: the pilot
     # may have taken over unseen; setpoints are ignored then, a request for a mode would not be.

@@ -14,9 +14,9 @@ from drocap_ros.flight.orbit.states import Limits, SafetyState, State
 #: Telemetry must arrive for so long after a loss before a mode is requested: longer than the 1 s between two
 #: heartbeats, and than packets that were late and arrive after newer ones.
 _STEADY_S = 1.3
-_DEFAULT_TIMEOUT_S = 0.5
+_DEFAULT_TIMEOUT_S = 0.5  # as max_control_timeout_s, where the autopilot reports none
 #: Out of sight for longer, the reported position may have jumped unseen (``vehicle_filter.py``).
-_UNSEEN_S = 0.25
+UNSEEN_S = 0.25
 
 
 def watch(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> SafetyState:
@@ -30,7 +30,7 @@ def watch(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> S
         return state if lost else dataclasses.replace(state, lost_s=now_s)
     if not lost or seen.link.heartbeat_age_s >= now_s - state.lost_s:
         return state
-    unseen = now_s - state.lost_s > _UNSEEN_S
+    unseen = now_s - state.lost_s > UNSEEN_S
     state = dataclasses.replace(state, lost_s=math.nan, seen_s=now_s)
     if state.state not in (State.HOLDING, State.FAULT):
         return state

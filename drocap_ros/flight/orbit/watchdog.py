@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 from drocap_ros.flight.mavlink.message import Message
 
-_PERIOD_S = 0.1
-_CHECK_S = 0.02
-_REQUEST_MODE_S = 3.0
-_GIVE_UP_S = 10.0
-_STOPPED_S = 0.5
+_PERIOD_S = 0.1  # between setpoints: five within the autopilot's time-out of 0.5 s
+_CHECK_S = 0.02  # between looks at the loop: a tenth of watchdog_s
+_REQUEST_MODE_S = 3.0  # without a step: the vehicle stands by then, as after hold_s
+GIVE_UP_S = 10.0  # without a step: the hold mode was requested long ago, and the loop does not return
+_STOPPED_S = 0.5  # for which this thread stood too: the autopilot's time-out
 
 
 class FallbackCommands(NamedTuple):
@@ -60,7 +60,7 @@ class Watchdog:
         if self._stood_s > _STOPPED_S:
             return  # the autopilot's time-out has ended the motion; the position of the last step is outdated
         silent_s = now_s - step_s
-        if commands is None or not self._limit_s < silent_s < _GIVE_UP_S or now_s - self._sent_s < _PERIOD_S:
+        if commands is None or not self._limit_s < silent_s < GIVE_UP_S or now_s - self._sent_s < _PERIOD_S:
             return
         self.fired, self._sent_s = True, now_s
         self._send(commands.hold)

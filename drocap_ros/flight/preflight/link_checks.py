@@ -74,13 +74,9 @@ def _rate(
     (limit_s, conditions), (real, wanted, gap_s) = _limit(config, name), stream
     found = f"{real:.1f} Hz" + (f", longest gap {gap_s:.2f} s" if real > 0 and math.isfinite(gap_s) else "")
     needed = f"{wanted:g} Hz, gaps below {limit_s:g} s" if limit_s else f"{wanted:g} Hz"
-    level, cause = Level.OK, ""
-    if not real >= _ENOUGH * wanted:
-        short = not real >= config.rate_shortfall * wanted or real * limit_s < 1.0
-        level = graded(missing=short and bool(conditions), warning=True)
-    elif 0.0 < limit_s < gap_s:
-        level, cause = Level.WARNING, f"a gap above {limit_s:g} s ends an orbit by a hold; "
     autopilot = _autopilot(measured)
+    short = not real >= config.rate_shortfall * wanted or real * limit_s < 1.0
+    level, cause = _judged(stream, limit_s, short=short and bool(conditions))
     in_control = measured.vehicle is not None and measured.vehicle.mode == autopilot.control_mode
     if name == _ECHO and level != Level.OK and not in_control:
         level, found = Level.OK, f"{found}, as outside the control mode"
@@ -92,6 +88,15 @@ def _rate(
         remedy = cause + "this autopilot grants no other rate"
     values = {"real_hz": real, "wanted_hz": wanted, "longest_gap_s": gap_s}
     return Verdict(level, found, needed, remedy, values), conditions
+
+
+def _judged(stream: Stream, limit_s: float, *, short: bool) -> tuple[Level, str]:
+    """Level of a stream, and its cause; ``short``: with its rate, were it too low, no orbit is flown."""
+    if not stream.real_hz >= _ENOUGH * stream.wanted_hz:
+        return graded(missing=short, warning=True), ""
+    if 0.0 < limit_s < stream.longest_gap_s:
+        return Level.WARNING, f"a gap above {limit_s:g} s ends an orbit by a hold; "
+    return Level.OK, ""
 
 
 def _limit(config: MavlinkBridgeConfig, name: str) -> tuple[float, tuple[ConditionCode, ...]]:

@@ -26,7 +26,8 @@ from drocap_ros.flight.preflight.measured import Measured, Stream
 from drocap_ros.flight.vehicle_state import LANDED_IN_AIR, VehicleState
 from drocap_ros.stamps import NS
 
-_CONDITIONS_PERIOD_S, _VERSION_PERIOD_S, _VERSION_TRIES = 0.1, 1.0, 4
+_CONDITIONS_PERIOD_S = 0.1  # between looks at the conditions for motion: two steps of the loop
+_VERSION_TRIES = 4  # to read the firmware's version, once a second
 
 
 class ListeningLink(MavlinkLink):
@@ -79,7 +80,7 @@ class ListeningLink(MavlinkLink):
     def _send_due(self) -> None:
         super()._send_due()
         wanted = self._autopilot and not self.version and self._version_tries < _VERSION_TRIES
-        if wanted and self._is_due("version", _VERSION_PERIOD_S):
+        if wanted and self._is_due("version", 1.0):
             self._version_tries += 1
             number = mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
             request = mavlink.MAV_CMD_REQUEST_MESSAGE

@@ -21,7 +21,6 @@ from drocap_ros.flight.vehicle_state import VehicleState
 _C = ConditionCode
 _EDGE = 0.04  # share of the picture's rows: detectors lose feet and head nearer to the border
 _WIND_LEAN_M_S2 = 0.9  # a copter of this size leans by 5 deg against 8 m/s
-_SIDEWAYS_RAD = 1.5  # from the optical axis, beyond which a point is beside the camera
 _DRIVER = "/dev/video"
 _STREAM_DELAY_S = 0.1  # of a usual network stream
 _LEAST_PX = 80.0  # height of a person below which the pose networks fail (docs/accuracy.md)
@@ -206,7 +205,7 @@ def person_in_picture(
 
     def row(height_m: float) -> float:
         angle = math.atan2(config.height_m - height_m, distance) - math.radians(pitch_down_deg)
-        if abs(angle) > _SIDEWAYS_RAD:
+        if abs(angle) >= 0.5 * math.pi:
             return math.copysign(math.inf, angle)
         return float(matrix[1, 2] + matrix[1, 1] * math.tan(angle))
 

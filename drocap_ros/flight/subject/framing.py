@@ -21,21 +21,21 @@ from drocap_ros.flight.subject.subject_filter import STANDING_M_S
 from drocap_ros.flight.vehicle_state import VehicleState
 from drocap_ros.geometry.rotations import matrix_from_quaternion
 
-_GRAVITY = 9.81
+_GRAVITY = 9.81  # m/s^2
 _HALF_WIDTH_M = 0.3  # of a person with the arms
 _HEADROOM_M = 0.1  # above the head
-_DIRECTIONS = 12
+_DIRECTIONS = 12  # of the nose against the wind: by 30 deg
 _GUSTS = 1.2  # times the lean by the mean wind
 _RESERVE_M_S2 = 0.4  # of corrections
 _LEAST_UP = 0.3  # of the body's axis; beyond it the vehicle tumbles
 _STILL_M_S = 0.5  # a hover: below it for so long, the vehicle leans by the wind alone
-_SETTLED_S = 1.0
+_SETTLED_S = 1.0  # the lean of the braking before has gone
 _LEARNING_S = 4.0  # of the lean against wind: a gust passes, the wind stays
 _STEADY_S = 0.7  # over which the margin now is averaged: a slower orbit cannot follow a gust
 _SAME_CAMERA = 0.03  # of the focal length, by which a camera matrix may change
 _CUT_OFF = 0.2  # share of the picture's height by which a mount may cut off feet or head: it does not lean further
 _COMFORT = 0.08  # share of the picture's height below which the orbit slows down
-_LEAST_PACE = 0.3  # of its speed: a standing orbit would not give way
+LEAST_PACE = 0.3  # share of its speed at which an orbit gives way still: one that stands would not
 
 
 class View(NamedTuple):
@@ -88,7 +88,7 @@ def _left_down(angle: np.ndarray) -> np.ndarray:
 
 def framed_pace(margin: float) -> float:
     """Share of its speed at which an orbit is flown with this margin; it leans less then."""
-    return min(max(margin / _COMFORT, _LEAST_PACE), 1.0)
+    return min(max(margin / _COMFORT, LEAST_PACE), 1.0)
 
 
 def orbit_margin(view: View, goal: OrbitGoal, body_height_m: float, wind: float) -> float:

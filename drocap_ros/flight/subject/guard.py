@@ -14,29 +14,25 @@ import numpy as np
 
 from drocap_ros.flight.observed import SizeSight
 from drocap_ros.flight.pose_history import CameraPose
-from drocap_ros.flight.subject.subject_measurement import locate_subject
+from drocap_ros.flight.subject.subject_measurement import MAX_BENDING, SIZE_NOISE, SubjectMeasurement, locate_subject
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.observation import PoseObservation
 from drocap_ros.stamps import NS
 
-_RADIAL_NOISE = 0.06  # of one image, share of the range: as the range by size in subject_measurement.py
 _BEARING_NOISE = 0.01  # share of the range
-_NOISE_M = 0.04
+_NOISE_M = 0.04  # of a place, whatever its range
 _ACCELERATION = 0.7  # m/s^2: standard deviation of the change of the subject's velocity in a second
-_MAX_BENDING = 0.3  # as in subject_filter.py
 _BENT = 4.0  # times the noise: a bent body looks smaller, its size counts for less
 _BEARING_GATE = 4.0  # standard deviations across the sight
 _SIZE_GATE = 0.35  # share of the range along it
 _SURE = 0.5  # standard deviations of the speed at which he walks away that are left out
 #: m/s over the square of the seconds for which he recedes, far and near: the speed at which he may be followed.  A body
 #: that swings or crouches shrinks too, for a second or two.
-_AWAY_FAR = 0.14
-_AWAY_NEAR = 0.3
+_AWAY_FAR, _AWAY_NEAR = 0.14, 0.3
 _RESTART_S = 1.0  # without a sure image, after which any image is sure, unless the vehicle flies by him
 #: m, where the distance begins to count and where it counts whole: an error of the size is an error of the speed in
 #: proportion to the distance.
-_NEAR_M = 8.0
-_FAR_M = 12.0
+_NEAR_M, _FAR_M = 8.0, 12.0
 
 
 class Guard:
@@ -57,23 +53,29 @@ class Guard:
 
         locked : the vehicle flies, so neither another track nor a far place may become the sure one
         """
-        known = camera is not None and observation.has_subject
-        found = locate_subject(observation, camera_matrix, camera, self._config) if known and camera else None
-        other = observation.track_id != self._track_id
-        sure = False
-        if found is not None and camera is not None:
-            gap_s = (observation.stamp_ns - self._stamp_ns) / NS
-            if self._state is None or (not locked and (other or abs(gap_s) > _RESTART_S)):
-                self._start(found.position[:2], observation)
-                sure = True
-            elif gap_s > 0 and not other:
-                bent = _BENT if not found.bending < _MAX_BENDING else 1.0
-                sure = self._correct(found.position[:2], camera.position[:2], gap_s, bent)
-                self._learn_away(camera.position[:2], gap_s)
-        if sure:
+        if camera is None:
+            return False
+        found = locate_subject(observation, camera_matrix, camera, self._config)
+        if found is None:
+            return False
+        if self._is_he(found, observation, camera.position[:2], locked=locked):
             self._stamp_ns, self._contradicted = observation.stamp_ns, False
-        elif found is not None and observation.stamp_ns > self._stamp_ns:
-            self._contradicted = True
+            return True
+        self._contradicted = self._contradicted or observation.stamp_ns > self._stamp_ns
+        return False
+
+    def _is_he(
+        self, found: SubjectMeasurement, observation: PoseObservation, camera: np.ndarray, *, locked: bool
+    ) -> bool:
+        """Begin with a place, or take it; returns whether the subject can be there."""
+        gap_s, other = (observation.stamp_ns - self._stamp_ns) / NS, observation.track_id != self._track_id
+        if self._state is None or (not locked and (other or abs(gap_s) > _RESTART_S)):
+            self._start(found.position[:2], observation)
+            return True
+        if gap_s <= 0 or other:
+            return False
+        sure = self._correct(found.position[:2], camera, gap_s, 1.0 if found.bending < MAX_BENDING else _BENT)
+        self._learn_away(camera, gap_s)
         return sure
 
     def sight(self, vehicle: np.ndarray, offset: np.ndarray, now_ns: int) -> SizeSight | None:
@@ -115,7 +117,7 @@ class Guard:
         along = sight / max(distance, 1e-6)
         across = np.array([-along[1], along[0]])
         basis = np.stack([along, across])
-        radial = bent * _RADIAL_NOISE * distance + _NOISE_M
+        radial = bent * SIZE_NOISE * distance + _NOISE_M
         noise = np.diag([radial, _BEARING_NOISE * distance + _NOISE_M]) ** 2
         innovation = basis @ (place - state[:2])
         spread = basis @ covariance[:2, :2] @ basis.T + noise

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.flight.pose_history import CameraPose
-from drocap_ros.flight.subject.subject_measurement import SubjectMeasurement, locate_subject
+from drocap_ros.flight.subject.subject_measurement import MAX_BENDING, SubjectMeasurement, locate_subject
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.observation import PoseObservation
 from drocap_ros.stamps import NS
@@ -18,10 +18,9 @@ WALKING_M_S = 0.5  # least speed of one who walks
 _DRIFT = 0.05  # m/sqrt(s), of the vehicle's position and of the feet that are set down; no motion of the subject
 _RATIO_MEMORY_NS = 4 * NS  # of size over ground: several strides
 _LEAST_RATIOS = 15  # images: a second of them
-_RATIO_QUANTILE = 0.4
+_RATIO_QUANTILE = 0.4  # a little less than the median: bending makes the body look smaller
 _WANDERING_MEMORY_NS = 1 * NS  # where the height wanders: recorded ones change by 0.1 m within it, 4 % of the range
 _WANDERING_RATIOS = 8  # images: half a second of them
-_MAX_BENDING = 0.3  # of a body whose size counts; 0.1 by noise alone
 _NEARER_S = 1.0  # filter of what the two ranges disagree by
 _MAX_SURPRISE = 0.3  # share of the range, beyond which the gate decides
 
@@ -98,19 +97,16 @@ class SubjectFilter:
 
         locked : the vehicle flies by this estimate, so neither another track nor a far measurement may restart it
         """
-        if camera is None or not observation.has_subject:
+        if camera is None:
             return False
         measurement = locate_subject(observation, camera_matrix, camera, self._config, self._ratio)
         if measurement is None:
             return False
         gap_s = (observation.stamp_ns - self._stamp_ns) / NS
         other = observation.track_id != self._track_id
-        if locked and (self._state is None or other):
-            self._contradicted = True
-            return False
-        if self._state is None or (not locked and (other or abs(gap_s) > 2.0)):
-            self._start(observation, measurement)
-            return True
+        strange = self._state is None or other
+        if strange if locked else strange or abs(gap_s) > 2.0:
+            return self._restart(observation, measurement, locked=locked)
         if gap_s <= 0:
             return False
         state, covariance = self._predicted(min(gap_s, 5.0))
@@ -119,11 +115,7 @@ class SubjectFilter:
         spread = covariance[:3, :3] + noise
         inverse = np.linalg.inv(spread)
         if float(innovation @ inverse @ innovation) > self._config.subject_gate:
-            if not locked and gap_s > 1.0:
-                self._start(observation, measurement)
-                return True
-            self._contradicted = True
-            return False
+            return self._restart(observation, measurement, locked=locked or gap_s <= 1.0)
         gain = covariance[:, :3] @ inverse
         self._state = state + gain @ innovation
         covariance = covariance - gain @ covariance[:3]
@@ -133,6 +125,14 @@ class SubjectFilter:
         self._nearer += (measurement.nearer - self._nearer) * min(gap_s / _NEARER_S, 1.0)
         self._learn_ratio(measurement, observation.stamp_ns)
         return True
+
+    def _restart(self, observation: PoseObservation, measurement: SubjectMeasurement, *, locked: bool) -> bool:
+        """Begin anew with a measurement that is not the subject's; where it is locked, it contradicts him."""
+        if locked:
+            self._contradicted = True
+        else:
+            self._start(observation, measurement)
+        return not locked
 
     def estimate(self, now_ns: int) -> SubjectEstimate | None:
         """The subject predicted to ``now_ns`` (half a second at most); None before the first measurement."""
@@ -160,7 +160,7 @@ class SubjectFilter:
         median does.  A quantile does not follow a few wrong images, the first ones least of all.
         """
         ratio = measurement.range_size_m / measurement.range_ground_m
-        if 0.5 < ratio < 2.0 and measurement.bending < _MAX_BENDING:  # NaN is not
+        if 0.5 < ratio < 2.0 and measurement.bending < MAX_BENDING:  # NaN is not
             self._ratios.append((stamp_ns, ratio))
         memory_ns, least = _RATIO_MEMORY_NS, _LEAST_RATIOS
         if self.height_wanders:

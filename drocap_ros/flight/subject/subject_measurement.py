@@ -37,18 +37,34 @@ _ANKLES = np.array([BODY_15.index("rankle"), BODY_15.index("lankle")])
 _TRUNK = np.array([BODY_15.index(name) for name in ("pelvis", "rhip", "lhip", "neck")])
 _NECK = BODY_15.index("neck")
 _ANKLE_HEIGHT = 0.055  # share of the stature; a swinging foot lifts the mean a little
-_CONFIDENCE = 0.25
-_STRIDE_M = 0.15  # standard deviation of the mean of the feet about the pelvis
+_CONFIDENCE = 0.25  # below it a joint counts as not seen
 _STEEP = np.sin(np.deg2rad(75.0))
 _SHALLOW = np.sin(np.deg2rad(4.0))
-_MAX_RANGE_M = 200.0
+_MAX_RANGE_M = 200.0  # a person is less than 10 px high there
 _THIRD_LONGEST = 0.99  # of the true length
-_GROUND_NOISE = 0.025  # of one image, share of the range, as the next two
-_SIZE_NOISE = 0.06
-_BEARING_NOISE = 0.008
-_LIFTED = 0.15  # feet apart by this share of the range: one is lifted
-_APART_NOISE = 0.1  # per distance between them
-_LEAN_RAD = 0.12  # standard deviation of the body's lean; looking down by a slope it changes lengths by as much
+SIZE_NOISE = 0.06  # of one image, share of the range
+MAX_BENDING = 0.3  # of a body whose size counts; 0.1 by noise alone
+
+
+class _Noise(NamedTuple):
+    """Standard deviations, of one image where nothing else is said; shares of the range where there is no unit.
+
+    ground, bearing : of the range by the ground, and across the sight
+    lifted : feet that are farther apart: one is lifted
+    apart : of the distance between the feet
+    stride_m : of the mean of the feet about the pelvis
+    lean_rad : of the body; looking down by a slope it changes lengths by as much
+    """
+
+    ground: float = 0.025
+    bearing: float = 0.008
+    lifted: float = 0.15
+    apart: float = 0.1
+    stride_m: float = 0.15
+    lean_rad: float = 0.12
+
+
+_NOISE = _Noise()
 
 
 class SubjectMeasurement(NamedTuple):
@@ -114,7 +130,7 @@ def locate_subject(
         return None
     slope = float(pelvis[2] / flat)
     size, bending = _range_from_size(rays, seen, pelvis[:2] / flat, config)
-    size_error = float(np.hypot(config.size_error, _LEAN_RAD * slope))
+    size_error = float(np.hypot(config.size_error, _NOISE.lean_rad * slope))
     ground, height, noise = _range_from_ground(rays, seen, camera.position, config)
     steady = size_over_ground * ground if np.isfinite(size_over_ground) and np.isfinite(ground) else size
     distance, sd = _fuse(steady, size_error, ground, _ground_sd(ground, height, config))
@@ -140,9 +156,9 @@ def locate_subject(
         )
 
     # Feet give a precise range from image to image, bones do not.
-    noise = noise if np.isfinite(noise) else _SIZE_NOISE * distance + 0.05
+    noise = noise if np.isfinite(noise) else SIZE_NOISE * distance + 0.05
     return SubjectMeasurement(
-        position, spread(noise, _BEARING_NOISE * distance + 0.03), spread(sd, turn), size, ground, bending, nearer
+        position, spread(noise, _NOISE.bearing * distance + 0.03), spread(sd, turn), size, ground, bending, nearer
     )
 
 
@@ -187,16 +203,16 @@ def _range_from_ground(
     ranges = height * np.hypot(ankles[:, 0], ankles[:, 1]) / -ankles[:, 2]
     apart, nearer = float(np.ptp(ranges)), float(ranges.min())
     # A lifted foot appears farther than the one that stands; feet a stride apart stand about the pelvis.
-    lifted = apart > _LIFTED * nearer
+    lifted = apart > _NOISE.lifted * nearer
     distance = nearer if lifted else float(ranges.mean())
-    noise = _GROUND_NOISE * distance + 0.05 + _APART_NOISE * min(apart, 0.5 * nearer)
+    noise = _NOISE.ground * distance + 0.05 + _NOISE.apart * min(apart, 0.5 * nearer)
     return distance, height, noise
 
 
 def _ground_sd(distance: float, height: float, config: SubjectConfig) -> float:
     """Standard deviation of a range of this length by the ground."""
     turn = np.deg2rad(config.attitude_error_deg)
-    errors = (turn * (height**2 + distance**2) / height, config.height_error_m * distance / height, _STRIDE_M)
+    errors = (turn * (height**2 + distance**2) / height, config.height_error_m * distance / height, _NOISE.stride_m)
     return float(np.linalg.norm(errors))
 
 
