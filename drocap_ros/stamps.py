@@ -6,8 +6,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 
-#: Nanoseconds of a second.
-NS = 10**9
+NS = 10**9  # nanoseconds of a second
 #: Longest time from the first to the last frame, ns: a year. More is no recording, and overflows.
 _LONGEST_NS = 365 * 86_400 * NS
 #: A stamp this far from the previous one belongs to another time.
