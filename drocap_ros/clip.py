@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -98,9 +97,7 @@ class Clip:
         use = (at_ns >= self.start_s * 1e9 - _SLACK_NS) & (at_ns <= self.end_s * 1e9 + _SLACK_NS)
         if not use.any():
             raise self._too_late(int(at_ns[-1]))
-        names = ("keypoints", "stamp_ns", "confidence", "covariance", "camera_rotation", "camera_position")
-        values = {name: getattr(tracks, name) for name in names}
-        return dataclasses.replace(tracks, **{k: v[use] for k, v in values.items() if v is not None})
+        return tracks.of_frames(use)
 
     def meter(
         self, progress: Progress | None, stage: str, duration_s: float | None

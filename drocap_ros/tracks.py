@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drocap_ros.background import Background, read_background
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.stamps import as_stamps, check_stamps
 
@@ -41,6 +42,7 @@ class Tracks:
     camera_rotation : (F, 3, 3) world (ENU) -> camera (x right, y down, z forward), or None
     camera_position : (F, 3) m ENU, or None
     camera_matrix : (3, 3) px, or None
+    background : fixed points of the scene in the images, or None
     """
 
     keypoints: np.ndarray
@@ -52,12 +54,20 @@ class Tracks:
     camera_rotation: np.ndarray | None = None
     camera_position: np.ndarray | None = None
     camera_matrix: np.ndarray | None = None
+    background: Background | None = None
 
     def __post_init__(self) -> None:
         _check(self)
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+    def of_frames(self, use: np.ndarray | slice) -> Tracks:
+        """A choice of the frames, at least one: (F,) bool, distinct indices in any order, or a slice."""
+        names = ("keypoints", "stamp_ns", "confidence", "covariance", "camera_rotation", "camera_position")
+        values = {name: getattr(self, name) for name in names}
+        background = None if self.background is None else self.background.of_frames(np.arange(len(self))[use])
+        return replace(self, background=background, **{k: v[use] for k, v in values.items() if v is not None})
 
     def at_rate(self, rate_hz: float) -> Tracks:
         """The same frames with ``rate_hz`` of them a second, gaps kept: slow motion at its true speed."""
@@ -88,6 +98,8 @@ def _check(t: Tracks) -> None:
         raise InputError(f"image_size: expected positive width and height, got {t.image_size}")
     _check_unit(k, t.image_size)
     _check_telemetry(t)
+    if t.background is not None:
+        t.background.check_frames(frames)
 
 
 def _check_unit(keypoints: np.ndarray, image_size: tuple[int, int]) -> None:
@@ -259,6 +271,7 @@ def load_tracks(path: str | Path) -> Tracks:
             joints=tuple(np.atleast_1d(arrays["joints"]).astype(str).tolist()),  # bytes, too
             stamp_ns=as_stamps(arrays["stamp_ns"]),
             image_size=(int(size[0]), int(size[1])),
+            background=read_background(arrays),
             **more,
         )
     except (InputError, ValueError) as error:
@@ -296,4 +309,5 @@ def save_tracks(path: str | Path, tracks: Tracks) -> None:
         stamp_ns=tracks.stamp_ns,
         image_size=np.array(tracks.image_size),
         **arrays,
+        **({} if tracks.background is None else tracks.background.arrays()),
     )

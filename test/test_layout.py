@@ -12,7 +12,7 @@ import pytest
 #: Bottom to top; a room imports rooms of its own layer or below.
 LAYERS = (
     ("errors", "revision", "parameters", "skeleton", "joint_maps", "leg_sides", "geometry", "keypoints", "observation",
-     "stamps", "tracks", "motion", "mocap", "clip", "contacts", "file_kind"),
+     "stamps", "background", "tracks", "motion", "mocap", "clip", "contacts", "file_kind"),
     ("perception", "flight", "reconstruction", "recording", "simulation"),
     ("open_images", "api", "config", "pipeline", "live_replay", "evaluation", "export", "report", "view"),
     ("ros",),
@@ -26,8 +26,9 @@ MAX_LINES = 350
 #: it makes needless; who raises a budget writes the reason beside the number.  The plan is issue 45's.
 BUDGETS = {
     ("errors", "revision", "parameters", "skeleton", "joint_maps", "leg_sides", "geometry", "keypoints", "observation",
-     "stamps", "tracks", "motion", "mocap", "clip", "contacts", "file_kind", "open_images", "api", "config", "pipeline",
-     "live_replay"): 3.30,  # 0.70 over the plan: poses' history, stamps, places on the Earth and images came down
+     "stamps", "background", "tracks", "motion", "mocap", "clip", "contacts", "file_kind", "open_images", "api",
+     "config", "pipeline", "live_replay"): 3.40,  # 0.80 over the plan: poses' history, stamps, places on the Earth and
+    # images came down; points of the scene in a tracks file (0.10)
     ("perception",): 5.20,  # 1.10 over the plan: tracking keeps its own association; foreign pictures and streams came
     ("reconstruction",): 7.50,  # 1.20 over the plan: world/ and live/ kept their steps; a constant a line, with reasons
     ("flight",): 8.90,  # 3.70 over the plan: an argument or constant a line, with reasons; filter of reports, preflight

@@ -77,19 +77,8 @@ def with_camera(
     at_ns : (F,) times of the images by the clock of the vehicle's states
     """
     poses = camera_poses(vehicle, at_ns, mount_pitch_deg)
-
-    def kept(values: np.ndarray | None) -> np.ndarray | None:
-        return None if values is None else values[poses.keep]
-
-    changed = dataclasses.replace(
-        tracks,
-        keypoints=tracks.keypoints[poses.keep],
-        stamp_ns=tracks.stamp_ns[poses.keep],
-        confidence=kept(tracks.confidence),
-        covariance=kept(tracks.covariance),
-        camera_rotation=poses.rotation,
-        camera_position=poses.position,
-    )
+    kept = dataclasses.replace(tracks, camera_rotation=None, camera_position=None).of_frames(poses.keep)
+    changed = dataclasses.replace(kept, camera_rotation=poses.rotation, camera_position=poses.position)
     return changed, poses.reason
 
 
