@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,3 +114,30 @@ def _whole(values: np.ndarray, field: str) -> np.ndarray:
     if values.size and not (np.abs(values.astype(np.float64)).max() < limit):
         raise InputError(f"{ARRAYS[field]}: expected indices, got up to {np.abs(values).max():g}; number them from 0")
     return values
+
+
+@dataclass(frozen=True)
+class FixedPoints:
+    """Fixed points of the scene in one image.
+
+    track : (N,) int64, the same number for the same point
+    point : (N, 2) float32 px
+    """
+
+    track: np.ndarray
+    point: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.track)
+
+
+def of_images(images: Iterable[FixedPoints | None]) -> Background | None:
+    """Observations of a recording's images in their order; None = no image was searched for points."""
+    found = [(frame, points) for frame, points in enumerate(images) if points is not None]
+    if not found:
+        return None
+    return Background(
+        np.repeat(np.array([f for f, _ in found], np.int32), [len(p) for _, p in found]),
+        np.concatenate([p.track for _, p in found]),
+        np.concatenate([p.point for _, p in found]),
+    )

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from drocap_ros.background import FixedPoints
 from drocap_ros.errors import InputError
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.skeleton import BODY_15, BODY_17, JointSet, body_set
@@ -30,6 +31,7 @@ class PoseObservation:
     covariance : (P, 3) float32 px^2, xx xy yy, NaN where the keypoint is
     confidence : (P,) float32 in [0, 1], calibrated: the share of such keypoints within 10 % of the box height of a
         human label
+    background : fixed points of the scene; None = the image was not searched for them
     """
 
     stamp_ns: int
@@ -41,6 +43,7 @@ class PoseObservation:
     keypoints: np.ndarray = field(default_factory=lambda: _empty(0, 2))
     covariance: np.ndarray = field(default_factory=lambda: _empty(0, 3))
     confidence: np.ndarray = field(default_factory=lambda: _empty(0))
+    background: FixedPoints | None = None
 
     @property
     def has_subject(self) -> bool:

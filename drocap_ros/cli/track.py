@@ -15,7 +15,7 @@ from drocap_ros.cli.options import (
     add_quiet_option,
     clip_of,
 )
-from drocap_ros.errors import DrocapError
+from drocap_ros.errors import DrocapError, InputError
 
 if TYPE_CHECKING:
     import cv2
@@ -47,6 +47,9 @@ def add_parser(subparsers: Subparsers) -> None:
     add_network_options(parser)
     parser.add_argument("--wait", action="store_true", help="track no other person after the subject is lost")
     parser.add_argument("--overlay", action="store_true", help="also write overlay.mp4 with the subject drawn")
+    parser.add_argument(
+        "--points", action="store_true", help="with --overlay: draw the scene's fixed points and their last second, too"
+    )
     add_config_option(parser)
     add_quiet_option(parser)
 
@@ -61,6 +64,8 @@ def run(args: argparse.Namespace) -> int:
     from drocap_ros.perception.tracking.pose_estimator_config import parse_subject
     from drocap_ros.pipeline import Selection
 
+    if args.points and not args.overlay:
+        raise InputError("--points: expected --overlay, whose video shows them, found none; add it")
     out = args.out or default_folder(Path(args.video), "tracks")
     check_output_folder(out)
     refuse_inputs([out / "persons.jpg"] if args.list else [out / "overlay.mp4"] * args.overlay, [args.video])
@@ -121,7 +126,7 @@ def _track(
     settings, begin_ns = follow_selected(args.video, config, models, selection, progress)
     estimator = PoseEstimator(models, settings)
     with open_images(args.video, config.image_ingest, args.topic) as images:
-        overlay = _OverlayWriter(target / "overlay.mp4", images.rate_hz) if args.overlay else None
+        overlay = _OverlayWriter(target / "overlay.mp4", images.rate_hz, args.points) if args.overlay else None
         meter = selection.clip.meter(progress, "2D pose", images.duration_s)
 
         def on_frame(frame: Frame, observation: PoseObservation) -> None:
@@ -145,8 +150,11 @@ def _track(
 class _OverlayWriter:
     """Writes the video with the subject drawn, at the given rate; without one, at that of its first two frames."""
 
-    def __init__(self, path: Path, rate_hz: float | None) -> None:
+    def __init__(self, path: Path, rate_hz: float | None, with_points: bool = False) -> None:
+        from drocap_ros.report.overlay import Trails
+
         self._path, self._rate_hz, self._count = path, rate_hz, 0
+        self._trails = Trails() if with_points else None
         self._first: tuple[int, np.ndarray] | None = None
         self._video: cv2.VideoWriter | None = None
 
@@ -158,7 +166,8 @@ class _OverlayWriter:
         height, width = frame.image.shape[:2]
         scale = min(1.0, 1280 / max(width, height))
         size = (max(2, round(width * scale) // 2 * 2), max(2, round(height * scale) // 2 * 2))
-        image = cv2.resize(draw(frame.image, observation), size, interpolation=cv2.INTER_AREA)
+        below = frame.image if self._trails is None else self._trails.draw(frame.image, observation)
+        image = cv2.resize(draw(below, observation), size, interpolation=cv2.INTER_AREA)
         if self._first is None:
             self._first = frame.stamp_ns, image
             return

@@ -1,7 +1,8 @@
 """Node ``pose_estimator``: images in, the subject's keypoints out.
 
 Subscribes ``image/compressed`` (sensor_msgs/CompressedImage) and ``roi`` (sensor_msgs/RegionOfInterest, the box of a
-drone's own tracker); publishes ``pose2d`` (drocap_ros/Pose2D) with the image's header.
+drone's own tracker); publishes ``pose2d`` (drocap_ros/Pose2D) and ``background`` (drocap_ros/BackgroundTracks) with the
+image's header.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from drocap_ros.perception.load_models import models_folder
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.recording.image_messages import image_from_message
 from drocap_ros.ros.component import OK, WARN
-from drocap_ros.ros.conversions import pose2d_to_ros, stamp_from_ros
+from drocap_ros.ros.conversions import background_to_ros, pose2d_to_ros, stamp_from_ros
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.image_input import ImageInput, ImageSample
 from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.load_level import LoadShedding
-from drocap_ros.ros.topics import TOPICS
+from drocap_ros.ros.topics import TOPICS, BackgroundTracks
 
 
 class PoseEstimatorNode(ManagedComponent):
@@ -37,6 +38,7 @@ class PoseEstimatorNode(ManagedComponent):
         self._roi: np.ndarray | None = None
         self._load_shedding = LoadShedding(self.config.max_load_level)
         self._pose2d = self.output("pose2d")
+        self._background = self.output("background") if BackgroundTracks is not None else None
         self._images = ImageInput(
             self, self._on_image, partial(image_from_message, compressed=True), TOPICS["image/compressed"].qos.depth
         )
@@ -77,6 +79,8 @@ class PoseEstimatorNode(ManagedComponent):
         if self._estimator.propagated:
             self.count(Key.IMAGES_PROPAGATED)
         self._pose2d.publish(pose2d_to_ros(observation, header.frame_id))
+        if self._background is not None and observation.background is not None:
+            self._background.publish(background_to_ros(observation.background, header))
         self.count(Key.IMAGES)
         self.produced(observation.stamp_ns)
         if observation.has_subject:

@@ -10,6 +10,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.observation import PoseObservation
+from drocap_ros.perception.background_tracks import BackgroundTracks
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import without_parts
 from drocap_ros.perception.load_models import limited_use, load_detector, load_pose_model
@@ -59,7 +60,7 @@ class PoseEstimator:
         self._body = BodyPoseModel(self.pose_model)
         self._others = OtherPoses(self.tracker, self._body)
         self._flow = KeypointFlow()
-        self._camera = CameraMotion()
+        self._background, self._camera = BackgroundTracks(), CameraMotion()
         self._motion: np.ndarray | None = None
         self._last_ns: int | None = None
         #: Rows of the last image that certainly showed the subject, and the subject in it.
@@ -97,6 +98,7 @@ class PoseEstimator:
             self.tracker.reset()
             self._flow.start(None, None)
             self._others = OtherPoses(self.tracker, self._body)
+            self._background.reset()
             self._camera.reset()
             self._margins, self._repeated, self._seen_ns = None, None, 0
         self._last_ns = stamp_ns
@@ -105,18 +107,29 @@ class PoseEstimator:
         rows = image[::_COMPARED_ROWS]
         if self._repeated is not None and roi is None and np.array_equal(rows, self._repeated[0]):
             return dataclasses.replace(self._repeated[1], stamp_ns=stamp_ns)
+        self._follow_background(image)
         observation, certain = self._observe(image, stamp_ns, roi, load_level)
         self._repeated = (rows.copy(), observation) if certain else None
-        return observation
+        points = self._background.renew([person.box for person in self.tracker.persons], stamp_ns)
+        return dataclasses.replace(observation, background=points)
+
+    def _follow_background(self, image: np.ndarray) -> None:
+        """Follow the scene's fixed points, and let all persons follow the camera's motion."""
+        last = self._background.points
+        now = self._background.follow(image)
+        if self.tracker.persons:
+            self._motion = self._camera.update(last, now, _size(image))
+        else:
+            self._camera.reset()
+            self._motion = None
+        if self._motion is not None:
+            self.tracker.move_camera(self._motion)
+            self._others.move_camera(self._motion)
 
     def _observe(
         self, image: np.ndarray, stamp_ns: int, roi: np.ndarray | None, load_level: int
     ) -> tuple[PoseObservation, bool]:
         """The subject in an image that differs from the last one, and whether it is certainly a person."""
-        self._motion = self._camera.update(image, [person.box for person in self.tracker.persons])
-        if self._motion is not None:
-            self.tracker.move_camera(self._motion)
-            self._others.move_camera(self._motion)
         self.keypoints = predicted = None
         if roi is None:
             if self._flow.steps < load_level and (moved := self._flow.propagate(image, stamp_ns)) is not None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
+from drocap_ros.background import of_images
 from drocap_ros.errors import InputError
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
@@ -84,4 +85,5 @@ def tracks_from_observations(observations: Sequence[PoseObservation], track_id: 
         image_size=observations[0].image_size,
         confidence=corrected.confidence,
         covariance=corrected.covariance,
+        background=of_images(o.background for o in observations),
     )

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drocap_ros.background import Background, FixedPoints, of_images
 from drocap_ros.errors import InputError
 from drocap_ros.flight.frames import optical_orientation
 from drocap_ros.geometry.camera_history import CameraHistory
@@ -55,6 +56,40 @@ def observation_from_message(message: Message) -> PoseObservation:
         covariance=covariance,
         confidence=confidence,
     )
+
+
+def fixed_points_from_message(message: Message) -> FixedPoints:
+    """``BackgroundTracks`` -> the scene's fixed points.
+
+    Raises
+    ------
+    InputError
+        When the arrays do not fit each other, a value is not finite, or a number is there twice.
+    """
+    track = np.array(message.track, np.int64)
+    point = float_array(message.point, (len(track), 2), "point")
+    if not np.isfinite(point).all():
+        raise InputError("point: expected finite px, got NaN; leave lost points out")
+    if len(np.unique(track)) < len(track):
+        raise InputError("track: expected distinct numbers in one image, got a repeated one; number the points")
+    return FixedPoints(track, point)
+
+
+def read_fixed_points(session: Session, topic: str, stamp_ns: np.ndarray) -> Background | None:
+    """Fixed points in the images of the stamps (F,); None = the topic has none.  Unusable messages are left out."""
+    images: list[FixedPoints | None] = [None] * len(stamp_ns)
+    place, refused = {stamp: i for i, stamp in enumerate(stamp_ns.tolist())}, 0
+    for _, message in session.messages((topic,)):
+        frame = place.get(header_stamp_ns(message))
+        if frame is None:
+            continue
+        try:
+            images[frame] = fixed_points_from_message(message)
+        except InputError:
+            refused += 1
+    if refused:
+        session.warn(f"{refused} messages on {topic} were refused")
+    return of_images(images)
 
 
 def add_state(history: CameraHistory, message: Message) -> None:

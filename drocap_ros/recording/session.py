@@ -17,6 +17,7 @@ from drocap_ros.errors import InputError
 #: A message as rclpy or rosbags decodes it: the fields of its definition, no common class.
 Message: TypeAlias = Any
 POSE2D = "drocap_ros/msg/Pose2D"
+BACKGROUND_TRACKS = "drocap_ros/msg/BackgroundTracks"
 POSE3D = "drocap_ros/msg/Pose3D"
 POSE3D_WINDOW = "drocap_ros/msg/Pose3DWindow"
 VEHICLE_STATE = "drocap_ros/msg/VehicleState"

@@ -12,7 +12,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.rotations import unit_quaternions
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.recording import session as recorded
-from drocap_ros.recording.pose_messages import float_array
+from drocap_ros.recording.pose_messages import float_array, read_fixed_points
 from drocap_ros.recording.session import Message, Session, TopicInfo, calibration_of, header_stamp_ns, xyzw_of
 from drocap_ros.recording.telemetry.camera_poses import with_camera
 from drocap_ros.recording.telemetry.log import VehicleTrack
@@ -64,6 +64,9 @@ def read_pose2d(session: Session, mount_pitch_deg: float | None = None, *, telem
     track_id = most_frequent_subject(session, ordered)
     try:
         tracks = _tracks_of(np.array(stamps, np.int64), ordered, track_id)
+        if (points := _nearest(session.topics_of(recorded.BACKGROUND_TRACKS), chosen.name)) is not None:
+            background = read_fixed_points(session, points.name, tracks.stamp_ns)
+            tracks = dataclasses.replace(tracks, background=background)
         return with_recorded_camera(session, tracks, chosen.name, mount_pitch_deg, telemetry=telemetry)
     except InputError as error:
         raise InputError(f"{session.path}: {chosen.name}: {error}") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Sequence
 from functools import partial
 
@@ -16,6 +17,8 @@ from drocap_ros.skeleton import side_of
 _COLOURS = {"left": (255, 160, 40), "right": (60, 60, 255), "middle": (90, 220, 90)}
 #: Radius of the ellipses in standard deviations.
 _SIGMAS = 2.0
+#: Points of the scene and their ways over the last second: magenta, as few scenes have it.
+_POINT, _TRAIL, _TRAIL_NS = (255, 0, 255), (210, 90, 210), 1_000_000_000
 #: Most images of the picture of all persons: four columns fill a screen.
 _MOST_IMAGES = 12
 #: Largest width of each, px.
@@ -52,6 +55,30 @@ def draw(image: np.ndarray, observation: PoseObservation) -> np.ndarray:
     for joint in np.nonzero(seen)[0]:
         _ellipse(out, points[joint], observation.covariance[joint], colours[joint], line_px)
     return out
+
+
+class Trails:
+    """Fixed points of the scene with their way over the last second."""
+
+    def __init__(self) -> None:
+        self._past: deque[tuple[int, dict[int, np.ndarray]]] = deque()
+
+    def draw(self, image: np.ndarray, observation: PoseObservation) -> np.ndarray:
+        """Copy of the next image (H, W, 3) uint8 BGR with the points; those that began in it are small."""
+        import cv2
+
+        out, points = image.copy(), observation.background
+        now = {} if points is None else dict(zip(points.track.tolist(), points.point, strict=True))
+        self._past.append((observation.stamp_ns, now))
+        while observation.stamp_ns - self._past[0][0] > _TRAIL_NS:
+            self._past.popleft()
+        line_px = max(1, round(max(image.shape[:2]) / 640))
+        for track, point in now.items():
+            way = np.round([past[track] for _, past in self._past if track in past]).astype(int)
+            cv2.polylines(out, [way[:, None]], False, _TRAIL, line_px, cv2.LINE_AA)
+            radius = 2 * line_px if len(way) > 1 else line_px
+            cv2.circle(out, tuple(np.round(point).astype(int).tolist()), radius, _POINT, -1, cv2.LINE_AA)
+        return out
 
 
 def draw_numbers(image: np.ndarray, boxes: dict[int, np.ndarray], title: str) -> np.ndarray:

@@ -10,9 +10,12 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from sensor_msgs.msg import CameraInfo, CompressedImage, RegionOfInterest
 from visualization_msgs.msg import ImageMarker, MarkerArray
 
+from drocap_ros import msg
 from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleState
 from drocap_ros.srv import OrbitCommand
 
+#: None in an installation whose messages were built before there was this one.
+BackgroundTracks = getattr(msg, "BackgroundTracks", None)
 try:
     from tf2_msgs.msg import TFMessage as TFMessage
 except ImportError:  # missing from the ROS wheels; `make setup` builds it
@@ -71,8 +74,12 @@ FROM_OUTSIDE = frozenset({"image/compressed", "camera_info", "roi", "vehicle/sta
 if TFMessage is not None:
     TOPICS["/tf"] = Topic(TFMessage, RESULT_QOS)
 
+if BackgroundTracks is not None:
+    TOPICS["background"] = Topic(BackgroundTracks, RESULT_QOS, one_clock=True)
+
 SERVICES: dict[str, type] = {"orbit/command": OrbitCommand}
 
+_BACKGROUND = ("background",) if BackgroundTracks is not None else ()
 _TF = ("/tf",) if TFMessage is not None else ()
 
 
@@ -95,7 +102,7 @@ class NodeEntry(NamedTuple):
 NODES: dict[str, NodeEntry] = {
     "image_ingest": NodeEntry(("image/compressed", "camera_info"), source=True, live=True, niceness=5),
     "flight_simulator": NodeEntry(("image/compressed", "camera_info"), source=True),
-    "pose_estimator": NodeEntry(("pose2d",), ("image/compressed", "roi"), live=True),
+    "pose_estimator": NodeEntry(("pose2d", *_BACKGROUND), ("image/compressed", "roi"), live=True),
     "capture_simulator": NodeEntry(("pose2d", "camera_info"), source=True),
     "initializer": NodeEntry(("pose3d/initial",), ("pose2d",), live=True),
     "bundle_adjuster": NodeEntry(

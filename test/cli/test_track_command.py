@@ -36,6 +36,53 @@ def test_track_writes_tracks_and_an_overlay(models, shared, tmp_path, capsys):
     assert tracks.image_size == (720, 1280)
     assert (out / "overlay.mp4").stat().st_size > 10_000
     assert "the subject in 65 (100.0%)" in capsys.readouterr().out
+    points = tracks.background
+    assert set(points.frame.tolist()) == set(range(65))
+    margin = 0.02 * np.array(tracks.image_size)
+    assert ((points.point >= -margin) & (points.point <= np.array(tracks.image_size) + margin)).all()
+    # The camera stands still: a point of the scaffold stays where it is.
+    longest = np.argmax(np.bincount(points.track))
+    way = points.point[points.track == longest]
+    assert len(way) > 30
+    assert np.ptp(way, axis=0).max() < 1.0
+
+
+def moving_camera(folder: Path, count: int = 12) -> None:
+    """Images of a rendered man before a wall with a pattern, over which the camera pans by 6 px an image."""
+    cv2 = pytest.importorskip("cv2")
+    folder.mkdir()
+    rng = np.random.default_rng(2)
+    coarse = rng.normal(120, 30, (60, 90)).clip(0, 255).astype(np.uint8)
+    wall = np.repeat(cv2.resize(coarse, (900, 600), interpolation=cv2.INTER_CUBIC)[..., None], 3, axis=2)
+    for i, image in enumerate(rendered_images(count)):
+        picture = cv2.resize(image, (640, 360))
+        picture[:90] = wall[100:190, 60 + 6 * i : 700 + 6 * i]
+        cv2.imwrite(str(folder / f"{i:03}.png"), picture)
+
+
+def test_overlay_shows_the_points_of_the_scene_on_request(tmp_path, capsys):
+    cv2 = pytest.importorskip("cv2")
+    moving_camera(tmp_path / "images")
+    words = ["track", str(tmp_path / "images"), "--models", "simulation", "--overlay"]
+    last = {}
+    for option in ((), ("--points",)):
+        out = tmp_path / f"out{len(option)}"
+        assert main([*words, *option, "--out", str(out)]) == 0
+        video = cv2.VideoCapture(str(out / "overlay.mp4"))
+        video.set(cv2.CAP_PROP_POS_FRAMES, 11)
+        last[option] = video.read()[1].astype(int)
+    points = load_tracks(tmp_path / "out1" / "tracks.npz").background
+    wall = points.point[(points.frame == 11) & (points.point[:, 1] < 70)]
+    assert len(wall) > 10
+    x, y = np.round(wall).astype(int).T
+    for option, shown in (("--points",), True), ((), False):
+        blue, green, red = last[option][y, x].T
+        assert ((np.minimum(blue, red) - green > 60).mean() > 0.9) == shown
+
+
+def test_points_are_shown_by_an_overlay_alone(tmp_path, capsys):
+    assert main(["track", str(tmp_path), "--models", "simulation", "--points"]) == 2
+    assert "--points: expected --overlay" in capsys.readouterr().err
 
 
 def test_wait_follows_nobody_after_the_subject(tmp_path, capsys):

@@ -10,6 +10,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.recording.open_session import open_session
 from drocap_ros.recording.pose_messages import add_calibration, read_observations
+from drocap_ros.recording.session import BACKGROUND_TRACKS as POINTS
 from drocap_ros.recording.session import COMPRESSED_IMAGE, IMAGE
 from drocap_ros.recording.session_tracks import read_pose2d
 from drocap_ros.simulation.capture import simulate_capture
@@ -31,6 +32,34 @@ def test_keypoints_exactly_as_in_the_messages(pose_session, capture):
     assert tracks.image_size == capture.tracks.image_size
     assert tracks.camera_rotation is None
     assert tracks.camera_matrix is None
+
+
+def test_fixed_points_exactly_as_in_the_messages(tmp_path, messages, capture):
+    """One message has another image's stamp, one has too few numbers, one repeats a number and one a lost point."""
+    stamps = capture.tracks.stamp_ns.tolist()
+    rng = np.random.default_rng(0)
+    entries, sent = [], {}
+    for i, stamp in enumerate(stamps):
+        entries.append(("/drocap/pose2d", messages.pose2d(capture.tracks, i, stamp), stamp))
+        track = np.arange(i, i + 20, dtype=np.int64)
+        point = rng.uniform(0, 700, (20, 2)).astype(np.float32)
+        if i < 4:
+            sent[i] = track, point.copy()
+        shown = stamp + 5 if i == 4 else stamp
+        track = track[:-1] if i == 5 else np.append(track[:-1], track[0]) if i == 6 else track
+        if i == 7:
+            point[3, 1] = np.nan
+        if i < 8:
+            message = messages(POINTS, header=messages.header(shown), track=track, point=point.ravel())
+            entries.append(("/drocap/background", message, stamp))
+    record(tmp_path / "s", [(topic, message, log, messages.cdr(message)) for topic, message, log in entries])
+    with open_session(tmp_path / "s") as session:
+        background = read_pose2d(session).background
+        assert session.warnings == ["3 messages on /drocap/background were refused"]
+    assert sorted(set(background.frame.tolist())) == sorted(sent)
+    for i, (track, point) in sent.items():
+        assert np.array_equal(background.track[background.frame == i], track)
+        assert np.array_equal(background.point[background.frame == i], point)
 
 
 def test_images_without_a_subject_are_frames_of_nan(tmp_path, messages, capture):

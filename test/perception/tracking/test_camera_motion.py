@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from drocap_ros.perception.background_tracks import BackgroundTracks
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.tracking.box_filter import BoxFilter
 from drocap_ros.perception.tracking.camera_motion import CameraMotion, moved_box, sweeps
@@ -40,6 +41,20 @@ def camera(x=-700.0, y=-500.0, degrees=0.0, zoom=1.0):
     return np.column_stack([turn, [x, y]])
 
 
+class Motion:
+    """The camera's motion over images, from the points that are followed in them."""
+
+    def __init__(self):
+        self.points, self.camera, self.images = BackgroundTracks(), CameraMotion(), 0
+
+    def update(self, image, persons):
+        last = self.points.points
+        found = self.camera.update(last, self.points.follow(image), image.shape[1::-1])
+        self.points.renew(persons, self.images * STEP_NS)
+        self.images += 1
+        return found
+
+
 def apart(found, first, second):
     """Largest error (px) of a motion between two cameras, in the corners of the image."""
     corners = np.array([[0, 0], [SIZE[0], 0], [0, SIZE[1]], SIZE], float)
@@ -58,7 +73,7 @@ def apart(found, first, second):
     ids=["pan", "fast pan, blurred", "turn and zoom"],
 )
 def test_the_motion_of_the_ground_is_found(ground, change, blur):
-    motion = CameraMotion()
+    motion = Motion()
     first, second = camera(), camera(**change)
     assert motion.update(view(ground, first, blur), PERSON) is None
     found = motion.update(view(ground, second, blur), PERSON)
@@ -67,7 +82,7 @@ def test_the_motion_of_the_ground_is_found(ground, change, blur):
 
 
 def test_a_person_who_fills_half_the_image_is_not_the_ground(ground):
-    motion = CameraMotion()
+    motion = Motion()
     box = np.array([[160.0, 0.0, 520.0, 360.0]])
     cameras = camera(), camera(x=-715.0)
     for i in range(2):
@@ -79,7 +94,7 @@ def test_a_person_who_fills_half_the_image_is_not_the_ground(ground):
 
 
 def test_small_motions_add_up(ground):
-    motion = CameraMotion()
+    motion = Motion()
     found = [motion.update(view(ground, camera(x=-700.0 - 2 * i)), PERSON) for i in range(10)]
     steps = [(i, matrix) for i, matrix in enumerate(found) if matrix is not None]
     assert [i for i, _ in steps] == [4, 8]
@@ -87,15 +102,22 @@ def test_small_motions_add_up(ground):
         assert apart(matrix, camera(), camera(x=-708.0)) < 1.0
 
 
+def test_after_a_reset_small_motions_add_up_anew(ground):
+    motion = Motion()
+    found = []
+    for i in range(8):
+        if i == 3:
+            motion.camera.reset()
+        found.append(motion.update(view(ground, camera(x=-700.0 - 2 * i)), PERSON))
+    assert [i for i, matrix in enumerate(found) if matrix is not None] == [6]
+
+
 def test_what_does_not_show_the_motion_gives_none(ground):
-    motion = CameraMotion()
+    motion = Motion()
     grey = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
     assert [motion.update(grey, PERSON) for _ in range(2)] == [None, None]
     assert motion.update(view(ground, camera()), PERSON) is None  # a cut
-    assert motion.update(view(ground, camera()), np.empty((0, 4))) is None
     assert motion.update(view(ground, camera(x=-1500.0)), PERSON) is None  # nothing in common
-    motion.reset()
-    assert motion.update(view(ground, camera()), PERSON) is None
     assert motion.update(view(ground, camera())[:180, :320].copy(), PERSON) is None  # another size
 
 
@@ -150,6 +172,6 @@ def test_way_of_a_quarter_of_the_person_blurs_it(way, blurred):
 
 @pytest.mark.parametrize("size", [(1, 5000), (5000, 2), (3, 961), (1, 1)])
 def test_image_of_a_few_rows_has_no_motion(size):
-    motion = CameraMotion()
+    motion = Motion()
     for _ in range(2):
         assert motion.update(np.zeros((*size, 3), np.uint8), PERSON) is None
