@@ -302,6 +302,8 @@ def _as_float(array: np.ndarray, name: str) -> np.ndarray:
 def save_tracks(path: str | Path, tracks: Tracks) -> None:
     """Write a tracks ``.npz``."""
     arrays = {name: getattr(tracks, name) for name in _OPTIONAL if getattr(tracks, name) is not None}
+    if tracks.background is not None:
+        arrays |= tracks.background.arrays()
     np.savez_compressed(
         path,
         keypoints=tracks.keypoints,
@@ -309,5 +311,4 @@ def save_tracks(path: str | Path, tracks: Tracks) -> None:
         stamp_ns=tracks.stamp_ns,
         image_size=np.array(tracks.image_size),
         **arrays,
-        **({} if tracks.background is None else tracks.background.arrays()),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -15,7 +15,7 @@ from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleSta
 from drocap_ros.srv import OrbitCommand
 
 #: None in an installation whose messages were built before there was this one.
-BackgroundTracks = getattr(msg, "BackgroundTracks", None)
+BackgroundTracks: Any = getattr(msg, "BackgroundTracks", None)
 try:
     from tf2_msgs.msg import TFMessage as TFMessage
 except ImportError:  # missing from the ROS wheels; `make setup` builds it
