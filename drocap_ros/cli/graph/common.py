@@ -60,4 +60,7 @@ def import_bringup() -> ModuleType:
     try:
         return importlib.import_module("drocap_ros.bringup")
     except ImportError as error:
-        raise InputError(f"expected ROS 2 with drocap_ros's messages, found none ({error}); run `make setup`") from None
+        raise InputError(
+            f"expected ROS 2 with drocap_ros's messages, found none ({error}); run `make setup` in a checkout, which"
+            " installs both, or see docs/install.md"
+        ) from None
