@@ -52,7 +52,7 @@ class MavlinkBridgeConfig(SubjectConfig, OrbitConfig, SafetyConfig):
         0.2, "time without a step of the control loop after which the watchdog holds the vehicle", "s", 0.1, 2
     )
     max_control_timeout_s: float = param(
-        0.5, "longest time-out of the autopilot without setpoints that allows motion; 0 = not checked", "s", 0, 10
+        0.5, "longest time-out without setpoints: a longer or unknown one forbids motion; 0 = not checked", "s", 0, 10
     )
     gimbal_control: bool = param(False, "whether the mount's pitch follows the subject")
 
