@@ -36,7 +36,7 @@ from drocap_ros.evaluation.protocol import (
 from drocap_ros.evaluation.rotation import rotation_study
 from drocap_ros.evaluation.tables import rotation_markdown, world_markdown
 from drocap_ros.evaluation.world import world_study
-from drocap_ros.evaluation.world_protocol import world_sequences
+from drocap_ros.evaluation.world_protocol import WorldCase, world_sequences
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.simulation.capture import simulate_capture
 from drocap_ros.simulation.capture_config import SimulationConfig
@@ -137,17 +137,25 @@ def world(args: argparse.Namespace) -> None:
 
 def telemetry(args: argparse.Namespace) -> None:
     pages = []
-    for level, still in (("exact", False), ("rtk", False), ("gps", False), ("exact", True)):
+    cases = [
+        WorldCase(level, background=background) for background in (False, True) for level in ("exact", "rtk", "gps")
+    ]
+    for case in (*cases, WorldCase("exact", still=True), WorldCase("exact", still=True, background=True)):
         with progress_bars() as progress:
-            rows = world_study(world_sequences(args.mocap, 3, args.limit), level, still=still, progress=progress)
-        pages.append(world_markdown(rows, level, still))
+            rows = world_study(world_sequences(args.mocap, 3, args.limit), case, progress=progress)
+        pages.append(world_markdown(rows, case))
     write_figures("accuracy_telemetry", "Motion in the world by telemetry that errs", "\n".join(pages))
 
 
 def calibration(args: argparse.Namespace) -> None:
-    with progress_bars() as progress:
-        rows = calibration_study(args.mocap, runs=args.runs, limit=args.limit, progress=progress)
-    write_figures("accuracy_calibration", "Yaw and latency of the telemetry, found", calibration_markdown(rows))
+    pages = []
+    for background in {"without": [False], "with": [True], "both": [False, True]}[args.background]:
+        with progress_bars() as progress:
+            options = {"runs": args.runs, "limit": args.limit, "background": background}
+            rows = calibration_study(args.mocap, **options, progress=progress)
+        title = "With fixed points of the scene:" if background else "By the body alone:"
+        pages.append(f"{title}\n\n{calibration_markdown(rows)}")
+    write_figures("accuracy_calibration", "Yaw and latency of the telemetry, found", "\n".join(pages))
 
 
 PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
@@ -162,6 +170,8 @@ def main() -> int:
     parser.add_argument("--mocap", type=Path, default=ROOT.parent / "shared" / "mocap" / "dev")
     parser.add_argument("--limit", type=int, help="only the first N sequences")
     parser.add_argument("--runs", type=int, default=20, help="flights of the calibration study (default 20)")
+    words = "fixed points of the scene in the calibration study (default both)"
+    parser.add_argument("--background", choices=("without", "with", "both"), default="both", help=words)
     parser.add_argument("--processes", type=int, default=1)
     args = parser.parse_args()
     for part in args.parts or PARTS:

@@ -109,12 +109,12 @@ def world_tracks(frames: int) -> Any:
     """A walking person, seen and measured by a drone with the errors of GPS (`drocap evaluate world`)."""
     import numpy as np
 
-    from drocap_ros.evaluation.world_protocol import FPS, world_view
+    from drocap_ros.evaluation.world_protocol import FPS, WorldCase, world_view
     from drocap_ros.mocap import Sequence
     from drocap_ros.simulation.simulated_person import simulate_person
 
     person = simulate_person(np.arange(frames) / FPS, action="walk", seed=0)
-    return world_view(Sequence("walk", 1000.0 * person), "gps").tracks
+    return world_view(Sequence("walk", 1000.0 * person), WorldCase("gps")).tracks
 
 
 if __name__ == "__main__":

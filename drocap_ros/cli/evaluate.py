@@ -75,7 +75,12 @@ def _add_world(kinds: Subparsers) -> None:
         " seen by a perspective camera that orbits the person, with telemetry of stated errors.",
     )
     _add_study_options(parser, "world.csv and world.md")
-    parser.add_argument("--telemetry", choices=("exact", "rtk", "gps"), default="exact", help="default: exact")
+    levels = ("none", "exact", "rtk", "gps")
+    parser.add_argument("--telemetry", choices=levels, default="exact", help="default: exact")
+    parser.add_argument("--background", action="store_true", help="the tracks hold fixed points of the scene")
+    parser.add_argument(
+        "--reverse", metavar="S", type=float, default=0.0, help="the orbit turns back every S seconds (default: never)"
+    )
     parser.add_argument("--still", action="store_true", help="the camera keeps its bearing from the person")
     parser.add_argument("--method", choices=METHODS, default="ba", help="default: ba")
     parser.add_argument("--every", metavar="N", type=int, default=1, help="only every N-th sequence")
@@ -129,15 +134,14 @@ def _world(args: argparse.Namespace) -> int:
     from drocap_ros.cli.progress import progress_bars
     from drocap_ros.evaluation.tables import study_record, world_markdown
     from drocap_ros.evaluation.world import world_study
-    from drocap_ros.evaluation.world_protocol import world_sequences
+    from drocap_ros.evaluation.world_protocol import WorldCase, world_sequences
 
     _check_out(args)
+    case = WorldCase(args.telemetry, args.still, args.reverse, args.background)
     with progress_bars(args.quiet) as progress:
         sequences = world_sequences(args.folder, args.every, args.limit)
-        rows = world_study(
-            sequences, args.telemetry, still=args.still, seed=args.seed, method=args.method, progress=progress
-        )
-    return _finish(args, "world", [study_record(row) for row in rows], world_markdown(rows, args.telemetry, args.still))
+        rows = world_study(sequences, case, seed=args.seed, method=args.method, progress=progress)
+    return _finish(args, "world", [study_record(row) for row in rows], world_markdown(rows, case))
 
 
 def _check_out(args: argparse.Namespace) -> None:

@@ -15,6 +15,7 @@ from drocap_ros.evaluation.compare import MotionErrors, WorldErrors
 from drocap_ros.evaluation.metrics import JOINT_GROUPS
 from drocap_ros.evaluation.rotation import RotationRow
 from drocap_ros.evaluation.world import WorldRow, world_means
+from drocap_ros.evaluation.world_protocol import WorldCase
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -146,14 +147,13 @@ def _group_cells(method: str, rows: list[RotationRow]) -> list[str]:
     return [LABELS[method], *(f"{g:.1f}" for g in groups), f"{np.mean(toes):.1f}" if toes else "-"]
 
 
-def world_markdown(rows: list[WorldRow], telemetry: str, still: bool) -> str:
+def world_markdown(rows: list[WorldRow], case: WorldCase) -> str:
     """Errors of every sequence and their means as Markdown."""
     cells = [[row.sequence, *world_cells(row.errors)] for row in rows]
     seconds = sum(row.seconds for row in rows) / sum(row.frames for row in rows) * 300
     measured, placed = sum(row.metric for row in rows), sum(row.frame == "world" for row in rows)
-    kind = f"{telemetry} telemetry, {'still camera' if still else 'orbit'}"
     lines = [
-        f"Motion in the world, {len(rows)} sequences, {kind}.",
+        f"Motion in the world, {len(rows)} sequences, {case.words()}.",
         "",
         *markdown_table(["sequence", *WORLD_HEAD], [*cells, ["mean", *world_cells(world_means(rows))]]),
         "",

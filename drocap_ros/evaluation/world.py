@@ -8,7 +8,7 @@ import numpy as np
 
 from drocap_ros.evaluation.compare import WorldErrors, world_errors
 from drocap_ros.evaluation.protocol import FPS, Progress, reported
-from drocap_ros.evaluation.world_protocol import world_view
+from drocap_ros.evaluation.world_protocol import WorldCase, world_view
 from drocap_ros.mocap import Sequence
 from drocap_ros.reconstruction.reconstruct import reconstruct
 
@@ -25,9 +25,9 @@ class WorldRow:
     errors: WorldErrors
 
 
-def measure_world(sequence: Sequence, telemetry: str, *, still: bool, seed: int, method: str) -> WorldRow:
+def measure_world(sequence: Sequence, case: WorldCase, *, seed: int, method: str) -> WorldRow:
     """Reconstruct one view of one sequence and compare it with the truth."""
-    view = world_view(sequence, telemetry, still=still, seed=seed)
+    view = world_view(sequence, case, seed=seed)
     motion = reconstruct(view.tracks, method=method)
     errors = world_errors(motion.joints3d, view.truth, FPS, motion.covariance)
     if motion.frame != "world":  # its telemetry was refused: in the camera's axes only the body is comparable
@@ -40,16 +40,15 @@ def measure_world(sequence: Sequence, telemetry: str, *, still: bool, seed: int,
 
 def world_study(
     sequences: list[tuple[int, Sequence]],
-    telemetry: str = "exact",
+    case: WorldCase | None = None,
     *,
-    still: bool = False,
     seed: int = 0,
     method: str = "ba",
     progress: Progress | None = None,
 ) -> list[WorldRow]:
     """Every sequence of :func:`~drocap_ros.evaluation.world_protocol.world_sequences`, with its own seed."""
     return [
-        measure_world(sequence, telemetry, still=still, seed=seed + own, method=method)
+        measure_world(sequence, case or WorldCase(), seed=seed + own, method=method)
         for own, sequence in reported(sequences, len(sequences), "world study", progress)
     ]
 

@@ -2,12 +2,13 @@
 
 Sequences of at least 8 s, their first 20 s at 24 fps.  A perspective camera (1280x720, 70 degrees wide) orbits at 6 m,
 2.5 m high, 19 deg/s, aimed at the person's smoothed place.  2D noise is 3 px per coordinate, correlated over 0.1 s;
-2 % of the joints are thrown by up to 80 px.  There are no confidences.
+2 % of the joints are thrown by up to 80 px.  There are no confidences.  Fixed points of the scene are those of
+:mod:`world_scene`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.protocol import FPS, protocol_sequences
+from drocap_ros.evaluation.world_scene import PinholePath, followed_points
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.mocap import Sequence
 from drocap_ros.skeleton import BODY_15, BODY_17, indices
@@ -66,6 +68,42 @@ TELEMETRY = {
     "rtk": TelemetryErrors(0.05, 0.3, 0.1),
     "gps": TelemetryErrors(0.5, 1.0, 0.3, 0.08),
 }
+#: Level without any telemetry: only the lens is known.
+NONE = "none"
+
+
+@dataclass(frozen=True)
+class WorldCase:
+    """What the study varies.
+
+    telemetry : a key of ``TELEMETRY`` or ``NONE``
+    still : the camera keeps its bearing from the person instead of orbiting
+    reverse_s : the orbit turns back every so many seconds, first after half of them, within a second; 0 = never
+    background : the tracks hold fixed points of the scene
+
+    Raises
+    ------
+    InputError
+        When the orbit turns back while it still turns.
+    """
+
+    telemetry: str = "exact"
+    still: bool = False
+    reverse_s: float = 0.0
+    background: bool = False
+
+    def __post_init__(self) -> None:
+        if not (self.reverse_s == 0.0 or 2 * _TURN_S <= self.reverse_s < np.inf):
+            raise InputError(
+                f"--reverse: expected 0 (never) or at least {2 * _TURN_S:g} s, got {self.reverse_s:g}; choose another"
+            )
+
+    def words(self) -> str:
+        """The case in a table's title."""
+        known = "no telemetry" if self.telemetry == NONE else f"{self.telemetry} telemetry"
+        way = "still camera" if self.still else "orbit"
+        back = f" that turns back every {self.reverse_s:g} s" if self.reverse_s and not self.still else ""
+        return f"{known}, {way}{back}{', background' if self.background else ''}"
 
 
 @dataclass(frozen=True)
@@ -75,11 +113,13 @@ class WorldView:
     tracks : keypoints in px and the telemetry
     truth : (F, P, 3) m, ENU; the lowest ankles stand 7 cm above z = 0
     camera_rotation : (F, 3, 3) true, world -> camera
+    camera_position : (F, 3) m, true
     """
 
     tracks: Tracks
     truth: np.ndarray
     camera_rotation: np.ndarray
+    camera_position: np.ndarray
 
 
 def world_sequences(folder: Path, every: int = 1, limit: int | None = None) -> list[tuple[int, Sequence]]:
@@ -99,49 +139,55 @@ def world_sequences(folder: Path, every: int = 1, limit: int | None = None) -> l
 
 
 def world_view(
-    sequence: Sequence,
-    telemetry: str | TelemetryErrors = "exact",
-    *,
-    still: bool = False,
-    reverse: bool = False,
-    seed: int = 0,
+    sequence: Sequence, case: WorldCase | None = None, errors: TelemetryErrors | None = None, *, seed: int = 0
 ) -> WorldView:
     """View of one sequence.
 
     Parameters
     ----------
-    telemetry : a key of ``TELEMETRY``, or other errors
-    still : the camera keeps its bearing from the person instead of orbiting
-    reverse : the orbit turns round in the middle, within a second
-    seed : of the orbit's phase, the 2D noise and the errors of the telemetry
+    case : default: exact telemetry of an orbit
+    errors : others than those of the case's telemetry
+    seed : of the orbit's phase, the 2D noise, the errors of the telemetry and the scene
     """
-    errors = TELEMETRY[telemetry] if isinstance(telemetry, str) else telemetry
+    case = case or WorldCase()
+    errors = errors or TELEMETRY.get(case.telemetry, TelemetryErrors())
     rng = np.random.default_rng(seed)
     truth = _on_ground(sequence.x / 1000.0)
     frames = len(truth)
-    phase, rate = rng.uniform(0, 2 * np.pi), 0.0 if still else np.deg2rad(SPEED_DEG_S)
-    turn_s = 0.5 * frames / FPS if reverse else np.inf
-    position, rotation = _camera(truth, phase, rate, 0.0, turn_s)
+    orbit = _Orbit(rng.uniform(0, 2 * np.pi), 0.0 if case.still else np.deg2rad(SPEED_DEG_S), case.reverse_s)
+    position, rotation = _camera(truth, orbit, 0.0)
     # The toes have draws of their own: those of the other joints are the same with and without them.
     body, toes = np.split(_project(truth, position, rotation), [len(BODY_15)], axis=1)
-    body, toes = _with_noise(rng, body), _with_noise(np.random.default_rng([seed, len(BODY_15)]), toes)
-    reported_position, reported_rotation = _camera(truth, phase, rate, errors.late_s, turn_s)
-    drift = _wander(rng, frames, _POSITION_WANDER_S, 3) * [1.0, 1.0, 0.7]
-    misalignment = np.deg2rad(errors.misalignment_deg) * rng.choice([-1.0, 1.0], 3)
-    north = exp_so3(np.array([0.0, 0.0, -np.deg2rad(errors.yaw_deg)]))
-    wander = np.deg2rad(errors.attitude_deg) * _wander(rng, frames, _ATTITUDE_WANDER_S, 3)
+    seen = [_with_noise(rng, body), _with_noise(np.random.default_rng([seed, len(BODY_15)]), toes)]
     tracks = Tracks(
-        keypoints=np.concatenate([body, toes], axis=1),
+        keypoints=np.concatenate(seen, axis=1),
         joints=BODY_17.joints[: truth.shape[1]],
         stamp_ns=np.round(np.arange(frames) * (1e9 / FPS)).astype(np.int64),
         image_size=IMAGE_SIZE,
-        camera_rotation=exp_so3(misalignment) @ exp_so3(wander) @ reported_rotation @ north,
-        camera_position=reported_position + errors.position_m * drift,
         camera_matrix=np.array(
             [[FOCAL_PX, 0.0, IMAGE_SIZE[0] / 2], [0.0, FOCAL_PX, IMAGE_SIZE[1] / 2], [0.0, 0.0, 1.0]]
         ),
     )
-    return WorldView(tracks, truth, rotation)
+    if case.telemetry != NONE:
+        reported = _reported(rng, _camera(truth, orbit, errors.late_s), errors)
+        tracks = replace(tracks, camera_position=reported[0], camera_rotation=reported[1])
+    if case.background:
+        path = PinholePath(position, rotation, FOCAL_PX, IMAGE_SIZE)
+        tracks = replace(tracks, background=followed_points(path, truth, FPS, seed))
+    return WorldView(tracks, truth, rotation, position)
+
+
+def _reported(
+    rng: np.random.Generator, camera: tuple[np.ndarray, np.ndarray], errors: TelemetryErrors
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position (F, 3) and rotation (F, 3, 3) with errors."""
+    position, rotation = camera
+    frames = len(position)
+    drift = _wander(rng, frames, _POSITION_WANDER_S, 3) * [1.0, 1.0, 0.7]
+    misalignment = np.deg2rad(errors.misalignment_deg) * rng.choice([-1.0, 1.0], 3)
+    north = exp_so3(np.array([0.0, 0.0, -np.deg2rad(errors.yaw_deg)]))
+    wander = np.deg2rad(errors.attitude_deg) * _wander(rng, frames, _ATTITUDE_WANDER_S, 3)
+    return position + errors.position_m * drift, exp_so3(misalignment) @ exp_so3(wander) @ rotation @ north
 
 
 def _on_ground(joints: np.ndarray) -> np.ndarray:
@@ -151,21 +197,33 @@ def _on_ground(joints: np.ndarray) -> np.ndarray:
     return moved
 
 
-def _camera(
-    truth: np.ndarray, phase: float, rate: float, ahead_s: float, turn_s: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Position (F, 3) and rotation (F, 3, 3) world -> camera, each ``ahead_s`` after its frame.
+class _Orbit(NamedTuple):
+    """Bearing at the first frame rad, its rate rad/s, and the time between two turns back s (0 = none)."""
 
-    turn_s : time at which the orbit is half turned round
-    """
+    phase: float
+    rate: float
+    reverse_s: float
+
+    def bearing(self, at: np.ndarray) -> np.ndarray:
+        """(F,) rad at times (F,) s."""
+        if self.reverse_s:
+            # The share of the rate falls from 1 to -1 within a second, after half the time between two turns.
+            time = np.arange(min(at[0], 0.0), at[-1] + 0.01, 0.01)
+            saw = np.abs((time / self.reverse_s) % 2 - 1) - 0.5
+            share = np.clip(saw * self.reverse_s / _TURN_S, -1.0, 1.0)
+            way = np.concatenate([[0.0], np.cumsum(0.5 * (share[1:] + share[:-1]) * np.diff(time))])
+            at = np.interp(at, time, way) - np.interp(0.0, time, way)
+        return np.asarray(self.phase + self.rate * at)
+
+
+def _camera(truth: np.ndarray, orbit: _Orbit, ahead_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Position (F, 3) and rotation (F, 3, 3) world -> camera, each ``ahead_s`` after its frame."""
     from scipy.ndimage import gaussian_filter1d
 
     time = np.arange(len(truth)) / FPS
     aim = gaussian_filter1d(truth[:, 0], _AIM_SMOOTHING_S * FPS, axis=0, mode="nearest", truncate=3.0)
     aim = np.stack([np.interp(time + ahead_s, time, aim[:, axis]) for axis in range(3)], axis=1)
-    at = time + ahead_s
-    past = np.clip(at - turn_s + _TURN_S, 0.0, 2 * _TURN_S)
-    bearing = phase + rate * (at - np.square(past) / (2 * _TURN_S) - 2 * np.maximum(at - turn_s - _TURN_S, 0.0))
+    bearing = orbit.bearing(time + ahead_s)
     flat = aim[:, :2] + RADIUS_M * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
     position = np.column_stack([flat, np.full(len(time), HEIGHT_M)])
     forward = np.column_stack([aim[:, :2], np.full(len(time), _AIM_M)]) - position

@@ -1,7 +1,7 @@
 """Study of what the adjustment in the world finds out about telemetry whose yaw and clock are wrong.
 
 Sequences of the world protocol, an orbit that reverses once; the camera's yaw is off by 1 to 3 degrees about the
-vertical, and attitude and position are both late.
+vertical, and attitude and position are both late.  The tracks hold fixed points of the scene, or the body alone.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from drocap_ros.evaluation.protocol import protocol_sequences, reported
+from drocap_ros.evaluation.protocol import FPS, protocol_sequences, reported
 from drocap_ros.evaluation.tables import markdown_table
-from drocap_ros.evaluation.world_protocol import SHORTEST_S, TelemetryErrors, world_view
+from drocap_ros.evaluation.world_protocol import SHORTEST_S, TelemetryErrors, WorldCase, world_view
 from drocap_ros.reconstruction.reconstruct import reconstruct
 
 LATE_S = 0.08
@@ -56,6 +56,7 @@ def calibration_study(
     *,
     runs: int,
     limit: int | None,
+    background: bool,
     progress: Callable[[str, float], None],
 ) -> list[CalibrationRow]:
     """``runs`` flights over the folder's sequences in turn, each with a yaw error and noise of its own."""
@@ -65,7 +66,8 @@ def calibration_study(
         sequence = sequences[run % len(sequences)]
         rng = np.random.default_rng([0, run])
         yaw = float(rng.uniform(1.0, 3.0) * rng.choice([-1.0, 1.0]))
-        view = world_view(sequence, TelemetryErrors(yaw_deg=yaw, late_s=LATE_S), reverse=True, seed=run)
+        case = WorldCase(reverse_s=len(sequence.x) / FPS, background=background)
+        view = world_view(sequence, case, TelemetryErrors(yaw_deg=yaw, late_s=LATE_S), seed=run)
         windows = reconstruct(view.tracks).meta.get("calibration")
         if windows:
             found = windows[0]

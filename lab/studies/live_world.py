@@ -12,7 +12,7 @@ import numpy as np
 from drocap_ros.evaluation.compare import WorldErrors, world_errors
 from drocap_ros.evaluation.protocol import FPS, reported
 from drocap_ros.evaluation.tables import WORLD_HEAD, markdown_table, world_cells
-from drocap_ros.evaluation.world_protocol import LONGEST_S, WorldView, world_sequences, world_view
+from drocap_ros.evaluation.world_protocol import LONGEST_S, WorldCase, WorldView, world_sequences, world_view
 from drocap_ros.geometry.camera_history import CameraHistory
 from drocap_ros.geometry.rotations import quaternion_from_matrix
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
@@ -58,7 +58,7 @@ def live_world_study(
     """
     sequences = world_sequences(folder, every, limit)
     rows = [
-        _row(sequence.name, world_view(sequence, telemetry, seed=seed), delay_s)
+        _row(sequence.name, world_view(sequence, WorldCase(telemetry), seed=seed), delay_s)
         for seed, sequence in reported(sequences, len(sequences), "live world study", progress)
     ]
     return [row for row in rows if row is not None]

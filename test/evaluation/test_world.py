@@ -15,7 +15,15 @@ from drocap_ros.evaluation import metrics
 from drocap_ros.evaluation.compare import compare, world_errors
 from drocap_ros.evaluation.tables import WORLD_HEAD, world_cells
 from drocap_ros.evaluation.world import measure_world, world_means, world_study
-from drocap_ros.evaluation.world_protocol import FOCAL_PX, FPS, IMAGE_SIZE, TELEMETRY, world_sequences, world_view
+from drocap_ros.evaluation.world_protocol import (
+    FOCAL_PX,
+    FPS,
+    IMAGE_SIZE,
+    TELEMETRY,
+    WorldCase,
+    world_sequences,
+    world_view,
+)
 from drocap_ros.mocap import Sequence
 from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.simulation.simulated_person import simulate_person
@@ -83,7 +91,7 @@ def test_coverage_of_ellipsoids_that_are_true_is_90_percent() -> None:
 
 @pytest.mark.parametrize("still", [False, True])
 def test_exact_telemetry_is_the_camera_that_took_the_images(still: bool) -> None:
-    view = world_view(_sequence(), "exact", still=still, seed=3)
+    view = world_view(_sequence(), WorldCase(still=still), seed=3)
     np.testing.assert_array_equal(view.tracks.camera_rotation, view.camera_rotation)
     seen = np.einsum(
         "fij,fpj->fpi", view.camera_rotation, view.truth - view.tracks.camera_position[:, None]
@@ -100,13 +108,48 @@ def test_exact_telemetry_is_the_camera_that_took_the_images(still: bool) -> None
 @pytest.mark.parametrize("level", ["rtk", "gps"])
 def test_telemetry_errs_as_stated(level: str) -> None:
     errors = TELEMETRY[level]
-    true, reported = (world_view(_sequence(), name, seed=5).tracks for name in ("exact", level))
+    true, reported = (world_view(_sequence(), WorldCase(name), seed=5).tracks for name in ("exact", level))
     turn = np.einsum("fij,fkj->fik", reported.camera_rotation, true.camera_rotation)
     angle = np.degrees(np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)))
     late = 19.0 * errors.late_s
     assert np.median(angle) == pytest.approx(np.sqrt(3) * errors.misalignment_deg, abs=late + 3 * errors.attitude_deg)
     shift = np.linalg.norm(reported.camera_position - true.camera_position, axis=1)
     assert 0.2 * errors.position_m < shift.mean() < 4 * errors.position_m + 2.5 * errors.late_s
+
+
+def test_an_orbit_turns_back_as_often_as_stated() -> None:
+    standing = Sequence("statue", np.tile(1000.0 * simulate_person(np.zeros(1), "walk", 1, 1.75, BODY_15), (480, 1, 1)))
+    position = world_view(standing, WorldCase(reverse_s=5.0)).camera_position
+    rate = np.degrees(np.diff(np.unwrap(np.arctan2(position[:, 1], position[:, 0])))) * FPS
+    np.testing.assert_allclose(np.abs(rate).max(), 19.0, rtol=0.01)
+    turns = np.flatnonzero(np.sign(rate[1:]) != np.sign(rate[:-1])) / FPS
+    np.testing.assert_allclose(turns, [2.5, 7.5, 12.5, 17.5], atol=2 / FPS)
+
+
+def test_points_of_the_scene_are_fixed() -> None:
+    """Two rays of one track meet: the true camera sees every point, but some that slide, where it is."""
+    view = world_view(_sequence(), WorldCase("none", background=True), seed=1)
+    points = view.tracks.background
+    assert points is not None
+    assert view.tracks.camera_rotation is None
+    alive = np.bincount(points.frame, minlength=len(view.truth))
+    assert (alive > 100).all()
+    assert (alive <= 150).all()
+    ray = np.column_stack([(points.point - np.array(IMAGE_SIZE) / 2) / FOCAL_PX, np.ones(len(points))])
+    ray = np.einsum("nij,ni->nj", view.camera_rotation[points.frame], ray)
+    missed = []
+    for track in np.unique(points.track):
+        rows = points.track == track
+        if rows.sum() < 24:
+            continue
+        across = np.eye(3) - ray[rows, :, None] * ray[rows, None] / np.square(ray[rows]).sum(1)[:, None, None]
+        place = view.camera_position[points.frame[rows]]
+        point = np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, place))
+        seen = np.einsum("nij,nj->ni", view.camera_rotation[points.frame[rows]], point - place)
+        px = FOCAL_PX * seen[:, :2] / seen[:, 2:] + np.array(IMAGE_SIZE) / 2
+        missed.append(np.linalg.norm(px - points.point[rows], axis=1).mean())
+    assert np.median(missed) < 0.7
+    assert (np.array(missed) > 3.0).mean() < 0.1
 
 
 def test_command_prints_and_writes_every_measure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -123,6 +166,7 @@ def test_command_prints_and_writes_every_measure(tmp_path: Path, capsys: pytest.
     assert 0 < float(line["w_mm"]) < 1500
     assert (line["frames"], line["frame"]) == ("240", "world")
     assert main([*words, "--every", "0"]) == 2
+    assert main([*words, "--reverse", "0.5"]) == 2
     assert main(["evaluate", "world", str(tmp_path / "absent")]) == 2
     assert main([*words, "--telemetry", "perfect"]) == 2
 
@@ -151,7 +195,7 @@ def test_a_sequence_whose_telemetry_is_refused_has_no_errors_in_the_world() -> N
     skater = simulate_person(time_s, "walk", 1, 1.75, BODY_15)
     skater[..., :2] -= skater[:, :1, :2]
     skater[..., 0] += 1.5 * time_s[:, None]
-    row = measure_world(Sequence("skater", 1000.0 * skater), "exact", still=False, seed=0, method="ba")
+    row = measure_world(Sequence("skater", 1000.0 * skater), WorldCase(), seed=0, method="ba")
     assert row.frame == "camera"
     assert [cell == "-" for cell in world_cells(row.errors)] == [
         head not in {"PA-MPJPE mm", "scale %"} for head in WORLD_HEAD
@@ -172,7 +216,7 @@ def test_a_sequence_has_the_same_seed_with_every_choice(tmp_path: Path) -> None:
 
 def test_study_is_the_same_every_time(tmp_path: Path) -> None:
     write_mocap(tmp_path, "a", X=_walker(260))
-    one, two = (astuple(world_study(world_sequences(tmp_path), "gps", seed=4)[0].errors) for _ in range(2))
+    one, two = (astuple(world_study(world_sequences(tmp_path), WorldCase("gps"), seed=4)[0].errors) for _ in range(2))
     np.testing.assert_array_equal(one, two)
 
 

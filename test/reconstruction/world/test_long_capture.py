@@ -16,7 +16,7 @@ from drocap_ros.skeleton import BODY_15
 def test_windows_of_a_long_capture_join_without_a_step() -> None:
     frames = 1100
     person = simulate_person(np.arange(frames) / FPS, action="walk", seed=0)
-    view = world_view(Sequence("walk", 1000.0 * person), "exact")
+    view = world_view(Sequence("walk", 1000.0 * person))
     motion = reconstruct(view.tracks)
     assert motion.frame == "world"
     assert len(motion.meta["calibration"]) == 2
@@ -31,7 +31,7 @@ def test_windows_of_a_long_capture_join_without_a_step() -> None:
 def test_ten_seconds_without_images_leave_the_telemetry_in_use() -> None:
     frames = 720
     person = simulate_person(np.arange(frames) / FPS, action="walk", seed=0)
-    view = world_view(Sequence("walk", 1000.0 * person), "exact")
+    view = world_view(Sequence("walk", 1000.0 * person))
     seen = np.r_[0:240, 480:frames]
     arrays = ("keypoints", "stamp_ns", "camera_rotation", "camera_position")
     tracks = dataclasses.replace(view.tracks, **{name: getattr(view.tracks, name)[seen] for name in arrays})
