@@ -1,0 +1,174 @@
+"""Adjustment of a camera's path by fixed points: steps of Gauss-Newton, then the rest of each frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drocap_ros.reconstruction.camera.path_equations import POINT_WEIGHT, PathEquations
+from drocap_ros.reconstruction.camera.path_model import KNOT, SHARED, PathInput, PathState
+from drocap_ros.reconstruction.camera.path_posterior import Posterior, posterior_of
+from drocap_ros.reconstruction.camera.path_residuals import OUTLIER_SQUARE, PathResiduals, weights_of
+from drocap_ros.reconstruction.camera.views import Views, triangulate
+from drocap_ros.reconstruction.common.stop_reason import CONVERGED, ITERATIONS, NO_DESCENT
+
+#: Relative decrease of the cost below which the adjustment has converged.
+_CONVERGED = 5e-4
+#: Damping of the first step, as a share of the diagonal, and the least one after a step that raises the cost.
+_FIRST_DAMPING = 1e-3
+_LEAST_DAMPING = 1e-6
+#: Most dampings that are tried for one step.
+_TRIALS = 8
+#: Steps of the rest of each frame, with the points held.
+_REST_STEPS = 2
+#: Points in a frame below which its camera is the neighbours' alone.
+ENOUGH_POINTS = 8
+
+
+@dataclass(frozen=True)
+class AdjustedPath:
+    """A path after the adjustment; F frames, J pieces of tracks.
+
+    rotation : (F, 3, 3) world -> camera; position : (F, 3) m
+    shared, shared_std : (SHARED,) misalignment (rad, camera axes), latencies of attitude and position (s: the given
+        path of so much later is the true one), logarithm of the focal length over the given one; deviation 0 = held,
+        NaN = unknown
+    views : the N observations that were used
+    points : (J, 4) x y z m, w: a point at x y z / w; weight : (N,) of the observations, about 0 = wrong
+    residual_px : median length of the residuals
+    covered : share of frames with enough points
+    posterior : covariances of the knots' errors, None = not determined
+    """
+
+    rotation: np.ndarray
+    position: np.ndarray
+    shared: np.ndarray
+    shared_std: np.ndarray
+    views: Views
+    points: np.ndarray
+    weight: np.ndarray
+    residual_px: float
+    covered: float
+    posterior: Posterior | None
+    state: PathState
+    cost: float
+    iterations: int
+    stop_reason: str
+
+
+def initial_state(data: PathInput, state: PathState | None = None) -> PathState:
+    """The given path with the points that it triangulates; ``state`` : errors and shared unknowns to begin with."""
+    knots, path = data.knots, data.path
+    rest, none = np.zeros((path.frames, KNOT)), np.zeros((len(data.views.track), 4))
+    if state is None:
+        state = PathState(np.zeros((knots.count, KNOT)), rest, np.zeros(SHARED), none, 1.0)
+    # The unit lets points be about one away, which the triangulation and the points' unknowns presume.
+    unit = max(float(np.linalg.norm(np.ptp(path.position, axis=0))), 1e-9)
+    for _ in range(2):
+        points = triangulate(data.views, path.rotation, path.position / unit, data.matrix)
+        away = np.linalg.norm(points[:, :3], axis=1) / np.maximum(np.abs(points[:, 3]), 1e-6)
+        unit *= float(np.clip(np.median(away), 1e-3, 1e3))
+    points = triangulate(data.views, path.rotation, path.position / unit, data.matrix)
+    return PathState(state.errors, rest, state.shared, points, unit)
+
+
+def adjust_path(data: PathInput, start: PathState | None = None) -> AdjustedPath | None:
+    """Adjust a given path, its shared errors and the points; None = no track is long enough.
+
+    Frames between the knots add little, as errors of tracks last for longer: they have their say in the rest alone.
+
+    start : errors and shared unknowns to start from
+    """
+    at_knots = np.zeros(data.path.frames, bool)
+    at_knots[data.knots.frame] = True
+    views, kept = data.views.at_frames(at_knots)
+    if not len(views.frame):
+        return None
+    every, data = replace(data, views=data.views.of(kept)), replace(data, views=views)
+    weights = weights_of(data)
+    here = PathResiduals(data, weights, initial_state(data, start), OUTLIER_SQUARE)
+    stop, done, damping = ITERATIONS, 0, _FIRST_DAMPING
+    for _ in range(data.config.iterations):
+        done += 1
+        before = here.outlier
+        here = here.with_outlier(here.usual_outlier())
+        there, damping = _improved(here, damping)
+        if there is None:
+            stop = NO_DESCENT
+            break
+        falls, here = 1.0 - there.cost / here.cost, there
+        if falls <= _CONVERGED and here.outlier >= 0.9 * before:
+            stop = CONVERGED
+            break
+    posterior = posterior_of(here)
+    final = with_rest(PathResiduals(every, weights, here.state, here.usual_outlier()))
+    return _solution(final, posterior, done, stop)
+
+
+def _improved(here: PathResiduals, damping: float) -> tuple[PathResiduals | None, float]:
+    """The point after a step that lowers the cost, and the damping of the next one; None = there is none.
+
+    Levenberg-Marquardt: without damping the whole path would turn far on, as only the priors hold it.
+    """
+    equations = PathEquations(here)
+    for _ in range(_TRIALS):
+        step = equations.step(damping)
+        if step is not None:
+            there = with_points(here.moved(step.errors, step.shared, step.points))
+            if there.cost <= here.cost:
+                return there, 0.1 * damping
+        damping = 10.0 * max(damping, _LEAST_DAMPING)
+    return None, damping
+
+
+def with_points(r: PathResiduals) -> PathResiduals:
+    """Residuals after a step of the points alone, where it lowers their cost."""
+    image, by_point, _ = r.image_derivatives
+    own = r.data.views.of_pieces(np.swapaxes(by_point, 1, 2) @ by_point) + POINT_WEIGHT * np.eye(3)
+    pull = r.data.views.of_pieces(np.einsum("nk,nki->ni", image, by_point))
+    there = r.moved(np.zeros_like(r.state.errors), np.zeros(SHARED), -np.linalg.solve(own, pull[..., None])[..., 0])
+    lower = r.data.views.of_pieces(there.square * there.robust - r.square * r.robust) < 0.0
+    points = np.where(lower[:, None], there.state.points, r.state.points)
+    return PathResiduals(r.data, r.weights, replace(r.state, points=points), r.outlier)
+
+
+def with_rest(r: PathResiduals) -> PathResiduals:
+    """Residuals after the rest of each frame has been found, with the points where they are."""
+    data, config = r.data, r.data.config
+    expected = np.repeat([config.jitter_m, np.deg2rad(config.jitter_deg)], 3) ** -2.0
+    frames, views = data.path.frames, data.views
+    for _ in range(_REST_STEPS):
+        image, _, camera = r.image_derivatives
+        order, place = views.by_frame
+        by_view = np.zeros((frames, int(place.max(initial=0)) + 1, 2, KNOT + 1))
+        by_view[views.frame[order], place, :, :KNOT] = camera[order][..., :KNOT]
+        by_view[views.frame[order], place, :, KNOT] = image[order]
+        rows = by_view.reshape(frames, -1, KNOT + 1)
+        own = np.swapaxes(rows, 1, 2) @ rows
+        right = own[:, :KNOT, KNOT] + expected * r.state.rest
+        step = np.linalg.solve(own[:, :KNOT, :KNOT] + np.diag(expected), -right[..., None])[..., 0]
+        r = PathResiduals(data, r.weights, replace(r.state, rest=r.state.rest + step), r.outlier)
+    return r
+
+
+def _solution(r: PathResiduals, found: Posterior | None, iterations: int, stop_reason: str) -> AdjustedPath:
+    views, length = r.data.views, np.linalg.norm(r.image, axis=1)
+    seen = np.bincount(views.frame[r.robust > 0.5], minlength=r.data.path.frames)
+    std = np.full(SHARED, np.nan) if found is None else np.sqrt(np.diag(found.shared))
+    return AdjustedPath(
+        rotation=r.rotation,
+        position=r.position,
+        shared=r.state.shared,
+        shared_std=np.where(r.weights.free, std, 0.0),
+        views=views,
+        points=r.state.points * np.array([r.state.unit] * 3 + [1.0]),
+        weight=np.square(r.robust),
+        residual_px=float(np.median(length)),
+        covered=float((seen >= ENOUGH_POINTS).mean()),
+        posterior=found,
+        state=r.state,
+        cost=r.cost,
+        iterations=iterations,
+        stop_reason=stop_reason,
+    )

@@ -1,0 +1,124 @@
+"""Unknowns and inputs of the adjustment of a camera's path by fixed points.
+
+The corrected path is the given one, shifted by the latencies, turned by the misalignment, plus an error of its own at
+every frame.  That error is linear between knots of time, plus a rest of each frame, which a second step finds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from drocap_ros.reconstruction.camera.views import Views
+from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
+
+#: Unknowns of a knot: position error (3) m, rotation error (3) rad in camera axes.
+KNOT = 6
+#: The unknowns of the whole recording, in this order.
+MISALIGNMENT = slice(0, 3)
+ATTITUDE_LATENCY = 3
+POSITION_LATENCY = 4
+FOCAL = 5
+SHARED = 6
+#: Knots per second: between them a camera that accelerates with 3 m/s^2 leaves a straight line by 6 mm.
+KNOTS_HZ = 8.0
+
+
+@dataclass(frozen=True)
+class PathConfig:
+    """Expected errors of a given path; a standard deviation of 0 holds an unknown.
+
+    tilt_deg, yaw_deg : of the camera's constant errors, about the gimbal's axes
+    latency_s : of attitude and position, which have most of it in common
+    focal : of the logarithm of the focal length
+    position_wander_m, attitude_wander_deg : of the slow errors, whose time constants are position_wander_s and
+        attitude_wander_s
+    acceleration_m_s2 : ordinary one of the camera, infinity = any
+    jitter_m, jitter_deg : of the rest of each frame
+    noise_px : of a point's coordinate
+    views_per_fact : observations of a track, one per knot, that carry one independent piece of information, as errors
+        of tracks last: the priors count as much more
+    iterations : most steps
+    """
+
+    tilt_deg: float = 0.3
+    yaw_deg: float = 2.0
+    latency_s: float = 0.1
+    focal: float = 0.0
+    position_wander_m: float = 0.05
+    position_wander_s: float = 60.0
+    attitude_wander_deg: float = 0.1
+    attitude_wander_s: float = 10.0
+    acceleration_m_s2: float = 3.0
+    jitter_m: float = 0.005
+    jitter_deg: float = 0.2
+    noise_px: float = 0.5
+    views_per_fact: float = 3.0
+    iterations: int = 12
+
+
+@dataclass(frozen=True)
+class PathInput:
+    """What is given: the path of F evenly spaced frames, camera matrix (3, 3) px, and observations of fixed points."""
+
+    path: CameraTelemetry
+    matrix: np.ndarray
+    views: Views
+    config: PathConfig = field(default_factory=PathConfig)
+
+    @cached_property
+    def knots(self) -> Knots:
+        """The knots of the path's errors."""
+        return Knots(self.path.frames, self.path.fps)
+
+
+class Knots:
+    """Knots of time, evenly spaced from the first frame to the last.
+
+    count : K, at least 2; step_s : between two
+    before : (F,) knot at or before each frame, below K - 1; share : (F,) of the knot after it
+    """
+
+    def __init__(self, frames: int, fps: float) -> None:
+        spans = max(round((frames - 1) / max(fps / KNOTS_HZ, 1.0)), 1)
+        at = np.arange(frames) * (spans / max(frames - 1, 1))
+        self.count, self.step_s = spans + 1, max(frames - 1, 1) / fps / spans
+        self.before = np.minimum(at.astype(np.intp), spans - 1)
+        self.share = at - self.before
+        #: (K,) frame nearest to each knot
+        self.frame = np.round(np.linspace(0, frames - 1, self.count)).astype(np.intp)
+
+    def at_frames(self, values: np.ndarray) -> np.ndarray:
+        """Values (K, ...) at the frames."""
+        share = self.share.reshape(-1, *(1,) * (values.ndim - 1))
+        return np.asarray((1.0 - share) * values[self.before] + share * values[self.before + 1])
+
+
+@dataclass(frozen=True)
+class PathState:
+    """One point in the space of the unknowns.
+
+    errors : (K, 6) at the knots; rest : (F, 6) of each frame; shared : (SHARED,)
+    points : (J, 4) of unit length: x y z in ``unit`` m, w
+    """
+
+    errors: np.ndarray
+    rest: np.ndarray
+    shared: np.ndarray
+    points: np.ndarray
+    unit: float
+
+    def moved(self, errors: np.ndarray, shared: np.ndarray, points: np.ndarray) -> PathState:
+        """The point after a step of the knots (K, 6), the shared unknowns and the points (J, 3)."""
+        there = self.points + np.einsum("jik,jk->ji", tangents(self.points), points)
+        there /= np.linalg.norm(there, axis=1, keepdims=True)
+        return PathState(self.errors + errors, self.rest, self.shared + shared, there, self.unit)
+
+
+def tangents(points: np.ndarray) -> np.ndarray:
+    """(J, 4, 3) three directions across each point (J, 4) of unit length: products of a quaternion with i, j, k."""
+    a, b, c, d = points.T
+    columns = [[-b, a, d, -c], [-c, -d, a, b], [-d, c, -b, a]]
+    return np.stack([np.stack(column, axis=1) for column in columns], axis=2)

@@ -1,0 +1,212 @@
+"""Cost of a camera's path at one point, its gradient, and the derivatives of the projected points.
+
+The terms, each 0.5 times a weighted square, robust (Geman-McClure) for the points:
+
+- the distance of a projected point from where it was seen,
+- the errors of the path at the knots, which wander (Gauss-Markov),
+- the acceleration of the corrected path,
+- the priors of misalignment, latencies and focal length.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.geometry.rotations import exp_so3, left_jacobian
+from drocap_ros.reconstruction.camera.path_model import (
+    ATTITUDE_LATENCY,
+    FOCAL,
+    KNOT,
+    MISALIGNMENT,
+    POSITION_LATENCY,
+    SHARED,
+    PathInput,
+    PathState,
+    tangents,
+)
+
+#: Squared residual, in standard deviations, at which a point has half its weight: three of them, as for joints.
+OUTLIER_SQUARE = 9.0
+#: The same over the median square, while all residuals are large.
+_OVER_MEDIAN = 4.0
+#: Least depth of a point over its distance from the origin, in the path's unit.
+_NEAREST = 1e-3
+#: Share of the latencies' variance that attitude and position do not have in common: one log holds both.
+_OWN_LATENCY = 0.2
+
+
+class PathWeights(NamedTuple):
+    """Weights that do not depend on the unknowns.
+
+    keep : (6,) share of an error that the next knot keeps; change, first : (6,) weights of its change and its value
+    acceleration : of the second difference of the position at the knots
+    shared : (SHARED, SHARED) inverse covariance of the priors; free : (SHARED,) bool, the others are held
+    """
+
+    keep: np.ndarray
+    change: np.ndarray
+    first: np.ndarray
+    acceleration: float
+    shared: np.ndarray
+    free: np.ndarray
+
+
+def weights_of(data: PathInput) -> PathWeights:
+    """Weights from the expected errors."""
+    config, step_s = data.config, data.knots.step_s
+    wander_s = np.repeat([config.position_wander_s, config.attitude_wander_s], 3)
+    first = np.repeat([config.position_wander_m, np.deg2rad(config.attitude_wander_deg)], 3) ** -2.0
+    keep = np.exp(-step_s / wander_s)
+    axes = data.path.gimbal_axes()
+    turned = np.deg2rad([config.tilt_deg, config.yaw_deg, config.tilt_deg])
+    covariance = np.zeros((SHARED, SHARED))
+    covariance[MISALIGNMENT, MISALIGNMENT] = axes.T @ np.diag(turned**2) @ axes
+    latencies = slice(ATTITUDE_LATENCY, POSITION_LATENCY + 1)
+    own = _OWN_LATENCY * np.eye(2) + (1.0 - _OWN_LATENCY)
+    covariance[latencies, latencies] = config.latency_s**2 * own
+    covariance[FOCAL, FOCAL] = config.focal**2
+    free, shared = np.zeros(SHARED, bool), np.zeros((SHARED, SHARED))
+    free[MISALIGNMENT] = min(config.tilt_deg, config.yaw_deg) > 0.0
+    free[latencies], free[FOCAL] = config.latency_s > 0.0, config.focal > 0.0
+    inside = np.ix_(free, free)
+    shared[inside] = np.linalg.inv(covariance[inside])
+    fact = config.views_per_fact
+    return PathWeights(
+        keep=keep,
+        change=fact * first / (1.0 - keep**2),
+        first=fact * first,
+        acceleration=fact * (config.acceleration_m_s2 * step_s**2) ** -2.0,
+        shared=fact * shared,
+        free=free,
+    )
+
+
+class PathResiduals:
+    """Residuals at one point.
+
+    outlier : squared residual, in standard deviations, at which a point has half its weight
+    """
+
+    def __init__(self, data: PathInput, weights: PathWeights, state: PathState, outlier: float) -> None:
+        self.data, self.weights, self.state, self.outlier = data, weights, state, outlier
+        self._correct()
+        self._compare_image()
+        self._compare_path()
+        self.cost = float(
+            0.5 * (self.square * self.robust).sum()
+            + 0.5 * (weights.first * np.square(state.errors[0])).sum()
+            + 0.5 * (weights.change * np.square(self.change)).sum()
+            + 0.5 * weights.acceleration * np.square(self.swing).sum()
+            + 0.5 * state.shared @ weights.shared @ state.shared
+        )
+
+    def _correct(self) -> None:
+        """The corrected path."""
+        shared = self.state.shared
+        path = self.data.path.shifted(float(shared[ATTITUDE_LATENCY]), float(shared[POSITION_LATENCY]))
+        self.errors = self.data.knots.at_frames(self.state.errors) + self.state.rest
+        self.turn = shared[MISALIGNMENT] + self.errors[:, 3:]
+        correction = exp_so3(self.turn)
+        self.rotation = correction @ path.rotation
+        self.turn_rate = np.einsum("fij,fj->fi", correction, path.turn_rate)
+        self.position, self.velocity = path.position + self.errors[:, :3], path.velocity
+
+    def _compare_image(self) -> None:
+        """Projected points with the seen ones."""
+        data, state, views = self.data, self.state, self.data.views
+        self.focal = np.diagonal(data.matrix)[:2] * np.exp(state.shared[FOCAL])
+        at = state.points[views.piece]
+        offset = at[:, :3] - at[:, 3:] * (self.position / state.unit)[views.frame]
+        self.seen = np.einsum("nij,nj->ni", self.rotation[views.frame], offset)
+        self.depth = np.maximum(self.seen[:, 2], _NEAREST)
+        self.slope = self.seen[:, :2] / self.depth[:, None]
+        self.image = self.focal * self.slope + data.matrix[:2, 2] - views.point
+        self.square = np.square(self.image).sum(axis=1) / data.config.noise_px**2
+        self.robust = 1.0 / (1.0 + self.square / self.outlier)
+
+    def _compare_path(self) -> None:
+        """Errors with those at the knot before, and the path with a steady flight."""
+        errors, given = self.state.errors, self.data.path.position[self.data.knots.frame]
+        self.change = errors[1:] - self.weights.keep * errors[:-1]
+        flown = given + errors[:, :3]
+        self.swing = flown[2:] - 2 * flown[1:-1] + flown[:-2]
+
+    def moved(self, errors: np.ndarray, shared: np.ndarray, points: np.ndarray) -> PathResiduals:
+        """Residuals of the same cost after a step."""
+        return PathResiduals(self.data, self.weights, self.state.moved(errors, shared, points), self.outlier)
+
+    def with_outlier(self, outlier: float) -> PathResiduals:
+        """Residuals at the same point with another square at which a point has half its weight."""
+        return PathResiduals(self.data, self.weights, self.state, outlier)
+
+    def usual_outlier(self) -> float:
+        """Squared residual that sets outliers apart from the rest: far from the solution all are large."""
+        return max(OUTLIER_SQUARE, _OVER_MEDIAN * float(np.median(self.square))) if len(self.square) else OUTLIER_SQUARE
+
+    @cached_property
+    def image_derivatives(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residuals (N, 2) at the present robust weight, and their derivatives by points and by camera.
+
+        By the point (N, 2, 3), and by the camera (N, 2, KNOT + SHARED): a frame's error, and the shared unknowns.
+        """
+        data, state, views = self.data, self.state, self.data.views
+        frame, root = views.frame, self.robust / data.config.noise_px
+        near = self.seen[:, 2] > _NEAREST
+        slope = np.where(near[:, None], self.slope, 0.0)
+        per_unit = (root / self.depth)[:, None] * self.focal
+        rotation = self.rotation[frame]
+        by_place = per_unit[..., None] * (rotation[:, :2] - slope[..., None] * rotation[:, 2:])
+        x, y, z = self.seen.T
+        by_turn = np.empty(by_place.shape)
+        by_turn[:, 0, 0], by_turn[:, 1, 0] = -slope[:, 0] * y, -z - slope[:, 1] * y
+        by_turn[:, 0, 1], by_turn[:, 1, 1] = z + slope[:, 0] * x, slope[:, 1] * x
+        by_turn[:, 0, 2], by_turn[:, 1, 2] = -y, x
+        by_turn *= per_unit[..., None]
+        at = state.points[views.piece]
+        by_position = by_place * (-at[:, 3] / state.unit)[:, None, None]
+        lever = by_place @ tangents(state.points)[views.piece][:, :3]
+        towards = -np.einsum("nki,ni->nk", by_place, (self.position / state.unit)[frame])
+        by_point = lever + towards[..., None] * tangents(state.points)[views.piece][:, 3][:, None]
+        camera = np.zeros((len(frame), 2, KNOT + SHARED))
+        camera[..., :3] = by_position
+        camera[..., 3:6] = by_turn @ left_jacobian(self.turn)[frame]
+        camera[..., KNOT : KNOT + 3] = camera[..., 3:6]
+        camera[..., KNOT + ATTITUDE_LATENCY] = np.einsum("nki,ni->nk", by_turn, self.turn_rate[frame])
+        camera[..., KNOT + POSITION_LATENCY] = np.einsum("nki,ni->nk", by_position, self.velocity[frame])
+        camera[..., KNOT + FOCAL] = root[:, None] * self.focal * self.slope
+        camera[..., KNOT:] *= self.weights.free
+        return root[:, None] * self.image, by_point, camera
+
+
+def gradient(r: PathResiduals) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Derivatives of the cost by the knots' errors (K, 6), the shared unknowns (SHARED,) and the points (J, 3)."""
+    data, state, weights = r.data, r.state, r.weights
+    image, by_point, by_camera = r.image_derivatives
+    pull = np.einsum("nk,nki->ni", image, by_camera)
+    of_frame = np.stack(
+        [np.bincount(data.views.frame, pull[:, i], minlength=data.path.frames) for i in range(KNOT)], axis=1
+    )
+    errors = knots_of_frames(r, of_frame)
+    errors[0] += weights.first * state.errors[0]
+    drift = weights.change * r.change
+    errors[1:] += drift
+    errors[:-1] -= weights.keep * drift
+    swing = weights.acceleration * r.swing
+    errors[2:, :3] += swing
+    errors[1:-1, :3] -= 2 * swing
+    errors[:-2, :3] += swing
+    shared = pull[:, KNOT:].sum(axis=0) + weights.shared @ state.shared
+    return errors, shared, data.views.of_pieces(np.einsum("nk,nki->ni", image, by_point))
+
+
+def knots_of_frames(r: PathResiduals, values: np.ndarray) -> np.ndarray:
+    """Sums (K, ...) of values (F, ...) by the shares of the knots beside each frame."""
+    knots = r.data.knots
+    share = knots.share.reshape(-1, *(1,) * (values.ndim - 1))
+    out = np.zeros((knots.count, *values.shape[1:]))
+    np.add.at(out, knots.before, (1.0 - share) * values)
+    np.add.at(out, knots.before + 1, share * values)
+    return out
