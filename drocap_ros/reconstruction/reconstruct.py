@@ -13,6 +13,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.joint_maps import TABLES, joint_map, joint_set_of
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
+from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, fuse_telemetry, with_fusion
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput, Progress
 from drocap_ros.reconstruction.common.refusal import Refusal
@@ -98,17 +99,19 @@ def reconstruct(
     every_joint = body_keypoints(tracks, BODY_19)
     keypoints = every_joint.with_joints(len(settings.body))
     with blas_threads(settings.adjuster.threads):
-        poses = _solve(tracks, keypoints, settings)
-        solved = time.perf_counter()
-        body = _in_metres(tracks, keypoints, poses, settings)
-        if not isinstance(body, _Body):
+        fused = fuse_telemetry(tracks, world_config(settings.adjuster))
+        corrected = time.perf_counter()
+        if isinstance(fused, Refusal):
+            found: tuple[ImagePoses, _Body, float] | Refusal = fused
+        else:
+            found = _solved(tracks if fused is None else fused.tracks, keypoints, settings, fused)
+        if isinstance(found, Refusal):
             # The lifter saw the camera's rotation: without it the poses differ too.
-            refusal, tracks = body, dataclasses.replace(tracks, camera_rotation=None, camera_position=None)
-            poses = _solve(tracks, keypoints, settings)
-            solved = time.perf_counter()
-            body = _in_metres(tracks, keypoints, poses, settings)
-            assert isinstance(body, _Body)
-            body.meta["telemetry_rejected"] = str(refusal)
+            refusal, tracks = found, dataclasses.replace(tracks, camera_rotation=None, camera_position=None)
+            found = _solved(tracks, keypoints, settings)
+            assert not isinstance(found, Refusal)
+            found[1].meta["telemetry_rejected"] = str(refusal)
+    poses, body, solved = found
     motion = Motion(
         joints=settings.body.joints,
         parents=settings.body.parents,
@@ -120,6 +123,8 @@ def reconstruct(
     if settings.body is BODY_17:
         motion = with_heels(motion, every_joint.without_joints(len(BODY_17)), poses.in_image)
     seconds = dict(poses.report.seconds)
+    if fused is not None:
+        seconds["camera"] = corrected - clock
     if motion.frame == "world":
         seconds["world"] = time.perf_counter() - solved
     total = time.perf_counter() - clock
@@ -127,6 +132,16 @@ def reconstruct(
         _meta(poses, settings), seconds={**seconds, "other": total - sum(seconds.values()), "total": total}
     )
     return motion
+
+
+def _solved(
+    tracks: Tracks, keypoints: Keypoints2D, settings: _Settings, fused: FusedTelemetry | None = None
+) -> tuple[ImagePoses, _Body, float] | Refusal:
+    """Poses in px and in metres, and the time between both; a refusal where the telemetry cannot be true."""
+    poses = _solve(tracks, keypoints, settings)
+    solved = time.perf_counter()
+    body = _in_metres(tracks, keypoints, poses, settings, fused)
+    return body if isinstance(body, Refusal) else (poses, body, solved)
 
 
 def _solve(tracks: Tracks, keypoints: Keypoints2D, settings: _Settings) -> ImagePoses:
@@ -206,7 +221,13 @@ def body_keypoints(tracks: Tracks, joints: JointSet = BODY_17) -> Keypoints2D:
     return found.with_joints(len(joints))
 
 
-def _in_metres(tracks: Tracks, keypoints: Keypoints2D, poses: ImagePoses, settings: _Settings) -> _Body | Refusal:
+def _in_metres(
+    tracks: Tracks,
+    keypoints: Keypoints2D,
+    poses: ImagePoses,
+    settings: _Settings,
+    fused: FusedTelemetry | None = None,
+) -> _Body | Refusal:
     """The one step from px to m: in the world where the camera's rotation is known, else in the camera's axes.
 
     In the world the poses are placed by the reported camera and, with its position and matrix, adjusted with it.  The
@@ -222,7 +243,8 @@ def _in_metres(tracks: Tracks, keypoints: Keypoints2D, poses: ImagePoses, settin
         placed = WorldPoses(_without_perspective(tracks, poses, per_px), False, "assumed_height", None)
     else:
         frame = "world"
-        placed, refined, refusal = in_world(tracks, keypoints, poses, per_px, world_config(settings.adjuster))
+        config = world_config(settings.adjuster) if fused is None else fused.config
+        placed, refined, refusal = in_world(tracks, keypoints, poses, per_px, config)
         if refusal is not None:
             return refusal
     if placed.scale is not None:
@@ -242,6 +264,8 @@ def _in_metres(tracks: Tracks, keypoints: Keypoints2D, poses: ImagePoses, settin
         if body.covariance is not None:
             meta["covariance_about"] = "pelvis"
         return body
+    if fused is not None:
+        refined = with_fusion(refined, fused)
     meta["calibration"], meta["covariance_about"] = refined.calibration, "origin"
     camera = refined.rotation, refined.position
     return dataclasses.replace(

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drocap_ros.reconstruction.camera.path_equations import PathEquations
-from drocap_ros.reconstruction.camera.path_model import KNOT
+from drocap_ros.reconstruction.camera.path_model import ATTITUDE_LATENCY, KNOT, MISALIGNMENT, POSITION_LATENCY, SHARED
 from drocap_ros.reconstruction.camera.path_residuals import PathResiduals
 from drocap_ros.reconstruction.common.banded import backward, band_factor, forward
 
@@ -18,11 +18,13 @@ class Posterior(NamedTuple):
     shared : (SHARED, SHARED) of the shared unknowns
     knots : (K, 6, 6) of the errors
     steps : (K - 1, 6, 6) of the change of the errors from knot to knot
+    pose : (K, 6, 6) of the corrected camera: errors and shared unknowns together
     """
 
     shared: np.ndarray
     knots: np.ndarray
     steps: np.ndarray
+    pose: np.ndarray
 
 
 def posterior_of(r: PathResiduals) -> Posterior | None:
@@ -39,13 +41,26 @@ def posterior_of(r: PathResiduals) -> Posterior | None:
     shared = inverse.T @ inverse
     knots, beside = _blocks(factor)
     lever = backward(factor, y).reshape(len(knots), KNOT, -1)
+    total = _by_shared(r) - lever
+    pose = knots + total @ shared @ np.swapaxes(total, 1, 2)
     knots = knots + lever @ shared @ np.swapaxes(lever, 1, 2)
     beside = beside + lever[:-1] @ shared @ np.swapaxes(lever[1:], 1, 2)
     steps = knots[1:] + knots[:-1] - beside - np.swapaxes(beside, 1, 2)
     # Half of the squared lengths of pairs with a standard deviation of 1 are below 1.39.
     noise = float(np.median(r.square)) / 1.39
     scale = r.data.config.views_per_fact * max(noise, 1e-12)
-    return Posterior(scale * shared, scale * knots, scale * steps)
+    return Posterior(scale * shared, scale * knots, scale * steps, scale * pose)
+
+
+def _by_shared(r: PathResiduals) -> np.ndarray:
+    """(K, 6, SHARED) derivatives of the corrected pose at the knots by the shared unknowns."""
+    frame = r.data.knots.frame
+    out = np.zeros((len(frame), KNOT, SHARED))
+    out[:, 3:, MISALIGNMENT] = np.eye(3)
+    out[:, 3:, ATTITUDE_LATENCY] = r.turn_rate[frame]
+    out[:, :3, POSITION_LATENCY] = r.velocity[frame]
+    out[..., ~r.weights.free] = 0.0
+    return out
 
 
 def _blocks(factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

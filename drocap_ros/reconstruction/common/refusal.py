@@ -24,6 +24,11 @@ class Why(Enum):
         "is not frozen (or the person glides: skates, lift)"
     )
     POSITION_JUMPS = "the camera's position jumps as no camera flies; check the log's time and its frame"
+    #: Fixed points of the picture lie elsewhere than any path near the reported one sees them: px.
+    POINTS_MOVE_OTHERWISE = (
+        "fixed points of the picture lie {:.1f} px off where the reported camera sees them; check that the log belongs"
+        " to the video, its time offset and the lens"
+    )
     NO_FOOT_RESTS = (
         "no foot of the body ever rests on its path in the world; check that the log belongs to the video, its "
         "time offset and the gimbal's yaw (or the person glides)"

@@ -101,7 +101,7 @@ def even_capture(tracks: Tracks, keypoints: Keypoints2D, poses: PlacedPoses, ori
         turn=project_to_so3(at_all_slots(tracks.camera_rotation, slot)),
         path=at_all_slots(tracks.camera_position - origin, slot),
         still=None if poses.still is None else at_all_slots(poses.still, slot),
-        parts=_parts(tracks.stamp_ns, slot),
+        parts=capture_parts(tracks.stamp_ns, slot),
     )
 
 
@@ -129,7 +129,7 @@ def at_all_slots(values: np.ndarray, slot: np.ndarray) -> np.ndarray:
     return out.reshape(-1, *values.shape[1:])
 
 
-def _parts(stamp_ns: np.ndarray, slot: np.ndarray) -> list[slice]:
+def capture_parts(stamp_ns: np.ndarray, slot: np.ndarray) -> list[slice]:
     """Slots of the parts of a recording between its pauses, each of ``LEAST_FRAMES`` images at least.
 
     A pause is a time without images that exceeds the usual one by ``MAX_GAP_S``.  The even grid holds a second of it:

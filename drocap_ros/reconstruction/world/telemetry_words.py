@@ -12,6 +12,9 @@ from drocap_ros.reconstruction.world.findings import MEASURED
 _CLEAR = 2.0
 #: Standard deviations from the assumed stature at which a measured one is doubtful: one person in 370 is.
 _UNLIKELY = 3.0
+#: Wander of the reported position (m) and attitude (degrees) that is stated: twice that of good telemetry.
+_WANDER_M = 0.1
+_WANDER_DEG = 0.2
 
 
 def telemetry_words(meta: Mapping[str, Any]) -> str:
@@ -34,7 +37,7 @@ def _calibrations(windows: list[Mapping[str, Any]], height_m: float | None) -> s
     scale = f"scale known to {100 * max(w['scale_std'] for w in windows):.1f} %"
     feet = f"feet in contact for {100 * min(w['contact_share'] for w in windows):.0f} % of the time"
     worst = f" (worst of {len(windows)} windows)" if len(windows) > 1 else ""
-    rest = f"{worst}{_path(windows)}{_stature(windows, height_m)}."
+    rest = f"{worst}{_points(windows)}{_path(windows)}{_stature(windows, height_m)}."
     return f"{corrections[0].upper()}{corrections[1:]}; {scale}, {feet}{rest}"
 
 
@@ -53,6 +56,23 @@ def _corrections(windows: list[Mapping[str, Any]]) -> list[str]:
         for name in ("attitude", "position")
     ]
     return [fact for fact in facts if fact]
+
+
+def _points(windows: list[Mapping[str, Any]]) -> str:
+    """What fixed points of the picture say about the reported path; the same in all windows."""
+    seen = windows[0].get("background")
+    if not isinstance(seen, Mapping):
+        return ""
+    words = f"; measured by {seen['tracks']} tracks of fixed points, {seen['residual_px']:.1f} px off"
+    wander = [
+        f"{name} by {seen[key]:.{digits}f} {unit}"
+        for name, key, digits, unit, least in (
+            ("position", "position_wander_m", 1, "m", _WANDER_M),
+            ("attitude", "attitude_wander_deg", 1, "deg", _WANDER_DEG),
+        )
+        if seen[key] > least
+    ]
+    return words + (f"; against them the reported pose wanders, {' and '.join(wander)}" if wander else "")
 
 
 def _path(windows: list[Mapping[str, Any]]) -> str:

@@ -1,0 +1,252 @@
+"""Telemetry corrected by the fixed points of the picture, before any body: path, constant errors, and what is left.
+
+The body turns with a camera that is turned wrongly; the scene does not.  So the points measure the telemetry, and the
+adjustment in the world starts from the corrected path, with the little that points leave open.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from drocap_ros.geometry.position_steps import without_steps
+from drocap_ros.geometry.rotations import exp_so3, log_so3, project_to_so3
+from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path
+from drocap_ros.reconstruction.camera.path_model import (
+    ATTITUDE_LATENCY,
+    KNOT,
+    MISALIGNMENT,
+    POSITION_LATENCY,
+    PathConfig,
+    PathInput,
+)
+from drocap_ros.reconstruction.camera.views import Views, views_of
+from drocap_ros.reconstruction.common.refusal import Refusal, Why
+from drocap_ros.reconstruction.common.windows import fade_weights, windows
+from drocap_ros.reconstruction.lifted.even_frames import even_slots
+from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
+from drocap_ros.reconstruction.world.even_capture import at_all_slots, capture_parts
+from drocap_ros.reconstruction.world.refine import RefinedWorld
+from drocap_ros.reconstruction.world.world_model import WorldConfig
+from drocap_ros.reconstruction.world.world_residuals import WANDER_S
+from drocap_ros.tracks import Tracks
+
+#: Slots of one adjustment: two minutes at 24 Hz, which bounds memory; and those that neighbours share, ten seconds:
+#: where GPS wanders, two windows differ by some decimetres.
+_WINDOW = 2880
+_OVERLAP = 240
+#: Errors that the first adjustment expects of any telemetry, m and degrees: those of GPS and of a cheap gimbal.
+_WIDE_POSITION_M = 0.5
+_WIDE_ATTITUDE_DEG = 0.3
+_WIDE_TILT_DEG = 1.0
+#: Time (s) over which the found errors tell how far they wander.
+_LAG_S = 4.0
+#: Ratio of expected errors from which a second adjustment is worth its time.
+_OTHER = 1.5
+#: Share of the frames with enough points, below which the points do not tell the path.
+_LEAST_COVERED = 0.5
+#: Median residual (px per 1000 px of focal length) above which no camera's path explains the points.
+_LARGEST_RESIDUAL = 3.0
+#: Found wander over the configured one, from which the place is that of a receiver without corrections, and the
+#: standard deviation (m) of such a place: data sheets state that half of all lie within 1.5 m.
+_UNCORRECTED = 2.0
+_RECEIVER_M = 1.0
+#: What the corrected path may still be off by, as a constant: nothing that a body could tell.
+_HELD_DEG = 0.02
+_HELD_S = 0.001
+
+
+@dataclass(frozen=True)
+class FusedTelemetry:
+    """Telemetry after the correction; F images.
+
+    tracks : with the corrected camera
+    covariance : (F, 6, 6) of the camera's position (m) and rotation (rad, camera axes)
+    config : of the adjustment in the world: what is left of the telemetry's errors
+    measured : JSON-compatible, of the longest part: constant errors and their standard deviations, and the points
+    """
+
+    tracks: Tracks
+    covariance: np.ndarray
+    config: WorldConfig
+    measured: dict[str, Any]
+
+
+def fuse_telemetry(tracks: Tracks, config: WorldConfig) -> FusedTelemetry | Refusal | None:
+    """Correct the telemetry of tracks with a background; None = there is none of both, or the points are too few.
+
+    A refusal where no camera's path near the telemetry explains the points.
+    """
+    rotation, position, matrix, points = (
+        tracks.camera_rotation,
+        tracks.camera_position,
+        tracks.camera_matrix,
+        tracks.background,
+    )
+    if rotation is None or position is None or matrix is None or points is None:
+        return None
+    if not (np.isfinite(rotation).all() and np.isfinite(position).all()):
+        return None
+    slot, fps = even_slots(tracks.stamp_ns)
+    origin = position.mean(axis=0)
+    path = at_all_slots(without_steps(position, tracks.stamp_ns) - origin, slot)
+    turn = project_to_so3(at_all_slots(rotation, slot))
+    faded = _Faded(len(turn))
+    best: tuple[AdjustedPath, CameraTelemetry] | None = None
+    for part in capture_parts(tracks.stamp_ns, slot):
+        for inside in windows(part.stop - part.start, _WINDOW, _OVERLAP):
+            rows = slice(part.start + inside.start, part.start + inside.stop)
+            given = CameraTelemetry(turn[rows], path[rows], fps)
+            of_part = (slot[points.frame] >= rows.start) & (slot[points.frame] < rows.stop)
+            frame = slot[points.frame[of_part]] - rows.start
+            views = views_of(frame, points.track[of_part], points.point[of_part], given.frames, fps)
+            found = _adjusted(given, matrix, views, config)
+            if found is None:
+                return None
+            faded.add(rows, fade_weights(inside, part.stop - part.start, _OVERLAP), given, found)
+            if best is None or given.frames > best[1].frames:
+                best = found, given
+    if best is None or best[0].covered < _LEAST_COVERED:
+        return None
+    if best[0].residual_px > _LARGEST_RESIDUAL * 1e-3 * float(matrix[0, 0]):
+        return Refusal(Why.POINTS_MOVE_OTHERWISE, best[0].residual_px)
+    change, covariance, steps = faded.mean()
+    measured = _measured(*best)
+    if measured["background"]["position_wander_m"] > _UNCORRECTED * config.position_wander_m:
+        # The place as a whole is none that a recording shows, nor one that its wander tells.
+        missing = np.maximum(_RECEIVER_M**2 - np.diagonal(covariance, axis1=1, axis2=2)[:, :3].mean(axis=0), 0.0)
+        covariance[:, :3, :3] += np.diag(missing)
+    corrected = replace(
+        tracks,
+        camera_rotation=(exp_so3(change[:, 3:]) @ turn)[slot],
+        camera_position=(path + change[:, :3])[slot] + origin,
+    )
+    return FusedTelemetry(corrected, covariance[slot], _left(config, steps), measured)
+
+
+def _adjusted(given: CameraTelemetry, matrix: np.ndarray, views: Views, config: WorldConfig) -> AdjustedPath | None:
+    """The path by errors as large as the points show them: first any, then those found."""
+    wide = PathConfig(
+        tilt_deg=max(config.tilt_error_deg, _WIDE_TILT_DEG),
+        yaw_deg=config.yaw_error_deg,
+        latency_s=config.latency_std_s,
+        position_wander_m=max(config.position_wander_m, _WIDE_POSITION_M),
+        attitude_wander_deg=max(config.attitude_wander_deg, _WIDE_ATTITUDE_DEG),
+        acceleration_m_s2=config.camera_acceleration_m_s2,
+    )
+    first = adjust_path(PathInput(given, matrix, views, wide))
+    if first is None or first.posterior is None:
+        return None
+    position_m, attitude_deg = _wander(first, given.fps)
+    tilt = np.degrees(np.abs(given.gimbal_axes()[[0, 2]] @ first.shared[MISALIGNMENT])).max()
+    own = replace(
+        wide,
+        tilt_deg=config.tilt_error_deg if tilt < 2 * config.tilt_error_deg else wide.tilt_deg,
+        position_wander_m=max(config.position_wander_m, position_m),
+        attitude_wander_deg=max(config.attitude_wander_deg, attitude_deg),
+    )
+    ratio = np.array([own.position_wander_m, own.attitude_wander_deg, own.tilt_deg])
+    ratio /= [wide.position_wander_m, wide.attitude_wander_deg, wide.tilt_deg]
+    if np.abs(np.log(ratio)).max() < np.log(_OTHER):
+        return first
+    second = adjust_path(PathInput(given, matrix, views, own), first.state)
+    return first if second is None or second.posterior is None else second
+
+
+def _wander(found: AdjustedPath, fps: float) -> tuple[float, float]:
+    """Standard deviations (m; degrees) of slow errors that change as the found ones do."""
+    errors = found.state.errors
+    knots_hz = (len(errors) - 1) / max((len(found.rotation) - 1) / fps, 1e-9)
+    lag = max(min(round(_LAG_S * knots_hz), len(errors) // 2), 1)
+    change = np.square(errors[lag:] - errors[:-lag]).mean(axis=0) / (2 * (1 - np.exp(-lag / knots_hz / WANDER_S)))
+    return float(np.sqrt(change[:3].mean())), float(np.degrees(np.sqrt(change[3:].mean())))
+
+
+class _Faded:
+    """Corrections of windows, faded into each other, their covariances, and those of the motion within a second."""
+
+    def __init__(self, slots: int) -> None:
+        self._sums = [np.zeros((slots, *shape)) for shape in ((KNOT,), (KNOT, KNOT), (KNOT,))]
+        self._weight = np.zeros(slots)
+
+    def add(self, rows: slice, fade: np.ndarray, given: CameraTelemetry, found: AdjustedPath) -> None:
+        assert found.posterior is not None
+        turned = log_so3(found.rotation @ np.swapaxes(given.rotation, 1, 2))
+        moved = found.position - given.position
+        knots = np.linspace(0, len(found.posterior.pose) - 1, given.frames)
+        near = np.round(knots).astype(np.intp)
+        # Steps between knots add up to a second as independent ones do.
+        hz = (len(found.posterior.pose) - 1) * given.fps / max(given.frames - 1, 1)
+        steps = hz * np.diagonal(found.posterior.steps, axis1=1, axis2=2)
+        values = (
+            np.concatenate([moved, turned], axis=1),
+            found.posterior.pose[near],
+            steps[np.minimum(near, len(steps) - 1)],
+        )
+        for total, value in zip(self._sums, values, strict=True):
+            total[rows] += fade.reshape(-1, *(1,) * (value.ndim - 1)) * value
+        self._weight[rows] += fade
+
+    def mean(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        weight = np.where(self._weight == 0.0, 1.0, self._weight)
+        change, covariance, steps = (total / weight.reshape(-1, *(1,) * (total.ndim - 1)) for total in self._sums)
+        return change, covariance, steps[self._weight > 0.0].mean(axis=0)
+
+
+def _left(config: WorldConfig, steps: np.ndarray) -> WorldConfig:
+    """Priors of the adjustment in the world: the path's motion within a second is known to variances (6,)."""
+    wander = np.sqrt(0.5 * WANDER_S * steps)
+    return replace(
+        config,
+        tilt_error_deg=_HELD_DEG,
+        yaw_error_deg=_HELD_DEG,
+        latency_std_s=_HELD_S,
+        position_wander_m=float(np.sqrt(np.square(wander[:3]).mean())),
+        attitude_wander_deg=float(np.degrees(np.sqrt(np.square(wander[3:]).mean()))),
+    )
+
+
+def _measured(found: AdjustedPath, given: CameraTelemetry) -> dict[str, Any]:
+    """JSON-compatible: the telemetry's errors as the points show them, in the terms of a calibration."""
+    axes, shared, wander = given.gimbal_axes(), found.shared, _wander(found, given.fps)
+    assert found.posterior is not None
+    variance = axes @ found.posterior.shared[MISALIGNMENT, MISALIGNMENT] @ axes.T
+    return {
+        "misalignment_deg": np.degrees(axes @ shared[MISALIGNMENT]).tolist(),
+        "misalignment_std_deg": np.degrees(np.sqrt(np.diag(variance))).tolist(),
+        "attitude_latency_s": -float(shared[ATTITUDE_LATENCY]),
+        "attitude_latency_std_s": float(found.shared_std[ATTITUDE_LATENCY]),
+        "position_latency_s": -float(shared[POSITION_LATENCY]),
+        "position_latency_std_s": float(found.shared_std[POSITION_LATENCY]),
+        "measured_by": "background",
+        "background": {
+            "tracks": len(found.views.track),
+            "residual_px": found.residual_px,
+            "covered_share": found.covered,
+            "position_wander_m": wander[0],
+            "attitude_wander_deg": wander[1],
+        },
+    }
+
+
+def with_fusion(refined: RefinedWorld, fused: FusedTelemetry) -> RefinedWorld:
+    """The adjusted world with what the points measured, and with the camera's own uncertainty in the joints'."""
+    lever = joints_by_camera(refined.joints, refined.rotation, refined.position)
+    more = lever @ fused.covariance[:, None] @ np.swapaxes(lever, -1, -2)
+    covariance = refined.covariance + more[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    calibration = [{**window, **fused.measured} for window in refined.calibration]
+    return replace(refined, covariance=covariance, calibration=calibration)
+
+
+def joints_by_camera(joints: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """(F, P, 3, 6) derivatives of places (F, P, 3) m of what a camera sees, by its position and its rotation.
+
+    rotation : (F, 3, 3) world -> camera, which changes by a turn (rad) in camera axes; position : (F, 3) m
+    """
+    x, y, z = np.moveaxis(joints - position[:, None], -1, 0)
+    none = np.zeros_like(x)
+    across = np.stack([np.stack(row, -1) for row in ((none, -z, y), (z, none, -x), (-y, x, none))], -2)
+    turned = across @ np.swapaxes(rotation, 1, 2)[:, None]
+    return np.concatenate([np.broadcast_to(np.eye(3), turned.shape), turned], axis=-1)
