@@ -37,13 +37,13 @@ from drocap_ros.tracks import Tracks
 #: where GPS wanders, two windows differ by some decimetres.
 _WINDOW = 2880
 _OVERLAP = 240
-#: Errors that the first adjustment expects of any telemetry, m and degrees: those of GPS and of a cheap gimbal.
+#: Errors that the second adjustment expects of telemetry worse than configured: those of GPS and of a cheap gimbal.
 _WIDE_POSITION_M = 0.5
 _WIDE_ATTITUDE_DEG = 0.3
 _WIDE_TILT_DEG = 1.0
 #: Time (s) over which the found errors tell how far they wander.
 _LAG_S = 4.0
-#: Ratio of expected errors from which a second adjustment is worth its time.
+#: Found errors over the configured ones, from which the configuration does not hold.
 _OTHER = 1.5
 #: Share of the frames with enough points, below which the points do not tell the path.
 _LEAST_COVERED = 0.5
@@ -127,31 +127,37 @@ def fuse_telemetry(tracks: Tracks, config: WorldConfig) -> FusedTelemetry | Refu
 
 
 def _adjusted(given: CameraTelemetry, matrix: np.ndarray, views: Views, config: WorldConfig) -> AdjustedPath | None:
-    """The path by errors as large as the points show them: first any, then those found."""
-    wide = PathConfig(
-        tilt_deg=max(config.tilt_error_deg, _WIDE_TILT_DEG),
+    """The path by errors as the configuration expects them, or by larger ones where the points show such.
+
+    Errors that are expected to wander far would take the part of a constant yaw.
+    """
+    own = PathConfig(
+        tilt_deg=config.tilt_error_deg,
         yaw_deg=config.yaw_error_deg,
         latency_s=config.latency_std_s,
-        position_wander_m=max(config.position_wander_m, _WIDE_POSITION_M),
-        attitude_wander_deg=max(config.attitude_wander_deg, _WIDE_ATTITUDE_DEG),
+        position_wander_m=config.position_wander_m,
+        attitude_wander_deg=config.attitude_wander_deg,
         acceleration_m_s2=config.camera_acceleration_m_s2,
     )
-    first = adjust_path(PathInput(given, matrix, views, wide))
+    first = adjust_path(PathInput(given, matrix, views, own))
     if first is None or first.posterior is None:
         return None
     position_m, attitude_deg = _wander(first, given.fps)
-    tilt = np.degrees(np.abs(given.gimbal_axes()[[0, 2]] @ first.shared[MISALIGNMENT])).max()
-    own = replace(
-        wide,
-        tilt_deg=config.tilt_error_deg if tilt < 2 * config.tilt_error_deg else wide.tilt_deg,
-        position_wander_m=max(config.position_wander_m, position_m),
-        attitude_wander_deg=max(config.attitude_wander_deg, attitude_deg),
+    tilt_deg = float(np.degrees(np.abs(given.gimbal_axes()[[0, 2]] @ first.shared[MISALIGNMENT])).max())
+    over = (
+        position_m / own.position_wander_m,
+        attitude_deg / own.attitude_wander_deg,
+        0.5 * tilt_deg / own.tilt_deg,  # two standard deviations of a constant are no exception
     )
-    ratio = np.array([own.position_wander_m, own.attitude_wander_deg, own.tilt_deg])
-    ratio /= [wide.position_wander_m, wide.attitude_wander_deg, wide.tilt_deg]
-    if np.abs(np.log(ratio)).max() < np.log(_OTHER):
+    if max(over) < _OTHER:
         return first
-    second = adjust_path(PathInput(given, matrix, views, own), first.state)
+    wide = replace(
+        own,
+        tilt_deg=max(own.tilt_deg, _WIDE_TILT_DEG),
+        position_wander_m=max(position_m, _WIDE_POSITION_M),
+        attitude_wander_deg=max(attitude_deg, _WIDE_ATTITUDE_DEG),
+    )
+    second = adjust_path(PathInput(given, matrix, views, wide), first.state)
     return first if second is None or second.posterior is None else second
 
 

