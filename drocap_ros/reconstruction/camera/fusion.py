@@ -49,6 +49,9 @@ _OTHER = 1.5
 _LEAST_COVERED = 0.5
 #: Median residual (px per 1000 px of focal length) above which no camera's path explains the points.
 _LARGEST_RESIDUAL = 3.0
+#: Latency (s) from which the reports are shifted, and the largest share of it that its standard deviation may be.
+_LONG_S = 0.02
+_SURE = 0.2
 #: Found wander over the configured one, from which the place is that of a receiver without corrections, and the
 #: standard deviation (m) of such a place: data sheets state that half of all lie within 1.5 m.
 _UNCORRECTED = 2.0
@@ -150,7 +153,7 @@ def _adjusted(given: CameraTelemetry, matrix: np.ndarray, views: Views, config: 
         0.5 * tilt_deg / own.tilt_deg,  # two standard deviations of a constant are no exception
     )
     if max(over) < _OTHER:
-        return first
+        return _without_latency(given, matrix, views, first, own)
     wide = replace(
         own,
         tilt_deg=max(own.tilt_deg, _WIDE_TILT_DEG),
@@ -158,7 +161,43 @@ def _adjusted(given: CameraTelemetry, matrix: np.ndarray, views: Views, config: 
         attitude_wander_deg=max(attitude_deg, _WIDE_ATTITUDE_DEG),
     )
     second = adjust_path(PathInput(given, matrix, views, wide), first.state)
-    return first if second is None or second.posterior is None else second
+    if second is None or second.posterior is None:
+        return first
+    return _without_latency(given, matrix, views, second, wide)
+
+
+def _without_latency(
+    given: CameraTelemetry, matrix: np.ndarray, views: Views, found: AdjustedPath, config: PathConfig
+) -> AdjustedPath:
+    """The path once more, by reports of the right time, where their latencies are found and are long.
+
+    The adjustment shifts a path by its smoothed motion, which takes a tenth of a latency for a part of the wander.
+    """
+    latencies = found.shared[[ATTITUDE_LATENCY, POSITION_LATENCY]]
+    std = found.shared_std[[ATTITUDE_LATENCY, POSITION_LATENCY]]
+    if np.abs(latencies).max() < _LONG_S or not (std < _SURE * np.abs(latencies).max()).all():
+        return found
+    later = at_other_time(given, *latencies.tolist())
+    shared = found.state.shared.copy()
+    shared[[ATTITUDE_LATENCY, POSITION_LATENCY]] = 0.0
+    again = adjust_path(PathInput(later, matrix, views, config), replace(found.state, shared=shared))
+    if again is None or again.posterior is None:
+        return found
+    again.shared[[ATTITUDE_LATENCY, POSITION_LATENCY]] += latencies
+    return again
+
+
+def at_other_time(given: CameraTelemetry, attitude_s: float, position_s: float) -> CameraTelemetry:
+    """The path with the attitude and the position of so many seconds later, interpolated between its frames."""
+    last = given.frames - 1
+    step = log_so3(given.rotation[1:] @ np.swapaxes(given.rotation[:-1], 1, 2))
+    at = np.arange(given.frames) + attitude_s * given.fps
+    frame = np.clip(np.floor(at).astype(np.intp), 0, last - 1)
+    rotation = exp_so3((at - frame)[:, None] * step[frame]) @ given.rotation[frame]
+    at = np.arange(given.frames) + position_s * given.fps
+    frame = np.clip(np.floor(at).astype(np.intp), 0, last - 1)
+    way = given.position[frame + 1] - given.position[frame]
+    return CameraTelemetry(rotation, given.position[frame] + (at - frame)[:, None] * way, given.fps)
 
 
 def _wander(found: AdjustedPath, fps: float) -> tuple[float, float]:
