@@ -31,8 +31,8 @@ BUDGETS = {
     # images came down; points of the scene in a tracks file (0.15)
     ("perception",): 5.40,  # 1.30 over the plan: tracking keeps its own association; foreign pictures and streams came;
     # points of the scene (0.20)
-    ("reconstruction",): 8.75,  # 2.45 over the plan: world/ and live/ kept their steps; a constant a line, with reasons;
-    # camera/, paths by fixed points of the scene (1.25)
+    ("reconstruction",): 8.75,  # 2.45 over the plan: world/ and live/ kept their steps; one constant a line;
+    # with reasons; camera/, paths by fixed points of the scene (1.25)
     ("flight",): 8.90,  # 3.70 over the plan: an argument or constant a line, with reasons; filter of reports, preflight
     ("recording",): 5.35,  # 1.05 over the plan: every format of telemetry stayed; keypoints of other tools came (0.38)
     ("simulation",): 3.58,  # 0.38 over the plan: reports err as recorded ones; one encoder a message
