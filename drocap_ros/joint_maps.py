@@ -73,6 +73,7 @@ TABLES: dict[str, dict[str, Weights]] = {
     "coco17": _coco_like(),
     "wholebody133": _coco_like() | _FEET,
     "halpe26": _coco_like() | _FEET,
+    "coco21": _coco_like() | _FEET,
     # MPII's upper neck is BODY_15's neck; the crown lies about 310 mm above the middle of the shoulders.
     "mpii16": {
         **_limbs_by_side(),
@@ -89,7 +90,7 @@ _EARS: dict[str, _Line] = {
     joint: (_SHOULDERS, _BOTH_EARS, spread) for joint, spread in (("neck", _NECK_SPREAD), ("head", _HEAD_SPREAD))
 }
 _EXTRA: dict[str, dict[str, _Line]] = {
-    **dict.fromkeys(("coco17", "wholebody133", "halpe26"), _EARS),
+    **dict.fromkeys(("coco17", "coco21", "wholebody133", "halpe26"), _EARS),
     "mpii16": {"head": ({"upper_neck": 1.0}, {"head_top": 1.0}, _CROWN_SPREAD)},
 }
 

@@ -76,6 +76,13 @@ COCO_17 = JointSet(
     (-1, 0, 0, 1, 2, 0, 0, 5, 6, 7, 8, 5, 6, 11, 12, 13, 14),
 )
 
+#: COCO's joints with toes and heels, as BlazePose gives them.
+COCO_21 = JointSet(
+    "coco21",
+    (*COCO_17.joints, *_names("left_big_toe right_big_toe left_heel right_heel")),
+    (*COCO_17.parents, 15, 16, 15, 16),
+)
+
 _HALPE_FEET = "left_big_toe right_big_toe left_small_toe right_small_toe left_heel right_heel"
 HALPE_26 = JointSet(
     "halpe26",
@@ -117,7 +124,7 @@ H36M_17 = JointSet(
 )
 
 JOINT_SETS: dict[str, JointSet] = {
-    s.name: s for s in (BODY_15, BODY_17, BODY_19, COCO_17, HALPE_26, WHOLEBODY_133, MPII_16, H36M_17)
+    s.name: s for s in (BODY_15, BODY_17, BODY_19, COCO_17, COCO_21, HALPE_26, WHOLEBODY_133, MPII_16, H36M_17)
 }
 
 #: The twelve joints of the averages in the paper's tables.

@@ -19,8 +19,8 @@ from drocap_ros.errors import DrocapError
 #: Modules under ``drocap_ros.cli``, in the order of ``drocap --help``.
 COMMANDS = (
     "demo.command", "graph.live", "graph.preflight", "graph.view", "graph.orbit", "graph.record", "graph.replay",
-    "track", "reconstruct", "batch.command", "learn_dictionary", "export", "report", "info", "recover", "graph.top",
-    "models", "evaluate",
+    "sample", "track", "reconstruct", "batch.command", "learn_dictionary", "export", "report", "info", "recover",
+    "graph.top", "models", "evaluate",
 )  # fmt: skip
 
 

