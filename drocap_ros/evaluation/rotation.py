@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import starmap
@@ -25,7 +26,7 @@ class RotationRow:
     """One sequence, seen at one speed, by one method.
 
     limb_spread : standard deviation over mean of each limb's length, averaged; 0 for a rigid skeleton
-    seconds_initial, seconds_adjust : wall-clock of the two stages
+    seconds_initial, seconds_adjust : wall-clock of the two stages; NaN where the method does not say it
     """
 
     sequence: str
@@ -50,8 +51,8 @@ def measure(sequence: Sequence, method: str, speed_deg_s: float, noisy: bool, se
         noisy=noisy,
         errors=compare(motion, view.truth / 1000.0, view.tracks.stamp_ns * 1e-9, "camera"),
         limb_spread=float(np.mean(lengths.std(axis=0) / lengths.mean(axis=0))),
-        seconds_initial=float(motion.meta["seconds"]["initial"]),
-        seconds_adjust=float(motion.meta["seconds"]["ba"]),
+        seconds_initial=float(motion.meta["seconds"].get("initial", math.nan)),
+        seconds_adjust=float(motion.meta["seconds"].get("ba", math.nan)),
     )
 
 

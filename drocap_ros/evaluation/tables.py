@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-LABELS = {
+_LABELS = {
     "ba": "default (`ba`)",
     "paper": "paper: bundle adjustment",
     "paper-no-articulation": "paper without articulation",
@@ -48,6 +48,11 @@ _WORLD = {
     "in 90 % ellipsoid": ("coverage", 1, ".0%"),
 }
 WORLD_HEAD = list(_WORLD)
+
+
+def label(method: str) -> str:
+    """Name of a method in tables and plots."""
+    return _LABELS.get(method, method)
 
 
 def markdown_table(head: list[str], lines: list[list[str]]) -> list[str]:
@@ -117,7 +122,7 @@ def rotation_markdown(rows: list[RotationRow]) -> str:
         *("", f"Per joint group at {speed:g} deg/s, mm.", ""),
         *markdown_table(["method", *JOINT_GROUPS, "toe"], list(starmap(_group_cells, at_speed.items()))),
         *("", f"Per sequence at {speed:g} deg/s, mm.", ""),
-        *markdown_table(["sequence", *(LABELS[m] for m in by_method)], per_sequence),
+        *markdown_table(["sequence", *(label(m) for m in by_method)], per_sequence),
     ]
     return "\n".join(lines) + "\n"
 
@@ -128,7 +133,7 @@ def _sequence_cells(rows: tuple[RotationRow, ...]) -> list[str]:
 
 
 def _speed_cells(method: str, rows: list[RotationRow], speeds: list[float]) -> list[str]:
-    return [LABELS[method], *(f"{_mean_mm(rows, s):.1f}" for s in speeds), str(sum(r.errors.mirrored for r in rows))]
+    return [label(method), *(f"{_mean_mm(rows, s):.1f}" for s in speeds), str(sum(r.errors.mirrored for r in rows))]
 
 
 def _by_method(rows: list[RotationRow]) -> dict[str, list[RotationRow]]:
@@ -144,7 +149,7 @@ def _group_cells(method: str, rows: list[RotationRow]) -> list[str]:
     errors = [r.errors for r in rows]
     groups = [np.mean([e.per_group_mm[group] for e in errors]) for group in JOINT_GROUPS]
     toes = [e.toe_mm for e in errors if not np.isnan(e.toe_mm)]
-    return [LABELS[method], *(f"{g:.1f}" for g in groups), f"{np.mean(toes):.1f}" if toes else "-"]
+    return [label(method), *(f"{g:.1f}" for g in groups), f"{np.mean(toes):.1f}" if toes else "-"]
 
 
 def world_markdown(rows: list[WorldRow], case: WorldCase) -> str:
@@ -167,7 +172,7 @@ def save_curves(path: Path, rows: list[RotationRow]) -> None:
     figure, axes = _plot(6.4, 4.2)
     for method, found in _by_method(rows).items():
         speeds = sorted({r.speed_deg_s for r in found})
-        axes.plot(speeds, [_mean_mm(found, s) for s in speeds], marker="o", label=LABELS[method])
+        axes.plot(speeds, [_mean_mm(found, s) for s in speeds], marker="o", label=label(method))
     axes.set(xlabel="orbit speed, deg/s", ylabel="reconstruction error, mm")
     axes.set_title(f"{len({r.sequence for r in rows})} sequences, {'noisy' if rows[0].noisy else 'clean'} 2D")
     axes.set_ylim(bottom=0)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from drocap_ros.errors import InputError
 from drocap_ros.geometry.interpolation import fill_frames
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput
@@ -19,13 +20,22 @@ def run_method(name: str, data: MethodInput) -> ImagePoses:
     Raises
     ------
     InputError
-        When the keypoints show no person.
+        When the keypoints show no person, or the method of another package gives something else than their poses.
     """
     normalize_tracks(data.keypoints)  # raises on input without a usable frame
     use = usable_frames(data.keypoints)
     if use.all():
-        return METHODS[name].run(data)
-    return _spread(METHODS[name].run(data.frames(use)), use, data.stamp_ns)
+        return _checked(name, data)
+    return _spread(_checked(name, data.frames(use)), use, data.stamp_ns)
+
+
+def _checked(name: str, data: MethodInput) -> ImagePoses:
+    poses = METHODS[name].run(data)
+    expected = (*data.keypoints.xy.shape[:2], 3)
+    found = poses.joints_px.shape if isinstance(poses, ImagePoses) else type(poses).__name__
+    if found != expected:
+        raise InputError(f"method {name}: expected ImagePoses with joints_px {expected}, found {found}; correct it")
+    return poses
 
 
 def usable_frames(keypoints: Keypoints2D) -> np.ndarray:
