@@ -1,4 +1,8 @@
-"""Fixed points of the scene, followed through the images: corners spread over a grid, by pyramidal optical flow."""
+"""Fixed points of the scene, followed through the images: corners spread over a grid.
+
+Pyramidal optical flow from image to image, there and back, finds a point to within half a px; aligning the patch that
+was taken when the point began (:mod:`drocap_ros.perception.patches`) keeps it from drifting.
+"""
 
 from __future__ import annotations
 
@@ -8,28 +12,29 @@ import cv2
 import numpy as np
 
 from drocap_ros.background import FixedPoints
+from drocap_ros.perception.patches import patches_at
 
-_SIDE_PX = 1440  # longest side in which points are followed; larger images are halved until they fit
-_CELLS = 160  # of the grid, one corner each
-_MOST = 160  # points at a time: ten times the least number that shows a motion
+_SIDE_PX = 1440  # longest side of the images in which patches lie; larger ones are halved until they fit
+_MOST = 160  # points at a time, and cells of the grid: ten times the least number that shows a motion
 _ENOUGH = 80  # of them: with fewer, cells take more than one
 _IN_A_CELL = 3  # most that one takes, and that may gather there as the camera backs off
 _GRADIENT = 2.5  # grey values per px along an edge's own direction, root mean square: sky, water and walls have less
 _BLOCK_PX = 5  # over which that is measured, in the image at half the size
-_EDGE_PX = 10  # of the image, in which the flow's window would not fit
-_WINDOW_PX = 15  # of the optical flow around each point, as in the examples of OpenCV
+_EDGE_PX = 10  # of the image, in which a patch would not fit
+_WINDOW_PX = 11  # of the optical flow around each point, in the image at half the size
 _COARSEST_PX = 16  # least height or width of the flow's coarsest image: its window has to fit
-_MOST_LEVELS = 5  # of the flow's pyramid: steps up to 7 * 2^5 = 224 px
-_BACK_PX = 0.5  # distance from its beginning at which a point may end up when it is followed back
-_BACK_LEVELS = 1  # of the way back, which begins where the others' motion says
+_LEVELS = 4  # of the flow's pyramid: steps up to 5 * 2^4 = 80 px of half the size
+_BACK_LEVELS = 1  # of the way back, which begins where the others' motion says,
+_BACK_PX = 0.5  # and distance from its beginning at which a point may end, in the image at half the size
 _FEW = 0.7  # share of the points that are found again below which the whole image's shift is tried
 _CUT = 0.2  # and below which the scene is another: no point goes on
 _SHIFT_PX = 480  # longer side of the images whose shift is measured
-_MARGIN = (0.1, 0.1, 0.1, 0.2)  # around a person's box, lengths: left, top, right, and below it feet and shadow
-_RENEW_NS = (
-    95_000_000  # interval of the search for new corners: a pan of 40 degrees/s brings in a twentieth of an image
-)
-_RENEW_SHARE = 0.75  # of the points after the last search, below which the next one is due at once
+_ALIGN_PX = 2.0  # farthest from the flow's end that a patch may be found: the flow errs by less
+_ALIKE = 0.6  # least correlation of a patch with what is there: below, something else is,
+_FRESH = 0.85  # and where it is less than this, a new patch is taken: the view has changed
+_MARGIN = np.array([-0.1, -0.1, 0.1, 0.2])  # around a person's box, lengths: below it feet and shadow
+_SEARCH_NS = 190_000_000  # interval of the search for corners: a pan of 40 degrees/s brings in a tenth of an image
+_SEARCH_SHARE = 0.75  # of the points after the last search, below which the next one is due at once
 
 
 class BackgroundTracks:
@@ -40,43 +45,44 @@ class BackgroundTracks:
         self._scale = 1.0  # px of the image per px of the grey one
         self._track: np.ndarray = np.empty(0, np.int64)
         self._point: np.ndarray = np.empty((0, 2), np.float32)  # px of the grey image
+        self._patches = patches_at(np.zeros((1, 1), np.uint8), self._point)
         self._next = 0
-        self._renewed: tuple[int, int] | None = None  # stamp of the last search for corners, and points after it
+        self._searched: tuple[int, int] | None = None  # stamp of the last search for corners, and points after it
 
     def reset(self) -> None:
         """End all tracks; their numbers are not used again."""
-        self._grey, self._renewed = None, None
+        self._grey, self._searched = None, None
         self._keep(np.zeros(len(self._track), bool))
 
     def follow(self, image: np.ndarray) -> FixedPoints:
         """Follow the points of the last image into this one (H, W, 3) uint8 BGR; those that it does not show end."""
-        grey, self._scale = _grey(image)
-        last, self._grey = self._grey, grey
-        if last is None or last.shape != grey.shape or min(grey.shape) < 2 * _EDGE_PX + 1:
+        grey, scale = _grey(image)
+        last = self._grey
+        if last is None or last.shape != grey.shape:
             self.reset()
-            self._grey = grey
         elif len(self._track):
-            self._point, found = _followed(last, grey, self._point)
+            moved, found = _followed(_half(last), _half(grey), _halved(self._point))
+            self._point = _doubled(moved)
             self._keep(found)
+            self._align(grey)
+        self._grey, self._scale = grey, scale
         return self.points
 
     def renew(self, persons: Sequence[np.ndarray], stamp_ns: int) -> FixedPoints:
         """End the points on persons, boxes (4,) px of this image, and begin new ones where the image has none."""
-        if self._grey is None or min(self._grey.shape) < 2 * _EDGE_PX + 1:
+        if self._grey is None or min(self._grey.shape) <= 2 * _EDGE_PX:
             return self.points
-        free = _free(self._grey.shape, self._scale, persons)
-        at = np.round(self._point).astype(int)
-        self._keep(free[at[:, 1], at[:, 0]] > 0)
-        if self._renewed is not None:
-            since_ns, count = stamp_ns - self._renewed[0], self._renewed[1]
-            if since_ns < _RENEW_NS and len(self._track) >= _RENEW_SHARE * count:
-                return self.points
-        self._keep(~_crowded(self._point, self._grey.shape))
-        new = _corners(self._grey, free, self._point)
-        self._track = np.append(self._track, np.arange(self._next, self._next + len(new)))
-        self._point = np.concatenate([self._point, new])
-        self._next += len(new)
-        self._renewed = stamp_ns, len(self._track)
+        wide = [(box + (box[2:] - box[:2]).max() * _MARGIN) / self._scale for box in persons]
+        for box in wide:
+            self._keep(~((self._point >= box[:2]) & (self._point <= box[2:])).all(axis=1))
+        if self._is_due(stamp_ns):
+            self._keep(~_crowded(self._point, self._grey.shape))
+            new = _corners(self._grey, wide, self._point)
+            self._track = np.append(self._track, np.arange(self._next, self._next + len(new)))
+            self._point = np.concatenate([self._point, new])
+            self._patches += patches_at(self._grey, new)
+            self._next += len(new)
+            self._searched = stamp_ns, len(self._track)
         return self.points
 
     @property
@@ -84,17 +90,50 @@ class BackgroundTracks:
         """The points that are followed, in the last image."""
         return FixedPoints(self._track, (self._point + np.float32(0.5)) * np.float32(self._scale) - np.float32(0.5))
 
+    def _is_due(self, stamp_ns: int) -> bool:
+        if self._searched is None:
+            return True
+        at_ns, count = self._searched
+        return stamp_ns - at_ns >= _SEARCH_NS or len(self._track) < _SEARCH_SHARE * count
+
+    def _align(self, grey: np.ndarray) -> None:
+        """Put the points where their patches are in the image; end those that something else has replaced."""
+        place, alike = self._patches.align(grey, self._point)
+        near = (alike >= _ALIKE) & (np.linalg.norm(place - self._point, axis=1) <= _ALIGN_PX)
+        inside = ((place >= _EDGE_PX) & (place <= np.array(grey.shape[::-1]) - 1 - _EDGE_PX)).all(axis=1)
+        self._point = place.astype(np.float32)
+        self._keep(near & inside)
+        old = alike[near & inside] < _FRESH
+        if old.any():
+            self._patches.replace(old, patches_at(grey, self._point[old]))
+
     def _keep(self, kept: np.ndarray) -> None:
-        self._track, self._point = self._track[kept], self._point[kept]
+        if not kept.all():
+            self._track, self._point, self._patches = self._track[kept], self._point[kept], self._patches[kept]
 
 
 def _grey(image: np.ndarray) -> tuple[np.ndarray, float]:
-    """Grey image, halved until it fits, and how much smaller it is: means of four pixels are fast."""
+    """Grey image, halved until it fits, and how much smaller it is."""
     grey, scale = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), 1.0
     while max(grey.shape) > _SIDE_PX and min(grey.shape) > 1:
-        even = grey[: grey.shape[0] // 2 * 2, : grey.shape[1] // 2 * 2]
-        grey, scale = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 2 * scale
+        grey, scale = _half(grey), 2 * scale
     return grey, scale
+
+
+def _half(grey: np.ndarray) -> np.ndarray:
+    """Means of four pixels, which are fast; a last odd row or column is left out."""
+    height, width = (side // 2 * 2 for side in grey.shape)
+    return cv2.resize(grey[:height, :width], (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+
+
+def _halved(points: np.ndarray) -> np.ndarray:
+    """Places (N, 2) px in the image at half the size."""
+    return np.asarray((points - 0.5) / 2, np.float32)
+
+
+def _doubled(points: np.ndarray) -> np.ndarray:
+    """Places (N, 2) px in the image at twice the size."""
+    return np.asarray(2 * points + 0.5, np.float32)
 
 
 def _followed(last: np.ndarray, grey: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -105,27 +144,23 @@ def _followed(last: np.ndarray, grey: np.ndarray, points: np.ndarray) -> tuple[n
         again, found_again = _flow(last, grey, points, points + _shift(last, grey))
         if found_again.sum() > found.sum():
             moved, found = again, found_again
-    if found.mean() < _CUT:
-        found[:] = False
-    return moved, found
+    return moved, found if found.mean() >= _CUT else np.zeros_like(found)
 
 
 def _flow(last: np.ndarray, grey: np.ndarray, points: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 2) followed from a start, and which come back to their beginning from where the others would."""
-    moved, found = _step(last, grey, points, start, _MOST_LEVELS)
+    moved, found = _step(last, grey, points, start, _LEVELS)
     if not found.any():
         return moved, found
     motion = np.median((moved - points)[found], axis=0)
     back, returned = _step(grey, last, moved, moved - motion, _BACK_LEVELS)
-    near = np.linalg.norm(back - points, axis=1) <= _BACK_PX
-    size = np.array(grey.shape[::-1])
-    inside = ((moved >= _EDGE_PX) & (moved <= size - 1 - _EDGE_PX)).all(axis=1)
-    return moved, found & returned & near & inside
+    return moved, found & returned & (np.linalg.norm(back - points, axis=1) <= _BACK_PX)
 
 
 def _step(
     last: np.ndarray, grey: np.ndarray, points: np.ndarray, start: np.ndarray, levels: int
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Optical flow of points (N, 2) px from a start, and which (N,) bool it found inside the image."""
     fitting = int(np.log2(min(grey.shape) / _COARSEST_PX))
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
         last,
@@ -136,7 +171,9 @@ def _step(
         maxLevel=max(0, min(levels, fitting)),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
-    return moved[:, 0], (status[:, 0] == 1) & np.isfinite(moved[:, 0]).all(axis=1)
+    place: np.ndarray = moved[:, 0]
+    inside = ((place >= 0) & (place <= np.array(grey.shape[::-1]) - 1)).all(axis=1)  # False for NaN
+    return place, (status[:, 0] == 1) & inside
 
 
 def _shift(last: np.ndarray, grey: np.ndarray) -> np.ndarray:
@@ -149,44 +186,37 @@ def _shift(last: np.ndarray, grey: np.ndarray) -> np.ndarray:
     return way
 
 
-def _free(shape: tuple[int, ...], scale: float, persons: Sequence[np.ndarray]) -> np.ndarray:
-    """(H, W) uint8, 255 where points may be: away from the edges and the persons, boxes (4,) px of the image."""
-    height, width = shape
-    mask = np.zeros(shape, np.uint8)
-    mask[_EDGE_PX : height - _EDGE_PX, _EDGE_PX : width - _EDGE_PX] = 255
-    for box in persons:
-        length = float((box[2:] - box[:2]).max())
-        wide = (box + length * np.array(_MARGIN) * [-1, -1, 1, 1]) / scale
-        x0, y0, x1, y1 = np.clip(wide, 0, [width, height, width, height]).astype(int)
-        mask[y0 : y1 + 1, x0 : x1 + 1] = 0
-    return mask
-
-
-def _corners(grey: np.ndarray, free: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _corners(grey: np.ndarray, persons: Sequence[np.ndarray], points: np.ndarray) -> np.ndarray:
     """(N, 2) float32 px, the best corners of the cells of the grid without a point, not more than there is room for.
 
-    Where little of the image has texture, its cells take more than one.
+    Where little of the image has texture, its cells take more than one.  None lies on persons, boxes (4,) px.
     """
-    half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    half = _half(grey)
     # OpenCV's scale: four times the mean square of the gradient, grey values from 0 to 1.
     response = cv2.cornerMinEigenVal(half, _BLOCK_PX) - 4 * (_GRADIENT / 255) ** 2
-    response[cv2.resize(free, half.shape[::-1], interpolation=cv2.INTER_NEAREST) == 0] = 0
-    found = points / 2
-    _without(response, found)
+    edge = _EDGE_PX // 2 + 1
+    response[:edge], response[-edge:], response[:, :edge], response[:, -edge:] = 0, 0, 0, 0
+    for box in persons:
+        x0, y0, x1, y1 = np.clip(box / 2, 0, np.tile(half.shape[::-1], 2)).astype(int)
+        response[y0 : y1 + 1, x0 : x1 + 1] = 0
+    there = _halved(points)
+    found = there
+    _take(response, there)
     for most in range(1, _IN_A_CELL + 1):
         if len(found) < (_MOST if most == 1 else _ENOUGH):
             new = _best(response, found, most)
-            _without(response, new)
+            _take(response, new)
             found = np.concatenate([found, new])
-    new_points: np.ndarray = (2 * found[len(points) :] + 0.5).astype(np.float32)
-    return new_points
+    return _doubled(found[len(there) :])
 
 
-def _without(response: np.ndarray, points: np.ndarray) -> None:
+def _take(response: np.ndarray, points: np.ndarray) -> None:
     """Take the surroundings of points (N, 2) px out of a response (H, W)."""
     near = _grid(response.shape)[0] // 3
-    for x, y in np.round(points).astype(int):
-        response[max(y - near, 0) : y + near + 1, max(x - near, 0) : x + near + 1] = 0
+    taken = np.zeros(response.shape, np.uint8)
+    x, y = np.clip(np.round(points), 0, np.array(response.shape[::-1]) - 1).astype(int).T
+    taken[y, x] = 1
+    response[cv2.dilate(taken, np.ones((2 * near + 1, 2 * near + 1), np.uint8)) > 0] = 0
 
 
 def _best(response: np.ndarray, points: np.ndarray, most: int) -> np.ndarray:
@@ -205,14 +235,14 @@ def _best(response: np.ndarray, points: np.ndarray, most: int) -> np.ndarray:
 
 def _grid(shape: tuple[int, ...]) -> tuple[int, int, int]:
     """Side of the square cells, px, and how many of them an image has from top to bottom and from left to right."""
-    side = max(1, int(np.sqrt(shape[0] * shape[1] / _CELLS)))
+    side = max(1, int(np.sqrt(shape[0] * shape[1] / _MOST)))
     return side, max(1, shape[0] // side), max(1, shape[1] // side)
 
 
 def _cell(points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """(N,) number of the cell of each point (N, 2) px."""
     side, rows, columns = _grid(shape)
-    x, y = np.minimum(points.astype(int) // side, [columns - 1, rows - 1]).T
+    x, y = np.clip(points.astype(int) // side, 0, [columns - 1, rows - 1]).T
     return np.asarray(y * columns + x)
 
 
@@ -220,7 +250,6 @@ def _crowded(points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """(N,) bool: points (N, 2) px, the oldest first, beside older ones that are enough for their cell."""
     cell = _cell(points, shape)
     order = np.argsort(cell, kind="stable")
-    rank = np.arange(len(cell)) - np.searchsorted(cell[order], cell[order])
     crowded = np.zeros(len(cell), bool)
-    crowded[order] = rank >= _IN_A_CELL
+    crowded[order] = np.arange(len(cell)) - np.searchsorted(cell[order], cell[order]) >= _IN_A_CELL
     return crowded
