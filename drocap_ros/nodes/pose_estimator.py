@@ -22,7 +22,7 @@ from drocap_ros.ros.diagnostics import Key
 from drocap_ros.ros.image_input import ImageInput, ImageSample
 from drocap_ros.ros.lifecycle import ManagedComponent
 from drocap_ros.ros.load_level import LoadShedding
-from drocap_ros.ros.topics import TOPICS, BackgroundTracks
+from drocap_ros.ros.topics import TOPICS
 
 
 class PoseEstimatorNode(ManagedComponent):
@@ -38,7 +38,7 @@ class PoseEstimatorNode(ManagedComponent):
         self._roi: np.ndarray | None = None
         self._load_shedding = LoadShedding(self.config.max_load_level)
         self._pose2d = self.output("pose2d")
-        self._background = self.output("background") if BackgroundTracks is not None else None
+        self._background = self.output("background")
         self._images = ImageInput(
             self, self._on_image, partial(image_from_message, compressed=True), TOPICS["image/compressed"].qos.depth
         )
@@ -79,7 +79,7 @@ class PoseEstimatorNode(ManagedComponent):
         if self._estimator.propagated:
             self.count(Key.IMAGES_PROPAGATED)
         self._pose2d.publish(pose2d_to_ros(observation, header.frame_id))
-        if self._background is not None and observation.background is not None:
+        if observation.background is not None:
             self._background.publish(background_to_ros(observation.background, header))
         self.count(Key.IMAGES)
         self.produced(observation.stamp_ns)

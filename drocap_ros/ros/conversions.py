@@ -16,14 +16,12 @@ from std_msgs.msg import Header
 from drocap_ros.background import FixedPoints
 from drocap_ros.flight.vehicle_state import VehicleState as VehicleStateData
 from drocap_ros.geometry.rotations import quaternion_from_matrix
-from drocap_ros.msg import Pose2D, Pose3D, Pose3DWindow, VehicleState
+from drocap_ros.msg import BackgroundTracks, Pose2D, Pose3D, Pose3DWindow, VehicleState
 from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.calibration import CameraModel
 from drocap_ros.reconstruction.live.latest_place import PlacedPose
 from drocap_ros.reconstruction.live.window import AdjustedWindow
 from drocap_ros.recording.pose_messages import float_array, observation_from_message
-from drocap_ros.recording.session import Message
-from drocap_ros.ros.topics import BackgroundTracks
 from drocap_ros.skeleton import BODY_15, BODY_17, joint_set
 from drocap_ros.srv import OrbitCommand
 
@@ -110,7 +108,7 @@ def pose2d_to_ros(observation: PoseObservation, frame_id: str) -> Pose2D:
 pose2d_from_ros = observation_from_message
 
 
-def background_to_ros(points: FixedPoints, header: Header) -> Message:
+def background_to_ros(points: FixedPoints, header: Header) -> BackgroundTracks:
     """The scene's fixed points in the image of a header -> message."""
     return BackgroundTracks(header=header, track=array("q", points.track.tolist()), point=floats(points.point))
 

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, RegionOfInterest
 from visualization_msgs.msg import ImageMarker, MarkerArray
 
-from drocap_ros import msg
-from drocap_ros.msg import OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleState
+from drocap_ros.msg import BackgroundTracks, OrbitStatus, Pose2D, Pose3D, Pose3DWindow, VehicleState
 from drocap_ros.srv import OrbitCommand
 
-#: None in an installation whose messages were built before there was this one.
-BackgroundTracks: Any = getattr(msg, "BackgroundTracks", None)
 try:
     from tf2_msgs.msg import TFMessage as TFMessage
 except ImportError:  # missing from the ROS wheels; `make setup` builds it
@@ -58,6 +55,7 @@ TOPICS: dict[str, Topic] = {
     "camera_info": Topic(CameraInfo, CAMERA_INFO_QOS, RESULT_QOS, one_clock=True),
     "roi": Topic(RegionOfInterest, RESULT_QOS),
     "pose2d": Topic(Pose2D, RESULT_QOS, one_clock=True),
+    "background": Topic(BackgroundTracks, RESULT_QOS, one_clock=True),
     "pose3d/initial": Topic(Pose3D, RESULT_QOS, one_clock=True),
     "pose3d/refined": Topic(Pose3DWindow, RESULT_QOS, one_clock=True),
     "pose3d/latest": Topic(Pose3D, RESULT_QOS, one_clock=True),
@@ -74,12 +72,8 @@ FROM_OUTSIDE = frozenset({"image/compressed", "camera_info", "roi", "vehicle/sta
 if TFMessage is not None:
     TOPICS["/tf"] = Topic(TFMessage, RESULT_QOS)
 
-if BackgroundTracks is not None:
-    TOPICS["background"] = Topic(BackgroundTracks, RESULT_QOS, one_clock=True)
-
 SERVICES: dict[str, type] = {"orbit/command": OrbitCommand}
 
-_BACKGROUND = ("background",) if BackgroundTracks is not None else ()
 _TF = ("/tf",) if TFMessage is not None else ()
 
 
@@ -102,7 +96,7 @@ class NodeEntry(NamedTuple):
 NODES: dict[str, NodeEntry] = {
     "image_ingest": NodeEntry(("image/compressed", "camera_info"), source=True, live=True, niceness=5),
     "flight_simulator": NodeEntry(("image/compressed", "camera_info"), source=True),
-    "pose_estimator": NodeEntry(("pose2d", *_BACKGROUND), ("image/compressed", "roi"), live=True),
+    "pose_estimator": NodeEntry(("pose2d", "background"), ("image/compressed", "roi"), live=True),
     "capture_simulator": NodeEntry(("pose2d", "camera_info"), source=True),
     "initializer": NodeEntry(("pose3d/initial",), ("pose2d",), live=True),
     "bundle_adjuster": NodeEntry(
