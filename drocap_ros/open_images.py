@@ -8,6 +8,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from drocap_ros.errors import InputError
 from drocap_ros.perception.sources import Frame, open_source
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
@@ -72,13 +74,18 @@ def _visible(source: str | Path, frames: Iterable[Frame]) -> Iterator[Frame]:
     count, blank = 0, True
     for frame in frames:
         count += 1
-        blank = blank and float(frame.image[::_SAMPLING, ::_SAMPLING].std()) < _BLANK
+        blank = blank and is_blank(frame.image)
         yield frame
     if count > 1 and blank:
         raise InputError(
             f"{source}: expected pictures, found {count} of one colour; look at them, or convert them:"
             " ffmpeg -i IN -pix_fmt yuv420p OUT.mp4"
         )
+
+
+def is_blank(image: np.ndarray) -> bool:
+    """Whether an image (H, W, 3) uint8 shows nothing."""
+    return float(image[::_SAMPLING, ::_SAMPLING].std()) < _BLANK
 
 
 def refuse_other_inputs(path: Path) -> None:

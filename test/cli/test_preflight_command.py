@@ -7,10 +7,12 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -18,15 +20,19 @@ from station_files import station_settings
 
 from drocap_ros.bringup import free_domain
 from drocap_ros.cli import main
+from drocap_ros.cli.graph.preflight import look, setup_of
 from drocap_ros.cli.graph.running_bridge import BridgeListener
+from drocap_ros.config import DrocapConfig
 from drocap_ros.errors import InputError
 from drocap_ros.flight.autopilot.autopilot import Level
 from drocap_ros.flight.bridge_config import MavlinkBridgeConfig
 from drocap_ros.flight.mavlink.transport import open_transport
 from drocap_ros.flight.preflight.checks import all_findings
 from drocap_ros.flight.preflight.link_checks import link_findings
-from drocap_ros.flight.preflight.setup_checks import Setup
+from drocap_ros.flight.preflight.setup_checks import Setup, setup_findings
 from drocap_ros.flight.vehicle_state import LANDED_ON_GROUND, VehicleState
+from drocap_ros.perception.sources import Frame, ImageSource
+from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.ros.diagnostics import Key
 from drocap_ros.simulation.vehicle.ports import free_udp_port
 
@@ -67,10 +73,21 @@ def start(*arguments, log):
         return subprocess.Popen(command, env=ENV, stdout=out, stderr=err)
 
 
+def pictures(folder):
+    """A folder of pictures in the place of a camera, which this machine does not have."""
+    path = folder / "pictures"
+    if not path.exists():
+        path.mkdir()
+        image = np.random.default_rng(0).integers(255, size=(720, 1280, 3), dtype=np.uint8)
+        for number in range(3):
+            cv2.imwrite(str(path / f"{number}.png"), image)
+    return path
+
+
 def write_config(path, url, models, **values):
     bridge = {"url": url, "commands_enabled": True, "mode_change_allowed": True, "size_error": 0.04, **values}
     bridge.update(max_state_age_s=1.0, max_round_trip_s=2.0)  # this machine may run other tests at the same time
-    ingest = {"source": "/dev/video0", "horizontal_fov_deg": 60.0, "width_px": 1280, "height_px": 720}
+    ingest = {"source": str(pictures(path.parent)), "horizontal_fov_deg": 60.0, "width_px": 1280, "height_px": 720}
     sections = {"mavlink_bridge": bridge, "image_ingest": ingest, "pose_estimator": {"models_dir": str(models)}}
     path.write_text(yaml.safe_dump(sections))
     return path
@@ -243,6 +260,79 @@ def test_with_a_running_graph_it_reads_what_the_bridge_hears(tmp_path):
     assert checks["rate_attitude_quaternion"]["values"]["real_hz"] > 25
     assert checks["battery"]["found"] == "87 %, 15.8 V"
     assert (checks["settings"]["level"], checks["settings"]["found"]) == ("warning", "not read")
+
+
+def images_check(ingest, config=None):
+    """The check of what `look` saw."""
+    setup = setup_of(DrocapConfig().replace("image_ingest", **ingest))
+    setup = setup._replace(pictures=look(ImageIngestConfig(**ingest)))
+    return {finding.code: finding for finding in setup_findings(config or MavlinkBridgeConfig(), setup)}.get("images")
+
+
+def test_a_camera_that_is_not_there_is_missing():
+    check = images_check({"source": "/dev/video97"})
+    assert (check.level, check.found, check.values["opened"]) == (Level.MISSING, "not opened", False)
+    assert check.remedy.startswith("/dev/video97: expected")
+
+
+def test_a_source_is_opened_and_its_images_are_measured(tmp_path):
+    source = {"source": str(pictures(tmp_path)), "folder_rate_hz": 12.5}
+    check = images_check({**source, "width_px": 1280, "height_px": 720})
+    assert (check.level, check.found) == (Level.OK, "1280x720 px, 12.5 images/s, latency not known")
+    assert check.values["rate_hz"] == pytest.approx(12.5)
+    other = images_check({**source, "width_px": 1920, "height_px": 1080})
+    assert other.level == Level.WARNING
+    assert other.wanted == "images of 1920x1080 px"
+
+
+def test_a_covered_lens_is_named(tmp_path):
+    cv2.imwrite(str(tmp_path / "1.png"), np.full((48, 64, 3), 9, np.uint8))
+    check = images_check({"source": str(tmp_path / "1.png")})
+    assert check.level == Level.WARNING
+    assert "all of one colour" in check.found
+    assert "uncover the lens" in check.remedy
+
+
+def test_the_images_of_a_topic_come_from_the_graph():
+    assert images_check({"source": "topic:/camera/image_raw"}) is None
+
+
+class Driver(ImageSource):
+    """A driver that stamps its images 80 ms before it gives them, and stops after some."""
+
+    live = True
+    size = (64, 48)
+
+    def __init__(self, count):
+        super().__init__()
+        self.left, self.closed = count, threading.Event()
+
+    def read(self):
+        if not self.left:
+            self.closed.wait(60)
+            return None
+        self.left -= 1
+        time.sleep(0.05)
+        return Frame(
+            time.time_ns() - 80_000_000, np.random.default_rng(0).integers(255, size=(48, 64, 3), dtype=np.uint8)
+        )
+
+    def close(self):
+        self.closed.set()
+
+
+@pytest.mark.parametrize(("count", "words"), [(1, "one image, then no more"), (100, " images/s, here 0.08 s after")])
+def test_a_driver_gives_rate_and_latency_and_may_stall(monkeypatch, count, words):
+    monkeypatch.setattr("drocap_ros.perception.sources.open_source", lambda *_: Driver(count))
+    begin = time.monotonic()
+    check = images_check({"source": "/dev/video0"})
+    assert words in check.found
+    assert check.values["latency_s"] == pytest.approx(0.08, abs=0.04)
+    assert time.monotonic() - begin < 10
+    if count == 1:
+        assert check.level == Level.WARNING
+    else:
+        assert 5 < check.values["rate_hz"] < 21
 
 
 def test_what_the_running_bridge_refuses_is_missing_whatever_the_file_permits():

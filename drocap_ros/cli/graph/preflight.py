@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
+import math
+import statistics
 import sys
+import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,12 +26,14 @@ if TYPE_CHECKING:
     from drocap_ros.config import DrocapConfig
     from drocap_ros.flight.preflight.findings import Finding
     from drocap_ros.flight.preflight.measured import Measured
-    from drocap_ros.flight.preflight.setup_checks import Setup
+    from drocap_ros.flight.preflight.setup_checks import Pictures, Setup
     from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 
 _COLOURS = {"ok": "green", "waits": "cyan", "warning": "yellow", "missing": "red"}
 #: Images of a camera whose size is not configured.
 _USUAL_SIZE = (1280, 720)
+#: Images that give the rate, two seconds at 15 Hz, and how long they may take.
+_IMAGES, _LOOK_S = 30, 5.0
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -66,6 +73,8 @@ def run(args: argparse.Namespace) -> int:
         check_output_file(args.json, "--json")
     setup = setup_of(config, args.models)
     measured = _measure(config, args)
+    if not measured.bridge:  # a running graph has its camera open
+        setup = setup._replace(pictures=look(config.image_ingest))
     found = all_findings(config.mavlink_bridge, setup, measured)
     ready = is_ready(found)
     status = 2 if not measured.heard else 0 if ready else 1
@@ -94,7 +103,39 @@ def setup_of(config: DrocapConfig, models: Path | None = None) -> Setup:
         source=ingest.source, assumed_height_m=config.initializer.assumed_height_m,
         models=str(folder) if present else "",
         models_remedy="run `drocap models fetch` or name a folder with --models or DROCAP_MODELS",
+        wanted_size=(ingest.width_px, ingest.height_px),
     )  # fmt: skip
+
+
+def look(ingest: ImageIngestConfig) -> Pictures | None:
+    """Open the source of the images for at most some seconds; None = there is none, or it is a topic."""
+    from drocap_ros.flight.preflight.setup_checks import DRIVER, Pictures
+    from drocap_ros.open_images import is_blank
+    from drocap_ros.perception.sources import open_source
+    from drocap_ros.ros.topics import TOPIC_SOURCE
+
+    if not ingest.source or ingest.source.startswith(TOPIC_SOURCE):
+        return None
+    stamps, late_s, blank = [], [], True
+    try:
+        with open_source(ingest.source, ingest) as source:
+            ends = threading.Timer(_LOOK_S, source.close) if source.live else None  # a camera that stalls ends thus
+            if ends:
+                ends.start()
+            for frame in itertools.islice(source, _IMAGES):
+                stamps.append(frame.stamp_ns)
+                late_s.append(1e-9 * (time.time_ns() - frame.stamp_ns))
+                blank = blank and is_blank(frame.image)
+            if ends:
+                ends.cancel()
+    except InputError as error:
+        return Pictures(refusal=str(error))
+    if not stamps:
+        return Pictures(refusal=f"{ingest.source}: expected images, found none; check its cable and power")
+    rate_hz = 1e9 * (len(stamps) - 1) / (stamps[-1] - stamps[0]) if len(stamps) > 1 else math.nan
+    # Only a driver says when it exposed: stamps of a stream are times of arrival, of a file times since its start.
+    latency_s = statistics.median(late_s) if ingest.source.startswith(DRIVER) else math.nan
+    return Pictures("", source.size, rate_hz, latency_s, blank)
 
 
 def _camera(ingest: ImageIngestConfig) -> tuple[np.ndarray | None, tuple[int, int], str]:

@@ -21,13 +21,30 @@ from drocap_ros.flight.vehicle_state import VehicleState
 _C = ConditionCode
 _EDGE = 0.04  # share of the picture's rows: detectors lose feet and head nearer to the border
 _WIND_LEAN_M_S2 = 0.9  # a copter of this size leans by 5 deg against 8 m/s
-_DRIVER = "/dev/video"
+DRIVER = "/dev/video"
 _STREAM_DELAY_S = 0.1  # of a usual network stream
 _LEAST_PX = 80.0  # height of a person below which the pose networks fail (docs/accuracy.md)
 _GOOD_PX = 150.0  # height of a person from which they do not gain
 _WALK_M_S = 1.4  # of a brisk walk
 _MEASURED_SIZE_ERROR = 0.05  # share: a stature that nobody measured errs by more
 _LEAST_ROOM_M = 10.0  # for the subject's walk
+
+
+class Pictures(NamedTuple):
+    """What the source of the images gave when it was opened.
+
+    refusal : why it gave none; "" = it did
+    size : width, height px
+    rate_hz : NaN = it gave one image
+    latency_s : from the driver's stamp of the exposure until the image was here; NaN = it does not say
+    blank : whether all images are of one colour
+    """
+
+    refusal: str = ""
+    size: tuple[int, int] = (0, 0)
+    rate_hz: float = math.nan
+    latency_s: float = math.nan
+    blank: bool = False
 
 
 class Setup(NamedTuple):
@@ -41,6 +58,8 @@ class Setup(NamedTuple):
     assumed_height_m : of the initializer
     models : where the networks are; "" = none found
     models_remedy : then
+    wanted_size : width, height px that the configuration asks of the source, 0 = any
+    pictures : None = the source was not opened
     """
 
     camera_matrix: np.ndarray | None
@@ -51,6 +70,8 @@ class Setup(NamedTuple):
     assumed_height_m: float
     models: str
     models_remedy: str = ""
+    wanted_size: tuple[int, int] = (0, 0)
+    pictures: Pictures | None = None
 
 
 class Fit(NamedTuple):
@@ -66,6 +87,8 @@ def setup_findings(config: MavlinkBridgeConfig, setup: Setup, vehicle: VehicleSt
     yield _permission(config)
     yield _limits(config)
     yield _source(setup)
+    if setup.pictures is not None:
+        yield _opened(setup, setup.pictures)
     yield _camera(setup)
     if setup.camera_matrix is not None:
         yield _picture(config, setup, setup.camera_matrix, vehicle)
@@ -113,6 +136,32 @@ def _source(setup: Setup) -> Verdict:
     return Verdict(graded(missing=bool(remedies)), found, wanted, "; ".join(remedies), values)
 
 
+@check("images", "images", _C.NO_SUBJECT)
+def _opened(setup: Setup, pictures: Pictures) -> Verdict:
+    """Whether the source gives images as it is asked to."""
+    wanted = "images"
+    if pictures.refusal:
+        return Verdict(Level.MISSING, "not opened", wanted, pictures.refusal, {"opened": False})
+    (width, height), remedies = pictures.size, []
+    words = [f"{width}x{height} px"]
+    words += [f"{pictures.rate_hz:.3g} images/s"] if math.isfinite(pictures.rate_hz) else ["one image, then no more"]
+    late = math.isfinite(pictures.latency_s)
+    words += [f"here {pictures.latency_s:.2f} s after the exposure"] if late else ["latency not known"]
+    if any(asked not in (0, got) for asked, got in zip(setup.wanted_size, pictures.size, strict=True)):
+        wanted = f"images of {setup.wanted_size[0]}x{setup.wanted_size[1]} px"
+        remedies.append("set width_px and height_px to a mode of the camera (v4l2-ctl --list-formats-ext)")
+    if pictures.blank:
+        words.append("all of one colour")
+        remedies.append("uncover the lens")
+    if math.isnan(pictures.rate_hz):
+        remedies.append("check the cable and the power of the camera")
+    values = {
+        "opened": True, "width_px": width, "height_px": height, "rate_hz": pictures.rate_hz,
+        "latency_s": pictures.latency_s,
+    }  # fmt: skip
+    return Verdict(graded(warning=bool(remedies)), ", ".join(words), wanted, "; ".join(remedies), values)
+
+
 @check("camera", "camera", _C.NO_CAMERA_INFO)
 def _camera(setup: Setup) -> Verdict:
     if setup.camera_matrix is None:
@@ -126,14 +175,14 @@ def _camera(setup: Setup) -> Verdict:
 @check("camera_latency", "camera latency")
 def _latency(config: MavlinkBridgeConfig, setup: Setup) -> Verdict:
     """Whether the stamps of the pictures are the driver's; how late they are cannot be seen from here."""
-    driver, stated_s = setup.source.startswith(_DRIVER), config.camera_latency_s
+    driver, stated_s = setup.source.startswith(DRIVER), config.camera_latency_s
     stamps = f"stamps are {'' if driver else 'not '}the driver's"
     values: Values = {"source": setup.source, "camera_latency_s": stated_s}
     if stated_s > 0:
         return Verdict(Level.OK, f"{stated_s:g} s as stated; {stamps}", "measured or stated", values=values)
     aside_deg = abs(config.angular_speed_deg_s) * _STREAM_DELAY_S
     remedy = (
-        f"use a camera on {_DRIVER}N, or a topic with stamps of the exposure, or measure the delay and set "
+        f"use a camera on {DRIVER}N, or a topic with stamps of the exposure, or measure the delay and set "
         f"camera_latency_s: {_STREAM_DELAY_S:g} s late, a picture has the person {aside_deg:.1f} deg aside"
     )
     return Verdict(graded(warning=not driver), f"not stated; {stamps}", "stamps of the exposure", remedy, values)
