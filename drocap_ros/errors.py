@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+#: Least likeness of words: one letter of four is wrong.  At difflib's own 0.6 `--wrong` is like `--config`.
+_ALIKE = 0.75
+
 
 class DrocapError(Exception):
     """Root of the errors that drocap_ros raises; a command ends with status 1."""
@@ -29,3 +34,11 @@ class NodeError(DrocapError):
 def first_line(error: BaseException) -> str:
     """The first line of an error's text, else its type."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """A question that ends an error's text, ``; did you mean KNOWN?``, or nothing where no known word is alike."""
+    from difflib import get_close_matches
+
+    near = get_close_matches(word, list(known), 1, _ALIKE)
+    return f"; did you mean {near[0]}?" if near else ""

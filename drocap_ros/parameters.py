@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias, TypeVar, get_type_hints
 
-from drocap_ros.errors import ParameterError
+from drocap_ros.errors import ParameterError, did_you_mean
 
 P = TypeVar("P", bound="Parameters")
 T = TypeVar("T", bool, int, float, str)
@@ -66,6 +66,7 @@ class Parameters:
         if unknown:
             raise ParameterError(
                 f"{where or cls.__name__}: unknown parameter {unknown[0]!r}; expected one of {', '.join(sorted(known))}"
+                + did_you_mean(unknown[0], known)
             )
         return cls(**values)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import errno
 import importlib
 import logging
@@ -14,7 +15,7 @@ from collections.abc import Sequence
 from drocap_ros import __version__
 from drocap_ros.cli.options import LineParser
 from drocap_ros.cli.signals import BOTH, interruptible
-from drocap_ros.errors import DrocapError
+from drocap_ros.errors import DrocapError, InputError
 
 #: Modules under ``drocap_ros.cli``, in the order of ``drocap --help``.
 COMMANDS = (
@@ -22,6 +23,19 @@ COMMANDS = (
     "sample", "track", "reconstruct", "batch.command", "learn_dictionary", "export", "report", "info", "recover",
     "graph.top", "models", "evaluate",
 )  # fmt: skip
+
+
+class _PrintCompletion(argparse.Action):
+    """Prints what a shell reads to complete the commands, and ends."""
+
+    def __call__(self, parser: argparse.ArgumentParser, _: object, values: object, __: str | None = None) -> None:
+        """As of argparse."""
+        try:
+            from argcomplete.shell_integration import shellcode
+        except ImportError:
+            raise InputError("--completion: expected argcomplete, found none; run pip install argcomplete") from None
+        print(shellcode(["drocap"], shell=str(values)))
+        parser.exit()
 
 
 def build_parser() -> LineParser:
@@ -32,6 +46,12 @@ def build_parser() -> LineParser:
         epilog="Exit status: 0 done, 2 the input or the options cannot be used, 130 interrupted, 1 anything else.",
     )
     parser.add_argument("--version", action="version", version=f"drocap {__version__}")
+    parser.add_argument(
+        "--completion",
+        action=_PrintCompletion,
+        choices=("bash", "zsh", "fish"),
+        help='completion by the Tab key; into ~/.bashrc: eval "$(drocap --completion bash)"',
+    )
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name in COMMANDS:
         importlib.import_module(f"drocap_ros.cli.{name}").add_parser(subparsers)
@@ -46,6 +66,10 @@ def main(argv: Sequence[str] | None = None, parser: LineParser | None = None) ->
     interrupted = threading.Event()
     try:
         parser = parser or build_parser()
+        if "_ARGCOMPLETE" in os.environ:  # the shell asks, by what --completion printed
+            import argcomplete
+
+            argcomplete.autocomplete(parser)
         if not words:
             parser.print_help()
             return 0

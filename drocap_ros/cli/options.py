@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, TypeAlias
 
-from drocap_ros.errors import InputError
+from drocap_ros.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from drocap_ros.clip import Clip
@@ -42,11 +42,19 @@ class LineParser(argparse.ArgumentParser):
         words = sys.argv[1:] if args is None else list(args)
         found, unknown = super().parse_known_args(words, namespace)
         if unknown:
-            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+            alike = did_you_mean(unknown[0], self._option_string_actions)
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{alike}")
         for before, word in zip([self.prog, *words], words, strict=False):
             if not word or re.fullmatch(r"--[\w-]+=", word):
                 self.error(f"expected a value after {word or before}, got an empty one, as of an unset shell variable")
         return found, []
+
+    def _check_value(self, action: argparse.Action, value: str) -> None:
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            error.message += did_you_mean(str(value), map(str, action.choices or ()))
+            raise
 
     def error(self, message: str) -> NoReturn:
         """Raise the InputError of a message."""

@@ -39,6 +39,9 @@ def test_no_word_prints_the_help(capsys):
     ("words", "line"),
     [
         ("nothing", "argument COMMAND: invalid choice: 'nothing'"),
+        ("reconstuct a.mp4", "did you mean reconstruct?"),
+        ("track a.mp4 --overlayed", "did you mean --overlay?"),
+        ("reconstruct a.mp4 --method papr", "did you mean paper?"),
         ("export m.npz", "the following arguments are required: --to; see drocap export --help"),
         ("export m.npz --to xyz", "invalid choice: 'xyz'"),
         ("track a.mp4 --wrong", "unrecognized arguments: --wrong; see drocap track --help"),
@@ -56,6 +59,63 @@ def test_wrong_option_gives_one_line(words, line, capsys):
     (said,) = capsys.readouterr().err.splitlines()
     assert said.startswith("drocap: ")
     assert line in said
+
+
+def test_a_word_that_is_like_nothing_gets_no_proposal(capsys):
+    assert main(["track", "a.mp4", "--wrong"]) == 2
+    assert "did you mean" not in capsys.readouterr().err
+
+
+def test_a_misspelt_parameter_gets_its_name(tmp_path, capsys):
+    config = tmp_path / "c.yaml"
+    config.write_text("image_ingest: {widht_px: 640}\n")
+    assert main(["reconstruct", "a.mp4", "--config", str(config)]) == 2
+    assert "did you mean width_px?" in capsys.readouterr().err
+
+
+@pytest.fixture
+def bash(tmp_path, root):
+    """Proposals of bash for a line, by what ``drocap --completion bash`` prints."""
+    pytest.importorskip("argcomplete", reason="argcomplete is not installed")
+    program = tmp_path / "drocap"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m drocap_ros.cli "$@"\n')
+    program.chmod(0o755)
+    env = {**os.environ, "PYTHONPATH": f"{root}:{os.environ.get('PYTHONPATH', '')}"}
+    env["PATH"] = f"{tmp_path}:{os.environ['PATH']}"
+
+    def propose(line):
+        words = line.split(" ")
+        script = f"""
+            eval "$(drocap --completion bash)"
+            COMP_LINE='{line}' COMP_POINT={len(line)} COMP_TYPE=9
+            COMP_WORDS=({line}) COMP_CWORD={len(words) - 1}
+            $(complete -p drocap | sed 's/.*-F \\([^ ]*\\).*/\\1/') drocap '{words[-1]}' '{words[-2]}'
+            echo "${{COMPREPLY[@]}}"
+        """
+        done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, env=env, timeout=120)
+        return done.stdout.split()
+
+    return propose
+
+
+@pytest.mark.parametrize(
+    ("line", "proposals"),
+    [
+        ("drocap rec", {"record", "reconstruct", "recover"}),
+        ("drocap reconstruct --meth", {"--method"}),
+        ("drocap export m.npz --to c", {"c3d", "csv", "csv-angles"}),
+    ],
+)
+def test_the_tab_key_completes_commands_options_and_values(bash, line, proposals):
+    assert set(bash(line)) == proposals
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_other_shells_get_their_own_words(shell, capsys):
+    pytest.importorskip("argcomplete", reason="argcomplete is not installed")
+    with pytest.raises(SystemExit, match="0"):
+        main(["--completion", shell])
+    assert "drocap" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,14 @@ import argparse
 import dataclasses
 import math
 import time
+from typing import TYPE_CHECKING
 
 from drocap_ros.cli.graph.common import add_place_options, chosen_domain, import_bringup
 from drocap_ros.cli.options import Subparsers, add_command
 from drocap_ros.errors import InputError
-from drocap_ros.recording.session import Message
+
+if TYPE_CHECKING:
+    from drocap_ros.recording.session import Message
 
 #: Parameter of the orbit behind each option: its range is checked here, its limits by the bridge.
 _PARAMETERS = {"--radius": "radius_m", "--height": "height_m", "--speed": "angular_speed_deg_s"}

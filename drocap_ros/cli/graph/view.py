@@ -19,12 +19,12 @@ from drocap_ros.cli.options import Subparsers, add_command, read_motion, ros_nam
 from drocap_ros.cli.progress import progress_bars
 from drocap_ros.cli.signals import interruptible, stop_signals
 from drocap_ros.errors import InputError
-from drocap_ros.recording.session import Message
 
 if TYPE_CHECKING:
     import rerun
 
     from drocap_ros.bringup import Graph
+    from drocap_ros.recording.session import Message
     from drocap_ros.view.message_view import MessageView
 
 #: Of the web page; the next one carries the data.
