@@ -65,7 +65,9 @@ ARDUPILOT = Autopilot(
         excess=1.1,  # lag and wind; recorded flights whose bridge was killed
         standing_m_s=0.2,
     ),
-    coast=CoastLimits(steady=0.75, greatest=0.9),  # gusts, turns and the way add to a steady flight
+    # Gusts, turns and the way add to a steady flight.  Of 204 deaths of the bridge 98 % moved by 2.5 m at most; with a
+    # greatest share of 0.935 94 % did.
+    coast=CoastLimits(steady=0.75, greatest=0.9),
     gives_way_s=1.2,  # fitted in the closed loop: the vehicle leans before it flies away
     echo=Echo(place_m=0.5, velocity_m_s=0.75),  # its target is the setpoint, integrated
     mount_type_setting="MNT1_TYPE",

@@ -53,7 +53,9 @@ PX4 = Autopilot(
     control_mode="OFFBOARD",
     hold_mode="LOITER",
     handed_over_mode="LOITER",  # OFFBOARD is entered only while setpoints stream: the pilot leaves it holding
-    warm_up_s=0.3,  # one setpoint younger than COM_OF_LOSS_T is enough: measured; a rejected request is repeated
+    # One setpoint younger than COM_OF_LOSS_T is enough: measured; a rejected request is repeated.  Six setpoints are
+    # sent: five of them may be lost.  A longer wait is longer a place behind a vehicle that the pilot still moves.
+    warm_up_s=0.3,
     answers_twice=True,
     estimator_message="ESTIMATOR_STATUS",
     estimator_bad=128 | 1024 | 2048,  # ESTIMATOR_STATUS_FLAGS: constant position, GPS glitch, accelerometer error

@@ -100,7 +100,8 @@ def start_condition(seen: Observed) -> Condition | None:
 
     A critical state is reported after a failsafe of battery, radio or ground station has triggered, or while one acts.
     That for the loss of setpoints is our own, and ends with them: the hold that it flies while the control mode is
-    still intended forbids nothing.  Where another failsafe flies the same hold, the autopilot does not leave it.
+    still intended forbids nothing.  Nothing but setpoints is sent in it, so where another failsafe flies the same hold,
+    the autopilot does not leave it.
     Of several vehicles the first one that was heard would fly, and need not be the one with the camera.
     """
     if len(seen.link.vehicles) > 1:

@@ -261,15 +261,21 @@ def _wait(state: SafetyState, now_s: float, problem: Condition | None) -> Safety
 
 
 def _not_granted(seen: Observed) -> Condition:
-    return condition(_C.CONTROL_NOT_GRANTED, answer=f" ({seen.refusal})" if seen.refusal else "")
+    answer = seen.refusal
+    if seen.mode.left_by_itself:
+        answer = "it holds although setpoints arrive: another failsafe of it acts, which its pilot has to end"
+    return condition(_C.CONTROL_NOT_GRANTED, answer=f" ({answer})" if answer else "")
 
 
 def _permitted(state: SafetyState, seen: Observed, now_s: float, limits: Limits) -> tuple[Action, ModeRequest]:
     if state.state == State.ORBITING:
         return Action.ORBIT, ModeRequest.NONE
     if state.state == State.READY and state.requesting:
-        warm = now_s - state.requesting_s >= limits.warm_up_s and mode_visible(state, seen, now_s, limits)
-        return Action.HOLD, ModeRequest.CONTROL if warm else ModeRequest.NONE
+        # Where the autopilot still intends the control mode, setpoints alone end the failsafe for their loss.  A
+        # request would end any other failsafe, too: the autopilot takes it for a pilot who takes over.
+        own_loss, warm = seen.mode.left_by_itself, now_s - state.requesting_s >= limits.warm_up_s
+        wanted = warm and not own_loss and start_condition(seen) is None and mode_visible(state, seen, now_s, limits)
+        return Action.HOLD, ModeRequest.CONTROL if wanted else ModeRequest.NONE
     silent = not seen.mode.in_control or is_silent(state, now_s, limits) or stream_ended(seen)
     if state.state in (State.HOLDING, State.FAULT) and not silent:
         return _permitted_in_hold(state, seen, now_s, limits)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.flight.pose_history import CameraPose
+from drocap_ros.flight.subject.parallax import Parallax
 from drocap_ros.flight.subject.subject_measurement import MAX_BENDING, SubjectMeasurement, locate_subject
 from drocap_ros.flight.subject_config import SubjectConfig
 from drocap_ros.observation import PoseObservation
@@ -84,6 +85,7 @@ class SubjectFilter:
         self._contradicted = False
         self._ratio, self._ratios = float("nan"), deque[tuple[int, float]]()
         self._nearer = 0.0
+        self._parallax = Parallax(config.size_error)
 
     def update(
         self,
@@ -99,9 +101,11 @@ class SubjectFilter:
         """
         if camera is None:
             return False
-        measurement = locate_subject(observation, camera_matrix, camera, self._config, self._ratio)
-        if measurement is None:
+        measured = locate_subject(observation, camera_matrix, camera, self._config, self._ratio)
+        if measured is None:
             return False
+        sight = measured.position - camera.position
+        measurement = measured._replace(position=camera.position + self._parallax.scale * sight)
         gap_s = (observation.stamp_ns - self._stamp_ns) / NS
         other = observation.track_id != self._track_id
         strange = self._state is None or other
@@ -124,6 +128,10 @@ class SubjectFilter:
         self._stamp_ns, self._contradicted = observation.stamp_ns, False
         self._nearer += (measurement.nearer - self._nearer) * min(gap_s / _NEARER_S, 1.0)
         self._learn_ratio(measurement, observation.stamp_ns)
+        if float(np.hypot(*self._state[3:5])) > WALKING_M_S:
+            self._parallax.forget()
+        else:
+            self._parallax.take(camera.position[:2], sight[:2], gap_s)
         return True
 
     def _restart(self, observation: PoseObservation, measurement: SubjectMeasurement, *, locked: bool) -> bool:
@@ -178,6 +186,7 @@ class SubjectFilter:
         if observation.track_id != self._track_id:  # another person
             self._ratios.clear()
             self._ratio = float("nan")
+            self._parallax = Parallax(self._config.size_error)
         self._stamp_ns, self._track_id = observation.stamp_ns, observation.track_id
         self._contradicted = False
         self._learn_ratio(measurement, observation.stamp_ns)

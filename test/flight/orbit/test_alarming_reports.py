@@ -7,7 +7,7 @@ from orbit_observations import GOOD, LIMITS, LOITER, changed, orbiting
 from drocap_ros.flight.conditions import ConditionCode
 from drocap_ros.flight.mavlink.telemetry_request import LinkStatus
 from drocap_ros.flight.orbit.safety import reduce
-from drocap_ros.flight.orbit.states import Action, Command, SafetyState, State
+from drocap_ros.flight.orbit.states import Action, Command, ModeRequest, SafetyState, State
 
 CRITICAL = 5
 
@@ -39,6 +39,19 @@ def test_a_critical_state_of_the_failsafe_for_lost_setpoints_alone_lets_an_orbit
     for other in ({"left_by_itself": False}, {"in_hold": False}):
         answer = reduce(SafetyState(), changed(own, **other), 1.0, Command.ENGAGE, LIMITS)[1].answer
         assert (answer.accepted, answer.condition.code) == (False, ConditionCode.AUTOPILOT_CRITICAL)
+
+
+def test_no_mode_is_requested_in_a_hold_of_the_autopilot_that_another_failsafe_may_fly():
+    own = changed(LOITER, autopilot="px4", mode="LOITER", in_hold=True, left_by_itself=True, system_status=CRITICAL)
+    state, decision = reduce(SafetyState(), own, 0.0, Command.ENGAGE, LIMITS)
+    assert decision.answer.accepted
+    for seen in (own, changed(own, system_status=4), changed(own, left_by_itself=False)):
+        assert reduce(state, seen, 2.0, None, LIMITS)[1][:2] == (Action.HOLD, ModeRequest.NONE)
+    chosen = changed(own, left_by_itself=False, system_status=4)
+    assert reduce(state, chosen, 2.0, None, LIMITS)[1].mode_request == ModeRequest.CONTROL
+    ended = reduce(state, own, 30.0, None, LIMITS)[0]
+    assert ended.condition.code == ConditionCode.CONTROL_NOT_GRANTED
+    assert "another failsafe" in str(ended.condition)
 
 
 def test_several_vehicles_forbid_a_start_and_end_no_orbit():

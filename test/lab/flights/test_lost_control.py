@@ -139,6 +139,20 @@ def test_engage_is_granted_within_a_second_of_each_loss_of_setpoints(loop, lose)
 
 @pytest.mark.parametrize("autopilot", ["px4"])
 @branched
+def test_engage_ends_no_failsafe_but_that_for_lost_setpoints(loop):
+    """PX4 takes a requested mode for a pilot who takes over, and leaves the hold for a lost remote control."""
+    loop.copter.set_mode("LOITER", "failsafe: remote control lost")
+    loop.copter.system_status = CRITICAL
+    loop.run(9.5)
+    loop.command(Command.ENGAGE)
+    loop.run(18.0)
+    assert loop.copter.mode_log[-1][1:] == ("LOITER", "failsafe: remote control lost")
+    assert loop.controller.safety.state != State.ORBITING
+    assert "another failsafe" in str(loop.controller.safety.condition)
+
+
+@pytest.mark.parametrize("autopilot", ["px4"])
+@branched
 def test_a_critical_state_with_another_cause_forbids_to_engage(loop):
     loop.command(Command.STOP)
     loop.run(10.0)
