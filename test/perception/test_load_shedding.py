@@ -131,9 +131,13 @@ def test_a_repeated_picture_gives_the_same_keypoints_bit_for_bit(estimator, imag
         assert again.stamp_ns == i * STEP_NS
         assert np.array_equal(again.keypoints, seen.keypoints, equal_nan=True)
         assert np.array_equal(again.roi, seen.roi)
+        assert again.background is None  # points that stand still would say that the camera does
     assert not np.array_equal(estimator.process(images[2], 8 * STEP_NS).keypoints, seen.keypoints)
-    # Stamps that go back restart the tracker.
-    assert estimator.process(images[2], 0).track_id == 2
+    # Stamps that go back restart the tracker, and the points of the scene.
+    restarted = estimator.process(images[2], 0)
+    assert restarted.track_id == 2
+    assert len(restarted.background) > 10
+    assert not np.isin(restarted.background.track, seen.background.track).any()
 
 
 def test_search_takes_one_window_per_image_in_turn(estimator, monkeypatch):
