@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import platform
 import time
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,6 +15,12 @@ from drocap_ros.joint_maps import TABLES, joint_map, joint_set_of
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, fuse_telemetry, with_fusion
+from drocap_ros.reconstruction.camera.picture_world import (
+    PictureWorld,
+    at_assumed_stature,
+    picture_camera,
+    with_camera,
+)
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
 from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput, Progress
 from drocap_ros.reconstruction.common.refusal import Refusal
@@ -33,6 +40,10 @@ from drocap_ros.tracks import Tracks
 
 #: Steps of each of the body's adjustments where the one in the world goes on from them: more change nothing there.
 _STEPS_BEFORE_WORLD = 2
+
+
+#: What knows the camera better than the telemetry as reported.
+_Source: TypeAlias = FusedTelemetry | PictureWorld | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,10 +149,27 @@ def _solved(
     tracks: Tracks, keypoints: Keypoints2D, settings: _Settings, fused: FusedTelemetry | None = None
 ) -> tuple[ImagePoses, _Body, float] | Refusal:
     """Poses in px and in metres, and the time between both; a refusal where the telemetry cannot be true."""
+    source: _Source = fused
+    if tracks.camera_rotation is None:
+        tracks, source = _with_picture(tracks, keypoints, settings)
     poses = _solve(tracks, keypoints, settings)
     solved = time.perf_counter()
-    body = _in_metres(tracks, keypoints, poses, settings, fused)
+    body = _in_metres(tracks, keypoints, poses, settings, source)
     return body if isinstance(body, Refusal) else (poses, body, solved)
+
+
+def _with_picture(tracks: Tracks, keypoints: Keypoints2D, settings: _Settings) -> tuple[Tracks, PictureWorld | None]:
+    """Tracks without telemetry with the camera that their fixed points give.
+
+    Its up and metres come from poses without it; then the lifter sees the camera's rotation.
+    """
+    camera = picture_camera(tracks)
+    if camera is None or not camera.kind.known:
+        return tracks, None if camera is None else PictureWorld(camera)
+    tracks = dataclasses.replace(tracks, camera_matrix=camera.matrix)
+    poses = _solve(tracks, keypoints, settings)
+    per_px = metres_per_px(poses.joints_px, tracks.stamp_ns, settings.initializer.assumed_height_m)
+    return with_camera(tracks, camera, poses, per_px, world_config(settings.adjuster))
 
 
 def _solve(tracks: Tracks, keypoints: Keypoints2D, settings: _Settings) -> ImagePoses:
@@ -226,7 +254,7 @@ def _in_metres(
     keypoints: Keypoints2D,
     poses: ImagePoses,
     settings: _Settings,
-    fused: FusedTelemetry | None = None,
+    source: _Source = None,
 ) -> _Body | Refusal:
     """The one step from px to m: in the world where the camera's rotation is known, else in the camera's axes.
 
@@ -243,10 +271,13 @@ def _in_metres(
         placed = WorldPoses(_without_perspective(tracks, poses, per_px), False, "assumed_height", None)
     else:
         frame = "world"
-        config = world_config(settings.adjuster) if fused is None else fused.config
+        config = world_config(settings.adjuster) if source is None or source.config is None else source.config
         placed, refined, refusal = in_world(tracks, keypoints, poses, per_px, config)
         if refusal is not None:
             return refusal
+    if isinstance(source, PictureWorld):
+        placed = dataclasses.replace(placed, metric=False, scale_source="assumed_height")
+        meta["camera"] = source.meta()
     if placed.scale is not None:
         meta["scale"] = dataclasses.asdict(placed.scale)
     body = _Body(
@@ -264,8 +295,8 @@ def _in_metres(
         if body.covariance is not None:
             meta["covariance_about"] = "pelvis"
         return body
-    if fused is not None:
-        refined = with_fusion(refined, fused)
+    if source is not None:
+        refined = at_assumed_stature(refined) if isinstance(source, PictureWorld) else with_fusion(refined, source)
     meta["calibration"], meta["covariance_about"] = refined.calibration, "origin"
     camera = refined.rotation, refined.position
     return dataclasses.replace(

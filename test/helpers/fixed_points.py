@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.geometry.rotations import log_so3
+
 MATRIX = np.array([[900.0, 0.0, 640.0], [0.0, 900.0, 360.0], [0.0, 0.0, 1.0]])
 SIZE = (1280, 720)
 
@@ -57,3 +59,19 @@ def seen(rotation: np.ndarray, position: np.ndarray, points: np.ndarray, fps: fl
     frame, point = np.nonzero(ok)
     part = (frame + 7 * point) // round(longest_s * fps)
     return Scene(rotation, position, frame, point * 1000 + part, pixels[frame, point], fps)
+
+
+def turn_errors_deg(path: np.ndarray, true: np.ndarray, fps: float) -> np.ndarray:
+    """Errors of the turns over a second of rotations (F, 3, 3)."""
+    lag = int(fps)
+    turn, expected = (r[lag:] @ r[:-lag].swapaxes(1, 2) for r in (path, true))
+    return np.degrees(np.linalg.norm(log_so3(turn @ expected.swapaxes(1, 2)), axis=1))
+
+
+def shape_error(path: np.ndarray, true: np.ndarray) -> float:
+    """RMS (m) of a path (F, 3) after the best similarity."""
+    a, b = path - path.mean(axis=0), true - true.mean(axis=0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
+    fitted = s @ np.diagonal(sign) / np.square(a).sum() * a @ (u @ sign @ vt).T
+    return float(np.sqrt(np.square(fitted - b).sum(axis=1).mean()))

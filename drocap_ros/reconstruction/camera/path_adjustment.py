@@ -18,6 +18,10 @@ _CONVERGED = 5e-4
 #: Damping of the first step, as a share of the diagonal, and the least one after a step that raises the cost.
 _FIRST_DAMPING = 1e-3
 _LEAST_DAMPING = 1e-6
+#: Range of the first nearness (1 / distance) of points of ground, in heights of the camera.
+_NEARNESS = (0.03, 2.0)
+#: Tangent of the angle from the image's middle up to the horizon, of a camera that looks down by 15 degrees.
+_HORIZON = 0.26
 #: Most dampings that are tried for one step.
 _TRIALS = 8
 #: Steps of the rest of each frame, with the points held.
@@ -57,8 +61,8 @@ class AdjustedPath:
     stop_reason: str
 
 
-def initial_state(data: PathInput, state: PathState | None = None) -> PathState:
-    """The given path with the points that it triangulates; ``state`` : errors and shared unknowns to begin with."""
+def initial_state(data: PathInput, state: PathState | None = None, horizon: float = _HORIZON) -> PathState:
+    """The given path with the points that it triangulates; the other arguments are those of :func:`adjust_path`."""
     knots, path = data.knots, data.path
     rest, none = np.zeros((path.frames, KNOT)), np.zeros((len(data.views.track), 4))
     if state is None:
@@ -70,15 +74,23 @@ def initial_state(data: PathInput, state: PathState | None = None) -> PathState:
         away = np.linalg.norm(points[:, :3], axis=1) / np.maximum(np.abs(points[:, 3]), 1e-6)
         unit *= float(np.clip(np.median(away), 1e-3, 1e3))
     points = triangulate(data.views, path.rotation, path.position / unit, data.matrix)
+    if not np.ptp(path.position, axis=0).any():
+        # Without any motion depths are unknown.  Ground is nearer in lower parts of the image: equal depths would leave
+        # a small motion to the turns, and its sign open.
+        below = (data.views.point[:, 1] - data.matrix[1, 2]) / data.matrix[1, 1]
+        lower = data.views.of_pieces(below) / np.bincount(data.views.piece)
+        points[:, 3] = np.clip(horizon + lower, *_NEARNESS)
+        points, unit = points / np.linalg.norm(points, axis=1, keepdims=True), 1.0
     return PathState(state.errors, rest, state.shared, points, unit)
 
 
-def adjust_path(data: PathInput, start: PathState | None = None) -> AdjustedPath | None:
+def adjust_path(data: PathInput, start: PathState | None = None, horizon: float = _HORIZON) -> AdjustedPath | None:
     """Adjust a given path, its shared errors and the points; None = no track is long enough.
 
     Frames between the knots add little, as errors of tracks last for longer: they have their say in the rest alone.
 
     start : errors and shared unknowns to start from
+    horizon : tangent of the angle from the image's middle up to the horizon: the first depths of a path without motion
     """
     at_knots = np.zeros(data.path.frames, bool)
     at_knots[data.knots.frame] = True
@@ -87,7 +99,7 @@ def adjust_path(data: PathInput, start: PathState | None = None) -> AdjustedPath
         return None
     every, data = replace(data, views=data.views.of(kept)), replace(data, views=views)
     weights = weights_of(data)
-    here = PathResiduals(data, weights, initial_state(data, start), OUTLIER_SQUARE)
+    here = PathResiduals(data, weights, initial_state(data, start, horizon), OUTLIER_SQUARE)
     stop, done, damping = ITERATIONS, 0, _FIRST_DAMPING
     for _ in range(data.config.iterations):
         done += 1

@@ -90,7 +90,11 @@ def triangulate(views: Views, rotation: np.ndarray, position: np.ndarray, matrix
     seen, at = rotation[views.frame], position[views.frame]
     camera = np.concatenate([seen, -np.einsum("nij,nj->ni", seen, at)[..., None]], axis=2)
     rows = camera[:, :2] - ray[..., None] * camera[:, 2:]
-    square = views.of_pieces(np.einsum("nki,nkj->nij", rows, rows))
-    point = np.linalg.eigh(square)[1][..., 0]
+    square = views.of_pieces(np.swapaxes(rows, 1, 2) @ rows)
+    if np.ptp(position, axis=0).any():
+        point = np.linalg.eigh(square)[1][..., 0]
+    else:  # rays from one place: directions alone
+        point = np.zeros((len(square), 4))
+        point[:, :3] = np.linalg.eigh(square[:, :3, :3])[1][..., 0]
     depth = views.of_pieces(np.einsum("ni,ni->n", camera[:, 2], point[views.piece]))
     return np.asarray(np.where(depth < 0.0, -1.0, 1.0)[:, None] * point)

@@ -122,7 +122,7 @@ def refine_in_world(
     origin = position.mean(axis=0) if before is None else _held_pelvis(before, int(tracks.stamp_ns[0]))
     capture = even_capture(tracks, keypoints, poses, origin)
     windows = capture_windows(capture, config.feet)
-    if refusal := _impossible(capture, windows):
+    if config.checks and (refusal := _impossible(capture, windows)):
         return refusal
     start, held = _start(tracks.stamp_ns, (poses.joints - origin) / poses.factor, origin, 1.0 / poses.factor, before)
     facts, faded = _Facts(), _Faded(len(capture.body))
@@ -130,7 +130,7 @@ def refine_in_world(
         faded.add(window, found, telemetry)
         facts.add(window, found, telemetry, config.stature_std)
         last = found
-    if refusal := facts.refusal():
+    if config.checks and (refusal := facts.refusal()):
         return refusal
     joints, camera, wander, covariance = (values[capture.slot] for values in faded.mean())
     joints += origin

@@ -52,6 +52,7 @@ class WorldConfig:
     contact_speed_m_s : standard deviation of the speed of a foot in contact
     feet : whether feet in contact keep their place
     frames_per_fact : frames that carry one independent piece of information: the priors count as much more
+    checks : whether telemetry that cannot be true is refused
     """
 
     iterations: int = 4
@@ -71,6 +72,7 @@ class WorldConfig:
     contact_speed_m_s: float = 0.1
     feet: bool = True
     frames_per_fact: float = 4.0
+    checks: bool = True
 
 
 def world_config(adjuster: BundleAdjusterConfig) -> WorldConfig:

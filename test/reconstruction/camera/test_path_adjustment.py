@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fixed_points import MATRIX, Scene, looking, orbit, points_of, seen
+from fixed_points import MATRIX, Scene, looking, orbit, points_of, seen, shape_error, turn_errors_deg
 
-from drocap_ros.geometry.rotations import exp_so3, log_so3
+from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.camera.path_adjustment import adjust_path, initial_state
 from drocap_ros.reconstruction.camera.path_equations import PathEquations
 from drocap_ros.reconstruction.camera.path_model import (
@@ -120,7 +120,7 @@ def test_noise_free_views_recover_misalignment_wander_and_focal_length_exactly()
     found = adjust_path(replace(data, matrix=np.column_stack([(MATRIX @ longer)[:, :2], MATRIX[:, 2]])))
     assert found is not None
     assert found.residual_px < 0.02
-    turned = turn_errors_deg(found.rotation, true.rotation)
+    turned = turn_errors_deg(found.rotation, true.rotation, FPS)
     assert turned.max() < 0.01
     assert np.exp(found.shared[5]) * 1.03 == pytest.approx(1.0, abs=1e-3)
     assert shape_error(found.position, true.position) < 0.01
@@ -161,7 +161,7 @@ def test_points_that_slide_lose_their_weight() -> None:
     weight = np.bincount(found.views.piece, found.weight) / np.bincount(found.views.piece)
     wrong = np.isin(found.views.track, bad)
     assert np.median(weight[wrong]) < 0.3 < 0.8 < np.median(weight[~wrong])
-    turned = turn_errors_deg(found.rotation, true.rotation)
+    turned = turn_errors_deg(found.rotation, true.rotation, FPS)
     assert np.sqrt(np.mean(turned**2)) < 0.05
 
 
@@ -177,18 +177,3 @@ def test_origin_north_and_unit_of_the_scene_do_not_matter() -> None:
     assert other is not None
     np.testing.assert_allclose(other.rotation @ turn, found.rotation, atol=2e-5)
     np.testing.assert_allclose((other.position / unit - [40.0, -30.0, 5.0]) @ turn, found.position, atol=2e-3)
-
-
-def turn_errors_deg(path: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Errors of the turns over a second."""
-    turn, expected = (r[int(FPS) :] @ r[: -int(FPS)].swapaxes(1, 2) for r in (path, true))
-    return np.degrees(np.linalg.norm(log_so3(turn @ expected.swapaxes(1, 2)), axis=1))
-
-
-def shape_error(path: np.ndarray, true: np.ndarray) -> float:
-    """RMS (m) after the best similarity."""
-    a, b = path - path.mean(axis=0), true - true.mean(axis=0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    sign = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
-    fitted = s @ np.diagonal(sign) / np.square(a).sum() * a @ (u @ sign @ vt).T
-    return float(np.sqrt(np.square(fitted - b).sum(axis=1).mean()))

@@ -1,0 +1,201 @@
+"""The camera of a recording without telemetry: what it does, its path and its lens, from fixed points alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drocap_ros.reconstruction.camera.growth import Growth, Pair, adjusted, begin, candidate_pairs, small_motion, turns
+from drocap_ros.reconstruction.camera.kinds import Kind, kind_of, turning_focal
+from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path
+from drocap_ros.reconstruction.camera.path_model import FOCAL, Knots, PathConfig, PathInput
+from drocap_ros.reconstruction.camera.sightings import Sightings
+from drocap_ros.reconstruction.camera.views import views_of
+from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
+
+#: Focal length of an unknown lens over the image's longer side, and the deviation of its logarithm: a factor of 1.4.
+FOCAL_SHARE = 0.9
+FOCAL_STD = 0.34
+#: Factors on it from which an unknown lens is sought.
+_FOCAL_STARTS = (0.7, 1.0, 1.5)
+#: Keyframes after which the starts are compared, and residuals over the least that are as good.
+_COMPARED = 16
+_AS_GOOD = 1.05
+#: Parallax (rad) of the best pair below which a camera moves little, and tangents of the angle from the image's middle
+#: up to the horizon that are tried then: of cameras that look down by 15, 40 and 0 degrees.
+_LITTLE_PARALLAX = 0.02
+_HORIZONS = (0.26, 0.8, 0.0)
+#: Share of the keyframes that need a camera, and the largest residual (px of an image 1280 wide) of a path that fits.
+_LEAST_KNOWN = 0.6
+_LARGEST_PX = 2.5
+#: Share of the observations that fit the path, at least: fewer, and what moves outnumbers what stands.
+_LEAST_FITTING = 0.4
+
+
+@dataclass(frozen=True)
+class PictureCamera:
+    """A camera of F frames, in a unit and axes of its own.
+
+    kind : what it does; the other fields count where that is known
+    rotation : (F, 3, 3) world -> camera; position : (F, 3), zeros where it does not move
+    matrix : (3, 3) px; focal_std : of the logarithm of the focal length, 0 = it was given
+    points : (J, 4) fixed points, x y z w
+    residual_px : median of the points' residuals; covered : share of the frames with enough points
+    position_std, turn_std_deg : of the path's change from knot to knot (an eighth of a second), in its unit, degrees
+    """
+
+    kind: Kind
+    rotation: np.ndarray
+    position: np.ndarray
+    matrix: np.ndarray
+    focal_std: float
+    points: np.ndarray
+    residual_px: float = float("nan")
+    covered: float = 0.0
+    position_std: float = float("nan")
+    turn_std_deg: float = float("nan")
+
+
+def camera_from_points(
+    frame: np.ndarray,
+    track: np.ndarray,
+    point: np.ndarray,
+    fps: float,
+    frames: int,
+    size: tuple[int, int],
+    matrix: np.ndarray | None,
+) -> PictureCamera:
+    """The camera of evenly spaced frames.
+
+    frame, track, point : (N,), (N,), (N, 2) px observations of fixed points; size : width, height px
+    matrix : (3, 3) px, None = unknown
+    """
+    focal_std = 0.0 if matrix is not None else FOCAL_STD
+    if matrix is None:
+        focal = FOCAL_SHARE * max(size)
+        matrix = np.array([[focal, 0.0, 0.5 * size[0]], [0.0, focal, 0.5 * size[1]], [0.0, 0.0, 1.0]])
+    views = views_of(frame, track, point, frames, fps)
+    knots = Knots(frames, fps)
+    sightings, key_hz = Sightings(views, knots.frame), 1.0 / knots.step_s
+    kind = kind_of(sightings, matrix, key_hz, size[0])
+    unknown = PictureCamera(
+        kind, np.tile(np.eye(3), (frames, 1, 1)), np.zeros((frames, 3)), matrix, focal_std, np.zeros((0, 4))
+    )
+    if kind is Kind.STANDS:
+        return replace(unknown, residual_px=0.0, covered=1.0)
+    if kind is Kind.TURNS:
+        return _turning(sightings, unknown, fps, key_hz)
+    return _moving(sightings, unknown, fps, key_hz) if kind is Kind.MOVES else unknown
+
+
+def _moving(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: float) -> PictureCamera:
+    """The path of a camera that moves: grown from a pair, or all at once where it moves little."""
+    starts = _starts(sightings, camera, fps, key_hz)
+    if not starts:
+        return replace(camera, kind=Kind.NOTHING_FIXED)
+    least = min(start.path.residual_px for _, start in starts)
+    small = None
+    if starts[0][0] < _LITTLE_PARALLAX:
+        small = _small_motion(sightings, camera, fps, _AS_GOOD * least)
+    if small is None or small.residual_px > _AS_GOOD * least:
+        # Where there is little parallax any path fits: of starts that fit as well the one with the most of it counts.
+        start = next(start for _, start in starts if start.path.residual_px <= _AS_GOOD * least)
+        grown = _grown(sightings, camera, start, fps)
+        if small is None and grown.residual_px > _AS_GOOD * least:
+            small = _small_motion(sightings, camera, fps, _AS_GOOD * least)
+        if small is None or grown.residual_px <= small.residual_px:
+            return grown
+    of_path = replace(camera, rotation=small.rotation, position=small.position)
+    return _checked(of_path, small, 1.0)
+
+
+def _small_motion(sightings: Sightings, camera: PictureCamera, fps: float, enough_px: float) -> AdjustedPath | None:
+    """The best path of a camera that moves little, of some that it may look down; the first one that fits."""
+    best: AdjustedPath | None = None
+    for horizon in _HORIZONS:
+        found = small_motion(sightings, camera.matrix, fps, camera.focal_std, horizon)
+        if found is not None and (best is None or found.residual_px < best.residual_px):
+            best = found
+        if best is not None and best.residual_px <= enough_px:
+            break
+    return best
+
+
+def _grown(sightings: Sightings, camera: PictureCamera, start: Growth, fps: float) -> PictureCamera:
+    """The path that grows from a start over all keyframes that can be placed."""
+    path = start.grow(len(sightings))
+    found = adjusted(sightings.views, sightings.frames, path, fps, camera.focal_std)
+    if found is None or path.known.mean() < _LEAST_KNOWN:
+        return replace(camera, kind=Kind.FEW_POINTS, residual_px=float("inf"))
+    known = np.flatnonzero(path.known)
+    begin_at, end = int(sightings.frames[known[0]]), int(sightings.frames[known[-1]]) + 1
+    frames = len(camera.rotation)
+    ends = np.clip(np.arange(frames), begin_at, end - 1) - begin_at
+    of_path = replace(camera, rotation=found.rotation[ends], position=found.position[ends], matrix=path.matrix)
+    return _checked(of_path, found, (end - begin_at) / frames)
+
+
+def _starts(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: float) -> list[tuple[float, Growth]]:
+    """Paths of some keyframes about every promising pair, with its parallax (rad), those that tell most first."""
+    growths: list[tuple[Pair, Growth]] = []
+    for factor in _FOCAL_STARTS if camera.focal_std else (1.0,):
+        matrix = with_focal(camera.matrix, factor)
+        for pair in candidate_pairs(sightings, matrix, key_hz):
+            start = begin(sightings, pair, matrix)
+            if start is not None:
+                growth = Growth(sightings, start, fps, camera.focal_std)
+                growth.grow(_COMPARED)
+                growths.append((pair, growth))
+    enough = min(_COMPARED, int(_LEAST_KNOWN * len(sightings)))
+    growths.sort(key=lambda entry: -entry[0].score)
+    return [(pair.parallax, growth) for pair, growth in growths if growth.path.known.sum() >= enough]
+
+
+def _turning(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: float) -> PictureCamera:
+    """The turns of a camera that keeps its place."""
+    matrix = camera.matrix
+    if camera.focal_std:
+        matrix = with_focal(matrix, turning_focal(sightings, matrix, key_hz))
+    turned, place = turns(sightings, matrix)
+    config = PathConfig(
+        tilt_deg=0.0,
+        yaw_deg=0.0,
+        latency_s=0.0,
+        focal=camera.focal_std,
+        position_wander_m=1e-6,
+        attitude_wander_deg=60.0,
+        jitter_m=1e-6,
+        jitter_deg=1.0,
+    )
+    found = adjust_path(PathInput(CameraTelemetry(turned, place, fps), matrix, sightings.views, config))
+    if found is None:
+        return replace(camera, kind=Kind.FEW_POINTS)
+    of_path = replace(camera, rotation=found.rotation, position=place, matrix=matrix)
+    return _checked(of_path, found, 1.0)
+
+
+def _checked(camera: PictureCamera, found: AdjustedPath, share: float) -> PictureCamera:
+    """The camera with what its adjustment tells, and whether it fits."""
+    focal = float(np.exp(found.shared[FOCAL]))
+    steps = None if found.posterior is None else np.sqrt(np.diagonal(found.posterior.steps, axis1=1, axis2=2))
+    fits = (
+        found.residual_px < _LARGEST_PX * camera.matrix[0, 2] * 2 / 1280.0
+        and np.mean(found.weight > 0.25) > _LEAST_FITTING
+    )
+    return replace(
+        camera,
+        kind=camera.kind if fits else Kind.NOTHING_FIXED,
+        matrix=with_focal(camera.matrix, focal),
+        focal_std=float(found.shared_std[FOCAL]),
+        points=found.points,
+        residual_px=found.residual_px,
+        covered=share * found.covered,
+        position_std=float("nan") if steps is None else float(np.median(steps[:, :3])),
+        turn_std_deg=float("nan") if steps is None else float(np.degrees(np.median(steps[:, 3:]))),
+    )
+
+
+def with_focal(matrix: np.ndarray, factor: float) -> np.ndarray:
+    """The camera matrix (3, 3) with focal lengths so many times as long."""
+    return np.asarray(matrix * np.array([[factor, 1.0, 1.0], [1.0, factor, 1.0], [1.0, 1.0, 1.0]]))

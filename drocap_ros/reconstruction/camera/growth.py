@@ -1,0 +1,314 @@
+"""A camera's path from fixed points alone: a pair of keyframes, then one keyframe after the other, both ways."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.geometry.rotations import exp_so3, log_so3
+from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path
+from drocap_ros.reconstruction.camera.path_model import FOCAL, PathConfig, PathInput
+from drocap_ros.reconstruction.camera.sightings import Sightings, rays, turn_between
+from drocap_ros.reconstruction.camera.views import Views, triangulate
+from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
+
+#: Times (s) between the keyframes of a pair, and how many places of a recording are tried.
+_PAIR_S = (0.5, 1.0, 2.0, 3.0)
+_PLACES = 12
+#: Points that both keyframes of a pair see, at least, and pairs that are tried.
+_LEAST_COMMON = 16
+_PAIRS = 4
+#: Parallax (rad) above which more helps no pair: six degrees.
+_ENOUGH_PARALLAX = 0.1
+#: Percentile of the points' parallaxes that counts.
+_NEARER = 75
+#: Distance (px) of a point from its epipolar line or its projection within which it supports a camera.
+_INLIER_PX = 2.0
+#: Points that place a keyframe, at least.
+_LEAST_PLACED = 10
+#: Keyframes after which the first adjustment runs, and their growth until the next one.
+_FIRST_KEYS = 12
+_GROWTH = 1.6
+#: Keyframes behind a gap that may be passed over while a camera sees too little.
+_GAP = 8
+#: Acceleration (heights of the camera per s^2) of a camera that moves little, and steps of its adjustment.
+_SMALL_ACCELERATION = 0.3
+_SMALL_STEPS = 25
+#: Depth of a point over the camera's way beyond which it places no camera.
+_FARTHEST = 200.0
+
+
+@dataclass(frozen=True)
+class Grown:
+    """A path at keyframes: rotation (K, 3, 3) world -> camera, position (K, 3), known (K,) bool; matrix (3, 3) px.
+
+    residual_px : median of the last adjustment; inf = none
+    """
+
+    rotation: np.ndarray
+    position: np.ndarray
+    known: np.ndarray
+    matrix: np.ndarray
+    residual_px: float = float("inf")
+
+
+class Pair(NamedTuple):
+    """Two keyframes, the parallax (rad) of the nearer points, and how much it tells."""
+
+    first: int
+    second: int
+    parallax: float
+    score: float
+
+
+def candidate_pairs(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> list[Pair]:
+    """Pairs with much parallax and many common points, best first."""
+    found: list[Pair] = []
+    for lag_s in _PAIR_S:
+        lag = max(round(lag_s * key_hz), 1)
+        if lag >= len(sightings):
+            continue
+        for first in np.unique(np.linspace(0, len(sightings) - 1 - lag, _PLACES).astype(int)).tolist():
+            both = sightings.common(first, first + lag)
+            if len(both.piece) < _LEAST_COMMON:
+                continue
+            _, angle = turn_between(rays(both.first, matrix), rays(both.second, matrix))
+            # What is far shows none: that of the nearer points tells.
+            parallax = float(np.percentile(angle, _NEARER))
+            score = min(parallax, _ENOUGH_PARALLAX) * float(np.sqrt(len(both.piece)))
+            found.append(Pair(first, first + lag, parallax, score))
+    found.sort(key=lambda pair: -pair.score)
+    apart: list[Pair] = []
+    for pair in found:
+        if all(abs(pair.first - other.first) > key_hz for other in apart):
+            apart.append(pair)
+    return apart[:_PAIRS]
+
+
+def begin(sightings: Sightings, pair: Pair, matrix: np.ndarray) -> Grown | None:
+    """The path at a pair of keyframes, one unit of length apart, by the essential matrix; None = too few points fit."""
+    import cv2
+
+    both = sightings.common(pair.first, pair.second)
+    plane = [np.ascontiguousarray(rays(points, matrix)) for points in (both.first, both.second)]
+    first, second = (direction[:, :2] / direction[:, 2:] for direction in plane)
+    within = _INLIER_PX / float(matrix[0, 0])
+    essential, inside = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, 0.999, within, 1000)
+    if essential is None or essential.shape != (3, 3):
+        return None
+    count, turn, shift, _ = cv2.recoverPose(essential, first, second, np.eye(3), mask=inside)
+    if count < _LEAST_PLACED:
+        return None
+    keys = len(sightings)
+    rotation, position, known = np.tile(np.eye(3), (keys, 1, 1)), np.zeros((keys, 3)), np.zeros(keys, bool)
+    rotation[pair.second], position[pair.second] = turn, -turn.T @ shift[:, 0]
+    known[[pair.first, pair.second]] = True
+    return Grown(rotation, position, known, matrix)
+
+
+class Growth:
+    """A path that grows: every known keyframe adds to the points, which place the next one."""
+
+    def __init__(self, sightings: Sightings, start: Grown, fps: float, focal_std: float) -> None:
+        self.sightings, self.path, self.fps, self.focal_std = sightings, start, fps, focal_std
+        self._gather()
+
+    def grow(self, most: int) -> Grown:
+        """Place keyframes on both sides until ``most`` are known or no more can be placed; adjust now and then."""
+        due = _FIRST_KEYS
+        while int(self.path.known.sum()) < most:
+            keys = self._next_keys()
+            placed = [key for key in keys if self._place(key)]
+            if not placed:
+                break
+            if self.path.known.sum() >= due:
+                self.adjust()
+                due = int(_GROWTH * self.path.known.sum())
+        if self.path.known.sum() > 2:
+            self.adjust()
+        return self.path
+
+    def _next_keys(self) -> list[int]:
+        """Keyframes to try: those inside a pair first, then the next ones outside, or beyond a gap."""
+        known = np.flatnonzero(self.path.known)
+        low, high = int(known[0]), int(known[-1])
+        inside = [key for key in range(low, high) if not self.path.known[key]]
+        if len(known) == 2 and inside:
+            return inside
+        for gap in range(1, _GAP + 1):
+            keys = [key for key in (low - gap, high + gap) if 0 <= key < len(self.sightings)]
+            if any(self._matches(key)[0].sum() >= _LEAST_PLACED for key in keys):
+                return keys
+        return []
+
+    def _matches(self, key: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        piece, point = self.sightings.at(key)
+        usable = self.usable[piece]
+        return usable, piece, point
+
+    def _place(self, key: int) -> bool:
+        """Place a keyframe by the points it sees; whether enough of them agree."""
+        import cv2
+
+        usable, piece, point = self._matches(key)
+        if usable.sum() < _LEAST_PLACED:
+            return False
+        rotation, position = self._predicted(key)
+        places, pixels = self.places[piece[usable]], np.ascontiguousarray(point[usable])
+        guess = cv2.Rodrigues(rotation)[0], np.ascontiguousarray((-rotation @ position)[:, None])
+        found, turn, shift, inside = cv2.solvePnPRansac(
+            np.ascontiguousarray(places), pixels, self.path.matrix, None, *guess,
+            useExtrinsicGuess=True, iterationsCount=200, reprojectionError=2 * _INLIER_PX, confidence=0.999,
+            flags=cv2.SOLVEPNP_ITERATIVE,
+        )  # fmt: skip
+        if not found or inside is None or len(inside) < max(_LEAST_PLACED, 0.4 * int(usable.sum())):
+            return False
+        rotation = cv2.Rodrigues(turn)[0]
+        self.path.rotation[key], self.path.position[key] = rotation, -rotation.T @ shift[:, 0]
+        self.path.known[key] = True
+        self._add(key)
+        self._solve(piece)
+        return True
+
+    def _predicted(self, key: int) -> tuple[np.ndarray, np.ndarray]:
+        """The nearest known keyframe's pose: the next one differs little."""
+        known = np.flatnonzero(self.path.known)
+        near = int(known[np.argmin(np.abs(known - key))])
+        both = self.sightings.common(near, key)
+        rotation = self.path.rotation[near]
+        if len(both.piece) >= _LEAST_PLACED:
+            rotation = (
+                turn_between(rays(both.first, self.path.matrix), rays(both.second, self.path.matrix))[0] @ rotation
+            )
+        return rotation, self.path.position[near]
+
+    def _gather(self) -> None:
+        """The points of all known keyframes anew."""
+        pieces = len(self.sightings.views.track)
+        self._square, self._count = np.zeros((pieces, 4, 4)), np.zeros(pieces, int)
+        self.places, self.usable = np.zeros((pieces, 3)), np.zeros(pieces, bool)
+        for key in np.flatnonzero(self.path.known).tolist():
+            self._add(key)
+        self._solve(np.arange(pieces))
+
+    def _add(self, key: int) -> None:
+        piece, point = self.sightings.at(key)
+        plane = (point - self.path.matrix[:2, 2]) / np.diagonal(self.path.matrix)[:2]
+        rotation, position = self.path.rotation[key], self.path.position[key]
+        camera = np.concatenate([rotation, -(rotation @ position)[:, None]], axis=1)
+        rows = camera[:2] - plane[..., None] * camera[2]
+        self._square[piece] += np.swapaxes(rows, 1, 2) @ rows
+        self._count[piece] += 1
+
+    def _solve(self, piece: np.ndarray) -> None:
+        """Points of pieces, and whether they are usable: seen twice, with a depth that the rays agree on."""
+        value, vector = np.linalg.eigh(self._square[piece])
+        point = vector[..., 0] * np.sign(vector[:, 3, :1])
+        known = np.flatnonzero(self.path.known)
+        way = max(float(np.linalg.norm(np.ptp(self.path.position[known], axis=0))), 1e-9)
+        self.places[piece] = point[:, :3] / np.maximum(point[:, 3:], 1e-12)
+        # The least square is that of a good point's residuals; the next one tells how well its depth is known.
+        noise = np.square(_INLIER_PX / self.path.matrix[0, 0]) * np.square(np.linalg.norm(point, axis=1))
+        agree = value[:, 0] < self._count[piece] * np.maximum(noise * np.square(way), 1e-30) * 100.0
+        near = np.linalg.norm(self.places[piece], axis=1) < _FARTHEST * way
+        deep = value[:, 1] > 30.0 * np.maximum(value[:, 0], 1e-30)
+        self.usable[piece] = (self._count[piece] >= 2) & agree & near & deep
+
+    def adjust(self) -> AdjustedPath | None:
+        """Adjust what is known, and take it over."""
+        known = np.flatnonzero(self.path.known)
+        found = adjusted(self.sightings.views, self.sightings.frames, self.path, self.fps, self.focal_std)
+        if found is None:
+            return None
+        frames = self.sightings.frames[known] - self.sightings.frames[known[0]]
+        rotation, position = self.path.rotation.copy(), self.path.position.copy()
+        rotation[known], position[known] = found.rotation[frames], found.position[frames]
+        focal = float(np.exp(found.shared[FOCAL]))
+        matrix = self.path.matrix * np.array([[focal, 1.0, 1.0], [1.0, focal, 1.0], [1.0, 1.0, 1.0]])
+        # The way is the unit: what an adjustment shrinks grows back.
+        scale = max(float(np.linalg.norm(np.ptp(position[known], axis=0))), 1e-9)
+        self.path = Grown(rotation, position / scale, self.path.known, matrix, found.residual_px)
+        self._gather()
+        return found
+
+
+def turns(sightings: Sightings, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations (F, 3, 3) from keyframe to keyframe, as if the camera kept its place, and zero positions (F, 3)."""
+    rotation = np.tile(np.eye(3), (len(sightings), 1, 1))
+    for key in range(1, len(sightings)):
+        both = sightings.common(key - 1, key)
+        step = np.eye(3)
+        if len(both.piece) >= 3:
+            step = turn_between(rays(both.first, matrix), rays(both.second, matrix))[0]
+        rotation[key] = step @ rotation[key - 1]
+    return between(sightings.frames, rotation, np.zeros((len(sightings), 3)))
+
+
+def small_motion(
+    sightings: Sightings, matrix: np.ndarray, fps: float, focal_std: float, horizon: float
+) -> AdjustedPath | None:
+    """The path of a camera that moves little beside the points' distances, from turns alone.
+
+    Source: Yu, Gallup 2014 (3D reconstruction from accidental motion): such a bundle adjustment needs no motion to
+    begin with, only depths that are about right.
+    """
+    path = CameraTelemetry(*turns(sightings, matrix), fps)
+    config = replace(free_config(1.0, focal_std), acceleration_m_s2=_SMALL_ACCELERATION, iterations=_SMALL_STEPS)
+    return adjust_path(PathInput(path, matrix, sightings.views, config), horizon=horizon)
+
+
+def free_config(unit: float, focal_std: float) -> PathConfig:
+    """Priors of a path that nothing but its points holds; ``unit`` : usual distance of points, in the path's unit."""
+    return PathConfig(
+        tilt_deg=0.0,
+        yaw_deg=0.0,
+        latency_s=0.0,
+        focal=focal_std,
+        position_wander_m=10.0 * unit,
+        attitude_wander_deg=60.0,
+        acceleration_m_s2=unit,
+        jitter_m=1e-3 * unit,
+        jitter_deg=1.0,
+    )
+
+
+def adjusted(views: Views, keys: np.ndarray, path: Grown, fps: float, focal_std: float) -> AdjustedPath | None:
+    """The core's adjustment of a grown path, over the frames from its first known keyframe to the last one."""
+    known = np.flatnonzero(path.known)
+    begin_at, end = int(keys[known[0]]), int(keys[known[-1]]) + 1
+    rotation, position = between(keys[known] - begin_at, path.rotation[known], path.position[known])
+    inside = (views.frame >= begin_at) & (views.frame < end)
+    enough = np.bincount(views.piece[inside], minlength=len(views.track)) >= 3
+    inside &= enough[views.piece]
+    number = np.cumsum(enough) - 1
+    part = Views(
+        views.frame[inside] - begin_at,
+        number[views.piece[inside]],
+        views.point[inside],
+        views.track[enough],
+        end - begin_at,
+    )
+    if not len(part.frame):
+        return None
+    way = max(float(np.linalg.norm(np.ptp(position, axis=0))), 1e-9)
+    points = triangulate(part, rotation, position / way, path.matrix)
+    unit = way * float(np.median(np.linalg.norm(points[:, :3], axis=1) / np.maximum(np.abs(points[:, 3]), 1e-3)))
+    return adjust_path(
+        PathInput(CameraTelemetry(rotation, position, fps), path.matrix, part, free_config(unit, focal_std))
+    )
+
+
+def between(frames: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses at all frames from those at some (N,), from 0 to the last one: splines of both."""
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    at = np.arange(int(frames[-1]) + 1)
+    if len(frames) < 3:
+        share = (at / max(at[-1], 1))[:, None]
+        turn = log_so3(rotation[-1] @ rotation[0].T)
+        return exp_so3(share * turn) @ rotation[0], (1.0 - share) * position[0] + share * position[-1]
+    turned = RotationSpline(frames, Rotation.from_matrix(rotation))(at).as_matrix()
+    return np.asarray(turned), np.asarray(CubicSpline(frames, position)(at))

@@ -1,0 +1,125 @@
+"""What a camera does, by the fixed points it sees: moves, stands, turns, zooms; or why that cannot be told."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.reconstruction.camera.sightings import Common, Sightings, rays, turn_between
+
+#: Times (s) between the keyframes that are compared, and most pairs of each.
+_LAGS_S = (1.0, 3.0)
+_PAIRS = 30
+#: Points that a pair has at least.
+_LEAST_COMMON = 12
+#: Motion (px of an image 1280 wide) of points before a camera that stands, or that a turn does not explain: errors of
+#: tracks reach half of it.
+_SAME_PX = 1.0
+_REFERENCE_WIDTH = 1280.0
+#: Change of the focal length from which a camera zooms, and steps to find it.
+_ZOOM = 0.01
+_ZOOM_STEPS = 4
+#: Share of pairs that have to agree.
+_MOST = 0.8
+#: Share of keyframes that see enough points, at least.
+_SEEING = 0.5
+
+
+class Kind(Enum):
+    """What the camera does; the value is a sentence's part for people."""
+
+    MOVES = "a camera that moves"
+    STANDS = "a camera that stands still"
+    TURNS = "a camera that turns in its place"
+    ZOOMS = "a camera that zooms: give a clip without a zoom"
+    FEW_POINTS = "too few fixed points: no texture, blur or water"
+    NOTHING_FIXED = "no points that stand still together: a crowd, leaves or water fill the picture"
+    CUT = "a cut in the clip: give one scene (--start, --end)"
+
+    @property
+    def known(self) -> bool:
+        """Whether the camera has a path."""
+        return self in (Kind.MOVES, Kind.STANDS, Kind.TURNS)
+
+
+class _Motion(NamedTuple):
+    """Of pairs (N,): median way of the points (px), what a turn leaves (px), what turn and zoom leave (px), zoom."""
+
+    way: np.ndarray
+    turned: np.ndarray
+    zoomed: np.ndarray
+    zoom: np.ndarray
+
+
+def kind_of(sightings: Sightings, matrix: np.ndarray, key_hz: float, width: int) -> Kind:
+    """What the camera does; ``Kind.MOVES`` where nothing simpler explains the points. ``width`` : of the image, px."""
+    if cut_at(sightings) is not None:
+        return Kind.CUT
+    seeing = np.mean([len(rows) >= _LEAST_COMMON for rows in sightings.rows])
+    motion = _motion(sightings, matrix, key_hz)
+    if seeing < _SEEING or not len(motion.way):
+        return Kind.FEW_POINTS
+    same = _SAME_PX * width / _REFERENCE_WIDTH
+    if np.mean(motion.way < same) >= _MOST and np.mean(motion.way < 2 * same) >= 0.5 * (1.0 + _MOST):
+        return Kind.STANDS
+    if np.mean(motion.turned < same) >= _MOST:
+        return Kind.TURNS
+    zooms = (motion.zoomed < same) & (np.abs(motion.zoom) > _ZOOM)
+    if zooms.any() and np.mean(motion.zoomed < same) >= _MOST:
+        return Kind.ZOOMS
+    return Kind.MOVES
+
+
+def cut_at(sightings: Sightings) -> int | None:
+    """Keyframe at which no point of the one before goes on, though both see many; None = there is none."""
+    for key in range(1, len(sightings)):
+        before, after = sightings.at(key - 1)[0], sightings.at(key)[0]
+        if min(len(before), len(after)) < _LEAST_COMMON:
+            continue
+        if np.isin(after, before, assume_unique=True).sum() == 0:
+            return key
+    return None
+
+
+def turning_focal(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> float:
+    """Factor on the focal length at which turns explain the points best; for a camera that turns in its place."""
+    factors = np.geomspace(0.5, 2.0, 15)
+    rest = []
+    for factor in factors:
+        other = matrix * np.array([[factor, 1.0, 1.0], [1.0, factor, 1.0], [1.0, 1.0, 1.0]])
+        rest.append(float(np.median(_motion(sightings, other, key_hz).turned)))
+    return float(factors[int(np.argmin(rest))])
+
+
+def _motion(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> _Motion:
+    found = []
+    for lag_s in _LAGS_S:
+        lag = max(round(lag_s * key_hz), 1)
+        last = len(sightings) - 1 - lag
+        if last < 0:
+            continue
+        for first in np.unique(np.linspace(0, last, _PAIRS).astype(int)).tolist():
+            both = sightings.common(first, first + lag)
+            if len(both.piece) >= _LEAST_COMMON:
+                found.append(_compare(both, matrix))
+    return _Motion(*np.array(found).reshape(-1, 4).T)
+
+
+def _compare(both: Common, matrix: np.ndarray) -> tuple[float, float, float, float]:
+    way = float(np.median(np.linalg.norm(both.second - both.first, axis=1)))
+    focal, first, zoom = float(matrix[0, 0]), rays(both.first, matrix), 1.0
+    rotation, angle = turn_between(first, rays(both.second, matrix))
+    turned = zoomed = focal * float(np.median(angle))
+    for _ in range(_ZOOM_STEPS):
+        expected = first @ rotation.T
+        plane = expected[:, :2] / np.maximum(expected[:, 2:], 0.1)
+        seen = (both.second - matrix[:2, 2]) / focal
+        length = np.square(plane).sum(axis=1)
+        outside = length > np.median(length)
+        zoom = float(np.median((plane * seen).sum(axis=1)[outside] / length[outside]))
+        larger = matrix * np.array([[zoom, 1.0, 1.0], [1.0, zoom, 1.0], [1.0, 1.0, 1.0]])
+        rotation, angle = turn_between(first, rays(both.second, larger))
+        zoomed = focal * float(np.median(angle))
+    return way, turned, zoomed, float(np.log(max(zoom, 1e-3)))

@@ -1,0 +1,119 @@
+"""A world without telemetry: the camera from the tracks' fixed points, upright and in metres by the body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drocap_ros.reconstruction.camera.from_picture import PictureCamera, camera_from_points
+from drocap_ros.reconstruction.camera.upright import Upright, set_upright
+from drocap_ros.reconstruction.common.poses import ImagePoses
+from drocap_ros.reconstruction.lifted.even_frames import even_slots
+from drocap_ros.reconstruction.world.even_capture import LEAST_FRAMES
+from drocap_ros.reconstruction.world.in_world import in_camera_axes
+from drocap_ros.reconstruction.world.placement import place_in_world
+from drocap_ros.reconstruction.world.refine import RefinedWorld
+from drocap_ros.reconstruction.world.world_model import WorldConfig
+from drocap_ros.tracks import Tracks
+
+#: Errors of a path from fixed points, per track of which a hundred remain: constant ones have no place in it, as the
+#: points turn with the camera; slow ones are what the adjustment of the path leaves.
+_TURNED_DEG = 0.02
+_LATENCY_S = 1e-3
+_POSITION_M = 0.02
+_ATTITUDE_DEG = 0.05
+#: Largest standard deviation of the logarithm of a path's scale, before body and camera are adjusted together.
+_SCALE_STD = 0.3
+
+
+@dataclass(frozen=True)
+class PictureWorld:
+    """What the picture tells of the camera.
+
+    upright, config : its path in the world, and the parameters of the adjustment of body and camera for it; None =
+        the camera is not known
+    """
+
+    camera: PictureCamera
+    upright: Upright | None = None
+    config: WorldConfig | None = None
+
+    def meta(self) -> dict[str, object]:
+        """JSON-compatible: where the world comes from."""
+        camera, upright = self.camera, self.upright
+        found: dict[str, object] = {"kind": camera.kind.name.lower(), "words": camera.kind.value}
+        if not camera.kind.known:
+            return found
+        focal = 0.5 * float(camera.matrix[0, 0] + camera.matrix[1, 1])
+        found |= {
+            "residual_px": _number(camera.residual_px),
+            "covered": camera.covered,
+            "focal_px": focal,
+            "focal_std_px": _number(focal * camera.focal_std),
+        }
+        if upright is not None:
+            found |= {
+                "up": upright.source.name.lower(),
+                "up_std_deg": upright.std_deg,
+                "scale_std": _number(upright.scale_std),
+            }
+        return found
+
+
+def picture_camera(tracks: Tracks) -> PictureCamera | None:
+    """The camera of tracks with fixed points and without telemetry; None for others and for too short ones."""
+    points = tracks.background
+    if points is None or tracks.camera_rotation is not None or len(tracks) < LEAST_FRAMES:
+        return None
+    slot, fps = even_slots(tracks.stamp_ns)
+    camera = camera_from_points(
+        slot[points.frame],
+        points.track,
+        points.point.astype(np.float64),
+        fps,
+        int(slot[-1]) + 1,
+        tracks.image_size,
+        tracks.camera_matrix,
+    )
+    return replace(camera, rotation=camera.rotation[slot], position=camera.position[slot])
+
+
+def with_camera(
+    tracks: Tracks, camera: PictureCamera, poses: ImagePoses, per_px: np.ndarray, config: WorldConfig
+) -> tuple[Tracks, PictureWorld]:
+    """The tracks with the camera's path in the world: metres and up by poses at (F,) metres per px."""
+    frames = len(tracks)
+    still = replace(tracks, camera_rotation=np.tile(np.eye(3), (frames, 1, 1)), camera_position=np.zeros((frames, 3)))
+    projected = poses.joints_px[..., :2] + poses.translation_px[:, None]
+    seen = place_in_world(in_camera_axes(poses, per_px), projected, per_px, still).joints
+    upright = set_upright(camera.rotation, camera.position, camera.points, seen, tracks.stamp_ns)
+    world = replace(tracks, camera_rotation=upright.rotation, camera_position=upright.position)
+    config = replace(
+        config,
+        stature_std=min(upright.scale_std, _SCALE_STD) if np.isfinite(upright.scale_std) else config.stature_std,
+        tilt_error_deg=_TURNED_DEG,
+        yaw_error_deg=_TURNED_DEG,
+        latency_std_s=_LATENCY_S,
+        position_wander_m=_POSITION_M,
+        attitude_wander_deg=_ATTITUDE_DEG,
+        checks=False,
+    )
+    return world, PictureWorld(camera, upright, config)
+
+
+def at_assumed_stature(refined: RefinedWorld) -> RefinedWorld:
+    """The world with the body at its assumed stature: nothing else gives a path of the picture its metres."""
+    scale = float(np.median([window["scale"] for window in refined.calibration]))
+    return replace(
+        refined,
+        joints=refined.joints / scale,
+        position=refined.position / scale,
+        covariance=refined.covariance / scale**2,
+        metric=False,
+    )
+
+
+def _number(value: float) -> float | None:
+    """A number for JSON, which knows no NaN."""
+    return value if np.isfinite(value) else None

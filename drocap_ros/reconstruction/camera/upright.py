@@ -1,0 +1,274 @@
+"""Up, floor and metres of a camera's path that the picture alone gave: from the body, its feet and the ground's points.
+
+- Metres: the factor of the path at which feet rest while the camera moves, for a body of the assumed stature.
+- Up: the body's mean direction from feet to neck; then the plane of resting feet; then that of the points about it.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.contacts import ANKLES, rest_likelihood
+from drocap_ros.reconstruction.world.metric_scale import estimate_scale
+from drocap_ros.skeleton import BODY_17
+
+_PELVIS, _NECK = BODY_17.index("pelvis"), BODY_17.index("neck")
+#: Octaves about the first guess in which the factor of the path is sought.
+_OCTAVES = 6
+#: Share of feet that rest below which contacts give no scale, and its errors over its formal deviation.
+_LEAST_SUPPORT = 0.1
+_CONTACT_STDS = 3.0
+#: Planes through three points that are tried, and distance of a point on one over the camera's height above it.
+_PLANES = 1000
+_ON_PLANE = 0.03
+#: Least standard deviation of the scale by a body's distance from the camera: the lifter's sizes.
+_GROUND_SCALE_STD = 0.04
+#: Standard deviation (degrees) of the body's mean direction from the vertical: people lean, and the lifter does.
+_BODY_STD_DEG = 5.0
+#: Angle (degrees) from the mean at which one frame's direction has half its weight.
+_LEANS_DEG = 15.0
+#: Standard deviation (m) of a resting foot's height, and frames per independent one: a foot rests for half a second.
+_FOOT_STD_M = 0.05
+_FEET_HZ = 2.0
+#: The same of a point of the ground, distance (m) from the feet up to which points count, and least number of them.
+_GROUND_STD_M = 0.1
+_GROUND_M = 15.0
+_LEAST_GROUND = 20
+#: Share of the points within the distance that lie on the ground's plane, at least.
+_GROUND_SHARE = 0.15
+#: Times (s) between two places of a foot that rests, and error (m) of its place.
+_REST_S = 0.25
+_REST_M = 0.05
+#: Steps of reweighting.
+_STEPS = 10
+#: Least standard deviation (degrees) of up: ground is no water level.
+_LEAST_STD_DEG = 0.5
+#: Height (m) of a resting ankle above the floor.
+_ANKLE_M = 0.07
+
+
+class UpSource(Enum):
+    """What tells where up is."""
+
+    GROUND = "the plane of the ground's points under the feet"
+    FEET = "the plane of resting feet"
+    BODY = "the body's direction while it stands and walks"
+
+
+class Upright(NamedTuple):
+    """A path in metres, z up, the floor at z = 0: rotation (F, 3, 3) world -> camera, position (F, 3) m.
+
+    source, std_deg : of up; scale_std : of the logarithm of the path's scale, NaN = the camera keeps its place
+    points : (J, 4) x y z m, w
+    """
+
+    rotation: np.ndarray
+    position: np.ndarray
+    source: UpSource
+    std_deg: float
+    scale_std: float
+    points: np.ndarray
+
+
+class PathScale(NamedTuple):
+    """Metres per unit of a path, and the standard deviation of its logarithm."""
+
+    factor: float
+    std: float
+
+
+class _Plane(NamedTuple):
+    """Up (3,) of length 1, height of the plane along it, and the covariance (2, 2) rad^2 of up across itself."""
+
+    up: np.ndarray
+    height: float
+    covariance: np.ndarray
+
+
+def set_upright(
+    rotation: np.ndarray, position: np.ndarray, points: np.ndarray, seen: np.ndarray, stamp_ns: np.ndarray
+) -> Upright:
+    """The path in metres and upright.
+
+    Parameters
+    ----------
+    rotation, position : (F, 3, 3) world -> camera, (F, 3) in any unit and orientation
+    points : (J, 4) fixed points there, x y z w
+    seen : (F, 17, 3) m, joints from the camera, in its axes, at the assumed stature
+    """
+    from_camera = seen @ rotation
+    up, std_deg = body_up(from_camera)
+    feet = from_camera[:, ANKLES]
+    factor, factor_std = 1.0, float("nan")
+    if np.ptp(position, axis=0).any():
+        found = [by_ground(up, feet, position, points), by_contacts(feet, position, stamp_ns)]
+        factor, factor_std = _together([scale for scale in found if scale is not None])
+    path, lying = factor * position, points * np.array([factor] * 3 + [1.0])
+    feet = path[:, None] + feet
+    plane, source = _Plane(up, 0.0, np.deg2rad(std_deg) ** 2 * np.eye(2)), UpSource.BODY
+    by_feet = _by_feet(plane, feet, stamp_ns)
+    # The tilt of feet on one line is known along it alone: half of the prior's variance stays.
+    if np.trace(by_feet.covariance) < 0.75 * np.trace(plane.covariance):
+        source = UpSource.FEET
+    plane, ground = by_feet, _by_points(by_feet, feet, lying)
+    if ground is not None:
+        plane, source = ground, UpSource.GROUND
+    turn = _axes(plane.up, rotation[0])
+    middle = feet.reshape(-1, 3).mean(axis=0)
+    origin = middle + (plane.height - middle @ plane.up - _ANKLE_M) * plane.up
+    moved = lying.copy()
+    moved[:, :3] = (lying[:, :3] - lying[:, 3:] * origin) @ turn.T
+    std = max(np.degrees(np.sqrt(0.5 * np.trace(plane.covariance))), _LEAST_STD_DEG)
+    return Upright(rotation @ turn.T, (path - origin) @ turn.T, source, float(std), factor_std, moved)
+
+
+def _together(found: list[PathScale]) -> PathScale:
+    """Scales as one, by their deviations; the unit of the path where there is none."""
+    if not found:
+        return PathScale(1.0, float("inf"))
+    weight = np.array([scale.std**-2 for scale in found])
+    log = np.log([scale.factor for scale in found])
+    return PathScale(float(np.exp(weight @ log / weight.sum())), float(weight.sum() ** -0.5))
+
+
+def by_contacts(feet: np.ndarray, position: np.ndarray, stamp_ns: np.ndarray) -> PathScale | None:
+    """The scale of a path (F, 3) at which feet (F, 2, 3) m from the camera rest; None = it moves too little."""
+    way = float(np.linalg.norm(np.ptp(position, axis=0)))
+    # A camera's way is about as long as its distance from the person.
+    guess = float(np.median(np.linalg.norm(feet, axis=-1))) / way
+    best, support = None, _LEAST_SUPPORT
+    for octave in range(-_OCTAVES, _OCTAVES + 1):
+        unit = guess * 2.0**octave
+        found = estimate_scale(feet, unit * position, stamp_ns)
+        if found is not None and found.support > support:
+            best, support = PathScale(unit / found.factor, _CONTACT_STDS * found.std), found.support
+    return best
+
+
+def by_ground(up: np.ndarray, feet: np.ndarray, position: np.ndarray, points: np.ndarray) -> PathScale | None:
+    """The scale of a path (F, 3) at which feet (F, 2, 3) m from the camera stand on a plane of points (J, 4).
+
+    The largest plane below the camera that is about level, as ``up`` (3,) tells; None = there is none.
+    """
+    near = np.abs(points[:, 3]) > 1e-9
+    places = points[near, :3] / points[near, 3:]
+    if len(places) < _LEAST_GROUND:
+        return None
+    rng = np.random.default_rng(0)
+    corners = places[rng.integers(len(places), size=(_PLANES, 3))]
+    normal = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    normal *= np.sign(normal @ up)[:, None]
+    level = np.einsum("ni,ni->n", normal, corners[:, 0])
+    height = np.median(position @ normal.T, axis=0) - level
+    usual = normal @ up > np.cos(np.deg2rad(3.0 * _BODY_STD_DEG))
+    normal, level, height = (values[usual & (height > 0.0)] for values in (normal, level, height))
+    if not len(normal):
+        return None
+    on = (np.abs(places @ normal.T - level) < _ON_PLANE * height).sum(axis=0)
+    best = int(on.argmax())
+    if on[best] < max(_LEAST_GROUND, _GROUND_SHARE * len(places)):
+        return None
+    # The lower foot of a frame stands, mostly; its ankle is a little above the ground.
+    down = -(feet @ normal[best])
+    above = position @ normal[best] - level[best]
+    standing = down.max(axis=1) + _ANKLE_M
+    fits = (standing > 0.0) & (above > 0.0)
+    if fits.mean() < 0.5:
+        return None
+    log = np.log(standing[fits] / above[fits])
+    spread = 1.48 * float(np.median(np.abs(log - np.median(log))))
+    return PathScale(float(np.exp(np.median(log))), max(_GROUND_SCALE_STD, 0.5 * spread))
+
+
+def body_up(joints: np.ndarray) -> tuple[np.ndarray, float]:
+    """(3,) mean direction of bodies (F, 17, 3), from the feet to the neck, and its standard deviation (degrees)."""
+    trunk = _unit(joints[:, _NECK] - joints[:, _PELVIS])
+    legs = _unit(joints[:, _PELVIS] - joints[:, ANKLES].mean(axis=1))
+    each = _unit(trunk + legs)
+    up = _unit(each.sum(axis=0))
+    for _ in range(_STEPS):
+        off = np.degrees(np.arccos(np.clip(each @ up, -1.0, 1.0)))
+        weight = 1.0 / (1.0 + np.square(off / _LEANS_DEG)) ** 2
+        up = _unit(weight @ each)
+    return up, max(_BODY_STD_DEG, 0.3 * float(np.median(off)))
+
+
+def resting(feet: np.ndarray, stamp_ns: np.ndarray) -> np.ndarray:
+    """(F, 2) weight of feet (F, 2, 3) m that stay where they are for a while."""
+    lag = max(int(np.searchsorted(stamp_ns, stamp_ns[0] + round(_REST_S * 1e9))), 1)
+    rest = np.zeros(feet.shape[:2])
+    if lag < len(feet):
+        stays = rest_likelihood(np.square(feet[lag:] - feet[:-lag]).sum(-1), _REST_M)
+        rest[: len(stays)] = stays
+        rest[lag:] = np.maximum(rest[lag:], stays)
+    return rest
+
+
+def _by_feet(prior: _Plane, feet: np.ndarray, stamp_ns: np.ndarray) -> _Plane:
+    """The plane of resting feet; frames of one rest count once."""
+    weight = resting(feet, stamp_ns).reshape(-1)
+    seconds = max(float(stamp_ns[-1] - stamp_ns[0]) * 1e-9, 1e-3)
+    return _fit(prior, feet.reshape(-1, 3), weight * min(_FEET_HZ * seconds / len(feet), 1.0), _FOOT_STD_M)
+
+
+def _by_points(plane: _Plane, feet: np.ndarray, points: np.ndarray) -> _Plane | None:
+    """The plane of points about the feet, which resting feet agree with; None = too few lie on one."""
+    middle = feet.reshape(-1, 3).mean(axis=0)
+    near = np.abs(points[:, 3]) > 1e-9
+    places = points[near, :3] / points[near, 3:]
+    places = places[np.linalg.norm(places - middle, axis=1) < _GROUND_M]
+    if len(places) < _LEAST_GROUND:
+        return None
+    floor = plane._replace(height=plane.height - _ANKLE_M)
+    found = _fit(floor, places, np.ones(len(places)), _GROUND_STD_M, hold_height=True)
+    off = np.abs(places @ found.up - found.height)
+    on = int((off < 2 * _GROUND_STD_M).sum())
+    if on < max(_LEAST_GROUND, _GROUND_SHARE * len(places)):
+        return None
+    return found._replace(height=found.height + _ANKLE_M)
+
+
+def _fit(prior: _Plane, places: np.ndarray, weight: np.ndarray, std_m: float, hold_height: bool = False) -> _Plane:
+    """Robust plane of weighted places (N, 3) with a prior of its direction, and of its height where that is held."""
+    across = _two_across(prior.up)
+    up, height = prior.up, prior.height
+    middle = np.average(places, axis=0, weights=weight + 1e-9)
+    if not hold_height:
+        height = float(np.average(places @ up, weights=weight + 1e-9))
+    precision = np.zeros((3, 3))
+    precision[:2, :2] = np.linalg.inv(prior.covariance)
+    precision[2, 2] = _FOOT_STD_M**-2 if hold_height else 1e-6
+    start = height - middle @ up
+    tilt = np.zeros(3)
+    for _ in range(_STEPS):
+        offset = places - middle
+        rows = np.concatenate([offset @ across.T, -np.ones((len(places), 1))], axis=1)
+        rest = offset @ prior.up - start + rows @ tilt
+        robust = weight / (1.0 + np.square(rest / (3.0 * std_m))) ** 2 / std_m**2
+        matrix = precision + rows.T @ (robust[:, None] * rows)
+        tilt = np.linalg.solve(matrix, -rows.T @ (robust * (offset @ prior.up - start)))
+    up = _unit(prior.up + tilt[:2] @ across)
+    return _Plane(up, float(start + tilt[2] + middle @ up), np.linalg.inv(matrix)[:2, :2])
+
+
+def _two_across(up: np.ndarray) -> np.ndarray:
+    """(2, 3) directions across a direction."""
+    first = np.eye(3)[np.argmin(np.abs(up))]
+    first = _unit(first - (first @ up) * up)
+    return np.stack([first, np.cross(up, first)])
+
+
+def _axes(up: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """(3, 3) rows of the new world in the old one: z up; the first camera looks along y, or its image's top does."""
+    forward = rotation[2] - (rotation[2] @ up) * up
+    if np.linalg.norm(forward) < 0.1:  # it looks down: a tenth of the length has no direction
+        forward = -rotation[1] + (rotation[1] @ up) * up
+    north = _unit(forward)
+    return np.stack([np.cross(north, up), north, up])
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12))

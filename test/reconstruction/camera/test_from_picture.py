@@ -1,0 +1,130 @@
+"""The camera of a recording without telemetry, by simulated fixed points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fixed_points import MATRIX, SIZE, Scene, looking, orbit, points_of, seen, shape_error, turn_errors_deg
+
+from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.reconstruction.camera.from_picture import PictureCamera, camera_from_points
+from drocap_ros.reconstruction.camera.kinds import Kind
+
+FPS = 12.0
+FRAMES = 96
+
+
+def orbiting(flat: bool = False, points: int = 400) -> Scene:
+    rng = np.random.default_rng(5)
+    return seen(*orbit(FRAMES, FPS), points_of(rng, points, flat), FPS)
+
+
+def camera_of(scene: Scene, matrix: np.ndarray | None = MATRIX, noise_px: float = 0.0) -> PictureCamera:
+    point = scene.point + noise_px * np.random.default_rng(1).standard_normal(scene.point.shape)
+    return camera_from_points(scene.frame, scene.track, point, FPS, len(scene.rotation), SIZE, matrix)
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_path_without_noise_is_found_exactly(flat: bool) -> None:
+    scene = orbiting(flat)
+    found = camera_of(scene)
+    assert found.kind is Kind.MOVES
+    assert found.covered == 1.0
+    assert turn_errors_deg(found.rotation, scene.rotation, FPS).max() < 0.05
+    assert shape_error(found.position, scene.position) < 0.02
+
+
+def test_path_and_lens_are_found_together() -> None:
+    scene = orbiting()
+    found = camera_of(scene, None, 0.4)
+    assert found.kind is Kind.MOVES
+    assert found.matrix[0, 0] == pytest.approx(MATRIX[0, 0], rel=0.02)
+    assert abs(np.log(found.matrix[0, 0] / MATRIX[0, 0])) < 4.0 * found.focal_std
+    assert shape_error(found.position, scene.position) < 0.1
+
+
+def test_camera_that_follows_slowly_is_found_without_parallax_to_begin_with() -> None:
+    time = np.arange(FRAMES) / FPS
+    position = np.stack([0.5 * np.sin(0.6 * time), -8.0 + 0.3 * np.sin(0.4 * time), np.full(FRAMES, 2.5)], axis=1)
+    rotation = looking(position, position + np.array([0.0, 8.0, -1.8]))
+    scene = seen(rotation, position, points_of(np.random.default_rng(6), 500), FPS)
+    found = camera_of(scene, noise_px=0.3)
+    assert found.kind is Kind.MOVES
+    assert shape_error(found.position, scene.position) < 0.05
+
+
+def test_camera_that_stands_still_is_named() -> None:
+    rotation, position = orbit(1, FPS)
+    points = points_of(np.random.default_rng(6), 300)
+    scene = seen(np.repeat(rotation, FRAMES, axis=0), np.repeat(position, FRAMES, axis=0), points, FPS)
+    found = camera_of(scene, noise_px=0.3)
+    assert found.kind is Kind.STANDS
+    assert not found.position.any()
+
+
+@pytest.mark.parametrize("lens_known", [True, False])
+def test_camera_that_turns_in_its_place_keeps_it_and_its_turns_are_found(lens_known: bool) -> None:
+    rotation, position = orbit(1, FPS)
+    time = np.arange(FRAMES) / FPS
+    turns = exp_so3(np.stack([0.1 * np.sin(0.8 * time), 0.25 * np.sin(0.5 * time), 0.0 * time], axis=1))
+    points = points_of(np.random.default_rng(6), 600)
+    scene = seen(turns @ rotation, np.repeat(position, FRAMES, axis=0), points, FPS)
+    found = camera_of(scene, MATRIX if lens_known else None, 0.3)
+    assert found.kind is Kind.TURNS
+    assert not found.position.any()
+    assert turn_errors_deg(found.rotation, scene.rotation, FPS).max() < (0.1 if lens_known else 1.0)
+
+
+def test_zoom_is_named() -> None:
+    rotation, position = orbit(1, FPS)
+    scene = seen(
+        np.repeat(rotation, FRAMES, axis=0),
+        np.repeat(position, FRAMES, axis=0),
+        points_of(np.random.default_rng(6), 300),
+        FPS,
+    )
+    zoom = np.exp(0.04 * scene.frame / FPS)[:, None]
+    point = (scene.point - MATRIX[:2, 2]) * zoom + MATRIX[:2, 2]
+    assert camera_of(scene._replace(point=point)).kind is Kind.ZOOMS
+
+
+def test_cut_is_named() -> None:
+    scene = orbiting()
+    after = scene.frame >= 50
+    assert camera_of(scene._replace(track=scene.track + after * 10**9)).kind is Kind.CUT
+
+
+def test_few_points_are_named() -> None:
+    scene = orbiting(points=400)
+    few = scene.track % 1000003 < 6000
+    kept = scene._replace(frame=scene.frame[few], track=scene.track[few], point=scene.point[few])
+    assert camera_of(kept).kind is Kind.FEW_POINTS
+
+
+def test_points_that_all_move_on_their_own_give_no_camera() -> None:
+    scene = orbiting()
+    rng = np.random.default_rng(7)
+    tracks, number = np.unique(scene.track, return_inverse=True)
+    angle = rng.uniform(0.0, 2.0 * np.pi, len(tracks))[number] + 0.3 * scene.frame
+    point = scene.point + 40.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1) * np.sin(0.2 * scene.frame)[:, None]
+    assert not camera_of(scene._replace(point=point)).kind.known
+
+
+def test_crowd_before_the_scene_does_not_bend_the_path() -> None:
+    scene = orbiting(points=500)
+    rng = np.random.default_rng(8)
+    tracks, number = np.unique(scene.track, return_inverse=True)
+    walks = (rng.random(len(tracks)) < 0.3)[number]
+    step = rng.normal(0.0, 2.0, (len(tracks), 2))[number]
+    point = scene.point + 0.3 * rng.standard_normal(scene.point.shape)
+    point[walks] += ((scene.frame % 36)[:, None] * step)[walks]
+    found = camera_of(scene._replace(point=point))
+    assert found.kind is Kind.MOVES
+    assert shape_error(found.position, scene.position) < 0.1
+
+
+def test_same_points_give_the_same_bits() -> None:
+    scene = orbiting()
+    first, second = camera_of(scene, noise_px=0.4), camera_of(scene, noise_px=0.4)
+    np.testing.assert_array_equal(first.rotation, second.rotation)
+    np.testing.assert_array_equal(first.position, second.position)
