@@ -6,7 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drocap_ros.reconstruction.camera.growth import Growth, Pair, adjusted, begin, candidate_pairs, small_motion, turns
+from drocap_ros.reconstruction.camera.growth import (
+    LAST_STEPS,
+    Growth,
+    Pair,
+    adjusted,
+    begin,
+    candidate_pairs,
+    small_motion,
+    turns,
+)
 from drocap_ros.reconstruction.camera.kinds import Kind, kind_of, turning_focal
 from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path
 from drocap_ros.reconstruction.camera.path_model import FOCAL, Knots, PathConfig, PathInput
@@ -79,13 +88,18 @@ def camera_from_points(
     knots = Knots(frames, fps)
     sightings, key_hz = Sightings(views, knots.frame), 1.0 / knots.step_s
     kind = kind_of(sightings, matrix, key_hz, size[0])
+    if focal_std and kind is Kind.MOVES:
+        # Through another lens, what looks like a way may be a turn.
+        other = with_focal(matrix, turning_focal(sightings, matrix, key_hz))
+        if kind_of(sightings, other, key_hz, size[0]) is Kind.TURNS:
+            kind, matrix = Kind.TURNS, other
     unknown = PictureCamera(
         kind, np.tile(np.eye(3), (frames, 1, 1)), np.zeros((frames, 3)), matrix, focal_std, np.zeros((0, 4))
     )
     if kind is Kind.STANDS:
         return replace(unknown, residual_px=0.0, covered=1.0)
     if kind is Kind.TURNS:
-        return _turning(sightings, unknown, fps, key_hz)
+        return _turning(sightings, unknown, fps)
     return _moving(sightings, unknown, fps, key_hz) if kind is Kind.MOVES else unknown
 
 
@@ -125,7 +139,7 @@ def _small_motion(sightings: Sightings, camera: PictureCamera, fps: float, enoug
 def _grown(sightings: Sightings, camera: PictureCamera, start: Growth, fps: float) -> PictureCamera:
     """The path that grows from a start over all keyframes that can be placed."""
     path = start.grow(len(sightings))
-    found = adjusted(sightings.views, sightings.frames, path, fps, camera.focal_std)
+    found = adjusted(sightings, path, fps, camera.focal_std, LAST_STEPS)
     if found is None or path.known.mean() < _LEAST_KNOWN:
         return replace(camera, kind=Kind.FEW_POINTS, residual_px=float("inf"))
     known = np.flatnonzero(path.known)
@@ -152,12 +166,9 @@ def _starts(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: flo
     return [(pair.parallax, growth) for pair, growth in growths if growth.path.known.sum() >= enough]
 
 
-def _turning(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: float) -> PictureCamera:
+def _turning(sightings: Sightings, camera: PictureCamera, fps: float) -> PictureCamera:
     """The turns of a camera that keeps its place."""
-    matrix = camera.matrix
-    if camera.focal_std:
-        matrix = with_focal(matrix, turning_focal(sightings, matrix, key_hz))
-    turned, place = turns(sightings, matrix)
+    turned, place = turns(sightings, camera.matrix)
     config = PathConfig(
         tilt_deg=0.0,
         yaw_deg=0.0,
@@ -168,10 +179,10 @@ def _turning(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: fl
         jitter_m=1e-6,
         jitter_deg=1.0,
     )
-    found = adjust_path(PathInput(CameraTelemetry(turned, place, fps), matrix, sightings.views, config))
+    found = adjust_path(PathInput(CameraTelemetry(turned, place, fps), camera.matrix, sightings.views, config))
     if found is None:
         return replace(camera, kind=Kind.FEW_POINTS)
-    of_path = replace(camera, rotation=found.rotation, position=place, matrix=matrix)
+    of_path = replace(camera, rotation=found.rotation, position=place)
     return _checked(of_path, found, 1.0)
 
 

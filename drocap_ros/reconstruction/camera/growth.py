@@ -19,7 +19,7 @@ _PAIR_S = (0.5, 1.0, 2.0, 3.0)
 _PLACES = 12
 #: Points that both keyframes of a pair see, at least, and pairs that are tried.
 _LEAST_COMMON = 16
-_PAIRS = 4
+_PAIRS = 3
 #: Parallax (rad) above which more helps no pair: six degrees.
 _ENOUGH_PARALLAX = 0.1
 #: Percentile of the points' parallaxes that counts.
@@ -28,6 +28,9 @@ _NEARER = 75
 _INLIER_PX = 2.0
 #: Points that place a keyframe, at least.
 _LEAST_PLACED = 10
+#: Steps of an adjustment while the path grows, and of the last one.
+_STEPS_WHILE_GROWING = 5
+LAST_STEPS = 12
 #: Keyframes after which the first adjustment runs, and their growth until the next one.
 _FIRST_KEYS = 12
 _GROWTH = 1.6
@@ -219,7 +222,7 @@ class Growth:
     def adjust(self) -> AdjustedPath | None:
         """Adjust what is known, and take it over."""
         known = np.flatnonzero(self.path.known)
-        found = adjusted(self.sightings.views, self.sightings.frames, self.path, self.fps, self.focal_std)
+        found = adjusted(self.sightings, self.path, self.fps, self.focal_std, _STEPS_WHILE_GROWING)
         if found is None:
             return None
         frames = self.sightings.frames[known] - self.sightings.frames[known[0]]
@@ -274,9 +277,9 @@ def free_config(unit: float, focal_std: float) -> PathConfig:
     )
 
 
-def adjusted(views: Views, keys: np.ndarray, path: Grown, fps: float, focal_std: float) -> AdjustedPath | None:
+def adjusted(sightings: Sightings, path: Grown, fps: float, focal_std: float, iterations: int) -> AdjustedPath | None:
     """The core's adjustment of a grown path, over the frames from its first known keyframe to the last one."""
-    known = np.flatnonzero(path.known)
+    views, keys, known = sightings.views, sightings.frames, np.flatnonzero(path.known)
     begin_at, end = int(keys[known[0]]), int(keys[known[-1]]) + 1
     rotation, position = between(keys[known] - begin_at, path.rotation[known], path.position[known])
     inside = (views.frame >= begin_at) & (views.frame < end)
@@ -295,9 +298,8 @@ def adjusted(views: Views, keys: np.ndarray, path: Grown, fps: float, focal_std:
     way = max(float(np.linalg.norm(np.ptp(position, axis=0))), 1e-9)
     points = triangulate(part, rotation, position / way, path.matrix)
     unit = way * float(np.median(np.linalg.norm(points[:, :3], axis=1) / np.maximum(np.abs(points[:, 3]), 1e-3)))
-    return adjust_path(
-        PathInput(CameraTelemetry(rotation, position, fps), path.matrix, part, free_config(unit, focal_std))
-    )
+    config = replace(free_config(unit, focal_std), iterations=iterations)
+    return adjust_path(PathInput(CameraTelemetry(rotation, position, fps), path.matrix, part, config))
 
 
 def between(frames: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.camera.sightings import Common, Sightings, rays, turn_between
 
 #: Times (s) between the keyframes that are compared, and most pairs of each.
@@ -20,7 +21,9 @@ _SAME_PX = 1.0
 _REFERENCE_WIDTH = 1280.0
 #: Change of the focal length from which a camera zooms, and steps to find it.
 _ZOOM = 0.01
-_ZOOM_STEPS = 4
+_ZOOM_STEPS = 6
+#: Factors on the focal length that are tried for a camera that turns: least, largest, how many.
+_FOCALS = (0.5, 2.0, 9)
 #: Share of pairs that have to agree.
 _MOST = 0.8
 #: Share of keyframes that see enough points, at least.
@@ -85,7 +88,7 @@ def cut_at(sightings: Sightings) -> int | None:
 
 def turning_focal(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> float:
     """Factor on the focal length at which turns explain the points best; for a camera that turns in its place."""
-    factors = np.geomspace(0.5, 2.0, 15)
+    factors = np.geomspace(*_FOCALS)
     rest = []
     for factor in factors:
         other = matrix * np.array([[factor, 1.0, 1.0], [1.0, factor, 1.0], [1.0, 1.0, 1.0]])
@@ -109,17 +112,23 @@ def _motion(sightings: Sightings, matrix: np.ndarray, key_hz: float) -> _Motion:
 
 def _compare(both: Common, matrix: np.ndarray) -> tuple[float, float, float, float]:
     way = float(np.median(np.linalg.norm(both.second - both.first, axis=1)))
-    focal, first, zoom = float(matrix[0, 0]), rays(both.first, matrix), 1.0
+    focal, first = float(matrix[0, 0]), rays(both.first, matrix)
     rotation, angle = turn_between(first, rays(both.second, matrix))
-    turned = zoomed = focal * float(np.median(angle))
+    zoom, zoomed = _turn_and_zoom(first @ rotation.T, (both.second - matrix[:2, 2]) / np.diagonal(matrix)[:2])
+    return way, focal * float(np.median(angle)), focal * zoomed, float(np.log(max(zoom, 1e-3)))
+
+
+def _turn_and_zoom(expected: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
+    """Zoom that with a further turn maps directions (N, 3) to places (N, 2), and the median of what remains."""
+    zoom, weight = 1.0, np.ones(len(seen))
     for _ in range(_ZOOM_STEPS):
-        expected = first @ rotation.T
-        plane = expected[:, :2] / np.maximum(expected[:, 2:], 0.1)
-        seen = (both.second - matrix[:2, 2]) / focal
-        length = np.square(plane).sum(axis=1)
-        outside = length > np.median(length)
-        zoom = float(np.median((plane * seen).sum(axis=1)[outside] / length[outside]))
-        larger = matrix * np.array([[zoom, 1.0, 1.0], [1.0, zoom, 1.0], [1.0, 1.0, 1.0]])
-        rotation, angle = turn_between(first, rays(both.second, larger))
-        zoomed = focal * float(np.median(angle))
-    return way, turned, zoomed, float(np.log(max(zoom, 1e-3)))
+        x, y = (expected[:, :2] / np.maximum(expected[:, 2:], 0.1)).T
+        rest = seen - zoom * np.stack([x, y], axis=1)
+        by_x = np.stack([-x * y * zoom, (1 + x * x) * zoom, -y * zoom, x], axis=1)
+        by_y = np.stack([-(1 + y * y) * zoom, x * y * zoom, x * zoom, y], axis=1)
+        rows, twice = np.concatenate([by_x, by_y]), np.tile(weight, 2)
+        change = np.linalg.lstsq(rows * twice[:, None], rest.T.reshape(-1) * twice, rcond=None)[0]
+        expected, zoom = expected @ exp_so3(change[:3]).T, zoom + float(change[3])
+        off = np.linalg.norm(rest, axis=1)
+        weight = 1.0 / (1.0 + np.square(off / max(float(np.median(off)), 1e-4)))
+    return zoom, float(np.median(off))

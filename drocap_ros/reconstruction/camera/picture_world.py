@@ -55,6 +55,7 @@ class PictureWorld:
         if upright is not None:
             found |= {
                 "up": upright.source.name.lower(),
+                "up_words": upright.source.value,
                 "up_std_deg": upright.std_deg,
                 "scale_std": _number(upright.scale_std),
             }

@@ -24,6 +24,8 @@ _CONTACT_STDS = 3.0
 #: Planes through three points that are tried, and distance of a point on one over the camera's height above it.
 _PLANES = 1000
 _ON_PLANE = 0.03
+#: Standard deviation (degrees) of a plane through three points.
+_LEVEL_STD_DEG = 3.0
 #: Least standard deviation of the scale by a body's distance from the camera: the lifter's sizes.
 _GROUND_SCALE_STD = 0.04
 #: Standard deviation (degrees) of the body's mean direction from the vertical: people lean, and the lifter does.
@@ -80,6 +82,14 @@ class PathScale(NamedTuple):
     std: float
 
 
+class Level(NamedTuple):
+    """Ground in the unit of a path: up (3,), height along it, and the scale at which feet stand on it."""
+
+    up: np.ndarray
+    height: float
+    scale: PathScale
+
+
 class _Plane(NamedTuple):
     """Up (3,) of length 1, height of the plane along it, and the covariance (2, 2) rad^2 of up across itself."""
 
@@ -102,9 +112,10 @@ def set_upright(
     from_camera = seen @ rotation
     up, std_deg = body_up(from_camera)
     feet = from_camera[:, ANKLES]
-    factor, factor_std = 1.0, float("nan")
+    factor, factor_std, level = 1.0, float("nan"), None
     if np.ptp(position, axis=0).any():
-        found = [by_ground(up, feet, position, points), by_contacts(feet, position, stamp_ns)]
+        level = by_ground(up, feet, position, points)
+        found = [None if level is None else level.scale, by_contacts(feet, position, stamp_ns)]
         factor, factor_std = _together([scale for scale in found if scale is not None])
     path, lying = factor * position, points * np.array([factor] * 3 + [1.0])
     feet = path[:, None] + feet
@@ -113,9 +124,10 @@ def set_upright(
     # The tilt of feet on one line is known along it alone: half of the prior's variance stays.
     if np.trace(by_feet.covariance) < 0.75 * np.trace(plane.covariance):
         source = UpSource.FEET
-    plane, ground = by_feet, _by_points(by_feet, feet, lying)
-    if ground is not None:
-        plane, source = ground, UpSource.GROUND
+    plane = by_feet
+    if level is not None:
+        begun = _Plane(level.up, factor * level.height + _ANKLE_M, np.deg2rad(_LEVEL_STD_DEG) ** 2 * np.eye(2))
+        plane, source = _by_points(begun, feet, lying) or begun, UpSource.GROUND
     turn = _axes(plane.up, rotation[0])
     middle = feet.reshape(-1, 3).mean(axis=0)
     origin = middle + (plane.height - middle @ plane.up - _ANKLE_M) * plane.up
@@ -148,8 +160,8 @@ def by_contacts(feet: np.ndarray, position: np.ndarray, stamp_ns: np.ndarray) ->
     return best
 
 
-def by_ground(up: np.ndarray, feet: np.ndarray, position: np.ndarray, points: np.ndarray) -> PathScale | None:
-    """The scale of a path (F, 3) at which feet (F, 2, 3) m from the camera stand on a plane of points (J, 4).
+def by_ground(up: np.ndarray, feet: np.ndarray, position: np.ndarray, points: np.ndarray) -> Level | None:
+    """The ground under a path (F, 3), of points (J, 4), and the scale at which feet (F, 2, 3) m from it stand there.
 
     The largest plane below the camera that is about level, as ``up`` (3,) tells; None = there is none.
     """
@@ -180,7 +192,8 @@ def by_ground(up: np.ndarray, feet: np.ndarray, position: np.ndarray, points: np
         return None
     log = np.log(standing[fits] / above[fits])
     spread = 1.48 * float(np.median(np.abs(log - np.median(log))))
-    return PathScale(float(np.exp(np.median(log))), max(_GROUND_SCALE_STD, 0.5 * spread))
+    scale = PathScale(float(np.exp(np.median(log))), max(_GROUND_SCALE_STD, 0.5 * spread))
+    return Level(normal[best], float(level[best]), scale)
 
 
 def body_up(joints: np.ndarray) -> tuple[np.ndarray, float]:

@@ -22,6 +22,8 @@ def telemetry_words(meta: Mapping[str, Any]) -> str:
     rejected = meta.get("telemetry_rejected")
     if isinstance(rejected, str):
         return f"Telemetry not used: {rejected}."
+    if isinstance(camera := meta.get("camera"), Mapping):
+        return _camera(camera)
     windows = meta.get("calibration")
     if not isinstance(windows, list) or not windows or not isinstance(windows[0], Mapping):
         return ""
@@ -29,6 +31,16 @@ def telemetry_words(meta: Mapping[str, Any]) -> str:
         return _calibrations(windows, meta.get("assumed_height_m"))
     except (KeyError, TypeError, ValueError, IndexError, ZeroDivisionError):
         return ""  # written by hand or by another version
+
+
+def _camera(camera: Mapping[str, Any]) -> str:
+    """The camera that the picture alone gave."""
+    words = f"Camera from the picture: {camera.get('words', 'unknown')}"
+    if "up_std_deg" in camera:
+        words += f"; up by {camera['up_words']}, to {camera['up_std_deg']:.1f} deg; metres by the assumed stature"
+    if camera.get("focal_std_px"):
+        words += f"; focal length {camera['focal_px']:.0f} +- {camera['focal_std_px']:.0f} px"
+    return f"{words}."
 
 
 def _calibrations(windows: list[Mapping[str, Any]], height_m: float | None) -> str:

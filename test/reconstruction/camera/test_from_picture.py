@@ -9,9 +9,10 @@ from fixed_points import MATRIX, SIZE, Scene, looking, orbit, points_of, seen, s
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.reconstruction.camera.from_picture import PictureCamera, camera_from_points
 from drocap_ros.reconstruction.camera.kinds import Kind
+from drocap_ros.reconstruction.common.threads import blas_threads
 
 FPS = 12.0
-FRAMES = 96
+FRAMES = 72
 
 
 def orbiting(flat: bool = False, points: int = 400) -> Scene:
@@ -21,7 +22,8 @@ def orbiting(flat: bool = False, points: int = 400) -> Scene:
 
 def camera_of(scene: Scene, matrix: np.ndarray | None = MATRIX, noise_px: float = 0.0) -> PictureCamera:
     point = scene.point + noise_px * np.random.default_rng(1).standard_normal(scene.point.shape)
-    return camera_from_points(scene.frame, scene.track, point, FPS, len(scene.rotation), SIZE, matrix)
+    with blas_threads(1):
+        return camera_from_points(scene.frame, scene.track, point, FPS, len(scene.rotation), SIZE, matrix)
 
 
 @pytest.mark.parametrize("flat", [False, True])

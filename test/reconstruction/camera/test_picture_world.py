@@ -1,0 +1,116 @@
+"""Motions in the world without telemetry: reconstruct with fixed points of the scene."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fixed_points import MATRIX, SIZE, looking, orbit, points_of, seen, shape_error
+from walking import make_walk
+
+from drocap_ros.background import Background
+from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.motion import Motion
+from drocap_ros.reconstruction.camera.upright import UpSource, set_upright
+from drocap_ros.reconstruction.reconstruct import reconstruct
+from drocap_ros.reconstruction.world.telemetry_words import telemetry_words
+from drocap_ros.skeleton import BODY_15
+from drocap_ros.tracks import Tracks
+
+FPS = 24.0
+FRAMES = 120
+
+
+def person() -> np.ndarray:
+    """(F, 15, 3) m, z up, on the ground z = 0, at one place."""
+    walk = make_walk(FRAMES)
+    joints = walk.in_camera @ walk.camera
+    return joints - [0.0, 0.0, joints[..., 2].min() - 0.07]
+
+
+def tracks(rotation: np.ndarray, position: np.ndarray, cut: bool = False) -> Tracks:
+    """The person and fixed points, as a camera without telemetry sees them."""
+    scene = seen(rotation, position, points_of(np.random.default_rng(5), 150), FPS)
+    noise = np.random.default_rng(3).normal(0.0, 0.3, scene.point.shape)
+    track = scene.track + 10**9 * (scene.frame >= FRAMES // 2) if cut else scene.track
+    joints = (person() - position[:, None]) @ np.swapaxes(rotation, 1, 2)
+    pixels = joints[..., :2] / joints[..., 2:] * np.diagonal(MATRIX)[:2] + MATRIX[:2, 2]
+    return Tracks(
+        keypoints=pixels + np.random.default_rng(4).normal(0.0, 1.0, pixels.shape),
+        joints=BODY_15.joints,
+        stamp_ns=np.round(np.arange(FRAMES) * 1e9 / FPS).astype(np.int64),
+        image_size=SIZE,
+        camera_matrix=MATRIX,
+        background=Background(
+            scene.frame.astype(np.int32), track.astype(np.int64), (scene.point + noise).astype(np.float32)
+        ),
+    )
+
+
+def tilt_deg(motion: Motion, rotation: np.ndarray) -> float:
+    """Angle of the motion's vertical from the true one, both as the camera sees them."""
+    return float(
+        np.degrees(np.arccos(np.clip((motion.camera_rotation[:, :, 2] * rotation[:, :, 2]).sum(-1), -1, 1))).max()
+    )
+
+
+def test_moving_camera_gives_a_world_that_is_upright_and_has_the_person_at_one_place() -> None:
+    rotation, position = orbit(FRAMES, FPS)
+    motion = reconstruct(tracks(rotation, position))
+    assert motion.frame == "world"
+    assert not motion.metric
+    assert motion.scale_source == "assumed_height"
+    assert tilt_deg(motion, rotation) < 2.0
+    assert shape_error(motion.camera_position, position) < 0.1
+    pelvis = motion.joints3d[:, 0]
+    assert np.linalg.norm(np.ptp(pelvis, axis=0)) < 0.5
+    assert motion.meta["camera"]["kind"] == "moves"
+    assert motion.meta["camera"]["up"] == "ground"
+    json.dumps(motion.meta, allow_nan=False)
+    assert "camera that moves" in telemetry_words(motion.meta)
+
+
+def test_camera_that_stands_still_gives_a_world_at_its_place() -> None:
+    rotation, position = (np.repeat(values, FRAMES, axis=0) for values in orbit(1, FPS))
+    motion = reconstruct(tracks(rotation, position))
+    assert motion.frame == "world"
+    assert motion.meta["camera"]["kind"] == "stands"
+    assert tilt_deg(motion, rotation) < 12.0
+    assert np.ptp(motion.camera_position, axis=0).max() < 0.1
+
+
+def test_cut_leaves_the_motion_in_camera_axes_and_is_named() -> None:
+    given = tracks(*orbit(FRAMES, FPS), cut=True)
+    motion = reconstruct(given)
+    assert motion.frame == "camera"
+    assert motion.meta["camera"]["kind"] == "cut"
+    assert "cut" in telemetry_words(motion.meta)
+    without = reconstruct(replace(given, background=None))
+    np.testing.assert_array_equal(motion.joints3d, without.joints3d)
+
+
+@pytest.mark.parametrize("unit", [0.05, 30.0])
+def test_unit_and_axes_of_a_path_do_not_matter_for_up_and_metres(unit: float) -> None:
+    rotation, position = orbit(FRAMES, FPS)
+    rng = np.random.default_rng(2)
+    turn, points = exp_so3(np.array([1.0, -0.5, 2.0])), points_of(rng, 300)
+    seen_joints = (person() - position[:, None]) @ np.swapaxes(rotation, 1, 2)
+    lying = np.column_stack([unit * points @ turn.T, np.ones(len(points))])
+    stamps = np.round(np.arange(FRAMES) * 1e9 / FPS).astype(np.int64)
+    found = set_upright(rotation @ turn.T, unit * position @ turn.T, lying, seen_joints, stamps)
+    assert found.source is UpSource.GROUND
+    assert np.degrees(np.arccos((found.rotation[:, :, 2] * rotation[:, :, 2]).sum(-1))).max() < 1.0
+    assert np.median(found.position[:, 2] / position[:, 2]) == pytest.approx(1.0, abs=0.1)
+    assert np.ptp(found.position[:, 0]) > 0.0
+
+
+def test_level_view_has_an_up() -> None:
+    position = np.stack([np.linspace(-2.0, 2.0, FRAMES), np.full(FRAMES, -6.0), np.full(FRAMES, 1.0)], axis=1)
+    rotation = looking(position, position + np.array([0.0, 1.0, 0.0]))
+    joints = (person() - position[:, None]) @ np.swapaxes(rotation, 1, 2)
+    stamps = np.round(np.arange(FRAMES) * 1e9 / FPS).astype(np.int64)
+    found = set_upright(rotation, position, np.zeros((0, 4)), joints, stamps)
+    assert found.source is not UpSource.GROUND
+    assert found.rotation[0, 1, 2] == pytest.approx(-1.0, abs=0.03)
