@@ -13,7 +13,7 @@ import numpy as np
 
 from drocap_ros.geometry.position_steps import without_steps
 from drocap_ros.geometry.rotations import exp_so3, log_so3, project_to_so3
-from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjust_path
+from drocap_ros.reconstruction.camera.path_adjustment import ENOUGH_POINTS, AdjustedPath, adjust_path
 from drocap_ros.reconstruction.camera.path_model import (
     ATTITUDE_LATENCY,
     KNOT,
@@ -28,7 +28,8 @@ from drocap_ros.reconstruction.common.windows import fade_weights, windows
 from drocap_ros.reconstruction.lifted.even_frames import even_slots
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 from drocap_ros.reconstruction.world.even_capture import at_all_slots, capture_parts
-from drocap_ros.reconstruction.world.refine import RefinedWorld
+from drocap_ros.reconstruction.world.refine import RefinedWorld, refinable
+from drocap_ros.reconstruction.world.telemetry_checks import frozen, turned_at_once
 from drocap_ros.reconstruction.world.world_model import WorldConfig
 from drocap_ros.reconstruction.world.world_residuals import WANDER_S
 from drocap_ros.tracks import Tracks
@@ -49,6 +50,9 @@ _OTHER = 1.5
 _LEAST_COVERED = 0.5
 #: Median residual (px per 1000 px of focal length) above which no camera's path explains the points.
 _LARGEST_RESIDUAL = 3.0
+#: Weight of an observation that fits, and the share of a frame's points with it, below which most lie elsewhere.
+_FITS = 0.25
+_FEW = 0.25
 #: Latency (s) from which the reports are shifted, and the largest share of it that its standard deviation may be.
 _LONG_S = 0.02
 _SURE = 0.2
@@ -82,15 +86,8 @@ def fuse_telemetry(tracks: Tracks, config: WorldConfig) -> FusedTelemetry | Refu
 
     A refusal where no camera's path near the telemetry explains the points.
     """
-    rotation, position, matrix, points = (
-        tracks.camera_rotation,
-        tracks.camera_position,
-        tracks.camera_matrix,
-        tracks.background,
-    )
-    if rotation is None or position is None or matrix is None or points is None:
-        return None
-    if not (np.isfinite(rotation).all() and np.isfinite(position).all()):
+    rotation, position, points = tracks.camera_rotation, tracks.camera_position, tracks.background
+    if points is None or rotation is None or position is None or not refinable(tracks):
         return None
     slot, fps = even_slots(tracks.stamp_ns)
     origin = position.mean(axis=0)
@@ -99,22 +96,19 @@ def fuse_telemetry(tracks: Tracks, config: WorldConfig) -> FusedTelemetry | Refu
     faded = _Faded(len(turn))
     best: tuple[AdjustedPath, CameraTelemetry] | None = None
     for part in capture_parts(tracks.stamp_ns, slot):
+        # Points that contradict a part of a path lose their weight there: it would stay as reported.
+        if refusal := frozen(turn[part], path[part], fps) or turned_at_once(turn[part], fps):
+            return refusal
         for inside in windows(part.stop - part.start, _WINDOW, _OVERLAP):
             rows = slice(part.start + inside.start, part.start + inside.stop)
             given = CameraTelemetry(turn[rows], path[rows], fps)
-            of_part = (slot[points.frame] >= rows.start) & (slot[points.frame] < rows.stop)
-            frame = slot[points.frame[of_part]] - rows.start
-            views = views_of(frame, points.track[of_part], points.point[of_part], given.frames, fps)
-            found = _adjusted(given, matrix, views, config)
-            if found is None:
-                return None
+            found = _of_window(given, tracks, slot, rows.start, config)
+            if isinstance(found, Refusal) or found is None:
+                return found
             faded.add(rows, fade_weights(inside, part.stop - part.start, _OVERLAP), given, found)
             if best is None or given.frames > best[1].frames:
                 best = found, given
-    if best is None or best[0].covered < _LEAST_COVERED:
-        return None
-    if best[0].residual_px > _LARGEST_RESIDUAL * 1e-3 * float(matrix[0, 0]):
-        return Refusal(Why.POINTS_MOVE_OTHERWISE, best[0].residual_px)
+    assert best is not None  # a recording has a part, and it has a window
     change, covariance, steps = faded.mean()
     measured = _measured(*best)
     if measured["background"]["position_wander_m"] > _UNCORRECTED * config.position_wander_m:
@@ -127,6 +121,24 @@ def fuse_telemetry(tracks: Tracks, config: WorldConfig) -> FusedTelemetry | Refu
         camera_position=(path + change[:, :3])[slot] + origin,
     )
     return FusedTelemetry(corrected, covariance[slot], _left(config, steps), measured)
+
+
+def _of_window(
+    given: CameraTelemetry, tracks: Tracks, slot: np.ndarray, begin: int, config: WorldConfig
+) -> AdjustedPath | Refusal | None:
+    """The path of the slots from ``begin`` on; None = its points are too few."""
+    points, matrix = tracks.background, tracks.camera_matrix
+    assert points is not None
+    assert matrix is not None
+    frame = slot[points.frame] - begin
+    inside = (frame >= 0) & (frame < given.frames)
+    views = views_of(frame[inside], points.track[inside], points.point[inside], given.frames, given.fps)
+    found = _adjusted(given, matrix, views, config)
+    if found is None or found.covered < _LEAST_COVERED:
+        return None
+    if found.residual_px > _LARGEST_RESIDUAL * 1e-3 * float(matrix[0, 0]):
+        return Refusal(Why.POINTS_MOVE_OTHERWISE, found.residual_px)
+    return found
 
 
 def _adjusted(given: CameraTelemetry, matrix: np.ndarray, views: Views, config: WorldConfig) -> AdjustedPath | None:
@@ -270,10 +282,18 @@ def _measured(found: AdjustedPath, given: CameraTelemetry) -> dict[str, Any]:
             "tracks": len(found.views.track),
             "residual_px": found.residual_px,
             "covered_share": found.covered,
+            "contradicted_share": _contradicted(found),
             "position_wander_m": wander[0],
             "attitude_wander_deg": wander[1],
         },
     }
+
+
+def _contradicted(found: AdjustedPath) -> float:
+    """Share of the frames whose points lie elsewhere than the corrected path sees most of them."""
+    frame, frames = found.views.frame, len(found.rotation)
+    seen, fit = np.bincount(frame, minlength=frames), np.bincount(frame, found.weight > _FITS, minlength=frames)
+    return float(((seen >= ENOUGH_POINTS) & (fit < _FEW * seen)).mean())
 
 
 def with_fusion(refined: RefinedWorld, fused: FusedTelemetry) -> RefinedWorld:

@@ -15,6 +15,8 @@ _UNLIKELY = 3.0
 #: Wander of the reported position (m) and attitude (degrees) that is stated: twice that of good telemetry.
 _WANDER_M = 0.1
 _WANDER_DEG = 0.2
+#: Share of the time in which points contradict the path that is stated.
+_CONTRADICTED = 0.02
 
 
 def telemetry_words(meta: Mapping[str, Any]) -> str:
@@ -84,6 +86,8 @@ def _points(windows: list[Mapping[str, Any]]) -> str:
         )
         if seen[key] > least
     ]
+    if (share := seen.get("contradicted_share", 0.0)) > _CONTRADICTED:
+        words += f"; for {100 * share:.0f} % of the time most lie elsewhere: they move, or the log is wrong there"
     return words + (f"; against them the reported pose wanders, {' and '.join(wander)}" if wander else "")
 
 
