@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drocap_ros.background import Background
+from drocap_ros.background import Background, FixedPoints, of_images
 from drocap_ros.clip import Clip
 from drocap_ros.errors import InputError
 from drocap_ros.skeleton import BODY_15
@@ -100,3 +100,23 @@ def test_estimates_of_other_tools_in_a_tracks_file_are_accepted(tmp_path):
     more = {"evidence": np.zeros((FRAMES, 15, 3)), "evidence_sigma": np.ones((FRAMES, 15))}
     np.savez(tmp_path / "t.npz", **np.load(tmp_path / "t.npz"), **more)
     assert len(load_tracks(tmp_path / "t.npz")) == FRAMES
+
+
+def images_of(counts):
+    return [None if n is None else FixedPoints(np.arange(n), np.full((n, 2), 5.0, np.float32)) for n in counts]
+
+
+def test_points_of_images_are_rows_of_their_frames():
+    background = of_images(images_of([2, None, 0, 3]))
+    assert background.frame.tolist() == [0, 0, 3, 3, 3]
+    assert background.track.tolist() == [0, 1, 0, 1, 2]
+    assert background.point.shape == (5, 2)
+    assert of_images(images_of([None, None])) is None
+    assert len(of_images(images_of([0, 0]))) == 0
+
+
+@pytest.mark.parametrize(("most", "frames"), [(120, range(12)), (119, range(0, 12, 2)), (31, range(0, 12, 4))])
+def test_a_long_recording_keeps_the_points_of_some_images(most, frames):
+    background = of_images(images_of([10] * 12), most)
+    assert sorted(set(background.frame.tolist())) == list(frames)
+    assert len(background) == 10 * len(frames) <= most
