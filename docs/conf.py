@@ -72,9 +72,11 @@ def _toctree(caption: str, pages: list[str]) -> str:
 def add_menu(_: Sphinx, page: str, source: list[str]) -> None:
     """The menu is no part of the pages: a reader of the repository would see its source."""
     if page == root_doc:
-        source[0] += _toctree("Start", ["/README"])
+        source[0] += _toctree("Start", ["Overview </README>"])
         source[0] += "".join(_toctree(name, pages.split()) for name, pages in MENU.items())
-        source[0] += _toctree("Develop", ["/ARCHITECTURE", "/CONTRIBUTING", "/CHANGELOG", "/autoapi/drocap_ros/index"])
+        source[0] += _toctree(
+            "Develop", ["/ARCHITECTURE", "/CONTRIBUTING", "/CHANGELOG", "Reference </autoapi/drocap_ros/index>"]
+        )
     elif page == "docs/figures/README":
         names = sorted(path.stem for path in (ROOT / "docs" / "figures").glob("*.md") if path.stem != "README")
         source[0] += _toctree("Figures", names)
@@ -104,7 +106,7 @@ def list_fields(_: Sphinx, *event: object) -> None:
             in_list = True
         else:
             in_list = in_list and bool(line.strip())
-            out.append(f"  {line}" if in_list else line)
+            out.append(f"  {line.strip()}" if in_list else line)
     lines[:] = out
 
 
