@@ -90,9 +90,11 @@ def with_camera(
     seen = place_in_world(in_camera_axes(poses, per_px), projected, per_px, still).joints
     upright = set_upright(camera.rotation, camera.position, camera.points, seen, tracks.stamp_ns)
     world = replace(tracks, camera_rotation=upright.rotation, camera_position=upright.position)
+    # What feet have measured the adjustment measures better, from the same feet: no prior counts them twice.
+    scale_std = _SCALE_STD if upright.feet_tell else min(upright.scale_std, _SCALE_STD)
     config = replace(
         config,
-        stature_std=min(upright.scale_std, _SCALE_STD) if np.isfinite(upright.scale_std) else config.stature_std,
+        stature_std=scale_std if np.isfinite(upright.scale_std) else config.stature_std,
         tilt_error_deg=_TURNED_DEG,
         yaw_error_deg=_TURNED_DEG,
         latency_std_s=_LATENCY_S,

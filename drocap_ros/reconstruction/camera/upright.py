@@ -21,6 +21,8 @@ _OCTAVES = 6
 #: Share of feet that rest below which contacts give no scale, and its errors over its formal deviation.
 _LEAST_SUPPORT = 0.1
 _CONTACT_STDS = 3.0
+#: Deviation of the scale below which contacts measure it.
+_FEET_TELL = 0.05
 #: Planes through three points that are tried, and distance of a point on one over the camera's height above it.
 _PLANES = 1000
 _ON_PLANE = 0.03
@@ -64,6 +66,7 @@ class Upright(NamedTuple):
     """A path in metres, z up, the floor at z = 0: rotation (F, 3, 3) world -> camera, position (F, 3) m.
 
     source, std_deg : of up; scale_std : of the logarithm of the path's scale, NaN = the camera keeps its place
+    feet_tell : resting feet measured it
     points : (J, 4) x y z m, w
     """
 
@@ -72,6 +75,7 @@ class Upright(NamedTuple):
     source: UpSource
     std_deg: float
     scale_std: float
+    feet_tell: bool
     points: np.ndarray
 
 
@@ -112,10 +116,12 @@ def set_upright(
     from_camera = seen @ rotation
     up, std_deg = body_up(from_camera)
     feet = from_camera[:, ANKLES]
-    factor, factor_std, level = 1.0, float("nan"), None
+    factor, factor_std, level, feet_tell = 1.0, float("nan"), None, False
     if np.ptp(position, axis=0).any():
         level = by_ground(up, feet, position, points)
-        found = [None if level is None else level.scale, by_contacts(feet, position, stamp_ns)]
+        contacts = by_contacts(feet, position, stamp_ns)
+        feet_tell = contacts is not None and contacts.std < _FEET_TELL
+        found = [None if level is None else level.scale, contacts]
         factor, factor_std = _together([scale for scale in found if scale is not None])
     path, lying = factor * position, points * np.array([factor] * 3 + [1.0])
     feet = path[:, None] + feet
@@ -134,7 +140,7 @@ def set_upright(
     moved = lying.copy()
     moved[:, :3] = (lying[:, :3] - lying[:, 3:] * origin) @ turn.T
     std = max(np.degrees(np.sqrt(0.5 * np.trace(plane.covariance))), _LEAST_STD_DEG)
-    return Upright(rotation @ turn.T, (path - origin) @ turn.T, source, float(std), factor_std, moved)
+    return Upright(rotation @ turn.T, (path - origin) @ turn.T, source, float(std), factor_std, feet_tell, moved)
 
 
 def _together(found: list[PathScale]) -> PathScale:
