@@ -10,6 +10,7 @@ import argparse
 
 from figures import table, write_figures
 
+from lab.flights.branches import over_processes
 from lab.flights.fault_flight import (
     EXCURSION_M,
     MOTION_S,
@@ -49,12 +50,25 @@ def row(fault: Fault, autopilot: str, result: FaultResult) -> list[str]:
     ]  # fmt: skip
 
 
+def flown(case: tuple[str, int, int]) -> list[str]:
+    """Cells of the worst flight of a case: its dialect, its number in the table, how many flights."""
+    autopilot, number, seeds = case
+    fault = FAULTS[number]
+    try:
+        results = [fly_fault(fault, autopilot, 4 + i) for i in range(seeds)]
+    except AssertionError as error:  # the flight did not come to where the fault begins
+        return ["-", autopilot, fault.name, *[""] * 6, f"NOT FLOWN: {error}"]
+    rows = [row(fault, autopilot, result) for result in results]
+    return rows[max(range(seeds), key=lambda i: ("+hc-".index(rows[i][0]), results[i].excursion_m))]
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("words", nargs="*", help="only cases whose names hold one of these; or `processes`")
     parser.add_argument("--seeds", type=int, default=1, help="flights of each case; the worst is printed")
     parser.add_argument("--part", default="1/1", metavar="I/N", help="only the I-th of N parts of the cases")
     parser.add_argument("--autopilot", choices=("ardupilot", "px4"))
+    parser.add_argument("--jobs", type=int, default=1, help="processes at a time")
     args = parser.parse_args()
     if args.words == ["processes"]:
         from flight_processes import main as fly_processes
@@ -62,19 +76,15 @@ def main() -> int:
         return fly_processes()
     worst: list[list[str]] = []
     part, parts = (int(number) for number in args.part.split("/"))
-    for autopilot in (args.autopilot,) if args.autopilot else ("ardupilot", "px4"):
-        for fault in FAULTS[part - 1 :: parts]:
-            if args.words and not any(word in fault.name for word in args.words):
-                continue
-            try:
-                results = [fly_fault(fault, autopilot, 4 + i) for i in range(args.seeds)]
-            except AssertionError as error:  # the flight did not come to where the fault begins
-                worst.append(["-", autopilot, fault.name, *[""] * 6, f"NOT FLOWN: {error}"])
-                print("  ".join(worst[-1]), flush=True)
-                continue
-            rows = [row(fault, autopilot, result) for result in results]
-            worst.append(rows[max(range(args.seeds), key=lambda i: ("+hc-".index(rows[i][0]), results[i].excursion_m))])
-            print("  ".join(worst[-1]), flush=True)
+    cases = [
+        (autopilot, number, args.seeds)
+        for autopilot in ((args.autopilot,) if args.autopilot else ("ardupilot", "px4"))
+        for number in range(part - 1, len(FAULTS), parts)
+        if not args.words or any(word in FAULTS[number].name for word in args.words)
+    ]
+    for cells in over_processes(flown, cases, args.jobs):
+        worst.append(cells)
+        print("  ".join(cells), flush=True)
     counts = {mark: sum(cells[0] == mark for cells in worst) for mark in "+ch-"}
     summary = (
         f"{len(worst)} cases, {args.seeds} flight(s) each, the worst of each: {counts['+']} within {MOTION_S:g} s and"

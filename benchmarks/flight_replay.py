@@ -11,9 +11,15 @@ from pathlib import Path
 import numpy as np
 from figures import ROOT, table, write_figures
 
+from drocap_ros.flight.autopilot import autopilot_of
+from drocap_ros.flight.vehicle_filter import VehicleFilter
 from lab.flights.replay import WIND_M_S, Case, RecordedFlight, load_recorded, recorded_cases, replay
 
 HEAD = ["recording", "autopilot", "from, s", "off after 1, 2, 3 s, m", "most, m", "went, simulated, m", "recorded, m"]
+REPORTED = [
+    "recording", "setpoints for, s", "reports doubted now", "position reported, off by m", "believed",
+    "velocity reported, off by m/s", "believed",
+]  # fmt: skip
 BOUND_M = 0.3
 #: Whole orbits, from their setpoints alone: wind, and from when on they are flown freely.
 ORBITS, FREE_FROM_S = {"orbit_standing_wind_8": WIND_M_S}, 6.0
@@ -25,9 +31,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default=ROOT.parent / "shared" / "flight")
     args = parser.parse_args()
-    rows, greatest, orbits, moves = [], [], [], []
+    rows, greatest, orbits, moves, reports = [], [], [], [], []
     for path in sorted(args.folder.glob("*.npz")):
-        flight, autopilot = load_recorded(path), "px4" if path.name.startswith("px4") else "ardupilot"
+        flight, autopilot = load_recorded(path), "px4" if "px4" in path.stem else "ardupilot"
+        if path.stem.startswith("t3_"):
+            reports.append(reported(path, autopilot))
+            continue
         if path.stem in ORBITS:
             orbits.append(whole_orbit(flight, path.stem, autopilot))
         if autopilot == "px4" and not any(word in path.stem for word in ("stand", "walk", "stick", "rtl")):
@@ -57,10 +66,40 @@ def main() -> int:
         ]  # fmt: skip
     summary = "\n".join(lines)
     print(summary)
+    answers = f"Reports of recorded flights into the bridge's filter of them:\n\n{table(REPORTED, reports)}"
     write_figures(
-        "flight_replay", "Recorded flights against the simulated vehicle", f"{summary}\n\n{table(HEAD, rows)}"
+        "flight_replay",
+        "Recorded flights against the simulated vehicle",
+        f"{summary}\n\n{table(HEAD, rows)}\n{answers}",
     )
     return 0
+
+
+def reported(path: Path, autopilot: str) -> list[str]:
+    """Cells of a flight whose reports are recorded: the orbit then, the answers to the same reports now."""
+    with np.load(path) as data:
+        flight = {name: np.asarray(data[name], float) for name in data.files}
+    times, places, speeds = (flight[f"reported_{name}"] for name in ("time_s", "position_m", "velocity_m_s"))
+    true, moved = (
+        np.stack([np.interp(times, flight["time_s"], flight[name][:, i]) for i in range(3)], axis=1)
+        for name in ("position_m", "velocity_m_s")
+    )
+    own, believed, doubts = VehicleFilter(autopilot_of(autopilot).velocity_sd_m_s), [], []
+    for t, place, speed in zip(times, places, speeds, strict=True):
+        doubts.append(own.take(t, place, speed))
+        believed.append((own.position, own.velocity))
+    found, velocities = np.array(believed).transpose(1, 0, 2)
+
+    def off(value: np.ndarray, truth: np.ndarray) -> str:
+        error = (value - truth)[len(times) // 4 :, :2]  # the filter has begun; a constant difference of maps is none
+        return f"{np.sqrt(((error - error.mean(axis=0)) ** 2).sum(axis=1).mean()):.2f}"
+
+    setpoints = flight.get("setpoint_time_s", np.zeros(0))
+    flown = f"{np.ptp(setpoints):.0f}" if len(setpoints) else "-"
+    doubted = sum(any(doubt) for doubt in doubts)
+    return [
+        path.stem, flown, str(doubted), off(places, true), off(found, true), off(speeds, moved), off(velocities, moved)
+    ]  # fmt: skip
 
 
 def whole_orbit(flight: RecordedFlight, name: str, autopilot: str) -> str:

@@ -240,7 +240,7 @@ _PILOT = (
         "pilot takes over during a hold", _LOSE_SUBJECT, FRAME_S, cause=PILOT, codes=_TAKEN,
         later=(TAKEN_S, _TO_POSITION),
     ),
-    _in_state("pilot takes control while idle", _TO_CONTROL, State.IDLE, (0.0, _LOSE_SUBJECT), codes=_LOCATED),
+    _in_state("pilot takes control while idle", _TO_CONTROL, State.IDLE, (0.0, _LOSE_SUBJECT), codes=(_C.NO_SUBJECT,)),
     _in_state("pilot takes position while ready", _TO_POSITION, State.READY, codes=()),
     _in_state(
         "pilot takes position while engaging", _TO_POSITION, State.READY, (0.0, _DENY_CONTROL),
