@@ -60,7 +60,7 @@ def in_world(
     if tracks.camera_position is not None and whole:
         tracks = replace(tracks, camera_position=without_steps(tracks.camera_position, tracks.stamp_ns))
     placed = place_in_world(in_camera_axes(poses, per_px), projected, per_px, tracks)
-    refusal = None if sigma is None else upside_down(placed.joints, rotation)
+    refusal = upside_down(placed.joints, rotation) if sigma is not None and config.checks else None
     if refusal or sigma is None or not whole or not np.isfinite(placed.joints).all():
         return WorldResult(placed, refusal=refusal)
     size = per_px[:, None]
