@@ -21,6 +21,8 @@ _OCTAVES = 6
 #: Share of feet that rest below which contacts give no scale, and its errors over its formal deviation.
 _LEAST_SUPPORT = 0.1
 _CONTACT_STDS = 3.0
+#: Deviation of the logarithm of a scale that is guessed: a factor of two.
+_GUESS_STD = 0.7
 #: Deviation of the scale below which contacts measure it.
 _FEET_TELL = 0.05
 #: Planes through three points that are tried, and distance of a point on one over the camera's height above it.
@@ -122,7 +124,9 @@ def set_upright(
         contacts = by_contacts(feet, position, stamp_ns)
         feet_tell = contacts is not None and contacts.std < _FEET_TELL
         found = [None if level is None else level.scale, contacts]
-        factor, factor_std = _together([scale for scale in found if scale is not None])
+        factor, factor_std = _together(
+            [scale for scale in found if scale is not None] or [_guess(feet, position, points)]
+        )
     path, lying = factor * position, points * np.array([factor] * 3 + [1.0])
     feet = path[:, None] + feet
     plane, source = _Plane(up, 0.0, np.deg2rad(std_deg) ** 2 * np.eye(2)), UpSource.BODY
@@ -144,12 +148,18 @@ def set_upright(
 
 
 def _together(found: list[PathScale]) -> PathScale:
-    """Scales as one, by their deviations; the unit of the path where there is none."""
-    if not found:
-        return PathScale(1.0, float("inf"))
+    """Scales as one, by their deviations."""
     weight = np.array([scale.std**-2 for scale in found])
     log = np.log([scale.factor for scale in found])
     return PathScale(float(np.exp(weight @ log / weight.sum())), float(weight.sum() ** -0.5))
+
+
+def _guess(feet: np.ndarray, position: np.ndarray, points: np.ndarray) -> PathScale:
+    """The scale at which points (J, 4) are about as far as feet (F, 2, 3) m from the camera (F, 3): over water, say."""
+    near = np.abs(points[:, 3]) > 1e-9
+    away = np.linalg.norm(points[near, :3] / points[near, 3:] - position.mean(axis=0), axis=1)
+    factor = float(np.median(np.linalg.norm(feet, axis=-1))) / float(np.median(away)) if near.any() else 1.0
+    return PathScale(factor, _GUESS_STD)
 
 
 def by_contacts(feet: np.ndarray, position: np.ndarray, stamp_ns: np.ndarray) -> PathScale | None:

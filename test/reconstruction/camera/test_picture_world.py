@@ -114,3 +114,13 @@ def test_level_view_has_an_up() -> None:
     found = set_upright(rotation, position, np.zeros((0, 4)), joints, stamps)
     assert found.source is not UpSource.GROUND
     assert found.rotation[0, 1, 2] == pytest.approx(-1.0, abs=0.03)
+
+
+def test_scale_is_a_guess_where_neither_ground_nor_feet_tell_it() -> None:
+    rotation, position = orbit(FRAMES, FPS)
+    joints = (person() - position[:, None]) @ np.swapaxes(rotation, 1, 2)
+    far = np.column_stack([np.random.default_rng(2).normal(0.0, 0.3, (15, 3)), np.ones(15)])
+    stamps = np.round(np.arange(FRAMES) * 1e9 / FPS).astype(np.int64)
+    found = set_upright(rotation, 0.1 * position, far, joints, stamps)
+    assert found.scale_std > 0.5
+    assert not found.feet_tell
