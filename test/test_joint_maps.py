@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.joint_maps import TABLES, joint_map
+from drocap_ros.joint_maps import SHOULDERS_OUTWARDS, TABLES, joint_map
 from drocap_ros.skeleton import BODY_15, BODY_19, LIMB_JOINTS, joint_set
 
 
@@ -44,6 +44,8 @@ def test_every_set_maps_an_upright_person_to_the_same_joints(name):
 
     s = joint_set(name)
     xy = np.array([place(j) for j in s.joints], float)
+    if name in ("coco17", "halpe26", "wholebody133"):  # their annotators draw shoulders inside the joints' centres
+        xy[[s.index("left_shoulder"), s.index("right_shoulder")], 0] /= SHOULDERS_OUTWARDS
     table = joint_map(name)
     out, covariance, confidence = table.apply(xy, np.ones((len(s), 3)), np.ones(len(s)), 1700.0)
     assert table.joints is (BODY_19 if name in ("halpe26", "wholebody133") else BODY_15)
@@ -65,6 +67,27 @@ def test_a_joint_without_one_of_its_parts_is_unknown():
     assert np.isfinite(np.delete(out, lost, 0)).all()
 
 
+def test_drawn_shoulders_move_apart_about_their_middle_with_a_variance_along_their_line():
+    s, table = joint_set("coco17"), joint_map("coco17")
+    drawn, own = [s.index("left_shoulder"), s.index("right_shoulder")], [9, 12]
+    xy, covariance = np.ones((17, 2)), np.tile([4.0, 0.0, 4.0], (17, 1))
+    xy[drawn] = (80.0, 10.0), (20.0, 10.0)
+    out, out_covariance, _ = table.apply(xy, covariance, np.ones(17), 100.0)
+    assert [BODY_15.joints[i] for i in own] == ["lshoulder", "rshoulder"]
+    np.testing.assert_allclose(out[own].mean(axis=0), xy[drawn].mean(axis=0))
+    np.testing.assert_allclose(out[own[0]] - out[own[1]], SHOULDERS_OUTWARDS * (xy[drawn[0]] - xy[drawn[1]]))
+    assert (out_covariance[own, 0] > out_covariance[own, 2] + 1.0).all()
+    xy[drawn[1]] = np.nan
+    alone, _, confidence = table.apply(xy, covariance, np.ones(17), 100.0)
+    np.testing.assert_array_equal(alone[own[0]], xy[drawn[0]])
+    assert confidence[own[0]] == 1.0
+
+
+def test_shoulders_of_networks_that_learned_joint_centres_stay():
+    for name in ("body15", "body17", "body19", "h36m17"):
+        assert not joint_map(name).outwards.any()
+
+
 def test_extrapolated_joints_have_more_variance_and_less_confidence():
     rng = np.random.default_rng(0)
     table = joint_map("coco17")
@@ -73,7 +96,7 @@ def test_extrapolated_joints_have_more_variance_and_less_confidence():
     outs = np.array([table.apply(x, np.tile([4.0, 0, 4.0], (17, 1)), np.full(17, 0.9), 100.0)[0] for x in noisy])
     _, covariance, confidence = table.apply(true, np.tile([4.0, 0, 4.0], (17, 1)), np.full(17, 0.9), 100.0)
     sampled = outs.var(axis=0)
-    limbs = [BODY_15.index(j) for j in (*LIMB_JOINTS, "pelvis")]
+    limbs = [BODY_15.index(j) for j in (*LIMB_JOINTS, "pelvis") if "shoulder" not in j]
     np.testing.assert_allclose(covariance[limbs][:, [0, 2]], sampled[limbs], rtol=0.15)
     head = BODY_15.index("head")
     assert covariance[head, 0] > sampled[head, 0]  # the lean of the head comes on top
