@@ -4,6 +4,8 @@ rotation     every method at four orbit speeds, clean and noisy 2D (`drocap eval
 live         the live method beside the offline one, clean and noisy 2D: page accuracy_live
 live-world   the live method in the world beside the offline one, every third sequence: page accuracy_live_world
 perspective  the default method with a camera 6 m and 10 m away, lens known and unknown: page accuracy_perspective
+near         cameras from 3.3 m on, exact 2D; lens, rotation and position known or not, the lens assumed; the
+             camera pitched, rolled and turned aside: page accuracy_near
 world        placement and scale from telemetry, on simulated captures: page accuracy_world
 telemetry    the motion in the world by telemetry that errs (`drocap evaluate world`), every third sequence: page
              accuracy_telemetry
@@ -47,6 +49,7 @@ from lab.studies.calibration import calibration_markdown, calibration_study
 from lab.studies.live_study import live_study
 from lab.studies.live_study_table import live_markdown
 from lab.studies.live_world import live_world_markdown, live_world_study
+from lab.studies.near_camera import DISTANCES_M, NearCamera, error_mm, known, without_camera
 
 SPEED_DEG_S = 25.0
 SOLUTION_DELAY_S = 0.5
@@ -115,6 +118,34 @@ def perspective(args: argparse.Namespace) -> None:
     write_figures("accuracy_perspective", "Accuracy with a camera nearby", text + table(head, rows))
 
 
+def near(args: argparse.Namespace) -> None:
+    """Errors by distance and knowledge, and of cameras that are rolled, pitched and turned aside."""
+    sequences = protocol_sequences(args.mocap, limit=args.limit)[::2]
+    cases = [
+        (
+            ", ".join(name for name, use in zip(("lens", "rotation", "position"), case, strict=True) if use)
+            or "nothing",
+            case,
+        )
+        for case in ((False,) * 3, (True, False, False), (False, True, False), (True, True, False), (True,) * 3)
+    ]
+    rows = []
+    for camera in (
+        *(NearCamera(distance, speed) for distance in DISTANCES_M for speed in (0.0, SPEED_DEG_S)),
+        *(NearCamera(DISTANCES_M[0], **{name: deg}) for name, deg in (("roll_deg", 26.0), ("pitch_deg", 40.0))),
+        NearCamera(DISTANCES_M[0], aside_deg=20.0),
+    ):
+        found = [
+            error_mm(sequences, camera, lambda tracks, c=case: known(tracks, lens=c[0], rotation=c[1], position=c[2]))
+            for _, case in cases
+        ]
+        real = error_mm(sequences, camera, lambda tracks: replace(without_camera(tracks), real_lens=True))
+        rows.append([str(camera), *(f"{error:.1f}" for error in (*found, real))])
+    text = f"Error in mm, mean over {len(sequences)} sequences, by what is known of the camera.\n\n"
+    head = ["camera", *(name for name, _ in cases), "lens assumed"]
+    write_figures("accuracy_near", "Near cameras", text + table(head, rows))
+
+
 def world(args: argparse.Namespace) -> None:
     """Error of the pelvis in the world, of the limbs' length, and W-MPJPE; a row per capture."""
     rows = []
@@ -159,8 +190,8 @@ def calibration(args: argparse.Namespace) -> None:
 
 
 PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
-    "rotation": rotation, "live": live, "live-world": live_world, "perspective": perspective, "world": world,
-    "telemetry": telemetry, "calibration": calibration,
+    "rotation": rotation, "live": live, "live-world": live_world, "perspective": perspective, "near": near,
+    "world": world, "telemetry": telemetry, "calibration": calibration,
 }  # fmt: skip
 
 

@@ -45,6 +45,8 @@ def recorded_config(session: Session) -> DrocapConfig | None:
             known = {field.name for field in dataclasses.fields(config.section(name))}
             if retired := sorted(f"{name}.{key}={values[key]}" for key in values.keys() - known):
                 session.warn(f"recorded parameters that this version does not have are ignored: {', '.join(retired)}")
+            if name == "bundle_adjuster":  # before there was one, no lens was assumed
+                values = {"assumed_focal": 0.0, **values}
             config = config.replace(name, **{key: values[key] for key in values.keys() & known})
     except (InputError, yaml.YAMLError, AttributeError) as error:
         session.warn(f"the recorded configuration cannot be used ({error}); the given one is used")
@@ -186,6 +188,7 @@ def _tracks(stamps: list[int], frames: list[_Frame], matrix: np.ndarray | None) 
         camera_rotation=rotation,
         camera_position=position,
         camera_matrix=matrix,
+        real_lens=True,
     )
 
 

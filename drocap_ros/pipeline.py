@@ -27,7 +27,7 @@ from drocap_ros.recording.image_messages import choose_images
 from drocap_ros.recording.open_session import is_recording, open_session
 from drocap_ros.recording.session import POSE2D, Session
 from drocap_ros.recording.session_tracks import read_pose2d, with_recorded_camera
-from drocap_ros.recording.video_telemetry import NO_TELEMETRY, Telemetry, read_video_telemetry, with_telemetry
+from drocap_ros.recording.video_telemetry import NO_TELEMETRY, Telemetry, read_video_telemetry, with_attitude, with_telemetry
 from drocap_ros.tracks import Tracks, load_tracks
 
 logger = logging.getLogger(__name__)
@@ -93,6 +93,7 @@ def reconstruct_input(
     tracks, origin = read_input(Path(path), config, models, progress, telemetry, selection)
     if log is not None:
         tracks, origin["telemetry"] = with_telemetry(Path(path), tracks, telemetry, log, config.image_ingest, progress)
+    tracks = with_attitude(tracks, telemetry.attitude_deg)
     if selection.rate_hz:
         tracks = tracks.at_rate(selection.rate_hz)
     seconds = time.perf_counter() - begin

@@ -43,6 +43,7 @@ class Tracks:
     camera_position : (F, 3) m ENU, or None
     camera_matrix : (3, 3) px, or None
     background : fixed points of the scene in the images, or None
+    real_lens : whether pictures of a lens were measured: one may be assumed where ``camera_matrix`` is None
     """
 
     keypoints: np.ndarray
@@ -55,6 +56,7 @@ class Tracks:
     camera_position: np.ndarray | None = None
     camera_matrix: np.ndarray | None = None
     background: Background | None = None
+    real_lens: bool = False
 
     def __post_init__(self) -> None:
         _check(self)
@@ -179,6 +181,8 @@ def check_camera_matrix(matrix: np.ndarray, size: tuple[int, int]) -> None:
 
 
 _REQUIRED = ("keypoints", "joints", "stamp_ns", "image_size")
+#: Array ``lens`` of a file: whether ``camera_matrix`` is the lens, or one may be assumed; without it nothing is known.
+_LENSES = (_ASSUMED, _GIVEN) = ("assumed", "given")
 _OPTIONAL = ("confidence", "covariance", "camera_rotation", "camera_position", "camera_matrix")
 
 
@@ -272,6 +276,7 @@ def load_tracks(path: str | Path) -> Tracks:
             stamp_ns=as_stamps(arrays["stamp_ns"]),
             image_size=(int(size[0]), int(size[1])),
             background=read_background(arrays),
+            real_lens=str(arrays.get("lens", "")) in _LENSES,
             **more,
         )
     except (InputError, ValueError) as error:
@@ -304,6 +309,8 @@ def save_tracks(path: str | Path, tracks: Tracks) -> None:
     arrays = {name: getattr(tracks, name) for name in _OPTIONAL if getattr(tracks, name) is not None}
     if tracks.background is not None:
         arrays |= tracks.background.arrays()
+    if tracks.real_lens:
+        arrays["lens"] = np.array(_ASSUMED if tracks.camera_matrix is None else _GIVEN)
     np.savez_compressed(
         path,
         keypoints=tracks.keypoints,

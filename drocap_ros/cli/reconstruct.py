@@ -85,6 +85,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="pitch of a camera fixed to a vehicle without a gimbal, negative looks down; for telemetry, or a session,"
         " without the camera's attitude",
     )
+    for axis, sense in (("pitch", "negative looks down"), ("roll", "positive is clockwise")):
+        parser.add_argument(
+            f"--camera-{axis}",
+            metavar="DEG",
+            type=float,
+            help=f"{axis} of a camera that stands still, where no telemetry says it: {sense} (default: 0 beside the"
+            " other)",
+        )
     parser.add_argument(
         "--rate",
         metavar="HZ",
@@ -183,7 +191,16 @@ def _telemetry(args: argparse.Namespace) -> Telemetry:
         _check_offset("--mount-pitch", args.mount_pitch, args, mount=True)
         if abs(args.mount_pitch) > 90.0:
             raise InputError(f"--mount-pitch: expected -90 to 90 deg, got {args.mount_pitch}; choose another")
-    return Telemetry(args.telemetry, args.time_offset, args.mount_pitch)
+    return Telemetry(args.telemetry, args.time_offset, args.mount_pitch, _attitude(args))
+
+
+def _attitude(args: argparse.Namespace) -> tuple[float, float] | None:
+    if args.camera_pitch is None and args.camera_roll is None:
+        return None
+    for axis, value, most in (("pitch", args.camera_pitch, 90.0), ("roll", args.camera_roll, 180.0)):
+        if value is not None and not abs(value) <= most:
+            raise InputError(f"--camera-{axis}: expected -{most:g} to {most:g} deg, got {value:g}; choose another")
+    return args.camera_pitch or 0.0, args.camera_roll or 0.0
 
 
 def _check_offset(name: str, value: float, args: argparse.Namespace, *, mount: bool) -> None:

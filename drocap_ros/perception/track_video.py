@@ -85,5 +85,6 @@ def tracks_from_observations(observations: Sequence[PoseObservation], track_id: 
         image_size=observations[0].image_size,
         confidence=corrected.confidence,
         covariance=corrected.covariance,
+        real_lens=True,
         background=of_images(o.background for o in observations),
     )

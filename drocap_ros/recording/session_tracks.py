@@ -167,7 +167,7 @@ def _tracks_of(stamp_ns: np.ndarray, messages: list[Message], track_id: int) -> 
         keypoints[i] = float_array(message.keypoints, keypoints[i].shape, "keypoints")
         covariance[i] = float_array(message.covariance, covariance[i].shape, "covariance")
         confidence[i] = float_array(message.confidence, confidence[i].shape, "confidence")
-    return Tracks(keypoints, joints.joints, stamp_ns, size, confidence, covariance)
+    return Tracks(keypoints, joints.joints, stamp_ns, size, confidence, covariance, real_lens=True)
 
 
 def _camera_matrix(session: Session, near: str, size: tuple[int, int]) -> np.ndarray | None:

@@ -7,7 +7,10 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from drocap_ros.errors import InputError
+from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.perception.calibration import camera_model
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.recording.open_session import is_recording
@@ -32,11 +35,31 @@ class Telemetry:
         where there is one
     time_offset_s : from the log's first state to the video's first image; None = known or estimated
     mount_pitch_deg : of a camera fixed to the body of a vehicle without a gimbal, negative down
+    attitude_deg : pitch, negative down, and roll, clockwise, of a camera that stands still
     """
 
     path: Path | None = None
     time_offset_s: float | None = None
     mount_pitch_deg: float | None = None
+    attitude_deg: tuple[float, float] | None = None
+
+
+def with_attitude(tracks: Tracks, attitude_deg: tuple[float, float] | None) -> Tracks:
+    """Tracks of a camera that stands still, with its rotation by pitch and roll (deg); it looks north.
+
+    Raises
+    ------
+    InputError
+        When the rotation is known already.
+    """
+    if attitude_deg is None:
+        return tracks
+    if tracks.camera_rotation is not None:
+        raise InputError("--camera-pitch: expected no telemetry, found the camera's attitude; leave the option out")
+    level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    turns = exp_so3(np.deg2rad([[-attitude_deg[0], 0.0, 0.0], [0.0, 0.0, -attitude_deg[1]]]))
+    rotation = np.broadcast_to(turns[1] @ turns[0] @ level, (len(tracks), 3, 3)).copy()
+    return dataclasses.replace(tracks, camera_rotation=rotation)
 
 
 def read_video_telemetry(video: Path, telemetry: Telemetry) -> TelemetryLog | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -90,9 +90,11 @@ def live_study(
         raise InputError(f"--limit: expected at least 1, got {limit}")
     sequences = protocol_sequences(folder, limit=limit)
     rows = []
+    # The protocol's camera is orthographic: it has no lens.
+    settings = replace(adjuster or BundleAdjusterConfig(), assumed_focal=0.0)
     for sequence in reported(sequences, len(sequences), "live study", progress):
         view = orbit_view(sequence.x, speed_deg_s, noisy=noisy, seed=seed)
-        result = simulate_live(view, delay_s, initializer or InitializerConfig(), adjuster or BundleAdjusterConfig())
+        result = simulate_live(view, delay_s, initializer or InitializerConfig(), settings)
         rows.append(_row(sequence, speed_deg_s, noisy, view, result))
     return rows
 

@@ -128,4 +128,11 @@ class BundleAdjusterConfig(Parameters):
         0.1, "accuracy of the stamps of its attitude and position", unit="s", minimum=1e-4, maximum=2.0
     )
     feet: bool = param(True, "in the world, feet in contact keep their place")
+    assumed_focal: float = param(
+        0.85,
+        "focal length of real pictures without a calibration, share of their longer side: phones' and drones' main"
+        " cameras (24 to 28 mm equivalent) crop video to 0.75 to 0.95; 0 = the camera is taken as distant",
+        minimum=0.0,
+        maximum=20.0,
+    )
     threads: int = param(1, "threads of the linear algebra; the matrices are small", minimum=1, maximum=64)

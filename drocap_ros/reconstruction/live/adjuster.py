@@ -104,7 +104,7 @@ class LiveAdjuster:
         cancelled: Cancelled | None,
     ) -> tuple[AdjustedWindow, WindowSolution]:
         """Poses in camera axes and in px, with what is known of the camera."""
-        focal = None if camera is None else camera.focal_px
+        focal = w.assumed_focal_px if camera is None else camera.focal_px
         rotation = None if camera is None else camera.rotation
         found = solve_window(w.stamp_ns, w.keypoints, focal, config, self._sizes(w), cancelled, rotation)
         if not np.isfinite(found.joints).all():

@@ -10,6 +10,7 @@ import numpy as np
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
+from drocap_ros.reconstruction.common.person_view import assumed_focal_px
 from drocap_ros.reconstruction.live.stream_order import StreamEvent, StreamOrder
 from drocap_ros.reconstruction.live.window import Window
 
@@ -77,6 +78,7 @@ class FrameBuffer:
             ),
             np.array([joints[:count] for _, joints in self._frames], np.float64),
             self.subject,
+            assumed_focal_px=assumed_focal_px(observations[-1].image_size, self._config.assumed_focal),
         )
 
 

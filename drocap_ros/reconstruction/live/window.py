@@ -23,6 +23,7 @@ class Window(NamedTuple):
     initial_joints : (F, 17, 3) m, camera axes
     subject : differs for every subject and for every pass of time
     camera : as reported; None = unknown
+    assumed_focal_px : of the lens where the camera is unknown; None = distant
     """
 
     stamp_ns: np.ndarray
@@ -30,6 +31,7 @@ class Window(NamedTuple):
     initial_joints: np.ndarray
     subject: int = 0
     camera: WindowCamera | None = None
+    assumed_focal_px: float | None = None
 
     def every(self, stride: int) -> Window:
         """Every ``stride``-th frame, counted back from the newest."""
@@ -38,7 +40,12 @@ class Window(NamedTuple):
     def frames(self, use: slice) -> Window:
         """Some of the frames."""
         camera = None if self.camera is None else self.camera.frames(use)
-        return Window(self.stamp_ns[use], self.keypoints[use], self.initial_joints[use], self.subject, camera)
+        return self._replace(
+            stamp_ns=self.stamp_ns[use],
+            keypoints=self.keypoints[use],
+            initial_joints=self.initial_joints[use],
+            camera=camera,
+        )
 
 
 @dataclass(frozen=True)

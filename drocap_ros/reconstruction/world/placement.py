@@ -54,14 +54,14 @@ def place_in_world(joints: np.ndarray, projected_px: np.ndarray, per_px: np.ndar
 
     The pelvis lies at the weak-perspective range, focal length times metres per px; every joint lies on the ray of
     its pixel (F, 15, 2) at the pose's depth.  This adds the perspective that the scaled orthographic model lacks.
-    Without the camera's position and matrix the pelvis stays at the origin.  Sufficient camera motion measures the
-    scale.
+    Without the camera's position the pelvis stays at the origin, without its matrix the perspective is unknown, too.
+    Sufficient camera motion measures the scale.
     """
     to_world = tracks.camera_rotation
     assert to_world is not None
-    if tracks.camera_position is None or tracks.camera_matrix is None:
-        return WorldPoses(joints @ to_world, False, "assumed_height", None)
     k = tracks.camera_matrix
+    if k is None:
+        return WorldPoses(joints @ to_world, False, "assumed_height", None)
     range_m = 0.5 * (k[0, 0] + k[1, 1]) * per_px
     ray = np.concatenate(
         [(projected_px - k[:2, 2]) / np.diagonal(k)[:2], np.ones((*projected_px.shape[:2], 1))], axis=-1
@@ -69,6 +69,8 @@ def place_in_world(joints: np.ndarray, projected_px: np.ndarray, per_px: np.ndar
     # A joint nearer than a tenth of the range is an error of the pose.
     depth = np.maximum(range_m[:, None] + joints[..., 2], 0.1 * range_m[:, None])
     from_camera = (ray * depth[..., None]) @ to_world
+    if tracks.camera_position is None:
+        return WorldPoses(from_camera - from_camera[:, :1], False, "assumed_height", None)
     feet = from_camera[:, [BODY_15.index("lankle"), BODY_15.index("rankle")]]
     scale = estimate_scale(feet, tracks.camera_position, tracks.stamp_ns)
     trusted = scale is not None and scale.trusted
