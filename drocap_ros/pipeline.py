@@ -23,11 +23,18 @@ from drocap_ros.perception.sources import Frame
 from drocap_ros.perception.track_video import observe, subjects, tracks_from_observations
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.reconstruction.reconstruct import reconstruct
+from drocap_ros.recording.evidence import with_evidence
 from drocap_ros.recording.image_messages import choose_images
 from drocap_ros.recording.open_session import is_recording, open_session
 from drocap_ros.recording.session import POSE2D, Session
 from drocap_ros.recording.session_tracks import read_pose2d, with_recorded_camera
-from drocap_ros.recording.video_telemetry import NO_TELEMETRY, Telemetry, read_video_telemetry, with_attitude, with_telemetry
+from drocap_ros.recording.video_telemetry import (
+    NO_TELEMETRY,
+    Telemetry,
+    read_video_telemetry,
+    with_attitude,
+    with_telemetry,
+)
 from drocap_ros.tracks import Tracks, load_tracks
 
 logger = logging.getLogger(__name__)
@@ -41,6 +48,7 @@ class Selection:
     redetect : estimate the 2D poses of a recording from its images, although it holds recorded ones
     topic : of the images of a recording; empty: colour before grey, then that with most messages
     rate_hz : true rate of the images where a video plays them slower
+    evidence : file of 3D poses of its images by another system
     """
 
     clip: Clip = field(default_factory=Clip)
@@ -48,6 +56,7 @@ class Selection:
     redetect: bool = False
     topic: str = ""
     rate_hz: float | None = None
+    evidence: Path | None = None
 
 
 _WHOLE, _FOUND = Selection(), Telemetry()
@@ -94,6 +103,8 @@ def reconstruct_input(
     if log is not None:
         tracks, origin["telemetry"] = with_telemetry(Path(path), tracks, telemetry, log, config.image_ingest, progress)
     tracks = with_attitude(tracks, telemetry.attitude_deg)
+    if selection.evidence is not None:
+        tracks = with_evidence(tracks, selection.evidence)
     if selection.rate_hz:
         tracks = tracks.at_rate(selection.rate_hz)
     seconds = time.perf_counter() - begin

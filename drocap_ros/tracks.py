@@ -43,6 +43,8 @@ class Tracks:
     camera_position : (F, 3) m ENU, or None
     camera_matrix : (3, 3) px, or None
     background : fixed points of the scene in the images, or None
+    evidence, evidence_sigma : (F, P, 3) and (F, P), a 3D estimate of every image in its camera's axes, any unit, and
+        its expected error; None
     real_lens : whether pictures of a lens were measured: one may be assumed where ``camera_matrix`` is None
     """
 
@@ -56,6 +58,8 @@ class Tracks:
     camera_position: np.ndarray | None = None
     camera_matrix: np.ndarray | None = None
     background: Background | None = None
+    evidence: np.ndarray | None = None
+    evidence_sigma: np.ndarray | None = None
     real_lens: bool = False
 
     def __post_init__(self) -> None:
@@ -66,8 +70,7 @@ class Tracks:
 
     def of_frames(self, use: np.ndarray | slice) -> Tracks:
         """A choice of the frames, at least one: (F,) bool, distinct indices in any order, or a slice."""
-        names = ("keypoints", "stamp_ns", "confidence", "covariance", "camera_rotation", "camera_position")
-        values = {name: getattr(self, name) for name in names}
+        values = {name: getattr(self, name) for name in (*_PER_FRAME, "keypoints", "stamp_ns")}
         background = None if self.background is None else self.background.of_frames(np.arange(len(self))[use])
         return replace(self, background=background, **{k: v[use] for k, v in values.items() if v is not None})
 
@@ -123,6 +126,8 @@ def _check_shapes(t: Tracks) -> None:
         "camera_rotation": (frames, 3, 3),
         "camera_position": (frames, 3),
         "camera_matrix": (3, 3),
+        "evidence": (frames, joints, 3),
+        "evidence_sigma": (frames, joints),
     }
     for name, shape in shapes.items():
         value = getattr(t, name)
@@ -183,7 +188,8 @@ def check_camera_matrix(matrix: np.ndarray, size: tuple[int, int]) -> None:
 _REQUIRED = ("keypoints", "joints", "stamp_ns", "image_size")
 #: Array ``lens`` of a file: whether ``camera_matrix`` is the lens, or one may be assumed; without it nothing is known.
 _LENSES = (_ASSUMED, _GIVEN) = ("assumed", "given")
-_OPTIONAL = ("confidence", "covariance", "camera_rotation", "camera_position", "camera_matrix")
+_PER_FRAME = ("confidence", "covariance", "camera_rotation", "camera_position", "evidence", "evidence_sigma")
+_OPTIONAL = (*_PER_FRAME, "camera_matrix")
 
 
 def kind_of(arrays: Collection[str]) -> str:

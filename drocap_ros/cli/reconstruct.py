@@ -85,6 +85,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="pitch of a camera fixed to a vehicle without a gimbal, negative looks down; for telemetry, or a session,"
         " without the camera's attitude",
     )
+    parser.add_argument(
+        "--evidence",
+        metavar="NPZ",
+        type=Path,
+        help="3D poses of the images by another system, in the camera's axes: they decide signs of depth",
+    )
     for axis, sense in (("pitch", "negative looks down"), ("roll", "positive is clockwise")):
         parser.add_argument(
             f"--camera-{axis}",
@@ -141,7 +147,9 @@ def run(args: argparse.Namespace) -> int:
             models=args.models,
             progress=progress,
             telemetry=telemetry,
-            selection=Selection(clip, person, args.redetect, args.topic, args.rate if source == args.input else None),
+            selection=Selection(
+                clip, person, args.redetect, args.topic, args.rate if source == args.input else None, args.evidence
+            ),
         )
     meta = {**motion.meta, "input": args.input.name, "command": args.command_line}
     motion = dataclasses.replace(motion, meta=meta)

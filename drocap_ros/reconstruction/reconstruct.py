@@ -22,6 +22,7 @@ from drocap_ros.reconstruction.camera.picture_world import (
     with_camera,
 )
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.common.evidence import Evidence
 from drocap_ros.reconstruction.common.person_view import lens_word, person_view, true_shape, with_lens
 from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput, Progress
 from drocap_ros.reconstruction.common.refusal import Refusal
@@ -194,6 +195,8 @@ def _solve(tracks: Tracks, keypoints: Keypoints2D, settings: _Settings) -> Image
         progress=settings.progress,
         rotation=tracks.camera_rotation if view is None else view.rotation(tracks.camera_rotation),
     )
+    if (evidence := body_evidence(tracks, len(settings.body))) is not None:
+        data = dataclasses.replace(data, evidence=evidence if view is None else evidence.turned(view.turn))
     poses = run_method(settings.method, data)
     if not np.isfinite(poses.joints_px).all(axis=(1, 2)).any():
         raise InputError("keypoints: expected those of a person, got none that give a finite pose; check the values")
@@ -263,6 +266,23 @@ def body_keypoints(tracks: Tracks, joints: JointSet = BODY_17) -> Keypoints2D:
         return Keypoints2D(keypoints, None, None).with_joints(len(joints))
     found = Keypoints2D(keypoints, confidence, covariance if tracks.covariance is not None else None)
     return found.with_joints(len(joints))
+
+
+def body_evidence(tracks: Tracks, count: int) -> Evidence | None:
+    """The tracks' 3D estimates for the first ``count`` joints of the body; None where there are none."""
+    if tracks.evidence is None:
+        return None
+    source, place = joint_set_of(tracks.joints)
+    sigma = np.full(tracks.keypoints.shape[:2], np.nan) if tracks.evidence_sigma is None else tracks.evidence_sigma
+    values = np.concatenate([tracks.evidence, sigma[..., None]], axis=-1)
+    given = np.where((place >= 0)[:, None], values[:, np.maximum(place, 0)], np.nan)
+    weights = joint_map(source.name).weights
+    known = ~((weights != 0) & ~np.isfinite(given[:, None, :, 0])).any(axis=-1, keepdims=True)
+    mapped = np.where(known, weights @ np.nan_to_num(given), np.nan)
+    mapped[..., 3] = np.where(mapped[..., 3] > 0, mapped[..., 3], np.nan)
+    body = np.full((len(tracks), count, 4), np.nan)
+    body[:, : min(count, mapped.shape[1])] = mapped[:, :count]
+    return Evidence(body[..., :3], body[..., 3])
 
 
 def _in_metres(

@@ -10,6 +10,7 @@ import numpy as np
 
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.common.evidence import Evidence
 from drocap_ros.reconstruction.common.stop_reason import NO_ADJUSTMENT
 
 Progress = Callable[[str, float], None]
@@ -24,6 +25,7 @@ class MethodInput:
     focal_px : of the camera, None = unknown
     rotation : (F, 3, 3) world (z up) -> camera, None = unknown
     progress : called with a stage and its fraction done
+    evidence : of the method's joints, in camera axes
     """
 
     stamp_ns: np.ndarray
@@ -33,11 +35,15 @@ class MethodInput:
     adjuster: BundleAdjusterConfig
     progress: Progress
     rotation: np.ndarray | None = None
+    evidence: Evidence | None = None
 
     def frames(self, use: np.ndarray | slice) -> MethodInput:
         """The input of some of the frames."""
         rotation = None if self.rotation is None else self.rotation[use]
-        return replace(self, stamp_ns=self.stamp_ns[use], keypoints=self.keypoints[use], rotation=rotation)
+        evidence = None if self.evidence is None else self.evidence.map(lambda values: values[use])
+        return replace(
+            self, stamp_ns=self.stamp_ns[use], keypoints=self.keypoints[use], rotation=rotation, evidence=evidence
+        )
 
 
 @dataclass(frozen=True)

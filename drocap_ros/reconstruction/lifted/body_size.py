@@ -12,6 +12,7 @@ import numpy as np
 
 from drocap_ros.geometry.bones import bone_lengths
 from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.common.evidence import Evidence
 from drocap_ros.reconstruction.lifted.adjustment import span_lengths
 from drocap_ros.reconstruction.lifted.lifted_config import LiftedConfig
 from drocap_ros.reconstruction.lifted.lifter import Lifter
@@ -49,12 +50,14 @@ class EvenView:
 
     focal : focal length in the keypoints' unit; None = unknown, the camera is taken as distant
     rotation : (F, 3, 3) world (z up) -> camera, NaN where unknown; None = unknown
+    evidence : poses of these frames by another method; None = there are none
     """
 
     keypoints: Keypoints2D
     fps: float
     focal: float | None
     rotation: np.ndarray | None
+    evidence: Evidence | None = None
 
 
 @dataclass(frozen=True)
@@ -93,7 +96,7 @@ def measure_size(view: EvenView, config: LiftedConfig, lifter: Lifter, cancelled
     prior *= mm / zoom[:, None, None]
     flat = _orthographic(keypoints.xy, prior[..., 2], centre, zoom, mm, focal)
     rough = replace(lifted, joints=prior, sigma=lifted.sigma * mm)
-    found = solve_signs_and_adjust(model, flat, rough, None, config.first_iterations, cancelled)
+    found = solve_signs_and_adjust(model, flat, rough, None, config.first_iterations, cancelled, view.evidence)
     lengths = _without_noise(found.lengths, np.median(span_lengths(prior), axis=0), model)
     zoom = zoom * found.zoom
     flat = _orthographic(keypoints.xy, found.joints[..., 2] - found.joints[:, :1, 2], centre, zoom, mm, focal)

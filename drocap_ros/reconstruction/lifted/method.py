@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.common.evidence import Evidence
 from drocap_ros.reconstruction.lifted.body_size import (
     YARDSTICK,
     YARDSTICK_MM,
@@ -77,7 +78,7 @@ class WindowSolution:
     seconds: dict[str, float]
 
 
-def solve_window(
+def solve_window(  # noqa: PLR0913 - what is known of camera, body and depth is known separately
     stamp_ns: np.ndarray,
     keypoints: Keypoints2D,
     focal: float | None,
@@ -85,6 +86,7 @@ def solve_window(
     known: BodySize | None = None,
     cancelled: Cancelled | None = None,
     rotation: np.ndarray | None = None,
+    evidence: Evidence | None = None,
 ) -> WindowSolution:
     """:func:`solve_even_window` for frames at any increasing times ``stamp_ns`` (F,).
 
@@ -92,16 +94,17 @@ def solve_window(
     """
     slot, fps = even_slots(stamp_ns)
     if slot[-1] + 1 == len(slot):
-        return solve_even_window(keypoints, fps, focal, config, known, cancelled, rotation)
+        return solve_even_window(keypoints, fps, focal, config, known, cancelled, rotation, evidence)
     if known is not None:
         known = replace(known, unit_per_mm=np.interp(np.arange(slot[-1] + 1), slot, known.unit_per_mm))
     turn = None if rotation is None else spread(rotation, slot, np.nan)
-    r = solve_even_window(spread_keypoints(keypoints, slot), fps, focal, config, known, cancelled, turn)
+    others = None if evidence is None else evidence.map(lambda values: spread(values, slot, np.nan))
+    r = solve_even_window(spread_keypoints(keypoints, slot), fps, focal, config, known, cancelled, turn, others)
     body = replace(r.body, unit_per_mm=r.body.unit_per_mm[slot])
     return replace(r, joints=r.joints[slot], sigma=r.sigma[slot], still=r.still[slot], body=body)
 
 
-def solve_even_window(
+def solve_even_window(  # noqa: PLR0913 - what is known of camera, body and depth is known separately
     keypoints: Keypoints2D,
     fps: float = LIFTER_FPS,
     focal: float | None = None,
@@ -109,6 +112,7 @@ def solve_even_window(
     known: BodySize | None = None,
     cancelled: Cancelled | None = None,
     rotation: np.ndarray | None = None,
+    evidence: Evidence | None = None,
 ) -> WindowSolution:
     """Poses of one window of evenly spaced frames.
 
@@ -121,6 +125,7 @@ def solve_even_window(
     known : size from an earlier window, for a warm start
     cancelled : called before every step of the adjustments but the first; True ends them
     rotation : (F, 3, 3) world (z up) -> camera, NaN where unknown; None = unknown
+    evidence : poses of these frames by another method, BODY_17 in camera axes; None = there are none
 
     Raises
     ------
@@ -130,12 +135,14 @@ def solve_even_window(
     config = config or LiftedConfig()
     lifter = Lifter.load(config.lifter or None)
     begin = time.perf_counter()
-    view = EvenView(keypoints, fps, focal, rotation)
+    view = EvenView(keypoints, fps, focal, rotation, evidence)
     sized = measure_size(view, config, lifter, cancelled) if known is None else apply_size(known, view, config, lifter)
     mm, zoom = sized.mm, sized.zoom
 
     clock = time.perf_counter()
-    found = solve_signs_and_adjust(sized.model, sized.flat, sized.lifted, sized.lengths, config.iterations, cancelled)
+    found = solve_signs_and_adjust(
+        sized.model, sized.flat, sized.lifted, sized.lengths, config.iterations, cancelled, evidence
+    )
     size = (zoom / mm)[:, None, None]
     joints = found.joints.copy()
     if focal is not None:

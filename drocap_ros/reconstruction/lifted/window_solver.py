@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drocap_ros.keypoints import Keypoints2D
+from drocap_ros.reconstruction.common.evidence import Evidence
 from drocap_ros.reconstruction.lifted.adjustment import (
     AdjustmentProblem,
     AdjustmentSolution,
@@ -132,15 +133,20 @@ def solve_signs_and_adjust(
     lengths: np.ndarray | None,
     iterations: int,
     cancelled: Cancelled | None,
+    evidence: Evidence | None = None,
 ) -> AdjustmentSolution:
     """Adjusted joints from the 2D joints (F, 17, 2) and the lifter's result, all in mm.
 
     Parameters
     ----------
     lengths : (18,) of the adjustment's spans; None = from the 2D joints and the lifter's depths
+    evidence : poses of the same frames by another method, any unit
     """
     config, fps = model.config, model.fps
     prior, sigma = lifted.joints, lifted.sigma
+    others = None if evidence is None else evidence.depths(prior)
+    if others is not None:
+        prior, sigma = _with_evidence(prior, sigma, *others)
     weight = 0.5 * (model.information[..., 0] + model.information[..., 2])
     points = np.where(weight[..., None] > 0, np.nan_to_num(keypoints), 0.0)
     prior_xy = config.image_weight / (2 * np.square(sigma[..., 0]) + 5.0**2)
@@ -185,6 +191,19 @@ def solve_signs_and_adjust(
         outlier_square=_where_fresh(model, config.outlier_square, config.fresh_outlier_square),
     )
     return adjust(problem, np.concatenate([flat, depth[..., None]], axis=-1), iterations, cancelled=cancelled)
+
+
+def _with_evidence(
+    prior: np.ndarray, sigma: np.ndarray, depth: np.ndarray, deviation: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The lifter's joints and errors with depths (F, P) of others, weighted by their precisions; places stay."""
+    own, other = sigma[..., 1] ** -2.0, deviation**-2.0
+    both = own + other
+    mixed, less = prior.copy(), sigma.copy()
+    mixed[..., 2] = np.where(other > 0, (own * prior[..., 2] + other * np.nan_to_num(depth)) / both, prior[..., 2])
+    mixed[..., 2] -= mixed[:, :1, 2]
+    less[..., 1] = both**-0.5
+    return mixed, less
 
 
 def _where_fresh(model: WindowModel, lasting: float, fresh: float) -> float:
