@@ -11,9 +11,9 @@ import numpy as np
 
 from drocap_ros import __version__
 from drocap_ros.errors import InputError
-from drocap_ros.joint_maps import TABLES, joint_map, joint_set_of
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
+from drocap_ros.reconstruction.body_input import body_evidence, body_keypoints
 from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, fuse_telemetry, with_fusion
 from drocap_ros.reconstruction.camera.picture_world import (
     PictureWorld,
@@ -22,8 +22,6 @@ from drocap_ros.reconstruction.camera.picture_world import (
     with_camera,
 )
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
-from drocap_ros.reconstruction.common.evidence import Evidence
-from drocap_ros.reconstruction.common.person_view import lens_word, person_view, true_shape, with_lens
 from drocap_ros.reconstruction.common.poses import ImagePoses, MethodInput, Progress
 from drocap_ros.reconstruction.common.refusal import Refusal
 from drocap_ros.reconstruction.common.threads import blas_threads
@@ -31,13 +29,13 @@ from drocap_ros.reconstruction.heels import with_heels
 from drocap_ros.reconstruction.methods import METHODS
 from drocap_ros.reconstruction.methods.run import run_method
 from drocap_ros.reconstruction.paper.dictionary import REFERENCE_STATURE_M
-from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS
+from drocap_ros.reconstruction.person_view import lens_word, person_view, true_shape, with_lens
 from drocap_ros.reconstruction.world.in_world import in_world
 from drocap_ros.reconstruction.world.placement import WorldPoses, metres_per_px
 from drocap_ros.reconstruction.world.refine import RefinedWorld, refinable
 from drocap_ros.reconstruction.world.world_model import world_config
 from drocap_ros.revision import git_revision
-from drocap_ros.skeleton import BODY_15, BODY_17, BODY_19, JointSet, body_set
+from drocap_ros.skeleton import BODY_17, BODY_19, JointSet
 from drocap_ros.tracks import Tracks
 
 #: Steps of each of the body's adjustments where the one in the world goes on from them: more change nothing there.
@@ -158,25 +156,29 @@ def _solved(
     """Poses in px and in metres, and the time between both; a refusal where the telemetry cannot be true."""
     source: _Source = fused
     if tracks.camera_rotation is None:
-        tracks, source = _with_picture(tracks, keypoints, settings)
+        tracks, source, settings = _with_picture(tracks, keypoints, settings)
     poses = _solve(tracks, keypoints, settings)
     solved = time.perf_counter()
     body = _in_metres(tracks, keypoints, poses, settings, source)
     return body if isinstance(body, Refusal) else (poses, body, solved)
 
 
-def _with_picture(tracks: Tracks, keypoints: Keypoints2D, settings: _Settings) -> tuple[Tracks, PictureWorld | None]:
+def _with_picture(
+    tracks: Tracks, keypoints: Keypoints2D, settings: _Settings
+) -> tuple[Tracks, PictureWorld | None, _Settings]:
     """Tracks without telemetry with the camera that their fixed points give.
 
     Its up and metres come from poses without it; then the lifter sees the camera's rotation.
     """
-    camera = picture_camera(tracks)
+    assumed = settings.lens == "assumed"
+    camera = picture_camera(dataclasses.replace(tracks, camera_matrix=None) if assumed else tracks)
     if camera is None or not camera.kind.known:
-        return tracks, None if camera is None else PictureWorld(camera)
+        return tracks, None if camera is None else PictureWorld(camera), settings
+    settings = dataclasses.replace(settings, lens="given" if settings.lens == "given" else "picture")
     tracks = dataclasses.replace(tracks, camera_matrix=camera.matrix)
     poses = _solve(tracks, keypoints, settings)
     per_px = metres_per_px(poses.joints_px, tracks.stamp_ns, settings.initializer.assumed_height_m)
-    return with_camera(tracks, camera, poses, per_px, world_config(settings.adjuster))
+    return (*with_camera(tracks, camera, poses, per_px, world_config(settings.adjuster)), settings)
 
 
 def _solve(tracks: Tracks, keypoints: Keypoints2D, settings: _Settings) -> ImagePoses:
@@ -222,67 +224,12 @@ def _meta(poses: ImagePoses, settings: _Settings) -> dict[str, object]:
         "versions": {"drocap_ros": __version__, "numpy": np.__version__, "python": platform.python_version()},
         "git_revision": git_revision(),
         "parameters": {name: dataclasses.asdict(values) for name, values in parameters.items()},
-        "lens": settings.lens,
         "iterations": report.iterations,
         "stop_reason": report.stop_reason,
         "cost_terms": report.cost_terms,
         "frames": len(poses.joints_px),
         **origin,
     }
-
-
-def body_keypoints(tracks: Tracks, joints: JointSet = BODY_17) -> Keypoints2D:
-    """Keypoints in the order of ``joints``, a body set; those that the tracks lack are NaN.
-
-    Names of the body sets, COCO, COCO-WholeBody, Halpe, MPII and Human3.6M are known (:mod:`drocap_ros.joint_maps`).
-
-    Raises
-    ------
-    InputError
-        When the names give too few joints of BODY_15.
-    """
-    source, place = joint_set_of(tracks.joints)
-    have = place >= 0
-    names = tuple(np.array(source.joints)[have])
-    given = sum(set(parts) <= set(names) for parts in TABLES[source.name].values())
-    if given < MIN_JOINTS:
-        raise InputError(
-            f"joints: expected at least {MIN_JOINTS} of {', '.join(BODY_15.joints)}, or names of"
-            f" {', '.join(list(TABLES)[3:])}, got {given} of them; rename the joints"
-        )
-    shape = (len(tracks), len(source))
-    keypoints, confidence, covariance = np.full((*shape, 2), np.nan), np.zeros(shape), np.full((*shape, 3), np.nan)
-    keypoints[:, have] = tracks.keypoints[:, place[have]]
-    keypoints[np.isnan(keypoints).any(-1)] = np.nan
-    if tracks.covariance is not None:
-        covariance[:, have] = tracks.covariance[:, place[have]]
-    seen = np.isfinite(keypoints).all(-1)
-    confidence[:, have] = tracks.confidence[:, place[have]] if tracks.confidence is not None else seen[:, have]
-    if not body_set(source):
-        high, low = (np.where(seen[..., None], keypoints, end) for end in (-np.inf, np.inf))
-        extent = np.where(seen.any(1), (high.max(1) - low.min(1)).max(1), 0.0)
-        keypoints, covariance, confidence = joint_map(source.name).apply(keypoints, covariance, confidence, extent)
-    elif tracks.confidence is None and tracks.covariance is None:
-        return Keypoints2D(keypoints, None, None).with_joints(len(joints))
-    found = Keypoints2D(keypoints, confidence, covariance if tracks.covariance is not None else None)
-    return found.with_joints(len(joints))
-
-
-def body_evidence(tracks: Tracks, count: int) -> Evidence | None:
-    """The tracks' 3D estimates for the first ``count`` joints of the body; None where there are none."""
-    if tracks.evidence is None:
-        return None
-    source, place = joint_set_of(tracks.joints)
-    sigma = np.full(tracks.keypoints.shape[:2], np.nan) if tracks.evidence_sigma is None else tracks.evidence_sigma
-    values = np.concatenate([tracks.evidence, sigma[..., None]], axis=-1)
-    given = np.where((place >= 0)[:, None], values[:, np.maximum(place, 0)], np.nan)
-    weights = joint_map(source.name).weights
-    known = ~((weights != 0) & ~np.isfinite(given[:, None, :, 0])).any(axis=-1, keepdims=True)
-    mapped = np.where(known, weights @ np.nan_to_num(given), np.nan)
-    mapped[..., 3] = np.where(mapped[..., 3] > 0, mapped[..., 3], np.nan)
-    body = np.full((len(tracks), count, 4), np.nan)
-    body[:, : min(count, mapped.shape[1])] = mapped[:, :count]
-    return Evidence(body[..., :3], body[..., 3])
 
 
 def _in_metres(
@@ -300,7 +247,11 @@ def _in_metres(
     height_m = settings.initializer.assumed_height_m
     shape = true_shape(poses.in_image, tracks.camera_matrix, about_pelvis=_by_place(tracks, settings))
     per_px = metres_per_px(shape, tracks.stamp_ns, height_m)
-    meta: dict[str, object] = {"assumed_height_m": height_m, "reference_stature_m": REFERENCE_STATURE_M}
+    meta: dict[str, object] = {
+        "lens": settings.lens,
+        "assumed_height_m": height_m,
+        "reference_stature_m": REFERENCE_STATURE_M,
+    }
     refined: RefinedWorld | None = None
     rotation = tracks.camera_rotation
     if rotation is None:

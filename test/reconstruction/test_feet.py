@@ -11,7 +11,7 @@ import pytest
 from drocap_ros.cli import main
 from drocap_ros.geometry.alignment import apply_similarity, similarity
 from drocap_ros.motion import load_motion, save_motion
-from drocap_ros.reconstruction.reconstruct import body_keypoints
+from drocap_ros.reconstruction.body_input import body_keypoints
 from drocap_ros.report.checks import MotionCheck, run_checks
 from drocap_ros.report.statistics import motion_statistics
 from drocap_ros.simulation.orbit_camera import orbit_camera, pinhole_matrix, project

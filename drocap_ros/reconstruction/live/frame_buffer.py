@@ -10,9 +10,9 @@ import numpy as np
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.common.person_view import assumed_focal_px
 from drocap_ros.reconstruction.live.stream_order import StreamEvent, StreamOrder
 from drocap_ros.reconstruction.live.window import Window
+from drocap_ros.reconstruction.person_view import assumed_focal_px
 
 #: The first adjustment is due after this fraction of a period: no earlier solution can serve meanwhile.
 _FIRST = 3

@@ -11,10 +11,11 @@ import pytest
 from drocap_ros.evaluation.protocol import protocol_sequences
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.mocap import Sequence
+from drocap_ros.reconstruction.body_input import body_keypoints
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
-from drocap_ros.reconstruction.common.person_view import PersonView, person_view, true_shape, with_lens
 from drocap_ros.reconstruction.common.poses import ImagePoses, Report
-from drocap_ros.reconstruction.reconstruct import body_keypoints, reconstruct
+from drocap_ros.reconstruction.person_view import PersonView, person_view, true_shape, with_lens
+from drocap_ros.reconstruction.reconstruct import reconstruct
 from drocap_ros.tracks import Tracks, load_tracks, save_tracks
 from lab.studies.near_camera import NearCamera, error_mm, known
 
