@@ -26,8 +26,9 @@ def run(data: MethodInput) -> ImagePoses:
         # The way of the body through the image is no noise of the keypoints.
         middle = np.nanmean(points, axis=1)
         seen = Keypoints2D(points - middle[:, None], weights, window.keypoints.covariance)
-        known = {"rotation": window.rotation, "evidence": window.evidence}
-        found = solve_window(window.stamp_ns, seen, data.focal_px, config, **known)
+        found = solve_window(
+            window.stamp_ns, seen, data.focal_px, config, rotation=window.rotation, evidence=window.evidence
+        )
         joints = found.joints.copy()
         joints[..., :2] += middle[:, None]
         report = Report(found.steps[1], found.stop_reason, found.cost_terms, found.seconds, origin)
