@@ -26,6 +26,8 @@ from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 #: Focal length of an unknown lens over the image's longer side, and the deviation of its logarithm: a factor of 1.4.
 FOCAL_SHARE = 0.9
 FOCAL_STD = 0.34
+#: Error of its logarithm that the posterior does not know, as errors of tracks last: orbits had 0.1 to 0.8 %.
+_LASTING_FOCAL_STD = 0.01
 #: Factors on it from which an unknown lens is sought.
 _FOCAL_STARTS = (0.7, 1.0, 1.5)
 #: Keyframes after which the starts are compared, and residuals over the least that are as good.
@@ -198,7 +200,7 @@ def _checked(camera: PictureCamera, found: AdjustedPath, share: float) -> Pictur
         camera,
         kind=camera.kind if fits else Kind.NOTHING_FIXED,
         matrix=with_focal(camera.matrix, focal),
-        focal_std=float(found.shared_std[FOCAL]),
+        focal_std=float(np.hypot(found.shared_std[FOCAL], _LASTING_FOCAL_STD)) if camera.focal_std else 0.0,
         points=found.points,
         residual_px=found.residual_px,
         covered=share * found.covered,
