@@ -32,11 +32,24 @@ def run(args: argparse.Namespace) -> int:
 
     path, motion = read_motion(args.motion)
     out = args.out or path.with_name("report.html")
-    with output_file(out, inputs=[path, args.video]) as file:
-        save_report(file, motion, video=args.video, command=args.command_line)
+    name = Path(str(motion.meta.get("input", "")))
+    video = args.video or _beside(path, name)
+    with output_file(out, inputs=[path, video]) as file:
+        save_report(file, motion, video=video, command=args.command_line)
     if not args.quiet:
+        if video is None and name.suffix != ".npz":
+            print(f"without images; --video {name} with its folder shows them")
         print(f"written: {out} ({out.stat().st_size / 1e6:.1f} MB)\n{open_words(out)}")
     return 0
+
+
+def _beside(motion: Path, name: Path) -> Path | None:
+    """A motion's source of this name with images, where it lies beside the motion or its folder; None = elsewhere."""
+    from drocap_ros.report.motion_images import has_images
+
+    places = (motion.parent, motion.parent.parent, Path())
+    found = (place / name.name for place in places if name.suffix)
+    return next((file for file in found if file.is_file() and has_images(file)), None)
 
 
 def open_words(report: Path) -> str:

@@ -131,7 +131,7 @@ class MotionCheck(Enum):
     ASSUMED_SCALE = ("Scale assumed", "Metres come from {source}{height}, not from a measurement.")
     TELEMETRY_REJECTED = ("Telemetry not used", "{words} The motion stays in the axes of the camera.")
     TELEMETRY_JUMPS = ("Reported position jumps", "{words}")
-    CALIBRATION = ("Camera", "{words}")
+    CALIBRATION = ("Camera measured", "{words}")
 
 
 @dataclass(frozen=True)

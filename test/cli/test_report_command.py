@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 from refusals import refused
@@ -30,6 +31,21 @@ def test_the_same_motion_gives_the_same_bytes(folder):
         assert main(["report", str(folder), "--quiet"]) == 0
         texts.append((folder / "report.html").read_bytes())
     assert texts[0] == texts[1]
+
+
+def test_images_of_a_video_beside_the_motion_are_shown(person, folder, capsys):
+    named = dataclasses.replace(person, meta={**person.meta, "input": "clip.avi"})
+    save_motion(folder / "motion.npz", named)
+    assert main(["report", str(folder)]) == 0
+    assert "--video clip.avi" in capsys.readouterr().out
+    height, width = np.nanmax(person.keypoints, axis=(0, 1)).astype(int)[::-1] + 20
+    writer = cv2.VideoWriter(str(folder / "clip.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 24.0, (int(width), int(height)))
+    for _ in range(len(person.stamp_ns)):
+        writer.write(np.full((height, width, 3), 90, np.uint8))
+    writer.release()
+    assert main(["report", str(folder)]) == 0
+    assert "--video" not in capsys.readouterr().out
+    assert '"/9j/' in (folder / "report.html").read_text()
 
 
 def test_what_cannot_be_shown_is_refused(person, folder, capsys):

@@ -61,7 +61,7 @@ const floors = (() => {
   });
 })();
 
-/** Target of the views in each frame: above the floor at the root, smoothed over time. */
+/** Target of the views in each frame: the root, smoothed over time, as people climb and a floor may be another's. */
 const targets = (() => {
   const roots = Array.from({ length: motion.count }, (_, f) => jointAt(f, motion.root));
   const columns = [0, 1].map((axis) => roots.map((p) => p[axis]));
@@ -69,8 +69,11 @@ const targets = (() => {
   const height = (meanAround(above, 0, motion.count) || 0.9) - 0.02;
   let last = [0, 0];
   return roots.map((_, f) => {
-    const place = [0, 1].map((axis) => meanAround(columns[axis], f, 12));
+    // As far on as back: a person who moves stays in the middle in the first and the last frames, too.
+    const half = Math.min(8, f, motion.count - 1 - f);
+    const place = [0, 1].map((axis) => meanAround(columns[axis], f, half));
     if (place.every(Number.isFinite)) last = place;
-    return [...last, floors[f] + height];
+    const here = meanAround(above, f, half) - 0.02;
+    return [...last, floors[f] + (Number.isFinite(here) ? here : height)];
   });
 })();
