@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from drocap_ros.cli.options import Subparsers, add_command, add_motion_argument, add_quiet_option, read_motion
+from drocap_ros.errors import InputError
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -35,7 +36,13 @@ def run(args: argparse.Namespace) -> int:
     name = Path(str(motion.meta.get("input", "")))
     video = args.video or _beside(path, name)
     with output_file(out, inputs=[path, video]) as file:
-        save_report(file, motion, video=video, command=args.command_line)
+        try:
+            save_report(file, motion, video=video, command=args.command_line)
+        except InputError:
+            if video is None or args.video:
+                raise
+            video = None  # another video of that name
+            save_report(file, motion, command=args.command_line)
     if not args.quiet:
         if video is None and name.suffix != ".npz":
             print(f"without images; --video {name} with its folder shows them")
