@@ -253,7 +253,7 @@ def _of_frame(motion: Motion) -> Iterator[Finding]:
     if words := telemetry_words(motion.meta):
         if "telemetry_rejected" in motion.meta:
             yield _warn(MotionCheck.TELEMETRY_REJECTED, words=words)
-        elif any(window.get("camera_jumps_m", 0.0) > 0 for window in motion.meta["calibration"]):
+        elif any(window.get("camera_jumps_m", 0.0) > 0 for window in motion.meta.get("calibration", ())):
             yield _warn(MotionCheck.TELEMETRY_JUMPS, words=words)
         else:
             yield _note(MotionCheck.CALIBRATION, words=words)

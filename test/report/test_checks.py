@@ -32,6 +32,21 @@ def test_a_good_motion_has_no_warning(person):
     assert MotionCheck.ASSUMED_SCALE in checks(person)
 
 
+@pytest.mark.parametrize(
+    ("camera", "words"),
+    [
+        ({"kind": "few_points", "words": "too few fixed points: no texture, blur or water"}, "too few fixed points"),
+        ({"kind": "moves", "words": "a camera that moves", "up_std_deg": 1.0}, None),  # of another version
+    ],
+)
+def test_a_camera_of_the_picture_is_told_without_any_calibration(person, camera, words):
+    told = dataclasses.replace(person, meta={"camera": camera})
+    if words is None:
+        assert MotionCheck.CALIBRATION not in checks(told)
+    else:
+        assert words in result_of(told, MotionCheck.CALIBRATION).text
+
+
 def test_the_view_span_is_that_of_the_orbit(person):
     m = motion_statistics(person)
     look = -person.camera_rotation[:, 2]

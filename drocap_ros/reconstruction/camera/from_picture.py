@@ -33,6 +33,8 @@ _FOCAL_STARTS = (0.7, 1.0, 1.5)
 #: Keyframes after which the starts are compared, and residuals over the least that are as good.
 _COMPARED = 16
 _AS_GOOD = 1.05
+#: The same of a whole path over those few keyframes: more points and times fit a little worse in any case.
+_WORSE = 1.5
 #: Parallax (rad) of the best pair below which a camera moves little, and tangents of the angle from the image's middle
 #: up to the horizon that are tried then: of cameras that look down by 15, 40 and 0 degrees.
 _LITTLE_PARALLAX = 0.02
@@ -118,7 +120,7 @@ def _moving(sightings: Sightings, camera: PictureCamera, fps: float, key_hz: flo
         # Where there is little parallax any path fits: of starts that fit as well the one with the most of it counts.
         start = next(start for _, start in starts if start.path.residual_px <= _AS_GOOD * least)
         grown = _grown(sightings, camera, start, fps)
-        if small is None and grown.residual_px > _AS_GOOD * least:
+        if small is None and grown.residual_px > _WORSE * least:
             small = _small_motion(sightings, camera, fps, _AS_GOOD * least)
         if small is None or grown.residual_px <= small.residual_px:
             return grown

@@ -24,12 +24,12 @@ def telemetry_words(meta: Mapping[str, Any]) -> str:
     rejected = meta.get("telemetry_rejected")
     if isinstance(rejected, str):
         return f"Telemetry not used: {rejected}."
-    if isinstance(camera := meta.get("camera"), Mapping):
-        return _camera(camera)
-    windows = meta.get("calibration")
-    if not isinstance(windows, list) or not windows or not isinstance(windows[0], Mapping):
-        return ""
+    camera, windows = meta.get("camera"), meta.get("calibration")
     try:
+        if isinstance(camera, Mapping):
+            return _camera(camera)
+        if not isinstance(windows, list) or not windows or not isinstance(windows[0], Mapping):
+            return ""
         return _calibrations(windows, meta.get("assumed_height_m"))
     except (KeyError, TypeError, ValueError, IndexError, ZeroDivisionError):
         return ""  # written by hand or by another version
