@@ -21,10 +21,11 @@ from drocap_ros.reconstruction.camera.path_adjustment import AdjustedPath, adjus
 from drocap_ros.reconstruction.camera.path_model import FOCAL, Knots, PathConfig, PathInput
 from drocap_ros.reconstruction.camera.sightings import Sightings
 from drocap_ros.reconstruction.camera.views import views_of
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.world.camera_telemetry import CameraTelemetry
 
 #: Focal length of an unknown lens over the image's longer side, and the deviation of its logarithm: a factor of 1.4.
-FOCAL_SHARE = 0.9
+FOCAL_SHARE: float = BundleAdjusterConfig.assumed_focal
 FOCAL_STD = 0.34
 #: Error of its logarithm that the posterior does not know, as errors of tracks last: orbits had 0.1 to 0.8 %.
 _LASTING_FOCAL_STD = 0.01
