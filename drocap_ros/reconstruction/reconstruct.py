@@ -15,6 +15,7 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
 from drocap_ros.reconstruction.body_input import body_evidence, body_keypoints
 from drocap_ros.reconstruction.camera.fusion import FusedTelemetry, fuse_telemetry, with_fusion
+from drocap_ros.reconstruction.camera.kinds import Kind
 from drocap_ros.reconstruction.camera.picture_world import (
     PictureWorld,
     at_assumed_stature,
@@ -155,9 +156,10 @@ def _solved(
 ) -> tuple[ImagePoses, _Body, float] | Refusal:
     """Poses in px and in metres, and the time between both; a refusal where the telemetry cannot be true."""
     source: _Source = fused
+    poses: ImagePoses | None = None
     if tracks.camera_rotation is None:
-        tracks, source, settings = _with_picture(tracks, keypoints, settings)
-    poses = _solve(tracks, keypoints, settings)
+        tracks, source, settings, poses = _with_picture(tracks, keypoints, settings)
+    poses = _solve(tracks, keypoints, settings) if poses is None else poses
     solved = time.perf_counter()
     body = _in_metres(tracks, keypoints, poses, settings, source)
     return body if isinstance(body, Refusal) else (poses, body, solved)
@@ -165,20 +167,23 @@ def _solved(
 
 def _with_picture(
     tracks: Tracks, keypoints: Keypoints2D, settings: _Settings
-) -> tuple[Tracks, PictureWorld | None, _Settings]:
-    """Tracks without telemetry with the camera that their fixed points give.
+) -> tuple[Tracks, PictureWorld | None, _Settings, ImagePoses | None]:
+    """Tracks without telemetry with the camera that their fixed points give, and the poses where these are final.
 
-    Its up and metres come from poses without it; then the lifter sees the camera's rotation.
+    Its up and metres come from poses without it; then the lifter sees the camera's rotation, where up is sure.
     """
     assumed = settings.lens == "assumed"
     camera = picture_camera(dataclasses.replace(tracks, camera_matrix=None) if assumed else tracks)
     if camera is None or not camera.kind.known:
-        return tracks, None if camera is None else PictureWorld(camera), settings
-    settings = dataclasses.replace(settings, lens="given" if settings.lens == "given" else "picture")
+        return tracks, None if camera is None else PictureWorld(camera), settings, None
+    # A camera that stands measures no lens.
+    lens = settings.lens if settings.lens == "given" else "assumed" if camera.kind is Kind.STANDS else "picture"
+    settings = dataclasses.replace(settings, lens=lens)
     tracks = dataclasses.replace(tracks, camera_matrix=camera.matrix)
     poses = _solve(tracks, keypoints, settings)
     per_px = metres_per_px(poses.joints_px, tracks.stamp_ns, settings.initializer.assumed_height_m)
-    return (*with_camera(tracks, camera, poses, per_px, world_config(settings.adjuster)), settings)
+    tracks, world = with_camera(tracks, camera, poses, per_px, world_config(settings.adjuster))
+    return tracks, world, settings, poses if world.config is None else None
 
 
 def _solve(tracks: Tracks, keypoints: Keypoints2D, settings: _Settings) -> ImagePoses:
@@ -245,7 +250,9 @@ def _in_metres(
     answer is a refusal where its telemetry cannot be true.
     """
     height_m = settings.initializer.assumed_height_m
-    shape = true_shape(poses.in_image, tracks.camera_matrix, about_pelvis=_by_place(tracks, settings))
+    alone = isinstance(source, PictureWorld) and source.config is None  # the body is as without a world
+    by_place = _by_place(dataclasses.replace(tracks, camera_rotation=None) if alone else tracks, settings)
+    shape = true_shape(poses.in_image, tracks.camera_matrix, about_pelvis=by_place)
     per_px = metres_per_px(shape, tracks.stamp_ns, height_m)
     meta: dict[str, object] = {
         "lens": settings.lens,
@@ -259,10 +266,13 @@ def _in_metres(
         placed = WorldPoses(shape * per_px[:, None, None], False, "assumed_height", None)
     else:
         frame = "world"
-        config = world_config(settings.adjuster) if source is None or source.config is None else source.config
+        config = world_config(settings.adjuster) if source is None else source.config
         placed, refined, refusal = in_world(tracks, keypoints, poses, per_px, config)
         if refusal is not None:
             return refusal
+        if alone:
+            about = (shape - shape[:, :1]) * per_px[:, None, None]
+            placed = dataclasses.replace(placed, joints=placed.joints[:, :1] + about @ rotation)
     if isinstance(source, PictureWorld):
         placed = dataclasses.replace(placed, metric=False, scale_source="assumed_height")
         meta["camera"] = source.meta()

@@ -69,13 +69,14 @@ def test_outdoor_walk_gives_an_upright_motion_of_every_frame(outdoor_walk):
     motion = outdoor_walk
     assert motion.joints3d.shape == (230, 17, 3)
     assert motion.joints3d.dtype == np.float64
-    assert motion.frame == "camera"
+    assert motion.frame == "world"
+    assert motion.meta["camera"]["kind"] == "stands"
+    assert motion.meta["lens"] == "assumed"
     seen = np.isfinite(motion.keypoints).all(axis=2)
     assert seen.any(axis=1).mean() >= 0.95
-    # In the optical frame y points down.
-    head, feet = (motion.joints3d[:, indices(motion.joints, names), 1] for names in (("head",), ("rankle", "lankle")))
+    head, feet = (motion.joints3d[:, indices(motion.joints, names), 2] for names in (("head",), ("rankle", "lankle")))
     # He jumps off a roof backwards and turns over in the air: his head is below his feet in images 175 to 177.
-    upright = (feet > head).all(axis=1)
+    upright = (feet < head).all(axis=1)
     assert upright[:170].all()
     assert not upright[175:178].any()
     assert upright[182:].all()

@@ -85,7 +85,7 @@ def test_same_seed_gives_the_same_flight_beside_a_busy_process(tmp_path, capsys)
     assert contents[0].keys() == contents[1].keys()
     for topic, messages in contents[0].items():
         assert messages == contents[1][topic], topic
-    assert len(contents[0]) == 14
+    assert len(contents[0]) == 15
     assert len(contents[0]["/drocap/pose2d"]) > 100
     for quiet, busy in zip(*arrays, strict=True):
         np.testing.assert_array_equal(quiet, busy)

@@ -41,7 +41,7 @@ def in_world(
     keypoints: Keypoints2D,
     poses: ImagePoses,
     per_px: np.ndarray,
-    config: WorldConfig,
+    config: WorldConfig | None,
     known: Findings | None = None,
     before: Before | None = None,
 ) -> WorldResult:
@@ -51,17 +51,18 @@ def in_world(
     ----------
     keypoints : of the method's joints
     per_px : (F,) metres per px at the assumed stature
+    config : of the adjustment; None = the poses are placed alone
     known, before : findings of earlier windows, and the last of them
     """
     rotation = tracks.camera_rotation
     assert rotation is not None
     projected, sigma = poses.joints_px[..., :2] + poses.translation_px[:, None], poses.sigma_px
-    whole = sigma is not None and refinable(tracks)
+    whole = sigma is not None and config is not None and refinable(tracks)
     if tracks.camera_position is not None and whole:
         tracks = replace(tracks, camera_position=without_steps(tracks.camera_position, tracks.stamp_ns))
     placed = place_in_world(in_camera_axes(poses, per_px), projected, per_px, tracks)
-    refusal = upside_down(placed.joints, rotation) if sigma is not None and config.checks else None
-    if refusal or sigma is None or not whole or not np.isfinite(placed.joints).all():
+    refusal = upside_down(placed.joints, rotation) if sigma is not None and config and config.checks else None
+    if refusal or sigma is None or config is None or not whole or not np.isfinite(placed.joints).all():
         return WorldResult(placed, refusal=refusal)
     size = per_px[:, None]
     depth = (poses.joints_px[..., 2] - poses.joints_px[:, [_PELVIS], 2]) * size
