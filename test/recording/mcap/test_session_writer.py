@@ -9,7 +9,7 @@ from killed_recording import killed_session
 from recorded import NAMES, START_NS, write_poses
 
 from drocap_ros.errors import InputError
-from drocap_ros.recording.mcap.file import CommittedFile
+from drocap_ros.recording.mcap.file import CommittedFile, McapFile
 from drocap_ros.recording.mcap.schemas import schema_text
 from drocap_ros.recording.mcap.session_config import SessionRecorderConfig
 from drocap_ros.recording.mcap.writer import SessionWriter
@@ -150,6 +150,32 @@ def test_messages_reach_the_disk_within_the_chunk_time(tmp_path, messages, captu
     with open_session(writer.path) as session:
         assert len(read_pose2d(session)) == 1
     writer.close()
+
+
+def test_messages_that_come_during_a_slow_save_are_kept_by_a_close_at_that_moment(
+    tmp_path, messages, capture, monkeypatch
+):
+    save, saving, go_on = McapFile.save, threading.Event(), threading.Event()
+
+    def slow(file, sync):
+        saving.set()
+        go_on.wait(10)
+        save(file, sync)
+
+    monkeypatch.setattr(McapFile, "save", slow)
+    data = messages.cdr(messages.pose2d(capture.tracks, 0, START_NS))
+    writer = SessionWriter(tmp_path / "s", SessionRecorderConfig(chunk_s=0.05))
+    writer.register("/a", POSE2D, schema_text(POSE2D))
+    writer.write("/a", data, START_NS)
+    assert saving.wait(10)
+    writer.write("/a", data, START_NS + 1)
+    closing = threading.Thread(target=writer.close)
+    closing.start()
+    closing.join(0.2)  # it waits for the save, and has said by now that nothing more comes
+    go_on.set()
+    closing.join(10)
+    with open_session(tmp_path / "s") as session:
+        assert session.info.message_count == 2
 
 
 def test_killed_writer_loses_only_the_last_chunk(tmp_path):
