@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError, first_line
+from drocap_ros.geometry.pinhole import centred_camera
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.tracks import check_camera_matrix
 
@@ -55,8 +56,7 @@ def camera_model(config: ImageIngestConfig, size: tuple[int, int]) -> CameraMode
         return model.resized(*size)
     if config.horizontal_fov_deg > 0:
         focal = 0.5 * size[0] / np.tan(np.deg2rad(0.5 * config.horizontal_fov_deg))
-        centre = (np.array(size) - 1) / 2
-        return CameraModel(*size, np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]]))
+        return CameraModel(*size, centred_camera(size, focal))
     return None
 
 

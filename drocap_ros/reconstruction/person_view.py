@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drocap_ros.geometry.pinhole import centred_camera
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.poses import ImagePoses
@@ -35,9 +36,7 @@ def with_lens(tracks: Tracks, share: float) -> Tracks:
     focal = assumed_focal_px(tracks.image_size, share)
     if focal is None or not tracks.real_lens or tracks.camera_matrix is not None:
         return tracks
-    (width, height) = tracks.image_size
-    matrix = np.array([[focal, 0.0, 0.5 * (width - 1)], [0.0, focal, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
-    return replace(tracks, camera_matrix=matrix, camera_position=None)
+    return replace(tracks, camera_matrix=centred_camera(tracks.image_size, focal), camera_position=None)
 
 
 def lens_word(given: Tracks, used: Tracks) -> str:

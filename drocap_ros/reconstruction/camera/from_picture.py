@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drocap_ros.geometry.pinhole import centred_camera
 from drocap_ros.reconstruction.camera.growth import (
     LAST_STEPS,
     Growth,
@@ -87,8 +88,7 @@ def camera_from_points(
     """
     focal_std = 0.0 if matrix is not None else FOCAL_STD
     if matrix is None:
-        focal = FOCAL_SHARE * max(size)
-        matrix = np.array([[focal, 0.0, 0.5 * size[0]], [0.0, focal, 0.5 * size[1]], [0.0, 0.0, 1.0]])
+        matrix = centred_camera(size, FOCAL_SHARE * max(size))
     views = views_of(frame, track, point, frames, fps)
     knots = Knots(frames, fps)
     sightings, key_hz = Sightings(views, knots.frame), 1.0 / knots.step_s
