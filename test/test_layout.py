@@ -28,7 +28,7 @@ BUDGETS = {
     ("errors", "revision", "parameters", "skeleton", "joint_maps", "leg_sides", "geometry", "keypoints", "observation",
      "stamps", "background", "tracks", "motion", "mocap", "clip", "contacts", "file_kind", "open_images", "api",
      "config", "pipeline", "live_replay"): 3.60,  # 1.00 over the plan: poses' history, stamps, places on the Earth and
-    # images came down; points of the scene in a tracks file (0.15); its evidence and lens, drawn shoulders (0.04), a camera (0.01)
+    # images came down; points of the scene in a tracks file (0.15); evidence, lens, shoulders, a camera (0.05)
     ("perception",): 6.00,  # 1.90 over the plan: tracking keeps its own association; foreign pictures and streams came;
     # points of the scene (0.35); networks of TensorFlow Lite, which registries hold, become ONNX (0.43)
     ("reconstruction",): 10.35,  # 4.02 over the plan: world/ and live/ kept their steps; one constant a line;
