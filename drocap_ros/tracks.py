@@ -282,7 +282,7 @@ def load_tracks(path: str | Path) -> Tracks:
             stamp_ns=as_stamps(arrays["stamp_ns"]),
             image_size=(int(size[0]), int(size[1])),
             background=read_background(arrays),
-            real_lens=str(arrays.get("lens", "")) in _LENSES,
+            real_lens=_names_lens(arrays.get("lens")),
             **more,
         )
     except (InputError, ValueError) as error:
@@ -302,6 +302,14 @@ def _checked_size(size: np.ndarray) -> np.ndarray:
     if size.shape != (2,) or size.dtype.kind not in "iuf" or not np.isfinite(size).all():
         raise InputError(f"image_size: expected positive width and height, two numbers, got {size.tolist()}")
     return size
+
+
+def _names_lens(word: np.ndarray | None) -> bool:
+    if word is None:
+        return False
+    if word.size != 1 or str(word.astype(str).item()) not in _LENSES:
+        raise InputError(f"lens: expected {' or '.join(map(repr, _LENSES))}, got {word.tolist()!r}; or leave it out")
+    return True
 
 
 def _as_float(array: np.ndarray, name: str) -> np.ndarray:

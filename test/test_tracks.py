@@ -64,6 +64,8 @@ def test_file_round_trip(tmp_path):
         ({"camera_rotation": -np.tile(np.eye(3), (4, 1, 1))}, "rotation matrices"),
         ({"camera_position": np.full((4, 3), np.nan)}, "finite metres"),
         ({"camera_matrix": np.zeros((3, 3))}, "the last row 0 0 1"),
+        ({"lens": np.array("foo")}, "lens: expected 'assumed' or 'given', got 'foo'"),
+        ({"lens": np.arange(2)}, "lens: expected"),
         ({"camera_matrix": lens(0.7)}, "focal lengths in px, between 64 and 64000 for an image width of 640, got 0.7"),
         ({"camera_matrix": lens(500.0, 0.7)}, "for an image height of 480, got 0.7"),
         ({"camera_matrix": lens(500.0).T}, "the last row 0 0 1"),

@@ -105,13 +105,13 @@ class CameraHistory:
         return "camera_info is for images of {}x{} px, pose2d of {}x{}".format(*self._matrices[-1][2], *size)
 
     def along(self, stamp_ns: np.ndarray, size: tuple[int, int] = (0, 0)) -> WindowCamera | None:
-        """The camera at images of increasing stamps (F,); None where no pose or no calibration is known.
+        """The camera at images of increasing stamps (F,); None where no calibration is known.
 
         Only a calibration of images of ``size`` (width, height) px counts; 0 = unknown.
         Between two poses up to 2 s apart values are interpolated; beyond the newest one they hold for 0.1 s.
         """
         matrix = self._matrix(int(stamp_ns[-1]), size)
-        if matrix is None or not self._stamps:
+        if matrix is None:
             return None
         begin = bisect_left(self._stamps, int(stamp_ns[0]) - _GAP_NS)
         end = bisect_right(self._stamps, int(stamp_ns[-1]) + _GAP_NS)

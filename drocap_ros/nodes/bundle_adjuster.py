@@ -237,9 +237,11 @@ class BundleAdjusterNode(ComponentNode):
         use, reason = window.telemetry, window.reason
         if use is TelemetryUse.NONE and self._uncalibrated:
             use, reason = TelemetryUse.REFUSED, self._uncalibrated
+        if use is TelemetryUse.NONE and self._had_telemetry:
+            use = TelemetryUse.LATE
         self.details[Key.TELEMETRY] = use.name.lower()
         self.details[Key.TELEMETRY_REFUSED] = reason
         self._had_telemetry |= use is TelemetryUse.USED
         words = _WORDS[use].format(reason)
-        refused = use is TelemetryUse.REFUSED or (self._had_telemetry and use in (TelemetryUse.NONE, TelemetryUse.LATE))
+        refused = use is TelemetryUse.REFUSED or (self._had_telemetry and use is TelemetryUse.LATE)
         self.report(WARN if refused else OK, f"{done}; {words}" if words else done)

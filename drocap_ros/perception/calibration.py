@@ -12,6 +12,9 @@ from drocap_ros.geometry.pinhole import centred_camera
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.tracks import check_camera_matrix
 
+#: Names of lens distortions that ``sensor_msgs/CameraInfo`` knows (``distortion_models.hpp`` of sensor_msgs).
+_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
+
 
 @dataclass(frozen=True)
 class CameraModel:
@@ -83,6 +86,8 @@ def load_calibration(path: Path) -> CameraModel:
             f"{path}: expected image_width, image_height, camera_matrix as camera_calibration writes them;"
             f" found a problem with {first_line(error)}"
         ) from None
+    if lens not in _MODELS:
+        raise InputError(f"{path}: distortion_model: expected one of {', '.join(_MODELS)}, found {lens!r}; correct it")
     if min(model.width, model.height) < 1:
         raise InputError(f"{path}: expected a positive image size, found {model.width}x{model.height}; correct it")
     try:

@@ -47,7 +47,7 @@ def test_poses_are_interpolated_between_reports_and_unknown_elsewhere() -> None:
     assert camera.position[1, 0] == pytest.approx(0.5)
 
 
-def test_without_a_calibration_or_a_pose_there_is_no_camera() -> None:
+def test_without_a_calibration_there_is_no_camera_and_without_a_pose_only_its_lens() -> None:
     assert CameraHistory(12.0).along(at(1.0)) is None
     bare = CameraHistory(12.0)
     bare.add_pose(S, np.zeros(3), LEVEL)
@@ -59,7 +59,10 @@ def test_without_a_calibration_or_a_pose_there_is_no_camera() -> None:
     blind.add_pose(S, np.array([1.0, np.nan, 0.0]), LEVEL)
     blind.add_pose(S, np.zeros(3), np.full(4, np.nan))
     blind.add_pose(S, np.zeros(3), np.zeros(4))
-    assert blind.along(at(1.0)) is None
+    lens = blind.along(at(1.0, 2.0))
+    assert lens is not None
+    assert lens.focal_px == MATRIX[0, 0]
+    assert not lens.known.any()
     assert blind.newest_ns == 0
 
 

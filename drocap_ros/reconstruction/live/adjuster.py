@@ -8,10 +8,11 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.geometry.bones import limb_lengths
-from drocap_ros.geometry.camera_history import WindowCamera
+from drocap_ros.geometry.ellipsoids import unpack_covariance
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
+from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.common.stop_reason import DEADLINE
 from drocap_ros.reconstruction.common.threads import blas_threads
 from drocap_ros.reconstruction.lifted.body_size import BodySize, magnification
@@ -22,6 +23,7 @@ from drocap_ros.reconstruction.live.stream_lifter import person_size
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort, Window
 from drocap_ros.reconstruction.live.world_windows import WorldWindows
 from drocap_ros.reconstruction.paper.normalize import MIN_JOINTS
+from drocap_ros.reconstruction.person_view import person_view
 from drocap_ros.skeleton import BODY_15
 
 #: Errors that an adjustment raises on arrays that it cannot solve.
@@ -82,10 +84,10 @@ class LiveAdjuster:
         covariance = w.keypoints.covariance if variance is not None and np.isfinite(variance[seen]).any() else None
         keypoints = Keypoints2D(np.where(seen[..., None], w.keypoints.xy, np.nan), confidence, covariance)
         w = w._replace(keypoints=keypoints)
-        camera = w.camera if self._world.trusted else None
-        result, found = self._solve(w, camera, config, effort, cancelled)
+        rotation = w.camera.rotation if w.camera is not None and self._world.trusted else None
+        result, found = self._solve(w, rotation, config, effort, cancelled)
         final = self._world.adjust(w, found, result)
-        if camera is not None and not self._world.trusted:
+        if rotation is not None and not self._world.trusted:
             # The lifter saw the camera's rotation: without it the poses differ too.  The same steps repeat this.
             if (steps := result.effort.steps) is not None:
                 config = replace(config, first_iterations=steps[0], iterations=steps[1])
@@ -98,19 +100,29 @@ class LiveAdjuster:
     def _solve(
         self,
         w: Window,
-        camera: WindowCamera | None,
+        rotation: np.ndarray | None,
         config: LiftedConfig,
         effort: Effort,
         cancelled: Cancelled | None,
     ) -> tuple[AdjustedWindow, WindowSolution]:
-        """Poses in camera axes and in px, with what is known of the camera."""
-        focal = w.assumed_focal_px if camera is None else camera.focal_px
-        rotation = None if camera is None else camera.rotation
-        found = solve_window(w.stamp_ns, w.keypoints, focal, config, self._sizes(w), cancelled, rotation)
+        """Poses in camera axes and in px of the image, with what is known of the camera."""
+        focal, view = w.assumed_focal_px, None
+        if w.camera is not None:
+            focal = w.camera.focal_px
+            turned = None if rotation is None else _without_gaps(rotation)
+            view = person_view(w.keypoints, w.camera.matrix, turned, (0, 0))
+        seen = w if view is None else w._replace(keypoints=view.keypoints(w.keypoints))
+        turned = rotation if view is None else view.rotation(rotation)
+        found = solve_window(w.stamp_ns, seen.keypoints, focal, config, self._sizes(w), cancelled, turned)
         if not np.isfinite(found.joints).all():
             raise FloatingPointError("the solver found no finite poses")
         steps = found.steps if found.stop_reason == DEADLINE or effort.steps is not None else None
-        return _adjusted(w, found, focal, Effort(effort.stride, steps)), found
+        result = _adjusted(seen, found, focal, Effort(effort.stride, steps))
+        if view is None:
+            return result, found
+        poses = view.in_image(ImagePoses.centred(found.joints, found.sigma))
+        assert poses.sigma_px is not None
+        return _turned_back(result, view.turn), replace(found, joints=poses.in_image, sigma=poses.sigma_px)
 
     def _sizes(self, w: Window) -> BodySize | None:
         if self._known is None or self._known[0] != w.subject:
@@ -119,6 +131,23 @@ class LiveAdjuster:
         begin = stamp_ns[0]
         size = np.interp((w.stamp_ns - begin) * 1e-9, (stamp_ns - begin) * 1e-9, body.unit_per_mm)
         return BodySize(body.lengths_mm, size)
+
+
+def _without_gaps(rotation: np.ndarray) -> np.ndarray | None:
+    """Rotations (F, 3, 3) with those of the nearest known frame where they are NaN; None = all are."""
+    known = np.flatnonzero(np.isfinite(rotation).all(axis=(1, 2)))
+    if not len(known):
+        return None
+    nearest = np.abs(np.arange(len(rotation))[:, None] - known).argmin(axis=1)
+    return rotation[known[nearest]]
+
+
+def _turned_back(result: AdjustedWindow, turn: np.ndarray) -> AdjustedWindow:
+    """Poses in the axes of a view, ``turn`` (F, 3, 3) camera -> view, in those of the camera."""
+    back = turn[:, None]
+    full = np.swapaxes(back, -1, -2) @ unpack_covariance(result.covariance) @ back
+    covariance = full[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    return replace(result, joints3d=result.joints3d @ turn, covariance=covariance)
 
 
 def _adjusted(w: Window, found: WindowSolution, focal: float | None, effort: Effort) -> AdjustedWindow:

@@ -20,6 +20,7 @@ from drocap_ros.reconstruction.common.poses import ImagePoses
 from drocap_ros.reconstruction.common.refusal import Refusal
 from drocap_ros.reconstruction.lifted.method import WindowSolution
 from drocap_ros.reconstruction.live.window import AdjustedWindow, InMap, TelemetryUse, Window
+from drocap_ros.reconstruction.person_view import true_shape
 from drocap_ros.reconstruction.world.findings import Findings
 from drocap_ros.reconstruction.world.in_world import in_world
 from drocap_ros.reconstruction.world.placement import metres_per_px
@@ -70,7 +71,7 @@ class WorldWindows:
         return result
 
     def _adjust(self, w: Window, found: WindowSolution, camera_result: AdjustedWindow) -> AdjustedWindow:
-        if w.camera is None:
+        if w.camera is None or not w.camera.known.any():
             return camera_result
         use = self._frames(w)
         if use is None:
@@ -81,7 +82,8 @@ class WorldWindows:
             return self._refused(camera_result, refusal)
         tracks = _tracks(stamps, keypoints, camera)
         poses = ImagePoses.centred(found.joints[use], sigma_px=found.sigma[use], still=found.still[use])
-        per_px = metres_per_px(poses.joints_px, stamps, _assumed_height(w.initial_joints))
+        shape = true_shape(poses.in_image, camera.matrix)
+        per_px = metres_per_px(shape, stamps, _assumed_height(w.initial_joints))
         known = self._prior(stamps)
         before = self._continued(stamps)
         config = self._first if before is None else self._next

@@ -245,3 +245,12 @@ def test_calibration_in_another_unit_is_refused(tmp_path: Path, focal: str, word
     with pytest.raises(InputError, match=words) as refused:
         load_calibration(path)
     assert str(path) in str(refused.value)
+
+
+def test_an_unknown_distortion_model_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    matrix = "[900.0, 0.0, 640.0, 0.0, 900.0, 360.0, 0.0, 0.0, 1.0]"
+    text = f"image_width: 1280\nimage_height: 720\ncamera_matrix: {{rows: 3, cols: 3, data: {matrix}}}\n"
+    path.write_text(f"{text}distortion_model: foo\n")
+    with pytest.raises(InputError, match=r"distortion_model: expected one of plumb_bob, .* found 'foo'"):
+        load_calibration(path)

@@ -12,6 +12,9 @@ from walking import make_walk, stamps
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation.metrics import pa_mpjpe
 from drocap_ros.geometry.bones import limb_lengths
+from drocap_ros.geometry.camera_history import WindowCamera
+from drocap_ros.geometry.ellipsoids import unpack_covariance
+from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.config import BundleAdjusterConfig
 from drocap_ros.reconstruction.live.adjuster import LiveAdjuster
@@ -34,6 +37,30 @@ def window(begin: int = 0, end: int = FRAMES, subject: int = 1) -> Window:
         initial,
         subject,
     )
+
+
+def seen_by(turn: np.ndarray, camera: bool = True) -> AdjustedWindow:
+    """The walk, 4 m away, by a camera of 700 px turned by so much, without a pose."""
+    there = (WALK.in_camera - WALK.in_camera[:, :1].mean(axis=0) + [0.0, 0.0, 4.0]) @ turn.T
+    matrix = np.array([[700.0, 0.0, 640.0], [0.0, 700.0, 360.0], [0.0, 0.0, 1.0]])
+    image = there[..., :2] / there[..., 2:] * 700.0 + matrix[:2, 2]
+    w = window()._replace(keypoints=Keypoints2D(image, np.ones(image.shape[:2])).with_joints(17))
+    unknown = np.full((FRAMES, 3, 3), np.nan)
+    return LiveAdjuster(BundleAdjusterConfig()).adjust(
+        w._replace(camera=WindowCamera(unknown, unknown[:, 0], matrix) if camera else None)
+    )
+
+
+def test_with_a_known_lens_alone_a_pose_does_not_depend_on_its_place_in_the_picture() -> None:
+    middle = seen_by(np.eye(3))
+    turn = exp_so3(np.deg2rad([0.0, 32.0, 0.0]))
+    aside = seen_by(turn)
+    assert np.abs(aside.joints3d - middle.joints3d @ turn.T).max() < 0.02
+    np.testing.assert_allclose(
+        unpack_covariance(aside.covariance), turn @ unpack_covariance(middle.covariance) @ turn.T, atol=2e-4
+    )
+    # A lens that is assumed does not know the place.
+    assert np.abs(seen_by(turn, camera=False).joints3d - middle.joints3d @ turn.T).max() > 0.1
 
 
 def adjust_twice(adjuster: LiveAdjuster, **second: int) -> tuple[AdjustedWindow, AdjustedWindow]:
