@@ -139,7 +139,7 @@ def _without_gaps(rotation: np.ndarray) -> np.ndarray | None:
     if not len(known):
         return None
     nearest = np.abs(np.arange(len(rotation))[:, None] - known).argmin(axis=1)
-    return rotation[known[nearest]]
+    return np.asarray(rotation[known[nearest]])
 
 
 def _turned_back(result: AdjustedWindow, turn: np.ndarray) -> AdjustedWindow:
