@@ -39,8 +39,8 @@ def reconstruct(  # noqa: PLR0913 - the options of the command
     method : "ba", "paper", "paper-no-articulation", "initial", "mf-nnm", or "live" for a recording of the live graph
     models : folder of ONNX files; None = ``DROCAP_MODELS`` or the user's own
     config : parameters, or their YAML file
-    telemetry : log beside a video, or "none", also for tracks; default: the DJI track inside the video, where there is
-        one
+    telemetry : log beside a video, or "none", also for tracks; default: the DJI track inside the video, or the
+        subtitles of its name beside it
     start_s, end_s : part of the source, seconds from its first image
     subject : number of a person as ``drocap track --list`` numbers them, "largest", "centre", or a box
         "x_min,y_min,x_max,y_max" px in the first image; empty = as configured

@@ -81,8 +81,8 @@ def reconstruct_input(
         graph on a recording with ``pose2d``, with the recorded parameters unless ``config`` differs from the defaults
     models : folder of ONNX files; None = ``DROCAP_MODELS`` or the user's own
     progress : called with a stage and its fraction done
-    telemetry : source of the camera's pose of a video; default: the DJI track inside it, where there is one.  With
-        ``NO_TELEMETRY`` that of a recording or tracks file is not used either; its pitch of a mount is that of a
+    telemetry : source of the camera's pose of a video; default: the DJI track inside it or the subtitles beside it.
+        With ``NO_TELEMETRY`` that of a recording or tracks file is not used either; its pitch of a mount is that of a
         recording without the camera's attitude, too
     selection : part of the input; default: all images, the person in most of them
 
@@ -98,10 +98,11 @@ def reconstruct_input(
             raise InputError("--method live: expected the recorded telemetry, got other; leave the options out")
         return _reconstruct_live(Path(path), config, progress)
     begin = time.perf_counter()
-    log = read_video_telemetry(Path(path), telemetry)
+    found = read_video_telemetry(Path(path), telemetry)
     tracks, origin = read_input(Path(path), config, models, progress, telemetry, selection)
-    if log is not None:
-        tracks, origin["telemetry"] = with_telemetry(Path(path), tracks, telemetry, log, config.image_ingest, progress)
+    if found is not None:
+        ingest = config.image_ingest
+        tracks, origin["telemetry"] = with_telemetry(Path(path), tracks, telemetry, found, ingest, progress)
     tracks = with_attitude(tracks, telemetry.attitude_deg)
     if selection.evidence is not None:
         tracks = with_evidence(tracks, selection.evidence)

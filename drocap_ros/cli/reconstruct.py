@@ -70,7 +70,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="LOG",
         type=Path,
         help="log beside a video: MAVLink .tlog, PX4 .ulg, ArduPilot .bin, DJI .srt, Airdata .csv (default: the DJI"
-        " track inside the video, where there is one); none: no telemetry, nor that of a session or tracks file",
+        " track inside the video, else the .SRT of its name); none: no telemetry, nor that of a session or tracks file",
     )
     parser.add_argument(
         "--time-offset",
@@ -214,10 +214,9 @@ def _attitude(args: argparse.Namespace) -> tuple[float, float] | None:
 def _check_offset(name: str, value: float, args: argparse.Namespace, *, mount: bool) -> None:
     """Refuse an offset that is no number, or without telemetry: a log, a video's own, of a mount a recording's."""
     from drocap_ros.recording.open_session import is_recording
-    from drocap_ros.recording.telemetry.djmd import has_djmd
-    from drocap_ros.recording.video_telemetry import NO_TELEMETRY
+    from drocap_ros.recording.video_telemetry import NO_TELEMETRY, own_telemetry
 
-    own = has_djmd(args.input) or (mount and args.input.exists() and is_recording(args.input))
+    own = own_telemetry(args.input) or (mount and args.input.exists() and is_recording(args.input))
     if args.telemetry == NO_TELEMETRY or (args.telemetry is None and not own):
         raise InputError(f"{name}: expected --telemetry LOG with it, found none; add the log")
     if not math.isfinite(value):

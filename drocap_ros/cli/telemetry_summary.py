@@ -54,13 +54,13 @@ def telemetry_summary(path: Path) -> Summary:
     if path.suffix.lower() in LOG_SUFFIXES:
         log = read_telemetry(path)
     else:
-        from drocap_ros.recording.telemetry.djmd import has_djmd, read_djmd
+        from drocap_ros.recording.video_telemetry import read_own
 
         facts += _video_facts(path)
-        try:
-            log = read_djmd(path) if has_djmd(path) else None
-        except (InputError, OSError) as error:
-            warnings.append(str(error))
+        own, warnings = read_own(path)
+        if own is not None:
+            log = own[1]
+            facts += [] if own[0] == path else [("beside the video", own[0].name)]
     if log is None:
         found = "not usable" if warnings else "none in the file"
         return Summary([*facts, ("telemetry", found)], warnings=warnings)

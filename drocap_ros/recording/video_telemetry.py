@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from drocap_ros.errors import InputError
+from drocap_ros.file_kind import FileKind, file_kind
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.perception.calibration import camera_model
 from drocap_ros.perception.sources.image_ingest_config import ImageIngestConfig
 from drocap_ros.recording.open_session import is_recording
+from drocap_ros.recording.telemetry import srt
 from drocap_ros.recording.telemetry.camera_poses import with_camera
 from drocap_ros.recording.telemetry.log import TelemetryLog
 from drocap_ros.recording.telemetry.read import read_telemetry
@@ -32,7 +34,7 @@ class Telemetry:
     """Source of a video's telemetry.
 
     path : log beside it (.tlog, .ulg, .bin, .srt, .csv), or ``NO_TELEMETRY``; None = the DJI track inside the video,
-        where there is one
+        else the subtitles of its name beside it, where there are any
     time_offset_s : from the log's first state to the video's first image; None = known or estimated
     mount_pitch_deg : of a camera fixed to the body of a vehicle without a gimbal, negative down
     attitude_deg : pitch, negative down, and roll, clockwise, of a camera that stands still
@@ -62,38 +64,57 @@ def with_attitude(tracks: Tracks, attitude_deg: tuple[float, float] | None) -> T
     return dataclasses.replace(tracks, camera_rotation=rotation)
 
 
-def read_video_telemetry(video: Path, telemetry: Telemetry) -> TelemetryLog | None:
-    """The log beside a video, else the telemetry inside it; None where there is none.
+def own_telemetry(video: Path) -> list[Path]:
+    """What tells a video's telemetry without being named: the video itself, and subtitles of its name beside it."""
+    from drocap_ros.recording.telemetry.djmd import has_djmd
 
-    Content inside the video that cannot be true is warned of and not used.
+    if not video.is_file() or file_kind(video) is not FileKind.VIDEO:
+        return []
+    suffix = srt.FORMAT.suffix  # in any case, and no name of the video is a pattern
+    beside = (file for file in video.parent.iterdir() if file.suffix.lower() == suffix and file.stem == video.stem)
+    return [video] * has_djmd(video) + sorted(beside)
+
+
+def read_video_telemetry(video: Path, telemetry: Telemetry) -> tuple[Path, TelemetryLog] | None:
+    """The named log of a video, else the first of :func:`own_telemetry` that can be used; None where there is none.
+
+    Own telemetry that cannot be true is warned of and not used.
 
     Raises
     ------
     InputError
-        When the log beside it cannot be used, or the input is no video.
+        When the named log cannot be used, or the input is no video.
     """
     if telemetry.path == NO_TELEMETRY:
         return None
     if telemetry.path is not None:
         if video.is_dir() or video.suffix == ".npz" or is_recording(video):
             raise InputError(f"--telemetry: expected a video file, found {video}; recordings hold their telemetry")
-        return read_telemetry(telemetry.path)
-    from drocap_ros.recording.telemetry.djmd import has_djmd, read_djmd
+        return telemetry.path, read_telemetry(telemetry.path)
+    found, problems = read_own(video)
+    for problem in problems:
+        logger.warning("%s; the video is used without it", problem)
+    return found
 
-    if not video.is_file() or not has_djmd(video):
-        return None
-    try:
-        return read_djmd(video)
-    except (InputError, OSError) as error:
-        logger.warning("%s; the video is used without telemetry", error)
-        return None
+
+def read_own(video: Path) -> tuple[tuple[Path, TelemetryLog] | None, list[str]]:
+    """The first of :func:`own_telemetry` that can be used, and why those before it cannot."""
+    from drocap_ros.recording.telemetry.djmd import read_djmd
+
+    problems: list[str] = []
+    for source in own_telemetry(video):
+        try:
+            return (source, read_djmd(video) if source == video else read_telemetry(source)), problems
+        except (InputError, OSError) as error:  # noqa: PERF203  # two files at most
+            problems.append(str(error))
+    return None, problems
 
 
 def with_telemetry(
     video: Path,
     tracks: Tracks,
     telemetry: Telemetry,
-    log: TelemetryLog,
+    found: tuple[Path, TelemetryLog],
     ingest: ImageIngestConfig,
     progress: Progress | None = None,
 ) -> tuple[Tracks, dict[str, str]]:
@@ -106,9 +127,10 @@ def with_telemetry(
     InputError
         When the time offset is unknown or the calibration cannot be used.
     """
-    name, pitch = telemetry.path or video, telemetry.mount_pitch_deg
+    (name, log), pitch = found, telemetry.mount_pitch_deg
     offset = find_offset(video, log, telemetry.time_offset_s, pitch, progress)
-    logger.warning("%s: %s; %s", name, log.kind, offset)
+    beside = "" if name in (telemetry.path, video) else ", found beside the video (--telemetry none leaves it out)"
+    logger.warning("%s: %s%s; %s", name, log.kind, beside, offset)
     for lack in log.lacks:
         logger.warning("%s: %s", name, lack)
     at_ns = tracks.stamp_ns + int(log.track.stamp_ns[0]) + round(offset.seconds * 1e9)

@@ -13,6 +13,8 @@ from typing import IO
 
 #: Bounds against damaged files: boxes at one level, and the bytes of an index of hours.
 _MAX_BOXES, _MAX_INDEX = 4096, 1 << 26
+#: Bytes of a box, of which a thousand times the boxes are a place in a file still (63 bits): beyond it is no MP4.
+_MAX_BOX = 1 << 50
 
 
 def movie_s(path: Path) -> float | None:
@@ -86,7 +88,7 @@ def _boxes(file: IO[bytes]) -> Iterator[tuple[int, bytes, int]]:
         size, begin = int.from_bytes(head[:4], "big"), place + 8
         if size == 1:
             size, begin = int.from_bytes(head[8:], "big"), place + 16
-        if size < begin - place:
+        if size < begin - place or size > _MAX_BOX:
             return
         yield begin, head[4:8], place + size
         place += size

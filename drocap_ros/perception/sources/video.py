@@ -144,7 +144,7 @@ class VideoSource(ImageSource):
         packets = [packet.tobytes() for ok, packet in (raw.read() for _ in self._pending) if ok]
         raw.release()
         largest_still = _STILL_BYTES + first.shape[0] * first.shape[1] // _STILL_PIXELS
-        differ = len(set(packets)) == len(self._pending) >= _PROBED[0]
+        differ = len(set(packets)) >= _PROBED[0]  # some programs repeat packets to raise the rate
         return differ and float(np.median([len(packet) for packet in packets])) > largest_still
 
     def _refuse(self) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import csv
 import itertools
 import math
+import re
 from collections.abc import Collection, Iterator
 from datetime import datetime, timezone
 from pathlib import Path
@@ -26,18 +27,25 @@ _MAX_ROWS = 200_000
 #: A later time than eleven days is damage.
 _LATEST_MS = 1e9
 _GIMBAL, _AIRCRAFT = ("gimbal pitch", "gimbal roll", "gimbal yaw"), ("pitch", "roll", "yaw")
-#: Name of a column in lower case -> ours, and our unit of it: ms, deg, m.
-_COLUMNS: dict[str, tuple[str, float]] = {
-    "time(millisecond)": ("time", 1.0), "osd.flytime [s]": ("time", 1000.0),
-    "datetime(utc)": ("utc", 1.0), "isvideo": ("video", 1.0), "camera.isvideo": ("video", 1.0),
-    **{f"{before}{name}": (name, 1.0) for before in ("", "osd.") for name in ("latitude", "longitude")},
-    "height_above_takeoff(feet)": ("height", 0.3048), "height_above_takeoff(meters)": ("height", 1.0),
-    "osd.height [ft]": ("height", 0.3048), "osd.height [m]": ("height", 1.0), "altitude(m)": ("height", 1.0),
-    "altitude(feet)": ("height", 0.3048), "compass_heading(degrees)": ("yaw", 1.0), "gimbal_heading(degrees)":
-    ("gimbal yaw", 1.0), "yaw(deg)": ("yaw", 1.0), "osd.yaw": ("yaw", 1.0), "gimbal.yaw": ("gimbal yaw", 1.0),
-    **{form.format(a): (a, 1.0) for a in ("pitch", "roll") for form in ("{}(degrees)", "{}(deg)", "osd.{}")},
-    **{form.format(a): (f"gimbal {a}", 1.0) for a in ("pitch", "roll") for form in ("gimbal_{}(degrees)", "gimbal.{}")},
-    **{f"gimbal{a}raw": (f"gimbal {a}", 0.1) for a in ("pitch", "roll", "yaw")},
+#: A column's title in lower case: its name, and its unit in brackets.
+_TITLE = re.compile(r"([^(\[]*[^(\[ ]) *(?:[(\[]([^)\]]*)[)\]])?")
+#: A flight record's time as text.
+_FLY_TIME = re.compile(r"(?:(\d{1,3})h *)?(?:(\d{1,4})m *)?(\d{1,4}(?:\.\d{1,6})?)s")
+_Units = dict[str, float]
+_MS: _Units = {"millisecond": 1.0, "milliseconds": 1.0, "ms": 1.0, **dict.fromkeys(("s", "sec", "seconds"), 1000.0)}
+_M: _Units = {**dict.fromkeys(("m", "meter", "meters", "metres"), 1.0), **dict.fromkeys(("ft", "feet"), 0.3048)}
+_DEG: _Units = {**dict.fromkeys(("", "deg", "degrees", "°", "360"), 1.0), "rad": math.degrees(1.0)}
+_PLAIN: _Units = {"": 1.0}
+#: Name of a column -> ours, and its possible units in ours: ms, deg, m.  A flight record without units has s and m.
+_COLUMNS: dict[str, tuple[str, _Units]] = {
+    "time": ("time", _MS), "osd.flytime": ("time", {"": 1000.0, **_MS}), "datetime": ("utc", {"utc": 1.0}),
+    "isvideo": ("video", _PLAIN), "camera.isvideo": ("video", _PLAIN), "height_above_takeoff": ("height", _M),
+    **{f"{before}{name}": (name, _DEG) for before in ("", "osd.") for name in ("latitude", "longitude")},
+    "osd.height": ("height", {"": 1.0, **_M}), "altitude": ("height", _M), "compass_heading": ("yaw", _DEG),
+    "gimbal_heading": ("gimbal yaw", _DEG),
+    **{f"{before}{a}": (a, _DEG) for a in _AIRCRAFT for before in ("", "osd.")},
+    **{f"{before}{a}": (f"gimbal {a}", _DEG) for a in _AIRCRAFT for before in ("gimbal_", "gimbal.")},
+    **{f"gimbal{a}raw": (f"gimbal {a}", {"": 0.1}) for a in _AIRCRAFT},
 }  # fmt: skip
 
 
@@ -79,8 +87,9 @@ class _Table:
         cells = _cells(path)
         head = [name.strip().lower() for name in next(cells, [])]
         found: dict[str, tuple[int, float]] = {}
-        for i, (name, unit) in ((i, _COLUMNS[title]) for i, title in enumerate(head) if title in _COLUMNS):
-            found.setdefault(name, (i, unit))
+        for i, title in enumerate(head):
+            if column := _column(title):
+                found.setdefault(column[0], (i, column[1]))
         _check_head(path, head, found)
         record = "flight record CSV" if "osd.yaw" in head else "Airdata CSV"
         self.kind = "Litchi CSV" if "gimbalpitchraw" in head else record
@@ -104,17 +113,23 @@ class _Table:
 
 
 def _cells(path: Path) -> Iterator[list[str]]:
-    """Rows as text, numbers with a point; a spreadsheet of some countries writes semicolons and decimal commas."""
+    """Rows as text; where the comma is for decimals a spreadsheet writes semicolons or tabs, and may name them."""
     with path.open("rb") as file:
         wide = file.read(2) in (b"\xff\xfe", b"\xfe\xff")
     with path.open("r", encoding="utf-16" if wide else "utf-8-sig", errors="replace", newline="") as text:
         first = text.readline(_LINE)
+        if first.lower().startswith("sep="):
+            first = text.readline(_LINE)
         lines = itertools.chain([first], iter(lambda: text.readline(_LINE), ""))
-        if first.count(";") <= first.count(","):
-            yield from csv.reader(lines)
-            return
-        for row in csv.reader(lines, delimiter=";"):
-            yield [cell.replace(",", ".") for cell in row]
+        yield from csv.reader(lines, delimiter=max(",;\t", key=first.count))
+
+
+def _column(title: str) -> tuple[str, float] | None:
+    """Our name of a column and its unit in ours, None where it is another column or unit."""
+    match = _TITLE.fullmatch(title)
+    name, units = _COLUMNS.get(match[1], ("", _PLAIN)) if match else ("", _PLAIN)
+    unit = units.get((match[2] or "") if match else "")
+    return (name, unit) if name and unit else None
 
 
 def _row(cells: list[str], columns: dict[str, tuple[int, float]]) -> list[float]:
@@ -131,8 +146,13 @@ def _check_head(path: Path, head: list[str], found: Collection[str]) -> None:
 
 
 def _number(text: str) -> float:
+    text = text.strip().lower()
+    if time := _FLY_TIME.fullmatch(text):
+        return 3600.0 * float(time[1] or 0) + 60.0 * float(time[2] or 0) + float(time[3])
+    if text.count(",") == 1 and "." not in text:
+        text = text.replace(",", ".")
     try:
-        value = float({"true": "1", "false": "0"}.get(text.strip().lower(), text))
+        value = float({"true": "1", "false": "0"}.get(text, text))
     except ValueError:
         return math.nan
     return value if math.isfinite(value) else math.nan

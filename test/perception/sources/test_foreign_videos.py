@@ -144,6 +144,13 @@ def test_undecoded_video_names_its_codec(shared):
         assert "convert it: ffmpeg" in str(error)  # noqa: PT017
 
 
+def test_an_elementary_stream_is_no_index_of_an_mp4(tmp_path):
+    """Its first bytes are a box of a size in 64 bits, beyond any file."""
+    (tmp_path / "a.h264").write_bytes(b"\0\0\0\x01\x67\x64\0\x1e" + b"\xff" * 400)
+    with pytest.raises(InputError, match="expected a video"):
+        open_source(tmp_path / "a.h264")
+
+
 def test_unknown_codec_is_named(tmp_path):
     path = write_video(tmp_path / "a.mp4")
     data = bytearray(path.read_bytes())

@@ -1,6 +1,7 @@
 """Airdata's CSV beside a video."""
 
 import random
+import re
 
 import numpy as np
 import pytest
@@ -73,6 +74,36 @@ def test_every_flight_log_in_every_saving_is_one_flight(tmp_path, form, save):
     enu = geodetic_to_enu(geodetic, np.array([*geodetic[0, :2], 0.0]))
     assert np.abs(log.track.position - enu).max() < 0.02
     assert len(log.video_parts) == 1
+
+
+def in_metric_words(content):
+    """The same log with the units, titles and times of another reader."""
+    table = [line.split(",") for line in content.split("\n")]
+    for i, title in enumerate(table[0]):
+        if title == "OSD.height [ft]":
+            for row in table[1:]:
+                row[i] = f"{float(row[i]) * 0.3048:.6f}"
+        if title == "OSD.flyTime [s]":
+            for row in table[1:]:
+                row[i] = f"0m {row[i]}s"
+    table[0] = [re.sub(r" \[(s|ft)\]", "", title) for title in table[0]]
+    return "\n".join(map(",".join, table))
+
+
+@pytest.mark.parametrize("save", [
+    in_metric_words,
+    lambda s: "sep=,\n" + s.replace("[ft]", "(feet)"),
+    lambda s: s.replace(",", "\t"),
+    lambda s: "\n".join(",".join(f'"{cell.replace(".", ",")}"' for cell in line.split(",")) if i else line
+                        for i, line in enumerate(s.split("\n"))),
+], ids=["metres", "named separator", "tabs", "quoted decimal commas"])  # fmt: skip
+def test_units_and_separators_of_other_programs_are_read(tmp_path, save):
+    (tmp_path / "f.csv").write_text(save(flight_record(tmp_path)), encoding="utf-8")
+    _, gimbal, _, geodetic = airdata_flight()
+    assert main(["info", str(tmp_path / "f.csv")]) == 0
+    track = read_telemetry(tmp_path / "f.csv").track
+    assert wrapped(angles_of(track.gimbal) - gimbal).max() < 1e-5
+    assert np.abs(track.position[:, 2] - geodetic[:, 2]).max() < 0.02
 
 
 def test_video_belongs_to_the_part_of_its_length(tmp_path):
