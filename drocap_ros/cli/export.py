@@ -24,7 +24,9 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--to", metavar="FORMAT", choices=tuple(FORMATS), required=True, help=", ".join(FORMATS))
     parser.add_argument("--out", metavar="FILE", type=Path, help="file to write (default: beside MOTION)")
     parser.add_argument(
-        "--names", choices=("h36m", "lafan1", "mixamo"), help="joint names of bvh and glb (default: h36m)"
+        "--names",
+        choices=("h36m", "lafan1", "mixamo", "mixamo-three"),
+        help="joint names of bvh and glb; mixamo-three: Mixamo's as three.js has them (default: h36m)",
     )
     parser.add_argument("--rest", choices=("t", "a"), help="rest pose of bvh and glb: T or A (default: t)")
     parser.add_argument(

@@ -42,7 +42,9 @@ def add_parser(subparsers: Subparsers) -> None:
     fetching.add_argument("names", nargs="*", metavar="NAME", help="models by name (default: rtmdet-nano rtmpose-s)")
     add_quiet_option(fetching)
     checking.add_argument("image", nargs="?", type=Path, metavar="IMAGE", help="image of a person")
-    checking.add_argument("--out", metavar="PNG", type=Path, help="output image (default: IMAGE_check.png)")
+    checking.add_argument(
+        "--out", metavar="PNG", type=Path, help="output image (default: IMAGE_check.png where it is called)"
+    )
 
 
 def run_list(args: argparse.Namespace) -> int:
@@ -130,7 +132,7 @@ def run_check(args: argparse.Namespace) -> int:
         print(f"{args.image}: no person found")
         return 0
     _print_keypoints(observation)
-    out = args.out or args.image.with_name(f"{args.image.stem}_check.png")
+    out = args.out or Path(f"{args.image.stem}_check.png")
     if not out.parent.is_dir() or not cv2.imwrite(str(out), draw(image, observation)):
         raise InputError(f"--out {out}: expected an image name (.png, .jpg) in a writable folder; choose another")
     print(f"written: {out}")

@@ -8,12 +8,13 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from drocap_ros.errors import InputError
 from drocap_ros.export.measured import write_trc
 from drocap_ros.export.opensim_model import WEIGHTS, model_xml
-from drocap_ros.export.rig import body_of
+from drocap_ros.export.rig import body_of, onto_the_floor
 from drocap_ros.export.take import Take, at_constant_rate, without_gaps, y_up
 
 
@@ -34,6 +35,8 @@ def write_mot(path: Path, take: Take) -> tuple[str, ...]:
 
     take = at_constant_rate(take)
     body, notes = body_of(y_up(take))
+    lift, floor_note = onto_the_floor(body, take.positions[:, take.joints.index("pelvis")])
+    take = replace(take, positions=take.positions + lift[:, None, None] * (0.0, 0.0, 1.0))
     opensim.Logger.removeFileSink()  # opensim.log in the current folder
     opensim.Logger.setLevelString("Off")
     # The tool writes further files into the working folder of its model.
@@ -71,7 +74,11 @@ def write_mot(path: Path, take: Take) -> tuple[str, ...]:
         except RuntimeError as error:
             reason = str(error).splitlines()[0]
             raise InputError(f"opensim: expected inverse kinematics to succeed, got {reason}; try --to trc") from None
-    return (*notes, f"skeletal model of these sizes: {path.with_suffix('.osim').name}, made by drocap, without muscles")
+    return (
+        *notes,
+        floor_note,
+        f"skeletal model of these sizes: {path.with_suffix('.osim').name}, made by drocap, without muscles",
+    )
 
 
 @contextlib.contextmanager

@@ -1,7 +1,8 @@
 """A plain skeletal model for OpenSim, of this project's own making, in the sizes of a motion.
 
-Rigid segments without muscles; axes X forwards, Y up, Z to the right.  A marker stands at each joint of the motion.
-Coordinates have the names of OpenSim's usual full-body models; left joints are mirrored.
+Rigid segments without muscles; axes X forwards, Y up, Z to the right.  A marker stands at each joint of the motion, an
+ellipsoid is each bone.  Coordinates have the names of OpenSim's usual full-body models; left joints are mirrored.  By
+default the model stands on the floor, y = 0.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from drocap_ros.export.rig import SOLE
 from drocap_ros.export.rigid_body import RigidBody
 from drocap_ros.skeleton import TOES
 
@@ -21,6 +23,9 @@ _LINEAR = '<LinearFunction name="function"><coefficients>1 0</coefficients></Lin
 _ZERO = '<Constant name="function"><value>0</value></Constant>'
 #: Ranges of coordinates, degrees; inverse kinematics stays within them.
 _RANGES = {"knee_angle": (-5.0, 160.0), "elbow_flex": (-5.0, 160.0)}
+#: Width of a bone, and of the head, over the length; colour of bone, red, green, blue; for the eye alone.
+_BONE, _HEAD = 0.22, 0.75
+_COLOUR = "0.93 0.89 0.8"
 #: Weights in inverse kinematics, m^2 per rad^2, of coordinates that joint positions show badly or not at all.
 WEIGHTS = {"lumbar_extension": 2.5e-3}
 WEIGHTS |= dict.fromkeys(("hip_rotation_r", "hip_rotation_l", "arm_rot_r", "arm_rot_l"), 2e-4)
@@ -31,7 +36,8 @@ def model_xml(body: RigidBody) -> str:
     trunk = float(sum(body.fixed[name][1] for name in ("spine", "chest", "upperchest", "thorax")))
     lumbar = float(body.fixed["spine"][1])
     half = float(body.fixed["lcollar"][0]) + 0.5 * (body.lengths["lshoulder"] + body.lengths["rshoulder"])
-    model = _Model()
+    sole = SOLE * body.lengths["lankle"]
+    model = _Model({"pelvis_ty": body.lengths["lknee"] + body.lengths["lankle"] + sole})
     pelvis = [("pelvis_rotation", _Y), ("pelvis_list", _X), ("pelvis_tilt", _Z)]
     model.segment("pelvis", "", (0, 0, 0), pelvis, [("pelvis_tx", _X), ("pelvis_ty", _Y), ("pelvis_tz", _Z)])
     spine = [("lumbar_extension", _Z), ("lumbar_bending", _X), ("lumbar_rotation", _Y)]
@@ -40,6 +46,10 @@ def model_xml(body: RigidBody) -> str:
     model.segment("head", "neck", (0, body.lengths["neck"], 0), [("head_extension", _Z), ("head_bending", _X)])
     model.markers += [("pelvis", "pelvis", (0, 0, 0)), ("neck", "head", (0, 0, 0))]
     model.markers.append(("head", "head", (0, body.lengths["head"], 0)))
+    model.bone("pelvis", (0, 0, 0), (0, lumbar, 0))
+    model.bone("torso", (0, 0, 0), (0, trunk - lumbar, 0))
+    model.bone("neck", (0, 0, 0), (0, body.lengths["neck"], 0))
+    model.bone("head", (0, 0, 0), (0, 2.0 * body.lengths["head"], 0), _HEAD)
     for side, sign in (("r", 1), ("l", -1)):
         _limbs(model, body, side, sign, (0, trunk - lumbar, sign * half))
     return model.xml()
@@ -49,6 +59,8 @@ def _limbs(model: _Model, body: RigidBody, side: str, sign: int, shoulder: tuple
     x, y, backwards = (sign, 0, 0), (0, sign, 0), (0, 0, -1)
     hip = (0, 0, sign * float(body.fixed["lhip"][0]))
     thigh, shank, upper, fore = ((0, -body.lengths[side + name], 0) for name in ("knee", "ankle", "elbow", "wrist"))
+    model.bone("pelvis", (0, 0, 0), hip)
+    model.bone("torso", (0, shoulder[1], 0), shoulder)
     femur, tibia, humerus, forearm = (f"{name}_{side}" for name in ("femur", "tibia", "humerus", "forearm"))
     ball = [(f"hip_flexion_{side}", _Z), (f"hip_adduction_{side}", x), (f"hip_rotation_{side}", y)]
     model.segment(femur, "pelvis", hip, ball)
@@ -56,19 +68,29 @@ def _limbs(model: _Model, body: RigidBody, side: str, sign: int, shoulder: tuple
     ball = [(f"arm_flex_{side}", _Z), (f"arm_add_{side}", x), (f"arm_rot_{side}", y)]
     model.segment(humerus, "torso", shoulder, ball)
     model.segment(forearm, humerus, upper, [(f"elbow_flex_{side}", _Z)])
+    for segment, end in ((femur, thigh), (tibia, shank), (humerus, upper), (forearm, fore)):
+        model.bone(segment, (0, 0, 0), end)
     if set(TOES) <= set(body.joints):
-        model.segment(f"foot_{side}", tibia, shank, [(f"ankle_angle_{side}", _Z)])
-        model.markers.append((side + "toe", f"foot_{side}", (body.lengths[side + "toe"], 0, 0)))
+        foot, toe = f"foot_{side}", (body.lengths[side + "toe"], 0, 0)
+        # The toes reach the floor, where the ankle stands at its height above the sole.
+        model.rest[f"ankle_angle_{side}"] = -float(np.arcsin(min(SOLE * body.lengths["lankle"] / toe[0], 1.0)))
+        model.segment(foot, tibia, shank, [(f"ankle_angle_{side}", _Z)])
+        model.bone(foot, (0, 0, 0), toe)
+        model.markers.append((side + "toe", foot, toe))
     model.markers += [(side + "hip", "pelvis", hip), (side + "knee", tibia, (0, 0, 0)), (side + "ankle", tibia, shank)]
     model.markers += [(side + "shoulder", "torso", shoulder), (side + "elbow", forearm, (0, 0, 0))]
     model.markers.append((side + "wrist", forearm, fore))
 
 
 class _Model:
-    """Bodies, joints and markers as XML of OpenSim 4."""
+    """Bodies, joints and markers as XML of OpenSim 4.
 
-    def __init__(self) -> None:
-        self.bodies: list[str] = []
+    rest : default values of coordinates that are not 0, m and rad
+    """
+
+    def __init__(self, rest: dict[str, float]) -> None:
+        self.rest = rest
+        self.bones: dict[str, list[str]] = {}
         self.joints: list[str] = []
         self.markers: list[tuple[str, str, tuple[float, ...]]] = []
 
@@ -81,30 +103,52 @@ class _Model:
         moves: Sequence[_Axis] | None = None,
     ) -> None:
         """Add a body and its joint at ``place`` of the parent ("": the ground): rotations in order, translations."""
-        # Inverse kinematics needs no masses; the reader refuses bodies without.
-        self.bodies.append(
-            f'<Body name="{name}"><mass>1</mass><mass_center>0 0 0</mass_center>'
-            "<inertia>0.01 0.01 0.01 0 0 0</inertia></Body>"
-        )
+        self.bones[name] = []
         axes, transform = _transform(turns, moves)
         above = f"/bodyset/{parent}" if parent else "/ground"
         self.joints.append(
             f'<CustomJoint name="{name}_joint"><socket_parent_frame>{name}_place</socket_parent_frame>'
             f"<socket_child_frame>/bodyset/{name}</socket_child_frame>"
-            f"<coordinates>{''.join(_coordinate(c) for c, _ in axes if c)}</coordinates>"
+            f"<coordinates>{''.join(self._coordinate(c) for c, _ in axes if c)}</coordinates>"
             f'<frames><PhysicalOffsetFrame name="{name}_place"><socket_parent>{above}</socket_parent><translation>'
             f"{_numbers(place)}</translation><orientation>0 0 0</orientation></PhysicalOffsetFrame></frames>"
             f"<SpatialTransform>{transform}</SpatialTransform></CustomJoint>"
         )
 
+    def bone(self, segment: str, start: Sequence[float], end: Sequence[float], width: float = _BONE) -> None:
+        """Show an ellipsoid between two places of a segment, ``width`` times as wide as long."""
+        along = np.subtract(end, start)
+        half = 0.5 * float(np.linalg.norm(along))
+        radii = np.where(np.abs(along) > half, half, width * half)
+        places = self.bones[segment]
+        name = f"{segment}_bone{len(places)}"
+        places.append(
+            f'<PhysicalOffsetFrame name="{name}"><socket_parent>/bodyset/{segment}</socket_parent><translation>'
+            f"{_numbers(0.5 * np.add(start, end))}</translation><orientation>0 0 0</orientation><attached_geometry>"
+            f'<Ellipsoid name="{name}_shape"><socket_frame>..</socket_frame><radii>{_numbers(radii)}</radii>'
+            f"<Appearance><color>{_COLOUR}</color></Appearance></Ellipsoid></attached_geometry></PhysicalOffsetFrame>"
+        )
+
+    def _coordinate(self, name: str) -> str:
+        inner = f"<default_value>{self.rest[name]:.9g}</default_value>" if name in self.rest else ""
+        if (span := _RANGES.get(name[:-2])) is not None:
+            inner += f"<range>{_numbers(np.radians(span))}</range><clamped>true</clamped>"
+        return f'<Coordinate name="{name}">{inner}</Coordinate>'
+
     def xml(self) -> str:
         """The whole document."""
+        # Inverse kinematics needs no masses; the reader refuses bodies without.
+        bodies = "\n".join(
+            f'<Body name="{name}"><components>{"".join(shapes)}</components><mass>1</mass>'
+            "<mass_center>0 0 0</mass_center><inertia>0.01 0.01 0.01 0 0 0</inertia></Body>"
+            for name, shapes in self.bones.items()
+        )
         markers = "\n".join(
             f'<Marker name="{name}"><socket_parent_frame>/bodyset/{segment}</socket_parent_frame>'
             f"<location>{_numbers(place)}</location></Marker>"
             for name, segment, place in self.markers
         )
-        parts = {"BodySet": "\n".join(self.bodies), "JointSet": "\n".join(self.joints), "MarkerSet": markers}
+        parts = {"BodySet": bodies, "JointSet": "\n".join(self.joints), "MarkerSet": markers}
         sets = "\n".join(
             f'<{kind} name="{kind.lower()}"><objects>\n{text}\n</objects></{kind}>' for kind, text in parts.items()
         )
@@ -125,13 +169,6 @@ def _transform(turns: Sequence[_Axis], moves: Sequence[_Axis] | None) -> tuple[l
         f"{_LINEAR if coordinate else _ZERO}</TransformAxis>"
         for (coordinate, axis), (kind, i) in zip(axes, _SIX, strict=True)
     )
-
-
-def _coordinate(name: str) -> str:
-    if (span := _RANGES.get(name[:-2])) is None:
-        return f'<Coordinate name="{name}" />'
-    limits = f"<range>{_numbers(np.radians(span))}</range><clamped>true</clamped>"
-    return f'<Coordinate name="{name}">{limits}</Coordinate>'
 
 
 def _numbers(values: Iterable[float]) -> str:

@@ -37,9 +37,11 @@ NAMES = {
     "lafan1": dict(zip(BODY, _LAFAN1, strict=True)),
     "mixamo": {joint: "mixamorig:" + _MIXAMO.get(name, name) for joint, name in zip(BODY, _LAFAN1, strict=True)},
 }
+# As three.js itself calls Mixamo's joints: a colon ends a name there.
+NAMES["mixamo-three"] = {joint: name.replace(":", "") for joint, name in NAMES["mixamo"].items()}
 #: Assumed sizes as shares of the shank: the foot's length from below the ankle to the toes, the ankle's height.
 _FOOT = 0.45
-_SOLE = 0.16  # of the shank; assumed
+SOLE = 0.16  # of the shank; assumed
 #: Length of a hand as a share of the forearm; of what the head's joint is below the crown, of neck to head; assumed.
 _HAND = 0.7
 _CROWN = 0.9  # of neck to head; assumed
@@ -103,8 +105,7 @@ def rig_of(take: Take, *, names: str = "h36m", rest: str = "t") -> tuple[Rig, tu
             raise InputError(f"{option}: expected one of {', '.join(table)}, got {value!r}")
     body, notes = body_of(take)
     pelvis = take.positions[:, take.joints.index("pelvis")]
-    path = np.nanmax(pelvis, axis=0) - np.nanmin(pelvis, axis=0)
-    lift, floor_note = _onto_the_floor(body, bool(path.max() > _STILL_M))
+    lift, floor_note = onto_the_floor(body, pelvis)
     rig = _rig(body, take.rate_hz, lift, NAMES[names], rest)
     if not set(TOES) <= set(body.joints):
         notes = (*notes, "no toes in the motion: each foot is assumed, square to its shank")
@@ -135,16 +136,18 @@ def body_of(take: Take) -> tuple[RigidBody, tuple[str, ...]]:
     return body, tuple(notes)
 
 
-def _onto_the_floor(body: RigidBody, root_moves: bool) -> tuple[np.ndarray, str]:
+def onto_the_floor(body: RigidBody, pelvis: np.ndarray) -> tuple[np.ndarray, str]:
     """(F,) heights to add, and a note.
+
+    pelvis : (F, 3) m of the motion, NaN where unknown
 
     A moving root has one constant: the floor is a low percentile of the lower sole.  A root that stands still has no
     known height: in each frame the lowest of soles and joints is on the floor, in a flip or on the back not a sole.
     """
     ends = TOES if set(TOES) <= set(body.joints) else ("rankle", "lankle")
-    soles = [body.at(end)[:, 1] - (0.0 if end in TOES else _SOLE * body.lengths[end]) for end in ends]
+    soles = [body.at(end)[:, 1] - (0.0 if end in TOES else SOLE * body.lengths[end]) for end in ends]
     lower = np.min(soles, axis=0)
-    if not root_moves:
+    if (np.nanmax(pelvis, axis=0) - np.nanmin(pelvis, axis=0)).max() <= _STILL_M:
         lowest = np.minimum(lower, body.positions[..., 1].min(axis=1))
         return -lowest, "no root motion known: in each frame the lowest of soles and joints is on the floor"
     floor = float(np.percentile(lower, _FLOOR_PERCENTILE))
@@ -162,7 +165,7 @@ def _rig(body: RigidBody, rate_hz: float, lift: np.ndarray, naming: dict[str, st
         names=tuple(naming[joint] for joint in kept),
         joints=kept,
         parents=parents,
-        rest=_rest_positions(kept, parents, offsets, _SOLE * body.lengths["lankle"]),
+        rest=_rest_positions(kept, parents, offsets, SOLE * body.lengths["lankle"]),
         ends={i: tips[joint] for i, joint in enumerate(kept) if i not in parents},
         root=body.positions[:, 0] + lift[:, None] * (0.0, 1.0, 0.0),
         turned=tuple(turned[joint] for joint in kept),
@@ -199,7 +202,7 @@ def _tips(offsets: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def _rest_offsets(body: RigidBody, arms_down_deg: float) -> dict[str, np.ndarray]:
     """Offset of each joint of ``BODY`` from its parent in the rest pose."""
     cosine, sine = np.cos(np.radians(arms_down_deg)), np.sin(np.radians(arms_down_deg))
-    toe = np.array([0.0, -_SOLE, _FOOT]) * 0.5 * (body.lengths["lankle"] + body.lengths["rankle"])
+    toe = np.array([0.0, -SOLE, _FOOT]) * 0.5 * (body.lengths["lankle"] + body.lengths["rankle"])
     directions = {"shoulder": (1.0, 0.0, 0.0), "toe": tuple(toe / np.linalg.norm(toe))}
     directions |= dict.fromkeys(("knee", "ankle"), (0.0, -1.0, 0.0))
     directions |= dict.fromkeys(("neck", "head"), (0.0, 1.0, 0.0))

@@ -1,6 +1,7 @@
 """``drocap export``: outputs and refused inputs."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -33,6 +34,10 @@ def test_names_and_rest_pose_are_chosen_for_rigs_only(folder, capsys):
     assert main(["export", str(folder), "--to", "bvh", *options]) == 0
     assert "mixamorig:LeftForeArm" in READERS["bvh"](out).joints
     assert "joints moved by" in capsys.readouterr().out
+    options[1] = "mixamo-three"
+    assert main(["export", str(folder), "--to", "bvh", *options]) == 0
+    # Names that three.js accepts in the path of an animated property: its PropertyBinding reserves [ ] . : /
+    assert not re.search(r"(ROOT|JOINT) \S*[\[\].:/]", out.read_text())
     refused(["export", folder, "--to", "trc", "--names", "mixamo"], folder, capsys, "expected with format bvh or glb")
 
 

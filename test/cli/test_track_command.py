@@ -152,7 +152,7 @@ def test_unusable_networks_end_with_status_2(models, shared, tmp_path, capsys, p
     assert "expected" in capsys.readouterr().err
 
 
-def test_models_list_and_check(models, shared, tmp_path, capsys):
+def test_models_list_and_check(models, shared, tmp_path, capsys, monkeypatch):
     assert main(["models", "list", "--models", models]) == 0
     listed = capsys.readouterr().out
     for part in ("rtmdet-nano", "Apache-2.0", "tinypose_256x192.onnx", "heatmap, 192x256, coco17", "rtmdet-maps"):
@@ -162,6 +162,9 @@ def test_models_list_and_check(models, shared, tmp_path, capsys):
     assert main(["models", "check", image, "--models", models, "--out", str(drawing)]) == 0
     assert "lwrist" in capsys.readouterr().out
     assert drawing.stat().st_size > 10_000
+    monkeypatch.chdir(tmp_path)
+    assert main(["models", "check", image, "--models", str(Path(models).resolve())]) == 0
+    assert (tmp_path / "skier_check.png").read_bytes() == drawing.read_bytes()
     assert main(["models", "check", "--models", models]) == 0
 
 

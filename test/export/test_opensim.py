@@ -52,6 +52,22 @@ def test_model_stands_in_the_sizes_of_the_motion(toes):
     np.testing.assert_allclose(at["rankle"], [0.0, -0.84, 0.09], atol=1e-3)
     np.testing.assert_allclose(at["lshoulder"][[0, 2]], [0.0, -0.17], atol=1e-3)
     np.testing.assert_allclose(at["lshoulder"] - at["lwrist"], [0.0, 0.53, 0.0], atol=1e-3)
+    stands = {
+        c.get("name"): vector(c, "default_value")
+        for c in root.iter("Coordinate")
+        if c.find("default_value") is not None
+    }
+    height = at["rankle"][1] + stands["pelvis_ty"][0]
+    assert 0.05 < height < 0.1  # of an ankle above the sole
+    if toes:
+        foot = at["rtoe"] - at["rankle"]
+        np.testing.assert_allclose(height + foot[0] * np.sin(stands["ankle_angle_r"]), 0.0, atol=1e-6)
+    bones = {
+        frame.get("name").rsplit("_bone")[0]
+        for frame in root.iter("PhysicalOffsetFrame")
+        if frame.find(".//Ellipsoid") is not None
+    }
+    assert bones == {body.get("name") for body in root.iter("Body")}
     coordinates = [coordinate.get("name") for coordinate in root.iter("Coordinate")]
     assert len(set(coordinates)) == len(coordinates) == (31 if toes else 29)
 
@@ -73,7 +89,7 @@ def test_inverse_kinematics_of_a_simulated_walk_gives_its_angles(walker, tmp_pat
     joints[20] = np.nan
     save_motion(tmp_path / "motion.npz", dataclasses.replace(walker, joints3d=joints))
     assert main(["export", str(tmp_path), "--to", "mot"]) == 0
-    assert "motion.osim" in capfd.readouterr().out
+    assert "so that the feet stand on it" in capfd.readouterr().out
     assert {path.name for path in tmp_path.iterdir()} == {"motion.npz", "motion.mot", "motion.osim"}
     assert (tmp_path / "motion.osim").read_text().startswith("<?xml")
     head, table = (tmp_path / "motion.mot").read_text().split("endheader\n")
@@ -88,3 +104,21 @@ def test_inverse_kinematics_of_a_simulated_walk_gives_its_angles(walker, tmp_pat
         assert np.sqrt(np.mean(knee**2)) < 5.0
         assert np.sqrt(np.mean(hip**2)) < 5.0
         assert columns[f"knee_angle_{side}"].min() > -5.0
+    assert 0.0 < lowest_ankle_m(columns, tmp_path / "motion.osim") < 0.12
+
+
+def lowest_ankle_m(columns, model_path):
+    """Lowest place of an ankle over the motion, as OpenSim places the model."""
+    import opensim
+
+    model = opensim.Model(str(model_path))
+    state = model.initSystem()
+    heights = []
+    for frame in range(len(columns["time"])):
+        for coordinate in model.getCoordinateSet():
+            value = columns[coordinate.getName()][frame]
+            turns = coordinate.getMotionType() == opensim.Coordinate.Rotational
+            coordinate.setValue(state, np.radians(value) if turns else value, False)
+        model.realizePosition(state)
+        heights += [model.getMarkerSet().get(name).getLocationInGround(state).get(1) for name in ("rankle", "lankle")]
+    return min(heights)

@@ -4,32 +4,47 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
+from importlib.resources import files
 from pathlib import Path
 from urllib.parse import quote
 
 from drocap_ros.cli.batch.recording import Record
 
-#: Title, explanation, key of the record, factor, format.
+#: Title, unit, explanation, key of the record, factor, format.
 _COLUMNS = (
-    ("doubts", "automatic checks that doubt the motion", "doubts", 1, "d"),
-    ("error", "median reprojection error, % of the body's size in the image", "error_body", 100, ".2f"),
-    ("seen", "frames with a subject, %", "seen", 100, ".0f"),
-    ("bones", "spread of bone lengths, %", "bone_spread", 100, ".1f"),
-    ("view", "range of the view of the body, degrees", "view_span_deg", 1, ".0f"),
-    ("length", "s", "duration_s", 1, ".1f"),
-    ("time", "of the reconstruction, s", "seconds", 1, ".1f"),
-    ("memory", "peak, MB", "peak_memory_mb", 1, ".0f"),
+    ("doubts", "", "automatic checks that doubt the motion", "doubts", 1, "d"),
+    (
+        "error",
+        "% of body",
+        "median reprojection error, share of the body's size in the image",
+        "error_body",
+        100,
+        ".2f",
+    ),
+    ("seen", "% of frames", "frames with a subject", "seen", 100, ".0f"),
+    ("bones", "% spread", "spread of bone lengths", "bone_spread", 100, ".1f"),
+    ("view", "°", "range of the view of the body", "view_span_deg", 1, ".0f"),
+    ("length", "s", "of the recording", "duration_s", 1, ".1f"),
+    ("time", "s", "of the reconstruction", "seconds", 1, ".1f"),
+    ("memory", "MB", "peak", "peak_memory_mb", 1, ".0f"),
 )
 
+#: On top of the report's style.
 _STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 80em; padding: 0 1em }
-table { border-collapse: collapse; width: 100% }
-th, td { padding: .25em .6em; border-bottom: 1px solid #8884; text-align: right; vertical-align: top }
-th { cursor: pointer; position: sticky; top: 0; background: Canvas }
+body { max-width: 1560px }
+.tiles { grid-template-columns: repeat(3, minmax(0, 180px)); margin-bottom: 14px }
+.card { overflow-x: auto }
+td, th { padding: 7px 14px; text-align: right; width: auto; white-space: nowrap }
+th { cursor: pointer; border-bottom: 2px solid var(--line) }
+th:hover { color: var(--accent) }
+th i { display: block; font-size: 11.5px; font-style: normal }
 th:first-child, td:first-child, th:last-child, td:last-child { text-align: left }
-tr.failed td { color: #b3261e }
-:root { color-scheme: light dark }
-@media (prefers-color-scheme: dark) { tr.failed td { color: #f2b8b5 } }
+td:first-child, th:first-child { position: sticky; left: 0; background: var(--card) }
+td:first-child { max-width: min(40vw, 26em); overflow: hidden; text-overflow: ellipsis }
+td:last-child { min-width: 18em; white-space: normal }
+td { font-variant-numeric: tabular-nums }
+a { color: var(--accent) }
+tr.failed td:last-child, tr.failed td:first-child { color: var(--right) }
 """
 
 _SCRIPT = """
@@ -52,19 +67,22 @@ def save_summary(path: Path, records: Sequence[Record], total: int) -> None:
     records : of the recordings so far, of ``total``
     """
     failures = sum(record["status"] != "done" for record in records)
-    heads = "".join(f'<th title="{escape(text)}">{title}</th>' for title, text, *_ in _COLUMNS)
+    style = (files("drocap_ros.report") / "page" / "style.css").read_text(encoding="utf-8") + _STYLE
+    heads = "".join(f'<th title="{escape(text)}">{title}<i>{unit}</i></th>' for title, unit, text, *_ in _COLUMNS)
+    counts = {"done": len(records) - failures, "failed": failures, "to do": total - len(records)}
+    tiles = "".join(f'<div class="tile"><b>{count}</b><span>{name}</span></div>' for name, count in counts.items())
     rows = "\n".join(map(_row, sorted(records, key=_doubtfulness)))
     page = f"""<!doctype html>
-<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
 <title>drocap batch: {total} recordings</title>
-<style>{_STYLE}</style>
-<h1>{total} recordings</h1>
-<p>{len(records) - failures} done, {failures} failed, {total - len(records)} to do.
-A click on a column's title sorts.</p>
-<table><thead><tr><th>recording</th>{heads}<th>remarks</th></tr></thead>
+<style>{style}</style>
+<header><h1>{total} recordings</h1><p>A name opens its report, a click on a column's title sorts.</p></header>
+<section class="tiles">{tiles}</section>
+<section class="card"><table><thead><tr><th>recording</th>{heads}<th>remarks</th></tr></thead>
 <tbody>
 {rows}
-</tbody></table>
+</tbody></table></section>
 <script>{_SCRIPT}</script>
 </html>
 """
@@ -79,7 +97,7 @@ def _doubtfulness(record: Record) -> tuple[bool, int, float, str]:
 def _row(record: Record) -> str:
     name = escape(Path(record["input"]).name)
     link = f'<a href="{quote(record["page"])}">{name}</a>' if "page" in record else name
-    cells = "".join(_cell(record.get(key), factor, form) for _, _, key, factor, form in _COLUMNS)
+    cells = "".join(_cell(record.get(key), factor, form) for *_, key, factor, form in _COLUMNS)
     remarks = [record["error"]] if "error" in record else [*record["doubts"], *record["messages"]]
     title = escape(record["input"])
     text = escape("; ".join(remarks))

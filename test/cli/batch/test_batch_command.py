@@ -110,6 +110,8 @@ def test_killed_batch_goes_on_and_repeats_nothing(season, tmp_path, capsys):
         assert 20 < record["peak_memory_mb"] < 4000
 
     page = (out / "summary.html").read_text()
+    for title in ("error<i>% of body</i>", "view<i>°</i>", "length<i>s</i>", "memory<i>MB</i>"):
+        assert title in page
     rows = re.findall(r'<tr class="(\w+)">', page)
     assert rows == ["failed"] + ["done"] * GOOD
     links = re.findall(r'href="([^"]+)"', page)
