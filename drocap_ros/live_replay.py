@@ -15,9 +15,9 @@ from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.motion import Motion
 from drocap_ros.observation import PoseObservation
 from drocap_ros.reconstruction.common.stop_reason import NO_WINDOW
+from drocap_ros.reconstruction.in_metres import reprojection_px
 from drocap_ros.reconstruction.live.replay import LivePose, LiveWindow, live_poses
 from drocap_ros.reconstruction.live.window import AdjustedWindow, Effort
-from drocap_ros.reconstruction.reconstruct import reprojection_px
 from drocap_ros.recording.pose_messages import read_observations
 from drocap_ros.recording.provenance import CONFIGURATION
 from drocap_ros.recording.published_poses import Agreement, PublishedPoses, RecordedCamera

@@ -298,11 +298,15 @@ def _contradicted(found: AdjustedPath) -> float:
 
 def with_fusion(refined: RefinedWorld, fused: FusedTelemetry) -> RefinedWorld:
     """The adjusted world with what the points measured, and with the camera's own uncertainty in the joints'."""
-    lever = joints_by_camera(refined.joints, refined.rotation, refined.position)
-    more = lever @ fused.covariance[:, None] @ np.swapaxes(lever, -1, -2)
-    covariance = refined.covariance + more[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     calibration = [{**window, **fused.measured} for window in refined.calibration]
-    return replace(refined, covariance=covariance, calibration=calibration)
+    return replace(with_camera_errors(refined, fused.covariance), calibration=calibration)
+
+
+def with_camera_errors(refined: RefinedWorld, errors: np.ndarray) -> RefinedWorld:
+    """The adjusted world whose joints are as uncertain as a camera's errors (F, 6, 6) make them, too."""
+    lever = joints_by_camera(refined.joints, refined.rotation, refined.position)
+    more = lever @ errors[:, None] @ np.swapaxes(lever, -1, -2)
+    return replace(refined, covariance=refined.covariance + more[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
 
 
 def joints_by_camera(joints: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:

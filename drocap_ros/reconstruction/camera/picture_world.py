@@ -87,10 +87,7 @@ def with_camera(
     tracks: Tracks, camera: PictureCamera, poses: ImagePoses, per_px: np.ndarray, config: WorldConfig
 ) -> tuple[Tracks, PictureWorld]:
     """The tracks with the camera's path in the world: metres and up by poses at (F,) metres per px."""
-    frames = len(tracks)
-    still = replace(tracks, camera_rotation=np.tile(np.eye(3), (frames, 1, 1)), camera_position=np.zeros((frames, 3)))
-    projected = poses.joints_px[..., :2] + poses.translation_px[:, None]
-    seen = place_in_world(in_camera_axes(poses, per_px), projected, per_px, still).joints
+    seen = seen_from_camera(tracks, poses, per_px)
     upright = set_upright(camera.rotation, camera.position, camera.points, seen, tracks.stamp_ns)
     world = replace(tracks, camera_rotation=upright.rotation, camera_position=upright.position)
     # What feet have measured the adjustment measures better, from the same feet: no prior counts them twice.
@@ -106,6 +103,14 @@ def with_camera(
         checks=False,
     )
     return world, PictureWorld(camera, upright, config if upright.std_deg < _SURE_UP_DEG else None)
+
+
+def seen_from_camera(tracks: Tracks, poses: ImagePoses, per_px: np.ndarray) -> np.ndarray:
+    """(F, P, 3) m, joints from the camera, in its axes, at (F,) metres per px."""
+    frames = len(tracks)
+    still = replace(tracks, camera_rotation=np.tile(np.eye(3), (frames, 1, 1)), camera_position=np.zeros((frames, 3)))
+    projected = poses.joints_px[..., :2] + poses.translation_px[:, None]
+    return place_in_world(in_camera_axes(poses, per_px), projected, per_px, still).joints
 
 
 def at_assumed_stature(refined: RefinedWorld) -> RefinedWorld:

@@ -1,0 +1,72 @@
+"""Several persons in the same images: one camera, and a motion of each in its world."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+
+from drocap_ros.motion import Motion
+from drocap_ros.parameters import Values
+from drocap_ros.reconstruction.common.config import BundleAdjusterConfig, InitializerConfig
+from drocap_ros.reconstruction.common.poses import Progress
+from drocap_ros.reconstruction.reconstruct import reconstruct_with_camera
+from drocap_ros.reconstruction.shared_camera import SharedCamera
+from drocap_ros.tracks import Tracks
+
+
+def reconstruct_people(
+    people: Mapping[int, Tracks],
+    *,
+    method: str = "ba",
+    initializer: InitializerConfig | None = None,
+    adjuster: BundleAdjusterConfig | None = None,
+    progress: Progress | None = None,
+) -> dict[int, Motion]:
+    """Motions of persons by their numbers, each from the first to the last image that shows the person.
+
+    The person whom most images show finds the camera, as :func:`~.reconstruct.reconstruct` does; its path and its
+    metres are those of all.  Their sizes are measured in it.
+
+    people : tracks of the same images by number, with the same camera and fixed points
+
+    Raises
+    ------
+    InputError
+        When the method is unknown or of a person too few joints are seen.
+    """
+    seen = {number: np.flatnonzero(np.isfinite(tracks.keypoints).any(axis=(1, 2))) for number, tracks in people.items()}
+    first = max(people, key=lambda number: (len(seen[number]), -number))
+    settings = {"method": method, "initializer": initializer, "adjuster": adjuster, "progress": progress}
+    lead, camera = reconstruct_with_camera(people[first], **settings)  # type: ignore[arg-type]
+    motions: dict[int, Motion] = {}
+    for number, tracks in people.items():
+        rows = slice(int(seen[number][0]), int(seen[number][-1]) + 1)
+        motion = of_frames(lead, rows) if number == first else _other(tracks.of_frames(rows), camera, lead, settings)
+        motions[number] = dataclasses.replace(motion, meta={**motion.meta, "camera_found_with": first})
+    return motions
+
+
+def _other(tracks: Tracks, camera: SharedCamera | None, lead: Motion, settings: Mapping[str, object]) -> Motion:
+    """The motion of another person than the one with whom the camera was found, where it was."""
+    if camera is None:
+        tracks = dataclasses.replace(tracks, background=None)
+        if "telemetry_rejected" in lead.meta:
+            tracks = dataclasses.replace(tracks, camera_rotation=None, camera_position=None)
+    else:
+        camera = camera.of_images(tracks.stamp_ns)
+    motion, _ = reconstruct_with_camera(tracks, camera=camera, **settings)  # type: ignore[arg-type]
+    told: Values = {name: lead.meta[name] for name in ("camera", "telemetry_rejected") if name in lead.meta}
+    return dataclasses.replace(motion, meta=motion.meta | told)
+
+
+def of_frames(motion: Motion, rows: slice) -> Motion:
+    """A part of a motion."""
+    frames = len(motion.stamp_ns)
+    arrays = {
+        field.name: value[rows]
+        for field in dataclasses.fields(motion)
+        if isinstance(value := getattr(motion, field.name), np.ndarray) and len(value) == frames
+    }
+    return dataclasses.replace(motion, meta={**motion.meta, "frames": len(arrays["stamp_ns"])}, **arrays)  # type: ignore[arg-type]
