@@ -32,6 +32,8 @@ class PoseObservation:
     confidence : (P,) float32 in [0, 1], calibrated: the share of such keypoints within 10 % of the box height of a
         human label
     background : fixed points of the scene; None = the image was not searched for them
+    space : (P, 3) float32 m, the joints in space as a network sees them in the person's crop: x right, y down, z away
+        along the ray to the person; None = no network gives it
     """
 
     stamp_ns: int
@@ -44,6 +46,7 @@ class PoseObservation:
     covariance: np.ndarray = field(default_factory=lambda: _empty(0, 3))
     confidence: np.ndarray = field(default_factory=lambda: _empty(0))
     background: FixedPoints | None = None
+    space: np.ndarray | None = None
 
     @property
     def has_subject(self) -> bool:

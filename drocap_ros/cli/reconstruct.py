@@ -129,6 +129,7 @@ def run(args: argparse.Namespace) -> int:
     out, clip = args.out or default_folder(args.input, "motion"), clip_of(args)
     names = _outputs(args, out, clip)
     person, rule = parse_subject(args.subject)
+    rule |= {"feet_model": args.feet} if args.feet else {}
     config = load_config(args.config).replace("pose_estimator", **rule)
     if args.dictionary:
         config = config.replace("initializer", dictionary=str(args.dictionary))

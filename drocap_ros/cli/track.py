@@ -70,6 +70,7 @@ def run(args: argparse.Namespace) -> int:
     check_output_folder(out)
     refuse_inputs([out / "persons.jpg"] if args.list else [out / "overlay.mp4"] * args.overlay, [args.video])
     person, rule = parse_subject(args.subject)
+    rule |= {"feet_model": args.feet} if args.feet else {}
     config = load_config(args.config).replace("pose_estimator", on_loss="wait" if args.wait else "next", **rule)
     folder = models_folder(args.models or config.pose_estimator.models_dir)
     ensure_networks(folder, args.video, args)

@@ -13,7 +13,7 @@ from drocap_ros.observation import PoseObservation
 from drocap_ros.perception.background_tracks import BackgroundTracks
 from drocap_ros.perception.detection.detector import Detections
 from drocap_ros.perception.detection.nms import without_parts
-from drocap_ros.perception.load_models import limited_use, load_detector, load_pose_model
+from drocap_ros.perception.load_models import limited_use, load_detector, load_feet_model, load_pose_model
 from drocap_ros.perception.load_shedding import KeypointFlow
 from drocap_ros.perception.pose.body_pose import CLEAR_CONFIDENCE, BodyPose, BodyPoseModel
 from drocap_ros.perception.pose.pose_model import NetworkKeypoints
@@ -23,6 +23,7 @@ from drocap_ros.perception.tracking.person import CONFIRM_CONFIDENCE, EMPTY_CONF
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 from drocap_ros.perception.tracking.search import SubjectSearch
 from drocap_ros.perception.tracking.subject import SubjectTracker
+from drocap_ros.skeleton import BODY_19
 
 _CLEAR_SCORE = 0.6  # detection score from which the next images need no detection, if the pose is clear
 _SLACK_S = 0.005  # tolerance of the detection interval against jitter of the stamps
@@ -51,6 +52,7 @@ class PoseEstimator:
         self.config = config or PoseEstimatorConfig()
         self.pose_model = load_pose_model(models_dir, self.config)
         self.detector = load_detector(models_dir, self.config)
+        self._feet = load_feet_model(models_dir, self.config)
         #: Notice of a network that is not for images of real people; else empty.
         self.limited_use = limited_use(self.pose_model.model) or limited_use(self.detector.model)
         if self.limited_use:
@@ -247,7 +249,9 @@ class PoseEstimator:
         self, image: np.ndarray, stamp_ns: int, subject: Subject, pose: BodyPose | None = None
     ) -> PoseObservation:
         """The subject in the image; without a pose, its predicted box without keypoints."""
-        joints, size = self._body.joint_map.joints, _size(image)
+        joints, size = BODY_19 if self._feet else self._body.joint_map.joints, _size(image)
+        if pose is not None and self._feet is not None:
+            pose = self._feet.add(image, subject.box, pose)
         if pose is None:
             confidence: np.ndarray = np.zeros(len(joints))
             xy, covariance = (np.full((len(joints), n), np.nan) for n in (2, 3))
@@ -260,7 +264,10 @@ class PoseEstimator:
             xy[unseen], covariance[unseen] = np.nan, np.nan
         score = 0.0 if pose is None else subject.score
         box, xy, covariance, confidence = (a.astype(np.float32) for a in (subject.box, xy, covariance, confidence))
-        return PoseObservation(stamp_ns, subject.track_id, size, joints, box, score, xy, covariance, confidence)
+        space = None if pose is None or pose.space is None else pose.space.astype(np.float32)
+        return PoseObservation(
+            stamp_ns, subject.track_id, size, joints, box, score, xy, covariance, confidence, space=space
+        )
 
 
 def _size(image: np.ndarray) -> tuple[int, int]:

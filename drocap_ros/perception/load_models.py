@@ -11,6 +11,7 @@ from drocap_ros.errors import InputError
 from drocap_ros.perception.detection.detector import Detector
 from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.perception.models.spec import ModelSpec, read_spec
+from drocap_ros.perception.pose.feet import FeetModel
 from drocap_ros.perception.pose.pose_model import PoseModel
 from drocap_ros.perception.tracking.pose_estimator_config import PoseEstimatorConfig
 
@@ -63,6 +64,13 @@ def load_detector(models_dir: str | Path, config: PoseEstimatorConfig) -> Detect
 def load_pose_model(models_dir: str | Path, config: PoseEstimatorConfig) -> PoseModel:
     """As :func:`load_detector`, for the 2D pose model."""
     return _load(Path(models_dir), "pose", config.pose_model, config, PoseModel)
+
+
+def load_feet_model(models_dir: str | Path, config: PoseEstimatorConfig) -> FeetModel | None:
+    """The configured second model for feet; None without one."""
+    if not config.feet_model:
+        return None
+    return FeetModel(_load(Path(models_dir), "pose", config.feet_model, config, PoseModel))
 
 
 def _load(

@@ -88,7 +88,13 @@ class KeypointFlow:
         shift = np.median(keypoints[joints] - before.keypoints[joints], axis=0)
         roi = np.clip(before.roi + np.tile(shift, 2), 0, np.tile(size, 2)).astype(np.float32)
         observation = dataclasses.replace(
-            before, stamp_ns=stamp_ns, roi=roi, keypoints=keypoints, covariance=covariance, confidence=confidence
+            before,
+            stamp_ns=stamp_ns,
+            roi=roi,
+            keypoints=keypoints,
+            covariance=covariance,
+            confidence=confidence,
+            space=None,
         )
         self.steps += 1
         self._reference = _reference(image, observation)

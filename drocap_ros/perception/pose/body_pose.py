@@ -26,12 +26,16 @@ _PENALTY = 0.3  # what a box full of shadow takes from the confidence of its pos
 
 
 class BodyPose(NamedTuple):
-    """Joints that the network gives, ``BODY_15`` first: (P, 2) px, (P, 3) px^2, (P,); and its own keypoints."""
+    """Joints that the network gives, ``BODY_15`` first: (P, 2) px, (P, 3) px^2, (P,); and its own keypoints.
+
+    space : (P, 3) m, axes as in :class:`NetworkKeypoints`; None = the network does not give it
+    """
 
     xy: np.ndarray
     covariance: np.ndarray
     confidence: np.ndarray
     network: NetworkKeypoints
+    space: np.ndarray | None = None
 
     @property
     def mean_confidence(self) -> float:
@@ -79,7 +83,8 @@ class BodyPoseModel:
         keypoints, spec = self._model.estimate(image, box), self._model.spec
         covariance, confidence = calibrate(keypoints, spec.layout, spec.sigma_scale)
         joints = self.joint_map.apply(keypoints.xy.astype(float), covariance, confidence, keypoints.box_size)
-        return BodyPose(*joints, keypoints)
+        space = None if keypoints.space is None else self.joint_map.weights @ keypoints.space.astype(float)
+        return BodyPose(*joints, keypoints, space)
 
 
 def shadow_share(image: np.ndarray, box: np.ndarray) -> float:

@@ -25,6 +25,7 @@ class NetworkKeypoints(NamedTuple):
 
     skeleton : name of the joint set
     box_size : px, longer side of the person's box, the unit of the calibration
+    space : (P, 3) m, x right, y down, z away along the ray to the person, of a network that gives it; else None
     """
 
     skeleton: str
@@ -33,6 +34,7 @@ class NetworkKeypoints(NamedTuple):
     spread: np.ndarray
     second: np.ndarray
     box_size: float
+    space: np.ndarray | None = None
 
 
 class PoseModel:
@@ -59,7 +61,9 @@ class PoseModel:
         peaks = self._decode(outputs, in_crop.reshape(4))
         spread = peaks.spread * np.float32(1 / crop.scale) ** 2
         size = float(max(box[2] - box[0], box[3] - box[1]))
-        return NetworkKeypoints(self.joints.name, crop.to_image(peaks.xy), peaks.score, spread, peaks.second, size)
+        space = outputs[1][0] if self.spec.layout == "movenet" and len(outputs) > 1 else None
+        xy = crop.to_image(peaks.xy)
+        return NetworkKeypoints(self.joints.name, xy, peaks.score, spread, peaks.second, size, space)
 
     def _decode(self, outputs: list[np.ndarray], box: np.ndarray) -> Peaks:
         size = self.spec.input_size

@@ -21,6 +21,11 @@ class PoseEstimatorConfig(Parameters):
     )
     detector: str = param("auto", "detector: file name in the models folder, or auto")
     pose_model: str = param("auto", "2D pose model: file name in the models folder, or auto")
+    feet_model: str = param(
+        "",
+        "second 2D pose model for toes, heels and depth of the body that the first one finds: file name in the models"
+        " folder, as blazepose-full; empty = none",
+    )
     provider: str = param(
         "auto",
         "execution provider of onnxruntime; auto = CUDA where offered, else CPU",

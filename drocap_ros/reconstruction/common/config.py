@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from drocap_ros.geometry.pinhole import ASSUMED_FOCAL
 from drocap_ros.parameters import Parameters, param
 
 
@@ -129,7 +130,7 @@ class BundleAdjusterConfig(Parameters):
     )
     feet: bool = param(True, "in the world, feet in contact keep their place")
     assumed_focal: float = param(
-        0.85,
+        ASSUMED_FOCAL,
         "focal length of real pictures without a calibration, share of their longer side: phones' and drones' main"
         " cameras (24 to 28 mm equivalent) crop video to 0.75 to 0.95; 0 = the camera is taken as distant",
         minimum=0.0,

@@ -13,8 +13,9 @@ from typing import ClassVar
 import pytest
 
 from drocap_ros.errors import InputError
-from drocap_ros.perception.models.fetch import FetchError, fetch
+from drocap_ros.perception.models.fetch import fetch
 from drocap_ros.perception.models.registry import DEFAULT_FETCH, KNOWN_MODELS, KnownModel, known_model
+from drocap_ros.perception.models.wheel import FetchError
 
 WEIGHTS = bytes(range(256)) * 4000
 SHA = hashlib.sha256(WEIGHTS).hexdigest()
