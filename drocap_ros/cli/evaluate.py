@@ -41,7 +41,7 @@ def _add_compare(kinds: Subparsers) -> None:
         description="Errors of MOTION: per joint group, world frame, handedness, scale.",
     )
     add_motion_argument(parser)
-    truth = "MoCap .npz, another motion.npz, or a folder with truth.npz or motion.npz"
+    truth = "MoCap .npz, .c3d, .trc or .bvh, another motion.npz, or a folder with truth.npz (or .c3d ...) or motion.npz"
     parser.add_argument("truth", metavar="TRUTH", type=Path, help=truth)
     _add_out(parser, "compare.csv, compare.md and compare.png")
     parser.set_defaults(run=_compare)

@@ -10,6 +10,7 @@ import numpy as np
 
 from drocap_ros.errors import InputError
 from drocap_ros.evaluation import metrics
+from drocap_ros.evaluation.truth_files import read_truth_file
 from drocap_ros.mocap import load_mocap
 from drocap_ros.motion import Motion, load_motion, motion_file
 from drocap_ros.skeleton import BODY_15, BODY_17, LIMB_JOINTS, in_body_order, indices
@@ -17,6 +18,8 @@ from drocap_ros.tracks import kind_of, read_npz, wrong_kind
 
 logger = logging.getLogger(__name__)
 
+#: Endings of files of a truth.
+TRUTH_SUFFIXES = (".npz", ".c3d", ".trc", ".bvh")
 _LIMBS = indices(BODY_15.joints, LIMB_JOINTS)
 
 
@@ -108,10 +111,10 @@ class MotionErrors:
 
 
 def load_truth(truth: Motion | str | Path) -> tuple[np.ndarray, np.ndarray, str]:
-    """True joints (T, 17, 3) in m, their times (T,) in s and their frame, of a motion, or a MoCap or motion ``.npz``.
+    """True joints (T, 17, 3) in m, their times (T,) in s and their frame, of a motion, or of a file of one or of MoCap.
 
-    In a folder ``truth.npz`` is the truth, else ``motion.npz``.  It has to hold the twelve limb joints; others that it
-    lacks are NaN.
+    The file is a MoCap or motion ``.npz``, C3D, TRC or BVH; in a folder ``truth`` with one of these endings, else
+    ``motion.npz``.  It has to hold the twelve limb joints; others that it lacks are NaN.
 
     Raises
     ------
@@ -119,7 +122,9 @@ def load_truth(truth: Motion | str | Path) -> tuple[np.ndarray, np.ndarray, str]
         When the file is neither.
     """
     if not isinstance(truth, Motion):
-        path = motion_file(truth, "truth.npz")
+        path = motion_file(truth, *(f"truth{suffix}" for suffix in TRUTH_SUFFIXES))
+        if path.is_file() and (found := read_truth_file(path)) is not None:
+            return *found, "world"
         names = read_npz(path, ())
         kind = kind_of(names)
         if kind == "MoCap":
@@ -135,8 +140,8 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
     """Errors of a motion against joints (T, P, 3) m, of BODY_15 or BODY_17, at increasing times (T,) s.
 
     Only joints that both have are compared; the twelve limb joints are required.  Times are absolute where both ranges
-    overlap; otherwise both start at zero.  The truth is interpolated at the motion's times; frames outside its range
-    are ignored.
+    overlap; otherwise both start at zero.  The truth is interpolated at the motion's times; frames outside its range,
+    or where it has gaps, are left out.
 
     Raises
     ------
@@ -156,10 +161,15 @@ def compare(motion: Motion, truth: np.ndarray, time_s: np.ndarray, frame: str) -
         raise InputError(
             "evaluate compare: expected poses within the truth's time, found none; check that the files belong together"
         )
-    estimate = np.where(known[:, None], estimate[usable], np.nan)
-    true = np.where(known[:, None], _at_times(truth, time_s, at[usable]), np.nan)
-    if not np.isfinite(true[:, known]).all():
+    true = _at_times(truth, time_s, at)
+    whole = usable & np.isfinite(true[:, known]).all(axis=(1, 2))
+    if not whole.any():
         raise InputError("evaluate compare: expected a truth of finite joints, got NaN or infinity; fill the gaps in")
+    if gaps := np.count_nonzero(usable & ~whole):
+        logger.warning("%d of %d poses lie in gaps of the truth: left out", gaps, np.count_nonzero(usable))
+    usable = whole
+    estimate = np.where(known[:, None], estimate[usable], np.nan)
+    true = np.where(known[:, None], true[usable], np.nan)
     in_world = None
     if motion.frame == "world" and frame == "world":
         covariance = None

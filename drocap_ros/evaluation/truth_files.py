@@ -1,0 +1,269 @@
+"""Truth from files of motion capture systems: C3D, TRC and BVH, as joints of ``BODY_17`` in metres, z up.
+
+Joints are known by their names (:func:`body_joints`).  Units and vertical are those that the file states or its format
+has by custom, unless the body contradicts them: a line then says what was taken.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from drocap_ros.errors import InputError, first_line
+from drocap_ros.evaluation.c3d_file import read_c3d
+from drocap_ros.geometry.rotations import exp_so3
+from drocap_ros.skeleton import BODY_17, LIMB_JOINTS, in_body_order, indices
+from drocap_ros.tracks import MAX_FRAMES
+
+logger = logging.getLogger(__name__)
+
+#: Part of the body -> names of its joint in other programs, the most certain first: Vicon's joint centres, names of
+#: segments in rigs (a segment begins at its joint), names of joints.  In rigs "shoulder" is often the clavicle, "hand"
+#: and "foot" may be ends, "leg" is the shank.
+_ALIASES = {
+    "hip": "hjc fep upleg upperleg thigh femur hip",
+    "knee": "kjc feo knee lowerleg shin calf tibia leg",
+    "ankle": "ajc tio ankle foot",
+    "shoulder": "sjc hup upperarm uparm humerus arm shldr shoulder",
+    "elbow": "ejc huo elbow lowerarm lowarm forearm radius",
+    "wrist": "wjc rao wrist hand",
+    "toe": "bigtoe",
+}
+#: Metres of a unit, as files write it.
+_UNITS = {"mm": 1e-3, "millimeters": 1e-3, "cm": 1e-2, "m": 1.0, "meters": 1.0, "in": 0.0254, "inches": 0.0254}
+#: Thigh and shank of people, m: of a child of two years, and of the tallest man.
+_LEG_M = (0.25, 1.4)
+#: Share of the line from ankles to shoulders along an axis, from which that is the vertical of the recording.
+_UPRIGHT = 0.8
+#: Turns of axes (x, y, z) to z up, by the vertical.
+_TO_Z_UP = {
+    "X": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+    "Y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "Z": np.eye(3),
+}
+_LIMBS = indices(BODY_17.joints, LIMB_JOINTS)
+#: Bounds against damaged files.
+_MAX_POINTS, _MAX_BYTES = 2000, 1 << 29
+_RATES_HZ = (1.0, 10_000.0)
+
+
+class _Points(NamedTuple):
+    """Points of a file: positions (F, P, 3), NaN unknown; times (F,) s; unit, and vertical "X", "Y", "Z" or "-X" ..."""
+
+    names: list[str]
+    positions: np.ndarray
+    time_s: np.ndarray
+    unit: str
+    up: str
+
+
+def read_truth_file(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """Joints (T, 17, 3) m, z up, NaN unknown, and their times (T,) s; None of a file that is none of these.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be used.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(64).removeprefix(b"\xef\xbb\xbf")
+        reader = next((read for begins, read in _READERS if begins.match(head)), None)
+        if reader is None:
+            return None
+        if path.stat().st_size > _MAX_BYTES:
+            raise InputError(f"expected at most {_MAX_BYTES >> 20} MiB, found more; cut the file")
+        with np.errstate(all="ignore"):
+            return _on_the_body(path, reader(path))
+    except OSError as error:
+        raise InputError(f"{path}: expected a readable file; {error.strerror or error}") from None
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def body_joints(names: list[str]) -> dict[str, int]:
+    """Joint of ``BODY_17`` -> its place among the names of a file.
+
+    Names of ``BODY_17`` stand for themselves.  Others are a side and a part in any spelling, with or without a prefix
+    before a colon: "mixamorig:LeftUpLeg", "RHip", "l_hip", "Subject:RKJC", "thigh.L".
+    """
+    bare = [re.sub(r".*[:|]", "", name).strip() for name in names]
+    words = [re.sub(r"[^a-z]", "", name.lower()) for name in bare]
+    found = {joint: bare.index(joint) for joint in BODY_17.joints if joint in bare}
+    for side, long in (("l", "left"), ("r", "right")):
+        for part, aliases in _ALIASES.items():
+            spelt = (form for a in aliases.split() for form in (long + a, side + a, a + long, a + side))
+            place = next((words.index(form) for form in spelt if form in words), None)
+            if place is not None:
+                found.setdefault(side + part, place)
+    return found
+
+
+def _on_the_body(path: Path, points: _Points) -> tuple[np.ndarray, np.ndarray]:
+    found = body_joints(points.names)
+    if missing := [joint for joint in LIMB_JOINTS if joint not in found]:
+        there = ", ".join(points.names[:40]) or "none"
+        raise InputError(f"expected joints by names, found no {', '.join(missing)} among {there}; rename the joints")
+    x = in_body_order(points.positions[:, list(found.values())].astype(np.float64), list(found), LIMB_JOINTS)
+    x[~np.isfinite(x).all(axis=2)] = np.nan
+    whole = x[np.isfinite(x[:, _LIMBS]).all(axis=(1, 2))]
+    if not len(whole):
+        raise InputError("expected every limb joint in some frame, found none; fill the gaps in")
+    words, metres = _metres(whole, points.unit)
+    up = _vertical(whole, points.up)
+    said = [words] * (words != points.unit) + [f"{up} up"] * (up != points.up)
+    if said:
+        logger.warning("%s: taken as %s, by the size and the stance of the body", path, ", ".join(said))
+    turn = _TO_Z_UP[up[-1]] * np.array([[1.0], [-1.0], [-1.0]]) if up[0] == "-" else _TO_Z_UP[up]
+    return metres * x @ turn.T, points.time_s
+
+
+def _metres(x: np.ndarray, stated: str) -> tuple[str, float]:
+    """The stated unit, else the first with which the legs are those of a person, and its metres."""
+    legs = [x[:, [BODY_17.index(side + joint) for joint in ("hip", "knee", "ankle")]] for side in "lr"]
+    leg = float(np.median(np.linalg.norm(np.diff(legs, axis=2), axis=3).sum(axis=2)))
+    for unit in dict.fromkeys((stated, "mm", "cm", "m", "in")):
+        if _LEG_M[0] <= leg * _UNITS[unit] <= _LEG_M[1]:
+            return unit, _UNITS[unit]
+    raise InputError(f"expected legs of a person in {stated}, found thigh and shank of {leg:.3g}; check the units")
+
+
+def _vertical(x: np.ndarray, stated: str) -> str:
+    """The axis along which the person mostly stands, the stated one where that is not clear."""
+    ankles, shoulders = (x[:, [BODY_17.index("l" + joint), BODY_17.index("r" + joint)]].mean(axis=1)
+                         for joint in ("ankle", "shoulder"))  # fmt: skip
+    line = np.median(shoulders - ankles, axis=0)
+    share = line / max(float(np.linalg.norm(line)), 1e-12)
+    axis = int(np.argmax(np.abs(share)))
+    if not abs(share[axis]) >= _UPRIGHT:
+        return stated
+    return ("-" if share[axis] < 0 else "") + "XYZ"[axis]
+
+
+def _even_times(count: int, rate_hz: float) -> np.ndarray:
+    if not (_RATES_HZ[0] <= rate_hz <= _RATES_HZ[1] and 1 <= count <= MAX_FRAMES):
+        raise InputError(f"expected 1 to {MAX_FRAMES} frames at 1 to 10000 Hz, found {count} at {rate_hz:g} Hz")
+    return np.arange(count) / rate_hz
+
+
+def _of_c3d(path: Path) -> _Points:
+    """Without a statement millimetres, z up."""
+    found = read_c3d(path)
+    unit = found.unit if found.unit in _UNITS else "mm"
+    up = found.vertical if found.vertical.lstrip("-") in _TO_Z_UP else "Z"
+    return _Points(found.names, found.positions, _even_times(len(found.positions), found.rate_hz), unit, up)
+
+
+def _read_trc(path: Path) -> _Points:
+    """Tab-separated: the labels stand in the row that begins with ``Frame#``; an empty cell is unknown."""
+    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    rows = [line.split("\t") for line in lines]
+    place = next((i for i, row in enumerate(rows[:20]) if row[0].strip().lower() == "frame#"), None)
+    if place is None or place < 2:
+        raise InputError("expected a TRC file with a row Frame#, found none; export it again")
+    header = dict(zip((cell.strip().lower() for cell in rows[place - 2]), rows[place - 1], strict=False))
+    names = [name.strip() for name in rows[place][2 : 2 + 3 * _MAX_POINTS : 3]]
+    width = 2 + 3 * len(names)
+    data = [[_number(cell) for cell in [*row, *[""] * width][:width]] for row in rows[place + 2 :] if row[0].strip()]
+    table = np.array(data[: MAX_FRAMES + 1], dtype=np.float64).reshape(-1, width)
+    time_s = table[:, 1]
+    if not len(table) or len(table) > MAX_FRAMES or not (np.isfinite(time_s).all() and (np.diff(time_s) > 0).all()):
+        raise InputError(f"expected 1 to {MAX_FRAMES} rows with a Time that increases, found others; export it again")
+    unit = header.get("units", "mm").strip().lower()
+    return _Points(names, table[:, 2:].reshape(len(table), -1, 3), time_s, unit if unit in _UNITS else "mm", "Y")
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
+
+
+class _Bone(NamedTuple):
+    """A joint of a BVH file: name, place of its parent, offset (3,), and columns of its channels by name, in order."""
+
+    name: str
+    parent: int
+    offset: list[float]
+    channels: list[str]
+
+
+def _read_bvh(path: Path) -> _Points:
+    """Forward kinematics of every joint; the format has no unit, centimetres are usual."""
+    words = iter(path.read_text(encoding="utf-8-sig", errors="replace").split())
+    try:
+        bones = _hierarchy(words)
+        text = list(words)  # Frames: N Frame Time: S, then the values
+        count, step = int(text[1]), float(text[4])
+        width = sum(len(bone.channels) for bone in bones)
+        if text[0].lower() != "frames:" or not 1 <= count <= MAX_FRAMES or count * width > len(text):
+            raise InputError(
+                f"expected whole frames of {width} numbers, found {len(text) - 5} of them; export it again"
+            )
+        values = np.array(text[5 : 5 + count * width], dtype=np.float64).reshape(count, width)
+    except (StopIteration, ValueError, IndexError) as error:
+        raise InputError(f"expected a BVH file that can be read; {first_line(error) or 'it ends early'}") from None
+    time_s = _even_times(count, 1.0 / step if step > 0 else 0.0)
+    return _Points([bone.name for bone in bones], _kinematics(bones, values), time_s, "cm", "Y")
+
+
+def _hierarchy(words: Iterator[str]) -> list[_Bone]:
+    """Joints in the order of the file, up to the word MOTION; ends of bones are no joints."""
+    bones: list[_Bone] = []
+    above: list[int] = []
+    for word in words:
+        if word == "MOTION":
+            break
+        if word in ("ROOT", "JOINT", "End"):
+            parts = list(iter(lambda: next(words), "{"))  # names may hold spaces
+            above.append(-1 if word == "End" else len(bones))
+            if word != "End":
+                parent = above[-2] if len(above) > 1 else -1
+                bones.append(_Bone(" ".join(parts), parent, [0.0, 0.0, 0.0], []))
+        elif word == "OFFSET":
+            numbers = [float(next(words)) for _ in range(3)]
+            if above[-1] >= 0:
+                bones[above[-1]].offset[:] = numbers
+        elif word == "CHANNELS":
+            bones[above[-1]].channels[:] = [next(words) for _ in range(min(int(next(words)), 6))]
+        elif word == "}":
+            above.pop()
+        if len(bones) > _MAX_POINTS:
+            raise InputError(f"expected at most {_MAX_POINTS} joints, found more")
+    return bones
+
+
+def _kinematics(bones: list[_Bone], values: np.ndarray) -> np.ndarray:
+    """(F, J, 3) places of joints by the channels (F, N); a channel of a position stands in the place of the offset."""
+    places, turns = np.zeros((len(values), len(bones), 3)), list[np.ndarray]()
+    column = 0
+    for joint, bone in enumerate(bones):
+        shift, turn = np.broadcast_to(np.array(bone.offset), (len(values), 3)).copy(), np.eye(3)
+        for channel in bone.channels:
+            axis, value = "XYZ".find(channel[:1].upper()), values[:, column]
+            column += 1
+            if channel[1:] == "position" and axis >= 0:
+                shift[:, axis] = value
+            elif channel[1:] == "rotation" and axis >= 0:
+                turn = turn @ exp_so3(np.deg2rad(value)[:, None] * np.eye(3)[axis])
+            else:
+                raise InputError(f"expected channels such as Xposition and Zrotation, found {channel[:40]!r}")
+        if bone.parent >= 0:
+            shift = places[:, bone.parent] + np.einsum("fij,fj->fi", turns[bone.parent], shift)
+            turn = turns[bone.parent] @ turn
+        places[:, joint] = shift
+        turns.append(np.broadcast_to(turn, (len(values), 3, 3)))
+    return places
+
+
+_READERS: tuple[tuple[re.Pattern[bytes], Callable[[Path], _Points]], ...] = (
+    (re.compile(rb".\x50", re.DOTALL), _of_c3d),
+    (re.compile(rb"\s*HIERARCHY"), _read_bvh),
+    (re.compile(rb"PathFileType"), _read_trc),
+)
