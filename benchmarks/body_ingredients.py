@@ -42,8 +42,8 @@ def _blind(**unknown: None) -> AbstractContextManager[Any]:
 def _with(**values: float) -> AbstractContextManager[Any]:
     """Other parameters of the default method."""
 
-    def config(adjuster: Any) -> LiftedConfig:
-        return replace(lifted_config(adjuster), **values)
+    def config(adjuster: Any, drawn_toes: bool) -> LiftedConfig:
+        return replace(lifted_config(adjuster, drawn_toes=drawn_toes), **values)
 
     return patch.object(ba, "lifted_config", config)
 

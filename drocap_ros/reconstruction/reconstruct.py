@@ -222,6 +222,7 @@ def _solve(tracks: Tracks, keypoints: Keypoints2D, settings: Settings) -> ImageP
         adjuster=adjuster,
         progress=settings.progress,
         rotation=tracks.camera_rotation if view is None else view.rotation(tracks.camera_rotation),
+        pictures=tracks.real_lens,
     )
     if (evidence := body_evidence(tracks, len(settings.body))) is not None:
         seen = view or person_view(keypoints, k, None, tracks.image_size)  # taken as in the middle

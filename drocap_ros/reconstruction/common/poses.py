@@ -26,6 +26,7 @@ class MethodInput:
     rotation : (F, 3, 3) world (z up) -> camera, None = unknown
     progress : called with a stage and its fraction done
     evidence : of the method's joints, in camera axes
+    pictures : whether a network found the keypoints in pictures of a lens
     """
 
     stamp_ns: np.ndarray
@@ -36,6 +37,7 @@ class MethodInput:
     progress: Progress
     rotation: np.ndarray | None = None
     evidence: Evidence | None = None
+    pictures: bool = False
 
     def frames(self, use: np.ndarray | slice) -> MethodInput:
         """The input of some of the frames."""

@@ -85,7 +85,8 @@ def measure_size(view: EvenView, config: LiftedConfig, lifter: Lifter, cancelled
     """Size of a new person: lift, adjust, and lift again with the lengths found."""
     keypoints, fps, focal = view.keypoints, view.fps, view.focal
     seen = LifterInput(keypoints.xy, keypoints.confidence, None, keypoints.covariance, view.rotation, focal)
-    lifted = lifter.lift(seen, fps)
+    lift = lifter.lift_toes_apart if config.drawn_toes else lifter.lift
+    lifted = lift(seen, fps)
     clock = time.perf_counter()
     mm = YARDSTICK_MM / max(float(np.median(bone_lengths(lifted.joints), axis=0)[YARDSTICK].sum()), 1e-12)
     model = window_model(keypoints, lifted.joints[..., :2], mm, fps, config, lifter.interleaved(fps))
@@ -102,7 +103,7 @@ def measure_size(view: EvenView, config: LiftedConfig, lifter: Lifter, cancelled
     flat = _orthographic(keypoints.xy, found.joints[..., 2] - found.joints[:, :1, 2], centre, zoom, mm, focal)
     seconds = time.perf_counter() - clock
     believed = without_outliers(flat, found.joints[..., :2], model.noise_mm, config)
-    lifted = lifter.lift(_flattened(believed, view, mm / zoom, lengths), fps)
+    lifted = lift(_flattened(believed, view, mm / zoom, lengths), fps)
     return SizedWindow(model, flat, lifted, lengths, centre, zoom, mm, seconds, found.iterations)
 
 
@@ -114,7 +115,8 @@ def apply_size(known: BodySize, view: EvenView, config: LiftedConfig, lifter: Li
     frames, joints_count = keypoints.xy.shape[:2]
     rough = _orthographic(keypoints.xy, np.zeros((frames, joints_count)), np.zeros((frames, 2)), zoom, mm, None)
     seen = _flattened(rough, view, mm / zoom, known.lengths_mm)
-    lifted = lifter.lift(replace(seen, focal=None if focal is None else focal * mm), fps)
+    lift = lifter.lift_toes_apart if config.drawn_toes else lifter.lift
+    lifted = lift(replace(seen, focal=None if focal is None else focal * mm), fps)
     middle = np.median(lifted.joints[..., :2], axis=1)
     centre = middle * (zoom / mm)[:, None]
     joints = lifted.joints.copy()

@@ -13,7 +13,7 @@ import numpy as np
 from drocap_ros.errors import InputError, first_line
 from drocap_ros.reconstruction.lifted.feature_network import FeatureNetwork
 from drocap_ros.reconstruction.lifted.network import Errors, LiftedMotion, LifterInput, Network
-from drocap_ros.skeleton import BODY_17
+from drocap_ros.skeleton import BODY_17, indices
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 SHIPPED = Path(__file__).parents[2] / "data" / "lifter_cmu.onnx"
 
 _JOINTS = len(BODY_17)
+_ANKLES, _TOES = indices(BODY_17.joints, ("rankle", "lankle")), indices(BODY_17.joints, ("rtoe", "ltoe"))
 #: Kinds of network by the name of their only input.
 NETWORKS: dict[str, Callable[[InferenceSession, str], Network]] = {"features": FeatureNetwork}
 #: Weights that give the end of the least-squares line through five values: 1 mm better than the last one alone.
@@ -88,6 +89,22 @@ class Lifter:
             factor = round(1 / pace)
             return self._lift_long(seen.spread(factor)).map(lambda values: values[::factor])
         return self._lift_long(seen)
+
+    def lift_toes_apart(self, seen: LifterInput, fps: float | None = None) -> LiftedMotion:
+        """As :meth:`lift`; the body is that without the toes, and the toes stand on its ankles.
+
+        For toes that a 2D network drew: they are not where MoCap's are, which the network learned from.
+        """
+        every = self.lift(seen, fps)
+        if not np.isfinite(seen.keypoints[:, _TOES]).any():
+            return every
+        keypoints = np.array(seen.keypoints, dtype=np.float64)
+        keypoints[:, _TOES] = np.nan
+        body = self.lift(replace(seen, keypoints=keypoints), fps)
+        joints, sigma = body.joints.copy(), body.sigma.copy()
+        joints[:, _TOES] = joints[:, _ANKLES] + every.joints[:, _TOES] - every.joints[:, _ANKLES]
+        sigma[:, _TOES] = every.sigma[:, _TOES]
+        return replace(every, joints=joints, sigma=sigma)
 
     def lift_last(self, seen: LifterInput, fps: float | None = None) -> LiftedMotion:
         """The newest frame of a short sequence: input as of :meth:`lift`, F = 1 in the result.

@@ -42,7 +42,7 @@ class LiveAdjuster:
 
     def __init__(self, config: BundleAdjusterConfig) -> None:
         # An invalid lifter file is refused here, and the first window does not pay for loading.
-        prepare(lifted_config(config))
+        prepare(lifted_config(config, drawn_toes=True))
         self._config = config
         self._known: tuple[int, np.ndarray, BodySize] | None = None
         self._world = WorldWindows(config)
@@ -71,7 +71,7 @@ class LiveAdjuster:
             return self._by_default(part, effort, cancelled)
 
     def _by_default(self, w: Window, effort: Effort, cancelled: Cancelled | None) -> AdjustedWindow:
-        config = lifted_config(self._config)
+        config = lifted_config(self._config, drawn_toes=True)
         if effort.steps is not None:
             config = replace(config, first_iterations=effort.steps[0], iterations=effort.steps[1])
         confidence = np.clip(w.keypoints.weights, 0.0, 1.0)

@@ -16,7 +16,7 @@ from drocap_ros.reconstruction.lifted.method import solve_window
 
 def run(data: MethodInput) -> ImagePoses:
     """Poses by the default method."""
-    config = lifted_config(data.adjuster)
+    config = lifted_config(data.adjuster, drawn_toes=data.pictures)
     origin = {"parameters": {"default_method": config}, "lifter": Lifter.load(config.lifter or None).origin}
 
     def solve(rows: slice) -> ImagePoses:

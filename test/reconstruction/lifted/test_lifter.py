@@ -119,6 +119,21 @@ def test_missing_joints_and_frames_are_estimated(lifter):
     assert np.median(apart[40:, 1:7]) < 15.0
 
 
+def test_toes_that_a_network_drew_leave_the_body_alone_and_turn_the_feet(lifter):
+    seen = walker(40)
+    low, unseen = seen.copy(), seen.copy()
+    low[:, 15:] += (0, 60)
+    unseen[:, 15:] = np.nan
+    body = lifter.lift(LifterInput(unseen))
+    here, there = (lifter.lift_toes_apart(LifterInput(points)) for points in (seen, low))
+    np.testing.assert_array_equal(there.joints[:, :15], body.joints[:, :15])
+    np.testing.assert_array_equal(here.joints[:, :15], body.joints[:, :15])
+    ankles = [BODY_17.index("rankle"), BODY_17.index("lankle")]
+    feet = [found.joints[:, 15:, 1] - found.joints[:, ankles, 1] for found in (here, there)]
+    assert (np.median(feet[1] - feet[0], axis=0) > 30).all()
+    np.testing.assert_array_equal(lifter.lift_toes_apart(LifterInput(unseen)).joints, body.joints)
+
+
 def test_given_bone_lengths_change_the_result_towards_them(lifter):
     body = simulate_person(np.arange(60) / 24, "walk", 3, 1.8)[:, :15]
     points = np.full((60, 17, 2), np.nan)
