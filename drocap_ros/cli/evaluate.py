@@ -1,4 +1,4 @@
-"""``drocap evaluate``: a motion against its truth, the camera-motion study, the motion in the world."""
+"""``drocap evaluate``: a motion against its truth, the paper's studies and tables, the motion in the world."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from drocap_ros.cli import reconstruct
 from drocap_ros.cli.options import (
     Subparsers,
     add_command,
+    add_config_option,
+    add_models_option,
     add_motion_argument,
     add_quiet_option,
     add_seed_option,
@@ -31,6 +33,7 @@ def add_parser(subparsers: Subparsers) -> None:
     _add_compare(kinds)
     _add_rotation(kinds)
     _add_world(kinds)
+    _add_table(kinds)
 
 
 def _add_compare(kinds: Subparsers) -> None:
@@ -84,6 +87,23 @@ def _add_world(kinds: Subparsers) -> None:
     parser.add_argument("--still", action="store_true", help="the camera keeps its bearing from the person")
     parser.add_argument("--method", choices=METHODS, default="ba", help="default: ba")
     parser.add_argument("--every", metavar="N", type=int, default=1, help="only every N-th sequence")
+
+
+def _add_table(kinds: Subparsers) -> None:
+    parser = add_command(
+        kinds,
+        "table",
+        _table,
+        help="the paper's tables from a folder of recordings with truth",
+        description="Every method on each recording with truth in DIR: a folder with truth.npz (.c3d, .trc, .bvh) and"
+        " tracks.npz, session or one other input; or NAME.mp4 (.npz, ...) beside NAME_truth.npz (...).",
+    )
+    parser.add_argument("folder", metavar="DIR", type=Path, help="folder of recordings with truth")
+    parser.add_argument("--methods", choices=METHODS, nargs="+", help="default: the paper's rows, and ba")
+    add_models_option(parser)
+    add_config_option(parser)
+    add_quiet_option(parser, "no progress, only the tables")
+    _add_out(parser, "table.csv and table.md")
 
 
 def _add_study_options(parser: argparse.ArgumentParser, files: str) -> None:
@@ -142,6 +162,20 @@ def _world(args: argparse.Namespace) -> int:
         sequences = world_sequences(args.folder, args.every, args.limit)
         rows = world_study(sequences, case, seed=args.seed, method=args.method, progress=progress)
     return _finish(args, "world", [study_record(row) for row in rows], world_markdown(rows, case))
+
+
+def _table(args: argparse.Namespace) -> int:
+    """The paper's tables over recordings with truth."""
+    from drocap_ros.cli.progress import progress_bars
+    from drocap_ros.config import load_config
+    from drocap_ros.evaluation import tables
+    from drocap_ros.evaluation.recordings import PAPER_METHODS, find_recordings, recordings_table
+
+    _check_out(args)
+    recordings, config = find_recordings(args.folder), load_config(args.config)
+    with progress_bars(args.quiet) as progress:
+        rows = recordings_table(recordings, args.methods or PAPER_METHODS, config, args.models, progress)
+    return _finish(args, "table", [tables.study_record(row) for row in rows], tables.recordings_markdown(rows))
 
 
 def _check_out(args: argparse.Namespace) -> None:

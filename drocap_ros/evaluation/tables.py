@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import csv
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from itertools import starmap
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from drocap_ros.evaluation.compare import MotionErrors, WorldErrors
 from drocap_ros.evaluation.metrics import JOINT_GROUPS
+from drocap_ros.evaluation.recordings import RecordingRow
 from drocap_ros.evaluation.rotation import RotationRow
 from drocap_ros.evaluation.world import WorldRow, world_means
 from drocap_ros.evaluation.world_protocol import WorldCase
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_Row = TypeVar("_Row", RotationRow, RecordingRow)
 _LABELS = {
     "ba": "default (`ba`)",
     "paper": "paper: bundle adjustment",
@@ -72,7 +75,7 @@ def _cell(value: float, form: str) -> str:
 def save_csv(path: Path, records: Sequence[Mapping[str, object]]) -> None:
     """One line per record under a head; floats with four decimals."""
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(records[0]))
+        writer = csv.DictWriter(file, fieldnames=list(dict.fromkeys(itertools.chain.from_iterable(records))))
         writer.writeheader()
         for record in records:
             writer.writerow({k: f"{v:.4f}" if isinstance(v, float) else v for k, v in record.items()})
@@ -88,7 +91,7 @@ def errors_record(e: MotionErrors | WorldErrors) -> dict[str, object]:
     return record
 
 
-def study_record(row: RotationRow | WorldRow) -> dict[str, object]:
+def study_record(row: RotationRow | WorldRow | RecordingRow) -> dict[str, object]:
     """One result of a study as columns for :func:`save_csv`."""
     return {key: value for key, value in vars(row).items() if key != "errors"} | errors_record(row.errors)
 
@@ -136,7 +139,27 @@ def _speed_cells(method: str, rows: list[RotationRow], speeds: list[float]) -> l
     return [label(method), *(f"{_mean_mm(rows, s):.1f}" for s in speeds), str(sum(r.errors.mirrored for r in rows))]
 
 
-def _by_method(rows: list[RotationRow]) -> dict[str, list[RotationRow]]:
+def recordings_markdown(rows: list[RecordingRow]) -> str:
+    """The paper's tables: mean error by method and recording, and per joint group; errors in the world where known."""
+    by_method, names = _by_method(rows), list(dict.fromkeys(row.sequence for row in rows))
+    means = {m: np.mean([row.errors.error_mm for row in of]) for m, of in by_method.items()}
+    cells = [
+        [label(m), *(f"{row.errors.error_mm:.1f}" for row in of), f"{means[m]:.1f}"] for m, of in by_method.items()
+    ]
+    lines = [
+        *("Reconstruction error in mm.", ""),
+        *markdown_table(["method", *names, "mean"], cells),
+        *("", "Per joint group, mm.", ""),
+        *markdown_table(["method", *JOINT_GROUPS, "toe"], list(starmap(_group_cells, by_method.items()))),
+    ]
+    placed = [(f"{r.sequence}, {label(r.method)}", r.errors.world) for r in rows if r.errors.world is not None]
+    if placed:
+        world = [[name, *world_cells(errors)] for name, errors in placed]
+        lines += ["", "In the world.", "", *markdown_table(["recording, method", *WORLD_HEAD], world)]
+    return "\n".join(lines) + "\n"
+
+
+def _by_method(rows: list[_Row]) -> dict[str, list[_Row]]:
     return {method: [r for r in rows if r.method == method] for method in dict.fromkeys(r.method for r in rows)}
 
 
@@ -144,10 +167,10 @@ def _mean_mm(rows: list[RotationRow], speed: float) -> float:
     return float(np.mean([r.errors.error_mm for r in rows if r.speed_deg_s == speed]))
 
 
-def _group_cells(method: str, rows: list[RotationRow]) -> list[str]:
+def _group_cells(method: str, rows: list[_Row]) -> list[str]:
     """The method and its mean error per joint group and of the toes, "-" where no row knows it."""
     errors = [r.errors for r in rows]
-    groups = [np.mean([e.per_group_mm[group] for e in errors]) for group in JOINT_GROUPS]
+    groups: list[np.floating] = [np.mean([e.per_group_mm[group] for e in errors]) for group in JOINT_GROUPS]
     toes = [e.toe_mm for e in errors if not np.isnan(e.toe_mm)]
     return [label(method), *(f"{g:.1f}" for g in groups), f"{np.mean(toes):.1f}" if toes else "-"]
 
